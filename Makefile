@@ -1,0 +1,64 @@
+# make demo   simulates a recording, calibrates it and exports the result, in demo/
+# make test   checks style and runs every test
+# make clean  removes what the two made
+
+PYTHON = $(firstword $(foreach p,python3.11 python3,$(shell $(p) -c \
+	'import sys; (3, 11) <= sys.version_info < (3, 15) and print("$(p)")' 2>/dev/null)))
+LIBRARIES = libusb-1.0-0 libgl1 libgomp1 libx11-6
+BIN = .venv/bin
+OPEN3D_LOADS = $(BIN)/python -c 'import sys; sys.tracebacklimit = 0; import open3d'
+PIP = $(BIN)/python -m pip install --quiet --disable-pip-version-check
+
+.PHONY: demo test system clean
+
+demo: system
+	@echo "== demo: a simulated recording of the default rig"
+	rm -rf demo
+	$(BIN)/rigcal simulate default -o demo/recording --seed 1
+	@echo "== demo: what the recording holds, and what can be estimated from it"
+	$(BIN)/rigcal check demo/recording
+	@echo "== demo: the joint calibration"
+	$(BIN)/rigcal fit demo/recording -o demo/run
+	$(BIN)/rigcal compare demo/run
+	@echo "== demo: the result as YAML, in demo/export"
+	$(BIN)/rigcal export demo/run -o demo/export --format yaml
+
+test: system .venv/.tested
+	@echo "== test: style"
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	@echo "== test: pytest"
+	$(BIN)/python -m pytest
+
+clean:
+	@echo "== clean: removing the environment, the demo and what the tools left"
+	rm -rf .venv demo build *.egg-info .pytest_cache .ruff_cache
+	find . -name __pycache__ -prune -exec rm -rf {} +
+
+system: .venv/.system
+
+.venv/.installed: pyproject.toml
+	@$(if $(PYTHON),,echo "rigcal needs Python 3.11 to 3.14, and neither python3.11 nor python3 is one." >&2; exit 1)
+	@echo "== install: rigcal and what it needs, into .venv (about 1.2 GB, minutes the first time)"
+	$(PYTHON) -m venv .venv
+	$(PIP) --editable .
+	@touch $@
+
+.venv/.tested: .venv/.installed
+	@echo "== install: what the tests need"
+	$(PIP) --editable '.[test]'
+	@touch $@
+
+.venv/.system: .venv/.installed
+	@echo "== system: does Open3D find its system libraries?"
+	@if $(OPEN3D_LOADS); then \
+		echo "yes"; \
+	elif [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
+		echo "no: installing them with apt-get"; \
+		apt-get update && apt-get install -y --no-install-recommends $(LIBRARIES) && $(OPEN3D_LOADS); \
+	else \
+		echo "no: on Debian or Ubuntu, type this and run make again" >&2; \
+		echo "    sudo apt-get install -y --no-install-recommends $(LIBRARIES)" >&2; \
+		exit 1; \
+	fi
+	@touch $@

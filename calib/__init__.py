@@ -1,0 +1,1 @@
+"""Inference: the only package that knows about error, probability and results."""

@@ -1,0 +1,48 @@
+"""The catalogue of effects. A new one is a short class and a line in `CATALOGUE`."""
+
+from __future__ import annotations
+
+import difflib
+
+from calib.effects.arm import ArmJointOffset, ArmLinkLength
+from calib.effects.base import Basis, Effect, LazyColumn, OneHot, Param, Site, View
+from calib.effects.lidar import RingRangeOffset
+from calib.effects.reference import SurfaceShift
+from calib.effects.rig import FrameOffset
+from chains.errors import InputError
+
+CATALOGUE: tuple[Effect, ...] = (
+    ArmLinkLength(),
+    ArmJointOffset(),
+    RingRangeOffset(),
+)
+DEFAULT = ("arm_link_length", "arm_joint_offset", "ring_range_offset")
+
+__all__ = [
+    "CATALOGUE",
+    "DEFAULT",
+    "Basis",
+    "Effect",
+    "FrameOffset",
+    "LazyColumn",
+    "OneHot",
+    "Param",
+    "Site",
+    "SurfaceShift",
+    "View",
+    "find",
+]
+
+
+def find(name: str) -> Effect:
+    """The effect of this name.
+
+    Raises:
+        InputError: when the catalogue has none, naming the nearest.
+    """
+    known = {effect.name: effect for effect in CATALOGUE}
+    if name not in known:
+        near = difflib.get_close_matches(name, known, 1)
+        hint = f"; did you mean '{near[0]}'?" if near else f": it has {', '.join(known)}."
+        raise InputError(f"effect '{name}' is not in the catalogue{hint}")
+    return known[name]

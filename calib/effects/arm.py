@@ -1,0 +1,54 @@
+"""How an arm lies."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calib.effects.base import Effect, Param, Site, View
+from calib.rig import Rig
+
+
+class ArmLinkLength(Effect):
+    """A URDF joint origin is longer than drawn: ``t -> t + dL * t / |t|``."""
+
+    name = "arm_link_length"
+    site = Site.EDGE
+    formula = "|origin of joint i| = nominal + dL_i, along the nominal direction"
+    typical = "0.1 to 5 mm"
+    covariates = "joint positions"
+    confounded_with = ("arm_base", "mount", "arm_joint_offset")
+    source = "S28 Schunk LWA 4P URDF; axes turned one at a time, radii of circles taken as lengths"
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        return tuple(Param(name, "m", 0.005) for name in rig.arm_edges)
+
+    def basis(self, view: View) -> np.ndarray:
+        tree = view.rig.tree
+        basis = np.zeros((1, len(tree.edges), 6, len(view.rig.arm_edges)))
+        for p, name in enumerate(view.rig.arm_edges):
+            e = tree.edge_names.index(name)
+            T_parent_child = tree.edges[e].T_parent_child
+            length_m = np.linalg.norm(T_parent_child[:3, 3])
+            if length_m > 1e-9:
+                basis[0, e, 3:, p] = T_parent_child[:3, :3].T @ T_parent_child[:3, 3] / length_m
+        return basis
+
+
+class ArmJointOffset(Effect):
+    """An encoder's zero is off: ``true joint = reported + offset``."""
+
+    name = "arm_joint_offset"
+    site = Site.JOINTS
+    formula = "q_i = reported_i + offset_i"
+    typical = "0.1 to 5 mrad"
+    covariates = "joint positions"
+    confounded_with = ("arm_base", "mount", "arm_joint_eccentricity")
+    source = "Mooring, Roth, Driels 1991, Fundamentals of Manipulator Calibration"
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        units = {True: "rad", False: "m"}
+        kinds = {e.joint.name: e.joint.kind for e in rig.tree.edges if e.joint is not None}
+        return tuple(Param(j, units[kinds[j] == "revolute"], 0.005) for j in rig.joint_names)
+
+    def basis(self, view: View) -> np.ndarray:
+        return np.eye(len(view.rig.joint_names))[None]

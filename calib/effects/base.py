@@ -1,0 +1,128 @@
+"""What an effect is: one way the hardware lies, as a site and a basis.
+
+Instruments (BEAM, TRACKER) add to the truth, ``measured = true + basis(view) @ theta``; geometry
+(JOINTS, EDGE, TARGET, REFERENCE) adds to what encoder, URDF, CAD or mesh say,
+``true = nominal + basis(view) @ theta``. ``theta = 0`` switches an effect off.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from enum import Enum
+from typing import ClassVar
+
+import numpy as np
+
+from calib.rig import Rig
+from chains.errors import InputError
+
+
+class Site(Enum):
+    """Where on the path from the room to the number the hardware lies.
+
+    The comment gives the shape of the error at one row of the site, and what a row is.
+    """
+
+    BEAM = "beam"  # (3,) range m, azimuth rad, elevation rad; a row per point
+    JOINTS = "joints"  # (J,) rad or m, what each encoder reports; a row per stop
+    EDGE = "edge"  # (E, 6) twist of every edge of the frame tree; a row per stop
+    TRACKER = "tracker"  # (B, 6) twist of every tracked body as seen; a row per stop
+    TARGET = "target"  # (3,) m, sphere centre on its rod, tracker frame; a row per target
+    REFERENCE = "reference"  # (3,) m, where the surface is, reference frame; a row per point
+    NOISE = "noise"  # (1,) log sigma of the range; a row per point
+
+
+@dataclass(frozen=True)
+class Param:
+    """One unknown of an effect: its name, its unit, and how large it may plausibly be."""
+
+    name: str
+    unit: str
+    sigma: float
+
+
+LazyColumn = np.ndarray | Callable[[], np.ndarray]
+
+
+@dataclass(frozen=True)
+class View:
+    """What an effect may look at: the rig, and named columns at the rows of its site.
+
+    Columns of a point are those of its stop too. Range and incidence are those *predicted* by the
+    model, never the measured ones: noise common to a column and its residual looks like an effect.
+
+    Args:
+        rig: the rig as built on paper.
+        rows: how many rows the site has here.
+        columns: name -> (rows,), or (1,) where one value holds for all rows; or a function
+            that gives it, for what is costly and seldom asked.
+        joints: (rows, J) or (1, J) reported joint values, rad or m.
+    """
+
+    rig: Rig
+    rows: int
+    columns: Mapping[str, LazyColumn]
+    joints: np.ndarray
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        if name not in self.columns:
+            known = ", ".join(sorted(self.columns))
+            raise InputError(f"column '{name}' is not in this recording, which has {known}.")
+        column = self.columns[name]
+        return column() if callable(column) else column
+
+
+@dataclass(frozen=True)
+class OneHot:
+    """A basis in which every row touches the parameters of one group only.
+
+    Args:
+        index: (rows,) group of each row; -1 touches none.
+        values: (rows, D) error at the site per unit of the group's parameter.
+        size: number of groups, which is the number of parameters.
+    """
+
+    index: np.ndarray
+    values: np.ndarray
+    size: int
+
+
+Basis = np.ndarray | OneHot
+
+
+class Effect(ABC):
+    """One way the hardware lies. A subclass states what it is and gives its basis; all else follows.
+
+    Attributes:
+        name: as in commands and files.
+        site: where it acts.
+        formula, typical, covariates, confounded_with, source: the catalogue's page.
+        of_lidar: True when the effect belongs to the mounted LiDAR, so that rigs do not share it.
+    """
+
+    name: str
+    site: ClassVar[Site]
+    formula: ClassVar[str] = ""
+    typical: ClassVar[str] = ""
+    covariates: ClassVar[str] = ""
+    confounded_with: ClassVar[tuple[str, ...]] = ()
+    source: ClassVar[str] = ""
+
+    @property
+    def of_lidar(self) -> bool:
+        return self.site in (Site.BEAM, Site.NOISE)
+
+    @abstractmethod
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        """The unknowns of this effect on this rig; empty where the rig has nothing it could act on."""
+
+    @abstractmethod
+    def basis(self, view: View) -> Basis:
+        """Error at the site per unit of each parameter.
+
+        Returns:
+            (rows, *shape of the site, P), or a `OneHot`. One row stands for all where the basis
+            depends on nothing that changes.
+        """

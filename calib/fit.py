@@ -1,0 +1,165 @@
+"""The joint estimate: linearise every stop, solve the graph, repeat; then the honest covariance."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.effects import SurfaceShift
+from calib.forward import Term
+from calib.graph import Block, Graph, Variable
+from calib.model import Source
+from calib.problem import Problem, effect_variable
+from calib.residuals.scan import LOCAL_SHARE, ScanStop
+from chains import se3
+
+Progress = Callable[[str, int, int], None]
+MAX_PASSES = 25
+SETTLED = 1e-5  # m and rad: after that, which triangle a beam meets is kept
+CONVERGED = 1e-8  # m and rad: a thousandth of the smallest sigma in sight
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What a fit found.
+
+    Args:
+        values: every variable of the graph, at the optimum.
+        names: calibration variables, in order.
+        covariance: (P, P) joint marginal of their tangents, with stop, surface and patch errors as
+            unknowns of the graph.
+        associations: per scan, which part of the surface each beam met.
+        scans: the scans as linearised last, the surface's unknowns included.
+        iterations: passes over the scans (or of the solver, where there are none).
+        converged: whether the last step was below tolerance.
+        graph: the last linearisation, for marginals of other variables.
+    """
+
+    values: dict[str, np.ndarray]
+    names: tuple[str, ...]
+    covariance: np.ndarray
+    associations: Sequence[np.ndarray]
+    scans: Sequence[ScanStop]
+    iterations: int
+    converged: bool
+    graph: Graph
+
+
+def solve(
+    problem: Problem,
+    prior: Block | None = None,
+    tolerance: float = CONVERGED,
+    progress: Progress = lambda what, done, total: None,
+) -> Estimate:
+    """Maximum a posteriori estimate of a problem.
+
+    Trackers and targets alone are solved first. Then each pass linearises every stop's rows at the
+    present state (robust weights and, until the fit has settled, the surface met included),
+    compresses them, and takes one Gauss-Newton step of the whole graph.
+
+    Args:
+        problem: what to estimate.
+        prior: a joint prior; the variables it speaks of then have no prior of their own.
+        tolerance: largest step of the last pass, m and rad.
+        progress: called with what is being done, how many stops are done, and of how many.
+    """
+    loop = _Loop(problem, prior, progress)
+    loop.solve_without_scans()
+    if not problem.scans:
+        return loop.estimate(converged=True)
+    loop.run(problem.scans, SETTLED, associate=True)
+    loop.fix_association()
+    loop.add_surface_unknowns()
+    return loop.estimate(loop.run(loop.scans, tolerance, associate=False))
+
+
+class _Loop:
+    """The state of a fit while it runs."""
+
+    def __init__(self, problem: Problem, prior: Block | None, progress: Progress) -> None:
+        self.problem, self.progress = problem, progress
+        self.prior = [prior] if prior else []
+        self.without = frozenset(prior.variables) if prior else frozenset()
+        self.variables = dict(problem.variables)
+        self.values = dict(problem.initial)
+        self.scans = list(problem.scans)
+        self.associations: list[np.ndarray] = []
+        self.passes = 0
+        self.graph: Graph | None = None
+
+    def solve_without_scans(self) -> None:
+        """Trackers and targets alone: a good start for the beams, or all there is."""
+        self._link([])
+        self.values = self.graph.solve(self.values)
+        self.passes += 1
+
+    def run(self, scans: Sequence[ScanStop], tolerance: float, associate: bool) -> bool:
+        """Passes until the step is below tolerance; whether that was reached."""
+        for _ in range(MAX_PASSES):
+            rows = []
+            for i, scan in enumerate(scans):
+                self.progress(f"pass {self.passes + 1}", i, len(scans))
+                rows.append(scan.compress(self.values, None if associate else self.associations[i]))
+            step = self._step(rows)
+            self.passes += 1
+            if step < tolerance:
+                return True
+        return False
+
+    def fix_association(self) -> None:
+        """Keep, from now on, what each beam meets; drop beams beside a depth edge."""
+        self.associations = []
+        for i, scan in enumerate(self.scans):
+            self.progress("looking for depth edges", i, len(self.scans))
+            self.associations.append(scan.associate(self.values, near_edges=True))
+
+    def add_surface_unknowns(self) -> None:
+        """Errors of the reference, common to the points of a surface or patch, as unknowns.
+
+        Those of surfaces and of patches share the variance that neighbouring points have in common.
+        """
+        for number, source in enumerate(self.problem.sources):
+            mine = [i for i, scan in enumerate(self.scans) if scan.recording is source.recording]
+            sigma_m = self.scans[mine[0]].reference_sigma_m if mine else 0.0
+            if not sigma_m:
+                continue
+            views = [self.scans[i].rows(self.values, self.associations[i]).view for i in mine]
+            for column in ("surface", "patch"):
+                parts = np.unique(np.concatenate([np.unique(view[column]) for view in views]))
+                each = sigma_m * np.sqrt((1.0 - LOCAL_SHARE) / 2.0)
+                effect = SurfaceShift(f"{number}/reference_{column}", column, parts, each)
+                self._switch_on(effect, source, mine)
+
+    def _switch_on(self, effect: SurfaceShift, source: Source, scans: Sequence[int]) -> None:
+        term = Term(effect, effect.name, np.arange(len(effect.parts)))
+        self.variables[effect.name] = effect_variable(term, source)
+        self.values[effect.name] = self.variables[effect.name].mean
+        for i in scans:
+            self.scans[i] = replace(self.scans[i], terms=[*self.scans[i].terms, term])
+
+    def estimate(self, converged: bool) -> Estimate:
+        """The result, with the covariance of the calibration."""
+        names = tuple(self.problem.calibration)
+        self.progress("marginals", 0, 1)
+        covariance = self.graph.covariance(self.values, names)
+        return Estimate(
+            self.values, names, covariance, self.associations, self.scans, self.passes, converged, self.graph
+        )
+
+    def _link(self, rows: Sequence[Block]) -> None:
+        blocks = [*self.problem.blocks, *self.prior, *rows]
+        self.graph = Graph(list(self.variables.values()), blocks, self.without)
+
+    def _step(self, rows: Sequence[Block]) -> float:
+        """One step of the graph; the largest change of any variable, in m or rad."""
+        self._link(rows)
+        before, self.values = self.values, self.graph.step(self.values)
+        return max(_change(v, before[n], self.values[n]) for n, v in self.variables.items())
+
+
+def _change(variable: Variable, before: np.ndarray, after: np.ndarray) -> float:
+    if variable.kind == "pose":
+        return float(np.abs(se3.log(se3.inverse(before) @ after)).max())
+    return float(np.abs(after - before).max())

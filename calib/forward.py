@@ -1,0 +1,135 @@
+"""The forward model: where every frame of the rig is, given the unknowns. The heart.
+
+    reference <- world (tracker) <- root of the rig <- ... arm ... <- mount <- lidar
+
+Each arrow that is known from CAD or URDF is a frame tree; the two that are not are poses. Effects
+bend the tree at its edges and joints through their bases, so the derivative of any frame by any
+unknown is the derivative by site times the basis.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.effects import Effect, OneHot, Site, View
+from calib.rig import Rig
+from chains import se3
+
+Values = Mapping[str, np.ndarray]
+Derivatives = dict[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Term:
+    """An effect as it stands in a model: its variable in the graph, and which parameters are free."""
+
+    effect: Effect
+    variable: str
+    free: np.ndarray  # (n,) indices into the effect's parameters
+
+    def basis(self, view: View) -> np.ndarray | OneHot:
+        """The effect's basis, of the free parameters only (a `OneHot` is always wholly free)."""
+        basis = self.effect.basis(view)
+        return basis if isinstance(basis, OneHot) else basis[..., self.free]
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A frame at K stops: T (K, 4, 4), and its right increment (K, 6, n) by each variable."""
+
+    T: np.ndarray
+    d: Derivatives
+
+
+@dataclass(frozen=True)
+class Stops:
+    """The geometry of K stops that share every variable.
+
+    Args:
+        rig: the rig on paper.
+        joints: (K, J) reported joints, rad or m.
+        edge_bases: variable -> (K or 1, E, 6, P), the twist of each edge per unit.
+        joint_bases: variable -> (K or 1, J, P), the joint error per unit.
+        root: variable of T_world_root.
+        reference: variable of T_world_reference, or None where both are one frame.
+    """
+
+    rig: Rig
+    joints: np.ndarray
+    edge_bases: Mapping[str, np.ndarray]
+    joint_bases: Mapping[str, np.ndarray]
+    root: str
+    reference: str | None
+
+    def with_joint_noise(self, variable: str) -> Stops:
+        """The same stops, with what their encoders misreport as one more unknown."""
+        noise = np.eye(self.joints.shape[1])[None]
+        return replace(self, joint_bases={**self.joint_bases, variable: noise})
+
+    @property
+    def variables(self) -> tuple[str, ...]:
+        """What places the rig in the world."""
+        return (self.root, *self.edge_bases, *self.joint_bases)
+
+    def in_root(self, frame: str, values: Values) -> Placed:
+        """T_root_frame under all effects of edges and joints."""
+        joints, twists = self.joints, np.zeros((1, len(self.rig.tree.edges), 6))
+        for name, basis in self.joint_bases.items():
+            joints = joints + basis @ values[name]
+        for name, basis in self.edge_bases.items():
+            twists = twists + basis @ values[name]
+        placed = self.rig.tree.place(frame, joints, twists)
+        count = len(joints)
+        by_twist = placed.d_twist.reshape(count, 6, -1)
+        d = {n: by_twist @ _flat(basis) for n, basis in self.edge_bases.items()}
+        for name, basis in self.joint_bases.items():
+            d[name] = d.get(name, 0.0) + placed.d_joint @ basis
+        return Placed(placed.Ts_root_frame, d)
+
+    def in_world(self, frame: str, values: Values) -> Placed:
+        """T_world_frame = T_world_root @ T_root_frame."""
+        inner = self.in_root(frame, values)
+        d = inner.d | {self.root: se3.adjoint(se3.inverse(inner.T))}
+        return Placed(values[self.root] @ inner.T, d)
+
+    def in_reference(self, frame: str, values: Values) -> Placed:
+        """T_reference_frame = inverse(T_world_reference) @ T_world_frame."""
+        outer = self.in_world(frame, values)
+        if self.reference is None:
+            return outer
+        T = se3.inverse(values[self.reference]) @ outer.T
+        return Placed(T, outer.d | {self.reference: -se3.adjoint(se3.inverse(T))})
+
+
+def place(
+    rig: Rig,
+    terms: Sequence[Term],
+    joints: np.ndarray,
+    columns: Mapping[str, np.ndarray],
+    root: str,
+    reference: str | None,
+) -> Stops:
+    """Bind a model's geometric effects to K stops.
+
+    Args:
+        rig: the rig on paper.
+        terms: the model's effects on this rig, of any site.
+        joints: (K, J) reported joints.
+        columns: (K,) per-stop covariates that effects may look at.
+        root: variable of T_world_root at these stops.
+        reference: variable of T_world_reference, or None.
+    """
+    view = View(rig, len(joints), columns, joints)
+    at = {
+        site: {t.variable: t.basis(view) for t in terms if t.effect.site is site}
+        for site in (Site.EDGE, Site.JOINTS)
+    }
+    return Stops(rig, joints, at[Site.EDGE], at[Site.JOINTS], root, reference)
+
+
+def _flat(basis: np.ndarray) -> np.ndarray:
+    rows, edges, dof, size = basis.shape
+    return basis.reshape(rows, edges * dof, size)

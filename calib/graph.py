@@ -1,0 +1,186 @@
+"""The factor graph: variables, blocks of rows, the solution and its marginals (the gtsam door).
+
+Everything else speaks numpy: a value is an array, a block returns residuals and derivatives as
+arrays, and this module alone turns them into GTSAM factors and back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+import gtsam
+import numpy as np
+
+Kind = Literal["vector", "pose", "direction"]
+Values = Mapping[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Variable:
+    """One unknown of the graph.
+
+    Args:
+        name: unique.
+        kind: "vector" (n,), "pose" (4, 4), or "direction", a unit vector (3,).
+        mean: what was known before, in the shape of the kind.
+        sigma: (dim,) how well it was known, per tangent direction; never zero.
+        dofs: (dim,) a name per tangent direction.
+        units: (dim,) "m" or "rad" or another unit, per tangent direction.
+    """
+
+    name: str
+    kind: Kind
+    mean: np.ndarray
+    sigma: np.ndarray
+    dofs: tuple[str, ...]
+    units: tuple[str, ...]
+
+    @property
+    def dim(self) -> int:
+        return len(self.sigma)
+
+
+class Block(Protocol):
+    """Whitened rows of one kind that should be zero but for unit noise.
+
+    ``evaluate`` gives residuals (m,) and, when asked, the derivative by each variable: (m, n) for a
+    vector, (m, 6) for a pose by its right increment, (m, 3) for a direction by its three components.
+    """
+
+    name: str
+    variables: tuple[str, ...]
+    rows: int
+
+    def evaluate(
+        self, values: Values, derivatives: bool
+    ) -> tuple[np.ndarray, dict[str, np.ndarray] | None]: ...
+
+
+class Graph:
+    """Blocks and priors as one `gtsam.NonlinearFactorGraph`.
+
+    Args:
+        variables: every unknown; each has a prior, weak where little is known.
+        blocks: the rows.
+        own_prior: False leaves out the priors of the named variables (a joint prior replaces them).
+    """
+
+    def __init__(
+        self,
+        variables: Sequence[Variable],
+        blocks: Sequence[Block],
+        without_prior: frozenset[str] = frozenset(),
+    ) -> None:
+        self.variables = {v.name: v for v in variables}
+        self._key = {name: k for k, name in enumerate(self.variables)}
+        self._graph = gtsam.NonlinearFactorGraph()
+        for variable in variables:
+            if variable.name not in without_prior:
+                self._graph.add(self._prior(variable))
+        for block in blocks:
+            self._graph.add(self._factor(block))
+
+    def error(self, values: Values) -> float:
+        """Half the sum of squared whitened rows, priors included."""
+        return self._graph.error(self._to_gtsam(values))
+
+    def solve(self, initial: Values, max_iterations: int = 50) -> dict[str, np.ndarray]:
+        """The maximum a posteriori values, by Levenberg-Marquardt from `initial`.
+
+        GTSAM's default tolerance is relative to the cost, and stops sigmas short of the optimum when
+        rows are many; here the last step must lower half the chi-square by less than 1e-9.
+        """
+        params = gtsam.LevenbergMarquardtParams()
+        params.setMaxIterations(max_iterations)
+        params.setRelativeErrorTol(0.0)
+        params.setAbsoluteErrorTol(1e-9)
+        start = self._to_gtsam(initial)
+        return self._from_gtsam(
+            gtsam.LevenbergMarquardtOptimizer(self._graph, start, params).optimize()
+        )
+
+    def step(self, values: Values) -> dict[str, np.ndarray]:
+        """The values one Gauss-Newton step on."""
+        at = self._to_gtsam(values)
+        return self._from_gtsam(at.retract(self._graph.linearize(at).optimize()))
+
+    def covariance(self, values: Values, names: Sequence[str]) -> np.ndarray:
+        """Joint marginal covariance of the named variables' tangents, in the order given."""
+        marginals = gtsam.Marginals(self._graph, self._to_gtsam(values))
+        keys = [self._key[name] for name in names]
+        if len(keys) == 1:
+            return marginals.marginalCovariance(keys[0])
+        return marginals.jointMarginalCovariance(keys).fullMatrix()
+
+    def _prior(self, v: Variable) -> gtsam.NonlinearFactor:
+        noise = gtsam.noiseModel.Diagonal.Sigmas(np.asarray(v.sigma, float))
+        make = {
+            "vector": gtsam.PriorFactorVector,
+            "pose": gtsam.PriorFactorPose3,
+            "direction": gtsam.PriorFactorUnit3,
+        }[v.kind]
+        return make(self._key[v.name], _wrap(v.kind, v.mean), noise)
+
+    def _factor(self, block: Block) -> gtsam.CustomFactor:
+        if len(set(block.variables)) != len(block.variables):
+            raise ValueError(f"block '{block.name}' names a variable twice")
+        keys = [self._key[name] for name in block.variables]
+        noise = gtsam.noiseModel.Unit.Create(block.rows)
+        return gtsam.CustomFactor(noise, keys, self._callback(block))
+
+    def _callback(self, block: Block) -> Callable:
+        variables = [self.variables[name] for name in block.variables]
+        keys = [self._key[name] for name in block.variables]
+
+        def rows(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list | None) -> np.ndarray:
+            now = {v.name: _read(v.kind, values, k) for v, k in zip(variables, keys, strict=True)}
+            residual, derivative = block.evaluate(now, jacobians is not None)
+            _check_finite(block, residual)
+            if jacobians is not None:
+                for i, v in enumerate(variables):
+                    d = derivative[v.name]
+                    if v.kind == "direction":
+                        d = d @ gtsam.Unit3(now[v.name]).basis()
+                    if d.shape != (block.rows, v.dim):
+                        raise ValueError(
+                            f"block '{block.name}': derivative by '{v.name}' has shape {d.shape}, "
+                            f"not {(block.rows, v.dim)}"
+                        )
+                    jacobians[i] = np.asfortranarray(d)
+            return residual
+
+        return rows
+
+    def _to_gtsam(self, values: Values) -> gtsam.Values:
+        out = gtsam.Values()
+        for name, v in self.variables.items():
+            out.insert(self._key[name], _wrap(v.kind, values[name]))
+        return out
+
+    def _from_gtsam(self, values: gtsam.Values) -> dict[str, np.ndarray]:
+        return {n: _read(v.kind, values, self._key[n]) for n, v in self.variables.items()}
+
+
+def _check_finite(block: Block, residual: np.ndarray) -> None:
+    # A NaN makes GTSAM return the start without a word.
+    if not np.isfinite(residual).all():
+        raise FloatingPointError(f"block '{block.name}' has a residual that is not finite")
+
+
+def _wrap(kind: Kind, value: np.ndarray) -> np.ndarray | gtsam.Pose3 | gtsam.Unit3:
+    if kind == "vector":
+        return np.asarray(value, float)
+    if kind == "direction":
+        return gtsam.Unit3(np.asarray(value, float))
+    # Pose3(4x4) keeps a rotation as given; make it orthonormal.
+    return gtsam.Pose3(gtsam.Rot3.ClosestTo(value[:3, :3]), value[:3, 3])
+
+
+def _read(kind: Kind, values: gtsam.Values, key: int) -> np.ndarray:
+    if kind == "vector":
+        return values.atVector(key)
+    if kind == "direction":
+        return values.atUnit3(key).point3()
+    return values.atPose3(key).matrix()

@@ -1,0 +1,1 @@
+"""What should be zero, and its derivative by site: one file per residual."""

@@ -1,0 +1,217 @@
+"""Beams: measured range against the range to the surface that the beam meets.
+
+``r = measured - effects - t``, where ``t = n.(s - o) / n.u`` is the distance along the beam (origin
+o, direction u) to the plane with normal n through s: that of the triangle hit, or one found in the
+scans. With hit point h, everything that moves the beam or the surface moves r by
+
+    d r = [h x n, n] / (n.u)  d(pose twist, lidar axes)
+    d r = -1, -n.(z x h) / (n.u), -t n.e / (n.u)  d(range, azimuth, elevation error)
+    d r = -n / (n.u)  d(surface point)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.effects import LazyColumn, OneHot, Site, View
+from calib.forward import Derivatives, Stops, Term, Values
+from calib.residuals.rows import Group, gram, square_root, tukey_cost
+from chains import se3
+from sensors.lidar import Beams
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Derivative of the rows by some components of one vector variable, one non-zero per row.
+
+    Args:
+        variable: whose.
+        index: (N,) which entry of `components` a row depends on; -1 for none.
+        value: (N,) the derivative.
+        components: (size,) indices into the variable.
+    """
+
+    variable: str
+    index: np.ndarray
+    value: np.ndarray
+    components: np.ndarray
+
+
+@dataclass(frozen=True)
+class Surface:
+    """What each beam meets, and what is known of it.
+
+    Args:
+        predicted_m: (N,) distance from the beam's origin.
+        normal: (N, 3) unit, facing the sensor, reference frame; zero where there is nothing.
+        usable: (N,) False where nothing was hit, or a depth edge or grazing hit spoils the beam.
+        columns: name -> (N, ...), or a function that gives it: label, surface, patch, plane, ...
+        unknown: derivative of the residual by what of the surface is itself unknown.
+    """
+
+    predicted_m: np.ndarray
+    normal: np.ndarray
+    usable: np.ndarray
+    columns: Mapping[str, LazyColumn]
+    unknown: Sequence[Columns] = ()
+
+
+@dataclass(frozen=True)
+class Rows:
+    """The rows of one stop at one state: residuals, their honest sigma, and their derivatives.
+
+    Args:
+        residual_m, sigma_m, weight: (N,); weight is robust, 0 to 1.
+        reference_sigma_m: (N,) error of the reference along the beam, beyond `sigma_m`: carried by
+            the surface's own unknowns where the model has them.
+        scale: how many sigmas wide the bulk of the rows is, at least 1.
+        by_twist: (N, 6) derivative by the lidar's right increment.
+        dense: variable -> (N, P) derivatives.
+        sparse: derivatives with one non-zero per row.
+        view: what effects looked at.
+        kept: (N,) indices of these rows in the scan.
+    """
+
+    residual_m: np.ndarray
+    sigma_m: np.ndarray
+    weight: np.ndarray
+    reference_sigma_m: np.ndarray
+    scale: float
+    by_twist: np.ndarray
+    dense: Mapping[str, np.ndarray]
+    sparse: Sequence[Columns]
+    view: View
+    kept: np.ndarray
+
+    @property
+    def cost(self) -> float:
+        """Half the robust chi-square."""
+        return tukey_cost(self.residual_m / self.sigma_m, self.scale)
+
+
+@dataclass(frozen=True)
+class Part:
+    """Columns of compressed rows that belong to some components of one variable."""
+
+    variable: str
+    columns: np.ndarray
+    components: np.ndarray
+
+
+@dataclass(frozen=True)
+class CompressedScan:
+    """A stop's rows in compressed form, as the graph sees them: at most P + 1 of them.
+
+    They are quadratic about the state of linearisation in the lidar's twist and linear in the
+    beam's and surface's unknowns; the chain behind the twist stays fully nonlinear.
+
+    Args:
+        name: for messages.
+        stops: the geometry of the stop (K = 1).
+        frame: the lidar's frame.
+        T0_lidar_reference: (4, 4) inverse of the pose of linearisation.
+        root: (m, 6 + 1 + n) rows: twist, residual, then the parts' columns.
+        parts: what the other columns are.
+        at: values of the parts' variables at linearisation.
+    """
+
+    name: str
+    stops: Stops
+    frame: str
+    T0_lidar_reference: np.ndarray
+    root: np.ndarray
+    parts: Sequence[Part]
+    at: Values
+    kind = "mesh"
+
+    @property
+    def variables(self) -> tuple[str, ...]:
+        where = (self.stops.reference,) if self.stops.reference else ()
+        return (*self.stops.variables, *where, *self.at)
+
+    @property
+    def rows(self) -> int:
+        return len(self.root)
+
+    def evaluate(self, values: Values, derivatives: bool) -> tuple[np.ndarray, Derivatives | None]:
+        """Compressed whitened rows and their derivatives."""
+        placed = self.stops.in_reference(self.frame, values)
+        twist = se3.log(self.T0_lidar_reference @ placed.T[0])
+        residual = self.root[:, 6] + self.root[:, :6] @ twist
+        for part in self.parts:
+            moved = (values[part.variable] - self.at[part.variable])[part.components]
+            residual = residual + self.root[:, part.columns] @ moved
+        if not derivatives:
+            return residual, None
+        by_twist = self.root[:, :6] @ se3.right_jacobian_inverse(twist)
+        d = {name: by_twist @ columns[0] for name, columns in placed.d.items()}
+        for name, value in self.at.items():
+            d[name] = np.zeros((self.rows, len(value)))
+        for part in self.parts:
+            d[part.variable][:, part.components] = self.root[:, part.columns]
+        return residual, d
+
+
+def derivatives(
+    beams: Beams, predicted_m: np.ndarray, hit: np.ndarray, normal: np.ndarray, along: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """d residual by pose twist (N, 6), by beam error (N, 3), by surface point (N, 3, lidar axes)."""
+    n = normal / along[:, None]
+    by_twist = np.empty((len(n), 6))
+    by_twist[:, 0] = hit[:, 1] * n[:, 2] - hit[:, 2] * n[:, 1]
+    by_twist[:, 1] = hit[:, 2] * n[:, 0] - hit[:, 0] * n[:, 2]
+    by_twist[:, 2] = hit[:, 0] * n[:, 1] - hit[:, 1] * n[:, 0]
+    by_twist[:, 3:] = n
+    u = beams.direction
+    flat = np.maximum(np.hypot(u[:, 0], u[:, 1]), 1e-12)
+    up = np.stack([-u[:, 0] * u[:, 2] / flat, -u[:, 1] * u[:, 2] / flat, flat], axis=1)
+    by_beam = np.empty((len(n), 3))
+    by_beam[:, 0] = -1.0
+    by_beam[:, 1] = -(n[:, 1] * hit[:, 0] - n[:, 0] * hit[:, 1])
+    by_beam[:, 2] = -predicted_m * np.einsum("ni,ni->n", n, up)
+    return by_twist, by_beam, -n
+
+
+def site_error(basis: np.ndarray | OneHot, theta: np.ndarray) -> np.ndarray:
+    """``basis @ theta``: the error at the site, (N or 1, D)."""
+    if isinstance(basis, OneHot):
+        # Index -1 finds the zero appended.
+        return basis.values * np.append(theta, 0.0)[basis.index][:, None]
+    return basis @ theta
+
+
+def effect_columns(
+    variable: str, site: Site, basis: np.ndarray | OneHot, by_site: np.ndarray
+) -> np.ndarray | Columns:
+    """Derivative of the rows by an effect's parameters: ``d r / d site @ basis``."""
+    if isinstance(basis, OneHot):
+        value = np.einsum("nd,nd->n", by_site, basis.values)
+        return Columns(variable, basis.index, value, np.arange(basis.size))
+    return np.einsum("nd,ndp->np", by_site, np.broadcast_to(basis, (len(by_site), *basis.shape[1:])))
+
+
+def compress(
+    name: str, rows: Rows, stops: Stops, frame: str, T_reference_lidar: np.ndarray, values: Values
+) -> CompressedScan:
+    """Whiten, weight and compress a stop's rows, linearised at the state `values`."""
+    parts, column = [], 7
+    for variable, block in rows.dense.items():
+        width = block.shape[1]
+        parts.append(Part(variable, np.arange(column, column + width), np.arange(width)))
+        column += width
+    groups = []
+    for c in rows.sparse:
+        used, index = np.unique(c.index, return_inverse=True)
+        first = int(used[0] < 0)
+        group = Group(index - first, c.value, len(used) - first)
+        at = np.arange(column, column + group.size)
+        parts.append(Part(c.variable, at, c.components[used[first:]]))
+        groups.append(group)
+        column += group.size
+    dense = np.hstack([rows.by_twist, rows.residual_m[:, None], *rows.dense.values()])
+    root = square_root(gram(dense, groups, rows.weight / np.square(rows.sigma_m)))
+    at = {v: np.array(values[v]) for v in dict.fromkeys(p.variable for p in parts)}
+    return CompressedScan(name, stops, frame, se3.inverse(T_reference_lidar), root, parts, at)

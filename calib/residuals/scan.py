@@ -1,0 +1,200 @@
+"""One stop's scan as rows: read, associated, weighted honestly, compressed.
+
+A stop is computed from the recording and a state alone, so stops can be computed anywhere, and no
+more than one of them is ever in memory per worker.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from calib.effects import LazyColumn, OneHot, Site, View
+from calib.forward import Stops, Term, Values
+from calib.residuals.beams import (
+    Columns,
+    CompressedScan,
+    Rows,
+    Surface,
+    compress,
+    derivatives,
+    effect_columns,
+    site_error,
+)
+from calib.residuals.rows import robust_scale, tukey_weight
+from calib.residuals.surfaces import Meeting
+from sensors.lidar import Beams, LidarModel, beams
+from sensors.recording import Recording, Scan
+
+PRIOR_COUNT = 20.0  # a measured spread of fewer sweeps than this leans on the datasheet
+LOCAL_SHARE = 0.25  # of the reference's variance, between neighbouring points of one patch
+
+
+@dataclass(frozen=True)
+class ScanStop:
+    """One stop's beams against what they meet.
+
+    Args:
+        name: for messages.
+        recording, index: where the scan is read.
+        stops: geometry of this stop (K = 1).
+        terms: the model's effects at BEAM and REFERENCE.
+        columns: (1,) covariates of the stop.
+        meeting: mesh or planes.
+        reference_sigma_m: how far the reference may be off its surface.
+    """
+
+    name: str
+    recording: Recording
+    index: int
+    stops: Stops
+    terms: Sequence[Term]
+    columns: Mapping[str, np.ndarray]
+    meeting: Meeting
+    reference_sigma_m: float
+
+    @property
+    def lidar(self) -> LidarModel:
+        return self.stops.rig.lidar
+
+    def pose(self, values: Values) -> np.ndarray:
+        """T_reference_lidar (4, 4) at a state."""
+        return self.stops.in_reference(self.stops.rig.lidar_frame, values).T[0]
+
+    def associate(self, values: Values, near_edges: bool) -> np.ndarray:
+        """Which part of the surface each beam meets, at a state."""
+        _, ray = self._read()
+        return self.meeting.associate(self.pose(values), ray, values, near_edges)
+
+    def rows(self, values: Values, association: np.ndarray | None = None) -> Rows:
+        """The stop's rows at a state; associated anew unless an association is given."""
+        scan, ray = self._read()
+        T = self.pose(values)
+        if association is None:
+            association = self.meeting.associate(T, ray, values, near_edges=False)
+        kept = np.flatnonzero(association >= 0)
+        scan, ray, part = _take(scan, kept), _take(ray, kept), association[kept]
+        surface = self.meeting.meet(T, ray, values, part)
+        view = self._view(scan, ray, surface)
+        bases = {t.variable: (t.effect.site, t.basis(view)) for t in self.terms}
+        error = {Site.BEAM: np.zeros((1, 3)), Site.REFERENCE: np.zeros((1, 3))}
+        for name, (site, basis) in bases.items():
+            error[site] = error[site] + site_error(basis, values[name])
+        if error[Site.BEAM][:, 1:].any():
+            ray = turned(ray, -error[Site.BEAM][:, 1], -error[Site.BEAM][:, 2])
+            surface = self.meeting.meet(T, ray, values, part)
+        return self._rows(scan, ray, surface, T, view, bases, error, kept)
+
+    def compress(self, values: Values, association: np.ndarray | None = None) -> CompressedScan:
+        """The stop's rows, compressed, linearised at a state."""
+        rows = self.rows(values, association)
+        frame = self.stops.rig.lidar_frame
+        return compress(self.name, rows, self.stops, frame, self.pose(values), values)
+
+    def _read(self) -> tuple[Scan, Beams]:
+        scan = self.recording.scan(self.index)
+        return scan, beams(scan.xyz_m, self.lidar.beam_origin_m)
+
+    def _view(self, scan: Scan, ray: Beams, surface: Surface) -> View:
+        columns: dict[str, LazyColumn] = {
+            **self.columns,
+            **scan.extra,
+            **surface.columns,
+            "ring": scan.ring,
+            "column": scan.column,
+            "intensity": scan.intensity,
+            "azimuth_rad": ray.azimuth_rad,
+            "elevation_rad": ray.elevation_rad,
+            "range_m": surface.predicted_m,
+        }
+        return View(self.stops.rig, len(scan.ring), columns, self.stops.joints)
+
+    def _rows(
+        self,
+        scan: Scan,
+        ray: Beams,
+        surface: Surface,
+        T: np.ndarray,
+        view: View,
+        bases: Mapping[str, tuple[Site, np.ndarray | OneHot]],
+        error: Mapping[Site, np.ndarray],
+        kept: np.ndarray,
+    ) -> Rows:
+        usable = surface.usable
+        t = np.where(usable, surface.predicted_m, 1.0)
+        normal = np.where(usable[:, None], surface.normal @ T[:3, :3], -ray.direction)
+        along = np.einsum("ni,ni->n", normal, ray.direction)
+        hit = ray.origin_m + t[:, None] * ray.direction
+        by_twist, by_beam, by_point = derivatives(ray, t, hit, normal, along)
+        moved = np.einsum("ni,ni->n", by_point @ T[:3, :3].T, np.broadcast_to(error[Site.REFERENCE], hit.shape))
+        residual = ray.range_m - error[Site.BEAM][:, 0] - t + moved
+        residual = np.where(usable, residual, 0.0)
+        local, reference = self._reference_sigma(along)
+        sigma = np.sqrt(self._beam_variance(scan, t, along) + local**2)
+        z = residual / sigma
+        scale = robust_scale(z[usable])
+        columns = {
+            name: effect_columns(name, site, basis, by_beam if site is Site.BEAM else by_point @ T[:3, :3].T)
+            for name, (site, basis) in bases.items()
+        }
+        return Rows(
+            residual,
+            sigma,
+            np.where(usable, tukey_weight(z, scale), 0.0),
+            reference,
+            scale,
+            by_twist,
+            {n: c for n, c in columns.items() if not isinstance(c, Columns)},
+            [c for c in columns.values() if isinstance(c, Columns)] + list(surface.unknown),
+            view,
+            kept,
+        )
+
+    def _reference_sigma(self, along: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Reference error along the beam: between neighbours, and in common with them."""
+        sigma = self.reference_sigma_m / np.abs(along)
+        return sigma * np.sqrt(LOCAL_SHARE), sigma * np.sqrt(1.0 - LOCAL_SHARE)
+
+    def _beam_variance(self, scan: Scan, t: np.ndarray, along: np.ndarray) -> np.ndarray:
+        """Variance of the averaged range: noise over count, beam angle, quantisation.
+
+        The spread measured over a hold leans on the datasheet's, scaled to this stop, as if that
+        were `PRIOR_COUNT` sweeps more: a spread of few sweeps is itself too uncertain a weight.
+        """
+        lidar = self.lidar
+        incidence = np.arccos(np.minimum(np.abs(along), 1.0))
+        single = np.square(lidar.sigma_range(t, incidence))
+        measured = np.square(scan.range_std_m)
+        known = np.isfinite(measured) & (scan.count > 1)
+        if known.any():
+            single = single * np.median((measured / single)[known])
+            dof = np.where(known, scan.count - 1.0, 0.0)
+            measured = np.where(known, measured, 0.0)
+            single = (PRIOR_COUNT * single + dof * measured) / (PRIOR_COUNT + dof)
+        angle = lidar.sigma_angle_rad * t * np.tan(incidence)
+        return single / scan.count + angle**2 + lidar.quantum_m**2 / (12.0 * scan.count)
+
+
+def turned(ray: Beams, azimuth_rad: np.ndarray, elevation_rad: np.ndarray) -> Beams:
+    """Beams turned by small angles: their origin goes along in azimuth."""
+    azimuth, elevation = ray.azimuth_rad + azimuth_rad, ray.elevation_rad + elevation_rad
+    u = np.stack(
+        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)],
+        axis=1,
+    )
+    c, s = np.cos(azimuth_rad), np.sin(azimuth_rad)
+    x, y, z = ray.origin_m.T
+    origin = np.stack([c * x - s * y, s * x + c * y, z], axis=1)
+    return Beams(origin, u, ray.range_m, azimuth, elevation)
+
+
+def _take(rows: Scan | Beams, kept: np.ndarray) -> Scan | Beams:
+    picked = {}
+    for field in fields(rows):
+        value = getattr(rows, field.name)
+        picked[field.name] = (
+            {n: v[kept] for n, v in value.items()} if isinstance(value, dict) else value[kept]
+        )
+    return replace(rows, **picked)

@@ -1,0 +1,143 @@
+"""What the beams of a stop meet: the reference mesh, or planes found in the scans."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Protocol
+
+import numpy as np
+
+from calib.forward import Values
+from calib.residuals.beams import Columns, Surface
+from chains import se3
+from sensors.lidar import Beams
+from sensors.planes import Planes
+from sensors.reference import Reference
+
+GRAZING_RAD = np.deg2rad(80.0)
+PATCH_M = 0.7
+
+
+class Meeting(Protocol):
+    """Something that beams meet. First associate, then meet: an association can be kept."""
+
+    def associate(
+        self, T: np.ndarray, beams: Beams, values: Values, near_edges: bool
+    ) -> np.ndarray: ...
+
+    def meet(self, T: np.ndarray, beams: Beams, values: Values, part: np.ndarray) -> Surface: ...
+
+
+@dataclass(frozen=True)
+class MeshSurface:
+    """The reference mesh.
+
+    Args:
+        reference: the mesh.
+        footprint_rad: how far beside a beam a depth edge spoils it.
+    """
+
+    reference: Reference
+    footprint_rad: float
+
+    def associate(
+        self, T: np.ndarray, beams: Beams, values: Values, near_edges: bool
+    ) -> np.ndarray:
+        """Triangle (N,) int32 of each beam, -1 where it hits nothing or at too grazing an angle.
+
+        Args:
+            T: (4, 4) T_reference_lidar.
+            beams: of the stop.
+            values: the state; a mesh does not depend on it.
+            near_edges: True probes beside each beam too, and drops those near a depth edge.
+        """
+        origins, directions = _in_reference(T, beams)
+        hits = self.reference.cast(origins, directions)
+        spoilt = hits.incidence_rad > GRAZING_RAD
+        if near_edges:
+            spoilt |= self.reference.near_edge(origins, directions, hits, self.footprint_rad)
+        return np.where(spoilt, -1, hits.triangle).astype(np.int32)
+
+    def meet(self, T: np.ndarray, beams: Beams, values: Values, part: np.ndarray) -> Surface:
+        """The triangle's plane that each beam meets under this association."""
+        hits = self.reference.hits(part, *_in_reference(T, beams))
+        surface = self.reference.surface
+        columns = {
+            "label": hits.label,
+            "reference_intensity": hits.intensity,
+            "surface": lambda: np.where(hits.triangle >= 0, surface[hits.triangle], -1),
+            "patch": partial(self.reference.patch, hits, PATCH_M),
+            "normal": hits.normal,
+            "point_m": hits.point_m,
+            "incidence_rad": hits.incidence_rad,
+        }
+        return Surface(hits.range_m, hits.normal, hits.triangle >= 0, columns)
+
+
+@dataclass(frozen=True)
+class PlaneSurface:
+    """Planes found in the scans; each is itself unknown, as three numbers of one vector variable.
+
+    Plane k is ``n.p = d`` with ``n ~ n0 + a side + b up`` and ``d = d0 + c``, where (a, b, c) are
+    components 3k to 3k + 2.
+
+    Args:
+        planes: as found, in the reference frame at the start.
+        variable: the vector variable's name.
+    """
+
+    planes: Planes
+    variable: str
+
+    def associate(
+        self, T: np.ndarray, beams: Beams, values: Values, near_edges: bool
+    ) -> np.ndarray:
+        """Plane (N,) int32 of each beam, by where its point lies; -1 for none."""
+        point = beams.origin_m + beams.range_m[:, None] * beams.direction
+        return self.planes.assign(se3.apply(T, point)).astype(np.int32)
+
+    def meet(self, T: np.ndarray, beams: Beams, values: Values, part: np.ndarray) -> Surface:
+        """The plane that each beam meets under this association."""
+        origins, directions = _in_reference(T, beams)
+        theta = values[self.variable].reshape(-1, 3)
+        axes = self.planes.axes
+        tilted = self.planes.normal + np.einsum("mk,mki->mi", theta[:, :2], axes)
+        length = np.linalg.norm(tilted, axis=1)
+        unit = tilted / length[:, None]
+        n, d = unit[part], (self.planes.distance_m + theta[:, 2])[part]
+        along = np.einsum("ni,ni->n", n, directions)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = (d - np.einsum("ni,ni->n", n, origins)) / along
+            hit = origins + t[:, None] * directions
+        incidence = np.arccos(np.minimum(np.abs(along), 1.0))
+        usable = (part >= 0) & (t > 0) & np.isfinite(t) & (incidence < GRAZING_RAD)
+        facing = np.where(along > 0, -1.0, 1.0)[:, None] * n
+        columns = {"plane": part, "normal": facing, "point_m": hit, "incidence_rad": incidence}
+        unknown = [self._by_tilt(k, part, hit, n, along, length, axes) for k in (0, 1)]
+        unknown.append(self._columns(2, part, -1.0 / along))
+        return Surface(t, facing, usable, columns, unknown)
+
+    def _by_tilt(
+        self,
+        k: int,
+        part: np.ndarray,
+        hit: np.ndarray,
+        n: np.ndarray,
+        along: np.ndarray,
+        length: np.ndarray,
+        axes: np.ndarray,
+    ) -> Columns:
+        # d r / d n = hit / n.u, and n moves along the axis, less what renormalising takes back.
+        axis = axes[:, k][part]
+        across = axis - np.einsum("ni,ni->n", axis, n)[:, None] * n
+        value = np.einsum("ni,ni->n", hit, across) / (along * length[part])
+        return self._columns(k, part, value)
+
+    def _columns(self, k: int, part: np.ndarray, value: np.ndarray) -> Columns:
+        components = 3 * np.arange(len(self.planes.normal)) + k
+        return Columns(self.variable, part, value, components)
+
+
+def _in_reference(T: np.ndarray, beams: Beams) -> tuple[np.ndarray, np.ndarray]:
+    return se3.apply(T, beams.origin_m), beams.direction @ T[:3, :3].T

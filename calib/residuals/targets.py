@@ -1,0 +1,82 @@
+"""Spheres on hanging rods: seen by the scanner as centres, by the tracker as two markers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.forward import Derivatives, Values
+
+
+@dataclass(frozen=True)
+class HangingTarget:
+    """One rod. Its lower marker's true place p is unknown; gravity g is common to all rods.
+
+    ``lower - p``, ``upper - p`` across the rod, and ``faro - T_faro_world (p + L g)``, each over
+    its sigma; the spacing of the markers is not used, so it need not be known.
+
+    Args:
+        name: for messages.
+        marker: variable of p (3,), world frame.
+        gravity: variable of g, a direction (pointing down) in the world frame.
+        reference: variable of T_world_faro.
+        faro_m, upper_m, lower_m: (3,) measured.
+        below_m: L, sphere centre below the lower marker.
+        sigma_sphere_m, sigma_marker_m: per axis.
+        shift: (3, P) per variable: where the sphere truly sits beyond that, world frame.
+    """
+
+    name: str
+    marker: str
+    gravity: str
+    reference: str
+    faro_m: np.ndarray
+    upper_m: np.ndarray
+    lower_m: np.ndarray
+    below_m: float
+    sigma_sphere_m: float
+    sigma_marker_m: float
+    shift: dict[str, np.ndarray]
+
+    kind = "target"
+    rows = 9
+
+    @property
+    def variables(self) -> tuple[str, ...]:
+        return (self.marker, self.gravity, self.reference, *self.shift)
+
+    def evaluate(self, values: Values, derivatives: bool) -> tuple[np.ndarray, Derivatives | None]:
+        """Nine whitened rows [lower marker, upper marker across the rod, sphere]."""
+        p, g, T = values[self.marker], values[self.gravity], values[self.reference]
+        rod = self.upper_m - p
+        across = rod - g * (g @ rod)
+        sphere = p + self.below_m * g + sum(b @ values[n] for n, b in self.shift.items())
+        R_t = T[:3, :3].T
+        in_faro = R_t @ (sphere - T[:3, 3])
+        residual = np.concatenate(
+            [
+                (self.lower_m - p) / self.sigma_marker_m,
+                across / self.sigma_marker_m,
+                (self.faro_m - in_faro) / self.sigma_sphere_m,
+            ]
+        )
+        return residual, self._derivatives(g, rod, R_t, in_faro) if derivatives else None
+
+    def _derivatives(
+        self, g: np.ndarray, rod: np.ndarray, R_t: np.ndarray, in_faro: np.ndarray
+    ) -> Derivatives:
+        marker, sphere, eye = 1.0 / self.sigma_marker_m, 1.0 / self.sigma_sphere_m, np.eye(3)
+        along = np.outer(g, g)
+        by_p = np.vstack([-eye * marker, (along - eye) * marker, -R_t * sphere])
+        by_g = np.zeros((9, 3))
+        by_g[3:6] = -((g @ rod) * eye + np.outer(g, rod)) * marker
+        by_g[6:9] = -self.below_m * R_t * sphere
+        by_T = np.zeros((9, 6))
+        x, y, z = in_faro
+        by_T[6:9, :3] = -np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) * sphere
+        by_T[6:9, 3:] = eye * sphere
+        d = {self.marker: by_p, self.gravity: by_g, self.reference: by_T}
+        for name, basis in self.shift.items():
+            d[name] = np.vstack([np.zeros((6, basis.shape[1])), -R_t @ basis * sphere])
+        return d

@@ -1,0 +1,83 @@
+"""Tracked bodies: what the tracker says of a body against where the chain puts it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.effects import Site
+from calib.forward import Derivatives, Stops, Values
+from chains import se3
+
+
+@dataclass(frozen=True)
+class TrackedBody:
+    """One body at K stops that share every variable.
+
+    ``r_rot = log(R_predicted^T R_measured)`` and ``r_pos = R_predicted^T (t_measured -
+    t_predicted)``, each over its sigma. Rows of stops where the body was not seen are left out by
+    the caller; a body seen as a point has the position rows only.
+
+    Args:
+        name: for messages.
+        stops: the K stops.
+        body: the body's frame.
+        measured: (K, 4, 4) T_world_body; the rotation is not used for a point.
+        sigma_m, sigma_rad: of one measurement, per axis.
+        is_point: True when the tracker gives no orientation.
+        bases: variable -> (K or 1, 6, P), what the tracker adds to the body's pose, per unit.
+    """
+
+    name: str
+    stops: Stops
+    body: str
+    measured: np.ndarray
+    sigma_m: float
+    sigma_rad: float
+    is_point: bool
+    bases: dict[str, np.ndarray]
+
+    site = Site.TRACKER
+    kind = "tracker"
+
+    @property
+    def variables(self) -> tuple[str, ...]:
+        return (*self.stops.variables, *self.bases)
+
+    @property
+    def rows(self) -> int:
+        return len(self.measured) * (3 if self.is_point else 6)
+
+    def evaluate(self, values: Values, derivatives: bool) -> tuple[np.ndarray, Derivatives | None]:
+        """Whitened rows, stop by stop [rotation, position], and their derivatives."""
+        placed = self.stops.in_world(self.body, values)
+        d_seen = {name: np.asarray(d) for name, d in placed.d.items()}
+        seen = placed.T
+        if self.bases:
+            added = sum(basis @ values[name] for name, basis in self.bases.items())
+            seen = seen @ se3.exp(added)
+            back = se3.adjoint(se3.inverse(se3.exp(added)))
+            d_seen = {name: back @ d for name, d in d_seen.items()}
+            d_seen |= {n: se3.right_jacobian(added) @ b for n, b in self.bases.items()}
+        rows, by_twist = _pose_error(seen, self.measured)
+        weight = 1.0 / np.repeat([self.sigma_rad, self.sigma_m], 3)
+        keep = slice(3, 6) if self.is_point else slice(0, 6)
+        residual = (rows * weight)[:, keep].ravel()
+        if not derivatives:
+            return residual, None
+        by_twist = (by_twist * weight[:, None])[:, keep]
+        return residual, {n: (by_twist @ d).reshape(len(residual), -1) for n, d in d_seen.items()}
+
+
+def _pose_error(predicted: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """[rotation, position] error in the predicted body's axes (K, 6), and its derivative by the
+    predicted pose's right increment (K, 6, 6)."""
+    R_t = predicted[:, :3, :3].mT
+    rotation = se3.so3_log(R_t @ measured[:, :3, :3])
+    position = np.matvec(R_t, measured[:, :3, 3] - predicted[:, :3, 3])
+    d = np.zeros((len(measured), 6, 6))
+    d[:, :3, :3] = -se3.so3_left_jacobian_inverse(rotation)
+    d[:, 3:, :3] = se3.skew(position)
+    d[:, 3:, 3:] = -np.eye(3)
+    return np.concatenate([rotation, position], axis=1), d

@@ -1,0 +1,298 @@
+"""rig.yaml: what is bolted to what, what measures it, and how sure its builder is."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import pydantic
+from numpy.typing import NDArray
+
+from chains import se3
+from chains.arm import read_arm
+from chains.errors import InputError
+from chains.frames import Edge, FrameTree, unknown_name
+from sensors.documents import Document, Marks, Number, Triple, read_yaml, validate
+from sensors.lidar import LidarFile, LidarModel, Size, load_lidar
+
+Sigma = Annotated[Number, pydantic.Field(gt=0)]
+
+LARGEST_FRAME_M = 10.0
+
+
+@dataclass(frozen=True)
+class Tracker:
+    """What sees the bodies: its world frame, and its noise per axis [m, rad]."""
+
+    frame: str
+    bodies: tuple[str, ...]
+    sigma_m: float
+    sigma_rad: float
+
+
+@dataclass(frozen=True)
+class TargetSpec:
+    """A rod with two markers and a sphere below them, hanging along gravity; in m."""
+
+    sphere_below_lower_marker_m: float
+    sigma_sphere_m: float
+    sigma_marker_m: float
+
+
+@dataclass(frozen=True)
+class ReferenceSpec:
+    """The scanned mesh: its world frame, its files, and the error of its surface [m]."""
+
+    frame: str
+    mesh: Path
+    faces: Path | None
+    labels: Path | None
+    sigma_m: float
+
+
+@dataclass(frozen=True)
+class Rig:
+    """The rig as built on paper, validated."""
+
+    name: str
+    folder: Path
+    tree: FrameTree
+    """Every edge from CAD, named after its child frame, and of the arm, named after its joint."""
+    frame_sigma: dict[str, NDArray[np.float64]]
+    """Per frame (6,) [rad rad rad m m m] how sure CAD is, about the child's axes; 0 = exact."""
+    lidar: LidarModel | None
+    lidar_frame: str | None
+    arm_edges: tuple[str, ...]
+    """URDF joints between the arm's base and tip, in order, fixed ones included."""
+    joint_names: tuple[str, ...]
+    """Those that move, as the stops name them."""
+    sigma_joint_rad: float
+    moves: Literal["stop", "location", "never"]
+    """When T_opti_base may change."""
+    tracker: Tracker | None
+    target: TargetSpec | None
+    reference: ReferenceSpec | None
+    shared: tuple[str, ...]
+    """Frames and effects that are the same hardware in every recording."""
+    own: tuple[str, ...]
+    """Frames and effects that belong to this recording alone."""
+
+    @property
+    def world(self) -> str:
+        """The frame that poses are given in: the tracker's, or else the reference's."""
+        return self.tracker.frame if self.tracker else self.reference_frame
+
+    @property
+    def reference_frame(self) -> str:
+        """The frame of the mesh and of the spheres' centres."""
+        return self.reference.frame if self.reference else "faro"
+
+    @property
+    def beyond_arm(self) -> frozenset[str]:
+        """Frames that hang from the arm's tip; all of them where there is no arm."""
+        edges = self.tree.edges
+        arm = {self.tree.edge_names.index(name) for name in self.arm_edges}
+        return frozenset(
+            name
+            for name in self.frame_sigma
+            if arm <= set(self.tree.path(edges[self.tree.edge_names.index(name)].child))
+        )
+
+    def joints_to(self, frame: str) -> tuple[str, ...]:
+        """The moving joints between the root and a frame."""
+        edges = (self.tree.edges[i] for i in self.tree.path(frame))
+        return tuple(edge.joint.name for edge in edges if edge.joint is not None)
+
+
+class _Frame(Document):
+    parent: str
+    xyz_m: tuple[Number, Number, Number]
+    rpy_rad: tuple[Number, Number, Number] = (0.0, 0.0, 0.0)
+    sigma_m: Triple
+    sigma_rad: Triple
+
+    @pydantic.field_validator("xyz_m")
+    @classmethod
+    def _metres(cls, xyz: tuple[float, ...]) -> tuple[float, ...]:
+        if max(map(abs, xyz)) > LARGEST_FRAME_M:
+            raise ValueError(f"{max(xyz, key=abs):g} m looks like millimetres; give metres")
+        return xyz
+
+    @pydantic.field_validator("rpy_rad")
+    @classmethod
+    def _radians(cls, rpy: tuple[float, ...]) -> tuple[float, ...]:
+        if max(map(abs, rpy)) > 2 * np.pi:
+            raise ValueError(f"{max(rpy, key=abs):g} rad looks like degrees; give radians")
+        return rpy
+
+    @pydantic.field_validator("sigma_m", "sigma_rad")
+    @classmethod
+    def _not_negative(cls, sigma: tuple[float, ...]) -> tuple[float, ...]:
+        if min(sigma) < 0:
+            raise ValueError(f"{min(sigma):g} is negative; a sigma is 0 (exact) or more")
+        return sigma
+
+
+_Lidar = pydantic.create_model(
+    "_Lidar",
+    __base__=Document,
+    model=(str, ...),
+    frame=(str, "lidar"),
+    **{
+        name: (Annotated[field.annotation, pydantic.Field(), *field.metadata], None)
+        for name, field in LidarFile.model_fields.items()
+    },
+)
+
+
+class _Arm(Document):
+    urdf: str
+    base: str
+    tip: str
+    sigma_joint_rad: Size = 0.0
+
+
+class _Base(Document):
+    moves: Literal["stop", "location", "never"] = "stop"
+
+
+class _Tracker(Document):
+    frame: str = "opti"
+    bodies: Annotated[tuple[str, ...], pydantic.Field(min_length=1)]
+    sigma_m: Sigma
+    sigma_rad: Sigma
+
+
+class _Target(Document):
+    sphere_below_lower_marker_m: Number
+    sigma_sphere_m: Size
+    sigma_marker_m: Sigma
+
+
+class _Reference(Document):
+    frame: str = "faro"
+    mesh: str
+    faces: str | None = None
+    labels: str | None = None
+    sigma_m: Size
+
+
+class _RigFile(Document):
+    name: str
+    lidar: _Lidar | None = None
+    arm: _Arm | None = None
+    frames: dict[str, _Frame] = pydantic.Field(default_factory=dict)
+    base: _Base = _Base()
+    tracker: _Tracker | None = None
+    target: _Target | None = None
+    reference: _Reference | None = None
+    shared: tuple[str, ...] = ()
+    own: tuple[str, ...] = ()
+
+
+def load_rig(folder: str | Path) -> Rig:
+    """Read and check rig.yaml in a recording's folder, with the URDF and LiDAR model it names.
+
+    Raises InputError, one sentence with file, line and key, for unknown keys and frames, missing
+    files, frames that form no tree, and numbers that look like millimetres or degrees.
+    """
+    folder = Path(folder)
+    path = folder / "rig.yaml"
+    data, marks = read_yaml(path)
+    file = validate(_RigFile, data, path, marks)
+    where = _Where(path, marks)
+    arm = _read_arm(file.arm, folder, where)
+    tree = _read_tree(file, arm, where)
+    _check_frames(file, tree, where)
+    return Rig(
+        name=file.name,
+        folder=folder,
+        tree=tree,
+        frame_sigma={
+            name: np.array(frame.sigma_rad + frame.sigma_m) for name, frame in file.frames.items()
+        },
+        lidar=_read_lidar(file.lidar, folder, where) if file.lidar else None,
+        lidar_frame=file.lidar.frame if file.lidar else None,
+        arm_edges=tuple(edge.name for edge in arm),
+        joint_names=tree.joint_names,
+        sigma_joint_rad=file.arm.sigma_joint_rad if file.arm else 0.0,
+        moves=file.base.moves,
+        tracker=Tracker(**file.tracker.model_dump()) if file.tracker else None,
+        target=TargetSpec(**file.target.model_dump()) if file.target else None,
+        reference=_read_reference(file.reference, folder, where) if file.reference else None,
+        shared=file.shared,
+        own=file.own,
+    )
+
+
+@dataclass(frozen=True)
+class _Where:
+    """Says where in rig.yaml something is wrong."""
+
+    path: Path
+    marks: Marks
+
+    def wrong(self, what: object, *key: str | int) -> InputError:
+        line = next(
+            (self.marks[key[:n]] for n in range(len(key), 0, -1) if key[:n] in self.marks), 1
+        )
+        return InputError(f"{self.path}:{line}: {'.'.join(map(str, key))}: {what}")
+
+    def file(self, folder: Path, name: str | None, *key: str) -> Path | None:
+        if name is None:
+            return None
+        if not (folder / name).is_file():
+            raise self.wrong(f"{folder / name} does not exist; add the file or drop the key", *key)
+        return folder / name
+
+
+def _read_arm(arm: _Arm | None, folder: Path, where: _Where) -> list[Edge]:
+    if arm is None:
+        return []
+    return read_arm(where.file(folder, arm.urdf, "arm", "urdf"), arm.base, arm.tip)
+
+
+def _read_tree(file: _RigFile, arm: list[Edge], where: _Where) -> FrameTree:
+    edges = [
+        Edge(name, frame.parent, name, se3.from_xyz_rpy(frame.xyz_m, frame.rpy_rad))
+        for name, frame in file.frames.items()
+    ]
+    root = file.lidar.frame if file.lidar else "base"
+    try:
+        return FrameTree([*edges, *arm], root=None if edges or arm else root)
+    except InputError as error:
+        raise where.wrong(error, "frames") from None
+
+
+def _check_frames(file: _RigFile, tree: FrameTree, where: _Where) -> None:
+    """Sensors and bodies stand in the tree, worlds outside of it."""
+    named = [(("lidar", "frame"), file.lidar.frame)] if file.lidar else []
+    bodies = file.tracker.bodies if file.tracker else ()
+    named += [(("tracker", "bodies", i), body) for i, body in enumerate(bodies)]
+    for key, name in named:
+        if name not in tree.frames:
+            raise where.wrong(unknown_name("frame", name, tree.frames), *key)
+    for section in ("tracker", "reference"):
+        world = getattr(file, section)
+        if world and world.frame in tree.frames:
+            what = f"'{world.frame}' is a frame of the rig; name the world that it moves in"
+            raise where.wrong(what, section, "frame")
+
+
+def _read_lidar(lidar: Document, folder: Path, where: _Where) -> LidarModel:
+    name = lidar.model
+    if name.endswith((".yaml", ".yml")):
+        name = where.file(folder, name, "lidar", "model")
+    changed = lidar.model_fields_set - {"model", "frame"}
+    try:
+        return load_lidar(name, {field: getattr(lidar, field) for field in changed})
+    except InputError as error:
+        raise where.wrong(error, "lidar") from None
+
+
+def _read_reference(reference: _Reference, folder: Path, where: _Where) -> ReferenceSpec:
+    paths = {
+        key: where.file(folder, getattr(reference, key), "reference", key)
+        for key in ("mesh", "faces", "labels")
+    }
+    return ReferenceSpec(frame=reference.frame, sigma_m=reference.sigma_m, **paths)

@@ -1,0 +1,1 @@
+"""Measurement: what each instrument delivers, and how well."""

@@ -1,0 +1,284 @@
+"""The documents people write and read: YAML, JSON, CSV.
+
+Reading is strict, and every complaint names the file, the line and what would be right. Writing is
+all or nothing: a file appears whole, under its own name, or not at all. This is the yaml door.
+"""
+
+import csv
+import difflib
+import json
+import math
+import os
+import re
+import typing
+import uuid
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import numpy as np
+import pydantic
+import yaml
+
+from chains.errors import InputError
+
+Marks = dict[tuple[str | int, ...], int]
+"""Line (from 1) of every key and item of a YAML document, by its path in the data."""
+
+Number = Annotated[float, pydantic.Strict()]
+"""A number, never a quoted one and never a boolean."""
+
+Triple = Annotated[
+    tuple[Number, Number, Number],
+    pydantic.BeforeValidator(lambda v: (v, v, v) if isinstance(v, int | float) else v),
+]
+"""Three numbers, or one that stands for all three."""
+
+
+class Document(pydantic.BaseModel):
+    """A mapping in a document: frozen, finite numbers only, unknown keys refused."""
+
+    model_config = pydantic.ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+Model = TypeVar("Model", bound=Document)
+
+
+# ---------------------------------------------------------------------------------------- reading
+
+
+class _StrictLoader(yaml.SafeLoader):
+    """YAML 1.2 scalars: 1e-3 is a number, 012 is twelve, `on` and `1:30` are text."""
+
+    yaml_implicit_resolvers: typing.ClassVar[dict] = {}
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
+        seen = set()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode) and key.value in seen:
+                raise yaml.MarkedYAMLError(
+                    problem=f"key {key.value} stands here twice; keep one of them",
+                    problem_mark=key.start_mark,
+                )
+            seen.add(str(key.value))
+        return super().construct_mapping(node, deep)
+
+
+_FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?$|[-+]?\.inf$|\.nan$")
+for _tag, _pattern, _first, _construct in (
+    ("null", re.compile(r"~$|null$|Null$|NULL$|$"), ["~", "n", "N", ""], lambda text: None),
+    (
+        "bool",
+        re.compile(r"(true|True|TRUE|false|False|FALSE)$"),
+        list("tTfF"),
+        lambda text: text.lower() == "true",
+    ),
+    ("int", re.compile(r"[-+]?[0-9]+$"), list("-+0123456789"), int),
+    (
+        "float",
+        _FLOAT,
+        list("-+.0123456789"),
+        lambda text: float(re.sub(r"\.(inf|nan)", r"\1", text)),
+    ),
+    ("merge", re.compile(r"<<$"), ["<"], None),
+):
+    _StrictLoader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", _pattern, _first)
+    if _construct:
+        _StrictLoader.add_constructor(
+            f"tag:yaml.org,2002:{_tag}",
+            lambda loader, node, construct=_construct: construct(loader.construct_scalar(node)),
+        )
+
+
+def read_yaml(path: str | Path) -> tuple[Any, Marks]:
+    """Read one YAML document, with the line of every key for later complaints.
+
+    Raises InputError where the file is missing, is no YAML, or has a key twice in one mapping.
+    """
+    loader = _StrictLoader(read_text(path))
+    try:
+        node = loader.get_single_node()
+        data = loader.construct_document(node) if node else None
+        return data, dict(_lines(node, ()))
+    except yaml.MarkedYAMLError as error:
+        line = f":{error.problem_mark.line + 1}" if error.problem_mark else ""
+        raise InputError(f"{path}{line}: {error.problem}") from None
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise InputError(f"{path} is not YAML text: {error}") from None
+    finally:
+        loader.dispose()
+
+
+def _lines(node: yaml.Node | None, path: tuple) -> Iterator[tuple[tuple, int]]:
+    if isinstance(node, yaml.MappingNode):
+        for key, value in node.value:
+            yield (*path, key.value), key.start_mark.line + 1
+            yield from _lines(value, (*path, key.value))
+    elif isinstance(node, yaml.SequenceNode):
+        for i, value in enumerate(node.value):
+            yield (*path, i), value.start_mark.line + 1
+            yield from _lines(value, (*path, i))
+
+
+def read_text(path: str | Path) -> str:
+    """Read a UTF-8 text file; InputError names the file that is missing or is no text."""
+    try:
+        return Path(path).read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise InputError(f"{path} does not exist") from None
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path} is not UTF-8 text") from None
+
+
+def read_csv(path: str | Path, text: Collection[str] = ()) -> dict[str, np.ndarray]:
+    """Read a comma-separated table with one header row into columns.
+
+    A column is float64 where every cell is a number or empty (NaN), otherwise text; the columns
+    named in `text` are text always. Raises InputError naming the row of a ragged line, or the
+    column that stands in the header twice.
+    """
+    lines = csv.reader(read_text(path).splitlines())
+    header = [name.strip() for name in next(lines, [])]
+    if len(header) <= 1 and ";" in "".join(header):
+        raise InputError(f"{path}:1: columns are separated by ';' here; separate them by commas")
+    for name in header:
+        if not name or header.count(name) > 1:
+            raise InputError(f"{path}:1: every column needs its own name, and {name!r} is not one")
+    rows = []
+    for row in lines:
+        if any(cell.strip() for cell in row):
+            if len(row) != len(header):
+                raise InputError(
+                    f"{path}:{lines.line_num}: {len(row)} cells where the header names"
+                    f" {len(header)} columns; write an empty cell for what is unknown"
+                )
+            rows.append([cell.strip() for cell in row])
+    columns = zip(*rows, strict=True) if rows else ((),) * len(header)
+    return {
+        name: np.array(cells, dtype=np.str_) if name in text else _numbers_or_text(cells)
+        for name, cells in zip(header, columns, strict=True)
+    }
+
+
+def _numbers_or_text(cells: Collection[str]) -> np.ndarray:
+    try:
+        return np.array([float(cell or "nan") for cell in cells], dtype=np.float64)
+    except ValueError:
+        return np.array(cells, dtype=np.str_)
+
+
+# ------------------------------------------------------------------------------------- validating
+
+
+def validate(model: type[Model], data: Any, path: str | Path, marks: Marks) -> Model:
+    """Turn a document's data into `model`.
+
+    The first thing wrong is raised as InputError, one sentence with file, line and key; an unknown
+    key comes first, with the nearest known one, because it explains the key that is missing.
+    """
+    try:
+        return model.model_validate(data if data is not None else {})
+    except pydantic.ValidationError as error:
+        problems = sorted(error.errors(), key=lambda p: p["type"] != "extra_forbidden")
+        raise InputError(_sentence(problems[0], model, path, marks)) from None
+
+
+def _sentence(problem: dict, model: type, path: str | Path, marks: Marks) -> str:
+    loc = problem["loc"]
+    known_part = next((loc[:n] for n in range(len(loc), 0, -1) if loc[:n] in marks), ())
+    where = f"{path}:{marks[known_part]}" if known_part else str(path)
+    key = ".".join(map(str, loc))
+    if problem["type"] == "extra_forbidden":
+        return f"{where}: unknown key {key}{nearest(str(loc[-1]), _keys(model, loc[:-1]))}"
+    if problem["type"] == "missing":
+        return f"{where}: {key} is missing"
+    if problem["type"] == "model_type":
+        return f"{where}: {key or 'the document'} should be a mapping of keys to values"
+    message = problem["msg"].removeprefix("Value error, ")
+    if problem["type"] == "value_error":
+        return f"{where}: {key + ': ' if key else ''}{message}"
+    return f"{where}: {key}: {message[0].lower()}{message[1:]}, not {problem['input']!r}"
+
+
+def nearest(name: str, known: Collection[str]) -> str:
+    """Return the rest of a sentence about an unknown name: the one probably meant, or all."""
+    close = difflib.get_close_matches(name, list(known), n=1)
+    return f"; did you mean {close[0]}?" if close else f"; known are {', '.join(known)}"
+
+
+def _keys(model: Any, loc: tuple) -> list[str]:
+    """Names of the fields that the model has at a place in the document."""
+    for step in loc:
+        if isinstance(model, type) and issubclass(model, pydantic.BaseModel):
+            field = model.model_fields.get(str(step))
+            model = field.annotation if field else None
+        else:
+            model = typing.get_args(model)[-1]
+        options = [a for a in typing.get_args(model) if a is not type(None)]
+        if options and typing.get_origin(model) is not dict:
+            model = options[0]
+    return list(model.model_fields) if hasattr(model, "model_fields") else []
+
+
+# ---------------------------------------------------------------------------------------- writing
+
+
+@contextmanager
+def write_atomically(path: str | Path) -> Iterator[Path]:
+    """Give a temporary path beside `path` to write to, moved into place when all went well."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.stem}.{uuid.uuid4().hex}{path.suffix}")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+class _Dumper(yaml.SafeDumper):
+    """Quotes every text that either YAML 1.1 or 1.2 would take for something else."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+
+_Dumper.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, list("-+.0123456789"))
+
+
+def write_yaml(path: str | Path, data: Any) -> None:
+    """Write a YAML document: numpy values as plain numbers, lists of numbers on one line."""
+    with write_atomically(path) as temporary, open(temporary, "w", encoding="utf-8") as file:
+        yaml.dump(
+            plain(data), file, _Dumper, sort_keys=False, allow_unicode=True, width=1000,
+            default_flow_style=None,
+        )  # fmt: skip
+
+
+def write_json(path: str | Path, data: Any) -> None:
+    """Write a JSON document; a number that is not finite becomes null, as JSON has none."""
+    with write_atomically(path) as temporary:
+        text = json.dumps(_finite(plain(data)), indent=1, ensure_ascii=False)
+        temporary.write_text(text + "\n", encoding="utf-8")
+
+
+def plain(data: Any) -> Any:
+    """Turn numpy values, tuples and paths, however deep, into plain Python."""
+    if isinstance(data, Mapping):
+        return {str(key): plain(value) for key, value in data.items()}
+    if isinstance(data, np.ndarray | np.generic):
+        return data.tolist()
+    if isinstance(data, list | tuple):
+        return [plain(value) for value in data]
+    return str(data) if isinstance(data, Path) else data
+
+
+def _finite(data: Any) -> Any:
+    if isinstance(data, dict):
+        return {key: _finite(value) for key, value in data.items()}
+    if isinstance(data, list):
+        return [_finite(value) for value in data]
+    return None if isinstance(data, float) and not math.isfinite(data) else data

@@ -1,0 +1,196 @@
+"""Spinning LiDARs: where their beams point and how they scatter, from a catalogue of models."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import pydantic
+from numpy.typing import ArrayLike, NDArray
+
+from chains.errors import InputError
+from sensors.documents import Document, Number, nearest, read_yaml, validate
+
+Array = NDArray[np.float64]
+Size = Annotated[Number, pydantic.Field(ge=0)]
+Count = Annotated[int, pydantic.Field(ge=1, strict=True)]
+
+CATALOG = Path(__file__).parent / "catalog"
+GRAZING_RAD = 1.5
+"""Incidence beyond which the spread grows no further: tan(90 deg) is no measurement."""
+
+
+@dataclass(frozen=True)
+class LidarModel:
+    """One model of spinning LiDAR with R rings; lengths in m, angles in rad."""
+
+    name: str
+    maker: str
+    source: str
+    rings: int
+    columns: int
+    """Azimuth steps of a full turn."""
+    elevation_rad: Array
+    """(R,) nominal, by ring, up positive."""
+    azimuth_offset_rad: Array
+    """(R,) of each ring from its column's azimuth, counter-clockwise positive."""
+    beam_origin_m: Array
+    """(2,) where beams start: along their azimuth, and to the left of it."""
+    min_range_m: float
+    max_range_m: float
+    sigma_range_m: float
+    """Single-shot range noise, at any range."""
+    sigma_range_per_m: float
+    """The part that grows with range."""
+    sigma_range_incidence: float
+    """The part that grows with range * tan(incidence)."""
+    quantum_m: float
+    """Step of the range readout."""
+    sigma_angle_rad: float
+    """Single-shot noise of azimuth and of elevation."""
+    beam_divergence_rad: float
+    """Full width of the beam."""
+    typical_range_offset_m: float
+    """Mean range error that such sensors have shown; for simulation."""
+    typical_ring_offset_m: float
+    """Standard deviation of range error between the rings; for simulation."""
+
+    def directions(self, rings: ArrayLike, columns: ArrayLike) -> Array:
+        """Return the nominal unit directions (..., 3) of beams in the LiDAR's frame.
+
+        Column c of C points to azimuth pi - 2 pi c / C, plus its ring's offset.
+        """
+        rings = np.asarray(rings)
+        azimuth = np.pi - 2 * np.pi * np.asarray(columns) / self.columns
+        azimuth = azimuth + self.azimuth_offset_rad[rings]
+        elevation = np.broadcast_to(self.elevation_rad[rings], azimuth.shape)
+        flat = np.cos(elevation)
+        return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], -1)
+
+    def sigma_range(self, range_m: ArrayLike, incidence_rad: ArrayLike) -> Array:
+        """Return the single-shot standard deviation of range (N,) m.
+
+        sigma^2 = s0^2 + (k r)^2 + (kappa r tan g)^2 + quantum^2 / 12, g held below 1.5 rad.
+        """
+        r = np.asarray(range_m, float)
+        slant = r * np.tan(np.clip(incidence_rad, 0, GRAZING_RAD))
+        return np.sqrt(
+            self.sigma_range_m**2
+            + (self.sigma_range_per_m * r) ** 2
+            + (self.sigma_range_incidence * slant) ** 2
+            + self.quantum_m**2 / 12
+        )
+
+
+@dataclass(frozen=True)
+class Beams:
+    """N beams in the LiDAR's frame: point = origin_m + range_m * direction."""
+
+    origin_m: Array
+    direction: Array
+    range_m: Array
+    azimuth_rad: Array
+    elevation_rad: Array
+
+
+def beams(xyz_m: ArrayLike, beam_origin_m: ArrayLike) -> Beams:
+    """Return the beams that measured points (N, 3) m, in the LiDAR's frame.
+
+    With H the radial and B the tangential part of `beam_origin_m`, a beam of azimuth a starts at
+    H (cos a, sin a, 0) + B (-sin a, cos a, 0); the point at horizontal distance d and azimuth
+    atan2(y, x) was seen by the beam with a = atan2(y, x) - asin(B / d).
+    """
+    p = np.asarray(xyz_m, float)
+    radial, tangential = np.asarray(beam_origin_m, float)
+    distance = np.maximum(np.hypot(p[:, 0], p[:, 1]), max(abs(tangential), 1e-12))
+    azimuth = np.arctan2(p[:, 1], p[:, 0]) - np.arcsin(tangential / distance)
+    c, s = np.cos(azimuth), np.sin(azimuth)
+    origin = np.stack([radial * c - tangential * s, radial * s + tangential * c, 0 * c], -1)
+    reach = p - origin
+    range_m = np.linalg.norm(reach, axis=-1)
+    direction = reach / range_m[:, None]
+    elevation = np.arctan2(direction[:, 2], np.hypot(direction[:, 0], direction[:, 1]))
+    return Beams(origin, direction, range_m, azimuth, elevation)
+
+
+class LidarFile(Document):
+    """A model as its YAML file says it; angles in degrees, as data sheets have them.
+
+    `elevation_deg` lists every ring, or the first and the last of evenly spread ones;
+    `azimuth_offset_deg` is repeated over the rings.
+    """
+
+    maker: str
+    source: str
+    rings: Count
+    columns: Count
+    elevation_deg: Annotated[tuple[Number, ...], pydantic.Field(min_length=1)]
+    azimuth_offset_deg: Annotated[tuple[Number, ...], pydantic.Field(min_length=1)] = (0.0,)
+    beam_origin_m: tuple[Number, Number] = (0.0, 0.0)
+    min_range_m: Size
+    max_range_m: Size
+    sigma_range_m: Size
+    sigma_range_per_m: Size = 0.0
+    sigma_range_incidence: Size = 0.0
+    quantum_m: Size = 0.0
+    sigma_angle_rad: Size = 0.0
+    beam_divergence_rad: Size = 0.0
+    typical_range_offset_m: Number = 0.0
+    typical_ring_offset_m: Size = 0.0
+
+    @pydantic.model_validator(mode="after")
+    def _check_rings(self) -> "LidarFile":
+        if len(self.elevation_deg) not in (2, self.rings):
+            raise ValueError(
+                f"elevation_deg has {len(self.elevation_deg)} values for {self.rings} rings;"
+                " give one for each, or the first and the last"
+            )
+        if self.rings % len(self.azimuth_offset_deg):
+            raise ValueError(
+                f"azimuth_offset_deg has {len(self.azimuth_offset_deg)} values, which do not repeat"
+                f" evenly over {self.rings} rings"
+            )
+        if max(map(abs, self.elevation_deg)) > 90:
+            raise ValueError("elevation_deg goes beyond 90 degrees")
+        if max(map(abs, self.beam_origin_m)) > 1:
+            raise ValueError("beam_origin_m is beyond 1 m, which looks like millimetres")
+        return self
+
+    def model(self, name: str) -> LidarModel:
+        """Return the model with its angles by ring, in radians."""
+        fields = self.model_dump()
+        elevation = np.radians(fields.pop("elevation_deg"))
+        if len(elevation) != self.rings:
+            elevation = np.linspace(*elevation, self.rings)
+        offset = np.radians(fields.pop("azimuth_offset_deg"))
+        return LidarModel(
+            name=name,
+            elevation_rad=elevation,
+            azimuth_offset_rad=np.tile(offset, self.rings // len(offset)),
+            beam_origin_m=np.array(fields.pop("beam_origin_m")),
+            **fields,
+        )
+
+
+def catalog() -> list[str]:
+    """Return the names of the models in the catalogue."""
+    return sorted(path.stem for path in CATALOG.glob("*.yaml"))
+
+
+def load_lidar(name_or_path: str | Path, overrides: Mapping[str, Any] | None = None) -> LidarModel:
+    """Load a LiDAR model by its name in the catalogue or the path of a YAML file.
+
+    `overrides` replace fields of the file. Raises InputError for an unknown name, naming the
+    nearest of the catalogue, for a missing file, and for fields that do not fit.
+    """
+    path = Path(name_or_path)
+    if path.suffix not in (".yaml", ".yml"):
+        if str(name_or_path) not in catalog():
+            name = str(name_or_path)
+            raise InputError(f"LiDAR model {name} is unknown{nearest(name, catalog())}")
+        path = CATALOG / f"{name_or_path}.yaml"
+    data, marks = read_yaml(path)
+    if isinstance(data, dict):
+        data = {**data, **(overrides or {})}
+    return validate(LidarFile, data, path, marks).model(path.stem)

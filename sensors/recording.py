@@ -1,0 +1,235 @@
+"""The recording folder: what every instrument delivered, validated once, scans read lazily.
+
+This is the pyarrow door: `read_table` and `write_table` serve whoever needs a Parquet file.
+"""
+
+import hashlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chains.errors import InputError
+from sensors.documents import write_atomically
+from sensors.holds import Columns, average_hold
+from sensors.stops import Array, Table, Targets, read_targets
+
+if TYPE_CHECKING:
+    import pyarrow
+    from pyarrow.parquet import ParquetFile
+
+_PARTS = ("rig.yaml", "*.urdf", "stops.csv", "targets.csv", "scans/*.parquet", "reference/*")
+_BATCH_ROWS = 1 << 20
+_FARTHEST_M = 200.0
+_KINDS = {"x": "f", "y": "f", "z": "f", "ring": "iu", "column": "iu"}
+
+
+@dataclass(frozen=True)
+class Scan:
+    """What the LiDAR returned at one stop: N points in the LiDAR's own frame."""
+
+    xyz_m: Array
+    """(N, 3) m, as the driver gives them, or their mean over the hold."""
+    ring: NDArray[np.int64]
+    """(N,) laser, from 0."""
+    column: NDArray[np.int64]
+    """(N,) azimuth index."""
+    intensity: Array
+    """(N,) in the sensor's units; NaN = not recorded."""
+    count: Array
+    """(N,) returns averaged into the point."""
+    range_std_m: Array
+    """(N,) standard deviation of one return; NaN = unknown."""
+    extra: dict[str, Array]
+    """Every other numeric column, each (N,): per-point covariates."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """K stops of one rig; `Recording.open` reads one."""
+
+    folder: Path
+    stops: list[str]
+    """(K,) unique names, which name the scan files too."""
+    location: NDArray[np.str_]
+    time_s: Array
+    joints: Array
+    """(K, J) what the encoders reported, rad or m."""
+    bodies: dict[str, Array]
+    """Per tracked body (K, 7) x y z [m] qw qx qy qz; NaN = not seen; a point has only NaN for q."""
+    base_guess: Array | None
+    """(K, 7) rough pose of the base in the reference's frame."""
+    covariates: dict[str, Array]
+    """Every other numeric column of the stops, each (K,); NaN = not recorded."""
+    targets: Targets | None
+    has_scan: NDArray[np.bool_]
+    """(K,) whether there is a scan file."""
+    rings: int | None
+    """How many rings the sensor has, None = not checked."""
+
+    @classmethod
+    def open(
+        cls,
+        folder: str | Path,
+        joint_names: Sequence[str],
+        bodies: Sequence[str],
+        rings: int | None = None,
+    ) -> "Recording":
+        """Read and check the stops and targets of a recording, without reading any scan.
+
+        Raises InputError, one sentence with file, row and column, for what is missing, has the
+        wrong type, or cannot be: half a pose, a quaternion far from unit length (nearly unit ones
+        are normalised), degrees for radians, millimetres for metres.
+        """
+        folder = Path(folder)
+        table = Table(folder / "stops.csv", key="stop", text=("location",))
+        stops = table.names()
+        return cls(
+            folder=folder,
+            stops=stops,
+            location=table.text("location"),
+            time_s=table.numbers("time_s", "every stop has its time in seconds"),
+            joints=table.joints(joint_names),
+            bodies={body: table.pose(body) for body in bodies},
+            base_guess=table.pose("base_guess") if "base_guess.x" in table else None,
+            covariates=table.rest(),
+            targets=read_targets(folder / "targets.csv"),
+            has_scan=_find_scans(folder / "scans", stops),
+            rings=rings,
+        )
+
+    def scan(self, stop: int) -> Scan:
+        """Read the scan of one stop, by its index; a raw hold is averaged per direction.
+
+        Points that are not finite, or lie in the origin, are no returns and left out. Raises
+        InputError for a file that is missing or empty, lacks a column or has one of the wrong type,
+        and for rings or ranges that the sensor cannot have delivered.
+        """
+        path = self.folder / "scans" / f"{self.stops[stop]}.parquet"
+        with _open_parquet(path) as file:
+            names = _check_types(path, file)
+            if "scan" in names:
+                columns = average_hold(lambda wanted: _batches(path, file, wanted), names)
+            else:
+                columns = _columns(path, file.read(names))
+        return _check_scan(path, columns, self.rings)
+
+    def digest(self) -> str:
+        """Return the SHA-256 (hex) of the names and contents of the recording's files."""
+        sha = hashlib.sha256()
+        files = {path for part in _PARTS for path in self.folder.glob(part) if path.is_file()}
+        for path in sorted(files):
+            sha.update(
+                f"{path.relative_to(self.folder).as_posix()}\0{path.stat().st_size}\0".encode()
+            )
+            with open(path, "rb") as file:
+                while block := file.read(1 << 20):
+                    sha.update(block)
+        return sha.hexdigest()
+
+
+def read_table(path: str | Path) -> dict[str, np.ndarray]:
+    """Read all columns of a Parquet file; InputError where it is missing or is none."""
+    with _open_parquet(Path(path)) as file:
+        return _columns(Path(path), file.read())
+
+
+def write_table(path: str | Path, columns: Mapping[str, np.ndarray]) -> None:
+    """Write columns of equal length to a Parquet file (zstd), whole or not at all."""
+    import pyarrow
+    import pyarrow.parquet
+
+    table = pyarrow.table({name: np.ascontiguousarray(values) for name, values in columns.items()})
+    with write_atomically(path) as temporary:
+        pyarrow.parquet.write_table(table, temporary, compression="zstd")
+
+
+def _open_parquet(path: Path) -> "ParquetFile":
+    import pyarrow
+    import pyarrow.parquet
+
+    try:
+        return pyarrow.parquet.ParquetFile(path)
+    except FileNotFoundError:
+        raise InputError(f"{path} does not exist") from None
+    except (pyarrow.ArrowException, OSError) as error:
+        raise InputError(f"{path} is not a Parquet file: {str(error).splitlines()[0]}") from None
+
+
+def _columns(path: Path, table: "pyarrow.Table | pyarrow.RecordBatch") -> Columns:
+    """Turn a table or batch into numpy columns; an index must have a value in every row."""
+    for name in {"ring", "column", "scan"}.intersection(table.schema.names):
+        if table[name].null_count:
+            raise InputError(f"{path}: column {name} has empty cells; every return needs one")
+    arrays = {name: table[name].to_numpy(zero_copy_only=False) for name in table.schema.names}
+    return {name: a.astype(np.str_) if a.dtype == object else a for name, a in arrays.items()}
+
+
+def _batches(path: Path, file: "ParquetFile", names: Sequence[str]) -> Iterator[Columns]:
+    for batch in file.iter_batches(_BATCH_ROWS, columns=list(names)):
+        yield _columns(path, batch)
+
+
+def _find_scans(folder: Path, stops: Sequence[str]) -> NDArray[np.bool_]:
+    """Say which stops have a scan; scans of which none belongs to a stop are a mistake."""
+    names = {path.stem for path in folder.glob("*.parquet")}
+    if names and names.isdisjoint(stops):
+        raise InputError(
+            f"{folder} holds {min(names)}.parquet, but nothing named after a stop of stops.csv,"
+            f" such as {stops[0]}.parquet; name scans after their stops"
+        )
+    return np.array([stop in names for stop in stops])
+
+
+def _check_types(path: Path, file: "ParquetFile") -> list[str]:
+    """Return the numeric columns, after checking that those every scan needs are among them."""
+    kinds = {field.name: _kind(field.type) for field in file.schema_arrow}
+    for name, kind in _KINDS.items():
+        if name not in kinds:
+            raise InputError(f"{path}: column {name} is missing; a scan has {', '.join(_KINDS)}")
+        if kinds[name] == "" or kinds[name] not in kind:
+            found = file.schema_arrow.field(name).type
+            should = "float32, in metres" if kind == "f" else "uint16"
+            raise InputError(f"{path}: column {name} is {found}; it should be {should}")
+    return [name for name, kind in kinds.items() if kind]
+
+
+def _kind(arrow_type) -> str:
+    """Return numpy's kind of a numeric column ('f', 'i', 'u'), '' for others."""
+    try:
+        kind = np.dtype(arrow_type.to_pandas_dtype()).kind
+    except (NotImplementedError, TypeError):
+        return ""
+    return kind if kind in "fiu" else ""
+
+
+def _check_scan(path: Path, columns: Columns, rings: int | None) -> Scan:
+    xyz = np.stack([columns.pop(axis) for axis in "xyz"], axis=-1).astype(np.float64)
+    range_m = np.linalg.norm(xyz, axis=-1)
+    seen = np.isfinite(range_m) & (range_m > 0)
+    _check_ranges(path, range_m[seen])
+    ring, column = (columns.pop(name)[seen].astype(np.int64) for name in ("ring", "column"))
+    wrong = ring[(ring < 0) | (ring >= (rings or np.inf))]
+    if wrong.size:
+        last = "" if rings is None else f" to {rings - 1}"
+        raise InputError(f"{path}: ring {wrong[0]} is not in the sensor's 0{last}; count from 0")
+    extra = {name: values[seen].astype(np.float64) for name, values in columns.items()}
+    unknown = np.full(len(ring), np.nan)
+    count = extra.pop("count", np.ones(len(ring)))
+    if not (count >= 1).all():
+        raise InputError(f"{path}: count is below 1; leave out directions without a return")
+    intensity, spread = (extra.pop(name, unknown) for name in ("intensity", "range_std_m"))
+    return Scan(xyz[seen], ring, column, intensity, count, spread, extra)
+
+
+def _check_ranges(path: Path, range_m: Array) -> None:
+    if not range_m.size:
+        raise InputError(f"{path} has no returns; remove the file if the stop was not scanned")
+    if np.median(range_m) > _FARTHEST_M:
+        raise InputError(
+            f"{path}: half of the points are beyond {np.median(range_m):.0f} m, which looks like"
+            " millimetres; x, y and z are in metres"
+        )

@@ -1,0 +1,312 @@
+"""The reference surface: the scanned mesh, what a beam meets on it, and which of it is one surface.
+
+The ray caster (Embree, in float32) only says *which* triangle a ray meets first, on the mesh moved
+to its own centre. Range, point, normal and incidence are then computed in float64 from that
+triangle's plane, so a residual and its derivatives agree as doubles wherever the mesh lies.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from chains.errors import InputError
+from sensors.surfaces import SurfaceGrid, connected_surfaces, transverse, triangle_planes
+
+# A probe that lands further than this from the plane of the hit has crossed a depth edge.
+DEPTH_STEP_M = 0.02
+
+
+@dataclass(frozen=True)
+class Hits:
+    """Where N beams meet the reference, in its frame.
+
+    A miss has triangle -1, label -1, range and point infinite, a zero normal, incidence pi / 2.
+    The intensity is NaN on a miss and where the reference states none.
+    """
+
+    triangle: np.ndarray  # (N,) int64
+    range_m: np.ndarray  # (N,)
+    point_m: np.ndarray  # (N, 3)
+    normal: np.ndarray  # (N, 3) unit, facing the sensor
+    incidence_rad: np.ndarray  # (N,) 0 where the beam meets the surface head-on
+    label: np.ndarray  # (N,) int64
+    intensity: np.ndarray  # (N,)
+
+
+class Reference:
+    """A triangle mesh with a label and an intensity per triangle, in the reference frame, metres.
+
+    Args:
+        vertices_m: (V, 3).
+        triangles: (F, 3) vertex indices.
+        label: (F,) integers; none means one label, 0.
+        intensity: (F,); none means NaN.
+        label_names: name of each label; a label without one is called `label_<n>`.
+
+    Raises:
+        InputError: the arrays do not fit each other, a vertex is not finite, no triangle has area.
+    """
+
+    def __init__(
+        self,
+        vertices_m: ArrayLike,
+        triangles: ArrayLike,
+        label: ArrayLike | None = None,
+        intensity: ArrayLike | None = None,
+        label_names: dict[int, str] | None = None,
+    ) -> None:
+        self.vertices_m = np.ascontiguousarray(vertices_m, dtype=np.float64)
+        self.triangles = np.ascontiguousarray(triangles, dtype=np.int64)
+        _check_mesh(self.vertices_m, self.triangles)
+        count = len(self.triangles)
+        label = _per_triangle(label, 0, count, "label")
+        if np.any((label < 0) | (label != np.floor(label))):
+            raise InputError("a label is no whole number, 0 or more.")
+        # One row more than there are triangles: index -1, the miss, finds it.
+        self._label = np.append(label, -1).astype(np.int64)
+        self._intensity = np.append(_per_triangle(intensity, np.nan, count, "intensity"), np.nan)
+        self._plane, self.area_m2 = triangle_planes(self.vertices_m[self.triangles])
+        if not self.area_m2.any():
+            raise InputError("the mesh has no triangle with an area; a surface is needed.")
+        self.label_names = {
+            int(n): (label_names or {}).get(int(n), f"label_{n}") for n in np.unique(self.label)
+        }
+
+    @classmethod
+    def read(
+        cls, mesh: Path | str, faces: Path | str | None = None, labels: Path | str | None = None
+    ) -> "Reference":
+        """Read a mesh (PLY, OBJ, STL) with its columns per triangle and its label names.
+
+        Args:
+            mesh: the file; double precision is kept.
+            faces: table with one row per triangle, in order: `label`, `intensity`, either or both.
+            labels: YAML of `number: name`.
+
+        Raises:
+            InputError: a file is missing, unreadable, or does not fit the others.
+        """
+        arrays = _read_mesh(Path(mesh))
+        columns = {} if faces is None else _read_faces(Path(faces))
+        names = None if labels is None else _read_labels(Path(labels))
+        try:
+            return cls(*arrays, columns.get("label"), columns.get("intensity"), names)
+        except InputError as error:
+            files = mesh if faces is None else f"{mesh} with {faces}"
+            raise InputError(f"{files}: {error}") from None
+
+    @property
+    def label(self) -> np.ndarray:
+        """Label (F,) of each triangle."""
+        return self._label[:-1]
+
+    @property
+    def intensity(self) -> np.ndarray:
+        """Intensity (F,) of each triangle, NaN where none is stated."""
+        return self._intensity[:-1]
+
+    def cast(self, origins_m: np.ndarray, directions: np.ndarray, nthreads: int = 0) -> Hits:
+        """First hit of each beam; beams in scan order are about twice as fast as shuffled ones.
+
+        Args:
+            origins_m: (N, 3) or (3,), in the reference frame.
+            directions: (N, 3) unit vectors.
+            nthreads: 0 means all.
+        """
+        return self.hits(
+            self._first_triangle(origins_m, directions, nthreads), origins_m, directions
+        )
+
+    def hits(self, triangle: np.ndarray, origins_m: np.ndarray, directions: np.ndarray) -> Hits:
+        """Where beams meet the planes of given triangles, each plane extended without end.
+
+        `range = (n.p - n.o) / n.d` for a plane through p with normal n. A plane behind the sensor,
+        or along the beam, is a miss.
+
+        Args:
+            triangle: (N,) triangle indices, -1 for none.
+            origins_m: (N, 3) or (3,), in the reference frame.
+            directions: (N, 3) unit vectors.
+        """
+        origins_m = np.broadcast_to(origins_m, directions.shape)
+        plane = self._plane.take(triangle, axis=0)
+        along = _dot(plane, directions)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            range_m = (plane[:, 3] - _dot(plane, origins_m)) / along
+            point_m = np.einsum("n,ni->ni", range_m, directions) + origins_m
+        normal = np.einsum("n,ni->ni", np.where(along > 0, -1.0, 1.0), plane[:, :3])
+        incidence_rad = np.arccos(np.minimum(np.abs(along), 1.0))
+        missed = np.flatnonzero(~((range_m > 0) & (range_m < np.inf)))
+        if len(missed):
+            triangle = np.array(triangle, dtype=np.int64)
+            triangle[missed] = -1
+            range_m[missed] = np.inf
+            point_m[missed] = np.inf
+            normal[missed] = 0.0
+            incidence_rad[missed] = np.pi / 2
+        return Hits(
+            triangle,
+            range_m,
+            point_m,
+            normal,
+            incidence_rad,
+            self._label[triangle],
+            self._intensity[triangle],
+        )
+
+    def near_edge(
+        self, origins_m: np.ndarray, directions: np.ndarray, hits: Hits, angle_rad: ArrayLike
+    ) -> np.ndarray:
+        """Whether a beam turned to any of four sides leaves the plane that the beam itself hit.
+
+        Such a beam may see two surfaces at once: a mixed pixel. A turned beam leaves the plane
+        when it misses, or lands more than 0.02 m off it.
+
+        Args:
+            origins_m: (N, 3) or (3,), in the reference frame.
+            directions: (N, 3) unit vectors.
+            hits: where those beams hit.
+            angle_rad: how far to turn, scalar or (N,).
+
+        Returns:
+            (N,) bool, False where the beam itself missed.
+        """
+        plane = self._plane.take(hits.triangle, axis=0)
+        near = np.zeros(len(directions), dtype=bool)
+        side = np.tan(np.asarray(angle_rad)).reshape(-1, 1) * transverse(directions)
+        up = np.cross(directions, side)
+        for turn in (side, -side, up, -up):
+            turned = directions + turn
+            turned /= np.linalg.norm(turned, axis=1, keepdims=True)
+            landed_m = self.cast(origins_m, turned).point_m
+            with np.errstate(invalid="ignore"):
+                near |= ~(np.abs(_dot(plane, landed_m) - plane[:, 3]) <= DEPTH_STEP_M)
+        return near & (hits.triangle >= 0)
+
+    @cached_property
+    def surface(self) -> np.ndarray:
+        """Surface (F,) int64 of each triangle, counted from 0.
+
+        Triangles of one label that share an edge, across which the normal turns less than 30
+        degrees, belong to one surface. Triangles without area each stand alone.
+        """
+        return connected_surfaces(self.vertices_m, self.triangles, self._normal, self.label)
+
+    def patch(self, hits: Hits, size_m: float = 0.7) -> np.ndarray:
+        """Patch (N,) int64 of each hit: a cell of about `size_m` of its surface's tangent plane.
+
+        Patches are counted over all surfaces; -1 where the beam missed.
+        """
+        patch = np.full(len(hits.triangle), -1, dtype=np.int64)
+        hit = np.flatnonzero(hits.triangle >= 0)
+        patch[hit] = self._grid.patch(self.surface[hits.triangle[hit]], hits.point_m[hit], size_m)
+        return patch
+
+    def patch_surface(self, size_m: float = 0.7) -> np.ndarray:
+        """Surface (P,) int64 of every patch that `patch` can return for that size."""
+        return self._grid.patch_surface(size_m)
+
+    @property
+    def _normal(self) -> np.ndarray:
+        return self._plane[:-1, :3]
+
+    @cached_property
+    def _grid(self) -> SurfaceGrid:
+        corners_m = self.vertices_m[self.triangles]
+        return SurfaceGrid.over(corners_m, self._normal, self.area_m2, self.surface)
+
+    @cached_property
+    def _solid(self) -> np.ndarray:
+        """Triangles that a ray can hit, then -1: where the ray caster's "no triangle" is sent."""
+        return np.append(np.flatnonzero(self.area_m2), -1)
+
+    @cached_property
+    def _centre_m(self) -> np.ndarray:
+        return self.vertices_m[self.triangles].mean(axis=(0, 1))
+
+    @cached_property
+    def _scene(self) -> Any:
+        import open3d as o3d
+
+        scene = o3d.t.geometry.RaycastingScene()
+        scene.add_triangles(
+            (self.vertices_m - self._centre_m).astype(np.float32),
+            self.triangles[self._solid[:-1]].astype(np.uint32),
+        )
+        return scene
+
+    def _first_triangle(
+        self, origins_m: np.ndarray, directions: np.ndarray, nthreads: int
+    ) -> np.ndarray:
+        rays = np.empty((len(directions), 6), dtype=np.float32)
+        rays[:, :3] = origins_m - self._centre_m
+        rays[:, 3:] = directions
+        found = self._scene.cast_rays(rays, nthreads=nthreads)["primitive_ids"].numpy()
+        return self._solid[np.minimum(found, len(self._solid) - 1)]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the ray caster's own scene, which cannot travel between processes."""
+        return {name: value for name, value in self.__dict__.items() if name != "_scene"}
+
+
+def _read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    if not path.is_file():
+        raise InputError(f"{path}: no such mesh; give a PLY, OBJ or STL file.")
+    import open3d as o3d
+
+    # The tensor reader would round doubles to float32; this one keeps them.
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        mesh = o3d.io.read_triangle_mesh(str(path))
+    if not mesh.has_triangles():
+        raise InputError(f"{path}: no triangles in it; a PLY, OBJ or STL mesh is needed.")
+    return np.asarray(mesh.vertices), np.asarray(mesh.triangles)
+
+
+def _read_faces(path: Path) -> dict[str, np.ndarray]:
+    from sensors.recording import read_table
+
+    columns = read_table(path)
+    if not {"label", "intensity"} & columns.keys():
+        raise InputError(f"{path}: has neither of the columns label and intensity.")
+    return columns
+
+
+def _read_labels(path: Path) -> dict[int, str]:
+    from sensors.documents import read_yaml
+
+    data, _ = read_yaml(path)
+    if not isinstance(data, dict) or not all(type(number) is int for number in data):
+        raise InputError(f"{path}: each line should read `number: name`, as in `0: floor`.")
+    return {number: str(name) for number, name in data.items()}
+
+
+def _check_mesh(vertices_m: np.ndarray, triangles: np.ndarray) -> None:
+    for what, array in (("vertices", vertices_m), ("triangles", triangles)):
+        if array.ndim != 2 or array.shape[1] != 3 or not len(array):
+            raise InputError(f"the mesh's {what} have shape {array.shape}; (n, 3) is needed.")
+    if not np.isfinite(vertices_m).all():
+        row = int(np.flatnonzero(~np.isfinite(vertices_m).all(axis=1))[0])
+        raise InputError(f"vertex {row} of the mesh is not finite.")
+    stray = triangles[(triangles < 0) | (triangles >= len(vertices_m))]
+    if len(stray):
+        raise InputError(
+            f"a triangle names vertex {stray[0]}, but the vertices are 0 to {len(vertices_m) - 1}."
+        )
+
+
+def _per_triangle(values: ArrayLike | None, default: float, count: int, what: str) -> np.ndarray:
+    values = np.full(count, default) if values is None else np.asarray(values, dtype=np.float64)
+    if values.shape != (count,):
+        raise InputError(
+            f"{what} has shape {values.shape}, but the mesh has {count} triangles: give one each."
+        )
+    return values
+
+
+def _dot(plane: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """n.v (N,) of planes [n, n.p] (N, 4) and vectors (N, 3)."""
+    return np.einsum("ni,ni->n", plane[:, :3], vectors)

@@ -1,0 +1,169 @@
+"""stops.csv and targets.csv: every cell checked, so that nothing behind them has to ask again."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chains.errors import InputError
+from sensors.documents import read_csv
+
+Array = NDArray[np.float64]
+
+POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
+_FARTHEST_M = 1000.0
+_LARGEST_JOINT = 4 * math.pi
+
+
+@dataclass(frozen=True)
+class Targets:
+    """M calibration targets: sphere centres in the reference's frame, markers in the tracker's."""
+
+    names: list[str]
+    faro_m: Array
+    """(M, 3) centre of the sphere."""
+    upper_m: Array
+    """(M, 3) upper marker of the rod."""
+    lower_m: Array
+    """(M, 3) lower marker of the rod."""
+
+
+class Table:
+    """A CSV table whose columns are taken one by one, each checked; `rest` gives the others."""
+
+    def __init__(self, path: Path, key: str, text: Sequence[str] = ()) -> None:
+        self.path = path
+        self._columns = read_csv(path, text=(key, *text))
+        self._names = self.text(key).tolist()
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._columns
+
+    def names(self) -> list[str]:
+        """Take the names of the rows: at least one row, no empty name, none twice."""
+        if not self._names:
+            raise InputError(f"{self.path} has no rows; it needs one per stop")
+        for row, name in enumerate(self._names):
+            if not name or "/" in name or "\\" in name:
+                raise InputError(f"{self.path}: row {row + 1}: {name!r} is no name for a file")
+            if name in self._names[:row]:
+                raise InputError(f"{self.path}: row {row + 1}: {name} is there twice; rename one")
+        return self._names
+
+    def text(self, name: str) -> NDArray[np.str_]:
+        """Take a column of text."""
+        if name not in self._columns:
+            raise InputError(f"{self.path}: column {name} is missing; every row needs one")
+        return self._columns.pop(name)
+
+    def numbers(self, name: str, why: str, largest: float = math.inf, units: str = "") -> Array:
+        """Take a column of finite numbers, none beyond `largest`, which would betray its units."""
+        values = self._loose(name, why)
+        self.refuse(~np.isfinite(values), f"{name} is empty or not finite; {why}")
+        wrong = np.abs(values) > largest
+        self.refuse(wrong, lambda row: f"{name} is {values[row]:g}; {units}")
+        return values
+
+    def joints(self, names: Sequence[str]) -> Array:
+        """Take the joints (K, J) by name, in rad or m."""
+        why = "the arm's URDF has this joint, so every stop needs its value"
+        units = "joints are in radians or metres, and this looks like degrees or millimetres"
+        columns = [self.numbers(name, why, _LARGEST_JOINT, units) for name in names]
+        return np.array(columns).reshape(len(names), len(self._names)).T
+
+    def points(self, name: str, separator: str) -> Array:
+        """Take three columns of positions (N, 3) in m."""
+        units = "positions are in metres, and this looks like millimetres"
+        names = [f"{name}{separator}{axis}" for axis in "xyz"]
+        why = f"{name} needs {', '.join(names)}"
+        return np.array([self.numbers(part, why, _FARTHEST_M, units) for part in names]).T
+
+    def pose(self, body: str) -> Array:
+        """Take a tracked body (K, 7): x y z [m] and a unit quaternion; NaN where not seen.
+
+        Without any q column the body is a point, whose quaternion is NaN throughout.
+        """
+        names = [f"{body}.{part}" for part in POSE]
+        if not any(name in self for name in names[3:]):
+            names = names[:3]
+        why = f"{body} needs {', '.join(names)}"
+        pose = np.array([self._loose(name, why) for name in names]).T
+        missing = ~np.isfinite(pose)
+        self.refuse(
+            missing.any(axis=1) & ~np.isnan(pose).all(axis=1),
+            lambda row: (
+                f"{names[np.argmax(missing[row])]} is empty or not finite, though {body} was"
+                " seen; give its whole pose, or leave all of it empty"
+            ),
+        )
+        self.refuse(
+            (np.abs(pose[:, :3]) > _FARTHEST_M).any(axis=1),
+            lambda row: (
+                f"{body} is {np.abs(pose[row, :3]).max():g} m away; positions are in metres,"
+                " and this looks like millimetres"
+            ),
+        )
+        if len(names) == 3:
+            return np.hstack([pose, np.full((len(pose), 4), np.nan)])
+        length = np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
+        self.refuse(
+            np.abs(length[:, 0] - 1) > 1e-3,
+            lambda row: (
+                f"the quaternion {body}.qw .qx .qy .qz has length {length[row, 0]:.4g}, and"
+                " a rotation has 1"
+            ),
+        )
+        return np.hstack([pose[:, :3], pose[:, 3:] / length])
+
+    def rest(self) -> dict[str, Array]:
+        """Give every other numeric column; one that is mostly numbers must be so throughout."""
+        for name, values in self._columns.items():
+            if values.dtype.kind != "f":
+                numeric = [_is_number(cell) for cell in values.tolist() if cell]
+                if 2 * sum(numeric) > len(numeric):
+                    self._loose(name, "leave a cell empty where the value is unknown")
+        return {name: column for name, column in self._columns.items() if column.dtype.kind == "f"}
+
+    def _loose(self, name: str, why: str) -> Array:
+        """Take a column of numbers, NaN where empty."""
+        if name not in self._columns:
+            raise InputError(f"{self.path}: column {name} is missing; {why}")
+        values = self._columns[name]
+        if values.dtype.kind != "f":
+            wrong = np.array([bool(cell) and not _is_number(cell) for cell in values.tolist()])
+            self.refuse(wrong, lambda row: f"{name} is '{values[row]}', not a number; {why}")
+        return self._columns.pop(name)
+
+    def refuse(self, wrong: NDArray[np.bool_], what: str | Callable[[int], str]) -> None:
+        """Raise InputError that says what is wrong with the first row where `wrong` (N,) holds."""
+        if wrong.any():
+            row = int(np.argmax(wrong))
+            problem = what if isinstance(what, str) else what(row)
+            raise InputError(f"{self.path}: row {row + 1} ({self._names[row]}): {problem}")
+
+
+def read_targets(path: Path) -> Targets | None:
+    """Read targets.csv, None where there is none; InputError for fewer than 3 targets."""
+    if not path.exists():
+        return None
+    table = Table(path, key="target")
+    names = table.names()
+    if len(names) < 3:
+        raise InputError(f"{path} has {len(names)} rows; it takes 3 targets to fix a transform")
+    faro, upper, lower = (table.points(part, "_") for part in ("faro", "upper", "lower"))
+    table.refuse(
+        np.linalg.norm(upper - lower, axis=1) < 1e-3,
+        "the two markers are in one place, and so show no direction of gravity",
+    )
+    return Targets(names, faro, upper, lower)
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True

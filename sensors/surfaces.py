@@ -1,0 +1,137 @@
+"""A mesh's triangles as planes, as connected surfaces, and as patches of those surfaces."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+# A triangle thinner than this has no normal: it is treated as a hole.
+THINNEST_TRIANGLE_M = 1e-9
+# Vertices closer than this are one vertex: meshes often repeat them, triangle by triangle.
+SAME_VERTEX_M = 1e-6
+# Across an edge that turns more than this, another surface begins.
+SMOOTH_TURN_RAD = np.radians(30.0)
+
+
+def triangle_planes(corners_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Planes [n, n.p] (F + 1, 4) and areas (F,) of triangles (F, 3, 3); no area, no plane.
+
+    A hole, and the last row, is the plane that no beam meets: n = 0, n.p = inf.
+    """
+    edges = np.roll(corners_m, -1, axis=1) - corners_m
+    cross = np.cross(edges[:, 0], edges[:, 1])
+    twice_area = np.linalg.norm(cross, axis=1)
+    solid = twice_area > THINNEST_TRIANGLE_M * np.linalg.norm(edges, axis=2).max(axis=1)
+    plane = np.tile([0.0, 0.0, 0.0, np.inf], (len(corners_m) + 1, 1))
+    normal = cross[solid] / twice_area[solid, None]
+    plane[:-1][solid] = np.column_stack(
+        [normal, np.einsum("ni,ni->n", normal, corners_m[solid].mean(axis=1))]
+    )
+    return plane, np.where(solid, twice_area / 2, 0.0)
+
+
+def connected_surfaces(
+    vertices_m: np.ndarray, triangles: np.ndarray, normal: np.ndarray, label: np.ndarray
+) -> np.ndarray:
+    """Surface (F,) int64 of each triangle: smooth across shared edges, and of one label.
+
+    Args:
+        vertices_m: (V, 3); vertices at the same place count as one.
+        triangles: (F, 3) vertex indices, wound either way.
+        normal: (F, 3) unit, by the right-hand rule; zero for a triangle without area, which
+            stands alone.
+        label: (F,).
+    """
+    first, second, alike = _shared_edges(_merge_vertices(vertices_m)[triangles])
+    cos_turn = np.where(alike, 1.0, -1.0) * np.einsum("ni,ni->n", normal[first], normal[second])
+    joined = (cos_turn > np.cos(SMOOTH_TURN_RAD)) & (label[first] == label[second])
+    count = len(triangles)
+    graph = coo_array((joined[joined], (first[joined], second[joined])), shape=(count, count))
+    return connected_components(graph, directed=False)[1].astype(np.int64)
+
+
+@dataclass(frozen=True)
+class SurfaceGrid:
+    """A grid of patches in the tangent plane of each of S surfaces."""
+
+    axes: np.ndarray  # (S, 2, 3) unit, in the tangent plane
+    corner_m: np.ndarray  # (S, 2) lower corner along the axes
+    size_m: np.ndarray  # (S, 2) extent along the axes
+
+    @classmethod
+    def over(
+        cls, corners_m: np.ndarray, normal: np.ndarray, area_m2: np.ndarray, surface: np.ndarray
+    ) -> "SurfaceGrid":
+        """Grid over triangles: corners (F, 3, 3), unit normals (F, 3), areas (F,), surfaces (F,).
+
+        The tangent plane stands across the main direction of the surface's normals, by area.
+        """
+        count = int(surface.max()) + 1
+        moment = np.zeros((count, 3, 3))
+        np.add.at(moment, surface, np.einsum("f,fi,fj->fij", area_m2, normal, normal))
+        main = np.linalg.eigh(moment)[1][:, :, -1]
+        side = transverse(main)
+        axes = np.stack([side, np.cross(main, side)], axis=1)
+        place_m = np.einsum("fki,fci->fck", axes[surface], corners_m)
+        low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
+        np.minimum.at(low, surface, place_m.min(axis=1))
+        np.maximum.at(high, surface, place_m.max(axis=1))
+        return cls(axes, low, np.maximum(high - low, SAME_VERTEX_M))
+
+    def patch(self, surface: np.ndarray, point_m: np.ndarray, cell_m: float) -> np.ndarray:
+        """Patch (N,) int64, counted over all surfaces, of points (N, 3) on given surfaces (N,)."""
+        cells = self._cells(cell_m)
+        first = np.cumsum(cells.prod(axis=1)) - cells.prod(axis=1)
+        per_m = cells / self.size_m
+        along = (self.axes * per_m[:, :, None]).take(surface, axis=0)
+        steps = np.einsum("nki,ni->nk", along, point_m) - (self.corner_m * per_m).take(
+            surface, axis=0
+        )
+        last = cells.take(surface, axis=0) - 1
+        row, column = np.clip(steps, 0, last).astype(np.int64).T
+        return first.take(surface) + row * (last[:, 1] + 1) + column
+
+    def patch_surface(self, cell_m: float) -> np.ndarray:
+        """Surface (P,) int64 of every patch."""
+        cells = self._cells(cell_m)
+        return np.repeat(np.arange(len(cells)), cells.prod(axis=1))
+
+    def _cells(self, cell_m: float) -> np.ndarray:
+        """Cells (S, 2) along the axes, each about `cell_m` wide: no slivers at the far rim."""
+        return np.maximum(1, np.rint(self.size_m / cell_m)).astype(np.int64)
+
+
+def transverse(directions: np.ndarray) -> np.ndarray:
+    """A unit vector (N, 3) at right angles to each direction (N, 3)."""
+    furthest_axis = np.eye(3)[np.argmin(np.abs(directions), axis=1)]
+    across = np.cross(directions, furthest_axis)
+    return across / np.linalg.norm(across, axis=1, keepdims=True)
+
+
+def _merge_vertices(vertices_m: np.ndarray) -> np.ndarray:
+    """Number (V,) of each vertex, the same for vertices at the same place."""
+    place = np.rint((vertices_m - vertices_m.mean(axis=0)) / SAME_VERTEX_M).astype(np.int64)
+    order = np.lexsort(place.T)
+    moved = np.any(np.diff(place[order], axis=0) != 0, axis=1)
+    number = np.empty(len(vertices_m), dtype=np.int64)
+    number[order] = np.append(0, np.cumsum(moved))
+    return number
+
+
+def _shared_edges(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """All pairs of triangles (n,), (n,) that share an edge, and whether they are wound alike."""
+    start, end = triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()
+    low, high = np.minimum(start, end), np.maximum(start, end)
+    order = np.lexsort((high, low))
+    low, high, forward, owner = low[order], high[order], (start < end)[order], order // 3
+    pairs = [(owner[:0], owner[:0], forward[:0])]
+    step = 1
+    # An edge may have more than two triangles: compare the sorted edges one step on, then two, ...
+    while (same := (low[step:] == low[:-step]) & (high[step:] == high[:-step])).any():
+        i = np.flatnonzero(same)
+        # Neighbours wound alike run along their shared edge in opposite senses.
+        pairs.append((owner[i], owner[i + step], forward[i] != forward[i + step]))
+        step += 1
+    first, second, alike = (np.concatenate(part) for part in zip(*pairs, strict=True))
+    return first, second, alike

@@ -1,0 +1,161 @@
+"""read_arm: forward kinematics against elementary matrices, and every refusal."""
+
+from itertools import pairwise
+from math import cos, pi, sin
+
+import numpy as np
+import pytest
+
+from chains.arm import read_arm
+from chains.errors import InputError
+from chains.frames import FrameTree
+
+ARM = """<robot name="arm3">
+  <link name="world"/> <link name="stand"/> <link name="upper"/> <link name="fore"/>
+  <link name="hand"/> <link name="flange"/> <link name="camera"/>
+  <joint name="foot" type="fixed">
+    <parent link="world"/><child link="stand"/>
+  </joint>
+  <joint name="flange_joint" type="fixed">
+    <origin xyz="0 0 0.1" rpy="0 0 0.5"/><parent link="hand"/><child link="flange"/>
+  </joint>
+  <joint name="shoulder" type="revolute">
+    <origin xyz="0 0 0.2" rpy="1.5707963267948966 0 0"/><parent link="stand"/><child link="upper"/>
+    <axis xyz="0 0 -2"/><limit lower="-1" upper="2" effort="1" velocity="1"/>
+  </joint>
+  <joint name="elbow" type="continuous">
+    <origin xyz="0.3 0 0"/><parent link="upper"/><child link="fore"/>
+  </joint>
+  <joint name="reach" type="prismatic">
+    <origin rpy="0 0.4 0"/><parent link="fore"/><child link="hand"/>
+    <axis xyz="0 1 0"/><limit upper="0.5" effort="1" velocity="1"/>
+  </joint>
+  <joint name="camera_joint" type="floating">
+    <parent link="hand"/><child link="camera"/>
+  </joint>
+</robot>"""
+
+
+def shift(x, y, z):
+    return np.array([[1, 0, 0, x], [0, 1, 0, y], [0, 0, 1, z], [0, 0, 0, 1]], float)
+
+
+def turn(axis, angle_rad):
+    c, s = cos(angle_rad), sin(angle_rad)
+    blocks = {"x": [[1, 0, 0], [0, c, -s], [0, s, c]], "y": [[c, 0, s], [0, 1, 0], [-s, 0, c]]}
+    blocks["z"] = [[c, -s, 0], [s, c, 0], [0, 0, 1]]
+    T = np.eye(4)
+    T[:3, :3] = blocks[axis]
+    return T
+
+
+@pytest.fixture
+def read(tmp_path):
+    """Write a URDF and read the chain of it."""
+
+    def write_and_read(text=ARM, base="world", tip="flange"):
+        path = tmp_path / "arm.urdf"
+        path.write_text(text)
+        return read_arm(path, base, tip)
+
+    return write_and_read
+
+
+def test_edges_are_the_joints_in_order(read):
+    edges = read()
+    names = ["foot", "shoulder", "elbow", "reach", "flange_joint"]
+    assert [edge.name for edge in edges] == names
+    links = ["world", "stand", "upper", "fore", "hand", "flange"]
+    assert [(edge.parent, edge.child) for edge in edges] == list(pairwise(links))
+    assert [edge.joint is None for edge in edges] == [True, False, False, False, True]
+
+
+def test_forward_kinematics(read):
+    joints = np.array([[0.7, -0.4, 0.25], [-0.3, 2.0, 0.1]])
+    Ts = FrameTree(read()).place("flange", joints).Ts_root_frame
+    for T, (shoulder, elbow, reach) in zip(Ts, joints, strict=True):
+        expected = (
+            shift(0, 0, 0.2)
+            @ turn("x", pi / 2)
+            @ turn("z", -shoulder)
+            @ shift(0.3, 0, 0)
+            @ turn("x", elbow)
+            @ turn("y", 0.4)
+            @ shift(0, reach, 0)
+            @ shift(0, 0, 0.1)
+            @ turn("z", 0.5)
+        )
+        np.testing.assert_allclose(T, expected, atol=1e-14)
+
+
+def test_axes_and_limits_with_their_defaults(read):
+    joints = {edge.name: edge.joint for edge in read()}
+    np.testing.assert_array_equal(joints["shoulder"].axis, [0, 0, -1])
+    assert (joints["shoulder"].lower, joints["shoulder"].upper) == (-1, 2)
+    np.testing.assert_array_equal(joints["elbow"].axis, [1, 0, 0])
+    assert (joints["elbow"].kind, joints["elbow"].lower) == ("revolute", -np.inf)
+    assert (joints["reach"].kind, joints["reach"].lower, joints["reach"].upper) == (
+        "prismatic",
+        0,
+        0.5,
+    )
+
+
+def test_a_chain_may_start_inside_the_arm(read):
+    assert [edge.name for edge in read(base="upper", tip="hand")] == ["elbow", "reach"]
+
+
+@pytest.mark.parametrize(
+    ("base", "tip", "words"),
+    [
+        ("word", "flange", ["link 'word'", "'world'", "stand, upper"]),
+        ("world", "tool", ["link 'tool'", "flange"]),
+        ("flange", "world", ["'flange'", "'world'", "no chain"]),
+        ("world", "camera", ["camera_joint", "floating", "prismatic"]),
+    ],
+)
+def test_a_chain_that_is_not_there_is_refused(read, base, tip, words):
+    refuses(read, words, base=base, tip=tip)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('xyz="0 0 0.2"', 'xyz="0 0 200"', ["shoulder", "200 m", "millimetres?"]),
+        ('xyz="0 0 0.2"', 'xyz="0 0.2"', ["shoulder", "origin xyz", "'0 0.2'", "3 numbers"]),
+        ('xyz="0 0 0.2"', 'xyz="0 0 nan"', ["shoulder", "origin xyz", "3 numbers"]),
+        ('xyz="0 0 -2"', 'xyz="0 0 0"', ["shoulder", "axis"]),
+        ('lower="-1"', 'lower="3"', ["shoulder", "lower 3", "upper 2"]),
+        ('lower="-1"', 'lower="low"', ["shoulder", "limit lower", "'low'", "a number"]),
+        ('<axis xyz="0 1 0"/>', '<mimic joint="elbow"/>', ["reach", "mimics"]),
+        ('type="continuous"', 'type="planar"', ["elbow", "planar"]),
+        ('<child link="upper"/>', '<child link="fore"/>', ["'fore'", "'shoulder' and 'elbow'"]),
+        ('<child link="upper"/>', "", ["shoulder", "no child link"]),
+        ('<parent link="stand"/>', '<parent link="fore"/>', ["no chain", "'world'", "'flange'"]),
+        ("</robot>", "", ["not XML"]),
+    ],
+)
+def test_a_bad_joint_is_refused_by_name(read, old, new, words):
+    assert old in ARM
+    refuses(read, words, text=ARM.replace(old, new, 1))
+
+
+def test_a_namespace_alone_is_no_xacro(read):
+    named = ARM.replace("<robot", '<robot xmlns:xacro="http://www.ros.org/wiki/xacro"')
+    assert len(read(named)) == 5
+
+
+def test_what_is_no_urdf_is_refused(read, tmp_path):
+    refuses(read, ["<mesh>", "<robot>"], text="<mesh/>")
+    macro = '<robot xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:arm/></robot>'
+    refuses(read, ["xacro FILE"], text=macro)
+    with pytest.raises(InputError, match=r"none\.urdf"):
+        read_arm(tmp_path / "none.urdf", "world", "flange")
+
+
+def refuses(read, words, **arguments):
+    """Check that reading fails by one sentence that holds the file and all the words."""
+    with pytest.raises(InputError) as refused:
+        read(**arguments)
+    for word in ["arm.urdf", *words]:
+        assert word in str(refused.value)
