@@ -12,13 +12,14 @@ from calib.forward import Term
 from calib.graph import Block, Graph, Variable
 from calib.model import Source
 from calib.problem import Problem, effect_variable
+from calib.residuals.beams import SharedSum
 from calib.residuals.scan import LOCAL_SHARE, ScanStop
 from chains import se3
 
 Progress = Callable[[str, int, int], None]
 MAX_PASSES = 25
 SETTLED = 1e-5  # m and rad: after that, which triangle a beam meets is kept
-CONVERGED = 1e-8  # m and rad: a thousandth of the smallest sigma in sight
+CONVERGED = 1e-7  # m and rad: a hundredth of the smallest sigma in sight
 
 
 @dataclass(frozen=True)
@@ -27,7 +28,7 @@ class Estimate:
 
     Args:
         values: every variable of the graph, at the optimum.
-        names: calibration variables, in order.
+        variables: the calibration's, in order.
         covariance: (P, P) joint marginal of their tangents, with stop, surface and patch errors as
             unknowns of the graph.
         associations: per scan, which part of the surface each beam met.
@@ -38,7 +39,7 @@ class Estimate:
     """
 
     values: dict[str, np.ndarray]
-    names: tuple[str, ...]
+    variables: tuple[Variable, ...]
     covariance: np.ndarray
     associations: Sequence[np.ndarray]
     scans: Sequence[ScanStop]
@@ -98,11 +99,14 @@ class _Loop:
     def run(self, scans: Sequence[ScanStop], tolerance: float, associate: bool) -> bool:
         """Passes until the step is below tolerance; whether that was reached."""
         for _ in range(MAX_PASSES):
-            rows = []
+            poses, shared = [], SharedSum()
             for i, scan in enumerate(scans):
                 self.progress(f"pass {self.passes + 1}", i, len(scans))
-                rows.append(scan.compress(self.values, None if associate else self.associations[i]))
-            step = self._step(rows)
+                association = None if associate else self.associations[i]
+                compressed = scan.compress(self.values, association)
+                poses.append(compressed.pose)
+                shared.add(compressed)
+            step = self._step([*poses, *shared.rows()])
             self.passes += 1
             if step < tolerance:
                 return True
@@ -141,11 +145,18 @@ class _Loop:
 
     def estimate(self, converged: bool) -> Estimate:
         """The result, with the covariance of the calibration."""
-        names = tuple(self.problem.calibration)
+        variables = tuple(self.variables[name] for name in self.problem.calibration)
         self.progress("marginals", 0, 1)
-        covariance = self.graph.covariance(self.values, names)
+        covariance = self.graph.covariance(self.values, self.problem.calibration)
         return Estimate(
-            self.values, names, covariance, self.associations, self.scans, self.passes, converged, self.graph
+            self.values,
+            variables,
+            covariance,
+            self.associations,
+            self.scans,
+            self.passes,
+            converged,
+            self.graph,
         )
 
     def _link(self, rows: Sequence[Block]) -> None:

@@ -31,9 +31,13 @@ class Term:
     free: np.ndarray  # (n,) indices into the effect's parameters
 
     def basis(self, view: View) -> np.ndarray | OneHot:
-        """The effect's basis, of the free parameters only (a `OneHot` is always wholly free)."""
+        """The effect's basis, of the free parameters only."""
         basis = self.effect.basis(view)
-        return basis if isinstance(basis, OneHot) else basis[..., self.free]
+        if not isinstance(basis, OneHot):
+            return basis[..., self.free]
+        column = np.full(basis.size + 1, -1)  # the last stands for index -1: none
+        column[self.free] = np.arange(len(self.free))
+        return OneHot(column[basis.index], basis.values, len(self.free))
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,20 @@ class Model:
     effects: tuple[str, ...] = effects.DEFAULT
     fixed: tuple[str, ...] = ()
 
+    @classmethod
+    def of(cls, chosen: str | None, fixed: Sequence[str]) -> Model:
+        """The model that a command line names: effects with commas, or the default ones.
+
+        Raises:
+            InputError: an effect that the catalogue has not.
+        """
+        if chosen is None:
+            return cls(fixed=tuple(fixed))
+        names = tuple(name.strip() for name in chosen.split(",") if name.strip())
+        for name in names:
+            effects.find(name)
+        return cls(names, tuple(fixed))
+
     def terms(self, rig: Rig, several: bool) -> list[Term]:
         """The model's effects on one rig: those with anything to act on.
 
@@ -55,8 +69,10 @@ class Model:
     def _free(self, effect: Effect, rig: Rig) -> np.ndarray:
         if effect.name in self.fixed:
             return np.zeros(0, int)
-        names = [f"{effect.name}.{p.name}" for p in effect.params(rig)]
-        return np.array([i for i, name in enumerate(names) if name not in self.fixed], int)
+        params = enumerate(effect.params(rig))
+        return np.array(
+            [i for i, p in params if p.sigma and f"{effect.name}.{p.name}" not in self.fixed], int
+        )
 
     def _check_fixed(self, chosen: Sequence[Effect], rig: Rig) -> None:
         known = {e.name for e in chosen}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,13 +14,13 @@ from calib.forward import Stops, Term, place
 from calib.graph import Block, Variable
 from calib.model import Model, Source
 from calib.residuals.scan import ScanStop
-from calib.residuals.surfaces import MeshSurface, PlaneSurface
+from calib.residuals.surfaces import Meeting, MeshSurface, PlaneSurface
 from calib.residuals.targets import HangingTarget
 from calib.residuals.tracker import TrackedBody
 from chains import se3
 from chains.errors import InputError
 from sensors.lidar import beams
-from sensors.planes import PlaneFinder
+from sensors.planes import PlaneFinder, Planes
 
 # What is known of a pose before any data: the room it is in.
 UNKNOWN_POSE = np.repeat([3.0, 10.0], 3)
@@ -39,6 +39,7 @@ class Problem:
         terms: per source, the model's effects.
         blocks: tracker and target rows.
         scans: one per stop with a scan.
+        meetings: per source, what its beams meet.
     """
 
     sources: Sequence[Source]
@@ -48,6 +49,7 @@ class Problem:
     calibration: list[str] = field(default_factory=list)
     blocks: list[Block] = field(default_factory=list)
     scans: list[ScanStop] = field(default_factory=list)
+    meetings: dict[int, Meeting] = field(default_factory=dict)
 
     def add(self, variable: Variable, value: np.ndarray | None = None) -> str:
         """Add a variable once; it starts at `value`, or at its mean."""
@@ -61,7 +63,7 @@ def build(
     sources: Sequence[Source],
     model: Model,
     use: Sequence[np.ndarray] | None = None,
-    progress: object = None,
+    meetings: Mapping[int, Meeting] | None = None,
 ) -> Problem:
     """The problem of a model on its recordings.
 
@@ -69,12 +71,14 @@ def build(
         sources: the recordings.
         model: what is estimated.
         use: per source, (K,) bool, which stops take part; all where None.
+        meetings: per source, what beams meet, where another problem has found that already.
 
     Raises:
         InputError: the recording has nothing to start from, or lacks what an effect needs.
     """
     several = len({s.rig.name for s in sources}) > 1
     problem = Problem(sources, [model.terms(s.rig, several) for s in sources])
+    problem.meetings.update(meetings or {})
     for source, terms in zip(sources, problem.terms, strict=True):
         for term in terms:
             problem.calibration.append(problem.add(effect_variable(term, source)))
@@ -292,27 +296,35 @@ class _Builder:
                 ScanStop(recording.stops[k], recording, k, self.geometry[root, k], terms, columns, meeting, sigma_m)
             )
 
-    def _meeting(self) -> MeshSurface | PlaneSurface:
-        lidar = self.source.rig.lidar
-        if self.source.reference is not None:
-            return MeshSurface(self.source.reference, 1.5 * lidar.beam_divergence_rad)
+    def _meeting(self) -> Meeting:
+        """What the beams meet: the mesh, or else planes found in the scans."""
+        found = self.problem.meetings.get(self.number)
+        if found is None:
+            lidar, reference = self.source.rig.lidar, self.source.reference
+            found = (
+                MeshSurface(reference, 1.5 * lidar.beam_divergence_rad)
+                if reference is not None
+                else PlaneSurface(self._find_planes(), f"{self.prefix}planes")
+            )
+            self.problem.meetings[self.number] = found
+        if isinstance(found, PlaneSurface):
+            self.problem.add(found.unknown)
+        return found
+
+    def _find_planes(self) -> Planes:
+        recording, lidar = self.source.recording, self.source.rig.lidar
         finder = PlaneFinder(noise_m=lidar.sigma_range_m)
-        for (root, k), index in self.stops.items():
-            if k < 0 or not self.source.recording.has_scan[k]:
+        for (root, k), _ in self.stops.items():
+            if k < 0 or not recording.has_scan[k]:
                 continue
-            scan = self.source.recording.scan(k)
-            ray = beams(scan.xyz_m, lidar.beam_origin_m)
-            T = self.geometry[root, k].in_reference(self.source.rig.lidar_frame, self.problem.initial).T[0]
+            ray = beams(recording.scan(k).xyz_m, lidar.beam_origin_m)
+            stops = self.geometry[root, k]
+            T = stops.in_reference(self.source.rig.lidar_frame, self.problem.initial).T[0]
             finder.add(k, se3.apply(T, ray.origin_m + ray.range_m[:, None] * ray.direction))
         planes = finder.planes(min_points=100)
         if not len(planes.normal):
             raise InputError(
-                f"{self.source.recording.folder}: no mesh, and no flat patch in the scans to fit to; add "
-                f"reference/mesh.ply, or scan walls."
+                f"{recording.folder}: there is no mesh, and no flat patch in the scans to fit to; "
+                f"add reference/mesh.ply, or scan walls"
             )
-        name = f"{self.prefix}planes"
-        dofs = tuple(f"plane_{m}.{d}" for m in range(len(planes.normal)) for d in ("tilt_1", "tilt_2", "distance"))
-        units = ("rad", "rad", "m") * len(planes.normal)
-        sigma = np.tile([0.5, 0.5, 1.0], len(planes.normal))
-        self.problem.add(Variable(name, "vector", np.zeros(len(dofs)), sigma, dofs, units))
-        return PlaneSurface(planes, name)
+        return planes

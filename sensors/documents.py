@@ -10,6 +10,7 @@ import json
 import math
 import os
 import re
+import shutil
 import typing
 import uuid
 from collections.abc import Collection, Iterator, Mapping
@@ -239,6 +240,28 @@ def write_atomically(path: str | Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+@contextmanager
+def replace_folder(path: str | Path, marker: str) -> Iterator[Path]:
+    """Give a temporary folder beside `path` to fill, moved into place when all went well.
+
+    A folder already there is replaced if it is empty or holds a file named `marker`, which says
+    that it is of the same kind. Raises InputError for any other.
+    """
+    path = Path(path)
+    if path.exists() and not (path.is_dir() and ((path / marker).exists() or not any(path.iterdir()))):
+        raise InputError(f"{path} exists and has no {marker}: give another folder, or remove that one")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
+    temporary.mkdir()
+    try:
+        yield temporary
+        if path.exists():
+            shutil.rmtree(path)
+        os.replace(temporary, path)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
 class _Dumper(yaml.SafeDumper):
     """Quotes every text that either YAML 1.1 or 1.2 would take for something else."""
 
@@ -261,8 +284,12 @@ def write_yaml(path: str | Path, data: Any) -> None:
 def write_json(path: str | Path, data: Any) -> None:
     """Write a JSON document; a number that is not finite becomes null, as JSON has none."""
     with write_atomically(path) as temporary:
-        text = json.dumps(_finite(plain(data)), indent=1, ensure_ascii=False)
-        temporary.write_text(text + "\n", encoding="utf-8")
+        temporary.write_text(json_text(data) + "\n", encoding="utf-8")
+
+
+def json_text(data: Any) -> str:
+    """The data as a JSON document; a number that is not finite becomes null."""
+    return json.dumps(_finite(plain(data)), indent=1, ensure_ascii=False)
 
 
 def plain(data: Any) -> Any:

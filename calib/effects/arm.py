@@ -20,7 +20,7 @@ class ArmLinkLength(Effect):
     source = "S28 Schunk LWA 4P URDF; axes turned one at a time, radii of circles taken as lengths"
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
-        return tuple(Param(name, "m", 0.005) for name in rig.arm_edges)
+        return tuple(Param(n, "m", 0.005 if _length_m(rig, n) else 0.0) for n in rig.arm_edges)
 
     def basis(self, view: View) -> np.ndarray:
         tree = view.rig.tree
@@ -28,10 +28,16 @@ class ArmLinkLength(Effect):
         for p, name in enumerate(view.rig.arm_edges):
             e = tree.edge_names.index(name)
             T_parent_child = tree.edges[e].T_parent_child
-            length_m = np.linalg.norm(T_parent_child[:3, 3])
-            if length_m > 1e-9:
+            if length_m := _length_m(view.rig, name):
                 basis[0, e, 3:, p] = T_parent_child[:3, :3].T @ T_parent_child[:3, 3] / length_m
         return basis
+
+
+def _length_m(rig: Rig, edge: str) -> float:
+    """Length of a joint's origin; exactly 0 where it has none to speak of."""
+    T_parent_child = rig.tree.edges[rig.tree.edge_names.index(edge)].T_parent_child
+    length_m = float(np.linalg.norm(T_parent_child[:3, 3]))
+    return length_m if length_m > 1e-9 else 0.0
 
 
 class ArmJointOffset(Effect):

@@ -36,7 +36,7 @@ class Site(Enum):
 
 @dataclass(frozen=True)
 class Param:
-    """One unknown of an effect: its name, its unit, and how large it may plausibly be."""
+    """One unknown of an effect: its name, its unit, and how large it may plausibly be; 0 holds it."""
 
     name: str
     unit: str

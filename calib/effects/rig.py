@@ -13,7 +13,7 @@ DOF = ("rx", "ry", "rz", "tx", "ty", "tz")
 class FrameOffset(Effect):
     """A frame sits elsewhere than in CAD: ``T_parent_child = T_cad exp(theta)``.
 
-    One per frame of ``rig.yaml``; the degrees of freedom with a sigma of 0 have no parameter.
+    One per frame of ``rig.yaml``; a degree of freedom with a sigma of 0 is held.
     """
 
     site = Site.EDGE
@@ -27,12 +27,11 @@ class FrameOffset(Effect):
         sigma = rig.frame_sigma[self.name]
         units = ("rad",) * 3 + ("m",) * 3
         return tuple(
-            Param(dof, unit, float(s)) for dof, unit, s in zip(DOF, units, sigma, strict=True) if s
+            Param(dof, unit, float(s)) for dof, unit, s in zip(DOF, units, sigma, strict=True)
         )
 
     def basis(self, view: View) -> np.ndarray:
         tree = view.rig.tree
-        free = np.flatnonzero(view.rig.frame_sigma[self.name])
-        basis = np.zeros((1, len(tree.edges), 6, len(free)))
-        basis[0, tree.edge_names.index(self.name), free, np.arange(len(free))] = 1.0
+        basis = np.zeros((1, len(tree.edges), 6, 6))
+        basis[0, tree.edge_names.index(self.name)] = np.eye(6)
         return basis

@@ -18,7 +18,7 @@ import numpy as np
 
 from calib.effects import LazyColumn, OneHot, Site, View
 from calib.forward import Derivatives, Stops, Term, Values
-from calib.residuals.rows import Group, gram, square_root, tukey_cost
+from calib.residuals.rows import Group, gram, split, square_root, tukey_cost
 from chains import se3
 from sensors.lidar import Beams
 
@@ -102,19 +102,19 @@ class Part:
 
 
 @dataclass(frozen=True)
-class CompressedScan:
-    """A stop's rows in compressed form, as the graph sees them: at most P + 1 of them.
+class PoseRows:
+    """The six rows in which a stop's beams speak of its pose, as the graph sees them.
 
     They are quadratic about the state of linearisation in the lidar's twist and linear in the
-    beam's and surface's unknowns; the chain behind the twist stays fully nonlinear.
+    unknowns of beams and surfaces; the chain behind the twist stays fully nonlinear.
 
     Args:
         name: for messages.
         stops: the geometry of the stop (K = 1).
         frame: the lidar's frame.
         T0_lidar_reference: (4, 4) inverse of the pose of linearisation.
-        root: (m, 6 + 1 + n) rows: twist, residual, then the parts' columns.
-        parts: what the other columns are.
+        by_twist: (6, 6), constant: (6,), by_part: (6, n) columns of the parts.
+        parts: what those columns are.
         at: values of the parts' variables at linearisation.
     """
 
@@ -122,37 +122,122 @@ class CompressedScan:
     stops: Stops
     frame: str
     T0_lidar_reference: np.ndarray
-    root: np.ndarray
+    by_twist: np.ndarray
+    constant: np.ndarray
+    by_part: np.ndarray
     parts: Sequence[Part]
     at: Values
-    kind = "mesh"
+
+    kind = "beams"
+    rows = 6
 
     @property
     def variables(self) -> tuple[str, ...]:
         where = (self.stops.reference,) if self.stops.reference else ()
         return (*self.stops.variables, *where, *self.at)
 
-    @property
-    def rows(self) -> int:
-        return len(self.root)
-
     def evaluate(self, values: Values, derivatives: bool) -> tuple[np.ndarray, Derivatives | None]:
-        """Compressed whitened rows and their derivatives."""
+        """Whitened rows and their derivatives."""
         placed = self.stops.in_reference(self.frame, values)
         twist = se3.log(self.T0_lidar_reference @ placed.T[0])
-        residual = self.root[:, 6] + self.root[:, :6] @ twist
-        for part in self.parts:
-            moved = (values[part.variable] - self.at[part.variable])[part.components]
-            residual = residual + self.root[:, part.columns] @ moved
+        residual = self.constant + self.by_twist @ twist
+        residual = residual + _moved(self.by_part, self.parts, self.at, values)
         if not derivatives:
             return residual, None
-        by_twist = self.root[:, :6] @ se3.right_jacobian_inverse(twist)
-        d = {name: by_twist @ columns[0] for name, columns in placed.d.items()}
-        for name, value in self.at.items():
-            d[name] = np.zeros((self.rows, len(value)))
-        for part in self.parts:
-            d[part.variable][:, part.components] = self.root[:, part.columns]
-        return residual, d
+        by_pose = self.by_twist @ se3.right_jacobian_inverse(twist)
+        d = {name: by_pose @ columns[0] for name, columns in placed.d.items()}
+        return residual, d | _by_variable(self.by_part, self.parts, self.at)
+
+
+@dataclass(frozen=True)
+class SharedRows:
+    """What all stops' beams say of their shared unknowns, beyond each stop's six pose rows.
+
+    Args:
+        constant: (m,) and by_part: (m, n) columns of the parts.
+        parts: what those columns are.
+        at: values of the parts' variables at linearisation.
+    """
+
+    constant: np.ndarray
+    by_part: np.ndarray
+    parts: Sequence[Part]
+    at: Values
+
+    name = "beams of all stops"
+    kind = "beams"
+
+    @property
+    def variables(self) -> tuple[str, ...]:
+        return tuple(self.at)
+
+    @property
+    def rows(self) -> int:
+        return len(self.constant)
+
+    def evaluate(self, values: Values, derivatives: bool) -> tuple[np.ndarray, Derivatives | None]:
+        """Whitened rows and their derivatives; linear."""
+        residual = self.constant + _moved(self.by_part, self.parts, self.at, values)
+        return residual, _by_variable(self.by_part, self.parts, self.at) if derivatives else None
+
+
+@dataclass(frozen=True)
+class CompressedScan:
+    """A stop's rows in compressed form: at most P + 1 with the same cost and linearisation.
+
+    Args:
+        pose: the six rows that know the stop's pose.
+        rest: (1 + n, 1 + n) Gram matrix of all others, [residual | columns of the parts]; it speaks
+            of shared unknowns only, so the stops' simply add up.
+    """
+
+    pose: PoseRows
+    rest: np.ndarray
+
+
+class SharedSum:
+    """Adds up what stops say of their shared unknowns, so that no stop need be kept."""
+
+    def __init__(self) -> None:
+        self._at: dict[str, np.ndarray] = {}
+        self._first: dict[str, int] = {}
+        self._total = np.zeros((1, 1))
+
+    def add(self, scan: CompressedScan) -> None:
+        """Add one stop's."""
+        for name, value in scan.pose.at.items():
+            if name not in self._at:
+                self._at[name], self._first[name] = value, len(self._total)
+                self._total = np.pad(self._total, (0, len(value)))
+        columns = [self._first[p.variable] + p.components for p in scan.pose.parts]
+        columns = np.concatenate([[0], *columns]).astype(int)
+        self._total[np.ix_(columns, columns)] += scan.rest
+
+    def rows(self) -> list[SharedRows]:
+        """The sum as rows; none where there are no shared unknowns."""
+        if not self._at:
+            return []
+        root = square_root(self._total)
+        parts = [
+            Part(name, self._first[name] - 1 + np.arange(len(v)), np.arange(len(v)))
+            for name, v in self._at.items()
+        ]
+        return [SharedRows(root[:, 0], root[:, 1:], parts, self._at)]
+
+
+def _moved(by_part: np.ndarray, parts: Sequence[Part], at: Values, values: Values) -> np.ndarray:
+    out = np.zeros(len(by_part))
+    for part in parts:
+        moved = (values[part.variable] - at[part.variable])[part.components]
+        out += by_part[:, part.columns] @ moved
+    return out
+
+
+def _by_variable(by_part: np.ndarray, parts: Sequence[Part], at: Values) -> Derivatives:
+    d = {name: np.zeros((len(by_part), len(value))) for name, value in at.items()}
+    for part in parts:
+        d[part.variable][:, part.components] = by_part[:, part.columns]
+    return d
 
 
 def derivatives(
@@ -197,7 +282,7 @@ def compress(
     name: str, rows: Rows, stops: Stops, frame: str, T_reference_lidar: np.ndarray, values: Values
 ) -> CompressedScan:
     """Whiten, weight and compress a stop's rows, linearised at the state `values`."""
-    parts, column = [], 7
+    parts, column = [], 0
     for variable, block in rows.dense.items():
         width = block.shape[1]
         parts.append(Part(variable, np.arange(column, column + width), np.arange(width)))
@@ -212,6 +297,9 @@ def compress(
         groups.append(group)
         column += group.size
     dense = np.hstack([rows.by_twist, rows.residual_m[:, None], *rows.dense.values()])
-    root = square_root(gram(dense, groups, rows.weight / np.square(rows.sigma_m)))
+    total = gram(dense, groups, rows.weight / np.square(rows.sigma_m))
+    top, rest = split(total, 6)
     at = {v: np.array(values[v]) for v in dict.fromkeys(p.variable for p in parts)}
-    return CompressedScan(name, stops, frame, se3.inverse(T_reference_lidar), root, parts, at)
+    T0 = se3.inverse(T_reference_lidar)
+    pose = PoseRows(name, stops, frame, T0, top[:, :6], top[:, 6], top[:, 7:], parts, at)
+    return CompressedScan(pose, rest)

@@ -117,3 +117,24 @@ def square_root(matrix: np.ndarray) -> np.ndarray:
     root = np.empty_like(upper)
     root[:, pivot - 1] = upper
     return root * scale
+
+
+def split(matrix: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rows that know the first columns, and the Gram matrix of what is left for the others.
+
+    With ``R.T @ R = matrix`` and the first columns eliminated first, R is ``[top; 0 | root(rest)]``.
+
+    Args:
+        matrix: (n, n) symmetric semidefinite.
+        count: how many columns come first; they may be dependent.
+
+    Returns:
+        top (count, n), rest (n - count, n - count).
+    """
+    scale = np.sqrt(np.maximum(np.diag(matrix)[:count], 1e-300))
+    values, axes = np.linalg.eigh(matrix[:count, :count] / np.outer(scale, scale))
+    known = values > count * np.finfo(float).eps * max(values[-1], 0.0)
+    root = np.sqrt(np.where(known, values, 1.0))
+    top = ((axes * known / root).T / scale) @ matrix[:count]
+    rest = matrix[count:, count:] - top[:, count:].T @ top[:, count:]
+    return top, rest

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import Protocol
 
 import numpy as np
 
 from calib.forward import Values
+from calib.graph import Variable
 from calib.residuals.beams import Columns, Surface
 from chains import se3
 from sensors.lidar import Beams
 from sensors.planes import Planes
 from sensors.reference import Reference
+from sensors.surfaces import transverse
 
 GRAZING_RAD = np.deg2rad(80.0)
 PATCH_M = 0.7
@@ -90,6 +92,26 @@ class PlaneSurface:
     planes: Planes
     variable: str
 
+    @property
+    def unknown(self) -> Variable:
+        """The planes' numbers as a variable of the graph, free within half a radian and a metre."""
+        count = len(self.planes.normal)
+        kinds = ("tilt_1", "tilt_2", "distance")
+        return Variable(
+            self.variable,
+            "vector",
+            np.zeros(3 * count),
+            np.tile([0.5, 0.5, 1.0], count),
+            tuple(f"plane_{m}.{kind}" for m in range(count) for kind in kinds),
+            ("rad", "rad", "m") * count,
+        )
+
+    @cached_property
+    def axes(self) -> np.ndarray:
+        """(M, 2, 3) two unit vectors in each plane as found."""
+        side = transverse(self.planes.normal)
+        return np.stack([side, np.cross(self.planes.normal, side)], axis=1)
+
     def associate(
         self, T: np.ndarray, beams: Beams, values: Values, near_edges: bool
     ) -> np.ndarray:
@@ -101,7 +123,7 @@ class PlaneSurface:
         """The plane that each beam meets under this association."""
         origins, directions = _in_reference(T, beams)
         theta = values[self.variable].reshape(-1, 3)
-        axes = self.planes.axes
+        axes = self.axes
         tilted = self.planes.normal + np.einsum("mk,mki->mi", theta[:, :2], axes)
         length = np.linalg.norm(tilted, axis=1)
         unit = tilted / length[:, None]

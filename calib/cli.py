@@ -1,0 +1,211 @@
+"""The command line: arguments in, one call, results out. Nothing heavy is imported before a call."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+# BLAS threads on shared cores cost many times what they save; set before numpy is imported.
+for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
+import typer
+
+from chains.errors import InputError
+
+app = typer.Typer(
+    name="rigcal",
+    help="Calibrate a LiDAR rig as one factor graph.",
+    no_args_is_help=True,
+    add_completion=True,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+
+Json = Annotated[bool, typer.Option("--json", help="Print the machine-readable result alone.")]
+Out = Annotated[Path, typer.Option("-o", "--out", help="Where to write.")]
+
+
+@app.command()
+def simulate(
+    spec: Annotated[str, typer.Argument(help="A preset, or a YAML file that says what to simulate.")],
+    out: Out,
+    seed: Annotated[int, typer.Option(help="Same seed, same recording.")] = 0,
+    hide: Annotated[
+        list[str] | None, typer.Option(metavar="EFFECT=SIZE", help="An effect to hide in it.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Write a recording, and the truth beside it."""
+    from calib.simulate import simulate as run
+
+    with _progress() as progress:
+        run(spec, out, seed, _sizes(hide or []), progress)
+    _say({"recording": str(out), "truth": f"{out}.truth.json"}, f"wrote {out} and {out}.truth.json", as_json)
+
+
+@app.command()
+def check(recording: Path, as_json: Json = False) -> None:
+    """What is in a recording, what is wrong, and what can and cannot be estimated from it."""
+    from calib.check import check as run
+
+    with _progress() as progress:
+        found = run(recording, progress)
+    if as_json:
+        _print_json(found.document())
+    else:
+        from calib.tables import print_check
+
+        print_check(found)
+    if found.problems:
+        raise SystemExit(2)
+
+
+@app.command()
+def fit(
+    recordings: Annotated[list[Path], typer.Argument(help="Recording folders.", metavar="REC...")],
+    out: Out,
+    effects: Annotated[str | None, typer.Option(help="Effects of the model, with commas.")] = None,
+    fix: Annotated[
+        list[str] | None, typer.Option(metavar="NAME", help="Hold a frame, effect or parameter.")
+    ] = None,
+    hold_out: Annotated[str, typer.Option(help="location, stop or none.")] = "location",
+    folds: Annotated[int, typer.Option(help="Folds of the held-out error.", min=1, max=5)] = 1,
+    prior: Annotated[
+        Path | None, typer.Option(metavar="RUN", help="An earlier run instead of CAD.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Estimate the rig jointly; several recordings share what is the same hardware."""
+    if hold_out not in ("location", "stop", "none"):
+        raise InputError(f"--hold-out {hold_out}: give location, stop or none")
+    from calib.calibrate import calibrate
+    from calib.model import Model
+
+    chosen = Model.of(effects, fix or [])
+    with _progress() as progress:
+        run = calibrate(recordings, out, chosen, hold_out, folds, prior, progress)
+    if as_json:
+        _print_json(run.summary | {"not_estimated": run.solution.not_estimated})
+    else:
+        from calib.tables import print_run
+
+        print_run(run)
+
+
+@app.command()
+def compare(
+    runs: Annotated[list[Path], typer.Argument(metavar="RUN...")], as_json: Json = False
+) -> None:
+    """Error, noise floor and parameters of runs, side by side."""
+    from calib.run import Run
+    from calib.tables import comparison, print_comparison
+
+    opened = [Run.open(run) for run in runs]
+    if as_json:
+        _print_json(comparison(opened))
+    else:
+        print_comparison(opened)
+
+
+@app.command()
+def export(
+    run: Path,
+    out: Out,
+    formats: Annotated[list[str] | None, typer.Option("--format", help="yaml; all if not given.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Write the result for others: YAML extrinsics with sigmas and provenance."""
+    from calib.export import export as write
+    from calib.run import Run
+
+    files = write(Run.open(run), out, formats or [])
+    _say({"files": [str(f) for f in files]}, "\n".join(f"wrote {f}" for f in files), as_json)
+
+
+@app.command()
+def effects(
+    name: Annotated[str | None, typer.Argument(help="One effect; all if not given.")] = None,
+    as_json: Json = False,
+) -> None:
+    """The catalogue: formula, unit, size, what an effect is confounded with, source."""
+    from calib.effects import CATALOGUE, find
+    from calib.tables import effect_page, print_catalogue
+
+    chosen = [find(name)] if name else list(CATALOGUE)
+    if as_json:
+        _print_json([effect_page(e) for e in chosen])
+    else:
+        print_catalogue(chosen, whole=name is not None)
+
+
+def main() -> None:
+    """Run the command line: exit code 0 done, 2 bad input or usage, 1 a fault of the program."""
+    import click
+
+    try:
+        code = app(standalone_mode=False)
+    except InputError as error:
+        _fail(str(error), 2)
+    except click.exceptions.NoArgsIsHelpError as error:
+        print(error.format_message())
+        raise SystemExit(0) from None
+    except click.ClickException as error:
+        _fail(error.format_message(), 2)
+    except (click.Abort, KeyboardInterrupt):
+        _fail("interrupted; nothing was left half-written", 130)
+    except Exception as error:
+        if os.environ.get("RIGCAL_TRACEBACK"):
+            raise
+        _fail(f"a fault of the program: {type(error).__name__}: {error} (RIGCAL_TRACEBACK=1 shows where)", 1)
+    raise SystemExit(code or 0)
+
+
+def _fail(message: str, code: int) -> None:
+    print(f"rigcal: {message}", file=sys.stderr)
+    raise SystemExit(code)
+
+
+def _sizes(hide: list[str]) -> dict[str, float]:
+    sizes = {}
+    for item in hide:
+        name, _, size = item.partition("=")
+        try:
+            sizes[name] = float(size)
+        except ValueError:
+            raise InputError(f"--hide {item}: give EFFECT=SIZE with a number, range_scale=1 say") from None
+    return sizes
+
+
+def _say(document: dict[str, Any], text: str, as_json: bool) -> None:
+    if as_json:
+        _print_json(document)
+    else:
+        print(text)
+
+
+def _print_json(document: Any) -> None:
+    from sensors.documents import json_text
+
+    print(json_text(document))
+
+
+@contextmanager
+def _progress() -> Iterator[Callable[[str, int, int], None]]:
+    """A progress bar on stderr where that is a terminal; else silence."""
+    if not sys.stderr.isatty():
+        yield lambda what, done, total: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("reading", total=None)
+        yield lambda what, done, total: bar.update(
+            task, description=what, completed=done + 1, total=total
+        )

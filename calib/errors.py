@@ -1,0 +1,93 @@
+"""How large the residuals are, and how large they should be if the model were right."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.graph import Graph
+from calib.residuals.scan import ScanStop
+from calib.residuals.tracker import TrackedBody
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Sums over residuals: count, sum [m], sum of squares [m2], and of expected variances [m2]."""
+
+    count: int = 0
+    total_m: float = 0.0
+    squares_m2: float = 0.0
+    expected_m2: float = 0.0
+
+    def __add__(self, other: Errors) -> Errors:
+        return Errors(
+            self.count + other.count,
+            self.total_m + other.total_m,
+            self.squares_m2 + other.squares_m2,
+            self.expected_m2 + other.expected_m2,
+        )
+
+    @property
+    def rms_mm(self) -> float | None:
+        return 1e3 * float(np.sqrt(self.squares_m2 / self.count)) if self.count else None
+
+    @property
+    def mean_mm(self) -> float | None:
+        return 1e3 * self.total_m / self.count if self.count else None
+
+    @property
+    def std_mm(self) -> float | None:
+        if not self.count:
+            return None
+        return float(np.sqrt(max(0.0, self.rms_mm**2 - self.mean_mm**2)))
+
+    @property
+    def floor_mm(self) -> float | None:
+        return 1e3 * float(np.sqrt(self.expected_m2 / self.count)) if self.count else None
+
+
+def scan_errors(
+    scan: ScanStop,
+    values: Mapping[str, np.ndarray],
+    association: np.ndarray | None,
+    graph: Graph | None,
+) -> Errors:
+    """Range residuals of a stop's inliers.
+
+    Args:
+        scan: the stop.
+        values: the state.
+        association: what each beam meets; found anew where None.
+        graph: where the stop's pose was predicted and not fitted to this scan, the graph whose
+            marginals say how well; its share belongs to what is expected.
+    """
+    rows = scan.rows(values, association)
+    inlier = rows.weight > 0
+    expected = np.square(rows.sigma_m) + np.square(rows.reference_sigma_m)
+    if graph is not None:
+        expected = expected + _predicted_variance(scan, values, graph, rows.by_twist)
+    r = rows.residual_m[inlier]
+    return Errors(len(r), float(r.sum()), float(r @ r), float(expected[inlier].sum()))
+
+
+def _predicted_variance(
+    scan: ScanStop, values: Mapping[str, np.ndarray], graph: Graph, by_twist: np.ndarray
+) -> np.ndarray:
+    placed = scan.stops.in_reference(scan.stops.rig.lidar_frame, values)
+    names = list(placed.d)
+    d = np.hstack([placed.d[name][0] for name in names])
+    twist = d @ graph.covariance(values, names) @ d.T
+    return np.einsum("ni,ij,nj->n", by_twist, twist, by_twist)
+
+
+def body_errors(blocks: Sequence[TrackedBody], values: Mapping[str, np.ndarray]) -> Errors:
+    """Distances between tracked and predicted positions of bodies."""
+    out = Errors()
+    for block in blocks:
+        placed = block.stops.in_world(block.body, values)
+        distance = np.linalg.norm(block.measured[:, :3, 3] - placed.T[:, :3, 3], axis=1)
+        expected = 3.0 * block.sigma_m**2 * len(distance)
+        out += Errors(len(distance), float(distance.sum()), float(distance @ distance), expected)
+    return out

@@ -1,0 +1,73 @@
+"""An earlier estimate as what is known before: one joint prior over many variables."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cholesky, solve_triangular
+
+from calib.forward import Derivatives, Values
+from calib.graph import Variable
+from chains import se3
+
+
+def difference(variable: Variable, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """How b differs from a, as a tangent at a: (dim,). Vectors and poses only."""
+    return se3.log(se3.inverse(a) @ b) if variable.kind == "pose" else b - a
+
+
+@dataclass(frozen=True)
+class JointPrior:
+    """Rows that hold several variables to an earlier estimate with its covariance.
+
+    Args:
+        held: the variables, in the order of the covariance.
+        means: their earlier values.
+        covariance: (P, P) of their tangents.
+    """
+
+    held: Sequence[Variable]
+    means: Mapping[str, np.ndarray]
+    covariance: np.ndarray
+
+    name = "prior"
+    kind = "prior"
+
+    @property
+    def variables(self) -> tuple[str, ...]:
+        return tuple(v.name for v in self.held)
+
+    @property
+    def rows(self) -> int:
+        return len(self.covariance)
+
+    def evaluate(self, values: Values, derivatives: bool) -> tuple[np.ndarray, Derivatives | None]:
+        """Whitened differences from the means."""
+        moved = [difference(v, self.means[v.name], values[v.name]) for v in self.held]
+        root = self._root()
+        residual = root @ np.concatenate(moved)
+        if not derivatives:
+            return residual, None
+        d, start = {}, 0
+        for v, step in zip(self.held, moved, strict=True):
+            columns = root[:, start : start + v.dim]
+            pose = v.kind == "pose"
+            d[v.name] = columns @ se3.right_jacobian_inverse(step) if pose else columns
+            start += v.dim
+        return residual, d
+
+    def without(self, name: str) -> JointPrior:
+        """The same, no longer holding one variable."""
+        sizes = [v.dim for v in self.held]
+        owner = np.repeat([v.name for v in self.held], sizes)
+        keep = owner != name
+        held = [v for v in self.held if v.name != name]
+        return JointPrior(held, self.means, self.covariance[np.ix_(keep, keep)])
+
+    def _root(self) -> np.ndarray:
+        """R with R.T @ R = inverse(covariance), scaled first: sigmas differ by orders."""
+        sigma = np.sqrt(np.diag(self.covariance))
+        lower = cholesky(self.covariance / np.outer(sigma, sigma), lower=True)
+        return solve_triangular(lower, np.diag(1.0 / sigma), lower=True)

@@ -1,0 +1,199 @@
+"""Effects: what a basis claims is what the geometry, or the measurement, does."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from calib import effects
+from calib.effects import Effect, FrameOffset, OneHot, Param, Site, SurfaceShift, View
+from calib.forward import Term, place
+from calib.model import Model, Source
+from calib.problem import build
+from chains.errors import InputError
+
+from . import rigs
+
+
+@pytest.fixture(scope="module")
+def problem(tmp_path_factory):
+    source = Source.open(rigs.write(tmp_path_factory.mktemp("effects") / "box"))
+    return build([source], Model())
+
+
+@pytest.fixture(scope="module")
+def views(problem):
+    """What an effect sees at each site."""
+    source = problem.sources[0]
+    beams = problem.scans[0].rows(problem.initial).view
+    count = len(source.recording.stops)
+    stops = View(source.rig, count, source.columns, source.recording.joints)
+    targets = View(source.rig, 4, {}, np.zeros((1, 0)))
+    return {
+        **dict.fromkeys((Site.BEAM, Site.REFERENCE, Site.NOISE), beams),
+        **dict.fromkeys((Site.JOINTS, Site.EDGE, Site.TRACKER), stops),
+        Site.TARGET: targets,
+    }
+
+
+def shape(site, rig):
+    return {
+        Site.BEAM: (3,),
+        Site.JOINTS: (len(rig.joint_names),),
+        Site.EDGE: (len(rig.tree.edges), 6),
+        Site.TRACKER: (len(rig.tracker.bodies), 6),
+        Site.TARGET: (3,),
+        Site.REFERENCE: (3,),
+        Site.NOISE: (1,),
+    }[site]
+
+
+@pytest.mark.parametrize("effect", effects.CATALOGUE, ids=lambda e: e.name)
+def test_a_basis_has_the_shape_of_its_site(effect, views):
+    view = views[effect.site]
+    params, basis = effect.params(view.rig), effect.basis(view)
+    assert params and len({p.name for p in params}) == len(params)
+    if isinstance(basis, OneHot):
+        assert basis.size == len(params) and basis.values.shape == (view.rows, *shape(effect.site, view.rig))
+        assert basis.index.shape == (view.rows,)
+        assert -1 <= basis.index.min() and basis.index.max() < basis.size
+        moves = np.bincount(basis.index[basis.index >= 0], minlength=basis.size) > 0
+        basis = basis.values
+    else:
+        assert basis.shape[0] in (1, view.rows)
+        assert basis.shape[1:] == (*shape(effect.site, view.rig), len(params))
+        moves = np.abs(basis).reshape(-1, len(params)).max(axis=0) > 0
+    assert np.isfinite(basis).all()
+    # A parameter that may differ from zero does something; one that is held does nothing.
+    assert (moves <= [p.sigma > 0 for p in params]).all() and moves.any()
+
+
+@pytest.mark.parametrize("effect", effects.CATALOGUE, ids=lambda e: e.name)
+def test_the_catalogue_says_what_an_effect_is(effect):
+    assert effects.find(effect.name) is effect
+    assert effect.formula and effect.typical and effect.covariates and effect.source
+
+
+def test_the_default_effects_are_in_the_catalogue():
+    assert set(effects.DEFAULT) <= {e.name for e in effects.CATALOGUE}
+
+
+def test_an_unknown_effect_is_refused_and_the_nearest_named():
+    with pytest.raises(InputError, match="did you mean 'ring_range_offset'"):
+        effects.find("ring_range_ofset")
+
+
+def placed(problem, effect, theta):
+    """Where the lidar is at every stop under one effect."""
+    source = problem.sources[0]
+    term = Term(effect, effect.name, np.arange(len(theta)))
+    values = {effect.name: np.asarray(theta, float)}
+    chain = place(source.rig, [term], source.recording.joints, source.columns, "root", None)
+    return chain.in_root("lidar", values).T
+
+
+@pytest.mark.parametrize("edge", range(len(rigs.ARM)))
+def test_a_link_is_longer_along_its_own_origin(problem, edge):
+    theta = np.zeros(len(rigs.ARM))
+    theta[edge] = 0.02
+    found = placed(problem, effects.find("arm_link_length"), theta)
+    for T, (_, joints) in zip(found, rigs.STOPS.values(), strict=True):
+        expected = rigs.placed("lidar", joints, rigs.Hardware(link_m=theta))
+        np.testing.assert_allclose(T, expected.as_matrix(), atol=1e-12)
+
+
+def test_a_joint_offset_adds_to_what_the_encoder_reports(problem):
+    theta = [0.02, -0.03, 0.01]
+    found = placed(problem, effects.find("arm_joint_offset"), theta)
+    for T, (_, joints) in zip(found, rigs.STOPS.values(), strict=True):
+        expected = rigs.placed("lidar", np.add(joints, theta), rigs.Hardware())
+        np.testing.assert_allclose(T, expected.as_matrix(), atol=1e-12)
+    units = [p.unit for p in effects.find("arm_joint_offset").params(problem.sources[0].rig)]
+    assert units == ["rad", "rad", "m"]
+
+
+def test_a_frame_is_off_in_its_own_axes(problem):
+    twist = np.array([0.02, -0.01, 0.03, 0.004, 0.005, -0.006])
+    found = placed(problem, FrameOffset("mount"), twist)
+    for T, (_, joints) in zip(found, rigs.STOPS.values(), strict=True):
+        expected = rigs.placed("lidar", joints, rigs.Hardware(frames={"mount": twist}))
+        np.testing.assert_allclose(T, expected.as_matrix(), atol=1e-12)
+
+
+def test_a_range_offset_reads_long(problem):
+    """measured = true + a: raising the measured range and the offset together changes nothing."""
+    scan, values = problem.scans[0], problem.initial
+    association = scan.associate(values, near_edges=False)
+    offset = np.linspace(-0.02, 0.03, rigs.RINGS)
+    before = scan.rows(values, association)
+    longer = replace(scan, recording=reaching(scan, lambda ring: offset[ring]))
+    after = longer.rows({**values, "ring_range_offset": offset}, association)
+    np.testing.assert_allclose(after.residual_m, before.residual_m, atol=1e-9)
+    assert np.abs(longer.rows(values, association).residual_m - before.residual_m).max() > 0.02
+
+
+def test_a_shifted_surface_stands_off_along_its_normal(problem):
+    """true = mesh + d n, n towards the sensor: the shifted mesh gives the same residuals."""
+    scan, values = problem.scans[0], problem.initial
+    association = scan.associate(values, near_edges=False)
+    before = scan.rows(values, association)
+    surfaces = np.unique(before.view["surface"])
+    theta = np.linspace(-0.02, 0.03, len(surfaces))
+    effect = SurfaceShift("shift", "surface", surfaces, 0.01)
+    shifting = replace(scan, terms=[*scan.terms, Term(effect, "shift", np.arange(len(surfaces)))])
+    after = shifting.rows({**values, "shift": theta}, association)
+    # Nearer by d / cos(incidence), so what is measured reads longer by as much.
+    nearer = theta[np.searchsorted(surfaces, before.view["surface"])]
+    expected = before.residual_m + nearer / np.cos(before.view["incidence_rad"])
+    np.testing.assert_allclose(after.residual_m, expected, atol=1e-9)
+
+
+def test_a_part_that_an_effect_does_not_name_stays(problem, views):
+    effect = SurfaceShift("shift", "surface", np.array([1, 4]), 0.01)
+    found = effect.basis(views[Site.REFERENCE])
+    surface = views[Site.REFERENCE]["surface"]
+    np.testing.assert_array_equal(found.index, np.select([surface == 1, surface == 4], [0, 1], -1))
+
+
+def reaching(scan, more_m):
+    """A recording whose beams reach further by `more_m` of their ring, in the same directions."""
+    read, origin_m = scan.recording.scan(scan.index), rigs.fan()[0]
+    direction = rigs.fan()[1]
+    longer = read.xyz_m + np.asarray(more_m(read.ring))[:, None] * direction
+    assert np.linalg.norm(read.xyz_m - origin_m, axis=1).min() > 0.1
+    return SimpleNamespace(scan=lambda index: replace(read, xyz_m=longer))
+
+
+class Nosy(Effect):
+    """Looks at everything of a beam that noise in the range could spoil."""
+
+    name, site = "nosy", Site.BEAM
+    columns = ("range_m", "incidence_rad", "azimuth_rad", "elevation_rad", "surface", "patch")
+
+    def params(self, rig):
+        return tuple(Param(name, "m", 1.0) for name in self.columns)
+
+    def basis(self, view):
+        basis = np.zeros((view.rows, 3, len(self.columns)))
+        basis[:, 0] = np.stack([view[name] for name in self.columns], axis=1)
+        return basis
+
+
+def test_covariates_are_predicted_not_measured(problem):
+    """Noise common to a column and its residual would look like an effect."""
+    scan, values = problem.scans[0], {**problem.initial, "nosy": np.zeros(6)}
+    scan = replace(scan, terms=[*scan.terms, Term(Nosy(), "nosy", np.arange(6))])
+    association = scan.associate(values, near_edges=False)
+    noise = np.random.default_rng(0).normal(0, 0.02, rigs.RINGS * rigs.COLUMNS)
+    noisy = replace(scan, recording=reaching(scan, lambda ring: noise))
+    before, after = scan.rows(values, association), noisy.rows(values, association)
+    assert np.abs(after.residual_m - before.residual_m).max() > 0.02
+    np.testing.assert_allclose(after.dense["nosy"], before.dense["nosy"], atol=1e-9)
+    np.testing.assert_allclose(after.sigma_m, before.sigma_m, atol=1e-12)
+    assert np.ptp(before.dense["nosy"], axis=0).min() > 0.1
+
+
+def test_an_absent_column_is_named_with_those_there(views):
+    with pytest.raises(InputError, match=r"'humidity'.*temperature_c"):
+        views[Site.EDGE]["humidity"]
