@@ -117,7 +117,8 @@ def solution_of(problem: Problem, estimate: Estimate) -> Solution:
     effects = frozenset(
         t.variable for terms in problem.terms for t in terms if not isinstance(t.effect, FrameOffset)
     )
-    untold = not_estimated(estimate.variables, estimate.covariance, effects)
+    touched = estimate.graph.touched(estimate.values, [v.name for v in estimate.variables])
+    untold = not_estimated(estimate.variables, estimate.covariance, effects, touched)
     names = tuple(f"{v.name}.{dof}" for v in estimate.variables for dof in v.dofs)
     return Solution(shared, recordings, untold + _absent(problem), names, estimate.covariance)
 
@@ -151,18 +152,18 @@ def _effect(source: Any, term: Term, theta: np.ndarray, covariance: np.ndarray) 
 
 def _absent(problem: Problem) -> list[dict[str, str]]:
     """Links of the whole chain that these recordings have no instrument for."""
-    rigs = [s.rig for s in problem.sources]
+    rigs, sources = [s.rig for s in problem.sources], problem.sources
     out = []
-    if all(s.reference is None and s.recording.targets is None for s in problem.sources):
-        why = "neither a mesh nor targets: nothing was seen by the scanner; add reference/mesh.ply or targets.csv"
+    if not any(s.reference or s.recording.targets for s in sources):
+        why = "neither a mesh nor targets, so the scanner saw nothing; add reference/mesh.ply or targets.csv"
         out.append({"name": rigs[0].reference_frame, "why": why})
-    elif all(r.tracker is None for r in rigs):
-        why = "no tracker: its frame does not occur, and poses are given in the scanner's"
+    if not any(r.tracker for r in rigs):
+        why = "no tracker, so poses are given in the reference's frame; add 'tracker' to rig.yaml"
         out.append({"name": "opti", "why": why})
-    if all(not r.joint_names for r in rigs):
+    if not any(r.joint_names for r in rigs):
         out.append({"name": "arm", "why": "the rig has no arm; add 'arm' to rig.yaml with its URDF"})
-    if all(not any(scan.recording is s.recording for scan in problem.scans) for s in problem.sources):
-        why = "no scans: the LiDAR's place and its ring offsets are not seen; add scans/<stop>.parquet"
+    if not problem.scans:
+        why = "no scans, so the LiDAR's place and its offsets are not seen; add scans/<stop>.parquet"
         out.append({"name": "lidar", "why": why})
     return out
 

@@ -93,8 +93,8 @@ class _Loop:
     def solve_without_scans(self) -> None:
         """Trackers and targets alone: a good start for the beams, or all there is."""
         self._link([])
-        self.values = self.graph.solve(self.values)
-        self.passes += 1
+        self.values, iterations = self.graph.solve(self.values)
+        self.passes = iterations if not self.scans else 1
 
     def run(self, scans: Sequence[ScanStop], tolerance: float, associate: bool) -> bool:
         """Passes until the step is below tolerance; whether that was reached."""

@@ -6,12 +6,14 @@ arrays, and this module alone turns them into GTSAM factors and back.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
 import gtsam
 import numpy as np
+from scipy.linalg import solve_triangular
 
 Kind = Literal["vector", "pose", "direction"]
 Values = Mapping[str, np.ndarray]
@@ -50,6 +52,7 @@ class Block(Protocol):
     """
 
     name: str
+    kind: str
     variables: tuple[str, ...]
     rows: int
 
@@ -64,7 +67,7 @@ class Graph:
     Args:
         variables: every unknown; each has a prior, weak where little is known.
         blocks: the rows.
-        own_prior: False leaves out the priors of the named variables (a joint prior replaces them).
+        without_prior: variables that have none of their own, as a block stands for it.
     """
 
     def __init__(
@@ -75,19 +78,25 @@ class Graph:
     ) -> None:
         self.variables = {v.name: v for v in variables}
         self._key = {name: k for k, name in enumerate(self.variables)}
+        self._blocks = blocks
         self._graph = gtsam.NonlinearFactorGraph()
         for variable in variables:
             if variable.name not in without_prior:
                 self._graph.add(self._prior(variable))
         for block in blocks:
             self._graph.add(self._factor(block))
+        # What few blocks touch goes first: a stop's own unknowns, then what stops share.
+        degree = Counter(name for block in blocks for name in block.variables)
+        self._by_degree = sorted(self.variables, key=lambda name: degree[name])
 
     def error(self, values: Values) -> float:
         """Half the sum of squared whitened rows, priors included."""
         return self._graph.error(self._to_gtsam(values))
 
-    def solve(self, initial: Values, max_iterations: int = 50) -> dict[str, np.ndarray]:
-        """The maximum a posteriori values, by Levenberg-Marquardt from `initial`.
+    def solve(
+        self, initial: Values, max_iterations: int = 50
+    ) -> tuple[dict[str, np.ndarray], int]:
+        """The maximum a posteriori values, by Levenberg-Marquardt from `initial`; and its iterations.
 
         GTSAM's default tolerance is relative to the cost, and stops sigmas short of the optimum when
         rows are many; here the last step must lower half the chi-square by less than 1e-9.
@@ -96,23 +105,46 @@ class Graph:
         params.setMaxIterations(max_iterations)
         params.setRelativeErrorTol(0.0)
         params.setAbsoluteErrorTol(1e-9)
+        # GTSAM's Cholesky gives up when what the data say outweighs a prior by some 1e7; QR does not.
+        params.setLinearSolverType("MULTIFRONTAL_QR")
+        params.setOrdering(self._ordering())
         start = self._to_gtsam(initial)
-        return self._from_gtsam(
-            gtsam.LevenbergMarquardtOptimizer(self._graph, start, params).optimize()
-        )
+        optimizer = gtsam.LevenbergMarquardtOptimizer(self._graph, start, params)
+        return self._from_gtsam(optimizer.optimize()), optimizer.iterations()
 
     def step(self, values: Values) -> dict[str, np.ndarray]:
         """The values one Gauss-Newton step on."""
         at = self._to_gtsam(values)
-        return self._from_gtsam(at.retract(self._graph.linearize(at).optimize()))
+        linear = self._graph.linearize(at)
+        return self._from_gtsam(at.retract(linear.optimize(self._ordering(), gtsam.EliminateQR)))
 
     def covariance(self, values: Values, names: Sequence[str]) -> np.ndarray:
-        """Joint marginal covariance of the named variables' tangents, in the order given."""
-        marginals = gtsam.Marginals(self._graph, self._to_gtsam(values))
-        keys = [self._key[name] for name in names]
-        if len(keys) == 1:
-            return marginals.marginalCovariance(keys[0])
-        return marginals.jointMarginalCovariance(keys).fullMatrix()
+        """Joint marginal covariance of the named variables' tangents, in the order given.
+
+        GTSAM eliminates all other variables; what then stands in the last rows of the Bayes net is
+        the square root of the inverse of this covariance.
+        """
+        linear = self._graph.linearize(self._to_gtsam(values))
+        net = linear.eliminateSequential(self._ordering(names), gtsam.EliminateQR)
+        size = sum(self.variables[name].dim for name in names)
+        root = solve_triangular(net.matrix()[0][-size:, -size:], np.eye(size))
+        return root @ root.T
+
+    def touched(self, values: Values, names: Sequence[str]) -> np.ndarray:
+        """Whether any row but a prior depends on each parameter of the named variables: (P,) bool."""
+        seen = {name: np.zeros(self.variables[name].dim, bool) for name in names}
+        for block in self._blocks:
+            if block.kind != "prior" and seen.keys() & set(block.variables):
+                derivative = block.evaluate(values, derivatives=True)[1]
+                for name in seen.keys() & derivative.keys():
+                    seen[name] |= np.abs(derivative[name]).max(axis=0) > 0
+        return np.concatenate([seen[name] for name in names])
+
+    def _ordering(self, last: Sequence[str] = ()) -> gtsam.Ordering:
+        ordering = gtsam.Ordering()
+        for name in [*(n for n in self._by_degree if n not in last), *last]:
+            ordering.push_back(self._key[name])
+        return ordering
 
     def _prior(self, v: Variable) -> gtsam.NonlinearFactor:
         noise = gtsam.noiseModel.Diagonal.Sigmas(np.asarray(v.sigma, float))

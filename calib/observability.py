@@ -11,11 +11,13 @@ from calib.graph import Variable
 
 UNTOLD = 0.98  # of the prior's variance left: the data said next to nothing
 PARTNER = 0.1  # of the leading parameter's share, in units of the priors
-MOST_PARTNERS = 6
 
 
 def not_estimated(
-    variables: Sequence[Variable], covariance: np.ndarray, effects: frozenset[str]
+    variables: Sequence[Variable],
+    covariance: np.ndarray,
+    effects: frozenset[str],
+    touched: np.ndarray,
 ) -> list[dict[str, str]]:
     """Parameters whose estimate is the prior's doing, and why.
 
@@ -27,6 +29,7 @@ def not_estimated(
         variables: those of the covariance, in order.
         covariance: (P, P) joint marginal.
         effects: names of those that are effects, not frames.
+        touched: (P,) whether any measurement depends on the parameter at all.
 
     Returns:
         A `name` and a `why` for each.
@@ -42,32 +45,43 @@ def not_estimated(
     _, _, order = qr((untold * preference[:, None]).T, mode="economic", pivoting=True)
     leading = order[: untold.shape[1]]
     directions = untold @ np.linalg.inv(untold[leading])
-    alone: dict[str, list[str]] = {}
-    tied = []
+    found: dict[tuple[str, str], list[str]] = {}
     for column, lead in sorted(zip(directions.T, leading, strict=True), key=lambda pair: pair[1]):
-        share = np.abs(column) * preference
-        partners = [i for i in np.argsort(-share) if share[i] > PARTNER * share[lead] and i != lead]
-        if partners:
-            tied.append(_tied(names[lead], [names[i] for i in partners]))
-        else:
-            alone.setdefault(owner[lead], []).append(names[lead].split(".", 1)[1])
+        share = np.abs(column)
+        partners = np.flatnonzero((share > PARTNER) & (np.arange(len(share)) != lead))
+        why = _why(touched[lead], _grouped(owner[partners], [names[i] for i in partners]))
+        found.setdefault((owner[lead], why), []).append(names[lead].split(".", 1)[1])
     whole = {v.name: v.dim for v in variables}
-    return [_alone(n, dofs, len(dofs) == whole[n]) for n, dofs in alone.items()] + tied
+    return [
+        {"name": _name(variable, dofs, whole[variable]), "why": why}
+        for (variable, why), dofs in found.items()
+    ]
 
 
-def _alone(variable: str, dofs: list[str], whole: bool) -> dict[str, str]:
-    name = variable if whole else f"{variable}.{dofs[0]}" if len(dofs) == 1 else f"{variable} ({', '.join(dofs)})"
-    return {
-        "name": name,
-        "why": "nothing measured here depends on it, so it stays as well known as before",
-    }
+def _name(variable: str, dofs: list[str], dim: int) -> str:
+    if len(dofs) == dim:
+        return variable
+    return f"{variable}.{dofs[0]}" if len(dofs) == 1 else f"{variable} ({', '.join(dofs)})"
 
 
-def _tied(name: str, partners: list[str]) -> dict[str, str]:
-    listed = ", ".join(partners[:MOST_PARTNERS])
-    more = f" and {len(partners) - MOST_PARTNERS} more" if len(partners) > MOST_PARTNERS else ""
-    return {
-        "name": name,
-        "why": f"all that is measured changes just as with {listed}{more}: only their combination "
-        f"is estimated, and the priors share it out; measure one of them directly to split it",
-    }
+def _grouped(owner: Sequence[str], names: Sequence[str]) -> str:
+    """The partners, a frame or effect each, with the parameter where there is one only."""
+    by_owner: dict[str, list[str]] = {}
+    for variable, name in zip(owner, names, strict=True):
+        by_owner.setdefault(variable, []).append(name)
+    listed = [found[0] if len(found) == 1 else variable for variable, found in by_owner.items()]
+    return " and ".join(listed)
+
+
+def _why(touched: bool, partners: str) -> str:
+    if partners:
+        return (
+            f"tied to {partners}: all that is measured changes alike, so only their combination is "
+            f"estimated and the priors share it out; measure one of them directly to split it"
+        )
+    if touched:
+        return (
+            "tied to where the rig's root stands, which is unknown too: all that is measured "
+            "changes alike; track a body on the root, or measure it directly"
+        )
+    return "nothing measured here depends on it, so it stays as well known as before"

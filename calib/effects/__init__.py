@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 
-from calib.effects.arm import ArmJointOffset, ArmLinkLength
+from calib.effects.arm import ArmAxisTilt, ArmJointOffset, ArmLinkLength
 from calib.effects.base import Basis, Effect, LazyColumn, OneHot, Param, Site, View
 from calib.effects.lidar import RingRangeOffset
 from calib.effects.reference import SurfaceShift
@@ -14,6 +14,7 @@ from chains.errors import InputError
 CATALOGUE: tuple[Effect, ...] = (
     ArmLinkLength(),
     ArmJointOffset(),
+    ArmAxisTilt(),
     RingRangeOffset(),
 )
 DEFAULT = ("arm_link_length", "arm_joint_offset", "ring_range_offset")

@@ -58,3 +58,27 @@ class ArmJointOffset(Effect):
 
     def basis(self, view: View) -> np.ndarray:
         return np.eye(len(view.rig.joint_names))[None]
+
+
+class ArmAxisTilt(Effect):
+    """A joint's axis leans from where the URDF draws it: two small turns across the axis."""
+
+    name = "arm_axis_tilt"
+    site = Site.EDGE
+    formula = "origin of joint i -> origin * exp(a_i * x_i + b_i * y_i), x_i and y_i across the axis"
+    typical = "0.1 to 2 mrad"
+    covariates = "joint positions"
+    confounded_with = ("arm_joint_offset", "arm_gravity_sag")
+    source = "Hayati and Mirmirani 1985, J. Robotic Systems 2(4): parallel axes need a tilt"
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        return tuple(Param(f"{j}.{side}", "rad", 0.003) for j in rig.joint_names for side in "ab")
+
+    def basis(self, view: View) -> np.ndarray:
+        tree = view.rig.tree
+        basis = np.zeros((1, len(tree.edges), 6, 2 * len(view.rig.joint_names)))
+        for e, edge in enumerate(tree.edges):
+            if edge.joint is not None:
+                p = 2 * view.rig.joint_names.index(edge.joint.name)
+                basis[0, e, :3, p : p + 2] = np.linalg.svd(edge.joint.axis[None])[2][1:].T
+        return basis

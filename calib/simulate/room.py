@@ -132,8 +132,7 @@ def _field(points_m: np.ndarray, rng: np.random.Generator, waves: int = 24) -> n
     """A Gaussian field of unit variance at points (N, 3), correlation exp(-d^2 / (2 l^2))."""
     wave_vectors = rng.standard_normal((3, waves)) / CORRELATION_M
     phases = rng.uniform(0, 2 * np.pi, waves)
-    amplitudes = rng.standard_normal(waves)
-    return np.sqrt(2 / waves) * np.cos(points_m @ wave_vectors + phases) @ amplitudes
+    return np.sqrt(2 / waves) * np.cos(points_m @ wave_vectors + phases).sum(axis=1)
 
 
 def _shell() -> list[Panel]:

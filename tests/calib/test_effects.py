@@ -55,7 +55,10 @@ def test_a_basis_has_the_shape_of_its_site(effect, views):
     params, basis = effect.params(view.rig), effect.basis(view)
     assert params and len({p.name for p in params}) == len(params)
     if isinstance(basis, OneHot):
-        assert basis.size == len(params) and basis.values.shape == (view.rows, *shape(effect.site, view.rig))
+        assert basis.size == len(params) and basis.values.shape == (
+            view.rows,
+            *shape(effect.site, view.rig),
+        )
         assert basis.index.shape == (view.rows,)
         assert -1 <= basis.index.min() and basis.index.max() < basis.size
         moves = np.bincount(basis.index[basis.index >= 0], minlength=basis.size) > 0

@@ -61,7 +61,9 @@ def state(rig, terms, size):
     values = {t.variable: size * rng.uniform(-1, 1, len(t.free)) for t in terms}
     values |= {"noise": size * rng.uniform(-1, 1, 3)}
     poses = rng.normal(0, 1, (2, 6))
-    return values | {n: gtsam.Pose3.Expmap(xi).matrix() for n, xi in zip(("root", "faro"), poses, strict=True)}
+    return values | {
+        n: gtsam.Pose3.Expmap(xi).matrix() for n, xi in zip(("root", "faro"), poses, strict=True)
+    }
 
 
 @pytest.mark.parametrize("where", ["in_root", "in_world", "in_reference"])
@@ -81,7 +83,9 @@ def test_derivatives_by_every_unknown(rig, where, frame, stops):
 
     def moved(values):
         T = getattr(chain, where)(frame, values).T
-        return np.stack([gtsam.Pose3.Logmap(gtsam.Pose3(b @ t)) for b, t in zip(T_back, T, strict=True)])
+        return np.stack(
+            [gtsam.Pose3.Logmap(gtsam.Pose3(b @ t)) for b, t in zip(T_back, T, strict=True)]
+        )
 
     for name, d in placed.d.items():
         kind = "pose" if name in ("root", "faro") else "vector"
@@ -152,4 +156,6 @@ def test_retract_moves_poses_as_the_chain_assumes():
     T = rigs.T_OPTI_FARO
     variable = Variable("T", "pose", T.as_matrix(), np.ones(6), ("",) * 6, ("",) * 6)
     expected = (T * RigidTransform.from_exp_coords(twist)).as_matrix()
-    np.testing.assert_allclose(rigs.retract(variable.kind, variable.mean, twist), expected, atol=1e-12)
+    np.testing.assert_allclose(
+        rigs.retract(variable.kind, variable.mean, twist), expected, atol=1e-12
+    )

@@ -12,6 +12,7 @@ from calib.residuals.rows import (
     Group,
     gram,
     robust_scale,
+    split,
     square_root,
     tukey_cost,
     tukey_weight,
@@ -53,7 +54,8 @@ def assert_is_root(root, matrix):
     size = np.sqrt(np.diag(matrix))
     size[size == 0] = 1.0
     assert np.isfinite(root).all()
-    np.testing.assert_allclose(root.T @ root / np.outer(size, size), matrix / np.outer(size, size), atol=1e-12)
+    unit = np.outer(size, size)
+    np.testing.assert_allclose(root.T @ root / unit, matrix / unit, atol=1e-12)
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e-140, 1e140])
@@ -79,7 +81,28 @@ def test_square_root_gives_the_residuals_cost():
     rows = np.column_stack([A, b])
     root = square_root(rows.T @ rows)
     x = rng.normal(size=6)
-    assert np.sum((root[:, 6] + root[:, :6] @ x) ** 2) == pytest.approx(np.sum((b + A @ x) ** 2), rel=1e-12)
+    assert np.sum((root[:, 6] + root[:, :6] @ x) ** 2) == pytest.approx(
+        np.sum((b + A @ x) ** 2), rel=1e-12
+    )
+
+
+@pytest.mark.parametrize("rank", [0, 1, 3, 6])
+def test_split_gives_the_same_cost_with_few_rows_that_know_the_first_columns(rank):
+    rng = np.random.default_rng(rank)
+    first = rng.normal(size=(200, rank)) @ rng.normal(size=(rank, 6)) * 10.0 ** np.arange(-3, 3)
+    A = np.hstack([first, rng.normal(size=(200, 9))])
+    top, rest = split(A.T @ A, 6)
+    assert top.shape == (6, 15) and np.count_nonzero(np.abs(top).max(axis=1)) == rank
+    rebuilt = top.T @ top
+    rebuilt[6:, 6:] += rest
+    size = np.maximum(np.linalg.norm(A, axis=0), 1e-9)
+    np.testing.assert_allclose(
+        rebuilt / np.outer(size, size), A.T @ A / np.outer(size, size), atol=1e-12
+    )
+    # What is left is what the others say once the first have taken up all they can.
+    taken = np.linalg.lstsq(A[:, :6] / size[:6], A[:, 6:], rcond=1e-12)[0]
+    left = A[:, 6:] - A[:, :6] / size[:6] @ taken
+    np.testing.assert_allclose(rest, left.T @ left, atol=1e-9)
 
 
 @pytest.fixture(scope="module")
@@ -116,7 +139,9 @@ def test_tukey_weight_is_the_slope_of_the_cost(scale):
 def test_tukey_cost_is_half_chi_square_near_zero_and_bounded_far_off():
     z = np.array([0.01, -0.02])
     assert tukey_cost(z) == pytest.approx(0.5 * z @ z, rel=1e-4)
-    assert tukey_cost(np.array([1e6])) == tukey_cost(np.array([20.0])) == pytest.approx(TUKEY**2 / 6)
+    assert (
+        tukey_cost(np.array([1e6])) == tukey_cost(np.array([20.0])) == pytest.approx(TUKEY**2 / 6)
+    )
     assert tukey_cost(np.array([20.0]), 3.0) == pytest.approx(1.5 * TUKEY**2)
 
 
