@@ -183,13 +183,14 @@ def _write_residuals(
         view = rows.view
         names = ("ring", "column", "range_m", "incidence_rad", "azimuth_rad", "elevation_rad")
         names += ("intensity", "label", "surface", "patch", "plane")
-        columns = {n: _compact(view[n]) for n in names if n in view.columns}
+        columns = {n: view[n] for n in names if n in view.columns}
         columns |= {
-            "residual_m": _compact(rows.residual_m),
-            "sigma_m": _compact(np.hypot(rows.sigma_m, rows.reference_sigma_m)),
-            "weight": _compact(rows.weight),
+            "residual_m": rows.residual_m,
+            "sigma_m": np.hypot(rows.sigma_m, rows.reference_sigma_m),
+            "weight": rows.weight,
         }
         name = f"{scan.stops.rig.name}.{scan.name}" if several else scan.name
+        columns = {n: _compact(column[rows.usable]) for n, column in columns.items()}
         write_table(folder / f"{name}.parquet", columns)
         total += scan_errors(scan, estimate.values, association, None)
     if not estimate.scans:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.graph import Graph
+from calib.residuals.beams import Association
 from calib.residuals.scan import ScanStop
 from calib.residuals.tracker import TrackedBody
 
@@ -51,7 +52,7 @@ class Errors:
 def scan_errors(
     scan: ScanStop,
     values: Mapping[str, np.ndarray],
-    association: np.ndarray | None,
+    association: Association | None,
     graph: Graph | None,
 ) -> Errors:
     """Range residuals of a stop's inliers.

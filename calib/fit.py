@@ -12,7 +12,7 @@ from calib.forward import Term
 from calib.graph import Block, Graph, Variable
 from calib.model import Source
 from calib.problem import Problem, effect_variable
-from calib.residuals.beams import SharedSum
+from calib.residuals.beams import Association, SharedSum
 from calib.residuals.scan import LOCAL_SHARE, ScanStop
 from chains import se3
 
@@ -41,7 +41,7 @@ class Estimate:
     values: dict[str, np.ndarray]
     variables: tuple[Variable, ...]
     covariance: np.ndarray
-    associations: Sequence[np.ndarray]
+    associations: Sequence[Association]
     scans: Sequence[ScanStop]
     iterations: int
     converged: bool
@@ -86,7 +86,7 @@ class _Loop:
         self.variables = dict(problem.variables)
         self.values = dict(problem.initial)
         self.scans = list(problem.scans)
-        self.associations: list[np.ndarray] = []
+        self.associations: list[Association] = []
         self.passes = 0
         self.graph: Graph | None = None
 

@@ -51,17 +51,30 @@ def not_estimated(
         partners = np.flatnonzero((share > PARTNER) & (np.arange(len(share)) != lead))
         why = _why(touched[lead], _grouped(owner[partners], [names[i] for i in partners]))
         found.setdefault((owner[lead], why), []).append(names[lead].split(".", 1)[1])
-    whole = {v.name: v.dim for v in variables}
+    whole = {v.name: v.dofs for v in variables}
     return [
         {"name": _name(variable, dofs, whole[variable]), "why": why}
         for (variable, why), dofs in found.items()
     ]
 
 
-def _name(variable: str, dofs: list[str], dim: int) -> str:
-    if len(dofs) == dim:
+def _name(variable: str, dofs: list[str], all_dofs: tuple[str, ...]) -> str:
+    if len(dofs) == len(all_dofs):
         return variable
-    return f"{variable}.{dofs[0]}" if len(dofs) == 1 else f"{variable} ({', '.join(dofs)})"
+    return f"{variable}.{dofs[0]}" if len(dofs) == 1 else f"{variable} ({_runs(dofs, all_dofs)})"
+
+
+def _runs(dofs: list[str], all_dofs: tuple[str, ...]) -> str:
+    """The names with commas; three or more that follow each other as first … last."""
+    index = np.array([all_dofs.index(dof) for dof in dofs])
+    runs = np.split(index, np.flatnonzero(np.diff(index) != 1) + 1)
+    parts = [
+        f"{all_dofs[run[0]]} … {all_dofs[run[-1]]}"
+        if len(run) > 2
+        else ", ".join(all_dofs[i] for i in run)
+        for run in runs
+    ]
+    return ", ".join(parts)
 
 
 def _grouped(owner: Sequence[str], names: Sequence[str]) -> str:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -90,8 +91,17 @@ class Beams:
     origin_m: Array
     direction: Array
     range_m: Array
-    azimuth_rad: Array
-    elevation_rad: Array
+
+    @cached_property
+    def azimuth_rad(self) -> Array:
+        """(N,) of the direction, counter-clockwise from x: the encoder's, wherever it starts."""
+        return np.arctan2(self.direction[:, 1], self.direction[:, 0])
+
+    @cached_property
+    def elevation_rad(self) -> Array:
+        """(N,) of the direction, up positive."""
+        u = self.direction
+        return np.arctan2(u[:, 2], np.hypot(u[:, 0], u[:, 1]))
 
 
 def beams(xyz_m: ArrayLike, beam_origin_m: ArrayLike) -> Beams:
@@ -103,15 +113,17 @@ def beams(xyz_m: ArrayLike, beam_origin_m: ArrayLike) -> Beams:
     """
     p = np.asarray(xyz_m, float)
     radial, tangential = np.asarray(beam_origin_m, float)
-    distance = np.maximum(np.hypot(p[:, 0], p[:, 1]), max(abs(tangential), 1e-12))
-    azimuth = np.arctan2(p[:, 1], p[:, 0]) - np.arcsin(tangential / distance)
-    c, s = np.cos(azimuth), np.sin(azimuth)
-    origin = np.stack([radial * c - tangential * s, radial * s + tangential * c, 0 * c], -1)
+    origin = np.zeros_like(p)
+    if radial or tangential:
+        square = np.maximum(p[:, 0] ** 2 + p[:, 1] ** 2, max(tangential**2, 1e-24))
+        along = np.sqrt(square - tangential**2)
+        c = (p[:, 0] * along + p[:, 1] * tangential) / square
+        s = (p[:, 1] * along - p[:, 0] * tangential) / square
+        origin[:, 0] = radial * c - tangential * s
+        origin[:, 1] = radial * s + tangential * c
     reach = p - origin
-    range_m = np.linalg.norm(reach, axis=-1)
-    direction = reach / range_m[:, None]
-    elevation = np.arctan2(direction[:, 2], np.hypot(direction[:, 0], direction[:, 1]))
-    return Beams(origin, direction, range_m, azimuth, elevation)
+    range_m = np.sqrt(np.einsum("ni,ni->n", reach, reach))
+    return Beams(origin, reach / range_m[:, None], range_m)
 
 
 class LidarFile(Document):

@@ -102,20 +102,8 @@ class Recording:
         )
 
     def scan(self, stop: int) -> Scan:
-        """Read the scan of one stop, by its index; a raw hold is averaged per direction.
-
-        Points that are not finite, or lie in the origin, are no returns and left out. Raises
-        InputError for a file that is missing or empty, lacks a column or has one of the wrong type,
-        and for rings or ranges that the sensor cannot have delivered.
-        """
-        path = self.folder / "scans" / f"{self.stops[stop]}.parquet"
-        with _open_parquet(path) as file:
-            names = _check_types(path, file)
-            if "scan" in names:
-                columns = average_hold(lambda wanted: _batches(path, file, wanted), names)
-            else:
-                columns = _columns(path, file.read(names))
-        return _check_scan(path, columns, self.rings)
+        """Read the scan of one stop, by its index, as `read_scan` does."""
+        return read_scan(self.folder / "scans" / f"{self.stops[stop]}.parquet", self.rings)
 
     def digest(self) -> str:
         """Return the SHA-256 (hex) of the names and contents of the recording's files."""
@@ -129,6 +117,23 @@ class Recording:
                 while block := file.read(1 << 20):
                     sha.update(block)
         return sha.hexdigest()
+
+
+def read_scan(path: str | Path, rings: int | None = None) -> Scan:
+    """Read one scan; a raw hold is averaged per direction.
+
+    Points that are not finite, or lie in the origin, are no returns and left out. Raises
+    InputError for a file that is missing or empty, lacks a column or has one of the wrong type,
+    and for rings (0 to `rings` - 1) or ranges that the sensor cannot have delivered.
+    """
+    path = Path(path)
+    with _open_parquet(path) as file:
+        names = _check_types(path, file)
+        if "scan" in names:
+            columns = average_hold(lambda wanted: _batches(path, file, wanted), names)
+        else:
+            columns = _columns(path, file.read(names))
+    return _check_scan(path, columns, rings)
 
 
 def read_table(path: str | Path) -> dict[str, np.ndarray]:

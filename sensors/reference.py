@@ -118,7 +118,7 @@ class Reference:
             nthreads: 0 means all.
         """
         return self.hits(
-            self._first_triangle(origins_m, directions, nthreads), origins_m, directions
+            self.first_triangle(origins_m, directions, nthreads), origins_m, directions
         )
 
     def hits(self, triangle: np.ndarray, origins_m: np.ndarray, directions: np.ndarray) -> Hits:
@@ -239,9 +239,10 @@ class Reference:
         )
         return scene
 
-    def _first_triangle(
-        self, origins_m: np.ndarray, directions: np.ndarray, nthreads: int
+    def first_triangle(
+        self, origins_m: np.ndarray, directions: np.ndarray, nthreads: int = 0
     ) -> np.ndarray:
+        """Triangle (N,) that each beam hits first, -1 for none; arguments as of `cast`."""
         rays = np.empty((len(directions), 6), dtype=np.float32)
         rays[:, :3] = origins_m - self._centre_m
         rays[:, 3:] = directions

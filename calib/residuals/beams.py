@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.effects import LazyColumn, OneHot, Site, View
+from calib.effects import LazyColumn, OneHot, View
 from calib.forward import Derivatives, Stops, Term, Values
 from calib.residuals.rows import Group, gram, split, square_root, tukey_cost
 from chains import se3
@@ -38,6 +38,19 @@ class Columns:
     index: np.ndarray
     value: np.ndarray
     components: np.ndarray
+
+
+@dataclass(frozen=True)
+class Association:
+    """What each beam meets, to be kept while a fit settles.
+
+    Args:
+        part: (N,) triangle or plane; -1 for nothing.
+        patch: (N,) patch of the surface, -1 for none; nowhere kept where None.
+    """
+
+    part: np.ndarray
+    patch: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -72,7 +85,7 @@ class Rows:
         dense: variable -> (N, P) derivatives.
         sparse: derivatives with one non-zero per row.
         view: what effects looked at.
-        kept: (N,) indices of these rows in the scan.
+        usable: (N,) False where the beam met nothing fit to compare with; its weight is 0.
     """
 
     residual_m: np.ndarray
@@ -84,7 +97,7 @@ class Rows:
     dense: Mapping[str, np.ndarray]
     sparse: Sequence[Columns]
     view: View
-    kept: np.ndarray
+    usable: np.ndarray
 
     @property
     def cost(self) -> float:
@@ -240,24 +253,29 @@ def _by_variable(by_part: np.ndarray, parts: Sequence[Part], at: Values) -> Deri
     return d
 
 
-def derivatives(
-    beams: Beams, predicted_m: np.ndarray, hit: np.ndarray, normal: np.ndarray, along: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """d residual by pose twist (N, 6), by beam error (N, 3), by surface point (N, 3, lidar axes)."""
-    n = normal / along[:, None]
-    by_twist = np.empty((len(n), 6))
-    by_twist[:, 0] = hit[:, 1] * n[:, 2] - hit[:, 2] * n[:, 1]
-    by_twist[:, 1] = hit[:, 2] * n[:, 0] - hit[:, 0] * n[:, 2]
-    by_twist[:, 2] = hit[:, 0] * n[:, 1] - hit[:, 1] * n[:, 0]
-    by_twist[:, 3:] = n
+def twist_derivative(hit: np.ndarray, n: np.ndarray) -> np.ndarray:
+    """d residual by the lidar's right increment (N, 6).
+
+    Args:
+        hit: (N, 3) hit point, lidar axes.
+        n: (N, 3) normal over n.u, lidar axes.
+    """
+    out = np.empty((len(n), 6))
+    out[:, 0] = hit[:, 1] * n[:, 2] - hit[:, 2] * n[:, 1]
+    out[:, 1] = hit[:, 2] * n[:, 0] - hit[:, 0] * n[:, 2]
+    out[:, 2] = hit[:, 0] * n[:, 1] - hit[:, 1] * n[:, 0]
+    out[:, 3:] = n
+    return out
+
+
+def beam_derivative(beams: Beams, t: np.ndarray, hit: np.ndarray, n: np.ndarray) -> np.ndarray:
+    """d residual by range, azimuth and elevation error (N, 3); arguments as above, t (N,) m."""
     u = beams.direction
     flat = np.maximum(np.hypot(u[:, 0], u[:, 1]), 1e-12)
     up = np.stack([-u[:, 0] * u[:, 2] / flat, -u[:, 1] * u[:, 2] / flat, flat], axis=1)
-    by_beam = np.empty((len(n), 3))
-    by_beam[:, 0] = -1.0
-    by_beam[:, 1] = -(n[:, 1] * hit[:, 0] - n[:, 0] * hit[:, 1])
-    by_beam[:, 2] = -predicted_m * np.einsum("ni,ni->n", n, up)
-    return by_twist, by_beam, -n
+    by_azimuth = n[:, 0] * hit[:, 1] - n[:, 1] * hit[:, 0]
+    by_elevation = -t * np.einsum("ni,ni->n", n, up)
+    return np.stack([np.full(len(t), -1.0), by_azimuth, by_elevation], axis=1)
 
 
 def site_error(basis: np.ndarray | OneHot, theta: np.ndarray) -> np.ndarray:
@@ -269,7 +287,7 @@ def site_error(basis: np.ndarray | OneHot, theta: np.ndarray) -> np.ndarray:
 
 
 def effect_columns(
-    variable: str, site: Site, basis: np.ndarray | OneHot, by_site: np.ndarray
+    variable: str, basis: np.ndarray | OneHot, by_site: np.ndarray
 ) -> np.ndarray | Columns:
     """Derivative of the rows by an effect's parameters: ``d r / d site @ basis``."""
     if isinstance(basis, OneHot):

@@ -7,21 +7,23 @@ more than one of them is ever in memory per worker.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from calib.effects import LazyColumn, OneHot, Site, View
 from calib.forward import Stops, Term, Values
 from calib.residuals.beams import (
+    Association,
     Columns,
     CompressedScan,
     Rows,
     Surface,
+    beam_derivative,
     compress,
-    derivatives,
     effect_columns,
     site_error,
+    twist_derivative,
 )
 from calib.residuals.rows import robust_scale, tukey_weight
 from calib.residuals.surfaces import Meeting
@@ -63,20 +65,18 @@ class ScanStop:
         """T_reference_lidar (4, 4) at a state."""
         return self.stops.in_reference(self.stops.rig.lidar_frame, values).T[0]
 
-    def associate(self, values: Values, near_edges: bool) -> np.ndarray:
+    def associate(self, values: Values, near_edges: bool) -> Association:
         """Which part of the surface each beam meets, at a state."""
         _, ray = self._read()
         return self.meeting.associate(self.pose(values), ray, values, near_edges)
 
-    def rows(self, values: Values, association: np.ndarray | None = None) -> Rows:
+    def rows(self, values: Values, association: Association | None = None) -> Rows:
         """The stop's rows at a state; associated anew unless an association is given."""
         scan, ray = self._read()
         T = self.pose(values)
         if association is None:
             association = self.meeting.associate(T, ray, values, near_edges=False)
-        kept = np.flatnonzero(association >= 0)
-        scan, ray, part = _take(scan, kept), _take(ray, kept), association[kept]
-        surface = self.meeting.meet(T, ray, values, part)
+        surface = self.meeting.meet(T, ray, values, association)
         view = self._view(scan, ray, surface)
         bases = {t.variable: (t.effect.site, t.basis(view)) for t in self.terms}
         error = {Site.BEAM: np.zeros((1, 3)), Site.REFERENCE: np.zeros((1, 3))}
@@ -84,10 +84,10 @@ class ScanStop:
             error[site] = error[site] + site_error(basis, values[name])
         if error[Site.BEAM][:, 1:].any():
             ray = turned(ray, -error[Site.BEAM][:, 1], -error[Site.BEAM][:, 2])
-            surface = self.meeting.meet(T, ray, values, part)
-        return self._rows(scan, ray, surface, T, view, bases, error, kept)
+            surface = self.meeting.meet(T, ray, values, association)
+        return self._rows(scan, ray, surface, T, view, bases, error)
 
-    def compress(self, values: Values, association: np.ndarray | None = None) -> CompressedScan:
+    def compress(self, values: Values, association: Association | None = None) -> CompressedScan:
         """The stop's rows, compressed, linearised at a state."""
         rows = self.rows(values, association)
         frame = self.stops.rig.lidar_frame
@@ -105,8 +105,8 @@ class ScanStop:
             "ring": scan.ring,
             "column": scan.column,
             "intensity": scan.intensity,
-            "azimuth_rad": ray.azimuth_rad,
-            "elevation_rad": ray.elevation_rad,
+            "azimuth_rad": lambda: ray.azimuth_rad,
+            "elevation_rad": lambda: ray.elevation_rad,
             "range_m": surface.predicted_m,
         }
         return View(self.stops.rig, len(scan.ring), columns, self.stops.joints)
@@ -120,51 +120,50 @@ class ScanStop:
         view: View,
         bases: Mapping[str, tuple[Site, np.ndarray | OneHot]],
         error: Mapping[Site, np.ndarray],
-        kept: np.ndarray,
     ) -> Rows:
-        usable = surface.usable
-        t = np.where(usable, surface.predicted_m, 1.0)
-        normal = np.where(usable[:, None], surface.normal @ T[:3, :3], -ray.direction)
-        along = np.einsum("ni,ni->n", normal, ray.direction)
+        usable, t, n = surface.usable, surface.predicted_m, surface.normal @ T[:3, :3]
+        lost = np.flatnonzero(~usable)
+        t[lost] = 1.0
+        n[lost] = ray.direction[lost]
+        cosine = np.abs(np.einsum("ni,ni->n", n, ray.direction))
+        n /= np.where(usable, -cosine, cosine)[:, None]
         hit = ray.origin_m + t[:, None] * ray.direction
-        by_twist, by_beam, by_point = derivatives(ray, t, hit, normal, along)
-        moved = np.einsum("ni,ni->n", by_point @ T[:3, :3].T, np.broadcast_to(error[Site.REFERENCE], hit.shape))
-        residual = ray.range_m - error[Site.BEAM][:, 0] - t + moved
-        residual = np.where(usable, residual, 0.0)
-        local, reference = self._reference_sigma(along)
-        sigma = np.sqrt(self._beam_variance(scan, t, along) + local**2)
+        by_site = {Site.REFERENCE: -n @ T[:3, :3].T}
+        if any(site is Site.BEAM for site, _ in bases.values()):
+            by_site[Site.BEAM] = beam_derivative(ray, t, hit, n)
+        residual = ray.range_m - t - error[Site.BEAM][:, 0]
+        if error[Site.REFERENCE].any():
+            residual += np.einsum("ni,ni->n", by_site[Site.REFERENCE], error[Site.REFERENCE])
+        residual[lost] = 0.0
+        reference = self.reference_sigma_m / cosine
+        sigma = np.sqrt(self._beam_variance(scan, t, cosine) + LOCAL_SHARE * reference**2)
         z = residual / sigma
         scale = robust_scale(z[usable])
         columns = {
-            name: effect_columns(name, site, basis, by_beam if site is Site.BEAM else by_point @ T[:3, :3].T)
+            name: effect_columns(name, basis, by_site[site])
             for name, (site, basis) in bases.items()
         }
         return Rows(
             residual,
             sigma,
             np.where(usable, tukey_weight(z, scale), 0.0),
-            reference,
+            reference * np.sqrt(1.0 - LOCAL_SHARE),
             scale,
-            by_twist,
-            {n: c for n, c in columns.items() if not isinstance(c, Columns)},
+            twist_derivative(hit, n),
+            {name: c for name, c in columns.items() if not isinstance(c, Columns)},
             [c for c in columns.values() if isinstance(c, Columns)] + list(surface.unknown),
             view,
-            kept,
+            usable,
         )
 
-    def _reference_sigma(self, along: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Reference error along the beam: between neighbours, and in common with them."""
-        sigma = self.reference_sigma_m / np.abs(along)
-        return sigma * np.sqrt(LOCAL_SHARE), sigma * np.sqrt(1.0 - LOCAL_SHARE)
-
-    def _beam_variance(self, scan: Scan, t: np.ndarray, along: np.ndarray) -> np.ndarray:
-        """Variance of the averaged range: noise over count, beam angle, quantisation.
+    def _beam_variance(self, scan: Scan, t: np.ndarray, cosine: np.ndarray) -> np.ndarray:
+        """Variance of the averaged range: noise over count, and the beam's angle.
 
         The spread measured over a hold leans on the datasheet's, scaled to this stop, as if that
         were `PRIOR_COUNT` sweeps more: a spread of few sweeps is itself too uncertain a weight.
         """
         lidar = self.lidar
-        incidence = np.arccos(np.minimum(np.abs(along), 1.0))
+        incidence = np.arccos(np.minimum(cosine, 1.0))
         single = np.square(lidar.sigma_range(t, incidence))
         measured = np.square(scan.range_std_m)
         known = np.isfinite(measured) & (scan.count > 1)
@@ -174,7 +173,7 @@ class ScanStop:
             measured = np.where(known, measured, 0.0)
             single = (PRIOR_COUNT * single + dof * measured) / (PRIOR_COUNT + dof)
         angle = lidar.sigma_angle_rad * t * np.tan(incidence)
-        return single / scan.count + angle**2 + lidar.quantum_m**2 / (12.0 * scan.count)
+        return single / scan.count + angle**2
 
 
 def turned(ray: Beams, azimuth_rad: np.ndarray, elevation_rad: np.ndarray) -> Beams:
@@ -187,14 +186,4 @@ def turned(ray: Beams, azimuth_rad: np.ndarray, elevation_rad: np.ndarray) -> Be
     c, s = np.cos(azimuth_rad), np.sin(azimuth_rad)
     x, y, z = ray.origin_m.T
     origin = np.stack([c * x - s * y, s * x + c * y, z], axis=1)
-    return Beams(origin, u, ray.range_m, azimuth, elevation)
-
-
-def _take(rows: Scan | Beams, kept: np.ndarray) -> Scan | Beams:
-    picked = {}
-    for field in fields(rows):
-        value = getattr(rows, field.name)
-        picked[field.name] = (
-            {n: v[kept] for n, v in value.items()} if isinstance(value, dict) else value[kept]
-        )
-    return replace(rows, **picked)
+    return Beams(origin, u, ray.range_m)

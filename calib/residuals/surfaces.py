@@ -10,14 +10,15 @@ import numpy as np
 
 from calib.forward import Values
 from calib.graph import Variable
-from calib.residuals.beams import Columns, Surface
+from calib.residuals.beams import Association, Columns, Surface
 from chains import se3
 from sensors.lidar import Beams
 from sensors.planes import Planes
 from sensors.reference import Reference
 from sensors.surfaces import transverse
 
-GRAZING_RAD = np.deg2rad(80.0)
+GRAZING_RAD = np.deg2rad(80.0)  # a fit keeps no beam that meets its surface flatter than this
+PARALLEL_RAD = np.deg2rad(89.0)
 PATCH_M = 0.7
 
 
@@ -26,9 +27,11 @@ class Meeting(Protocol):
 
     def associate(
         self, T: np.ndarray, beams: Beams, values: Values, near_edges: bool
-    ) -> np.ndarray: ...
+    ) -> Association: ...
 
-    def meet(self, T: np.ndarray, beams: Beams, values: Values, part: np.ndarray) -> Surface: ...
+    def meet(
+        self, T: np.ndarray, beams: Beams, values: Values, association: Association
+    ) -> Surface: ...
 
 
 @dataclass(frozen=True)
@@ -45,36 +48,41 @@ class MeshSurface:
 
     def associate(
         self, T: np.ndarray, beams: Beams, values: Values, near_edges: bool
-    ) -> np.ndarray:
-        """Triangle (N,) int32 of each beam, -1 where it hits nothing or at too grazing an angle.
+    ) -> Association:
+        """Triangle of each beam; near edges its patch too, and -1 for what is better left out.
 
         Args:
             T: (4, 4) T_reference_lidar.
             beams: of the stop.
             values: the state; a mesh does not depend on it.
-            near_edges: True probes beside each beam too, and drops those near a depth edge.
+            near_edges: True drops beams near a depth edge, and grazing ones.
         """
         origins, directions = _in_reference(T, beams)
+        if not near_edges:
+            return Association(self.reference.first_triangle(origins, directions))
         hits = self.reference.cast(origins, directions)
         spoilt = hits.incidence_rad > GRAZING_RAD
-        if near_edges:
-            spoilt |= self.reference.near_edge(origins, directions, hits, self.footprint_rad)
-        return np.where(spoilt, -1, hits.triangle).astype(np.int32)
+        spoilt |= self.reference.near_edge(origins, directions, hits, self.footprint_rad)
+        triangle = np.where(spoilt, -1, hits.triangle).astype(np.int32)
+        return Association(triangle, self.reference.patch(hits, PATCH_M).astype(np.int32))
 
-    def meet(self, T: np.ndarray, beams: Beams, values: Values, part: np.ndarray) -> Surface:
+    def meet(
+        self, T: np.ndarray, beams: Beams, values: Values, association: Association
+    ) -> Surface:
         """The triangle's plane that each beam meets under this association."""
-        hits = self.reference.hits(part, *_in_reference(T, beams))
+        hits = self.reference.hits(association.part, *_in_reference(T, beams))
+        patch = association.patch
         surface = self.reference.surface
         columns = {
             "label": hits.label,
             "reference_intensity": hits.intensity,
             "surface": lambda: np.where(hits.triangle >= 0, surface[hits.triangle], -1),
-            "patch": partial(self.reference.patch, hits, PATCH_M),
+            "patch": partial(self.reference.patch, hits, PATCH_M) if patch is None else patch,
             "normal": hits.normal,
             "point_m": hits.point_m,
             "incidence_rad": hits.incidence_rad,
         }
-        return Surface(hits.range_m, hits.normal, hits.triangle >= 0, columns)
+        return Surface(hits.range_m, hits.normal, hits.incidence_rad < PARALLEL_RAD, columns)
 
 
 @dataclass(frozen=True)
@@ -114,14 +122,17 @@ class PlaneSurface:
 
     def associate(
         self, T: np.ndarray, beams: Beams, values: Values, near_edges: bool
-    ) -> np.ndarray:
-        """Plane (N,) int32 of each beam, by where its point lies; -1 for none."""
+    ) -> Association:
+        """Plane of each beam, by where its point lies; -1 for none."""
         point = beams.origin_m + beams.range_m[:, None] * beams.direction
-        return self.planes.assign(se3.apply(T, point)).astype(np.int32)
+        return Association(self.planes.assign(se3.apply(T, point)).astype(np.int32))
 
-    def meet(self, T: np.ndarray, beams: Beams, values: Values, part: np.ndarray) -> Surface:
+    def meet(
+        self, T: np.ndarray, beams: Beams, values: Values, association: Association
+    ) -> Surface:
         """The plane that each beam meets under this association."""
         origins, directions = _in_reference(T, beams)
+        part = association.part
         theta = values[self.variable].reshape(-1, 3)
         axes = self.axes
         tilted = self.planes.normal + np.einsum("mk,mki->mi", theta[:, :2], axes)
@@ -133,7 +144,7 @@ class PlaneSurface:
             t = (d - np.einsum("ni,ni->n", n, origins)) / along
             hit = origins + t[:, None] * directions
         incidence = np.arccos(np.minimum(np.abs(along), 1.0))
-        usable = (part >= 0) & (t > 0) & np.isfinite(t) & (incidence < GRAZING_RAD)
+        usable = (part >= 0) & (t > 0) & np.isfinite(t) & (incidence < PARALLEL_RAD)
         facing = np.where(along > 0, -1.0, 1.0)[:, None] * n
         columns = {"plane": part, "normal": facing, "point_m": hit, "incidence_rad": incidence}
         unknown = [self._by_tilt(k, part, hit, n, along, length, axes) for k in (0, 1)]

@@ -34,7 +34,8 @@ def urdf() -> str:
             f'  <link name="arm_{i}"><inertial><origin xyz="{_text(centre_m)}" rpy="0 0 0"/>'
             f'<mass value="{mass_kg}"/><inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0"'
             ' izz="0.01"/></inertial></link>',
-            f'  <joint name="{name}" type="revolute"><parent link="{parent}"/><child link="arm_{i}"/>'
+            f'  <joint name="{name}" type="revolute">'
+            f'<parent link="{parent}"/><child link="arm_{i}"/>'
             f'<origin xyz="{_text(xyz)}" rpy="{_text(rpy)}"/><axis xyz="0 0 {axis}"/>'
             f'<limit lower="{-limit:.9g}" upper="{limit:.9g}" effort="100" velocity="1"/></joint>',
         ]
@@ -62,7 +63,8 @@ def bodies(spec: Spec) -> list[str]:
 
 def document(spec: Spec) -> dict[str, Any]:
     """What rig.yaml says of the rig that the spec asks for."""
-    rig: dict[str, Any] = {"name": f"{'husky-lwa4p' if spec.arm else 'handheld'}-{spec.lidar or 'no-lidar'}"}
+    carrier = "husky-lwa4p" if spec.arm else "handheld"
+    rig: dict[str, Any] = {"name": f"{carrier}-{spec.lidar or 'no-lidar'}"}
     if spec.lidar:
         rig["lidar"] = {"model": spec.lidar, "frame": "lidar"}
     if spec.arm:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,8 +13,11 @@ from sensors.reference import Reference
 SIZE_M = np.array([8.0, 6.0, 3.0])
 # The FARO's frame: level, its origin at the scanner's head; the room's middle lies elsewhere.
 FLOOR_CENTRE_M = np.array([0.6, -0.4, -1.2])
+X, Y, Z = np.eye(3)
 CELL_M = 0.22
 CORRELATION_M = 1.0
+
+Triple = tuple[float, float, float]
 
 # name: (FARO intensity, reflectivity at the LiDAR's wavelength); low goes with low
 MATERIALS: dict[str, tuple[float, float]] = {
@@ -137,7 +139,7 @@ def _field(points_m: np.ndarray, rng: np.random.Generator, waves: int = 24) -> n
 
 def _shell() -> list[Panel]:
     """Floor, ceiling and four walls, their normals pointing inwards."""
-    x, y, z = SIZE_M * np.eye(3)
+    x, y, z = SIZE_M[0] * X, SIZE_M[1] * Y, SIZE_M[2] * Z
     corner = -(x + y) / 2
     wide, half = 2 * x / 8 * 3, y / 2
     return [
@@ -153,27 +155,27 @@ def _shell() -> list[Panel]:
 
 
 def _box(
-    centre_m: Iterable[float], size_m: Iterable[float], material: str, rpy_rad: Iterable[float] = (0, 0, 0)
+    centre_m: Triple, size_m: Triple, material: str, rpy_rad: Triple = (0, 0, 0)
 ) -> list[Panel]:
     """The six sides of a box whose middle stands at `centre_m`, turned by `rpy_rad`."""
-    T = se3.from_xyz_rpy(np.array(list(centre_m), float), np.array(list(rpy_rad), float))
-    x, y, z = np.array(list(size_m), float)[:, None] * T[:3, :3].T
+    T = se3.from_xyz_rpy(centre_m, rpy_rad)
+    x, y, z = np.array(size_m)[:, None] * T[:3, :3].T
     low, high = T[:3, 3] - (x + y + z) / 2, T[:3, 3] + (x + y + z) / 2
     sides = [(low, y, x), (low, z, y), (low, x, z), (high, -x, -y), (high, -y, -z), (high, -z, -x)]
     return [Panel(corner, along, up, material) for corner, along, up in sides]
 
 
-def _standing(x: float, y: float, size_m: tuple[float, float, float], material: str, yaw: float = 0):
+def _standing(x: float, y: float, size_m: Triple, material: str, yaw: float = 0.0) -> list[Panel]:
+    """A box on the floor."""
     return _box((x, y, size_m[2] / 2 + 0.002), size_m, material, (0, 0, yaw))
 
 
 def _table(x: float, y: float, yaw: float) -> list[Panel]:
     top = _box((x, y, 0.74), (1.4, 0.7, 0.04), "wood_panel", (0, 0, yaw))
-    R = se3.from_xyz_rpy(np.zeros(3), np.array([0, 0, yaw]))[:2, :2]
-    for corner in ((0.64, 0.3), (0.64, -0.3), (-0.64, 0.3), (-0.64, -0.3)):
-        foot = np.array([x, y]) + R @ np.array(corner)
-        top += _standing(foot[0], foot[1], (0.06, 0.06, 0.71), "metal_cabinet", yaw)
-    return top
+    corners = [(a, b, 0) for a in (0.64, -0.64) for b in (0.3, -0.3)]
+    feet = se3.apply(se3.from_xyz_rpy((x, y, 0), (0, 0, yaw)), np.array(corners))
+    legs = [_standing(*foot[:2], (0.06, 0.06, 0.71), "metal_cabinet", yaw) for foot in feet]
+    return [panel for part in (top, *legs) for panel in part]
 
 
 def _shelf(x: float, y: float) -> list[Panel]:
@@ -201,7 +203,7 @@ def _furniture(rng: np.random.Generator) -> list[Panel]:
         _box((-3.985, -1.4, 1.6), (0.02, 0.8, 1.1), "paper"),
         _box((-2.7, -2.985, 1.5), (0.7, 0.02, 0.5), "sticker"),
         _box((3.985, 1.9, 1.5), (0.02, 0.5, 0.7), "sticker"),
-        [Panel(np.array([0.2, -2.85, 0.05]), 2.4 * np.eye(3)[0], 2.6 * np.eye(3)[2], "curtain", 0.05)],
+        [Panel(np.array([0.2, -2.85, 0.05]), 2.4 * X, 2.6 * Z, "curtain", 0.03)],
     ]
     leaning = ["foam", "whiteboard", "plastic_white", "cardboard", "plastic_red", "wood_panel"]
     places = [(-3.0, 2.0), (-3.1, -0.9), (-1.4, -2.4), (2.9, -0.7), (1.6, 2.3), (3.0, 1.7)]

@@ -172,7 +172,7 @@ def write(
     """
     rng = np.random.default_rng(seed)
     hardware = drawn(rng)
-    rig = {name: part for name, part in (_rig() | changes).items() if part is not None}
+    rig = {name: part for name, part in (drawing() | changes).items() if part is not None}
     (folder / "scans").mkdir(parents=True)
     (folder / "reference").mkdir()
     (folder / "rig.yaml").write_text(yaml.safe_dump(rig, sort_keys=False))
@@ -213,7 +213,8 @@ def _targets(offset_m: np.ndarray, rng: np.random.Generator) -> list[dict]:
     return rows
 
 
-def _rig() -> dict:
+def drawing() -> dict:
+    """What rig.yaml says."""
     keys = ("parent", "xyz_m", "rpy_rad", "sigma_m", "sigma_rad")
     frames = {name: dict(zip(keys, map(_plain, row), strict=True)) for name, row in FRAMES.items()}
     return {

@@ -60,7 +60,7 @@ def test_a_basis_has_the_shape_of_its_site(effect, views):
             *shape(effect.site, view.rig),
         )
         assert basis.index.shape == (view.rows,)
-        assert -1 <= basis.index.min() and basis.index.max() < basis.size
+        assert basis.index.min() >= -1 and basis.index.max() < basis.size
         moves = np.bincount(basis.index[basis.index >= 0], minlength=basis.size) > 0
         basis = basis.values
     else:

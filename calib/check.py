@@ -1,0 +1,223 @@
+"""What a recording holds, what is wrong with it, and what can be estimated from it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from calib import inventory
+from calib import problem as problems
+from calib.calibrate import solution_of
+from calib.fit import Estimate, Progress, _Loop
+from calib.forward import Values
+from calib.inventory import PlacedScan, ScanSums
+from calib.model import Model, Source
+from calib.problem import Problem
+from calib.residuals.scan import ScanStop
+from calib.rig import Rig, load_rig
+from chains.errors import InputError
+from sensors.recording import Recording, read_scan
+from sensors.reference import Reference
+from sensors.stops import read_targets
+
+MOST_SCANS = 20  # of which one linearisation tells what can be estimated
+TOLD = 0.99  # of the prior's sigma left: less than that, and the data say something
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Check:
+    """What was found in a recording.
+
+    Args:
+        contents: what is there: its name, and how much of it.
+        problems: what is wrong and keeps a fit from running, a sentence each.
+        odd: what is no error and yet worth a look, a sentence each.
+        expected: link -> unit -> rough sigma of the worst of its parameters that the data tell.
+        cannot: a `name` and a `why` for what the data could not tell.
+    """
+
+    contents: list[tuple[str, str]] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)
+    odd: list[str] = field(default_factory=list)
+    expected: dict[str, dict[str, float]] = field(default_factory=dict)
+    cannot: list[dict[str, str]] = field(default_factory=list)
+
+    @property
+    def can(self) -> list[str]:
+        """What can be estimated and about how well, a line each."""
+        return [
+            f"{link}: {', '.join(f'{value:.2g} {unit}'.rstrip() for unit, value in sigma.items())}"
+            for link, sigma in self.expected.items()
+        ]
+
+    def document(self) -> dict[str, Any]:
+        """As ``--json`` prints it."""
+        return {
+            "contents": dict(self.contents),
+            "problems": self.problems,
+            "odd": self.odd,
+            "can": self.can,
+            "expected_sigma": self.expected,
+            "cannot": self.cannot,
+        }
+
+
+def check(folder: Path | str, progress: Progress = lambda what, done, total: None) -> Check:
+    """Read all of a recording, each part apart, and try its graph.
+
+    What can be estimated comes from the joint marginals of one linearisation at the start, of the
+    default model and at most 20 of the scans.
+
+    Raises:
+        InputError: there is no such folder.
+    """
+    from threadpoolctl import threadpool_limits
+
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(f"{folder}: there is no such folder; a recording is one, with a rig.yaml")
+    with threadpool_limits(limits=1):
+        found = Check()
+        _Checker(folder, found, progress).run()
+    return found
+
+
+@dataclass
+class _Checker:
+    """Fills a check, part by part."""
+
+    folder: Path
+    found: Check
+    progress: Progress
+
+    def run(self) -> None:
+        """Look at every part; at the graph, if those it is made of are all right."""
+        found, folder = self.found, self.folder
+        rig = self._attempt(load_rig, folder)
+        recording = self._attempt(_open, folder, rig)
+        targets = (
+            recording.targets
+            if recording
+            else self._attempt(read_targets, folder / "targets.csv")
+        )
+        if rig:
+            found.contents.extend(inventory.of_rig(rig))
+        if rig and recording:
+            found.contents.extend(inventory.of_stops(recording))
+            found.odd.extend(inventory.odd_stops(rig, recording))
+        scans = self._read_scans(rig)
+        if rig and recording:
+            found.odd.extend(inventory.odd_scans(rig, recording, scans))
+        if targets:
+            found.contents.extend(inventory.of_targets(targets))
+        reference = self._read_mesh(rig)
+        if rig and recording and (reference or not rig.reference):
+            self._try_graph(Source(rig, recording, reference), scans)
+
+    def _attempt(self, function: Callable[..., T], *args: Any) -> T | None:
+        """What the function returns, or None where it found a problem, which is noted once."""
+        try:
+            return function(*args)
+        except InputError as error:
+            if str(error) not in self.found.problems:
+                self.found.problems.append(str(error))
+            return None
+
+    def _read_scans(self, rig: Rig | None) -> ScanSums:
+        paths = sorted((self.folder / "scans").glob("*.parquet"))
+        rings = rig.lidar.rings if rig and rig.lidar else None
+        scans = ScanSums(rings=np.zeros(rings or 0, int))
+        for i, path in enumerate(paths):
+            self.progress("reading scans", i, len(paths))
+            scan = self._attempt(read_scan, path, rings)
+            if scan is not None:
+                scans.add(path.stem, scan)
+        if scans.points:
+            self.found.contents.extend(inventory.of_scans(scans))
+        return scans
+
+    def _read_mesh(self, rig: Rig | None) -> Reference | None:
+        if rig is None or rig.reference is None:
+            return None
+        spec = rig.reference
+        self.progress("reading the mesh", 0, 1)
+        reference = self._attempt(Reference.read, spec.mesh, spec.faces, spec.labels)
+        if reference is not None:
+            self.found.contents.extend(inventory.of_mesh(reference))
+        return reference
+
+    def _try_graph(self, source: Source, scans: ScanSums) -> None:
+        """Build the graph and linearise it once, without scans that are a problem already."""
+        problem = self._attempt(problems.build, [source], Model())
+        if problem is None:
+            return
+        readable = [scan for scan in problem.scans if scan.name in scans.points]
+        readable = readable[:: -(-len(readable) // MOST_SCANS) or 1]
+        problem.scans, placed = [], []
+        for i, scan in enumerate(readable):
+            self.progress("placing scans", i, len(readable))
+            at = self._attempt(_place, scan, problem.initial)
+            if at is not None:
+                problem.scans.append(scan)
+                placed.append(at)
+        if placed:
+            self.found.contents.extend(inventory.of_beams(placed))
+            self.found.odd.extend(inventory.odd_beams(placed))
+        estimate = self._attempt(_preview, problem, self.progress)
+        if estimate is not None:
+            self.found.expected.update(_expected(estimate))
+            self.found.cannot.extend(solution_of(problem, estimate).not_estimated)
+
+
+def _open(folder: Path, rig: Rig | None) -> Recording:
+    """The recording, its joints and bodies included where the rig says which they are."""
+    if rig is None:
+        return Recording.open(folder, (), ())
+    bodies = rig.tracker.bodies if rig.tracker else ()
+    return Recording.open(folder, rig.joint_names, bodies, rig.lidar.rings if rig.lidar else None)
+
+
+def _place(scan: ScanStop, values: Values) -> PlacedScan:
+    rows = scan.rows(values)
+    met = rows.weight > 0
+    return PlacedScan(
+        scan.name,
+        scan.pose(values),
+        float(rows.usable.mean()),
+        rows.view["range_m"][met],
+        rows.view["incidence_rad"][met],
+        float(np.median(np.abs(rows.residual_m[rows.usable]))),
+    )
+
+
+def _preview(problem: Problem, progress: Progress) -> Estimate:
+    """What a fit would know, from one linearisation at the start."""
+    loop = _Loop(problem, None, progress)
+    loop.solve_without_scans()
+    if problem.scans:
+        loop.fix_association()
+        loop.add_surface_unknowns()
+        loop.run(loop.scans, np.inf, associate=False)
+    return loop.estimate(converged=False)
+
+
+def _expected(estimate: Estimate) -> dict[str, dict[str, float]]:
+    """Per link and unit the worst sigma that the data tell; lengths in mm, angles in mrad."""
+    sigma = np.sqrt(np.diag(estimate.covariance))
+    shown = {"m": ("mm", 1e3), "rad": ("mrad", 1e3)}
+    out: dict[str, dict[str, float]] = {}
+    start = 0
+    for v in estimate.variables:
+        for unit, prior, now in zip(v.units, v.sigma, sigma[start : start + v.dim], strict=True):
+            if now < TOLD * prior:
+                name, scale = shown.get(unit, (unit, 1.0))
+                link = out.setdefault(v.name, {})
+                link[name] = max(link.get(name, 0.0), float(scale * now))
+        start += v.dim
+    return out

@@ -1,0 +1,223 @@
+"""What a recording holds, in a line each, and what of it looks odd without being an error."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from calib.rig import Rig
+from sensors.recording import Recording, Scan
+from sensors.reference import Reference
+from sensors.stops import Targets
+
+FEW_LOCATIONS = 3  # below that no whole location can be held out
+STILL = 0.05  # rad or m that a joint travels: too little to tell its own errors
+LIMIT_SLACK = 1e-3  # rad or m beyond a joint's limit
+LEVEL_RAD = np.radians(3.0)
+NARROW_RAD = np.radians(30.0)
+FAR_OFF_M = 0.3  # median residual at the start: more than CAD is wrong by
+
+Line = tuple[str, str]
+
+
+@dataclass
+class ScanSums:
+    """What the readable scans hold, summed up while only one of them is in memory.
+
+    Args:
+        points: scan -> number of points.
+        sweeps: the most returns that were averaged into a point.
+        rings: (R,) points by ring.
+        columns: names of the per-point covariates.
+    """
+
+    points: dict[str, int] = field(default_factory=dict)
+    sweeps: int = 0
+    rings: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
+    columns: dict[str, None] = field(default_factory=dict)
+
+    def add(self, name: str, scan: Scan) -> None:
+        """Take in one scan."""
+        self.points[name] = len(scan.ring)
+        self.sweeps = max(self.sweeps, int(scan.count.max()))
+        rings = np.bincount(scan.ring, minlength=len(self.rings))
+        rings[: len(self.rings)] += self.rings
+        self.rings = rings
+        self.columns |= dict.fromkeys(scan.extra)
+
+
+@dataclass(frozen=True)
+class PlacedScan:
+    """A scan where the recording says that it was made.
+
+    Args:
+        name: of the stop.
+        T: (4, 4) T_reference_lidar.
+        share: of the beams that meet a surface.
+        range_m, incidence_rad: (n,) of those.
+        residual_m: median of their size.
+    """
+
+    name: str
+    T: np.ndarray
+    share: float
+    range_m: np.ndarray
+    incidence_rad: np.ndarray
+    residual_m: float
+
+
+# ---------------------------------------------------------------------------------- what is there
+
+
+def of_rig(rig: Rig) -> Iterator[Line]:
+    """The rig's instruments."""
+    parts = [f"{rig.lidar.name} with {rig.lidar.rings} rings"] if rig.lidar else []
+    parts += [f"arm of {counted(len(rig.joint_names), 'joint')}"] if rig.joint_names else []
+    parts += [f"{counted(len(rig.frame_sigma), 'frame')} from CAD"] if rig.frame_sigma else []
+    yield "rig", f"{rig.name}: {', '.join(parts) or 'nothing on it'}"
+
+
+def of_stops(recording: Recording) -> Iterator[Line]:
+    """Stops, locations, and how often each body is seen."""
+    count, locations = len(recording.stops), len(set(recording.location))
+    minutes = np.ptp(recording.time_s) / 60
+    yield "stops", f"{count} at {counted(locations, 'location')}, over {minutes:.0f} min"
+    for body, seen in _seen(recording).items():
+        yield body, f"seen at {seen.sum()} of {count} stops"
+    if recording.base_guess is not None:
+        given = np.isfinite(recording.base_guess).all(axis=1).sum()
+        yield "base_guess", f"given at {given} of {count} stops"
+    if recording.covariates:
+        yield "per-stop covariates", ", ".join(recording.covariates)
+
+
+def of_scans(scans: ScanSums) -> Iterator[Line]:
+    """Scans, their points, rings and covariates."""
+    low, high = min(scans.points.values()), max(scans.points.values())
+    points = f"{low:,}" if low == high else f"{low:,} to {high:,}"
+    sweeps = f", up to {scans.sweeps} sweeps averaged" if scans.sweeps > 1 else ""
+    yield "scans", f"{len(scans.points)} of {points} points{sweeps}"
+    yield "rings", f"{np.count_nonzero(scans.rings)} of {len(scans.rings)} seen"
+    if scans.columns:
+        yield "per-point covariates", ", ".join(scans.columns)
+
+
+def of_targets(targets: Targets) -> Iterator[Line]:
+    """How many targets hang, and how far apart."""
+    yield "targets", f"{len(targets.names)} within {_size(targets.faro_m)}"
+
+
+def of_mesh(reference: Reference) -> Iterator[Line]:
+    """The mesh's size, and its labels."""
+    triangles, surfaces = len(reference.triangles), int(reference.surface.max()) + 1
+    size = _size(reference.vertices_m)
+    yield "mesh", f"{triangles:,} triangles in {counted(surfaces, 'surface')}, {size}"
+    yield "labels", ", ".join(reference.label_names.values())
+
+
+def of_beams(placed: Sequence[PlacedScan]) -> Iterator[Line]:
+    """What the beams meet, where the recording says that they were sent out."""
+    share = np.mean([p.share for p in placed])
+    near, far = _nine_tenths([p.range_m for p in placed])
+    low, high = np.degrees(_nine_tenths([p.incidence_rad for p in placed]))
+    yield (
+        "beams",
+        f"{share:.0%} meet a surface, nine tenths of them at {near:.1f} to {far:.1f} m and "
+        f"{low:.0f} to {high:.0f} deg from its normal",
+    )
+
+
+# ---------------------------------------------------------------------------------- what looks odd
+
+
+def odd_stops(rig: Rig, recording: Recording) -> Iterator[str]:
+    """Too few locations, bodies that are hardly seen, joints beyond limits or at rest."""
+    names = np.array(recording.stops)
+    if (locations := len(set(recording.location))) < FEW_LOCATIONS:
+        yield (
+            f"all stops stand at {counted(locations, 'location')}; with {FEW_LOCATIONS} or more, "
+            "whole locations can be held out of a fit"
+        )
+    seen = _seen(recording)
+    for body, at in seen.items():
+        if at.sum() < len(at) / 2:
+            yield f"{body} is seen at {at.sum()} of {len(at)} stops only; look for what hides it"
+    if seen and (unseen := names[~np.any(list(seen.values()), axis=0)]).size:
+        yield f"no tracked body is seen at {_listed(unseen)}; give them a base_guess, or see one"
+    joints = {e.joint.name: e.joint for e in rig.tree.edges if e.joint is not None}
+    for name, at in zip(rig.joint_names, recording.joints.T, strict=True):
+        joint, unit = joints[name], "rad" if joints[name].kind == "revolute" else "m"
+        beyond = (at < joint.lower - LIMIT_SLACK) | (at > joint.upper + LIMIT_SLACK)
+        if beyond.any():
+            yield (
+                f"{name} is beyond its limits of {joint.lower:g} to {joint.upper:g} {unit} at "
+                f"{_listed(names[beyond])}; check its sign, zero and unit"
+            )
+        if np.ptp(at) < STILL:
+            yield f"{name} moves by {np.ptp(at):.2g} {unit} in all, too little to tell its errors"
+
+
+def odd_scans(rig: Rig, recording: Recording, scans: ScanSums) -> Iterator[str]:
+    """Scans without stop, stops without scan, rings without points."""
+    if stray := sorted(scans.points.keys() - set(recording.stops)):
+        yield f"scans/ holds {_listed(stray)}, but stops.csv has no such stop; they are not used"
+    if not scans.points:
+        return
+    if rig.lidar is None:
+        yield "there are scans, but no 'lidar' in rig.yaml, so they are not used"
+        return
+    if not recording.has_scan.all():
+        missing = np.array(recording.stops)[~recording.has_scan]
+        yield f"there is no scan of {_listed(missing)}, though of other stops"
+    if (silent := np.flatnonzero(scans.rings == 0)).size:
+        yield f"no point comes from ring {_listed(silent)}; rings are counted from 0"
+
+
+def odd_beams(placed: Sequence[PlacedScan]) -> Iterator[str]:
+    """Views that are all alike, and scans that lie beside what they should meet."""
+    spin = np.array([p.T[:3, 2] for p in placed])
+    if len(spin) > 1 and np.arccos(np.clip(spin @ spin[0], -1, 1)).max() < LEVEL_RAD:
+        yield (
+            "the LiDAR's spin axis points the same way at all stops, so what shifts the LiDAR "
+            "along it looks like a shift of the room; tilt it at some stops"
+        )
+    low, high = _nine_tenths([p.incidence_rad for p in placed])
+    if high - low < NARROW_RAD:
+        low, high = np.degrees([low, high])
+        yield (
+            f"beams meet surfaces at {low:.0f} to {high:.0f} deg from their normal only; what "
+            "depends on incidence cannot be told from an offset"
+        )
+    off = [p.name for p in placed if p.residual_m > FAR_OFF_M]
+    if off:
+        yield (
+            f"at {_listed(off)} half of the beams end more than {FAR_OFF_M:g} m from the surface "
+            "that they should meet; check base_guess, tracker and targets"
+        )
+
+
+def counted(n: int, what: str) -> str:
+    """A number of things, in words."""
+    return f"{n:,} {what}" if n == 1 else f"{n:,} {what}s"
+
+
+def _seen(recording: Recording) -> dict[str, np.ndarray]:
+    return {body: np.isfinite(pose[:, 0]) for body, pose in recording.bodies.items()}
+
+
+def _size(points_m: np.ndarray) -> str:
+    return " x ".join(f"{m:.1f}" for m in np.ptp(points_m, axis=0)) + " m"
+
+
+def _nine_tenths(parts: Sequence[np.ndarray]) -> np.ndarray:
+    """The range (2,) in which nine tenths of the values lie."""
+    return np.quantile(np.concatenate(parts), [0.05, 0.95])
+
+
+def _listed(names: Sequence[Any], most: int = 3) -> str:
+    """The first few names, and how many more there are."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(map(str, names[:most])) + more

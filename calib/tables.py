@@ -1,0 +1,306 @@
+"""What people read in a terminal: tables in mm and mrad, at most 100 columns wide."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rich.console import Console
+from rich.padding import Padding
+from rich.table import Table
+
+from calib.estimates import Found, comparison, found
+
+__all__ = [
+    "comparison",
+    "effect_page",
+    "print_catalogue",
+    "print_check",
+    "print_comparison",
+    "print_run",
+]
+
+if TYPE_CHECKING:
+    from calib.check import Check
+    from calib.effects import Effect
+    from calib.run import Run
+
+WIDTH = 100
+LISTED = 12  # an effect of more parameters than these is summarised
+ABREAST = 3  # runs in one table
+ERROR_LABELS = {
+    "nominal": "before, all as in CAD",
+    "fit": "after the fit",
+    "held_out": "after, of stops held out",
+    "noise_floor": "noise floor, if the model were right",
+}
+SHOWN = {"m": (1e3, "mm"), "rad": (1e3, "mrad"), "1": (1.0, "")}
+
+
+def print_check(check: Check) -> None:
+    """Print what a recording holds, what is wrong, and what can be estimated from it."""
+    console = _console()
+    _grid(console, "what is there", check.contents)
+    if check.problems:
+        _grid(console, "what is wrong", [("", problem) for problem in check.problems])
+    if check.odd:
+        _grid(console, "what is worth a look", [("", sentence) for sentence in check.odd])
+    _grid(console, "what can be estimated", [("", line) for line in check.can or ["nothing"]])
+    _print_reasons(console, "what cannot", check.cannot)
+
+
+def print_run(run: Run) -> None:
+    """Print a run: every link and effect with its sigma, the errors, and what was not told."""
+    console, rows = _console(), found(run)
+    summary = run.summary
+    console.print(f"{run.folder}: {_outcome(summary)}\n")
+    console.print(_links_table([row for row in rows if row.parent is not None]))
+    effects = [row for row in rows if row.parent is None]
+    if effects:
+        console.print(_effects_table(effects))
+    console.print(_error_table(summary))
+    if "links" in summary:
+        _print_moved(console, summary["links"])
+    _print_reasons(console, "not told by the data", run.solution.not_estimated)
+
+
+def print_comparison(runs: Sequence[Run]) -> None:
+    """Print errors, noise floor and parameters of runs side by side."""
+    console = _console()
+    for run in runs:
+        console.print(f"{run.folder}: {_model(run)}; {_outcome(run.summary)}")
+    for start in range(0, len(runs), ABREAST):
+        console.print()
+        console.print(_comparison_table(runs[start : start + ABREAST]))
+
+
+def effect_page(effect: Effect) -> dict[str, Any]:
+    """The catalogue's page of an effect."""
+    return {
+        "name": effect.name,
+        "what": (effect.__doc__ or "").split("\n\n")[0].replace("``", "").strip(),
+        "site": effect.site.value,
+        "formula": effect.formula,
+        "typical": effect.typical,
+        "covariates": effect.covariates,
+        "confounded_with": list(effect.confounded_with),
+        "source": effect.source,
+    }
+
+
+def print_catalogue(effects: Sequence[Effect], whole: bool) -> None:
+    """Print the catalogue as a list, or the whole page of each effect."""
+    console = _console()
+    pages = [effect_page(effect) for effect in effects]
+    if whole:
+        for page in pages:
+            page["confounded_with"] = ", ".join(page["confounded_with"])
+            name = page.pop("name")
+            _grid(console, name, [(k.replace("_", " "), text) for k, text in page.items() if text])
+        return
+    table = _table("effect", "where", "size", "what")
+    for page in pages:
+        table.add_row(page["name"], page["site"], page["typical"], page["what"])
+    console.print(table)
+
+
+# ---------------------------------------------------------------------------------------- numbers
+
+
+def _shown(unit: str) -> tuple[float, str]:
+    """Factor and unit in which a unit is shown; mixed ones as a list."""
+    scaled = [SHOWN.get(part, (1.0, part)) for part in unit.split(", ")]
+    return scaled[0][0], ", ".join(name for _, name in scaled)
+
+
+def _cell(estimate: float, sigma: float, unit: str) -> str:
+    """An estimate and its sigma in the unit shown, as ``+1.234 ± 0.056``."""
+    if sigma == 0.0:
+        return "held"
+    scale, _ = _shown(unit)
+    sigma = scale * sigma
+    if scale == 1.0:
+        spread, value = f"± {sigma:.2g}", f"{estimate:+.4g}"
+    else:
+        digits = 2 if sigma >= 0.095 else 3
+        spread, value = f"± {sigma:.{digits}f}", f"{scale * estimate:+z.{digits}f}"
+    return spread if np.isnan(estimate) else f"{value} {spread}"
+
+
+def _mm(value: float | None, sign: str = "") -> str:
+    return "" if value is None else f"{value:{sign}z.2f}"
+
+
+# ----------------------------------------------------------------------------------------- tables
+
+
+def _console() -> Console:
+    console = Console(markup=False, highlight=False, emoji=False)
+    console.width = min(console.width, WIDTH) if console.is_terminal else WIDTH
+    return console
+
+
+def _table(*columns: str) -> Table:
+    table = Table(box=None, padding=(0, 2, 0, 0), header_style="bold", pad_edge=False)
+    for column in columns:
+        table.add_column(column)
+    return table
+
+
+def _grid(console: Console, title: str, rows: Iterable[tuple[str, str]]) -> None:
+    console.print(title, style="bold")
+    table = _table("", "")
+    table.show_header = False
+    for name, text in rows:
+        table.add_row(name, text)
+    console.print(Padding(table, (0, 0, 1, 2)))
+
+
+def _links_table(rows: Sequence[Found]) -> Table:
+    table = _table("moved from CAD, own axes", "x", "y", "z", "", "not told by the data")
+    for row in rows:
+        for part, unit in ((slice(3, 6), "m"), (slice(0, 3), "rad")):
+            cells = map(_cell, row.estimate[part], row.sigma[part], (unit,) * 3)
+            untold = " ".join(np.array(["x", "y", "z"])[~row.told[part]])
+            label = f"{row.parent} -> {row.variable}" if unit == "m" else ""
+            table.add_row(label, *cells, _shown(unit)[1], untold)
+    table.add_row()
+    return table
+
+
+def _effects_table(rows: Sequence[Found]) -> Table:
+    table = _table("effect", "parameter", "estimate", "", "")
+    for row in rows:
+        name = row.variable
+        for parameter, cell, unit, told in _effect_cells(row):
+            table.add_row(name, parameter, cell, unit, "" if told else "not told")
+            name = ""
+    table.add_row()
+    return table
+
+
+def _effect_cells(row: Found) -> Iterable[tuple[str, str, str, bool]]:
+    """Parameter, its cell, unit and whether it was told: one by one, or a summary of many."""
+    if len(row.parameters) > LISTED:
+        free = row.sigma > 0
+        yield f"{free.sum()} values", *_summary_cell(row, free), bool(row.told[free].all())
+        return
+    for parameter, unit, *numbers, told in zip(
+        row.parameters, row.units, row.estimate, row.sigma, row.told, strict=True
+    ):
+        if numbers[1]:
+            yield parameter, _cell(*numbers, unit), _shown(unit)[1], told
+
+
+def _summary_cell(row: Found, free: np.ndarray) -> tuple[str, str]:
+    scale, unit = _shown(row.units[0])
+    values = scale * row.estimate[free]
+    if not len(values):
+        return "held", unit
+    digits = ".2f" if scale != 1.0 else ".3g"
+    return (
+        f"mean {values.mean():+{digits}}, sd {values.std():{digits}}, {values.min():+{digits}} to "
+        f"{values.max():+{digits}}, median sigma {scale * np.median(row.sigma[free]):.2g}"
+    ), unit
+
+
+def _error_table(summary: Mapping[str, Any]) -> Table:
+    table = _table(f"{summary['residual']} residual, mm", "rms", "mean", "std")
+    for column in table.columns[1:]:
+        column.justify = "right"
+    for kind, label in ERROR_LABELS.items():
+        rms, mean, std = (summary[error].get(kind) for error in ("rms_mm", "mean_mm", "std_mm"))
+        if rms is not None:
+            table.add_row(label, _mm(rms), _mm(mean, "+"), _mm(std))
+    table.add_row()
+    return table
+
+
+def _print_moved(console: Console, links: Sequence[Mapping[str, Any]]) -> None:
+    """What has moved since the run that was the prior, and what has not."""
+    rows, still, silent = [], [], []
+    for link in links:
+        if link["moved"]:
+            rows.append((link["name"], f"{_change(link)}; p = {link['p_value']:.1g}"))
+        elif link["p_value"] is None:
+            silent.append(link["name"])
+        else:
+            still.append(f"{link['name']} (p = {link['p_value']:.2g})")
+    rows = rows or [("nothing", "no change is beyond the uncertainty of then and now")]
+    _grid(console, "moved since the earlier run", rows)
+    if still:
+        _grid(console, "not moved", [("", ", ".join(still))])
+    if silent:
+        _grid(console, "the new data say nothing of", [("", ", ".join(silent))])
+
+
+def _change(link: Mapping[str, Any]) -> str:
+    """By how much a link moved: lengths and angles, parameter by parameter where they are few."""
+    texts = []
+    for unit in dict.fromkeys(link["units"]):
+        mine = [i for i, u in enumerate(link["units"]) if u == unit]
+        cells = [
+            f"{link['parameters'][i]} {_cell(link['change'][i], link['sigma'][i], unit)}"
+            for i in mine
+        ]
+        if len(mine) > LISTED:
+            rms = np.sqrt(np.mean(np.square([link["change"][i] for i in mine])))
+            cells = [f"{len(mine)} values by {_shown(unit)[0] * rms:.2f} rms"]
+        texts.append(f"{', '.join(cells)} {_shown(unit)[1]}".rstrip())
+    return "; ".join(texts[::-1])
+
+
+def _print_reasons(console: Console, title: str, entries: Sequence[Mapping[str, str]]) -> None:
+    """Names and why, entries with the same explanation after the colon together."""
+    groups: dict[str, list[tuple[str, str]]] = defaultdict(list)
+    for entry in entries:
+        tied, colon, why = entry["why"].partition(": ")
+        groups[why if colon else tied].append((entry["name"], tied if colon else ""))
+    for why, rows in groups.items():
+        _grid(console, f"{title}: {why}", rows)
+
+
+def _comparison_table(runs: Sequence[Run]) -> Table:
+    compared = comparison(runs)
+    table = _table("", "", *(run.folder.name or str(run.folder) for run in runs))
+    for error in ("rms_mm", "mean_mm", "std_mm"):
+        for kind, label in ERROR_LABELS.items():
+            values = compared[error].get(kind, ())
+            if any(value is not None for value in values):
+                cells = (_mm(value, "+" if error == "mean_mm" else "") for value in values)
+                table.add_row(f"{error[:-3]} {label}", "mm", *cells)
+    for variable, parameters in compared["parameters"].items():
+        if len(parameters) > LISTED:
+            _add_spread(table, variable, list(parameters.values()))
+            continue
+        for name, entry in parameters.items():
+            numbers = zip(entry["estimate"], entry["sigma"], strict=True)
+            cells = ("" if s is None else _cell(e, s, entry["unit"]) for e, s in numbers)
+            table.add_row(f"{variable}.{name}", _shown(entry["unit"])[1], *cells)
+    return table
+
+
+def _add_spread(table: Table, variable: str, entries: Sequence[Mapping[str, Any]]) -> None:
+    """Mean and standard deviation, per run, over an effect's many parameters."""
+    scale, unit = _shown(entries[0]["unit"])
+    estimates = np.array([entry["estimate"] for entry in entries], float).T
+    for what, function in (("mean", np.mean), ("sd", np.std)):
+        present = (each[~np.isnan(each)] for each in estimates)
+        cells = (f"{scale * function(each):+.3g}" if len(each) else "" for each in present)
+        table.add_row(f"{variable}, {what}", unit, *cells)
+
+
+def _model(run: Run) -> str:
+    model = run.model
+    text = ", ".join(model["effects"]) or "no effects"
+    text += f"; fixed {', '.join(model['fixed'])}" if model["fixed"] else ""
+    return text + (f"; from {model['prior']}" if model["prior"] else "")
+
+
+def _outcome(summary: Mapping[str, Any]) -> str:
+    settled = "converged" if summary["converged"] else "NOT CONVERGED"
+    points = f"{summary['points']} points at " if summary["points"] else ""
+    passes = f"{settled} in {summary['iterations']} passes, {summary['seconds']:.0f} s"
+    return f"{points}{summary['stops']} stops; {passes}"
