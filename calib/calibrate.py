@@ -195,7 +195,7 @@ def _write_residuals(
         total += scan_errors(scan, estimate.values, association, None)
     if not estimate.scans:
         bodies = [b for b in problem.blocks if isinstance(b, TrackedBody)]
-        total = body_errors(bodies, estimate.values)
+        total = body_errors(bodies, estimate.values, None)
     return total
 
 

@@ -83,12 +83,18 @@ def _predicted_variance(
     return np.einsum("ni,ij,nj->n", by_twist, twist, by_twist)
 
 
-def body_errors(blocks: Sequence[TrackedBody], values: Mapping[str, np.ndarray]) -> Errors:
-    """Distances between tracked and predicted positions of bodies."""
+def body_errors(
+    blocks: Sequence[TrackedBody], values: Mapping[str, np.ndarray], graph: Graph | None
+) -> Errors:
+    """Distances between tracked and predicted positions of bodies; arguments as above."""
     out = Errors()
     for block in blocks:
         placed = block.stops.in_world(block.body, values)
         distance = np.linalg.norm(block.measured[:, :3, 3] - placed.T[:, :3, 3], axis=1)
         expected = 3.0 * block.sigma_m**2 * len(distance)
+        if graph is not None:
+            names = list(placed.d)
+            d = np.concatenate([placed.d[name][:, 3:] for name in names], axis=2)
+            expected += np.einsum("kip,pq,kiq->", d, graph.covariance(values, names), d)
         out += Errors(len(distance), float(distance.sum()), float(distance @ distance), expected)
     return out

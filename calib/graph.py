@@ -121,14 +121,26 @@ class Graph:
     def covariance(self, values: Values, names: Sequence[str]) -> np.ndarray:
         """Joint marginal covariance of the named variables' tangents, in the order given.
 
-        GTSAM eliminates all other variables; what then stands in the last rows of the Bayes net is
-        the square root of the inverse of this covariance.
+        GTSAM eliminates all other variables first; what the Bayes net then says of those named is
+        the square root R of the inverse of this covariance.
         """
         linear = self._graph.linearize(self._to_gtsam(values))
         net = linear.eliminateSequential(self._ordering(names), gtsam.EliminateQR)
-        size = sum(self.variables[name].dim for name in names)
-        root = solve_triangular(net.matrix()[0][-size:, -size:], np.eye(size))
-        return root @ root.T
+        at = self._positions(net)
+        found = np.sort(np.concatenate([at[name] for name in names]))
+        root = solve_triangular(net.matrix()[0][np.ix_(found, found)], np.eye(len(found)))
+        order = np.searchsorted(found, np.concatenate([at[name] for name in names]))
+        return (root @ root.T)[np.ix_(order, order)]
+
+    def _positions(self, net: gtsam.GaussianBayesNet) -> dict[str, np.ndarray]:
+        """Rows of each variable in the net's matrix: parts that nothing connects come one by one."""
+        names = list(self.variables)
+        at, start = {}, 0
+        for i in range(net.size()):
+            name = names[net.at(i).keys()[0]]
+            at[name] = np.arange(start, start + self.variables[name].dim)
+            start += self.variables[name].dim
+        return at
 
     def touched(self, values: Values, names: Sequence[str]) -> np.ndarray:
         """Whether any row but a prior depends on each parameter of the named variables: (P,) bool."""

@@ -79,7 +79,7 @@ def predict(unseen: Problem, trained: Problem, estimate: Estimate) -> Errors:
     predicted = solve(unseen, prior)
     if not scans:
         judged = [b for b in bodies if b not in unseen.blocks and b.stops.root in told]
-        return body_errors(judged, predicted.values)
+        return body_errors(judged, predicted.values, predicted.graph)
     return sum((_scan(scan, predicted, scan.stops.root in told) for scan in scans), Errors())
 
 

@@ -55,7 +55,8 @@ def print_run(run: Run) -> None:
     """Print a run: every link and effect with its sigma, the errors, and what was not told."""
     console, rows = _console(), found(run)
     summary = run.summary
-    console.print(f"{run.folder}: {_outcome(summary)}\n")
+    console.print(str(run.folder), style="bold", soft_wrap=True)
+    console.print(f"{_outcome(summary)}\n")
     console.print(_links_table([row for row in rows if row.parent is not None]))
     effects = [row for row in rows if row.parent is None]
     if effects:
@@ -70,7 +71,8 @@ def print_comparison(runs: Sequence[Run]) -> None:
     """Print errors, noise floor and parameters of runs side by side."""
     console = _console()
     for run in runs:
-        console.print(f"{run.folder}: {_model(run)}; {_outcome(run.summary)}")
+        console.print(str(run.folder), style="bold", soft_wrap=True)
+        console.print(f"{_model(run)}; {_outcome(run.summary)}")
     for start in range(0, len(runs), ABREAST):
         console.print()
         console.print(_comparison_table(runs[start : start + ABREAST]))

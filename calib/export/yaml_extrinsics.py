@@ -154,7 +154,7 @@ class _Part(Document):
 class _File(_Part):
     format: Literal[FORMAT]
     units: dict[str, str]
-    conventions: dict[str, str]
+    conventions: dict[str, Any]
     provenance: dict[str, Any]
     not_estimated: tuple[dict[str, str], ...]
     recordings: dict[str, _Part]

@@ -27,6 +27,7 @@ from calib.residuals.beams import (
 )
 from calib.residuals.rows import robust_scale, tukey_weight
 from calib.residuals.surfaces import Meeting
+from chains.errors import InputError
 from sensors.lidar import Beams, LidarModel, beams
 from sensors.recording import Recording, Scan
 
@@ -68,14 +69,14 @@ class ScanStop:
     def associate(self, values: Values, near_edges: bool) -> Association:
         """Which part of the surface each beam meets, at a state."""
         _, ray = self._read()
-        return self.meeting.associate(self.pose(values), ray, values, near_edges)
+        return self._associate(self.pose(values), ray, values, near_edges)
 
     def rows(self, values: Values, association: Association | None = None) -> Rows:
         """The stop's rows at a state; associated anew unless an association is given."""
         scan, ray = self._read()
         T = self.pose(values)
         if association is None:
-            association = self.meeting.associate(T, ray, values, near_edges=False)
+            association = self._associate(T, ray, values, near_edges=False)
         surface = self.meeting.meet(T, ray, values, association)
         view = self._view(scan, ray, surface)
         bases = {t.variable: (t.effect.site, t.basis(view)) for t in self.terms}
@@ -92,6 +93,14 @@ class ScanStop:
         rows = self.rows(values, association)
         frame = self.stops.rig.lidar_frame
         return compress(self.name, rows, self.stops, frame, self.pose(values), values)
+
+    def _associate(
+        self, T: np.ndarray, ray: Beams, values: Values, near_edges: bool
+    ) -> Association:
+        try:
+            return self.meeting.associate(T, ray, values, near_edges)
+        except InputError as error:
+            raise InputError(f"{self.recording.folder}: stop '{self.name}': {error}") from None
 
     def _read(self) -> tuple[Scan, Beams]:
         scan = self.recording.scan(self.index)

@@ -80,28 +80,28 @@ def drawn(rng: np.random.Generator) -> Hardware:
 
 
 def placed(frame: str, joints: Sequence[float], hardware: Hardware) -> RigidTransform:
-    """T_base_frame, link after link up to the root."""
+    """T_base_frame, link after link up to the root.
+
+    Joints and hardware may hold N cases along their first axis; so does what comes back then.
+    """
     if frame == "base":
         return RigidTransform.identity()
+    joints = np.asarray(joints)
     if frame in FRAMES:
         parent, xyz_m, rpy_rad, _, _ = FRAMES[frame]
-        twist = hardware.frames.get(frame, np.zeros(6))
-        return (
-            placed(parent, joints, hardware)
-            * pose(xyz_m, rpy_rad)
-            * RigidTransform.from_exp_coords(twist)
-        )
+        own = RigidTransform.from_exp_coords(hardware.frames.get(frame, np.zeros(6)))
+        return placed(parent, joints, hardware) * pose(xyz_m, rpy_rad) * own
     i = next(i for i, (_, child, *_) in enumerate(ARM.values()) if child == frame)
     kind, _, xyz_m, rpy_rad, axis = list(ARM.values())[i]
-    length_m = np.linalg.norm(xyz_m)
-    origin = pose(np.array(xyz_m) * (1 + hardware.link_m[i] / length_m), rpy_rad)
-    parent = "arm_base" if i == 0 else list(ARM.values())[i - 1][1]
-    screw = np.zeros(6)
+    longer_m = np.divide(xyz_m, np.linalg.norm(xyz_m)) * hardware.link_m[..., i, None]
+    origin = RigidTransform.from_translation(xyz_m + longer_m) * pose((0, 0, 0), rpy_rad)
     if axis:
-        q = joints[i] + hardware.joint[i]
-        screw[:3] = np.multiply(axis, q) if kind == "revolute" else 0
-        screw[3:] = np.multiply(axis, q) if kind == "prismatic" else 0
-    return placed(parent, joints, hardware) * origin * RigidTransform.from_exp_coords(screw)
+        q = (joints + hardware.joint)[..., i, None]
+        still = np.zeros_like(q * axis)
+        turn, slide = (q * axis, still) if kind == "revolute" else (still, q * axis)
+        origin = origin * RigidTransform.from_exp_coords(np.concatenate([turn, slide], axis=-1))
+    parent = "arm_base" if i == 0 else list(ARM.values())[i - 1][1]
+    return placed(parent, joints, hardware) * origin
 
 
 def room(offset_m: Sequence[float] = (0, 0, 0)) -> tuple[np.ndarray, np.ndarray]:

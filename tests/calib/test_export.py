@@ -137,7 +137,11 @@ def test_a_frame_that_contradicts_itself_is_refused(path):
     ("old", "new", "complaint"),
     [
         ("format: rigcal", "format: other", "is missing, so this is no export"),
-        ("sigma_rad:", "sigma_deg:", r"extrinsics.yaml:\d+: unknown key .*sigma_deg; .*sigma_rad"),
+        (
+            "sigma_rad: [",
+            "sigma_deg: [",
+            r"extrinsics.yaml:\d+: unknown key .*sigma_deg; .*sigma_rad",
+        ),
         ("offset_m:", "offset:", r"ring_range_offset: a row has ring, offset, sigma_m; each has"),
     ],
 )

@@ -1,0 +1,256 @@
+"""What people read: numbers in mm and mrad with their sigma, flags, and nothing too wide."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform
+
+from calib import tables
+from calib.check import Check
+from calib.effects import CATALOGUE
+from calib.run import EffectEstimate, FrameEstimate, Part, Run, Solution
+from sensors.documents import json_text
+
+from . import rigs
+
+DOF = ("rx", "ry", "rz", "tx", "ty", "tz")
+MOVED = np.array([0.0012, -0.0034, 0.0, 0.00123, -0.00456, 0.0])  # rad, m
+SIGMA = np.array([0.0004, 0.0005, 0.00004, 0.00045, 0.00012, 0.000021])
+WHY = "all that is measured changes alike; measure one of them directly to split it"
+SUMMARY = {
+    "points": 1234,
+    "stops": 4,
+    "residual": "range",
+    "rms_mm": {"nominal": 24.31, "fit": 3.34, "held_out": 3.47, "noise_floor": 3.62},
+    "mean_mm": {"nominal": 8.2, "fit": -0.001, "held_out": 0.02},
+    "std_mm": {"nominal": 22.9, "fit": 3.3, "held_out": 3.4},
+    "iterations": 9,
+    "converged": True,
+    "seconds": 5.2,
+}
+
+
+@pytest.fixture(scope="module")
+def box(tmp_path_factory):
+    return rigs.write(tmp_path_factory.mktemp("tables") / "box")
+
+
+@pytest.fixture
+def run(box, tmp_path):
+    """A run of the box rig whose lidar has moved by what `MOVED` says."""
+    parent, xyz_m, rpy_rad, *_ = rigs.FRAMES["lidar"]
+    T = (rigs.pose(xyz_m, rpy_rad) * RigidTransform.from_exp_coords(MOVED)).as_matrix()
+    frames = {
+        "lidar": FrameEstimate(parent, T, SIGMA[3:], SIGMA[:3]),
+        "faro": FrameEstimate("opti", np.eye(4), SIGMA[3:], SIGMA[:3]),
+    }
+    rings = tuple(f"ring_{k:03d}" for k in range(16))
+    effects = {
+        "arm_link_length": EffectEstimate(
+            "m", ("turn", "lift"), np.array([0.00211, 0.0]), np.array([0.00098, 0.0])
+        ),
+        "ring_range_offset": EffectEstimate(
+            "m", rings, np.linspace(-0.007, 0.009, 16), np.full(16, 0.00031)
+        ),
+        "a_scale": EffectEstimate("1", ("s",), np.array([1.234e-5]), np.array([2e-6])),
+    }
+    names = tuple(f"{frame}.{dof}" for frame in frames for dof in DOF)
+    untold = [
+        {"name": "lidar (rx … rz, ty)", "why": f"tied to mount: {WHY}"},
+        {"name": "arm_link_length.turn", "why": f"tied to faro.tz: {WHY}"},
+        {"name": "opti", "why": "no tracker"},
+    ]
+    model = {
+        "recordings": [{"path": str(box), "rig": "box", "sha256": "0"}],
+        "effects": list(effects),
+        "fixed": [],
+        "prior": None,
+    }
+    covariance = np.diag(np.tile(np.square(SIGMA), 2))
+    solution = Solution(Part(frames, effects), {}, untold, names, covariance)
+    return Run(tmp_path / "first", model, SUMMARY, solution)
+
+
+@pytest.fixture
+def printed(capsys):
+    """Print, and give the lines with runs of blanks squeezed, having checked their form."""
+
+    def lines(function, *args):
+        function(*args)
+        out = capsys.readouterr().out.splitlines()
+        assert max(len(line) for line in out if not line.startswith("/")) <= 100
+        assert not any("\x1b" in line for line in out)
+        return [re.sub(" +", " ", line).strip() for line in out]
+
+    return lines
+
+
+def after(lines, start):
+    """The lines that follow the one starting so."""
+    return lines[next(i for i, line in enumerate(lines) if line.startswith(start)) :]
+
+
+def test_a_link_is_shown_as_its_move_from_cad_with_sigma_and_flags(run, printed):
+    lines = printed(tables.print_run, run)
+    at = next(i for i, line in enumerate(lines) if line.startswith("mount -> lidar"))
+    assert lines[at] == "mount -> lidar +1.23 ± 0.45 -4.56 ± 0.12 +0.000 ± 0.021 mm y"
+    assert lines[at + 1] == "+1.20 ± 0.40 -3.40 ± 0.50 +0.000 ± 0.040 mrad x y z"
+
+
+def test_a_frame_that_no_cad_knows_is_shown_by_its_sigma(run, printed):
+    assert "opti -> faro ± 0.45 ± 0.12 ± 0.021 mm" in printed(tables.print_run, run)
+
+
+def test_a_recording_that_is_gone_leaves_the_sigmas(run, printed):
+    gone = [{"path": "/nowhere", "rig": "box", "sha256": "0"}]
+    lines = printed(tables.print_run, replace(run, model=run.model | {"recordings": gone}))
+    assert "mount -> lidar ± 0.45 ± 0.12 ± 0.021 mm y" in lines
+
+
+def test_what_belongs_to_one_rig_carries_its_name(run, printed):
+    own = Part({"lidar": run.solution.shared.frames["lidar"]}, {})
+    names = tuple(f"box/{n}" for n in run.solution.names)
+    solution = replace(run.solution, shared=Part(), recordings={"box": own}, names=names)
+    lines = printed(tables.print_run, replace(run, solution=solution))
+    assert any(re.match(r"mount -> box/lidar \+1.23 ± 0.45", line) for line in lines)
+
+
+def test_effects_are_listed_or_summed_up(run, printed):
+    lines = printed(tables.print_run, run)
+    assert "arm_link_length turn +2.11 ± 0.98 mm not told" in lines
+    assert not any("lift" in line for line in lines)  # held
+    assert "a_scale s +1.234e-05 ± 2e-06" in lines
+    offsets_mm = 1e3 * np.linspace(-0.007, 0.009, 16)
+    text = " ".join(after(lines, "ring_range_offset"))
+    assert f"16 values mean +1.00, sd {offsets_mm.std():.2f}, -7.00 to +9.00" in text
+    assert "0.31" in text
+
+
+def test_the_errors_before_and_after_stand_together(run, printed):
+    lines = printed(tables.print_run, run)
+    assert "before, all as in CAD 24.31 +8.20 22.90" in lines
+    assert "after the fit 3.34 +0.00 3.30" in lines
+    assert "after, of stops held out 3.47 +0.02 3.40" in lines
+    assert "noise floor, if the model were right 3.62" in lines
+
+
+def test_an_error_that_was_not_taken_has_no_line(run, printed):
+    summary = SUMMARY | {"rms_mm": {"fit": 3.34, "held_out": None, "noise_floor": 3.62}}
+    text = "\n".join(printed(tables.print_run, replace(run, summary=summary)))
+    assert "held out" not in text
+    assert "before" not in text
+
+
+def test_a_fit_that_did_not_converge_says_so(run, printed):
+    text = printed(tables.print_run, replace(run, summary=SUMMARY | {"converged": False}))
+    assert any("NOT CONVERGED" in line for line in text)
+
+
+def test_reasons_are_given_once(run, printed):
+    text = " ".join(printed(tables.print_run, run))
+    assert text.count(WHY) == 1
+    assert "lidar (rx … rz, ty) tied to mount arm_link_length.turn tied to faro.tz" in text
+    assert "not told by the data: no tracker opti" in text
+
+
+def test_what_moved_is_told_from_what_did_not(run, printed):
+    def link(name, moved, p_value, parameters=DOF, units=("rad",) * 3 + ("m",) * 3):
+        n = len(parameters)
+        return {
+            "name": name,
+            "moved": moved,
+            "p_value": p_value,
+            "parameters": list(parameters),
+            "units": list(units),
+            "change": (MOVED if n == 6 else np.full(n, 0.003)).tolist(),
+            "sigma": (SIGMA if n == 6 else np.full(n, 1e-4)).tolist(),
+        }
+
+    many = [f"ring_{k:03d}" for k in range(16)]
+    links = [
+        link("lidar", True, 3e-9),
+        link("ring_range_offset", True, 2e-5, many, ["m"] * 16),
+        link("mount", False, 0.41),
+        link("arm_base", False, None),
+    ]
+    text = " ".join(printed(tables.print_run, replace(run, summary=SUMMARY | {"links": links})))
+    assert "tx +1.23 ± 0.45, ty -4.56 ± 0.12, tz +0.000 ± 0.021 mm; rx +1.20 ± 0.40" in text
+    assert "mrad; p = 3e-09" in text
+    assert "16 values by 3.00 rms mm; p = 2e-05" in text
+    assert "not moved mount (p = 0.41)" in text
+    assert "say nothing of arm_base" in text
+
+
+def test_nothing_moved_is_said(run, printed):
+    text = " ".join(printed(tables.print_run, replace(run, summary=SUMMARY | {"links": []})))
+    assert "moved since the earlier run nothing" in text
+
+
+def test_comparison_has_an_entry_per_run(run, tmp_path):
+    bare = replace(run.solution, shared=Part(run.solution.shared.frames, {}))
+    compared = tables.comparison([run, replace(run, folder=tmp_path / "second", solution=bare)])
+    assert compared["runs"] == [str(tmp_path / "first"), str(tmp_path / "second")]
+    assert compared["rms_mm"]["fit"] == [3.34, 3.34]
+    lidar = [compared["parameters"]["lidar"][dof] for dof in DOF]
+    np.testing.assert_allclose(
+        [e["estimate"] for e in lidar], np.tile(MOVED[:, None], 2), atol=1e-12
+    )
+    np.testing.assert_allclose([e["sigma"] for e in lidar], np.tile(SIGMA[:, None], 2), rtol=1e-12)
+    turn = compared["parameters"]["arm_link_length"]["turn"]
+    assert turn == {"unit": "m", "estimate": [0.00211, None], "sigma": [0.00098, None]}
+    assert '"faro"' in json_text(compared)
+
+
+def test_comparison_is_printed_side_by_side(run, tmp_path, printed):
+    bare = replace(run.solution, shared=Part(run.solution.shared.frames, {}))
+    summary = SUMMARY | {"rms_mm": {"fit": 9.9}}
+    other = replace(run, folder=tmp_path / "second", solution=bare, summary=summary)
+    lines = printed(tables.print_comparison, [run, other])
+    assert "first second" in lines
+    assert "rms after the fit mm 3.34 9.90" in lines
+    assert "rms before, all as in CAD mm 24.31" in lines
+    assert "lidar.tx mm +1.23 ± 0.45 +1.23 ± 0.45" in lines
+    assert "arm_link_length.turn mm +2.11 ± 0.98" in lines
+    assert "ring_range_offset, mean mm +1" in lines
+
+
+def test_many_runs_are_broken_into_tables(run, printed):
+    runs = [replace(run, folder=run.folder.with_name(f"run{i}")) for i in range(7)]
+    lines = printed(tables.print_comparison, runs)
+    heads = [line for line in lines if re.fullmatch(r"(run\d ?)+", line)]
+    assert " ".join(heads).split() == [f"run{i}" for i in range(7)]
+
+
+def test_the_catalogue_is_printed(printed):
+    text = " ".join(printed(tables.print_catalogue, CATALOGUE, False))
+    assert all(effect.name in text for effect in CATALOGUE)
+
+
+@pytest.mark.parametrize("effect", CATALOGUE, ids=lambda e: e.name)
+def test_an_effect_has_its_page(effect, printed):
+    page = tables.effect_page(effect)
+    assert page["name"] == effect.name
+    assert page["site"] == effect.site.value
+    for key in ("what", "formula", "typical", "covariates", "source"):
+        assert page[key], f"{effect.name} does not say its {key}"
+    text = " ".join(printed(tables.print_catalogue, [effect], True))
+    assert effect.formula in text
+    assert all(name in text for name in effect.confounded_with)
+
+
+def test_a_check_is_printed(printed):
+    check = Check(
+        [("stops", "12 at 4 locations")],
+        ["stops.csv:3: no such thing [red]"],
+        ["joint_1 hardly moves"],
+        {"lidar": {"mm": 0.62}},
+        [{"name": "mount.tz", "why": f"tied to lidar.tz: {WHY}"}],
+    )
+    text = " ".join(printed(tables.print_check, check))
+    assert "stops 12 at 4 locations" in text
+    assert "stops.csv:3: no such thing [red]" in text
+    assert "joint_1 hardly moves" in text
+    assert check.can[0] in text
+    assert "mount.tz tied to lidar.tz" in text
