@@ -38,22 +38,23 @@ class Check:
         contents: what is there: its name, and how much of it.
         problems: what is wrong and keeps a fit from running, a sentence each.
         odd: what is no error and yet worth a look, a sentence each.
-        expected: link -> unit -> rough sigma of the worst of its parameters that the data tell.
+        expected: link -> unit -> rough sigma of its best and its worst known parameter, of those
+            that the data tell.
         cannot: a `name` and a `why` for what the data could not tell.
     """
 
     contents: list[tuple[str, str]] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
     odd: list[str] = field(default_factory=list)
-    expected: dict[str, dict[str, float]] = field(default_factory=dict)
+    expected: dict[str, dict[str, tuple[float, float]]] = field(default_factory=dict)
     cannot: list[dict[str, str]] = field(default_factory=list)
 
     @property
     def can(self) -> list[str]:
         """What can be estimated and about how well, a line each."""
         return [
-            f"{link}: {', '.join(f'{value:.2g} {unit}'.rstrip() for unit, value in sigma.items())}"
-            for link, sigma in self.expected.items()
+            f"{link}: {', '.join(_about(*sigma, unit) for unit, sigma in by_unit.items())}"
+            for link, by_unit in self.expected.items()
         ]
 
     def document(self) -> dict[str, Any]:
@@ -102,12 +103,11 @@ class _Checker:
         rig = self._attempt(load_rig, folder)
         recording = self._attempt(_open, folder, rig)
         targets = (
-            recording.targets
-            if recording
-            else self._attempt(read_targets, folder / "targets.csv")
+            recording.targets if recording else self._attempt(read_targets, folder / "targets.csv")
         )
         if rig:
             found.contents.extend(inventory.of_rig(rig))
+            found.odd.extend(inventory.odd_rig(rig))
         if rig and recording:
             found.contents.extend(inventory.of_stops(recording))
             found.odd.extend(inventory.odd_stops(rig, recording))
@@ -116,6 +116,8 @@ class _Checker:
             found.odd.extend(inventory.odd_scans(rig, recording, scans))
         if targets:
             found.contents.extend(inventory.of_targets(targets))
+        if targets and rig and rig.target:
+            found.odd.extend(inventory.odd_targets(targets, rig.target))
         reference = self._read_mesh(rig)
         if rig and recording and (reference or not rig.reference):
             self._try_graph(Source(rig, recording, reference), scans)
@@ -203,21 +205,27 @@ def _preview(problem: Problem, progress: Progress) -> Estimate:
     if problem.scans:
         loop.fix_association()
         loop.add_surface_unknowns()
-        loop.run(loop.scans, np.inf, associate=False)
     return loop.estimate(converged=False)
 
 
-def _expected(estimate: Estimate) -> dict[str, dict[str, float]]:
-    """Per link and unit the worst sigma that the data tell; lengths in mm, angles in mrad."""
+def _expected(estimate: Estimate) -> dict[str, dict[str, tuple[float, float]]]:
+    """Per link and unit, the sigmas (least, largest) that data tell; in mm for m, mrad for rad."""
     sigma = np.sqrt(np.diag(estimate.covariance))
     shown = {"m": ("mm", 1e3), "rad": ("mrad", 1e3)}
-    out: dict[str, dict[str, float]] = {}
+    out: dict[str, dict[str, tuple[float, float]]] = {}
     start = 0
     for v in estimate.variables:
-        for unit, prior, now in zip(v.units, v.sigma, sigma[start : start + v.dim], strict=True):
-            if now < TOLD * prior:
+        now, units = sigma[start : start + v.dim], np.array(v.units)
+        for unit in dict.fromkeys(v.units):
+            told = now[(units == unit) & (now < TOLD * v.sigma)]
+            if len(told):
                 name, scale = shown.get(unit, (unit, 1.0))
-                link = out.setdefault(v.name, {})
-                link[name] = max(link.get(name, 0.0), float(scale * now))
+                least, largest = (float(scale * f(told)) for f in (np.min, np.max))
+                out.setdefault(v.name, {})[name] = (least, largest)
         start += v.dim
     return out
+
+
+def _about(least: float, largest: float, unit: str) -> str:
+    low, high = f"{least:.2g}", f"{largest:.2g}"
+    return f"{low if low == high else f'{low} to {high}'} {unit}".rstrip()

@@ -13,12 +13,13 @@ from calib.graph import Block, Graph, Variable
 from calib.model import Source
 from calib.problem import Problem, effect_variable
 from calib.residuals.beams import Association, SharedSum
-from calib.residuals.scan import LOCAL_SHARE, ScanStop
+from calib.residuals.scan import ScanStop
 from chains import se3
 
 Progress = Callable[[str, int, int], None]
 MAX_PASSES = 25
-SETTLED = 1e-5  # m and rad: after that, which triangle a beam meets is kept
+COMMON_SHARE = 0.7  # of the reference's variance, for surfaces and for patches each
+SETTLED = 1e-4  # m and rad: after that, which triangle a beam meets is kept
 CONVERGED = 1e-7  # m and rad: a hundredth of the smallest sigma in sight
 
 
@@ -99,18 +100,22 @@ class _Loop:
     def run(self, scans: Sequence[ScanStop], tolerance: float, associate: bool) -> bool:
         """Passes until the step is below tolerance; whether that was reached."""
         for _ in range(MAX_PASSES):
-            poses, shared = [], SharedSum()
-            for i, scan in enumerate(scans):
-                self.progress(f"pass {self.passes + 1}", i, len(scans))
-                association = None if associate else self.associations[i]
-                compressed = scan.compress(self.values, association)
-                poses.append(compressed.pose)
-                shared.add(compressed)
-            step = self._step([*poses, *shared.rows()])
+            self._linearise(scans, associate, newton=not associate)
             self.passes += 1
-            if step < tolerance:
+            if self._step() < tolerance:
                 return True
         return False
+
+    def _linearise(self, scans: Sequence[ScanStop], associate: bool, newton: bool) -> None:
+        """Link the graph anew, with every stop's beams linearised at the present state."""
+        poses, shared = [], SharedSum()
+        for i, scan in enumerate(scans):
+            self.progress(f"pass {self.passes + 1}", i, len(scans))
+            association = None if associate else self.associations[i]
+            compressed = scan.compress(self.values, association, newton)
+            poses.append(compressed.pose)
+            shared.add(compressed)
+        self._link([*poses, *shared.rows()])
 
     def fix_association(self) -> None:
         """Keep, from now on, what each beam meets; drop beams beside a depth edge."""
@@ -122,7 +127,8 @@ class _Loop:
     def add_surface_unknowns(self) -> None:
         """Errors of the reference, common to the points of a surface or patch, as unknowns.
 
-        Those of surfaces and of patches share the variance that neighbouring points have in common.
+        Each kind is given more than half of the reference's variance: errors that are smooth over
+        metres join neighbouring patches, which are unknowns of their own here.
         """
         for number, source in enumerate(self.problem.sources):
             mine = [i for i, scan in enumerate(self.scans) if scan.recording is source.recording]
@@ -132,7 +138,7 @@ class _Loop:
             views = [self.scans[i].rows(self.values, self.associations[i]).view for i in mine]
             for column in ("surface", "patch"):
                 parts = np.unique(np.concatenate([np.unique(view[column]) for view in views]))
-                each = sigma_m * np.sqrt((1.0 - LOCAL_SHARE) / 2.0)
+                each = sigma_m * np.sqrt(COMMON_SHARE)
                 effect = SurfaceShift(f"{number}/reference_{column}", column, parts, each)
                 self._switch_on(effect, source, mine)
 
@@ -146,7 +152,8 @@ class _Loop:
     def estimate(self, converged: bool) -> Estimate:
         """The result, with the covariance of the calibration."""
         variables = tuple(self.variables[name] for name in self.problem.calibration)
-        self.progress("marginals", 0, 1)
+        if self.scans:
+            self._linearise(self.scans, associate=False, newton=False)
         covariance = self.graph.covariance(self.values, self.problem.calibration)
         return Estimate(
             self.values,
@@ -163,9 +170,8 @@ class _Loop:
         blocks = [*self.problem.blocks, *self.prior, *rows]
         self.graph = Graph(list(self.variables.values()), blocks, self.without)
 
-    def _step(self, rows: Sequence[Block]) -> float:
+    def _step(self) -> float:
         """One step of the graph; the largest change of any variable, in m or rad."""
-        self._link(rows)
         before, self.values = self.values, self.graph.step(self.values)
         return max(_change(v, before[n], self.values[n]) for n, v in self.variables.items())
 

@@ -8,7 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from calib.rig import Rig
+from calib.rig import Rig, TargetSpec
+from chains import se3
+from chains.align import align_points
+from chains.errors import InputError
 from sensors.recording import Recording, Scan
 from sensors.reference import Reference
 from sensors.stops import Targets
@@ -18,6 +21,9 @@ STILL = 0.05  # rad or m that a joint travels: too little to tell its own errors
 LIMIT_SLACK = 1e-3  # rad or m beyond a joint's limit
 LEVEL_RAD = np.radians(3.0)
 NARROW_RAD = np.radians(30.0)
+ASKEW_RAD = np.radians(3.0)
+APART_M = 0.01
+COARSE_M = 0.05  # no instrument here is as bad as that
 FAR_OFF_M = 0.3  # median residual at the start: more than CAD is wrong by
 
 Line = tuple[str, str]
@@ -133,6 +139,15 @@ def of_beams(placed: Sequence[PlacedScan]) -> Iterator[Line]:
 # ---------------------------------------------------------------------------------- what looks odd
 
 
+def odd_rig(rig: Rig) -> Iterator[str]:
+    """Sigmas that look like millimetres."""
+    for section in ("tracker", "target", "reference"):
+        for key in ("sigma_m", "sigma_marker_m", "sigma_sphere_m"):
+            sigma_m = getattr(getattr(rig, section), key, 0.0)
+            if sigma_m > COARSE_M:
+                yield f"{section}.{key} is {sigma_m:g} m in rig.yaml; was it meant in millimetres?"
+
+
 def odd_stops(rig: Rig, recording: Recording) -> Iterator[str]:
     """Too few locations, bodies that are hardly seen, joints beyond limits or at rest."""
     names = np.array(recording.stops)
@@ -174,6 +189,31 @@ def odd_scans(rig: Rig, recording: Recording, scans: ScanSums) -> Iterator[str]:
         yield f"there is no scan of {_listed(missing)}, though of other stops"
     if (silent := np.flatnonzero(scans.rings == 0)).size:
         yield f"no point comes from ring {_listed(silent)}; rings are counted from 0"
+
+
+def odd_targets(targets: Targets, spec: TargetSpec) -> Iterator[str]:
+    """Rods that hang askew, and spheres that both instruments see at different places."""
+    names, rods = np.array(targets.names), targets.lower_m - targets.upper_m
+    rods /= np.linalg.norm(rods, axis=1, keepdims=True)
+    down = np.median(rods, axis=0)
+    down /= np.linalg.norm(down)
+    askew = rods @ down < np.cos(ASKEW_RAD)
+    if askew.any():
+        yield (
+            f"the rod of {_listed(names[askew])} does not hang as the others do; are its markers "
+            "swapped?"
+        )
+    sphere_m = targets.lower_m + spec.sphere_below_lower_marker_m * down
+    try:
+        T_world_reference, _ = align_points(sphere_m, targets.faro_m)
+    except InputError:
+        return
+    off_m = np.linalg.norm(sphere_m - se3.apply(T_world_reference, targets.faro_m), axis=1)
+    if off_m.max() > APART_M:
+        yield (
+            f"tracker and scanner place {names[off_m.argmax()]} {1e3 * off_m.max():.0f} mm apart, "
+            f"the others up to {1e3 * np.sort(off_m)[-2]:.0f} mm; is it the same target in both?"
+        )
 
 
 def odd_beams(placed: Sequence[PlacedScan]) -> Iterator[str]:

@@ -104,6 +104,12 @@ class Rig:
         return tuple(edge.joint.name for edge in edges if edge.joint is not None)
 
 
+def _metres(length: float) -> float:
+    if abs(length) > LARGEST_FRAME_M:
+        raise ValueError(f"{length:g} m looks like millimetres; give metres")
+    return length
+
+
 class _Frame(Document):
     parent: str
     xyz_m: tuple[Number, Number, Number]
@@ -113,9 +119,8 @@ class _Frame(Document):
 
     @pydantic.field_validator("xyz_m")
     @classmethod
-    def _metres(cls, xyz: tuple[float, ...]) -> tuple[float, ...]:
-        if max(map(abs, xyz)) > LARGEST_FRAME_M:
-            raise ValueError(f"{max(xyz, key=abs):g} m looks like millimetres; give metres")
+    def _in_metres(cls, xyz: tuple[float, ...]) -> tuple[float, ...]:
+        _metres(max(xyz, key=abs))
         return xyz
 
     @pydantic.field_validator("rpy_rad")
@@ -162,9 +167,17 @@ class _Tracker(Document):
     sigma_m: Sigma
     sigma_rad: Sigma
 
+    @pydantic.field_validator("bodies")
+    @classmethod
+    def _once_each(cls, bodies: tuple[str, ...]) -> tuple[str, ...]:
+        for body in bodies:
+            if bodies.count(body) > 1:
+                raise ValueError(f"{body} is there twice; name every body once")
+        return bodies
+
 
 class _Target(Document):
-    sphere_below_lower_marker_m: Number
+    sphere_below_lower_marker_m: Annotated[Number, pydantic.AfterValidator(_metres)]
     sigma_sphere_m: Size
     sigma_marker_m: Sigma
 
@@ -178,7 +191,7 @@ class _Reference(Document):
 
 
 class _RigFile(Document):
-    name: str
+    name: Annotated[str, pydantic.Field(pattern=r"^[^/\\]+$")]
     lidar: _Lidar | None = None
     arm: _Arm | None = None
     frames: dict[str, _Frame] = pydantic.Field(default_factory=dict)
@@ -198,6 +211,8 @@ def load_rig(folder: str | Path) -> Rig:
     """
     folder = Path(folder)
     path = folder / "rig.yaml"
+    if not path.is_file():
+        raise InputError(f"{path} does not exist; a recording is a folder that holds one")
     data, marks = read_yaml(path)
     file = validate(_RigFile, data, path, marks)
     where = _Where(path, marks)
@@ -277,6 +292,9 @@ def _check_frames(file: _RigFile, tree: FrameTree, where: _Where) -> None:
         if world and world.frame in tree.frames:
             what = f"'{world.frame}' is a frame of the rig; name the world that it moves in"
             raise where.wrong(what, section, "frame")
+    if file.tracker and file.reference and file.tracker.frame == file.reference.frame:
+        what = f"'{file.reference.frame}' is the tracker's frame; name another, and how the two lie"
+        raise where.wrong(f"{what} to each other is found by the fit", "reference", "frame")
 
 
 def _read_lidar(lidar: Document, folder: Path, where: _Where) -> LidarModel:

@@ -45,7 +45,7 @@ def root_pose(source: Source, stops: Sequence[int]) -> np.ndarray | None:
 
 
 def reference_from_targets(source: Source) -> np.ndarray | None:
-    """T_world_reference (4, 4) from the spheres, the rods taken to hang along their mean direction."""
+    """T_world_reference (4, 4) from the spheres, the rods hanging along their mean direction."""
     targets, spec = source.recording.targets, source.rig.target
     if targets is None or spec is None:
         return None
@@ -55,7 +55,7 @@ def reference_from_targets(source: Source) -> np.ndarray | None:
         return align_points(sphere, targets.faro_m)[0]
     except InputError as error:
         raise InputError(
-            f"{source.recording.folder / 'targets.csv'}: {error} Hang targets so that they span an area."
+            f"{source.recording.folder / 'targets.csv'}: {error}, and hang targets around an area"
         ) from None
 
 

@@ -1,8 +1,8 @@
 """A rig was calibrated on Monday. On Friday somebody bumped into its LiDAR. What has moved?
 
 The second fit takes the first as its prior, sigmas and correlations included, and asks of every
-link whether its change is larger than the two fits together allow. What has moved is estimated
-anew from its CAD values; what has not keeps what Monday knew.
+link whether its change is larger than the two fits together allow. What has not moved keeps what
+Monday knew, so what has moved is found far better than either fit alone could tell.
 
     python examples/01_recalibrate_a_rig.py [FOLDER]
 """
@@ -16,11 +16,10 @@ import numpy as np
 
 from calib.calibrate import calibrate
 from calib.simulate import load_spec, simulate
-from calib.tables import print_run
 from chains import se3
 from sensors.recording import read_table, write_table
 
-BUMP = np.array([0.0, 0.0, 0.004, 0.003, 0.0, 0.0])  # 4 mrad about the LiDAR's z, 3 mm along its x
+BUMP = np.array([0, 0, 0.004, 0.003, 0, 0])  # 4 mrad about the LiDAR's z, 3 mm along its x
 
 
 def keep(recording: Path, locations: tuple[str, ...]) -> None:
@@ -31,25 +30,27 @@ def keep(recording: Path, locations: tuple[str, ...]) -> None:
 
 
 def bump(recording: Path) -> None:
-    """Turn and shift the LiDAR on its mount: it sees every point from elsewhere."""
+    """Move the LiDAR on its mount: it now sees every point from elsewhere."""
     for path in (recording / "scans").glob("*.parquet"):
         scan = read_table(path)
-        points = np.stack([scan[axis] for axis in "xyz"], axis=1)
-        seen = se3.apply(se3.exp(-BUMP), points).astype(np.float32)
-        write_table(path, scan | dict(zip("xyz", seen.T, strict=True)))
+        points = se3.apply(se3.exp(-BUMP), np.stack([scan[axis] for axis in "xyz"], axis=1))
+        write_table(path, scan | dict(zip("xyz", points.T.astype(np.float32), strict=True)))
 
 
 out = Path(sys.argv[1] if len(sys.argv) > 1 else tempfile.mkdtemp(prefix="rigcal-"))
 monday, friday = out / "monday", out / "friday"
 simulate(load_spec("tiny").model_copy(update={"locations": 8}), monday, seed=1)
-shutil.copytree(monday, friday)
+shutil.copytree(monday, friday, dirs_exist_ok=True)
 keep(monday, ("L00", "L01", "L02", "L03"))
 keep(friday, ("L04", "L05", "L06", "L07"))
 bump(friday)
 
-calibrate([monday], out / "run-monday", hold_out="none")
-run = calibrate([friday], out / "run-friday", hold_out="none", prior=out / "run-monday")
-print_run(run)
+calibrate([monday], out / "monday-run", hold_out="none")
+run = calibrate([friday], out / "friday-run", hold_out="none", prior=out / "monday-run")
 
 for link in run.summary["links"]:
-    print(f"{link['name']:20}", "moved" if link["moved"] else "did not move")
+    print(f"{link['name']:18}", "has moved" if link["moved"] else "has not moved")
+    if link["moved"]:
+        columns = (link[key] for key in ("parameters", "units", "change", "sigma"))
+        for name, unit, change, sigma in zip(*columns, strict=True):
+            print(f"    {name} {1e3 * change:+.2f} ± {1e3 * sigma:.2f} m{unit}")

@@ -231,7 +231,7 @@ def _keys(model: Any, loc: tuple) -> list[str]:
 def write_atomically(path: str | Path) -> Iterator[Path]:
     """Give a temporary path beside `path` to write to, moved into place when all went well."""
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    _make_folder(path.parent, path)
     temporary = path.with_name(f".{path.stem}.{uuid.uuid4().hex}{path.suffix}")
     try:
         yield temporary
@@ -248,11 +248,14 @@ def replace_folder(path: str | Path, marker: str) -> Iterator[Path]:
     that it is of the same kind. Raises InputError for any other.
     """
     path = Path(path)
-    if path.exists() and not (path.is_dir() and ((path / marker).exists() or not any(path.iterdir()))):
-        raise InputError(f"{path} exists and has no {marker}: give another folder, or remove that one")
-    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.exists() and not (
+        path.is_dir() and ((path / marker).exists() or not any(path.iterdir()))
+    ):
+        raise InputError(
+            f"{path} exists and has no {marker}: give another folder, or remove that one"
+        )
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
-    temporary.mkdir()
+    _make_folder(temporary, path)
     try:
         yield temporary
         if path.exists():
@@ -260,6 +263,13 @@ def replace_folder(path: str | Path, marker: str) -> Iterator[Path]:
         os.replace(temporary, path)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _make_folder(folder: Path, wanted: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{wanted} cannot be written ({error.strerror}); give another") from None
 
 
 class _Dumper(yaml.SafeDumper):

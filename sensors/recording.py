@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 _PARTS = ("rig.yaml", "*.urdf", "stops.csv", "targets.csv", "scans/*.parquet", "reference/*")
 _BATCH_ROWS = 1 << 20
 _FARTHEST_M = 200.0
+_LARGEST_SPREAD_M = 0.5
 _KINDS = {"x": "f", "y": "f", "z": "f", "ring": "iu", "column": "iu"}
 
 
@@ -85,7 +86,10 @@ class Recording:
         are normalised), degrees for radians, millimetres for metres.
         """
         folder = Path(folder)
-        table = Table(folder / "stops.csv", key="stop", text=("location",))
+        path = folder / "stops.csv"
+        if not path.exists():
+            raise InputError(f"{path} does not exist; a recording has a row for every stop there")
+        table = Table(path, key="stop", text=("location",))
         stops = table.names()
         return cls(
             folder=folder,
@@ -227,7 +231,18 @@ def _check_scan(path: Path, columns: Columns, rings: int | None) -> Scan:
     if not (count >= 1).all():
         raise InputError(f"{path}: count is below 1; leave out directions without a return")
     intensity, spread = (extra.pop(name, unknown) for name in ("intensity", "range_std_m"))
+    _check_spread(path, spread[np.isfinite(spread)])
     return Scan(xyz[seen], ring, column, intensity, count, spread, extra)
+
+
+def _check_spread(path: Path, spread_m: Array) -> None:
+    if (spread_m < 0).any():
+        raise InputError(f"{path}: range_std_m is negative; leave it empty where it is unknown")
+    if spread_m.size and np.median(spread_m) > _LARGEST_SPREAD_M:
+        raise InputError(
+            f"{path}: half of range_std_m is above {np.median(spread_m):g} m, which looks like"
+            " millimetres; it is in metres"
+        )
 
 
 def _check_ranges(path: Path, range_m: Array) -> None:

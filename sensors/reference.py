@@ -5,6 +5,9 @@ to its own centre. Range, point, normal and incidence are then computed in float
 triangle's plane, so a residual and its derivatives agree as doubles wherever the mesh lies.
 """
 
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -262,11 +265,24 @@ def _read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
     import open3d as o3d
 
     # The tensor reader would round doubles to float32; this one keeps them.
-    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+    with _silence(), o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         mesh = o3d.io.read_triangle_mesh(str(path))
     if not mesh.has_triangles():
-        raise InputError(f"{path}: no triangles in it; a PLY, OBJ or STL mesh is needed.")
+        raise InputError(f"{path}: no triangles in it, or broken; give a PLY, OBJ or STL mesh.")
     return np.asarray(mesh.vertices), np.asarray(mesh.triangles)
+
+
+@contextmanager
+def _silence() -> Iterator[None]:
+    """Keep what a C library prints of a broken file off stderr: the error raised says it."""
+    stderr, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        yield
+    finally:
+        os.dup2(stderr, 2)
+        os.close(stderr)
+        os.close(nowhere)
 
 
 def _read_faces(path: Path) -> dict[str, np.ndarray]:
@@ -297,7 +313,7 @@ def _check_mesh(vertices_m: np.ndarray, triangles: np.ndarray) -> None:
     size_m = np.ptp(vertices_m, axis=0).max()
     if size_m > WIDEST_M:
         raise InputError(
-            f"the mesh is {size_m:.0f} m wide, which looks like millimetres; vertices are in metres."
+            f"the mesh is {size_m:.0f} m wide, which looks like millimetres; give metres."
         )
     stray = triangles[(triangles < 0) | (triangles >= len(vertices_m))]
     if len(stray):

@@ -18,7 +18,7 @@ import numpy as np
 
 from calib.effects import LazyColumn, OneHot, View
 from calib.forward import Derivatives, Stops, Term, Values
-from calib.residuals.rows import Group, gram, split, square_root, tukey_cost
+from calib.residuals.rows import Group, gram, split, square_root, tukey_cost, tukey_curvature
 from chains import se3
 from sensors.lidar import Beams
 
@@ -297,9 +297,19 @@ def effect_columns(
 
 
 def compress(
-    name: str, rows: Rows, stops: Stops, frame: str, T_reference_lidar: np.ndarray, values: Values
+    name: str,
+    rows: Rows,
+    stops: Stops,
+    frame: str,
+    T_reference_lidar: np.ndarray,
+    values: Values,
+    newton: bool,
 ) -> CompressedScan:
-    """Whiten, weight and compress a stop's rows, linearised at the state `values`."""
+    """Whiten, weight and compress a stop's rows, linearised at the state `values`.
+
+    With `newton` the rows' curvature takes the place of their weight, at the same gradient: fewer
+    steps to the optimum, but not its covariance.
+    """
     parts, column = [], 0
     for variable, block in rows.dense.items():
         width = block.shape[1]
@@ -314,8 +324,12 @@ def compress(
         parts.append(Part(c.variable, at, c.components[used[first:]]))
         groups.append(group)
         column += group.size
-    dense = np.hstack([rows.by_twist, rows.residual_m[:, None], *rows.dense.values()])
-    total = gram(dense, groups, rows.weight / np.square(rows.sigma_m))
+    weight, residual = rows.weight, rows.residual_m
+    if newton:
+        weight = np.where(rows.usable, tukey_curvature(residual / rows.sigma_m, rows.scale), 0.0)
+        residual = residual * (rows.weight / np.maximum(weight, 1e-300))
+    dense = np.hstack([rows.by_twist, residual[:, None], *rows.dense.values()])
+    total = gram(dense, groups, weight / np.square(rows.sigma_m))
     top, rest = split(total, 6)
     at = {v: np.array(values[v]) for v in dict.fromkeys(p.variable for p in parts)}
     T0 = se3.inverse(T_reference_lidar)

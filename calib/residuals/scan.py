@@ -32,7 +32,7 @@ from sensors.lidar import Beams, LidarModel, beams
 from sensors.recording import Recording, Scan
 
 PRIOR_COUNT = 20.0  # a measured spread of fewer sweeps than this leans on the datasheet
-LOCAL_SHARE = 0.25  # of the reference's variance, between neighbouring points of one patch
+LOCAL_SHARE = 0.05  # of the reference's variance, between neighbouring points of one patch
 
 
 @dataclass(frozen=True)
@@ -88,23 +88,27 @@ class ScanStop:
             surface = self.meeting.meet(T, ray, values, association)
         return self._rows(scan, ray, surface, T, view, bases, error)
 
-    def compress(self, values: Values, association: Association | None = None) -> CompressedScan:
-        """The stop's rows, compressed, linearised at a state."""
+    def compress(
+        self, values: Values, association: Association | None = None, newton: bool = False
+    ) -> CompressedScan:
+        """The stop's rows, compressed, linearised at a state; `newton` as of `beams.compress`."""
         rows = self.rows(values, association)
         frame = self.stops.rig.lidar_frame
-        return compress(self.name, rows, self.stops, frame, self.pose(values), values)
-
-    def _associate(
-        self, T: np.ndarray, ray: Beams, values: Values, near_edges: bool
-    ) -> Association:
-        try:
-            return self.meeting.associate(T, ray, values, near_edges)
-        except InputError as error:
-            raise InputError(f"{self.recording.folder}: stop '{self.name}': {error}") from None
+        return compress(self.name, rows, self.stops, frame, self.pose(values), values, newton)
 
     def _read(self) -> tuple[Scan, Beams]:
         scan = self.recording.scan(self.index)
         return scan, beams(scan.xyz_m, self.lidar.beam_origin_m)
+
+    def _associate(self, T: np.ndarray, ray: Beams, values: Values, near_edges: bool) -> Association:
+        found = self.meeting.associate(T, ray, values, near_edges)
+        if not (found.part >= 0).any():
+            raise InputError(
+                f"{self.recording.folder}: stop '{self.name}': none of its {len(found.part)} beams meets "
+                f"a surface; check the units of the scan, the mesh's frame, and where the stop starts "
+                f"(base_guess, targets)"
+            )
+        return found
 
     def _view(self, scan: Scan, ray: Beams, surface: Surface) -> View:
         columns: dict[str, LazyColumn] = {

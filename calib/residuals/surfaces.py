@@ -12,7 +12,6 @@ from calib.forward import Values
 from calib.graph import Variable
 from calib.residuals.beams import Association, Columns, Surface
 from chains import se3
-from chains.errors import InputError
 from sensors.lidar import Beams
 from sensors.planes import Planes
 from sensors.reference import Reference
@@ -57,17 +56,9 @@ class MeshSurface:
             beams: of the stop.
             values: the state; a mesh does not depend on it.
             near_edges: True drops beams near a depth edge, and grazing ones.
-
-        Raises:
-            InputError: no beam at all meets the mesh.
         """
         origins, directions = _in_reference(T, beams)
         triangle = self.reference.first_triangle(origins, directions)
-        if (triangle < 0).all():
-            raise InputError(
-                f"none of {len(triangle)} beams meets the mesh; check that mesh and poses are in "
-                "metres, that targets or base_guess are in the mesh's frame, and the joints' signs"
-            )
         if not near_edges:
             return Association(triangle)
         hits = self.reference.hits(triangle, origins, directions)

@@ -47,7 +47,9 @@ def refused(rec, monkeypatch, capfd):
             main()
         out, err = capfd.readouterr()
         assert exit_.value.code == 2, err
-        import os; os.environ.get('SHOW') and open(os.environ['SHOW'],'a').write(err)
+        import os
+
+        os.environ.get("SHOW") and open(os.environ["SHOW"], "a").write(err)
         assert out == "" and err.startswith("rigcal: ") and err.count("\n") == 1, err
         assert contents(rec.parent) == before, "something was left behind"
         return err

@@ -10,7 +10,7 @@ from calib.effects import Effect, OneHot, Param, Site, SurfaceShift
 from calib.forward import Term
 from calib.model import Model, Source
 from calib.problem import build, effect_variable
-from calib.residuals.beams import SharedSum
+from calib.residuals.beams import Association, SharedSum
 from calib.residuals.rows import tukey_weight
 from calib.residuals.scan import turned
 from calib.residuals.surfaces import PlaneSurface
@@ -211,9 +211,10 @@ def test_a_wild_beam_loses_its_own_weight_and_no_others(on_mesh):
 
 
 def test_a_stop_that_meets_nothing_says_nothing(on_mesh):
-    """A guess outside the room, say: every beam misses, and the others still count."""
-    scan, count = on_mesh.problem.scans[0], len(on_mesh.association[0])
-    compressed = scan.compress(on_mesh.values, np.full(count, -1))
+    """All its beams may graze, or pass close to edges; the other stops still count."""
+    scan = on_mesh.problem.scans[0]
+    nothing = Association(np.full(len(on_mesh.association[0].part), -1))
+    compressed = scan.compress(on_mesh.values, nothing)
     residual, d = compressed.pose.evaluate(on_mesh.values, True)
     assert not residual.any() and not any(column.any() for column in d.values())
 
@@ -236,14 +237,14 @@ def test_a_beam_whose_plane_fell_behind_it_is_left_out(on_mesh):
     """With its triangle kept, a beam may come to look away from it: infinitely far, as a miss is."""
     scan = replace(on_mesh.problem.scans[0], terms=[Term(Far(), "far", np.arange(1))])
     values = {**on_mesh.values, "far": np.array([0.01])}
-    association = on_mesh.association[0].copy()
-    rows = scan.rows(values, association)
+    part = on_mesh.association[0].part.copy()
+    rows = scan.rows(values, Association(part))
     behind = np.flatnonzero(rows.view["normal"] @ rows.view["normal"][0] < -0.99)[0]
-    association[behind], association[1] = association[0], -1
-    left = scan.rows(values, association)
+    part[behind], part[1] = part[0], -1
+    left = scan.rows(values, Association(part))
     assert np.isfinite(left.residual_m).all()
     assert left.weight[behind] == left.weight[1] == 0
-    residual, d = scan.compress(values, association).pose.evaluate(values, True)
+    residual, d = scan.compress(values, Association(part)).pose.evaluate(values, True)
     assert np.isfinite(residual).all() and all(np.isfinite(column).all() for column in d.values())
 
 
@@ -313,8 +314,7 @@ def test_a_corridor_leaves_its_own_direction_open(on_mesh):
     scan = case.problem.scans[0]
     rows = scan.rows(case.values, case.association[0])
     wall = np.abs(rows.view["normal"] @ rows.view["normal"][0]) > 0.99
-    association = np.full(len(case.association[0]), -1, np.int32)
-    association[wall] = case.association[0][wall]
+    association = Association(np.where(wall, case.association[0].part, -1))
     plain = replace(scan, terms=[])
     quiet = plain.rows(case.values, association)
     block = plain.compress(case.values, association).pose
