@@ -10,13 +10,10 @@ from typing import Any
 import numpy as np
 
 from calib import problem as problems
-from calib.effects import FrameOffset
-from calib.errors import Errors, body_errors, scan_errors
+from calib.errors import Errors, body_errors, misfit, scan_errors
 from calib.fit import Estimate, Progress, solve
-from calib.forward import Term
 from calib.holdout import held_out
 from calib.model import Model, Source
-from calib.observability import not_estimated
 from calib.problem import Problem
 from calib.recalibrate import Link, earlier, solve_from
 from calib.residuals.tracker import TrackedBody
@@ -26,16 +23,15 @@ from calib.run import (
     RESIDUALS,
     SOLUTION,
     SUMMARY,
-    EffectEstimate,
-    FrameEstimate,
-    Part,
     Run,
-    Solution,
     versions,
 )
-from chains import se3
+from calib.solution import solution_of
 from sensors.documents import replace_folder, write_json, write_yaml
 from sensors.recording import write_table
+
+# Residuals so much larger than their sigmas are no accident: the result's sigmas are widened.
+TOLERATED = 1.2
 
 
 def calibrate(
@@ -76,96 +72,38 @@ def calibrate(
         unseen = Errors()
         if hold_out != "none":
             unseen = held_out(sources, model, hold_out, folds, progress)
+        nominal = _nominal(problem, progress)
         seen = _write_residuals(problem, estimate, folder / RESIDUALS, progress)
-        solution = solution_of(problem, estimate)
+        worse = misfit(estimate.graph, estimate.values, seen)
+        widened = max([1.0, *(x for x in worse.values() if x > TOLERATED)])
+        solution = solution_of(problem, estimate, widened)
         write_yaml(folder / SOLUTION, solution.document())
-        np.savez(folder / COVARIANCE, names=np.array(solution.names), covariance=solution.covariance)
+        np.savez(
+            folder / COVARIANCE, names=np.array(solution.names), covariance=solution.covariance
+        )
         write_yaml(folder / MODEL, _model_document(sources, model, hold_out, folds, prior))
-        summary = _summary(problem, estimate, seen, unseen, time.monotonic() - began)
+        summary = _summary(problem, estimate, nominal, seen, unseen)
+        summary |= {"misfit": worse, "sigmas_widened_by": widened}
+        summary["seconds"] = time.monotonic() - began
         if links is not None:
             summary["links"] = [_link_document(link) for link in links]
         write_json(folder / SUMMARY, summary)
     return Run.open(out)
 
 
-def solution_of(problem: Problem, estimate: Estimate) -> Solution:
-    """An estimate as frames and effects, with what it could not tell."""
-    start = np.cumsum([0] + [v.dim for v in estimate.variables])
-    at = {
-        v.name: slice(a, a + v.dim) for v, a in zip(estimate.variables, start, strict=False)
-    }
-    shared, recordings = Part(), {}
-    for source, terms in zip(problem.sources, problem.terms, strict=True):
-        rig = source.rig
-        for term in terms:
-            own = term.variable != term.effect.name
-            part = recordings.setdefault(rig.name, Part()) if own else shared
-            theta = estimate.values[term.variable]
-            covariance = estimate.covariance[at[term.variable], at[term.variable]]
-            if isinstance(term.effect, FrameOffset):
-                part.frames[term.effect.name] = _frame(source, term, theta, covariance)
-            else:
-                part.effects[term.effect.name] = _effect(source, term, theta, covariance)
-        if rig.reference_frame in at:
-            covariance = estimate.covariance[at[rig.reference_frame], at[rig.reference_frame]]
-            T = estimate.values[rig.reference_frame]
-            shared.frames[rig.reference_frame] = _pose(rig.world, T, covariance)
-        for name, edge in zip(rig.tree.edge_names, rig.tree.edges, strict=True):
-            known = name in shared.frames or name in recordings.get(rig.name, Part()).frames
-            if name in rig.frame_sigma and not known:
-                shared.frames[name] = _pose(edge.parent, edge.T_parent_child, np.zeros((6, 6)))
-    effects = frozenset(
-        t.variable for terms in problem.terms for t in terms if not isinstance(t.effect, FrameOffset)
-    )
-    touched = estimate.graph.touched(estimate.values, [v.name for v in estimate.variables])
-    untold = not_estimated(estimate.variables, estimate.covariance, effects, touched)
-    names = tuple(f"{v.name}.{dof}" for v in estimate.variables for dof in v.dofs)
-    return Solution(shared, recordings, untold + _absent(problem), names, estimate.covariance)
-
-
-def _frame(source: Any, term: Term, theta: np.ndarray, covariance: np.ndarray) -> FrameEstimate:
-    tree = source.rig.tree
-    edge = tree.edges[tree.edge_names.index(term.effect.name)]
-    xi, full = np.zeros(6), np.zeros((6, 6))
-    xi[term.free] = theta
-    full[np.ix_(term.free, term.free)] = covariance
-    turn = se3.right_jacobian(xi)
-    return _pose(edge.parent, edge.T_parent_child @ se3.exp(xi), turn @ full @ turn.T)
-
-
-def _pose(parent: str, T: np.ndarray, covariance: np.ndarray) -> FrameEstimate:
-    R = T[:3, :3]
-    position = R @ covariance[3:, 3:] @ R.T
-    return FrameEstimate(
-        parent, T, np.sqrt(np.diag(position)), np.sqrt(np.diag(covariance[:3, :3]))
-    )
-
-
-def _effect(source: Any, term: Term, theta: np.ndarray, covariance: np.ndarray) -> EffectEstimate:
-    params = term.effect.params(source.rig)
-    estimate, sigma = np.zeros(len(params)), np.zeros(len(params))
-    estimate[term.free] = theta
-    sigma[term.free] = np.sqrt(np.diag(covariance))
-    unit = ", ".join(dict.fromkeys(p.unit for p in params))
-    return EffectEstimate(unit, tuple(p.name for p in params), estimate, sigma)
-
-
-def _absent(problem: Problem) -> list[dict[str, str]]:
-    """Links of the whole chain that these recordings have no instrument for."""
-    rigs, sources = [s.rig for s in problem.sources], problem.sources
-    out = []
-    if not any(s.reference or s.recording.targets for s in sources):
-        why = "neither a mesh nor targets, so the scanner saw nothing; add reference/mesh.ply or targets.csv"
-        out.append({"name": rigs[0].reference_frame, "why": why})
-    if not any(r.tracker for r in rigs):
-        why = "no tracker, so poses are given in the reference's frame; add 'tracker' to rig.yaml"
-        out.append({"name": "opti", "why": why})
-    if not any(r.joint_names for r in rigs):
-        out.append({"name": "arm", "why": "the rig has no arm; add 'arm' to rig.yaml with its URDF"})
+def _nominal(problem: Problem, progress: Progress) -> Errors:
+    """Residuals with every frame and effect as on paper, the rig where it then seems to be."""
     if not problem.scans:
-        why = "no scans, so the LiDAR's place and its offsets are not seen; add scans/<stop>.parquet"
-        out.append({"name": "lidar", "why": why})
-    return out
+        return body_errors(_bodies(problem), problem.initial, None)
+    total = Errors()
+    for i, scan in enumerate(problem.scans):
+        progress("nominal residuals", i, len(problem.scans))
+        total += scan_errors(scan, problem.initial, None, None)
+    return total
+
+
+def _bodies(problem: Problem) -> list[TrackedBody]:
+    return [b for b in problem.blocks if isinstance(b, TrackedBody)]
 
 
 def _write_residuals(
@@ -194,8 +132,7 @@ def _write_residuals(
         write_table(folder / f"{name}.parquet", columns)
         total += scan_errors(scan, estimate.values, association, None)
     if not estimate.scans:
-        bodies = [b for b in problem.blocks if isinstance(b, TrackedBody)]
-        total = body_errors(bodies, estimate.values, None)
+        total = body_errors(_bodies(problem), estimate.values, None)
     return total
 
 
@@ -204,7 +141,7 @@ def _compact(column: np.ndarray) -> np.ndarray:
 
 
 def _summary(
-    problem: Problem, estimate: Estimate, seen: Errors, unseen: Errors, seconds: float
+    problem: Problem, estimate: Estimate, nominal: Errors, seen: Errors, unseen: Errors
 ) -> dict[str, Any]:
     rows = seen.count if estimate.scans else 0
     rows += sum(block.rows for block in problem.blocks)
@@ -214,14 +151,18 @@ def _summary(
         "points": seen.count if estimate.scans else 0,
         "stops": sum(len(s.recording.stops) for s in problem.sources),
         "residual": "range" if estimate.scans else "tracked position",
-        "rms_mm": {"fit": seen.rms_mm, "held_out": unseen.rms_mm, "noise_floor": floor.floor_mm},
-        "mean_mm": {"fit": seen.mean_mm, "held_out": unseen.mean_mm},
-        "std_mm": {"fit": seen.std_mm, "held_out": unseen.std_mm},
+        "rms_mm": {
+            "nominal": nominal.rms_mm,
+            "fit": seen.rms_mm,
+            "held_out": unseen.rms_mm,
+            "noise_floor": floor.floor_mm,
+        },
+        "mean_mm": {"nominal": nominal.mean_mm, "fit": seen.mean_mm, "held_out": unseen.mean_mm},
+        "std_mm": {"nominal": nominal.std_mm, "fit": seen.std_mm, "held_out": unseen.std_mm},
         "cost": estimate.graph.error(estimate.values),
         "dof": rows - free + sum(v.dim for v in estimate.variables),
         "iterations": estimate.iterations,
         "converged": estimate.converged,
-        "seconds": seconds,
     }
 
 
@@ -257,4 +198,3 @@ def _link_document(link: Link) -> dict[str, Any]:
         "change": link.change,
         "sigma": link.sigma,
     }
-

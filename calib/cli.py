@@ -1,4 +1,4 @@
-"""The command line: arguments in, one call, results out. Nothing heavy is imported before a call."""
+"""The command line: arguments in, one call, results out. What is heavy is imported by the call."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from typing import Annotated, Any
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
-import typer
+import typer  # noqa: E402
 
-from chains.errors import InputError
+from chains.errors import InputError  # noqa: E402
 
 app = typer.Typer(
     name="rigcal",
@@ -32,7 +32,9 @@ Out = Annotated[Path, typer.Option("-o", "--out", help="Where to write.")]
 
 @app.command()
 def simulate(
-    spec: Annotated[str, typer.Argument(help="A preset, or a YAML file that says what to simulate.")],
+    spec: Annotated[
+        str, typer.Argument(help="A preset, or a YAML file that says what to simulate.")
+    ],
     out: Out,
     seed: Annotated[int, typer.Option(help="Same seed, same recording.")] = 0,
     hide: Annotated[
@@ -45,7 +47,11 @@ def simulate(
 
     with _progress() as progress:
         run(spec, out, seed, _sizes(hide or []), progress)
-    _say({"recording": str(out), "truth": f"{out}.truth.json"}, f"wrote {out} and {out}.truth.json", as_json)
+    _say(
+        {"recording": str(out), "truth": f"{out}.truth.json"},
+        f"wrote {out} and {out}.truth.json",
+        as_json,
+    )
 
 
 @app.command()
@@ -116,7 +122,9 @@ def compare(
 def export(
     run: Path,
     out: Out,
-    formats: Annotated[list[str] | None, typer.Option("--format", help="yaml; all if not given.")] = None,
+    formats: Annotated[
+        list[str] | None, typer.Option("--format", help="yaml; all if not given.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Write the result for others: YAML extrinsics with sigmas and provenance."""
@@ -161,7 +169,10 @@ def main() -> None:
     except Exception as error:
         if os.environ.get("RIGCAL_TRACEBACK"):
             raise
-        _fail(f"a fault of the program: {type(error).__name__}: {error} (RIGCAL_TRACEBACK=1 shows where)", 1)
+        _fail(
+            f"internal fault: {type(error).__name__}: {error} (RIGCAL_TRACEBACK=1 says where)",
+            1,
+        )
     raise SystemExit(code or 0)
 
 
@@ -177,7 +188,9 @@ def _sizes(hide: list[str]) -> dict[str, float]:
         try:
             sizes[name] = float(size)
         except ValueError:
-            raise InputError(f"--hide {item}: give EFFECT=SIZE with a number, range_scale=1 say") from None
+            raise InputError(
+                f"--hide {item}: give EFFECT=SIZE with a number, range_scale=1 say"
+            ) from None
     return sizes
 
 
@@ -203,7 +216,12 @@ def _progress() -> Iterator[Callable[[str, int, int], None]]:
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+    )
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("reading", total=None)
         yield lambda what, done, total: bar.update(

@@ -98,3 +98,35 @@ def body_errors(
             expected += np.einsum("kip,pq,kiq->", d, graph.covariance(values, names), d)
         out += Errors(len(distance), float(distance.sum()), float(distance @ distance), expected)
     return out
+
+
+def misfit(graph: Graph, values: Mapping[str, np.ndarray], beams: Errors) -> dict[str, float]:
+    """How many times larger than their sigmas allow the residuals are, by kind of instrument.
+
+    For trackers and targets the root of chi-square over its degrees of freedom, their own unknowns
+    taken off; for beams the rms of inliers over what is expected of them. About 1 when all is well.
+
+    Args:
+        graph: as solved.
+        values: the solution.
+        beams: of all scans, as fitted.
+    """
+    out = {}
+    for kind in ("tracker", "target"):
+        blocks = [b for b in graph.blocks if b.kind == kind]
+        if blocks:
+            chi2 = sum(float(np.sum(np.square(b.evaluate(values, False)[0]))) for b in blocks)
+            own = {n for b in blocks for n in b.variables if "@" in n or ":" in n or n == "gravity"}
+            joints = {n for n in own if "joints@" in n}
+            free = sum(graph.variables[n].dim for n in own - joints)
+            chi2 += sum(_prior_cost(graph, values, n) for n in joints)
+            dof = max(1, sum(b.rows for b in blocks) - free)
+            out[kind] = float(np.sqrt(chi2 / dof))
+    if beams.count and any(b.kind == "beams" for b in graph.blocks):
+        out["beams"] = float(np.sqrt(beams.squares_m2 / beams.expected_m2))
+    return out
+
+
+def _prior_cost(graph: Graph, values: Mapping[str, np.ndarray], name: str) -> float:
+    v = graph.variables[name]
+    return float(np.sum(np.square((values[name] - v.mean) / v.sigma)))

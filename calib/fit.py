@@ -15,6 +15,7 @@ from calib.problem import Problem, effect_variable
 from calib.residuals.beams import Association, SharedSum
 from calib.residuals.scan import ScanStop
 from chains import se3
+from sensors.reference import Reference
 
 Progress = Callable[[str, int, int], None]
 MAX_PASSES = 25
@@ -130,17 +131,31 @@ class _Loop:
         Each kind is given more than half of the reference's variance: errors that are smooth over
         metres join neighbouring patches, which are unknowns of their own here.
         """
-        for number, source in enumerate(self.problem.sources):
-            mine = [i for i, scan in enumerate(self.scans) if scan.recording is source.recording]
-            sigma_m = self.scans[mine[0]].reference_sigma_m if mine else 0.0
+        for number, scans in self._by_mesh().items():
+            sigma_m = self.scans[scans[0]].reference_sigma_m
             if not sigma_m:
                 continue
-            views = [self.scans[i].rows(self.values, self.associations[i]).view for i in mine]
+            views = [self.scans[i].rows(self.values, self.associations[i]).view for i in scans]
             for column in ("surface", "patch"):
                 parts = np.unique(np.concatenate([np.unique(view[column]) for view in views]))
                 each = sigma_m * np.sqrt(COMMON_SHARE)
                 effect = SurfaceShift(f"{number}/reference_{column}", column, parts, each)
-                self._switch_on(effect, source, mine)
+                self._switch_on(effect, self.problem.sources[number], scans)
+
+    def _by_mesh(self) -> dict[int, list[int]]:
+        """First source with a mesh -> the scans on that mesh, of whatever recording."""
+        sources = self.problem.sources
+        meshes = [s.reference for s in sources]
+        first = {
+            id(s.recording): next(
+                i for i, mesh in enumerate(meshes) if same_mesh(mesh, s.reference)
+            )
+            for s in sources
+        }
+        found: dict[int, list[int]] = {}
+        for i, scan in enumerate(self.scans):
+            found.setdefault(first[id(scan.recording)], []).append(i)
+        return found
 
     def _switch_on(self, effect: SurfaceShift, source: Source, scans: Sequence[int]) -> None:
         term = Term(effect, effect.name, np.arange(len(effect.parts)))
@@ -174,6 +189,13 @@ class _Loop:
         """One step of the graph; the largest change of any variable, in m or rad."""
         before, self.values = self.values, self.graph.step(self.values)
         return max(_change(v, before[n], self.values[n]) for n, v in self.variables.items())
+
+
+def same_mesh(a: Reference | None, b: Reference | None) -> bool:
+    """Whether two references are one: their errors are then the same too."""
+    if a is None or b is None:
+        return a is b
+    return np.array_equal(a.vertices_m, b.vertices_m) and np.array_equal(a.triangles, b.triangles)
 
 
 def _change(variable: Variable, before: np.ndarray, after: np.ndarray) -> float:

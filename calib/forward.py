@@ -24,7 +24,7 @@ Derivatives = dict[str, np.ndarray]
 
 @dataclass(frozen=True)
 class Term:
-    """An effect as it stands in a model: its variable in the graph, and which parameters are free."""
+    """An effect as it stands in a model: its variable in the graph, and what of it is free."""
 
     effect: Effect
     variable: str

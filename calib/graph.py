@@ -48,7 +48,7 @@ class Block(Protocol):
     """Whitened rows of one kind that should be zero but for unit noise.
 
     ``evaluate`` gives residuals (m,) and, when asked, the derivative by each variable: (m, n) for a
-    vector, (m, 6) for a pose by its right increment, (m, 3) for a direction by its three components.
+    vector, (m, 6) for a pose by its right increment, (m, 3) for a direction by its components.
     """
 
     name: str
@@ -78,7 +78,7 @@ class Graph:
     ) -> None:
         self.variables = {v.name: v for v in variables}
         self._key = {name: k for k, name in enumerate(self.variables)}
-        self._blocks = blocks
+        self.blocks = blocks
         self._graph = gtsam.NonlinearFactorGraph()
         for variable in variables:
             if variable.name not in without_prior:
@@ -93,19 +93,17 @@ class Graph:
         """Half the sum of squared whitened rows, priors included."""
         return self._graph.error(self._to_gtsam(values))
 
-    def solve(
-        self, initial: Values, max_iterations: int = 50
-    ) -> tuple[dict[str, np.ndarray], int]:
-        """The maximum a posteriori values, by Levenberg-Marquardt from `initial`; and its iterations.
+    def solve(self, initial: Values, max_iterations: int = 50) -> tuple[dict[str, np.ndarray], int]:
+        """The maximum a posteriori values, by Levenberg-Marquardt, and its iterations.
 
-        GTSAM's default tolerance is relative to the cost, and stops sigmas short of the optimum when
-        rows are many; here the last step must lower half the chi-square by less than 1e-9.
+        GTSAM's default tolerance is relative to the cost: where rows are many, it stops sigmas
+        short of the optimum. Here the last step must lower half the chi-square by less than 1e-9.
         """
         params = gtsam.LevenbergMarquardtParams()
         params.setMaxIterations(max_iterations)
         params.setRelativeErrorTol(0.0)
         params.setAbsoluteErrorTol(1e-9)
-        # GTSAM's Cholesky gives up when what the data say outweighs a prior by some 1e7; QR does not.
+        # GTSAM's Cholesky gives up where data outweigh a prior by some 1e7; its QR does not.
         params.setLinearSolverType("MULTIFRONTAL_QR")
         params.setOrdering(self._ordering())
         start = self._to_gtsam(initial)
@@ -133,7 +131,7 @@ class Graph:
         return (root @ root.T)[np.ix_(order, order)]
 
     def _positions(self, net: gtsam.GaussianBayesNet) -> dict[str, np.ndarray]:
-        """Rows of each variable in the net's matrix: parts that nothing connects come one by one."""
+        """Rows of each variable in the net's matrix: unconnected parts come one by one."""
         names = list(self.variables)
         at, start = {}, 0
         for i in range(net.size()):
@@ -143,9 +141,9 @@ class Graph:
         return at
 
     def touched(self, values: Values, names: Sequence[str]) -> np.ndarray:
-        """Whether any row but a prior depends on each parameter of the named variables: (P,) bool."""
+        """Whether any row but a prior depends on each parameter of those variables: (P,) bool."""
         seen = {name: np.zeros(self.variables[name].dim, bool) for name in names}
-        for block in self._blocks:
+        for block in self.blocks:
             if block.kind != "prior" and seen.keys() & set(block.variables):
                 derivative = block.evaluate(values, derivatives=True)[1]
                 for name in seen.keys() & derivative.keys():

@@ -72,7 +72,7 @@ def predict(unseen: Problem, trained: Problem, estimate: Estimate) -> Errors:
     covariance = estimate.graph.covariance(estimate.values, names)
     prior = JointPrior(held, {n: estimate.values[n] for n in names}, covariance)
     scans, bodies = unseen.scans, [b for b in unseen.blocks if isinstance(b, TrackedBody)]
-    # Without a LiDAR, bodies before the joints say where the rig stands, and those beyond are judged.
+    # Without a LiDAR, bodies before the joints tell where the rig is; those beyond are judged.
     unseen.blocks = bodies if scans else [b for b in bodies if not b.stops.rig.joints_to(b.body)]
     told = {block.stops.root for block in unseen.blocks} | set(shared)
     unseen.scans = [scan for scan in scans if scan.stops.root not in told]

@@ -63,7 +63,9 @@ class Model:
             free = self._free(effect, rig)
             if len(free):
                 own = several and owned(effect, rig)
-                terms.append(Term(effect, f"{rig.name}/{effect.name}" if own else effect.name, free))
+                terms.append(
+                    Term(effect, f"{rig.name}/{effect.name}" if own else effect.name, free)
+                )
         return terms
 
     def _free(self, effect: Effect, rig: Rig) -> np.ndarray:
@@ -81,8 +83,8 @@ class Model:
         for name in self.fixed:
             if name not in known:
                 raise InputError(
-                    f"--fix {name}: the model has no such frame, effect or parameter; it has "
-                    f"{', '.join(sorted(e.name for e in chosen))} and their parameters, as name.parameter."
+                    f"--fix {name}: no such frame, effect or parameter in the model; it has "
+                    f"{', '.join(sorted(e.name for e in chosen))} and name.parameter of each"
                 )
 
 

@@ -125,7 +125,9 @@ class _Builder:
         self.groups = self._groups()
         self.reference = self._reference()
         self.stops = {
-            (name, k): index for name, stops in self.groups.items() for k, index in self._split(stops)
+            (name, k): index
+            for name, stops in self.groups.items()
+            for k, index in self._split(stops)
         }
         for name, stops in self.groups.items():
             self._add_root(name, stops)
@@ -164,7 +166,9 @@ class _Builder:
             return None
         name = rig.reference_frame
         if name in self.model.fixed:
-            raise InputError(f"--fix {name}: its place is not known before a fit, so it cannot be held.")
+            raise InputError(
+                f"--fix {name}: its place is not known before a fit, so it cannot be held."
+            )
         if name in self.problem.variables:
             return name
         T = start.reference_from_targets(self.source)
@@ -204,8 +208,8 @@ class _Builder:
             if near is None:
                 stop = source.recording.stops[stops[0]]
                 raise InputError(
-                    f"{source.recording.folder / 'stops.csv'}: stop '{stop}': no tracker sees the rig "
-                    f"and there is no base_guess to start from; add base_guess.x … base_guess.qz."
+                    f"{source.recording.folder / 'stops.csv'}: '{stop}': nothing tracks the rig"
+                    f" and there is no base_guess to start from; add base_guess.x … base_guess.qz"
                 )
             variable = pose_variable(name, near)
         self.problem.add(variable)
@@ -215,7 +219,10 @@ class _Builder:
         recording = self.source.recording
         k = int(stops[0])
         order = np.lexsort(
-            (np.abs(recording.time_s - recording.time_s[k]), recording.location != recording.location[k])
+            (
+                np.abs(recording.time_s - recording.time_s[k]),
+                recording.location != recording.location[k],
+            )
         )
         poses = (start.root_pose(self.source, [j]) for j in order)
         return next((T for T in poses if T is not None), None)
@@ -224,14 +231,18 @@ class _Builder:
         source = self.source
         columns = {name: values[index] for name, values in source.columns.items()}
         terms = self.problem.terms[self.number]
-        stops = place(source.rig, terms, source.recording.joints[index], columns, root, self.reference)
+        stops = place(
+            source.rig, terms, source.recording.joints[index], columns, root, self.reference
+        )
         sigma = source.rig.sigma_joint_rad
         if not sigma or not source.rig.joint_names:
             return stops
         name = f"{self.prefix}joints@{source.recording.stops[index[0]]}"
         count = len(source.rig.joint_names)
         units = ("rad",) * count
-        noise = Variable(name, "vector", np.zeros(count), np.full(count, sigma), source.rig.joint_names, units)
+        noise = Variable(
+            name, "vector", np.zeros(count), np.full(count, sigma), source.rig.joint_names, units
+        )
         self.problem.add(noise)
         return stops.with_joint_noise(name)
 
@@ -248,7 +259,16 @@ class _Builder:
                 name = f"{body} at {recording.stops[seen[0]]}"
                 bases = {v: basis[:, b] for v, basis in self._bases(Site.TRACKER, seen).items()}
                 self.problem.blocks.append(
-                    TrackedBody(name, stops, body, poses[seen], tracker.sigma_m, tracker.sigma_rad, point, bases)
+                    TrackedBody(
+                        name,
+                        stops,
+                        body,
+                        poses[seen],
+                        tracker.sigma_m,
+                        tracker.sigma_rad,
+                        point,
+                        bases,
+                    )
                 )
 
     def _bases(self, site: Site, index: np.ndarray) -> dict[str, np.ndarray]:
@@ -263,7 +283,12 @@ class _Builder:
         if targets is None or spec is None or self.reference is None:
             return
         gravity = Variable(
-            "gravity", "direction", start.gravity(self.source), np.ones(2), ("across_1", "across_2"), ("rad",) * 2
+            "gravity",
+            "direction",
+            start.gravity(self.source),
+            np.ones(2),
+            ("across_1", "across_2"),
+            ("rad",) * 2,
         )
         self.problem.add(gravity)
         view = View(self.source.rig, len(targets.names), {}, np.zeros((1, 0)))
@@ -271,29 +296,57 @@ class _Builder:
         shifts = {t.variable: t.basis(view) for t in terms}
         for m, name in enumerate(targets.names):
             marker = Variable(
-                f"{self.prefix}target:{name}", "vector", targets.lower_m[m], np.full(3, 10.0), ("x", "y", "z"), ("m",) * 3
+                f"{self.prefix}target:{name}",
+                "vector",
+                targets.lower_m[m],
+                np.full(3, 10.0),
+                ("x", "y", "z"),
+                ("m",) * 3,
             )
             self.problem.add(marker)
             self.problem.blocks.append(
                 HangingTarget(
-                    f"target {name}", marker.name, "gravity", self.reference,
-                    targets.faro_m[m], targets.upper_m[m], targets.lower_m[m],
-                    spec.sphere_below_lower_marker_m, spec.sigma_sphere_m, spec.sigma_marker_m,
-                    {v: np.broadcast_to(b, (len(targets.names), *b.shape[1:]))[m] for v, b in shifts.items()},
+                    f"target {name}",
+                    marker.name,
+                    "gravity",
+                    self.reference,
+                    targets.faro_m[m],
+                    targets.upper_m[m],
+                    targets.lower_m[m],
+                    spec.sphere_below_lower_marker_m,
+                    spec.sigma_sphere_m,
+                    spec.sigma_marker_m,
+                    {
+                        v: np.broadcast_to(b, (len(targets.names), *b.shape[1:]))[m]
+                        for v, b in shifts.items()
+                    },
                 )
             )
 
     def _add_scans(self) -> None:
         source, recording = self.source, self.source.recording
         meeting = self._meeting()
-        terms = [t for t in self.problem.terms[self.number] if t.effect.site in (Site.BEAM, Site.REFERENCE)]
+        terms = [
+            t
+            for t in self.problem.terms[self.number]
+            if t.effect.site in (Site.BEAM, Site.REFERENCE)
+        ]
         sigma_m = source.rig.reference.sigma_m if source.rig.reference and source.reference else 0.0
         for (root, k), index in self.stops.items():
             if k < 0 or not recording.has_scan[k]:
                 continue
             columns = {name: values[index] for name, values in source.columns.items()}
             self.problem.scans.append(
-                ScanStop(recording.stops[k], recording, k, self.geometry[root, k], terms, columns, meeting, sigma_m)
+                ScanStop(
+                    recording.stops[k],
+                    recording,
+                    k,
+                    self.geometry[root, k],
+                    terms,
+                    columns,
+                    meeting,
+                    sigma_m,
+                )
             )
 
     def _meeting(self) -> Meeting:

@@ -89,7 +89,13 @@ def solve_from(
         prior = prior.without(worst)
     names = [n for n in problem.calibration if n in prior.means]
     return estimate, [
-        _link(problem.variables[n], prior.means[n], estimate, released.get(n, tests.get(n)), n in released)
+        _link(
+            problem.variables[n],
+            prior.means[n],
+            estimate,
+            released.get(n, tests.get(n)),
+            n in released,
+        )
         for n in names
     ]
 

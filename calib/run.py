@@ -102,12 +102,16 @@ class Run:
         """
         folder = Path(folder)
         if not (folder / MODEL).is_file():
-            raise InputError(f"{folder}: no run there ({MODEL} is missing); make one with 'rigcal fit'")
+            raise InputError(
+                f"{folder}: no run there ({MODEL} is missing); make one with 'rigcal fit'"
+            )
         for name in (SOLUTION, SUMMARY, COVARIANCE):
             if not (folder / name).is_file():
                 raise InputError(f"{folder / name} is missing; the run is incomplete, fit it again")
         try:
-            return cls(folder, _yaml(folder / MODEL), _json(folder / SUMMARY), read_solution(folder))
+            return cls(
+                folder, _yaml(folder / MODEL), _json(folder / SUMMARY), read_solution(folder)
+            )
         except (KeyError, TypeError, ValueError) as error:
             if isinstance(error, InputError):
                 raise
@@ -177,7 +181,10 @@ def _read_part(data: Mapping[str, Any]) -> Part:
     }
     effects = {
         name: EffectEstimate(
-            e["unit"], tuple(e["names"]), np.array(e["estimate"], float), np.array(e["sigma"], float)
+            e["unit"],
+            tuple(e["names"]),
+            np.array(e["estimate"], float),
+            np.array(e["sigma"], float),
         )
         for name, e in data["effects"].items()
     }

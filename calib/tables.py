@@ -225,11 +225,11 @@ def _print_moved(console: Console, links: Sequence[Mapping[str, Any]]) -> None:
     rows, still, silent = [], [], []
     for link in links:
         if link["moved"]:
-            rows.append((link["name"], f"{_change(link)}; p = {link['p_value']:.1g}"))
+            rows.append((link["name"], f"{_change(link)}; {_chance(link['p_value'])}"))
         elif link["p_value"] is None:
             silent.append(link["name"])
         else:
-            still.append(f"{link['name']} (p = {link['p_value']:.2g})")
+            still.append(f"{link['name']} ({_chance(link['p_value'])})")
     rows = rows or [("nothing", "no change is beyond the uncertainty of then and now")]
     _grid(console, "moved since the earlier run", rows)
     if still:
@@ -252,6 +252,10 @@ def _change(link: Mapping[str, Any]) -> str:
             cells = [f"{len(mine)} values by {_shown(unit)[0] * rms:.2f} rms"]
         texts.append(f"{', '.join(cells)} {_shown(unit)[1]}".rstrip())
     return "; ".join(texts[::-1])
+
+
+def _chance(p: float) -> str:
+    return f"p = {p:.2g}" if p > 1e-12 else "p < 1e-12"
 
 
 def _print_reasons(console: Console, title: str, entries: Sequence[Mapping[str, str]]) -> None:

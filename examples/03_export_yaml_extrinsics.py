@@ -17,6 +17,7 @@ import yaml
 
 from calib.calibrate import calibrate
 from calib.export import export
+from calib.rig import load_rig
 from calib.simulate import simulate
 
 
@@ -43,6 +44,9 @@ for name, frame in extrinsics["frames"].items():
     print(f"  {frame['parent']} -> {name}: {xyz_m} m, sigma {1e3 * max(frame['sigma_m']):.2f} mm")
 
 found = {n: np.array(f["T_parent_child"]) for n, f in extrinsics["frames"].items()}
+cad = {edge.name: edge.T_parent_child for edge in load_rig(out / "recording").tree.edges}
 truth = json.loads((out / "recording.truth.json").read_text())["frames"]
-true = {name: np.array(T) for name, T in truth.items()}
-print("mount_markers -> lidar:", off(markers_to_lidar(found), markers_to_lidar(true)))
+true = markers_to_lidar({name: np.array(T) for name, T in truth.items()})
+print("mount_markers -> lidar")
+for name, frames in (("CAD", cad), ("fit", found)):
+    print(f"  {name}: {off(markers_to_lidar(frames), true)}")

@@ -65,7 +65,9 @@ class ArmAxisTilt(Effect):
 
     name = "arm_axis_tilt"
     site = Site.EDGE
-    formula = "origin of joint i -> origin * exp(a_i * x_i + b_i * y_i), x_i and y_i across the axis"
+    formula = (
+        "origin of joint i -> origin * exp(a_i * x_i + b_i * y_i), x_i and y_i across the axis"
+    )
     typical = "0.1 to 2 mrad"
     covariates = "joint positions"
     confounded_with = ("arm_joint_offset", "arm_gravity_sag")

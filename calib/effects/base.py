@@ -36,7 +36,7 @@ class Site(Enum):
 
 @dataclass(frozen=True)
 class Param:
-    """One unknown of an effect: its name, its unit, and how large it may plausibly be; 0 holds it."""
+    """One unknown of an effect: name, unit, and how large it may plausibly be; 0 holds it."""
 
     name: str
     unit: str
@@ -93,7 +93,7 @@ Basis = np.ndarray | OneHot
 
 
 class Effect(ABC):
-    """One way the hardware lies. A subclass states what it is and gives its basis; all else follows.
+    """One way the hardware lies. A subclass says what it is and gives its basis; all else follows.
 
     Attributes:
         name: as in commands and files.
@@ -116,7 +116,7 @@ class Effect(ABC):
 
     @abstractmethod
     def params(self, rig: Rig) -> tuple[Param, ...]:
-        """The unknowns of this effect on this rig; empty where the rig has nothing it could act on."""
+        """The unknowns of this effect on this rig; empty where it has nothing to act on."""
 
     @abstractmethod
     def basis(self, view: View) -> Basis:

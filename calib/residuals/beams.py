@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.effects import LazyColumn, OneHot, View
-from calib.forward import Derivatives, Stops, Term, Values
+from calib.forward import Derivatives, Stops, Values
 from calib.residuals.rows import Group, gram, split, square_root, tukey_cost, tukey_curvature
 from chains import se3
 from sensors.lidar import Beams
@@ -293,7 +293,9 @@ def effect_columns(
     if isinstance(basis, OneHot):
         value = np.einsum("nd,nd->n", by_site, basis.values)
         return Columns(variable, basis.index, value, np.arange(basis.size))
-    return np.einsum("nd,ndp->np", by_site, np.broadcast_to(basis, (len(by_site), *basis.shape[1:])))
+    return np.einsum(
+        "nd,ndp->np", by_site, np.broadcast_to(basis, (len(by_site), *basis.shape[1:]))
+    )
 
 
 def compress(

@@ -96,9 +96,7 @@ def gram(dense: np.ndarray, groups: list[Group], weight: np.ndarray) -> np.ndarr
 def _one_hot(g: Group) -> csr_matrix:
     rows = len(g.index)
     value = np.where(g.index >= 0, g.value, 0.0)
-    return csr_matrix(
-        (value, np.maximum(g.index, 0), np.arange(rows + 1)), shape=(rows, g.size)
-    )
+    return csr_matrix((value, np.maximum(g.index, 0), np.arange(rows + 1)), shape=(rows, g.size))
 
 
 def _cross(g: Group, h: Group, weight: np.ndarray) -> np.ndarray:
@@ -130,7 +128,7 @@ def square_root(matrix: np.ndarray) -> np.ndarray:
 def split(matrix: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Rows that know the first columns, and the Gram matrix of what is left for the others.
 
-    With ``R.T @ R = matrix`` and the first columns eliminated first, R is ``[top; 0 | root(rest)]``.
+    With ``R.T @ R = matrix`` and those columns eliminated first, R is ``[top; 0 | root(rest)]``.
 
     Args:
         matrix: (n, n) symmetric semidefinite.

@@ -100,13 +100,15 @@ class ScanStop:
         scan = self.recording.scan(self.index)
         return scan, beams(scan.xyz_m, self.lidar.beam_origin_m)
 
-    def _associate(self, T: np.ndarray, ray: Beams, values: Values, near_edges: bool) -> Association:
+    def _associate(
+        self, T: np.ndarray, ray: Beams, values: Values, near_edges: bool
+    ) -> Association:
         found = self.meeting.associate(T, ray, values, near_edges)
         if not (found.part >= 0).any():
             raise InputError(
-                f"{self.recording.folder}: stop '{self.name}': none of its {len(found.part)} beams meets "
-                f"a surface; check the units of the scan, the mesh's frame, and where the stop starts "
-                f"(base_guess, targets)"
+                f"{self.recording.folder}: stop '{self.name}': none of its {len(found.part)} beams "
+                f"meets a surface; check the scan's units, the mesh's frame, and where the stop "
+                f"starts (base_guess, targets)"
             )
         return found
 
@@ -193,7 +195,11 @@ def turned(ray: Beams, azimuth_rad: np.ndarray, elevation_rad: np.ndarray) -> Be
     """Beams turned by small angles: their origin goes along in azimuth."""
     azimuth, elevation = ray.azimuth_rad + azimuth_rad, ray.elevation_rad + elevation_rad
     u = np.stack(
-        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)],
+        [
+            np.cos(elevation) * np.cos(azimuth),
+            np.cos(elevation) * np.sin(azimuth),
+            np.sin(elevation),
+        ],
         axis=1,
     )
     c, s = np.cos(azimuth_rad), np.sin(azimuth_rad)

@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 
 from calib import problem as problems
+from calib.calibrate import solution_of
 from calib.check import check
 from calib.fit import solve
 from calib.inventory import PlacedScan, odd_beams
 from calib.model import Model, Source
 from chains.errors import InputError
-from sensors.documents import read_yaml, write_yaml
-from sensors.recording import read_table, write_table
+from sensors.recording import read_table
 
-from . import rigs
+from . import broken, rigs
 
 
 @pytest.fixture(scope="module")
@@ -35,26 +35,9 @@ def rec(box, tmp_path):
     return shutil.copytree(box, tmp_path / "box")
 
 
-def column(path, name, change):
-    """Change a column of a CSV file, a list of texts."""
-    head, *rows = [line.split(",") for line in path.read_text().splitlines()]
-    at = head.index(name)
-    for row, value in zip(rows, change([row[at] for row in rows]), strict=True):
-        row[at] = str(value)
-    path.write_text("\n".join(",".join(row) for row in (head, *rows)) + "\n")
-
-
-def rig(folder, change):
-    """Change rig.yaml through its data."""
-    data, _ = read_yaml(folder / "rig.yaml")
-    change(data)
-    write_yaml(folder / "rig.yaml", data)
-
-
-def scan(folder, stop, **columns):
-    """Change columns of a scan."""
-    path = folder / f"scans/{stop}.parquet"
-    write_table(path, read_table(path) | columns)
+def poses(body):
+    """A pattern of a body's columns in stops.csv."""
+    return rf"{body}_markers\.(x|y|z|q.)"
 
 
 # ---------------------------------------------------------------------------------- what is there
@@ -128,8 +111,6 @@ def test_what_can_be_told_is_said_with_its_unit(found):
 
 
 def test_what_cannot_be_told_is_what_the_fit_says_too(box, found):
-    from calib.calibrate import solution_of
-
     problem = problems.build([Source.open(box)], Model())
     later = solution_of(problem, solve(problem)).not_estimated
     assert [entry["name"] for entry in found.cannot] == [entry["name"] for entry in later]
@@ -145,7 +126,7 @@ def test_without_scans_the_lidar_cannot_be_told(rec):
 
 
 def test_more_noise_is_foretold(box, rec):
-    rig(rec, lambda data: data["tracker"].update(sigma_m=0.004, sigma_rad=0.006))
+    broken.rig("tracker", "sigma_m", value=0.004)(rec)
     coarse, fine = check(rec).expected, check(box).expected
     assert coarse["faro"]["mm"][0] > fine["faro"]["mm"][0]
 
@@ -161,46 +142,45 @@ def test_the_document_is_json_with_all_of_it(found):
 # ----------------------------------------------------------------------------------- what is wrong
 
 
-def test_one_problem_does_not_hide_another(rec):
-    (rec / "scans/s1.parquet").write_text("no table")
-    scan(rec, "s2", ring=np.full(400, 16, np.uint16))
-    (rec / "targets.csv").write_text("target,faro_x\nt0,1\n")
-    (rec / "reference/mesh.ply").write_text("ply\n")
-    problems_ = check(rec).problems
-    for part in ("s1.parquet", "s2.parquet: ring 16", "targets.csv", "mesh.ply"):
+def assert_each_once(problems_, parts):
+    for part in parts:
         assert sum(part in problem for problem in problems_) == 1, (part, problems_)
-    assert len(problems_) == 4
+    assert len(problems_) == len(parts), problems_
+
+
+def test_one_problem_does_not_hide_another(rec):
+    broken.overwrite("scans/s1.parquet")(rec)
+    broken.table("scans/s2.parquet", ring=lambda r: r + np.uint16(1))(rec)
+    broken.overwrite("targets.csv")(rec)
+    broken.overwrite("reference/mesh.ply")(rec)
+    parts = ("s1.parquet", "s2.parquet: ring 16", "targets.csv", "mesh.ply")
+    assert_each_once(check(rec).problems, parts)
 
 
 def test_a_broken_rig_hides_neither_stops_nor_targets_nor_scans(rec):
-    (rec / "rig.yaml").write_text("name: [\n")
-    column(rec / "stops.csv", "time_s", lambda cells: ["soon", *cells[1:]])
-    column(rec / "targets.csv", "faro_x", lambda cells: ["", *cells[1:]])
-    scan(rec, "s0", count=np.zeros(400))
-    problems_ = check(rec).problems
-    for part in ("rig.yaml", "stops.csv: row 1", "targets.csv: row 1", "s0.parquet: count"):
-        assert sum(part in problem for problem in problems_) == 1, (part, problems_)
+    broken.text("rig.yaml", "name:", "name: [")(rec)
+    broken.cells("stops.csv", "time_s", "soon", row=0)(rec)
+    broken.cells("targets.csv", "faro_x", "", row=1)(rec)
+    broken.table("scans/s0.parquet", count=np.zeros_like)(rec)
+    parts = ("rig.yaml:", "stops.csv: row 1", "targets.csv: row 2", "s0.parquet: count")
+    assert_each_once(check(rec).problems, parts)
 
 
 def test_a_scan_that_cannot_be_read_leaves_the_others_to_tell(rec, found):
-    (rec / "scans/s1.parquet").write_text("no table")
+    broken.overwrite("scans/s1.parquet")(rec)
     less = check(rec)
-    assert len(less.problems) == 1 and "scans" in dict(less.contents)
-    assert (
-        less.expected["ring_range_offset"]["mm"][0] > found.expected["ring_range_offset"]["mm"][0]
+    assert_each_once(less.problems, ["s1.parquet"])
+    assert dict(less.contents)["scans"].startswith("3 of 400 points")
+    ring, before = (of.expected["ring_range_offset"]["mm"] for of in (less, found))
+    assert ring[0] == pytest.approx(before[0] * np.sqrt(4 / 3), rel=0.1)
+
+
+def test_stops_that_see_nothing_of_the_mesh_are_a_problem_each(rec):
+    for stop in (2, 3):
+        broken.cells("stops.csv", r".*_markers\.[xyz]", lambda m: m + 50, row=stop)(rec)
+    assert_each_once(
+        check(rec).problems, ["stop 's2': none of its 400", "stop 's3': none of its 400"]
     )
-
-
-def test_a_stop_that_sees_nothing_of_the_mesh_is_a_problem(rec):
-    keys = [f"base_markers.{axis}" for axis in "xyz"] + [f"mount_markers.{axis}" for axis in "xyz"]
-    for key in keys:
-        column(
-            rec / "stops.csv", key, lambda cells: [*cells[:2], *(float(c) + 50 for c in cells[2:])]
-        )
-    problems_ = check(rec).problems
-    assert len(problems_) == 2, problems_
-    assert all("400 beams" in problem for problem in problems_)
-    assert "'s2'" in problems_[0] and "'s3'" in problems_[1]
 
 
 def test_a_folder_that_is_not_there_is_refused(tmp_path):
@@ -211,62 +191,64 @@ def test_a_folder_that_is_not_there_is_refused(tmp_path):
 # ----------------------------------------------------------------------------------- what looks odd
 
 
-def oddities(folder):
+def assert_odd(folder, *sentences):
+    """The check finds no problem, these oddities, and no other but the few locations."""
     found = check(folder)
     assert found.problems == []
-    return [line for line in found.odd if "locations" not in line]
+    odd = [line for line in found.odd if "locations" not in line]
+    for sentence in sentences:
+        assert sum(sentence in line for line in odd) == 1, (sentence, odd)
+    assert len(odd) == len(sentences), odd
 
 
 def test_a_joint_at_rest_and_one_beyond_its_limits(rec):
-    column(rec / "stops.csv", "turn", lambda cells: [*cells[:-1], 3.5])
-    column(rec / "stops.csv", "slide", lambda cells: ["0.1"] * 4)
-    text = oddities(rec)
-    assert any(t.startswith("turn is beyond its limits of -3 to 3 rad at s3") for t in text), text
-    assert any(t.startswith("slide moves by 0 m in all") for t in text), text
+    broken.cells("stops.csv", "slide", 0.1)(rec)
+    broken.cells("stops.csv", "turn", 3.5, row=3)(rec)
+    broken.cells("stops.csv", poses("mount"), "", row=3)(rec)
+    assert_odd(rec, "turn is beyond its limits of -3 to 3 rad at s3;", "slide moves by 0 m in all")
 
 
 def test_bodies_that_are_hardly_seen(rec):
-    for part in ("x", "y", "z", "qw", "qx", "qy", "qz"):
-        column(rec / "stops.csv", f"mount_markers.{part}", lambda cells: [cells[0], "", "", ""])
-        column(rec / "stops.csv", f"base_markers.{part}", lambda cells: [*cells[:3], ""])
-    text = oddities(rec)
-    assert "mount_markers is seen at 1 of 4 stops only; look for what hides it" in text
-    assert any(t.startswith("no tracked body is seen at s3;") for t in text), text
+    for stop in (1, 2, 3):
+        broken.cells("stops.csv", poses("mount"), "", row=stop)(rec)
+    broken.cells("stops.csv", poses("base"), "", row=3)(rec)
+    assert_odd(rec, "mount_markers is seen at 1 of 4 stops only", "no tracked body is seen at s3;")
 
 
 def test_scans_without_stop_stops_without_scan_rings_without_points(rec):
-    shutil.move(rec / "scans/s3.parquet", rec / "scans/s9.parquet")
-    for stop in ("s0", "s1", "s2", "s9"):
-        ring = read_table(rec / f"scans/{stop}.parquet")["ring"]
-        scan(rec, stop, ring=np.where(ring == 7, 8, ring).astype(np.uint16))
-    text = oddities(rec)
-    assert any("s9" in t and "no such stop" in t for t in text), text
-    assert any(t.startswith("there is no scan of s3") for t in text), text
-    assert any(t.startswith("no point comes from ring 7;") for t in text), text
+    (rec / "scans/s3.parquet").rename(rec / "scans/s9.parquet")
+    for path in (rec / "scans").iterdir():
+        broken.table(f"scans/{path.name}", ring=lambda r: np.where(r == 7, 8, r).astype("u2"))(rec)
+    assert_odd(
+        rec,
+        "scans/ holds s9, but stops.csv has no such stop",
+        "there is no scan of s3",
+        "no point comes from ring 7;",
+    )
 
 
 def test_scans_that_the_rig_has_no_lidar_for(rec):
-    rig(rec, lambda data: data.pop("lidar"))
-    assert any("no 'lidar' in rig.yaml" in t for t in oddities(rec))
+    broken.rig("lidar", value=None)(rec)
+    assert_odd(rec, "no 'lidar' in rig.yaml")
 
 
 def test_targets_that_are_mixed_up(rec):
-    column(rec / "targets.csv", "faro_x", lambda cells: [float(cells[0]) + 0.2, *cells[1:]])
-    for axis in "xyz":
-        path = rec / "targets.csv"
-        swapped = {}
-        for end in ("upper", "lower"):
-            column(path, f"{end}_{axis}", lambda cells, end=end: swapped.setdefault(end, cells))
-        column(path, f"upper_{axis}", lambda cells: [*cells[:3], swapped["lower"][3]])
-        column(path, f"lower_{axis}", lambda cells: [*cells[:3], swapped["upper"][3]])
-    text = check(rec).odd
-    assert any(t.startswith("the rod of t3 does not hang as the others do") for t in text), text
-    assert any(t.startswith("tracker and scanner place t") for t in text), text
+    def swap(text):
+        """Exchange upper and lower of the last target, and the spheres of the first two."""
+        rows = [line.split(",") for line in text.splitlines()]
+        rows[4][4:7], rows[4][7:10] = rows[4][7:10], rows[4][4:7]
+        rows[1][1:4], rows[2][1:4] = rows[2][1:4], rows[1][1:4]
+        return "\n".join(map(",".join, rows)) + "\n"
+
+    broken.text("targets.csv", swap)(rec)
+    odd = check(rec).odd
+    assert any(line.startswith("the rod of t3 does not hang as the others do") for line in odd), odd
+    assert any(line.startswith("tracker and scanner place t") for line in odd), odd
 
 
 def test_a_sigma_in_millimetres(rec):
-    rig(rec, lambda data: data["reference"].update(sigma_m=0.6))
-    assert any(t.startswith("reference.sigma_m is 0.6 m in rig.yaml") for t in oddities(rec))
+    broken.rig("reference", "sigma_m", value=0.6)(rec)
+    assert_odd(rec, "reference.sigma_m is 0.6 m in rig.yaml")
 
 
 def placed(roll_rad, incidence_deg=(5, 70), residual_m=0.01):

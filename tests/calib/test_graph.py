@@ -83,7 +83,7 @@ def test_our_weights_are_those_of_one_robust_factor_per_row_and_gtsams_stacked_o
     # softer loss the plain mean, pulled to 3 by the wild rows.
     loss = gtsam.noiseModel.mEstimator.Huber.Create(1.345)
     noise = gtsam.noiseModel.Robust.Create(loss, gtsam.noiseModel.Unit.Create(len(z)))
-    A, b = custom(z, noise).linearize(_at_zero()).jacobian()
+    A, _ = custom(z, noise).linearize(_at_zero()).jacobian()
     np.testing.assert_allclose(A, A[0, 0])
     assert gtsam_step([custom(z, noise)]) == pytest.approx(z.mean(), rel=1e-9)
 
@@ -248,7 +248,9 @@ def test_solve_finds_what_scipy_finds():
         return (seen - (points * (1 + values["s"]) + 0.3 * values["g"]) @ R.T - t).ravel()
 
     def rows(values):
-        d = {n: rigs.differences(residual, values, n, k) for n, k in (("T", "pose"), ("s", "vector"))}
+        d = {
+            n: rigs.differences(residual, values, n, k) for n, k in (("T", "pose"), ("s", "vector"))
+        }
         R = values["T"][:3, :3]
         return residual(values), d | {"g": np.tile(-0.3 * R, (8, 1))}
 

@@ -234,7 +234,7 @@ class Far(Effect):
 
 
 def test_a_beam_whose_plane_fell_behind_it_is_left_out(on_mesh):
-    """With its triangle kept, a beam may come to look away from it: infinitely far, as a miss is."""
+    """With its triangle kept, a beam may come to look away from it: as far off as a miss."""
     scan = replace(on_mesh.problem.scans[0], terms=[Term(Far(), "far", np.arange(1))])
     values = {**on_mesh.values, "far": np.array([0.01])}
     part = on_mesh.association[0].part.copy()
@@ -251,11 +251,11 @@ def test_a_beam_whose_plane_fell_behind_it_is_left_out(on_mesh):
 # ------------------------------------------------------------------------------------- compression
 
 
-def compressed(case, stops):
+def compressed(case, stops, newton=False):
     """What the graph sees of some stops."""
     poses, shared = [], SharedSum()
     for k in stops:
-        scan = case.problem.scans[k].compress(case.values, case.association[k])
+        scan = case.problem.scans[k].compress(case.values, case.association[k], newton)
         poses.append(scan.pose)
         shared.add(scan)
     return [*poses, *shared.rows()]
@@ -298,6 +298,20 @@ def test_compressed_rows_have_the_normal_equations_of_all_rows(meeting, stops, r
     )
     rows_few = sum(b.rows for b in blocks)
     assert rows_few <= 6 * len(stops) + 1 + sum(len(case.values[n]) for n in blocks[-1].variables)
+
+
+@pytest.mark.parametrize("meeting", ["on_mesh", "on_planes"])
+def test_newtons_curvature_leaves_the_gradient_as_it_is(meeting, request):
+    case = request.getfixturevalue(meeting)
+    plain, newton = (compressed(case, [0, 2], newton) for newton in (False, True))
+    names = list(dict.fromkeys(name for block in plain for name in block.variables))
+    A, B = (
+        normal_equations([b.evaluate(case.values, True) for b in blocks], names, case.values)
+        for blocks in (plain, newton)
+    )
+    size = np.sqrt(np.maximum(np.diag(A), 1e-30))[:-1]
+    np.testing.assert_allclose(B[:-1, -1] / size, A[:-1, -1] / size, atol=1e-9 * A[-1, -1] ** 0.5)
+    assert np.abs(B - A)[:-1, :-1].max() > 0.01 * np.abs(A).max()
 
 
 @pytest.mark.parametrize("meeting", ["on_mesh", "on_planes"])

@@ -1,0 +1,71 @@
+"""Do the intervals that users see hold? Rigs simulated, fitted, and compared with their truth."""
+
+from __future__ import annotations
+
+import json
+import os
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+RIGS = int(os.environ.get("RIGCAL_COVERAGE_RIGS", "24"))
+
+
+def _fit_one(seed: int, folder: str) -> tuple[np.ndarray, np.ndarray, float, float]:
+    """Errors over sigma of links and of rings, and the held-out and expected mean squares."""
+    from calib.calibrate import calibrate
+    from calib.simulate import simulate
+    from chains import se3
+
+    recording = Path(folder) / f"rig{seed}"
+    simulate("tiny", recording, seed)
+    run = calibrate([recording], Path(folder) / f"run{seed}")
+    truth = json.loads(Path(f"{recording}.truth.json").read_text())
+    frames = truth["frames"] | {"faro": np.linalg.inv(truth["T_faro_opti"])}
+    links, rings = [], []
+    for name, frame in run.solution.shared.frames.items():
+        T = np.array(frames[name])
+        turn = se3.log(se3.inverse(frame.T_parent_child) @ T)[:3]
+        links += [turn / frame.sigma_rad, (T - frame.T_parent_child)[:3, 3] / frame.sigma_m]
+    for name, effect in run.solution.shared.effects.items():
+        told = effect.sigma > 0
+        z = (effect.estimate - np.array(truth["effects"][name]))[told] / effect.sigma[told]
+        (rings if name == "ring_range_offset" else links).append(z)
+    rms = run.summary["rms_mm"]
+    squares = rms["held_out"] ** 2, rms["noise_floor"] ** 2
+    return np.concatenate(links), np.concatenate(rings), *squares
+
+
+@pytest.fixture(scope="module")
+def rigs(tmp_path_factory: pytest.TempPathFactory) -> list:
+    folder = str(tmp_path_factory.mktemp("rigs"))
+    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
+        return list(pool.map(_fit_one, range(1000, 1000 + RIGS), [folder] * RIGS))
+
+
+def test_intervals_hold(rigs: list) -> None:
+    """95 % intervals of links hold in 93 to 97 %, beyond what so few rigs leave to chance.
+
+    Parameters of one rig err together, so the spread between rigs says how sure the share is.
+    """
+    held = np.array([np.mean(np.abs(links) < 1.96) for links, *_ in rigs])
+    chance = 2.0 * held.std(ddof=1) / np.sqrt(len(held))
+    assert 0.93 - chance < held.mean() < 0.97 + chance
+
+
+def test_ring_intervals_hold(rigs: list) -> None:
+    """Rings of one rig share its range zero: the share of intervals that hold varies by rig."""
+    held = np.array([np.mean(np.abs(rings) < 1.96) for _, rings, *_ in rigs])
+    chance = 2.0 * held.std(ddof=1) / np.sqrt(len(held))
+    assert 0.93 - chance < held.mean() < 0.97 + chance
+
+
+def test_held_out_error_is_the_noise_floor(rigs: list) -> None:
+    """With nothing missing, the held-out rms is within 5 % of what the sigmas predict."""
+    held, floor = np.array([r[2] for r in rigs]), np.array([r[3] for r in rigs])
+    ratio = np.sqrt(held.mean() / floor.mean())
+    chance = 2.0 * np.std(held / floor.mean(), ddof=1) / np.sqrt(len(held)) / 2.0
+    assert abs(ratio - 1.0) < 0.05 + chance

@@ -1,0 +1,227 @@
+"""The command line as its users meet it: exit codes, what stands on which stream, Ctrl-C."""
+
+import json
+import os
+import pty
+import signal
+import subprocess
+import sys
+import threading
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from calib.cli import app, main
+
+ROOT = Path(__file__).resolve().parents[1]
+SPEC = "{lidar: hesai_pandarxt32, locations: 3, stops_per_location: 2, column_step: 200}"
+COMMANDS = sorted(command.callback.__name__ for command in app.registered_commands)
+
+
+@pytest.fixture
+def rigcal(monkeypatch, capfd):
+    """A function that runs a command here, and returns its exit code, stdout and stderr."""
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["rigcal", *map(str, arguments)])
+        with pytest.raises(SystemExit) as exit_:
+            main()
+        return exit_.value.code, *capfd.readouterr()
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A folder with a recording and a run, and what making them printed: folder, {command: out}."""
+    folder = tmp_path_factory.mktemp("cli")
+    (folder / "spec.yaml").write_text(SPEC)
+    printed = {}
+    for command, *arguments in (
+        ["simulate", folder / "spec.yaml", "-o", folder / "rec", "--seed", 1],
+        ["fit", folder / "rec", "-o", folder / "run", "--hold-out", "none"],
+    ):
+        started = program(command, *arguments, "--json")
+        done = subprocess.run(started, cwd=ROOT, capture_output=True, text=True)
+        assert (done.returncode, done.stderr) == (0, "")
+        printed[command] = done.stdout
+    return folder, printed
+
+
+@pytest.fixture
+def folder(made):
+    """The folder with a recording and a run."""
+    return made[0]
+
+
+def program(*arguments):
+    """What starts a command in a process of its own."""
+    return [sys.executable, "-c", "from calib.cli import main; main()", *map(str, arguments)]
+
+
+@contextmanager
+def at_a_terminal(*arguments):
+    """A process whose stderr is a terminal, and a list that fills with what it shows there."""
+    terminal, stderr = pty.openpty()
+    process = subprocess.Popen(
+        program(*arguments), cwd=ROOT, stdout=subprocess.PIPE, stderr=stderr, text=True
+    )
+    os.close(stderr)
+    shown = []
+
+    def read():
+        try:
+            while chunk := os.read(terminal, 4096):
+                shown.append(chunk.decode(errors="replace"))
+        except OSError:  # the process has closed its side
+            pass
+
+    reader = threading.Thread(target=read)
+    reader.start()
+    try:
+        yield process, shown
+    finally:
+        process.kill()
+        process.wait()
+        process.stdout.close()
+        reader.join()
+        os.close(terminal)
+
+
+def contents(folder):
+    return {p: p.read_bytes() if p.is_file() else None for p in folder.rglob("*")}
+
+
+# -------------------------------------------------------------------------------------- exit codes
+
+
+def test_without_arguments_stands_the_help(rigcal):
+    code, out, err = rigcal()
+    assert (code, err) == (0, "") and "Usage: rigcal" in out
+    assert all(f" {command} " in out for command in COMMANDS)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_help_and_json(rigcal, command):
+    code, out, err = rigcal(command, "--help")
+    assert (code, err) == (0, "") and "--json" in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        (["fitt"], "fitt"),
+        (["fit", "rec", "-o", "run", "--hold"], "--hold"),
+        (["--nope"], "--nope"),
+        (["fit", "rec"], "--out"),
+        (["fit", "-o", "run"], "REC"),
+        (["check"], "recording"),
+        (["check", "a", "b"], "b"),
+        (["fit", "rec", "-o", "run", "--folds", "many"], "--folds"),
+        (["simulate", "tinny", "-o", "rec"], "did you mean tiny"),
+        (["simulate", "tiny", "-o", "rec", "--hide", "range_scale"], "EFFECT=SIZE"),
+        (["effects", "ring_offset"], "did you mean 'ring_range_offset'"),
+        (["compare", "nowhere"], "nowhere"),
+    ],
+    ids=lambda value: "" if isinstance(value, str) else " ".join(value),
+)
+def test_wrong_usage_is_one_sentence_and_2(rigcal, tmp_path, monkeypatch, arguments, part):
+    monkeypatch.chdir(tmp_path)
+    code, out, err = rigcal(*arguments)
+    assert code == 2 and out == ""
+    assert err.startswith("rigcal: ") and err.count("\n") == 1 and part in err, err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_fault_of_the_program_is_one_sentence_and_1(rigcal, monkeypatch):
+    def broken(*_):
+        raise RuntimeError("the sky fell")
+
+    monkeypatch.setattr("calib.effects.find", broken)
+    monkeypatch.delenv("RIGCAL_TRACEBACK", raising=False)
+    code, out, err = rigcal("effects", "ring_range_offset")
+    assert code == 1 and out == "" and err.count("\n") == 1
+    assert "internal fault: RuntimeError: the sky fell" in err
+    monkeypatch.setenv("RIGCAL_TRACEBACK", "1")
+    monkeypatch.setattr(sys, "argv", ["rigcal", "effects", "ring_range_offset"])
+    with pytest.raises(RuntimeError):
+        main()
+
+
+def test_a_check_that_finds_problems_is_2_and_says_them_on_stdout(rigcal, tmp_path):
+    (tmp_path / "rig.yaml").write_text("name: empty\n")
+    code, out, err = rigcal("check", tmp_path, "--json")
+    assert (code, err) == (2, "")
+    assert any("stops.csv does not exist" in problem for problem in json.loads(out)["problems"])
+    code, out, err = rigcal("check", tmp_path)
+    assert (code, err) == (2, "") and "stops.csv" in out
+
+
+# ----------------------------------------------------------------------------------------- streams
+
+
+def test_json_of_what_takes_long_stands_alone_on_stdout(made):
+    folder, printed = made
+    written = json.loads(printed["simulate"])
+    assert all(Path(written[key]).exists() for key in ("recording", "truth"))
+    summary = json.loads((folder / "run/summary.json").read_text())
+    told = json.loads(printed["fit"])
+    assert told.pop("not_estimated") and told == summary
+
+
+@pytest.mark.parametrize(
+    ("arguments", "keys"),
+    [
+        (["check", "rec"], {"contents", "problems", "odd", "can", "cannot"}),
+        (["compare", "run", "run"], {"rms_mm", "parameters"}),
+        (["export", "run", "-o", "out"], {"files"}),
+        (["effects"], {"name", "formula", "source"}),
+        (["effects", "ring_range_offset"], {"name", "formula", "source"}),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_json_stands_alone_on_stdout(rigcal, folder, monkeypatch, arguments, keys):
+    monkeypatch.chdir(folder)
+    code, out, err = rigcal(*arguments, "--json")
+    assert (code, err) == (0, "")
+    document = json.loads(out)
+    for part in document if isinstance(document, list) else [document]:
+        assert keys <= part.keys()
+
+
+@pytest.mark.parametrize(
+    "command", [["check", "rec"], ["compare", "run"], ["effects"]], ids=" ".join
+)
+def test_without_json_people_are_told_on_stdout(rigcal, folder, monkeypatch, command):
+    monkeypatch.chdir(folder)
+    code, out, err = rigcal(*command)
+    assert (code, err) == (0, "") and len(out.splitlines()) > 3
+    with pytest.raises(json.JSONDecodeError):
+        json.loads(out)
+
+
+def test_progress_is_shown_at_a_terminal_and_never_on_stdout(folder):
+    with at_a_terminal("check", folder / "rec", "--json") as (process, shown):
+        out = process.stdout.read()
+        assert process.wait() == 0
+    assert "━" in "".join(shown), "a bar"
+    assert json.loads(out)["problems"] == []
+
+
+# ------------------------------------------------------------------------------------------ Ctrl-C
+
+
+def test_an_interrupted_fit_leaves_the_earlier_run_as_it_was(folder):
+    before = contents(folder)
+    arguments = ["fit", folder / "rec", "-o", folder / "run", "--hold-out", "stop", "--folds", 3]
+    with at_a_terminal(*arguments) as (process, shown):
+        while "pass" not in "".join(shown):
+            assert process.poll() is None, "".join(shown)
+            threading.Event().wait(0.01)
+        assert list(folder.glob(".run.*")), "it writes elsewhere than beside its result"
+        process.send_signal(signal.SIGINT)
+        assert process.wait(20) == 130
+        assert process.stdout.read() == ""
+    assert "rigcal: interrupted" in "".join(shown)
+    assert contents(folder) == before
