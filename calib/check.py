@@ -11,7 +11,6 @@ import numpy as np
 
 from calib import inventory
 from calib import problem as problems
-from calib.calibrate import solution_of
 from calib.fit import Estimate, Progress, _Loop
 from calib.forward import Values
 from calib.inventory import PlacedScan, ScanSums
@@ -19,6 +18,7 @@ from calib.model import Model, Source
 from calib.problem import Problem
 from calib.residuals.scan import ScanStop
 from calib.rig import Rig, load_rig
+from calib.solution import solution_of
 from chains.errors import InputError
 from sensors.recording import Recording, read_scan
 from sensors.reference import Reference
@@ -111,6 +111,7 @@ class _Checker:
         if rig and recording:
             found.contents.extend(inventory.of_stops(recording))
             found.odd.extend(inventory.odd_stops(rig, recording))
+            found.odd.extend(inventory.odd_joints(rig, recording))
         scans = self._read_scans(rig)
         if rig and recording:
             found.odd.extend(inventory.odd_scans(rig, recording, scans))

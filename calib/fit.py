@@ -15,6 +15,7 @@ from calib.problem import Problem, effect_variable
 from calib.residuals.beams import Association, SharedSum
 from calib.residuals.scan import ScanStop
 from chains import se3
+from chains.errors import InputError
 from sensors.reference import Reference
 
 Progress = Callable[[str, int, int], None]
@@ -67,7 +68,12 @@ def solve(
         prior: a joint prior; the variables it speaks of then have no prior of their own.
         tolerance: largest step of the last pass, m and rad.
         progress: called with what is being done, how many stops are done, and of how many.
+
+    Raises:
+        InputError: nothing is left to estimate.
     """
+    if not problem.calibration:
+        raise InputError("nothing is left to estimate: fix fewer names, or choose an effect")
     loop = _Loop(problem, prior, progress)
     loop.solve_without_scans()
     if not problem.scans:
@@ -135,9 +141,14 @@ class _Loop:
             sigma_m = self.scans[scans[0]].reference_sigma_m
             if not sigma_m:
                 continue
-            views = [self.scans[i].rows(self.values, self.associations[i]).view for i in scans]
-            for column in ("surface", "patch"):
-                parts = np.unique(np.concatenate([np.unique(view[column]) for view in views]))
+            seen: dict[str, list[np.ndarray]] = {"surface": [], "patch": []}
+            for i in scans:
+                view = self.scans[i].rows(self.values, self.associations[i]).view
+                for column, parts in seen.items():
+                    parts.append(np.unique(view[column]))
+            for column, found in seen.items():
+                parts = np.unique(np.concatenate(found))
+                parts = parts[parts >= 0]
                 each = sigma_m * np.sqrt(COMMON_SHARE)
                 effect = SurfaceShift(f"{number}/reference_{column}", column, parts, each)
                 self._switch_on(effect, self.problem.sources[number], scans)

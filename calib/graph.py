@@ -157,6 +157,9 @@ class Graph:
         return ordering
 
     def _prior(self, v: Variable) -> gtsam.NonlinearFactor:
+        if not np.all(np.asarray(v.sigma) > 0):
+            # GTSAM would take it for a constraint, and call all of this variable's marginals zero.
+            raise ValueError(f"variable '{v.name}' has a sigma of 0; leave out what is held")
         noise = gtsam.noiseModel.Diagonal.Sigmas(np.asarray(v.sigma, float))
         make = {
             "vector": gtsam.PriorFactorVector,
@@ -179,7 +182,7 @@ class Graph:
         def rows(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list | None) -> np.ndarray:
             now = {v.name: _read(v.kind, values, k) for v, k in zip(variables, keys, strict=True)}
             residual, derivative = block.evaluate(now, jacobians is not None)
-            _check_finite(block, residual)
+            _check_finite(block, residual, "residual")
             if jacobians is not None:
                 for i, v in enumerate(variables):
                     d = derivative[v.name]
@@ -190,6 +193,7 @@ class Graph:
                             f"block '{block.name}': derivative by '{v.name}' has shape {d.shape}, "
                             f"not {(block.rows, v.dim)}"
                         )
+                    _check_finite(block, d, f"derivative by '{v.name}'")
                     jacobians[i] = np.asfortranarray(d)
             return residual
 
@@ -205,10 +209,10 @@ class Graph:
         return {n: _read(v.kind, values, self._key[n]) for n, v in self.variables.items()}
 
 
-def _check_finite(block: Block, residual: np.ndarray) -> None:
+def _check_finite(block: Block, values: np.ndarray, what: str) -> None:
     # A NaN makes GTSAM return the start without a word.
-    if not np.isfinite(residual).all():
-        raise FloatingPointError(f"block '{block.name}' has a residual that is not finite")
+    if not np.isfinite(values).all():
+        raise FloatingPointError(f"block '{block.name}' has a {what} that is not finite")
 
 
 def _wrap(kind: Kind, value: np.ndarray) -> np.ndarray | gtsam.Pose3 | gtsam.Unit3:

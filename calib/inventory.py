@@ -149,7 +149,7 @@ def odd_rig(rig: Rig) -> Iterator[str]:
 
 
 def odd_stops(rig: Rig, recording: Recording) -> Iterator[str]:
-    """Too few locations, bodies that are hardly seen, joints beyond limits or at rest."""
+    """Too few locations, and bodies that are hardly seen."""
     names = np.array(recording.stops)
     if (locations := len(set(recording.location))) < FEW_LOCATIONS:
         yield (
@@ -161,18 +161,23 @@ def odd_stops(rig: Rig, recording: Recording) -> Iterator[str]:
         if at.sum() < len(at) / 2:
             yield f"{body} is seen at {at.sum()} of {len(at)} stops only; look for what hides it"
     if seen and (unseen := names[~np.any(list(seen.values()), axis=0)]).size:
-        yield f"no tracked body is seen at {_listed(unseen)}; give them a base_guess, or see one"
-    joints = {e.joint.name: e.joint for e in rig.tree.edges if e.joint is not None}
-    for name, at in zip(rig.joint_names, recording.joints.T, strict=True):
-        joint, unit = joints[name], "rad" if joints[name].kind == "revolute" else "m"
+        yield f"no tracked body is seen at {_listed(unseen)}; what they tell rests on their scans"
+
+
+def odd_joints(rig: Rig, recording: Recording) -> Iterator[str]:
+    """Joints at rest, or beyond their limits."""
+    names = np.array(recording.stops)
+    values = dict(zip(rig.joint_names, recording.joints.T, strict=True))
+    if still := [name for name, at in values.items() if np.ptp(at) < STILL]:
+        yield f"{_listed(still)} hardly moved, too little to tell their own errors; move them"
+    for joint in (edge.joint for edge in rig.tree.edges if edge.joint is not None):
+        at, unit = values[joint.name], "rad" if joint.kind == "revolute" else "m"
         beyond = (at < joint.lower - LIMIT_SLACK) | (at > joint.upper + LIMIT_SLACK)
         if beyond.any():
             yield (
-                f"{name} is beyond its limits of {joint.lower:g} to {joint.upper:g} {unit} at "
-                f"{_listed(names[beyond])}; check its sign, zero and unit"
+                f"{joint.name} is beyond its limits of {joint.lower:g} to {joint.upper:g} {unit} "
+                f"at {_listed(names[beyond])}; check its sign, zero and unit"
             )
-        if np.ptp(at) < STILL:
-            yield f"{name} moves by {np.ptp(at):.2g} {unit} in all, too little to tell its errors"
 
 
 def odd_scans(rig: Rig, recording: Recording, scans: ScanSums) -> Iterator[str]:

@@ -121,7 +121,7 @@ class _Builder:
 
     def build(self) -> None:
         rig, recording = self.source.rig, self.source.recording
-        self.has_lidar = rig.lidar is not None and bool(recording.has_scan.any())
+        self.has_lidar = rig.lidar is not None and bool(recording.has_scan[self.chosen].any())
         self.groups = self._groups()
         self.reference = self._reference()
         self.stops = {
@@ -200,8 +200,8 @@ class _Builder:
             variable = pose_variable(name, tracked)
         elif guess is not None:
             variable = pose_variable(name, guess, GUESSED_POSE)
-        elif len(self.groups) == 1:
-            # No tracker, no mesh pose: the world is wherever the rig stands. Any choice will do.
+        elif len(self.groups) == 1 and self.source.reference is None:
+            # Nothing says where the rig is, and nothing else has a place: any choice will do.
             variable = pose_variable(name, np.eye(4), np.full(6, 1e-3))
         else:
             near = self._neighbour(stops)
@@ -239,7 +239,7 @@ class _Builder:
             return stops
         name = f"{self.prefix}joints@{source.recording.stops[index[0]]}"
         count = len(source.rig.joint_names)
-        units = ("rad",) * count
+        units = tuple("rad" if kind == "revolute" else "m" for kind in source.rig.joint_kinds)
         noise = Variable(
             name, "vector", np.zeros(count), np.full(count, sigma), source.rig.joint_names, units
         )

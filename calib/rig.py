@@ -98,6 +98,12 @@ class Rig:
             if arm <= set(self.tree.path(edges[self.tree.edge_names.index(name)].child))
         )
 
+    @property
+    def joint_kinds(self) -> tuple[str, ...]:
+        """ "revolute" or "prismatic", by joint."""
+        kinds = {e.joint.name: e.joint.kind for e in self.tree.edges if e.joint is not None}
+        return tuple(kinds[name] for name in self.joint_names)
+
     def joints_to(self, frame: str) -> tuple[str, ...]:
         """The moving joints between the root and a frame."""
         edges = (self.tree.edges[i] for i in self.tree.path(frame))

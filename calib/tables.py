@@ -13,15 +13,6 @@ from rich.table import Table
 
 from calib.estimates import Found, comparison, found
 
-__all__ = [
-    "comparison",
-    "effect_page",
-    "print_catalogue",
-    "print_check",
-    "print_comparison",
-    "print_run",
-]
-
 if TYPE_CHECKING:
     from calib.check import Check
     from calib.effects import Effect
@@ -204,7 +195,7 @@ def _summary_cell(row: Found, free: np.ndarray) -> tuple[str, str]:
     digits = ".2f" if scale != 1.0 else ".3g"
     return (
         f"mean {values.mean():+{digits}}, sd {values.std():{digits}}, {values.min():+{digits}} to "
-        f"{values.max():+{digits}}, median sigma {scale * np.median(row.sigma[free]):.2g}"
+        f"{values.max():+{digits}}, sigma {scale * np.median(row.sigma[free]):.2g}"
     ), unit
 
 

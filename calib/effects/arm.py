@@ -52,9 +52,11 @@ class ArmJointOffset(Effect):
     source = "Mooring, Roth, Driels 1991, Fundamentals of Manipulator Calibration"
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
-        units = {True: "rad", False: "m"}
-        kinds = {e.joint.name: e.joint.kind for e in rig.tree.edges if e.joint is not None}
-        return tuple(Param(j, units[kinds[j] == "revolute"], 0.005) for j in rig.joint_names)
+        units = {"revolute": "rad", "prismatic": "m"}
+        return tuple(
+            Param(joint, units[kind], 0.005)
+            for joint, kind in zip(rig.joint_names, rig.joint_kinds, strict=True)
+        )
 
     def basis(self, view: View) -> np.ndarray:
         return np.eye(len(view.rig.joint_names))[None]

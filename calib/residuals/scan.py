@@ -136,28 +136,31 @@ class ScanStop:
         bases: Mapping[str, tuple[Site, np.ndarray | OneHot]],
         error: Mapping[Site, np.ndarray],
     ) -> Rows:
-        usable, t, n = surface.usable, surface.predicted_m, surface.normal @ T[:3, :3]
+        usable, t, n = surface.usable, surface.predicted_m.copy(), surface.normal @ T[:3, :3]
         lost = np.flatnonzero(~usable)
         t[lost] = 1.0
         n[lost] = ray.direction[lost]
         cosine = np.abs(np.einsum("ni,ni->n", n, ray.direction))
         n /= np.where(usable, -cosine, cosine)[:, None]
+        if error[Site.REFERENCE].any():
+            t += np.einsum("ni,ni->n", n @ T[:3, :3].T, error[Site.REFERENCE])
         hit = ray.origin_m + t[:, None] * ray.direction
         by_site = {Site.REFERENCE: -n @ T[:3, :3].T}
         if any(site is Site.BEAM for site, _ in bases.values()):
             by_site[Site.BEAM] = beam_derivative(ray, t, hit, n)
         residual = ray.range_m - t - error[Site.BEAM][:, 0]
-        if error[Site.REFERENCE].any():
-            residual += np.einsum("ni,ni->n", by_site[Site.REFERENCE], error[Site.REFERENCE])
         residual[lost] = 0.0
         reference = self.reference_sigma_m / cosine
-        sigma = np.sqrt(self._beam_variance(scan, t, cosine) + LOCAL_SHARE * reference**2)
+        variance = self._beam_variance(scan, t, cosine, usable)
+        sigma = np.sqrt(variance + LOCAL_SHARE * reference**2)
         z = residual / sigma
         scale = robust_scale(z[usable])
         columns = {
             name: effect_columns(name, basis, by_site[site])
             for name, (site, basis) in bases.items()
         }
+        for c in (*columns.values(), *surface.unknown):
+            (c.value if isinstance(c, Columns) else c)[lost] = 0.0  # 0 * inf would be NaN
         return Rows(
             residual,
             sigma,
@@ -171,7 +174,9 @@ class ScanStop:
             usable,
         )
 
-    def _beam_variance(self, scan: Scan, t: np.ndarray, cosine: np.ndarray) -> np.ndarray:
+    def _beam_variance(
+        self, scan: Scan, t: np.ndarray, cosine: np.ndarray, usable: np.ndarray
+    ) -> np.ndarray:
         """Variance of the averaged range: noise over count, and the beam's angle.
 
         The spread measured over a hold leans on the datasheet's, scaled to this stop, as if that
@@ -181,7 +186,7 @@ class ScanStop:
         incidence = np.arccos(np.minimum(cosine, 1.0))
         single = np.square(lidar.sigma_range(t, incidence))
         measured = np.square(scan.range_std_m)
-        known = np.isfinite(measured) & (scan.count > 1)
+        known = np.isfinite(measured) & (scan.count > 1) & usable
         if known.any():
             single = single * np.median((measured / single)[known])
             dof = np.where(known, scan.count - 1.0, 0.0)

@@ -84,11 +84,11 @@ POSES = {
     "nan": (cells(STOPS, r"base_markers\.y", "nan", 2), "row 3 (L01P00)", "base_markers.y"),
     "no unit": (cells(STOPS, r"base_markers\.qw", "2", 0), "row 1 (L00P00)", "length"),
     "degrees": (cells(STOPS, "joint_1", "45", 0), "row 1 (L00P00)", "joint_1", "degrees"),
-    "never seen": (UNSEEN, "stop 'L00P00'", "no tracker sees", "base_guess"),
+    "never seen": (UNSEEN, "'L00P00'", "base_guess.x"),
     "base that is never seen nor moved": (
         all_of(UNSEEN, rig("base", "moves", value="never")),
-        "no tracker sees",
-        "base_guess",
+        "'L00P00'",
+        "base_guess.x",
     ),
     "mesh, but neither tracker nor guess": (
         all_of(
@@ -97,8 +97,8 @@ POSES = {
             rig("base", "moves", value="never"),
             remove(TARGETS),
         ),
-        "no tracker sees",
-        "base_guess",
+        "'L00P00'",
+        "base_guess.x",
     ),
     "no tie to the mesh": (remove(TARGETS), "'faro' to 'opti'", "targets.csv", "base_guess"),
     "a body twice": (
@@ -127,7 +127,7 @@ IMPOSSIBLE = {
     "faces too few": (rows(FACES, slice(1, None)), MESH, FACES, "give one each"),
     "faces of no use": (table(FACES, label=None, intensity=None), FACES, "label and intensity"),
     "mesh": (mesh(lambda v: np.where(v == v[0, 0], np.nan, v)), MESH, "vertex 0", "not finite"),
-    "mesh elsewhere": (mesh(lambda v: v + np.full(3, 50.0)), "stop 'L00P00'", "beams", "mesh"),
+    "mesh elsewhere": (mesh(lambda v: v + np.full(3, 50.0)), "'L00P00'", "beams", "mesh"),
     "line of targets": (text(TARGETS, on_a_line), TARGETS, "one line", "area"),
     "two targets": (text(TARGETS, lambda t: "\n".join(t.splitlines()[:3])), TARGETS, "3 targets"),
 }

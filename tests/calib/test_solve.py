@@ -5,6 +5,8 @@ minimises with `scipy.optimize.least_squares`. Of the fit it takes only what a f
 which triangle each beam meets, the sigma of each row and how wide the bulk of a stop's rows is.
 """
 
+import csv
+
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
@@ -14,6 +16,7 @@ from calib.calibrate import calibrate
 from calib.fit import solve
 from calib.model import Model, Source
 from calib.problem import build
+from chains.errors import InputError
 
 from . import rigs
 
@@ -281,6 +284,18 @@ def test_the_surface_has_an_unknown_for_every_part_met_and_no_other(fitted):
     found = estimate.graph.variables["0/reference_surface"].dofs
     assert found == tuple(f"surface_{part}" for part in parts)
     assert not any("-" in dof for dof in estimate.graph.variables["0/reference_patch"].dofs)
+
+
+def test_a_rig_that_nothing_places_in_its_mesh_is_refused(tmp_path):
+    """Any choice of world will do without a mesh; with one, a guess of the drawing is wrong."""
+    folder = rigs.write(tmp_path / "box", tracker=None, target=None, base={"moves": "never"})
+    with (folder / "stops.csv").open() as file:
+        names, *rows = csv.reader(file)
+    known = [k for k, name in enumerate(names) if not name.startswith("base_guess")]
+    with (folder / "stops.csv").open("w", newline="") as file:
+        csv.writer(file).writerows([row[k] for k in known] for row in (names, *rows))
+    with pytest.raises(InputError, match="base_guess"):
+        build([Source.open(folder)], MODEL)
 
 
 class Seen(Exception):
