@@ -58,13 +58,11 @@ class JointPrior:
             start += v.dim
         return residual, d
 
-    def without(self, name: str) -> JointPrior:
-        """The same, no longer holding one variable."""
-        sizes = [v.dim for v in self.held]
-        owner = np.repeat([v.name for v in self.held], sizes)
-        keep = owner != name
-        held = [v for v in self.held if v.name != name]
-        return JointPrior(held, self.means, self.covariance[np.ix_(keep, keep)])
+    def loosened(self, name: str) -> JointPrior:
+        """The same, where one variable has since moved by as much as its own sigma allows."""
+        moved = [v.sigma if v.name == name else np.zeros(v.dim) for v in self.held]
+        covariance = self.covariance + np.diag(np.square(np.concatenate(moved)))
+        return JointPrior(self.held, self.means, covariance)
 
     def _root(self) -> np.ndarray:
         """R with R.T @ R = inverse(covariance), scaled first: sigmas differ by orders."""

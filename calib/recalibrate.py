@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import chi2
@@ -30,7 +31,7 @@ class Link:
         moved: whether it moved by more than the two uncertainties allow.
         p_value: of the change, if it had not; None where the new data say nothing of it.
         change: (n,) now minus then, per parameter, m or rad.
-        sigma: (n,) of the estimate now.
+        sigma: (n,) of the change where it moved, else of the estimate now.
         parameters: (n,) names.
         units: (n,).
     """
@@ -71,73 +72,110 @@ def earlier(problem: Problem, solution: Solution) -> JointPrior:
 def solve_from(
     problem: Problem, prior: JointPrior, progress: Progress
 ) -> tuple[Estimate, list[Link]]:
-    """Estimate with an earlier solution as prior, releasing link by link what has moved.
+    """Estimate with an earlier solution as prior, letting go link by link of what has moved.
 
-    With nothing moved, an update changes a link by ``d ~ N(0, S_then - S_now)``. The link whose
-    change is least likely is released to its CAD prior and the fit repeated, until none is beyond
-    chance (1 % over all links).
+    The link that explains the contradiction between prior and data best is taken to have moved by
+    as much as CAD was unsure of it, and the fit repeated, until none is beyond chance (1 % over all
+    links).
     """
-    released: dict[str, float] = {}
+    moved: dict[str, _Test] = {}
     while True:
         estimate = solve(problem, prior, progress=progress)
-        tests = {v.name: _change_test(v, prior, estimate) for v in prior.held}
-        found = {name: p for name, p in tests.items() if p is not None}
+        tests = _tests(prior, estimate)
+        found = {n: test for n, test in tests.items() if test is not None and n not in moved}
         worst = min(found, key=found.get, default=None)
-        if worst is None or found[worst] > ALARM / len(found) or len(prior.held) == 1:
+        if worst is None or found[worst].p > ALARM / len(tests):
             break
-        released[worst] = found[worst]
-        prior = prior.without(worst)
-    names = [n for n in problem.calibration if n in prior.means]
-    return estimate, [
-        _link(
-            problem.variables[n],
-            prior.means[n],
-            estimate,
-            released.get(n, tests.get(n)),
-            n in released,
-        )
-        for n in names
-    ]
+        moved[worst] = found[worst]
+        prior = prior.loosened(worst)
+    tests |= moved
+    return estimate, [_link(v, prior, estimate, tests[v.name], v.name in moved) for v in prior.held]
 
 
-def _change_test(variable: Variable, prior: JointPrior, estimate: Estimate) -> float | None:
-    then = _block(prior.held, prior.covariance, variable.name)
-    now = _estimate_block(estimate, variable)
-    root = np.linalg.inv(np.linalg.cholesky(then))
-    left, axes = np.linalg.eigh(root @ now @ root.T)
-    d = difference(variable, prior.means[variable.name], estimate.values[variable.name])
-    told = left < TOLD
-    if not told.any():
+def _tests(prior: JointPrior, estimate: Estimate) -> dict[str, _Test | None]:
+    """Per link, a test of its not having moved; None where the data cannot tell.
+
+    Baarda's test of a group of observations, which the prior's means m of covariance S are. With
+    nothing moved, ``d = now - m ~ N(0, S - S_now)``; with P = S^-1, link k alone having moved shows
+    in ``T = (P d)_k^T [(P (S - S_now) P)_kk]^-1 (P d)_k``, chi2-distributed if it has not. Links
+    are strongly correlated, so the change of each by itself would accuse the wrong one.
+
+    Baarda 1968, A testing procedure for use in geodetic networks.
+    """
+    scale = np.sqrt(np.diag(prior.covariance))
+    P = np.linalg.inv(prior.covariance / np.outer(scale, scale))
+    now = _covariance(estimate, prior.held) / np.outer(scale, scale)
+    force = P @ (_change(prior, estimate) / scale)
+    spread = P - P @ now @ P
+    blocks = _blocks(prior.held)
+    return {name: _test(force[k], spread[k, k], P[k, k]) for name, k in blocks.items()}
+
+
+class _Test(NamedTuple):
+    """The less likely, the smaller: by p, and by the statistic where p is 0 in floating point."""
+
+    p: float
+    minus_statistic: float
+
+
+def _test(force: np.ndarray, spread: np.ndarray, precision: np.ndarray) -> _Test | None:
+    """Of a force ~ N(0, spread), along the axes that anything but the prior holds."""
+    root = np.linalg.inv(np.linalg.cholesky(precision))
+    told, axes = np.linalg.eigh(root @ spread @ root.T)
+    use = told > 1.0 - TOLD
+    if not use.any():
         return None
-    z2 = np.square(axes.T @ root @ d)[told] / (1.0 - left[told])
-    return float(chi2.sf(z2.sum(), told.sum()))
+    statistic = float((np.square(axes.T @ root @ force)[use] / told[use]).sum())
+    return _Test(float(chi2.sf(statistic, use.sum())), -statistic)
 
 
 def _link(
-    variable: Variable, mean: np.ndarray, estimate: Estimate, p_value: float | None, moved: bool
+    variable: Variable, prior: JointPrior, estimate: Estimate, test: _Test | None, moved: bool
 ) -> Link:
+    """The link, with the move that explains all changes best where it is the one that moved.
+
+    With x = m + error + move, error ~ N(0, S) and move ~ N(0, D_k) of each link k that moved, after
+    the fit ``move_k = G (x - m)``, ``G = D_k (S + D)^-1``, of ``G S_now G^T + D_k - G D_k``.
+    """
+    k = _blocks(prior.held)[variable.name]
+    change = _change(prior, estimate)
+    covariance = _covariance(estimate, prior.held)
+    if moved:
+        D = np.diag(np.square(variable.sigma))
+        scale = np.sqrt(np.diag(prior.covariance))
+        P = np.linalg.inv(prior.covariance / np.outer(scale, scale)) / np.outer(scale, scale)
+        G = D @ P[k]
+        change = G @ change
+        covariance = G @ covariance @ G.T + D - G[:, k] @ D
+    else:
+        change, covariance = change[k], covariance[k, k]
     return Link(
         variable.name,
         moved,
-        p_value,
-        difference(variable, mean, estimate.values[variable.name]),
-        np.sqrt(np.diag(_estimate_block(estimate, variable))),
+        test.p if test else None,
+        change,
+        np.sqrt(np.diag(covariance)),
         variable.dofs,
         variable.units,
     )
 
 
-def _block(variables: Sequence[Variable], covariance: np.ndarray, name: str) -> np.ndarray:
-    start = 0
-    for v in variables:
-        if v.name == name:
-            return covariance[start : start + v.dim, start : start + v.dim]
-        start += v.dim
-    raise KeyError(name)
+def _change(prior: JointPrior, estimate: Estimate) -> np.ndarray:
+    """Now minus then of all that the prior holds, as one tangent."""
+    values = ((v, prior.means[v.name], estimate.values[v.name]) for v in prior.held)
+    return np.concatenate([difference(*each) for each in values])
 
 
-def _estimate_block(estimate: Estimate, variable: Variable) -> np.ndarray:
-    return _block(estimate.variables, estimate.covariance, variable.name)
+def _covariance(estimate: Estimate, held: Sequence[Variable]) -> np.ndarray:
+    """Covariance of some of the estimate's variables, in the order given."""
+    blocks, order = _blocks(estimate.variables), np.arange(len(estimate.covariance))
+    index = np.concatenate([order[blocks[v.name]] for v in held])
+    return estimate.covariance[np.ix_(index, index)]
+
+
+def _blocks(variables: Sequence[Variable]) -> dict[str, slice]:
+    ends = np.cumsum([v.dim for v in variables])
+    return {v.name: slice(end - v.dim, end) for v, end in zip(variables, ends, strict=True)}
 
 
 def _earlier_value(problem: Problem, variable: Variable, solution: Solution) -> np.ndarray | None:

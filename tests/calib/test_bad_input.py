@@ -215,10 +215,12 @@ def test_a_fit_refuses_a_recording_in_one_sentence(rec, refused, case):
         (["--prior", "nowhere"], ["nowhere", "no run there", "rigcal fit"]),
         (["--folds", "9"], ["--folds", "5"]),
         (["nowhere"], ["nowhere", "rig.yaml does not exist"]),
+        (["rec/../rec"], ["rec is given twice"]),
     ],
     ids=lambda value: " ".join(value[:1]),
 )
-def test_a_fit_refuses_an_argument_in_one_sentence(rec, refused, arguments, parts):
+def test_a_fit_refuses_an_argument_in_one_sentence(rec, refused, monkeypatch, arguments, parts):
+    monkeypatch.chdir(rec.parent)
     sentence = refused("fit", rec, *arguments, "-o", rec.parent / "run")
     for part in parts:
         assert part in sentence, sentence
