@@ -27,6 +27,7 @@ from calib.run import (
     versions,
 )
 from calib.solution import solution_of
+from chains.errors import InputError
 from sensors.documents import replace_folder, write_json, write_yaml
 from sensors.recording import write_table
 
@@ -61,6 +62,7 @@ def calibrate(
 
     began = time.monotonic()
     with threadpool_limits(limits=1), replace_folder(out, MODEL) as folder:
+        _refuse_twice([Path(r).resolve() for r in recordings])
         sources = [Source.open(r) for r in recordings]
         before = Run.open(prior).solution if prior else None
         problem = problems.build(sources, model)
@@ -89,6 +91,12 @@ def calibrate(
             summary["links"] = [_link_document(link) for link in links]
         write_json(folder / SUMMARY, summary)
     return Run.open(out)
+
+
+def _refuse_twice(recordings: Sequence[Path]) -> None:
+    for recording in recordings:
+        if recordings.count(recording) > 1:
+            raise InputError(f"{recording} is given twice; as data it counts once")
 
 
 def _nominal(problem: Problem, progress: Progress) -> Errors:
@@ -120,7 +128,7 @@ def _write_residuals(
         rows = scan.rows(estimate.values, association)
         view = rows.view
         names = ("ring", "column", "range_m", "incidence_rad", "azimuth_rad", "elevation_rad")
-        names += ("intensity", "label", "surface", "patch", "plane")
+        names += ("intensity", "label", "surface", "region", "patch", "plane")
         columns = {n: view[n] for n in names if n in view.columns}
         columns |= {
             "residual_m": rows.residual_m,

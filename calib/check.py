@@ -11,11 +11,10 @@ import numpy as np
 
 from calib import inventory
 from calib import problem as problems
-from calib.fit import Estimate, Progress, _Loop
+from calib.fit import Estimate, Progress, preview
 from calib.forward import Values
 from calib.inventory import PlacedScan, ScanSums
 from calib.model import Model, Source
-from calib.problem import Problem
 from calib.residuals.scan import ScanStop
 from calib.rig import Rig, load_rig
 from calib.solution import solution_of
@@ -172,7 +171,7 @@ class _Checker:
         if placed:
             self.found.contents.extend(inventory.of_beams(placed))
             self.found.odd.extend(inventory.odd_beams(placed))
-        estimate = self._attempt(_preview, problem, self.progress)
+        estimate = self._attempt(preview, problem, self.progress)
         if estimate is not None:
             self.found.expected.update(_expected(estimate))
             self.found.cannot.extend(solution_of(problem, estimate).not_estimated)
@@ -197,16 +196,6 @@ def _place(scan: ScanStop, values: Values) -> PlacedScan:
         rows.view["incidence_rad"][met],
         float(np.median(np.abs(rows.residual_m[rows.usable]))),
     )
-
-
-def _preview(problem: Problem, progress: Progress) -> Estimate:
-    """What a fit would know, from one linearisation at the start."""
-    loop = _Loop(problem, None, progress)
-    loop.solve_without_scans()
-    if problem.scans:
-        loop.fix_association()
-        loop.add_surface_unknowns()
-    return loop.estimate(converged=False)
 
 
 def _expected(estimate: Estimate) -> dict[str, dict[str, tuple[float, float]]]:

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NoReturn
 
 # BLAS threads on shared cores cost many times what they save; set before numpy is imported.
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -17,10 +17,11 @@ import typer  # noqa: E402
 
 from chains.errors import InputError  # noqa: E402
 
+INTERRUPTED = 130  # as shells have it: 128 and the signal's number
+
 app = typer.Typer(
     name="rigcal",
     help="Calibrate a LiDAR rig as one factor graph.",
-    no_args_is_help=True,
     add_completion=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
@@ -153,30 +154,34 @@ def effects(
 
 def main() -> None:
     """Run the command line: exit code 0 done, 2 bad input or usage, 1 a fault of the program."""
-    import click
-
     try:
-        code = app(standalone_mode=False)
+        code = app(sys.argv[1:] or ["--help"], prog_name="rigcal", standalone_mode=False)
     except InputError as error:
         _fail(str(error), 2)
-    except click.exceptions.NoArgsIsHelpError as error:
-        print(error.format_message())
-        raise SystemExit(0) from None
-    except click.ClickException as error:
-        _fail(error.format_message(), 2)
-    except (click.Abort, KeyboardInterrupt):
-        _fail("interrupted; nothing was left half-written", 130)
+    except KeyboardInterrupt:
+        code = INTERRUPTED
     except Exception as error:
-        if os.environ.get("RIGCAL_TRACEBACK"):
-            raise
-        _fail(
-            f"internal fault: {type(error).__name__}: {error} (RIGCAL_TRACEBACK=1 says where)",
-            1,
-        )
+        if hasattr(error, "format_message"):  # wrong usage: typer's click, wherever that lives
+            _fail(error.format_message(), 2)
+        if not _interrupted(error):
+            if os.environ.get("RIGCAL_TRACEBACK"):
+                raise
+            name = type(error).__name__
+            _fail(f"internal fault: {name}: {error} (RIGCAL_TRACEBACK=1 says where)", 1)
+        code = INTERRUPTED
+    if code == INTERRUPTED:  # typer's answer to Ctrl-C, too
+        _fail("interrupted; nothing was left half-written", code)
     raise SystemExit(code or 0)
 
 
-def _fail(message: str, code: int) -> None:
+def _interrupted(error: BaseException | None) -> bool:
+    """Whether Ctrl-C is behind an error: a library that it hits while loading reports its own."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
+
+
+def _fail(message: str, code: int) -> NoReturn:
     print(f"rigcal: {message}", file=sys.stderr)
     raise SystemExit(code)
 

@@ -20,7 +20,9 @@ from sensors.reference import Reference
 
 Progress = Callable[[str, int, int], None]
 MAX_PASSES = 25
-COMMON_SHARE = 0.7  # of the reference's variance, for surfaces and for patches each
+# Variance of the steps between surfaces, and between their cells, as shares of the reference's. It
+# is more than all of it: steps must stand for the slopes of an error that is smooth over metres.
+SURFACE_SHARES = {"surface": 0.6, "region": 0.6, "patch": 2.0}
 SETTLED = 1e-4  # m and rad: after that, which triangle a beam meets is kept
 CONVERGED = 1e-7  # m and rad: a hundredth of the smallest sigma in sight
 
@@ -84,6 +86,16 @@ def solve(
     return loop.estimate(loop.run(loop.scans, tolerance, associate=False))
 
 
+def preview(problem: Problem, progress: Progress = lambda what, done, total: None) -> Estimate:
+    """What a fit would know, from one linearisation at the start: its covariance, near enough."""
+    loop = _Loop(problem, None, progress)
+    loop.solve_without_scans()
+    if problem.scans:
+        loop.fix_association()
+        loop.add_surface_unknowns()
+    return loop.estimate(converged=False)
+
+
 class _Loop:
     """The state of a fit while it runs."""
 
@@ -132,16 +144,12 @@ class _Loop:
             self.associations.append(scan.associate(self.values, near_edges=True))
 
     def add_surface_unknowns(self) -> None:
-        """Errors of the reference, common to the points of a surface or patch, as unknowns.
-
-        Each kind is given more than half of the reference's variance: errors that are smooth over
-        metres join neighbouring patches, which are unknowns of their own here.
-        """
+        """Errors of the reference, common to the points of a surface or cell, as unknowns."""
         for number, scans in self._by_mesh().items():
             sigma_m = self.scans[scans[0]].reference_sigma_m
             if not sigma_m:
                 continue
-            seen: dict[str, list[np.ndarray]] = {"surface": [], "patch": []}
+            seen: dict[str, list[np.ndarray]] = {column: [] for column in SURFACE_SHARES}
             for i in scans:
                 view = self.scans[i].rows(self.values, self.associations[i]).view
                 for column, parts in seen.items():
@@ -149,7 +157,7 @@ class _Loop:
             for column, found in seen.items():
                 parts = np.unique(np.concatenate(found))
                 parts = parts[parts >= 0]
-                each = sigma_m * np.sqrt(COMMON_SHARE)
+                each = sigma_m * np.sqrt(SURFACE_SHARES[column])
                 effect = SurfaceShift(f"{number}/reference_{column}", column, parts, each)
                 self._switch_on(effect, self.problem.sources[number], scans)
 

@@ -39,7 +39,7 @@ class Model:
         """
         if chosen is None:
             return cls(fixed=tuple(fixed))
-        names = tuple(name.strip() for name in chosen.split(",") if name.strip())
+        names = tuple(dict.fromkeys(name.strip() for name in chosen.split(",") if name.strip()))
         for name in names:
             effects.find(name)
         return cls(names, tuple(fixed))

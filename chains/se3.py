@@ -166,7 +166,10 @@ def right_jacobian_inverse(xi: ArrayLike) -> Array:
 def apply(T: ArrayLike, points: ArrayLike) -> Array:
     """Return the points (..., N, 3) in metres of frame b expressed in frame a, for T_a_b."""
     T = np.asarray(T, float)
-    return np.asarray(points, float) @ T[..., :3, :3].mT + T[..., None, :3, 3]
+    moved = np.asarray(points, float) @ T[..., :3, :3].mT
+    for axis in range(3):  # one axis of all points at a time: numpy adds rows of three slowly
+        moved[..., axis] += T[..., None, axis, 3]
+    return moved
 
 
 def from_xyz_rpy(xyz: ArrayLike, rpy: ArrayLike) -> Array:

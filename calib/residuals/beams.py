@@ -12,7 +12,7 @@ scans. With hit point h, everything that moves the beam or the surface moves r b
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -46,11 +46,11 @@ class Association:
 
     Args:
         part: (N,) triangle or plane; -1 for nothing.
-        patch: (N,) patch of the surface, -1 for none; nowhere kept where None.
+        patches: kind of patch -> (N,) patch of the surface, -1 for none; empty if not kept.
     """
 
     part: np.ndarray
-    patch: np.ndarray | None = None
+    patches: Mapping[str, np.ndarray] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -269,12 +269,14 @@ def twist_derivative(hit: np.ndarray, n: np.ndarray) -> np.ndarray:
 
 
 def beam_derivative(beams: Beams, t: np.ndarray, hit: np.ndarray, n: np.ndarray) -> np.ndarray:
-    """d residual by range, azimuth and elevation error (N, 3); arguments as above, t (N,) m."""
+    """d residual by range, azimuth and elevation error (N, 3); arguments as above, t (N,) m.
+
+    As n.u = 1 here, ``n.e = (n_z - u_z) / hypot(u_x, u_y)`` for the elevation's unit vector e.
+    """
     u = beams.direction
     flat = np.maximum(np.hypot(u[:, 0], u[:, 1]), 1e-12)
-    up = np.stack([-u[:, 0] * u[:, 2] / flat, -u[:, 1] * u[:, 2] / flat, flat], axis=1)
     by_azimuth = n[:, 0] * hit[:, 1] - n[:, 1] * hit[:, 0]
-    by_elevation = -t * np.einsum("ni,ni->n", n, up)
+    by_elevation = t * (u[:, 2] - n[:, 2]) / flat
     return np.stack([np.full(len(t), -1.0), by_azimuth, by_elevation], axis=1)
 
 
@@ -319,11 +321,12 @@ def compress(
         column += width
     groups = []
     for c in rows.sparse:
-        used, index = np.unique(c.index, return_inverse=True)
-        first = int(used[0] < 0)
-        group = Group(index - first, c.value, len(used) - first)
+        used = np.bincount(c.index + 1, minlength=len(c.components) + 1) > 0
+        used[0] = False  # index -1: none
+        renumbered = np.cumsum(used) - 1
+        group = Group(renumbered[c.index + 1], c.value, int(renumbered[-1]) + 1)
         at = np.arange(column, column + group.size)
-        parts.append(Part(c.variable, at, c.components[used[first:]]))
+        parts.append(Part(c.variable, at, c.components[used[1:]]))
         groups.append(group)
         column += group.size
     weight, residual = rows.weight, rows.residual_m

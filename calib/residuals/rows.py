@@ -100,10 +100,11 @@ def _one_hot(g: Group) -> csr_matrix:
 
 
 def _cross(g: Group, h: Group, weight: np.ndarray) -> np.ndarray:
-    seen = (g.index >= 0) & (h.index >= 0)
-    flat = (g.index * h.size + h.index)[seen]
-    sums = np.bincount(flat, (weight * g.value * h.value)[seen], g.size * h.size)
-    return sums.reshape(g.size, h.size)
+    product = np.where((g.index >= 0) & (h.index >= 0), weight * g.value * h.value, 0.0)
+    if g is h:
+        return np.diag(np.bincount(np.maximum(g.index, 0), product, g.size)[: g.size])
+    flat, size = np.maximum(g.index * h.size + h.index, 0), g.size * h.size
+    return np.bincount(flat, product, size)[:size].reshape(g.size, h.size)
 
 
 def square_root(matrix: np.ndarray) -> np.ndarray:

@@ -145,8 +145,10 @@ class ScanStop:
         if error[Site.REFERENCE].any():
             t += np.einsum("ni,ni->n", n @ T[:3, :3].T, error[Site.REFERENCE])
         hit = ray.origin_m + t[:, None] * ray.direction
-        by_site = {Site.REFERENCE: -n @ T[:3, :3].T}
-        if any(site is Site.BEAM for site, _ in bases.values()):
+        sites, by_site = {site for site, _ in bases.values()}, {}
+        if Site.REFERENCE in sites:
+            by_site[Site.REFERENCE] = n @ -T[:3, :3].T
+        if Site.BEAM in sites:
             by_site[Site.BEAM] = beam_derivative(ray, t, hit, n)
         residual = ray.range_m - t - error[Site.BEAM][:, 0]
         residual[lost] = 0.0

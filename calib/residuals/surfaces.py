@@ -19,7 +19,7 @@ from sensors.surfaces import transverse
 
 GRAZING_RAD = np.deg2rad(80.0)  # a fit keeps no beam that meets its surface flatter than this
 PARALLEL_RAD = np.deg2rad(89.0)
-PATCH_M = 0.7
+PATCHES_M = {"region": 1.2, "patch": 0.5}  # widths of the cells that a surface is divided into
 
 
 class Meeting(Protocol):
@@ -49,7 +49,7 @@ class MeshSurface:
     def associate(
         self, T: np.ndarray, beams: Beams, values: Values, near_edges: bool
     ) -> Association:
-        """Triangle of each beam; near edges its patch too, and -1 for what is better left out.
+        """Triangle of each beam; near edges its patches too, and -1 for what is better left out.
 
         Args:
             T: (4, 4) T_reference_lidar.
@@ -65,24 +65,29 @@ class MeshSurface:
         spoilt = hits.incidence_rad > GRAZING_RAD
         spoilt |= self.reference.near_edge(origins, directions, hits, self.footprint_rad)
         triangle = np.where(spoilt, -1, hits.triangle).astype(np.int32)
-        return Association(triangle, self.reference.patch(hits, PATCH_M).astype(np.int32))
+        patches = {
+            kind: self.reference.patch(hits, size_m).astype(np.int32)
+            for kind, size_m in PATCHES_M.items()
+        }
+        return Association(triangle, patches)
 
     def meet(
         self, T: np.ndarray, beams: Beams, values: Values, association: Association
     ) -> Surface:
         """The triangle's plane that each beam meets under this association."""
         hits = self.reference.hits(association.part, *_in_reference(T, beams))
-        patch = association.patch
         surface = self.reference.surface
         columns = {
             "label": hits.label,
             "reference_intensity": hits.intensity,
             "surface": lambda: np.where(hits.triangle >= 0, surface[hits.triangle], -1),
-            "patch": partial(self.reference.patch, hits, PATCH_M) if patch is None else patch,
             "normal": hits.normal,
             "point_m": hits.point_m,
             "incidence_rad": hits.incidence_rad,
         }
+        for kind, size_m in PATCHES_M.items():
+            columns[kind] = partial(self.reference.patch, hits, size_m)
+        columns |= association.patches
         return Surface(hits.range_m, hits.normal, hits.incidence_rad < PARALLEL_RAD, columns)
 
 

@@ -86,7 +86,7 @@ def bent(problem, surfaces):
         view = problem.scans[0].rows(problem.initial).view
         chosen += [
             SurfaceShift(column, column, np.unique(view[column]), 0.001)
-            for column in ("surface", "patch")
+            for column in ("surface", "region", "patch")
         ]
     terms = [Term(e, e.name, np.arange(len(e.params(source.rig)))) for e in chosen]
     for term in terms:

@@ -56,7 +56,7 @@ class Dense:
         normal /= np.linalg.norm(normal, axis=1)[:, None]
         columns = {"origin": origin, "direction": direction, "range_m": range_m, "normal": normal}
         columns |= {"ring": read.ring, "point": a, "sigma": rows.sigma_m}
-        columns |= {part: rows.view[part] for part in ("surface", "patch")}
+        columns |= {part: rows.view[part] for part in ("surface", "region", "patch")}
         held = {name: column[kept] for name, column in columns.items()}
         return held | {"name": scan.name, "scale": rows.scale}
 
@@ -132,7 +132,7 @@ class Dense:
         along = np.einsum("nij,kj,ik->nk", R, stop["direction"], n, optimize=True)
         start = np.einsum("nij,kj,ik->nk", R, stop["origin"], n, optimize=True) + t @ n
         off = np.zeros_like(along)
-        for column in ("surface", "patch"):
+        for column in ("surface", "region", "patch"):
             name = f"0/reference_{column}"
             if name in values:
                 dofs = self.estimate.graph.variables[name].dofs

@@ -1,0 +1,81 @@
+"""How much memory a fit takes: stops come and go, so three times as many hardly need more.
+
+    python tests/bench/bench_memory.py [--stops 4] [--rows 131072]
+
+Each fit runs in a process of its own; its peak is the operating system's (VmHWM, Linux alone).
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from workload import BEAMS, recorded
+
+from calib.fit import solve
+from calib.model import Model, Source
+from calib.problem import Problem, build
+from calib.residuals.beams import Rows
+
+MB = 1e6
+
+
+def problem(recording: Path, stops: int) -> Problem:
+    """The default model on the first stops of a recording."""
+    source = Source.open(recording)
+    return build([source], Model(), [np.arange(len(source.recording.stops)) < stops])
+
+
+def rows_mb(recording: Path) -> float:
+    """What the rows of one stop take, with their derivatives."""
+    first = problem(recording, 1)
+    graph = solve(first)
+    scan = graph.scans[0]
+    return size(scan.rows(graph.values, graph.associations[0])) / MB
+
+
+def size(rows: Rows) -> int:
+    """Bytes of one stop's residuals, weights and derivatives."""
+    vectors = [rows.residual_m, rows.sigma_m, rows.weight, rows.by_twist, *rows.dense.values()]
+    vectors += [array for c in rows.sparse for array in (c.index, c.value)]
+    return sum(array.nbytes for array in vectors)
+
+
+def peak_mb(recording: Path, stops: int) -> float:
+    """Peak of a process that fits so many stops."""
+    command = [sys.executable, __file__, "--fit", str(recording), "--stops", str(stops)]
+    return float(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+
+
+def own_peak_mb() -> float:
+    """Peak of this process so far."""
+    status = Path("/proc/self/status").read_text(encoding="ascii")
+    line = next(line for line in status.splitlines() if line.startswith("VmHWM"))
+    return float(line.split()[1]) * 1024 / MB
+
+
+def main() -> None:
+    """Fit K and 3 K stops and print what each took."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--stops", type=int, default=4)
+    parser.add_argument("--rows", type=int, default=BEAMS, help="of each stop")
+    parser.add_argument("--fit", type=Path, help=argparse.SUPPRESS)
+    wanted = parser.parse_args()
+    if wanted.fit:
+        solve(problem(wanted.fit, wanted.stops))
+        print(own_peak_mb())
+        return
+    few, many = wanted.stops, 3 * wanted.stops
+    with tempfile.TemporaryDirectory() as folder:
+        recording = recorded(Path(folder), many * wanted.rows, many)
+        a, b = peak_mb(recording, few), peak_mb(recording, many)
+        print(f"{few} stops: {a:.0f} MB at most; {many} stops: {b:.0f} MB")
+        print(f"a stop more: {(b - a) / (many - few):.1f} MB; its rows: {rows_mb(recording):.1f} MB")
+
+
+if __name__ == "__main__":
+    main()

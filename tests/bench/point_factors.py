@@ -1,0 +1,113 @@
+"""The usual graph: one `gtsam.CustomFactor` per point, over the variables of the compressed one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import cached_property, partial
+
+import gtsam
+import numpy as np
+from workload import Values, Work
+
+from calib.graph import Graph
+from calib.residuals.beams import Rows
+from calib.residuals.scan import ScanStop
+from sensors.lidar import beams
+
+RINGS = "ring_range_offset"
+
+
+class PointFactors:
+    """The graph of a workload, linearised at its start; what beams meet is kept.
+
+    In its favour, each ring's offset is a key of its own, and where the rig's chain puts the LiDAR
+    is computed beforehand, once per stop. With `given`, residuals and derivatives are too, so that
+    a callback does no more than hand them over.
+    """
+
+    def __init__(self, work: Work, given: bool) -> None:
+        self.work, self.given = work, given
+        variables = work.problem.variables
+        self.rest = Graph([v for v in variables.values() if v.name != RINGS], work.problem.blocks)
+        self.rings = len(variables) + np.arange(variables[RINGS].dim)  # their keys
+
+    @cached_property
+    def graph(self) -> gtsam.NonlinearFactorGraph:
+        """Priors, trackers and targets as ever, then point by point."""
+        graph = gtsam.NonlinearFactorGraph(self.rest._graph)
+        for key, sigma in zip(self.rings, self.work.problem.variables[RINGS].sigma, strict=True):
+            noise = gtsam.noiseModel.Isotropic.Sigma(1, sigma)
+            graph.add(gtsam.PriorFactorVector(key, np.zeros(1), noise))
+        for i in range(len(self.work.problem.scans)):
+            for factor in self._factors(i):
+                graph.add(factor)
+        return graph
+
+    def _factors(self, i: int) -> Iterator[gtsam.CustomFactor]:
+        scan, values = self.work.problem.scans[i], self.work.start
+        rows = scan.rows(values, self.work.associations[i])
+        placed = scan.stops.in_reference(self.work.source.rig.lidar_frame, values)
+        chain = {name: d[0] for name, d in placed.d.items() if d.any()}
+        keys = [self.rest._key[name] for name in chain]
+        (ring,) = rows.sparse
+        make = _given if self.given else _computed
+        callbacks = make(rows, scan, placed.T[0], list(chain.values()))
+        noise = gtsam.noiseModel.Unit.Create(1)
+        for key, callback in zip(self.rings[ring.components[ring.index]], callbacks, strict=True):
+            yield gtsam.CustomFactor(noise, [*keys, key], callback)
+
+    def step(self) -> Values:
+        """One Gauss-Newton step from the start, as GTSAM does it by default."""
+        at = self.rest._to_gtsam(self.work.start)
+        for key, offset in zip(self.rings, self.work.start[RINGS], strict=True):
+            at.insert(key, np.array([offset]))
+        after = at.retract(self.graph.linearize(at).optimize())
+        rings = np.concatenate([after.atVector(key) for key in self.rings])
+        return self.rest._from_gtsam(after) | {RINGS: rings}
+
+
+def _given(
+    rows: Rows, scan: ScanStop, T: np.ndarray, chain: list[np.ndarray]
+) -> Iterator[Callable]:
+    root = (np.sqrt(rows.weight) / rows.sigma_m)[:, None]
+    residual = root * rows.residual_m[:, None]
+    derivatives = [*(root * rows.by_twist @ d for d in chain), -root]
+    for n in range(len(root)):
+        row = gtsam.JacobianVector([d[n : n + 1] for d in derivatives])
+        yield partial(_hand_over, residual[n], row)
+
+
+def _hand_over(residual, row, factor, values, jacobians):
+    if jacobians is not None:
+        jacobians[:] = row
+    return residual
+
+
+def _computed(
+    rows: Rows, scan: ScanStop, T: np.ndarray, chain: list[np.ndarray]
+) -> Iterator[Callable]:
+    root = np.sqrt(rows.weight) / rows.sigma_m
+    ray = beams(scan.recording.scan(scan.index).xyz_m, scan.lidar.beam_origin_m)
+    normal, point = rows.view["normal"], np.where(rows.usable[:, None], rows.view["point_m"], 0)
+    for n in range(len(root)):
+        beam = ray.origin_m[n], ray.direction[n], ray.range_m[n]
+        yield partial(_compute, T, chain, beam, normal[n], normal[n] @ point[n], root[n])
+
+
+def _compute(T, chain, beam, normal, distance, root, factor, values, jacobians):
+    if root == 0.0:
+        normal = -T[:3, :3] @ beam[1]
+    origin, direction, range_m = beam
+    n = normal @ T[:3, :3]
+    along = n @ direction
+    t = (distance - normal @ T[:3, 3] - n @ origin) / along
+    n = n / along
+    ring = values.atVector(factor.keys()[-1])[0]
+    if jacobians is not None:
+        x, y, z = origin + t * direction
+        a, b, c = n
+        by_twist = root * np.array([[y * c - z * b, z * a - x * c, x * b - y * a, a, b, c]])
+        for i, d in enumerate(chain):
+            jacobians[i] = by_twist @ d
+        jacobians[len(chain)] = np.array([[-root]])
+    return np.array([root * (range_m - t - ring)])
