@@ -117,6 +117,8 @@ def misfit(graph: Graph, values: Mapping[str, np.ndarray], beams: Errors) -> dic
         if blocks:
             chi2 = sum(float(np.sum(np.square(b.evaluate(values, False)[0]))) for b in blocks)
             own = {n for b in blocks for n in b.variables if "@" in n or ":" in n or n == "gravity"}
+            if kind == "tracker" and beams.count:
+                own = {n for n in own if "root@" not in n}  # the beams hold where the rig stands
             joints = {n for n in own if "joints@" in n}
             free = sum(graph.variables[n].dim for n in own - joints)
             chi2 += sum(_prior_cost(graph, values, n) for n in joints)

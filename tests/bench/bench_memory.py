@@ -74,7 +74,9 @@ def main() -> None:
         recording = recorded(Path(folder), many * wanted.rows, many)
         a, b = peak_mb(recording, few), peak_mb(recording, many)
         print(f"{few} stops: {a:.0f} MB at most; {many} stops: {b:.0f} MB")
-        print(f"a stop more: {(b - a) / (many - few):.1f} MB; its rows: {rows_mb(recording):.1f} MB")
+        print(
+            f"a stop more: {(b - a) / (many - few):.1f} MB; its rows: {rows_mb(recording):.1f} MB"
+        )
 
 
 if __name__ == "__main__":

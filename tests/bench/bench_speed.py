@@ -12,6 +12,7 @@ import argparse
 import tempfile
 from pathlib import Path
 
+import numpy as np
 from point_factors import PointFactors
 from sparse_rows import FrozenRows, SparseRows
 from threadpoolctl import threadpool_limits

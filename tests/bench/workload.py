@@ -1,4 +1,4 @@
-"""What the benchmarks fit: scans of an OS0-128 in the simulated lab, and steps of the fit on them."""
+"""What the benchmarks fit: scans of an OS0-128 in the simulated lab; and steps of the fit."""
 
 from __future__ import annotations
 
