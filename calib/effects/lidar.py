@@ -25,4 +25,5 @@ class RingRangeOffset(Effect):
 
     def basis(self, view: View) -> OneHot:
         ring = view["ring"]
-        return OneHot(ring, np.tile([1.0, 0.0, 0.0], (len(ring), 1)), view.rig.lidar.rings)
+        along = np.broadcast_to([1.0, 0.0, 0.0], (len(ring), 3))
+        return OneHot(ring, along, view.rig.lidar.rings)

@@ -268,12 +268,17 @@ def twist_derivative(hit: np.ndarray, n: np.ndarray) -> np.ndarray:
     return out
 
 
-def beam_derivative(beams: Beams, t: np.ndarray, hit: np.ndarray, n: np.ndarray) -> np.ndarray:
+def beam_derivative(
+    beams: Beams, t: np.ndarray, hit: np.ndarray, n: np.ndarray, turns: bool
+) -> np.ndarray:
     """d residual by range, azimuth and elevation error (N, 3); arguments as above, t (N,) m.
 
     As n.u = 1 here, ``n.e = (n_z - u_z) / hypot(u_x, u_y)`` for the elevation's unit vector e.
+    Without `turns`, where no effect turns a beam, the angles' columns are not computed but zero.
     """
     u = beams.direction
+    if not turns:
+        return np.broadcast_to([-1.0, 0.0, 0.0], (len(t), 3))
     flat = np.maximum(np.hypot(u[:, 0], u[:, 1]), 1e-12)
     by_azimuth = n[:, 0] * hit[:, 1] - n[:, 1] * hit[:, 0]
     by_elevation = t * (u[:, 2] - n[:, 2]) / flat
@@ -286,6 +291,12 @@ def site_error(basis: np.ndarray | OneHot, theta: np.ndarray) -> np.ndarray:
         # Index -1 finds the zero appended.
         return basis.values * np.append(theta, 0.0)[basis.index][:, None]
     return basis @ theta
+
+
+def turns_beams(basis: np.ndarray | OneHot) -> bool:
+    """Whether an effect at BEAM has any part in azimuth or elevation."""
+    values = basis.values if isinstance(basis, OneHot) else basis
+    return bool(np.any(values[:, 1:]))
 
 
 def effect_columns(

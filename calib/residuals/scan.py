@@ -23,6 +23,7 @@ from calib.residuals.beams import (
     compress,
     effect_columns,
     site_error,
+    turns_beams,
     twist_derivative,
 )
 from calib.residuals.rows import robust_scale, tukey_weight
@@ -145,11 +146,10 @@ class ScanStop:
         if error[Site.REFERENCE].any():
             t += np.einsum("ni,ni->n", n @ T[:3, :3].T, error[Site.REFERENCE])
         hit = ray.origin_m + t[:, None] * ray.direction
-        sites, by_site = {site for site, _ in bases.values()}, {}
-        if Site.REFERENCE in sites:
+        turns = any(turns_beams(b) for site, b in bases.values() if site is Site.BEAM)
+        by_site = {Site.BEAM: beam_derivative(ray, t, hit, n, turns)}
+        if any(site is Site.REFERENCE for site, _ in bases.values()):
             by_site[Site.REFERENCE] = n @ -T[:3, :3].T
-        if Site.BEAM in sites:
-            by_site[Site.BEAM] = beam_derivative(ray, t, hit, n)
         residual = ray.range_m - t - error[Site.BEAM][:, 0]
         residual[lost] = 0.0
         reference = self.reference_sigma_m / cosine
