@@ -17,7 +17,7 @@ class ArmLinkLength(Effect):
     typical = "0.1 to 5 mm"
     covariates = "joint positions"
     confounded_with = ("arm_base", "mount", "arm_joint_offset")
-    source = "S28 Schunk LWA 4P URDF; axes turned one at a time, radii of circles taken as lengths"
+    source = "circle-point analysis: Mooring, Roth, Driels 1991, Manipulator Calibration"
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
         return tuple(Param(n, "m", 0.005 if _length_m(rig, n) else 0.0) for n in rig.arm_edges)
