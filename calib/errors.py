@@ -104,7 +104,9 @@ def misfit(graph: Graph, values: Mapping[str, np.ndarray], beams: Errors) -> dic
     """How many times larger than their sigmas allow the residuals are, by kind of instrument.
 
     For trackers and targets the root of chi-square over its degrees of freedom, their own unknowns
-    taken off; for beams the rms of inliers over what is expected of them. About 1 when all is well.
+    taken off; for beams the rms of inliers over what is expected of them; for the reference how far
+    its surfaces had to be moved, over how far they may be off. About 1 or less when all is well: an
+    effect that is missing in the LiDAR may be laid on beams or on surfaces, and shows in either.
 
     Args:
         graph: as solved.
@@ -126,6 +128,10 @@ def misfit(graph: Graph, values: Mapping[str, np.ndarray], beams: Errors) -> dic
             out[kind] = float(np.sqrt(chi2 / dof))
     if beams.count and any(b.kind == "beams" for b in graph.blocks):
         out["beams"] = float(np.sqrt(beams.squares_m2 / beams.expected_m2))
+    moved = [n for n in graph.variables if "/reference_" in n]
+    if moved:
+        worst = max(_prior_cost(graph, values, n) / graph.variables[n].dim for n in moved)
+        out["reference"] = float(np.sqrt(worst))
     return out
 
 

@@ -53,9 +53,23 @@ def print_run(run: Run) -> None:
     if effects:
         console.print(_effects_table(effects))
     console.print(_error_table(summary))
+    if summary.get("sigmas_widened_by", 1.0) > 1.0:
+        console.print(_warning(summary), style="bold", soft_wrap=True)
+        console.print()
     if "links" in summary:
         _print_moved(console, summary["links"])
     _print_reasons(console, "not told by the data", run.solution.not_estimated)
+
+
+def _warning(summary: dict[str, Any]) -> str:
+    """That residuals are larger than they may be, where, and what was done about it."""
+    factor = summary["sigmas_widened_by"]
+    kind = max(summary["misfit"], key=summary["misfit"].get)
+    what = "errors of the reference" if kind == "reference" else f"residuals of {kind}"
+    return (
+        f"the {what} are {factor:.1f} times larger than their sigmas allow: something is missing "
+        f"from the model, or a sigma in rig.yaml too small; every sigma above is widened by that"
+    )
 
 
 def print_comparison(runs: Sequence[Run]) -> None:

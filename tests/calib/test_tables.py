@@ -254,3 +254,12 @@ def test_a_check_is_printed(printed):
     assert "joint_1 hardly moves" in text
     assert "lidar: 0.6 mm" in text
     assert "mount.tz tied to lidar.tz" in text
+
+
+def test_a_misfit_is_said_and_named(run, capsys):
+    """Sigmas that residuals do not bear out are widened, and the reader is told why."""
+    tables.print_run(run)
+    assert "larger than their sigmas" not in capsys.readouterr().out
+    misfit = {"misfit": {"beams": 0.9, "tracker": 4.4}, "sigmas_widened_by": 4.4}
+    tables.print_run(replace(run, summary=run.summary | misfit))
+    assert "residuals of tracker are 4.4 times larger than their sigmas" in capsys.readouterr().out

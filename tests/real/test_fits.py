@@ -46,6 +46,13 @@ def test_still_sweeps_prove_no_ring_offset(shared, tmp_path, model, thickest_mm)
     assert np.median(sigma) > 0.005
 
 
+def test_a_hidden_effect_does_not_pass_unseen(shared, tmp_path):
+    """A range bias with incidence can hide in the surfaces: their errors then are past belief."""
+    run = calibrate([shared / "recordings/known_incidence"], tmp_path / "run", hold_out="none")
+    assert run.summary["misfit"]["reference"] > 3
+    assert run.summary["sigmas_widened_by"] > 3
+
+
 def test_a_recording_of_another_simulator(shared, tmp_path):
     """Links and rings within their sigmas of the truth, and the held-out error at its floor."""
     folder = shared / "recordings/known_nothing_hidden"
@@ -71,5 +78,6 @@ def test_a_recording_of_another_simulator(shared, tmp_path):
     rings = z["ring_range_offset"]
     assert np.mean(np.abs(links) < 1.96) > 0.85
     assert np.mean(np.abs(rings) < 1.96) > 0.85
+    assert run.summary["sigmas_widened_by"] == 1.0
     rms = run.summary["rms_mm"]
     assert abs(rms["held_out"] / rms["noise_floor"] - 1.0) < 0.05
