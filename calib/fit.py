@@ -19,7 +19,7 @@ from chains.errors import InputError
 from sensors.reference import Reference
 
 Progress = Callable[[str, int, int], None]
-MAX_PASSES = 25
+MAX_PASSES = 40
 # Variance of the steps between surfaces, and between their cells, as shares of the reference's. It
 # is more than all of it: steps must stand for the slopes of an error that is smooth over metres.
 SURFACE_SHARES = {"surface": 0.6, "region": 0.6, "patch": 2.0}
@@ -125,8 +125,8 @@ class _Loop:
             step = self._step()
             if step < tolerance:
                 return True
-            # Far from the optimum a row's curvature misleads; its weight never does.
-            newton, last = newton and step < 0.5 * last, step
+            # Where a row's curvature misleads, steps grow; its weight never does.
+            newton, last = not associate and step < last, step
         return False
 
     def _linearise(self, scans: Sequence[ScanStop], associate: bool, newton: bool) -> None:

@@ -19,7 +19,10 @@ from sensors.surfaces import transverse
 
 GRAZING_RAD = np.deg2rad(80.0)  # a fit keeps no beam that meets its surface flatter than this
 PARALLEL_RAD = np.deg2rad(89.0)
-PATCHES_M = {"region": 1.2, "patch": 0.5}  # widths of the cells that a surface is divided into
+# Widths of the cells that surfaces are divided into, in a room whose box has 200 m2 of walls; in
+# larger ones the cells grow alike, so that there are never many more of them.
+PATCHES_M = {"region": 1.2, "patch": 0.5}
+ROOM_M2 = 200.0
 
 
 class Meeting(Protocol):
@@ -46,6 +49,14 @@ class MeshSurface:
     reference: Reference
     footprint_rad: float
 
+    @cached_property
+    def patches_m(self) -> dict[str, float]:
+        """Kind of patch -> its width, in this room."""
+        length, width, height = np.ptp(self.reference.vertices_m, axis=0)
+        walls_m2 = 2.0 * (length * width + width * height + height * length)
+        scale = max(1.0, float(np.sqrt(walls_m2 / ROOM_M2)))
+        return {kind: scale * size_m for kind, size_m in PATCHES_M.items()}
+
     def associate(
         self, T: np.ndarray, beams: Beams, values: Values, near_edges: bool
     ) -> Association:
@@ -67,7 +78,7 @@ class MeshSurface:
         triangle = np.where(spoilt, -1, hits.triangle).astype(np.int32)
         patches = {
             kind: self.reference.patch(hits, size_m).astype(np.int32)
-            for kind, size_m in PATCHES_M.items()
+            for kind, size_m in self.patches_m.items()
         }
         return Association(triangle, patches)
 
@@ -85,7 +96,7 @@ class MeshSurface:
             "point_m": hits.point_m,
             "incidence_rad": hits.incidence_rad,
         }
-        for kind, size_m in PATCHES_M.items():
+        for kind, size_m in self.patches_m.items():
             columns[kind] = partial(self.reference.patch, hits, size_m)
         columns |= association.patches
         return Surface(hits.range_m, hits.normal, hits.incidence_rad < PARALLEL_RAD, columns)
