@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from calib import problem as problems
-from calib.errors import Errors, body_errors, misfit, scan_errors
+from calib.errors import Errors, body_errors, misfit, row_errors, scan_errors
 from calib.fit import Estimate, Progress, solve
 from calib.holdout import held_out
 from calib.model import Model, Source
@@ -61,7 +61,7 @@ def calibrate(
     from threadpoolctl import threadpool_limits
 
     began = time.monotonic()
-    with threadpool_limits(limits=1), replace_folder(out, MODEL) as folder:
+    with threadpool_limits(limits=1), replace_folder(out, MODEL, "run") as folder:
         _refuse_twice([Path(r).resolve() for r in recordings])
         sources = [Source.open(r) for r in recordings]
         before = Run.open(prior).solution if prior else None
@@ -138,7 +138,7 @@ def _write_residuals(
         name = f"{scan.stops.rig.name}.{scan.name}" if several else scan.name
         columns = {n: _compact(column[rows.usable]) for n, column in columns.items()}
         write_table(folder / f"{name}.parquet", columns)
-        total += scan_errors(scan, estimate.values, association, None)
+        total += row_errors(rows)
     if not estimate.scans:
         total = body_errors(_bodies(problem), estimate.values, None)
     return total

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.graph import Graph
-from calib.residuals.beams import Association
+from calib.residuals.beams import Association, Rows
 from calib.residuals.scan import ScanStop
 from calib.residuals.tracker import TrackedBody
 
@@ -65,10 +65,20 @@ def scan_errors(
             marginals say how well; its share belongs to what is expected.
     """
     rows = scan.rows(values, association)
+    if graph is None:
+        return row_errors(rows)
+    return row_errors(rows, _predicted_variance(scan, values, graph, rows.by_twist))
+
+
+def row_errors(rows: Rows, predicted_m2: np.ndarray | float = 0.0) -> Errors:
+    """Range residuals of the inliers among a stop's rows.
+
+    Args:
+        rows: the rows.
+        predicted_m2: variance (N,) that the stop's predicted pose adds to what is expected.
+    """
     inlier = rows.weight > 0
-    expected = np.square(rows.sigma_m) + np.square(rows.reference_sigma_m)
-    if graph is not None:
-        expected = expected + _predicted_variance(scan, values, graph, rows.by_twist)
+    expected = np.square(rows.sigma_m) + np.square(rows.reference_sigma_m) + predicted_m2
     r = rows.residual_m[inlier]
     return Errors(len(r), float(r.sum()), float(r @ r), float(expected[inlier].sum()))
 

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
-import tempfile
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from calib.rig import load_rig
@@ -17,7 +14,7 @@ from calib.simulate.stops import World, plan
 from calib.simulate.truth import draw, stream
 from calib.simulate.write import write_reference, write_stops, write_targets, write_truth
 from chains.errors import InputError
-from sensors.documents import write_yaml
+from sensors.documents import replace_folder, write_yaml
 from sensors.recording import write_table
 
 __all__ = ["PRESETS", "Spec", "load_spec", "simulate"]
@@ -51,7 +48,7 @@ def simulate(
     if seed < 0:
         raise InputError(f"seed {seed} is negative; give 0 or more")
     out = Path(out)
-    with _replacing(out) as folder:
+    with replace_folder(out, "rig.yaml", "recording") as folder:
         _record(spec, folder, seed, dict(hide or {}), progress or (lambda what, done, total: None))
         (folder / "truth.json").replace(out.with_name(f"{out.name}.truth.json"))
 
@@ -82,22 +79,3 @@ def _record(
             write_table(folder / "scans" / f"{name}.parquet", scan)
             progress("simulating", k, len(stops.names))
     write_truth(folder / "truth.json", world, spec, seed, hide)
-
-
-@contextmanager
-def _replacing(out: Path) -> Iterator[Path]:
-    """A temporary folder beside `out` that takes its place when all went well."""
-    empty = out.is_dir() and not any(out.iterdir())
-    if out.exists() and not empty and not (out / "rig.yaml").is_file():
-        raise InputError(f"{out} exists and is no recording; give another name, or remove it first")
-    out.parent.mkdir(parents=True, exist_ok=True)
-    work = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
-    try:
-        new = work / "new"
-        new.mkdir()
-        yield new
-        if out.exists():
-            out.rename(work / "old")
-        new.rename(out)
-    finally:
-        shutil.rmtree(work)
