@@ -74,8 +74,10 @@ class ScanStop:
 
     def rows(self, values: Values, association: Association | None = None) -> Rows:
         """The stop's rows at a state; associated anew unless an association is given."""
+        return self._rows_from(self.pose(values), values, association)
+
+    def _rows_from(self, T: np.ndarray, values: Values, association: Association | None) -> Rows:
         scan, ray = self._read()
-        T = self.pose(values)
         if association is None:
             association = self._associate(T, ray, values, near_edges=False)
         surface = self.meeting.meet(T, ray, values, association)
@@ -93,9 +95,10 @@ class ScanStop:
         self, values: Values, association: Association | None = None, newton: bool = False
     ) -> CompressedScan:
         """The stop's rows, compressed, linearised at a state; `newton` as of `beams.compress`."""
-        rows = self.rows(values, association)
+        T = self.pose(values)
+        rows = self._rows_from(T, values, association)
         frame = self.stops.rig.lidar_frame
-        return compress(self.name, rows, self.stops, frame, self.pose(values), values, newton)
+        return compress(self.name, rows, self.stops, frame, T, values, newton)
 
     def _read(self) -> tuple[Scan, Beams]:
         scan = self.recording.scan(self.index)
