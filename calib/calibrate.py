@@ -186,7 +186,7 @@ def _model_document(
             }
             for s in sources
         ],
-        "effects": list(model.effects),
+        "effects": list(model.names),
         "fixed": list(model.fixed),
         "hold_out": hold_out,
         "folds": folds,

@@ -22,13 +22,17 @@ class Model:
     """A choice of effects; frames with a sigma are always in it unless fixed.
 
     Args:
-        effects: names in the catalogue.
+        effects: those to estimate; the name of one in the catalogue stands for it.
         fixed: names kept at their nominal value: a frame or effect, or one parameter of it as
             ``name.parameter``, ``lidar.tz`` say.
     """
 
-    effects: tuple[str, ...] = effects.DEFAULT
+    effects: tuple[Effect, ...] = effects.DEFAULT
     fixed: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        chosen = (effects.find(e) if isinstance(e, str) else e for e in self.effects)
+        object.__setattr__(self, "effects", tuple(chosen))
 
     @classmethod
     def of(cls, chosen: str | None, fixed: Sequence[str]) -> Model:
@@ -40,9 +44,12 @@ class Model:
         if chosen is None:
             return cls(fixed=tuple(fixed))
         names = tuple(dict.fromkeys(name.strip() for name in chosen.split(",") if name.strip()))
-        for name in names:
-            effects.find(name)
         return cls(names, tuple(fixed))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of its effects."""
+        return tuple(effect.name for effect in self.effects)
 
     def terms(self, rig: Rig, several: bool) -> list[Term]:
         """The model's effects on one rig: those with anything to act on.
@@ -56,7 +63,7 @@ class Model:
             InputError: an effect or a fixed name that this rig does not know.
         """
         chosen: list[Effect] = [FrameOffset(name) for name in rig.frame_sigma]
-        chosen += [effects.find(name) for name in self.effects]
+        chosen += self.effects
         self._check_fixed(chosen, rig)
         terms = []
         for effect in chosen:
@@ -127,4 +134,21 @@ class Source:
     @property
     def columns(self) -> dict[str, np.ndarray]:
         """Per-stop covariates (K,) that effects may look at."""
-        return {"time_s": self.recording.time_s, **self.recording.covariates}
+        moved = moved_columns(self.rig.joint_names, self.recording.joints, self.recording.time_s)
+        return {"time_s": self.recording.time_s, **moved, **self.recording.covariates}
+
+
+def moved_columns(
+    names: Sequence[str], joints: np.ndarray, time_s: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Which way each joint turned to come to each stop, ``moved.<joint>`` (K,): -1, 0 or 1.
+
+    Args:
+        names: of the joints.
+        joints: (K, J) reported.
+        time_s: (K,) of the stops; nothing is known of the first.
+    """
+    order = np.argsort(time_s, kind="stable")
+    way = np.zeros(np.shape(joints))
+    way[order[1:]] = np.sign(np.diff(joints[order], axis=0))
+    return {f"moved.{name}": way[:, j] for j, name in enumerate(names)}

@@ -91,7 +91,7 @@ def effect_page(effect: Effect) -> dict[str, Any]:
         "site": effect.site.value,
         "formula": effect.formula,
         "typical": effect.typical,
-        "covariates": effect.covariates,
+        "covariates": list(effect.covariates),
         "confounded_with": list(effect.confounded_with),
         "source": effect.source,
     }
@@ -103,7 +103,8 @@ def print_catalogue(effects: Sequence[Effect], whole: bool) -> None:
     pages = [effect_page(effect) for effect in effects]
     if whole:
         for page in pages:
-            page["confounded_with"] = ", ".join(page["confounded_with"])
+            for several in ("confounded_with", "covariates"):
+                page[several] = ", ".join(page[several])
             name = page.pop("name")
             _grid(console, name, [(k.replace("_", " "), text) for k, text in page.items() if text])
         return

@@ -36,14 +36,25 @@ __all__ = [
 
 
 def find(name: str) -> Effect:
-    """The effect of this name.
+    """The effect of this name, ``family`` or ``family@shape``.
 
     Raises:
         InputError: when the catalogue has none, naming the nearest.
     """
+    family, _, shape = name.partition("@")
     known = {effect.name: effect for effect in CATALOGUE}
-    if name not in known:
-        near = difflib.get_close_matches(name, known, 1)
+    if family not in known:
+        near = difflib.get_close_matches(family, known, 1)
         hint = f"; did you mean '{near[0]}'?" if near else f": it has {', '.join(known)}."
         raise InputError(f"effect '{name}' is not in the catalogue{hint}")
-    return known[name]
+    effect = known[family]
+    if not shape:
+        return effect
+    try:
+        chosen = float(shape)
+    except ValueError:
+        chosen = float("nan")
+    if not effect.shape_name or not chosen < float("inf"):
+        wanted = f"write {family}@NUMBER" if effect.shape_name else "it has no shape to choose"
+        raise InputError(f"effect '{name}': {wanted}")
+    return effect.at(chosen)

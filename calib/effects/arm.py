@@ -15,7 +15,7 @@ class ArmLinkLength(Effect):
     site = Site.EDGE
     formula = "|origin of joint i| = nominal + dL_i, along the nominal direction"
     typical = "0.1 to 5 mm"
-    covariates = "joint positions"
+    covariates = ("joints",)
     confounded_with = ("arm_base", "mount", "arm_joint_offset")
     source = "circle-point analysis: Mooring, Roth, Driels 1991, Manipulator Calibration"
 
@@ -47,7 +47,7 @@ class ArmJointOffset(Effect):
     site = Site.JOINTS
     formula = "q_i = reported_i + offset_i"
     typical = "0.1 to 5 mrad"
-    covariates = "joint positions"
+    covariates = ("joints",)
     confounded_with = ("arm_base", "mount", "arm_joint_eccentricity")
     source = "Mooring, Roth, Driels 1991, Fundamentals of Manipulator Calibration"
 
@@ -71,7 +71,7 @@ class ArmAxisTilt(Effect):
         "origin of joint i -> origin * exp(a_i * x_i + b_i * y_i), x_i and y_i across the axis"
     )
     typical = "0.1 to 2 mrad"
-    covariates = "joint positions"
+    covariates = ("joints",)
     confounded_with = ("arm_joint_offset", "arm_gravity_sag")
     source = "Hayati and Mirmirani 1985, J. Robotic Systems 2(4): parallel axes need a tilt"
 

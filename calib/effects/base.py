@@ -7,11 +7,12 @@ Instruments (BEAM, TRACKER) add to the truth, ``measured = true + basis(view) @ 
 
 from __future__ import annotations
 
+import copy
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -95,10 +96,17 @@ Basis = np.ndarray | OneHot
 class Effect(ABC):
     """One way the hardware lies. A subclass says what it is and gives its basis; all else follows.
 
+    An effect that is not linear in one more number (a wavelength, a time constant) is linear once
+    that number, its shape, is chosen: `shapes` lists those worth trying, `at` chooses one.
+
     Attributes:
-        name: as in commands and files.
+        name: as in commands and files; with a chosen shape ``family@shape``.
         site: where it acts.
-        formula, typical, covariates, confounded_with, source: the catalogue's page.
+        covariates: columns of the view that its basis looks at; "joints" are the reported joints.
+            Where a recording lacks one, the effect cannot be tested.
+        formula, typical, confounded_with, source: the catalogue's page.
+        shape_name: what the shape is, with its unit (``wavelength_m``); empty where there is none.
+        shape: the one chosen.
         of_lidar: True when the effect belongs to the mounted LiDAR, so that rigs do not share it.
     """
 
@@ -106,9 +114,30 @@ class Effect(ABC):
     site: ClassVar[Site]
     formula: ClassVar[str] = ""
     typical: ClassVar[str] = ""
-    covariates: ClassVar[str] = ""
+    covariates: ClassVar[tuple[str, ...]] = ()
     confounded_with: ClassVar[tuple[str, ...]] = ()
     source: ClassVar[str] = ""
+    shape_name: ClassVar[str] = ""
+    shape: float = 0.0
+
+    @property
+    def family(self) -> str:
+        """The name without a shape."""
+        return self.name.partition("@")[0]
+
+    def shapes(self, stops: View) -> tuple[float, ...]:
+        """The shapes worth trying on a recording; empty where there is nothing to choose.
+
+        Args:
+            stops: its stops, with their columns.
+        """
+        return ()
+
+    def at(self, shape: float) -> Self:
+        """The effect with this shape chosen."""
+        chosen = copy.copy(self)
+        chosen.shape, chosen.name = shape, f"{self.family}@{shape:.6g}"
+        return chosen
 
     @property
     def of_lidar(self) -> bool:

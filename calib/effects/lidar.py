@@ -15,7 +15,7 @@ class RingRangeOffset(Effect):
     site = Site.BEAM
     formula = "range = true + a_ring"
     typical = "1 to 25 mm, patterned over the rings"
-    covariates = "ring"
+    covariates = ("ring",)
     confounded_with = ("range_offset", "ring_elevation_offset", "near_range_bias")
     source = "the accuracy by ring of indoor LiDARs; Velodyne HDL-64E factory tables"
 
