@@ -1,15 +1,19 @@
-"""From recordings to a run folder: the whole of ``rigcal fit``."""
+"""From recordings to a run folder: ``rigcal fit``, and growing a run from another."""
 
 from __future__ import annotations
 
+import json
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from calib import problem as problems
+from calib.effects import Effect, load_effects
 from calib.errors import Errors, body_errors, misfit, row_errors, scan_errors
 from calib.fit import Estimate, Progress, solve
 from calib.holdout import held_out
@@ -19,12 +23,14 @@ from calib.recalibrate import Link, earlier, solve_from
 from calib.residuals.tracker import TrackedBody
 from calib.run import (
     COVARIANCE,
+    DIAGNOSIS,
     MODEL,
     RESIDUALS,
     SOLUTION,
     SUMMARY,
     Run,
     versions,
+    write_state,
 )
 from calib.solution import solution_of
 from chains.errors import InputError
@@ -58,39 +64,152 @@ def calibrate(
     Raises:
         InputError: what is wrong with the input, in one sentence.
     """
-    from threadpoolctl import threadpool_limits
-
-    began = time.monotonic()
-    with threadpool_limits(limits=1), replace_folder(out, MODEL, "run") as folder:
+    with _folder(out) as folder:
         _refuse_twice([Path(r).resolve() for r in recordings])
         sources = [Source.open(r) for r in recordings]
-        before = Run.open(prior).solution if prior else None
-        problem = problems.build(sources, model)
-        links: list[Link] | None = None
-        if before is None:
-            estimate = solve(problem, progress=progress)
-        else:
-            estimate, links = solve_from(problem, earlier(problem, before), progress)
-        unseen = Errors()
-        if hold_out != "none":
-            unseen = held_out(sources, model, hold_out, folds, progress)
-        nominal = _nominal(problem, progress)
-        seen = _write_residuals(problem, estimate, folder / RESIDUALS, progress)
-        worse = misfit(estimate.graph, estimate.values, seen)
-        widened = max([1.0, *(x for x in worse.values() if x > TOLERATED)])
-        solution = solution_of(problem, estimate, widened)
-        write_yaml(folder / SOLUTION, solution.document())
-        np.savez(
-            folder / COVARIANCE, names=np.array(solution.names), covariance=solution.covariance
-        )
-        write_yaml(folder / MODEL, _model_document(sources, model, hold_out, folds, prior))
-        summary = _summary(problem, estimate, nominal, seen, unseen)
-        summary |= {"misfit": worse, "sigmas_widened_by": widened}
-        summary["seconds"] = time.monotonic() - began
-        if links is not None:
-            summary["links"] = [_link_document(link) for link in links]
-        write_json(folder / SUMMARY, summary)
+        _fit(sources, model, folder, _Choices(hold_out, folds, prior), progress)
     return Run.open(out)
+
+
+def grow(
+    run: Run,
+    model: Model,
+    out: Path | str,
+    progress: Progress = lambda what, done, total: None,
+) -> Run:
+    """Fit another model to a run's recordings, from where that run stood.
+
+    Args:
+        run: the run to grow from; stops are held out, and a prior is taken, as it did.
+        model: what is estimated now; see `grown_model`.
+        out: the run folder to make; an earlier run there is replaced, anything else is refused.
+        progress: called with what is being done, and how far it is.
+
+    Raises:
+        InputError: the run's recordings are not what they were, or it is of an earlier version.
+    """
+    if Path(out).resolve() == run.folder.resolve():
+        raise InputError(f"{out}: a run cannot replace the one that it grows from; give another -o")
+    start = run.state()
+    with _folder(out) as folder:
+        sources = [reopened(recording, run) for recording in run.model["recordings"]]
+        _refuse_idle(model, run, sources)
+        told = {key: run.model.get(key) for key in ("hold_out", "folds", "prior")}
+        _fit(sources, model, folder, _Choices(**told, grown_from=run), progress, start)
+    return Run.open(out)
+
+
+def grown_model(run: Run, added: Sequence[str]) -> Model:
+    """A run's model and more effects, as ``rigcal add`` names them.
+
+    An effect that needs a shape and is given none takes the one that the run's diagnosis found
+    for it, or else its usual one.
+
+    Raises:
+        InputError: an effect is unknown, or in the model already.
+    """
+    found = (_shaped(effect, run) for effect in load_effects(added))
+    return Model.read(run.model, run.folder / MODEL).plus(tuple(found))
+
+
+def _shaped(effect: Effect, run: Run) -> Effect:
+    if not effect.shape_name or effect.name != effect.family:
+        return effect
+    path = run.folder / DIAGNOSIS
+    try:
+        text = path.read_text(encoding="utf-8") if path.is_file() else '{"candidates": []}'
+        # Best first, so that the best is what stays.
+        ranked = reversed(json.loads(text)["candidates"])
+        names = {c["effect"]: c.get("add", "") for c in ranked}
+        shape = names.get(effect.family, "").partition("@")[2]
+        return effect.at(float(shape) if shape else effect.shape)
+    except (ValueError, KeyError, TypeError, AttributeError):
+        raise InputError(
+            f"{path} is no diagnosis of this version; write {effect.name}@NUMBER, or diagnose again"
+        ) from None
+
+
+def reopened(recording: Mapping[str, str], run: Run) -> Source:
+    """A run's recording, as it was when the run was fitted to it."""
+    path = Path(recording["path"])
+    if not path.is_dir():
+        raise InputError(
+            f"{path}, which {run.folder} was fitted to, is no longer there; put it back, or fit it "
+            f"where it is now with 'rigcal fit'"
+        )
+    source = Source.open(path)
+    if source.recording.digest() != recording["sha256"]:
+        raise InputError(
+            f"{path} has changed since {run.folder} was fitted to it; fit it anew with 'rigcal fit'"
+        )
+    return source
+
+
+def _refuse_idle(model: Model, run: Run, sources: Sequence[Source]) -> None:
+    """An effect that was asked for, and that these rigs have nothing of, would be lost unseen."""
+    for effect in model.effects:
+        if effect.name not in run.effects and not any(effect.params(s.rig) for s in sources):
+            raise InputError(
+                f"effect '{effect.name}' has nothing to act on in the recordings of {run.folder}; "
+                f"'rigcal effects {effect.family}' says what it needs"
+            )
+
+
+@dataclass(frozen=True)
+class _Choices:
+    """What a fit was asked beside its model; see `calibrate`."""
+
+    hold_out: str
+    folds: int
+    prior: Path | str | None
+    grown_from: Run | None = None
+
+
+@contextmanager
+def _folder(out: Path | str) -> Iterator[Path]:
+    """The run folder while it is made."""
+    from threadpoolctl import threadpool_limits
+
+    with threadpool_limits(limits=1), replace_folder(out, MODEL, "run") as folder:
+        yield folder
+
+
+def _fit(
+    sources: Sequence[Source],
+    model: Model,
+    folder: Path,
+    choices: _Choices,
+    progress: Progress,
+    start: Mapping[str, np.ndarray] | None = None,
+) -> None:
+    """Estimate, judge by what was held out, and write the run."""
+    began = time.monotonic()
+    before = Run.open(choices.prior).solution if choices.prior else None
+    problem = problems.build(sources, model)
+    links: list[Link] | None = None
+    if before is None:
+        estimate = solve(problem, progress=progress, start=start)
+    else:
+        estimate, links = solve_from(problem, earlier(problem, before), progress)
+    unseen = Errors()
+    if choices.hold_out != "none":
+        by, count = choices.hold_out, choices.folds
+        unseen = held_out(sources, model, by, count, progress, estimate.state)
+    nominal = _nominal(problem, progress)
+    seen = _write_residuals(problem, estimate, folder / RESIDUALS, progress)
+    worse = misfit(estimate.graph, estimate.values, seen)
+    widened = max([1.0, *(x for x in worse.values() if x > TOLERATED)])
+    solution = solution_of(problem, estimate, widened)
+    write_yaml(folder / SOLUTION, solution.document())
+    np.savez(folder / COVARIANCE, names=np.array(solution.names), covariance=solution.covariance)
+    write_state(folder, estimate.state)
+    write_yaml(folder / MODEL, _model_document(sources, model, choices))
+    summary = _summary(problem, estimate, nominal, seen, unseen)
+    summary |= {"misfit": worse, "sigmas_widened_by": widened}
+    summary["seconds"] = time.monotonic() - began
+    if links is not None:
+        summary["links"] = [_link_document(link) for link in links]
+    write_json(folder / SUMMARY, summary)
 
 
 def _refuse_twice(recordings: Sequence[Path]) -> None:
@@ -174,9 +293,8 @@ def _summary(
     }
 
 
-def _model_document(
-    sources: Sequence[Source], model: Model, hold_out: str, folds: int, prior: Path | str | None
-) -> dict[str, Any]:
+def _model_document(sources: Sequence[Source], model: Model, choices: _Choices) -> dict[str, Any]:
+    prior, grown_from = choices.prior, choices.grown_from
     return {
         "recordings": [
             {
@@ -186,12 +304,11 @@ def _model_document(
             }
             for s in sources
         ],
-        "effects": list(model.names),
-        "fixed": list(model.fixed),
-        "hold_out": hold_out,
-        "folds": folds,
+        **model.document(),
+        "hold_out": choices.hold_out,
+        "folds": choices.folds,
         "prior": str(Path(prior).resolve()) if prior else None,
-        "grown_from": None,
+        "grown_from": str(grown_from.folder.resolve()) if grown_from else None,
         "versions": versions(),
     }
 

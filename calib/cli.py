@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 # BLAS threads on shared cores cost many times what they save; set before numpy is imported.
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -16,6 +16,9 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 import typer  # noqa: E402
 
 from chains.errors import InputError  # noqa: E402
+
+if TYPE_CHECKING:
+    from calib.run import Run
 
 INTERRUPTED = 130  # as shells have it: 128 and the signal's number
 
@@ -76,7 +79,9 @@ def check(recording: Path, as_json: Json = False) -> None:
 def fit(
     recordings: Annotated[list[Path], typer.Argument(help="Recording folders.", metavar="REC...")],
     out: Out,
-    effects: Annotated[str | None, typer.Option(help="Effects of the model, with commas.")] = None,
+    effects: Annotated[
+        str | None, typer.Option(help="Effects of the model, or files of them, with commas.")
+    ] = None,
     fix: Annotated[
         list[str] | None, typer.Option(metavar="NAME", help="Hold a frame, effect or parameter.")
     ] = None,
@@ -96,25 +101,41 @@ def fit(
     chosen = Model.of(effects, fix or [])
     with _progress() as progress:
         run = calibrate(recordings, out, chosen, hold_out, folds, prior, progress)
-    if as_json:
-        _print_json(run.summary | {"not_estimated": run.solution.not_estimated})
-    else:
-        from calib.tables import print_run
+    _tell(run, as_json)
 
-        print_run(run)
+
+@app.command()
+def add(
+    run: Path,
+    effects: Annotated[
+        list[str], typer.Argument(help="Effects, or files of them.", metavar="EFFECT...")
+    ],
+    out: Out,
+    as_json: Json = False,
+) -> None:
+    """The model of a run and more effects, refitted from that run to the same recordings."""
+    from calib.calibrate import grow, grown_model
+    from calib.run import Run
+
+    earlier = Run.open(run)
+    model = grown_model(earlier, effects)
+    with _progress() as progress:
+        _tell(grow(earlier, model, out, progress), as_json)
 
 
 @app.command()
 def compare(
     runs: Annotated[list[Path], typer.Argument(metavar="RUN...")], as_json: Json = False
 ) -> None:
-    """Error, noise floor and parameters of runs, side by side."""
+    """Errors and parameters of runs side by side, and the ladder by which they grew."""
+    from calib.ladder import ladder
     from calib.run import Run
     from calib.tables import comparison, print_comparison
 
     opened = [Run.open(run) for run in runs]
     if as_json:
-        _print_json(comparison(opened))
+        rungs = [rung.document() for rung in ladder(opened)]
+        _print_json(comparison(opened) | {"ladder": rungs})
     else:
         print_comparison(opened)
 
@@ -197,6 +218,16 @@ def _sizes(hide: list[str]) -> dict[str, float]:
                 f"--hide {item}: give EFFECT=SIZE with a number, range_scale=1 say"
             ) from None
     return sizes
+
+
+def _tell(run: Run, as_json: bool) -> None:
+    """Print what a fit found."""
+    if as_json:
+        _print_json(run.summary | {"not_estimated": run.solution.not_estimated})
+    else:
+        from calib.tables import print_run
+
+        print_run(run)
 
 
 def _say(document: dict[str, Any], text: str, as_json: bool) -> None:

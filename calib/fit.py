@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,6 +25,11 @@ MAX_PASSES = 40
 SURFACE_SHARES = {"surface": 0.6, "region": 0.6, "patch": 2.0}
 SETTLED = 1e-4  # m and rad: after that, which triangle a beam meets is kept
 CONVERGED = 1e-6  # m and rad: a tenth of the smallest sigma in sight, and steps shrink fast
+STRAYED = 3e-3  # m and rad: a scan that has moved further looks anew what its beams meet
+LOOKS = 3  # how often, in a fit that starts from an earlier one
+# Of a state, beside a variable's NAME: the parameters of a vector, and the value at which the beams
+# looked what they meet.
+DOFS, SEEN = ".dofs", ".seen"
 
 
 @dataclass(frozen=True)
@@ -41,6 +46,7 @@ class Estimate:
         iterations: passes over the scans (or of the solver, where there are none).
         converged: whether the last step was below tolerance.
         graph: the last linearisation, for marginals of other variables.
+        seen: the values at which the scans were associated; empty where there are none.
     """
 
     values: dict[str, np.ndarray]
@@ -51,6 +57,15 @@ class Estimate:
     iterations: int
     converged: bool
     graph: Graph
+    seen: dict[str, np.ndarray]
+
+    @property
+    def state(self) -> dict[str, np.ndarray]:
+        """Enough for another fit to start from: all values; per vector ``NAME.dofs``, its
+        parameters; and ``NAME.seen``, the value at which the scans were associated."""
+        vectors = (v for v in self.graph.variables.values() if v.kind == "vector")
+        dofs = {f"{v.name}{DOFS}": np.array(v.dofs, np.str_) for v in vectors}
+        return self.values | dofs | {f"{name}{SEEN}": x for name, x in self.seen.items()}
 
 
 def solve(
@@ -58,25 +73,31 @@ def solve(
     prior: Block | None = None,
     tolerance: float = CONVERGED,
     progress: Progress = lambda what, done, total: None,
+    start: Mapping[str, np.ndarray] | None = None,
 ) -> Estimate:
     """Maximum a posteriori estimate of a problem.
 
     Trackers and targets alone are solved first. Then each pass linearises every stop's rows at the
     present state (robust weights and, until the fit has settled, the surface met included),
-    compresses them, and takes one Gauss-Newton step of the whole graph.
+    compresses them, and takes one Gauss-Newton step of the whole graph. From an earlier state, what
+    the beams meet is known and a few passes are all there is.
 
     Args:
         problem: what to estimate.
         prior: a joint prior; the variables it speaks of then have no prior of their own.
         tolerance: largest step of the last pass, m and rad.
         progress: called with what is being done, how many stops are done, and of how many.
+        start: a state to start from, ``Estimate.state`` of a fit of much the same problem; what it
+            does not know starts at its mean.
 
     Raises:
         InputError: nothing is left to estimate.
     """
     if not problem.calibration:
         raise InputError("nothing is left to estimate: fix fewer names, or choose an effect")
-    loop = _Loop(problem, prior, progress)
+    loop = _Loop(problem, prior, progress, start)
+    if start and problem.scans:
+        return loop.estimate(loop.run_on(tolerance))
     loop.solve_without_scans()
     if not problem.scans:
         return loop.estimate(converged=True)
@@ -96,16 +117,57 @@ def preview(problem: Problem, progress: Progress = lambda what, done, total: Non
     return loop.estimate(converged=False)
 
 
+def resume(
+    problem: Problem,
+    start: Mapping[str, np.ndarray],
+    progress: Progress = lambda what, done, total: None,
+) -> Estimate:
+    """A fit as it stood: what its beams met and its surfaces' unknowns again, and not one step.
+
+    Args:
+        problem: the problem that was solved.
+        start: its state.
+        progress: as of `solve`.
+
+    Returns:
+        The estimate, without a covariance.
+    """
+    loop = _Loop(problem, None, progress, start)
+    loop.stand()
+    names = problem.calibration
+    variables = tuple(loop.variables[name] for name in names)
+    return Estimate(
+        loop.values,
+        variables,
+        np.zeros((0, 0)),
+        loop.associations,
+        loop.scans,
+        0,
+        True,
+        loop.graph,
+        loop.seen,
+    )
+
+
 class _Loop:
     """The state of a fit while it runs."""
 
-    def __init__(self, problem: Problem, prior: Block | None, progress: Progress) -> None:
-        self.problem, self.progress = problem, progress
+    def __init__(
+        self,
+        problem: Problem,
+        prior: Block | None,
+        progress: Progress,
+        start: Mapping[str, np.ndarray] | None = None,
+    ) -> None:
+        self.problem, self.progress, self.start = problem, progress, start or {}
         self.prior = [prior] if prior else []
         self.without = frozenset(prior.variables) if prior else frozenset()
         self.variables = dict(problem.variables)
-        self.values = dict(problem.initial)
+        self.values = {
+            n: _started(v, self.start, problem.initial[n]) for n, v in self.variables.items()
+        }
         self.scans = list(problem.scans)
+        self.seen: dict[str, np.ndarray] = {}
         self.associations: list[Association] = []
         self.passes = 0
         self.graph: Graph | None = None
@@ -118,16 +180,47 @@ class _Loop:
 
     def run(self, scans: Sequence[ScanStop], tolerance: float, associate: bool) -> bool:
         """Passes until the step is below tolerance; whether that was reached."""
-        newton, last = not associate, np.inf
+        newton, last, misled, wait = False, np.inf, 0, 0
         for _ in range(MAX_PASSES):
             self._linearise(scans, associate, newton)
             self.passes += 1
             step = self._step()
             if step < tolerance:
                 return True
-            # Where a row's curvature misleads, steps grow; its weight never does.
-            newton, last = not associate and step < last, step
+            # Where a row's curvature misleads, steps grow; its weight never does. It is tried again
+            # after twice as many passes each time, lest the steps go round in circles.
+            if newton and step >= last:
+                misled, wait = misled + 1, 2 ** (misled + 1)
+            wait = max(wait - 1, 0)
+            newton, last = not associate and not wait and step < last, step
         return False
+
+    def stand(self) -> None:
+        """Where the start was left."""
+        if self.scans:
+            self.fix_association(self._seen_before())
+            self.add_surface_unknowns()
+        self._link([])
+
+    def run_on(self, tolerance: float) -> bool:
+        """Passes from an earlier state, whose scans keep what they met unless they move far."""
+        seen = self._seen_before()
+        converged = False
+        for _ in range(LOOKS):
+            self.scans, self.variables = list(self.problem.scans), dict(self.problem.variables)
+            self.fix_association(seen)
+            self.add_surface_unknowns()
+            converged = self.run(self.scans, tolerance, associate=False)
+            pairs = ((scan.pose(seen), scan.pose(self.values)) for scan in self.scans)
+            if all(np.abs(se3.log(se3.inverse(a) @ b)).max() < STRAYED for a, b in pairs):
+                break
+            seen = self.values
+        return converged
+
+    def _seen_before(self) -> dict[str, np.ndarray]:
+        """Where the start was when it took what its beams met."""
+        known = self.variables.items()
+        return {n: _started(v, self.start, self.values[n], SEEN) for n, v in known}
 
     def _linearise(self, scans: Sequence[ScanStop], associate: bool, newton: bool) -> None:
         """Link the graph anew, with every stop's beams linearised at the present state."""
@@ -140,12 +233,12 @@ class _Loop:
             shared.add(compressed)
         self._link([*poses, *shared.rows()])
 
-    def fix_association(self) -> None:
-        """Keep, from now on, what each beam meets; drop beams beside a depth edge."""
-        self.associations = []
+    def fix_association(self, seen: Mapping[str, np.ndarray] | None = None) -> None:
+        """Keep what each beam meets, here or at other values; drop beams beside a depth edge."""
+        self.associations, self.seen = [], dict(seen or self.values)
         for i, scan in enumerate(self.scans):
             self.progress("looking for depth edges", i, len(self.scans))
-            self.associations.append(scan.associate(self.values, near_edges=True))
+            self.associations.append(scan.associate(self.seen, near_edges=True))
 
     def add_surface_unknowns(self) -> None:
         """Errors of the reference, common to the points of a surface or cell, as unknowns."""
@@ -182,8 +275,9 @@ class _Loop:
 
     def _switch_on(self, effect: SurfaceShift, source: Source, scans: Sequence[int]) -> None:
         term = Term(effect, effect.name, np.arange(len(effect.parts)))
-        self.variables[effect.name] = effect_variable(term, source)
-        self.values[effect.name] = self.variables[effect.name].mean
+        variable = effect_variable(term, source)
+        self.variables[effect.name] = variable
+        self.values[effect.name] = _started(variable, self.start, variable.mean)
         for i in scans:
             self.scans[i] = replace(self.scans[i], terms=[*self.scans[i].terms, term])
 
@@ -202,6 +296,7 @@ class _Loop:
             self.passes,
             converged,
             self.graph,
+            self.seen,
         )
 
     def _link(self, rows: Sequence[Block]) -> None:
@@ -220,6 +315,20 @@ def same_mesh(a: Reference | None, b: Reference | None) -> bool:
     if a is None or b is None:
         return a is b
     return np.array_equal(a.vertices_m, b.vertices_m) and np.array_equal(a.triangles, b.triangles)
+
+
+def _started(
+    variable: Variable, start: Mapping[str, np.ndarray], otherwise: np.ndarray, kind: str = ""
+) -> np.ndarray:
+    """The variable's value in a state, parameter by parameter where it names them."""
+    found, dofs = start.get(f"{variable.name}{kind}"), start.get(f"{variable.name}{DOFS}")
+    if found is None or (dofs is None and found.shape != otherwise.shape):
+        return otherwise
+    if dofs is None:
+        return found
+    known = dict(zip(dofs.tolist(), found, strict=True))
+    pairs = zip(variable.dofs, otherwise, strict=True)
+    return np.array([known.get(dof, value) for dof, value in pairs], float)
 
 
 def _change(variable: Variable, before: np.ndarray, after: np.ndarray) -> float:

@@ -7,7 +7,7 @@ arrays, and this module alone turns them into GTSAM factors and back.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
@@ -139,6 +139,21 @@ class Graph:
             at[name] = np.arange(start, start + self.variables[name].dim)
             start += self.variables[name].dim
         return at
+
+    def linear_rows(
+        self, values: Values
+    ) -> Iterator[tuple[Block | None, dict[str, np.ndarray], np.ndarray]]:
+        """Block (none for a prior), whitened derivative by each variable (m, n), and right side
+        (m,), minus the residual, of everything in the graph."""
+        linear = self._graph.linearize(self._to_gtsam(values))
+        names = list(self.variables)
+        priors = linear.size() - len(self.blocks)
+        for i in range(linear.size()):
+            A, b = linear.at(i).jacobian()
+            keys = [names[key] for key in list(linear.at(i).keys())]
+            ends = np.cumsum([self.variables[name].dim for name in keys])
+            by = dict(zip(keys, np.split(A, ends[:-1], axis=1), strict=True))
+            yield (self.blocks[i - priors] if i >= priors else None), by, b
 
     def touched(self, values: Values, names: Sequence[str]) -> np.ndarray:
         """Whether any row but a prior depends on each parameter of those variables: (P,) bool."""

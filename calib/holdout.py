@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from calib.model import Model, Source
 from calib.prior import JointPrior
 from calib.problem import Problem
 from calib.residuals.scan import ScanStop
+from calib.residuals.surfaces import PlaneSurface
 from calib.residuals.tracker import TrackedBody
 
 FOLDS = 5  # a fit leaves out about a fifth of the locations
@@ -36,7 +37,12 @@ def folds(sources: Sequence[Source], by: str) -> list[list[np.ndarray]]:
 
 
 def held_out(
-    sources: Sequence[Source], model: Model, by: str, count: int, progress: Progress
+    sources: Sequence[Source],
+    model: Model,
+    by: str,
+    count: int,
+    progress: Progress,
+    start: Mapping[str, np.ndarray] | None = None,
 ) -> Errors:
     """Residuals of stops left out of the fit, their poses told by tracker and arm alone.
 
@@ -46,6 +52,7 @@ def held_out(
         by: "location" or "stop".
         count: how many folds to evaluate.
         progress: as of `fit.solve`.
+        start: the state of a fit of all stops: each fold's fit is near it, and starts from there.
     """
     out = Errors()
     for number, fold in enumerate(folds(sources, by)[:count], 1):
@@ -54,10 +61,21 @@ def held_out(
             progress(f"without fold {number}: {what}", done, total)
 
         trained = problems.build(sources, model, [~left for left in fold])
-        estimate = solve(trained, progress=tell)
+        estimate = solve(trained, progress=tell, start=_without_planes(trained, start))
         unseen = problems.build(sources, model, fold, trained.meetings)
         out += predict(unseen, trained, estimate)
     return out
+
+
+def _without_planes(
+    trained: Problem, start: Mapping[str, np.ndarray] | None
+) -> dict[str, np.ndarray] | None:
+    """A state less the planes found in the scans: other scans, other planes."""
+    if start is None:
+        return None
+    found = (m for m in trained.meetings.values() if isinstance(m, PlaneSurface))
+    planes = {meeting.variable for meeting in found}
+    return {name: value for name, value in start.items() if name not in planes}
 
 
 def predict(unseen: Problem, trained: Problem, estimate: Estimate) -> Errors:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +14,10 @@ from calib import effects
 from calib.effects import Effect, FrameOffset
 from calib.forward import Term
 from calib.rig import Rig, load_rig
+from chains import se3
+from chains.align import align_points
 from chains.errors import InputError
+from sensors.documents import nearest
 from sensors.recording import Recording
 from sensors.reference import Reference
 
@@ -39,12 +44,53 @@ class Model:
         """The model that a command line names: effects with commas, or the default ones.
 
         Raises:
-            InputError: an effect that the catalogue has not.
+            InputError: an effect that there is not, in the catalogue or in a file.
         """
         if chosen is None:
             return cls(fixed=tuple(fixed))
-        names = tuple(dict.fromkeys(name.strip() for name in chosen.split(",") if name.strip()))
-        return cls(names, tuple(fixed))
+        return cls(effects.load_effects(chosen), tuple(fixed))
+
+    @classmethod
+    def read(cls, document: Mapping[str, Any], path: Path | str = "model.yaml") -> Model:
+        """The model that a run's model.yaml describes, `path` being where that stands.
+
+        Raises:
+            InputError: an effect that there is not, or no longer.
+        """
+        found = tuple(effects.read(effect, path) for effect in document["effects"])
+        return cls(found, tuple(document["fixed"]))
+
+    def document(self) -> dict[str, Any]:
+        """As model.yaml holds it."""
+        return {"effects": [e.document() for e in self.effects], "fixed": list(self.fixed)}
+
+    def plus(self, added: Sequence[Effect]) -> Model:
+        """The model with more effects.
+
+        Raises:
+            InputError: one is in it already, with the same shape.
+        """
+        have = {(e.family, e.shape) for e in self.effects}
+        for effect in added:
+            if (effect.family, effect.shape) in have:
+                raise InputError(f"effect '{effect.name}' is in the model already")
+            have.add((effect.family, effect.shape))
+        return replace(self, effects=(*self.effects, *added))
+
+    def minus(self, names: Sequence[str]) -> Model:
+        """The model without some effects, and without what it held of them.
+
+        Raises:
+            InputError: one is not in it.
+        """
+        for name in names:
+            if name not in self.names:
+                raise InputError(f"effect '{name}' is not in the model{nearest(name, self.names)}")
+        kept = tuple(e for e in self.effects if e.name not in names)
+        # A shape may have a point in it, as what is held has between an effect and a parameter.
+        gone = tuple(f"{name}." for name in names)
+        fixed = (n for n in self.fixed if n not in names and not n.startswith(gone))
+        return Model(kept, tuple(fixed))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -64,6 +110,7 @@ class Model:
         """
         chosen: list[Effect] = [FrameOffset(name) for name in rig.frame_sigma]
         chosen += self.effects
+        self._check_names(rig)
         self._check_fixed(chosen, rig)
         terms = []
         for effect in chosen:
@@ -82,6 +129,14 @@ class Model:
         return np.array(
             [i for i, p in params if p.sigma and f"{effect.name}.{p.name}" not in self.fixed], int
         )
+
+    def _check_names(self, rig: Rig) -> None:
+        taken = {*rig.frame_sigma, rig.reference_frame, "gravity", "planes"}
+        for name in self.names:
+            if name in taken:
+                raise InputError(
+                    f"effect '{name}': the graph has a '{name}' already; call the effect otherwise"
+                )
 
     def _check_fixed(self, chosen: Sequence[Effect], rig: Rig) -> None:
         known = {e.name for e in chosen}
@@ -131,24 +186,51 @@ class Source:
         mesh = Reference.read(spec.mesh, spec.faces, spec.labels) if spec and spec.mesh else None
         return cls(rig, recording, mesh)
 
-    @property
+    @cached_property
     def columns(self) -> dict[str, np.ndarray]:
-        """Per-stop covariates (K,) that effects may look at."""
-        moved = moved_columns(self.rig.joint_names, self.recording.joints, self.recording.time_s)
-        return {"time_s": self.recording.time_s, **moved, **self.recording.covariates}
+        """Per-stop columns (K, ...) that effects may look at; see `stop_columns`."""
+        recording = self.recording
+        columns = stop_columns(self.rig, recording.joints, recording.time_s)
+        if self.rig.tracker:
+            columns["tracked"] = tracked_poses(self.rig, recording)
+        return {**columns, **recording.covariates}
 
 
-def moved_columns(
-    names: Sequence[str], joints: np.ndarray, time_s: np.ndarray
-) -> dict[str, np.ndarray]:
-    """Which way each joint turned to come to each stop, ``moved.<joint>`` (K,): -1, 0 or 1.
+def stop_columns(rig: Rig, joints: np.ndarray, time_s: np.ndarray) -> dict[str, np.ndarray]:
+    """What follows from when and how the arm came to each of K stops, (K,) each.
+
+    ``time_s``; ``elapsed_s`` since the first stop; each joint by its name as reported, rad or m;
+    and ``moved.<joint>``, which way it last turned: -1, 0 or 1, nothing being known of the first.
 
     Args:
-        names: of the joints.
+        rig: whose joints they are.
         joints: (K, J) reported.
-        time_s: (K,) of the stops; nothing is known of the first.
+        time_s: (K,) of the stops.
     """
     order = np.argsort(time_s, kind="stable")
     way = np.zeros(np.shape(joints))
     way[order[1:]] = np.sign(np.diff(joints[order], axis=0))
-    return {f"moved.{name}": way[:, j] for j, name in enumerate(names)}
+    columns = {"time_s": time_s, "elapsed_s": time_s - time_s.min(initial=np.inf)}
+    for j, name in enumerate(rig.joint_names):
+        columns |= {name: joints[:, j], f"moved.{name}": way[:, j]}
+    return columns
+
+
+def tracked_poses(rig: Rig, recording: Recording) -> np.ndarray:
+    """T_world_body (K, B, 4, 4) of the tracked bodies as measured, NaN where not known.
+
+    Bodies seen as points are turned as CAD says, the rig lying as three or more points say.
+    """
+    seen = np.stack([recording.bodies[body] for body in rig.tracker.bodies], axis=1)
+    T = se3.from_xyz_quat(seen[..., :3], seen[..., 3:])
+    nominal = [rig.tree.place(b, recording.joints).Ts_root_frame for b in rig.tracker.bodies]
+    nominal = np.stack(nominal, axis=1)
+    points = np.isfinite(seen[..., 0]) & ~np.isfinite(seen[..., 3:]).all(axis=-1)
+    for k in np.flatnonzero(points.any(axis=1)):
+        at = np.flatnonzero(points[k])
+        try:
+            T_world_root, _ = align_points(seen[k, at, :3], nominal[k, at, :3, 3])
+        except InputError:
+            continue
+        T[k, at, :3, :3] = T_world_root[:3, :3] @ nominal[k, at, :3, :3]
+    return T

@@ -268,6 +268,7 @@ class _Builder:
                         tracker.sigma_rad,
                         point,
                         bases,
+                        [(recording.folder, int(k)) for k in seen],
                     )
                 )
 

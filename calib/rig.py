@@ -1,6 +1,6 @@
 """rig.yaml: what is bolted to what, what measures it, and how sure its builder is."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -9,7 +9,7 @@ import pydantic
 from numpy.typing import NDArray
 
 from chains import se3
-from chains.arm import read_arm
+from chains.arm import Mass, read_arm, read_masses
 from chains.errors import InputError
 from chains.frames import Edge, FrameTree, unknown_name
 from sensors.documents import Document, Marks, Number, Triple, read_yaml, validate
@@ -76,6 +76,10 @@ class Rig:
     """Frames and effects that are the same hardware in every recording."""
     own: tuple[str, ...]
     """Frames and effects that belong to this recording alone."""
+    masses: tuple[Mass, ...] = ()
+    """What weighs on the arm's joints, as the URDF says."""
+    labels: dict[int, str] = field(default_factory=dict)
+    """Names of the labels of the reference's triangles; empty where nothing names them."""
 
     @property
     def world(self) -> str:
@@ -222,7 +226,8 @@ def load_rig(folder: str | Path) -> Rig:
     data, marks = read_yaml(path)
     file = validate(_RigFile, data, path, marks)
     where = _Where(path, marks)
-    arm = _read_arm(file.arm, folder, where)
+    arm, masses = _read_arm(file.arm, folder, where)
+    reference = _read_reference(file.reference, folder, where) if file.reference else None
     tree = _read_tree(file, arm, where)
     _check_frames(file, tree, where)
     return Rig(
@@ -240,9 +245,11 @@ def load_rig(folder: str | Path) -> Rig:
         moves=file.base.moves,
         tracker=Tracker(**file.tracker.model_dump()) if file.tracker else None,
         target=TargetSpec(**file.target.model_dump()) if file.target else None,
-        reference=_read_reference(file.reference, folder, where) if file.reference else None,
+        reference=reference,
         shared=file.shared,
         own=file.own,
+        masses=masses,
+        labels=_read_labels(reference.labels) if reference else {},
     )
 
 
@@ -267,10 +274,12 @@ class _Where:
         return folder / name
 
 
-def _read_arm(arm: _Arm | None, folder: Path, where: _Where) -> list[Edge]:
+def _read_arm(arm: _Arm | None, folder: Path, where: _Where) -> tuple[list[Edge], tuple[Mass, ...]]:
     if arm is None:
-        return []
-    return read_arm(where.file(folder, arm.urdf, "arm", "urdf"), arm.base, arm.tip)
+        return [], ()
+    urdf = where.file(folder, arm.urdf, "arm", "urdf")
+    edges = read_arm(urdf, arm.base, arm.tip)
+    return edges, tuple(read_masses(urdf, arm.base, arm.tip))
 
 
 def _read_tree(file: _RigFile, arm: list[Edge], where: _Where) -> FrameTree:
@@ -320,3 +329,11 @@ def _read_reference(reference: _Reference, folder: Path, where: _Where) -> Refer
         for key in ("mesh", "faces", "labels")
     }
     return ReferenceSpec(frame=reference.frame, sigma_m=reference.sigma_m, **paths)
+
+
+def _read_labels(path: Path | None) -> dict[int, str]:
+    """Number -> name, in the numbers' order."""
+    data = read_yaml(path)[0] if path else {}
+    if not isinstance(data, dict) or not all(type(number) is int for number in data):
+        raise InputError(f"{path}: each line should read `number: name`, as in `0: floor`.")
+    return {number: str(data[number]) for number in sorted(data)}

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import importlib.metadata
 import platform
-from collections.abc import Mapping
+import zipfile
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,13 +16,16 @@ from chains import se3
 from chains.errors import InputError
 from sensors.documents import read_yaml
 
-SOLUTION, MODEL, SUMMARY, COVARIANCE, RESIDUALS = (
+SOLUTION, MODEL, SUMMARY, COVARIANCE, RESIDUALS, STATE, DIAGNOSIS = (
     "solution.yaml",
     "model.yaml",
     "summary.json",
     "covariance.npz",
     "residuals.parquet",
+    "state.npz",
+    "diagnosis.json",
 )
+_OF_STATE = "state/"  # before every name in that file: numpy reserves a few
 
 
 @dataclass(frozen=True)
@@ -37,12 +41,21 @@ class FrameEstimate:
 
 @dataclass(frozen=True)
 class EffectEstimate:
-    """An effect's parameters (P,), with their sigma; 0 is held."""
+    """An effect's parameters (P,), with their sigma; 0 is held.
+
+    The unit is that of all, or a list with commas that has one for each, as `one_unit` writes it.
+    """
 
     unit: str
     names: tuple[str, ...]
     estimate: np.ndarray
     sigma: np.ndarray
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """(P,) of each parameter."""
+        each = tuple(self.unit.split(", "))
+        return each if len(each) == len(self.names) else (self.unit,) * len(self.names)
 
 
 @dataclass(frozen=True)
@@ -124,6 +137,28 @@ class Run:
         """Where the recordings were that this run was fitted to."""
         return [Path(r["path"]) for r in self.model["recordings"]]
 
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Names of its model's effects; of one in a Python file, its class."""
+        return tuple(_effect_name(effect) for effect in self.model["effects"])
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Where the fit stood, as `fit.Estimate.state` gives it.
+
+        Raises:
+            InputError: the run has none.
+        """
+        path = self.folder / STATE
+        if not path.is_file():
+            raise InputError(
+                f"{path} is missing: the run was made by an earlier version; fit it again"
+            )
+        try:
+            with np.load(path) as stored:
+                return {name.removeprefix(_OF_STATE): stored[name] for name in stored.files}
+        except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+            raise InputError(f"{path} cannot be read ({error}); fit the run again") from None
+
 
 def read_solution(folder: Path) -> Solution:
     """The solution of a run folder."""
@@ -132,6 +167,16 @@ def read_solution(folder: Path) -> Solution:
         names, covariance = tuple(stored["names"].tolist()), stored["covariance"]
     recordings = {n: _read_part(p) for n, p in data.get("recordings", {}).items()}
     return Solution(_read_part(data), recordings, data["not_estimated"], names, covariance)
+
+
+def write_state(folder: Path, state: Mapping[str, np.ndarray]) -> None:
+    """Put where a fit stood into its run folder."""
+    np.savez(folder / STATE, **{f"{_OF_STATE}{name}": value for name, value in state.items()})
+
+
+def one_unit(units: Sequence[str]) -> str:
+    """Units of an effect's parameters as one text: that of all, or a list with one for each."""
+    return units[0] if len(set(units)) == 1 else ", ".join(units)
 
 
 def versions() -> dict[str, str]:
@@ -160,6 +205,13 @@ def effect_document(effect: EffectEstimate) -> dict[str, Any]:
         "estimate": effect.estimate,
         "sigma": effect.sigma,
     }
+
+
+def _effect_name(document: str | Mapping[str, Any]) -> str:
+    if isinstance(document, str):
+        return document
+    shape = document.get("shape")
+    return str(document["name"]) + (f"@{shape:.6g}" if shape is not None else "")
 
 
 def _part_document(part: Part) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from calib.forward import Term
 from calib.model import Source
 from calib.observability import not_estimated
 from calib.problem import Problem
-from calib.run import EffectEstimate, FrameEstimate, Part, Solution
+from calib.run import EffectEstimate, FrameEstimate, Part, Solution, one_unit
 from chains import se3
 
 
@@ -81,7 +81,7 @@ def _effect(
     estimate, sigma = np.zeros(len(params)), np.zeros(len(params))
     estimate[term.free] = theta
     sigma[term.free] = np.sqrt(np.diag(covariance))
-    unit = ", ".join(dict.fromkeys(p.unit for p in params))
+    unit = one_unit([p.unit for p in params])
     return EffectEstimate(unit, tuple(p.name for p in params), estimate, sigma)
 
 

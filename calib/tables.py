@@ -12,6 +12,7 @@ from rich.padding import Padding
 from rich.table import Table
 
 from calib.estimates import Found, comparison, found
+from calib.ladder import Rung, ladder
 
 if TYPE_CHECKING:
     from calib.check import Check
@@ -73,7 +74,7 @@ def _warning(summary: dict[str, Any]) -> str:
 
 
 def print_comparison(runs: Sequence[Run]) -> None:
-    """Print errors, noise floor and parameters of runs side by side."""
+    """Print errors, noise floor and parameters of runs side by side, and the ladder of a study."""
     console = _console()
     for run in runs:
         console.print(str(run.folder), style="bold", soft_wrap=True)
@@ -81,15 +82,23 @@ def print_comparison(runs: Sequence[Run]) -> None:
     for start in range(0, len(runs), ABREAST):
         console.print()
         console.print(_comparison_table(runs[start : start + ABREAST]))
+    rungs = ladder(runs)
+    if rungs:
+        console.print()
+        console.print(_ladder_table(rungs))
 
 
 def effect_page(effect: Effect) -> dict[str, Any]:
     """The catalogue's page of an effect."""
+    what, _, notes = (effect.__doc__ or "").replace("``", "").partition("\n\n")
     return {
         "name": effect.name,
-        "what": (effect.__doc__ or "").split("\n\n")[0].replace("``", "").strip(),
+        "what": " ".join(what.split()),
+        "notes": " ".join(notes.split()),
         "site": effect.site.value,
         "formula": effect.formula,
+        "shape": f"{effect.shape_name}, {effect.shape:g}" if effect.shape_name else "",
+        "unit": effect.unit,
         "typical": effect.typical,
         "covariates": list(effect.covariates),
         "confounded_with": list(effect.confounded_with),
@@ -118,9 +127,8 @@ def print_catalogue(effects: Sequence[Effect], whole: bool) -> None:
 
 
 def _shown(unit: str) -> tuple[float, str]:
-    """Factor and unit in which a unit is shown; mixed ones as a list."""
-    scaled = [SHOWN.get(part, (1.0, part)) for part in unit.split(", ")]
-    return scaled[0][0], ", ".join(name for _, name in scaled)
+    """Factor and unit in which a unit is shown."""
+    return SHOWN.get(unit, (1.0, unit))
 
 
 def _cell(estimate: float, sigma: float, unit: str) -> str:
@@ -190,10 +198,12 @@ def _effects_table(rows: Sequence[Found]) -> Table:
 
 
 def _effect_cells(row: Found) -> Iterable[tuple[str, str, str, bool]]:
-    """Parameter, its cell, unit and whether it was told: one by one, or a summary of many."""
+    """Parameter, its cell, unit and whether it was told: one by one, or of each unit a summary."""
     if len(row.parameters) > LISTED:
-        free = row.sigma > 0
-        yield f"{free.sum()} values", *_summary_cell(row, free), bool(row.told[free].all())
+        for unit in dict.fromkeys(row.units):
+            free = (row.sigma > 0) & (np.array(row.units) == unit)
+            cells = _summary_cell(row, free, unit)
+            yield f"{free.sum()} values", *cells, bool(row.told[free].all())
         return
     for parameter, unit, *numbers, told in zip(
         row.parameters, row.units, row.estimate, row.sigma, row.told, strict=True
@@ -202,8 +212,8 @@ def _effect_cells(row: Found) -> Iterable[tuple[str, str, str, bool]]:
             yield parameter, _cell(*numbers, unit), _shown(unit)[1], told
 
 
-def _summary_cell(row: Found, free: np.ndarray) -> tuple[str, str]:
-    scale, unit = _shown(row.units[0])
+def _summary_cell(row: Found, free: np.ndarray, unit: str) -> tuple[str, str]:
+    scale, unit = _shown(unit)
     values = scale * row.estimate[free]
     if not len(values):
         return "held", unit
@@ -294,19 +304,45 @@ def _comparison_table(runs: Sequence[Run]) -> Table:
     return table
 
 
+def _ladder_table(rungs: Sequence[Rung]) -> Table:
+    """What each rung changed of the model, and what that did to the error of stops held out."""
+    table = _table("ladder", "model", "held out, mm", "fit, mm", "noise floor, mm")
+    for column in table.columns[2:]:
+        column.justify = "right"
+    for rung in rungs:
+        rms = rung.run.summary["rms_mm"]
+        below = rung.below.summary["rms_mm"] if rung.below else {}
+        held_out = " -> ".join(filter(None, (_mm(r.get("held_out")) for r in (below, rms))))
+        name = rung.run.folder.name or str(rung.run.folder)
+        table.add_row(name, _step(rung), held_out, _mm(rms["fit"]), _mm(rms["noise_floor"]))
+    return table
+
+
+def _step(rung: Rung) -> str:
+    """What a rung added and dropped."""
+    if rung.grown_from is None:
+        return "start"
+    if rung.below is None:
+        return f"grew from {rung.grown_from.name}, which is gone"
+    added = [f"+ {name}" for name in rung.added]
+    return ", ".join([*added, *(f"- {name}" for name in rung.dropped)]) or "the same model"
+
+
 def _add_spread(table: Table, variable: str, entries: Sequence[Mapping[str, Any]]) -> None:
-    """Mean and standard deviation, per run, over an effect's many parameters."""
-    scale, unit = _shown(entries[0]["unit"])
-    estimates = np.array([entry["estimate"] for entry in entries], float).T
-    for what, function in (("mean", np.mean), ("sd", np.std)):
-        present = (each[~np.isnan(each)] for each in estimates)
-        cells = (f"{scale * function(each):+.3g}" if len(each) else "" for each in present)
-        table.add_row(f"{variable}, {what}", unit, *cells)
+    """Mean and standard deviation, per run, over an effect's many parameters of each unit."""
+    for kind in dict.fromkeys(entry["unit"] for entry in entries):
+        scale, unit = _shown(kind)
+        alike = [entry["estimate"] for entry in entries if entry["unit"] == kind]
+        estimates = np.array(alike, float).T
+        for what, function in (("mean", np.mean), ("sd", np.std)):
+            present = (each[~np.isnan(each)] for each in estimates)
+            cells = (f"{scale * function(each):+.3g}" if len(each) else "" for each in present)
+            table.add_row(f"{variable}, {what}", unit, *cells)
 
 
 def _model(run: Run) -> str:
     model = run.model
-    text = ", ".join(model["effects"]) or "no effects"
+    text = ", ".join(run.effects) or "no effects"
     text += f"; fixed {', '.join(model['fixed'])}" if model["fixed"] else ""
     return text + (f"; from {model['prior']}" if model["prior"] else "")
 

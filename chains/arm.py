@@ -1,9 +1,11 @@
-"""An arm as its maker describes it: the chain of joints of a URDF file.
+"""An arm as its maker describes it: the chain of joints of a URDF file, and what its links weigh.
 
 URDF: https://wiki.ros.org/urdf/XML/joint. A joint's origin is T_parent_child at zero, its axis
 stands in the child's frame, and what is left out has the defaults given there.
 """
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 from xml.etree import ElementTree
@@ -13,15 +15,25 @@ import numpy as np
 
 from chains import se3
 from chains.errors import InputError
-from chains.frames import Edge, Joint, unknown_name
+from chains.frames import Edge, FrameTree, Joint, unknown_name
 from chains.se3 import Array
 
+G = 9.80665  # m/s^2
 _LONGEST_LINK_M = 10.0
 _KIND: dict[str | None, Literal["revolute", "prismatic"]] = {
     "revolute": "revolute",
     "continuous": "revolute",
     "prismatic": "prismatic",
 }
+
+
+@dataclass(frozen=True)
+class Mass:
+    """What weighs ``kg`` (a number, or (K,) by stop) at ``centre_m`` (3,) of a frame."""
+
+    frame: str
+    kg: float | Array
+    centre_m: Array
 
 
 def read_arm(urdf_path: str | Path, base: str, tip: str) -> list[Edge]:
@@ -42,6 +54,52 @@ def read_arm(urdf_path: str | Path, base: str, tip: str) -> list[Edge]:
         return [_edge(joint) for joint in _chain(robot, base, tip)]
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
+
+
+def read_masses(urdf_path: str | Path, base: str, tip: str) -> list[Mass]:
+    """Return what weighs on the arm's joints, link by link, in kg and m.
+
+    The base's own mass weighs on none. A link that hangs beside the chain counts for the link of
+    the chain that carries it, its own joints at zero. Raises InputError as ``read_arm`` does.
+    """
+    path = Path(urdf_path)
+    robot = _parse(path)
+    above = {_link(joint, "child"): joint for joint in robot.findall("joint")}
+    masses = []
+    try:
+        chain = {_link(joint, "child") for joint in _chain(robot, base, tip)}
+        for link in robot.findall("link"):
+            kg = float(_numbers(link, "inertial/mass", "value", [0.0])[0])
+            if kg < 0:
+                raise InputError(f"link '{link.get('name')}' weighs {kg:g} kg; 0 or more is wanted")
+            centre_m, name = _numbers(link, "inertial/origin", "xyz", [0, 0, 0]), link.get("name")
+            climbed: set[str] = set()
+            while kg and name not in chain and name in above and name not in climbed:
+                climbed.add(name)
+                T_parent_child = _origin(above[name])
+                centre_m = T_parent_child[:3, :3] @ centre_m + T_parent_child[:3, 3]
+                name = _link(above[name], "parent")
+            if kg and name in chain:
+                masses.append(Mass(name, kg, centre_m))
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    return masses
+
+
+def gravity_torque(tree: FrameTree, masses: Sequence[Mass], joints: Array) -> Array:
+    """Return what gravity exerts on every joint (K, J), N m about or N along its axis.
+
+    ``tau = -d(potential energy) / dq`` at ``joints`` (K, J), with z of the tree's root up: a joint
+    that gave way would turn along it.
+    """
+    torque = np.zeros(np.shape(joints))
+    for mass in masses:
+        placed = tree.place(mass.frame, joints)
+        turn, shift = placed.d_joint[:, :3], placed.d_joint[:, 3:]
+        moved = shift - se3.skew(mass.centre_m) @ turn
+        rise = np.einsum("ki,kij->kj", placed.Ts_root_frame[:, 2, :3], moved)
+        torque -= G * np.reshape(mass.kg, (-1, 1)) * rise
+    return torque
 
 
 def _parse(path: Path) -> Element:
@@ -81,16 +139,20 @@ def _chain(robot: Element, base: str, tip: str) -> list[Element]:
 
 
 def _edge(joint: Element) -> Edge:
-    name = joint.get("name", "")
-    xyz = _numbers(joint, "origin", "xyz", [0, 0, 0])
-    rpy = _numbers(joint, "origin", "rpy", [0, 0, 0])
-    if np.linalg.norm(xyz) > _LONGEST_LINK_M:
+    name, T_parent_child = joint.get("name", ""), _origin(joint)
+    length_m = np.linalg.norm(T_parent_child[:3, 3])
+    if length_m > _LONGEST_LINK_M:
         raise InputError(
-            f"joint '{name}' sits {np.linalg.norm(xyz):g} m from its parent; URDF lengths are in "
-            f"metres (millimetres?)"
+            f"joint '{name}' sits {length_m:g} m from its parent; URDF lengths are in metres "
+            f"(millimetres?)"
         )
-    parent, child = _link(joint, "parent"), _link(joint, "child")
-    return Edge(name, parent, child, se3.from_xyz_rpy(xyz, rpy), _motion(joint))
+    return Edge(name, _link(joint, "parent"), _link(joint, "child"), T_parent_child, _motion(joint))
+
+
+def _origin(joint: Element) -> Array:
+    """Return T_parent_child (4, 4) at the joint's zero."""
+    xyz, rpy = (_numbers(joint, "origin", part, [0, 0, 0]) for part in ("xyz", "rpy"))
+    return se3.from_xyz_rpy(xyz, rpy)
 
 
 def _motion(joint: Element) -> Joint | None:
@@ -127,9 +189,9 @@ def _link(joint: Element, role: str) -> str:
     return link
 
 
-def _numbers(joint: Element, tag: str, attribute: str, default: list[float]) -> Array:
-    """Return the finite numbers of one attribute, as many as the default has."""
-    element = joint.find(tag)
+def _numbers(owner: Element, tag: str, attribute: str, default: list[float]) -> Array:
+    """Return the finite numbers of one attribute of a joint or link, as many as the default has."""
+    element = owner.find(tag)
     text = None if element is None else element.get(attribute)
     if text is None:
         return np.array(default, float)
@@ -140,6 +202,6 @@ def _numbers(joint: Element, tag: str, attribute: str, default: list[float]) -> 
     if values.shape != (len(default),) or not np.isfinite(values).all():
         count = "a number" if len(default) == 1 else f"{len(default)} numbers"
         raise InputError(
-            f"joint '{joint.get('name')}': {tag} {attribute} is '{text}'; it must be {count}"
+            f"{owner.tag} '{owner.get('name')}': {tag} {attribute} is '{text}'; it must be {count}"
         )
     return values

@@ -121,8 +121,12 @@ def test_every_command_has_help_and_json(rigcal, command):
         (["fit", "rec", "-o", "run", "--folds", "many"], "--folds"),
         (["simulate", "tinny", "-o", "rec"], "did you mean tiny"),
         (["simulate", "tiny", "-o", "rec", "--hide", "range_scale"], "EFFECT=SIZE"),
-        (["effects", "ring_offset"], "did you mean 'ring_range_offset'"),
+        (["effects", "ring_range_ofset"], "did you mean 'ring_range_offset'"),
         (["compare", "nowhere"], "nowhere"),
+        (["add", "nowhere", "arm_axis_tilt", "-o", "run"], "nowhere"),
+        (["add", "run", "-o", "grown"], "EFFECT"),
+        (["add", "run", "arm_axis_tilt"], "--out"),
+        (["fit", "rec", "-o", "run", "--effects", "own.yaml"], "own.yaml does not exist"),
     ],
     ids=lambda value: "" if isinstance(value, str) else " ".join(value),
 )
@@ -174,7 +178,7 @@ def test_json_of_what_takes_long_stands_alone_on_stdout(made):
     ("arguments", "keys"),
     [
         (["check", "rec"], {"contents", "problems", "odd", "can", "cannot"}),
-        (["compare", "run", "run"], {"rms_mm", "parameters"}),
+        (["compare", "run", "run"], {"rms_mm", "parameters", "ladder"}),
         (["export", "run", "-o", "out"], {"files"}),
         (["effects"], {"name", "formula", "source"}),
         (["effects", "ring_range_offset"], {"name", "formula", "source"}),
@@ -188,6 +192,26 @@ def test_json_stands_alone_on_stdout(rigcal, folder, monkeypatch, arguments, key
     document = json.loads(out)
     for part in document if isinstance(document, list) else [document]:
         assert keys <= part.keys()
+
+
+def test_a_run_grows_and_the_ladder_says_by_what(rigcal, folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    (folder / "lean.yaml").write_text(
+        "{name: lean, site: range, unit: m, sigma: 0.01, basis: ['sin(2 * azimuth)']}"
+    )
+    code, out, err = rigcal("add", "run", "arm_axis_tilt", "lean.yaml", "-o", "grown", "--json")
+    assert (code, err) == (0, "")
+    assert json.loads(out)["converged"] is True
+    code, out, err = rigcal("compare", "grown", "--json")
+    assert (code, err) == (0, "")
+    foot, top = json.loads(out)["ladder"]
+    assert foot["grown_from"] is None and Path(foot["run"]) == Path(top["grown_from"])
+    assert top["added"] == ["arm_axis_tilt", "lean"] and top["dropped"] == []
+    code, out, err = rigcal("compare", "grown")
+    assert "+ arm_axis_tilt, + lean" in out
+    code, out, err = rigcal("add", "grown", "lean.yaml", "-o", "more")
+    assert (code, out) == (2, "") and "'lean' is in the model already" in err
+    assert not (folder / "more").exists()
 
 
 @pytest.mark.parametrize(

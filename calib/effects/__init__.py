@@ -3,19 +3,99 @@
 from __future__ import annotations
 
 import difflib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
 
-from calib.effects.arm import ArmAxisTilt, ArmJointOffset, ArmLinkLength
+from calib.effects.arm import (
+    ArmAxisTilt,
+    ArmBacklash,
+    ArmGearError,
+    ArmGravitySag,
+    ArmJointEccentricity,
+    ArmJointOffset,
+    ArmJointScale,
+    ArmLinkLength,
+    ArmThermalGrowth,
+)
 from calib.effects.base import Basis, Effect, LazyColumn, OneHot, Param, Site, View
-from calib.effects.lidar import RingRangeOffset
-from calib.effects.reference import SurfaceShift
-from calib.effects.rig import FrameOffset
+from calib.effects.beams import (
+    BeamOriginOffset,
+    ElevationScale,
+    EncoderEccentricity,
+    EncoderSecondHarmonic,
+    NearRangeAzimuth,
+    RingAzimuthOffset,
+    RingElevationOffset,
+    SpinAxisWobble,
+)
+from calib.effects.noise import NoiseIncidence, NoiseIntensity, NoiseRange
+from calib.effects.range import (
+    AzimuthRangeHarmonic,
+    IncidenceAngleBias,
+    IntensityRangeWalk,
+    LabelRangeOffset,
+    NearRangeBias,
+    RangeCyclic,
+    RangeOffset,
+    RangeQuantisation,
+    RangeScale,
+    RangeStep,
+    RingRangeOffset,
+    TemperatureDrift,
+    WarmupDrift,
+)
+from calib.effects.reference import FaroScale, MovedSurface, SurfaceShift
+from calib.effects.rig import BaseFlex, FrameOffset, MountBending, MountCreep, MountSlip
+from calib.effects.targets import TargetRodTilt, TargetSphereOffset
+from calib.effects.tracker import OptitrackDistortion, OptitrackScale
+from calib.effects.user import from_document, from_file, is_file
 from chains.errors import InputError
 
 CATALOGUE: tuple[Effect, ...] = (
+    RangeOffset(),
+    RangeScale(),
+    RingRangeOffset(),
+    RangeCyclic(),
+    NearRangeBias(),
+    RangeStep(),
+    IncidenceAngleBias(),
+    IntensityRangeWalk(),
+    LabelRangeOffset(),
+    WarmupDrift(),
+    TemperatureDrift(),
+    AzimuthRangeHarmonic(),
+    RangeQuantisation(),
+    RingElevationOffset(),
+    RingAzimuthOffset(),
+    ElevationScale(),
+    BeamOriginOffset(),
+    EncoderEccentricity(),
+    EncoderSecondHarmonic(),
+    SpinAxisWobble(),
+    NearRangeAzimuth(),
     ArmLinkLength(),
     ArmJointOffset(),
     ArmAxisTilt(),
-    RingRangeOffset(),
+    ArmJointScale(),
+    ArmJointEccentricity(),
+    ArmGravitySag(),
+    ArmBacklash(),
+    ArmGearError(),
+    ArmThermalGrowth(),
+    BaseFlex(),
+    MountSlip(),
+    MountCreep(),
+    MountBending(),
+    OptitrackScale(),
+    OptitrackDistortion(),
+    TargetRodTilt(),
+    TargetSphereOffset(),
+    FaroScale(),
+    MovedSurface(),
+    NoiseRange(),
+    NoiseIncidence(),
+    NoiseIntensity(),
 )
 DEFAULT = ("arm_link_length", "arm_joint_offset", "ring_range_offset")
 
@@ -32,6 +112,8 @@ __all__ = [
     "SurfaceShift",
     "View",
     "find",
+    "load_effects",
+    "read",
 ]
 
 
@@ -58,3 +140,44 @@ def find(name: str) -> Effect:
         wanted = f"write {family}@NUMBER" if effect.shape_name else "it has no shape to choose"
         raise InputError(f"effect '{name}': {wanted}")
     return effect.at(chosen)
+
+
+def load_effects(texts: str | Iterable[str]) -> tuple[Effect, ...]:
+    """The effects that a command line names, each once.
+
+    Args:
+        texts: names of the catalogue, ``family@shape``, and files of effects of the user's own:
+            ``file.yaml`` of formulas, ``file.py`` or ``file.py:Class``. One text may hold several
+            of these, with commas between.
+
+    Raises:
+        InputError: there is no such effect or file, or two effects have one name.
+    """
+    texts = texts.split(",") if isinstance(texts, str) else texts
+    found: dict[str, Effect] = {}
+    for text in (text.strip() for text in texts if text.strip()):
+        for effect in map(_own, from_file(text)) if is_file(text) else [find(text)]:
+            same = found.setdefault(effect.name, effect)
+            if same.document() != effect.document():
+                raise InputError(f"{text}: another effect is called '{effect.name}' too")
+    return tuple(found.values())
+
+
+def read(document: str | Mapping[str, Any], path: str | Path = "model.yaml") -> Effect:
+    """The effect that `Effect.document` spelled.
+
+    Args:
+        document: a name in the catalogue, the mapping of a formula, or a class in a Python file.
+        path: where it stands, for messages.
+
+    Raises:
+        InputError: there is no such effect.
+    """
+    return find(document) if isinstance(document, str) else _own(from_document(document, path))
+
+
+def _own(effect: Effect) -> Effect:
+    """A user's effect, unless the catalogue has one of its name."""
+    if any(known.family == effect.family for known in CATALOGUE):
+        raise InputError(f"effect '{effect.name}' is in the catalogue; give yours another name")
+    return effect

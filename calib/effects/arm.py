@@ -5,7 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from calib.effects.base import Effect, Param, Site, View
+from calib.effects.basis import finite
+from calib.effects.range import AMBIENT_C
 from calib.rig import Rig
+from chains.arm import Mass, gravity_torque
 
 
 class ArmLinkLength(Effect):
@@ -13,6 +16,7 @@ class ArmLinkLength(Effect):
 
     name = "arm_link_length"
     site = Site.EDGE
+    unit = "m"
     formula = "|origin of joint i| = nominal + dL_i, along the nominal direction"
     typical = "0.1 to 5 mm"
     covariates = ("joints",)
@@ -45,6 +49,7 @@ class ArmJointOffset(Effect):
 
     name = "arm_joint_offset"
     site = Site.JOINTS
+    unit = "rad"
     formula = "q_i = reported_i + offset_i"
     typical = "0.1 to 5 mrad"
     covariates = ("joints",)
@@ -52,11 +57,7 @@ class ArmJointOffset(Effect):
     source = "Mooring, Roth, Driels 1991, Fundamentals of Manipulator Calibration"
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
-        units = {"revolute": "rad", "prismatic": "m"}
-        return tuple(
-            Param(joint, units[kind], 0.005)
-            for joint, kind in zip(rig.joint_names, rig.joint_kinds, strict=True)
-        )
+        return tuple(Param(joint, unit, 0.005) for joint, unit in _units(rig).items())
 
     def basis(self, view: View) -> np.ndarray:
         return np.eye(len(view.rig.joint_names))[None]
@@ -67,6 +68,7 @@ class ArmAxisTilt(Effect):
 
     name = "arm_axis_tilt"
     site = Site.EDGE
+    unit = "rad"
     formula = (
         "origin of joint i -> origin * exp(a_i * x_i + b_i * y_i), x_i and y_i across the axis"
     )
@@ -86,3 +88,155 @@ class ArmAxisTilt(Effect):
                 p = 2 * view.rig.joint_names.index(edge.joint.name)
                 basis[0, e, :3, p : p + 2] = np.linalg.svd(edge.joint.axis[None])[2][1:].T
         return basis
+
+
+class ArmJointScale(Effect):
+    """An encoder counts too many steps a turn: ``true joint = reported * (1 + k)``."""
+
+    name = "arm_joint_scale"
+    site = Site.JOINTS
+    unit = "1"
+    formula = "q_i = reported_i + k_i * reported_i"
+    typical = "up to 0.1 percent, size assumed"
+    covariates = ("joints",)
+    confounded_with = ("arm_joint_offset", "arm_joint_eccentricity")
+    source = "size assumed"
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        return tuple(Param(joint, "1", 0.001) for joint in rig.joint_names)
+
+    def basis(self, view: View) -> np.ndarray:
+        return view.joints[:, :, None] * np.eye(view.joints.shape[1])
+
+
+class ArmJointEccentricity(Effect):
+    """A joint's encoder disc sits off its axis: the angle errs once a turn."""
+
+    name = "arm_joint_eccentricity"
+    site = Site.JOINTS
+    unit = "rad"
+    formula = "q_i = reported_i + a_i * sin(reported_i) + b_i * cos(reported_i)"
+    typical = "0.1 to 1 mrad, size assumed"
+    covariates = ("joints",)
+    confounded_with = ("arm_gravity_sag", "arm_joint_offset", "arm_joint_scale")
+    source = "Judd and Knasinski 1990, IEEE Trans. Robotics and Automation 6(1)"
+    sigma = 0.001
+    shape = 1.0
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        turning = (joint for joint, unit in _units(rig).items() if unit == "rad")
+        return tuple(Param(f"{j}.{f}", "rad", self.sigma) for j in turning for f in ("sin", "cos"))
+
+    def basis(self, view: View) -> np.ndarray:
+        turning = [j for j, unit in enumerate(_units(view.rig).values()) if unit == "rad"]
+        basis = np.zeros((*view.joints.shape, 2 * len(turning)))
+        for p, j in enumerate(turning):
+            turn = self.shape * view.joints[:, j]
+            basis[:, j, 2 * p], basis[:, j, 2 * p + 1] = np.sin(turn), np.cos(turn)
+        return basis
+
+
+class ArmGearError(ArmJointEccentricity):
+    """A joint's gear is uneven: the angle errs N times a turn, N the gear's ratio or twice it."""
+
+    name = "arm_gear_error"
+    formula = "q_i = reported_i + a_i * sin(N * reported_i) + b_i * cos(N * reported_i)"
+    typical = "0.1 to 0.5 mrad, size assumed"
+    confounded_with = ("arm_backlash", "arm_joint_eccentricity")
+    source = "harmonic drives: Mechanism and Machine Theory 2021, 104122"
+    sigma = 0.0005
+    shape_name, shape = "ratio", 100.0
+
+    def shapes(self, stops: View) -> tuple[float, ...]:
+        """Ratios usual in arms, singly and doubled, and the low orders of a bent shaft."""
+        ratios = (2, 3, 4, 8, 16, 32, 50, 51, 80, 81, 100, 101, 120, 121, 160, 161, 200, 202)
+        return tuple(map(float, ratios)) if stops.rig.joint_names else ()
+
+
+class ArmGravitySag(Effect):
+    """A joint gives way under the arm's weight, by so much per unit of gravity's torque.
+
+    The weights are those of the URDF's links, and `payload_kg` at the arm's tip where stops say
+    it; the root's z axis is taken to point up. ``c > 0`` droops.
+    """
+
+    name = "arm_gravity_sag"
+    site = Site.JOINTS
+    unit = "rad/(N m)"
+    formula = "q_i = reported_i + c_i * torque of gravity about joint i"
+    typical = "0.2 to 2 mrad at full reach: 0.00002 to 0.0002 rad/(N m), size assumed"
+    covariates = ("joints",)
+    confounded_with = ("arm_joint_eccentricity", "base_flex", "arm_joint_offset")
+    source = "stiffness of arms: Klimchik et al.; size assumed"
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        if not rig.masses:
+            return ()
+        units = {"rad": "rad/(N m)", "m": "m/N"}
+        return tuple(Param(joint, units[unit], 2e-4) for joint, unit in _units(rig).items())
+
+    def basis(self, view: View) -> np.ndarray:
+        torque = gravity_torque(view.rig.tree, masses(view), view.joints)
+        return torque[:, :, None] * np.eye(torque.shape[1])
+
+
+class ArmBacklash(Effect):
+    """A joint lies half its play behind the way it came: ``true = reported + h * (+1 or -1)``."""
+
+    name = "arm_backlash"
+    site = Site.JOINTS
+    unit = "rad"
+    formula = "q_i = reported_i + h_i * (sign of joint i's last move)"
+    typical = "0.1 to 1 mrad, size assumed"
+    covariates = ("joints", "time_s")
+    confounded_with = ("arm_joint_offset", "arm_gear_error")
+    source = "size assumed"
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        return tuple(Param(joint, unit, 0.0005) for joint, unit in _units(rig).items())
+
+    def basis(self, view: View) -> np.ndarray:
+        way = np.stack([view[f"moved.{joint}"] for joint in view.rig.joint_names], axis=1)
+        return way[:, :, None] * np.eye(way.shape[1])
+
+
+class ArmThermalGrowth(Effect):
+    """The arm's links grow with the temperature, all by one coefficient."""
+
+    name = "arm_thermal_growth"
+    site = Site.EDGE
+    unit = "1/K"
+    formula = "|origin of joint i| = nominal * (1 + alpha * (temperature - 20 degrees C))"
+    typical = "23 ppm/K for aluminium: 0.15 mm over 0.65 m and 10 K"
+    covariates = ("temperature_c",)
+    confounded_with = ("arm_link_length",)
+    source = "expansion of aluminium, as in any handbook"
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        return (Param("alpha", "1/K", 5e-5),) if rig.arm_edges else ()
+
+    def basis(self, view: View) -> np.ndarray:
+        tree, warmer = view.rig.tree, finite(view["temperature_c"] - AMBIENT_C)
+        basis = np.zeros((len(warmer), len(tree.edges), 6, 1))
+        for name in view.rig.arm_edges:
+            e = tree.edge_names.index(name)
+            T_parent_child = tree.edges[e].T_parent_child
+            origin_m = T_parent_child[:3, :3].T @ T_parent_child[:3, 3]
+            basis[:, e, 3:, 0] = warmer[:, None] * origin_m
+        return basis
+
+
+def masses(view: View) -> list[Mass]:
+    """What weighs on the arm at the view's stops: its links, and the payload at its tip."""
+    found = list(view.rig.masses)
+    if "payload_kg" in view.columns:
+        tree = view.rig.tree
+        tip = tree.edges[tree.edge_names.index(view.rig.arm_edges[-1])].child
+        found.append(Mass(tip, finite(view["payload_kg"]), np.zeros(3)))
+    return found
+
+
+def _units(rig: Rig) -> dict[str, str]:
+    """The unit of every joint, by its name."""
+    units = {"revolute": "rad", "prismatic": "m"}
+    return {j: units[kind] for j, kind in zip(rig.joint_names, rig.joint_kinds, strict=True)}

@@ -12,7 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -57,8 +57,8 @@ class View:
     Args:
         rig: the rig as built on paper.
         rows: how many rows the site has here.
-        columns: name -> (rows,), or (1,) where one value holds for all rows; or a function
-            that gives it, for what is costly and seldom asked.
+        columns: name -> (rows, ...), or (1, ...) where one value holds for all rows; or a
+            function that gives it, for what is costly and seldom asked.
         joints: (rows, J) or (1, J) reported joint values, rad or m.
     """
 
@@ -104,14 +104,17 @@ class Effect(ABC):
         site: where it acts.
         covariates: columns of the view that its basis looks at; "joints" are the reported joints.
             Where a recording lacks one, the effect cannot be tested.
+        unit: of its parameters, of all of them if they differ; of revolute joints.
         formula, typical, confounded_with, source: the catalogue's page.
         shape_name: what the shape is, with its unit (``wavelength_m``); empty where there is none.
         shape: the one chosen.
+        origin: the Python file and class of a user's effect; None for one of the catalogue.
         of_lidar: True when the effect belongs to the mounted LiDAR, so that rigs do not share it.
     """
 
     name: str
     site: ClassVar[Site]
+    unit: ClassVar[str] = ""
     formula: ClassVar[str] = ""
     typical: ClassVar[str] = ""
     covariates: ClassVar[tuple[str, ...]] = ()
@@ -119,6 +122,7 @@ class Effect(ABC):
     source: ClassVar[str] = ""
     shape_name: ClassVar[str] = ""
     shape: float = 0.0
+    origin: Mapping[str, Any] | None = None
 
     @property
     def family(self) -> str:
@@ -138,6 +142,12 @@ class Effect(ABC):
         chosen = copy.copy(self)
         chosen.shape, chosen.name = shape, f"{self.family}@{shape:.6g}"
         return chosen
+
+    def document(self) -> str | dict[str, Any]:
+        """How a model's file spells it; `calib.effects.read` is the inverse."""
+        if self.origin is None:
+            return self.name
+        return {**self.origin, **({"shape": self.shape} if self.family != self.name else {})}
 
     @property
     def of_lidar(self) -> bool:

@@ -311,19 +311,11 @@ def effect_columns(
     )
 
 
-def compress(
-    name: str,
-    rows: Rows,
-    stops: Stops,
-    frame: str,
-    T_reference_lidar: np.ndarray,
-    values: Values,
-    newton: bool,
-) -> CompressedScan:
-    """Whiten, weight and compress a stop's rows, linearised at the state `values`.
+def unknown_columns(rows: Rows) -> tuple[list[Part], list[Group]]:
+    """The columns of a stop's rows by unknowns of beams and surfaces: dense ones, then sparse.
 
-    With `newton` the rows' curvature takes the place of their weight, at the same gradient: fewer
-    steps to the optimum, but not its covariance.
+    Returns:
+        The parts, with columns counted from 0, and the sparse columns that this stop touches.
     """
     parts, column = [], 0
     for variable, block in rows.dense.items():
@@ -340,6 +332,24 @@ def compress(
         parts.append(Part(c.variable, at, c.components[used[1:]]))
         groups.append(group)
         column += group.size
+    return parts, groups
+
+
+def compress(
+    name: str,
+    rows: Rows,
+    stops: Stops,
+    frame: str,
+    T_reference_lidar: np.ndarray,
+    values: Values,
+    newton: bool,
+) -> CompressedScan:
+    """Whiten, weight and compress a stop's rows, linearised at the state `values`.
+
+    With `newton` the rows' curvature takes the place of their weight, at the same gradient: fewer
+    steps to the optimum, but not its covariance.
+    """
+    parts, groups = unknown_columns(rows)
     weight, residual = rows.weight, rows.residual_m
     if newton:
         weight = np.where(rows.usable, tukey_curvature(residual / rows.sigma_m, rows.scale), 0.0)

@@ -57,6 +57,12 @@ class MeshSurface:
         scale = max(1.0, float(np.sqrt(walls_m2 / ROOM_M2)))
         return {kind: scale * size_m for kind, size_m in PATCHES_M.items()}
 
+    def surface_of(self, kind: str, parts: np.ndarray) -> np.ndarray:
+        """The surface that each of those parts is of; a surface is its own."""
+        if kind == "surface":
+            return parts
+        return self.reference.patch_surface(self.patches_m[kind])[parts]
+
     def associate(
         self, T: np.ndarray, beams: Beams, values: Values, near_edges: bool
     ) -> Association:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -27,6 +29,7 @@ class TrackedBody:
         sigma_m, sigma_rad: of one measurement, per axis.
         is_point: True when the tracker gives no orientation.
         bases: variable -> (K or 1, 6, P), what the tracker adds to the body's pose, per unit.
+        stop_names: (K,) recording and number of each stop: rows of one err together.
     """
 
     name: str
@@ -37,6 +40,7 @@ class TrackedBody:
     sigma_rad: float
     is_point: bool
     bases: dict[str, np.ndarray]
+    stop_names: Sequence[tuple[Path, int]] = ()
 
     site = Site.TRACKER
     kind = "tracker"

@@ -38,7 +38,7 @@ def simulate(
         spec: a preset, the path of a YAML file, or a spec.
         out: the recording's folder; another recording there is replaced.
         seed: 0 or more.
-        hide: effect -> size, in sigmas of its parameters (see `truth.draw`).
+        hide: effect, or file of effects -> size, in sigmas of its parameters (see `truth.draw`).
         progress: called with what is done, how much of it, and how much there is.
 
     Raises:
@@ -73,9 +73,9 @@ def _record(
     if spec.lidar:
         scanner, Ts_faro_lidar = Scanner(truth, room, spec), world.in_faro(rig.lidar_frame)
         for k, name in enumerate(stops.names):
-            columns = {c: v[k : k + 1] for c, v in stops.columns.items()}
+            columns = {c: v[k : k + 1] for c, v in world.columns.items()}
             rng = stream(seed, f"scan {name}")
             scan = scanner.scan(Ts_faro_lidar[k], columns, stops.joints[k : k + 1], rng)
             write_table(folder / "scans" / f"{name}.parquet", scan)
             progress("simulating", k, len(stops.names))
-    write_truth(folder / "truth.json", world, spec, seed, hide)
+    write_truth(folder / "truth.json", world, spec, seed)

@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from calib.effects import Site, View
+from calib.model import stop_columns
 from calib.rig import Rig
 from calib.simulate.room import FLOOR_CENTRE_M
 from calib.simulate.spec import Spec
@@ -40,6 +41,10 @@ class Plan:
     joints: np.ndarray
     Ts_faro_root: np.ndarray
     columns: dict[str, np.ndarray]
+
+    def seen(self, rig: Rig) -> dict[str, np.ndarray]:
+        """What effects may look at (K,), by name, as in a fit."""
+        return {**stop_columns(rig, self.joints, self.columns["time_s"]), **self.columns}
 
     @cached_property
     def names(self) -> list[str]:
@@ -175,11 +180,23 @@ class World:
     @classmethod
     def of(cls, truth: Truth, stops: Plan, noise: float, rng: np.random.Generator) -> World:
         """Bend the rig by its effects: ``true = nominal + effect``, encoders with their noise."""
-        rig, view = truth.rig, _view(truth, stops)
+        rig, view = (
+            truth.rig,
+            View(truth.rig, len(stops.joints), stops.seen(truth.rig), stops.joints),
+        )
         shape = stops.joints.shape
         jitter = noise * rig.sigma_joint_rad * rng.standard_normal(shape)
         joints = stops.joints + jitter + truth.error(Site.JOINTS, view, shape[1:])
         return cls(truth, stops, joints, truth.error(Site.EDGE, view, (len(rig.tree.edges), 6)))
+
+    @cached_property
+    def columns(self) -> dict[str, np.ndarray]:
+        """What effects may look at (K, ...), by name, as in a fit; bodies where they truly are."""
+        columns, tracker = self.plan.seen(self.truth.rig), self.truth.rig.tracker
+        if tracker:
+            bodies = [self.truth.T_opti_faro @ self.in_faro(body) for body in tracker.bodies]
+            columns["tracked"] = np.stack(bodies, axis=1)
+        return columns
 
     def in_faro(self, frame: str) -> np.ndarray:
         """True T_faro_frame (K, 4, 4)."""
@@ -188,15 +205,16 @@ class World:
 
     def tracked(self, noise: float, rng: np.random.Generator) -> dict[str, np.ndarray]:
         """What the tracker said: body -> T_opti_body (K, 4, 4), with its effects and its noise."""
-        tracker = self.truth.rig.tracker
-        bodies = tracker.bodies if tracker else ()
-        added = self.truth.error(Site.TRACKER, _view(self.truth, self.plan), (len(bodies), 6))
+        tracker, count = self.truth.rig.tracker, len(self.joints)
+        if tracker is None:
+            return {}
+        view = View(self.truth.rig, count, self.columns, self.plan.joints)
+        added = self.truth.error(Site.TRACKER, view, (len(tracker.bodies), 6))
         seen = {}
-        for b, body in enumerate(bodies):
+        for b, body in enumerate(tracker.bodies):
             sigma = noise * np.repeat([tracker.sigma_rad, tracker.sigma_m], 3)
-            jitter = se3.exp(sigma * rng.standard_normal((len(self.joints), 6)))
-            T_opti_body = self.truth.T_opti_faro @ self.in_faro(body)
-            seen[body] = T_opti_body @ se3.exp(added[:, b]) @ jitter
+            jitter = se3.exp(sigma * rng.standard_normal((count, 6)))
+            seen[body] = self.columns["tracked"][:, b] @ se3.exp(added[:, b]) @ jitter
         return seen
 
     def guessed(self, moves: str, rng: np.random.Generator) -> np.ndarray:
@@ -231,7 +249,3 @@ def hang_targets(
     return {
         name: at + noise * sigma_m * rng.standard_normal(at.shape) for name, at, sigma_m in measured
     }
-
-
-def _view(truth: Truth, stops: Plan) -> View:
-    return View(truth.rig, len(stops.joints), stops.columns, stops.joints)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.effects import DEFAULT, Effect, FrameOffset, OneHot, Site, View, find
+from calib.effects import DEFAULT, Effect, FrameOffset, OneHot, Site, View, find, load_effects
 from calib.model import owned
 from calib.rig import Rig
 from calib.simulate.spec import Spec
@@ -32,11 +32,13 @@ class Truth:
         rig: the rig on paper.
         effects: each effect with the values (P,) of its parameters.
         T_opti_faro: (4, 4).
+        hidden: size of every effect that was asked for, by its name.
     """
 
     rig: Rig
     effects: tuple[tuple[Effect, np.ndarray], ...]
     T_opti_faro: np.ndarray
+    hidden: Mapping[str, float]
 
     def error(self, site: Site, view: View, shape: tuple[int, ...]) -> np.ndarray:
         """Sum of all effects at a site, (rows or 1, *shape): ``sum of basis(view) @ theta``."""
@@ -69,21 +71,29 @@ def draw(rig: Rig, spec: Spec, hide: Mapping[str, float], seed: int) -> Truth:
     1; so an effect of one parameter has ``theta = +-s * sigma``. A default effect that is hidden is
     drawn in this way instead.
 
+    Args:
+        rig: the rig on paper.
+        spec: how far from paper hardware is built.
+        hide: what `calib.effects.load_effects` takes -> size.
+        seed: of the recording.
+
     Raises:
-        InputError: a hidden effect is not in the catalogue, or finds nothing to act on.
+        InputError: there is no such effect, or it finds nothing to act on.
     """
     shared_seed = seed if spec.world_seed is None else spec.world_seed
+    asked = [(effect, size) for text, size in hide.items() for effect in load_effects([text])]
+    hidden = {effect.name: size for effect, size in asked}
     usual = [FrameOffset(name) for name in rig.frame_sigma]
-    usual += [find(name) for name in DEFAULT if name not in hide]
+    usual += [find(name) for name in DEFAULT if name not in hidden]
     effects = []
-    for effect in [*usual, *map(find, hide)]:
+    for effect in [*usual, *(effect for effect, _ in asked)]:
         rng = stream(seed if owned(effect, rig) else shared_seed, effect.name)
         sigma = np.array([p.sigma for p in effect.params(rig)])
-        if effect.name in hide:
+        if effect.name in hidden:
             if not sigma.any():
                 raise InputError(f"effect '{effect.name}' has nothing to act on in rig {rig.name}")
             z = rng.standard_normal(len(sigma)) * (sigma > 0)
-            theta = hide[effect.name] * sigma * z / np.sqrt(np.mean(z[sigma > 0] ** 2))
+            theta = hidden[effect.name] * sigma * z / np.sqrt(np.mean(z[sigma > 0] ** 2))
         elif effect.of_lidar:
             theta = spec.build_error * _pattern(rig, len(sigma), rng)
         else:
@@ -91,7 +101,7 @@ def draw(rig: Rig, spec: Spec, hide: Mapping[str, float], seed: int) -> Truth:
             theta = spec.build_error * built * sigma * rng.standard_normal(len(sigma))
         if len(theta):
             effects.append((effect, theta))
-    return Truth(rig, tuple(effects), _opti_faro(stream(shared_seed, "opti")))
+    return Truth(rig, tuple(effects), _opti_faro(stream(shared_seed, "opti")), hidden)
 
 
 def _pattern(rig: Rig, count: int, rng: np.random.Generator) -> np.ndarray:

@@ -60,7 +60,7 @@ def write_targets(path: Path, truth: Truth, spec: Spec, rng: np.random.Generator
     _write_csv(path, columns)
 
 
-def write_truth(path: Path, world: World, spec: Spec, seed: int, hide: Mapping[str, float]) -> None:
+def write_truth(path: Path, world: World, spec: Spec, seed: int) -> None:
     """Write what a fit should find: frames, effects, and where every stop truly was."""
     truth, stops = world.truth, world.plan
     frames = {"root": stops.Ts_faro_root}
@@ -69,7 +69,7 @@ def write_truth(path: Path, world: World, spec: Spec, seed: int, hide: Mapping[s
     document = {
         "spec": spec.model_dump(),
         "seed": seed,
-        "hidden": dict(hide),
+        "hidden": dict(truth.hidden),
         "T_faro_opti": se3.inverse(truth.T_opti_faro),
         "frames": truth.frames,
         "effects": {e.name: theta for e, theta in truth.effects if e.name not in truth.frames},

@@ -11,9 +11,11 @@ from calib.effects import Effect, FrameOffset, OneHot, Param, Site, SurfaceShift
 from calib.forward import Term, place
 from calib.model import Model, Source
 from calib.problem import build
+from calib.rig import load_rig
 from chains.errors import InputError
 
 from . import rigs
+from .hidden import coarse, hide
 
 
 @pytest.fixture(scope="module")
@@ -23,10 +25,12 @@ def problem(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def views(problem):
-    """What an effect sees at each site."""
-    source = problem.sources[0]
-    beams = problem.scans[0].rows(problem.initial).view
+def views(tmp_path_factory):
+    """What an effect sees at each site of a recording that has all that any effect looks at."""
+    source, _ = hide(tmp_path_factory.mktemp("views") / "rec", "range_offset")
+    problem = build([source], Model())
+    beams = problem.scans[-1].rows(problem.initial).view
+    beams = replace(beams, rig=coarse(beams.rig))
     count = len(source.recording.stops)
     stops = View(source.rig, count, source.columns, source.recording.joints)
     targets = View(source.rig, 4, {}, np.zeros((1, 0)))
@@ -73,9 +77,49 @@ def test_a_basis_has_the_shape_of_its_site(effect, views):
 
 
 @pytest.mark.parametrize("effect", effects.CATALOGUE, ids=lambda e: e.name)
-def test_the_catalogue_says_what_an_effect_is(effect):
-    assert effects.find(effect.name) is effect
-    assert effect.formula and effect.typical and effect.covariates and effect.source
+def test_the_catalogue_says_what_an_effect_is(effect, views):
+    assert effects.find(effect.name) is effect and effects.read(effect.document()) is effect
+    assert effect.formula and effect.typical and effect.source
+    others = {e.name for e in effects.CATALOGUE} | {*views[Site.EDGE].rig.tree.edge_names, "faro"}
+    assert set(effect.confounded_with) <= others - {effect.name}
+    view = views[effect.site]
+    units = dict.fromkeys(p.unit for p in effect.params(view.rig))
+    assert effect.unit == ", ".join(units)
+    assert set(effect.covariates) <= {*view.columns, "joints"}
+    # It looks at nothing else.
+    columns = {name: view.columns[name] for name in effect.covariates if name != "joints"}
+    if "time_s" in columns:
+        columns |= {n: c for n, c in view.columns.items() if n.startswith("moved.")}
+    normal = {"normal": view.columns["normal"]} if effect.site is Site.REFERENCE else {}
+    joints = view.joints if {"joints", "time_s"} & set(effect.covariates) else view.joints * np.nan
+    effect.basis(View(view.rig, view.rows, columns | normal, joints))
+
+
+def test_every_name_is_there_once():
+    names = [effect.name for effect in effects.CATALOGUE]
+    assert len(set(names)) == len(names) > 40
+
+
+@pytest.fixture(scope="module")
+def bare(tmp_path_factory):
+    """A LiDAR alone in a room without labels, and an arm alone that weighs nothing."""
+    folder = tmp_path_factory.mktemp("bare")
+    none = {"tracker": None, "target": None, "reference": None}
+    carrier = {"arm_base": rigs.drawing()["frames"]["arm_base"]}
+    rigs.write(folder / "lidar", arm=None, frames={}, **none)
+    rigs.write(folder / "arm", lidar=None, frames=carrier, **none)
+    return load_rig(folder / "lidar"), load_rig(folder / "arm")
+
+
+@pytest.mark.parametrize("effect", effects.CATALOGUE, ids=lambda e: e.name)
+def test_a_rig_without_what_it_acts_on_has_no_such_effect(effect, bare):
+    lidar, arm = bare
+    unknown = {"label_range_offset", "range_quantisation"}
+    of_lidar = effect.site in (Site.BEAM, Site.NOISE) and effect.name not in unknown
+    assert bool(effect.params(lidar)) == of_lidar
+    unknown = {"arm_gravity_sag", "base_flex", "mount_bending", "mount_slip", "mount_creep"}
+    of_arm = effect.site in (Site.JOINTS, Site.EDGE) and effect.name not in unknown
+    assert bool(effect.params(arm)) == of_arm
 
 
 def test_the_default_effects_are_in_the_catalogue():
@@ -152,10 +196,10 @@ def test_a_shifted_surface_stands_off_along_its_normal(problem):
     np.testing.assert_allclose(after.residual_m, expected, atol=1e-9)
 
 
-def test_a_part_that_an_effect_does_not_name_stays(problem, views):
+def test_a_part_that_an_effect_does_not_name_stays(problem):
     effect = SurfaceShift("shift", "surface", np.array([1, 4]), 0.01)
-    found = effect.basis(views[Site.REFERENCE])
-    surface = views[Site.REFERENCE]["surface"]
+    view = problem.scans[0].rows(problem.initial).view
+    found, surface = effect.basis(view), view["surface"]
     np.testing.assert_array_equal(found.index, np.select([surface == 1, surface == 4], [0, 1], -1))
 
 
@@ -198,5 +242,5 @@ def test_covariates_are_predicted_not_measured(problem):
 
 
 def test_an_absent_column_is_named_with_those_there(views):
-    with pytest.raises(InputError, match=r"'humidity'.*temperature_c"):
-        views[Site.EDGE]["humidity"]
+    with pytest.raises(InputError, match=r"'moisture'.*temperature_c"):
+        views[Site.EDGE]["moisture"]

@@ -14,6 +14,7 @@ from calib.simulate import Spec, simulate
 from calib.simulate.room import build
 from calib.simulate.truth import draw, stream
 
+from .hidden import coarse
 from .simulated import BELOW_M, EXACT, changed, made, nominal, off_mesh, pose, rays, seen
 
 
@@ -220,8 +221,9 @@ def test_a_noise_lie_scales_the_scatter(lying):
 
 @pytest.mark.parametrize("effect", CATALOGUE, ids=lambda e: e.name)
 def test_every_effect_can_be_hidden_at_its_size(paper_rig, effect):
-    sigma = np.array([p.sigma for p in effect.params(paper_rig)])
-    truth = draw(paper_rig, Spec(build_error=0), {effect.name: 3.0}, 1)
+    rig = coarse(paper_rig)
+    sigma = np.array([p.sigma for p in effect.params(rig)])
+    truth = draw(rig, Spec(build_error=0), {effect.name: 3.0}, 1)
     (theta,) = (theta for hidden, theta in truth.effects if hidden.name == effect.name)
     free = sigma > 0
     assert np.sqrt(np.mean((theta[free] / sigma[free]) ** 2)) == pytest.approx(3.0)

@@ -18,7 +18,7 @@ from calib.model import Model, Source
 from calib.problem import build
 from chains.errors import InputError
 
-from . import rigs
+from . import rigs, simulated
 
 MODEL = Model(("arm_link_length", "arm_joint_offset", "ring_range_offset"))
 DOFS = ["rx", "ry", "rz", "tx", "ty", "tz"]
@@ -296,6 +296,13 @@ def test_a_rig_that_nothing_places_in_its_mesh_is_refused(tmp_path):
         csv.writer(file).writerows([row[k] for k in known] for row in (names, *rows))
     with pytest.raises(InputError, match="base_guess"):
         build([Source.open(folder)], MODEL)
+
+
+def test_curvature_that_misleads_sends_no_fit_round_in_circles(tmp_path):
+    """Few beams, of which many are outliers: tried at every turn, it took steps back for ever."""
+    source, _ = simulated.made(tmp_path / "rec", "tiny", seed=1)
+    estimate = solve(build([source], MODEL))
+    assert estimate.converged and estimate.iterations < 25
 
 
 class Seen(Exception):

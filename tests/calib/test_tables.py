@@ -216,6 +216,46 @@ def test_comparison_is_printed_side_by_side(run, tmp_path, printed):
     assert "ring_range_offset, mean mm +1" in lines
 
 
+def test_parameters_of_several_units_are_shown_each_in_its_own(run, printed):
+    slip = EffectEstimate("rad, m", ("r", "t"), np.array([0.001, 0.002]), np.array([0.0005] * 2))
+    names = tuple(f"p{k}" for k in range(14))
+    units = ", ".join(["rad"] * 10 + ["m"] * 4)
+    many = EffectEstimate(units, names, np.repeat([0.003, 0.005], [10, 4]), np.full(14, 0.0004))
+    effects = {"slip": slip, "many": many}
+    told = replace(run.solution, shared=Part({}, effects), not_estimated=[])
+    run = replace(run, solution=told)
+    lines = printed(tables.print_run, run)
+    assert "slip r +1.00 ± 0.50 mrad" in lines and "t +2.00 ± 0.50 mm" in lines
+    assert "many 10 values mean +3.00, sd 0.00, +3.00 to +3.00, sigma 0.4 mrad" in lines
+    assert "4 values mean +5.00, sd 0.00, +5.00 to +5.00, sigma 0.4 mm" in lines
+    lines = printed(tables.print_comparison, [run])
+    assert "slip.r mrad +1.00 ± 0.50" in lines and "slip.t mm +2.00 ± 0.50" in lines
+    assert "many, mean mrad +3" in lines and "many, mean mm +5" in lines
+
+
+def test_the_ladder_is_printed_below_the_comparison(run, printed):
+    model = run.model | {"effects": ["ring_range_offset", {"name": "lean"}]}
+    below = replace(run, folder=run.folder.with_name("00"), model=model)
+    rms = {"fit": 2.22, "held_out": 2.31, "noise_floor": 2.2}
+    grown = model | {"effects": ["ring_range_offset", "mount_slip@150", "arm_backlash"]}
+    above = replace(
+        run,
+        folder=run.folder.with_name("01"),
+        model=grown | {"grown_from": str(below.folder)},
+        summary=SUMMARY | {"rms_mm": rms},
+    )
+    lines = after(printed(tables.print_comparison, [above, below]), "ladder")
+    assert lines[1] == "00 start 3.47 3.34 3.62"
+    assert lines[2] == "01 + mount_slip@150, + arm_backlash, - lean 3.47 -> 2.31 2.22 2.20"
+    unheld = replace(below, summary=SUMMARY | {"rms_mm": rms | {"held_out": None}})
+    lines = after(printed(tables.print_comparison, [unheld, above]), "ladder")
+    assert lines[1] == "00 start 2.22 2.20"
+    alone = printed(tables.print_comparison, [below])
+    assert not any(line.startswith("ladder") for line in alone)
+    lines = after(printed(tables.print_comparison, [above]), "ladder")
+    assert lines[1].startswith("01 grew from 00, which is gone 2.31")
+
+
 def test_many_runs_are_broken_into_tables(run, printed):
     runs = [replace(run, folder=run.folder.with_name(f"run{i}")) for i in range(7)]
     lines = printed(tables.print_comparison, runs)
@@ -233,7 +273,7 @@ def test_an_effect_has_its_page(effect, printed):
     page = tables.effect_page(effect)
     assert page["name"] == effect.name
     assert page["site"] == effect.site.value
-    for key in ("what", "formula", "typical", "covariates", "source"):
+    for key in ("what", "formula", "typical", "source"):
         assert page[key], f"{effect.name} does not say its {key}"
     text = " ".join(printed(tables.print_catalogue, [effect], True))
     assert effect.formula in text

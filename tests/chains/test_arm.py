@@ -1,4 +1,4 @@
-"""read_arm: forward kinematics against elementary matrices, and every refusal."""
+"""An arm read from URDF: kinematics and gravity by elementary means, and every refusal."""
 
 from itertools import pairwise
 from math import cos, pi, sin
@@ -6,7 +6,7 @@ from math import cos, pi, sin
 import numpy as np
 import pytest
 
-from chains.arm import read_arm
+from chains.arm import Mass, gravity_torque, read_arm, read_masses
 from chains.errors import InputError
 from chains.frames import FrameTree
 
@@ -138,6 +138,95 @@ def test_a_chain_that_is_not_there_is_refused(read, base, tip, words):
 def test_a_bad_joint_is_refused_by_name(read, old, new, words):
     assert old in ARM
     refuses(read, words, text=ARM.replace(old, new, 1))
+
+
+WEIGHTS = """
+  <link name="tool"><inertial><origin xyz="0.1 0 0"/><mass value="0.5"/></inertial></link>
+  <joint name="grip" type="revolute">
+    <origin xyz="0 0 0.2" rpy="0 0 1.5707963267948966"/>
+    <parent link="fore"/><child link="tool"/><axis xyz="0 0 1"/>
+  </joint>
+</robot>"""
+
+
+def weighing(**kg_and_centre):
+    """The arm with masses: link=(kg, xyz)."""
+    text = ARM
+    for link, (kg, xyz) in kg_and_centre.items():
+        inertial = f'<inertial><origin xyz="{xyz}"/><mass value="{kg}"/></inertial>'
+        assert f'<link name="{link}"/>' in text
+        text = text.replace(f'<link name="{link}"/>', f'<link name="{link}">{inertial}</link>')
+    return text
+
+
+def test_masses_are_those_that_the_joints_carry(tmp_path):
+    path = tmp_path / "arm.urdf"
+    text = weighing(stand=(9, "0 0 0"), upper=(2, "0.1 0 0.02"), camera=(0.1, "0 0 0.3"))
+    path.write_text(text.replace("</robot>", WEIGHTS))
+    masses = {mass.frame: mass for mass in read_masses(path, "stand", "hand")}
+    assert set(masses) == {"upper", "fore", "hand"}
+    assert (masses["upper"].kg, masses["fore"].kg, masses["hand"].kg) == (2, 0.5, 0.1)
+    np.testing.assert_allclose(masses["upper"].centre_m, [0.1, 0, 0.02])
+    # The tool hangs from the forearm: turned by 90 degrees, 0.2 m up.
+    np.testing.assert_allclose(masses["fore"].centre_m, [0, 0.1, 0.2], atol=1e-15)
+
+
+def test_masses_that_hang_from_nothing_weigh_nothing(tmp_path):
+    loop = "".join(
+        f'<link name="{a}"><inertial><mass value="1"/></inertial></link>'
+        f'<joint name="{a}{b}" type="fixed"><parent link="{b}"/><child link="{a}"/></joint>'
+        for a, b in ("pq", "qp")
+    )
+    path = tmp_path / "arm.urdf"
+    path.write_text(ARM.replace("</robot>", f"{loop}</robot>"))
+    assert read_masses(path, "world", "flange") == []
+
+
+def test_a_pendulum_s_torque(tmp_path):
+    """Shoulder turns about -z of a frame rolled by 90 degrees: at q its link points down by q."""
+    path = tmp_path / "arm.urdf"
+    path.write_text(weighing(upper=(2, "0.3 0 0")))
+    tree = FrameTree(read_arm(path, "world", "flange"))
+    joints = np.array([[0.0, 0.5, 0.1], [0.4, 0.0, 0.0], [pi / 2, 0.0, 0.0]])
+    torque = gravity_torque(tree, read_masses(path, "world", "flange"), joints)
+    expected = 2 * 9.80665 * 0.3 * np.cos(joints[:, 0])
+    np.testing.assert_allclose(torque[:, 0], expected, atol=1e-12)
+    assert not torque[:, 1:].any()
+
+
+def test_gravity_pulls_down_the_potential(tmp_path):
+    path = tmp_path / "arm.urdf"
+    path.write_text(
+        weighing(upper=(2, "0.1 0 0.02"), fore=(1, "0 0.1 0.1"), hand=(0.5, "0.1 -0.1 0"))
+    )
+    tree = FrameTree(read_arm(path, "world", "flange"))
+    masses = read_masses(path, "world", "flange")
+    joints = np.array([[0.7, -0.4, 0.25], [-0.3, 2.0, 0.1]])
+
+    def potential(q):
+        return sum(
+            9.80665 * m.kg * (tree.place(m.frame, q).Ts_root_frame @ [*m.centre_m, 1])[:, 2]
+            for m in masses
+        )
+
+    slopes = [(potential(joints + d) - potential(joints - d)) / 2e-6 for d in 1e-6 * np.eye(3)]
+    torque = gravity_torque(tree, masses, joints)
+    np.testing.assert_allclose(torque, -np.stack(slopes, axis=1), atol=1e-7)
+    assert np.abs(torque).min() > 0.01  # the prismatic joint's, in N, too
+    heavier = [Mass(m.frame, m.kg * np.array([1.0, 2.0]), m.centre_m) for m in masses]
+    np.testing.assert_allclose(gravity_torque(tree, heavier, joints), torque * [[1], [2]])
+
+
+@pytest.mark.parametrize(
+    ("kg", "xyz", "words"),
+    [(-1, "0 0 0", "weighs -1 kg"), ("heavy", "0 0 0", "'heavy'"), (1, "0 0", "inertial/origin")],
+)
+def test_a_bad_mass_is_refused_by_its_link(tmp_path, kg, xyz, words):
+    path = tmp_path / "arm.urdf"
+    path.write_text(weighing(upper=(kg, xyz)))
+    with pytest.raises(InputError, match=words) as refused:
+        read_masses(path, "world", "flange")
+    assert "arm.urdf" in str(refused.value) and "link 'upper'" in str(refused.value)
 
 
 def test_a_namespace_alone_is_no_xacro(read):

@@ -1,0 +1,187 @@
+"""What could be missing: every effect of the catalogue that a model does not have, and structure.
+
+Structure is what no physics is claimed for: an error of its own for every bin of a covariate, or
+of a pair, and for the arm a smooth function of its joints. It finds what nobody has named.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import chain, combinations, permutations
+
+import numpy as np
+
+from calib.effects import CATALOGUE, Effect, OneHot, Param, Site, View
+from calib.effects.basis import RANGE
+from calib.model import Model, Source
+from calib.rig import Rig
+
+BINS, PAIR_BINS = 12, 6
+AZIMUTH_BINS = 24
+# What a range error may hang on alone, and the pairs that matter; others pair with range.
+POINT = ("range_m", "incidence_rad", "azimuth_rad", "elevation_rad", "intensity")
+PAIRS = (*combinations(POINT[:4], 2), ("intensity", "range_m"), ("label", "incidence_rad"))
+
+
+class Binned(Effect):
+    """Range has an error of its own in every bin of some covariates; empirical.
+
+    Args:
+        edges: covariate -> (B - 1,) ascending values between its bins.
+        centres: covariate -> (B,) mean of its values in each bin.
+    """
+
+    site = Site.BEAM
+    formula = "range = true + a_bin"
+    typical = "empirical"
+
+    def __init__(self, edges: Mapping[str, np.ndarray], centres: Mapping[str, np.ndarray]) -> None:
+        self.edges, self.centres = edges, centres
+        self.covariates = tuple(edges)
+        self.name = "structure:" + ",".join(edges)
+
+    @property
+    def bins(self) -> tuple[int, ...]:
+        """How many of each covariate."""
+        return tuple(len(e) + 1 for e in self.edges.values())
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        count = int(np.prod(self.bins))
+        return tuple(Param(f"bin_{i}", "m", 0.01) for i in range(count if rig.lidar else 0))
+
+    def basis(self, view: View) -> OneHot:
+        index, known = np.zeros(view.rows, int), np.ones(view.rows, bool)
+        for name, edges in self.edges.items():
+            column = np.broadcast_to(view[name], view.rows)
+            index = index * (len(edges) + 1) + np.searchsorted(edges, column)
+            known &= np.isfinite(column)
+        along = np.zeros(3)
+        along[RANGE] = 1.0
+        size = int(np.prod(self.bins))
+        return OneHot(np.where(known, index, -1), np.broadcast_to(along, (view.rows, 3)), size)
+
+
+class JointShape(Effect):
+    """A joint turns by a smooth function of itself, or of another joint beside; empirical."""
+
+    site = Site.JOINTS
+    typical = "empirical"
+    formula = "q_i = reported_i + sum over m = 1..3 of a_m sin(m q_k) + b_m cos(m q_k)"
+
+    def __init__(self, joint: str, other: str) -> None:
+        self.joint, self.other = joint, other
+        self.covariates = ("joints",)
+        self.name = f"structure:{joint}" + (f",{other}" if other != joint else "")
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        unit = dict(zip(rig.joint_names, rig.joint_kinds, strict=True)).get(self.joint)
+        count = 6 if unit == "revolute" else 0
+        return tuple(Param(f"wave_{i}", "rad", 0.003) for i in range(count))
+
+    def basis(self, view: View) -> np.ndarray:
+        i, k = (view.rig.joint_names.index(n) for n in (self.joint, self.other))
+        q = view.joints[:, k]
+        waves = [f(m * q) for m in (1, 2, 3) for f in (np.sin, np.cos)]
+        out = np.zeros((len(q), view.joints.shape[1], len(waves)))
+        out[:, i] = np.stack(waves, axis=1)
+        return out
+
+
+def known_effects(model: Model, sources: Sequence[Source], columns: frozenset[str]) -> list[Effect]:
+    """The catalogue's effects that the model lacks and the recordings can show, shape by shape.
+
+    Args:
+        model: as fitted.
+        sources: the recordings.
+        columns: what points and stops carry.
+    """
+    there = {effect.family for effect in model.effects}
+    found = []
+    for effect in CATALOGUE:
+        if effect.family in there or effect.site is Site.NOISE:
+            continue
+        if effect.family in model.fixed or lacking(effect, sources, columns):
+            continue
+        shapes = {}
+        for source in sources:
+            shapes |= dict.fromkeys(effect.shapes(stops_view(source)))
+        if effect.shape_name:
+            found += [effect.at(shape) for shape in shapes]
+        else:
+            found.append(effect)
+    return found
+
+
+def lacking(effect: Effect, sources: Sequence[Source], columns: frozenset[str]) -> list[str]:
+    """What the recordings lack to test an effect: columns, or anything to act on."""
+    missing = [c for c in effect.covariates if c != "joints" and c not in columns]
+    if "joints" in effect.covariates and not any(s.rig.joint_names for s in sources):
+        missing.append("joints")
+    if not missing and not any(effect.params(s.rig) for s in sources):
+        missing.append("hardware that it acts on")
+    return missing
+
+
+def stops_view(source: Source) -> View:
+    """The stops of a recording as effects see them."""
+    count = len(source.recording.stops)
+    return View(source.rig, count, source.columns, source.recording.joints)
+
+
+def covariates() -> set[str]:
+    """Columns that structure may hang on in any recording."""
+    return {*POINT, "time_s", *chain(*PAIRS)}
+
+
+def structure(sources: Sequence[Source], sample: Mapping[str, np.ndarray]) -> list[Effect]:
+    """Effects without a formula, over every covariate that there is.
+
+    Args:
+        sources: the recordings.
+        sample: covariate -> its values at some of the points; empty without a LiDAR.
+    """
+    out: list[Effect] = []
+    own = [c for c in sample if c not in covariates() - {"time_s"}]
+    wanted = [(c,) for c in (*POINT, *own) if c in sample]
+    wanted += [p for p in PAIRS if all(c in sample for c in p)]
+    wanted += [(c, "range_m") for c in own]
+    for names in wanted:
+        edges = {c: _edges(sample[c], _bins(c, len(names))) for c in names}
+        if all(len(e) for e in edges.values()):
+            out.append(Binned(edges, {c: _centres(sample[c], e) for c, e in edges.items()}))
+    joints = dict.fromkeys(j for s in sources for j in _moving(s))
+    out += [JointShape(j, j) for j in joints]
+    out += [JointShape(i, k) for i, k in permutations(joints, 2)]
+    return out
+
+
+def _moving(source: Source) -> Iterator[str]:
+    turned = np.ptp(source.recording.joints, axis=0) if len(source.recording.joints) else ()
+    for name, kind, way in zip(
+        source.rig.joint_names, source.rig.joint_kinds, turned, strict=False
+    ):
+        if kind == "revolute" and way > 1e-3:
+            yield name
+
+
+def _bins(covariate: str, together: int) -> int:
+    if together > 1:
+        return PAIR_BINS
+    return AZIMUTH_BINS if covariate == "azimuth_rad" else BINS
+
+
+def _centres(values: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    values = values[np.isfinite(values)]
+    index = np.searchsorted(edges, values)
+    count = np.bincount(index, minlength=len(edges) + 1)
+    total = np.bincount(index, values, len(edges) + 1)
+    return total / np.maximum(count, 1)
+
+
+def _edges(values: np.ndarray, bins: int) -> np.ndarray:
+    """Values between bins of about equal count; between all values where they are few."""
+    values = values[np.isfinite(values)]
+    distinct = np.unique(values)
+    if len(distinct) <= bins:
+        return (distinct[1:] + distinct[:-1]) / 2
+    return np.unique(np.quantile(values, np.arange(1, bins) / bins))

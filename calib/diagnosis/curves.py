@@ -1,0 +1,72 @@
+"""Where the model fails: the mean residual against covariates, in bands that hold for clusters."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from calib.diagnosis.candidates import Binned
+from calib.diagnosis.score import COMMON
+from calib.diagnosis.screen import Screen
+
+CONFIDENCE = 0.95
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Mean range residual in the bins of one covariate, or of two.
+
+    Args:
+        centres: covariate -> (B,) mean of its values in each bin.
+        mean_m: (B,) or (B1, B2), weighted mean of what is left after the fit; NaN where nothing is.
+        band_m: half the width of a band that holds all bins together with 95 % probability where
+            the model is right, stops and surfaces counted, not rows; moderated as the tests are.
+    """
+
+    centres: Mapping[str, np.ndarray]
+    mean_m: np.ndarray
+    band_m: np.ndarray
+
+    @property
+    def covariates(self) -> tuple[str, ...]:
+        return tuple(self.centres)
+
+    def document(self) -> dict[str, Any]:
+        """As in diagnosis.json."""
+        return {
+            "covariates": list(self.centres),
+            "centres": [c for c in self.centres.values()],
+            "mean_mm": 1e3 * self.mean_m,
+            "band_mm": 1e3 * self.band_m,
+        }
+
+
+def curves(screen: Screen) -> list[Curve]:
+    """The curve of every covariate, and the map of every pair, that was tested for structure."""
+    drawn = screen.scores.draws()
+    return [
+        _curve(screen, c.effect, c.test.columns, drawn[:, c.test.columns])
+        for c in screen.candidates
+        if isinstance(c.effect, Binned)
+    ]
+
+
+def _curve(screen: Screen, effect: Binned, columns: np.ndarray, drawn: np.ndarray) -> Curve:
+    scores = screen.scores
+    weight = np.diag(scores.whole)[columns]
+    weight = np.where(weight > 1e-9 * weight.max(), weight, np.nan)
+    stop, place = np.square(scores.by_stop[:, columns]), np.square(scores.by_place[:, columns])
+    one_way = np.maximum(stop.sum(axis=0), place.sum(axis=0))
+    two_way = stop.sum(axis=0) + place.sum(axis=0) - np.diag(scores.both)[columns]
+    clusters = (stop > 0).sum(axis=0)
+    model = screen.common * np.diag(scores.information)[columns]
+    variance = clusters * np.maximum(one_way, two_way) + COMMON * model
+    sigma = np.sqrt(np.maximum(variance, 0.0) / (clusters + COMMON)) / weight
+    by_chance = np.abs(drawn) / np.sqrt(np.maximum(stop.sum(axis=0) + place.sum(axis=0), 1e-300))
+    width = np.quantile(by_chance[:, np.isfinite(weight)].max(axis=1), CONFIDENCE)
+    # A range error of 1 m changes every residual of its bin by as much: mean = score / weight.
+    mean = scores.score[columns] / weight
+    return Curve(effect.centres, mean.reshape(effect.bins), (width * sigma).reshape(effect.bins))

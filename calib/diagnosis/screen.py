@@ -1,0 +1,135 @@
+"""All candidates tested together: by family, adjusted for how many were looked at, and ranked."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from calib.diagnosis.score import Scores, Test, test
+from calib.effects import Effect
+
+QUANTILE = 0.05  # of the smallest p-value, at which dependent tests are counted
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An effect that might be missing, in its best shape.
+
+    Args:
+        effect: with that shape.
+        test: its test.
+        p_value: adjusted for the shapes tried.
+        p_adjusted: adjusted for all candidates as well.
+        evidence: see `Test.evidence`.
+        looks: by how many independent looks p_adjusted pays.
+    """
+
+    effect: Effect
+    test: Test
+    p_value: float
+    p_adjusted: float
+    evidence: float
+    looks: float
+
+
+@dataclass(frozen=True)
+class Screen:
+    """What one pass over all rows says of all candidates.
+
+    Args:
+        scores: as projected.
+        common: the inflation that candidates have in common; 1 where all sigmas are right.
+        candidates: best first.
+        gauges: effects of which the data could show nothing.
+    """
+
+    scores: Scores
+    common: float
+    candidates: Sequence[Candidate]
+    gauges: Sequence[Effect]
+
+    def size_m(self, candidate: Candidate) -> float:
+        """Root mean square of what it does to the ranges, all that the model takes on included."""
+        theta, columns = candidate.test.estimate(), candidate.test.columns
+        whole = self.scores.whole[np.ix_(columns, columns)]
+        return float(np.sqrt(theta @ whole @ theta / max(self.scores.weight_m2, 1e-300)))
+
+    def rms_m(self, candidate: Candidate) -> float:
+        """Root mean square of the range residual that it alone can explain."""
+        return float(np.sqrt(candidate.test.statistic / max(self.scores.weight_m2, 1e-300)))
+
+
+def screen(
+    scores: Scores,
+    effects: Sequence[Effect],
+    columns: Mapping[str, np.ndarray],
+    common: float | None = None,
+) -> Screen:
+    """Test effects, and shapes of one family together.
+
+    Args:
+        scores: of all of them.
+        effects: those to test.
+        columns: effect's name -> its columns among the scores.
+        common: inflation from elsewhere, if not from these effects.
+    """
+    tests = {e.name: test(scores, columns[e.name]) for e in effects if e.name in columns}
+    gauges = [e for e in effects if e.name not in tests or not tests[e.name].dof]
+    tests = {name: t for name, t in tests.items() if t.dof}
+    if common is None:
+        common = float(np.median([t.inflation for t in tests.values()])) if tests else 1.0
+    by_chance = _by_chance(scores, tests)
+    families: dict[str, list[Effect]] = {}
+    for effect in effects:
+        if effect.name in tests:
+            families.setdefault(effect.family, []).append(effect)
+    least, found = [], []
+    for family in families.values():
+        drawn = np.min([by_chance[e.name] for e in family], axis=0)
+        looks = looked(drawn)
+        least.append(_adjust(drawn, looks))
+        best = max(family, key=lambda e: tests[e.name].evidence(common))
+        p = min(tests[e.name].p_value(common) for e in family)
+        found.append((best, _adjust(p, looks), looks))
+    together = looked(np.min(least, axis=0)) if least else 1.0
+    candidates = [
+        Candidate(
+            effect,
+            tests[effect.name],
+            float(p),
+            float(_adjust(p, together)),
+            tests[effect.name].evidence(common),
+            looks * together,
+        )
+        for effect, p, looks in found
+    ]
+    return Screen(scores, common, sorted(candidates, key=lambda c: -c.evidence), gauges)
+
+
+def _by_chance(scores: Scores, tests: Mapping[str, Test]) -> dict[str, np.ndarray]:
+    """p-values (R,) of every test on scores that are nothing but chance."""
+    drawn = scores.draws()
+    shares = np.vstack([scores.by_stop, scores.by_place])
+    out = {}
+    for name, t in tests.items():
+        whitened = shares[:, t.columns] @ t.whiten
+        spread = whitened.T @ whitened
+        first, second = float(np.trace(spread)), float(np.sum(np.square(spread)))
+        nu = first**2 / second if second else 1.0
+        statistic = np.sum(np.square(drawn[:, t.columns] @ t.whiten), axis=1)
+        out[name] = stats.chi2.sf(statistic * nu / max(first, 1e-300), nu)
+    return out
+
+
+def looked(smallest: np.ndarray) -> float:
+    """How many independent tests have so small a smallest p-value, by chance (R,), at 5 %."""
+    limit = float(np.quantile(smallest, QUANTILE))
+    return max(1.0, float(np.log1p(-QUANTILE) / np.log1p(-min(max(limit, 1e-12), QUANTILE))))
+
+
+def _adjust(p: np.ndarray | float, looks: float) -> np.ndarray | float:
+    """Chance that the smallest of so many p-values is as small (Sidak)."""
+    return -np.expm1(looks * np.log1p(-np.minimum(p, 1 - 1e-15)))

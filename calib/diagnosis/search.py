@@ -1,0 +1,155 @@
+"""From one look to a named effect: the best explanation is fitted, then judged, then looked past.
+
+A signal that is missing from the model also widens the clusters that judge it. So the leading
+candidate is fitted truly, and its test is read from residuals that no longer hold it. What is then
+left is looked at again: an effect that nobody has named dresses up as several that somebody has.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.diagnosis.score import log_tail, test
+from calib.diagnosis.screen import Candidate, Screen
+from calib.diagnosis.stand import Look, Stand
+from calib.effects import Effect
+from calib.fit import Progress
+
+ALPHA = 0.04  # chance that a named effect is found where nothing is missing
+ALPHA_UNNAMED = 0.01  # and that structure is
+MOST = 3  # an explanation that needs more names than this is none
+TRIES = 2  # how many suspects are fitted before a look is called quiet
+FINER = 9  # shapes tried between the two beside the best one
+ODDS = np.log(20.0)  # of a rival: within these it can stand in for the best
+
+
+@dataclass(frozen=True)
+class Found:
+    """An effect that the data confirm.
+
+    Args:
+        candidate: as it stood out before, in its best shape.
+        before, after: the looks before it was fitted and after.
+        p_adjusted: of its own test once fitted, all that was looked at paid for.
+        rivals: candidates that explain as much, and what to tell them apart by.
+    """
+
+    candidate: Candidate
+    before: Look
+    after: Look
+    p_adjusted: float
+    rivals: Sequence[Candidate]
+
+    @property
+    def effect(self) -> Effect:
+        return self.candidate.effect
+
+
+@dataclass(frozen=True)
+class Search:
+    """What was found, step by step.
+
+    Args:
+        looks: from the fit as it was, and after each effect found.
+        found: named effects, in the order in which they were added.
+        unnamed: structure that is confirmed after that, strongest first.
+    """
+
+    looks: Sequence[Look]
+    found: Sequence[Found]
+    unnamed: Sequence[Candidate]
+
+
+def search(stand: Stand, progress: Progress, most: int = MOST) -> Search:
+    """Name what is missing, one effect after another, then ask whether that is all.
+
+    Args:
+        stand: a fitted model.
+        progress: as of `fit.solve`.
+        most: how many effects are named at most.
+    """
+    looks, found = [stand.look(progress)], []
+    while len(found) < most:
+        step = _named(looks[-1], progress)
+        if step is None:
+            break
+        found.append(step)
+        looks.append(step.after)
+    return Search(looks, found, _unnamed(looks[-1], progress))
+
+
+def _named(look: Look, progress: Progress) -> Found | None:
+    """The best candidate that is confirmed once fitted."""
+    for candidate in suspects(look.named, ALPHA):
+        effect = look.stand.finest(candidate.effect, progress)
+        after = look.stand.with_effects([effect], progress).look(progress)
+        p = _judged(after, effect, candidate)
+        if p < ALPHA:
+            best = Candidate(
+                effect,
+                candidate.test,
+                candidate.p_value,
+                candidate.p_adjusted,
+                candidate.evidence,
+                candidate.looks,
+            )
+            return Found(best, look, after, p, rivals(look.named, candidate, after.named.common))
+    return None
+
+
+def _unnamed(look: Look, progress: Progress) -> list[Candidate]:
+    """Structure that remains, if the strongest of it is confirmed once fitted."""
+    wanted = list(suspects(look.unnamed, ALPHA_UNNAMED))
+    for candidate in wanted:
+        fitted = look.stand.with_effects([candidate.effect], progress)
+        after = fitted.look(progress)
+        if _judged(after, candidate.effect, candidate) < ALPHA_UNNAMED:
+            return [c for c in look.unnamed.candidates if _stands_out(c, ALPHA_UNNAMED)]
+    return []
+
+
+def suspects(screen: Screen, alpha: float) -> Iterator[Candidate]:
+    """Candidates found if rows were independent, or found by clusters, best first."""
+    standing_out = [c for c in screen.candidates if _stands_out(c, alpha)]
+    yield from standing_out[:TRIES]
+
+
+def _stands_out(candidate: Candidate, alpha: float) -> bool:
+    alone = -log_tail(candidate.test.statistic, candidate.test.dof)
+    return candidate.p_adjusted < alpha or alone > np.log(candidate.looks / alpha)
+
+
+def _judged(after: Look, effect: Effect, candidate: Candidate) -> float:
+    p = after.judged(effect.name).p_value(after.named.common)
+    return float(-np.expm1(candidate.looks * np.log1p(-min(p, 1 - 1e-15))))
+
+
+def rivals(screen: Screen, best: Candidate, common: float) -> list[Candidate]:
+    """Candidates that leave the best one nothing to explain that they do not, at like cost.
+
+    Args:
+        screen: the look at which all of them were missing.
+        best: the leading candidate.
+        common: inflation once the best one is in the model, so free of its signal.
+    """
+    own = best.test.evidence(common)
+    out = []
+    for other in screen.candidates:
+        if other.effect.family == best.effect.family:
+            continue
+        if own - other.test.evidence(common) < ODDS:
+            together = test(screen.scores, np.concatenate([best.test.columns, other.test.columns]))
+            left = (together.statistic - other.test.statistic) / common
+            if -log_tail(max(left, 0.0), max(1, together.dof - other.test.dof)) < ODDS:
+                out.append(other)
+    return out
+
+
+def angle_deg(screen: Screen, a: Candidate, b: Candidate) -> float:
+    """Smallest principal angle between what two candidates would do to the residuals."""
+    cross = screen.scores.information[np.ix_(a.test.columns, b.test.columns)]
+    cosine = np.linalg.svd(a.test.whiten.T @ cross @ b.test.whiten, compute_uv=False)[0]
+    return float(np.degrees(np.arccos(min(1.0, cosine))))

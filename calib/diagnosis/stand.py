@@ -1,0 +1,153 @@
+"""Where a fit stands, and what one look from there shows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import chain
+
+import numpy as np
+
+from calib import problem as problems
+from calib.calibrate import reopened
+from calib.diagnosis.candidates import covariates, known_effects, stops_view, structure
+from calib.diagnosis.linear import Linear, linearise
+from calib.diagnosis.score import Test, project, test
+from calib.diagnosis.screen import Screen, screen
+from calib.effects import Effect
+from calib.fit import Estimate, Progress, resume, solve
+from calib.model import Model, Source
+from calib.problem import Problem
+from calib.run import MODEL, Run
+from sensors.recording import Recording
+
+FINER = 9  # shapes tried between the two beside the best one
+SAMPLED = 8  # scans from which the bins of covariates are taken
+
+
+@dataclass(frozen=True)
+class Stand:
+    """A model fitted to its recordings."""
+
+    sources: Sequence[Source]
+    model: Model
+    problem: Problem
+    estimate: Estimate
+
+    @classmethod
+    def of(cls, run: Run, progress: Progress) -> Stand:
+        """Where a run stands.
+
+        Raises:
+            InputError: its recordings are not what they were.
+        """
+        sources = [reopened(recording, run) for recording in run.model["recordings"]]
+        model = Model.read(run.model, run.folder / MODEL)
+        problem = problems.build(sources, model)
+        return cls(sources, model, problem, resume(problem, run.state(), progress))
+
+    def with_effects(self, added: Sequence[Effect], progress: Progress) -> Stand:
+        """The model with more effects, fitted from here."""
+        model = self.model.plus(tuple(added))
+        problem = problems.build(self.sources, model, meetings=self.problem.meetings)
+        estimate = solve(problem, progress=progress, start=self.estimate.state)
+        return Stand(self.sources, model, problem, estimate)
+
+    def look(self, progress: Progress) -> Look:
+        """Test everything that the model lacks."""
+        columns, sample = self._columns()
+        known = known_effects(self.model, self.sources, columns)
+        there = set(self.model.names)
+        unnamed = [e for e in structure(self.sources, sample) if e.name not in there]
+        linear, at = self.linearise((*known, *unnamed), progress)
+        scores = project(linear, linear.candidates)
+        named = screen(scores, known, at)
+        rest = screen(scores, unnamed, at, named.common if named.candidates else None)
+        return Look(self, linear, named, rest, columns)
+
+    def linearise(
+        self, candidates: Sequence[Effect], progress: Progress
+    ) -> tuple[Linear, dict[str, np.ndarray]]:
+        """All rows with these candidates beside the model, and each one's columns among theirs."""
+        wider = self.model.plus(tuple(candidates))
+        wide = problems.build(self.sources, wider, meetings=self.problem.meetings)
+        variables = _variables(wide, {e.name for e in candidates})
+        linear = linearise(wide, self.estimate, [*chain(*variables.values())], progress)
+        at, start = {}, 0
+        for name, theirs in variables.items():
+            size = sum(wide.variables[v].dim for v in theirs)
+            at[name], start = np.arange(start, start + size), start + size
+        return linear, at
+
+    def finest(self, effect: Effect, progress: Progress) -> Effect:
+        """An effect with its shape chosen more finely than the grid on which it was found."""
+        if not effect.shape_name:
+            return effect
+        grid = sorted({shape for s in self.sources for shape in effect.shapes(stops_view(s))})
+        i = grid.index(effect.shape)
+        ends = grid[max(0, i - 1)], grid[min(len(grid) - 1, i + 1)]
+        spaced = np.geomspace if ends[0] > 0 else np.linspace
+        finer = {f"{shape:.6g}": None for shape in (*spaced(*ends, FINER), effect.shape)}
+        shaped = [effect.at(float(shape)) for shape in finer]
+        linear, at = self.linearise(shaped, progress)
+        scores = project(linear, linear.candidates)
+        return max(shaped, key=lambda e: test(scores, at[e.name]).statistic)
+
+    def _columns(self) -> tuple[frozenset[str], dict[str, np.ndarray]]:
+        """Which columns there are, and the values of covariates at some of the points."""
+        columns = {c for s in self.sources for c in s.columns}
+        scans = self.estimate.scans
+        chosen = np.unique(np.linspace(0, len(scans) - 1, SAMPLED).round().astype(int))
+        found: dict[str, list[np.ndarray]] = {}
+        for i in chosen.tolist() if scans else ():
+            rows = scans[i].rows(self.estimate.values, self.estimate.associations[i])
+            columns |= set(rows.view.columns)
+            own = self._own_columns(scans[i].recording)
+            for name in {*covariates(), *own} & set(rows.view.columns):
+                whole = np.broadcast_to(rows.view[name], rows.view.rows)
+                found.setdefault(name, []).append(whole[rows.usable])
+        return frozenset(columns), {n: np.concatenate(parts) for n, parts in found.items()}
+
+    def _own_columns(self, recording: Recording) -> tuple[str, ...]:
+        """Columns that the recording's maker added."""
+        scanned = np.flatnonzero(recording.has_scan)
+        return (*recording.covariates, *recording.scan(int(scanned[0])).extra)
+
+
+@dataclass(frozen=True)
+class Look:
+    """What the rows say from where a fit stands.
+
+    Args:
+        stand: that fit.
+        linear: the rows, linearised.
+        named: the catalogue's effects, tested.
+        unnamed: structure, tested.
+        columns: what points and stops carry.
+    """
+
+    stand: Stand
+    linear: Linear
+    named: Screen
+    unnamed: Screen
+    columns: frozenset[str]
+
+    def judged(self, effect: str) -> Test:
+        """The test of an effect that the model has: what it does explain, with its own signal out
+        of the residual that judges it, as in Wald's test."""
+        names = _variables(self.stand.problem, {effect})[effect]
+        scores = project(self.linear, names)
+        values = np.concatenate([self.stand.estimate.values[n] for n in names])
+        # What the score would be without the effect, but for the clusters' shares in it.
+        without = replace(scores, score=scores.score + scores.information @ values)
+        return test(without, np.arange(len(values)))
+
+
+def _variables(problem: Problem, effects: set[str]) -> dict[str, list[str]]:
+    """Effect -> its variables: one, or one per rig."""
+    found: dict[str, dict[str, None]] = {}
+    for terms in problem.terms:
+        for term in terms:
+            if term.effect.name in effects:
+                found.setdefault(term.effect.name, {})[term.variable] = None
+    return {name: list(variables) for name, variables in found.items()}

@@ -1,0 +1,113 @@
+"""What to do about a finding: a formula to add, a measurement to make."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from calib.diagnosis.candidates import Binned, JointShape
+from calib.diagnosis.screen import Candidate
+from calib.effects import Effect, Site
+
+KNOTS = 7  # of the piecewise linear function that is suggested for one covariate
+PAIR_KNOTS = 3
+WAVES = 2  # of the harmonics of azimuth
+
+WORDS = {
+    "range_m": "range",
+    "incidence_rad": "incidence",
+    "azimuth_rad": "azimuth",
+    "elevation_rad": "elevation",
+    "point_m": "where in the room the beam lands",
+    "label": "material",
+    "ring": "ring",
+    "time_s": "time",
+    "elapsed_s": "time",
+    "temperature_c": "temperature",
+    "joints": "the arm's pose",
+    "intensity": "intensity",
+}
+
+
+def words(covariate: str) -> str:
+    """A covariate in a roboticist's words."""
+    return WORDS.get(covariate, covariate)
+
+
+def formula(candidate: Candidate) -> dict[str, Any] | None:
+    """An effect as a formula that the user can add as it stands, empirical as it is.
+
+    Piecewise linear over the covariate's bins, products of such for a pair, the strongest harmonics
+    of azimuth; for a joint, harmonics of the joint that it hangs on.
+    """
+    effect = candidate.effect
+    name = "empirical_" + "_".join(
+        c.removesuffix("_rad").removesuffix("_m") for c in hangs_on(effect)
+    )
+    page = {"name": name, "unit": "m", "sigma": 0.01, "what": "Empirical: fitted, not explained."}
+    if isinstance(effect, JointShape):
+        basis = [f"{f}({m} * {effect.other})" for m in (1, 2, 3) for f in ("sin", "cos")]
+        return page | {
+            "site": f"joint:{effect.joint}",
+            "unit": "rad",
+            "sigma": 0.003,
+            "basis": basis,
+        }
+    if not isinstance(effect, Binned) or "label" in effect.covariates:
+        return None
+    sides = [list(_shapes(c, effect, candidate)) for c in effect.covariates]
+    basis = sides[0]
+    for side in sides[1:]:
+        basis = [f"({a}) * ({b})" for a in basis for b in side]
+    return page | {"site": "range", "basis": basis}
+
+
+def hangs_on(effect: Effect) -> tuple[str, ...]:
+    """The covariates of structure, joints by their names."""
+    if isinstance(effect, JointShape):
+        return tuple(dict.fromkeys((effect.joint, effect.other)))
+    return effect.covariates
+
+
+def _shapes(covariate: str, effect: Binned, candidate: Candidate) -> Iterator[str]:
+    if covariate == "azimuth_rad":
+        waves = _strongest_waves(candidate) if len(effect.covariates) == 1 else (1, 2)
+        yield from (f"{f}({m} * azimuth_rad)" for m in waves for f in ("sin", "cos"))
+        return
+    count = KNOTS if len(effect.covariates) == 1 else PAIR_KNOTS
+    at = np.unique(np.quantile(effect.centres[covariate], np.linspace(0, 1, count)))
+    gaps = [b - a for a, b in pairwise(at)]
+    for i, knot in enumerate(at):
+        left = gaps[max(i - 1, 0)]
+        right = gaps[min(i, len(gaps) - 1)]
+        rise = f"1 - ({knot:.4g} - {covariate}) / {left:.4g}"
+        fall = f"1 - ({covariate} - {knot:.4g}) / {right:.4g}"
+        yield f"maximum(0, minimum({rise}, {fall}))"
+
+
+def _strongest_waves(candidate: Candidate) -> tuple[int, ...]:
+    """Orders of the harmonics that fit what each bin of azimuth wants best."""
+    centres = candidate.effect.centres["azimuth_rad"]
+    wanted = candidate.test.estimate()
+    orders = range(1, len(centres) // 3 + 1)
+    power = [np.abs(np.sum(wanted * np.exp(1j * m * centres))) for m in orders]
+    return tuple(sorted(int(m) + 1 for m in np.argsort(power)[::-1][:WAVES]))
+
+
+def what_separates(a: Effect, b: Effect) -> str:
+    """The measurement that would tell two effects apart, from what they hang on."""
+    mine, other = set(a.covariates), set(b.covariates)
+    if mine - other and other - mine:
+        return f"stops at which {_list(mine - other)} changes while {_list(other - mine)} does not"
+    if mine ^ other:
+        return f"stops that spread {_list(mine ^ other)} more widely"
+    if Site.EDGE in (a.site, b.site) or Site.JOINTS in (a.site, b.site):
+        return "arm poses of other kinds: elbow up and down, wrist turned, another payload"
+    return f"a wider spread of {_list(mine or {'poses'})}, the sensor rolled and tilted"
+
+
+def _list(covariates: set[str]) -> str:
+    return " and ".join(sorted({words(c) for c in covariates}))

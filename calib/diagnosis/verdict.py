@@ -1,0 +1,270 @@
+"""The diagnosis: what was found, in numbers for scripts and in sentences for people."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from calib.diagnosis.candidates import lacking
+from calib.diagnosis.curves import Curve, curves
+from calib.diagnosis.score import log_tail
+from calib.diagnosis.screen import Candidate, Screen
+from calib.diagnosis.search import ALPHA, ODDS, Found, Search, angle_deg
+from calib.diagnosis.stand import Look
+from calib.diagnosis.suggest import formula, hangs_on, what_separates, words
+from calib.effects import CATALOGUE, Site
+
+ABSORBED = 0.7  # share of the structure that named effects must explain to be the answer
+TOLD = 6  # untestable effects and rivals that a sentence names
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What is missing from a model.
+
+    Args:
+        verdict: "adequate", "missing_effect" or "unexplained_structure".
+        sentences: the finding in words, the verdict first.
+        candidates: the catalogue's effects that the model lacks, best first.
+        unexplained: structure that no effect accounts for, strongest first.
+        weak_directions: what the data hardly determine, and what would.
+        untestable: effect -> what the recordings lack to test it.
+        misfit: instrument -> how many times larger than their sigmas its residuals are.
+        curves: mean residual against covariates.
+    """
+
+    verdict: str
+    sentences: Sequence[str]
+    candidates: Sequence[Mapping[str, Any]]
+    unexplained: Sequence[Mapping[str, Any]]
+    weak_directions: Sequence[Mapping[str, Any]]
+    untestable: Mapping[str, str]
+    misfit: Mapping[str, float]
+    curves: Sequence[Curve] = field(repr=False)
+
+    @property
+    def worth_adding(self) -> list[str]:
+        """Names of the effects that were confirmed, in the order in which to add them."""
+        confirmed = [c for c in self.candidates if c["step"]]
+        return [c["add"] for c in sorted(confirmed, key=lambda c: c["step"])]
+
+    def document(self) -> dict[str, Any]:
+        """As written to diagnosis.json."""
+        return {
+            "verdict": self.verdict,
+            "sentences": list(self.sentences),
+            "candidates": list(self.candidates),
+            "unexplained": list(self.unexplained),
+            "weak_directions": list(self.weak_directions),
+            "untestable": dict(self.untestable),
+            "misfit": dict(self.misfit),
+            "curves": [curve.document() for curve in self.curves],
+        }
+
+
+def conclude(
+    found: Search,
+    held_out: Mapping[str, tuple[float, float, float]],
+    misfit: Mapping[str, float],
+    weak: Sequence[Mapping[str, Any]],
+) -> Diagnosis:
+    """Sum up a search.
+
+    Args:
+        found: the search.
+        held_out: effect -> held-out rms before and after it was truly fitted, and noise floor, mm.
+        misfit: by instrument.
+        weak: weak directions.
+    """
+    first = found.looks[0]
+    verdict = _verdict(found)
+    candidates = [_candidate(c, found, held_out) for c in _ranked(found)]
+    unexplained = [_unexplained(c, found.looks[-1].unnamed) for c in found.unnamed]
+    untestable = _untestable(first)
+    return Diagnosis(
+        verdict,
+        _sentences(verdict, found, candidates, unexplained, untestable),
+        candidates,
+        unexplained,
+        weak,
+        untestable,
+        misfit,
+        curves(first.unnamed),
+    )
+
+
+def _verdict(found: Search) -> str:
+    if not found.found:
+        return "unexplained_structure" if found.unnamed else "adequate"
+    named = _names_hold(found) and (not found.unnamed or _absorbed(found) > ABSORBED)
+    return "missing_effect" if named else "unexplained_structure"
+
+
+def _names_hold(found: Search) -> bool:
+    """Whether the names explain as much, at their price, as a single structure without a name.
+
+    Something that nobody has named is dressed up by a search in several names, each of which takes
+    a part of it; where a name is right, no bins do better.
+    """
+    common = found.looks[-1].named.common
+    tests = [step.candidate.test for step in found.found]
+    together = sum(t.statistic for t in tests), sum(t.dof for t in tests)
+    price = sum(np.log(step.candidate.looks) for step in found.found)
+    named = -log_tail(together[0] / common, together[1]) - price
+    bins = (c.test.evidence(common) for c in found.looks[0].unnamed.candidates)
+    return named > max(bins, default=0.0) - ODDS
+
+
+def _absorbed(found: Search) -> float:
+    """Share of the structure seen at first that the named effects account for."""
+    before, after = (
+        max((c.test.statistic - c.test.dof for c in look.unnamed.candidates), default=0.0)
+        for look in (found.looks[0], found.looks[-1])
+    )
+    return 1.0 - max(after, 0.0) / max(before, after, 1e-9)
+
+
+def _ranked(found: Search) -> list[Candidate]:
+    """Those confirmed first, in the order in which they were; then by what they explain."""
+    confirmed = [step.candidate for step in found.found]
+    families = {c.effect.family for c in confirmed}
+    rest = (c for c in found.looks[0].named.candidates if c.effect.family not in families)
+    return [*confirmed, *rest]
+
+
+def _candidate(
+    candidate: Candidate, found: Search, held_out: Mapping[str, tuple[float, float, float]]
+) -> dict[str, Any]:
+    """As the contract has it."""
+    effect, test, look = candidate.effect, candidate.test, found.looks[0].named
+    step = next((i for i, s in enumerate(found.found, 1) if s.effect.name == effect.name), None)
+    if step:
+        look = found.found[step - 1].before.named
+    rig = next(s.rig for s in found.looks[0].stand.sources if effect.params(s.rig))
+    params = [p for p in effect.params(rig) if p.sigma]
+    whole = len(params) == len(test.columns)
+    before, after, floor = held_out.get(effect.name, (None, None, None))
+    clean = found.looks[-1].named.common
+    rivals = _rivals(found.found[step - 1]) if step else []
+    alpha = -np.expm1(np.log1p(-ALPHA) / candidate.looks)
+    return {
+        "effect": effect.family,
+        "add": effect.name,
+        "site": "range" if effect.site is Site.BEAM else effect.site.value,
+        "p_value": candidate.p_value,
+        "p_adjusted": found.found[step - 1].p_adjusted if step else candidate.p_adjusted,
+        "statistic": test.statistic,
+        "dof": test.dof,
+        "step": step,
+        "held_out_rms_mm": {"before": before, "after": after},
+        "error_explained": _explained(before, after, floor),
+        "rms_mm": 1e3 * look.size_m(candidate),
+        "unabsorbed_rms_mm": 1e3 * look.rms_m(candidate),
+        "parameters": {
+            "unit": ", ".join(dict.fromkeys(p.unit for p in params)),
+            "names": [p.name for p in params] if whole else [],
+            "estimate": test.estimate() if whole else [],
+            "sigma": test.sigma(clean) if whole else [],
+        },
+        "smallest_detectable": test.smallest_detectable(clean, alpha),
+        "indistinguishable_from": [r["effect"] for r in rivals],
+        "rivals": rivals,
+    }
+
+
+def _explained(before: float | None, after: float | None, floor: float | None) -> float | None:
+    """Share of what the held-out error has above the noise floor."""
+    if before is None or after is None or floor is None:
+        return None
+    return (before**2 - after**2) / max(before**2 - floor**2, before**2 - after**2, 1e-12)
+
+
+def _rivals(step: Found) -> list[dict[str, Any]]:
+    screen = step.before.named
+    return [
+        {
+            "effect": other.effect.family,
+            "add": other.effect.name,
+            "angle_deg": angle_deg(screen, step.candidate, other),
+            "odds": float(np.exp(min(step.candidate.evidence - other.evidence, 50.0))),
+            "separate": what_separates(step.effect, other.effect),
+        }
+        for other in step.rivals
+    ]
+
+
+def _unexplained(candidate: Candidate, screen: Screen) -> dict[str, Any]:
+    return {
+        "covariates": list(hangs_on(candidate.effect)),
+        "rms_mm": 1e3 * screen.rms_m(candidate),
+        "p_value": candidate.p_value,
+        "p_adjusted": candidate.p_adjusted,
+        "formula": formula(candidate),
+    }
+
+
+def _untestable(look: Look) -> dict[str, str]:
+    found = {}
+    there = {e.family for e in look.stand.model.effects}
+    gauges = {g.family for g in look.named.gauges} - {
+        c.effect.family for c in look.named.candidates
+    }
+    for effect in CATALOGUE:
+        if effect.family in there or effect.site is Site.NOISE:
+            continue
+        if missing := lacking(effect, look.stand.sources, look.columns):
+            found[effect.family] = f"the recordings lack {', '.join(missing)}"
+        elif effect.family in gauges:
+            found[effect.family] = "not observable: the model can take on all that it does"
+    return found
+
+
+def _sentences(
+    verdict: str,
+    found: Search,
+    candidates: Sequence[Mapping[str, Any]],
+    unexplained: Sequence[Mapping[str, Any]],
+    untestable: Mapping[str, str],
+) -> list[str]:
+    look = found.looks[0]
+    out = []
+    if verdict == "adequate":
+        out.append(
+            f"The model is adequate: of {len(look.named.candidates)} known effects and "
+            f"{len(look.unnamed.candidates)} kinds of structure none stands out from chance."
+        )
+    for step in found.found:
+        out += _step_sentences(step, next(c for c in candidates if c["add"] == step.effect.name))
+    if verdict == "unexplained_structure":
+        out.insert(0, "Something is here that no known effect explains.")
+    for each in unexplained[:2]:
+        what = " and ".join(words(c) for c in each["covariates"])
+        out.append(f"What is left hangs on {what}: {each['rms_mm']:.2f} mm of range residual.")
+        if each["formula"]:
+            out.append(
+                f"An empirical effect for it, '{each['formula']['name']}', stands in diagnosis.json"
+                f" ready to be saved and added; it describes, and explains nothing."
+            )
+    gone = [name for name, why in untestable.items() if why.startswith("the recordings")]
+    if gone:
+        more = f" and {len(gone) - TOLD} more" if len(gone) > TOLD else ""
+        out.append(f"Could not be tested, for lack of columns: {', '.join(gone[:TOLD])}{more}.")
+    return out
+
+
+def _step_sentences(step: Found, candidate: Mapping[str, Any]) -> list[str]:
+    before, after = (candidate["held_out_rms_mm"][k] for k in ("before", "after"))
+    fall = f"; the held-out error goes from {before:.2f} to {after:.2f} mm" if after else ""
+    out = [
+        f"{step.effect.name} is missing: it bends the ranges by {candidate['rms_mm']:.2f} mm rms "
+        f"(p = {max(step.p_adjusted, 1e-99):.1g} after all that was looked at){fall}."
+    ]
+    for rival in candidate["rivals"][:TOLD]:
+        out.append(
+            f"This data cannot tell it from {rival['effect']} (odds {rival['odds']:.1f} to 1); "
+            f"{rival['separate']} would."
+        )
+    return out

@@ -1,0 +1,39 @@
+"""What bases are made of: columns kept finite, and put where they belong."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calib.effects.base import View
+from sensors.lidar import GRAZING_RAD
+
+RANGE, AZIMUTH, ELEVATION = range(3)
+
+
+def beam(axis: int, *columns: np.ndarray) -> np.ndarray:
+    """The basis (rows, 3, P) of columns that each add to one axis of BEAM."""
+    stacked = np.stack(np.broadcast_arrays(*map(np.atleast_1d, columns)), axis=-1)
+    basis = np.zeros((len(stacked), 3, len(columns)))
+    basis[:, axis] = stacked
+    return basis
+
+
+def range_m(view: View) -> np.ndarray:
+    """Predicted range (rows,); 0 where a beam meets nothing."""
+    return finite(view["range_m"])
+
+
+def incidence_rad(view: View) -> np.ndarray:
+    """Incidence (rows,), held below 1.5 rad: beams flatter than that tell nothing."""
+    return np.clip(finite(view["incidence_rad"]), 0.0, GRAZING_RAD)
+
+
+def finite(column: np.ndarray) -> np.ndarray:
+    """A column with 0 where nothing was recorded."""
+    return np.where(np.isfinite(column), column, 0.0)
+
+
+def place_of(values: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Index of each value among the known ones, which ascend; -1 for one that is not known."""
+    at = np.minimum(np.searchsorted(known, values), len(known) - 1)
+    return np.where(known[at] == values, at, -1)

@@ -1,0 +1,68 @@
+"""How a tracker lies."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from calib.effects.base import Effect, Param, Site, View
+from calib.rig import Rig
+
+VOLUME_M = 3.0  # half the width of a usual volume
+
+
+class OptitrackScale(Effect):
+    """The tracker's metre is too long or too short: ``measured = true * (1 + s)``."""
+
+    name = "optitrack_scale"
+    site = Site.TRACKER
+    unit = "1"
+    formula = "position of a body = true + s * true, tracker frame"
+    typical = "100 to 1000 ppm, size assumed"
+    covariates = ("tracked",)
+    confounded_with = ("optitrack_distortion", "faro_scale", "range_scale")
+    source = "wand calibration: docs.optitrack.com; Merriaux et al. 2017, Sensors 17:1591"
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        return (Param("scale", "1", 0.0005),) if rig.tracker else ()
+
+    def basis(self, view: View) -> np.ndarray:
+        return _in_body(view, lambda at_m: at_m[..., None])
+
+
+class OptitrackDistortion(Effect):
+    """The tracked volume is bent: a quadratic field of the position, about the tracker's origin."""
+
+    name = "optitrack_distortion"
+    site = Site.TRACKER
+    unit = "m"
+    formula = "position p of a body = true + sum of c_ijk p_j p_k / (3 m)^2, tracker frame"
+    typical = "0.2 to 2 mm at 3 m, size assumed"
+    covariates = ("tracked",)
+    confounded_with = ("optitrack_scale", "mount_slip")
+    source = "calibration of the volume: docs.optitrack.com; size assumed"
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        names = [f"{i}.{j}{k}" for i in "xyz" for j, k in ("xx", "xy", "xz", "yy", "yz", "zz")]
+        return tuple(Param(name, "m", 0.001) for name in names) if rig.tracker else ()
+
+    def basis(self, view: View) -> np.ndarray:
+        j, k = np.triu_indices(3)
+
+        def field(at_m: np.ndarray) -> np.ndarray:
+            p = at_m / VOLUME_M
+            return np.kron(np.eye(3), (p[:, j] * p[:, k])[:, None, :])
+
+        return _in_body(view, field)
+
+
+def _in_body(view: View, field: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """The twists (K, B, 6, P) of shifts (N, 3, P) that depend on where (N, 3) a body is.
+
+    Column ``tracked`` (K, B, 4, 4) holds the bodies' poses, NaN where not seen.
+    """
+    T = np.nan_to_num(view["tracked"])
+    shift = field(T[..., :3, 3].reshape(-1, 3))
+    shift = np.swapaxes(T[..., :3, :3], -1, -2) @ shift.reshape(*T.shape[:2], 3, -1)
+    return np.concatenate([np.zeros_like(shift), shift], axis=2)

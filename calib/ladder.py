@@ -1,0 +1,97 @@
+"""The ladder of a study: runs that grew from each other, rung by rung down to the noise floor."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from calib.run import Run
+from chains.errors import InputError
+
+
+@dataclass(frozen=True)
+class Rung:
+    """A run, and the one that it grew from; None where that is gone, or it is the first.
+
+    Args:
+        run: the run.
+        below: what it grew from.
+    """
+
+    run: Run
+    below: Run | None
+
+    @property
+    def grown_from(self) -> Path | None:
+        """Where the run below was when this one grew from it."""
+        found = self.run.model.get("grown_from")
+        return Path(found) if found else None
+
+    @property
+    def added(self) -> list[str] | None:
+        """Effects that the run below has not; None where that is gone."""
+        if self.below is None:
+            return None if self.grown_from else []
+        return [name for name in self.run.effects if name not in self.below.effects]
+
+    @property
+    def dropped(self) -> list[str] | None:
+        """Effects that only the run below has; None where that is gone."""
+        if self.below is None:
+            return None if self.grown_from else []
+        return [name for name in self.below.effects if name not in self.run.effects]
+
+    def document(self) -> dict[str, Any]:
+        """As ``rigcal compare --json`` gives it."""
+        rms = self.run.summary["rms_mm"]
+        return {
+            "run": str(self.run.folder),
+            "grown_from": str(self.grown_from) if self.grown_from else None,
+            "added": self.added,
+            "dropped": self.dropped,
+            "held_out_rms_mm": rms["held_out"],
+            "fit_rms_mm": rms["fit"],
+            "noise_floor_mm": rms["noise_floor"],
+        }
+
+
+def ladder(runs: Sequence[Run]) -> list[Rung]:
+    """The rungs of runs that grew, or were grown from, the lowest first; empty where none did.
+
+    Args:
+        runs: those to show; of a single one, all that it grew from, as far as they are there.
+    """
+    if len(runs) == 1:
+        runs = list(_down(runs[0]))[::-1]
+    known = {run.folder.resolve(): run for run in runs}
+    below = {folder: _below(run, known) for folder, run in known.items()}
+    related = {folder for folder, run in known.items() if run.model.get("grown_from")}
+    related |= {run.folder.resolve() for run in below.values() if run is not None}
+    shown = [folder for folder in known if folder in related]
+    depth = {folder: len(list(_down(known[folder], known))) for folder in shown}
+    return [Rung(known[f], below[f]) for f in sorted(shown, key=depth.__getitem__)]
+
+
+def _down(run: Run, known: dict[Path, Run] | None = None) -> Iterator[Run]:
+    """The run, what it grew from, what that grew from, and so on; each once."""
+    seen: set[Path] = set()
+    found: Run | None = run
+    while found is not None and found.folder.resolve() not in seen:
+        seen.add(found.folder.resolve())
+        yield found
+        found = _below(found, known or {})
+
+
+def _below(run: Run, known: dict[Path, Run]) -> Run | None:
+    """What a run grew from, where that is still there."""
+    folder = run.model.get("grown_from")
+    if not folder:
+        return None
+    if Path(folder).resolve() in known:
+        return known[Path(folder).resolve()]
+    try:
+        return Run.open(folder)
+    except InputError:
+        return None

@@ -1,0 +1,61 @@
+"""Recordings of perfect hardware but for one effect, and the state in which they were made."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from calib import effects
+from calib.model import Model, Source
+from calib.problem import Problem, build
+from calib.rig import Rig
+from calib.simulate import Spec
+
+from .simulated import changed, made
+
+# Enough of everything that an effect may need: labels, masses, targets, a quarter of an hour.
+FLAWLESS = Spec(
+    lidar="hesai_pandarxt32",
+    locations=3,
+    stops_per_location=4,
+    column_step=125,
+    noise=0,
+    build_error=0,
+    mesh_error_m=0,
+    mixed_pixel_share=0,
+    occluded_share=0,
+)
+STEEPEST_RAD = np.radians(80)
+
+
+def coarse(rig: Rig) -> Rig:
+    """The rig with a LiDAR that rounds range to 2 cm, far beyond its noise."""
+    return replace(rig, lidar=replace(rig.lidar, quantum_m=0.02))
+
+
+def hide(folder: Path, name: str, size: float = 1.0, **fields: object) -> tuple[Source, dict]:
+    """A recording with one effect hidden in flawless hardware, and its truth."""
+    return made(folder, changed(FLAWLESS, **fields), **{name: size})
+
+
+def at_truth(source: Source, truth: dict, name: str) -> tuple[Problem, dict, np.ndarray]:
+    """The problem of one effect, its values where the recording was made, and the effect's own."""
+    problem = build([source], Model((effects.find(name),)))
+    T_opti_faro = np.linalg.inv(truth["T_faro_opti"])
+    values = dict(problem.initial)
+    values[source.rig.reference_frame] = T_opti_faro
+    for stop, at in truth["stops"].items():
+        values[f"root@{stop}"] = T_opti_faro @ np.array(at["T_faro_root"])
+    term = next(t for t in problem.terms[0] if t.variable == name)
+    theta = np.array(truth["effects"][name])[term.free]
+    return problem, {**values, name: theta}, theta
+
+
+def residuals(problem: Problem, values: dict) -> tuple[np.ndarray, np.ndarray]:
+    """Range residuals of all beams but grazing ones, m, and whitened ones of trackers and rods."""
+    beams = []
+    for scan in problem.scans:
+        rows = scan.rows(values)
+        beams.append(rows.residual_m[rows.usable & (rows.view["incidence_rad"] < STEEPEST_RAD)])
+    others = [block.evaluate(values, False)[0] for block in problem.blocks]
+    return np.concatenate(beams), np.concatenate(others)

@@ -1,0 +1,349 @@
+"""Effects of beams, arm, mount, tracker and targets, against the geometry that they stand for."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform
+
+from calib.effects import View, find
+from calib.forward import Term, place
+from calib.model import Source, stop_columns, tracked_poses
+from calib.rig import load_rig
+from calib.simulate import PRESETS, simulate
+from chains.errors import InputError
+from sensors.lidar import beams
+
+from . import rigs
+from .hidden import FLAWLESS, coarse, hide
+from .simulated import changed, made, nominal, pose, seen
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory) -> Source:
+    return hide(tmp_path_factory.mktemp("geometry") / "rec", "range_offset", 0.0)[0]
+
+
+def stops_of(source: Source, **columns: np.ndarray) -> View:
+    count = len(source.recording.stops)
+    return View(source.rig, count, {**source.columns, **columns}, source.recording.joints)
+
+
+def placed(source: Source, name: str, theta: object, frame: str = "lidar") -> np.ndarray:
+    """T_root_frame (K, 4, 4) under one effect."""
+    theta = np.atleast_1d(np.asarray(theta, float))
+    term = Term(find(name), name, np.arange(len(theta)))
+    joints, columns = source.recording.joints, source.columns
+    return place(source.rig, [term], joints, columns, "root", None).in_root(frame, {name: theta}).T
+
+
+def height_energy(source: Source, joints: np.ndarray, twists: np.ndarray | None = None):
+    """Potential energy (K,) J of what weighs on the arm, by where each link's centre is."""
+    energy = 0.0
+    for mass in source.rig.masses:
+        T = source.rig.tree.place(mass.frame, joints, twists).Ts_root_frame
+        energy = energy + 9.80665 * mass.kg * (T @ np.append(mass.centre_m, 1.0))[:, 2]
+    return energy
+
+
+# ------------------------------------------------------------------------------------------ beams
+
+
+@pytest.mark.parametrize("origin_m", [(0.0, 0.0), (0.03, 0.01)])
+@pytest.mark.parametrize("off_m", [(1e-4, 0.0), (0.0, 1e-4), (-7e-5, 5e-5)])
+def test_a_beam_that_starts_elsewhere_reads_elsewhere(source, origin_m, off_m):
+    """The sensor refers range to its centre: it measures range - H cos(elevation) from the start
+    of the beam, and its driver lays the point there with the H and B that it believes in."""
+    rng = np.random.default_rng(0)
+    azimuth, elevation = rng.uniform(-3, 3, 200), rng.uniform(-1.0, 1.0, 200)
+    range_m = rng.uniform(0.5, 6.0, 200)
+    ahead = np.stack([np.cos(azimuth), np.sin(azimuth), 0 * azimuth], axis=1)
+    left = np.stack([-np.sin(azimuth), np.cos(azimuth), 0 * azimuth], axis=1)
+    direction = np.cos(elevation)[:, None] * ahead
+    direction[:, 2] = np.sin(elevation)
+
+    def point(H, B):
+        from_start = range_m - H * np.cos(elevation)
+        return H * ahead + B * left + from_start[:, None] * direction
+
+    told = beams(point(*origin_m), origin_m)
+    true = beams(point(*np.add(origin_m, off_m)), origin_m)
+    error = np.stack(
+        [
+            told.range_m - true.range_m,
+            np.angle(np.exp(1j * (told.azimuth_rad - true.azimuth_rad))),
+            told.elevation_rad - true.elevation_rad,
+        ],
+        axis=1,
+    )
+    rig = replace(source.rig, lidar=replace(source.rig.lidar, beam_origin_m=np.array(origin_m)))
+    columns = {"range_m": true.range_m, "elevation_rad": true.elevation_rad}
+    basis = find("beam_origin_offset").basis(View(rig, 200, columns, np.zeros((1, 6))))
+    np.testing.assert_allclose(basis @ off_m, error, atol=2e-7)
+    assert np.abs(error).max() > 5e-5
+
+
+def test_ring_offsets_turn_their_ring_only(source):
+    columns = {"ring": np.array([3, 0, 3])}
+    view = View(source.rig, 3, columns, np.zeros((1, 6)))
+    for name, axis in (("ring_range", 0), ("ring_azimuth", 1), ("ring_elevation", 2)):
+        found = find(f"{name}_offset").basis(view)
+        np.testing.assert_array_equal(found.index, [3, 0, 3])
+        np.testing.assert_array_equal(found.values, np.tile(np.eye(3)[axis], (3, 1)))
+
+
+@pytest.mark.parametrize(
+    ("name", "columns", "expected"),
+    [
+        ("range_cyclic@2", {"range_m": [0.5, 1.0]}, [[1, 0], [0, -1]]),
+        ("range_step@2", {"range_m": [1.9, 2.1]}, [[0], [1]]),
+        ("near_range_bias@0.5", {"range_m": [0.5, 1.0]}, [[np.exp(-1)], [np.exp(-2)]]),
+        ("incidence_angle_bias", {"incidence_rad": [0, np.pi / 3]}, [[0], [1]]),
+        (
+            "intensity_range_walk",
+            {"intensity": [100 * np.e, np.nan, 0]},
+            [[1], [0], [-np.log(100)]],
+        ),
+        ("warmup_drift@100", {"elapsed_s": [0, 100]}, [[0], [1 - np.exp(-1)]]),
+        ("temperature_drift", {"temperature_c": [21.5, np.nan]}, [[1.5], [0]]),
+        ("range_quantisation", {"range_m": [1.0013, 1.0133]}, [[-0.0013], [0.0067]]),
+    ],
+)
+def test_range_errors_are_what_their_formulas_say(source, name, columns, expected):
+    columns = {k: np.array(v, float) for k, v in columns.items()}
+    view = View(coarse(source.rig), len(expected), columns, np.zeros((1, 6)))
+    found = find(name).basis(view)
+    assert not found[:, 1:].any()
+    np.testing.assert_allclose(found[:, 0], expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("name", "axis", "columns", "expected"),
+    [
+        ("range_offset", 0, {}, [[1]]),
+        ("range_scale", 0, {"range_m": [2.0, np.inf]}, [[2], [0]]),
+        ("azimuth_range_harmonic", 0, {"azimuth_rad": [np.pi / 2]}, [[1, 0, 0, -1, -1, 0, 0, 1]]),
+        ("elevation_scale", 2, {"elevation_rad": [0.3]}, [[0.3]]),
+        ("encoder_eccentricity", 1, {"azimuth_rad": [np.pi / 6]}, [[0.5, np.sqrt(0.75)]]),
+        ("encoder_second_harmonic", 1, {"azimuth_rad": [np.pi / 12]}, [[0.5, np.sqrt(0.75)]]),
+        ("spin_axis_wobble", 2, {"azimuth_rad": [np.pi / 12]}, [[0.5, np.sqrt(0.75)]]),
+        ("near_range_azimuth@2", 1, {"range_m": [2.0, 4.0]}, [[np.exp(-1)], [np.exp(-2)]]),
+    ],
+)
+def test_beam_errors_are_what_their_formulas_say(source, name, axis, columns, expected):
+    columns = {k: np.array(v, float) for k, v in columns.items()}
+    found = find(name).basis(View(source.rig, len(expected), columns, np.zeros((1, 6))))
+    np.testing.assert_allclose(found[:, axis], expected, atol=1e-12)
+    assert np.count_nonzero(found) == np.count_nonzero(found[:, axis])
+
+
+# -------------------------------------------------------------------------------------------- arm
+
+
+def test_joints_sag_along_gravity(source):
+    """The torque is the slope of the potential energy, downhill."""
+    joints, step = source.recording.joints, 1e-5
+    basis = find("arm_gravity_sag").basis(stops_of(source))
+    for j in range(joints.shape[1]):
+        nudge = step * np.eye(joints.shape[1])[j]
+        slope = height_energy(source, joints + nudge) - height_energy(source, joints - nudge)
+        np.testing.assert_allclose(basis[:, j, j], -slope / (2 * step), atol=1e-6)
+    assert np.abs(basis[:, 1, 1]).max() > 5  # N m, at the shoulder
+    np.testing.assert_allclose(basis[:, 0, 0], 0, atol=1e-9)  # its axis is upright
+
+
+def test_a_payload_weighs_at_the_tip(source):
+    joints, kg = source.recording.joints, np.linspace(0, 2, len(source.recording.stops))
+    kg[0] = np.nan
+    effect = find("arm_gravity_sag")
+    more = effect.basis(stops_of(source, payload_kg=kg)) - effect.basis(stops_of(source))
+    step = 1e-5 * np.eye(6)[1]
+    up, down = (source.rig.tree.place("arm_end", joints + s) for s in (step, -step))
+    rise = (up.Ts_root_frame - down.Ts_root_frame)[:, 2, 3] / 2e-5
+    np.testing.assert_allclose(more[:, 1, 1], -np.nan_to_num(kg) * 9.80665 * rise, atol=1e-6)
+
+
+def test_the_base_tilts_along_gravity(source):
+    joints, tree = source.recording.joints, source.rig.tree
+    basis = find("base_flex").basis(stops_of(source))
+    edge = tree.edge_names.index("arm_base")
+    for axis in (0, 1):
+        twist = np.zeros((1, len(tree.edges), 6))
+        twist[0, edge, axis] = 1e-5
+        slope = height_energy(source, joints, twist) - height_energy(source, joints, -twist)
+        np.testing.assert_allclose(basis[:, edge, axis, axis], -slope / 2e-5, atol=1e-5)
+    elsewhere = basis.copy()
+    elsewhere[:, edge, (0, 1), (0, 1)] = 0
+    assert not elsewhere.any() and np.abs(basis).max() > 5
+
+
+def test_without_a_frame_before_it_the_arm_s_first_edge_tilts(source):
+    tree = source.rig.tree
+    below = ("arm_base", "base_markers")
+    inner = type(tree)([e for e in tree.edges if e.name not in below])
+    assert inner.root == "arm_base"
+    rig = replace(source.rig, tree=inner)
+    view = View(rig, len(source.recording.stops), {}, source.recording.joints)
+    found = find("base_flex").basis(view)
+    moved = np.abs(found).max(axis=(0, 2, 3)) > 0
+    assert [e for e, m in zip(inner.edge_names, moved, strict=True) if m] == ["joint_1"]
+
+
+def test_the_mount_bends_down(source):
+    """The LiDAR comes lower wherever its lever does not hang or stand along gravity."""
+    plain, bent = placed(source, "mount_bending", 0.0), placed(source, "mount_bending", 1e-3)
+    mount = source.rig.tree.place("mount", source.recording.joints).Ts_root_frame
+    lever = plain[:, :3, 3] - mount[:, :3, 3]
+    across = np.linalg.norm(lever[:, :2], axis=1)
+    fall = (plain - bent)[:, 2, 3]
+    # By an angle of 1 mrad times the sine between lever and gravity, at arm's length of the lever.
+    np.testing.assert_allclose(fall, 1e-3 * across**2 / np.linalg.norm(lever, axis=1), atol=1e-7)
+    assert fall.max() > 2e-5
+
+
+def test_a_slip_is_a_step_and_creep_goes_with_time(source):
+    twist = np.array([1e-3, -2e-3, 3e-3, 1e-3, 2e-3, -1e-3])
+    elapsed_s = source.columns["elapsed_s"]
+    slipped, crept = (placed(source, f"mount_{n}", twist) for n in ("slip@300", "creep"))
+    assert 0 < (elapsed_s > 300).sum() < len(elapsed_s)
+    for k, joints in enumerate(source.recording.joints):
+        mount = nominal(source, "mount", joints)
+        beyond = mount.inv() * nominal(source, "lidar", joints)
+        for found, share in ((slipped, elapsed_s[k] > 300), (crept, elapsed_s[k] / 3600)):
+            expected = mount * RigidTransform.from_exp_coords(twist * share) * beyond
+            np.testing.assert_allclose(found[k], expected.as_matrix(), atol=1e-12)
+
+
+def test_links_grow_with_the_temperature(source):
+    alpha = 1e-3
+    found = placed(source, "arm_thermal_growth", alpha)
+    warmer = source.columns["temperature_c"] - 20
+    for k, joints in enumerate(source.recording.joints):
+        edges = []
+        for edge in source.rig.tree.edges:
+            T = edge.T_parent_child.copy()
+            if edge.name in source.rig.arm_edges:
+                T[:3, 3] *= 1 + alpha * warmer[k]
+            edges.append(replace(edge, T_parent_child=T))
+        grown = replace(source, rig=replace(source.rig, tree=type(source.rig.tree)(edges)))
+        expected = nominal(grown, "lidar", joints).as_matrix()
+        np.testing.assert_allclose(found[k], expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("name", "error"),
+    [
+        ("arm_joint_scale", lambda q: q),
+        ("arm_gear_error@7", lambda q: np.sin(7 * q)),
+        ("arm_joint_eccentricity", np.sin),
+    ],
+)
+def test_joint_errors_are_what_their_formulas_say(source, name, error):
+    params = [p.name for p in find(name).params(source.rig)]
+    theta = np.zeros(len(params))
+    theta[next(i for i, p in enumerate(params) if p in ("joint_3", "joint_3.sin"))] = 0.01
+    for k, joints in enumerate(source.recording.joints):
+        turned = joints + 0.01 * error(joints[2]) * np.eye(6)[2]
+        expected = nominal(source, "lidar", turned).as_matrix()
+        np.testing.assert_allclose(placed(source, name, theta)[k], expected, atol=1e-12)
+
+
+def test_backlash_follows_the_way_each_joint_came(source):
+    joints = np.array([[0.0, 1, 0, 0, 0, 0], [0.2, 1, 0, 0, 0, 0], [0.1, 2, 0, 0, 0, 0]])
+    columns = stop_columns(source.rig, joints, np.array([50.0, 900.0, 400.0]))
+    np.testing.assert_array_equal(columns["moved.joint_1"], [0, 1, 1])
+    np.testing.assert_array_equal(columns["moved.joint_2"], [0, -1, 1])
+    np.testing.assert_array_equal(columns["elapsed_s"], [0, 850, 350])
+    np.testing.assert_array_equal(columns["joint_2"], [1, 1, 2])
+    basis = find("arm_backlash").basis(View(source.rig, 3, columns, joints))
+    np.testing.assert_array_equal(basis[1], np.diag([1, -1, 0, 0, 0, 0]))
+
+
+# --------------------------------------------------------------------- tracker, targets, reference
+
+
+def test_the_tracker_stretches_and_bends_where_it_sees(source):
+    view, stretch = stops_of(source), 0.01
+    for b, body in enumerate(source.rig.tracker.bodies):
+        by = {n: find(f"optitrack_{n}").basis(view)[:, b] for n in ("scale", "distortion")}
+        names = [p.name for p in find("optitrack_distortion").params(source.rig)]
+        for k in range(view.rows):
+            T = seen(source, body, k)
+            found = T * RigidTransform.from_exp_coords(by["scale"][k, :, 0] * stretch)
+            np.testing.assert_allclose(found.translation, 1.01 * T.translation, atol=1e-12)
+            np.testing.assert_allclose(found.rotation.as_matrix(), T.rotation.as_matrix())
+            c = np.zeros(18)
+            c[names.index("y.xz")] = 0.02
+            found = T * RigidTransform.from_exp_coords(by["distortion"][k] @ c)
+            x, _, z = T.translation / 3
+            moved = found.translation - T.translation
+            np.testing.assert_allclose(moved, [0, 0.02 * x * z, 0], atol=1e-12)
+
+
+def test_what_is_not_seen_is_not_stretched(tmp_path):
+    source, _ = made(tmp_path / "rec", changed(FLAWLESS, occluded_share=0.5, lidar=None, targets=0))
+    poses = tracked_poses(source.rig, source.recording)
+    hidden = np.isnan(source.recording.bodies["mount_markers"][:, 0])
+    assert 0 < hidden.sum() < len(hidden)
+    np.testing.assert_array_equal(np.isnan(poses[:, 1, :3]).any(axis=(1, 2)), hidden)
+    basis = find("optitrack_scale").basis(stops_of(source))
+    assert not basis[hidden, 1].any() and basis[~hidden, 1].any() and basis[:, 0].any()
+
+
+def test_points_are_turned_as_they_lie_together(tmp_path):
+    spec = changed(PRESETS["laser-tracker"], noise=0, build_error=0, occluded_share=0)
+    source, truth = made(tmp_path / "rec", spec)
+    poses = tracked_poses(source.rig, source.recording)
+    T_opti_faro = pose(truth["T_faro_opti"]).inv()
+    for k, (stop, at) in enumerate(truth["stops"].items()):
+        assert stop == source.recording.stops[k]
+        for b, body in enumerate(source.rig.tracker.bodies):
+            on_paper = nominal(source, body, source.recording.joints[k])
+            expected = T_opti_faro * pose(at["T_faro_root"]) * on_paper
+            np.testing.assert_allclose(poses[k, b], expected.as_matrix(), atol=1e-8)
+    for body in source.rig.tracker.bodies[1:]:
+        source.recording.bodies[body][:] = np.nan
+    alone = tracked_poses(source.rig, source.recording)
+    assert np.isnan(alone[:, :, :3, :3]).all()
+    assert not find("optitrack_scale").basis(stops_of(replace(source))).any()
+
+
+def test_spheres_hang_lower_and_rods_askew(source):
+    view = View(source.rig, 5, {}, np.zeros((1, 0)))
+    lower = find("target_sphere_offset").basis(view) @ [0.001]
+    askew = find("target_rod_tilt").basis(view) @ [0.01, -0.02]
+    np.testing.assert_allclose(lower, [[0, 0, -0.001]])
+    np.testing.assert_allclose(askew, [[0.0018, -0.0036, 0]])
+
+
+def test_the_mesh_is_stretched_about_its_origin(source):
+    columns = {"point_m": np.array([[1.0, -2, 3], [np.inf] * 3])}
+    found = find("faro_scale").basis(View(source.rig, 2, columns, np.zeros((1, 6))))
+    np.testing.assert_array_equal(found @ [1e-3], [[1e-3, -2e-3, 3e-3], [0, 0, 0]])
+
+
+def test_labels_have_names_and_only_theirs_move(source, tmp_path):
+    labels = source.rig.labels
+    assert labels[0] == "floor" and list(labels) == sorted(labels)
+    columns = {"label": np.array([2, -1, 0, 77]), "normal": np.eye(4)[:, :3]}
+    view = View(source.rig, 4, columns, np.zeros((1, 6)))
+    for name in ("label_range_offset", "moved_surface"):
+        found = find(name).basis(view)
+        np.testing.assert_array_equal(found.index, [2, -1, 0, -1])
+        assert find(name).params(source.rig)[2].name == f"2_{labels[2]}"
+    simulate(FLAWLESS, tmp_path / "rec", 0)
+    path = tmp_path / "rec/reference/labels.yaml"
+    path.write_text("4: four\n1: one\n")
+    rig = load_rig(tmp_path / "rec")
+    assert list(rig.labels.items()) == [(1, "one"), (4, "four")]
+    found = find("moved_surface").basis(
+        replace(view, rig=rig, columns=columns | {"label": np.array([4, 2, 1, -1])})
+    )
+    np.testing.assert_array_equal(found.index, [1, -1, 0, -1])
+    path.write_text("floor: 0\n")
+    with pytest.raises(InputError, match=r"labels\.yaml.*number: name"):
+        load_rig(tmp_path / "rec")
+
+
+def test_a_mesh_without_names_has_no_labels(tmp_path):
+    assert load_rig(rigs.write(tmp_path / "box")).labels == {}

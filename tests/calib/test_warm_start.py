@@ -1,0 +1,128 @@
+"""A fit that starts from the state of another: what it takes over, and that it ends the same."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform
+
+from calib.fit import solve
+from calib.holdout import held_out
+from calib.model import Model, Source
+from calib.problem import build
+from calib.residuals.surfaces import PlaneSurface
+from calib.simulate import Spec
+
+from . import rigs, simulated
+
+MODEL = Model(("arm_link_length", "arm_joint_offset", "ring_range_offset"))
+SMALL = Model(("arm_link_length", "ring_range_offset"))
+PLANES = Spec(mesh=False, targets=0, locations=3, stops_per_location=2, column_step=40)
+
+
+@pytest.fixture(scope="module", params=["mesh", "planes", "no lidar"])
+def cold(request, tmp_path_factory):
+    """A recording, and what a small model makes of it."""
+    folder = tmp_path_factory.mktemp("cold") / "rec"
+    if request.param == "planes":
+        source, _ = simulated.made(folder, PLANES)
+    else:
+        changes = {"lidar": None} if request.param == "no lidar" else {}
+        source = Source.open(rigs.write(folder, seed=4, **changes))
+    return source, solve(build([source], SMALL))
+
+
+def sigmas_apart(a, b):
+    """The largest difference of two estimates' calibrations, in sigmas of the first."""
+    off = []
+    for v in a.variables:
+        here, there = a.values[v.name], b.values[v.name]
+        if v.kind == "pose":
+            here, there = map(RigidTransform.from_matrix, (here, there))
+            off.append((here.inv() * there).as_exp_coords())
+        else:
+            off.append(there - here)
+    return np.abs(np.concatenate(off) / np.sqrt(np.diag(a.covariance))).max()
+
+
+def test_a_fit_goes_on_from_its_own_state(cold):
+    """Planes too are found anew, and found the same."""
+    source, first = cold
+    problem = build([source], SMALL)
+    again = solve(problem, start=first.state)
+    assert first.converged and again.converged
+    assert again.iterations <= 2 < first.iterations
+    assert sigmas_apart(first, again) < 0.01
+    for a, b in zip(first.associations, again.associations, strict=True):
+        np.testing.assert_array_equal(a.part, b.part)
+    for meeting in problem.meetings.values():
+        if isinstance(meeting, PlaneSurface):
+            np.testing.assert_array_equal(
+                meeting.planes.normal, first.scans[0].meeting.planes.normal
+            )
+
+
+def test_a_larger_model_goes_on_from_a_smaller_one_and_back(cold):
+    source, first = cold
+    whole = solve(build([source], MODEL))
+    grown = solve(build([source], MODEL), start=first.state)
+    assert grown.converged and grown.iterations <= whole.iterations
+    assert sigmas_apart(whole, grown) < 0.15 < sigmas_apart(grown, _with(first, grown))
+    smaller = solve(build([source], SMALL), start=whole.state)
+    assert smaller.converged and sigmas_apart(first, smaller) < 0.15
+
+
+def _with(estimate, other):
+    """An estimate with zeros for what only another has."""
+    missing = {v.name: np.zeros(v.dim) for v in other.variables if v.name not in estimate.values}
+    return type("Values", (), {"values": missing | estimate.values})
+
+
+def test_values_are_taken_over_by_the_names_of_their_parameters(cold):
+    """A state may list parts of surfaces in another order, and know others."""
+    source, first = cold
+    state = dict(first.state)
+    vectors = [name.removesuffix(".dofs") for name in state if name.endswith(".dofs")]
+    on_mesh = bool(first.scans) and source.reference is not None
+    assert any(name.startswith("0/reference") for name in vectors) == on_mesh
+    for name in vectors:
+        for key in (name, f"{name}.seen"):
+            if key in state:
+                state[key] = np.append(state[key][::-1], 1e3)
+        state[f"{name}.dofs"] = np.append(state[f"{name}.dofs"][::-1], "of another rig")
+    again = solve(build([source], SMALL), start=state)
+    assert again.iterations <= 2 and sigmas_apart(first, again) < 0.01
+
+
+def test_what_a_state_does_not_know_starts_at_its_mean(cold):
+    """Nothing but the poses is known: the rest is found again."""
+    source, first = cold
+    poses = {name: value for name, value in first.values.items() if value.shape == (4, 4)}
+    again = solve(build([source], SMALL), start=poses)
+    assert again.converged and sigmas_apart(first, again) < 0.15
+
+
+def test_from_afar_beams_look_anew_what_they_meet(tmp_path):
+    """A state of another place is a poor start, and no worse than that."""
+    source = Source.open(rigs.write(tmp_path / "box", seed=4))
+    whole = solve(build([source], SMALL))
+    state = dict(whole.state)
+    for name in ("faro", "faro.seen"):
+        state[name] = rigs.retract("pose", state[name], np.array([0.01, 0, -0.01, 0.03, 0.03, 0]))
+    again = solve(build([source], SMALL), start=state)
+    assert again.converged and sigmas_apart(whole, again) < 0.1
+    met = [a.part != b.part for a, b in zip(whole.associations, again.associations, strict=True)]
+    assert np.mean(np.concatenate(met)) < 0.01
+
+
+def test_held_out_errors_do_not_depend_on_where_their_fit_starts(cold):
+    source, first = cold
+    passes = {}
+
+    def told(start):
+        """Held-out rms, and how many passes were told of."""
+        seen = set()
+        errors = held_out([source], SMALL, "stop", 1, lambda *what: seen.add(what[0]), start)
+        passes[start is None] = len(seen)
+        return errors.rms_mm
+
+    assert told(first.state) == pytest.approx(told(None), rel=0.01)
+    assert passes[False] < passes[True] or not first.scans
