@@ -18,6 +18,7 @@ from calib.rig import Rig
 
 BINS, PAIR_BINS = 12, 6
 AZIMUTH_BINS = 24
+STEP = 0.01  # relative, to either side, for the derivative by a shape
 # What a range error may hang on alone, and the pairs that matter; others pair with range.
 POINT = ("range_m", "incidence_rad", "azimuth_rad", "elevation_rad", "intensity")
 PAIRS = (*combinations(POINT[:4], 2), ("intensity", "range_m"), ("label", "incidence_rad"))
@@ -85,6 +86,30 @@ class JointShape(Effect):
         out = np.zeros((len(q), view.joints.shape[1], len(waves)))
         out[:, i] = np.stack(waves, axis=1)
         return out
+
+
+class ShapeStep(Effect):
+    """What an effect of a model would do more were its shape larger: its derivative, per unit of
+    the shape's logarithm.
+
+    Args:
+        effect: in the model, with a shape.
+        theta: (P,) its parameters as estimated.
+    """
+
+    typical = "derivative"
+
+    def __init__(self, effect: Effect, theta: np.ndarray) -> None:
+        self.effect, self.theta, self.site = effect, theta, effect.site
+        self.name = f"shape of {effect.name}"
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        return (Param("log", "1", 1.0),) if self.effect.params(rig) else ()
+
+    def basis(self, view: View) -> np.ndarray:
+        sides = (self.effect.at(self.effect.shape * f) for f in (1 + STEP, 1 / (1 + STEP)))
+        larger, smaller = (side.basis(view) @ self.theta for side in sides)
+        return (larger - smaller)[..., None] / (2 * np.log1p(STEP))
 
 
 def known_effects(model: Model, sources: Sequence[Source], columns: frozenset[str]) -> list[Effect]:

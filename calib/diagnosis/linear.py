@@ -17,7 +17,7 @@ from calib.fit import Estimate, Progress
 from calib.forward import Values
 from calib.graph import Block, Graph
 from calib.problem import Problem
-from calib.residuals.beams import Part, Rows, unknown_columns
+from calib.residuals.beams import Rows, unknown_columns
 from calib.residuals.rows import Group, gram
 from calib.residuals.scan import ScanStop
 from calib.residuals.surfaces import Meeting
@@ -120,15 +120,21 @@ class _Sums:
         parts, groups = unknown_columns(rows)
         weight = rows.weight / np.square(rows.sigma_m)
         dense = np.hstack([rows.by_twist, *rows.dense.values()])
-        columns, chain = self._chain(scan, parts)
-        local = chain.T @ (chain.T @ gram(dense, groups, weight)).T
-        self.information[np.ix_(columns, columns)] += local
         kind = next(name for name in PLACES if name in rows.view.columns)
         found, cluster = np.unique(rows.view[kind], return_inverse=True)
         gradient = _by_cluster(dense, groups, -weight * rows.residual_m, cluster, len(found))
+        # The twist is the doing of all that places the lidar; other columns are unknowns as such.
+        placed = scan.stops.in_reference(scan.stops.rig.lidar_frame, self.values)
+        chain = np.hstack([d[0] for d in placed.d.values()])
+        columns = [*map(self._columns, placed.d)]
+        columns += [self._columns(p.variable)[p.components] for p in parts]
+        columns = np.concatenate(columns)
+        local = gram(dense, groups, weight)
+        self.information[np.ix_(columns, columns)] += _chained(_chained(local, chain).T, chain)
         places = [self._number(self.places, (room, p)) for p in found.tolist()]
         stop = self._number(self.stops, (scan.recording.folder, scan.index))
-        self._add(gradient @ chain, columns, np.full(len(found), stop), np.array(places))
+        stops = np.full(len(found), stop)
+        self._add(_chained(gradient, chain), columns, stops, np.array(places))
         for name in scan.stops.variables:
             self.known_to.setdefault(name, set()).add(stop)
         self.weight_m2 += float(weight.sum())
@@ -170,19 +176,6 @@ class _Sums:
         place = np.array([self._number(self.places, key) for key in keys])
         self._add(A * b[:, None], columns, nowhere, place)
 
-    def _chain(self, scan: ScanStop, parts: Sequence[Part]) -> tuple[np.ndarray, csr_array]:
-        """Unknowns that a stop's columns [twist | parts] depend on, and the derivative."""
-        placed = scan.stops.in_reference(scan.stops.rig.lidar_frame, self.values)
-        chain = [(np.arange(6), self._columns(n), d[0]) for n, d in placed.d.items()]
-        for part in parts:
-            to = self._columns(part.variable)[part.components]
-            chain.append((6 + part.columns, to, np.eye(len(to))))
-        columns = np.unique(np.concatenate([to for _, to, _ in chain]))
-        out = np.zeros((6 + sum(len(p.columns) for p in parts), len(columns)))
-        for rows, to, d in chain:
-            out[np.ix_(rows, np.searchsorted(columns, to))] += d
-        return columns, csr_array(out)
-
     def _add(
         self, gradient: np.ndarray, columns: np.ndarray, stop: np.ndarray, place: np.ndarray
     ) -> None:
@@ -199,6 +192,11 @@ class _Sums:
 
     def _number(self, among: dict[object, int], key: object) -> int:
         return among.setdefault(key, len(among))
+
+
+def _chained(rows: np.ndarray, chain: np.ndarray) -> np.ndarray:
+    """Rows over [twist | others] as rows over [what the twist depends on | others]."""
+    return np.hstack([rows[:, :6] @ chain, rows[:, 6:]])
 
 
 def _by_cluster(

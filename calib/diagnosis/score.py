@@ -14,7 +14,7 @@ candidates have in common, as Smyth (2004) does for variances.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -91,6 +91,12 @@ def project(linear: Linear, names: Sequence[str]) -> Scores:
         both.T @ both,
         linear.weight_m2,
     )
+
+
+def as_if_missing(scores: Scores, theta: np.ndarray) -> Scores:
+    """Scores of what a model has, at values (Q,), as they would be without it; the clusters' shares
+    in them stay those of residuals that no longer hold it, as in Wald's test."""
+    return replace(scores, score=scores.score + scores.information @ theta)
 
 
 def _sums(cells: np.ndarray, index: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ left is looked at again: an effect that nobody has named dresses up as several t
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -47,6 +47,12 @@ class Found:
     def effect(self) -> Effect:
         return self.candidate.effect
 
+    def with_effect(self, effect: Effect | None) -> Found:
+        """With another shape of its effect, if there is one."""
+        if effect is None:
+            return self
+        return replace(self, candidate=replace(self.candidate, effect=effect))
+
 
 @dataclass(frozen=True)
 class Search:
@@ -78,6 +84,10 @@ def search(stand: Stand, progress: Progress, most: int = MOST) -> Search:
             break
         found.append(step)
         looks.append(step.after)
+        stand, swapped = step.after.stand.retuned([f.effect.name for f in found[:-1]], progress)
+        if swapped:
+            looks[-1] = stand.look(progress)
+            found = [f.with_effect(swapped.get(f.effect.name)) for f in found]
     return Search(looks, found, _unnamed(looks[-1], progress))
 
 

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 from itertools import chain
 
 import numpy as np
 
 from calib import problem as problems
 from calib.calibrate import reopened
-from calib.diagnosis.candidates import covariates, known_effects, stops_view, structure
+from calib.diagnosis.candidates import (
+    ShapeStep,
+    covariates,
+    known_effects,
+    stops_view,
+    structure,
+)
 from calib.diagnosis.linear import Linear, linearise
-from calib.diagnosis.score import Test, project, test
+from calib.diagnosis.score import Test, as_if_missing, project, test
 from calib.diagnosis.screen import Screen, screen
 from calib.effects import Effect
 from calib.fit import Estimate, Progress, resume, solve
@@ -22,6 +28,8 @@ from calib.run import MODEL, Run
 from sensors.recording import Recording
 
 FINER = 9  # shapes tried between the two beside the best one
+WORTH = 9.0  # squared sigmas by which another shape must fit better
+LARGEST = 0.4  # change of a shape's logarithm at once
 SAMPLED = 8  # scans from which the bins of covariates are taken
 
 
@@ -93,6 +101,44 @@ class Stand:
         scores = project(linear, linear.candidates)
         return max(shaped, key=lambda e: test(scores, at[e.name]).statistic)
 
+    def retuned(
+        self, names: Collection[str], progress: Progress
+    ) -> tuple[Stand, dict[str, Effect]]:
+        """With better shapes of some effects, where others have since changed what is best.
+
+        Returns:
+            The fit with them, and the effects that took the place of others, by the others' names.
+        """
+        shaped = [e for e in self.model.effects if e.name in names and e.shape_name]
+        steps = [ShapeStep(e, self._theta(e)) for e in shaped]
+        if not steps:
+            return self, {}
+        linear, at = self.linearise(steps, progress)
+        scores = project(linear, linear.candidates)
+        swapped = {}
+        for effect, step in zip(shaped, steps, strict=True):
+            found = test(scores, at[step.name])
+            if found.dof and found.statistic > WORTH:
+                by = np.exp(np.clip(found.estimate()[0], -LARGEST, LARGEST))
+                swapped[effect.name] = effect.at(float(f"{effect.shape * by:.6g}"))
+        if not swapped:
+            return self, {}
+        model = Model(tuple(swapped.get(e.name, e) for e in self.model.effects), self.model.fixed)
+        start = {_renamed(name, swapped): value for name, value in self.estimate.state.items()}
+        problem = problems.build(self.sources, model, meetings=self.problem.meetings)
+        estimate = solve(problem, progress=progress, start=start)
+        return Stand(self.sources, model, problem, estimate), swapped
+
+    def _theta(self, effect: Effect) -> np.ndarray:
+        """All parameters of an effect, those held included."""
+        for terms, source in zip(self.problem.terms, self.sources, strict=True):
+            for term in terms:
+                if term.effect.name == effect.name:
+                    theta = np.zeros(len(effect.params(source.rig)))
+                    theta[term.free] = self.estimate.values[term.variable]
+                    return theta
+        raise ValueError(f"'{effect.name}' is not in the model")
+
     def _columns(self) -> tuple[frozenset[str], dict[str, np.ndarray]]:
         """Which columns there are, and the values of covariates at some of the points."""
         columns = {c for s in self.sources for c in s.columns}
@@ -134,13 +180,19 @@ class Look:
 
     def judged(self, effect: str) -> Test:
         """The test of an effect that the model has: what it does explain, with its own signal out
-        of the residual that judges it, as in Wald's test."""
+        of the residual that judges it."""
         names = _variables(self.stand.problem, {effect})[effect]
         scores = project(self.linear, names)
         values = np.concatenate([self.stand.estimate.values[n] for n in names])
-        # What the score would be without the effect, but for the clusters' shares in it.
-        without = replace(scores, score=scores.score + scores.information @ values)
-        return test(without, np.arange(len(values)))
+        return test(as_if_missing(scores, values), np.arange(len(values)))
+
+
+def _renamed(name: str, swapped: dict[str, Effect]) -> str:
+    """A name of a state once effects have other shapes: EFFECT, RIG/EFFECT, EFFECT.dofs, …"""
+    for old, effect in swapped.items():
+        if old in name.split("/")[-1]:
+            return name.replace(old, effect.name)
+    return name
 
 
 def _variables(problem: Problem, effects: set[str]) -> dict[str, list[str]]:
