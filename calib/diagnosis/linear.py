@@ -7,20 +7,20 @@ matrix of ``[J | Z]``, and the gradient ``[J | Z]^T b`` of each cluster of rows 
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from scipy.sparse import csr_array, vstack
 
 from calib.fit import Estimate, Progress
-from calib.forward import Values
 from calib.graph import Block, Graph
 from calib.problem import Problem
 from calib.residuals.beams import Rows, unknown_columns
 from calib.residuals.rows import Group, gram
 from calib.residuals.scan import ScanStop
-from calib.residuals.surfaces import Meeting
 from calib.residuals.tracker import TrackedBody
 
 # What paper says of the hardware is no evidence against a candidate: its sigmas are widened so much
@@ -63,118 +63,191 @@ def linearise(
         candidates: variables that the model does not have; they have no prior here.
         progress: called with what is being done, how many stops are done, and of how many.
     """
-    variables = list((wide.variables | estimate.graph.variables).values())
-    values = {n: wide.variables[n].mean for n in candidates} | estimate.values
-    graph = Graph(variables, wide.blocks, frozenset(candidates))
-    sums = _Sums(graph, values, wide.meetings)
-    for i, scan in enumerate(wide.scans):
-        progress("testing what is missing", i, len(wide.scans))
-        surfaces = [t for t in estimate.scans[i].terms if t.variable not in wide.variables]
-        scan = replace(scan, terms=[*scan.terms, *surfaces])
-        room = next((t.variable.partition("/")[0] for t in surfaces), str(scan.recording.folder))
-        sums.add_scan(scan, scan.rows(values, estimate.associations[i]), room)
-    priors = []
-    for block, by, b in graph.linear_rows(values):
-        if block is None:
-            priors.append((*by.items(), b))
-        else:
-            sums.add_block(block, by, b)
-    for (name, A), b in priors:
-        scale = 1.0 / WIDENED if name in wide.calibration else 1.0
-        sums.add_prior(name, scale * A, scale * b)
-    return sums.total(candidates)
+    return Sums(wide, estimate, candidates).walk(progress, "testing what is missing").total()
 
 
-@dataclass
-class _Sums:
-    """Adds rows up."""
+class Walk(ABC):
+    """Visits all rows, linearised at a model's solution, cluster by cluster.
 
-    graph: Graph
-    values: Values
-    meetings: Mapping[int, Meeting]
-    at: dict[str, slice] = field(default_factory=dict)
-    stops: dict[object, int] = field(default_factory=dict)
-    places: dict[object, int] = field(default_factory=dict)
-    known_to: dict[str, set[int]] = field(default_factory=dict)
-    gradients: list[csr_array] = field(default_factory=list)
-    clusters: list[np.ndarray] = field(default_factory=list)
-    weight_m2: float = 0.0
+    Args:
+        wide, estimate, candidates: as of `linearise`.
+    """
 
-    def __post_init__(self) -> None:
-        start = 0
-        for name, variable in self.graph.variables.items():
-            self.at[name] = slice(start, start + variable.dim)
-            start += variable.dim
-        self.information = np.zeros((start, start))
+    def __init__(self, wide: Problem, estimate: Estimate, candidates: Sequence[str]) -> None:
+        variables = list((wide.variables | estimate.graph.variables).values())
+        self.wide, self.estimate, self.candidates = wide, estimate, tuple(candidates)
+        self.values = {n: wide.variables[n].mean for n in candidates} | estimate.values
+        self.graph = Graph(variables, wide.blocks, frozenset(candidates))
+        ends = np.cumsum([0, *(v.dim for v in variables)]).tolist()
+        self.unknowns = ends[-1]
+        self.at = {v.name: slice(i, k) for v, i, k in zip(variables, ends, ends[1:], strict=False)}
+        self._stops: dict[object, int] = {}
+        self._places: dict[object, int] = {}
+        self._known_to: dict[str, set[int]] = {}
 
-    def total(self, candidates: Sequence[str]) -> Linear:
-        """What was added up."""
-        stop, place = np.concatenate(self.clusters, axis=1)
-        gradient = csr_array(vstack(self.gradients))
-        return Linear(
-            tuple(candidates), self.at, self.information, gradient, stop, place, self.weight_m2
-        )
+    @abstractmethod
+    def beams(self, beams: LocalRows) -> None:
+        """Take in a stop's beams."""
 
-    def add_scan(self, scan: ScanStop, rows: Rows, room: str) -> None:
-        """A stop's beams; their clusters are the places in the room that they meet."""
+    @abstractmethod
+    def others(
+        self, A: np.ndarray, b: np.ndarray, columns: np.ndarray, stop: np.ndarray, place: np.ndarray
+    ) -> None:
+        """Take in whitened rows (m, n) over some columns, with the stop and place of each."""
+
+    def walk(self, progress: Progress, what: str) -> Self:
+        """Visit beams, then trackers and targets, then priors."""
+        scans = self.wide.scans
+        for i, scan in enumerate(scans):
+            progress(what, i, len(scans))
+            terms = self.estimate.scans[i].terms
+            surfaces = [t for t in terms if t.variable not in self.wide.variables]
+            room = next((t.variable.partition("/")[0] for t in surfaces), None)
+            whole = replace(scan, terms=[*scan.terms, *surfaces])
+            rows = whole.rows(self.values, self.estimate.associations[i])
+            self.beams(self._local(whole, rows, room or str(scan.recording.folder)))
+        priors = []
+        for block, by, b in self.graph.linear_rows(self.values):
+            if block is None:
+                priors.append((*by.items(), b))
+            else:
+                self._block(block, by, b)
+        for (name, A), b in priors:
+            scale = 1.0 / WIDENED if name in self.wide.calibration else 1.0
+            self.others(scale * A, scale * b, self._columns(name), *self._prior_clusters(name))
+        return self
+
+    def _local(self, scan: ScanStop, rows: Rows, room: str) -> LocalRows:
         parts, groups = unknown_columns(rows)
-        weight = rows.weight / np.square(rows.sigma_m)
-        dense = np.hstack([rows.by_twist, *rows.dense.values()])
-        kind = next(name for name in PLACES if name in rows.view.columns)
-        found, cluster = np.unique(rows.view[kind], return_inverse=True)
-        gradient = _by_cluster(dense, groups, -weight * rows.residual_m, cluster, len(found))
-        # The twist is the doing of all that places the lidar; other columns are unknowns as such.
         placed = scan.stops.in_reference(scan.stops.rig.lidar_frame, self.values)
-        chain = np.hstack([d[0] for d in placed.d.values()])
         columns = [*map(self._columns, placed.d)]
         columns += [self._columns(p.variable)[p.components] for p in parts]
-        columns = np.concatenate(columns)
-        local = gram(dense, groups, weight)
-        self.information[np.ix_(columns, columns)] += _chained(_chained(local, chain).T, chain)
-        places = [self._number(self.places, (room, p)) for p in found.tolist()]
-        stop = self._number(self.stops, (scan.recording.folder, scan.index))
-        stops = np.full(len(found), stop)
-        self._add(_chained(gradient, chain), columns, stops, np.array(places))
+        kind = next(name for name in PLACES if name in rows.view.columns)
+        found, cluster = np.unique(rows.view[kind], return_inverse=True)
+        stop = _number(self._stops, (scan.recording.folder, scan.index))
         for name in scan.stops.variables:
-            self.known_to.setdefault(name, set()).add(stop)
-        self.weight_m2 += float(weight.sum())
+            self._known_to.setdefault(name, set()).add(stop)
+        return LocalRows(
+            np.hstack([rows.by_twist, *rows.dense.values()]),
+            groups,
+            rows.weight / np.square(rows.sigma_m),
+            -rows.residual_m,
+            np.hstack([d[0] for d in placed.d.values()]),
+            np.concatenate(columns),
+            cluster,
+            stop,
+            np.array([_number(self._places, (room, p)) for p in found.tolist()]),
+        )
 
-    def add_block(self, block: Block, by: dict[str, np.ndarray], b: np.ndarray) -> None:
-        """Rows of trackers and targets: whitened derivatives, and what is left."""
-        columns = np.concatenate([self._columns(name) for name in by])
-        A = np.hstack(list(by.values()))
-        self.information[np.ix_(columns, columns)] += A.T @ A
+    def _block(self, block: Block, by: Mapping[str, np.ndarray], b: np.ndarray) -> None:
+        """Rows of a tracked body, which err with their stops, or of a target."""
+        stop = place = np.full(len(b), -1)
         if isinstance(block, TrackedBody):
-            count = len(block.stop_names)
-            stop = np.array([self._number(self.stops, name) for name in block.stop_names])
-            each = A.reshape(count, -1, len(columns)), b.reshape(count, -1)
-            self._add(np.einsum("kri,kr->ki", *each), columns, stop, np.full(count, -1))
-            for name in by:
-                self.known_to.setdefault(name, set()).update(stop.tolist())
+            numbers = [_number(self._stops, name) for name in block.stop_names]
+            stop = np.repeat(numbers, len(b) // len(numbers))
         else:
-            place = np.array([self._number(self.places, block.name)])
-            self._add((A.T @ b)[None], columns, np.array([-1]), place)
-            for name in by:
-                self.known_to.setdefault(name, set()).add(-1)
+            place = np.full(len(b), _number(self._places, block.name))
+        for name in by:
+            self._known_to.setdefault(name, set()).update(np.unique(stop).tolist())
+        columns = np.concatenate([self._columns(name) for name in by])
+        self.others(np.hstack(list(by.values())), b, columns, stop, place)
 
-    def add_prior(self, name: str, A: np.ndarray, b: np.ndarray) -> None:
-        """A prior: it belongs to the one stop, or to the surface, whose error it bounds."""
-        columns = self._columns(name)
-        self.information[np.ix_(columns, columns)] += A.T @ A
-        known = self.known_to.get(name, set())
+    def _prior_clusters(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """Stop and place of a prior's rows: of the one stop, or the surface, whose error it
+        bounds; any other row stands alone."""
+        known = self._known_to.get(name, set())
         room, _, kind = name.partition("/reference_")
         dofs = self.graph.variables[name].dofs
-        nowhere = np.full(len(b), -1)
-        if len(known) == 1:
-            self._add(A * b[:, None], columns, np.full(len(b), *known), nowhere)
-            return
+        nowhere = np.full(len(dofs), -1)
+        if len(known) == 1 and -1 not in known:
+            return np.full(len(dofs), *known), nowhere
         if kind:
             parts = np.array([int(dof.rpartition("_")[2]) for dof in dofs])
-            keys = [(room, s) for s in self.meetings[int(room)].surface_of(kind, parts).tolist()]
-        else:
-            keys = [(name, dof) for dof in dofs]
-        place = np.array([self._number(self.places, key) for key in keys])
-        self._add(A * b[:, None], columns, nowhere, place)
+            surfaces = self.wide.meetings[int(room)].surface_of(kind, parts).tolist()
+            return nowhere, np.array([_number(self._places, (room, s)) for s in surfaces])
+        return nowhere, np.array([_number(self._places, (name, dof)) for dof in dofs])
+
+    def _columns(self, variable: str) -> np.ndarray:
+        return np.arange(self.at[variable].start, self.at[variable].stop)
+
+
+@dataclass(frozen=True)
+class LocalRows:
+    """The beams of one stop over [twist | dense | sparse] columns.
+
+    Args:
+        dense: (N, 6 + d) derivatives by the lidar's twist and by unknowns.
+        groups: columns of which each row touches one.
+        weight: (N,) robust weight over variance, 1/m2.
+        b: (N,) minus the residual, m.
+        chain: (6, n) derivative of the twist by what places the lidar.
+        columns: (n + d + sparse,) which unknowns those are, and the other columns.
+        cluster: (N,) which of the places a row meets.
+        stop: number of the stop.
+        places: (G,) numbers of the places.
+    """
+
+    dense: np.ndarray
+    groups: Sequence[Group]
+    weight: np.ndarray
+    b: np.ndarray
+    chain: np.ndarray
+    columns: np.ndarray
+    cluster: np.ndarray
+    stop: int
+    places: np.ndarray
+
+    def chained(self, rows: np.ndarray) -> np.ndarray:
+        """Rows over [twist | others] as rows over `columns`."""
+        return np.hstack([rows[:, :6] @ self.chain, rows[:, 6:]])
+
+    def along(self, directions: np.ndarray) -> np.ndarray:
+        """The rows (N, q) along directions (U, q) in all unknowns."""
+        mine = directions[self.columns]
+        twist, rest = self.chain @ mine[: self.chain.shape[1]], mine[self.chain.shape[1] :]
+        dense = self.dense.shape[1] - 6
+        out = self.dense @ np.vstack([twist, rest[:dense]])
+        start = dense
+        for g in self.groups:
+            theirs = rest[start : start + g.size]
+            value = np.where(g.index >= 0, g.value, 0.0)
+            out += value[:, None] * theirs[np.maximum(g.index, 0)]
+            start += g.size
+        return out
+
+
+class Sums(Walk):
+    """Adds rows up to normal equations."""
+
+    def __init__(self, wide: Problem, estimate: Estimate, candidates: Sequence[str]) -> None:
+        super().__init__(wide, estimate, candidates)
+        self._information = np.zeros((self.unknowns, self.unknowns))
+        self._gradients: list[csr_array] = []
+        self._clusters: list[np.ndarray] = []
+        self._weight_m2 = 0.0
+
+    def total(self) -> Linear:
+        """What was added up."""
+        stop, place = np.concatenate(self._clusters, axis=1)
+        gradient = csr_array(vstack(self._gradients))
+        return Linear(
+            self.candidates, self.at, self._information, gradient, stop, place, self._weight_m2
+        )
+
+    def beams(self, beams: LocalRows) -> None:
+        local = beams.chained(gram(beams.dense, list(beams.groups), beams.weight))
+        self._information[np.ix_(beams.columns, beams.columns)] += beams.chained(local.T)
+        gradient = beams.chained(_by_cluster(beams))
+        self._add(gradient, beams.columns, np.full(len(gradient), beams.stop), beams.places)
+        self._weight_m2 += float(beams.weight.sum())
+
+    def others(
+        self, A: np.ndarray, b: np.ndarray, columns: np.ndarray, stop: np.ndarray, place: np.ndarray
+    ) -> None:
+        self._information[np.ix_(columns, columns)] += A.T @ A
+        (stop, place), cell = np.unique([stop, place], axis=1, return_inverse=True)
+        pick = csr_array((b, cell, np.arange(len(b) + 1)), shape=(len(b), len(stop)))
+        self._add(pick.T @ A, columns, stop, place)
 
     def _add(
         self, gradient: np.ndarray, columns: np.ndarray, stop: np.ndarray, place: np.ndarray
@@ -182,32 +255,24 @@ class _Sums:
         found = csr_array(gradient)
         found = csr_array(
             (found.data, columns[found.indices], found.indptr),
-            shape=(len(stop), len(self.information)),
+            shape=(len(stop), self.unknowns),
         )
-        self.gradients.append(found)
-        self.clusters.append(np.stack([stop, place]))
-
-    def _columns(self, variable: str) -> np.ndarray:
-        return np.arange(self.at[variable].start, self.at[variable].stop)
-
-    def _number(self, among: dict[object, int], key: object) -> int:
-        return among.setdefault(key, len(among))
+        self._gradients.append(found)
+        self._clusters.append(np.stack([stop, place]))
 
 
-def _chained(rows: np.ndarray, chain: np.ndarray) -> np.ndarray:
-    """Rows over [twist | others] as rows over [what the twist depends on | others]."""
-    return np.hstack([rows[:, :6] @ chain, rows[:, 6:]])
+def _number(among: dict[object, int], key: object) -> int:
+    return among.setdefault(key, len(among))
 
 
-def _by_cluster(
-    dense: np.ndarray, groups: Sequence[Group], b: np.ndarray, cluster: np.ndarray, count: int
-) -> np.ndarray:
-    """``[dense | groups]^T b`` of each cluster of rows, (count, columns)."""
-    rows = len(b)
-    pick = csr_array((b, cluster, np.arange(rows + 1)), shape=(rows, count))
-    out = [pick.T @ dense]
-    for g in groups:
-        flat = np.where(g.index >= 0, cluster * g.size + g.index, 0)
+def _by_cluster(beams: LocalRows) -> np.ndarray:
+    """``[dense | groups]^T W b`` of each cluster of rows, (G, columns)."""
+    rows, count = len(beams.b), len(beams.places)
+    b = beams.weight * beams.b
+    pick = csr_array((b, beams.cluster, np.arange(rows + 1)), shape=(rows, count))
+    out = [pick.T @ beams.dense]
+    for g in beams.groups:
+        flat = np.where(g.index >= 0, beams.cluster * g.size + g.index, 0)
         value = np.where(g.index >= 0, g.value * b, 0.0)
         out.append(np.bincount(flat, value, count * g.size).reshape(count, g.size))
     return np.hstack(out)

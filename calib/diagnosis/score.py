@@ -14,7 +14,7 @@ candidates have in common, as Smyth (2004) does for variances.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -60,6 +60,22 @@ class Scores:
         return np.random.default_rng(seed).standard_normal((DRAWS, len(shares))) @ shares
 
 
+def away_from_model(linear: Linear, names: Sequence[str]) -> np.ndarray:
+    """Directions (U, Q) of variables, be they candidates or of the model itself, with all that the
+    model can take on of them taken off; other candidates play no part."""
+    theirs = np.concatenate([np.r_[linear.at[name]] for name in names])
+    apart = [np.r_[linear.at[name]] for name in {*linear.candidates, *names}]
+    model = np.setdiff1d(np.arange(len(linear.information)), np.concatenate(apart))
+    scale = np.sqrt(np.maximum(np.diag(linear.information), 1e-300))
+    root = linear.information[np.ix_(model, model)] / np.outer(scale[model], scale[model])
+    cross = linear.information[np.ix_(model, theirs)] / scale[model, None]
+    away = np.zeros((len(linear.information), len(theirs)))
+    away[theirs] = np.eye(len(theirs))
+    away[model] = -cho_solve(cho_factor(root + 1e-13 * np.eye(len(model))), cross)
+    away[model] /= scale[model, None]
+    return away
+
+
 def project(linear: Linear, names: Sequence[str]) -> Scores:
     """Project variables off the model, be they candidates or of the model itself."""
     at, start = {}, 0
@@ -67,18 +83,8 @@ def project(linear: Linear, names: Sequence[str]) -> Scores:
         size = linear.at[name].stop - linear.at[name].start
         at[name], start = slice(start, start + size), start + size
     theirs = np.concatenate([np.r_[linear.at[name]] for name in names])
-    away = [np.r_[linear.at[name]] for name in {*linear.candidates, *names}]
-    model = np.setdiff1d(np.arange(len(linear.information)), np.concatenate(away))
-    scale = np.sqrt(np.maximum(np.diag(linear.information), 1e-300))
-    whole = linear.information / np.outer(scale, scale)
-    cross = whole[np.ix_(model, theirs)]
-    root = cho_factor(whole[np.ix_(model, model)] + 1e-13 * np.eye(len(model)))
-    absorbed = cho_solve(root, cross)
-    size = scale[theirs]
-    left = (whole[np.ix_(theirs, theirs)] - cross.T @ absorbed) * np.outer(size, size)
-    away = np.zeros((len(whole), len(theirs)))
-    away[theirs] = np.eye(len(theirs))
-    away[model] = -absorbed * size / scale[model, None]
+    away = away_from_model(linear, names)
+    left = linear.information[theirs] @ away
     cells = linear.gradient @ away
     both = cells[(linear.stop >= 0) & (linear.place >= 0)]
     return Scores(
@@ -91,12 +97,6 @@ def project(linear: Linear, names: Sequence[str]) -> Scores:
         both.T @ both,
         linear.weight_m2,
     )
-
-
-def as_if_missing(scores: Scores, theta: np.ndarray) -> Scores:
-    """Scores of what a model has, at values (Q,), as they would be without it; the clusters' shares
-    in them stay those of residuals that no longer hold it, as in Wald's test."""
-    return replace(scores, score=scores.score + scores.information @ theta)
 
 
 def _sums(cells: np.ndarray, index: np.ndarray) -> np.ndarray:

@@ -1,8 +1,7 @@
-"""From one look to a named effect: the best explanation is fitted, then judged, then looked past.
+"""From one look to a named effect: the best explanation is judged, then fitted, then looked past.
 
-A signal that is missing from the model also widens the clusters that judge it. So the leading
-candidate is fitted truly, and its test is read from residuals that no longer hold it. What is then
-left is looked at again: an effect that nobody has named dresses up as several that somebody has.
+What is left once it is fitted is looked at again: an effect that nobody has named dresses up as
+several that somebody has.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from calib.fit import Progress
 ALPHA = 0.04  # chance that a named effect is found where nothing is missing
 ALPHA_UNNAMED = 0.01  # and that structure is
 MOST = 3  # an explanation that needs more names than this is none
-TRIES = 2  # how many suspects are fitted before a look is called quiet
+TRIES = 3  # how many suspects are judged before a look is called quiet
 FINER = 9  # shapes tried between the two beside the best one
 ODDS = np.log(20.0)  # of a rival: within these it can stand in for the best
 
@@ -33,7 +32,7 @@ class Found:
     Args:
         candidate: as it stood out before, in its best shape.
         before, after: the looks before it was fitted and after.
-        p_adjusted: of its own test once fitted, all that was looked at paid for.
+        p_adjusted: as judged.
         rivals: candidates that explain as much, and what to tell them apart by.
     """
 
@@ -92,33 +91,31 @@ def search(stand: Stand, progress: Progress, most: int = MOST) -> Search:
 
 
 def _named(look: Look, progress: Progress) -> Found | None:
-    """The best candidate that is confirmed once fitted."""
+    """The best candidate that is confirmed, fitted."""
     for candidate in suspects(look.named, ALPHA):
-        effect = look.stand.finest(candidate.effect, progress)
-        after = look.stand.with_effects([effect], progress).look(progress)
-        p = _judged(after, effect, candidate)
+        p = judged(look, candidate, progress)
         if p < ALPHA:
-            best = Candidate(
-                effect,
-                candidate.test,
-                candidate.p_value,
-                candidate.p_adjusted,
-                candidate.evidence,
-                candidate.looks,
-            )
-            return Found(best, look, after, p, rivals(look.named, candidate, after.named.common))
+            effect = look.stand.finest(candidate.effect, progress)
+            after = look.stand.with_effects([effect], progress).look(progress)
+            others = rivals(look.named, candidate, after.named.common)
+            return Found(replace(candidate, effect=effect), look, after, p, others)
     return None
 
 
 def _unnamed(look: Look, progress: Progress) -> list[Candidate]:
-    """Structure that remains, if the strongest of it is confirmed once fitted."""
-    wanted = list(suspects(look.unnamed, ALPHA_UNNAMED))
-    for candidate in wanted:
-        fitted = look.stand.with_effects([candidate.effect], progress)
-        after = fitted.look(progress)
-        if _judged(after, candidate.effect, candidate) < ALPHA_UNNAMED:
+    """Structure that remains, if the strongest of it is confirmed."""
+    for candidate in suspects(look.unnamed, ALPHA_UNNAMED):
+        if judged(look, candidate, progress) < ALPHA_UNNAMED:
             return [c for c in look.unnamed.candidates if _stands_out(c, ALPHA_UNNAMED)]
     return []
+
+
+def judged(look: Look, candidate: Candidate, progress: Progress) -> float:
+    """The p-value of a candidate with its clusters jackknifed, all that was looked at paid for."""
+    found = look.judged(candidate, progress)
+    # What candidates have in common may be another effect's signal; it need not be this one's.
+    p = found.p_value(min(look.named.common, max(found.inflation, 1.0)))
+    return float(-np.expm1(candidate.looks * np.log1p(-min(p, 1 - 1e-15))))
 
 
 def suspects(screen: Screen, alpha: float) -> Iterator[Candidate]:
@@ -130,11 +127,6 @@ def suspects(screen: Screen, alpha: float) -> Iterator[Candidate]:
 def _stands_out(candidate: Candidate, alpha: float) -> bool:
     alone = -log_tail(candidate.test.statistic, candidate.test.dof)
     return candidate.p_adjusted < alpha or alone > np.log(candidate.looks / alpha)
-
-
-def _judged(after: Look, effect: Effect, candidate: Candidate) -> float:
-    p = after.judged(effect.name).p_value(after.named.common)
-    return float(-np.expm1(candidate.looks * np.log1p(-min(p, 1 - 1e-15))))
 
 
 def rivals(screen: Screen, best: Candidate, common: float) -> list[Candidate]:

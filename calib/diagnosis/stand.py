@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 
 import numpy as np
@@ -17,9 +17,10 @@ from calib.diagnosis.candidates import (
     stops_view,
     structure,
 )
+from calib.diagnosis.jackknife import Shares
 from calib.diagnosis.linear import Linear, linearise
-from calib.diagnosis.score import Test, as_if_missing, project, test
-from calib.diagnosis.screen import Screen, screen
+from calib.diagnosis.score import Test, away_from_model, project, test
+from calib.diagnosis.screen import Candidate, Screen, screen
 from calib.effects import Effect
 from calib.fit import Estimate, Progress, resume, solve
 from calib.model import Model, Source
@@ -178,13 +179,17 @@ class Look:
     unnamed: Screen
     columns: frozenset[str]
 
-    def judged(self, effect: str) -> Test:
-        """The test of an effect that the model has: what it does explain, with its own signal out
-        of the residual that judges it."""
-        names = _variables(self.stand.problem, {effect})[effect]
-        scores = project(self.linear, names)
-        values = np.concatenate([self.stand.estimate.values[n] for n in names])
-        return test(as_if_missing(scores, values), np.arange(len(values)))
+    def judged(self, candidate: Candidate, progress: Progress) -> Test:
+        """A candidate's test with its clusters jackknifed: see `jackknife`."""
+        stand, found = self.stand, candidate.test
+        model = stand.model.plus((candidate.effect,))
+        wide = problems.build(stand.sources, model, meetings=stand.problem.meetings)
+        names = _variables(wide, {candidate.effect.name})[candidate.effect.name]
+        away = away_from_model(self.linear, names) @ found.whiten
+        by_variable = {name: away[at] for name, at in self.linear.at.items()}
+        shares = Shares(wide, stand.estimate, names, by_variable)
+        covariance = shares.walk(progress, "judging what stands out").covariance()
+        return replace(found, covariance=covariance)
 
 
 def _renamed(name: str, swapped: dict[str, Effect]) -> str:

@@ -1,0 +1,93 @@
+"""One candidate judged by leaving out cluster after cluster.
+
+A signal that the model lacks widens the clusters that judge it; and one odd cluster can make a
+candidate that acts in few of them look sure of itself. Both are cured by asking what each cluster
+says beyond what the candidate explains of it, divided by what the others leave it to say: the
+cluster jackknife (MacKinnon, Nielsen and Webb 2022, CV3), by stops and by surfaces. It needs each
+cluster's own share of the information, so it is one more pass, for one candidate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from calib.diagnosis.linear import LocalRows, Walk
+from calib.fit import Estimate
+from calib.problem import Problem
+
+WHOLE = 0.999  # of a direction's information: a cluster that has more of it is alone with it
+
+
+class Shares(Walk):
+    """Each cluster's share of a candidate's score and of its information.
+
+    Args:
+        wide, estimate, candidates: as of `linear.linearise`.
+        away: variable -> (dim, r) of the candidate's directions, projected off the model and
+            whitened, in that variable.
+    """
+
+    def __init__(
+        self,
+        wide: Problem,
+        estimate: Estimate,
+        candidates: Sequence[str],
+        away: dict[str, np.ndarray],
+    ) -> None:
+        super().__init__(wide, estimate, candidates)
+        self.away = np.concatenate([away[name] for name in self.at])
+        self._cells: dict[tuple[int, int], list[np.ndarray]] = {}
+
+    def beams(self, beams: LocalRows) -> None:
+        along = beams.along(self.away) * np.sqrt(beams.weight)[:, None]
+        b = np.sqrt(beams.weight) * beams.b
+        stop = np.full(len(b), beams.stop)
+        self._add(along, b, stop, beams.places[beams.cluster])
+
+    def others(
+        self, A: np.ndarray, b: np.ndarray, columns: np.ndarray, stop: np.ndarray, place: np.ndarray
+    ) -> None:
+        self._add(A @ self.away[columns], b, stop, place)
+
+    def _add(self, rows: np.ndarray, b: np.ndarray, stop: np.ndarray, place: np.ndarray) -> None:
+        pairs, cell = np.unique([stop, place], axis=1, return_inverse=True)
+        order = np.argsort(cell, kind="stable")
+        bounds = np.searchsorted(cell[order], np.arange(pairs.shape[1] + 1))
+        for pair, i, k in zip(pairs.T.tolist(), bounds, bounds[1:], strict=False):
+            mine, right = rows[order[i:k]], b[order[i:k]]
+            self._sum(self._cells, tuple(pair), mine.T @ right, mine.T @ mine)
+
+    @staticmethod
+    def _sum(to: dict, key: object, score: np.ndarray, information: np.ndarray) -> None:
+        if key in to:
+            to[key][0] += score
+            to[key][1] += information
+        else:
+            to[key] = [score.copy(), information.copy()]
+
+    def covariance(self) -> np.ndarray:
+        """Covariance (r, r) of the whitened score: by stops, plus by places, less by both."""
+        total = sum(score for score, _ in self._cells.values())
+        ways = {"stop": {}, "place": {}, "both": {}}
+        for (stop, place), (score, information) in self._cells.items():
+            if stop >= 0:
+                self._sum(ways["stop"], stop, score, information)
+            if place >= 0:
+                self._sum(ways["place"], place, score, information)
+            if stop >= 0 and place >= 0:
+                self._sum(ways["both"], (stop, place), score, information)
+        stop, place, both = (_spread(cells.values(), total) for cells in ways.values())
+        return max(stop + place - both, stop, place, key=np.trace)
+
+
+def _spread(cells: Sequence[list[np.ndarray]], total: np.ndarray) -> np.ndarray:
+    """Sum of squares of what each cluster says beyond its due."""
+    out = np.zeros((len(total), len(total)))
+    for score, information in cells:
+        values, axes = np.linalg.eigh(information)
+        left = 1.0 - np.clip(values, 0.0, WHOLE)
+        beyond = axes @ ((axes.T @ (score - information @ total)) / left)
+        out += np.outer(beyond, beyond)
+    return out
