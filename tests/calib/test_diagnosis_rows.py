@@ -1,0 +1,135 @@
+"""The rows behind a diagnosis: the linearised normal equations, and what clusters share of them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib import effects
+from calib import problem as problems
+from calib.diagnosis.jackknife import Shares
+from calib.diagnosis.linear import PLACES
+from calib.diagnosis.score import project
+from calib.diagnosis.score import test as score_test
+from calib.diagnosis.stand import Stand
+from calib.fit import solve
+from calib.model import Model
+from calib.simulate import Spec
+
+from .simulated import made
+
+SMALL = Spec(lidar="hesai_pandarxt32", locations=4, stops_per_location=3, column_step=100)
+ADDED = ("incidence_angle_bias", "ring_elevation_offset", "arm_gravity_sag", "optitrack_scale")
+
+
+def quiet(what, done, total):
+    pass
+
+
+@pytest.fixture(scope="module")
+def stand(tmp_path_factory):
+    source, _ = made(tmp_path_factory.mktemp("rows") / "rec", SMALL, 4, incidence_angle_bias=0.4)
+    problem = problems.build([source], Model())
+    return Stand([source], Model(), problem, solve(problem))
+
+
+@pytest.fixture(scope="module")
+def looked(stand):
+    return stand.look(quiet)
+
+
+@pytest.fixture(scope="module")
+def linear(stand):
+    return stand.linearise([effects.find(name) for name in ADDED], quiet)[0]
+
+
+def test_the_fit_is_where_its_own_gradient_vanishes(linear):
+    total = np.asarray(linear.gradient.sum(axis=0)).ravel()
+    scale = np.sqrt(np.diag(linear.information))
+    for name, at in linear.at.items():
+        # In sigmas of independent rows; priors from paper are left out here, all others are in.
+        if name.startswith(("root@", "joints@", "0/reference")):
+            assert np.abs(total[at] / scale[at]).max() < 0.05, name
+
+
+def test_what_an_effect_would_explain_is_what_a_refit_finds(stand, linear):
+    found = project(linear, linear.candidates)
+    name = "incidence_angle_bias"
+    one = score_test(found, np.r_[found.at[name]])
+    refit = stand.with_effects([effects.find(name)], quiet)
+    fitted = refit.estimate.values[name]
+    assert one.estimate()[0] == pytest.approx(fitted[0], rel=0.1)
+    assert abs(one.estimate()[0]) == pytest.approx(0.4 * 0.003, rel=0.3)
+
+
+def test_gradients_are_derivatives_of_the_cost(stand, linear):
+    """By finite differences of the whitened rows of one stop, weights held."""
+    scan, association = stand.estimate.scans[0], stand.estimate.associations[0]
+    effect = effects.find("incidence_angle_bias")
+    term = problems.build(stand.sources, stand.model.plus((effect,))).terms[0][-1]
+    wide = replace(scan, terms=[*scan.terms, term])
+
+    def rows(size):
+        return wide.rows({**stand.estimate.values, term.variable: np.array([size])}, association)
+
+    at, step = rows(0.0), 1e-5
+    change = (rows(step).residual_m - rows(-step).residual_m) / (2 * step)
+    weight = at.weight / np.square(at.sigma_m)
+    expected = -np.sum(weight * change * at.residual_m)
+    column = linear.at[term.variable].start
+    cells = (linear.stop == 0) & (linear.place >= 0)
+    found = linear.gradient[cells][:, [column]].sum()
+    assert found == pytest.approx(expected, rel=1e-5)
+
+
+def test_beams_cluster_by_surface_and_trackers_by_stop(stand, linear):
+    assert PLACES[0] == "surface"
+    assert set(range(12)) <= set(linear.stop[linear.place >= 0].tolist())
+    alone = (linear.stop >= 0) & (linear.place < 0)
+    assert set(linear.stop[alone].tolist()) == set(range(12))
+
+
+@pytest.mark.parametrize("name", ["incidence_angle_bias", "arm_gravity_sag"])
+def test_shares_of_clusters_add_up_to_the_whole(looked, name):
+    candidate = next(c for c in looked.named.candidates if c.effect.name == name)
+    shares = shares_of(looked, candidate)
+    total = sum(information for _, information in shares._cells.values())
+    np.testing.assert_allclose(total, np.eye(candidate.test.dof), atol=1e-5)
+    score = sum(score for score, _ in shares._cells.values())
+    assert np.sum(np.square(score)) == pytest.approx(candidate.test.statistic, rel=1e-4)
+
+
+def shares_of(look, candidate):
+    from calib.diagnosis.score import away_from_model
+
+    stand = look.stand
+    wide = problems.build(stand.sources, stand.model.plus((candidate.effect,)))
+    names = [candidate.effect.name]
+    away = away_from_model(look.linear, names) @ candidate.test.whiten
+    by_variable = {name: away[at] for name, at in look.linear.at.items()}
+    return Shares(wide, stand.estimate, names, by_variable).walk(quiet, "")
+
+
+def test_a_signal_no_longer_widens_the_clusters_that_judge_it(looked):
+    best = looked.named.candidates[0]
+    assert best.effect.name == "incidence_angle_bias"
+    judged = looked.judged(best, quiet)
+    assert judged.statistic == best.test.statistic
+    assert judged.inflation < 3.0 < best.test.inflation
+
+
+def test_what_one_cluster_alone_says_is_not_believed():
+    shares = Shares.__new__(Shares)
+    one = np.ones((1, 1))
+    # Twenty stops with a little each, and one that has nearly all of the information and signal.
+    cells = {(k, -1): [np.array([0.1 * (-1) ** k]), 0.002 * one] for k in range(20)}
+    cells[20, -1] = [np.array([6.0]), 0.96 * one]
+    shares._cells = cells
+    assert shares.covariance()[0, 0] > 10.0
+    # The same signal, spread evenly over all of them, is believed.
+    shares._cells = {(k, -1): [np.array([6.0 / 21]), one / 21] for k in range(21)}
+    assert shares.covariance()[0, 0] < 1e-12
+
+
+def test_a_gauge_is_named_not_observable(looked):
+    assert "range_offset" in {g.name for g in looked.named.gauges}
