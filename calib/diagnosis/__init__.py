@@ -48,6 +48,6 @@ def diagnose(
             )
             falls[step.effect.name] = (before, unseen.rms_mm, unseen.floor_mm)
             before = unseen.rms_mm
-    result = conclude(found, falls, run.summary["misfit"], weak_directions(run, stand))
+    result = conclude(found, falls, run.summary["misfit"], weak_directions(run, found.looks[0]))
     write_json(run.folder / DIAGNOSIS, result.document())
     return result

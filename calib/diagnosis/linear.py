@@ -40,7 +40,8 @@ class Linear:
         gradient: (C, U) sparse, of each cluster; their sum is the whole gradient.
         stop: (C,) which stop the rows of a cluster belong to, -1 for none.
         place: (C,) which part of the room they look at, -1 for none.
-        weight_m2: sum of the beams' weights over their variances [1/m2].
+        weight_m2: sum of the beams' weights over their variances [1/m2]; without beams that of the
+            tracked positions.
     """
 
     candidates: tuple[str, ...]
@@ -84,6 +85,7 @@ class Walk(ABC):
         self._stops: dict[object, int] = {}
         self._places: dict[object, int] = {}
         self._known_to: dict[str, set[int]] = {}
+        self._tracked_m2 = 0.0
 
     @abstractmethod
     def beams(self, beams: LocalRows) -> None:
@@ -145,6 +147,7 @@ class Walk(ABC):
         if isinstance(block, TrackedBody):
             numbers = [_number(self._stops, name) for name in block.stop_names]
             stop = np.repeat(numbers, len(b) // len(numbers))
+            self._tracked_m2 += len(numbers) / block.sigma_m**2
         else:
             place = np.full(len(b), _number(self._places, block.name))
         for name in by:
@@ -230,9 +233,8 @@ class Sums(Walk):
         """What was added up."""
         stop, place = np.concatenate(self._clusters, axis=1)
         gradient = csr_array(vstack(self._gradients))
-        return Linear(
-            self.candidates, self.at, self._information, gradient, stop, place, self._weight_m2
-        )
+        weight_m2 = self._weight_m2 or self._tracked_m2
+        return Linear(self.candidates, self.at, self._information, gradient, stop, place, weight_m2)
 
     def beams(self, beams: LocalRows) -> None:
         local = beams.chained(gram(beams.dense, list(beams.groups), beams.weight))

@@ -230,6 +230,7 @@ def _sentences(
     untestable: Mapping[str, str],
 ) -> list[str]:
     look = found.looks[0]
+    residual = _residual(look)
     out = []
     if verdict == "adequate":
         out.append(
@@ -242,7 +243,7 @@ def _sentences(
         out.insert(0, "Something is here that no known effect explains.")
     for each in unexplained[:2]:
         what = " and ".join(words(c) for c in each["covariates"])
-        out.append(f"What is left hangs on {what}: {each['rms_mm']:.2f} mm of range residual.")
+        out.append(f"What is left hangs on {what}: {each['rms_mm']:.2f} mm rms of {residual}.")
         if each["formula"]:
             out.append(
                 f"An empirical effect for it, '{each['formula']['name']}', stands in diagnosis.json"
@@ -259,8 +260,10 @@ def _step_sentences(step: Found, candidate: Mapping[str, Any]) -> list[str]:
     before, after = (candidate["held_out_rms_mm"][k] for k in ("before", "after"))
     fall = f"; the held-out error goes from {before:.2f} to {after:.2f} mm" if after else ""
     out = [
-        f"{step.effect.name} is missing: it bends the ranges by {candidate['rms_mm']:.2f} mm rms "
-        f"(p = {max(step.p_adjusted, 1e-99):.1g} after all that was looked at){fall}."
+        f"{step.effect.name} is missing: it bends {_residual(step.before)} by "
+        f"{candidate['rms_mm']:.2f} mm rms, {candidate['unabsorbed_rms_mm']:.2f} mm of which the "
+        f"model cannot take on (p = {max(step.p_adjusted, 1e-99):.1g} after all that was looked "
+        f"at){fall}."
     ]
     for rival in candidate["rivals"][:TOLD]:
         out.append(
@@ -268,3 +271,7 @@ def _step_sentences(step: Found, candidate: Mapping[str, Any]) -> list[str]:
             f"{rival['separate']} would."
         )
     return out
+
+
+def _residual(look: Look) -> str:
+    return "the ranges" if look.stand.estimate.scans else "the tracked poses"

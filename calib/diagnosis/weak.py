@@ -1,57 +1,116 @@
-"""What the data hardly determine: directions in which a fit still leans on paper."""
+"""What data hardly determine: where a fit leans on paper, where one name may be another's."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from scipy.linalg import cho_factor, cho_solve
 
-from calib.diagnosis.stand import Stand
+from calib.diagnosis.candidates import JointShape
+from calib.diagnosis.stand import Look
+from calib.diagnosis.suggest import what_separates
+from calib.effects import Effect
 from calib.run import Run
 
 LEANS = 0.5  # of the prior's variance left in a direction that the data hardly determine
 SHARE = 0.35  # of a direction, for a parameter to be named
+STANDS_IN = 0.97  # of what a candidate does, that an effect of the model can take on
 MOST = 8
 
 
-def weak_directions(run: Run, stand: Stand) -> list[dict[str, Any]]:
-    """The weakest directions of a run's solution, in units of what was known before.
+def weak_directions(run: Run, look: Look) -> list[dict[str, Any]]:
+    """Directions in which a solution leans on paper, then effects that may stand for others.
 
     Returns:
-        Per direction its `parameters`, `sigma_mm` (of a length, or of an angle one metre out), the
-        `share` of the prior's variance that is left, and what it `needs`.
+        For each its `parameters`, `sigma_mm` (of a length, or of an angle one metre out; none for
+        effects), and what it `needs`.
     """
-    solution = run.solution
+    return [*leaning(run, look), *standing_in(look)]
+
+
+def leaning(run: Run, look: Look) -> list[dict[str, Any]]:
+    """The weakest directions of a run's solution, in units of what was known before."""
+    solution, problem = run.solution, look.stand.problem
     prior = {}
-    for name in stand.problem.calibration:
-        variable = stand.problem.variables[name]
+    for name in problem.calibration:
+        variable = problem.variables[name]
         prior |= {f"{name}.{d}": s for d, s in zip(variable.dofs, variable.sigma, strict=True)}
     known = np.array([prior.get(name, np.nan) for name in solution.names])
     usable = np.flatnonzero(np.isfinite(known))
     if not len(usable):
         return []
-    scaled = solution.covariance[np.ix_(usable, usable)] / np.outer(known[usable], known[usable])
-    scaled /= max(1.0, float(run.summary["sigmas_widened_by"])) ** 2
+    known, names = known[usable], [solution.names[i] for i in usable]
+    widened = max(1.0, float(run.summary["sigmas_widened_by"]))
+    scaled = solution.covariance[np.ix_(usable, usable)] / np.outer(known, known) / widened**2
     values, axes = np.linalg.eigh(scaled)
     out = []
     for value, axis in zip(values[::-1], axes.T[::-1], strict=True):
         if value < LEANS or len(out) == MOST:
             break
-        named = [i for i in np.argsort(-np.abs(axis)) if abs(axis[i]) > SHARE]
-        moved = np.sqrt(value) * axis * known[usable]
-        out.append(
-            {
-                "parameters": [solution.names[usable[i]] for i in named],
-                "sigma_mm": float(1e3 * np.abs(moved[named]).max()) if named else 0.0,
-                "share": float(min(value, 1.0)),
-                "needs": _needs([solution.names[usable[i]] for i in named]),
-            }
-        )
-    return [direction for direction in out if direction["parameters"]]
+        named = [int(i) for i in np.argsort(-np.abs(axis)) if abs(axis[i]) > SHARE]
+        if named:
+            moved = np.sqrt(value) * np.abs(axis * known)[named]
+            out.append(
+                {
+                    "parameters": [names[i] for i in named],
+                    "sigma_mm": float(1e3 * moved.max()),
+                    "needs": _needs([names[i] for i in named]),
+                }
+            )
+    return out
 
 
 def _needs(names: list[str]) -> str:
     owners = list(dict.fromkeys(name.rpartition(".")[0] for name in names))
-    if len(names) > 1:
+    if len(owners) > 1:
         return f"stops at which {' and '.join(owners)} act differently; only their sum is seen"
-    return f"a measurement of {names[0]} itself, or stops that it moves more"
+    return f"a measurement of {' and '.join(names)} itself, or stops that it moves more"
+
+
+def standing_in(look: Look) -> list[dict[str, Any]]:
+    """Effects of the model that could as well be a candidate: on this data they do the same.
+
+    A candidate that the model takes on almost wholly, and would not without one of its effects, may
+    be what that effect's estimate is made of.
+    """
+    linear, stand = look.linear, look.stand
+    ours = {t.effect.name: (t.effect, t.variable) for terms in stand.problem.terms for t in terms}
+    ours = {n: v for n, v in ours.items() if n in stand.model.names}
+    theirs = [c for c in look.named.candidates if not isinstance(c.effect, JointShape)]
+    left = {c.effect.name: _left(look, c.test.columns) for c in theirs}
+    out = []
+    for name, (effect, variable) in ours.items():
+        without = _information_without(look, np.r_[linear.at[variable]])
+        for candidate in theirs:
+            columns = candidate.test.columns
+            free = np.trace(without[np.ix_(columns, columns)])
+            if left[candidate.effect.name] < (1.0 - STANDS_IN) * free:
+                out.append(_stand_in(name, effect, candidate.effect))
+    return out
+
+
+def _left(look: Look, columns: np.ndarray) -> float:
+    return float(np.trace(look.named.scores.information[np.ix_(columns, columns)]))
+
+
+def _stand_in(name: str, effect: Effect, other: Effect) -> dict[str, Any]:
+    return {
+        "parameters": [name, other.family],
+        "sigma_mm": None,
+        "needs": f"{what_separates(effect, other)}: on this data {name} takes on what "
+        f"{other.family} would do",
+    }
+
+
+def _information_without(look: Look, gone: Sequence[int]) -> np.ndarray:
+    """Information (Q, Q) of all candidates were some columns of the model not in it."""
+    linear = look.linear
+    theirs = np.concatenate([np.r_[linear.at[name]] for name in linear.candidates])
+    model = np.setdiff1d(np.arange(len(linear.information)), np.concatenate([theirs, gone]))
+    scale = np.sqrt(np.maximum(np.diag(linear.information), 1e-300))
+    root = linear.information[np.ix_(model, model)] / np.outer(scale[model], scale[model])
+    cross = linear.information[np.ix_(model, theirs)] / scale[model, None]
+    absorbed = cho_solve(cho_factor(root + 1e-13 * np.eye(len(model))), cross)
+    return linear.information[np.ix_(theirs, theirs)] - cross.T @ absorbed

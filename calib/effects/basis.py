@@ -19,8 +19,8 @@ def beam(axis: int, *columns: np.ndarray) -> np.ndarray:
 
 
 def range_m(view: View) -> np.ndarray:
-    """Predicted range (rows,); 0 where a beam meets nothing."""
-    return finite(view["range_m"])
+    """Predicted range (rows,); 0 where a beam meets nothing ahead."""
+    return np.maximum(finite(view["range_m"]), 0.0)
 
 
 def incidence_rad(view: View) -> np.ndarray:
