@@ -330,7 +330,7 @@ class _Builder:
         terms = [
             t
             for t in self.problem.terms[self.number]
-            if t.effect.site in (Site.BEAM, Site.REFERENCE)
+            if t.effect.site in (Site.BEAM, Site.REFERENCE, Site.NOISE)
         ]
         sigma_m = source.rig.reference.sigma_m if source.rig.reference and source.reference else 0.0
         for (root, k), index in self.stops.items():

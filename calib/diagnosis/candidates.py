@@ -123,7 +123,7 @@ def known_effects(model: Model, sources: Sequence[Source], columns: frozenset[st
     there = {effect.family for effect in model.effects}
     found = []
     for effect in CATALOGUE:
-        if effect.family in there or effect.site is Site.NOISE:
+        if effect.family in there:
             continue
         if effect.family in model.fixed or lacking(effect, sources, columns):
             continue
@@ -139,7 +139,8 @@ def known_effects(model: Model, sources: Sequence[Source], columns: frozenset[st
 
 def lacking(effect: Effect, sources: Sequence[Source], columns: frozenset[str]) -> list[str]:
     """What the recordings lack to test an effect: columns, or anything to act on."""
-    missing = [c for c in effect.covariates if c != "joints" and c not in columns]
+    needed = (*effect.covariates, "range_std_m") if effect.site is Site.NOISE else effect.covariates
+    missing = [c for c in needed if c != "joints" and c not in columns]
     if "joints" in effect.covariates and not any(s.rig.joint_names for s in sources):
         missing.append("joints")
     if not missing and not any(effect.params(s.rig) for s in sources):

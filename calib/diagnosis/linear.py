@@ -107,7 +107,13 @@ class Walk(ABC):
             room = next((t.variable.partition("/")[0] for t in surfaces), None)
             whole = replace(scan, terms=[*scan.terms, *surfaces])
             rows = whole.rows(self.values, self.estimate.associations[i])
-            self.beams(self._local(whole, rows, room or str(scan.recording.folder)))
+            local = self._local(whole, rows, room or str(scan.recording.folder))
+            self.beams(local)
+            if rows.spread is not None:
+                columns = np.concatenate([self._columns(n) for n in rows.spread.columns])
+                A = np.hstack(list(rows.spread.columns.values()))
+                stop, place = np.full(len(A), local.stop), local.places[local.cluster]
+                self.others(A, -rows.spread.residual, columns, stop, place)
         priors = []
         for block, by, b in self.graph.linear_rows(self.values):
             if block is None:

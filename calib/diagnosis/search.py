@@ -14,7 +14,7 @@ import numpy as np
 from calib.diagnosis.score import log_tail, test
 from calib.diagnosis.screen import Candidate, Screen
 from calib.diagnosis.stand import Look, Stand
-from calib.effects import Effect
+from calib.effects import Effect, Site
 from calib.fit import Progress
 
 ALPHA = 0.04  # chance that a named effect is found where nothing is missing
@@ -61,11 +61,13 @@ class Search:
         looks: from the fit as it was, and after each effect found.
         found: named effects, in the order in which they were added.
         unnamed: structure that is confirmed after that, strongest first.
+        scatter: the effect on the scatter that is confirmed, if one is.
     """
 
     looks: Sequence[Look]
     found: Sequence[Found]
     unnamed: Sequence[Candidate]
+    scatter: Candidate | None
 
 
 def search(stand: Stand, progress: Progress, most: int = MOST) -> Search:
@@ -87,7 +89,7 @@ def search(stand: Stand, progress: Progress, most: int = MOST) -> Search:
         if swapped:
             looks[-1] = stand.look(progress)
             found = [f.with_effect(swapped.get(f.effect.name)) for f in found]
-    return Search(looks, found, _unnamed(looks[-1], progress))
+    return Search(looks, found, _unnamed(looks[-1], progress), _scatter(looks[-1], progress))
 
 
 def _named(look: Look, progress: Progress) -> Found | None:
@@ -110,11 +112,20 @@ def _unnamed(look: Look, progress: Progress) -> list[Candidate]:
     return []
 
 
+def _scatter(look: Look, progress: Progress) -> Candidate | None:
+    for candidate in suspects(look.noise, ALPHA):
+        p = judged(look, candidate, progress)
+        if p < ALPHA:
+            return replace(candidate, p_adjusted=p)
+    return None
+
+
 def judged(look: Look, candidate: Candidate, progress: Progress) -> float:
     """The p-value of a candidate with its clusters jackknifed, all that was looked at paid for."""
     found = look.judged(candidate, progress)
     # What candidates have in common may be another effect's signal; it need not be this one's.
-    p = found.p_value(min(look.named.common, max(found.inflation, 1.0)))
+    common = (look.noise if candidate.effect.site is Site.NOISE else look.named).common
+    p = found.p_value(min(common, max(found.inflation, 1.0)))
     return float(-np.expm1(candidate.looks * np.log1p(-min(p, 1 - 1e-15))))
 
 

@@ -21,7 +21,7 @@ from calib.diagnosis.jackknife import Shares
 from calib.diagnosis.linear import Linear, linearise
 from calib.diagnosis.score import Test, away_from_model, project, test
 from calib.diagnosis.screen import Candidate, Screen, screen
-from calib.effects import Effect
+from calib.effects import Effect, Site
 from calib.fit import Estimate, Progress, resume, solve
 from calib.model import Model, Source
 from calib.problem import Problem
@@ -70,9 +70,10 @@ class Stand:
         unnamed = [e for e in structure(self.sources, sample) if e.name not in there]
         linear, at = self.linearise((*known, *unnamed), progress)
         scores = project(linear, linear.candidates)
-        named = screen(scores, known, at)
+        named = screen(scores, [e for e in known if e.site is not Site.NOISE], at)
         rest = screen(scores, unnamed, at, named.common if named.candidates else None)
-        return Look(self, linear, named, rest, columns)
+        noise = screen(scores, [e for e in known if e.site is Site.NOISE], at, 1.0)
+        return Look(self, linear, named, rest, noise, columns)
 
     def linearise(
         self, candidates: Sequence[Effect], progress: Progress
@@ -149,6 +150,8 @@ class Stand:
         for i in chosen.tolist() if scans else ():
             rows = scans[i].rows(self.estimate.values, self.estimate.associations[i])
             columns |= set(rows.view.columns)
+            if np.isfinite(scans[i].recording.scan(scans[i].index).range_std_m).any():
+                columns.add("range_std_m")
             own = self._own_columns(scans[i].recording)
             for name in {*covariates(), *own} & set(rows.view.columns):
                 whole = np.broadcast_to(rows.view[name], rows.view.rows)
@@ -170,6 +173,7 @@ class Look:
         linear: the rows, linearised.
         named: the catalogue's effects, tested.
         unnamed: structure, tested.
+        noise: effects on the scatter, tested; they move no mean.
         columns: what points and stops carry.
     """
 
@@ -177,6 +181,7 @@ class Look:
     linear: Linear
     named: Screen
     unnamed: Screen
+    noise: Screen
     columns: frozenset[str]
 
     def judged(self, candidate: Candidate, progress: Progress) -> Test:

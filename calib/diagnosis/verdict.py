@@ -132,7 +132,11 @@ def _ranked(found: Search) -> list[Candidate]:
     confirmed = [step.candidate for step in found.found]
     families = {c.effect.family for c in confirmed}
     rest = (c for c in found.looks[0].named.candidates if c.effect.family not in families)
-    return [*confirmed, *rest]
+    noise = found.looks[-1].noise.candidates
+    if found.scatter is not None:
+        family = found.scatter.effect.family
+        noise = [found.scatter, *(c for c in noise if c.effect.family != family)]
+    return [*confirmed, *rest, *noise]
 
 
 def _candidate(
@@ -147,7 +151,8 @@ def _candidate(
     params = [p for p in effect.params(rig) if p.sigma]
     whole = len(params) == len(test.columns)
     before, after, floor = held_out.get(effect.name, (None, None, None))
-    clean = found.looks[-1].named.common
+    noise = effect.site is Site.NOISE
+    clean = (found.looks[-1].noise if noise else found.looks[-1].named).common
     rivals = _rivals(found.found[step - 1]) if step else []
     alpha = -np.expm1(np.log1p(-ALPHA) / candidate.looks)
     return {
@@ -161,8 +166,8 @@ def _candidate(
         "step": step,
         "held_out_rms_mm": {"before": before, "after": after},
         "error_explained": _explained(before, after, floor),
-        "rms_mm": 1e3 * look.size_m(candidate),
-        "unabsorbed_rms_mm": 1e3 * look.rms_m(candidate),
+        "rms_mm": None if noise else 1e3 * look.size_m(candidate),
+        "unabsorbed_rms_mm": None if noise else 1e3 * look.rms_m(candidate),
         "parameters": {
             "unit": ", ".join(dict.fromkeys(p.unit for p in params)),
             "names": [p.name for p in params] if whole else [],
@@ -213,7 +218,7 @@ def _untestable(look: Look) -> dict[str, str]:
         c.effect.family for c in look.named.candidates
     }
     for effect in CATALOGUE:
-        if effect.family in there or effect.site is Site.NOISE:
+        if effect.family in there:
             continue
         if missing := lacking(effect, look.stand.sources, look.columns):
             found[effect.family] = f"the recordings lack {', '.join(missing)}"
@@ -249,6 +254,12 @@ def _sentences(
                 f"An empirical effect for it, '{each['formula']['name']}', stands in diagnosis.json"
                 f" ready to be saved and added; it describes, and explains nothing."
             )
+    if found.scatter is not None:
+        what = " and ".join(words(c) for c in found.scatter.effect.covariates)
+        out.append(
+            f"The scatter grows with {what} otherwise than the LiDAR's model has it: "
+            f"{found.scatter.effect.name} would weigh the rows better, and move no mean."
+        )
     gone = [name for name, why in untestable.items() if why.startswith("the recordings")]
     if gone:
         more = f" and {len(gone) - TOLD} more" if len(gone) > TOLD else ""

@@ -19,6 +19,7 @@ import numpy as np
 from calib.effects import LazyColumn, OneHot, View
 from calib.forward import Derivatives, Stops, Values
 from calib.residuals.rows import Group, gram, split, square_root, tukey_cost, tukey_curvature
+from calib.residuals.spread import SpreadRows
 from chains import se3
 from sensors.lidar import Beams
 
@@ -86,6 +87,7 @@ class Rows:
         sparse: derivatives with one non-zero per row.
         view: what effects looked at.
         usable: (N,) False where the beam met nothing fit to compare with; its weight is 0.
+        spread: rows of the scatter within the hold, where an effect speaks of it.
     """
 
     residual_m: np.ndarray
@@ -98,6 +100,7 @@ class Rows:
     sparse: Sequence[Columns]
     view: View
     usable: np.ndarray
+    spread: SpreadRows | None = None
 
     @property
     def cost(self) -> float:
@@ -202,10 +205,12 @@ class CompressedScan:
         pose: the six rows that know the stop's pose.
         rest: (1 + n, 1 + n) Gram matrix of all others, [residual | columns of the parts]; it speaks
             of shared unknowns only, so the stops' simply add up.
+        spread: the same, over [residual | columns] of its own parts, of the scatter.
     """
 
     pose: PoseRows
     rest: np.ndarray
+    spread: tuple[np.ndarray, Sequence[Part], Values] | None = None
 
 
 class SharedSum:
@@ -218,13 +223,18 @@ class SharedSum:
 
     def add(self, scan: CompressedScan) -> None:
         """Add one stop's."""
-        for name, value in scan.pose.at.items():
+        self._add(scan.rest, scan.pose.parts, scan.pose.at)
+        if scan.spread is not None:
+            self._add(*scan.spread)
+
+    def _add(self, matrix: np.ndarray, parts: Sequence[Part], at: Values) -> None:
+        for name, value in at.items():
             if name not in self._at:
                 self._at[name], self._first[name] = value, len(self._total)
                 self._total = np.pad(self._total, (0, len(value)))
-        columns = [self._first[p.variable] + p.components for p in scan.pose.parts]
+        columns = [self._first[p.variable] + p.components for p in parts]
         columns = np.concatenate([[0], *columns]).astype(int)
-        self._total[np.ix_(columns, columns)] += scan.rest
+        self._total[np.ix_(columns, columns)] += matrix
 
     def rows(self) -> list[SharedRows]:
         """The sum as rows; none where there are no shared unknowns."""
@@ -360,4 +370,13 @@ def compress(
     at = {v: np.array(values[v]) for v in dict.fromkeys(p.variable for p in parts)}
     T0 = se3.inverse(T_reference_lidar)
     pose = PoseRows(name, stops, frame, T0, top[:, :6], top[:, 6], top[:, 7:], parts, at)
-    return CompressedScan(pose, rest)
+    return CompressedScan(pose, rest, _spread_sum(rows, values))
+
+
+def _spread_sum(rows: Rows, values: Values) -> tuple[np.ndarray, list[Part], Values] | None:
+    if rows.spread is None:
+        return None
+    columns = rows.spread.columns
+    whole = np.hstack([rows.spread.residual[:, None], *columns.values()])
+    parts = [Part(name, np.zeros(0, int), np.arange(c.shape[1])) for name, c in columns.items()]
+    return whole.T @ whole, parts, {name: np.array(values[name]) for name in columns}

@@ -27,11 +27,13 @@ from calib.residuals.beams import (
     twist_derivative,
 )
 from calib.residuals.rows import robust_scale, tukey_weight
+from calib.residuals.spread import spread_rows
 from calib.residuals.surfaces import Meeting
 from chains.errors import InputError
 from sensors.lidar import Beams, LidarModel, beams
 from sensors.recording import Recording, Scan
 
+SIZE = {Site.BEAM: 3, Site.REFERENCE: 3, Site.NOISE: 1}
 PRIOR_COUNT = 20.0  # a measured spread of fewer sweeps than this leans on the datasheet
 LOCAL_SHARE = 0.05  # of the reference's variance, between neighbouring points of one patch
 
@@ -44,7 +46,7 @@ class ScanStop:
         name: for messages.
         recording, index: where the scan is read.
         stops: geometry of this stop (K = 1).
-        terms: the model's effects at BEAM and REFERENCE.
+        terms: the model's effects at BEAM, REFERENCE and NOISE.
         columns: (1,) covariates of the stop.
         meeting: mesh or planes.
         reference_sigma_m: how far the reference may be off its surface.
@@ -83,7 +85,7 @@ class ScanStop:
         surface = self.meeting.meet(T, ray, values, association)
         view = self._view(scan, ray, surface)
         bases = {t.variable: (t.effect.site, t.basis(view)) for t in self.terms}
-        error = {Site.BEAM: np.zeros((1, 3)), Site.REFERENCE: np.zeros((1, 3))}
+        error = {s: np.zeros((1, d)) for s, d in SIZE.items()}
         for name, (site, basis) in bases.items():
             error[site] = error[site] + site_error(basis, values[name])
         if error[Site.BEAM][:, 1:].any():
@@ -156,14 +158,17 @@ class ScanStop:
         residual = ray.range_m - t - error[Site.BEAM][:, 0]
         residual[lost] = 0.0
         reference = self.reference_sigma_m / cosine
-        variance = self._beam_variance(scan, t, cosine, usable)
+        single = self._single_variance(t, cosine) * np.exp(2.0 * error[Site.NOISE][:, 0])
+        variance = self._beam_variance(scan, single, t, cosine, usable)
         sigma = np.sqrt(variance + LOCAL_SHARE * reference**2)
         z = residual / sigma
         scale = robust_scale(z[usable])
         columns = {
             name: effect_columns(name, basis, by_site[site])
             for name, (site, basis) in bases.items()
+            if site is not Site.NOISE
         }
+        growth = {name: b[:, 0] for name, (site, b) in bases.items() if site is Site.NOISE}
         for c in (*columns.values(), *surface.unknown):
             (c.value if isinstance(c, Columns) else c)[lost] = 0.0  # 0 * inf would be NaN
         return Rows(
@@ -177,19 +182,27 @@ class ScanStop:
             [c for c in columns.values() if isinstance(c, Columns)] + list(surface.unknown),
             view,
             usable,
+            spread_rows(scan, single, usable, growth),
         )
 
+    def _single_variance(self, t: np.ndarray, cosine: np.ndarray) -> np.ndarray:
+        """Variance of one range (N,), as the LiDAR's model has it."""
+        return np.square(self.lidar.sigma_range(t, np.arccos(np.minimum(cosine, 1.0))))
+
     def _beam_variance(
-        self, scan: Scan, t: np.ndarray, cosine: np.ndarray, usable: np.ndarray
+        self,
+        scan: Scan,
+        single: np.ndarray,
+        t: np.ndarray,
+        cosine: np.ndarray,
+        usable: np.ndarray,
     ) -> np.ndarray:
         """Variance of the averaged range: noise over count, and the beam's angle.
 
         The spread measured over a hold leans on the datasheet's, scaled to this stop, as if that
         were `PRIOR_COUNT` sweeps more: a spread of few sweeps is itself too uncertain a weight.
         """
-        lidar = self.lidar
         incidence = np.arccos(np.minimum(cosine, 1.0))
-        single = np.square(lidar.sigma_range(t, incidence))
         measured = np.square(scan.range_std_m)
         known = np.isfinite(measured) & (scan.count > 1) & usable
         if known.any():
@@ -197,7 +210,7 @@ class ScanStop:
             dof = np.where(known, scan.count - 1.0, 0.0)
             measured = np.where(known, measured, 0.0)
             single = (PRIOR_COUNT * single + dof * measured) / (PRIOR_COUNT + dof)
-        angle = lidar.sigma_angle_rad * t * np.tan(incidence)
+        angle = self.lidar.sigma_angle_rad * t * np.tan(incidence)
         return single / scan.count + angle**2
 
 

@@ -1,0 +1,87 @@
+"""Effects on the scatter: estimated in the graph from what holds show, and moving no mean."""
+
+import numpy as np
+import pytest
+
+from calib import effects
+from calib import problem as problems
+from calib.diagnosis.search import judged
+from calib.diagnosis.stand import Stand
+from calib.fit import solve
+from calib.model import Model
+from calib.residuals.spread import spread_rows
+from calib.simulate import Spec
+from sensors.recording import Scan
+
+from .simulated import made
+
+SMALL = Spec(lidar="hesai_pandarxt32", locations=4, stops_per_location=3, column_step=50)
+POWER = 0.4  # what size 1 stands for
+
+
+def quiet(what, done, total):
+    pass
+
+
+def fitted(folder, size, model, seed=2):
+    hide = {"noise_range": size} if size else {}
+    source, truth = made(folder / "rec", SMALL, seed, **hide)
+    problem = problems.build([source], model)
+    return Stand([source], model, problem, solve(problem)), truth
+
+
+def test_the_power_of_range_is_found_within_its_sigma(tmp_path):
+    model = Model().plus((effects.find("noise_range"),))
+    stand, truth = fitted(tmp_path, 1.0, model)
+    true = truth["effects"]["noise_range"][0]
+    names = [v.name for v in stand.estimate.variables]
+    dims = np.cumsum([0, *(v.dim for v in stand.estimate.variables)])
+    at = dims[names.index("noise_range")]
+    sigma = np.sqrt(stand.estimate.covariance[at, at])
+    assert abs(true) == pytest.approx(POWER)
+    assert sigma < 0.02
+    assert abs(stand.estimate.values["noise_range"][0] - true) < 4 * sigma
+
+
+def test_it_stands_out_where_it_is_and_not_where_it_is_not(tmp_path):
+    found = {}
+    for size in (0.0, 1.0):
+        (tmp_path / str(size)).mkdir()
+        look = fitted(tmp_path / str(size), size, Model())[0].look(quiet)
+        found[size] = {c.effect.name: c for c in look.noise.candidates}
+        # It moves no mean, so nothing else is made of it.
+        assert min(c.p_adjusted for c in look.named.candidates) > 0.01
+    assert found[0.0]["noise_range"].p_adjusted > 0.01
+    assert found[1.0]["noise_range"].evidence > 50 > found[0.0]["noise_range"].evidence
+    assert judged(look, found[1.0]["noise_range"], quiet) < 1e-6
+    one = found[1.0]["noise_range"].test.estimate()[0]
+    assert abs(one) == pytest.approx(POWER, rel=0.35)  # one step
+
+
+def scan(spread_m, count):
+    n = len(spread_m)
+    columns = {f.name: None for f in Scan.__dataclass_fields__.values()}
+    columns |= {"range_std_m": spread_m, "count": np.full(n, count), "xyz_m": np.zeros((n, 3))}
+    return Scan(**columns)
+
+
+def test_rows_are_the_derivative_of_the_scatter():
+    rng = np.random.default_rng(1)
+    growth, count, theta = rng.uniform(-1, 1, (4000, 1)), 25, 0.05
+    sigma_m = 0.004 * np.exp(growth[:, 0] * theta)
+    spread_m = sigma_m * np.sqrt(rng.chisquare(count - 1, len(sigma_m)) / (count - 1))
+    rows = spread_rows(
+        scan(spread_m, count),
+        np.full(len(growth), 0.004**2),
+        np.ones(len(growth), bool),
+        {"g": growth},
+    )
+    A = rows.columns["g"]
+    found, information = -(A.T @ rows.residual), A.T @ A
+    assert np.std(rows.residual) == pytest.approx(1.0, abs=0.15)
+    assert found[0] / information[0, 0] == pytest.approx(theta, abs=4 / np.sqrt(information[0, 0]))
+
+
+def test_a_direction_seen_once_says_nothing_of_scatter():
+    spread_m, usable = np.full(5, np.nan), np.ones(5, bool)
+    assert spread_rows(scan(spread_m, 1), np.ones(5), usable, {"g": np.ones((5, 1))}) is None
