@@ -11,6 +11,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from calib.residuals.rows import gram
+
 HERE = Path(__file__).parent
 ROWS, STOPS = 8000, 4
 
@@ -18,7 +20,14 @@ ROWS, STOPS = 8000, 4
 @pytest.fixture(scope="module")
 def bench() -> Iterator[SimpleNamespace]:
     """The benchmarks' modules, which import each other as scripts do."""
-    names = ("workload", "point_factors", "sparse_rows", "bench_speed", "bench_memory")
+    names = (
+        "workload",
+        "point_factors",
+        "sparse_rows",
+        "bench_speed",
+        "bench_memory",
+        "bench_screen",
+    )
     sys.path.insert(0, str(HERE))
     try:
         yield SimpleNamespace(**{name: import_module(name) for name in names})
@@ -72,3 +81,14 @@ def test_the_memory_of_a_stops_rows_is_counted(bench, work):
     rows = work.problem.scans[0].rows(work.start, work.associations[0])
     # residual, sigma, weight, six derivatives by the pose, index and value of the ring
     assert bench.bench_memory.size(rows) == 11 * 8 * len(work.associations[0].part)
+
+
+def test_the_screen_adds_up_what_blas_does(bench, work):
+    stand = bench.bench_screen.fitted(work.source.recording.folder)
+    for _, beams in bench.bench_screen.captured(stand)[:2]:
+        whole = bench.bench_screen.stacked(beams)
+        ours = gram(beams.dense, list(beams.groups), beams.weight)
+        scale = np.sqrt(np.maximum(np.diag(ours), 1e-30))
+        np.testing.assert_allclose(
+            ours / np.outer(scale, scale), whole.T @ whole / np.outer(scale, scale), atol=1e-9
+        )
