@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.diagnosis.score import log_tail, test
+from calib.diagnosis.score import Test, log_tail
+from calib.diagnosis.score import test as joint_test
 from calib.diagnosis.screen import Candidate, Screen
 from calib.diagnosis.stand import Look, Stand
 from calib.effects import Effect, Site
@@ -32,6 +33,7 @@ class Found:
     Args:
         candidate: as it stood out before, in its best shape.
         before, after: the looks before it was fitted and after.
+        judged: its test with clusters jackknifed.
         p_adjusted: as judged.
         rivals: candidates that explain as much, and what to tell them apart by.
     """
@@ -39,6 +41,7 @@ class Found:
     candidate: Candidate
     before: Look
     after: Look
+    judged: Test
     p_adjusted: float
     rivals: Sequence[Candidate]
 
@@ -95,38 +98,39 @@ def search(stand: Stand, progress: Progress, most: int = MOST) -> Search:
 def _named(look: Look, progress: Progress) -> Found | None:
     """The best candidate that is confirmed, fitted."""
     for candidate in suspects(look.named, ALPHA):
-        p = judged(look, candidate, progress)
+        test, p = judged(look, candidate, progress)
         if p < ALPHA:
             effect = look.stand.finest(candidate.effect, progress)
             after = look.stand.with_effects([effect], progress).look(progress)
             others = rivals(look.named, candidate, after.named.common)
-            return Found(replace(candidate, effect=effect), look, after, p, others)
+            return Found(replace(candidate, effect=effect), look, after, test, p, others)
     return None
 
 
 def _unnamed(look: Look, progress: Progress) -> list[Candidate]:
     """Structure that remains, if the strongest of it is confirmed."""
     for candidate in suspects(look.unnamed, ALPHA_UNNAMED):
-        if judged(look, candidate, progress) < ALPHA_UNNAMED:
+        if judged(look, candidate, progress)[1] < ALPHA_UNNAMED:
             return [c for c in look.unnamed.candidates if _stands_out(c, ALPHA_UNNAMED)]
     return []
 
 
 def _scatter(look: Look, progress: Progress) -> Candidate | None:
     for candidate in suspects(look.noise, ALPHA):
-        p = judged(look, candidate, progress)
+        test, p = judged(look, candidate, progress)
         if p < ALPHA:
-            return replace(candidate, p_adjusted=p)
+            return replace(candidate, test=test, p_adjusted=p)
     return None
 
 
-def judged(look: Look, candidate: Candidate, progress: Progress) -> float:
-    """The p-value of a candidate with its clusters jackknifed, all that was looked at paid for."""
+def judged(look: Look, candidate: Candidate, progress: Progress) -> tuple[Test, float]:
+    """A candidate's test with its clusters jackknifed; its p-value, all that was looked at paid
+    for."""
     found = look.judged(candidate, progress)
     # What candidates have in common may be another effect's signal; it need not be this one's.
     common = (look.noise if candidate.effect.site is Site.NOISE else look.named).common
     p = found.p_value(min(common, max(found.inflation, 1.0)))
-    return float(-np.expm1(candidate.looks * np.log1p(-min(p, 1 - 1e-15))))
+    return found, float(-np.expm1(candidate.looks * np.log1p(-min(p, 1 - 1e-15))))
 
 
 def suspects(screen: Screen, alpha: float) -> Iterator[Candidate]:
@@ -154,7 +158,9 @@ def rivals(screen: Screen, best: Candidate, common: float) -> list[Candidate]:
         if other.effect.family == best.effect.family:
             continue
         if own - other.test.evidence(common) < ODDS:
-            together = test(screen.scores, np.concatenate([best.test.columns, other.test.columns]))
+            together = joint_test(
+                screen.scores, np.concatenate([best.test.columns, other.test.columns])
+            )
             left = (together.statistic - other.test.statistic) / common
             if -log_tail(max(left, 0.0), max(1, together.dof - other.test.dof)) < ODDS:
                 out.append(other)

@@ -112,7 +112,7 @@ class Stand:
             The fit with them, and the effects that took the place of others, by the others' names.
         """
         shaped = [e for e in self.model.effects if e.name in names and e.shape_name]
-        steps = [ShapeStep(e, self._theta(e)) for e in shaped]
+        steps = [ShapeStep(e, self.theta(e, whole=True)) for e in shaped]
         if not steps:
             return self, {}
         linear, at = self.linearise(steps, progress)
@@ -131,14 +131,15 @@ class Stand:
         estimate = solve(problem, progress=progress, start=start)
         return Stand(self.sources, model, problem, estimate), swapped
 
-    def _theta(self, effect: Effect) -> np.ndarray:
-        """All parameters of an effect, those held included."""
+    def theta(self, effect: Effect, whole: bool) -> np.ndarray:
+        """Parameters of an effect of the model: the `whole` effect's, or those that are free."""
         for terms, source in zip(self.problem.terms, self.sources, strict=True):
             for term in terms:
                 if term.effect.name == effect.name:
+                    values = self.estimate.values[term.variable]
                     theta = np.zeros(len(effect.params(source.rig)))
-                    theta[term.free] = self.estimate.values[term.variable]
-                    return theta
+                    theta[term.free] = values
+                    return theta if whole else values
         raise ValueError(f"'{effect.name}' is not in the model")
 
     def _columns(self) -> tuple[frozenset[str], dict[str, np.ndarray]]:

@@ -154,6 +154,10 @@ def _candidate(
     noise = effect.site is Site.NOISE
     clean = (found.looks[-1].noise if noise else found.looks[-1].named).common
     rivals = _rivals(found.found[step - 1]) if step else []
+    estimate, sigma = test.estimate(), test.sigma(max(clean, 1.0))
+    if step:
+        estimate = found.looks[-1].stand.theta(effect, whole=False)
+        sigma = found.found[step - 1].judged.sigma(max(clean, 1.0))
     alpha = -np.expm1(np.log1p(-ALPHA) / candidate.looks)
     return {
         "effect": effect.family,
@@ -171,8 +175,8 @@ def _candidate(
         "parameters": {
             "unit": ", ".join(dict.fromkeys(p.unit for p in params)),
             "names": [p.name for p in params] if whole else [],
-            "estimate": test.estimate() if whole else [],
-            "sigma": test.sigma(clean) if whole else [],
+            "estimate": estimate if whole else [],
+            "sigma": sigma if whole else [],
         },
         "smallest_detectable": test.smallest_detectable(clean, alpha),
         "indistinguishable_from": [r["effect"] for r in rivals],
@@ -263,7 +267,7 @@ def _sentences(
     gone = [name for name, why in untestable.items() if why.startswith("the recordings")]
     if gone:
         more = f" and {len(gone) - TOLD} more" if len(gone) > TOLD else ""
-        out.append(f"Could not be tested, for lack of columns: {', '.join(gone[:TOLD])}{more}.")
+        out.append(f"Could not be tested on these recordings: {', '.join(gone[:TOLD])}{more}.")
     return out
 
 
