@@ -63,12 +63,14 @@ class Search:
     Args:
         looks: from the fit as it was, and after each effect found.
         found: named effects, in the order in which they were added.
-        unnamed: structure that is confirmed after that, strongest first.
+        at_first: structure that is confirmed before any effect was found, strongest first.
+        unnamed: structure that is confirmed after all of them.
         scatter: the effect on the scatter that is confirmed, if one is.
     """
 
     looks: Sequence[Look]
     found: Sequence[Found]
+    at_first: Sequence[Candidate]
     unnamed: Sequence[Candidate]
     scatter: Candidate | None
 
@@ -92,7 +94,9 @@ def search(stand: Stand, progress: Progress, most: int = MOST) -> Search:
         if swapped:
             looks[-1] = stand.look(progress)
             found = [f.with_effect(swapped.get(f.effect.name)) for f in found]
-    return Search(looks, found, _unnamed(looks[-1], progress), _scatter(looks[-1], progress))
+    unnamed = structures(looks[-1], progress)
+    at_first = structures(looks[0], progress) if found else unnamed
+    return Search(looks, found, at_first, unnamed, _scatter(looks[-1], progress))
 
 
 def _named(look: Look, progress: Progress) -> Found | None:
@@ -107,12 +111,27 @@ def _named(look: Look, progress: Progress) -> Found | None:
     return None
 
 
-def _unnamed(look: Look, progress: Progress) -> list[Candidate]:
-    """Structure that remains, if the strongest of it is confirmed."""
-    for candidate in suspects(look.unnamed, ALPHA_UNNAMED):
-        if judged(look, candidate, progress)[1] < ALPHA_UNNAMED:
-            return [c for c in look.unnamed.candidates if _stands_out(c, ALPHA_UNNAMED)]
-    return []
+def structures(look: Look, progress: Progress) -> list[Candidate]:
+    """Structure that is confirmed: what stands out most, and what does beside it, not by it."""
+    out: list[Candidate] = []
+    for candidate in look.unnamed.candidates:
+        if _stands_out(candidate, ALPHA_UNNAMED) and not _covered(look.unnamed, candidate, out):
+            p = judged(look, candidate, progress)[1]
+            if p < ALPHA_UNNAMED:
+                out.append(replace(candidate, p_adjusted=p))
+    return out
+
+
+def _covered(screen: Screen, candidate: Candidate, by: Sequence[Candidate]) -> bool:
+    """Whether others leave a candidate nothing to explain."""
+    if not by:
+        return False
+    columns = np.unique(np.concatenate([c.test.columns for c in by]))
+    there = joint_test(screen.scores, columns)
+    both = joint_test(screen.scores, np.union1d(columns, candidate.test.columns))
+    gain = max(both.statistic - there.statistic, 0.0) / max(screen.common, 1.0)
+    more = both.dof - there.dof
+    return more < 1 or -log_tail(gain, more) < np.log(candidate.looks / ALPHA_UNNAMED)
 
 
 def _scatter(look: Look, progress: Progress) -> Candidate | None:

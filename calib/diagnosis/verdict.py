@@ -17,6 +17,7 @@ from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import formula, hangs_on, what_separates, words
 from calib.effects import CATALOGUE, Site
 
+UNNAMED = "unexplained_structure"
 ABSORBED = 0.7  # share of the structure that named effects must explain to be the answer
 TOLD = 6  # untestable effects and rivals that a sentence names
 
@@ -47,8 +48,9 @@ class Diagnosis:
 
     @property
     def worth_adding(self) -> list[str]:
-        """Names of the effects that were confirmed, in the order in which to add them."""
-        confirmed = [c for c in self.candidates if c["step"]]
+        """Names of the effects that were confirmed, in the order in which to add them; not those
+        that something without a name is dressed up in."""
+        confirmed = [c for c in self.candidates if c["step"] and not c["dressed_up"]]
         return [c["add"] for c in sorted(confirmed, key=lambda c: c["step"])]
 
     def document(self) -> dict[str, Any]:
@@ -81,8 +83,8 @@ def conclude(
     """
     first = found.looks[0]
     verdict = _verdict(found)
-    candidates = [_candidate(c, found, held_out) for c in _ranked(found)]
-    unexplained = [_unexplained(c, found.looks[-1].unnamed) for c in found.unnamed]
+    candidates = [_candidate(c, verdict, found, held_out) for c in _ranked(found)]
+    unexplained = [_unexplained(c, screen) for screen, c in _without_a_name(found, verdict)]
     untestable = _untestable(first)
     return Diagnosis(
         verdict,
@@ -98,9 +100,9 @@ def conclude(
 
 def _verdict(found: Search) -> str:
     if not found.found:
-        return "unexplained_structure" if found.unnamed else "adequate"
+        return UNNAMED if found.unnamed else "adequate"
     named = _names_hold(found) and (not found.unnamed or _absorbed(found) > ABSORBED)
-    return "missing_effect" if named else "unexplained_structure"
+    return "missing_effect" if named else UNNAMED
 
 
 def _names_hold(found: Search) -> bool:
@@ -139,8 +141,25 @@ def _ranked(found: Search) -> list[Candidate]:
     return [*confirmed, *rest, *noise]
 
 
+def _without_a_name(found: Search, verdict: str) -> list[tuple[Screen, Candidate]]:
+    """What is left without a name; as it stood at first if the first name is not to be believed."""
+    worn = verdict == UNNAMED and bool(found.found) and _dressed_up(found, 0)
+    left, look = (found.at_first, 0) if worn else (found.unnamed, -1)
+    return [(found.looks[look].unnamed, c) for c in left]
+
+
+def _dressed_up(found: Search, i: int) -> bool:
+    """Whether structure without a name would have explained more than the name at its step."""
+    common, step = found.looks[-1].named.common, found.found[i]
+    bins = (c.test.evidence(common) for c in step.before.unnamed.candidates)
+    return step.candidate.test.evidence(common) < max(bins, default=0.0) - ODDS
+
+
 def _candidate(
-    candidate: Candidate, found: Search, held_out: Mapping[str, tuple[float, float, float]]
+    candidate: Candidate,
+    verdict: str,
+    found: Search,
+    held_out: Mapping[str, tuple[float, float, float]],
 ) -> dict[str, Any]:
     """As the contract has it."""
     effect, test, look = candidate.effect, candidate.test, found.looks[0].named
@@ -168,6 +187,7 @@ def _candidate(
         "statistic": test.statistic,
         "dof": test.dof,
         "step": step,
+        "dressed_up": bool(step) and verdict == UNNAMED and _dressed_up(found, step - 1),
         "held_out_rms_mm": {"before": before, "after": after},
         "error_explained": _explained(before, after, floor),
         "rms_mm": None if noise else 1e3 * look.size_m(candidate),
@@ -248,7 +268,7 @@ def _sentences(
         )
     for step in found.found:
         out += _step_sentences(step, next(c for c in candidates if c["add"] == step.effect.name))
-    if verdict == "unexplained_structure":
+    if verdict == UNNAMED:
         out.insert(0, "Something is here that no known effect explains.")
     for each in unexplained[:2]:
         what = " and ".join(words(c) for c in each["covariates"])
@@ -272,6 +292,11 @@ def _sentences(
 
 
 def _step_sentences(step: Found, candidate: Mapping[str, Any]) -> list[str]:
+    if candidate["dressed_up"]:
+        return [
+            f"{step.effect.name} takes on a part of it, as a name will; bins without any name "
+            f"explain more, so it is not to be believed."
+        ]
     before, after = (candidate["held_out_rms_mm"][k] for k in ("before", "after"))
     fall = f"; the held-out error goes from {before:.2f} to {after:.2f} mm" if after else ""
     out = [
