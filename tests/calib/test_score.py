@@ -1,5 +1,6 @@
 """The score test: against a dense re-solve, against chance, and against what it must not see."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,6 +9,7 @@ from scipy import stats
 from scipy.sparse import csr_array
 
 from calib.diagnosis import score
+from calib.diagnosis.jackknife import Shares
 from calib.diagnosis.linear import Linear
 from calib.diagnosis.screen import looked, screen
 from calib.diagnosis.search import rivals
@@ -45,16 +47,15 @@ class World:
         for name, size in effects.items():
             self.b += self.columns[name] @ np.full(THEIRS[name], size)
 
-    def linear(self, knows=()):
-        """Normal equations once a fit has taken off what the model and what it `knows` explain."""
+    def linear(self):
+        """Normal equations once a fit has taken off what the model explains."""
         names = list(self.columns)
         J = np.hstack([self.model, *self.columns.values()])
         ends = np.cumsum([2, *(THEIRS[n] for n in names)])
         at = {"model": slice(0, 2)}
         at |= {n: slice(int(i), int(k)) for n, i, k in zip(names, ends, ends[1:], strict=False)}
         _, cell = np.unique(self.stop * PLACES + self.place, return_inverse=True)
-        known = np.hstack([self.model, *(self.columns[n] for n in knows)])
-        fitted = self.b - known @ np.linalg.lstsq(known, self.b, rcond=None)[0]
+        fitted = self.b - self.model @ np.linalg.lstsq(self.model, self.b, rcond=None)[0]
         pick = csr_array((fitted, (cell, np.arange(len(cell)))))
         stop, place = np.divmod(np.arange(STOPS * PLACES), PLACES)
         return Linear(tuple(names), at, J.T @ J, csr_array(pick @ J), stop, place, float(len(J)))
@@ -71,11 +72,15 @@ def trial(world, name):
 
 
 def judged(world, name):
-    """The test of a candidate once it has been fitted: its own signal does not widen clusters."""
-    known = np.hstack([world.model, world.columns[name]])
-    theta = np.linalg.lstsq(known, world.b, rcond=None)[0][2:]
-    found = score.project(world.linear([name]), [name])
-    return score.test(score.as_if_missing(found, theta), np.arange(len(theta)))
+    """The test of a candidate with its clusters jackknifed."""
+    found = trial(world, name)
+    column = world.columns[name]
+    away = column - world.model @ np.linalg.lstsq(world.model, column, rcond=None)[0]
+    left = world.b - world.model @ np.linalg.lstsq(world.model, world.b, rcond=None)[0]
+    shares = Shares.__new__(Shares)
+    shares._cells = {}
+    shares._add(away @ found.whiten, left, world.stop, world.place)
+    return replace(found, covariance=shares.covariance())
 
 
 @pytest.mark.parametrize("name", ["one", "several", "rings"])
@@ -160,7 +165,7 @@ def test_an_effect_of_the_smallest_detectable_size_is_found_four_times_out_of_fi
     assert 0.72 < np.mean(hits) < 0.88
 
 
-def test_a_signal_widens_the_clusters_that_judge_it_until_it_is_fitted():
+def test_a_signal_widens_the_clusters_that_judge_it_unless_they_are_jackknifed():
     world = World(1, one=0.5)
     before, after = trial(world, "one"), judged(world, "one")
     np.testing.assert_allclose(before.statistic, after.statistic, rtol=1e-6)
