@@ -106,7 +106,7 @@ def _named(look: Look, progress: Progress) -> Found | None:
         if p < ALPHA:
             effect = look.stand.finest(candidate.effect, progress)
             after = look.stand.with_effects([effect], progress).look(progress)
-            others = rivals(look.named, candidate, after.named.common)
+            others = rivals(look.named, candidate, max(after.named.common, test.inflation))
             return Found(replace(candidate, effect=effect), look, after, test, p, others)
     return None
 
@@ -163,27 +163,17 @@ def _stands_out(candidate: Candidate, alpha: float) -> bool:
     return candidate.p_adjusted < alpha or alone > np.log(candidate.looks / alpha)
 
 
-def rivals(screen: Screen, best: Candidate, common: float) -> list[Candidate]:
-    """Candidates that leave the best one nothing to explain that they do not, at like cost.
+def rivals(screen: Screen, best: Candidate, scale: float) -> list[Candidate]:
+    """Candidates that explain nearly as much as the best one, at their price.
 
     Args:
         screen: the look at which all of them were missing.
         best: the leading candidate.
-        common: inflation once the best one is in the model, so free of its signal.
+        scale: how much wider than their sigmas allow rows scatter once it is in the model.
     """
-    own = best.test.evidence(common)
-    out = []
-    for other in screen.candidates:
-        if other.effect.family == best.effect.family:
-            continue
-        if own - other.test.evidence(common) < ODDS:
-            together = joint_test(
-                screen.scores, np.concatenate([best.test.columns, other.test.columns])
-            )
-            left = (together.statistic - other.test.statistic) / common
-            if -log_tail(max(left, 0.0), max(1, together.dof - other.test.dof)) < ODDS:
-                out.append(other)
-    return out
+    own = best.test.evidence(scale)
+    others = (c for c in screen.candidates if c.effect.family != best.effect.family)
+    return [c for c in others if own - c.test.evidence(scale) < ODDS]
 
 
 def angle_deg(screen: Screen, a: Candidate, b: Candidate) -> float:

@@ -142,6 +142,16 @@ class Stand:
                     return theta if whole else values
         raise ValueError(f"'{effect.name}' is not in the model")
 
+    def sigma(self, effect: Effect) -> np.ndarray:
+        """Sigma of each free parameter of an effect of the model, as the graph has it."""
+        start = 0
+        for variable in self.estimate.variables:
+            if variable.name.rpartition("/")[2] == effect.name:
+                at = np.arange(start, start + variable.dim)
+                return np.sqrt(np.diag(self.estimate.covariance)[at])
+            start += variable.dim
+        raise ValueError(f"'{effect.name}' is not in the model")
+
     def _columns(self) -> tuple[frozenset[str], dict[str, np.ndarray]]:
         """Which columns there are, and the values of covariates at some of the points."""
         columns = {c for s in self.sources for c in s.columns}

@@ -176,7 +176,8 @@ def _candidate(
     estimate, sigma = test.estimate(), test.sigma(max(clean, 1.0))
     if step:
         estimate = found.looks[-1].stand.theta(effect, whole=False)
-        sigma = found.found[step - 1].judged.sigma(max(clean, 1.0))
+        wider = max(1.0, clean, found.found[step - 1].judged.inflation)
+        sigma = np.sqrt(wider) * found.looks[-1].stand.sigma(effect)
     alpha = -np.expm1(np.log1p(-ALPHA) / candidate.looks)
     return {
         "effect": effect.family,
@@ -213,12 +214,14 @@ def _explained(before: float | None, after: float | None, floor: float | None) -
 
 def _rivals(step: Found) -> list[dict[str, Any]]:
     screen = step.before.named
+    scale = max(step.after.named.common, step.judged.inflation)
+    own = step.candidate.test.evidence(scale)
     return [
         {
             "effect": other.effect.family,
             "add": other.effect.name,
             "angle_deg": angle_deg(screen, step.candidate, other),
-            "odds": float(np.exp(min(step.candidate.evidence - other.evidence, 50.0))),
+            "odds": float(np.exp(own - other.test.evidence(scale))),
             "separate": what_separates(step.effect, other.effect),
         }
         for other in step.rivals

@@ -1,0 +1,164 @@
+"""What simpler ways would have named, from the same linearised rows.
+
+All take the sigmas as stated. The naive F test and the lasso take every row for a fact of its own:
+they know the stops' poses as unknowns, and no error of the mesh. The others project off what the
+diagnosis does. The oracle, which knows the effect, is in the results of a case: the test of that
+effect alone. Boosted trees would need scikit-learn, which nothing here depends on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from scipy import stats
+from scipy.sparse import csr_array
+
+from calib.diagnosis.candidates import known_effects
+from calib.diagnosis.score import GAUGE, Scores, project, test
+from calib.diagnosis.stand import Look
+from calib.effects import Effect
+
+MOST = 4  # names that a selection goes on to
+LEVEL = 0.05
+PATH = np.geomspace(0.9, 0.02, 14)  # of the smallest penalty that leaves nothing
+STEPS = 150
+
+Columns = Mapping[Effect, np.ndarray]
+NAMES = ("naive F with BIC", "stop-clustered", "leave-location-out", "LASSO")
+
+
+def answers(look: Look) -> dict[str, list[str]]:
+    """Baseline -> families that it would add, in its order."""
+    scores, stand = look.named.scores, look.stand
+    known = known_effects(stand.model, stand.sources, look.columns)
+    at = {e: np.r_[scores.at[e.name]] for e in known if e.name in scores.at}
+    at = {e: columns for e, columns in at.items() if test(scores, columns).dof}
+    rows = sum(len(a.part) for a in stand.estimate.associations)
+    naive = without_mesh_errors(look)
+    found = (
+        forward(naive, at, rows),
+        stop_clustered(scores, at),
+        leave_location_out(scores, at, look),
+        lasso(naive, at, rows),
+    )
+    return dict(zip(NAMES, found, strict=True))
+
+
+def without_mesh_errors(look: Look) -> Scores:
+    """The scores as they are where no error of the mesh is an unknown; not by clusters."""
+    linear, values = look.linear, look.stand.estimate.values
+    surfaces = [name for name in linear.at if "/reference_" in name]
+    gone = np.concatenate([np.r_[linear.at[name]] for name in surfaces])
+    taken = np.concatenate([values[name] for name in surfaces])
+    # What the mesh's errors took on is in the residual again.
+    gradient = np.asarray(linear.gradient.sum(axis=0)) + linear.information[:, gone] @ taken
+    kept = np.setdiff1d(np.arange(len(gradient)), gone)
+    at, start = {}, 0
+    for name, columns in linear.at.items():
+        if name not in surfaces:
+            size = columns.stop - columns.start
+            at[name], start = slice(start, start + size), start + size
+    none = np.full(1, -1)
+    alone = replace(
+        linear,
+        at=at,
+        information=linear.information[np.ix_(kept, kept)],
+        gradient=csr_array(gradient[kept][None]),
+        stop=none,
+        place=none,
+    )
+    return project(alone, alone.candidates)
+
+
+def forward(scores: Scores, at: Columns, rows: int) -> list[str]:
+    """Forward selection by BIC, rows as independent."""
+    chosen, columns, before = [], np.zeros(0, int), 0.0
+    while len(chosen) < MOST:
+        best, gain = None, 0.0
+        for effect, own in at.items():
+            if effect.family in chosen:
+                continue
+            found = test(scores, np.concatenate([columns, own]))
+            net = found.statistic - before - len(own) * np.log(rows)
+            if net > gain:
+                best, gain = effect, net
+        if best is None:
+            break
+        chosen.append(best.family)
+        columns = np.concatenate([columns, at[best]])
+        before = test(scores, columns).statistic
+    return chosen
+
+
+def stop_clustered(scores: Scores, at: Columns) -> list[str]:
+    """Wald's test with stops as the clusters, Bonferroni over all; most significant first."""
+    found: dict[str, float] = {}
+    for effect, columns in at.items():
+        whiten = test(scores, columns).whiten
+        share = scores.by_stop[:, columns] @ whiten
+        clusters = int((np.abs(share).max(axis=1) > 0).sum())
+        q = whiten.shape[1]
+        if 2 * q > clusters:
+            continue
+        score = whiten.T @ scores.score[columns]
+        square = float(score @ np.linalg.pinv(share.T @ share) @ score)
+        ratio = square * (clusters - q) / (q * (clusters - 1))
+        p = float(stats.f.sf(ratio, q, clusters - q))
+        found[effect.family] = min(p, found.get(effect.family, 1.0))
+    named = [family for family, p in found.items() if p * len(at) < LEVEL]
+    return sorted(named, key=found.get)
+
+
+def leave_location_out(scores: Scores, at: Columns, look: Look) -> list[str]:
+    """The effect that, fitted without a location, lowers the error there most, over all of them.
+
+    Linearised; every location is taken to hold an equal part of the information.
+    """
+    scans = look.stand.problem.scans
+    location = np.array([scan.recording.location[scan.index] for scan in scans])
+    places = np.unique(location)
+    gains: dict[str, float] = {}
+    for effect, columns in at.items():
+        share = scores.by_stop[: len(scans), columns] @ test(scores, columns).whiten
+        by_place = np.stack([share[location == p].sum(axis=0) for p in places])
+        n = len(places)
+        theta = (by_place.sum(axis=0) - by_place) * n / (n - 1)
+        gain = float(np.sum(2 * theta * by_place - theta**2 / n))
+        gains[effect.family] = max(gain, gains.get(effect.family, -np.inf))
+    best = max(gains, key=gains.get)
+    return [best] if gains[best] > 0 else []
+
+
+def lasso(scores: Scores, at: Columns, rows: int) -> list[str]:
+    """The lasso over all candidates' columns, its penalty by BIC; what explains most first."""
+    columns = np.concatenate(list(at.values()))
+    family = np.repeat([e.family for e in at], [len(c) for c in at.values()])
+    seen = np.diag(scores.information)[columns] > GAUGE * np.diag(scores.whole)[columns]
+    columns, family = columns[seen], family[seen]
+    size = np.sqrt(np.diag(scores.information)[columns])
+    gram = scores.information[np.ix_(columns, columns)] / np.outer(size, size)
+    score = scores.score[columns] / size
+    steepest = float(np.linalg.eigvalsh(gram)[-1])
+    b, best, least = np.zeros(len(score)), np.zeros(len(score)), 0.0
+    for penalty in PATH * np.abs(score).max():
+        b = _shrunk(gram, score, penalty, steepest, b)
+        cost = b @ gram @ b - 2 * score @ b + np.log(rows) * np.count_nonzero(b)
+        if cost < least:
+            best, least = b, cost
+    explains = {f: float((best * score)[family == f].sum()) for f in np.unique(family[best != 0])}
+    return sorted(map(str, explains), key=lambda f: -explains[f])
+
+
+def _shrunk(
+    gram: np.ndarray, score: np.ndarray, penalty: float, steepest: float, b: np.ndarray
+) -> np.ndarray:
+    """Minimum of ``b'Gb / 2 - s'b + penalty |b|`` from a start (Beck and Teboulle 2009)."""
+    ahead, t = b, 1.0
+    for _ in range(STEPS):
+        moved = ahead - (gram @ ahead - score) / steepest
+        after = np.sign(moved) * np.maximum(np.abs(moved) - penalty / steepest, 0.0)
+        later = (1 + np.sqrt(1 + 4 * t * t)) / 2
+        ahead, b, t = after + (t - 1) / later * (after - b), after, later
+    return b
