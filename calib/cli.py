@@ -32,6 +32,13 @@ app = typer.Typer(
 
 Json = Annotated[bool, typer.Option("--json", help="Print the machine-readable result alone.")]
 Out = Annotated[Path, typer.Option("-o", "--out", help="Where to write.")]
+Recordings = Annotated[list[Path], typer.Argument(help="Recording folders.", metavar="REC...")]
+Effects = Annotated[
+    str | None, typer.Option(help="Effects of the model, or files of them, with commas.")
+]
+Fix = Annotated[
+    list[str] | None, typer.Option(metavar="NAME", help="Hold a frame, effect or parameter.")
+]
 
 
 @app.command()
@@ -77,14 +84,10 @@ def check(recording: Path, as_json: Json = False) -> None:
 
 @app.command()
 def fit(
-    recordings: Annotated[list[Path], typer.Argument(help="Recording folders.", metavar="REC...")],
+    recordings: Recordings,
     out: Out,
-    effects: Annotated[
-        str | None, typer.Option(help="Effects of the model, or files of them, with commas.")
-    ] = None,
-    fix: Annotated[
-        list[str] | None, typer.Option(metavar="NAME", help="Hold a frame, effect or parameter.")
-    ] = None,
+    effects: Effects = None,
+    fix: Fix = None,
     hold_out: Annotated[str, typer.Option(help="location, stop or none.")] = "location",
     folds: Annotated[int, typer.Option(help="Folds of the held-out error.", min=1, max=5)] = 1,
     prior: Annotated[
@@ -121,6 +124,52 @@ def add(
     model = grown_model(earlier, effects)
     with _progress() as progress:
         _tell(grow(earlier, model, out, progress), as_json)
+
+
+@app.command()
+def diagnose(
+    run: Path,
+    refits: Annotated[
+        bool, typer.Option("--refits/--no-refits", help="Whether to take the held-out falls.")
+    ] = True,
+    as_json: Json = False,
+) -> None:
+    """Where a run's model fails and which effect it lacks; written to RUN/diagnosis.json."""
+    from calib.diagnosis import diagnose as find
+    from calib.run import Run
+
+    fitted = Run.open(run)
+    with _progress() as progress:
+        found = find(fitted, progress, refits)
+    if as_json:
+        _print_json(found.document())
+    else:
+        from calib.diagnosis_tables import print_diagnosis
+
+        print_diagnosis(found, fitted.summary["residual"])
+
+
+@app.command()
+def explain(
+    recordings: Recordings,
+    out: Out,
+    effects: Effects = None,
+    fix: Fix = None,
+    as_json: Json = False,
+) -> None:
+    """Fit, diagnose, add, until nothing worth adding is left; every rung is kept in DIR."""
+    from calib.explain import explain as climb
+    from calib.model import Model
+
+    chosen = Model.of(effects, fix or [])
+    with _progress() as progress:
+        found = climb(recordings, out, chosen, progress)
+    if as_json:
+        _print_json(found.document())
+    else:
+        from calib.diagnosis_tables import print_explanation
+
+        print_explanation(found)
 
 
 @app.command()

@@ -11,6 +11,7 @@ from calib.graph import Graph
 from calib.residuals.beams import Association, Rows
 from calib.residuals.scan import ScanStop
 from calib.residuals.tracker import TrackedBody
+from chains import se3
 
 
 @dataclass(frozen=True)
@@ -100,7 +101,9 @@ def body_errors(
     out = Errors()
     for block in blocks:
         placed = block.stops.in_world(block.body, values)
-        distance = np.linalg.norm(block.measured[:, :3, 3] - placed.T[:, :3, 3], axis=1)
+        added = sum((B @ values[n] for n, B in block.bases.items()), np.zeros((1, 6)))
+        seen = placed.T @ se3.exp(added)
+        distance = np.linalg.norm(block.measured[:, :3, 3] - seen[:, :3, 3], axis=1)
         expected = 3.0 * block.sigma_m**2 * len(distance)
         if graph is not None:
             names = list(placed.d)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +13,14 @@ from calib.calibrate import calibrate, grow
 from calib.diagnosis import Diagnosis, diagnose
 from calib.effects import load_effects
 from calib.fit import Progress
-from calib.model import Model
+from calib.model import Model, Source
 from calib.run import Run
 from chains.errors import InputError
-from sensors.documents import write_json
+from sensors.documents import plain, write_json
 
 EXPLANATION = "explanation.json"
 MOST_RUNGS = 8
+WORTH = 0.01  # of what the held-out error has above the noise floor: what an effect must take away
 
 
 @dataclass(frozen=True)
@@ -55,8 +57,9 @@ def explain(
 ) -> Explanation:
     """Grow a model until it is adequate, or what is left has no name; every rung is kept.
 
-    What is found is added only if the held-out error falls, and dropped again if later steps leave
-    it without effect. Rungs that an interrupted call has finished are taken up again.
+    What is found is added only if the held-out error falls, by a hundredth of what it has above the
+    noise floor or more, and dropped again if later steps leave it nothing to lower. Rungs that an
+    interrupted call has finished are taken up again.
 
     Args:
         recordings: folders.
@@ -69,17 +72,16 @@ def explain(
     """
     out = Path(out)
     _refuse_other(out)
-    out.mkdir(parents=True, exist_ok=True)
     climb = _Climb([Path(r) for r in recordings], out, progress)
-    climb.first(model)
-    while True:
-        found = diagnose(climb.run, progress, refits=False)
-        before = len(climb.runs)
-        for name in found.worth_adding:
-            climb.add(name)
-        climb.drop_idle()
-        if len(climb.runs) == before or len(climb.runs) > MOST_RUNGS:
-            break
+    try:
+        climb.first(model)
+    except BaseException:
+        _remove_if_empty(out)
+        raise
+    found = diagnose(climb.run, climb.tell, refits=False)
+    while len(climb.runs) < MOST_RUNGS and climb.improve(found.worth_adding):
+        found = diagnose(climb.run, climb.tell, refits=False)
+    climb.clear_above()
     result = Explanation(climb.runs, climb.steps, climb.refused, found)
     write_json(out / EXPLANATION, result.document())
     return result
@@ -97,6 +99,11 @@ def _refuse_other(out: Path) -> None:
         raise InputError(f"{out} holds {others[0]}, so it is no ladder of runs; give another -o")
 
 
+def _remove_if_empty(folder: Path) -> None:
+    if folder.is_dir() and not any(folder.iterdir()):
+        folder.rmdir()
+
+
 class _Climb:
     """The ladder while it is climbed."""
 
@@ -110,27 +117,42 @@ class _Climb:
     def run(self) -> Run:
         return self.runs[-1]
 
+    def tell(self, what: str, done: int, total: int) -> None:
+        """Progress, with the rung's name."""
+        self.progress(f"{self._next().name}: {what}", done, total)
+
     def first(self, model: Model) -> None:
         """The fit to start from."""
         folder = self._next()
         run = self._finished(folder, model, None)
         if run is None:
-            run = calibrate(self.recordings, folder, model, progress=self.progress)
+            run = calibrate(self.recordings, folder, model, progress=self.tell)
         self._keep(run, [], [])
 
-    def add(self, name: str) -> None:
-        """A rung more, if it lowers the held-out error."""
-        effect = load_effects((name,))
-        if name in self.refused or any(e.family == effect[0].family for e in self._model.effects):
-            return
-        self._try(self._model.plus(effect), [name], [])
+    def improve(self, names: Sequence[str]) -> bool:
+        """Add what lowers the held-out error, drop what that made idle; whether any was added."""
+        earlier = [name for step in self.steps for name in step["added"]]
+        before = len(self.runs)
+        for name in names:
+            self._add(name)
+        if len(self.runs) == before:
+            return False
+        for name in earlier:
+            if name in self._model.names:
+                self._try(self._model.minus([name]), [], [name])
+        return True
 
-    def drop_idle(self) -> None:
-        """Without an effect that was added and that later rungs left with nothing to do."""
-        for name in [n for step in self.steps[:-1] for n in step["added"]]:
-            if name in self.run.effects and len(self.steps) > 2:
-                rest = tuple(e for e in self._model.effects if e.name != name)
-                self._try(Model(rest, self._model.fixed), [], [name])
+    def clear_above(self) -> None:
+        """Remove rungs that an earlier call left above the last one."""
+        for folder in self.out.iterdir():
+            if folder.name.isdigit() and int(folder.name) >= len(self.runs):
+                shutil.rmtree(folder)
+
+    def _add(self, name: str) -> None:
+        effects = load_effects((name,))
+        families = {effect.family for effect in self._model.effects}
+        if name not in self.refused and effects[0].family not in families:
+            self._try(self._model.plus(effects), [name], [])
 
     @property
     def _model(self) -> Model:
@@ -140,8 +162,8 @@ class _Climb:
         folder = self._next()
         run = self._finished(folder, model, self.run)
         if run is None:
-            run = grow(self.run, model, folder, self.progress)
-        if _held_out(run) < _held_out(self.run):
+            run = grow(self.run, model, folder, self.tell)
+        if _falls(self.run, run, WORTH if added else 0.0):
             self._keep(run, added, dropped)
         else:
             shutil.rmtree(folder)
@@ -168,15 +190,37 @@ class _Climb:
         """The rung that an earlier call made here, if it is the same one."""
         try:
             run = Run.open(folder)
+            run.state()
         except InputError:
             return None
-        grown_from = str(below.folder.resolve()) if below else None
-        same = (
-            run.model["grown_from"] == grown_from
-            and Model.read(run.model).names == model.names
-            and [p.resolve() for p in run.recordings] == [p.resolve() for p in self.recordings]
-        )
-        return run if same else None
+        wanted = {
+            **model.document(),
+            "recordings": self._told,
+            "grown_from": str(below.folder.resolve()) if below else None,
+            "hold_out": "location",
+            "prior": None,
+        }
+        return run if all(run.model[key] == plain(wanted[key]) for key in wanted) else None
+
+    @cached_property
+    def _told(self) -> list[dict[str, str]]:
+        """The recordings as a run's model.yaml has them."""
+        sources = [Source.open(folder) for folder in self.recordings]
+        return [
+            {
+                "path": str(s.recording.folder.resolve()),
+                "rig": s.rig.name,
+                "sha256": s.recording.digest(),
+            }
+            for s in sources
+        ]
+
+
+def _falls(before: Run, after: Run, share: float) -> bool:
+    """Whether the squared held-out error falls, and by this share of what is above the floor."""
+    was, now = _held_out(before) ** 2, _held_out(after) ** 2
+    excess = was - before.summary["rms_mm"]["noise_floor"] ** 2
+    return now < was and was - now >= share * excess
 
 
 def _held_out(run: Run) -> float:

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 WIDTH = 100
 LISTED = 12  # an effect of more parameters than these is summarised
 ABREAST = 3  # runs in one table
+LEAST_P = 1e-12  # smaller ones are not told from each other
 ERROR_LABELS = {
     "nominal": "before, all as in CAD",
     "fit": "after the fit",
@@ -33,19 +34,19 @@ SHOWN = {"m": (1e3, "mm"), "rad": (1e3, "mrad"), "1": (1.0, "")}
 
 def print_check(check: Check) -> None:
     """Print what a recording holds, what is wrong, and what can be estimated from it."""
-    console = _console()
-    _grid(console, "what is there", check.contents)
+    console = terminal()
+    print_pairs(console, "what is there", check.contents)
     if check.problems:
-        _grid(console, "what is wrong", [("", problem) for problem in check.problems])
+        print_pairs(console, "what is wrong", [("", problem) for problem in check.problems])
     if check.odd:
-        _grid(console, "what is worth a look", [("", sentence) for sentence in check.odd])
-    _grid(console, "what can be estimated", [("", line) for line in check.can or ["nothing"]])
+        print_pairs(console, "what is worth a look", [("", sentence) for sentence in check.odd])
+    print_pairs(console, "what can be estimated", [("", line) for line in check.can or ["nothing"]])
     _print_reasons(console, "what cannot", check.cannot)
 
 
 def print_run(run: Run) -> None:
     """Print a run: every link and effect with its sigma, the errors, and what was not told."""
-    console, rows = _console(), found(run)
+    console, rows = terminal(), found(run)
     summary = run.summary
     console.print(str(run.folder), style="bold", soft_wrap=True)
     console.print(f"{_outcome(summary)}\n")
@@ -75,7 +76,7 @@ def _warning(summary: dict[str, Any]) -> str:
 
 def print_comparison(runs: Sequence[Run]) -> None:
     """Print errors, noise floor and parameters of runs side by side, and the ladder of a study."""
-    console = _console()
+    console = terminal()
     for run in runs:
         console.print(str(run.folder), style="bold", soft_wrap=True)
         console.print(f"{_model(run)}; {_outcome(run.summary)}")
@@ -85,7 +86,7 @@ def print_comparison(runs: Sequence[Run]) -> None:
     rungs = ladder(runs)
     if rungs:
         console.print()
-        console.print(_ladder_table(rungs))
+        console.print(ladder_table(rungs))
 
 
 def effect_page(effect: Effect) -> dict[str, Any]:
@@ -108,16 +109,18 @@ def effect_page(effect: Effect) -> dict[str, Any]:
 
 def print_catalogue(effects: Sequence[Effect], whole: bool) -> None:
     """Print the catalogue as a list, or the whole page of each effect."""
-    console = _console()
+    console = terminal()
     pages = [effect_page(effect) for effect in effects]
     if whole:
         for page in pages:
             for several in ("confounded_with", "covariates"):
                 page[several] = ", ".join(page[several])
             name = page.pop("name")
-            _grid(console, name, [(k.replace("_", " "), text) for k, text in page.items() if text])
+            print_pairs(
+                console, name, [(k.replace("_", " "), text) for k, text in page.items() if text]
+            )
         return
-    table = _table("effect", "where", "size", "what")
+    table = columns_table("effect", "where", "size", "what")
     for page in pages:
         table.add_row(page["name"], page["site"], page["typical"], page["what"])
     console.print(table)
@@ -126,48 +129,56 @@ def print_catalogue(effects: Sequence[Effect], whole: bool) -> None:
 # ---------------------------------------------------------------------------------------- numbers
 
 
-def _shown(unit: str) -> tuple[float, str]:
-    """Factor and unit in which a unit is shown."""
+def shown(unit: str) -> tuple[float, str]:
+    """Factor and unit in which a unit is shown, m/K as m is."""
+    length, per, rest = unit.partition("/")
+    if per and length in SHOWN and length != "1":
+        scale, name = SHOWN[length]
+        return scale, f"{name}/{rest}"
     return SHOWN.get(unit, (1.0, unit))
 
 
-def _cell(estimate: float, sigma: float, unit: str) -> str:
+def estimate_cell(estimate: float, sigma: float, unit: str) -> str:
     """An estimate and its sigma in the unit shown, as ``+1.234 ± 0.056``."""
     if sigma == 0.0:
         return "held"
-    scale, _ = _shown(unit)
+    scale, _ = shown(unit)
     sigma = scale * sigma
-    if scale == 1.0:
-        spread, value = f"± {sigma:.2g}", f"{estimate:+.4g}"
+    if scale == 1.0 or "/" in unit:
+        spread, value = f"± {sigma:.2g}", f"{scale * estimate:+.4g}"
     else:
         digits = 2 if sigma >= 0.095 else 3
         spread, value = f"± {sigma:.{digits}f}", f"{scale * estimate:+z.{digits}f}"
     return spread if np.isnan(estimate) else f"{value} {spread}"
 
 
-def _mm(value: float | None, sign: str = "") -> str:
+def mm(value: float | None, sign: str = "") -> str:
+    """A length in mm that may be missing."""
     return "" if value is None else f"{value:{sign}z.2f}"
 
 
 # ----------------------------------------------------------------------------------------- tables
 
 
-def _console() -> Console:
+def terminal() -> Console:
+    """Where people read: at most `WIDTH` columns wide, and as wide where nobody looks."""
     console = Console(markup=False, highlight=False, emoji=False)
     console.width = min(console.width, WIDTH) if console.is_terminal else WIDTH
     return console
 
 
-def _table(*columns: str) -> Table:
+def columns_table(*columns: str) -> Table:
+    """An empty table with these headings."""
     table = Table(box=None, padding=(0, 2, 0, 0), header_style="bold", pad_edge=False)
     for column in columns:
         table.add_column(column)
     return table
 
 
-def _grid(console: Console, title: str, rows: Iterable[tuple[str, str]]) -> None:
+def print_pairs(console: Console, title: str, rows: Iterable[tuple[str, str]]) -> None:
+    """Print names and what is to be said of each, below a title."""
     console.print(title, style="bold")
-    table = _table("", "")
+    table = columns_table("", "")
     table.show_header = False
     for name, text in rows:
         table.add_row(name, text)
@@ -175,19 +186,19 @@ def _grid(console: Console, title: str, rows: Iterable[tuple[str, str]]) -> None
 
 
 def _links_table(rows: Sequence[Found]) -> Table:
-    table = _table("moved from CAD, own axes", "x", "y", "z", "", "not told by the data")
+    table = columns_table("moved from CAD, own axes", "x", "y", "z", "", "not told by the data")
     for row in rows:
         for part, unit in ((slice(3, 6), "m"), (slice(0, 3), "rad")):
-            cells = map(_cell, row.estimate[part], row.sigma[part], (unit,) * 3)
+            cells = map(estimate_cell, row.estimate[part], row.sigma[part], (unit,) * 3)
             untold = " ".join(np.array(["x", "y", "z"])[~row.told[part]])
             label = f"{row.parent} -> {row.variable}" if unit == "m" else ""
-            table.add_row(label, *cells, _shown(unit)[1], untold)
+            table.add_row(label, *cells, shown(unit)[1], untold)
     table.add_row()
     return table
 
 
 def _effects_table(rows: Sequence[Found]) -> Table:
-    table = _table("effect", "parameter", "estimate", "", "")
+    table = columns_table("effect", "parameter", "estimate", "", "")
     for row in rows:
         name = row.variable
         for parameter, cell, unit, told in _effect_cells(row):
@@ -209,11 +220,11 @@ def _effect_cells(row: Found) -> Iterable[tuple[str, str, str, bool]]:
         row.parameters, row.units, row.estimate, row.sigma, row.told, strict=True
     ):
         if numbers[1]:
-            yield parameter, _cell(*numbers, unit), _shown(unit)[1], told
+            yield parameter, estimate_cell(*numbers, unit), shown(unit)[1], told
 
 
 def _summary_cell(row: Found, free: np.ndarray, unit: str) -> tuple[str, str]:
-    scale, unit = _shown(unit)
+    scale, unit = shown(unit)
     values = scale * row.estimate[free]
     if not len(values):
         return "held", unit
@@ -225,13 +236,13 @@ def _summary_cell(row: Found, free: np.ndarray, unit: str) -> tuple[str, str]:
 
 
 def _error_table(summary: Mapping[str, Any]) -> Table:
-    table = _table(f"{summary['residual']} residual, mm", "rms", "mean", "std")
+    table = columns_table(f"{summary['residual']} residual, mm", "rms", "mean", "std")
     for column in table.columns[1:]:
         column.justify = "right"
     for kind, label in ERROR_LABELS.items():
         rms, mean, std = (summary[error].get(kind) for error in ("rms_mm", "mean_mm", "std_mm"))
         if rms is not None:
-            table.add_row(label, _mm(rms), _mm(mean, "+"), _mm(std))
+            table.add_row(label, mm(rms), mm(mean, "+"), mm(std))
     table.add_row()
     return table
 
@@ -241,17 +252,17 @@ def _print_moved(console: Console, links: Sequence[Mapping[str, Any]]) -> None:
     rows, still, silent = [], [], []
     for link in links:
         if link["moved"]:
-            rows.append((link["name"], f"{_change(link)}; {_chance(link['p_value'])}"))
+            rows.append((link["name"], f"{_change(link)}; {chance(link['p_value'])}"))
         elif link["p_value"] is None:
             silent.append(link["name"])
         else:
-            still.append(f"{link['name']} ({_chance(link['p_value'])})")
+            still.append(f"{link['name']} ({chance(link['p_value'])})")
     rows = rows or [("nothing", "no change is beyond the uncertainty of then and now")]
-    _grid(console, "moved since the earlier run", rows)
+    print_pairs(console, "moved since the earlier run", rows)
     if still:
-        _grid(console, "not moved", [("", ", ".join(still))])
+        print_pairs(console, "not moved", [("", ", ".join(still))])
     if silent:
-        _grid(console, "the new data say nothing of", [("", ", ".join(silent))])
+        print_pairs(console, "the new data say nothing of", [("", ", ".join(silent))])
 
 
 def _change(link: Mapping[str, Any]) -> str:
@@ -260,18 +271,24 @@ def _change(link: Mapping[str, Any]) -> str:
     for unit in dict.fromkeys(link["units"]):
         mine = [i for i, u in enumerate(link["units"]) if u == unit]
         cells = [
-            f"{link['parameters'][i]} {_cell(link['change'][i], link['sigma'][i], unit)}"
+            f"{link['parameters'][i]} {estimate_cell(link['change'][i], link['sigma'][i], unit)}"
             for i in mine
         ]
         if len(mine) > LISTED:
             rms = np.sqrt(np.mean(np.square([link["change"][i] for i in mine])))
-            cells = [f"{len(mine)} values by {_shown(unit)[0] * rms:.2f} rms"]
-        texts.append(f"{', '.join(cells)} {_shown(unit)[1]}".rstrip())
+            cells = [f"{len(mine)} values by {shown(unit)[0] * rms:.2f} rms"]
+        texts.append(f"{', '.join(cells)} {shown(unit)[1]}".rstrip())
     return "; ".join(texts[::-1])
 
 
-def _chance(p: float) -> str:
-    return f"p = {p:.2g}" if p > 1e-12 else "p < 1e-12"
+def chance(p: float) -> str:
+    """A p-value as people read it."""
+    return f"p {small(p)}" if p <= LEAST_P else f"p = {small(p)}"
+
+
+def small(p: float) -> str:
+    """A p-value in a table."""
+    return f"{p:.2g}" if p > LEAST_P else f"< {LEAST_P:.0e}"
 
 
 def _print_reasons(console: Console, title: str, entries: Sequence[Mapping[str, str]]) -> None:
@@ -281,17 +298,17 @@ def _print_reasons(console: Console, title: str, entries: Sequence[Mapping[str, 
         tied, colon, why = entry["why"].partition(": ")
         groups[why if colon else tied].append((entry["name"], tied if colon else ""))
     for why, rows in groups.items():
-        _grid(console, f"{title}: {why}", rows)
+        print_pairs(console, f"{title}: {why}", rows)
 
 
 def _comparison_table(runs: Sequence[Run]) -> Table:
     compared = comparison(runs)
-    table = _table("", "", *(run.folder.name or str(run.folder) for run in runs))
+    table = columns_table("", "", *(run.folder.name or str(run.folder) for run in runs))
     for error in ("rms_mm", "mean_mm", "std_mm"):
         for kind, label in ERROR_LABELS.items():
             values = compared[error].get(kind, ())
             if any(value is not None for value in values):
-                cells = (_mm(value, "+" if error == "mean_mm" else "") for value in values)
+                cells = (mm(value, "+" if error == "mean_mm" else "") for value in values)
                 table.add_row(f"{error[:-3]} {label}", "mm", *cells)
     for variable, parameters in compared["parameters"].items():
         if len(parameters) > LISTED:
@@ -299,22 +316,22 @@ def _comparison_table(runs: Sequence[Run]) -> Table:
             continue
         for name, entry in parameters.items():
             numbers = zip(entry["estimate"], entry["sigma"], strict=True)
-            cells = ("" if s is None else _cell(e, s, entry["unit"]) for e, s in numbers)
-            table.add_row(f"{variable}.{name}", _shown(entry["unit"])[1], *cells)
+            cells = ("" if s is None else estimate_cell(e, s, entry["unit"]) for e, s in numbers)
+            table.add_row(f"{variable}.{name}", shown(entry["unit"])[1], *cells)
     return table
 
 
-def _ladder_table(rungs: Sequence[Rung]) -> Table:
+def ladder_table(rungs: Sequence[Rung]) -> Table:
     """What each rung changed of the model, and what that did to the error of stops held out."""
-    table = _table("ladder", "model", "held out, mm", "fit, mm", "noise floor, mm")
+    table = columns_table("ladder", "model", "held out, mm", "fit, mm", "noise floor, mm")
     for column in table.columns[2:]:
         column.justify = "right"
     for rung in rungs:
         rms = rung.run.summary["rms_mm"]
         below = rung.below.summary["rms_mm"] if rung.below else {}
-        held_out = " -> ".join(filter(None, (_mm(r.get("held_out")) for r in (below, rms))))
+        held_out = " -> ".join(filter(None, (mm(r.get("held_out")) for r in (below, rms))))
         name = rung.run.folder.name or str(rung.run.folder)
-        table.add_row(name, _step(rung), held_out, _mm(rms["fit"]), _mm(rms["noise_floor"]))
+        table.add_row(name, _step(rung), held_out, mm(rms["fit"]), mm(rms["noise_floor"]))
     return table
 
 
@@ -331,7 +348,7 @@ def _step(rung: Rung) -> str:
 def _add_spread(table: Table, variable: str, entries: Sequence[Mapping[str, Any]]) -> None:
     """Mean and standard deviation, per run, over an effect's many parameters of each unit."""
     for kind in dict.fromkeys(entry["unit"] for entry in entries):
-        scale, unit = _shown(kind)
+        scale, unit = shown(kind)
         alike = [entry["estimate"] for entry in entries if entry["unit"] == kind]
         estimates = np.array(alike, float).T
         for what, function in (("mean", np.mean), ("sd", np.std)):

@@ -3,6 +3,8 @@
 import json
 import os
 import pty
+import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -127,6 +129,12 @@ def test_every_command_has_help_and_json(rigcal, command):
         (["add", "run", "-o", "grown"], "EFFECT"),
         (["add", "run", "arm_axis_tilt"], "--out"),
         (["fit", "rec", "-o", "run", "--effects", "own.yaml"], "own.yaml does not exist"),
+        (["diagnose", "nowhere"], "nowhere: no run there"),
+        (["diagnose"], "run"),
+        (["explain", "rec"], "--out"),
+        (["explain", "-o", "ladder"], "REC"),
+        (["explain", "nowhere", "-o", "ladder"], "nowhere"),
+        (["explain", "rec", "-o", "ladder", "--effects", "range_scal"], "did you mean"),
     ],
     ids=lambda value: "" if isinstance(value, str) else " ".join(value),
 )
@@ -179,6 +187,7 @@ def test_json_of_what_takes_long_stands_alone_on_stdout(made):
     [
         (["check", "rec"], {"contents", "problems", "odd", "can", "cannot"}),
         (["compare", "run", "run"], {"rms_mm", "parameters", "ladder"}),
+        (["diagnose", "run"], {"verdict", "candidates", "unexplained", "weak_directions"}),
         (["export", "run", "-o", "out"], {"files"}),
         (["effects"], {"name", "formula", "source"}),
         (["effects", "ring_range_offset"], {"name", "formula", "source"}),
@@ -214,8 +223,45 @@ def test_a_run_grows_and_the_ladder_says_by_what(rigcal, folder, monkeypatch):
     assert not (folder / "more").exists()
 
 
+def test_a_diagnosis_stands_in_the_run_as_it_is_printed(rigcal, folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    code, out, err = rigcal("diagnose", "run", "--no-refits", "--json")
+    assert (code, err) == (0, "")
+    assert json.loads(out) == json.loads((folder / "run/diagnosis.json").read_text())
+    code, out, err = rigcal("diagnose", "run", "--no-refits")
+    assert (code, err) == (0, "") and out.startswith("verdict: ")
+
+
+def test_a_run_that_cannot_be_diagnosed_is_one_sentence_and_2(rigcal, folder, tmp_path):
+    shutil.copytree(folder / "run", tmp_path / "run")
+    (tmp_path / "run/state.npz").unlink()
+    code, out, err = rigcal("diagnose", tmp_path / "run")
+    assert (code, out) == (2, "") and err.count("\n") == 1 and "fit it again" in err
+
+
+def test_explain_prints_its_ladder_and_goes_on_from_what_is_there(rigcal, folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    effects = "arm_link_length,arm_joint_offset,arm_axis_tilt,ring_range_offset"
+    arguments = ["explain", "rec", "-o", "ladder", "--fix", "mount.tx", "--effects", effects]
+    code, out, err = rigcal(*arguments)
+    assert (code, err) == (0, "")
+    assert "ladder/00" in out and re.search(r"^00 +start +\d", out, flags=re.M)
+    assert "verdict: " in out
+    runs = sorted(path.name for path in (folder / "ladder").iterdir())
+    assert runs[0] == "00" and runs[-1] == "explanation.json"
+    made = (folder / "ladder/00/summary.json").stat().st_mtime_ns
+    code, out, err = rigcal(*arguments, "--json")
+    assert (code, err) == (0, "")
+    assert json.loads(out) == json.loads((folder / "ladder/explanation.json").read_text())
+    assert (folder / "ladder/00/summary.json").stat().st_mtime_ns == made
+    model = (folder / "ladder/00/model.yaml").read_text()
+    assert "mount.tx" in model and "arm_axis_tilt" in model
+
+
 @pytest.mark.parametrize(
-    "command", [["check", "rec"], ["compare", "run"], ["effects"]], ids=" ".join
+    "command",
+    [["check", "rec"], ["compare", "run"], ["diagnose", "run"], ["effects"]],
+    ids=" ".join,
 )
 def test_without_json_people_are_told_on_stdout(rigcal, folder, monkeypatch, command):
     monkeypatch.chdir(folder)

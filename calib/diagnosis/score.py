@@ -25,6 +25,7 @@ from scipy.sparse import csr_array
 from calib.diagnosis.linear import Linear
 
 GAUGE = 1e-6  # share of a direction's information that is left, below which there is none
+UNFELT = 1e-9  # of an effect's largest column, below which no row feels a parameter
 COMMON = 30.0  # how many clusters the candidates' common inflation counts for
 POWER = 0.8  # with which an effect of the smallest detectable size is found
 DRAWS = 999
@@ -198,7 +199,8 @@ def log_tail(x: float, q: float) -> float:
 
 def test(scores: Scores, columns: np.ndarray) -> Test:
     """Test the candidate of these columns."""
-    size = np.sqrt(np.maximum(np.diag(scores.whole)[columns], 1e-300))
+    size = np.sqrt(np.maximum(np.diag(scores.whole)[columns], 0.0))
+    size = np.where(size > UNFELT * size.max(initial=0.0), size, np.inf)
     block = scores.information[np.ix_(columns, columns)]
     values, axes = np.linalg.eigh(block / np.outer(size, size))
     seen = values > GAUGE

@@ -21,6 +21,7 @@ from calib.fit import Progress
 ALPHA = 0.04  # chance that a named effect is found where nothing is missing
 ALPHA_UNNAMED = 0.01  # and that structure is
 MOST = 3  # an explanation that needs more names than this is none
+FEWEST = 4  # stops, below which nothing is claimed
 TRIES = 3  # how many suspects are judged before a look is called quiet
 FINER = 9  # shapes tried between the two beside the best one
 ODDS = np.log(20.0)  # of a rival: within these it can stand in for the best
@@ -159,6 +160,8 @@ def suspects(screen: Screen, alpha: float) -> Iterator[Candidate]:
 
 
 def _stands_out(candidate: Candidate, alpha: float) -> bool:
+    if candidate.test.clusters < FEWEST:
+        return False
     alone = -log_tail(candidate.test.statistic, candidate.test.dof)
     return candidate.p_adjusted < alpha or alone > np.log(candidate.looks / alpha)
 

@@ -96,8 +96,9 @@ class Stand:
         grid = sorted({shape for s in self.sources for shape in effect.shapes(stops_view(s))})
         i = grid.index(effect.shape)
         ends = grid[max(0, i - 1)], grid[min(len(grid) - 1, i + 1)]
-        spaced = np.geomspace if ends[0] > 0 else np.linspace
-        finer = {f"{shape:.6g}": None for shape in (*spaced(*ends, FINER), effect.shape)}
+        spaced = (np.geomspace if ends[0] > 0 else np.linspace)(*ends, FINER)
+        spaced = np.rint(spaced) if effect.whole else spaced
+        finer = {f"{shape:.6g}": None for shape in (*spaced, effect.shape)}
         shaped = [effect.at(float(shape)) for shape in finer]
         linear, at = self.linearise(shaped, progress)
         scores = project(linear, linear.candidates)
@@ -111,7 +112,7 @@ class Stand:
         Returns:
             The fit with them, and the effects that took the place of others, by the others' names.
         """
-        shaped = [e for e in self.model.effects if e.name in names and e.shape_name]
+        shaped = [e for e in self.model.effects if e.name in names and e.shape_name and not e.whole]
         steps = [ShapeStep(e, self.theta(e, whole=True)) for e in shaped]
         if not steps:
             return self, {}

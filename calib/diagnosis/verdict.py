@@ -12,10 +12,11 @@ from calib.diagnosis.candidates import lacking
 from calib.diagnosis.curves import Curve, curves
 from calib.diagnosis.score import log_tail
 from calib.diagnosis.screen import Candidate, Screen
-from calib.diagnosis.search import ALPHA, ODDS, Found, Search, angle_deg
+from calib.diagnosis.search import ALPHA, FEWEST, ODDS, Found, Search, angle_deg
 from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import formula, hangs_on, what_separates, words
 from calib.effects import CATALOGUE, Site
+from calib.run import one_unit
 
 UNNAMED = "unexplained_structure"
 ABSORBED = 0.7  # share of the structure that named effects must explain to be the answer
@@ -194,7 +195,7 @@ def _candidate(
         "rms_mm": None if noise else 1e3 * look.size_m(candidate),
         "unabsorbed_rms_mm": None if noise else 1e3 * look.rms_m(candidate),
         "parameters": {
-            "unit": ", ".join(dict.fromkeys(p.unit for p in params)),
+            "unit": one_unit([p.unit for p in params]),
             "names": [p.name for p in params] if whole else [],
             "estimate": estimate if whole else [],
             "sigma": sigma if whole else [],
@@ -264,7 +265,13 @@ def _sentences(
     look = found.looks[0]
     residual = _residual(look)
     out = []
-    if verdict == "adequate":
+    stops = int(look.linear.stop.max()) + 1
+    if stops < FEWEST:
+        out.append(
+            f"Nothing can be said: {stops} stops are too few to name an effect, as all of them may "
+            f"share one error; {FEWEST} are the least, and 20 are better."
+        )
+    elif verdict == "adequate":
         out.append(
             f"The model is adequate: of {len(look.named.candidates)} known effects and "
             f"{len(look.unnamed.candidates)} kinds of structure none stands out from chance."

@@ -145,12 +145,12 @@ class ArmGearError(ArmJointEccentricity):
     confounded_with = ("arm_backlash", "arm_joint_eccentricity")
     source = "harmonic drives: Mechanism and Machine Theory 2021, 104122"
     sigma = 0.0005
-    shape_name, shape = "ratio", 100.0
+    shape_name, shape, whole = "ratio", 100.0, True
 
     def shapes(self, stops: View) -> tuple[float, ...]:
-        """Ratios usual in arms, singly and doubled, and the low orders of a bent shaft."""
-        ratios = (2, 3, 4, 8, 16, 32, 50, 51, 80, 81, 100, 101, 120, 121, 160, 161, 200, 202)
-        return tuple(map(float, ratios)) if stops.rig.joint_names else ()
+        """Every low order, as of shafts and teeth, and ratios usual in arms, singly and doubled."""
+        high = (48, 50, 51, 60, 64, 80, 81, 100, 101, 120, 121, 128, 160, 161, 200, 202)
+        return tuple(map(float, (*range(2, 41), *high))) if stops.rig.joint_names else ()
 
 
 class ArmGravitySag(Effect):

@@ -108,6 +108,7 @@ class Effect(ABC):
         formula, typical, confounded_with, source: the catalogue's page.
         shape_name: what the shape is, with its unit (``wavelength_m``); empty where there is none.
         shape: the one chosen.
+        whole: True where a shape is a whole number.
         origin: the Python file and class of a user's effect; None for one of the catalogue.
         of_lidar: True when the effect belongs to the mounted LiDAR, so that rigs do not share it.
     """
@@ -122,6 +123,7 @@ class Effect(ABC):
     source: ClassVar[str] = ""
     shape_name: ClassVar[str] = ""
     shape: float = 0.0
+    whole: ClassVar[bool] = False
     origin: Mapping[str, Any] | None = None
 
     @property

@@ -84,7 +84,9 @@ class ScanStop:
             association = self._associate(T, ray, values, near_edges=False)
         surface = self.meeting.meet(T, ray, values, association)
         view = self._view(scan, ray, surface)
-        bases = {t.variable: (t.effect.site, t.basis(view)) for t in self.terms}
+        bases = {
+            t.variable: (t.effect.site, _finite(t.basis(view), surface.usable)) for t in self.terms
+        }
         error = {s: np.zeros((1, d)) for s, d in SIZE.items()}
         for name, (site, basis) in bases.items():
             error[site] = error[site] + site_error(basis, values[name])
@@ -212,6 +214,16 @@ class ScanStop:
             single = (PRIOR_COUNT * single + dof * measured) / (PRIOR_COUNT + dof)
         angle = self.lidar.sigma_angle_rad * t * np.tan(incidence)
         return single / scan.count + angle**2
+
+
+def _finite(basis: np.ndarray | OneHot, usable: np.ndarray) -> np.ndarray | OneHot:
+    """A basis with 0 where a beam met nothing and its formula has no value there."""
+    lost = np.flatnonzero(~usable)
+    if isinstance(basis, OneHot) or len(basis) < len(usable) or np.isfinite(basis[lost]).all():
+        return basis
+    kept = basis.copy()
+    kept[lost] = 0.0
+    return kept
 
 
 def turned(ray: Beams, azimuth_rad: np.ndarray, elevation_rad: np.ndarray) -> Beams:

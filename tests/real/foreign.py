@@ -12,6 +12,7 @@ import struct
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from datetime import datetime
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +38,16 @@ UR10_JOINTS = (
     "wrist_1_joint",
     "wrist_2_joint",
     "wrist_3_joint",
+)
+# kg, and centre of mass (x, z) in the link's frame, m: ros-industrial's ur_description, which has
+# them from the maker; y and the wrists' centres are within 5 cm of 0 and left there.
+UR10_LINKS = (
+    (7.778, (0.0, 0.0)),
+    (12.93, (-0.38757, 0.15061)),
+    (3.87, (-0.1984, 0.06112)),
+    (1.96, (0.0, 0.163941)),
+    (1.96, (0.0, 0.1157)),
+    (0.202, (0.0, 0.0922)),
 )
 UR10_FILES = {"A": "Series_A/measurements_grid.csv", "D": "Series_D/measurements_iso_cubes.csv"}
 
@@ -76,7 +87,7 @@ def ur10(series: str, source: Path, out: Path, max_stops: int | None = None) -> 
     }
     out.mkdir(parents=True)
     _write_csv(out / "stops.csv", columns)
-    _write_urdf(out / "arm.urdf", "ur10", *_ur10_origins())
+    _write_urdf(out / "arm.urdf", "ur10", *_ur10_origins(), UR10_LINKS)
     T_tool_flange = np.loadtxt(source / f"Series_{series}/Trafo_TM_F_init.txt")
     distance_m = float(np.linalg.norm(T_tool_flange[:3, 3])) / 1000
     mount = {
@@ -267,9 +278,21 @@ def _arm_rig(name: str, mount: dict, tracker: dict) -> dict:
     }
 
 
-def _write_urdf(path: Path, name: str, joints: Mapping[str, Origin], tip: Origin) -> None:
+def _write_urdf(
+    path: Path,
+    name: str,
+    joints: Mapping[str, Origin],
+    tip: Origin,
+    masses: Sequence[tuple[float, tuple[float, float]]] = (),
+) -> None:
     links = ["arm_base", *(f"link_{k + 1}" for k in range(len(joints))), "arm_end"]
-    lines = [f'<robot name="{name}">', *(f'  <link name="{link}"/>' for link in links)]
+    lines = [f'<robot name="{name}">', f'  <link name="{links[0]}"/>']
+    for link, inertial in zip_longest(links[1:], masses):
+        lines.append(f'  <link name="{link}"{"" if inertial else "/"}>')
+        if inertial:
+            mass_kg, (x, z) = inertial
+            lines.append(f'    <inertial><origin xyz="{x} 0 {z}"/><mass value="{mass_kg}"/>')
+            lines.append("    </inertial></link>")
     for k, (joint, (xyz, rpy)) in enumerate([*joints.items(), ("flange", tip)]):
         kind = "fixed" if joint == "flange" else "revolute"
         lines += [

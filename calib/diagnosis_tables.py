@@ -1,0 +1,181 @@
+"""What people read of a diagnosis, and of the ladder that explains a recording."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from calib.ladder import Rung, ladder
+from calib.tables import (
+    columns_table,
+    estimate_cell,
+    ladder_table,
+    mm,
+    print_pairs,
+    shown,
+    small,
+    terminal,
+)
+
+if TYPE_CHECKING:
+    from calib.diagnosis import Diagnosis
+    from calib.explain import Explanation
+
+LEADING = 8  # candidates that are shown; diagnosis.json has all
+WEAKEST = 4  # directions that are shown
+VERDICTS = {
+    "adequate": "the model is adequate",
+    "missing_effect": "an effect is missing",
+    "unexplained_structure": "structure that no effect explains",
+}
+
+
+def print_diagnosis(diagnosis: Diagnosis, residual: str = "range") -> None:
+    """Print what is missing from a model: in sentences, then in tables.
+
+    Args:
+        diagnosis: what was found.
+        residual: what its sizes are of, as a run's summary has it.
+    """
+    console = terminal()
+    _say_verdict(console, diagnosis)
+    if diagnosis.candidates:
+        console.print(_candidates_table(diagnosis.candidates[:LEADING], residual))
+    rivals = [(c["add"], c["indistinguishable_from"]) for c in diagnosis.candidates]
+    tied = [(name, ", ".join(those)) for name, those in rivals if those]
+    if tied:
+        print_pairs(console, "what this data cannot tell apart", tied)
+    if diagnosis.unexplained:
+        console.print(_unexplained_table(diagnosis.unexplained[:LEADING], residual))
+    if diagnosis.verdict == "adequate":
+        console.print(_detectable_table(diagnosis.candidates))
+    _print_untestable(console, diagnosis.untestable)
+    _print_weak(console, diagnosis.weak_directions)
+
+
+def print_explanation(explanation: Explanation) -> None:
+    """Print the rungs of a ladder, what was not worth adding, and what is left."""
+    console, runs = terminal(), explanation.runs
+    for run in runs:
+        console.print(str(run.folder), style="bold", soft_wrap=True)
+    console.print()
+    console.print(ladder_table(ladder(runs) or [Rung(runs[0], None)]))
+    console.print()
+    if explanation.refused:
+        names = ", ".join(dict.fromkeys(explanation.refused))
+        console.print(f"Found, and not added, as the held-out error did not fall: {names}.")
+    _say_verdict(console, explanation.diagnosis)
+
+
+def _say_verdict(console: Console, diagnosis: Diagnosis) -> None:
+    console.print(f"verdict: {VERDICTS[diagnosis.verdict]}", style="bold")
+    for sentence in diagnosis.sentences:
+        console.print(sentence)
+    console.print()
+
+
+def _candidates_table(candidates: Sequence[Mapping[str, Any]], residual: str) -> Table:
+    """The leading candidates; those that were confirmed carry the number of their step."""
+    table = columns_table("", "effect", "p", "explains", "held out", "would be")
+    for column in table.columns:
+        column.no_wrap = True
+    for column in table.columns[2:5]:
+        column.justify = "right"
+    table.title = f"what may be missing; p after all looks, mm rms of {residual}"
+    table.title_justify, table.title_style = "left", "bold"
+    for each in candidates:
+        held_out = each["held_out_rms_mm"]
+        table.add_row(
+            str(each["step"] or ""),
+            each["add"],
+            small(each["p_adjusted"]),
+            _size(each["unabsorbed_rms_mm"]),
+            " -> ".join(filter(None, (mm(held_out["before"]), mm(held_out["after"])))),
+            _estimate(each["parameters"]),
+        )
+    table.add_row()
+    return table
+
+
+def _unexplained_table(unexplained: Sequence[Mapping[str, Any]], residual: str) -> Table:
+    table = columns_table("left without a name, over", "p", "mm", "formula in diagnosis.json")
+    for column in table.columns[1:3]:
+        column.justify = "right"
+    table.title = f"structure; p after all looks, mm rms of {residual}"
+    table.title_justify, table.title_style = "left", "bold"
+    for each in unexplained:
+        formula = each["formula"]["name"] if each["formula"] else ""
+        table.add_row(
+            " x ".join(each["covariates"]),
+            small(each["p_adjusted"]),
+            _size(each["rms_mm"]),
+            formula,
+        )
+    table.add_row()
+    return table
+
+
+def _detectable_table(candidates: Iterable[Mapping[str, Any]]) -> Table:
+    """Of each effect the smallest size that would have been found, two effects abreast."""
+    table = columns_table(*("effect", "found from", "") * 2)
+    for column in (1, 4):
+        table.columns[column].justify = "right"
+    cells = []
+    for each in sorted(candidates, key=lambda c: c["effect"]):
+        size, units = each["smallest_detectable"], each["parameters"]["unit"].split(", ")
+        scale, unit = shown(units[0])
+        if len(set(units)) == 1 and size is not None and np.isfinite(size):
+            cells.append((each["effect"], f"{scale * size:.2g}", unit))
+    half = (len(cells) + 1) // 2
+    for left, right in zip(cells[:half], [*cells[half:], ("", "", "")], strict=False):
+        table.add_row(*left, *right)
+    table.add_row()
+    return table
+
+
+def _print_untestable(console: Console, untestable: Mapping[str, str]) -> None:
+    """What could not be tested, by why."""
+    names: dict[str, list[str]] = defaultdict(list)
+    for name, why in untestable.items():
+        names[why].append(name)
+    if names:
+        rows = [(why, ", ".join(those)) for why, those in names.items()]
+        print_pairs(console, "what could not be tested", rows)
+
+
+def _print_weak(console: Console, directions: Sequence[Mapping[str, Any]]) -> None:
+    """What the data hardly determine, and what would."""
+    rows = [
+        (f"{', '.join(d['parameters'])} ± {d['sigma_mm']:.2f} mm", d["needs"])
+        for d in directions[:WEAKEST]
+    ]
+    if rows:
+        print_pairs(console, "what the data hardly tell, and what would", rows)
+
+
+def _estimate(parameters: Mapping[str, Any]) -> str:
+    """One parameter with its sigma, or the size of several, unit by unit."""
+    units, names = parameters["unit"].split(", "), parameters["names"]
+    estimate, sigma = (np.asarray(parameters[k], float) for k in ("estimate", "sigma"))
+    if len(names) == 1:
+        cell = estimate_cell(estimate[0], sigma[0], units[0])
+        return f"{cell} {shown(units[0])[1]}".rstrip()
+    units = units * len(names) if len(units) == 1 else units
+    if len(units) != len(names):
+        return ""
+    parts = []
+    for kind in dict.fromkeys(units):
+        scale, unit = shown(kind)
+        alike = scale * estimate[np.array(units) == kind]
+        parts.append(f"{np.sqrt(np.mean(np.square(alike))):.2g} {unit}".rstrip())
+    return f"{len(names)} of {', '.join(parts)} rms" if names else ""
+
+
+def _size(size_mm: float) -> str:
+    """A length in mm, however large."""
+    return mm(size_mm) if size_mm < 1e4 else f"{size_mm:.0e}"

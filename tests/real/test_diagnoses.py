@@ -1,0 +1,44 @@
+"""What the diagnosis says of real hardware, where something is missing and nobody knows what."""
+
+import pytest
+
+from calib.calibrate import calibrate, grow, grown_model
+from calib.diagnosis import diagnose
+from calib.model import Model
+
+from . import foreign
+
+GEOMETRIC = Model(("arm_link_length", "arm_joint_offset", "arm_axis_tilt"))
+
+
+def test_a_ur10_gives_way_and_errs_with_its_gears(shared, tmp_path):
+    """Gravity and an error 17 times a turn: what stops that the fit never saw bear out."""
+    recording = foreign.ur10("D", shared / "arms/ur10_tmac", tmp_path / "ur10")
+    run = calibrate([recording], tmp_path / "run", GEOMETRIC)
+    found = diagnose(run, refits=False)
+    assert found.verdict != "adequate"
+    first, second = found.worth_adding[:2]
+    assert first == "arm_gravity_sag" and second.startswith("arm_gear_error@1")
+    # Sizes are of the tracked position, where there are no ranges.
+    assert 0.2 < found.candidates[0]["unabsorbed_rms_mm"] < 0.3
+    assert "range" not in found.sentences[0].split("Could not")[0]
+    grown = grow(run, grown_model(run, [first, "arm_gear_error@17"]), tmp_path / "grown")
+    held_out = [r.summary["rms_mm"]["held_out"] for r in (run, grown)]
+    assert held_out[1] < 0.75 * held_out[0]
+    sag = grown.solution.shared.effects[first]
+    lift, elbow = (list(sag.names).index(f"{joint}_joint") for joint in ("shoulder_lift", "elbow"))
+    assert all(sag.estimate[i] > 10 * sag.sigma[i] for i in (lift, elbow)), "and it droops"
+
+
+@pytest.mark.parametrize("kind", ["qt64", "ouster"])
+def test_a_single_pose_proves_no_ring_offset(shared, tmp_path, kind):
+    """A pattern over the rings repeats within a plane, and does not carry to the next."""
+    if kind == "ouster":
+        recording = foreign.ouster(shared / "lidar/ouster_sdk_tests", tmp_path / kind)
+    else:
+        recording = foreign.hesai(kind, shared / "lidar/hesai_nebula", tmp_path / kind)
+    run = calibrate([recording], tmp_path / "run", Model(("range_offset",)))
+    found = diagnose(run, refits=False)
+    assert not any(name.startswith("ring_") for name in found.worth_adding)
+    ring = next(c for c in found.candidates if c["effect"] == "ring_range_offset")
+    assert ring["p_adjusted"] > 0.5 and ring["step"] is None
