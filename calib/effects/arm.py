@@ -149,8 +149,8 @@ class ArmGearError(ArmJointEccentricity):
 
     def shapes(self, stops: View) -> tuple[float, ...]:
         """Every low order, as of shafts and teeth, and ratios usual in arms, singly and doubled."""
-        high = (48, 50, 51, 60, 64, 80, 81, 100, 101, 120, 121, 128, 160, 161, 200, 202)
-        return tuple(map(float, (*range(2, 41), *high))) if stops.rig.joint_names else ()
+        high = (24, 32, 34, 50, 51, 80, 100, 101, 120, 160, 161, 200)
+        return tuple(map(float, (*range(2, 21), *high))) if stops.rig.joint_names else ()
 
 
 class ArmGravitySag(Effect):

@@ -101,7 +101,8 @@ def _frame_document(frame: FrameEstimate) -> dict[str, Any]:
 
 
 def _formula(name: str) -> str:
-    return next((effect.formula for effect in CATALOGUE if effect.name == name), "")
+    family = name.partition("@")[0]
+    return next((effect.formula for effect in CATALOGUE if effect.name == family), "")
 
 
 def _ring_document(effect: EffectEstimate) -> dict[str, Any]:
