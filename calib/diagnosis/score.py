@@ -28,7 +28,7 @@ GAUGE = 1e-6  # share of a direction's information that is left, below which the
 UNFELT = 1e-9  # of an effect's largest column, below which no row feels a parameter
 COMMON = 30.0  # how many clusters the candidates' common inflation counts for
 POWER = 0.8  # with which an effect of the smallest detectable size is found
-DRAWS = 999
+DRAWS = 1999
 
 
 @dataclass(frozen=True)
