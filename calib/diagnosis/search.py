@@ -21,6 +21,7 @@ from calib.fit import Progress
 ALPHA = 0.04  # chance that a named effect is found where nothing is missing
 ALPHA_UNNAMED = 0.01  # and that structure is
 MOST = 3  # an explanation that needs more names than this is none
+INSTEAD = 0.5  # of the leading structure's evidence, for another covariate to be named too
 FEWEST = 4  # stops, below which nothing is claimed
 TRIES = 3  # how many suspects are judged before a look is called quiet
 FINER = 9  # shapes tried between the two beside the best one
@@ -113,10 +114,15 @@ def _named(look: Look, progress: Progress) -> Found | None:
 
 
 def structures(look: Look, progress: Progress) -> list[Candidate]:
-    """Structure that is confirmed: what stands out most, and what does beside it, not by it."""
+    """Structure that is confirmed: what stands out most, what does beside it, and single covariates
+    that could stand for it."""
     out: list[Candidate] = []
     for candidate in look.unnamed.candidates:
-        if _stands_out(candidate, ALPHA_UNNAMED) and not _covered(look.unnamed, candidate, out):
+        if not _stands_out(candidate, ALPHA_UNNAMED):
+            continue
+        instead = out and len(candidate.effect.covariates) == 1
+        instead = instead and candidate.evidence > INSTEAD * out[0].evidence
+        if instead or not _covered(look.unnamed, candidate, out):
             p = judged(look, candidate, progress)[1]
             if p < ALPHA_UNNAMED:
                 out.append(replace(candidate, p_adjusted=p))
