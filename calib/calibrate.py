@@ -293,17 +293,22 @@ def _summary(
     }
 
 
+def recordings_document(sources: Sequence[Source]) -> list[dict[str, str]]:
+    """Recordings as model.yaml names them: where they are, whose, and what was in them."""
+    return [
+        {
+            "path": str(s.recording.folder.resolve()),
+            "rig": s.rig.name,
+            "sha256": s.recording.digest(),
+        }
+        for s in sources
+    ]
+
+
 def _model_document(sources: Sequence[Source], model: Model, choices: _Choices) -> dict[str, Any]:
     prior, grown_from = choices.prior, choices.grown_from
     return {
-        "recordings": [
-            {
-                "path": str(s.recording.folder.resolve()),
-                "rig": s.rig.name,
-                "sha256": s.recording.digest(),
-            }
-            for s in sources
-        ],
+        "recordings": recordings_document(sources),
         **model.document(),
         "hold_out": choices.hold_out,
         "folds": choices.folds,

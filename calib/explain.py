@@ -9,7 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from calib.calibrate import calibrate, grow
+from calib.calibrate import calibrate, grow, recordings_document
 from calib.diagnosis import Diagnosis, diagnose
 from calib.effects import load_effects
 from calib.fit import Progress
@@ -205,15 +205,7 @@ class _Climb:
     @cached_property
     def _told(self) -> list[dict[str, str]]:
         """The recordings as a run's model.yaml has them."""
-        sources = [Source.open(folder) for folder in self.recordings]
-        return [
-            {
-                "path": str(s.recording.folder.resolve()),
-                "rig": s.rig.name,
-                "sha256": s.recording.digest(),
-            }
-            for s in sources
-        ]
+        return recordings_document([Source.open(folder) for folder in self.recordings])
 
 
 def _falls(before: Run, after: Run, share: float) -> bool:

@@ -46,7 +46,7 @@ class Curve:
 
 def curves(screen: Screen) -> list[Curve]:
     """The curve of every covariate, and the map of every pair, that was tested for structure."""
-    drawn = screen.scores.draws()
+    drawn = screen.scores.draws
     return [
         _curve(screen, c.effect, c.test.columns, drawn[:, c.test.columns])
         for c in screen.candidates

@@ -54,19 +54,20 @@ class Scores:
     both: np.ndarray
     weight_m2: float
 
-    def draws(self, seed: int = 0) -> np.ndarray:
+    @cached_property
+    def draws(self) -> np.ndarray:
         """Scores (R, Q) as chance might have dealt them: every cluster's share, times a normal
         number of its own (the multiplier bootstrap)."""
         shares = np.vstack([self.by_stop, self.by_place])
-        return np.random.default_rng(seed).standard_normal((DRAWS, len(shares))) @ shares
+        return np.random.default_rng(0).standard_normal((DRAWS, len(shares))) @ shares
 
 
 def away_from_model(linear: Linear, names: Sequence[str]) -> np.ndarray:
     """Directions (U, Q) of variables, be they candidates or of the model itself, with all that the
     model can take on of them taken off; other candidates play no part."""
-    theirs = np.concatenate([np.r_[linear.at[name]] for name in names])
-    apart = [np.r_[linear.at[name]] for name in {*linear.candidates, *names}]
-    model = np.setdiff1d(np.arange(len(linear.information)), np.concatenate(apart))
+    theirs = _columns(linear, names)
+    apart = _columns(linear, [*linear.candidates, *names])
+    model = np.setdiff1d(np.arange(len(linear.information)), apart)
     scale = np.sqrt(np.maximum(np.diag(linear.information), 1e-300))
     root = linear.information[np.ix_(model, model)] / np.outer(scale[model], scale[model])
     cross = linear.information[np.ix_(model, theirs)] / scale[model, None]
@@ -77,27 +78,35 @@ def away_from_model(linear: Linear, names: Sequence[str]) -> np.ndarray:
     return away
 
 
+def information_left(linear: Linear, names: Sequence[str], away: np.ndarray) -> np.ndarray:
+    """Information (Q, Q) of variables along their directions `away` from the model."""
+    left = linear.information[_columns(linear, names)] @ away
+    return (left + left.T) / 2
+
+
 def project(linear: Linear, names: Sequence[str]) -> Scores:
     """Project variables off the model, be they candidates or of the model itself."""
     at, start = {}, 0
     for name in names:
         size = linear.at[name].stop - linear.at[name].start
         at[name], start = slice(start, start + size), start + size
-    theirs = np.concatenate([np.r_[linear.at[name]] for name in names])
-    away = away_from_model(linear, names)
-    left = linear.information[theirs] @ away
+    theirs, away = _columns(linear, names), away_from_model(linear, names)
     cells = linear.gradient @ away
     both = cells[(linear.stop >= 0) & (linear.place >= 0)]
     return Scores(
         at,
         cells.sum(axis=0),
-        (left + left.T) / 2,
+        information_left(linear, names, away),
         linear.information[np.ix_(theirs, theirs)],
         _sums(cells, linear.stop),
         _sums(cells, linear.place),
         both.T @ both,
         linear.weight_m2,
     )
+
+
+def _columns(linear: Linear, names: Sequence[str]) -> np.ndarray:
+    return np.concatenate([np.r_[linear.at[name]] for name in names])
 
 
 def _sums(cells: np.ndarray, index: np.ndarray) -> np.ndarray:

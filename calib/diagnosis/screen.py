@@ -111,7 +111,7 @@ def screen(
 
 def _by_chance(scores: Scores, tests: Mapping[str, Test]) -> dict[str, np.ndarray]:
     """p-values (R,) of every test on scores that are nothing but chance: each by its rank."""
-    drawn = scores.draws()
+    drawn = scores.draws
     out = {}
     for name, t in tests.items():
         statistic = np.sum(np.square(drawn[:, t.columns] @ t.whiten), axis=1)

@@ -65,16 +65,23 @@ class Search:
     Args:
         looks: from the fit as it was, and after each effect found.
         found: named effects, in the order in which they were added.
-        at_first: structure that is confirmed before any effect was found, strongest first.
-        unnamed: structure that is confirmed after all of them.
+        unnamed: structure that is confirmed after all of them, strongest first.
         scatter: the effect on the scatter that is confirmed, if one is.
+        at_first: structure that is confirmed before any of them; empty, as not asked for, unless
+            the first of them is dressed up.
     """
 
     looks: Sequence[Look]
     found: Sequence[Found]
-    at_first: Sequence[Candidate]
     unnamed: Sequence[Candidate]
     scatter: Candidate | None
+    at_first: Sequence[Candidate] = ()
+
+    def dressed_up(self, i: int) -> bool:
+        """Whether structure without a name would have explained more than the i-th name did."""
+        common, step = self.looks[-1].named.common, self.found[i]
+        bins = (c.test.evidence(common) for c in step.before.unnamed.candidates)
+        return step.candidate.test.evidence(common) < max(bins, default=0.0) - ODDS
 
 
 def search(stand: Stand, progress: Progress, most: int = MOST) -> Search:
@@ -96,9 +103,11 @@ def search(stand: Stand, progress: Progress, most: int = MOST) -> Search:
         if swapped:
             looks[-1] = stand.look(progress)
             found = [f.with_effect(swapped.get(f.effect.name)) for f in found]
-    unnamed = structures(looks[-1], progress)
-    at_first = structures(looks[0], progress) if found else unnamed
-    return Search(looks, found, at_first, unnamed, _scatter(looks[-1], progress))
+    last = looks[-1]
+    done = Search(looks, found, structures(last, progress), _scatter(last, progress))
+    if found and done.dressed_up(0):
+        return replace(done, at_first=structures(looks[0], progress))
+    return done
 
 
 def _named(look: Look, progress: Progress) -> Found | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 
@@ -57,10 +57,16 @@ class Stand:
 
     def with_effects(self, added: Sequence[Effect], progress: Progress) -> Stand:
         """The model with more effects, fitted from here."""
-        model = self.model.plus(tuple(added))
-        problem = problems.build(self.sources, model, meetings=self.problem.meetings)
-        estimate = solve(problem, progress=progress, start=self.estimate.state)
+        return self._refitted(self.model.plus(tuple(added)), self.estimate.state, progress)
+
+    def _refitted(self, model: Model, start: Mapping[str, np.ndarray], progress: Progress) -> Stand:
+        problem = self.problem_of(model)
+        estimate = solve(problem, progress=progress, start=start)
         return Stand(self.sources, model, problem, estimate)
+
+    def problem_of(self, model: Model) -> Problem:
+        """The problem of another model on these recordings; beams meet what they met here."""
+        return problems.build(self.sources, model, meetings=self.problem.meetings)
 
     def look(self, progress: Progress) -> Look:
         """Test everything that the model lacks."""
@@ -79,8 +85,7 @@ class Stand:
         self, candidates: Sequence[Effect], progress: Progress
     ) -> tuple[Linear, dict[str, np.ndarray]]:
         """All rows with these candidates beside the model, and each one's columns among theirs."""
-        wider = self.model.plus(tuple(candidates))
-        wide = problems.build(self.sources, wider, meetings=self.problem.meetings)
+        wide = self.problem_of(self.model.plus(tuple(candidates)))
         variables = _variables(wide, {e.name for e in candidates})
         linear = linearise(wide, self.estimate, [*chain(*variables.values())], progress)
         at, start = {}, 0
@@ -128,9 +133,7 @@ class Stand:
             return self, {}
         model = Model(tuple(swapped.get(e.name, e) for e in self.model.effects), self.model.fixed)
         start = {_renamed(name, swapped): value for name, value in self.estimate.state.items()}
-        problem = problems.build(self.sources, model, meetings=self.problem.meetings)
-        estimate = solve(problem, progress=progress, start=start)
-        return Stand(self.sources, model, problem, estimate), swapped
+        return self._refitted(model, start, progress), swapped
 
     def theta(self, effect: Effect, whole: bool) -> np.ndarray:
         """Parameters of an effect of the model: the `whole` effect's, or those that are free."""
@@ -199,8 +202,7 @@ class Look:
     def judged(self, candidate: Candidate, progress: Progress) -> Test:
         """A candidate's test with its clusters jackknifed: see `jackknife`."""
         stand, found = self.stand, candidate.test
-        model = stand.model.plus((candidate.effect,))
-        wide = problems.build(stand.sources, model, meetings=stand.problem.meetings)
+        wide = stand.problem_of(stand.model.plus((candidate.effect,)))
         names = _variables(wide, {candidate.effect.name})[candidate.effect.name]
         away = away_from_model(self.linear, names) @ found.whiten
         by_variable = {name: away[at] for name, at in self.linear.at.items()}

@@ -144,16 +144,9 @@ def _ranked(found: Search) -> list[Candidate]:
 
 def _without_a_name(found: Search, verdict: str) -> list[tuple[Screen, Candidate]]:
     """What is left without a name; as it stood at first if the first name is not to be believed."""
-    worn = verdict == UNNAMED and bool(found.found) and _dressed_up(found, 0)
+    worn = verdict == UNNAMED and bool(found.found) and found.dressed_up(0)
     left, look = (found.at_first, 0) if worn else (found.unnamed, -1)
     return [(found.looks[look].unnamed, c) for c in left]
-
-
-def _dressed_up(found: Search, i: int) -> bool:
-    """Whether structure without a name would have explained more than the name at its step."""
-    common, step = found.looks[-1].named.common, found.found[i]
-    bins = (c.test.evidence(common) for c in step.before.unnamed.candidates)
-    return step.candidate.test.evidence(common) < max(bins, default=0.0) - ODDS
 
 
 def _candidate(
@@ -189,7 +182,7 @@ def _candidate(
         "statistic": test.statistic,
         "dof": test.dof,
         "step": step,
-        "dressed_up": bool(step) and verdict == UNNAMED and _dressed_up(found, step - 1),
+        "dressed_up": bool(step) and verdict == UNNAMED and found.dressed_up(step - 1),
         "held_out_rms_mm": {"before": before, "after": after},
         "error_explained": _explained(before, after, floor),
         "rms_mm": None if noise else 1e3 * look.size_m(candidate),

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
 
-from calib.diagnosis.candidates import JointShape
+from calib.diagnosis.score import away_from_model, information_left
 from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import what_separates
 from calib.effects import Effect
@@ -78,21 +76,16 @@ def standing_in(look: Look) -> list[dict[str, Any]]:
     linear, stand = look.linear, look.stand
     ours = {t.effect.name: (t.effect, t.variable) for terms in stand.problem.terms for t in terms}
     ours = {n: v for n, v in ours.items() if n in stand.model.names}
-    theirs = [c for c in look.named.candidates if not isinstance(c.effect, JointShape)]
-    left = {c.effect.name: _left(look, c.test.columns) for c in theirs}
     out = []
     for name, (effect, variable) in ours.items():
-        without = _information_without(look, np.r_[linear.at[variable]])
-        for candidate in theirs:
-            columns = candidate.test.columns
-            free = np.trace(without[np.ix_(columns, columns)])
-            if left[candidate.effect.name] < (1.0 - STANDS_IN) * free:
+        names = [*linear.candidates, variable]
+        without = information_left(linear, names, away_from_model(linear, names))
+        for candidate in look.named.candidates:
+            own = np.ix_(candidate.test.columns, candidate.test.columns)
+            left = np.trace(look.named.scores.information[own])
+            if left < (1.0 - STANDS_IN) * np.trace(without[own]):
                 out.append(_stand_in(name, effect, candidate.effect))
     return out
-
-
-def _left(look: Look, columns: np.ndarray) -> float:
-    return float(np.trace(look.named.scores.information[np.ix_(columns, columns)]))
 
 
 def _stand_in(name: str, effect: Effect, other: Effect) -> dict[str, Any]:
@@ -102,15 +95,3 @@ def _stand_in(name: str, effect: Effect, other: Effect) -> dict[str, Any]:
         "needs": f"{what_separates(effect, other)}: on this data {name} takes on what "
         f"{other.family} would do",
     }
-
-
-def _information_without(look: Look, gone: Sequence[int]) -> np.ndarray:
-    """Information (Q, Q) of all candidates were some columns of the model not in it."""
-    linear = look.linear
-    theirs = np.concatenate([np.r_[linear.at[name]] for name in linear.candidates])
-    model = np.setdiff1d(np.arange(len(linear.information)), np.concatenate([theirs, gone]))
-    scale = np.sqrt(np.maximum(np.diag(linear.information), 1e-300))
-    root = linear.information[np.ix_(model, model)] / np.outer(scale[model], scale[model])
-    cross = linear.information[np.ix_(model, theirs)] / scale[model, None]
-    absorbed = cho_solve(cho_factor(root + 1e-13 * np.eye(len(model))), cross)
-    return linear.information[np.ix_(theirs, theirs)] - cross.T @ absorbed

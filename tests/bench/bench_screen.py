@@ -75,7 +75,7 @@ def against_blas(stand: Stand) -> None:
 
 
 def against_fit(folder: Path) -> None:
-    """A whole look, its 999 draws included, against the fit that it looks from."""
+    """A whole look, its draws included, against the fit that it looks from."""
     stand, fit_s = timed(lambda: fitted(folder))
     look_s = timed(lambda: stand.look(silent))[1]
     report("look, draws included / fit", look_s, fit_s, "<= 1")
