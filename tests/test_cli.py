@@ -14,7 +14,8 @@ from pathlib import Path
 
 import pytest
 
-from calib.cli import app, main
+from calib.cli import main
+from calib.cli.app import app
 
 ROOT = Path(__file__).resolve().parents[1]
 SPEC = "{lidar: hesai_pandarxt32, locations: 3, stops_per_location: 2, column_step: 200}"

@@ -1,37 +1,18 @@
-"""The command line: arguments in, one call, results out. What is heavy is imported by the call."""
+"""The loop on the command line: simulate, check, fit, diagnose, add, compare."""
 
 from __future__ import annotations
 
-import os
-import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated
 
-# BLAS threads on shared cores cost many times what they save; set before numpy is imported.
-for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ.setdefault(_name, "1")
+import typer
 
-import typer  # noqa: E402
-
-from chains.errors import InputError  # noqa: E402
+from calib.cli.app import Json, Out, Runs, app, print_json, progress_bar, say
+from chains.errors import InputError
 
 if TYPE_CHECKING:
     from calib.run import Run
 
-INTERRUPTED = 130  # as shells have it: 128 and the signal's number
-
-app = typer.Typer(
-    name="rigcal",
-    help="Calibrate a LiDAR rig as one factor graph.",
-    add_completion=True,
-    rich_markup_mode=None,
-    pretty_exceptions_enable=False,
-)
-
-Json = Annotated[bool, typer.Option("--json", help="Print the machine-readable result alone.")]
-Out = Annotated[Path, typer.Option("-o", "--out", help="Where to write.")]
 Recordings = Annotated[list[Path], typer.Argument(help="Recording folders.", metavar="REC...")]
 Effects = Annotated[
     str | None, typer.Option(help="Effects of the model, or files of them, with commas.")
@@ -56,9 +37,9 @@ def simulate(
     """Write a recording, and the truth beside it."""
     from calib.simulate import simulate as run
 
-    with _progress() as progress:
+    with progress_bar() as progress:
         run(spec, out, seed, _sizes(hide or []), progress)
-    _say(
+    say(
         {"recording": str(out), "truth": f"{out}.truth.json"},
         f"wrote {out} and {out}.truth.json",
         as_json,
@@ -70,10 +51,10 @@ def check(recording: Path, as_json: Json = False) -> None:
     """What is in a recording, what is wrong, and what can and cannot be estimated from it."""
     from calib.check import check as run
 
-    with _progress() as progress:
+    with progress_bar() as progress:
         found = run(recording, progress)
     if as_json:
-        _print_json(found.document())
+        print_json(found.document())
     else:
         from calib.tables import print_check
 
@@ -102,7 +83,7 @@ def fit(
     from calib.model import Model
 
     chosen = Model.of(effects, fix or [])
-    with _progress() as progress:
+    with progress_bar() as progress:
         run = calibrate(recordings, out, chosen, hold_out, folds, prior, progress)
     _tell(run, as_json)
 
@@ -122,7 +103,7 @@ def add(
 
     earlier = Run.open(run)
     model = grown_model(earlier, effects)
-    with _progress() as progress:
+    with progress_bar() as progress:
         _tell(grow(earlier, model, out, progress), as_json)
 
 
@@ -139,10 +120,10 @@ def diagnose(
     from calib.run import Run
 
     fitted = Run.open(run)
-    with _progress() as progress:
+    with progress_bar() as progress:
         found = find(fitted, progress, refits)
     if as_json:
-        _print_json(found.document())
+        print_json(found.document())
     else:
         from calib.diagnosis_tables import print_diagnosis
 
@@ -162,10 +143,10 @@ def explain(
     from calib.model import Model
 
     chosen = Model.of(effects, fix or [])
-    with _progress() as progress:
+    with progress_bar() as progress:
         found = climb(recordings, out, chosen, progress)
     if as_json:
-        _print_json(found.document())
+        print_json(found.document())
     else:
         from calib.diagnosis_tables import print_explanation
 
@@ -173,9 +154,7 @@ def explain(
 
 
 @app.command()
-def compare(
-    runs: Annotated[list[Path], typer.Argument(metavar="RUN...")], as_json: Json = False
-) -> None:
+def compare(runs: Runs, as_json: Json = False) -> None:
     """Errors and parameters of runs side by side, and the ladder by which they grew."""
     from calib.ladder import ladder
     from calib.run import Run
@@ -184,26 +163,9 @@ def compare(
     opened = [Run.open(run) for run in runs]
     if as_json:
         rungs = [rung.document() for rung in ladder(opened)]
-        _print_json(comparison(opened) | {"ladder": rungs})
+        print_json(comparison(opened) | {"ladder": rungs})
     else:
         print_comparison(opened)
-
-
-@app.command()
-def export(
-    run: Path,
-    out: Out,
-    formats: Annotated[
-        list[str] | None, typer.Option("--format", help="yaml; all if not given.")
-    ] = None,
-    as_json: Json = False,
-) -> None:
-    """Write the result for others: YAML extrinsics with sigmas and provenance."""
-    from calib.export import export as write
-    from calib.run import Run
-
-    files = write(Run.open(run), out, formats or [])
-    _say({"files": [str(f) for f in files]}, "\n".join(f"wrote {f}" for f in files), as_json)
 
 
 @app.command()
@@ -217,43 +179,9 @@ def effects(
 
     chosen = [find(name)] if name else list(CATALOGUE)
     if as_json:
-        _print_json([effect_page(e) for e in chosen])
+        print_json([effect_page(e) for e in chosen])
     else:
         print_catalogue(chosen, whole=name is not None)
-
-
-def main() -> None:
-    """Run the command line: exit code 0 done, 2 bad input or usage, 1 a fault of the program."""
-    try:
-        code = app(sys.argv[1:] or ["--help"], prog_name="rigcal", standalone_mode=False)
-    except InputError as error:
-        _fail(str(error), 2)
-    except KeyboardInterrupt:
-        code = INTERRUPTED
-    except Exception as error:
-        if hasattr(error, "format_message"):  # wrong usage: typer's click, wherever that lives
-            _fail(error.format_message(), 2)
-        if not _interrupted(error):
-            if os.environ.get("RIGCAL_TRACEBACK"):
-                raise
-            name = type(error).__name__
-            _fail(f"internal fault: {name}: {error} (RIGCAL_TRACEBACK=1 says where)", 1)
-        code = INTERRUPTED
-    if code == INTERRUPTED:  # typer's answer to Ctrl-C, too
-        _fail("interrupted; nothing was left half-written", code)
-    raise SystemExit(code or 0)
-
-
-def _interrupted(error: BaseException | None) -> bool:
-    """Whether Ctrl-C is behind an error: a library that it hits while loading reports its own."""
-    while error is not None and not isinstance(error, KeyboardInterrupt):
-        error = error.__cause__ or error.__context__
-    return error is not None
-
-
-def _fail(message: str, code: int) -> NoReturn:
-    print(f"rigcal: {message}", file=sys.stderr)
-    raise SystemExit(code)
 
 
 def _sizes(hide: list[str]) -> dict[str, float]:
@@ -272,43 +200,8 @@ def _sizes(hide: list[str]) -> dict[str, float]:
 def _tell(run: Run, as_json: bool) -> None:
     """Print what a fit found."""
     if as_json:
-        _print_json(run.summary | {"not_estimated": run.solution.not_estimated})
+        print_json(run.summary | {"not_estimated": run.solution.not_estimated})
     else:
         from calib.tables import print_run
 
         print_run(run)
-
-
-def _say(document: dict[str, Any], text: str, as_json: bool) -> None:
-    if as_json:
-        _print_json(document)
-    else:
-        print(text)
-
-
-def _print_json(document: Any) -> None:
-    from sensors.documents import json_text
-
-    print(json_text(document))
-
-
-@contextmanager
-def _progress() -> Iterator[Callable[[str, int, int], None]]:
-    """A progress bar on stderr where that is a terminal; else silence."""
-    if not sys.stderr.isatty():
-        yield lambda what, done, total: None
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-    )
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("reading", total=None)
-        yield lambda what, done, total: bar.update(
-            task, description=what, completed=done + 1, total=total
-        )

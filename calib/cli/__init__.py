@@ -1,0 +1,51 @@
+"""The command line: arguments in, one call, results out. What is heavy is imported by the call."""
+
+from __future__ import annotations
+
+import os
+import sys
+from typing import NoReturn
+
+# BLAS threads on shared cores cost many times what they save; set before numpy is imported.
+for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
+from calib.cli import files, study  # noqa: E402, F401 - their commands register themselves
+from calib.cli.app import app  # noqa: E402
+from chains.errors import InputError  # noqa: E402
+
+INTERRUPTED = 130  # as shells have it: 128 and the signal's number
+
+
+def main() -> None:
+    """Run the command line: exit code 0 done, 2 bad input or usage, 1 a fault of the program."""
+    try:
+        code = app(sys.argv[1:] or ["--help"], prog_name="rigcal", standalone_mode=False)
+    except InputError as error:
+        _fail(str(error), 2)
+    except KeyboardInterrupt:
+        code = INTERRUPTED
+    except Exception as error:
+        if hasattr(error, "format_message"):  # wrong usage: typer's click, wherever that lives
+            _fail(error.format_message(), 2)
+        if not _interrupted(error):
+            if os.environ.get("RIGCAL_TRACEBACK"):
+                raise
+            name = type(error).__name__
+            _fail(f"internal fault: {name}: {error} (RIGCAL_TRACEBACK=1 says where)", 1)
+        code = INTERRUPTED
+    if code == INTERRUPTED:  # typer's answer to Ctrl-C, too
+        _fail("interrupted; nothing was left half-written", code)
+    raise SystemExit(code or 0)
+
+
+def _interrupted(error: BaseException | None) -> bool:
+    """Whether Ctrl-C is behind an error: a library that it hits while loading reports its own."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
+
+
+def _fail(message: str, code: int) -> NoReturn:
+    print(f"rigcal: {message}", file=sys.stderr)
+    raise SystemExit(code)
