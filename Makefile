@@ -9,7 +9,9 @@ BIN = .venv/bin
 OPEN3D_LOADS = $(BIN)/python -c 'import sys; sys.tracebacklimit = 0; import open3d'
 PIP = $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
-.PHONY: demo test system clean
+BROWSER = $(firstword $(foreach b,chromium chromium-browser google-chrome,$(shell command -v $(b))))
+
+.PHONY: demo test system browser clean
 
 demo: system
 	@echo "== demo: a simulated recording of the default rig"
@@ -23,7 +25,7 @@ demo: system
 	@echo "== demo: the result as YAML, in demo/export"
 	$(BIN)/rigcal export demo/run -o demo/export --format yaml
 
-test: system .venv/.tested
+test: system browser .venv/.tested
 	@echo "== test: style"
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -62,3 +64,15 @@ system: .venv/.system
 		exit 1; \
 	fi
 	@touch $@
+
+browser:
+	@echo "== browser: is there a Chromium for the tests of pages?"
+	@if [ -n "$(BROWSER)" ]; then \
+		echo "yes: $(BROWSER)"; \
+	elif [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
+		echo "no: installing it with apt-get"; \
+		apt-get update && apt-get install -y --no-install-recommends chromium \
+			|| echo "that failed: the tests of pages will be skipped" >&2; \
+	else \
+		echo "no: the tests of pages will be skipped; on Debian: sudo apt-get install chromium" >&2; \
+	fi
