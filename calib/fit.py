@@ -163,9 +163,7 @@ class _Loop:
         self.prior = [prior] if prior else []
         self.without = frozenset(prior.variables) if prior else frozenset()
         self.variables = dict(problem.variables)
-        self.values = {
-            n: _started(v, self.start, problem.initial[n]) for n, v in self.variables.items()
-        }
+        self.values = values_of(problem, self.start)
         self.scans = list(problem.scans)
         self.seen: dict[str, np.ndarray] = {}
         self.associations: list[Association] = []
@@ -308,6 +306,12 @@ class _Loop:
         before, self.values = self.values, self.graph.step(self.values)
         names = self.problem.calibration
         return max(_change(self.variables[n], before[n], self.values[n]) for n in names)
+
+
+def values_of(problem: Problem, state: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Where a state puts a problem's variables; those that it lacks are where they start."""
+    known = problem.variables.items()
+    return {n: _started(v, state, problem.initial[n]) for n, v in known}
 
 
 def same_mesh(a: Reference | None, b: Reference | None) -> bool:

@@ -16,7 +16,7 @@ Progress = Callable[[str, int, int], None]
 # As people meet them; `rigcal --help` lists them so.
 ORDER = (
     *("import", "simulate", "check", "fit", "diagnose", "add", "explain", "compare"),
-    *("report", "view", "plot", "export", "effects"),
+    *("evaluate", "report", "view", "plot", "export", "apply", "effects"),
 )
 
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from calib.cli.app import Json, Out, app, say
+from calib.cli.app import Json, Out, app, progress_bar, say
 
 
 @app.command()
@@ -25,3 +25,35 @@ def export(
 
     files = write(Run.open(run), out, formats or [])
     say({"files": [str(f) for f in files]}, "\n".join(f"wrote {f}" for f in files), as_json)
+
+
+@app.command()
+def apply(
+    run: Path,
+    clouds: Annotated[
+        list[Path], typer.Argument(metavar="CLOUD...", help="PCD, PLY, Parquet, or recordings.")
+    ],
+    out: Out,
+    rig: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Whose LiDAR, where the run has several.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Write corrected clouds: what the run has learnt of its LiDAR is taken off."""
+    from calib.apply import apply as correct
+    from calib.run import Run
+
+    with progress_bar() as progress:
+        done = correct(Run.open(run), clouds, out, rig, progress)
+    document = {
+        "clouds": [
+            {"file": str(a.path), "points": a.points, "moved_rms_mm": 1e3 * a.rms_m}
+            | {"not_corrected": a.left_out}
+            for a in done
+        ]
+    }
+    lines = []
+    for a in done:
+        lines.append(f"wrote {a.path}: {a.points} points, moved by {1e3 * a.rms_m:.2f} mm rms")
+        lines += [f"  not corrected: {name}, which {why}" for name, why in a.left_out.items()]
+    say(document, "\n".join(lines), as_json)

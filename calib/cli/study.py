@@ -169,6 +169,29 @@ def compare(runs: Runs, as_json: Json = False) -> None:
 
 
 @app.command()
+def evaluate(
+    run: Path,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="Where to write; the run if not given.")
+    ] = None,
+    raw: Annotated[bool, typer.Option("--raw", help="Of the returns before correction.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Accuracy and precision of every return, by ring, distance, incidence and label."""
+    from calib.evaluate import evaluate as measure
+    from calib.run import Run
+
+    with progress_bar() as progress:
+        found = measure(Run.open(run), out, raw, progress)
+    if as_json:
+        print_json(found)
+    else:
+        from calib.evaluation_tables import print_evaluation
+
+        print_evaluation(found)
+
+
+@app.command()
 def effects(
     name: Annotated[str | None, typer.Argument(help="One effect; all if not given.")] = None,
     as_json: Json = False,

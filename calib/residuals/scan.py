@@ -29,13 +29,60 @@ from calib.residuals.beams import (
 from calib.residuals.rows import robust_scale, tukey_weight
 from calib.residuals.spread import spread_rows
 from calib.residuals.surfaces import Meeting
+from chains import se3
 from chains.errors import InputError
 from sensors.lidar import Beams, LidarModel, beams
 from sensors.recording import Recording, Scan
 
 SIZE = {Site.BEAM: 3, Site.REFERENCE: 3, Site.NOISE: 1}
 PRIOR_COUNT = 20.0  # a measured spread of fewer sweeps than this leans on the datasheet
+MET = ("label", "incidence_rad")
 LOCAL_SHARE = 0.05  # of the reference's variance, between neighbouring points of one patch
+
+
+@dataclass(frozen=True)
+class Ranges:
+    """What one stop's beams measured, against the surface that they met.
+
+    Args:
+        T_reference_lidar: (4, 4).
+        scan: all N points of the stop.
+        view: columns (N,) of the points, ranges and incidence as predicted for the beams as read.
+        hit: (H,) indices of the points whose beam meets the surface.
+        surface_m: (H, 3) where it does, corrected beams, in the reference's frame.
+        direction, normal: (H, 3) of the corrected beams and of the surface, facing them, unit.
+        raw_m: (H,) measured - predicted range, nothing corrected.
+        corrected_m: (H,) the same, after what the model corrects of beams and surface.
+    """
+
+    T_reference_lidar: np.ndarray
+    scan: Scan
+    view: View
+    hit: np.ndarray
+    surface_m: np.ndarray
+    direction: np.ndarray
+    normal: np.ndarray
+    raw_m: np.ndarray
+    corrected_m: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """A scan, its beams as they truly pointed, what they meet, and the error at each site."""
+
+    scan: Scan
+    ray: Beams
+    surface: Surface
+    view: View
+    bases: Mapping[str, tuple[Site, np.ndarray | OneHot]]
+    error: Mapping[Site, np.ndarray]
+
+    def error_at(self, site: Site, rows: np.ndarray) -> np.ndarray:
+        """The error (R, D) at some rows."""
+        error = self.error[site]
+        return (
+            error[rows] if len(error) > 1 else np.broadcast_to(error, (len(rows), error.shape[1]))
+        )
 
 
 @dataclass(frozen=True)
@@ -82,6 +129,54 @@ class ScanStop:
         scan, ray = self._read()
         if association is None:
             association = self._associate(T, ray, values, near_edges=False)
+        return self._rows(T, self._seen(T, values, association, scan, ray))
+
+    def ranges(self, values: Values) -> Ranges:
+        """Every beam that meets the surface, before and after what the effects correct."""
+        T = self.pose(values)
+        scan, ray = self._read()
+        found = self._associate(T, ray, values, near_edges=False)
+        seen = self._seen(T, values, found, scan, ray)
+        nominal_m = np.asarray(seen.view["range_m"])
+        hit = np.flatnonzero(seen.surface.usable & np.isfinite(nominal_m))
+        normal, direction = seen.surface.normal[hit], seen.ray.direction[hit] @ T[:3, :3].T
+        moved = np.einsum("ni,ni->n", normal, seen.error_at(Site.REFERENCE, hit))
+        moved /= np.einsum("ni,ni->n", normal, direction)
+        predicted_m = seen.surface.predicted_m[hit] + moved
+        origin_m = se3.apply(T, seen.ray.origin_m[hit])
+        measured_m = ray.range_m[hit]
+        return Ranges(
+            T,
+            scan,
+            seen.view,
+            hit,
+            origin_m + predicted_m[:, None] * direction,
+            direction,
+            normal,
+            measured_m - nominal_m[hit],
+            measured_m - seen.error_at(Site.BEAM, hit)[:, 0] - predicted_m,
+        )
+
+    def met(self, ray: Beams, values: Values) -> dict[str, np.ndarray]:
+        """What is known (N,) of any beams of this stop: range, incidence and label of what they
+        meet, and (1,) the stop's own columns; of beams that meet nothing, their own range, an
+        incidence of NaN and label -1."""
+        T = self.pose(values)
+        surface = self.meeting.meet(T, ray, values, self._associate(T, ray, values, False))
+        columns = {n: c() if callable(c) else c for n, c in surface.columns.items() if n in MET}
+        columns["range_m"] = np.where(surface.usable, surface.predicted_m, ray.range_m)
+        columns["incidence_rad"] = np.where(surface.usable, columns["incidence_rad"], np.nan)
+        return {n: c for n, c in self.columns.items() if c.ndim == 1} | columns
+
+    def _seen(
+        self,
+        T: np.ndarray,
+        values: Values,
+        association: Association,
+        scan: Scan,
+        ray: Beams,
+    ) -> _Seen:
+        """What the beams meet, turned as they truly were, and the error at each site."""
         surface = self.meeting.meet(T, ray, values, association)
         view = self._view(scan, ray, surface)
         bases = {
@@ -93,7 +188,7 @@ class ScanStop:
         if error[Site.BEAM][:, 1:].any():
             ray = turned(ray, -error[Site.BEAM][:, 1], -error[Site.BEAM][:, 2])
             surface = self.meeting.meet(T, ray, values, association)
-        return self._rows(scan, ray, surface, T, view, bases, error)
+        return _Seen(scan, ray, surface, view, bases, error)
 
     def compress(
         self, values: Values, association: Association | None = None, newton: bool = False
@@ -134,16 +229,9 @@ class ScanStop:
         }
         return View(self.stops.rig, len(scan.ring), columns, self.stops.joints)
 
-    def _rows(
-        self,
-        scan: Scan,
-        ray: Beams,
-        surface: Surface,
-        T: np.ndarray,
-        view: View,
-        bases: Mapping[str, tuple[Site, np.ndarray | OneHot]],
-        error: Mapping[Site, np.ndarray],
-    ) -> Rows:
+    def _rows(self, T: np.ndarray, seen: _Seen) -> Rows:
+        scan, ray, surface = seen.scan, seen.ray, seen.surface
+        view, bases, error = seen.view, seen.bases, seen.error
         usable, t, n = surface.usable, surface.predicted_m.copy(), surface.normal @ T[:3, :3]
         lost = np.flatnonzero(~usable)
         t[lost] = 1.0

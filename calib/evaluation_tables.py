@@ -1,0 +1,56 @@
+"""What ``rigcal evaluate`` prints."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from rich.table import Table
+
+from calib.tables import columns_table, mm, terminal
+
+HEADINGS = {
+    "incidence_deg": "incidence, degrees",
+    "distance_m": "distance, m",
+    "label": "material",
+    "ring": "ring",
+}
+LISTED = 16  # rings of a sensor with more are not listed one by one
+
+
+def print_evaluation(found: Mapping[str, Any]) -> None:
+    """Print an evaluation: as a whole, then by what it may depend on."""
+    console = terminal()
+    how = "corrected by the model" if found["corrected"] else "as measured"
+    console.print(f"{found['returns']} returns, {how}; mm", style="bold")
+    signed, nearest = found["signed_error_mm"], found["cloud_to_mesh_mm"]
+    table = _table("")
+    table.add_row(
+        "range against the surface",
+        *(mm(signed["mean"], "+"), mm(signed["std"])),
+        *(mm(found["accuracy_mm"]), mm(found["precision_mm"])),
+    )
+    table.add_row("cloud to mesh", mm(nearest["mean"], "+"), mm(nearest["std"]), "", "")
+    table.add_row()
+    console.print(table)
+    for name, heading in HEADINGS.items():
+        rows = found["by"][name]
+        if len(rows) > 1 and (name != "ring" or len(rows) <= LISTED):
+            console.print(_by(heading, rows))
+
+
+def _by(heading: str, rows: Sequence[Mapping[str, Any]]) -> Table:
+    table = _table(heading)
+    for row in rows:
+        cells = (mm(row["mean_mm"], "+"), mm(row["std_mm"]))
+        cells += (mm(row["accuracy_mm"]), mm(row["precision_mm"]))
+        table.add_row(row.get("name") or f"{row['value']:g}", *cells, f"{row['n']}")
+    table.add_row()
+    return table
+
+
+def _table(heading: str) -> Table:
+    table = columns_table(heading, "mean", "std", "accuracy", "precision", "returns")
+    for column in table.columns[1:]:
+        column.justify = "right"
+    return table
