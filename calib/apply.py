@@ -209,6 +209,8 @@ def _correct(
     numbers = {n: c for n, c in columns.items() if c.ndim == 1 and c.dtype.kind in "fiu"}
     told = known(beams(xyz_m[seen], correction.rig.lidar.beam_origin_m))
     there = {n: c[seen] for n, c in numbers.items()} | told
+    if "ring" in there:  # some formats hold it as a float
+        there["ring"] = there["ring"].astype(np.int64)
     usable, left_out = correction.usable(there)
     if any("incidence_rad" in e.covariates for e, _ in usable.effects):
         met = _incidence(xyz_m[seen], usable.rig, there.get("incidence_rad"))
@@ -272,7 +274,6 @@ def _check_rings(rig: Rig, path: Path, columns: Columns, seen: np.ndarray) -> No
             f"{path}: ring {ring.min()} to {ring.max()}, but {rig.lidar.name} has 0 to "
             f"{rig.lidar.rings - 1}; count from 0, or give a run of this LiDAR"
         )
-    columns["ring"] = columns["ring"].astype(np.uint16)
 
 
 def _rig(run: Run, name: str | None) -> Rig:

@@ -4,8 +4,9 @@ Per direction of a stop, with D the ranges of its n returns and D_true that of t
 
     signed error = mean(D - D_true)        accuracy = mean|D - D_true|        precision = std(D)
 
-Averaged holds give the mean e and standard deviation s of D - D_true, not the returns themselves;
-over normal returns the mean of their sizes is that of a folded normal (Leone et al. 1961),
+Averaged holds give the mean e and standard deviation of D - D_true, not the returns themselves;
+over normal returns, which scatter by s about their own mean, the mean of their sizes is that of a
+folded normal (Leone et al. 1961),
 
     accuracy = s sqrt(2 / pi) exp(-e^2 / 2 s^2) + e erf(e / (s sqrt 2)).
 
@@ -109,6 +110,7 @@ def accuracy(error_m: np.ndarray, spread_m: np.ndarray) -> np.ndarray:
 def _points(ranges: Ranges) -> Columns:
     view, scan, hit = ranges.view, ranges.scan, ranges.hit
     spread_m, nothing = scan.range_std_m[hit], np.full(len(view["ring"]), np.nan)
+    about_mean_m = spread_m * np.sqrt(1.0 - 1.0 / scan.count[hit])
     at = ranges.surface_m + ranges.corrected_m[:, None] * ranges.direction
     columns = {f"{axis}_m": at[:, k] for k, axis in enumerate("xyz")}
     columns |= {"ring": scan.ring[hit], "column": scan.column[hit], "count": scan.count[hit]}
@@ -119,10 +121,10 @@ def _points(ranges: Ranges) -> Columns:
         "reference_intensity": view.columns.get("reference_intensity", nothing)[hit],
         "intensity": scan.intensity[hit],
         "signed_error_m": ranges.corrected_m,
-        "accuracy_m": accuracy(ranges.corrected_m, spread_m),
+        "accuracy_m": accuracy(ranges.corrected_m, about_mean_m),
         "precision_m": spread_m,
         "raw_signed_error_m": ranges.raw_m,
-        "raw_accuracy_m": accuracy(ranges.raw_m, spread_m),
+        "raw_accuracy_m": accuracy(ranges.raw_m, about_mean_m),
     }
     whole = ("ring", "column", "label")
     return {n: c.astype(np.uint16 if n in whole else np.float32) for n, c in columns.items()}
