@@ -78,6 +78,8 @@ class Rig:
     """Frames and effects that belong to this recording alone."""
     masses: tuple[Mass, ...] = ()
     """What weighs on the arm's joints, as the URDF says."""
+    arm_urdf: Path | None = None
+    """The URDF that the arm was read from."""
     labels: dict[int, str] = field(default_factory=dict)
     """Names of the labels of the reference's triangles; empty where nothing names them."""
 
@@ -249,6 +251,7 @@ def load_rig(folder: str | Path) -> Rig:
         shared=file.shared,
         own=file.own,
         masses=masses,
+        arm_urdf=folder / file.arm.urdf if file.arm else None,
         labels=_read_labels(reference.labels) if reference else {},
     )
 

@@ -201,14 +201,14 @@ def _effects_table(rows: Sequence[Found]) -> Table:
     table = columns_table("effect", "parameter", "estimate", "", "")
     for row in rows:
         name = row.variable
-        for parameter, cell, unit, told in _effect_cells(row):
+        for parameter, cell, unit, told in effect_cells(row):
             table.add_row(name, parameter, cell, unit, "" if told else "not told")
             name = ""
     table.add_row()
     return table
 
 
-def _effect_cells(row: Found) -> Iterable[tuple[str, str, str, bool]]:
+def effect_cells(row: Found) -> Iterable[tuple[str, str, str, bool]]:
     """Parameter, its cell, unit and whether it was told: one by one, or of each unit a summary."""
     if len(row.parameters) > LISTED:
         for unit in dict.fromkeys(row.units):

@@ -183,10 +183,18 @@ def from_xyz_rpy(xyz: ArrayLike, rpy: ArrayLike) -> Array:
 
 
 def to_rpy(T: ArrayLike) -> Array:
-    """Return URDF's roll, pitch, yaw (..., 3) in radians; at pitch +-pi/2 the yaw is set to 0."""
-    T = np.asarray(T, float)
-    rotation = Rotation.from_matrix(T[..., :3, :3].reshape(-1, 3, 3))
-    return rotation.as_euler("xyz", suppress_warnings=True).reshape(*T.shape[:-2], 3)
+    """Return URDF's roll, pitch, yaw (..., 3) in radians; at pitch +-pi/2 the yaw is set to 0.
+
+    Each angle is read off what those before it leave of R, so that R is met to rounding at any
+    pitch, which Euler angles computed one by one do not do close to +-pi/2.
+    """
+    R = np.asarray(T, float)[..., :3, :3]
+    upright = np.hypot(R[..., 0, 0], R[..., 1, 0]) < 1e-15
+    yaw = np.where(upright, 0.0, np.arctan2(R[..., 1, 0], R[..., 0, 0]))
+    c, s = np.cos(yaw)[..., None], np.sin(yaw)[..., None]
+    x, y = c * R[..., 0, :] + s * R[..., 1, :], c * R[..., 1, :] - s * R[..., 0, :]
+    pitch = np.arctan2(-R[..., 2, 0], x[..., 0])
+    return np.stack([np.arctan2(-y[..., 2], y[..., 1]), pitch, yaw], axis=-1)
 
 
 def from_xyz_quat(xyz: ArrayLike, quat_wxyz: ArrayLike) -> Array:

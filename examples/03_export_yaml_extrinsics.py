@@ -1,12 +1,13 @@
-"""Calibrate, export to YAML, and use the file without rigcal: PyYAML and numpy are enough.
+"""Calibrate, export, and use the files without rigcal: YAML with PyYAML, URDF with yourdfpy.
 
-From the tracked markers to the LiDAR there are two links, `mount -> mount_markers` and
-`mount -> lidar`. Neither can be told alone, as the mount itself is never seen; that is why their
-sigmas are half a millimetre. What a user needs is the two together, and that is told far better.
+Neither `mount -> mount_markers` nor `mount -> lidar` can be told alone, as the mount itself is
+never seen: their sigmas are half a millimetre. The two together are told far better, and so is all
+from the base's markers to the LiDAR: `rig.urdf`, the arm's with other origins, and the frames.
 
     python examples/03_export_yaml_extrinsics.py [FOLDER]
 """
 
+import csv
 import json
 import sys
 import tempfile
@@ -21,11 +22,6 @@ from calib.rig import load_rig
 from calib.simulate import simulate
 
 
-def markers_to_lidar(T_parent_child: dict[str, np.ndarray]) -> np.ndarray:
-    """T_mount_markers_lidar (4, 4)."""
-    return np.linalg.inv(T_parent_child["mount_markers"]) @ T_parent_child["lidar"]
-
-
 def off(T: np.ndarray, T_true: np.ndarray) -> str:
     """How far a transform is from the true one."""
     turn = np.linalg.norm(T[:3, :3] @ T_true[:3, :3].T - np.eye(3)) / np.sqrt(2)
@@ -35,7 +31,7 @@ def off(T: np.ndarray, T_true: np.ndarray) -> str:
 out = Path(sys.argv[1] if len(sys.argv) > 1 else tempfile.mkdtemp(prefix="rigcal-"))
 simulate("tiny", out / "recording", seed=1)
 run = calibrate([out / "recording"], out / "run", hold_out="none")
-(file,) = export(run, out / "export", ["yaml"])
+file, _, urdf = export(run, out / "export", ["yaml", "urdf"]).files
 
 extrinsics = yaml.safe_load(file.read_text())
 print(f"{file.name}, fitted to {extrinsics['provenance']['recordings'][0]['rig']}")
@@ -45,8 +41,23 @@ for name, frame in extrinsics["frames"].items():
 
 found = {n: np.array(f["T_parent_child"]) for n, f in extrinsics["frames"].items()}
 cad = {edge.name: edge.T_parent_child for edge in load_rig(out / "recording").tree.edges}
-truth = json.loads((out / "recording.truth.json").read_text())["frames"]
-true = markers_to_lidar({name: np.array(T) for name, T in truth.items()})
+truth = json.loads((out / "recording.truth.json").read_text())
+true = {name: np.array(T) for name, T in truth["frames"].items()}
+T_true, *others = (np.linalg.inv(T["mount_markers"]) @ T["lidar"] for T in (true, cad, found))
 print("mount_markers -> lidar")
-for name, frames in (("CAD", cad), ("fit", found)):
-    print(f"  {name}: {off(markers_to_lidar(frames), true)}")
+for name, T in zip(("CAD", "fit"), others, strict=True):
+    print(f"  {name}: {off(T, T_true)}")
+
+try:
+    from yourdfpy import URDF
+except ImportError:
+    print("rig.urdf not read: yourdfpy is not installed")
+    sys.exit()
+robot, worst_m = URDF.load(urdf, load_meshes=False), 0.0
+for stop in csv.DictReader((out / "recording/stops.csv").open()):
+    robot.update_cfg({joint: float(stop[joint]) for joint in robot.actuated_joint_names})
+    T_faro_root, T_faro_lidar = map(np.array, truth["stops"][stop["stop"]].values())
+    T_true = np.linalg.inv(T_faro_root @ true["base_markers"]) @ T_faro_lidar
+    T = robot.get_transform("lidar", "base_markers")
+    worst_m = max(worst_m, np.linalg.norm((T - T_true)[:3, 3]))
+print(f"base_markers -> lidar through {urdf.name}: {1e3 * worst_m:.2f} mm off at the worst stop")

@@ -285,12 +285,17 @@ _Dumper.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, list("-+.012345
 
 
 def write_yaml(path: str | Path, data: Any) -> None:
-    """Write a YAML document: numpy values as plain numbers, lists of numbers on one line."""
-    with write_atomically(path) as temporary, open(temporary, "w", encoding="utf-8") as file:
-        yaml.dump(
-            plain(data), file, _Dumper, sort_keys=False, allow_unicode=True, width=1000,
-            default_flow_style=None,
-        )  # fmt: skip
+    """Write a YAML document as `yaml_text` gives it, whole or not at all."""
+    with write_atomically(path) as temporary:
+        temporary.write_text(yaml_text(data), encoding="utf-8")
+
+
+def yaml_text(data: Any) -> str:
+    """The data as a YAML document: numpy values as plain numbers, lists of numbers on one line."""
+    return yaml.dump(
+        plain(data), None, _Dumper, sort_keys=False, allow_unicode=True, width=1000,
+        default_flow_style=None,
+    )  # fmt: skip
 
 
 def write_json(path: str | Path, data: Any) -> None:

@@ -15,16 +15,33 @@ def export(
     run: Path,
     out: Out,
     formats: Annotated[
-        list[str] | None, typer.Option("--format", help="yaml; all if not given.")
+        list[str] | None,
+        typer.Option(
+            "--format",
+            help="yaml, urdf, ros2, autoware, kalibr, rings, hesai, ouster, tree, latex, markdown; "
+            "all that have anything to hold if not given.",
+        ),
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Write the result for others: YAML extrinsics with sigmas and provenance."""
+    """Write the result for others: YAML, URDF, ROS 2, ring tables, pictures, tables."""
     from calib.export import export as write
     from calib.run import Run
 
-    files = write(Run.open(run), out, formats or [])
-    say({"files": [str(f) for f in files]}, "\n".join(f"wrote {f}" for f in files), as_json)
+    done = write(Run.open(run), out, formats or [])
+    document = {
+        "files": [str(file) for file in done.files],
+        "not_held": done.not_held,
+        "left_out": done.left_out,
+    }
+    lines = [f"wrote {file}" for file in done.files]
+    for name, why in done.left_out.items():
+        lines.append(f"left out {name}: {why}")
+    for name, sentences in done.not_held.items():
+        if what := ", ".join(sentence.partition(":")[0] for sentence in sentences):
+            lines.append(f"{name} does not hold {what}")
+    lines.append("Why, in whole sentences: --json, and the head of each file that has comments.")
+    say(document, "\n".join(lines), as_json)
 
 
 @app.command()

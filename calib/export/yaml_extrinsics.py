@@ -9,6 +9,8 @@ from typing import Any, Literal
 import numpy as np
 
 from calib.effects import CATALOGUE
+from calib.export.fitted import Fitted
+from calib.export.written import Written
 from calib.run import EffectEstimate, FrameEstimate, Part, Run, effect_document, frame_document
 from chains import se3
 from chains.errors import InputError
@@ -32,8 +34,9 @@ CONVENTIONS = {
 RING = re.compile(r"ring_(\d+)")
 
 
-def write_extrinsics(run: Run, folder: Path) -> list[Path]:
-    """Write extrinsics.yaml of a run into a folder, whole or not at all; return its path."""
+def write_extrinsics(fitted: Fitted, folder: Path) -> Written:
+    """Write extrinsics.yaml of a run into a folder, whole or not at all; it holds everything."""
+    run = fitted.run
     solution = run.solution
     data = {
         "format": FORMAT,
@@ -45,7 +48,7 @@ def write_extrinsics(run: Run, folder: Path) -> list[Path]:
         "recordings": {rig: _part_document(part) for rig, part in solution.recordings.items()},
     }
     write_yaml(folder / FILE, data)
-    return [folder / FILE]
+    return Written([folder / FILE])
 
 
 def read_extrinsics(path: Path | str) -> tuple[Part, dict[str, Part]]:

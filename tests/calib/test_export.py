@@ -50,7 +50,8 @@ def run(tmp_path):
 
 @pytest.fixture
 def path(run, tmp_path):
-    return export(run, tmp_path / "out", ["yaml"])[0]
+    (file,) = export(run, tmp_path / "out", ["yaml"]).files
+    return file
 
 
 @pytest.fixture
@@ -157,10 +158,18 @@ def test_an_unknown_format_names_those_there_are(run, tmp_path):
     assert not (tmp_path / "none").exists()
 
 
-def test_all_formats_are_written_where_none_is_named(run, tmp_path):
-    files = export(run, tmp_path / "all")
-    assert sorted(files) == sorted((tmp_path / "all").iterdir())
-    assert len(files) >= len(FORMATS)
+def test_all_formats_are_written_or_left_out_where_none_is_named(run, tmp_path):
+    """The recordings of this run are not there, which YAML and tables can do without."""
+    done = export(run, tmp_path / "all")
+    assert sorted(done.files) == sorted((tmp_path / "all").iterdir())
+    assert {file.suffix for file in done.files} == {".yaml", ".tex", ".md"}
+    assert done.not_held.keys() | done.left_out.keys() == set(FORMATS)
+    assert done.not_held["yaml"] == []
+    assert all("/data/one" in why and "no longer there" in why for why in done.left_out.values())
+
+
+def test_a_format_twice_is_written_once(run, tmp_path):
+    assert len(export(run, tmp_path / "out", ["yaml", "yaml"]).files) == 1
 
 
 def test_a_file_in_the_way_is_left_alone(run, path):
@@ -172,9 +181,7 @@ def test_a_file_in_the_way_is_left_alone(run, path):
 
 def test_a_failure_leaves_the_earlier_export(run, path, monkeypatch):
     before = path.read_bytes()
-    monkeypatch.setattr(
-        "sensors.documents.yaml.dump", lambda _, file, *a, **k: file.write("ha") / 0
-    )
+    monkeypatch.setattr("sensors.documents.yaml.dump", lambda *_, **__: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         export(run, path.parent)
     assert path.read_bytes() == before
