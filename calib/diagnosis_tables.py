@@ -45,15 +45,15 @@ def print_diagnosis(diagnosis: Diagnosis, residual: str = "range") -> None:
     console = terminal()
     _say_verdict(console, diagnosis)
     if diagnosis.candidates:
-        console.print(_candidates_table(diagnosis.candidates[:LEADING], residual))
+        console.print(candidates_table(diagnosis.candidates[:LEADING], residual))
     rivals = [(c["add"], c["indistinguishable_from"]) for c in diagnosis.candidates]
     tied = [(name, ", ".join(those)) for name, those in rivals if those]
     if tied:
         print_pairs(console, "what this data cannot tell apart", tied)
     if diagnosis.unexplained:
-        console.print(_unexplained_table(diagnosis.unexplained[:LEADING], residual))
+        console.print(unexplained_table(diagnosis.unexplained[:LEADING], residual))
     if diagnosis.verdict == "adequate":
-        console.print(_detectable_table(diagnosis.candidates))
+        console.print(detectable_table(diagnosis.candidates))
     _print_untestable(console, diagnosis.untestable)
     _print_weak(console, diagnosis.weak_directions)
 
@@ -79,7 +79,7 @@ def _say_verdict(console: Console, diagnosis: Diagnosis) -> None:
     console.print()
 
 
-def _candidates_table(candidates: Sequence[Mapping[str, Any]], residual: str) -> Table:
+def candidates_table(candidates: Sequence[Mapping[str, Any]], residual: str) -> Table:
     """The leading candidates; those that were confirmed carry the number of their step."""
     table = columns_table("", "effect", "p", "explains", "held out", "would be")
     for column in table.columns:
@@ -102,7 +102,8 @@ def _candidates_table(candidates: Sequence[Mapping[str, Any]], residual: str) ->
     return table
 
 
-def _unexplained_table(unexplained: Sequence[Mapping[str, Any]], residual: str) -> Table:
+def unexplained_table(unexplained: Sequence[Mapping[str, Any]], residual: str) -> Table:
+    """Structure that no effect accounts for, strongest first."""
     table = columns_table("left without a name, over", "p", "mm", "formula in diagnosis.json")
     for column in table.columns[1:3]:
         column.justify = "right"
@@ -120,7 +121,7 @@ def _unexplained_table(unexplained: Sequence[Mapping[str, Any]], residual: str) 
     return table
 
 
-def _detectable_table(candidates: Iterable[Mapping[str, Any]]) -> Table:
+def detectable_table(candidates: Iterable[Mapping[str, Any]]) -> Table:
     """Of each effect the smallest size that would have been found, two effects abreast."""
     table = columns_table(*("effect", "found from", "") * 2)
     for column in (1, 4):

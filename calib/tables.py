@@ -50,11 +50,11 @@ def print_run(run: Run) -> None:
     summary = run.summary
     console.print(str(run.folder), style="bold", soft_wrap=True)
     console.print(f"{_outcome(summary)}\n")
-    console.print(_links_table([row for row in rows if row.parent is not None]))
+    console.print(links_table([row for row in rows if row.parent is not None]))
     effects = [row for row in rows if row.parent is None]
     if effects:
-        console.print(_effects_table(effects))
-    console.print(_error_table(summary))
+        console.print(effects_table(effects))
+    console.print(error_table(summary))
     if summary.get("sigmas_widened_by", 1.0) > 1.0:
         console.print(_warning(summary), style="bold", soft_wrap=True)
         console.print()
@@ -185,7 +185,8 @@ def print_pairs(console: Console, title: str, rows: Iterable[tuple[str, str]]) -
     console.print(Padding(table, (0, 0, 1, 2)))
 
 
-def _links_table(rows: Sequence[Found]) -> Table:
+def links_table(rows: Sequence[Found]) -> Table:
+    """How far every frame lies from CAD, in its own axes, mm and mrad."""
     table = columns_table("moved from CAD, own axes", "x", "y", "z", "", "not told by the data")
     for row in rows:
         for part, unit in ((slice(3, 6), "m"), (slice(0, 3), "rad")):
@@ -197,7 +198,8 @@ def _links_table(rows: Sequence[Found]) -> Table:
     return table
 
 
-def _effects_table(rows: Sequence[Found]) -> Table:
+def effects_table(rows: Sequence[Found]) -> Table:
+    """Every parameter of every effect; of one with many, a summary."""
     table = columns_table("effect", "parameter", "estimate", "", "")
     for row in rows:
         name = row.variable
@@ -235,7 +237,8 @@ def _summary_cell(row: Found, free: np.ndarray, unit: str) -> tuple[str, str]:
     ), unit
 
 
-def _error_table(summary: Mapping[str, Any]) -> Table:
+def error_table(summary: Mapping[str, Any]) -> Table:
+    """The errors of a run's summary: before, after, of stops held out; and the noise floor."""
     table = columns_table(f"{summary['residual']} residual, mm", "rms", "mean", "std")
     for column in table.columns[1:]:
         column.justify = "right"

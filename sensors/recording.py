@@ -7,7 +7,7 @@ import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 from chains.errors import InputError
 from sensors.documents import write_atomically
 from sensors.holds import Columns, average_hold
-from sensors.stops import Array, Table, Targets, read_targets
+from sensors.stops import POSE, Array, Table, Targets, read_targets
 
 if TYPE_CHECKING:
+    import pandas
     import pyarrow
     from pyarrow.parquet import ParquetFile
 
@@ -47,6 +48,41 @@ class Scan:
     extra: dict[str, Array]
     """Every other numeric column, each (N,): per-point covariates."""
 
+    def columns(self) -> Columns:
+        """All columns by the names of the scan file, each (N,): x y z in m, ring, column, …"""
+        return {
+            **dict(zip("xyz", self.xyz_m.T, strict=True)),
+            "ring": self.ring,
+            "column": self.column,
+            "intensity": self.intensity,
+            "count": self.count,
+            "range_std_m": self.range_std_m,
+            **self.extra,
+        }
+
+    def to_arrow(self) -> "pyarrow.Table":
+        """The points as a `pyarrow.Table`, a row each; columns as of `columns`."""
+        import pyarrow
+
+        arrays = {name: np.ascontiguousarray(values) for name, values in self.columns().items()}
+        return pyarrow.table(arrays)
+
+    def to_pandas(self) -> "pandas.DataFrame":
+        """The points as a `pandas.DataFrame`; InputError where pandas is not installed."""
+        return _data_frame(self.columns())
+
+    def to_open3d(self) -> Any:
+        """The points as an `open3d.t.geometry.PointCloud` with every column as an attribute.
+
+        InputError where Open3D cannot be loaded.
+        """
+        from sensors.meshes import open3d_cloud
+
+        try:
+            return open3d_cloud(self.columns())
+        except ImportError as error:
+            raise InputError(f"to_open3d needs open3d: pip install open3d ({error})") from None
+
 
 @dataclass(frozen=True)
 class Recording:
@@ -70,6 +106,8 @@ class Recording:
     """(K,) whether there is a scan file."""
     rings: int | None
     """How many rings the sensor has, None = not checked."""
+    joint_names: tuple[str, ...] = ()
+    """(J,) of the columns of `joints`."""
 
     @classmethod
     def open(
@@ -103,6 +141,29 @@ class Recording:
             targets=read_targets(folder / "targets.csv"),
             has_scan=_find_scans(folder / "scans", stops),
             rings=rings,
+            joint_names=tuple(joint_names),
+        )
+
+    def to_pandas(self) -> "pandas.DataFrame":
+        """The stops as a `pandas.DataFrame` with the columns of stops.csv, in m, rad and s.
+
+        InputError where pandas is not installed.
+        """
+        poses = self.bodies | ({} if self.base_guess is None else {"base_guess": self.base_guess})
+        return _data_frame(
+            {
+                "stop": np.array(self.stops),
+                "location": self.location,
+                "time_s": self.time_s,
+                **dict(zip(self.joint_names, self.joints.T, strict=True)),
+                **{
+                    f"{body}.{part}": pose[:, i]
+                    for body, pose in poses.items()
+                    for i, part in enumerate(POSE)
+                    if i < 3 or not np.isnan(pose[:, 3:]).all()
+                },
+                **self.covariates,
+            }
         )
 
     def scan(self, stop: int) -> Scan:
@@ -156,6 +217,24 @@ def write_table(path: str | Path, columns: Mapping[str, np.ndarray]) -> None:
         pyarrow.parquet.write_table(table, temporary, compression="zstd")
 
 
+def unpack_zstd(data: bytes, size: int) -> bytes:
+    """Decompress zstd data whose plain size is known; ValueError where it is no such data."""
+    import pyarrow
+
+    try:
+        return pyarrow.decompress(data, decompressed_size=size, codec="zstd", asbytes=True)
+    except OSError as error:
+        raise ValueError(str(error)) from None
+
+
+def _data_frame(columns: Mapping[str, np.ndarray]) -> "pandas.DataFrame":
+    try:
+        import pandas
+    except ImportError:
+        raise InputError("to_pandas needs pandas: pip install pandas") from None
+    return pandas.DataFrame(dict(columns))
+
+
 def _open_parquet(path: Path) -> "ParquetFile":
     import pyarrow
     import pyarrow.parquet
@@ -206,7 +285,7 @@ def _check_types(path: Path, file: "ParquetFile") -> list[str]:
     return [name for name, kind in kinds.items() if kind]
 
 
-def _kind(arrow_type) -> str:
+def _kind(arrow_type: "pyarrow.DataType") -> str:
     """Return numpy's kind of a numeric column ('f', 'i', 'u'), '' for others."""
     try:
         kind = np.dtype(arrow_type.to_pandas_dtype()).kind

@@ -5,9 +5,6 @@ to its own centre. Range, point, normal and incidence are then computed in float
 triangle's plane, so a residual and its derivatives agree as doubles wherever the mesh lies.
 """
 
-import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from chains.errors import InputError
+from sensors.meshes import ray_caster, read_mesh
 from sensors.surfaces import SurfaceGrid, connected_surfaces, transverse, triangle_planes
 
 # A probe that lands further than this from the plane of the hit has crossed a depth edge.
@@ -95,7 +93,7 @@ class Reference:
         Raises:
             InputError: a file is missing, unreadable, or does not fit the others.
         """
-        arrays = _read_mesh(Path(mesh))
+        arrays = read_mesh(Path(mesh))
         columns = {} if faces is None else _read_faces(Path(faces))
         names = None if labels is None else _read_labels(Path(labels))
         try:
@@ -235,14 +233,7 @@ class Reference:
 
     @cached_property
     def _scene(self) -> Any:
-        import open3d as o3d
-
-        scene = o3d.t.geometry.RaycastingScene()
-        scene.add_triangles(
-            (self.vertices_m - self._centre_m).astype(np.float32),
-            self.triangles[self._solid[:-1]].astype(np.uint32),
-        )
-        return scene
+        return ray_caster(self.vertices_m - self._centre_m, self.triangles[self._solid[:-1]])
 
     def first_triangle(
         self, origins_m: np.ndarray, directions: np.ndarray, nthreads: int = 0
@@ -254,35 +245,20 @@ class Reference:
         found = self._scene.cast_rays(rays, nthreads=nthreads)["primitive_ids"].numpy()
         return self._solid[np.minimum(found, len(self._solid) - 1)]
 
+    def distance_m(self, points_m: np.ndarray) -> np.ndarray:
+        """Distance (N,) of points (N, 3) in the reference frame from the nearest triangle."""
+        points = (points_m - self._centre_m).astype(np.float32)
+        found = self._scene.compute_closest_points(points)
+        triangle = self._solid[found["primitive_ids"].numpy()]
+        # Float32 says which triangle and where on it; the offset across its plane is a double.
+        across = _dot(self._plane.take(triangle, axis=0), points_m) - self._plane[triangle, 3]
+        beside = points - found["points"].numpy()
+        beside -= _dot(self._plane.take(triangle, axis=0), beside)[:, None] * self._normal[triangle]
+        return np.hypot(across, np.linalg.norm(beside, axis=1))
+
     def __getstate__(self) -> dict[str, Any]:
         """Without the ray caster's own scene, which cannot travel between processes."""
         return {name: value for name, value in self.__dict__.items() if name != "_scene"}
-
-
-def _read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    if not path.is_file():
-        raise InputError(f"{path}: no such mesh; give a PLY, OBJ or STL file.")
-    import open3d as o3d
-
-    # The tensor reader would round doubles to float32; this one keeps them.
-    with _silence(), o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        mesh = o3d.io.read_triangle_mesh(str(path))
-    if not mesh.has_triangles():
-        raise InputError(f"{path}: no triangles in it, or broken; give a PLY, OBJ or STL mesh.")
-    return np.asarray(mesh.vertices), np.asarray(mesh.triangles)
-
-
-@contextmanager
-def _silence() -> Iterator[None]:
-    """Keep what a C library prints of a broken file off stderr: the error raised says it."""
-    stderr, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(nowhere, 2)
-        yield
-    finally:
-        os.dup2(stderr, 2)
-        os.close(stderr)
-        os.close(nowhere)
 
 
 def _read_faces(path: Path) -> dict[str, np.ndarray]:

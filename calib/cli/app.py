@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import io
+import re
 import sys
+import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TextIO
 
 import typer
 import typer.core
@@ -34,6 +37,39 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
+# Results go there; -q takes everything else that is printed away from it.
+_stdout: TextIO | None = None
+_verbose = False
+
+
+@app.callback()
+def manners(
+    context: typer.Context,
+    verbose: Annotated[
+        bool, typer.Option("-v", "--verbose", help="Tell every step on stderr, in a file too.")
+    ] = False,
+    quiet: Annotated[
+        bool, typer.Option("-q", "--quiet", help="Print nothing but errors, and what --json asks.")
+    ] = False,
+) -> None:
+    """Take down what is said of how much is to be said."""
+    global _stdout, _verbose
+    _stdout, _verbose = sys.stdout, verbose
+    if quiet:
+        context.with_resource(redirect_stdout(io.StringIO()))
+
+
+def effect_names(incomplete: str) -> list[str]:
+    """Names of the catalogue that begin so, for a shell to complete.
+
+    They are read from the text of its files: importing them takes longer than a key may.
+    """
+    files = (Path(__file__).parents[1] / "effects").glob("*.py")
+    texts = (file.read_text(encoding="utf-8") for file in sorted(files))
+    names = (name for text in texts for name in re.findall(r'^    name = "(\w+)"$', text, re.M))
+    return [name for name in names if name.startswith(incomplete)]
+
+
 Json = Annotated[bool, typer.Option("--json", help="Print the machine-readable result alone.")]
 Out = Annotated[Path, typer.Option("-o", "--out", help="Where to write.")]
 Runs = Annotated[list[Path], typer.Argument(metavar="RUN...", help="Run folders.")]
@@ -51,14 +87,14 @@ def print_json(document: Any) -> None:
     """Print a document as JSON."""
     from sensors.documents import json_text
 
-    print(json_text(document))
+    print(json_text(document), file=_stdout)
 
 
 @contextmanager
 def progress_bar() -> Iterator[Progress]:
-    """A progress bar on stderr where that is a terminal; else silence."""
+    """A progress bar on stderr where that is a terminal; else silence, or with -v a line a step."""
     if not sys.stderr.isatty():
-        yield lambda what, done, total: None
+        yield _line_by_line() if _verbose else lambda what, done, total: None
         return
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
@@ -74,3 +110,14 @@ def progress_bar() -> Iterator[Progress]:
         yield lambda what, done, total: bar.update(
             task, description=what, completed=done + 1, total=total
         )
+
+
+def _line_by_line() -> Progress:
+    """Progress as lines on stderr: seconds since the start, and what is done next."""
+    start = time.monotonic()
+
+    def tell(what: str, done: int, total: int) -> None:
+        seconds = time.monotonic() - start
+        print(f"{seconds:8.1f} s  {what} {done + 1}/{total}", file=sys.stderr, flush=True)
+
+    return tell

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calib.cli.app import Json, Out, Runs, app, print_json, progress_bar, say
+from calib.cli.app import Json, Out, Runs, app, effect_names, print_json, progress_bar, say
 from chains.errors import InputError
 
 if TYPE_CHECKING:
@@ -92,7 +92,10 @@ def fit(
 def add(
     run: Path,
     effects: Annotated[
-        list[str], typer.Argument(help="Effects, or files of them.", metavar="EFFECT...")
+        list[str],
+        typer.Argument(
+            help="Effects, or files of them.", metavar="EFFECT...", autocompletion=effect_names
+        ),
     ],
     out: Out,
     as_json: Json = False,
@@ -170,30 +173,37 @@ def compare(runs: Runs, as_json: Json = False) -> None:
 
 @app.command()
 def evaluate(
-    run: Path,
+    runs: Runs,
     out: Annotated[
-        Path | None, typer.Option("-o", "--out", help="Where to write; the run if not given.")
+        Path | None,
+        typer.Option(
+            "-o", "--out", help="Where to write, of several runs in a folder each; else the run."
+        ),
     ] = None,
     raw: Annotated[bool, typer.Option("--raw", help="Of the returns before correction.")] = False,
     as_json: Json = False,
 ) -> None:
     """Accuracy and precision of every return, by ring, distance, incidence and label."""
-    from calib.evaluate import evaluate as measure
+    from calib.evaluate import evaluate_all
     from calib.run import Run
 
+    opened = [Run.open(run) for run in runs]
     with progress_bar() as progress:
-        found = measure(Run.open(run), out, raw, progress)
+        found = evaluate_all(opened, out, raw, progress)
     if as_json:
-        print_json(found)
+        print_json(found if len(found) > 1 else next(iter(found.values())))
     else:
-        from calib.evaluation_tables import print_evaluation
+        from calib.evaluation_tables import print_evaluations
 
-        print_evaluation(found)
+        print_evaluations(found)
 
 
 @app.command()
 def effects(
-    name: Annotated[str | None, typer.Argument(help="One effect; all if not given.")] = None,
+    name: Annotated[
+        str | None,
+        typer.Argument(help="One effect; all if not given.", autocompletion=effect_names),
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """The catalogue: formula, unit, size, what an effect is confounded with, source."""

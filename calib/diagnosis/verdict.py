@@ -54,6 +54,12 @@ class Diagnosis:
         confirmed = [c for c in self.candidates if c["step"] and not c["dressed_up"]]
         return [c["add"] for c in sorted(confirmed, key=lambda c: c["step"])]
 
+    def _repr_html_(self) -> str:
+        """As a notebook shows it."""
+        from calib.notebook import diagnosis_html
+
+        return diagnosis_html(self)
+
     def document(self) -> dict[str, Any]:
         """As written to diagnosis.json."""
         return {

@@ -157,6 +157,14 @@ class Options:
         lidar: a model of the catalogue.
         metadata: the sensor's own file: Ouster's JSON, Hesai's table of angles.
         base: the arm's first link; tip: its last.
+        euler: the order of a table's Euler angles, as scipy writes it: "XYZ" turns about the moved
+            axes, "xyz" about the fixed ones.
+        rows: whether rows of a table are "stops" or a "log".
+        packages: ROS package -> its folder, for xacro files.
+        dh: the convention of a table of Denavit and Hartenberg: "standard" or "modified".
+        sphere_radius_m: the radius of calibration spheres, to find them in clouds of more.
+        joints: joint of the arm -> "revolute" or "prismatic"; no flag, but what the arm's own
+            source says, which is read before all others.
     """
 
     topics: tuple[str, ...] = ()
@@ -171,6 +179,12 @@ class Options:
     metadata: Path | None = None
     base: str | None = None
     tip: str | None = None
+    euler: str | None = None
+    rows: str | None = None
+    packages: Mapping[str, Path] = field(default_factory=dict)
+    dh: str | None = None
+    sphere_radius_m: float | None = None
+    joints: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -188,3 +202,14 @@ class Reader:
     reads: str
     read: Callable[[Sequence[Path], Options, Progress], Found]
     extra: str | None = None
+
+
+def together(found: Sequence[Found]) -> Found:
+    """What the files of one source say, as one `Found`; of the LiDAR, what the first file says."""
+    return Found(
+        tracks=tuple(track for f in found for track in f.tracks),
+        sweeps=tuple(sweeps for f in found for sweeps in f.sweeps),
+        lidar=next((f.lidar for f in found if f.lidar is not None), None),
+        understood=tuple(line for f in found for line in f.understood),
+        odd=tuple(dict.fromkeys(line for f in found for line in f.odd)),
+    )

@@ -1,0 +1,86 @@
+"""What a notebook shows of results: the tables of the terminal, as HTML."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from calib.diagnosis_tables import (
+    LEADING,
+    VERDICTS,
+    candidates_table,
+    detectable_table,
+    unexplained_table,
+)
+from calib.estimates import found
+from calib.tables import effects_table, error_table, ladder_table, links_table
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from calib.diagnosis import Diagnosis
+    from calib.ladder import Rung
+    from calib.run import Run
+
+_PAGE = """\
+<div><p><b>{{ title }}</b></p>
+{%- for sentence in sentences %}
+<p>{{ sentence }}</p>
+{%- endfor %}
+{%- for table in tables %}
+<table>
+{%- if table.title %}<caption>{{ table.title }}</caption>{% endif %}
+<thead><tr>{% for column in table.columns %}<th>{{ column.header }}</th>{% endfor %}</tr></thead>
+<tbody>
+{%- for row in table.rows %}
+<tr>{% for cell, column in row %}
+<td style="text-align:{{ column.justify }};white-space:nowrap">{{ cell }}</td>{% endfor %}</tr>
+{%- endfor %}
+</tbody></table>
+{%- endfor %}</div>
+"""
+
+
+def run_html(run: Run) -> str:
+    """A run: every link and effect with its sigma in mm and mrad, the errors, what is not told."""
+    rows = found(run)
+    effects = [row for row in rows if row.parent is None]
+    tables = [links_table([row for row in rows if row.parent is not None])]
+    tables += [effects_table(effects)] if effects else []
+    untold = [f"not told: {each['name']}: {each['why']}" for each in run.solution.not_estimated]
+    return _html(str(run.folder), untold, [*tables, error_table(run.summary)])
+
+
+def diagnosis_html(diagnosis: Diagnosis) -> str:
+    """A diagnosis: the verdict, the sentences, and what may be missing."""
+    tables = []
+    if diagnosis.candidates:
+        tables.append(candidates_table(diagnosis.candidates[:LEADING], "residual"))
+    if diagnosis.unexplained:
+        tables.append(unexplained_table(diagnosis.unexplained[:LEADING], "residual"))
+    if diagnosis.verdict == "adequate":
+        tables.append(detectable_table(diagnosis.candidates))
+    return _html(f"verdict: {VERDICTS[diagnosis.verdict]}", diagnosis.sentences, tables)
+
+
+def rung_html(rung: Rung) -> str:
+    """A rung: what it changed of the model, and what that did to the errors."""
+    return _html(str(rung.run.folder), (), [ladder_table([rung])])
+
+
+def _html(title: str, sentences: Sequence[str], tables: Sequence[Table]) -> str:
+    from jinja2 import Environment
+
+    page = Environment(autoescape=True).from_string(_PAGE)
+    return page.render(title=title, sentences=sentences, tables=[_rows(t) for t in tables])
+
+
+def _rows(table: Table) -> dict[str, Any]:
+    """Title, columns and rows of a table of the terminal, without its empty rows."""
+    rows = zip(*(list(column.cells) for column in table.columns), strict=True)
+    filled = (row for row in rows if any(row))
+    return {
+        "title": table.title,
+        "columns": table.columns,
+        "rows": [list(zip(row, table.columns, strict=True)) for row in filled],
+    }

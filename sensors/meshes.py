@@ -1,0 +1,258 @@
+"""Clouds and meshes as files, rays against a mesh, a mesh from a cloud. This is the open3d door."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from chains.errors import InputError
+from sensors.documents import write_atomically
+from sensors.ply import Columns, read_ply, write_ply
+from sensors.recording import write_table
+
+if TYPE_CHECKING:  # the readers of sensors.readers import this file
+    from sensors.readers.base import Surface
+
+_GROUPS = {
+    "positions": ("x", "y", "z"),
+    "normals": ("nx", "ny", "nz"),
+    "colors": ("red", "green", "blue"),
+}
+"""The columns that Open3D holds as one array of three."""
+
+
+# ------------------------------------------------------------------------------------------ clouds
+
+
+def read_cloud(path: str | Path) -> Columns:
+    """Read a point cloud, PLY or PCD: every field by its name, each (N,) in its own type.
+
+    Positions are x y z, normals nx ny nz, colours red green blue. Raises InputError for a file
+    that is missing, empty, broken or no such cloud.
+    """
+    path = Path(path)
+    if path.suffix.lower() == ".ply":
+        columns = read_ply(path).get("vertex", {})
+    elif path.suffix.lower() == ".pcd":
+        columns = _read_pcd(path)
+    else:
+        raise InputError(f"{path}: a cloud is read from a .ply or .pcd file, not {path.suffix!r}")
+    if not {"x", "y", "z"} <= columns.keys():
+        fields = ", ".join(columns) or "none"
+        raise InputError(f"{path} has no points: x, y and z are needed, its fields are {fields}")
+    return {name: values for name, values in columns.items() if values.ndim == 1}
+
+
+def write_cloud(path: str | Path, columns: Mapping[str, np.ndarray]) -> None:
+    """Write a point cloud (binary PLY or PCD), whole or not at all; columns as `read_cloud`'s."""
+    path = Path(path)
+    if path.suffix.lower() == ".ply":
+        write_ply(path, {"vertex": columns})
+    elif path.suffix.lower() == ".pcd":
+        _write_pcd(path, columns)
+    else:
+        raise InputError(f"{path}: a cloud is written to a .ply or .pcd file, not {path.suffix!r}")
+
+
+def _read_pcd(path: Path) -> Columns:
+    count = _count_of_pcd(path)
+    import open3d as o3d
+
+    with _quiet():
+        try:
+            cloud = o3d.t.io.read_point_cloud(str(path), format="pcd")
+        except RuntimeError as error:
+            raise InputError(f"{path} is a broken PCD file: {_sentence(error)}") from None
+    columns: Columns = {}
+    for name, tensor in cloud.point.items():
+        values = tensor.numpy()
+        names = _GROUPS.get(name, (name,))
+        columns |= {n: np.ascontiguousarray(values[:, i]) for i, n in enumerate(names)}
+    columns.pop("_", None)  # what fills the gaps of a record
+    if len(columns.get("x", ())) != count:
+        raise InputError(
+            f"{path} should hold {count} points, but they cannot be read; get the whole file"
+        )
+    return columns
+
+
+def _count_of_pcd(path: Path) -> int:
+    """How many points the header says there are: Open3D reads a broken file as an empty one."""
+    try:
+        with open(path, "rb") as file:
+            head = file.read(1 << 14)
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}") from None
+    if not head:
+        raise InputError(f"{path} is empty (0 bytes); a PCD file was wanted")
+    count = re.search(rb"^POINTS\s+(\d+)", head, re.MULTILINE)
+    if count is None or not re.search(rb"^DATA\s+\w+", head, re.MULTILINE):
+        raise InputError(f"{path} is no PCD file: it has no header with POINTS and DATA")
+    return int(count[1])
+
+
+def _write_pcd(path: Path, columns: Mapping[str, np.ndarray]) -> None:
+    import open3d as o3d
+
+    cloud = open3d_cloud(columns)
+    with write_atomically(path) as temporary, _quiet():
+        try:
+            done = o3d.t.io.write_point_cloud(str(temporary), cloud)
+        except RuntimeError as error:
+            raise InputError(f"{path} cannot be written: {_sentence(error)}") from None
+        if not done:
+            raise InputError(f"{path} cannot be written as PCD")
+
+
+def open3d_cloud(columns: Mapping[str, np.ndarray]) -> Any:
+    """The columns (N,) as an `open3d.t.geometry.PointCloud`, every field an attribute (N, 1)."""
+    import open3d as o3d
+
+    cloud, left = o3d.t.geometry.PointCloud(), dict(columns)
+    # Open3D writes beyond its memory where normals are of another type than positions.
+    number = np.result_type(np.float32, *(left[axis].dtype for axis in "xyz"))
+    for group, names in _GROUPS.items():
+        bytewise = group != "colors" or all(left[n].dtype == np.uint8 for n in names if n in left)
+        if left.keys() >= set(names) and bytewise:
+            values = np.stack([left.pop(name) for name in names], axis=1)
+            values = values if group == "colors" else values.astype(number)
+            cloud.point[group] = o3d.core.Tensor(values)
+    for name, values in left.items():
+        values = values.astype(np.uint8) if values.dtype == bool else values
+        cloud.point[name] = o3d.core.Tensor(np.ascontiguousarray(values).reshape(-1, 1))
+    return cloud
+
+
+def ransac_plane(points_m: np.ndarray, within_m: float) -> np.ndarray:
+    """Rows (M,) of the points (N, 3) that lie no further than `within_m` from the plane that most
+    do (RANSAC of Open3D, 1000 draws, the same each time)."""
+    import open3d as o3d
+
+    if len(points_m) < 3:
+        raise InputError(f"{len(points_m)} points lie on no plane in particular; 3 are needed")
+    o3d.utility.random.seed(0)
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points_m))
+    return np.asarray(cloud.segment_plane(within_m, ransac_n=3, num_iterations=1000)[1])
+
+
+# ------------------------------------------------------------------------------------------ meshes
+
+
+def read_mesh(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
+    """Read vertices (V, 3) in double precision and triangles (F, 3) of a PLY, OBJ or STL file.
+
+    Raises InputError for a file that is missing or broken, or has no triangles.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such mesh; give a PLY, OBJ or STL file.")
+    import open3d as o3d
+
+    # The tensor reader would round doubles to float32; this one keeps them.
+    with _quiet():
+        mesh = o3d.io.read_triangle_mesh(str(path))
+    if not mesh.has_triangles():
+        raise InputError(f"{path}: no triangles in it, or broken; give a PLY, OBJ or STL mesh.")
+    return np.asarray(mesh.vertices), np.asarray(mesh.triangles)
+
+
+def ray_caster(vertices_m: np.ndarray, triangles: np.ndarray) -> Any:
+    """A scene (Embree) that casts rays against vertices (V, 3) and triangles (F, 3), in float32."""
+    import open3d as o3d
+
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(vertices_m.astype(np.float32), triangles.astype(np.uint32))
+    return scene
+
+
+def surface_normals(points_m: np.ndarray) -> np.ndarray:
+    """Unit normals (N, 3) of points (N, 3), of whichever sign: of the plane through 30 of them."""
+    import open3d as o3d
+
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points_m))
+    cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(20))
+    return np.array(cloud.normals)
+
+
+def poisson_mesh(
+    points_m: np.ndarray, normals: np.ndarray, depth: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A closed surface through oriented points (N, 3), as Poisson's equation has it.
+
+    Its finest cells are 1 / 2^depth of 1.1 times the widest extent.
+
+    Returns:
+        Vertices (V, 3), triangles (F, 3), and how dense the points are round each vertex (V,): one
+        more where they are half as far apart.
+    """
+    import open3d as o3d
+
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points_m))
+    cloud.normals = o3d.utility.Vector3dVector(normals)
+    with _quiet():
+        mesh, density = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(
+            cloud, depth=depth
+        )
+    return np.array(mesh.vertices), np.array(mesh.triangles, np.int64), np.array(density)
+
+
+def distance_to_mesh(
+    vertices_m: np.ndarray, triangles: np.ndarray, points_m: np.ndarray
+) -> np.ndarray:
+    """Distance (N,) of points (N, 3) to the nearest triangle, m, in float32."""
+    scene = ray_caster(vertices_m, triangles)
+    return scene.compute_distance(points_m.astype(np.float32)).numpy().astype(np.float64)
+
+
+def write_surface(surface: Surface, folder: str | Path) -> None:
+    """Write `reference/` into a recording's folder: mesh.ply, faces.parquet, labels.yaml.
+
+    Label and intensity are columns of faces.parquet where the surface has them; labels without a
+    name are called label_<n>. Without either, the mesh is all there is.
+    """
+    reference = Path(folder) / "reference"
+    reference.mkdir(parents=True, exist_ok=True)
+    xyz = dict(zip("xyz", np.asarray(surface.vertices_m, np.float64).T, strict=True))
+    corners = {"vertex_indices": np.asarray(surface.triangles, np.int32)}
+    write_ply(reference / "mesh.ply", {"vertex": xyz, "face": corners})
+    faces = {}
+    if surface.label is not None:
+        faces["label"] = surface.label.astype(np.uint16)
+        names = {int(n): surface.names.get(int(n), f"label_{n}") for n in np.unique(surface.label)}
+        (reference / "labels.yaml").write_text(
+            "".join(f"{number}: {name}\n" for number, name in names.items()), encoding="utf-8"
+        )
+    if surface.intensity is not None:
+        faces["intensity"] = surface.intensity.astype(np.float32)
+    if faces:
+        write_table(reference / "faces.parquet", faces)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep what libraries print of a broken file off the terminal: the error raised says it."""
+    import open3d as o3d
+
+    nowhere, kept = os.open(os.devnull, os.O_WRONLY), (os.dup(1), os.dup(2))
+    try:
+        os.dup2(nowhere, 1)
+        os.dup2(nowhere, 2)
+        with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+            yield
+    finally:
+        for number, copy in enumerate(kept, start=1):
+            os.dup2(copy, number)
+            os.close(copy)
+        os.close(nowhere)
+
+
+def _sentence(error: RuntimeError) -> str:
+    """What Open3D says, without its colours and where in its code."""
+    text = re.sub(r"\x1b\[[0-9;]*m", "", str(error)).strip()
+    return re.sub(r"^\[Open3D Error\] \(.*?\) \S+:\d+: ", "", text).rstrip(".")

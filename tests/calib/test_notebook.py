@@ -1,0 +1,95 @@
+"""Results as a notebook shows them: the numbers of the terminal's tables, as sound HTML."""
+
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from calib.diagnosis.verdict import Diagnosis
+from calib.ladder import Rung
+from calib.run import EffectEstimate, FrameEstimate, Part, Run, Solution
+from calib.tables import print_run
+
+NAMES = ("lidar.rx", "lidar.ry", "lidar.rz", "lidar.tx", "lidar.ty", "lidar.tz")
+
+
+@pytest.fixture
+def run():
+    """A run of one frame and two effects, with a name that would break HTML."""
+    frame = FrameEstimate("mount", np.eye(4), np.full(3, 2e-4), np.full(3, 3e-4))
+    effects = {
+        "ring<offset>": EffectEstimate("m", ("a & b", "c"), np.array([0.0012, -0.0034]),
+                                       np.array([0.0001, 0.0])),
+        "many": EffectEstimate("rad", tuple(f"p{i}" for i in range(20)),
+                               np.linspace(-0.001, 0.001, 20), np.full(20, 1e-5)),
+    }  # fmt: skip
+    solution = Solution(
+        Part({"lidar": frame}, effects),
+        {},
+        [{"name": "lidar.tz", "why": "no <floor> in sight"}],
+        NAMES,
+        np.diag(np.full(6, 9e-8)),
+    )
+    rms = {"fit": 0.86, "held_out": 1.42, "noise_floor": 1.74}
+    summary = {
+        **{"points": 10, "stops": 2, "converged": True, "iterations": 3, "seconds": 1.0},
+        **{"rms_mm": rms, "mean_mm": {"fit": 0.01}, "std_mm": {"fit": 0.86}, "residual": "range"},
+    }
+    model = {"effects": [], "fixed": [], "prior": None, "recordings": []}
+    return Run(Path("runs/a&b"), model, summary, solution)
+
+
+def parsed(html):
+    """The page as a tree: it must be well-formed."""
+    return ElementTree.fromstring(html)
+
+
+def cells(html):
+    """The text of every cell, row by row."""
+    return [["".join(c.itertext()).strip() for c in row] for row in parsed(html).iter("tr")]
+
+
+def test_a_run_shows_what_the_terminal_shows(run, capsys):
+    rows = cells(run._repr_html_())
+    print_run(run)
+    printed = " ".join(capsys.readouterr().out.split())
+    for row in rows:
+        for cell in row:
+            assert " ".join(cell.split()) in printed
+    assert ["ring<offset>", "a & b", "+1.20 ± 0.10", "mm", ""] in rows
+    assert any("1.42" in row for row in rows)
+    assert not any(row for row in rows if not any(row))
+    said = "".join(parsed(run._repr_html_()).itertext())
+    assert "runs/a&b" in said
+    assert "not told: lidar.tz: no <floor> in sight" in said
+
+
+def candidate(name):
+    """A confirmed candidate of a diagnosis."""
+    return {
+        "effect": name, "add": name, "site": "range", "step": 1, "p_adjusted": 3e-36,
+        "unabsorbed_rms_mm": 0.44, "held_out_rms_mm": {"before": 7.71, "after": 1.42},
+        "parameters": {"unit": "m", "names": ["a"], "estimate": [0.00619], "sigma": [0.00012]},
+        "smallest_detectable": 0.0004, "dressed_up": False, "indistinguishable_from": [],
+    }  # fmt: skip
+
+
+def test_a_diagnosis_shows_its_verdict_sentences_and_candidates():
+    sentences = ["incidence_angle_bias is missing: 2.97 mm < rms & so on."]
+    found = Diagnosis(
+        "missing_effect", sentences, [candidate("incidence_angle_bias")], [], [], {}, {}, []
+    )
+    html = found._repr_html_()
+    said = "".join(parsed(html).itertext())
+    assert "verdict: an effect is missing" in said
+    assert sentences[0] in said
+    row = next(row for row in cells(html) if "incidence_angle_bias" in row)
+    assert "7.71 -> 1.42" in row
+    assert any("+6.19 ± 0.12" in cell for cell in row)
+
+
+def test_a_rung_shows_its_errors(run):
+    rows = cells(Rung(run, None)._repr_html_())
+    assert rows[0] == ["ladder", "model", "held out, mm", "fit, mm", "noise floor, mm"]
+    assert rows[1] == ["a&b", "start", "1.42", "0.86", "1.74"]
