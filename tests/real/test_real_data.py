@@ -5,6 +5,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
+import pandas
 import pyarrow.parquet as pq
 import pytest
 import yaml
@@ -91,10 +92,10 @@ def test_ur10_urdf_leads_to_the_planned_poses(series, shared, tmp_path):
     source = shared / "arms/ur10_tmac"
     recording = foreign.ur10(series, source, tmp_path / "ur10")
     table = stops(recording)
-    plan = foreign._decimal_comma_table(source / foreign.UR10_FILES[series])
-    plan = {key: plan[key][[int(stop[5:]) for stop in table["stop"]]] for key in plan}
+    plan = pandas.read_csv(source / foreign.UR10_FILES[series], sep=";", decimal=",")
+    plan = plan.iloc[[int(stop.removeprefix("row")) for stop in table["stop"]]]
     xyz, rpy = (
-        np.stack([plan[f"Goal {axis}"] for axis in axes], axis=1)
+        plan[[f"Goal {axis}" for axis in axes]].to_numpy(float)
         for axes in (("x", "y", "z"), ("roll", "pitch", "yaw"))
     )
     goal = RigidTransform.from_components(xyz, Rotation.from_euler("xyz", rpy))
@@ -164,8 +165,9 @@ def test_hesai_sweeps_match_the_decoded_cloud(model, shared, tmp_path):
 def test_hesai_columns_count_clockwise_from_behind(model, shared, tmp_path):
     source = shared / "lidar/hesai_nebula"
     xyz, columns = sweep_table(foreign.hesai(model, source, tmp_path / model))
-    _, table, _, _, steps, _ = foreign.HESAI[model]
-    angles = np.loadtxt(source / f"calibration/{table}.csv", delimiter=",", skiprows=1)
+    steps = {"qt64": 600, "xt32": 2000}[model]
+    table = source / f"calibration/{foreign.HESAI[model]}.csv"
+    angles = np.loadtxt(table, delimiter=",", skiprows=1)
     elevation, clockwise = np.radians(angles[columns["ring"].astype(int), 1:]).T
     azimuth = np.pi - 2 * np.pi * columns["column"] / steps - clockwise
     expected = np.stack([np.cos(azimuth), np.sin(azimuth), np.tan(elevation)], axis=1)
