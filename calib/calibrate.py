@@ -20,6 +20,7 @@ from calib.holdout import held_out
 from calib.model import Model, Source
 from calib.problem import Problem
 from calib.recalibrate import Link, earlier, solve_from
+from calib.residuals.table import residual_table, table_path
 from calib.residuals.tracker import TrackedBody
 from calib.run import (
     COVARIANCE,
@@ -239,32 +240,16 @@ def _write_residuals(
     """Write every row's residual, stop by stop; their sums, or those of bodies without scans."""
     folder.mkdir()
     total = Errors()
-    several = len(problem.sources) > 1
     for i, (scan, association) in enumerate(
         zip(estimate.scans, estimate.associations, strict=True)
     ):
         progress("writing residuals", i, len(estimate.scans))
         rows = scan.rows(estimate.values, association)
-        view = rows.view
-        names = ("ring", "column", "range_m", "incidence_rad", "azimuth_rad", "elevation_rad")
-        names += ("intensity", "label", "surface", "region", "patch", "plane")
-        columns = {n: view[n] for n in names if n in view.columns}
-        columns |= {
-            "residual_m": rows.residual_m,
-            "sigma_m": np.hypot(rows.sigma_m, rows.reference_sigma_m),
-            "weight": rows.weight,
-        }
-        name = f"{scan.stops.rig.name}.{scan.name}" if several else scan.name
-        columns = {n: _compact(column[rows.usable]) for n, column in columns.items()}
-        write_table(folder / f"{name}.parquet", columns)
+        write_table(table_path(folder, scan, problem.sources), residual_table(rows))
         total += row_errors(rows)
     if not estimate.scans:
         total = body_errors(_bodies(problem), estimate.values, None)
     return total
-
-
-def _compact(column: np.ndarray) -> np.ndarray:
-    return column.astype(np.int32 if column.dtype.kind in "iu" else np.float32)
 
 
 def _summary(

@@ -10,7 +10,7 @@ from typing import NoReturn
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
-from calib.cli import files, study  # noqa: E402, F401 - their commands register themselves
+from calib.cli import bring, files, look, study  # noqa: E402, F401 - their commands register themselves
 from calib.cli.app import app  # noqa: E402
 from chains.errors import InputError  # noqa: E402
 

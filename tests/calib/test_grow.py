@@ -282,3 +282,12 @@ def test_parameters_of_several_units_have_one_each(made, first):
     written = read_yaml(second.folder / "solution.yaml")[0]["effects"]
     assert written["mount_slip@150"]["unit"] == slip.unit
     assert EffectEstimate("m", ("a", "b"), np.zeros(2), np.ones(2)).units == ("m", "m")
+
+
+def test_recordings_of_one_rig_keep_a_table_for_every_stop(tmp_path):
+    for seed in (4, 5):
+        rigs.write(tmp_path / f"rec{seed}", seed=seed)
+    folders = [tmp_path / "rec4", tmp_path / "rec5"]
+    run = calibrate(folders, tmp_path / "run", SMALL, "none")
+    tables = sorted(path.name for path in (run.folder / "residuals.parquet").iterdir())
+    assert tables == [f"box.{k}.{stop}.parquet" for k in (0, 1) for stop in sorted(rigs.STOPS)]

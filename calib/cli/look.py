@@ -1,0 +1,75 @@
+"""Runs for people to look at: report, plot, view."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from calib.cli.app import Json, Out, Runs, app, progress_bar, say
+from chains.errors import InputError
+
+
+@app.command()
+def report(runs: Runs, out: Out, as_json: Json = False) -> None:
+    """One page for a colleague: the verdict, what was found, and how good it is; no network."""
+    from calib.report import report as write
+    from calib.run import Run
+
+    opened = [Run.open(run) for run in runs]
+    with progress_bar() as progress:
+        written = write(opened, out, progress)
+    say(written.document(), f"wrote {out}: {written.summary}", as_json)
+
+
+@app.command()
+def plot(
+    run: Path,
+    name: Annotated[str | None, typer.Argument(help="Which figure; --list names them.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="A .png, .svg or .pdf file.")
+    ] = None,
+    listed: Annotated[bool, typer.Option("--list", help="Which figures this run has.")] = False,
+    as_json: Json = False,
+) -> None:
+    """One figure of a run's report, for a paper."""
+    from calib.report import Evidence, charts_of
+    from calib.report import plot as draw
+    from calib.run import Run
+
+    with progress_bar() as progress:
+        evidence = Evidence.of([Run.open(run)], progress)
+        if listed:
+            charts = [chart.document() for chart in charts_of(evidence).charts]
+    if listed:
+        text = "\n".join(f"{chart['id']:24}  {chart['title']}" for chart in charts)
+        say({"charts": charts}, text, as_json)
+        return
+    if name is None or out is None:
+        raise InputError("give a figure's NAME and -o FILE.png, .svg or .pdf; --list names them")
+    with progress_bar() as progress:
+        chart = draw(evidence, name, out)
+    say(chart.document() | {"file": str(out)}, f"wrote {out}: {chart.title}", as_json)
+
+
+@app.command()
+def view(
+    runs: Runs,
+    port: Annotated[
+        int, typer.Option(help="Where to serve; 0 is any free port.", min=0, max=65535)
+    ] = 0,
+    show: Annotated[
+        bool, typer.Option("--open/--no-open", help="Whether to open it in a browser.")
+    ] = True,
+    as_json: Json = False,
+) -> None:
+    """The browser workbench, on this machine alone, until Ctrl-C."""
+    from calib.view import view as serve
+
+    def tell(url: str) -> None:
+        say({"url": url}, f"{url} (Ctrl-C ends it)", as_json)
+        sys.stdout.flush()
+
+    serve(runs, port, show, tell)

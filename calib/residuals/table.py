@@ -1,0 +1,49 @@
+"""Every row's residual as a table per stop, as a run keeps them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from calib.model import Source
+from calib.residuals.beams import Rows
+from calib.residuals.scan import ScanStop
+
+_FIRST = ("ring", "column", "range_m", "incidence_rad", "azimuth_rad", "elevation_rad", "intensity")
+_PLACES = ("label", "surface", "region", "patch", "plane")
+
+
+def table_path(folder: Path, scan: ScanStop, sources: Sequence[Source]) -> Path:
+    """Where the table of a stop is: STOP.parquet; of several recordings RIG.STOP.parquet, with the
+    recording's number in between where they are of one rig."""
+    if len(sources) == 1:
+        return folder / f"{scan.name}.parquet"
+    rig = scan.stops.rig.name
+    alike = [s.recording for s in sources if s.rig.name == rig]
+    number = next(i for i, recording in enumerate(alike) if recording is scan.recording)
+    owner = f"{rig}.{number}" if len(alike) > 1 else rig
+    return folder / f"{owner}.{scan.name}.parquet"
+
+
+def residual_table(rows: Rows) -> dict[str, np.ndarray]:
+    """The usable rows of a stop as columns (N,).
+
+    What effects look at, every further column that the recording's points carry included; then
+    ``residual_m``, ``sigma_m`` with the reference's error in it, and the robust ``weight``.
+    """
+    view = rows.view
+    names = [n for n in (*_FIRST, *_PLACES) if n in view.columns]
+    further = (n for n, column in view.columns.items() if not callable(column))
+    names += [n for n in further if n not in names and np.shape(view[n]) == (view.rows,)]
+    columns = {n: view[n] for n in names} | {
+        "residual_m": rows.residual_m,
+        "sigma_m": np.hypot(rows.sigma_m, rows.reference_sigma_m),
+        "weight": rows.weight,
+    }
+    return {n: _compact(column[rows.usable]) for n, column in columns.items()}
+
+
+def _compact(column: np.ndarray) -> np.ndarray:
+    return column.astype(np.int32 if column.dtype.kind in "iu" else np.float32)

@@ -1,0 +1,197 @@
+"""What lies on the workbench: the runs, the one chosen, its ladder and what was found about it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib.effects import CATALOGUE, find
+from calib.ladder import Rung, ladder
+from calib.run import DIAGNOSIS, Run
+from chains.errors import InputError
+
+_OF_CANDIDATE = ("add", "p_adjusted", "step", "dressed_up", "held_out_rms_mm", "unabsorbed_rms_mm")
+
+
+@dataclass(frozen=True)
+class Findings:
+    """A run's diagnosis, as diagnosis.json has it.
+
+    Args:
+        verdict: of three.
+        sentences: the finding in words.
+        candidates: effects that the model lacks, best first.
+        unexplained: structure without a name.
+        curves: mean residual against one covariate each, by its name.
+    """
+
+    verdict: str
+    sentences: Sequence[str]
+    candidates: Sequence[Mapping[str, Any]]
+    unexplained: Sequence[Mapping[str, Any]]
+    curves: Mapping[str, Curve]
+
+    @classmethod
+    def read(cls, run: Run) -> Findings | None:
+        """What was found about a run; None where it was not diagnosed.
+
+        Raises:
+            InputError: the file is of another version.
+        """
+        path = run.folder / DIAGNOSIS
+        if not path.is_file():
+            return None
+        try:
+            found = json.loads(path.read_text(encoding="utf-8"))
+            single = (c for c in found["curves"] if len(c["covariates"]) == 1)
+            curves = {c["covariates"][0]: Curve.read(c) for c in single}
+            lists = (found[key] for key in ("sentences", "candidates", "unexplained"))
+            lacking = [k for c in found["candidates"] for k in _OF_CANDIDATE if k not in c]
+            if lacking:
+                raise KeyError(lacking[0])
+            return cls(found["verdict"], *lists, curves)
+        except (ValueError, KeyError, TypeError, IndexError) as error:
+            raise InputError(
+                f"{path} is no diagnosis of this version ({error}); diagnose the run again"
+            ) from None
+
+    @property
+    def worth_adding(self) -> list[str]:
+        """Names of the effects that were confirmed, in the order in which to add them."""
+        told = [c for c in self.candidates if c["step"] and not c["dressed_up"]]
+        return [c["add"] for c in sorted(told, key=lambda c: c["step"])]
+
+    def covariate_of(self, effect: str) -> str | None:
+        """The covariate whose curve shows an effect best: its own, or what stands out most."""
+        if not self.curves:
+            return None
+        known = any(e.family == effect.partition("@")[0] for e in CATALOGUE)
+        own = [c for c in find(effect).covariates if c in self.curves] if known else []
+        return max(own or self.curves, key=lambda c: self.curves[c].stands_out)
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Mean range residual (B,) in the bins of a covariate, with the band of chance; mm."""
+
+    centres: np.ndarray
+    mean_mm: np.ndarray
+    band_mm: np.ndarray
+
+    @classmethod
+    def read(cls, document: Mapping[str, Any]) -> Curve:
+        """As diagnosis.json has it; what is null there is NaN."""
+        parts = document["centres"][0], document["mean_mm"], document["band_mm"]
+        return cls(*(np.array(part, float) for part in parts))
+
+    @property
+    def stands_out(self) -> float:
+        """The most that a bin's mean is beyond 0, in bands."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return float(np.nanmax(np.abs(self.mean_mm) / self.band_mm, initial=0.0))
+
+
+@dataclass
+class Desk:
+    """The runs on the workbench.
+
+    Args:
+        runs: by the name that each is shown under, the lowest rung of a ladder first.
+        chosen: which of them is looked at.
+        refused: a sentence for each folder that could not be opened.
+    """
+
+    runs: dict[str, Run] = field(default_factory=dict)
+    chosen: str = ""
+    refused: list[str] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, folders: Sequence[Path | str]) -> Desk:
+        """Runs, and those that they grew from; the last one is chosen.
+
+        Raises:
+            InputError: none of them can be opened; of several, those that can are.
+        """
+        desk = cls()
+        for folder in folders:
+            try:
+                desk.add(Path(folder))
+            except InputError as error:
+                desk.refused.append(str(error))
+        if not desk.runs:
+            raise InputError("; ".join(desk.refused) or "no run was given; name a run folder")
+        return desk
+
+    @property
+    def run(self) -> Run:
+        """The one that is looked at."""
+        return self.runs[self.chosen]
+
+    def add(self, folder: Path) -> None:
+        """Lay a run on the bench, with those below it, and choose it.
+
+        Raises:
+            InputError: it cannot be opened.
+        """
+        run = Run.open(folder)
+        for rung in ladder([run]) or [Rung(run, None)]:
+            self.chosen = self._name(rung.run)
+            self.runs[self.chosen] = rung.run
+
+    def choose(self, name: str) -> None:
+        """Look at another run."""
+        self.chosen = name
+
+    def rungs(self) -> list[Rung]:
+        """From the run that all began with to the one looked at."""
+        return ladder([self.run]) or [Rung(self.run, None)]
+
+    def undo(self) -> str:
+        """Go back to the run that this one grew from; what to tell of that.
+
+        Raises:
+            InputError: it grew from none, or that is gone.
+        """
+        left, below = self.run, self.rungs()[-1].below
+        if below is None:
+            raise InputError(f"{left.folder} grew from no other run that is still there")
+        self.chosen = self._name(below)
+        self.runs[self.chosen] = below
+        return f"Back at {self.chosen}; {left.folder} stays on disk."
+
+    def addable(self, found: Findings | None) -> dict[str, str | Mapping[str, Any]]:
+        """Effects that the model lacks, those found first: name -> what `rigcal add` takes.
+
+        What has no name is a formula, as a document of an effect's file.
+        """
+        offered: dict[str, str | Mapping[str, Any]] = {}
+        if found is not None:
+            offered |= {name: name for name in found.worth_adding}
+            formulas = (each["formula"] for each in found.unexplained if each.get("formula"))
+            offered |= {formula["name"]: formula for formula in formulas}
+            offered |= {c["add"]: c["add"] for c in found.candidates}
+        families = {name.partition("@")[0] for name in (*offered, *self.run.effects)}
+        offered |= {e.name: e.name for e in CATALOGUE if e.family not in families}
+        return {name: what for name, what in offered.items() if name not in self.run.effects}
+
+    def folder_for(self, effect: str) -> Path:
+        """Where a run with one more effect goes: beside this one, under a name not yet taken."""
+        here = self.run.folder.resolve()
+        wanted = here.with_name(f"{here.name}+{effect}")
+        taken, number = wanted, 2
+        while taken.exists():
+            taken, number = wanted.with_name(f"{wanted.name}-{number}"), number + 1
+        return taken
+
+    def _name(self, run: Run) -> str:
+        """A run's folder, as short as tells it from the others."""
+        here = run.folder.resolve()
+        known = next((n for n, r in self.runs.items() if r.folder.resolve() == here), None)
+        if known is not None:
+            return known
+        return str(here) if here.name in self.runs else here.name

@@ -1,0 +1,128 @@
+"""A refit or a diagnosis in a process of its own: the page stays alive, and a job can be stopped.
+
+The process does what ``rigcal add`` and ``rigcal diagnose`` do, and tells of it through a pipe.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+import tempfile
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, Literal
+
+from chains.errors import InputError
+
+PATIENCE_S = 10.0  # for a process that was stopped to clean up
+
+
+@dataclass(frozen=True)
+class Told:
+    """What a job says of itself.
+
+    Args:
+        kind: "progress"; "run", a run folder stands; "done"; "failed"; "stopped".
+        text: what is being done, the folder, or the sentence that says what is wrong.
+        share: of the present step that is done, 0 to 1.
+    """
+
+    kind: Literal["progress", "run", "done", "failed", "stopped"]
+    text: str = ""
+    share: float = 0.0
+
+
+class Job:
+    """One effect added to a run and the result diagnosed; or a run diagnosed, where no effect is.
+
+    Args:
+        run: folder of the run to start from.
+        effect: as `Desk.addable` has it: a name, or the document of a formula.
+        out: folder of the run to make.
+    """
+
+    def __init__(
+        self, run: Path, effect: str | Mapping[str, Any] | None = None, out: Path | None = None
+    ) -> None:
+        # Spawned: a process with threads and libraries such as these cannot be forked safely.
+        context = multiprocessing.get_context("spawn")
+        self._ear, mouth = context.Pipe(duplex=False)
+        self._stopped = False
+        self._process = context.Process(
+            target=_work, args=(mouth, run, effect, out), daemon=True, name="rigcal job"
+        )
+        self._process.start()
+        mouth.close()  # so that the pipe ends when the process does
+
+    def listen(self) -> Iterator[Told]:
+        """All that the job says until it is over; the last is "done", "failed" or "stopped"."""
+        last = Told("progress")
+        while last.kind not in ("done", "failed"):
+            try:
+                last = self._ear.recv()
+            except (EOFError, OSError):
+                break
+            if not self._stopped:
+                yield last
+        self._process.join(PATIENCE_S)
+        if self._stopped:
+            yield Told("stopped")
+        elif last.kind not in ("done", "failed"):
+            code = self._process.exitcode
+            yield Told("failed", f"the process ended with code {code}; is there enough memory?")
+
+    def stop(self) -> None:
+        """End the process; a run that is not whole by then leaves nothing."""
+        self._stopped = True
+        self._process.terminate()
+        self._process.join(PATIENCE_S)
+        if self._process.is_alive():
+            self._process.kill()
+
+
+def _work(
+    mouth: Connection, run: Path, effect: str | Mapping[str, Any] | None, out: Path | None
+) -> None:
+    """What the process does."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the page, which ends its jobs
+    signal.signal(signal.SIGTERM, _leave)
+    try:
+        _study(mouth, run, effect, out)
+        mouth.send(Told("done"))
+    except InputError as error:
+        mouth.send(Told("failed", str(error)))
+    except BrokenPipeError:
+        pass  # the page is gone
+    except Exception as error:
+        mouth.send(Told("failed", f"internal fault: {type(error).__name__}: {error}"))
+
+
+def _study(
+    mouth: Connection, folder: Path, effect: str | Mapping[str, Any] | None, out: Path | None
+) -> None:
+    from calib.calibrate import grow, grown_model
+    from calib.diagnosis import diagnose
+    from calib.run import Run
+    from sensors.documents import write_yaml
+
+    def progress(what: str, done: int, total: int) -> None:
+        mouth.send(Told("progress", what, (done + 1) / max(total, 1)))
+
+    run = Run.open(folder)
+    if effect is not None:
+        with tempfile.TemporaryDirectory() as scratch:
+            if not isinstance(effect, str):
+                path = Path(scratch) / "formula.yaml"
+                write_yaml(path, dict(effect))
+                effect = str(path)
+            model = grown_model(run, [effect])
+        run = grow(run, model, out, progress)
+        mouth.send(Told("run", str(run.folder)))
+    diagnose(run, progress)
+
+
+def _leave(number: int, frame: object) -> None:
+    """Leave as an exception would, so that half-made folders are taken away."""
+    raise SystemExit(128 + number)

@@ -1,0 +1,202 @@
+"""The panel's pieces as HTML: legend, findings, ladder, the point that was clicked."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib.ladder import Rung
+from calib.view.colours import Scale, column
+from calib.view.desk import Findings
+from calib.view.scene import Points
+
+SHOWN = 6  # candidates in the table; the menu has all
+VERDICTS = {
+    "adequate": "The model is adequate",
+    "missing_effect": "An effect is missing",
+    "unexplained_structure": "There is structure that no effect explains",
+}
+LEAST_P = 1e-12  # smaller ones are not told from each other
+LARGE = ((1e9, " billion"), (1e6, " million"), (1.0, ""))
+_FRAME = "padding:0 1.2em .4em .75em;font-size:12px;line-height:1.4;color:#222"
+_QUIET = "color:#555"
+_CUT = "overflow:hidden;text-overflow:ellipsis;white-space:nowrap"
+
+
+def legend(scale: Scale) -> str:
+    """What the colours mean."""
+    if scale.low is None:
+        items = "".join(
+            f'<span style="margin-right:1em;white-space:nowrap"><span style="display:inline-block;'
+            f'width:.8em;height:.8em;background:{colour}"></span> {escape(name)}</span>'
+            for name, colour in scale.names.items()
+        )
+        return _framed(items)
+    middle, unit = (scale.low + scale.high) / 2, f" {scale.unit}" if scale.unit else ""
+    signed = "+" if scale.low == -scale.high else ""
+    ends = [f"{value:{signed if value else ''}.3g}" for value in (scale.low, middle, scale.high)]
+    if signed:
+        ends = [f"{ends[0]}{unit}, short", ends[1], f"{ends[2]}{unit}, long"]
+    else:
+        ends = [f"{end}{unit}" for end in ends]
+    bar = f"height:.9em;background:linear-gradient(to right,{','.join(scale.stops)})"
+    texts = "".join(f"<span>{escape(end)}</span>" for end in ends)
+    return _framed(
+        f'<div style="{bar}"></div>'
+        f'<div style="display:flex;justify-content:space-between">{texts}</div>'
+    )
+
+
+def scan(points: Points | None, drawn: int, stop: str) -> str:
+    """What the stop's beams say, all of them, however few are drawn."""
+    if points is None:
+        return _framed(f"Stop {escape(stop)} was not scanned.")
+    if not points.inlier.any():
+        return _framed(f"{len(points.inlier):,} beams, none of which the fit took for an inlier.")
+    residual = 1e3 * points.columns["residual_m"][points.inlier].astype(float)
+    return _framed(
+        f"{len(points.inlier):,} beams, {drawn:,} drawn; residual of the inliers "
+        f"{math.sqrt(np.mean(residual**2)):.2f} mm rms, {residual.mean():+.2f} mm mean"
+    )
+
+
+def point(points: Points, index: int, label_names: Mapping[int, str]) -> str:
+    """All that is known of one point."""
+
+    def told(name: str, digits: int) -> str:
+        shown = column(name)
+        return f"{points.columns[name][index] * shown.scale:.{digits}f} {shown.unit}".strip()
+
+    sigma = f"{1e3 * points.columns['sigma_m'][index]:.2f} mm"
+    residual = f"{1e3 * points.columns['residual_m'][index]:+.2f} ± {sigma}"
+    rows = {
+        "residual": residual + ("" if points.inlier[index] else ", outlier"),
+        "range": told("range_m", 3),
+        "ring, column": f"{told('ring', 0)}, {told('column', 0)}",
+        "incidence": told("incidence_rad", 1),
+    }
+    if "label" in points.columns:
+        number = int(points.columns["label"][index])
+        rows["label"] = label_names.get(number, f"label {number}")
+    if np.isfinite(points.columns.get("intensity", np.array([np.nan]))[0]):
+        rows["intensity"] = told("intensity", 3)
+    cells = [
+        f'<td style="{_QUIET};padding-right:.8em">{escape(name)}</td>'
+        f'<td style="padding-right:1.2em">{escape(text)}</td>'
+        for name, text in rows.items()
+    ]
+    pairs = "".join(f"<tr>{''.join(cells[i : i + 2])}</tr>" for i in range(0, len(cells), 2))
+    return _framed(f'<table data-is="point">{pairs}</table>')
+
+
+def findings(found: Findings | None) -> str:
+    """The verdict in sentences, and the candidates in their order."""
+    if found is None:
+        return _framed("This run has not been diagnosed.")
+    sentences = "".join(f'<p style="margin:.3em 0">{escape(text)}</p>' for text in found.sentences)
+    verdict = escape(VERDICTS.get(found.verdict, found.verdict))
+    return _framed(f'<b data-is="verdict">{verdict}</b>{sentences}{_candidates(found)}')
+
+
+def _candidates(found: Findings) -> str:
+    if not found.candidates:
+        return ""
+    head = "".join(
+        f'<th style="text-align:{side};font-weight:600;padding-right:.6em">{text}</th>'
+        for text, side in (("effect", "left"), ("mm", "right"), ("by chance", "left"))
+    )
+    head += '<th style="text-align:left;font-weight:600">held out</th>'
+    rows = "".join(_candidate(each, found) for each in found.candidates[:SHOWN])
+    return f'<table data-is="findings" style="width:100%"><tr>{head}</tr>{rows}</table>'
+
+
+def _candidate(each: Mapping[str, Any], found: Findings) -> str:
+    size = each["unabsorbed_rms_mm"]
+    held = [each["held_out_rms_mm"][k] for k in ("before", "after")]
+    held_out = f"{held[0]:.2f} → {held[1]:.2f}" if None not in held else ""
+    worth = "color:#222" if each["add"] in found.worth_adding else _QUIET
+    return (
+        f'<tr style="{worth}"><td>{escape(each["add"]).replace("_", "_<wbr>")}</td>'
+        f'<td style="text-align:right;padding-right:.6em">{"" if size is None else f"{size:.2f}"}'
+        f'</td><td style="white-space:nowrap">{by_chance(each["p_adjusted"])}</td>'
+        f'<td style="white-space:nowrap">{held_out}</td></tr>'
+    )
+
+
+def by_chance(p: float | None) -> str:
+    """How often chance alone does as much, in words; nothing where that is not known."""
+    if p is None:
+        return ""
+    if p > 0.1:
+        return "often"
+    if p < LEAST_P:
+        return "1 in over 10¹²"
+    odds = float(f"{1 / p:.1g}")
+    size, word = next(each for each in LARGE if odds >= each[0])
+    return f"1 in {odds / size:,.0f}{word}"
+
+
+def ladder(rungs: Sequence[Rung]) -> str:
+    """Every rung's held-out error as a bar, and the noise floor as a line through all of them."""
+    errors = [_error(rung) for rung in rungs]
+    floor = rungs[-1].run.summary["rms_mm"]["noise_floor"]
+    most = max([*(mm for mm, _ in errors), floor]) * 1.02 or 1.0
+    rows = "".join(
+        _rung(rung, mm, 100 * mm / most, 100 * floor / most)
+        for rung, (mm, _) in zip(rungs, errors, strict=True)
+    )
+    said = f"Error of {errors[-1][1]}; dashed: noise floor, {floor:.2f} mm"
+    return _framed(f'<div data-is="ladder">{rows}</div><div style="{_QUIET}">{said}</div>')
+
+
+def _error(rung: Rung) -> tuple[float, str]:
+    rms = rung.run.summary["rms_mm"]
+    if rms["held_out"] is None:
+        return rms["fit"], "the fit, as no stop was held out"
+    return rms["held_out"], "stops held out"
+
+
+def _rung(rung: Rung, mm: float, width: float, floor: float) -> str:
+    """One bar, `width` and `floor` in percent of the panel."""
+    name = escape(rung.run.folder.name or str(rung.run.folder))
+    line = f"position:absolute;top:0;bottom:0;left:{floor:.2f}%;border-left:2px dashed #00664a"
+    return (
+        f'<div style="display:flex;gap:.6em" title="{name}">'
+        f'<span style="{_CUT};flex:1">{escape(_step(rung))}</span><b>{mm:.2f} mm</b></div>'
+        f'<div style="position:relative"><div style="background:#7fb2d9;height:.9em;'
+        f'width:{width:.2f}%" data-mm="{mm:.4f}"></div><div style="{line}"></div></div>'
+    )
+
+
+def _step(rung: Rung) -> str:
+    if rung.grown_from is None:
+        return f"start: {rung.run.folder.name}"
+    if rung.below is None:
+        return f"{rung.run.folder.name}, grown from {rung.grown_from.name}, which is gone"
+    changes = [f"+ {n}" for n in rung.added] + [f"- {n}" for n in rung.dropped]
+    return ", ".join(changes) or "the same model"
+
+
+def note(text: str, bad: bool = False) -> str:
+    """A sentence to the person at the page."""
+    colour = (
+        "#fdecea;border-left:4px solid #b3261e" if bad else "#eef4fa;border-left:4px solid #2171b5"
+    )
+    return (
+        f'<div role="status" style="margin:0 1.2em .4em .75em;padding:.4em .6em;'
+        f'background:{colour};font-size:12px;color:#222;overflow-wrap:anywhere">{escape(text)}</div>'
+    )
+
+
+def new_run(folder: Path) -> str:
+    """Which run has just been made."""
+    return f"Made {folder}, an ordinary run folder."
+
+
+def _framed(inner: str) -> str:
+    return f'<div style="{_FRAME}">{inner}</div>'

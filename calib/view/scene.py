@@ -1,0 +1,253 @@
+"""What a run shows at a stop, as arrays in the reference's frame: points, rig and room.
+
+Points are drawn from the run's own residual tables: each on its beam, off the surface that it met
+by its residual, which is what is left when all that the model knows has been taken off.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from calib import problem as problems
+from calib.calibrate import reopened
+from calib.forward import Stops
+from calib.model import Model, Source
+from calib.residuals.scan import ScanStop
+from calib.residuals.table import table_path
+from calib.residuals.tracker import TrackedBody
+from calib.run import MODEL, RESIDUALS, Run
+from chains import se3
+from chains.errors import InputError
+from sensors.recording import read_table
+
+MOST_POINTS = 150_000  # more than a screen can tell apart
+MOST_TRIANGLES = 300_000
+NEAR = 0.01  # of its distance from the eye: what a click may miss a point by
+_NEEDED = ("ring", "column", "range_m", "incidence_rad", "azimuth_rad", "elevation_rad")
+_NEEDED += ("residual_m", "sigma_m", "weight")
+
+
+@dataclass(frozen=True)
+class Points:
+    """The beams of one stop that the fit used, N of them.
+
+    Args:
+        xyz_m: (N, 3) in the reference's frame.
+        eye_m: (3,) where the LiDAR is, in the same.
+        columns: (N,) each, as in the residual table.
+    """
+
+    xyz_m: np.ndarray
+    eye_m: np.ndarray
+    columns: Mapping[str, np.ndarray]
+
+    @property
+    def inlier(self) -> np.ndarray:
+        """(N,) bool, those with any weight in the fit."""
+        return self.columns["weight"] > 0
+
+    def drawn(self, below_m: float = np.inf, most: int = MOST_POINTS) -> np.ndarray:
+        """Indices (n,) of those to draw: lower than `below_m`, every so many of them."""
+        low = np.flatnonzero(self.xyz_m[:, 2] < below_m)
+        return low[:: max(1, -(-len(low) // most))]
+
+    def picked(
+        self, among: np.ndarray, origin_m: Sequence[float], direction: Sequence[float]
+    ) -> int | None:
+        """Index of the point that a ray through a pixel meant; None where it meant none.
+
+        The nearest to the eye of those hardly beside the ray, as that one hides the others.
+
+        Args:
+            among: (n,) indices of those that are drawn.
+            origin_m: (3,) the eye.
+            direction: (3,) of any length.
+        """
+        reach = self.xyz_m[among] - np.asarray(origin_m, float)
+        along = reach @ (np.asarray(direction, float) / np.linalg.norm(direction))
+        beside = np.sqrt(np.maximum(np.einsum("ni,ni->n", reach, reach) - along**2, 0.0))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            off = np.where(along > 0, beside / along, np.inf)
+        meant = np.flatnonzero(off < max(NEAR / 4, min(NEAR, off.min(initial=np.inf) * 1.5)))
+        return int(among[meant[np.argmin(along[meant])]]) if len(meant) else None
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A run's recordings, and where its fit puts everything.
+
+    Args:
+        run: the run.
+        sources: its recordings.
+        problem: its model on them; nothing in it is solved.
+        state: where its fit stood.
+    """
+
+    run: Run
+    sources: Sequence[Source]
+    problem: problems.Problem
+    state: Mapping[str, np.ndarray]
+
+    @classmethod
+    def of(cls, run: Run) -> Scene:
+        """Open what a run was fitted to.
+
+        Raises:
+            InputError: the recordings are gone or changed, or the run is of an earlier version.
+        """
+        sources = [reopened(recording, run) for recording in run.model["recordings"]]
+        model = Model.read(run.model, run.folder / MODEL)
+        # Poses need no surface, and planes would have to be looked for in every scan.
+        nothing = dict.fromkeys(range(len(sources)), object())
+        problem = problems.build(sources, model, meetings=nothing)
+        scene = cls(run, sources, problem, run.state())
+        for stops, _ in scene._stops.values():
+            unknown = [name for name in stops.variables if name not in scene.state]
+            if unknown:
+                raise InputError(f"{run.folder}: its state lacks '{unknown[0]}'; fit the run again")
+        return scene
+
+    @property
+    def names(self) -> list[str]:
+        """Of its recordings, by their folders."""
+        folders = [s.recording.folder for s in self.sources]
+        names = [folder.name for folder in folders]
+        return names if len(set(names)) == len(names) else [str(folder) for folder in folders]
+
+    def stops(self, recording: int) -> list[str]:
+        """Stops of a recording at which something was measured."""
+        names = self.sources[recording].recording.stops
+        return [names[k] for number, k in self._stops if number == recording]
+
+    def place(self, recording: int, stop: str, frame: str) -> np.ndarray:
+        """T_reference_frame (4, 4) as fitted; in the tracker's frame where there is no reference.
+
+        Raises:
+            InputError: nothing was measured at the stop, so nothing says where the rig was.
+        """
+        key = recording, self.sources[recording].recording.stops.index(stop)
+        if key not in self._stops:
+            raise InputError(f"stop '{stop}' has neither a scan nor a tracked body")
+        stops, row = self._stops[key]
+        return stops.in_reference(frame, self.state).T[row]
+
+    def frames(self, recording: int, stop: str) -> dict[str, np.ndarray]:
+        """Frame -> T_reference_frame (4, 4): the rig's root, its arm's ends, all that CAD names."""
+        rig = self.sources[recording].rig
+        edges = rig.tree.edges
+        named = [e.child for e in edges if e.name not in rig.arm_edges]
+        arm = [e for e in edges if e.name in rig.arm_edges]
+        ends = [arm[0].parent, arm[-1].child] if arm else []
+        names = dict.fromkeys((rig.tree.root, *ends, *named))
+        return {name: self.place(recording, stop, name) for name in names}
+
+    def links(self, recording: int, stop: str) -> tuple[np.ndarray, np.ndarray]:
+        """Segments (n, 2, 3) m from frame to frame, and which of them (n,) are the arm's."""
+        rig = self.sources[recording].rig
+        at = {f: self.place(recording, stop, f)[:3, 3] for f in rig.tree.frames}
+        ends = [(at[e.parent], at[e.child]) for e in rig.tree.edges]
+        arm = [e.name in rig.arm_edges for e in rig.tree.edges]
+        long = np.array([np.linalg.norm(b - a) > 1e-6 for a, b in ends], bool)
+        return np.reshape(ends, (-1, 2, 3))[long], np.array(arm, bool)[long]
+
+    def points(self, recording: int, stop: str) -> Points | None:
+        """The stop's beams; None where it was not scanned.
+
+        Raises:
+            InputError: the run's table of the stop is gone, or of another version.
+        """
+        scan = self._scans.get((recording, stop))
+        if scan is None:
+            return None
+        path = table_path(self.run.folder / RESIDUALS, scan, self.sources)
+        try:
+            columns = read_table(path)
+        except InputError as error:
+            raise InputError(f"{error}; the run is incomplete, fit it again") from None
+        missing = [name for name in _NEEDED if name not in columns]
+        if missing:
+            raise InputError(f"{path} has no column {missing[0]}; fit the run again")
+        T = scan.pose(self.state)
+        xyz_m = se3.apply(T, _beam_ends(columns, scan.lidar.beam_origin_m))
+        return Points(xyz_m, T[:3, 3], columns)
+
+    def room(self, recording: int) -> tuple[np.ndarray, np.ndarray] | None:
+        """Vertices (V, 3) m and triangles (F, 3) of the mesh, its faces turned to the LiDAR.
+
+        Of a mesh too large to be drawn, the largest triangles; None where there is none.
+        """
+        mesh = self.sources[recording].reference
+        if mesh is None:
+            return None
+        kept = np.arange(len(mesh.triangles))
+        if len(kept) > MOST_TRIANGLES:
+            kept = np.sort(np.argsort(-mesh.area_m2)[:MOST_TRIANGLES])
+        triangles = mesh.triangles[kept].copy()
+        first = next((s for number, s in self._scans if number == recording), None)
+        if first is not None:
+            lidar = self.sources[recording].rig.lidar_frame
+            eye = self.place(recording, first, lidar)[:3, 3]
+            a, b, c = np.moveaxis(mesh.vertices_m[triangles], 1, 0)
+            away = np.einsum("ni,ni->n", np.cross(b - a, c - a), eye - a) < 0
+            triangles[away] = triangles[away][:, ::-1]
+        return mesh.vertices_m, triangles
+
+    @cached_property
+    def _scans(self) -> dict[tuple[int, str], ScanStop]:
+        number = {id(s.recording): i for i, s in enumerate(self.sources)}
+        return {(number[id(s.recording)], s.name): s for s in self.problem.scans}
+
+    @cached_property
+    def _stops(self) -> dict[tuple[int, int], tuple[Stops, int]]:
+        """(recording, stop) -> the geometry that places it, and its row there; in their order."""
+        number = {s.recording.folder: i for i, s in enumerate(self.sources)}
+        found: dict[tuple[int, int], tuple[Stops, int]] = {}
+        for block in self.problem.blocks:
+            if isinstance(block, TrackedBody):
+                for row, (folder, k) in enumerate(block.stop_names):
+                    found[number[folder], k] = block.stops, row
+        for scan in self.problem.scans:
+            found[number[scan.recording.folder], scan.index] = scan.stops, 0
+        return dict(sorted(found.items(), key=lambda item: item[0]))
+
+
+def _beam_ends(columns: Mapping[str, np.ndarray], beam_origin_m: np.ndarray) -> np.ndarray:
+    """Where beams end (N, 3), in the LiDAR's frame: origin + (predicted + residual) direction."""
+    azimuth, elevation = (columns[n].astype(float) for n in ("azimuth_rad", "elevation_rad"))
+    range_m = columns["range_m"].astype(float) + columns["residual_m"]
+    radial, tangential = beam_origin_m
+    c, s = np.cos(azimuth), np.sin(azimuth)
+    flat = radial + range_m * np.cos(elevation)
+    z = range_m * np.sin(elevation)
+    return np.stack([flat * c - tangential * s, flat * s + tangential * c, z], axis=1)
+
+
+def sunk(vertices_m: np.ndarray, triangles: np.ndarray, depth_m: float) -> np.ndarray:
+    """Vertices (V, 3) of a mesh moved so far behind its faces, where those meet on average."""
+    a, b, c = np.moveaxis(vertices_m[triangles], 1, 0)
+    across = np.cross(b - a, c - a)
+    # Where surfaces only touch, each has vertices of its own: they must go the same way.
+    _, place = np.unique(np.round(vertices_m, 6), axis=0, return_inverse=True)
+    normal = np.zeros((place.max(initial=-1) + 1, 3))
+    for corner in triangles.T:
+        np.add.at(normal, place[corner], across)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    return vertices_m - depth_m * normal[place]
+
+
+def box(points_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Corners (3,) of a box that holds nearly all points (N, 3)."""
+    low, high = np.quantile(points_m, [0.01, 0.99], axis=0)
+    return low, high
+
+
+def camera(low_m: np.ndarray, high_m: np.ndarray, fov_rad: float) -> tuple[np.ndarray, np.ndarray]:
+    """Where an eye stands (3,) to see a box from above one corner, and where it looks (3,)."""
+    centre = (low_m + high_m) / 2
+    size = max(float(np.linalg.norm(high_m - low_m)), 1.0)
+    along = np.array([-0.5, -0.65, 0.7])
+    return centre + along * (0.5 * size / np.tan(fov_rad / 2)), centre

@@ -1,0 +1,186 @@
+"""The 3-D part of the page: the room, the rig and the points, as nodes of viser's scene."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from calib.view import scene as scenes
+from calib.view.scene import Points, Scene
+from chains import se3
+
+ROOM, RIG, AXES, POINTS, PICKED = "/room", "/rig", "/axes", "/points", "/picked"
+ARM_COLOUR, MOUNT_COLOUR, ROOM_COLOUR = (60, 70, 85), (150, 155, 165), (236, 236, 232)
+THICK_M, THIN_M = 0.05, 0.015
+FINEST_M, COARSEST = 0.006, 1 / 350  # of a point: metres, and a share of the room
+BEHIND_M = 0.01  # the room is drawn so far behind its surface
+OVERHEAD = 0.75  # of the way from the LiDAR to the ceiling: points above that hide the rest
+LETTER_M = 0.03  # frames are centimetres apart: their names are read from close by
+PANEL_PX = 400  # width of the panel beside the picture
+FOV_RAD = np.radians(50.0)
+
+
+class Stage:
+    """What is drawn. All is drawn about the room's middle, as browsers have single precision.
+
+    Args:
+        server: viser's.
+    """
+
+    def __init__(self, server: Any) -> None:
+        self.server = server
+        self.scene: Scene | None = None
+        self.points: Points | None = None
+        self.shown = np.zeros(0, int)
+        self._middle_m = np.zeros(3)
+        self._room: tuple[str, str] | None = None
+        self._around: np.ndarray | None = None
+        self.hidden: set[str] = set()
+        server.scene.configure_default_lights(cast_shadow=False)
+        server.on_client_connect(self._aim)
+
+    def clear(self) -> None:
+        """Draw nothing."""
+        self.scene, self.points, self._room = None, None, None
+        for name in (ROOM, RIG, AXES, POINTS, PICKED):
+            self.server.scene.remove_by_name(name)
+
+    def open(self, scene: Scene, recording: int) -> None:
+        """Draw another run's room; the same one is not sent again."""
+        self.scene = scene
+        known = scene.run.model["recordings"][recording]
+        if self._room == (known["path"], known["sha256"]):
+            return
+        self.clear()
+        self.scene, self._room = scene, (known["path"], known["sha256"])
+        room = scene.room(recording)
+        first = scene.stops(recording)[0]
+        around = room[0] if room else self._extent(recording, first)
+        self._middle_m = np.mean(scenes.box(around), axis=0)
+        if room:
+            # Half of every point would be inside the wall that it lies on.
+            vertices = scenes.sunk(*room, BEHIND_M) - self._middle_m
+            self.server.scene.add_mesh_simple(
+                ROOM,
+                vertices,
+                room[1],
+                color=ROOM_COLOUR,
+                side="front",
+                flat_shading=True,
+                visible=ROOM not in self.hidden,
+            )
+
+    def show(self, recording: int, stop: str) -> Points | None:
+        """Draw the rig at a stop, and read its points; `paint` draws those.
+
+        Raises:
+            InputError: the points cannot be read.
+        """
+        self.server.scene.remove_by_name(PICKED)
+        self._draw_rig(recording, stop)
+        self.points = None
+        self.points = self.scene.points(recording, stop)
+        if self.points is None:
+            self.server.scene.remove_by_name(POINTS)
+        if self._around is None:
+            self._around = self._extent(recording, stop) - self._middle_m
+            for client in self.server.get_clients().values():
+                self._aim(client)
+        return self.points
+
+    def ceiling_m(self) -> tuple[float, float, float]:
+        """Height of the lowest and highest point, and that below which the view is free."""
+        low, high = self.points.xyz_m[:, 2].min(), self.points.xyz_m[:, 2].max()
+        eye = self.points.eye_m[2]
+        return float(low), float(high), float(eye + OVERHEAD * max(high - eye, 0.0))
+
+    def paint(self, colours: np.ndarray, below_m: float) -> int:
+        """Draw the stop's points (N,) in their colours (N, 3) uint8; how many are drawn."""
+        points = self.points
+        self.shown = points.drawn(below_m)
+        span = float(np.linalg.norm(np.subtract(*scenes.box(points.xyz_m))))
+        size = float(np.clip(span / 2 / np.sqrt(len(self.shown) + 1), FINEST_M, span * COARSEST))
+        xyz = points.xyz_m[self.shown] - self._middle_m
+        self.server.scene.add_point_cloud(
+            POINTS,
+            xyz.astype(np.float32),
+            colours[self.shown],
+            point_size=size,
+            point_shape="circle",
+            point_shading="flat",
+            precision="float32",
+        )
+        return len(self.shown)
+
+    def pick(self, origin_m: np.ndarray, direction: np.ndarray) -> int | None:
+        """The point that was clicked, which is marked; None where the click met none."""
+        if self.points is None or not len(self.shown):
+            return None
+        index = self.points.picked(self.shown, origin_m + self._middle_m, direction)
+        if index is None:
+            self.server.scene.remove_by_name(PICKED)
+        else:
+            at = self.points.xyz_m[index] - self._middle_m
+            distance = np.linalg.norm(at - origin_m)
+            self.server.scene.add_icosphere(
+                PICKED, radius=0.006 * distance, color=(0, 0, 0), position=at
+            )
+        return index
+
+    def _extent(self, recording: int, stop: str) -> np.ndarray:
+        """Points (N, 3) about which the stop's picture is."""
+        points = self.scene.points(recording, stop)
+        if points is not None:
+            return points.xyz_m
+        frames = self.scene.frames(recording, stop).values()
+        return np.array([T[:3, 3] for T in frames])
+
+    def _draw_rig(self, recording: int, stop: str) -> None:
+        scene = self.server.scene
+        scene.remove_by_name(RIG)
+        scene.remove_by_name(AXES)
+        scene.add_frame(RIG, show_axes=False, visible=RIG not in self.hidden)
+        links, arm = self.scene.links(recording, stop)
+        for part, thick, colour, name in (
+            (arm, THICK_M, ARM_COLOUR, "arm"),
+            (~arm, THIN_M, MOUNT_COLOUR, "mounts"),
+        ):
+            if part.any():
+                ends = links[part] - self._middle_m
+                scene.add_line_segments(f"{RIG}/{name}", ends, colour, thickness=thick)
+        for i, end in enumerate(links[arm].reshape(-1, 3)[1::2] - self._middle_m):
+            scene.add_icosphere(f"{RIG}/joint{i}", THICK_M * 0.75, ARM_COLOUR, position=end)
+        scene.add_frame(AXES, show_axes=False, visible=AXES not in self.hidden)
+        for name, T in self.scene.frames(recording, stop).items():
+            at = T[:3, 3] - self._middle_m
+            scene.add_frame(
+                f"{AXES}/{name}",
+                axes_length=0.12,
+                axes_radius=0.006,
+                wxyz=se3.to_quat_wxyz(T),
+                position=at,
+            )
+            scene.add_label(
+                f"{AXES}/{name}/name", name, font_size_mode="scene", font_scene_height=LETTER_M
+            )
+
+    def toggle(self, name: str) -> None:
+        """Hide the room, the rig or its axes; or show it again."""
+        self.hidden ^= {name}
+        node = self.server.scene.get_handle_by_name(name)
+        if node is not None:
+            node.visible = name not in self.hidden
+
+    def _aim(self, client: Any) -> None:
+        """Let a person who comes to the page look at all of it, from above one corner."""
+        if self._around is None:
+            return
+        # What is told is the window: the panel stands beside the picture, or below it on a phone.
+        width, height = client.camera.image_width, client.camera.image_height
+        width -= PANEL_PX if width > 1.5 * PANEL_PX else 0
+        wide = min(1.0, width / max(height, 1))  # the angle of view is the height's
+        angle = 2 * np.arctan(np.tan(FOV_RAD / 2) * wide)
+        eye, target = scenes.camera(*scenes.box(self._around), angle)
+        client.camera.fov = FOV_RAD
+        client.camera.position, client.camera.look_at = eye, target

@@ -1,0 +1,171 @@
+"""The workbench in a real browser: an effect found, added, undone; points clicked; bad input."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib.calibrate import calibrate
+from calib.diagnosis import diagnose
+from calib.run import Run
+from calib.simulate import simulate
+from calib.view.desk import Desk
+from calib.view.page import Page
+from calib.view.server import address, serve, stop
+from calib.view.stage import PANEL_PX
+from tests.browser import SOFTWARE_GL, Watched, browser_page
+from tests.calib.viewed import diagnosed, small_run
+
+pytestmark = pytest.mark.slow
+SOON_MS, FIT_MS = 60_000, 300_000
+
+
+@contextmanager
+def shown(*runs: Path, width: int = 1400) -> Iterator[tuple[Watched, Page]]:
+    """The workbench of runs in a browser, its first picture drawn."""
+    server = serve(0)
+    try:
+        with browser_page(width, 900, *SOFTWARE_GL) as watched:
+            page = Page(server, Desk.of(runs))
+            watched.page.set_default_timeout(SOON_MS)
+            watched.page.goto(address(server))
+            page.open()
+            button(watched, "Add").wait_for()
+            yield watched, page
+            watched.assert_clean()
+            page.close()
+    finally:
+        stop(server)
+
+
+def bars(watched: Watched) -> list[float]:
+    """Held-out errors that the ladder shows, mm."""
+    found = watched.page.locator("[data-is=ladder] [data-mm]").all()
+    return [float(bar.get_attribute("data-mm")) for bar in found]
+
+
+def button(watched: Watched, name: str):
+    return watched.page.get_by_role("button", name=name, exact=True)
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory) -> Run:
+    run = small_run(tmp_path_factory.mktemp("small"))
+    diagnosed(run.folder)
+    return run
+
+
+@pytest.fixture(scope="module")
+def hidden(tmp_path_factory) -> Run:
+    """A run whose model lacks what was hidden in its recording."""
+    folder = tmp_path_factory.mktemp("hidden")
+    simulate("tiny", folder / "rec", 1, {"incidence_angle_bias": 2.0})
+    run = calibrate([folder / "rec"], folder / "run")
+    diagnose(run, refits=False)
+    return run
+
+
+def test_the_first_finding_is_added_and_the_ladder_falls(hidden):
+    with shown(hidden.folder) as (watched, _):
+        first = watched.page.locator("[data-is=findings] tr").nth(1).inner_text()
+        assert first.startswith("incidence_angle_bias")
+        assert watched.page.get_by_label("Effect").input_value() == "incidence_angle_bias"
+        before = bars(watched)
+        assert before == [pytest.approx(hidden.summary["rms_mm"]["held_out"], abs=1e-3)]
+        button(watched, "Add").click()
+        button(watched, "Cancel").wait_for()
+        assert button(watched, "Add").is_disabled()
+        watched.page.locator("[data-is=ladder] [data-mm]").nth(1).wait_for(timeout=FIT_MS)
+        after = bars(watched)
+        assert after[0] == before[0] and after[-1] < before[0] / 2
+        made = Run.open(f"{hidden.folder}+incidence_angle_bias")
+        assert made.summary["rms_mm"]["held_out"] == pytest.approx(after[-1], abs=1e-3)
+        button(watched, "Cancel").wait_for(state="hidden", timeout=FIT_MS)
+        assert watched.page.locator("[data-is=verdict]").inner_text() == "The model is adequate"
+        assert (made.folder / "diagnosis.json").is_file()
+        button(watched, "Undo").click()
+        watched.page.get_by_text("stays on disk").wait_for()
+        assert bars(watched) == before and made.folder.is_dir()
+
+
+def test_a_click_reads_the_point_that_it_meets(small):
+    with shown(small.folder) as (watched, page):
+        points, shown_points = page.stage.points, page.stage.shown
+        watched.page.wait_for_timeout(3000)
+        (client,) = page.server.get_clients().values()
+        box = watched.page.locator("canvas").first.bounding_box()
+        eye = client.camera.position
+        ahead = client.camera.look_at - eye
+        ahead /= np.linalg.norm(ahead)
+        right = np.cross(ahead, [0, 0, 1])
+        right /= np.linalg.norm(right)
+        axes = np.stack([right, np.cross(right, ahead), ahead])
+        local = (points.xyz_m[shown_points] - page.stage._middle_m - eye) @ axes.T
+        focal = box["height"] / 2 / np.tan(client.camera.fov / 2)
+        x = box["x"] + box["width"] / 2 + focal * local[:, 0] / local[:, 2]
+        y = box["y"] + box["height"] / 2 - focal * local[:, 1] / local[:, 2]
+        inside = (x > 300) & (x < 1400 - PANEL_PX - 20) & (y > 200) & (y < 880)
+        wanted = np.flatnonzero(inside)[0]
+        watched.page.mouse.click(x[wanted], y[wanted])
+        table = watched.page.locator("[data-is=point]")
+        table.wait_for()
+        cells = table.locator("td").all_inner_texts()
+        rows = dict(zip(cells[::2], cells[1::2], strict=True))
+        ring, column = map(int, rows["ring, column"].split(", "))
+        found = np.flatnonzero(
+            (points.columns["ring"] == ring) & (points.columns["column"] == column)
+        )
+        spot = np.flatnonzero(shown_points == found[0])[0]
+        assert np.hypot(x[spot] - x[wanted], y[spot] - y[wanted]) < 12
+        assert float(rows["range"].split()[0]) == pytest.approx(
+            points.columns["range_m"][found[0]], abs=1e-3
+        )
+        assert rows["residual"].startswith(f"{1e3 * points.columns['residual_m'][found[0]]:+.2f}")
+        assert set(rows) == {"residual", "ring, column", "range", "incidence", "label", "intensity"}
+
+
+def test_stops_and_colours_are_chosen(small):
+    with shown(small.folder) as (watched, page):
+        page_text = watched.page.locator("body")
+        assert "short" in page_text.inner_text() and page._stop.value == "L00P00"
+        for label, option in (("Stop", "L01P01"), ("Colour", "incidence, deg")):
+            watched.page.get_by_label(label, exact=True).click()
+            watched.page.get_by_role("option", name=option, exact=True).click()
+        watched.page.get_by_text("deg", exact=False).first.wait_for()
+        watched.page.wait_for_timeout(1000)
+        assert page._stop.value == "L01P01" and "short" not in page_text.inner_text()
+        count = len(page.stage.scene.points(0, "L01P01").inlier)
+        assert f"{count:,} beams" in page_text.inner_text()
+
+
+@pytest.mark.parametrize("width", [1400, 700])
+def test_the_page_fits_its_window(small, width):
+    with shown(small.folder, width=width) as (watched, _):
+        assert button(watched, "Add").is_visible()
+        wide = watched.page.evaluate("document.documentElement.scrollWidth")
+        assert wide <= width
+        for text in ("Run", "Stop", "Ladder", "Findings"):
+            box = watched.page.get_by_text(text, exact=True).first.bounding_box()
+            assert box["x"] >= 0 and box["x"] + box["width"] <= width
+
+
+def test_a_recording_that_is_gone_is_said_on_the_page(small, tmp_path):
+    shutil.copytree(small.folder, tmp_path / "run")
+    text = (tmp_path / "run" / "model.yaml").read_text()
+    gone = text.replace(str(small.recordings[0]), str(tmp_path / "gone"))
+    (tmp_path / "run" / "model.yaml").write_text(gone)
+    (tmp_path / "run" / "diagnosis.json").write_text("{}")
+    with shown(tmp_path / "run") as (watched, page):
+        watched.page.get_by_text("is no diagnosis of this version").wait_for()
+        (tmp_path / "run" / "diagnosis.json").unlink()
+        page.open()
+        watched.page.get_by_text("is no longer there; put it back").wait_for()
+        assert len(bars(watched)) == 1  # the ladder stands all the same
+        button(watched, "Diagnose").click()
+        watched.page.get_by_text("is no longer there").wait_for()
+        button(watched, "Add").click(trial=True, timeout=FIT_MS)  # enabled again

@@ -1,0 +1,267 @@
+"""The workbench without a browser: runs, ladders, findings, background jobs, bad input."""
+
+import json
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from html.parser import HTMLParser
+
+import pytest
+
+from calib.ladder import Rung
+from calib.run import Run
+from calib.view import panels
+from calib.view.desk import Desk, Findings
+from calib.view.job import Job
+from calib.view.server import serve, stop
+from chains.errors import InputError
+from tests.calib.viewed import candidate, diagnosed, grown, small_run
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Run:
+    return small_run(tmp_path_factory.mktemp("desk"))
+
+
+@pytest.fixture
+def first(made, tmp_path) -> Run:
+    shutil.copytree(made.folder, tmp_path / "run")
+    return Run.open(tmp_path / "run")
+
+
+# -------------------------------------------------------------------------------------------- desk
+
+
+def test_a_run_brings_those_below_it_and_undo_goes_back(first, tmp_path):
+    second = grown(first, tmp_path / "second", "range_scale", 3.0)
+    third = grown(second, tmp_path / "third", "faro_scale", 2.0)
+    desk = Desk.of([third.folder])
+    assert list(desk.runs) == ["run", "second", "third"] and desk.chosen == "third"
+    assert [rung.added for rung in desk.rungs()] == [[], ["range_scale"], ["faro_scale"]]
+    assert "third stays on disk" in desk.undo() and third.folder.is_dir()
+    assert desk.chosen == "second" and len(desk.rungs()) == 2
+    desk.undo()
+    with pytest.raises(InputError, match="grew from no other run"):
+        desk.undo()
+    assert desk.chosen == "run"
+
+
+def test_runs_of_one_name_are_told_apart(first, tmp_path):
+    shutil.copytree(first.folder, tmp_path / "b" / "run")
+    desk = Desk.of([first.folder, tmp_path / "b" / "run", first.folder])
+    assert list(desk.runs) == ["run", str((tmp_path / "b" / "run").resolve())]
+    assert desk.run.folder == first.folder
+
+
+def test_new_runs_go_beside_under_a_name_not_taken(first, tmp_path):
+    desk = Desk.of([first.folder])
+    assert desk.folder_for("near_range_bias@2") == tmp_path / "run+near_range_bias@2"
+    (tmp_path / "run+x").mkdir()
+    (tmp_path / "run+x-2").mkdir()
+    assert desk.folder_for("x") == tmp_path / "run+x-3"
+
+
+def test_of_several_folders_those_that_are_runs_are_opened(first, tmp_path):
+    desk = Desk.of([first.folder, tmp_path / "none"])
+    assert list(desk.runs) == ["run"]
+    assert len(desk.refused) == 1 and "no run there" in desk.refused[0]
+    with pytest.raises(InputError, match="no run there"):
+        Desk.of([tmp_path / "none"])
+
+
+def test_effects_to_add_begin_with_what_was_found(first):
+    diagnosed(first.folder)
+    offered = Desk.of([first.folder]).addable(Findings.read(first))
+    assert list(offered)[:3] == ["incidence_angle_bias", "empirical_range", "range_scale"]
+    assert offered["empirical_range"] == {"name": "empirical_range", "basis": ["range"]}
+    assert "faro_scale" in offered and "ring_range_offset" not in offered
+    undiagnosed = Desk.of([first.folder]).addable(None)
+    assert set(offered) - set(undiagnosed) == {"empirical_range"}
+
+
+def test_a_name_that_something_is_dressed_up_in_is_not_offered_first(first):
+    names = [candidate("range_scale", 1, dressed_up=True), candidate("faro_scale", 2)]
+    diagnosed(first.folder, candidates=names)
+    assert Findings.read(first).worth_adding == ["faro_scale"]
+
+
+def test_the_curve_is_the_effects_own_or_that_which_stands_out_most(first):
+    diagnosed(first.folder)
+    found = Findings.read(first)
+    assert list(found.curves) == ["range_m", "incidence_rad"]
+    assert found.covariate_of("incidence_angle_bias") == "incidence_rad"
+    assert found.covariate_of("range_scale") == "range_m"
+    assert found.covariate_of("empirical_range") == "range_m"
+    assert found.curves["incidence_rad"].stands_out == pytest.approx(2.0)
+
+
+OLD = '{"verdict": "", "sentences": [], "candidates": [{}], "unexplained": [], "curves": []}'
+
+
+@pytest.mark.parametrize("text", [OLD, "{", "[]", '{"verdict": "adequate"}', '{"curves": [{}]}'])
+def test_a_diagnosis_of_another_version_is_said(first, text):
+    (first.folder / "diagnosis.json").write_text(text)
+    with pytest.raises(InputError, match="diagnose the run again"):
+        Findings.read(first)
+
+
+# ------------------------------------------------------------------------------------------ panels
+
+
+class Text(HTMLParser):
+    """Tags and text of a piece of HTML, as a browser would take it."""
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.tags, self.text = [], ""
+        self.feed(html)
+        self.close()
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+
+    def handle_data(self, data):
+        self.text += data
+
+
+@pytest.mark.parametrize(
+    "p, words",
+    [
+        (0.5, "often"),
+        (0.02, "1 in 50"),
+        (3.3e-5, "1 in 30,000"),
+        (1.2e-7, "1 in 8 million"),
+        (2.9e-10, "1 in 3 billion"),
+        (3e-36, "1 in over 10¹²"),
+        (0.0, "1 in over 10¹²"),
+    ],
+)
+def test_chance_is_told_in_words(p, words):
+    assert panels.by_chance(p) == words
+
+
+def test_the_ladder_draws_every_rung_and_the_floor_to_scale(first, tmp_path):
+    runs = [first, grown(first, tmp_path / "second", "range_scale", 3.0)]
+    below = [None, runs[0]]
+    rungs = [Rung(run, b) for run, b in zip(runs, below, strict=True)]
+    runs[0].summary["rms_mm"] |= {"held_out": 6.0}
+    runs[1].summary["rms_mm"] |= {"noise_floor": 1.5}
+    html = panels.ladder(rungs)
+    widths = [float(x) for x in re.findall(r"width:([\d.]+)%", html)]
+    floors = [float(x) for x in re.findall(r"left:([\d.]+)%", html)]
+    assert re.findall(r'data-mm="([\d.]+)"', html) == ["6.0000", "3.0000"]
+    assert widths[0] == pytest.approx(2 * widths[1], rel=1e-3)
+    assert floors == pytest.approx([widths[0] / 4] * 2, rel=1e-3)
+    assert "+ range_scale" in Text(html).text and "start: run" in Text(html).text
+
+
+def test_names_cannot_become_markup(first):
+    evil = '<script>alert("x")</script>'
+    diagnosed(first.folder, sentences=[evil], candidates=[candidate(evil)])
+    for html in (panels.findings(Findings.read(first)), panels.note(evil)):
+        assert "script" not in Text(html).tags and evil in Text(html).text
+
+
+# -------------------------------------------------------------------------------------------- jobs
+
+
+def test_a_job_that_cannot_be_done_ends_in_its_sentence(first, tmp_path):
+    *_, last = Job(first.folder, "no_such_effect", tmp_path / "out").listen()
+    assert last.kind == "failed" and "not in the catalogue" in last.text
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_job_that_is_stopped_leaves_nothing(first, tmp_path):
+    before = sorted(path.name for path in tmp_path.iterdir())
+    job = Job(first.folder, "range_scale", tmp_path / "out")
+    told = job.listen()
+    assert next(told).kind == "progress"
+    during = {path.name for path in tmp_path.iterdir()} - set(before)
+    assert len(during) == 1 and during.pop().startswith(".out.")
+    job.stop()
+    assert [each.kind for each in told] == ["stopped"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == before
+
+
+@pytest.mark.slow
+def test_a_job_makes_the_run_that_rigcal_add_makes(first, tmp_path):
+    from calib.calibrate import grow, grown_model
+
+    formula = {"name": "humid", "site": "range", "unit": "1", "sigma": 0.01, "basis": ["range"]}
+    told = []
+    job = Job(first.folder, formula, tmp_path / "out")
+    for each in job.listen():
+        told.append(each)
+        if each.kind == "run":
+            job.stop()
+    *progress, made, last = told
+    assert (made.text, last.kind) == (str(tmp_path / "out"), "stopped")
+    assert all(0 < each.share <= 1 for each in progress)
+    mine = tmp_path / "mine.yaml"
+    mine.write_text(json.dumps(formula))
+    wanted = grow(first, grown_model(first, [str(mine)]), tmp_path / "wanted")
+    found = Run.open(tmp_path / "out")
+    assert found.model == wanted.model and found.model["grown_from"] == str(first.folder.resolve())
+    rms = [r.summary["rms_mm"]["fit"] for r in (found, wanted, first)]
+    assert rms[0] == pytest.approx(rms[1], rel=1e-9) and rms[0] != rms[2]
+
+
+# ------------------------------------------------------------------------------------ command line
+
+
+def start(*arguments: object) -> subprocess.Popen:
+    program = "from calib.cli import main; main()"
+    command = [sys.executable, "-c", program, "view", *map(str, arguments)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def test_view_serves_this_machine_alone_and_ends_with_ctrl_c(first):
+    process = start(first.folder, "--no-open", "--json")
+    try:
+        text = ""
+        while "}" not in text:
+            text += process.stdout.readline()
+        url = json.loads(text)["url"]
+        host, port = url.removeprefix("http://").split(":")
+        assert host == "127.0.0.1"
+        page = urllib.request.urlopen(url, timeout=30).read()
+        assert b"<html" in page[:500].lower()
+        with pytest.raises(OSError):  # nobody listens at this machine's other addresses
+            socket.create_connection(("127.0.0.2", int(port)), timeout=5)
+        taken = start(first.folder, "--no-open", "--port", port)
+        assert taken.wait(60) == 2
+        assert f"--port {port} is taken" in taken.stderr.read()
+        time.sleep(1)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30) == 0
+        assert process.stdout.read() == ""
+    finally:
+        process.kill()
+
+
+def test_no_page_can_open_a_tunnel_to_the_outside(monkeypatch):
+    viser = pytest.importorskip("viser")
+    monkeypatch.setattr(viser._viser, "ViserTunnel", None)  # calling it would fail
+    server = serve(0)
+    try:
+        assert server.request_share_url() is None and server._share_tunnel is None
+    finally:
+        stop(server)
+
+
+def test_a_missing_library_is_said(monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(InputError, match=re.escape("pip install 'rigcal[view]'")):
+        serve(0)
+
+
+def test_view_of_no_run_is_one_sentence(tmp_path):
+    process = start(tmp_path)
+    assert process.wait(60) == 2
+    said = process.stderr.read().strip().splitlines()
+    assert len(said) == 1 and "no run there" in said[0] and "rigcal fit" in said[0]
