@@ -68,8 +68,12 @@ class Check:
         }
 
 
-def check(folder: Path | str, progress: Progress = lambda what, done, total: None) -> Check:
-    """Read all of a recording, each part apart, and try its graph.
+def check(
+    folder: Path | str,
+    progress: Progress = lambda what, done, total: None,
+    graph: bool = True,
+) -> Check:
+    """Read all of a recording, each part apart, and try its graph, unless told not to.
 
     What can be estimated comes from the joint marginals of one linearisation at the start, of the
     default model and at most 20 of the scans.
@@ -84,7 +88,7 @@ def check(folder: Path | str, progress: Progress = lambda what, done, total: Non
         raise InputError(f"{folder}: there is no such folder; a recording is one, with a rig.yaml")
     with threadpool_limits(limits=1):
         found = Check()
-        _Checker(folder, found, progress).run()
+        _Checker(folder, found, progress, graph).run()
     return found
 
 
@@ -95,6 +99,7 @@ class _Checker:
     folder: Path
     found: Check
     progress: Progress
+    graph: bool
 
     def run(self) -> None:
         """Look at every part; at the graph, if those it is made of are all right."""
@@ -119,7 +124,7 @@ class _Checker:
         if targets and rig and rig.target:
             found.odd.extend(inventory.odd_targets(targets, rig.target))
         reference = self._read_mesh(rig)
-        if rig and recording and (reference or not rig.reference):
+        if self.graph and rig and recording and (reference or not rig.reference):
             self._try_graph(Source(rig, recording, reference), scans)
 
     def _attempt(self, function: Callable[..., T], *args: Any) -> T | None:

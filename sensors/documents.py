@@ -97,7 +97,11 @@ def read_yaml(path: str | Path) -> tuple[Any, Marks]:
 
     Raises InputError where the file is missing, is no YAML, or has a key twice in one mapping.
     """
-    loader = _StrictLoader(read_text(path))
+    text = read_text(path)
+    try:
+        loader = _StrictLoader(text)
+    except yaml.YAMLError as error:
+        raise InputError(f"{path} is not YAML text: {str(error).splitlines()[0]}") from None
     try:
         node = loader.get_single_node()
         data = loader.construct_document(node) if node else None
@@ -106,7 +110,7 @@ def read_yaml(path: str | Path) -> tuple[Any, Marks]:
         line = f":{error.problem_mark.line + 1}" if error.problem_mark else ""
         raise InputError(f"{path}{line}: {error.problem}") from None
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise InputError(f"{path} is not YAML text: {error}") from None
+        raise InputError(f"{path} is not YAML text: {str(error).splitlines()[0]}") from None
     finally:
         loader.dispose()
 

@@ -1,7 +1,8 @@
 """stops.csv and targets.csv: every cell checked, so that nothing behind them has to ask again."""
 
+import csv
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chains.errors import InputError
-from sensors.documents import read_csv
+from sensors.documents import plain, read_csv, write_atomically
 
 Array = NDArray[np.float64]
 
@@ -159,6 +160,15 @@ def read_targets(path: Path) -> Targets | None:
         "the two markers are in one place, and so show no direction of gravity",
     )
     return Targets(names, faro, upper, lower)
+
+
+def write_columns(path: str | Path, columns: Mapping[str, Iterable]) -> None:
+    """Write columns of equal length as CSV; what is not a number is an empty cell."""
+    with write_atomically(path) as work, open(work, "w", newline="", encoding="utf-8") as file:
+        table = csv.writer(file, lineterminator="\n")
+        table.writerow(columns)
+        for row in zip(*(plain(values) for values in columns.values()), strict=True):
+            table.writerow("" if cell != cell else cell for cell in row)
 
 
 def _is_number(cell: str) -> bool:

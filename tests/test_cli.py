@@ -19,7 +19,7 @@ from calib.cli.app import app
 
 ROOT = Path(__file__).resolve().parents[1]
 SPEC = "{lidar: hesai_pandarxt32, locations: 3, stops_per_location: 2, column_step: 200}"
-COMMANDS = sorted(command.callback.__name__ for command in app.registered_commands)
+COMMANDS = sorted(c.name or c.callback.__name__ for c in app.registered_commands)
 
 
 @pytest.fixture
@@ -292,7 +292,7 @@ def test_an_interrupted_fit_leaves_the_earlier_run_as_it_was(folder):
             threading.Event().wait(0.01)
         assert list(folder.glob(".run.*")), "it writes elsewhere than beside its result"
         process.send_signal(signal.SIGINT)
-        assert process.wait(20) == 130
+        assert process.wait(60) == 130
         assert process.stdout.read() == ""
     assert "rigcal: interrupted" in "".join(shown)
     assert contents(folder) == before

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +12,10 @@ from calib.simulate.spec import Spec
 from calib.simulate.stops import World, hang_targets
 from calib.simulate.truth import Truth
 from chains import se3
-from sensors.documents import plain, write_json
+from sensors.documents import write_json
 from sensors.recording import write_table
 from sensors.reference import Reference
-from sensors.stops import POSE
+from sensors.stops import POSE, write_columns
 
 
 def write_reference(folder: Path, mesh: Reference) -> None:
@@ -48,7 +47,7 @@ def write_stops(path: Path, world: World, spec: Spec, rng: np.random.Generator) 
     if not spec.tracker:
         pose = _pose(world.guessed(spec.base_moves, rng))
         columns |= {f"base_guess.{part}": pose[:, i] for i, part in enumerate(POSE)}
-    _write_csv(path, columns)
+    write_columns(path, columns)
 
 
 def write_targets(path: Path, truth: Truth, spec: Spec, rng: np.random.Generator) -> None:
@@ -57,7 +56,7 @@ def write_targets(path: Path, truth: Truth, spec: Spec, rng: np.random.Generator
     columns: dict[str, Iterable] = {"target": [f"T{m + 1}" for m in range(spec.targets)]}
     for name, at in measured.items():
         columns |= {f"{name}_{axis}": at[:, i] for i, axis in enumerate("xyz")}
-    _write_csv(path, columns)
+    write_columns(path, columns)
 
 
 def write_truth(path: Path, world: World, spec: Spec, seed: int) -> None:
@@ -84,12 +83,3 @@ def write_truth(path: Path, world: World, spec: Spec, seed: int) -> None:
 def _pose(T: np.ndarray) -> np.ndarray:
     """x y z qw qx qy qz (K, 7) of poses (K, 4, 4)."""
     return np.concatenate([T[:, :3, 3], se3.to_quat_wxyz(T)], axis=1)
-
-
-def _write_csv(path: Path, columns: Mapping[str, Iterable]) -> None:
-    """Write columns; what is not a number is an empty cell."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        table = csv.writer(file, lineterminator="\n")
-        table.writerow(columns)
-        for row in zip(*(plain(values) for values in columns.values()), strict=True):
-            table.writerow("" if cell != cell else cell for cell in row)

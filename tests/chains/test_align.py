@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import minimize
 
 from chains import se3
-from chains.align import align_points, mean_pose
+from chains.align import align_points, hand_eye, mean_pose
 from chains.errors import InputError
 
 RNG = np.random.default_rng(3)
@@ -82,3 +82,32 @@ def test_mean_pose_minimises_the_chordal_distance():
         return np.sum((Ts - mean @ se3.exp(xi)) ** 2)
 
     assert all(distance(s * d) > distance(np.zeros(6)) for s in (-1e-3, 1e-3) for d in np.eye(6))
+
+
+# ---------------------------------------------------------------------------------------- hand-eye
+
+T_TIP_BODY, T_WORLD_BASE = se3.exp([0.3, -2, 1, 0.1, 0.2, -0.3]), se3.exp([3.0, 0.4, 0, 2, -1, 0.5])
+
+
+def test_exact_poses_give_both_ends_of_an_arm_back():
+    T_base_tip = se3.exp(RNG.normal(size=(8, 6)))
+    X, Z = hand_eye(T_WORLD_BASE @ T_base_tip @ T_TIP_BODY, T_base_tip)
+    np.testing.assert_allclose(X, T_TIP_BODY, atol=1e-10)
+    np.testing.assert_allclose(Z, T_WORLD_BASE, atol=1e-10)
+
+
+def test_noise_moves_them_by_no_more_than_it_may():
+    T_base_tip = se3.exp(RNG.normal(size=(200, 6)))
+    noise = se3.exp(1e-3 * RNG.normal(size=(200, 6)))
+    X, Z = hand_eye(T_WORLD_BASE @ T_base_tip @ T_TIP_BODY @ noise, T_base_tip)
+    for found, true in ((X, T_TIP_BODY), (Z, T_WORLD_BASE)):
+        gap = se3.log(se3.inverse(true) @ found)
+        assert 1e-6 < np.linalg.norm(gap) < 1e-3
+
+
+@pytest.mark.parametrize("count", [2, 9])
+def test_turns_about_one_axis_do_not_tell(count):
+    one_axis = np.zeros((count, 6))
+    one_axis[:, 2:] = RNG.normal(size=(count, 4))
+    with pytest.raises(InputError, match="at least 3" if count < 3 else "one axis"):
+        hand_eye(se3.exp(one_axis), se3.exp(one_axis))

@@ -1,0 +1,254 @@
+"""Foreign files put together as a recording: clocks, holds, stops, the rig, all written once."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib.check import Check, check
+from calib.intake import rigfile, scans, stops, targets
+from calib.intake.clocks import align
+from calib.intake.gather import (
+    Gathered,
+    Given,
+    finite_times,
+    gather,
+    joint_track,
+    once_each,
+    section,
+    sources,
+)  # fmt: skip
+from calib.intake.still import MIN_HOLD_S, find_holds
+from calib.rig import load_rig
+from chains.errors import InputError
+from sensors.documents import replace_folder, write_atomically
+from sensors.meshes import write_surface
+from sensors.readers.base import Columns, Options, Progress
+from sensors.stops import write_columns
+
+__all__ = ["Choices", "Imported", "import_files", "sources"]
+
+FEW = 500  # stops; with more, what can be estimated is left to `rigcal check`, for its time
+
+
+@dataclass(frozen=True)
+class Choices:
+    """What a user decides about putting sources together.
+
+    Args:
+        rig: a rig.yaml of theirs, taken as it is.
+        clock_offsets: clock -> s to be added to it.
+        still: rad/s or m/s below which something is at rest; None = learned from the data.
+        min_hold_s: shorter holds are none.
+        blocks: locations as so many equal blocks in the order of time; None = found out.
+        most_stops: of more stops, so many, evenly spread; None = all.
+    """
+
+    rig: Path | None = None
+    clock_offsets: Mapping[str, float] = field(default_factory=dict)
+    still: float | None = None
+    min_hold_s: float = MIN_HOLD_S
+    blocks: int | None = None
+    most_stops: int | None = None
+
+
+@dataclass(frozen=True)
+class Imported:
+    """A recording that was written, what was understood of its sources, and what looked odd."""
+
+    folder: Path
+    understood: list[str]
+    odd: list[str]
+    check: Check
+
+    def document(self) -> dict[str, Any]:
+        """As ``--json`` prints it."""
+        return {
+            "recording": str(self.folder),
+            "understood": self.understood,
+            "odd": self.odd,
+            "check": self.check.document(),
+        }
+
+
+@dataclass(frozen=True)
+class _Cut:
+    """Sources cut into stops: their columns, and which turns of the LiDAR belong to each."""
+
+    columns: Columns
+    share: scans.Share
+    understood: list[str]
+    odd: list[str]
+
+
+def import_files(
+    given: Sequence[Given],
+    out: Path | str,
+    options: Options | None = None,
+    choices: Choices | None = None,
+    progress: Progress = lambda what, done, total: None,
+) -> Imported:
+    """Turn foreign files into a recording folder, whole or not at all, and check it.
+
+    Args:
+        given: kinds and their files; `sources` cuts a command line into them.
+        out: the recording's folder.
+        options: what readers are told.
+        choices: what is decided about putting sources together.
+
+    Raises:
+        InputError: a file is wrong, something essential is ambiguous (the sentence names the flag
+            that decides it), or the recording would not be one.
+    """
+    options, choices, out = options or Options(), choices or Choices(), Path(out)
+    if choices.rig is not None and not choices.rig.is_file():
+        raise InputError(f"--rig {choices.rig}: there is no such file")
+    found = gather(given, options, choices.rig, progress)
+    cut = _from_rows(found) if found.stops is not None else _from_logs(found, choices)
+    understood, odd = [*found.understood, *cut.understood], [*found.odd, *cut.odd]
+    columns, share = _thinned(cut, choices.most_stops)
+    with replace_folder(out, "rig.yaml", "recording") as folder, _called(folder, out):
+        _write_parts(folder, found, choices.rig)
+        if choices.rig is not None:
+            columns, said, more = rigfile.matched(choices.rig, columns)
+        else:
+            name = re.sub(r"[/\\]", "-", out.name) or "rig"
+            columns, said, more = rigfile.first_rig(folder, name, found, columns, options.lidar)
+        rig = load_rig(folder)
+        base = next((b for b in (rig.tracker.bodies if rig.tracker else ())
+                     if b not in rig.beyond_arm), None)  # fmt: skip
+        columns, words = stops.locations(columns, base if rig.arm_edges else None, choices.blocks)
+        understood += [*said, f"locations: {words}"]
+        odd += more
+        write_columns(folder / "stops.csv", _ordered(columns))
+        if share:
+            scans.write(folder / "scans", columns["stop"].tolist(), share, progress)
+        rods, more = targets.join(found.spheres, found.tracks)
+        odd += more
+        if rods is not None:
+            write_columns(folder / "targets.csv", rods)
+        checked = check(folder, progress, graph=len(columns["stop"]) <= FEW)
+        if checked.problems:
+            raise InputError(checked.problems[0])
+    return Imported(out, understood, odd, checked)
+
+
+@contextmanager
+def _called(folder: Path, name: Path) -> Iterator[None]:
+    """Complaints about files of a folder name it as its reader will find it."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(str(error).replace(str(folder), str(name))) from None
+
+
+def _from_rows(found: Gathered) -> _Cut:
+    """Stops that a table lists, and clouds that are named after them."""
+    columns = dict(found.stops)
+    count = len(next(iter(columns.values())))
+    columns.setdefault("stop", np.array([f"row{k:05d}" for k in range(count)]))
+    columns.setdefault("time_s", np.arange(count, dtype=float))
+    missing = [name for name in found.joints if name not in columns]
+    if missing:
+        raise InputError(
+            f"the table of stops has no column of the arm's joint {missing[0]}; say --column "
+            f"{missing[0]}=THEIRS"
+        )
+    share, odd = scans.by_name(found.sweeps, columns["stop"].tolist()) if found.sweeps else ([], [])
+    if found.tracks:
+        names = ", ".join(dict.fromkeys(track.name for track in found.tracks))
+        odd = [*odd, f"the logs {names} are left out: a table lists the stops already"]
+    return _Cut(columns, share, [], odd)
+
+
+def _from_logs(found: Gathered, choices: Choices) -> _Cut:
+    """Holds found in logs; or, where nothing was logged, what the LiDAR saw as one stop or more."""
+    tracks = [t for t in joint_track(found.tracks, found.joints) if not targets.is_rod(t)] \
+        if found.tracks or found.joints else []  # fmt: skip
+    once_each(tracks)
+    timed = bool(found.sweeps) and finite_times(found.sweeps)
+    if not tracks:
+        return _still(found, timed)
+    clocks = align(tracks, found.sweeps if timed else [], found.edges, choices.clock_offsets)
+    holds = find_holds(clocks.tracks, found.edges, choices.still, choices.min_hold_s)
+    columns, odd = stops.table(clocks.tracks, holds.spans_s)
+    share: scans.Share = []
+    if timed:
+        share, more = scans.by_time(clocks.sweeps, holds.spans_s)
+        odd += more
+    elif found.sweeps:
+        share, more = scans.by_name(found.sweeps, columns["stop"].tolist())
+        odd += more
+    return _Cut(columns, share, [*clocks.understood, *holds.understood], [*clocks.odd, *odd])
+
+
+def _still(found: Gathered, timed: bool) -> _Cut:
+    """Nothing but a LiDAR: one stop of all its turns, or one for every file without a clock."""
+    if not found.sweeps:
+        raise InputError(
+            "the sources hold no logs, no table of stops and no LiDAR data; nothing can be made of "
+            "them"
+        )
+    scans.one_lidar(found.sweeps)
+    names = ["still"] if timed else [one.name for one in found.sweeps]
+    if len(set(names)) < len(names):
+        raise InputError(f"two clouds are named {max(names, key=names.count)}; rename one")
+    share = [
+        (one, np.full(len(one.time_s), 0 if timed else k)) for k, one in enumerate(found.sweeps)
+    ]
+    start_s = float(found.sweeps[0].time_s[0]) if timed else 0.0
+    columns = {"stop": np.array(names), "time_s": start_s + np.arange(len(names), dtype=float)}
+    what = "all turns of the LiDAR are one stop" if timed else "every cloud is a stop"
+    return _Cut(columns, share, [], [f"nothing says when the rig stood still: {what}"])
+
+
+def _thinned(cut: _Cut, most: int | None) -> tuple[Columns, scans.Share]:
+    """The stops, or so many of them, evenly spread, and which turns belong to each."""
+    count = len(cut.columns["stop"])
+    if most is None or count <= most:
+        return cut.columns, cut.share
+    if most < 1:
+        raise InputError(f"--most-stops {most}: at least 1 is wanted")
+    kept = np.linspace(0, count - 1, most).astype(int)
+    number = np.full(count + 1, -1)
+    number[kept] = np.arange(most)
+    share = [(one, number[stop]) for one, stop in cut.share]
+    return {name: values[kept] for name, values in cut.columns.items()}, share
+
+
+def _write_parts(folder: Path, found: Gathered, rig: Path | None) -> None:
+    """Arm and reference under the names that the rig has for them; the rig itself where given."""
+    name = "arm.urdf"
+    if rig is not None:
+        name = str(section(rig, "arm").get("urdf", name))
+        shutil.copyfile(rig, folder / "rig.yaml")
+        for file in _files_of(rig):
+            if (rig.parent / file).is_file():
+                (folder / file).parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(rig.parent / file, folder / file)
+    if found.arm:
+        with write_atomically(folder / name) as path:
+            path.write_text(found.arm.urdf, encoding="utf-8")
+    if found.surface:
+        write_surface(found.surface, folder)
+
+
+def _files_of(rig: Path) -> list[str]:
+    """The files that a rig.yaml names, relative to itself; the arm's is not among them."""
+    files = [section(rig, "lidar").get("model")]
+    files += [section(rig, "reference").get(key) for key in ("mesh", "faces", "labels")]
+    inside = [f for f in files if isinstance(f, str) and "." in f and not Path(f).is_absolute()]
+    return [f for f in inside if ".." not in Path(f).parts]
+
+
+def _ordered(columns: Columns) -> Columns:
+    """stop, location and time first, as people look for them."""
+    first = ("stop", "location", "time_s")
+    return {n: columns[n] for n in first} | {n: v for n, v in columns.items() if n not in first}

@@ -1,0 +1,294 @@
+"""Clocks brought together: how far one is ahead of another, from the motion that both logged."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.intake.motion import Motion, motions
+from chains.errors import InputError
+from chains.frames import Edge
+from chains.se3 import Array
+from sensors.documents import nearest
+from sensors.readers.base import Sweeps, Track
+
+WINDOW_S = 0.2  # rates are smoothed over it before they are compared
+LEAST_LIKE = 0.75  # correlation below which two motions are not the same
+RIVAL = 0.8  # of the best evidence, at another offset: then nobody knows which is right
+LOBE_S = 1.0  # within it of the best, a peak is the same one
+LEAST_OVERLAP = 0.3  # of the shorter log
+PARTS = 8  # of the logs, whose own offsets tell the uncertainty
+LEAST_S = 2.0
+DRIFT_S = 0.02  # from the first part to the last
+
+
+@dataclass(frozen=True)
+class Offset:
+    """What is added to one clock to give another: s, with its sigma, and how alike motions are."""
+
+    offset_s: float
+    sigma_s: float
+    likeness: float
+    drift_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class Aligned:
+    """Logs on one clock, and what was understood and looked odd on the way."""
+
+    tracks: list[Track]
+    sweeps: list[Sweeps]
+    understood: list[str]
+    odd: list[str]
+
+
+def align(
+    tracks: Sequence[Track],
+    sweeps: Sequence[Sweeps],
+    edges: Sequence[Edge],
+    given_s: Mapping[str, float],
+) -> Aligned:
+    """Bring logs onto one clock: the LiDAR's, or else the joints', or else the first.
+
+    Args:
+        tracks, sweeps: logs against any clocks.
+        edges: the arm's chain; empty where there is none.
+        given_s: clock -> what its owner says is to be added to it.
+
+    Raises:
+        InputError: an offset is ambiguous, or clocks have nothing in common; the flag is
+            --clock-offset NAME=SECONDS.
+    """
+    spans = _spans(tracks, sweeps)
+    if wrong := [name for name in given_s if name not in spans]:
+        raise InputError(
+            f"--clock-offset {wrong[0]}: there is no such clock{nearest(wrong[0], spans)}"
+        )
+    main = _main(tracks, sweeps, spans)
+    known = {main: 0.0} if main is not None else {}
+    known |= {name: float(s) for name, s in given_s.items()}
+    out = Aligned([], [], [], [])
+    if len(spans) > 1:
+        out.understood.append(f"clocks: all times are those of {main}")
+    out.understood.extend(f"clocks: {n} {s:+.4f} s, as given" for n, s in given_s.items())
+    heard = {
+        c: [m for t in tracks if t.clock == c for m in motions(t, edges, WINDOW_S)] for c in spans
+    }
+    moving = [c for c in spans if heard[c]]
+    for clock in sorted((c for c in spans if c not in known), key=lambda c: c not in moving):
+        others = [(c, m) for c in known for m in heard[c]]
+        known[clock] = _offset(clock, heard[clock], others, known, spans, main, out)
+    for track in tracks:
+        out.tracks.append(replace(track, time_s=track.time_s + known.get(track.clock, 0.0)))
+    for one in sweeps:
+        out.sweeps.append(replace(one, time_s=one.time_s + known.get(one.clock, 0.0)))
+    return out
+
+
+def _spans(tracks: Sequence[Track], sweeps: Sequence[Sweeps]) -> dict[str, tuple[float, float]]:
+    """Clock -> first and last time of what it stamped."""
+    spans: dict[str, tuple[float, float]] = {}
+    for log in (*tracks, *sweeps):
+        time_s = log.time_s[np.isfinite(log.time_s)]
+        if len(time_s):
+            low, high = spans.get(log.clock, (np.inf, -np.inf))
+            spans[log.clock] = (min(low, float(time_s.min())), max(high, float(time_s.max())))
+    return spans
+
+
+def _main(
+    tracks: Sequence[Track], sweeps: Sequence[Sweeps], spans: Mapping[str, tuple[float, float]]
+) -> str | None:
+    """The clock that the others are brought to."""
+    first = [s.clock for s in sweeps] + [t.clock for t in tracks if t.kind == "joints"]
+    return next((clock for clock in (*first, *spans) if clock in spans), None)
+
+
+def _offset(
+    clock: str, mine: Sequence[Motion], others: Sequence[tuple[str, Motion]],
+    known: Mapping[str, float], spans: Mapping[str, tuple[float, float]], main: str, out: Aligned,
+) -> float:  # fmt: skip
+    """What is added to a clock, from motion where there is some, else from nothing but overlap."""
+    pairs = [(c, a, b) for a in mine for c, b in others if {a.kind, b.kind} <= _alike(a.kind)]
+    found = [(estimate(a, replace(b, time_s=b.time_s + known[c])), c, a, b) for c, a, b in pairs]
+    told = [entry for entry in found if entry[0] is not None]
+    if not told:
+        return _by_overlap(clock, spans, known, main, out)
+    best, _, a, b = max(told, key=lambda entry: entry[0].likeness)
+    if best.likeness < LEAST_LIKE:
+        raise InputError(
+            f"clock {clock}: its motion ({a.name}) is like that of {b.name} at no offset (the best "
+            f"correlation is {best.likeness:.2f}); say --clock-offset {clock}=SECONDS"
+        )
+    if np.isnan(best.sigma_s):
+        raise InputError(
+            f"clock {clock}: the motions of {a.name} and {b.name} repeat, so they fit at several "
+            f"offsets, {best.offset_s:.2f} s being one; say --clock-offset {clock}=SECONDS"
+        )
+    out.understood.append(
+        f"clocks: {clock} {best.offset_s:+.4f} ± {best.sigma_s:.4f} s, from the motion of "
+        f"{a.name} and {b.name} (correlation {best.likeness:.2f})"
+    )
+    if abs(best.drift_s) > DRIFT_S:
+        out.odd.append(
+            f"clock {clock} drifts by {best.drift_s:+.3f} s from the beginning to the end; one "
+            "offset was applied"
+        )
+    return best.offset_s
+
+
+def _alike(kind: str) -> set[str]:
+    """Kinds of motion that can be compared."""
+    return {"turn"} if kind == "turn" else {"joints", "shift"}
+
+
+def _by_overlap(
+    clock: str, spans: Mapping[str, tuple[float, float]], known: Mapping[str, float], main: str,
+    out: Aligned,
+) -> float:  # fmt: skip
+    (a0, a1), (b0, b1) = spans[clock], spans[main]
+    if min(a1, b1) < max(a0, b0):
+        raise InputError(
+            f"clock {clock} runs from {a0:.3f} to {a1:.3f} s and {main} from {b0:.3f} to {b1:.3f} "
+            f"s; they do not overlap, and no motion tells how they lie: say --clock-offset "
+            f"{clock}=SECONDS"
+        )
+    out.odd.append(
+        f"clock {clock} is taken for the same as {main}: their times overlap, and no motion that "
+        f"both logged says otherwise; --clock-offset {clock}=SECONDS corrects it"
+    )
+    return 0.0
+
+
+# ------------------------------------------------------------------------------- two motions
+
+
+def estimate(mine: Motion, other: Motion) -> Offset | None:
+    """What is added to the times of `mine` so that it moves when `other` does.
+
+    Both speeds are correlated at all offsets at which enough of them overlaps, masked where either
+    is not known. The offset is where a correlation r over n samples is the least likely by chance,
+    the maximum of -n log(1 - r^2), to a fraction of a sample by a parabola. Its sigma comes from
+    the scatter of the offsets of parts of the logs.
+
+    Returns:
+        None where one of the two hardly moves; a sigma of NaN where another offset is as good.
+    """
+    step_s = float(np.clip(min(_step(mine), _step(other)), 0.002, 0.1))
+    a, b = (_grid(motion, step_s) for motion in (mine, other))
+    if min(np.nanstd(a), np.nanstd(b)) < 1e-3 or min(len(a), len(b)) * step_s < LEAST_S:
+        return None
+    lag, likeness, count = _likeness(a, b)
+    if not np.isfinite(likeness).any():
+        return None
+    evidence = -count * np.log1p(-(np.clip(likeness, 0, 0.9999) ** 2))
+    best = int(np.nanargmax(evidence))
+    peak_s = (lag[best] + _vertex(likeness, best)) * step_s
+    far = np.abs(lag - lag[best]) * step_s > LOBE_S
+    rival = np.nanmax(evidence, where=far & np.isfinite(evidence), initial=0.0)
+    offset_s = float(other.time_s[0] - mine.time_s[0] + peak_s)
+    top = float(likeness[best])
+    if rival > RIVAL * evidence[best] and top > LEAST_LIKE:
+        return Offset(offset_s, np.nan, top)
+    sigma_s, drift_s = _scatter(a, b, int(lag[best]), step_s)
+    return Offset(offset_s, sigma_s, top, drift_s)
+
+
+def _step(motion: Motion) -> float:
+    return float(np.median(np.diff(motion.time_s)))
+
+
+def _grid(motion: Motion, step_s: float) -> Array:
+    """Speed at even steps from its first time; NaN within pauses."""
+    speed, time_s = motion.speed, motion.time_s
+    at = np.arange(time_s[0], time_s[-1], step_s)
+    known = np.isfinite(speed)
+    if known.sum() < 2:
+        return np.full(len(at), np.nan)
+    grid = np.interp(at, time_s[known], speed[known])
+    after = np.clip(np.searchsorted(time_s[known], at), 1, known.sum() - 1)
+    grid[np.diff(time_s[known])[after - 1] > 0.5] = np.nan
+    return grid
+
+
+def _likeness(a: Array, b: Array) -> tuple[Array, Array, Array]:
+    """Lags (L,) in steps, the correlation (L,) of a(k) with b(k + lag), and how many samples of
+    both are known there.
+
+    Padfield, Masked object registration in the Fourier domain, IEEE TIP 21 (2012).
+    """
+    size = len(a) + len(b) - 1
+    n = 1 << (size - 1).bit_length()
+    known = [np.isfinite(x).astype(float) for x in (a, b)]
+    values = [np.where(np.isfinite(x), x - np.nanmean(x), 0.0) for x in (a, b)]
+    A, AA, M = (np.conj(np.fft.rfft(x, n)) for x in (values[0], values[0] ** 2, known[0]))
+    B, BB, N = (np.fft.rfft(x, n) for x in (values[1], values[1] ** 2, known[1]))
+    lags = np.arange(-(len(a) - 1), len(b))
+    count, ab, sa, sb, saa, sbb = (
+        np.fft.irfft(x, n)[lags] for x in (M * N, A * B, A * N, M * B, AA * N, M * BB)
+    )
+    least = LEAST_OVERLAP * min(known[0].sum(), known[1].sum())
+    enough = count > max(least, 3)
+    count = np.maximum(count, 1)
+    spread_a = np.maximum(saa - sa**2 / count, 0)
+    spread_b = np.maximum(sbb - sb**2 / count, 0)
+    # An overlap in which one of them stands still says nothing, however alike the rest is.
+    enough &= (spread_a > 0.1 * spread_a.max()) & (spread_b > 0.1 * spread_b.max())
+    with np.errstate(invalid="ignore", divide="ignore"):
+        likeness = (ab - sa * sb / count) / np.sqrt(spread_a * spread_b)
+    return lags, np.where(enough, likeness, np.nan), count
+
+
+def _vertex(values: Array, k: int) -> float:
+    """Where a parabola through a peak and its neighbours has its top, in steps from the peak."""
+    if not 0 < k < len(values) - 1 or not np.isfinite(values[k - 1 : k + 2]).all():
+        return 0.0
+    before, at, after = values[k - 1 : k + 2]
+    curve = before - 2 * at + after
+    return 0.0 if curve >= 0 else float(np.clip((before - after) / (2 * curve), -1, 1))
+
+
+def _scatter(a: Array, b: Array, lag: int, step_s: float) -> tuple[float, float]:
+    """Standard error of the offset, and how much it changes from the first part to the last."""
+    start, end = max(0, -lag), min(len(a), len(b) - lag)
+    reach = max(2, round(0.25 / step_s))
+    edges = np.linspace(start, end, PARTS + 1).astype(int)
+    found = []
+    for low, high in itertools.pairwise(edges):
+        low, high = max(low, reach - lag, 0), min(high, len(b) - lag - reach)
+        if (high - low) * step_s < LEAST_S / 2:
+            continue
+        shifts = np.arange(-reach, reach + 1)
+        like = np.array(
+            [_correlation(a[low:high], b[low + lag + s : high + lag + s]) for s in shifts]
+        )
+        if np.isfinite(like).all() and like.max() > LEAST_LIKE:
+            k = int(like.argmax())
+            found.append((shifts[k] + _vertex(like, k)) * step_s)
+    if len(found) < 3:
+        return step_s, 0.0
+    found = np.array(found)
+    spread = 1.4826 * np.median(np.abs(found - np.median(found)))
+    least = step_s / 20  # no more is believed of a parabola
+    return max(float(spread / np.sqrt(len(found))), least), _drift(found)
+
+
+def _drift(offset_s: Array) -> float:
+    """By how much offsets change from the first part to the last; 0 where they merely scatter."""
+    if len(offset_s) < 4:
+        return 0.0
+    part = np.arange(len(offset_s)) - (len(offset_s) - 1) / 2
+    slope = float(part @ offset_s / (part @ part))
+    left = offset_s - offset_s.mean() - slope * part
+    sigma = np.sqrt(left @ left / (len(part) - 2) / (part @ part))
+    return slope * (len(part) - 1) if abs(slope) > 4 * sigma else 0.0
+
+
+def _correlation(a: Array, b: Array) -> float:
+    both = np.isfinite(a) & np.isfinite(b)
+    if both.sum() < 3 or a[both].std() < 1e-4 or b[both].std() < 1e-4:
+        return np.nan
+    return float(np.corrcoef(a[both], b[both])[0, 1])

@@ -1,0 +1,278 @@
+"""Every source read by its reader, and all that they hold as one."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from chains.arm import read_arm
+from chains.errors import InputError
+from chains.frames import Edge
+from sensors.documents import nearest, read_text, read_yaml
+from sensors.lidar import catalog
+from sensors.readers import READERS
+from sensors.readers.base import (
+    Arm,
+    Columns,
+    Found,
+    Options,
+    Progress,
+    Spheres,
+    Surface,
+    Sweeps,
+    Track,
+)  # fmt: skip
+from sensors.readers.urdf import with_ends
+
+ARMS = ("urdf", "dh")  # read before all others, which look for the arm's joints
+
+Given = tuple[str, Sequence[Path]]
+"""A kind, and its files."""
+
+
+@dataclass(frozen=True)
+class Gathered:
+    """What all sources hold; the fields are those of `Found`, `edges` the arm's chain."""
+
+    tracks: list[Track]
+    sweeps: list[Sweeps]
+    stops: Columns | None
+    lidar: Mapping[str, Any] | None
+    arm: Arm | None
+    edges: list[Edge]
+    surface: Surface | None
+    spheres: Spheres | None
+    understood: list[str]
+    odd: list[str]
+
+    @property
+    def joints(self) -> list[str]:
+        """Names of the arm's moving joints, in order."""
+        return [edge.joint.name for edge in self.edges if edge.joint is not None]
+
+
+def sources(words: Sequence[str]) -> list[Given]:
+    """Cut the words of a command line into sources: a kind, and its files.
+
+    Raises:
+        InputError: the first word is no kind, a kind has no files, or a file does not exist.
+    """
+    if not words or words[0] not in READERS:
+        found = f"'{words[0]}' is no kind of file" if words else "no kind of file is given"
+        raise InputError(f"{found}{nearest(words[0] if words else '', READERS)}")
+    given: list[tuple[str, list[Path]]] = []
+    for word in words:
+        if word in READERS and not (given and Path(word).is_file()):
+            given.append((word, []))
+            continue
+        path = Path(word)
+        if not path.exists():
+            raise InputError(f"{word} is neither a file nor a kind{nearest(word, READERS)}")
+        given[-1][1].append(path)
+    for kind, files in given:
+        if not files:
+            raise InputError(f"{kind}: no file is named after it; it reads {READERS[kind].reads}")
+        for path in files:
+            if path.is_file() and path.stat().st_size == 0:
+                raise InputError(f"{path} is empty (0 bytes); was its transfer cut short?")
+    return given
+
+
+def gather(
+    given: Sequence[Given], options: Options, rig: Path | None, progress: Progress
+) -> Gathered:
+    """Read all sources, arms first, and put together what they hold.
+
+    Raises:
+        InputError: as readers do; two sources describe the same thing.
+    """
+    if rig:
+        options = _told_by_rig(rig, options)
+    arms = [Found(arm=_arm_beside(rig))] if rig else []
+    arms += [_read(kind, files, options, progress) for kind, files in given if kind in ARMS]
+    arm = _only([f.arm for f in arms if f.arm], "describe an arm", [k for k, _ in given])
+    edges = chain(arm)
+    kinds = {e.joint.name: e.joint.kind for e in edges if e.joint is not None}
+    options = replace(options, joints=kinds)
+    rest = [_read(kind, files, options, progress) for kind, files in given if kind not in ARMS]
+    if arm is None:
+        arm = _only([f.arm for f in rest if f.arm], "describe an arm", [k for k, _ in given])
+        arm = with_ends("the description of the arm", arm, options) if arm else None
+        edges = chain(arm)
+    found = [*arms, *rest]
+    names = [kind for kind, _ in given]
+    return Gathered(
+        tracks=[_renamed(t, options.bodies) for f in found for t in f.tracks],
+        sweeps=[s for f in found for s in f.sweeps],
+        stops=_one_table([f.stops for f in found if f.stops is not None], options.bodies),
+        lidar=_one_lidar([f.lidar for f in found if f.lidar is not None]),
+        arm=arm,
+        edges=edges,
+        surface=_only([f.surface for f in found if f.surface], "hold a surface", names),
+        spheres=_only([f.spheres for f in found if f.spheres], "hold spheres", names),
+        understood=[line for f in found for line in f.understood],
+        odd=[line for f in found for line in f.odd],
+    )
+
+
+def _read(kind: str, files: Sequence[Path], options: Options, progress: Progress) -> Found:
+    return READERS[kind].read(files, options, progress)
+
+
+def chain(arm: Arm | None) -> list[Edge]:
+    """The edges of an arm from its base to its tip; none of no arm."""
+    if arm is None:
+        return []
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "arm.urdf"
+        path.write_text(arm.urdf, encoding="utf-8")
+        try:
+            return read_arm(path, arm.base, arm.tip)
+        except InputError as error:
+            raise InputError(str(error).replace(str(path), "the arm")) from None
+
+
+def section(rig: Path, name: str) -> dict[str, Any]:
+    """A section of a rig.yaml; empty where there is none that could be one."""
+    data, _ = read_yaml(rig)
+    found = data.get(name) if isinstance(data, dict) else None
+    return found if isinstance(found, dict) else {}
+
+
+def _arm_of(rig: Path) -> dict[str, str]:
+    """Where the arm's URDF is and between which links it moves, or nothing."""
+    arm = section(rig, "arm")
+    whole = {"urdf", "base", "tip"} <= arm.keys()
+    return {key: str(arm[key]) for key in ("urdf", "base", "tip")} if whole else {}
+
+
+def _told_by_rig(rig: Path, options: Options) -> Options:
+    """The options with what rig.yaml says: the arm's links, and the LiDAR's model."""
+    arm = _arm_of(rig)
+    model = section(rig, "lidar").get("model")
+    return replace(
+        options,
+        base=options.base or arm.get("base"),
+        tip=options.tip or arm.get("tip"),
+        lidar=options.lidar or (model if model in catalog() else None),
+    )
+
+
+def _arm_beside(rig: Path) -> Arm | None:
+    """The arm that a rig.yaml names, where its URDF lies beside it."""
+    arm = _arm_of(rig)
+    path = rig.parent / arm["urdf"] if arm else None
+    if path is None or not path.is_file():
+        return None
+    return Arm(read_text(path), arm["base"], arm["tip"])
+
+
+def _only(found: Sequence[Any], what: str, kinds: Sequence[str]) -> Any:
+    """The last of what should be one: a source given outdoes what lies beside rig.yaml."""
+    if len(found) > 2 or (len(found) == 2 and what != "describe an arm"):
+        raise InputError(f"{len(found)} of the sources ({', '.join(kinds)}) {what}; give one")
+    return found[-1] if found else None
+
+
+def _one_table(tables: Sequence[Columns], bodies: Mapping[str, str]) -> Columns | None:
+    """The columns of all tables of stops, joined by the names of the stops."""
+    if not tables:
+        return None
+    renamed = [
+        {_column(name, bodies): values for name, values in table.items()} for table in tables
+    ]
+    first = renamed[0]
+    for other in renamed[1:]:
+        if "stop" not in first or "stop" not in other:
+            raise InputError(
+                "two sources hold a row for every stop; they need a column `stop` to be joined by"
+            )
+        rows = {name: k for k, name in enumerate(other["stop"])}
+        if missing := [name for name in first["stop"] if name not in rows]:
+            raise InputError(f"stop {missing[0]} is in one table of stops, and not in the other")
+        order = [rows[name] for name in first["stop"]]
+        first = {name: values[order] for name, values in other.items()} | first
+    return first
+
+
+def _column(name: str, bodies: Mapping[str, str]) -> str:
+    body, dot, part = name.rpartition(".")
+    return f"{bodies.get(body, body)}{dot}{part}"
+
+
+def _renamed(track: Track, bodies: Mapping[str, str]) -> Track:
+    if track.kind not in ("pose", "point"):
+        return track
+    return replace(track, name=bodies.get(track.name, track.name))
+
+
+def _one_lidar(found: Sequence[Mapping[str, Any]]) -> Mapping[str, Any] | None:
+    """What sources say of the LiDAR; two that name different models are two LiDARs."""
+    models = list(dict.fromkeys(one["model"] for one in found if one.get("model")))
+    if len(models) > 1:
+        raise InputError(
+            f"the sources are of several LiDARs, {', '.join(models)}; a recording has one"
+        )
+    merged: dict[str, Any] = {}
+    for one in found:
+        merged |= {key: value for key, value in one.items() if value is not None}
+    return merged or None
+
+
+def once_each(tracks: Sequence[Track]) -> None:
+    """Refuse a body, or the joints, that two logs follow.
+
+    Raises:
+        InputError: which of the two is meant is not known.
+    """
+    seen: dict[str, Track] = {}
+    for track in (t for t in tracks if t.kind in ("joints", "pose", "point")):
+        key = "joints" if track.kind == "joints" else track.name
+        if key in seen:
+            raise InputError(
+                f"two logs follow {key}, on the clocks {seen[key].clock} and {track.clock}; give "
+                "one of them, or name topics with --topic"
+            )
+        seen[key] = track
+
+
+def joint_track(tracks: Sequence[Track], joints: Sequence[str]) -> list[Track]:
+    """The tracks, those with all of the arm's joints as joints, in the arm's order.
+
+    Raises:
+        InputError: no log has them all.
+    """
+    if not joints:
+        return list(tracks)
+    out, met, have = [], False, []
+    for track in tracks:
+        have += track.names if track.kind in ("joints", "covariate") else []
+        if track.kind in ("joints", "covariate") and set(joints) <= set(track.names):
+            order = [track.names.index(name) for name in joints]
+            out.append(
+                replace(track, kind="joints", names=tuple(joints), values=track.values[:, order])
+            )
+            rest = [k for k in range(len(track.names)) if k not in order]
+            if rest and track.kind == "covariate":
+                names = tuple(track.names[k] for k in rest)
+                out.append(replace(track, names=names, values=track.values[:, rest]))
+            met = True
+        elif track.kind != "joints":
+            out.append(track)
+    if not met:
+        missing = next((name for name in joints if name not in have), joints[0])
+        raise InputError(
+            f"no source has values of the arm's joint {missing}"
+            f"{nearest(missing, have or ['none'])}; say --column {missing}=THEIRS"
+        )
+    return out
+
+
+def finite_times(sweeps: Sequence[Sweeps]) -> bool:
+    """Whether all turns of the LiDAR have a time."""
+    return all(np.isfinite(one.time_s).all() for one in sweeps)

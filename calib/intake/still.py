@@ -1,0 +1,122 @@
+"""Holds: the periods in which nothing moves, found in whatever logged motion."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.intake.motion import Motion, motions
+from chains.errors import InputError
+from chains.frames import Edge
+from chains.se3 import Array
+from sensors.readers.base import Track
+
+WINDOW_S = 0.25
+REST_SHARE = 0.1  # of the time at least, things are taken to be at rest
+FACTOR = 4.0  # above the rate at rest, and it is no noise
+SLOWEST, FASTEST = 0.003, 0.05  # rad/s or m/s between which the threshold lies
+SETTLE_S = 0.3  # cut from both ends of a hold
+MIN_HOLD_S = 1.0
+
+
+@dataclass(frozen=True)
+class Holds:
+    """The periods (H, 2) s in which all stands still, and what was understood."""
+
+    spans_s: Array
+    understood: list[str]
+
+
+def find_holds(
+    tracks: Sequence[Track],
+    edges: Sequence[Edge],
+    threshold: float | None = None,
+    min_hold_s: float = MIN_HOLD_S,
+) -> Holds:
+    """Find when nothing moves: no joint, no tracked body, no gyro.
+
+    A rate is small if it stays below four times its size at rest, which is that of the quietest
+    tenth of the log, held between 3 and 50 mrad/s (mm/s); `threshold` replaces it. A log that
+    does not see something, neither makes nor breaks a hold, and holds are cut short by 0.3 s at
+    both ends, in which things settle.
+
+    Args:
+        tracks: logs on one clock.
+        edges: the arm's chain; empty where there is none.
+        threshold: rad/s or m/s.
+        min_hold_s: shorter holds are none.
+
+    Raises:
+        InputError: there is no motion in the logs, or no hold.
+    """
+    rates = [_fastest(track, edges) for track in tracks]
+    rates = [rate for rate in rates if rate is not None]
+    if not rates:
+        raise InputError(
+            "no log tells when the rig stood still; give joints, a tracked body or a gyro, or a "
+            "table with a row for every stop"
+        )
+    still, said = [], []
+    for time_s, rate, name in rates:
+        limit = threshold if threshold is not None else learned(rate)
+        still.append(_spans(time_s, rate < limit, ~np.isfinite(rate)))
+        said.append(f"holds: {name} is at rest below {1e3 * limit:.1f} mrad/s or mm/s")
+    spans = still[0]
+    for other in still[1:]:
+        spans = _both(spans, other)
+    spans = spans + np.array([SETTLE_S, -SETTLE_S])
+    spans = spans[spans[:, 1] - spans[:, 0] >= min_hold_s - 1e-9]
+    if not len(spans):
+        raise InputError(
+            f"nothing stands still for {min_hold_s:g} s anywhere in the logs; say --still "
+            "RAD_PER_S for what is at rest, or --min-hold SECONDS"
+        )
+    lengths = spans[:, 1] - spans[:, 0]
+    said.append(
+        f"holds: {len(spans)}, of {lengths.min():.1f} to {lengths.max():.1f} s, over "
+        f"{spans[-1, 1] - spans[0, 0]:.0f} s"
+    )
+    return Holds(spans, said)
+
+
+def learned(rate: Array) -> float:
+    """The rate below which something is at rest, from how fast it is when it is quietest."""
+    known = rate[np.isfinite(rate)]
+    return float(np.clip(FACTOR * np.quantile(known, REST_SHARE), SLOWEST, FASTEST))
+
+
+def _fastest(track: Track, edges: Sequence[Edge]) -> tuple[Array, Array, str] | None:
+    """Times and the size of all rates of a track, a metre counting for a radian."""
+    found = motions(track, edges if track.kind != "joints" else (), WINDOW_S)
+    if not found:
+        return None
+    rate = np.concatenate([_unbiased(motion) for motion in found], axis=1)
+    return found[0].time_s, np.linalg.norm(rate, axis=1), track.name
+
+
+def _unbiased(motion: Motion) -> Array:
+    """Rates (N, D); of a gyro without what it reads at rest."""
+    if motion.kind != "turn":
+        return motion.rate
+    change = np.linalg.norm(np.diff(motion.rate, axis=0, append=motion.rate[-1:]), axis=1)
+    quiet = change <= np.nanquantile(change, REST_SHARE)
+    return motion.rate - np.nanmedian(motion.rate[quiet], axis=0)
+
+
+def _spans(time_s: Array, still: Array, unknown: Array) -> Array:
+    """Periods (H, 2) s in which a log says that all is still, or says nothing."""
+    calm = np.concatenate([[False], still | unknown, [False]]).astype(int)
+    starts, ends = np.flatnonzero(np.diff(calm) == 1), np.flatnonzero(np.diff(calm) == -1) - 1
+    known = np.concatenate([[0], np.cumsum(~unknown)])
+    seen = known[ends + 1] > known[starts]
+    return np.stack([time_s[starts[seen]], time_s[ends[seen]]], axis=1)
+
+
+def _both(a: Array, b: Array) -> Array:
+    """Periods in both of two lists of periods, each in order."""
+    low = np.maximum(a[:, None, 0], b[None, :, 0])
+    high = np.minimum(a[:, None, 1], b[None, :, 1])
+    met = high > low
+    return np.stack([low[met], high[met]], axis=1)

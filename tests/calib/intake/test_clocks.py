@@ -1,0 +1,134 @@
+"""Clocks brought together by motion: known offsets recovered, and what is ambiguous refused."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from calib.intake.clocks import align, estimate
+from calib.intake.gather import chain
+from calib.intake.motion import motions
+from chains.dh import Row, to_urdf
+from chains.errors import InputError
+from sensors.readers.base import POSE, Arm, Sweeps, Track
+
+from .moving import DH, JOINTS, T_TIP_CUP, T_WORLD_BASE, logged, plan, tip
+
+RNG = np.random.default_rng(3)
+HELD, SPANS = plan(12)
+END_S = float(SPANS[-1, 1])
+
+
+@pytest.fixture(scope="module")
+def edges():
+    rows = [Row(n, a, alpha, d) for n, (a, alpha, d) in zip(JOINTS, DH, strict=True)]
+    return chain(Arm(to_urdf("arm", rows, False), "arm_base", "arm_end"))
+
+
+def joints(offset_s=0.0, clock="joints", rate_hz=50):
+    time_s = np.arange(0, END_S, 1 / rate_hz)
+    return Track(clock, "joints", clock, time_s - offset_s, JOINTS, logged(HELD, SPANS, time_s))
+
+
+def cup(offset_s, clock="take", rate_hz=100, noise=2e-4, within=(0, 1)):
+    time_s = np.arange(within[0] * END_S, within[1] * END_S, 1 / rate_hz)
+    pose = T_WORLD_BASE * tip(logged(HELD, SPANS, time_s)) * T_TIP_CUP
+    turn = pose.rotation * Rotation.from_rotvec(noise * RNG.normal(size=(len(time_s), 3)))
+    values = np.hstack([pose.translation, turn.as_quat(scalar_first=True)])
+    return Track("cup", "pose", clock, time_s - offset_s, POSE, values)
+
+
+def other_motion():
+    """As long as the logs, with moves at other times."""
+    held, spans = plan(14, seed=9)
+    time_s = np.arange(0, END_S, 0.01)
+    pose = T_WORLD_BASE * tip(logged(held, spans, time_s))
+    return np.hstack([pose.translation, pose.rotation.as_quat(scalar_first=True)])
+
+
+def sweeps(time_s, clock="lidar"):
+    return Sweeps("top", clock, np.asarray(time_s, float), lambda wanted: iter(()))
+
+
+@pytest.mark.parametrize("offset_s", [0.0, 0.0037, -2.5, 1.6e9 + 0.123])
+@pytest.mark.parametrize("within", [(0, 1), (0.3, 0.8)])
+def test_an_offset_is_found_to_milliseconds(edges, offset_s, within):
+    """The tip turns as the joints say, which is what a tracker sees: 100 Hz, 0.2 mrad of noise."""
+    found = align([joints(), cup(offset_s, within=within)], [], edges, {})
+    moved = found.tracks[1].time_s[0] - (within[0] * END_S - offset_s)
+    assert abs(moved - offset_s) < 2e-3
+    assert any("± 0.0" in line for line in found.understood) and not found.odd
+
+
+def test_its_sigma_is_of_the_size_of_its_error(edges):
+    """Over six draws of the noise, the offset scatters as it is said to, within a few."""
+    (mine,) = motions(joints(), edges, 0.1)[:1]
+    found = [estimate(motions(cup(0.5, noise=3e-3), (), 0.1)[0], mine) for _ in range(6)]
+    errors = np.array([one.offset_s - 0.5 for one in found])
+    sigma = np.median([one.sigma_s for one in found])
+    assert sigma / 4 < np.sqrt(np.mean(errors**2)) < 4 * sigma
+
+
+def test_gyro_and_pose_share_their_turns(edges):
+    time_s = np.arange(0, END_S, 0.01)
+    turn = tip(logged(HELD, SPANS, time_s)).rotation
+    rate = (turn[:-1].inv() * turn[1:]).as_rotvec() / 0.01 + [0.01, -0.02, 0.005]
+    gyro = Track("imu", "gyro", "imu", time_s[:-1] + 0.005 + 7.0, ("x", "y", "z"), rate)
+    found = align([cup(0.0), gyro], [], (), {})
+    assert abs(found.tracks[1].time_s[0] - 0.005) < 5e-3
+
+
+def test_without_an_arm_joints_and_a_point_are_matched(edges):
+    pose = cup(3.0)
+    point = Track("cup", "point", "take", pose.time_s, POSE[:3], pose.values[:, :3])
+    found = align([joints(), point], [], (), {})
+    assert abs(found.tracks[1].time_s[0]) < 0.05
+
+
+def test_the_lidars_clock_leads_and_overlap_is_said(edges):
+    found = align([joints(), cup(0.0, "joints")], [sweeps([1, 2, 3])], edges, {})
+    assert "lidar" in found.understood[0] and "taken for the same" in found.odd[0]
+
+
+def test_what_is_given_is_applied_and_not_estimated(edges):
+    found = align([joints(), cup(2.0)], [], edges, {"take": 5.0})
+    assert found.tracks[1].time_s[0] == pytest.approx(3.0) and "as given" in found.understood[1]
+
+
+def test_a_clock_that_drifts_is_named(edges):
+    drifting = cup(0.0, noise=0)
+    drifting = replace(drifting, time_s=drifting.time_s * 1.005)
+    said = align([joints(), drifting], [], edges, {})
+    assert any("drifts" in line for line in said.odd), said.understood
+
+
+def test_motion_that_repeats_is_ambiguous(edges):
+    held = np.tile(HELD[:2], (8, 1))
+    spans = 5.0 * np.arange(16)[:, None] + [0, 3]
+    time_s = np.arange(0, 78, 0.01)
+    values = logged(held, spans, time_s)
+    pair = [
+        Track(name, "joints", name, time_s + late, JOINTS, values)
+        for name, late in (("a", 0.0), ("b", 4.0))
+    ]
+    with pytest.raises(InputError, match="--clock-offset b=SECONDS"):
+        align(pair, [], edges, {})
+
+
+@pytest.mark.parametrize(
+    ("tracks", "scans", "given", "said"),
+    [
+        ([joints()], [sweeps([1e9, 1e9 + 1])], {}, "do not overlap.*--clock-offset joints=SECONDS"),
+        ([joints(), cup(0.0)], [], {"tak": 1.0}, "did you mean take"),
+        (
+            [joints(), replace(cup(0.0, "x"), values=other_motion())],
+            [],
+            {},
+            "--clock-offset x=SECONDS",
+        ),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_told_names_the_flag(edges, tracks, scans, given, said):
+    with pytest.raises(InputError, match=said):
+        align(tracks, scans, edges, given)

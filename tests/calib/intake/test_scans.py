@@ -1,0 +1,86 @@
+"""Turns of a LiDAR given to stops, by time or by name, and written stop by stop."""
+
+import numpy as np
+import pytest
+
+from calib.intake import scans, targets
+from chains.errors import InputError
+from sensors.readers.base import POSE, Spheres, Sweep, Sweeps, Track
+from sensors.recording import read_table
+
+STOPS = ("a", "b", "c")
+SPANS = np.array([[0.0, 1.0], [2.0, 3.0], [5.0, 6.0]])
+
+
+def turns(time_s, name="top", first=0):
+    """Turn k has k + 1 points, all with intensity k."""
+
+    def read(wanted):
+        for k in np.flatnonzero(wanted):
+            points = {axis: np.full(k + 1, 1.0, np.float32) for axis in "xyz"}
+            points |= {n: np.zeros(k + 1, np.uint16) for n in ("ring", "column")}
+            points["intensity"] = np.full(k + 1, first + k, np.float32)
+            yield Sweep(time_s[k], points)
+
+    return Sweeps(name, name, np.asarray(time_s, float), read)
+
+
+def written(folder, share):
+    scans.write(folder, STOPS, share, lambda *a: None)
+    return {path.stem: read_table(path) for path in folder.iterdir()}
+
+
+def test_turns_belong_to_the_hold_in_which_their_middle_lies(tmp_path):
+    share, odd = scans.by_time([turns([0.5, 0.9, 1.5, 2.0, 3.0, 5.5])], SPANS)
+    found = written(tmp_path / "scans", share)
+    assert not odd and found.keys() == {"a", "b", "c"}
+    assert sorted(set(found["a"]["intensity"])) == [0, 1]
+    assert sorted(set(found["b"]["intensity"])) == [3, 4]
+    assert found["b"]["scan"].tolist() == [0] * 4 + [1] * 5
+    assert "scan" not in found["c"]
+
+
+def test_a_hold_that_two_files_share_is_one_scan(tmp_path):
+    files = [turns([2.6, 2.8, 5.5], "late", 10), turns([0.5, 2.2, 2.4], "early")]
+    found = written(tmp_path / "scans", scans.by_time(files, SPANS)[0])
+    assert sorted(set(found["b"]["intensity"])) == [1, 2, 10, 11]
+    assert sorted(set(found["b"]["scan"])) == [0, 1, 2, 3]
+
+
+def test_holds_without_turns_are_said_and_none_is_refused():
+    assert "2 of 3 holds" in scans.by_time([turns([0.5])], SPANS)[1][0]
+    with pytest.raises(InputError, match="--clock-offset"):
+        scans.by_time([turns([9.5])], SPANS)
+
+
+def test_two_lidars_at_once_are_refused():
+    with pytest.raises(InputError, match="--topic"):
+        scans.by_time([turns([0, 2]), turns([1, 3], "rear")], SPANS)
+
+
+def test_files_go_to_stops_by_name_or_in_order():
+    nan = [np.nan]
+    share, odd = scans.by_name([turns(nan, "c"), turns(nan, "a")], STOPS)
+    assert [stop.tolist() for _, stop in share] == [[2], [0]] and not odd
+    share, odd = scans.by_name([turns(nan, n) for n in ("p2", "p0", "p1")], STOPS)
+    assert [stop.tolist() for _, stop in share] == [[2], [0], [1]] and "order of name" in odd[0]
+    with pytest.raises(InputError, match="2 clouds have no time, and there are 3 stops"):
+        scans.by_name([turns(nan, "p"), turns(nan, "q")], STOPS)
+    with pytest.raises(InputError, match="cloud x is named after no stop"):
+        scans.by_name([turns(nan, "a"), turns(nan, "x")], STOPS)
+
+
+def test_targets_are_joined_by_name():
+    centre = np.arange(12.0).reshape(4, 3)
+    spheres = Spheres(("T1", "T2", "T3", "T4"), centre)
+    points = [
+        Track(f"T{k}{mark}{part}", "point", "c", np.arange(3.0), POSE[:3],
+              np.array([[k, 0, 2.0], [k, 0, 2.0], [np.nan] * 3]) - [0, 0, part == "lower"])
+        for k in (1, 2, 3) for part, mark in (("upper", ":"), ("lower", " "))
+    ]  # fmt: skip
+    found, odd = targets.join(spheres, points)
+    assert found["target"].tolist() == ["T1", "T2", "T3"] and "T4" in odd[0]
+    assert found["faro_y"].tolist() == [1, 4, 7]
+    assert found["upper_x"].tolist() == [1, 2, 3] and found["lower_z"].tolist() == [1, 1, 1]
+    assert targets.join(spheres, points[:4])[0] is None
+    assert targets.join(None, []) == (None, [])

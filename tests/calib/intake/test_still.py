@@ -1,0 +1,111 @@
+"""Holds found in logs: where they truly are, whatever logged them."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from calib.intake.still import SETTLE_S, find_holds
+from calib.intake.stops import locations, table
+from chains.errors import InputError
+from sensors.readers.base import POSE, Track
+
+from .moving import JOINTS, T_TIP_CUP, T_WORLD_BASE, logged, plan, tip
+
+HELD, SPANS = plan(9, seed=1)
+TIME_S = np.arange(0, SPANS[-1, 1], 0.01)
+VALUES = logged(HELD, SPANS, TIME_S)
+RNG = np.random.default_rng(2)
+
+
+def joints(noise=1e-5):
+    values = VALUES + noise * RNG.normal(size=VALUES.shape)
+    return Track("log", "joints", "c", TIME_S, JOINTS, values)
+
+
+def cup(noise_m=1e-4, noise_rad=2e-4):
+    pose = T_WORLD_BASE * tip(VALUES) * T_TIP_CUP
+    turn = pose.rotation * Rotation.from_rotvec(noise_rad * RNG.normal(size=(len(TIME_S), 3)))
+    xyz = pose.translation + noise_m * RNG.normal(size=(len(TIME_S), 3))
+    values = np.hstack([xyz, turn.as_quat(scalar_first=True)])
+    return Track("cup", "pose", "c", TIME_S, POSE, values)
+
+
+def gyro():
+    turn = tip(VALUES).rotation
+    rate = (turn[:-1].inv() * turn[1:]).as_rotvec() / 0.01
+    rate += [0.02, -0.03, 0.01] + 2e-3 * RNG.normal(size=rate.shape)
+    return Track("imu", "gyro", "c", TIME_S[1:], ("x", "y", "z"), rate)
+
+
+def inside(found):
+    """Holds lie within the true ones, and miss little of them at both ends."""
+    assert len(found) == len(SPANS)
+    early, late = found[:, 0] - SPANS[:, 0], SPANS[:, 1] - found[:, 1]
+    for gap in (early, late):
+        assert gap.min() > 0 and gap.max() < SETTLE_S + 0.35
+
+
+@pytest.mark.parametrize("make", [joints, cup, gyro], ids=["joints", "tracker", "gyro"])
+def test_holds_are_where_nothing_moves(make):
+    inside(find_holds([make()], ()).spans_s)
+
+
+def test_all_that_moves_must_be_still():
+    """The base is driven off in the middle of the third hold, with the arm at rest."""
+    start, end = SPANS[2]
+    middle = (start + end) / 2
+    xyz = np.zeros((len(TIME_S), 7))
+    xyz[:, 3] = 1
+    xyz[:, 0] = np.clip((TIME_S - middle) / 0.2, 0, 1)
+    base = Track("base", "pose", "c", TIME_S, POSE, xyz)
+    found = find_holds([joints(), base], (), min_hold_s=0.5).spans_s
+    assert not np.any((found[:, 0] < middle) & (found[:, 1] > middle + 0.2))
+
+
+def test_a_body_out_of_sight_breaks_no_hold():
+    hidden = cup()
+    hidden.values[(SPANS[4, 0] + 0.8 < TIME_S) & (SPANS[4, 1] - 0.8 > TIME_S)] = np.nan
+    inside(find_holds([joints(), hidden], ()).spans_s)
+
+
+def test_means_are_those_of_what_was_held():
+    spans = find_holds([joints(), cup()], ()).spans_s
+    minutes, heat = np.array([0.0, 100.0]), np.array([[20.0], [21.0]])
+    slow = Track("air", "covariate", "c", minutes, ("heat",), heat)
+    columns, odd = table([joints(), cup(), slow], spans)
+    assert not odd
+    found = np.stack([columns[name] for name in JOINTS], axis=1)
+    np.testing.assert_allclose(found, HELD, atol=5e-6)
+    pose = T_WORLD_BASE * tip(HELD) * T_TIP_CUP
+    xyz = np.stack([columns[f"cup.{p}"] for p in "xyz"], axis=1)
+    np.testing.assert_allclose(xyz, pose.translation, atol=6e-5)
+    quat = np.stack([columns[f"cup.{p}"] for p in POSE[3:]], axis=1)
+    gap = Rotation.from_quat(quat, scalar_first=True).inv() * pose.rotation
+    assert gap.magnitude().max() < 1e-4
+    np.testing.assert_allclose(columns["heat"], 20 + spans.mean(axis=1) / 100)
+
+
+def test_what_creeps_is_named():
+    slow = joints()
+    slow.values[:, 0] += 2.5e-3 * TIME_S
+    spans = find_holds([slow], (), threshold=0.01).spans_s
+    assert "creeps" in table([slow], spans)[1][0]
+
+
+def test_nothing_that_stands_still_is_refused():
+    wild = joints()
+    wild.values[:, 1] += 0.5 * np.sin(TIME_S)
+    with pytest.raises(InputError, match="--still"):
+        find_holds([wild], ())
+    with pytest.raises(InputError, match="no log tells"):
+        find_holds([], ())
+
+
+def test_locations_are_where_the_base_stood():
+    at = np.array([0.0, 0.001, 2.0, 0.002, np.nan, 2.001])
+    columns = {"stop": np.array(list("abcdef")), "base.x": at}
+    columns |= {f"base.{p}": np.where(np.isnan(at), np.nan, p == "qw") for p in POSE[1:]}
+    found, words = locations(columns, "base", None)
+    assert found["location"].tolist() == ["L00", "L00", "L01", "L00", "L00", "L01"]
+    assert "2 places" in words
+    assert locations(columns, "base", 3)[0]["location"].tolist()[::2] == ["L00", "L01", "L02"]
