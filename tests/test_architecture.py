@@ -13,13 +13,20 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("chains", "sensors", "calib")  # each may import itself and those before it
 DOORS = {
+    "PIL": "sensors/readers/osf.py",
     "gtsam": "calib/graph.py",
+    "laspy": "sensors/readers/las.py",
     "matplotlib": "calib/plots.py",
-    "open3d": "sensors/reference.py",
+    "open3d": "sensors/meshes.py",
     "pyarrow": "sensors/recording.py",
+    "trimesh": "sensors/mesh_files.py",
+    "pye57": "sensors/readers/e57.py",
+    "rosbags": "sensors/readers/ros.py",
+    "viser": "calib/view/server.py",
+    "xacrodoc": "sensors/readers/xacros.py",
     "yaml": "sensors/documents.py",
 }
-NOT_AT_STARTUP = {"gtsam", "matplotlib", "open3d", "pyarrow", "pydantic", "scipy"}
+NOT_AT_STARTUP = {"gtsam", "matplotlib", "open3d", "pyarrow", "pydantic", "scipy", "viser"}
 LONGEST_FILE, LONGEST_FUNCTION = 400, 60
 
 SOURCES = {
@@ -185,5 +192,28 @@ def test_everything_public_has_a_docstring():
             for path, tree in PACKAGE_SOURCES.items()
             for name, node in public(tree.body, module_name(path))
             if not ast.get_docstring(node)
+        ]
+    )
+
+
+def unannotated(function: ast.FunctionDef) -> list[str]:
+    """What of a function has no type: arguments, and `return`."""
+    given = function.args
+    arguments = [*given.posonlyargs, *given.args, *given.kwonlyargs]
+    arguments += filter(None, (given.vararg, given.kwarg))
+    lacking = [a.arg for a in arguments if a.annotation is None and a.arg not in ("self", "cls")]
+    return lacking + (["return"] if function.returns is None else [])
+
+
+def test_everything_public_is_typed():
+    """A type checker of a user sees the packages' types, as `py.typed` promises."""
+    none(
+        [
+            f"{path}:{node.lineno} {node.name}: {', '.join(lacking)}"
+            for path, tree in PACKAGE_SOURCES.items()
+            for body in (tree, *(n for n in ast.walk(tree) if isinstance(n, ast.ClassDef)))
+            for node in body.body
+            if isinstance(node, ast.FunctionDef) and not node.name.startswith("_")
+            if (lacking := unannotated(node))
         ]
     )

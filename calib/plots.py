@@ -1,0 +1,157 @@
+"""Figures for pages and papers: their style, and how they become SVG, PNG or PDF.
+
+This is the matplotlib door. Colours are Okabe and Ito's, which those who confuse red and green can
+tell apart; signed values run from purple to orange about white.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from chains.errors import InputError
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+AFTER, BEFORE, FLOOR, INK, PALE = "#0072b2", "#d55e00", "#009e73", "#333333", "#999999"
+LINES = (AFTER, BEFORE, FLOOR, "#cc79a7", "#e69f00", "#56b4e9")
+SIGNED, UNSIGNED = "PuOr_r", "cividis"
+HALF, WIDE = 5.6, 8.0  # inches: of a column of the page, and of both
+FORMATS = ("png", "svg", "pdf")
+PAPER_DPI, MAP_DPI = 300, 110
+_STYLE = {
+    "font.size": 9.5,
+    "text.parse_math": False,  # a dollar in a run's name is a dollar
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": "#888888",
+    "axes.labelcolor": INK,
+    "axes.linewidth": 0.8,
+    "axes.titlesize": 9.5,
+    "axes.titlelocation": "left",
+    "axes.axisbelow": True,
+    "xtick.color": "#555555",
+    "ytick.color": "#555555",
+    "grid.color": "#e4e4e4",
+    "legend.frameon": False,
+    "text.color": INK,
+    "legend.fontsize": 9,
+    "lines.linewidth": 1.5,
+    "svg.fonttype": "none",
+    "svg.hashsalt": "rigcal",
+    "pdf.fonttype": 42,
+}
+
+
+def axes(
+    width: float = HALF,
+    height: float = 3.0,
+    rows: int = 1,
+    columns: int = 1,
+    **options: Any,
+) -> tuple[Figure, np.ndarray]:
+    """A figure of so many inches, and its axes (rows, columns) with faint grids.
+
+    Args:
+        width, height: inches.
+        rows, columns: of axes.
+        options: more for ``Figure.subplots``.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout="constrained")
+    grid = figure.subplots(rows, columns, squeeze=False, **options)
+    for each in grid.flat:
+        each.grid(True)
+    return figure, grid
+
+
+@contextmanager
+def styled() -> Iterator[None]:
+    """The house style, for what is drawn inside."""
+    from matplotlib import rc_context
+
+    with rc_context(_STYLE):
+        yield
+
+
+def band(ax: Axes, x: np.ndarray, mean: np.ndarray, half: np.ndarray, colour: str) -> None:
+    """A shaded band about a line."""
+    ax.fill_between(x, mean - half, mean + half, color=colour, alpha=0.25, linewidth=0)
+
+
+def log_axis(ax: Axes, least: float, most: float) -> None:
+    """Make the x axis logarithmic, with a number at every 1, 2 and 5."""
+    ax.set_xscale("log")
+    powers = np.arange(np.floor(np.log10(least)), np.ceil(np.log10(most)) + 1)
+    ticks = np.outer(10.0**powers, [1, 2, 5]).ravel()
+    ticks = ticks[(ticks > 0.7 * least) & (ticks < 1.4 * most)]
+    ax.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+    ax.set_xticks([], minor=True)
+
+
+def signed_map(
+    ax: Axes, values: np.ndarray, extent: Sequence[float], limit: float, scale: str = SIGNED
+) -> Any:
+    """A map (rows, columns) about zero, drawn as one picture; grey where it is NaN.
+
+    Args:
+        ax: where.
+        values: rows from below.
+        extent: left, right, bottom, top.
+        limit: the value at the scale's ends.
+        scale: matplotlib's name of the colours.
+    """
+    ax.set_facecolor("#d8d8d8")
+    ax.grid(False)
+    options = {"aspect": "auto", "origin": "lower", "interpolation": "nearest"}
+    return ax.imshow(values, scale, vmin=-limit, vmax=limit, extent=extent, **options)
+
+
+def svg(figure: Figure, name: str) -> str:
+    """The figure as an ``<svg>`` to stand in a page among others: every id begins with `name`."""
+    file = io.StringIO()
+    with styled():
+        # Laid out here and not by savefig, which would draw all of it once more to that end.
+        figure.get_layout_engine().execute(figure)
+        figure.set_layout_engine("none")
+        figure.savefig(file, format="svg", dpi=MAP_DPI, metadata={"Date": None})
+    text = file.getvalue()
+    text = text[text.index("<svg") :]
+    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+    # As large as its column, and in the page's own letters.
+    text = re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", text, count=1)
+    text = re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", text, count=1)
+    text = re.sub(r"font: ([0-9.]+px) [^;\"]*", r"font-size: \1; font-family: inherit", text)
+    text = re.sub(r'\bid="', f'id="{name}-', text)
+    return re.sub(r'(url\(#|href="#)', rf"\1{name}-", text)
+
+
+def check_format(path: Path | str) -> str:
+    """The format that a path's end asks for.
+
+    Raises:
+        InputError: it is none of .png, .svg and .pdf.
+    """
+    kind = Path(path).suffix.lower().removeprefix(".")
+    if kind not in FORMATS:
+        ends = ", ".join(f".{f}" for f in FORMATS)
+        raise InputError(f"{path}: a figure is written as one of {ends}; name the file so")
+    return kind
+
+
+def save(figure: Figure, path: Path | str) -> None:
+    """Write a figure as the end of the path says; `check_format` says what it may be."""
+    from matplotlib import rc_context
+
+    # A paper is read where our letters may not be there: they are drawn.
+    with styled(), rc_context({"svg.fonttype": "path"}):
+        figure.savefig(path, format=check_format(path), dpi=PAPER_DPI, facecolor="white")

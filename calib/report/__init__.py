@@ -1,0 +1,148 @@
+"""A run for a colleague who was not there: ``rigcal report``, ``rigcal plot`` for one figure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+from calib import plots
+from calib.fit import Progress
+from calib.report.chart import Absent, Chart
+from calib.report.charts import SECTIONS
+from calib.report.evidence import Evidence
+from calib.report.page import Section, render
+from calib.report.verdict import Verdict, judge
+from calib.run import Run
+from chains.errors import InputError
+from sensors.documents import nearest, write_atomically
+
+__all__ = ["Evidence", "Written", "charts_of", "plot", "report"]
+
+
+@dataclass(frozen=True)
+class Contents:
+    """The figures of a run, by section, and those that it does not have."""
+
+    sections: dict[str, list[Chart]]
+    absent: list[Absent]
+
+    @property
+    def charts(self) -> list[Chart]:
+        return [chart for charts in self.sections.values() for chart in charts]
+
+
+@dataclass(frozen=True)
+class Written:
+    """A report as written."""
+
+    file: Path
+    verdict: Verdict
+    contents: Contents
+
+    @property
+    def summary(self) -> str:
+        """What was written, in short."""
+        return f"{self.verdict.light}, {len(self.contents.charts)} figures"
+
+    def document(self) -> dict[str, Any]:
+        """As ``rigcal report --json`` gives it."""
+        return {
+            "file": str(self.file),
+            "light": self.verdict.light,
+            "verdict": self.verdict.sentence,
+            "reasons": self.verdict.reasons,
+            "charts": [chart.document() for chart in self.contents.charts],
+            "left_out": [{"id": a.id, "why": a.why} for a in self.contents.absent],
+        }
+
+
+def charts_of(evidence: Evidence) -> Contents:
+    """Every figure that a run has; none is drawn yet.
+
+    Raises:
+        InputError: residuals are missing, or of another version.
+    """
+    sections: dict[str, list[Chart]] = {}
+    absent: list[Absent] = []
+    for title, makers in SECTIONS.items():
+        found = [each for make in makers for each in make(evidence)]
+        sections[title] = [each for each in found if isinstance(each, Chart)]
+        absent += [each for each in found if isinstance(each, Absent)]
+    return Contents(sections, absent)
+
+
+def report(
+    runs: Sequence[Run],
+    out: Path | str,
+    progress: Progress = lambda what, done, total: None,
+) -> Written:
+    """Write a page about runs: the last rung of their ladder, and how it was reached.
+
+    Args:
+        runs: one run, whose whole ladder is shown as far as it is there; or those to show.
+        out: the HTML file, which needs nothing beside it.
+        progress: called with what is being done, and how far it is.
+
+    Raises:
+        InputError: a recording has moved or changed, a run is incomplete or of another version, or
+            the file cannot be written.
+    """
+    evidence = Evidence.of(runs, progress)
+    contents = charts_of(evidence)
+    verdict = judge(evidence.run, evidence.diagnosis)
+    done, total, sections = 0, len(contents.charts), []
+    for title, charts in contents.sections.items():
+        drawn = []
+        for chart in charts:
+            progress("drawing", done, total)
+            drawn.append((chart, plots.svg(chart.figure(), chart.id)))
+            done += 1
+        sections.append(Section(title, drawn))
+    page = render(evidence, verdict, sections, contents.absent)
+    with _file(out) as temporary:
+        temporary.write_text(page, encoding="utf-8")
+    return Written(Path(out), verdict, contents)
+
+
+def plot(evidence: Evidence, name: str, out: Path | str) -> Chart:
+    """Write one figure as the end of the path says: .png, .svg or .pdf.
+
+    Args:
+        evidence: of the run.
+        name: the figure's id.
+        out: the file.
+
+    Raises:
+        InputError: there is no such figure, or not for this run, or not in that format.
+    """
+    plots.check_format(out)
+    chart = _find(evidence, name)
+    with _file(out) as temporary:
+        plots.save(chart.figure(), temporary)
+    return chart
+
+
+def _find(evidence: Evidence, name: str) -> Chart:
+    """The figure of that name; none behind it is looked at."""
+    known = []
+    for make in chain(*SECTIONS.values()):
+        for each in make(evidence):
+            if each.id == name and isinstance(each, Chart):
+                return each
+            if each.id == name:
+                raise InputError(f"{evidence.run.folder} has no figure '{name}': {each.why}")
+            known += [each.id] if isinstance(each, Chart) else []
+    raise InputError(f"there is no figure '{name}'{nearest(name, known)}")
+
+
+@contextmanager
+def _file(out: Path | str) -> Iterator[Path]:
+    try:
+        with write_atomically(out) as temporary:
+            yield temporary
+    except OSError as error:
+        raise InputError(f"{out} cannot be written ({error.strerror}); give another -o") from None

@@ -1,0 +1,128 @@
+"""The variance budget: what each link and effect contributes to what is measured, in mm.
+
+With J the derivative of a range (of the three coordinates of a tracked position, added up, where
+there are no scans) by one variable's parameters, C their joint covariance and theta how far they
+came from paper,
+
+    uncertain = sqrt(mean over rows of J C J^T),    moved = sqrt(mean over rows of (J theta)^2).
+
+Both speak of one variable alone, all others held. What two of them trade with each other, or with
+where the rig stands at a stop, counts in each, so the parts may well exceed the error of the whole.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.fit import Progress
+from calib.problem import Problem
+from calib.residuals.beams import Columns
+from calib.residuals.scan import ScanStop
+from calib.residuals.tracker import TrackedBody
+from calib.run import Solution
+
+STOPS, ROWS = 24, 2000  # of each stop that is looked at, no more rows than that
+
+Jacobian = dict[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What each variable contributes, rms over rows, m.
+
+    Args:
+        uncertain_m: variable -> by what is not known of it.
+        moved_m: variable -> by how far it came from paper; none where paper says nothing.
+        rows: how many beams, or tracked positions, were looked at.
+        stops: at how many stops; of tracked positions, in how many groups that share every unknown.
+    """
+
+    uncertain_m: Mapping[str, float]
+    moved_m: Mapping[str, float]
+    rows: int
+    stops: int
+
+
+def budget(
+    problem: Problem,
+    values: Mapping[str, np.ndarray],
+    solution: Solution,
+    progress: Progress = lambda what, done, total: None,
+) -> Budget:
+    """The budget at a solution, over rows drawn evenly from stops drawn evenly.
+
+    Args:
+        problem: what was solved.
+        values: the solution's state.
+        solution: its covariance.
+        progress: called with what is being done, and how far it is.
+    """
+    at: dict[str, list[int]] = {}
+    for i, name in enumerate(solution.names):
+        at.setdefault(name.rpartition(".")[0], []).append(i)
+    drawn = [n for n in at if problem.variables[n].kind == "vector"]  # a pose has no paper
+    uncertain, moved = dict.fromkeys(at, 0.0), dict.fromkeys(drawn, 0.0)
+    rows, stops = 0, 0
+    for J, count in _jacobians(problem, values, progress):
+        for name in at.keys() & J.keys():
+            uncertain[name] += _variance(J[name], solution.covariance[np.ix_(at[name], at[name])])
+            if name in moved:
+                moved[name] += float(np.square(J[name] @ values[name]).sum())
+        rows, stops = rows + count, stops + 1
+    rms = {n: float(np.sqrt(v / max(rows, 1))) for n, v in uncertain.items()}
+    shifts = {n: float(np.sqrt(v / max(rows, 1))) for n, v in moved.items()}
+    return Budget(rms, shifts, rows, stops)
+
+
+def _variance(J: np.ndarray, covariance: np.ndarray) -> float:
+    return float(np.einsum("ni,ij,nj->", J, covariance, J, optimize=True))
+
+
+def _jacobians(
+    problem: Problem, values: Mapping[str, np.ndarray], progress: Progress
+) -> Iterator[tuple[Jacobian, int]]:
+    """Per stop, variable -> (n, dim) derivative of what is measured there, m per unit; and how many
+    measurements that is."""
+    if problem.scans:
+        chosen = np.linspace(0, len(problem.scans) - 1, STOPS).round().astype(int)
+        for k, i in enumerate(np.unique(chosen).tolist()):
+            progress("derivatives", k, len(chosen))
+            found = beam_jacobian(problem.scans[i], values)
+            yield found, len(next(iter(found.values())))
+        return
+    for block in problem.blocks:
+        if isinstance(block, TrackedBody):
+            _, d = block.evaluate(values, derivatives=True)
+            width = 3 if block.is_point else 6
+            of_position = np.arange(block.rows) % width >= width - 3
+            found = {name: block.sigma_m * each[of_position] for name, each in d.items()}
+            yield found, len(block.measured)
+
+
+def beam_jacobian(scan: ScanStop, values: Mapping[str, np.ndarray]) -> Jacobian:
+    """Variable -> (n, dim) derivative of the range residuals of a stop's beams, m per unit.
+
+    Args:
+        scan: the stop; of its beams that the fit keeps, at most `ROWS` are taken, evenly.
+        values: the state.
+    """
+    rows = scan.rows(values)
+    kept = np.flatnonzero(rows.weight > 0)
+    some = kept[np.unique(np.linspace(0, len(kept) - 1, ROWS).round().astype(int))]
+    placed = scan.stops.in_reference(scan.stops.rig.lidar_frame, values)
+    out = {name: rows.by_twist[some] @ d[0] for name, d in placed.d.items()}
+    out |= {name: columns[some] for name, columns in rows.dense.items()}
+    for columns in rows.sparse:
+        out[columns.variable] = out.get(columns.variable, 0.0) + _spread(columns, some, values)
+    return out
+
+
+def _spread(columns: Columns, some: np.ndarray, values: Mapping[str, np.ndarray]) -> np.ndarray:
+    out = np.zeros((len(some), len(values[columns.variable])))
+    index = columns.index[some]
+    hit = np.flatnonzero(index >= 0)
+    out[hit, columns.components[index[hit]]] = columns.value[some][hit]
+    return out

@@ -1,0 +1,19 @@
+"""Every figure of a report. A new one is a function and its line in `SECTIONS`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+
+from calib.report.chart import Absent, Chart
+from calib.report.charts import bodies, fit, knowledge, links, residuals
+from calib.report.evidence import Evidence
+
+Charts = Callable[[Evidence], Iterator[Chart | Absent]]
+
+SECTIONS: Mapping[str, tuple[Charts, ...]] = {
+    "How good it is": (fit.ladder, fit.variance, fit.scatter),
+    "What was found": (knowledge.findings,),
+    "The chain": (links.chain, links.moves, links.effects, knowledge.budget),
+    "What is left": (residuals.ring_map, residuals.curves, bodies.tracked, bodies.targets),
+    "What could not be determined": (knowledge.correlation,),
+}

@@ -1,0 +1,312 @@
+"""The chain: every link with its estimate, its sigma, and how far it is from CAD; the effects."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from calib import plots
+from calib.estimates import Found
+from calib.report.chart import Absent, Chart
+from calib.report.evidence import Evidence
+from calib.rig import Rig
+from calib.tables import LISTED, shown
+
+if TYPE_CHECKING:
+    from calib.plots import Axes, Figure
+
+FAR = 3.0  # sigmas of CAD
+SHIFT, TURN = slice(3, 6), slice(0, 3)
+
+
+@dataclass(frozen=True)
+class Link:
+    """A frame as the chain shows it.
+
+    Args:
+        name: of the frame.
+        depth: how many links it hangs below the world.
+        what: what ties it to its parent, where no estimate does.
+        found: the estimate; None where the link was not estimated.
+        cad_sigma: (6,) how sure CAD was; NaN where it says nothing, 0 where it is exact.
+    """
+
+    name: str
+    depth: int
+    what: str = ""
+    found: Found | None = None
+    cad_sigma: np.ndarray | None = None
+
+    @property
+    def moved(self) -> float | None:
+        """The largest of the six moves, in sigmas of CAD."""
+        if self.found is None or self.cad_sigma is None:
+            return None
+        z = np.abs(self.found.estimate) / np.where(self.cad_sigma > 0, self.cad_sigma, np.inf)
+        return float(np.nanmax(z)) if np.isfinite(z).any() else None
+
+
+def _links(evidence: Evidence, rig: Rig) -> list[Link]:
+    """The frames of one rig, parents before children, the arm drawn together."""
+    found = {f.variable: f for f in evidence.found if f.parent is not None}
+    found |= {n.removeprefix(f"{rig.name}/"): f for n, f in found.items()}
+    out = [Link(rig.world, 0, "the tracker's frame" if rig.tracker else "the reference's frame")]
+    if rig.reference_frame in found and rig.reference_frame != rig.world:
+        far = found[rig.reference_frame]
+        out.append(Link(rig.reference_frame, 1, "the scanned mesh and the targets", far))
+    out.append(Link(rig.tree.root, 1, f"stands elsewhere {MOVES[rig.moves]}"))
+    _children(rig, rig.tree.root, 2, found, evidence.prior_sigma, out)
+    return out
+
+
+MOVES = {"stop": "at every stop", "location": "at every location", "never": "at no stop"}
+
+
+def _children(
+    rig: Rig,
+    parent: str,
+    depth: int,
+    found: dict[str, Found],
+    prior: dict[str, float],
+    out: list[Link],
+) -> None:
+    arm = [edge for edge in rig.tree.edges if edge.name in rig.arm_edges]
+    if arm and arm[0].parent == parent:
+        joints = len(rig.joint_names)
+        out.append(Link(arm[-1].child, depth, f"the arm: {joints} joints, from its URDF"))
+        _children(rig, arm[-1].child, depth + 1, found, prior, out)
+    for edge in rig.tree.edges:
+        if edge.parent == parent and edge.name in rig.frame_sigma:
+            mine = found.get(edge.child)
+            held = mine is None or not mine.sigma.any()
+            sigma = None
+            if not held:
+                names = (f"{mine.variable}.{dof}" for dof in mine.parameters)
+                sigma = np.array([prior.get(n, 0.0) for n in names])
+            out.append(Link(edge.child, depth, "held as in CAD", None if held else mine, sigma))
+            _children(rig, edge.child, depth + 1, found, prior, out)
+
+
+def chain(evidence: Evidence) -> Iterator[Chart | Absent]:
+    """The chain as a diagram, one for each rig."""
+    rigs = {source.rig.name: source.rig for source in evidence.sources}
+    for i, rig in enumerate(rigs.values(), 1):
+        links = _links(evidence, rig)
+        moved = {link.name: link.moved for link in links if link.moved is not None}
+        title = "No link of the chain was estimated against CAD"
+        if moved:
+            worst = max(moved, key=moved.get)
+            count = sum(z > FAR for z in moved.values())
+            title = (
+                f"No link is more than {FAR:.0f} sigmas from CAD; the furthest is {worst}, "
+                f"{moved[worst]:.1f} sigmas"
+                if not count
+                else f"{count} of {len(moved)} links lie more than {FAR:.0f} sigmas from CAD: "
+                f"{worst} by {moved[worst]:.1f}"
+            )
+        yield Chart(
+            "chain" if len(rigs) == 1 else f"chain-{i}",
+            f"{rig.name}: {title}" if len(rigs) > 1 else title,
+            "Every frame hangs from the one above it to the left. Beside it: how far its origin "
+            "and its axes are from where CAD has them, with the 68 % uncertainty of the length, "
+            "and the largest of the six moves in sigmas of CAD; orange from 3 on.",
+            lambda links=links: _chain(links),
+            wide=True,
+        )
+
+
+def _chain(links: Sequence[Link]) -> Figure:
+    figure, grid = plots.axes(plots.WIDE, 0.7 + 0.42 * len(links))
+    ax = grid[0, 0]
+    ax.set_axis_off()
+    ax.set_xlim(0, 100)
+    ax.set_ylim(len(links) - 0.4, -1.1)
+    for x, text in ((47, "origin moved, mm"), (66, "turned, mrad"), (84, "sigmas of CAD")):
+        ax.text(x, -0.8, text, color="#555555", va="center")
+    trunk: dict[int, int] = {}
+    for row, link in enumerate(links):
+        x = 1 + 4.5 * link.depth
+        if link.depth:
+            ax.plot([x - 3, x - 3, x], [trunk[link.depth - 1], row, row], color=plots.PALE, lw=1.2)
+        trunk[link.depth] = row
+        far = (link.moved or 0.0) > FAR
+        box = {"boxstyle": "round,pad=0.35", "facecolor": "#f5f7fa", "edgecolor": "#777777"}
+        if far:
+            box |= {"edgecolor": plots.BEFORE, "linewidth": 1.6}
+        ax.text(x, row, link.name, va="center", weight="bold", bbox=box)
+        _estimate(ax, row, link, far)
+    return figure
+
+
+def _estimate(ax: Axes, row: int, link: Link, far: bool) -> None:
+    if link.found is None or np.isnan(link.found.estimate).any():
+        ax.text(47, row, link.what, va="center", style="italic", color="#555555")
+        if link.found is not None:
+            sizes = (1e3 * np.linalg.norm(link.found.sigma[part]) for part in (SHIFT, TURN))
+            text = "known to {:.2f} mm, {:.2f} mrad".format(*sizes)
+            ax.text(84, row, text, va="center", fontsize=8, ha="left", color="#555555")
+        return
+    for x, part in ((47, SHIFT), (66, TURN)):
+        length, sigma = _length(link.found.estimate[part], link.found.sigma[part])
+        ax.text(x, row, f"{length:.2f} ± {sigma:.2f}", va="center")
+    if link.moved is not None:
+        ax.plot([84, 84 + min(link.moved, 8.0)], [row, row], lw=7, solid_capstyle="butt",
+                color=plots.BEFORE if far else plots.AFTER)  # fmt: skip
+        ax.text(85 + min(link.moved, 8.0), row, f"{link.moved:.1f}", va="center")
+
+
+def _length(vector: np.ndarray, sigma: np.ndarray) -> tuple[float, float]:
+    """Length of a vector and its sigma along itself, in thousandths."""
+    length = float(np.linalg.norm(vector))
+    along = vector / length if length > 0 else np.full(3, 1 / np.sqrt(3))
+    return 1e3 * length, 1e3 * float(np.linalg.norm(along * sigma))
+
+
+def moves(evidence: Evidence) -> Iterator[Chart | Absent]:
+    """Every link's six numbers against CAD."""
+    prior = evidence.prior_sigma
+    rows = []
+    for f in evidence.found:
+        if f.parent is None or np.isnan(f.estimate).any():
+            continue
+        known = np.array([prior.get(f"{f.variable}.{dof}", 0.0) for dof in f.parameters])
+        if known.any():
+            rows.append((f, known))
+    if not rows:
+        yield Absent("moves", "no link was estimated against CAD")
+        return
+    told = sum(int(((f.sigma < 0.5 * known) & (known > 0)).sum()) for f, known in rows)
+    free = sum(int((known > 0).sum()) for _, known in rows)
+    yield Chart(
+        "moves",
+        f"The data halved the uncertainty, or better, of {told} of {free} numbers of the links",
+        "A dot per axis of each link: how far from CAD, in sigmas of CAD, with its 95 % interval. "
+        "The grey band is what CAD allows (95 %). An interval as wide as the band means that the "
+        "data said nothing and the number is CAD's.",
+        lambda: _moves(rows),
+        wide=True,
+    )
+
+
+def _moves(rows: Sequence[tuple[Found, np.ndarray]]) -> Figure:
+    figure, grid = plots.axes(plots.WIDE, 0.8 + 0.5 * len(rows), 1, 2, sharey=True, sharex=True)
+    names, shades = [f.variable for f, _ in rows], (plots.AFTER, plots.LINES[4], plots.FLOOR)
+    for ax, part, what in zip(grid[0], (SHIFT, TURN), ("origin", "axes"), strict=True):
+        ax.axvspan(-1.96, 1.96, color="#eeeeee", zorder=0)
+        ax.axvline(0, color=plots.PALE, linewidth=1)
+        for k, axis in enumerate("xyz"):
+            at = [(r, f.estimate[part][k] / s[part][k], f.sigma[part][k] / s[part][k])
+                  for r, (f, s) in enumerate(rows) if s[part][k] > 0]  # fmt: skip
+            if at:
+                y, z, sigma = np.array(at).T
+                ax.errorbar(z, y + 0.22 * (k - 1), xerr=1.96 * sigma, fmt="o", ms=4, lw=1.2,
+                            color=shades[k], label=axis)  # fmt: skip
+        ax.set_xlabel(f"{what}: moved from CAD, sigmas of CAD")
+    grid[0, 0].set_yticks(range(len(rows)), names)
+    grid[0, 0].set_ylim(len(rows) - 0.5, -0.5)
+    handles, labels = grid[0, 0].get_legend_handles_labels()
+    if handles:
+        figure.legend(handles, labels, loc="outside upper left", ncols=3)
+    return figure
+
+
+def effects(evidence: Evidence) -> Iterator[Chart | Absent]:
+    """Effects of few parameters as dots, of many as curves; per-ring corrections are of these."""
+    drawn = [f for f in evidence.found if f.parent is None and (f.sigma > 0).any()]
+    few = [f for f in drawn if len(f.parameters) <= LISTED]
+    many = [f for f in drawn if len(f.parameters) > LISTED]
+    if few:
+        z = {
+            f"{f.variable}.{p}": abs(e / s)
+            for f in few
+            for p, e, s in zip(f.parameters, f.estimate, f.sigma, strict=True)
+            if s > 0
+        }
+        clear = sum(v > FAR for v in z.values())
+        yield Chart(
+            "effects",
+            f"{clear} of {len(z)} parameters of effects differ clearly from zero; the clearest is "
+            f"{max(z, key=z.get)}",
+            "A panel per effect, a dot per parameter with its 95 % interval. Zero is what paper "
+            "says; instruments are corrected by taking the effect off, geometry by adding it.",
+            lambda: _few(few),
+        )
+    else:
+        yield Absent("effects", "the model has no effect of few parameters")
+    per_ring = [f for f in many if _per_ring(f)]
+    for i, f in enumerate(per_ring, 1):
+        yield _rings_chart(f, "rings" if len(per_ring) == 1 else f"rings-{i}")
+    if not per_ring:
+        yield Absent("rings", "the model has no correction per ring")
+    for i, f in enumerate((f for f in many if not _per_ring(f)), 1):
+        yield _many_chart(f, f"parameters-{i}")
+
+
+def _per_ring(found: Found) -> bool:
+    return all(p.startswith("ring_") for p in found.parameters)
+
+
+def _rings_chart(found: Found, name: str) -> Chart:
+    return Chart(
+        name,
+        f"{found.variable}: rings differ by {_spread(found)}",
+        "The estimate of each ring with its 95 % band. Where the band holds zero, no correction is "
+        "called for; elsewhere take the value off what the ring measures.",
+        lambda: _curve(found, "ring"),
+    )
+
+
+def _many_chart(found: Found, name: str) -> Chart:
+    return Chart(
+        name,
+        f"{found.variable}: its parameters differ by {_spread(found)}",
+        "The estimate of each parameter, in the order of solution.yaml, with its 95 % band; zero "
+        "is what paper says.",
+        lambda: _curve(found, "parameter"),
+        tail=True,
+    )
+
+
+def _spread(found: Found) -> str:
+    scale, unit = shown(found.units[0])
+    values = scale * found.estimate[found.sigma > 0]
+    sigma = scale * np.median(found.sigma[found.sigma > 0])
+    ends = f"from {values.min():+.2f} to {values.max():+.2f}"
+    return f"{values.std():.2f} {unit} rms, {ends}, known to {sigma:.2f}"
+
+
+def _curve(found: Found, along: str) -> Figure:
+    figure, grid = plots.axes(plots.HALF, 2.7)
+    ax, (scale, unit) = grid[0, 0], shown(found.units[0])
+    x = np.arange(len(found.parameters))
+    value, half = scale * found.estimate, 1.96 * scale * found.sigma
+    plots.band(ax, x, value, half, plots.AFTER)
+    ax.plot(x, value, ".-", ms=4, lw=1, color=plots.AFTER)
+    ax.axhline(0, color=plots.PALE, linewidth=1)
+    ax.set_xlabel(along)
+    ax.set_ylabel(f"{found.variable}, {unit}".rstrip(", "))
+    return figure
+
+
+def _few(drawn: Sequence[Found]) -> Figure:
+    count = sum(int((f.sigma > 0).sum()) for f in drawn)
+    heights = [max(1, int((f.sigma > 0).sum())) for f in drawn]
+    figure, grid = plots.axes(
+        plots.HALF, 0.6 * len(drawn) + 0.22 * count, len(drawn), height_ratios=heights
+    )
+    for ax, f in zip(grid[:, 0], drawn, strict=True):
+        free = f.sigma > 0
+        scale = np.array([shown(u)[0] for u in f.units])[free]
+        units = list(dict.fromkeys(shown(u)[1] for u in f.units))
+        names = [p for p, is_free in zip(f.parameters, free, strict=True) if is_free]
+        y = np.arange(len(names))
+        ax.errorbar(scale * f.estimate[free], y, xerr=1.96 * scale * f.sigma[free], fmt="o", ms=4,
+                    color=plots.AFTER)  # fmt: skip
+        ax.axvline(0, color=plots.PALE, linewidth=1)
+        ax.set_yticks(y, names)
+        ax.set_ylim(len(names) - 0.4, -0.6)
+        ax.set_title(f"{f.variable}, {' and '.join(units)}".rstrip(", "))
+    return figure

@@ -1,0 +1,203 @@
+"""What is left of the residuals along every covariate, and over ring and azimuth."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from calib import plots
+from calib.diagnosis.suggest import words
+from calib.report.chart import Absent, Chart
+from calib.report.evidence import FIRST, Evidence
+from calib.report.statistics import Curve, Statistics
+
+if TYPE_CHECKING:
+    from calib.plots import Axes, Figure
+
+NO_BEAMS = "there are no scans, so no residuals of beams"
+FRONT = {*FIRST, "stop", "elapsed_s", "recording"}  # what is not folded away, and temperature
+UNITS = {"_rad": ("deg", 180.0 / np.pi), "_m": ("m", 1.0), "_s": ("min", 1 / 60), "_c": ("°C", 1.0)}
+BY_CHANCE = 0.02  # how seldom so many bins may lie outside their bands by chance
+SELDOM = 0.01  # of the rows: things seen less decide no scale
+MOST_NAMES = 40  # names of things along an axis
+
+
+def curves(evidence: Evidence) -> Iterator[Chart | Absent]:
+    """A chart for each covariate of points and stops."""
+    if not evidence.has_beams:
+        yield Absent("residual-…", NO_BEAMS)
+        return
+    for name, now in evidence.after.curves.items():
+        was = evidence.earlier.curves.get(name)
+        yield Chart(
+            curve_id(name),
+            _title(name, now, was, evidence.before),
+            "Mean of measured less predicted before and now, now alone, and how widely single "
+            "residuals scatter. Bands hold the mean with 95 %, stops and surfaces counted, not "
+            "points; where one holds zero, nothing is left to explain there.",
+            lambda now=now, was=was: _curve(now, was, evidence.before),
+            tail=name not in FRONT and "temperature" not in name,
+        )
+    for name in FIRST:
+        if name not in evidence.after.curves:
+            yield Absent(curve_id(name), f"the recording has no {words(name)}, or only one value")
+
+
+def curve_id(covariate: str) -> str:
+    """The name of a covariate's chart."""
+    return f"residual-{_bare(covariate).replace('.', '-').replace('_', '-')}"
+
+
+def _bare(covariate: str) -> str:
+    for suffix in UNITS:
+        if covariate.endswith(suffix):
+            return covariate.removesuffix(suffix)
+    return covariate
+
+
+def _unit(covariate: str) -> tuple[str, float]:
+    """Unit and factor in which a covariate is shown."""
+    return next((u for suffix, u in UNITS.items() if covariate.endswith(suffix)), ("", 1.0))
+
+
+def spoken(covariate: str) -> str:
+    """A covariate as a title names it."""
+    known = words(covariate)
+    return known if known != covariate else _bare(covariate).replace("_", " ")
+
+
+def outside(curve: Curve) -> tuple[int, int, bool]:
+    """How many bins lie outside their band about zero, of how many; whether chance does not."""
+    from scipy.stats import binom
+
+    known = np.isfinite(curve.band_m)
+    out = int((np.abs(curve.mean_m[known]) > curve.band_m[known]).sum())
+    return out, int(known.sum()), bool(binom.sf(out - 1, known.sum(), 0.05) < BY_CHANCE)
+
+
+def _title(name: str, now: Curve, was: Curve | None, before: str) -> str:
+    out, bins, hangs = outside(now)
+    earlier = ""
+    if was is not None:
+        size_mm = 1e3 * was.rms_m
+        earlier = f"; {before}: {size_mm:.2f} mm rms" if size_mm >= 0.005 else f"; nor {before}"
+    what = spoken(name)
+    if not bins:
+        return f"Of {what} nothing can be said: a single stop and surface"
+    if hangs:
+        return f"What is left hangs on {what}: {1e3 * now.rms_m:.2f} mm rms{earlier}"
+    inside = f"{bins - out} of {bins} bins within their band"
+    return f"No clear trace of {what} is left ({inside}{earlier})"
+
+
+def _curve(now: Curve, was: Curve | None, before: str) -> Figure:
+    figure, grid = plots.axes(plots.HALF, 4.3, 3, sharex=True, height_ratios=(2.0, 2.0, 1.0))
+    top, middle, bottom = grid[:, 0]
+    if was is not None:
+        _draw(top, was, plots.BEFORE, before)
+        _line(bottom, was, was.std_m, plots.BEFORE)
+    _draw(top, now, plots.AFTER, "now")
+    _draw(middle, now, plots.AFTER, None)
+    _line(bottom, now, now.std_m, plots.AFTER)
+    bottom.set_ylim(bottom=0)
+    for ax, label in ((top, "mean, mm"), (middle, "now, mm"), (bottom, "sd, mm")):
+        ax.set_ylabel(label)
+    for ax in (top, middle):
+        ax.axhline(0, color=plots.PALE, linewidth=1, zorder=1)
+    if now.axis.names:
+        for ax, drawn in ((top, [now, was or now]), (middle, [now])):
+            limit = max(map(_reach, drawn))
+            ax.set_ylim(-limit, limit)
+    figure.align_ylabels()
+    _name_bins(bottom, now)
+    figure.legend(loc="outside upper left", ncols=2)
+    return figure
+
+
+def _reach(curve: Curve) -> float:
+    """How far, in mm, means and bands reach of things that are seen often; seldom ones may leave
+    the picture."""
+    often = np.isfinite(curve.mean_m) & (curve.count >= SELDOM * curve.count.sum())
+    return 1.15e3 * float((np.abs(curve.mean_m) + np.nan_to_num(curve.band_m))[often].max())
+
+
+def _x(curve: Curve) -> np.ndarray:
+    if curve.axis.names:
+        return np.arange(curve.axis.bins, dtype=float)
+    return _unit(curve.axis.name)[1] * curve.at
+
+
+def _draw(ax: Axes, curve: Curve, colour: str, label: str | None) -> None:
+    """Means with their bands: a line, or dots where bins are things."""
+    x, mean, half = _x(curve), 1e3 * curve.mean_m, 1e3 * curve.band_m
+    if curve.axis.names:
+        ax.errorbar(x, mean, np.nan_to_num(half), fmt="o", ms=4, lw=1.2, color=colour, label=label)
+        return
+    order = np.argsort(x)
+    order = order[np.isfinite(mean[order])]
+    plots.band(ax, x[order], mean[order], half[order], colour)
+    ax.plot(x[order], mean[order], ".-", ms=4, color=colour, label=label)
+
+
+def _line(ax: Axes, curve: Curve, values_m: np.ndarray, colour: str) -> None:
+    known = np.isfinite(values_m)
+    style = "o" if curve.axis.names else "-"
+    ax.plot(_x(curve)[known], 1e3 * values_m[known], style, ms=4, lw=1.2, color=colour)
+
+
+def _name_bins(ax: Axes, curve: Curve) -> None:
+    unit = _unit(curve.axis.name)[0]
+    ax.set_xlabel(f"{spoken(curve.axis.name)}, {unit}" if unit else spoken(curve.axis.name))
+    names = curve.axis.names
+    if names and len(names) <= MOST_NAMES:
+        ax.set_xticks(range(len(names)), names, rotation=45 if len(names) > 6 else 0,
+                      ha="right" if len(names) > 6 else "center", rotation_mode="anchor",
+                      fontsize=8)  # fmt: skip
+
+
+def ring_map(evidence: Evidence) -> Iterator[Chart | Absent]:
+    """Mean residual over ring and azimuth, before and after."""
+    if not evidence.has_beams:
+        yield Absent("map", NO_BEAMS)
+        return
+    was, now = (_map_mm(s) for s in (evidence.earlier, evidence.after))
+    sizes = [float(np.sqrt(np.nanmean(np.square(m)))) for m in (was, now)]
+    yield Chart(
+        "map",
+        f"Over ring and azimuth the mean residual is {sizes[1]:.2f} mm rms; {evidence.before}: "
+        f"{sizes[0]:.2f} mm",
+        f"Every cell is the mean residual of all stops in one ring and {360 / now.shape[1]:.3g} "
+        "degrees of azimuth: orange reads long, purple short, grey was not seen. Each map has a "
+        "scale of its own. Stripes along a ring are range zeros of rings; stripes across rings "
+        "hang on the encoder, or on what is bolted to the LiDAR.",
+        lambda: _ring_map(was, now, evidence.before),
+        wide=True,
+    )
+
+
+def _map_mm(statistics: Statistics) -> np.ndarray:
+    return 1e3 * statistics.map_m
+
+
+def _ring_map(was: np.ndarray, now: np.ndarray, before: str) -> Figure:
+    figure, grid = plots.axes(plots.WIDE, 3.4, 1, 2, sharey=True)
+    for ax, values, title in zip(grid[0], (was, now), (before, "now"), strict=True):
+        limit = nice(float(np.nanquantile(np.abs(values), 0.98)))
+        picture = plots.signed_map(ax, values, (-180, 180, -0.5, len(values) - 0.5), limit)
+        bar = figure.colorbar(picture, ax=ax, orientation="horizontal", aspect=35, extend="both")
+        bar.set_label("mean residual, mm")
+        ax.set_title(title)
+        ax.set_xlabel("azimuth, deg")
+        ax.set_xticks(range(-180, 181, 90))
+    grid[0, 0].set_ylabel("ring")
+    return figure
+
+
+def nice(value: float) -> float:
+    """The next of 1, 2, 5 times a power of ten."""
+    if not value > 0:
+        return 1.0
+    power = 10.0 ** np.floor(np.log10(value))
+    return float(next(m for m in (1, 2, 5, 10) if m * power >= value * (1 - 1e-9)) * power)

@@ -1,0 +1,254 @@
+"""What a report is made from: runs, recordings, residuals and derivatives, read when asked."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib import problem as problems
+from calib.calibrate import reopened
+from calib.estimates import Found, found
+from calib.fit import Progress, same_mesh, values_of
+from calib.ladder import Rung, ladder
+from calib.model import Model, Source
+from calib.problem import Problem
+from calib.report.budget import Budget, budget
+from calib.report.statistics import AZIMUTHS, BINS, PLACES, Axis, Statistics, Table, gather
+from calib.residuals.scan import ScanStop
+from calib.residuals.table import residual_table, table_path
+from calib.run import DIAGNOSIS, MODEL, RESIDUALS, SUMMARY, Run
+from chains.errors import InputError
+from sensors.recording import read_table
+
+FEW = 4  # bins of a stop's covariate, at least
+SAMPLED = 8  # tables from which the bins of covariates are taken
+# Columns of a table that are no covariate: they name a place, or are what is explained.
+NOT_COVARIATES = {*PLACES, "region", "patch", "column", "residual_m", "sigma_m", "weight"}
+NEEDED = {"ring", "column", "azimuth_rad", "range_m", "incidence_rad"}
+TOLD = {"rms_mm", "misfit", "converged", "residual", "stops", "points"}  # of a summary
+NEEDED |= {"residual_m", "sigma_m", "weight"}
+FIRST = ("incidence_rad", "range_m", "ring", "azimuth_rad", "elevation_rad", "intensity", "label")
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """A run, the rungs below it, and all that a report may ask of them.
+
+    Args:
+        rungs: of the ladder, or the runs given where none grew from another; the last is reported.
+        sources: the recordings of that one.
+        progress: called with what is being done, and how far it is.
+    """
+
+    rungs: Sequence[Rung]
+    sources: Sequence[Source]
+    progress: Progress = field(repr=False)
+
+    @classmethod
+    def of(
+        cls, runs: Sequence[Run], progress: Progress = lambda what, done, total: None
+    ) -> Evidence:
+        """Read what runs are about.
+
+        Raises:
+            InputError: a recording is not where or what it was.
+        """
+        climbed = ladder(runs)
+        for run in runs:
+            _check(run)
+        known = {rung.run.folder for rung in climbed}
+        rungs = [*(Rung(run, None) for run in runs if run.folder not in known), *climbed]
+        last = rungs[-1].run
+        return cls(rungs, [reopened(r, last) for r in last.model["recordings"]], progress)
+
+    @property
+    def run(self) -> Run:
+        """The run that is reported."""
+        return self.rungs[-1].run
+
+    @property
+    def below(self) -> Run | None:
+        """The run that it is compared with."""
+        return self.rungs[-1].below or (self.rungs[-2].run if len(self.rungs) > 1 else None)
+
+    @property
+    def before(self) -> str:
+        """What the residuals before are those of."""
+        return f"before, {folder_name(self.below.folder)}" if self.below else "before, as in CAD"
+
+    @cached_property
+    def diagnosis(self) -> Mapping[str, Any] | None:
+        """diagnosis.json; None where the run has not been diagnosed."""
+        import json
+
+        path = self.run.folder / DIAGNOSIS
+        if not path.is_file():
+            return None
+        try:
+            read = json.loads(path.read_text(encoding="utf-8"))
+            read["verdict"], read["sentences"], read["candidates"], read["weak_directions"]
+            return read
+        except (ValueError, KeyError, TypeError):
+            raise InputError(
+                f"{path} is no diagnosis of this version; diagnose the run again with "
+                f"'rigcal diagnose {self.run.folder}'"
+            ) from None
+
+    @cached_property
+    def found(self) -> list[Found]:
+        """Links and effects of the run, as plain rows."""
+        return found(self.run)
+
+    @cached_property
+    def problem(self) -> Problem:
+        """The run's variables, blocks and scans."""
+        return problems.build(self.sources, Model.read(self.run.model, self.run.folder / MODEL))
+
+    @cached_property
+    def values(self) -> dict[str, np.ndarray]:
+        """The state in which the fit was left."""
+        return values_of(self.problem, self.run.state())
+
+    @cached_property
+    def prior_sigma(self) -> dict[str, float]:
+        """``variable.parameter`` of the calibration -> how sure CAD was of it, rad or m."""
+        variables = (self.problem.variables[name] for name in self.problem.calibration)
+        return {
+            f"{v.name}.{dof}": float(s)
+            for v in variables
+            for dof, s in zip(v.dofs, v.sigma, strict=True)
+        }
+
+    @cached_property
+    def budget(self) -> Budget:
+        """What each link and effect contributes."""
+        return budget(self.problem, self.values, self.run.solution, self.progress)
+
+    # ----------------------------------------------------------------------------------- residuals
+
+    @cached_property
+    def has_beams(self) -> bool:
+        """Whether there are scans, and so residuals of beams."""
+        return self.run.summary["residual"] == "range"
+
+    @cached_property
+    def axes(self) -> list[Axis]:
+        """The covariates of points and stops, those of the catalogue first, cut into bins."""
+        scans = self.problem.scans
+        chosen = np.unique(np.linspace(0, len(scans) - 1, SAMPLED).round().astype(int))
+        sample: dict[str, list[np.ndarray]] = {}
+        for i in chosen.tolist():
+            for name, column in self._columns(self.run, scans[i]).items():
+                if name not in NOT_COVARIATES - {"label"}:
+                    sample.setdefault(name, []).append(column)
+        points = {name: np.concatenate(parts) for name, parts in sample.items()}
+        stops = [self._stop(scan, k) for k, scan in enumerate(scans)]
+        per_stop = {n: np.array([s.get(n, np.nan) for s in stops]) for s in stops for n in s}
+        names = dict.fromkeys([*(n for n in FIRST if n in points), "stop", *per_stop, *points])
+        wanted = (self._axis(n, points[n] if n in points else per_stop[n]) for n in names)
+        return [axis for axis in wanted if len(axis.edges)]
+
+    def _axis(self, name: str, values: np.ndarray) -> Axis:
+        if name == "ring":
+            return Axis.of_things(name, range(self.rings))
+        if name == "stop":
+            several, scans = len(self.sources) > 1, self.problem.scans
+            names = [f"{s.stops.rig.name}.{s.name}" if several else s.name for s in scans]
+            return Axis.of_things(name, range(len(names)), names)
+        if name == "recording":
+            names = [s.rig.name for s in self.sources]
+            return Axis.of_things(name, range(len(names)), names)
+        if name == "label":
+            known = {n: text for s in self.sources for n, text in s.rig.labels.items()}
+            numbers = sorted({*known, *np.unique(values).astype(int).tolist()})
+            return Axis.of_things(name, numbers, [known.get(n, str(n)) for n in numbers])
+        if len(values) == len(self.problem.scans):  # a value per stop: several stops in each bin
+            return Axis.of_values(name, values, min(BINS, max(FEW, len(values) // 3)))
+        return Axis.of_values(name, values)
+
+    @property
+    def rings(self) -> int:
+        """How many rings the LiDARs have at most."""
+        return max(scan.lidar.rings for scan in self.problem.scans)
+
+    @cached_property
+    def azimuths(self) -> int:
+        """In how many parts of a turn beams can be told apart on a map."""
+        columns = self._columns(self.run, self.problem.scans[0])["column"]
+        return int(min(AZIMUTHS, len(np.unique(columns))))
+
+    @cached_property
+    def after(self) -> Statistics:
+        """The residuals of the run."""
+        return gather(self._tables(self.run, "residuals"), self.axes, self.rings, self.azimuths)
+
+    @cached_property
+    def earlier(self) -> Statistics:
+        """The residuals of the run below, or where there is none with everything as in CAD."""
+        what = "residuals before"
+        return gather(self._tables(self.below, what), self.axes, self.rings, self.azimuths)
+
+    def _tables(self, run: Run | None, what: str) -> Iterator[Table]:
+        meshes = [source.reference for source in self.sources]
+        rooms = [next(i for i, m in enumerate(meshes) if same_mesh(m, mesh)) for mesh in meshes]
+        scans = self.problem.scans
+        for k, scan in enumerate(scans):
+            self.progress(what, k, len(scans))
+            yield Table(
+                self._columns(run, scan),
+                self._stop(scan, k),
+                rooms[self._source(scan)],
+                scan.lidar.sigma_angle_rad,
+                scan.reference_sigma_m,
+            )
+
+    def _columns(self, run: Run | None, scan: ScanStop) -> dict[str, np.ndarray]:
+        """The residuals of a stop: as a run left them, or with everything as in CAD."""
+        if run is None:
+            return residual_table(scan.rows(self.problem.initial))
+        path = table_path(run.folder / RESIDUALS, scan, self.sources)
+        if not path.is_file():
+            raise InputError(f"{path} is missing; the run is incomplete, fit it again")
+        columns = read_table(path)
+        lacking = NEEDED - columns.keys()
+        if lacking:
+            raise InputError(
+                f"{path} has no column {min(lacking)}: written by another version of rigcal, or "
+                f"edited; fit the run again"
+            )
+        return columns
+
+    def _source(self, scan: ScanStop) -> int:
+        return next(i for i, s in enumerate(self.sources) if s.recording is scan.recording)
+
+    def _stop(self, scan: ScanStop, number: int) -> dict[str, float]:
+        """Covariates of a stop: when, where and how it was, and what its recording says of it."""
+        source = self.sources[self._source(scan)]
+        out = {"stop": float(number)}
+        if len(self.sources) > 1:
+            out["recording"] = float(self._source(scan))
+        for name, column in source.columns.items():
+            told = name in source.recording.covariates or name == "elapsed_s"
+            if (told or name in source.rig.joint_names) and np.ndim(column) == 1:
+                out[name] = float(column[scan.index])
+        return out
+
+
+def _check(run: Run) -> None:
+    """A run of another version may lack what a report tells."""
+    lacking = sorted(TOLD - run.summary.keys())
+    if lacking:
+        raise InputError(
+            f"{run.folder / SUMMARY} has no '{lacking[0]}': written by another version of rigcal, "
+            f"or edited; fit the run again"
+        )
+
+
+def folder_name(path: Path) -> str:
+    """A run's name as people see it."""
+    return path.name or str(path)

@@ -1,0 +1,186 @@
+"""The page: one HTML file with all in it; charts inline, nothing to fetch."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from calib.diagnosis.search import ALPHA
+from calib.effects import CATALOGUE
+from calib.report.chart import Absent, Chart
+from calib.report.charts.fit import error_mm
+from calib.report.evidence import Evidence, folder_name
+from calib.report.verdict import Verdict
+from calib.tables import chance, effect_page, estimate_cell, mm, shown
+
+LEADING = 8  # candidates whose evidence is told
+LISTED = 12  # weak directions that are told
+
+
+@dataclass(frozen=True)
+class Section:
+    """A heading and its charts, each with its SVG."""
+
+    title: str
+    charts: Sequence[tuple[Chart, str]]
+
+    @property
+    def id(self) -> str:
+        return self.title.lower().replace(" ", "-")
+
+    @property
+    def shown(self) -> list[tuple[Chart, str]]:
+        return [pair for pair in self.charts if not pair[0].tail]
+
+    @property
+    def folded(self) -> list[tuple[Chart, str]]:
+        return [pair for pair in self.charts if pair[0].tail]
+
+
+def render(
+    evidence: Evidence, verdict: Verdict, sections: Sequence[Section], absent: Sequence[Absent]
+) -> str:
+    """The page as HTML text; every text of the run is escaped.
+
+    Args:
+        evidence: the run.
+        verdict: on it.
+        sections: the charts.
+        absent: figures that the run does not have.
+    """
+    import jinja2
+
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=jinja2.StrictUndefined,
+    )
+    return environment.get_template("page.html.j2").render(
+        run=evidence.run,
+        name=folder_name(evidence.run.folder),
+        verdict=verdict,
+        numbers=_numbers(evidence),
+        sections=sections,
+        absent=absent,
+        diagnosis=evidence.diagnosis,
+        candidates=_candidates(evidence),
+        detectable=_detectable(evidence),
+        weak=_weak(evidence),
+        untold=_untold(evidence),
+        links=evidence.run.summary.get("links"),
+        provenance=_provenance(evidence),
+    )
+
+
+def _numbers(evidence: Evidence) -> list[tuple[str, str]]:
+    """The few numbers that one looks for first: a value, and what it is."""
+    summary, (kind, error) = evidence.run.summary, error_mm(evidence.rungs[-1])
+    rms = summary["rms_mm"]
+    told = {
+        "held-out": "rms error of stops that the fit never saw",
+        "fit": "rms error of the fit; none held out",
+    }
+    out = [
+        (f"{error:.2f} mm", told[kind]),
+        (f"{rms['noise_floor']:.2f} mm", "noise floor, if the model were right"),
+        (f"{rms['nominal']:.1f} mm", "before, with everything as in CAD"),
+        (f"{summary['stops']}", "stops"),
+    ]
+    if summary["points"]:
+        out.append((f"{summary['points']:,}".replace(",", " "), "points fitted"))
+    return out
+
+
+def _candidates(evidence: Evidence) -> list[dict[str, str]]:
+    """Candidates that are confirmed, or beyond chance, each with its evidence in words."""
+    about = {effect.family: effect_page(effect)["what"] for effect in CATALOGUE}
+    found = evidence.diagnosis["candidates"] if evidence.diagnosis else []
+    return [
+        {
+            "name": c["add"],
+            "what": about.get(c["effect"], ""),
+            "confirmed": bool(c["step"]) and not c["dressed_up"],
+            "told": "; ".join(_told(c)),
+        }
+        for c in [c for c in found if c["step"] or c["p_adjusted"] < ALPHA][:LEADING]
+    ]
+
+
+def _told(candidate: dict[str, Any]) -> list[str]:
+    out = [f"{chance(candidate['p_adjusted'])} after all that was looked at"]
+    if candidate["unabsorbed_rms_mm"] is not None:
+        out.append(
+            f"would explain {mm(candidate['unabsorbed_rms_mm'])} mm rms that the model cannot take "
+            f"on, of {mm(candidate['rms_mm'])} mm that it does"
+        )
+    before, after = (candidate["held_out_rms_mm"][k] for k in ("before", "after"))
+    if before is not None and after is not None:
+        out.append(f"the held-out error goes from {before:.2f} to {after:.2f} mm with it")
+    parameters = candidate["parameters"]
+    if len(parameters["names"]) == 1:
+        unit = parameters["unit"]
+        cell = estimate_cell(parameters["estimate"][0], parameters["sigma"][0], unit)
+        out.append(f"its size would be {cell} {shown(unit)[1]}".rstrip())
+    if candidate["dressed_up"]:
+        out.append("bins without a name explain more, so it is not to be believed")
+    for rival in candidate["rivals"]:
+        out.append(f"this data cannot tell it from {rival['effect']}, {rival['separate']} would")
+    return out
+
+
+def _detectable(evidence: Evidence) -> list[tuple[str, str]]:
+    """Effects that were tested and not confirmed, and the size from which each would have been."""
+    out = []
+    for c in sorted((evidence.diagnosis or {}).get("candidates", ()), key=lambda c: c["effect"]):
+        size, units = c["smallest_detectable"], set(c["parameters"]["unit"].split(", "))
+        if not c["step"] and size is not None and len(units) == 1:
+            scale, unit = shown(*units)
+            out.append((c["effect"], f"{scale * size:.2g} {unit}".rstrip()))
+    return out
+
+
+def _weak(evidence: Evidence) -> list[tuple[str, str, str]]:
+    """What the data hardly tell: names, how much they may be off, what would determine them."""
+    found = evidence.diagnosis["weak_directions"] if evidence.diagnosis else []
+    return [
+        (
+            " and ".join(w["parameters"]),
+            "" if w["sigma_mm"] is None else f"± {w['sigma_mm']:.2f} mm",
+            w["needs"],
+        )
+        for w in found[:LISTED]
+    ]
+
+
+def _untold(evidence: Evidence) -> list[tuple[str, list[str]]]:
+    """Why things were not estimated or tested, and what; those with one reason together."""
+    reasons: dict[str, list[str]] = {}
+    for entry in evidence.run.solution.not_estimated:
+        tied, colon, why = entry["why"].partition(": ")
+        name = f"{entry['name']}, {tied}" if colon else entry["name"]
+        reasons.setdefault(why if colon else tied, []).append(name)
+    for name, why in (evidence.diagnosis or {}).get("untestable", {}).items():
+        reasons.setdefault(f"not tested: {why}", []).append(name)
+    return list(reasons.items())
+
+
+def _provenance(evidence: Evidence) -> list[tuple[str, str]]:
+    model = evidence.run.model
+    out = [("run", str(evidence.run.folder))]
+    out += [
+        ("recording", f"{r['path']} ({r['rig']}), SHA-256 {r['sha256']}")
+        for r in model["recordings"]
+    ]
+    out += [
+        ("model", ", ".join(evidence.run.effects) or "no effects"),
+        ("held fixed", ", ".join(model["fixed"]) or "nothing but what CAD has exact"),
+        ("held out", f"{model['hold_out']}, {model['folds']} fold(s)"),
+        ("made with", ", ".join(f"{n} {v}" for n, v in model["versions"].items())),
+        ("written", datetime.datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z")),
+    ]
+    return out

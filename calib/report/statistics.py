@@ -1,0 +1,246 @@
+"""What the residuals of a run do along every covariate: exact sums over all rows, stop by stop.
+
+No more than one stop is in memory. The band of a mean counts clusters, not rows: rows of one stop,
+and rows on one surface, err together. With the weighted residuals about the mean summed within each
+cluster, s_c, the variance of the mean is the two-way one of Cameron, Gelbach and Miller (2011),
+``(sum over stops s^2 + over surfaces s^2 - over stop x surface s^2) / W^2``, never less than any of
+the three alone, each with its ``G / (G - 1)`` for G clusters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+CONFIDENCE = 0.95
+BINS, AZIMUTHS = 30, 180  # at most
+Z_EDGES = np.linspace(-5.0, 5.0, 101)
+PLACES = ("surface", "plane", "label")
+
+
+@dataclass(frozen=True)
+class Axis:
+    """A covariate cut into bins.
+
+    Args:
+        name: column.
+        edges: (B - 1,) ascending values between the bins; the first and last bin are open.
+        names: of the bins, where each stands for one thing; else empty.
+    """
+
+    name: str
+    edges: np.ndarray
+    names: tuple[str, ...] = ()
+
+    @classmethod
+    def of_values(cls, name: str, values: np.ndarray, bins: int = BINS) -> Axis:
+        """Bins of about equal count; a bin for each value where they are few."""
+        values = values[np.isfinite(values)]
+        distinct = np.unique(values)
+        if len(distinct) <= bins:
+            return cls(name, (distinct[1:] + distinct[:-1]) / 2)
+        return cls(name, np.unique(np.quantile(values, np.arange(1, bins) / bins)))
+
+    @classmethod
+    def of_things(cls, name: str, numbers: Sequence[int], names: Sequence[str] = ()) -> Axis:
+        """A bin for each of some ascending whole numbers."""
+        numbers = np.asarray(numbers, float)
+        return cls(name, (numbers[1:] + numbers[:-1]) / 2, tuple(names))
+
+    @property
+    def bins(self) -> int:
+        return len(self.edges) + 1
+
+
+@dataclass(frozen=True)
+class Table:
+    """The residuals of one stop.
+
+    Args:
+        columns: (N,) per point, as `residual_table` has them.
+        stop: covariate -> the stop's value.
+        room: number of the mesh that its beams met; surfaces are counted within it.
+        sigma_angle_rad, sigma_reference_m: of the stop's LiDAR and mesh.
+    """
+
+    columns: Mapping[str, np.ndarray]
+    stop: Mapping[str, float]
+    room: int = 0
+    sigma_angle_rad: float = 0.0
+    sigma_reference_m: float = 0.0
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Residuals by the bins (B,) of a covariate: robustly weighted mean and spread.
+
+    Args:
+        axis: the bins.
+        count: rows that the fit did not throw out.
+        at: mean of the covariate.
+        mean_m, std_m: of the residual; NaN in an empty bin.
+        band_m: half the width of the 95 % band of the mean, NaN where a bin has one cluster.
+    """
+
+    axis: Axis
+    count: np.ndarray
+    at: np.ndarray
+    mean_m: np.ndarray
+    std_m: np.ndarray
+    band_m: np.ndarray
+
+    @property
+    def rms_m(self) -> float:
+        """How much of the residual hangs on this covariate: rms over rows of the bins' means, what
+        their bands would give by chance taken off."""
+        known = np.isfinite(self.mean_m) & np.isfinite(self.band_m)
+        if not known.any():
+            return 0.0
+        chance = np.square(self.band_m[known] / 1.96)
+        square = np.average(np.square(self.mean_m[known]) - chance, weights=self.count[known])
+        return float(np.sqrt(max(square, 0.0)))
+
+
+class _Sums:
+    """Sums over the rows of each bin of one axis, and over clusters of them."""
+
+    def __init__(self, axis: Axis) -> None:
+        self.axis = axis
+        self.rows = np.zeros((5, axis.bins))  # count, weight, w r, w r^2, covariate
+        self.by_stop = np.zeros((4, axis.bins))  # clusters, W^2, W R, R^2
+        self.by_both = np.zeros((4, axis.bins))
+        self.places = np.zeros((2, axis.bins, 0))  # W, R of each place
+
+    def add(
+        self, x: np.ndarray, residual: np.ndarray, weight: np.ndarray, place: np.ndarray
+    ) -> None:
+        """Take in one stop's rows; `place` numbers its surfaces among those of all stops."""
+        known = np.isfinite(x)
+        if not known.all():
+            x, residual, weight, place = (v[known] for v in (x, residual, weight, place))
+        bins = self.axis.bins
+        b = np.searchsorted(self.axis.edges, x)
+        wr = weight * residual
+        each = (None, weight, wr, wr * residual, x)
+        self.rows += [np.bincount(b, values, bins) for values in each]
+        theirs, local = np.unique(place, return_inverse=True)
+        flat, size = b * len(theirs) + local, bins * len(theirs)
+        sums = np.stack([np.bincount(flat, v, size).reshape(bins, -1) for v in (weight, wr)])
+        self.by_both += _squares(sums)
+        self.by_stop += _squares(sums.sum(axis=2, keepdims=True))
+        missing = int(theirs.max(initial=-1)) + 1 - self.places.shape[2]
+        if missing > 0:
+            self.places = np.pad(self.places, ((0, 0), (0, 0), (0, missing)))
+        self.places[:, :, theirs] += sums
+
+    def curve(self) -> Curve:
+        """What the sums say."""
+        count, weight, total, squares, x = self.rows
+        with np.errstate(invalid="ignore", divide="ignore"):
+            mean, at = total / weight, x / count
+            std = np.sqrt(np.maximum(squares / weight - mean**2, 0.0))
+            band = self._band(mean, weight)
+        return Curve(self.axis, count.astype(int), at, mean, std, band)
+
+    def _band(self, mean: np.ndarray, weight: np.ndarray) -> np.ndarray:
+        from scipy.stats import t
+
+        clusters = [self.by_stop, _squares(self.places), self.by_both]
+        stop, place, both = (
+            np.maximum(ww * mean**2 - 2 * wr * mean + rr, 0.0) * np.where(g > 1, g / (g - 1), 0.0)
+            for g, ww, wr, rr in clusters
+        )
+        variance = np.maximum.reduce([stop + place - both, stop, place, both])
+        few = np.minimum(*(np.where(g > 1, g, np.inf) for g in (clusters[0][0], clusters[1][0])))
+        many = np.where(np.isfinite(few), few, clusters[2][0])
+        half = t.ppf(0.5 + CONFIDENCE / 2, np.maximum(many - 1, 1)) * np.sqrt(variance) / weight
+        return np.where(many > 1, half, np.nan)
+
+
+def _squares(sums: np.ndarray) -> np.ndarray:
+    """(4, B) how many clusters have rows, and W^2, W R, R^2 added up, of (2, B, C) W and R."""
+    weight, total = sums
+    parts = ((weight > 0).astype(float), weight * weight, weight * total, total * total)
+    return np.stack([part.sum(axis=1) for part in parts])
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """What the residuals of a run do.
+
+    Args:
+        curves: covariate -> its curve.
+        map_m: (rings, azimuths) mean residual, azimuth from -pi to pi; NaN where no beam went.
+        z: (100,) how many rows have so many sigmas, in the bins of `Z_EDGES`.
+        rows, kept: how many rows there are, and how many the fit did not throw out.
+        variance_m2: what a row's sigma is made of: range noise, angle noise, reference.
+    """
+
+    curves: Mapping[str, Curve]
+    map_m: np.ndarray
+    z: np.ndarray
+    rows: int
+    kept: int
+    variance_m2: Mapping[str, float]
+
+
+def gather(
+    tables: Iterable[Table], axes: Iterable[Axis], rings: int, azimuths: int = AZIMUTHS
+) -> Statistics:
+    """One pass over the residuals of a run.
+
+    Args:
+        tables: its stops.
+        axes: the covariates to look at; one that a table lacks gets nothing from it.
+        rings: how many rings the LiDARs have at most.
+        azimuths: how many parts of a turn the map has.
+    """
+    sums, places = [_Sums(axis) for axis in axes], {}
+    cells = np.zeros((2, rings * azimuths))
+    z, counts, variance = np.zeros(len(Z_EDGES) - 1), np.zeros(2, int), np.zeros(3)
+    for table in tables:
+        kept = table.columns["weight"] > 0
+        counts += len(kept), int(kept.sum())
+        columns = {name: column[kept] for name, column in table.columns.items()}
+        residual, weight = (columns[n].astype(float) for n in ("residual_m", "weight"))
+        place = _numbered(columns, table.room, places)
+        for each in sums:
+            x = columns.get(each.axis.name, table.stop.get(each.axis.name))
+            if x is not None:
+                x = np.broadcast_to(np.asarray(x, float), residual.shape)
+                each.add(x, residual, weight, place)
+        turn = ((columns["azimuth_rad"] / (2 * np.pi) + 0.5) * azimuths).astype(int)
+        cell = columns["ring"] * azimuths + np.clip(turn, 0, azimuths - 1)
+        cells += [np.bincount(cell, v, rings * azimuths) for v in (weight, weight * residual)]
+        z += np.histogram(residual / columns["sigma_m"], Z_EDGES)[0]
+        variance += _variance(columns, table)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        shown = (cells[1] / cells[0]).reshape(rings, azimuths)
+    parts = dict(zip(("range noise", "angle noise", "reference"), variance, strict=True))
+    return Statistics(
+        {s.axis.name: s.curve() for s in sums if s.rows[0].any()},
+        shown,
+        z,
+        *map(int, counts),
+        {name: value / max(counts[1], 1) for name, value in parts.items()},
+    )
+
+
+def _numbered(columns: Mapping[str, np.ndarray], room: int, among: dict[Any, int]) -> np.ndarray:
+    """(N,) which place each row looks at, numbered among those of all stops."""
+    kind = next(name for name in PLACES if name in columns)
+    found, local = np.unique(columns[kind], return_inverse=True)
+    numbers = [among.setdefault((room, p), len(among)) for p in found.tolist()]
+    return np.array(numbers, int)[local]
+
+
+def _variance(columns: Mapping[str, np.ndarray], table: Table) -> np.ndarray:
+    """Sums of (noise, angle, reference) variances m2, as the rows' sigmas hold them."""
+    incidence = columns["incidence_rad"].astype(float)
+    angle = np.square(table.sigma_angle_rad * columns["range_m"] * np.tan(incidence)).sum()
+    reference = np.square(table.sigma_reference_m / np.cos(incidence)).sum()
+    whole = np.square(columns["sigma_m"].astype(float)).sum()
+    return np.array([max(whole - angle - reference, 0.0), angle, reference])

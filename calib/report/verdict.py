@@ -1,0 +1,101 @@
+"""The verdict: a light, and in words why it shows what it shows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from calib.calibrate import TOLERATED
+from calib.run import Run
+
+NEAR = 1.25  # times the noise floor: a held-out error as good as it
+FAR = 3.0  # times its sigmas, or the floor: residuals that something large is behind
+MEANING = {"green": "use it", "amber": "use it with care", "red": "do not use it yet"}
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What a run is worth.
+
+    Args:
+        light: "green", "amber" or "red".
+        sentence: the verdict.
+        reasons: why the light is not green, or that nothing speaks against it.
+    """
+
+    light: str
+    sentence: str
+    reasons: tuple[str, ...]
+
+    @property
+    def meaning(self) -> str:
+        """What the light asks of the reader."""
+        return MEANING[self.light]
+
+
+def judge(run: Run, diagnosis: Mapping[str, Any] | None) -> Verdict:
+    """The verdict on a run.
+
+    Red where an effect is known to be missing, or residuals are several times larger than their
+    sigmas or than the noise floor allow; amber where that has not been looked at, or something is
+    weak or unexplained; green where the model is adequate, stops that the fit never saw are as well
+    predicted as noise allows, and nothing that the data left open is several times larger than
+    that noise.
+    """
+    red, amber = list(_wrong(run, diagnosis)), list(_doubtful(run, diagnosis))
+    light = "red" if red else "amber" if amber else "green"
+    sentence = diagnosis["sentences"][0] if diagnosis else _undiagnosed(run)
+    fine = "no effect is missing, and stops that it never saw are predicted as well as noise allows"
+    return Verdict(light, sentence, tuple(red + amber) or (fine,))
+
+
+def _undiagnosed(run: Run) -> str:
+    rms = run.summary["rms_mm"]
+    told = f"its residuals are {rms['fit']:.2f} mm, and no stops were held out"
+    if rms.get("held_out") is not None:
+        told = f"stops that it never saw are off by {rms['held_out']:.2f} mm"
+    floor = f"noise is {rms['noise_floor']:.2f} mm"
+    return f"Nobody has asked yet what this model lacks: {told}; {floor}."
+
+
+def _wrong(run: Run, diagnosis: Mapping[str, Any] | None) -> Iterator[str]:
+    if diagnosis and diagnosis["verdict"] == "missing_effect":
+        yield "an effect is missing that is worth adding"
+    if not run.summary["converged"]:
+        yield "the fit has not converged"
+    for kind, times in run.summary["misfit"].items():
+        if times > FAR:
+            yield _misfit(kind, times)
+    if (times := _over_floor(run)) > FAR:
+        yield f"the held-out error is {times:.1f} times the noise floor"
+
+
+def _doubtful(run: Run, diagnosis: Mapping[str, Any] | None) -> Iterator[str]:
+    rms = run.summary["rms_mm"]
+    if diagnosis is None:
+        yield f"not diagnosed; 'rigcal diagnose {run.folder}' asks what is missing"
+    elif diagnosis["verdict"] == "unexplained_structure":
+        yield "there is structure that no known effect explains"
+    if rms.get("held_out") is None:
+        yield "no stops were held out, so nothing says how well it predicts"
+    if NEAR < (times := _over_floor(run)) <= FAR:
+        yield f"the held-out error is {times:.1f} times the noise floor"
+    for kind, times in run.summary["misfit"].items():
+        if TOLERATED < times <= FAR:
+            yield _misfit(kind, times)
+    for weak in (diagnosis or {}).get("weak_directions", ()):
+        if (weak["sigma_mm"] or 0.0) > FAR * rms["noise_floor"]:
+            names = " and ".join(weak["parameters"])
+            yield f"{names} may still be off by {weak['sigma_mm']:.1f} mm (one sigma)"
+
+
+def _misfit(kind: str, times: float) -> str:
+    what = "errors of the reference" if kind == "reference" else f"residuals of {kind}"
+    return f"the {what} are {times:.1f} times larger than their sigmas allow"
+
+
+def _over_floor(run: Run) -> float:
+    """The held-out error in noise floors; 0 where nothing was held out."""
+    rms = run.summary["rms_mm"]
+    return (rms.get("held_out") or 0.0) / rms["noise_floor"]

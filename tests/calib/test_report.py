@@ -1,0 +1,332 @@
+"""The report of a run and its single figures: what they say, and that a browser shows them."""
+
+import json
+import re
+import shutil
+import sys
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from calib.calibrate import calibrate, grow, grown_model
+from calib.cli import main
+from calib.diagnosis import diagnose
+from calib.report import Evidence, charts_of, plot, report
+from calib.report.budget import beam_jacobian, budget
+from calib.report.statistics import Z_EDGES
+from calib.run import RESIDUALS, SUMMARY, Run, Solution
+from calib.simulate import Spec, simulate
+from chains.errors import InputError
+from sensors.documents import write_json
+from sensors.recording import read_table, write_table
+
+from ..browser import browser_page
+from .rigs import retract
+
+SMALL = Spec(
+    lidar="hesai_pandarxt32", room="box", locations=3, stops_per_location=2, column_step=200
+)
+ALWAYS = ("ladder", "chain", "moves", "effects", "budget", "tracker", "correlation")
+OF_BEAMS = (
+    *("variance", "scatter", "rings", "map", "targets", "findings"),
+    *(f"residual-{c}" for c in ("incidence", "range", "ring", "azimuth", "elevation", "intensity")),
+    *(f"residual-{c}" for c in ("label", "stop", "elapsed", "temperature", "humidity", "near-ir")),
+)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """A recording with an effect hidden in it, a run without and, grown from it, one with it.
+
+    The runs' names are such as HTML and mathematical text would take for something else.
+    """
+    folder = tmp_path_factory.mktemp("report")
+    simulate(SMALL, folder / "rec", 1, {"incidence_angle_bias": 3.0})
+    for path in (folder / "rec" / "scans").iterdir():
+        columns = read_table(path)
+        write_table(path, columns | {"near_ir": columns["x"] ** 2})  # a column of its maker's own
+    first = calibrate([folder / "rec"], folder / "<b>first & $x^2$")
+    diagnose(first, refits=False)
+    grow(first, grown_model(first, ["incidence_angle_bias"]), folder / "grown")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def runs(folder) -> tuple[Run, Run]:
+    """The run that lacks the effect, and the one that has it."""
+    return Run.open(folder / "<b>first & $x^2$"), Run.open(folder / "grown")
+
+
+@pytest.fixture(scope="module")
+def first(runs) -> Evidence:
+    return Evidence.of([runs[0]])
+
+
+@pytest.fixture(scope="module")
+def grown(runs) -> Evidence:
+    return Evidence.of([runs[1]])
+
+
+@pytest.fixture(scope="module")
+def pages(folder, runs):
+    """Both runs' reports as written."""
+    return report([runs[0]], folder / "first.html"), report([runs[1]], folder / "grown.html")
+
+
+@pytest.fixture(scope="module", params=[1400, 700])
+def window(request):
+    """A browser of one of two widths."""
+    with browser_page(request.param, 900) as watched:
+        yield watched
+
+
+@pytest.fixture
+def shown(pages, window):
+    """The first run's page in that."""
+    window.page.goto(pages[0].file.as_uri())
+    yield window
+    window.page.emulate_media(media="screen")
+
+
+# ------------------------------------------------------------------------------------- the browser
+
+
+def test_a_browser_shows_every_chart_and_asks_nobody_for_anything(pages, shown):
+    page, ids = shown.page, [chart.id for chart in pages[0].contents.charts]
+    assert {*ALWAYS, *OF_BEAMS} <= set(ids)
+    found = page.eval_on_selector_all("figure", "all => all.map(f => f.id)")
+    assert found == sorted(found, key=found.index) and sorted(found) == sorted(ids)
+    page.evaluate("document.querySelectorAll('details').forEach(d => d.open = true)")
+    for chart in pages[0].contents.charts:
+        figure = page.locator(f"figure[id='{chart.id}']")
+        assert figure.locator("h4").inner_text() == chart.title
+        assert chart.reading in figure.locator("figcaption").inner_text()
+        box = figure.locator("svg").bounding_box()
+        assert box["width"] > 300 and box["height"] > 80, chart.id
+    shown.assert_clean()
+
+
+def test_nothing_is_wider_than_the_window(shown):
+    page = shown.page
+    page.evaluate("document.querySelectorAll('details').forEach(d => d.open = true)")
+    assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
+
+
+def test_no_two_parts_of_the_page_have_one_id(shown):
+    ids = shown.page.eval_on_selector_all("[id]", "all => all.map(e => e.id)")
+    assert len(ids) == len(set(ids))
+    missing = """() => [...document.querySelectorAll('[clip-path], a[href^="#"]')].filter(e => {
+        const to = e.getAttribute('href') || e.getAttribute('clip-path').slice(4, -1);
+        return !document.getElementById(to.slice(1)) }).length"""
+    assert shown.page.evaluate(missing) == 0
+
+
+def test_names_are_text_and_no_markup(shown):
+    assert shown.page.locator("h1").inner_text() == "Calibration report: <b>first & $x^2$"
+    assert "<b>first & $x^2$" in shown.page.locator("figure[id='ladder'] svg").text_content()
+    assert shown.page.locator("h1 b").count() == 0
+
+
+def test_print_opens_what_is_folded(shown):
+    folded = shown.page.locator("details figure").first
+    assert not folded.is_visible()
+    shown.page.emulate_media(media="print")
+    assert folded.is_visible() and folded.bounding_box()["height"] > 80
+    assert not shown.page.locator("nav").is_visible()
+
+
+# ------------------------------------------------------------------------------------ what it says
+
+
+def test_the_verdict_names_what_is_missing_and_the_ladder_what_it_did(pages, runs):
+    before, after = pages
+    assert before.verdict.light == "red"
+    assert before.verdict.sentence.startswith("incidence_angle_bias is missing")
+    assert after.verdict.light != "red"
+    errors = [f"{run.summary['rms_mm']['held_out']:.2f}" for run in runs]
+    title = after.contents.charts[0].title
+    assert title.startswith(f"The held-out error went from {errors[0]} to {errors[1]} mm")
+
+
+def test_what_the_data_could_not_tell_is_told_with_what_would(pages, first):
+    text = pages[0].file.read_text(encoding="utf-8")
+    assert first.diagnosis["weak_directions"] and first.run.solution.not_estimated
+    for weak in first.diagnosis["weak_directions"]:
+        assert weak["needs"] in text
+    for entry in first.run.solution.not_estimated:
+        assert entry["name"] in text
+    assert first.run.model["recordings"][0]["sha256"] in text
+
+
+def test_figures_that_do_not_apply_are_named_with_the_reason(pages, folder):
+    assert [a.id for a in pages[1].contents.absent] == ["findings"]
+    assert "findings</code>: not diagnosed" in pages[1].file.read_text(encoding="utf-8")
+
+
+def test_a_page_fetches_nothing(pages):
+    text = pages[0].file.read_text(encoding="utf-8")
+    links = re.findall(r"""(?:src|href)=["']?([^"'\s>]+)""", text)
+    assert links and all(link.startswith(("#", "data:")) for link in links)
+    assert "<script" not in text and "@import" not in text
+    assert pages[0].file.stat().st_size < 4e6
+
+
+def test_residuals_before_are_those_of_the_run_below_and_else_of_cad(first, grown, runs):
+    for statistics, run in ((grown.earlier, runs[0]), (grown.after, runs[1])):
+        parts = [read_table(p) for p in sorted((run.folder / RESIDUALS).iterdir())]
+        names = ("residual_m", "sigma_m", "weight")
+        r, sigma, weight = (np.concatenate([p[n] for p in parts]).astype(float) for n in names)
+        assert statistics.kept == (weight > 0).sum()
+        counts = np.histogram((r / sigma)[weight > 0], Z_EDGES)[0]
+        assert np.abs(counts - statistics.z).sum() <= 2  # on an edge, but for rounding
+    nominal = runs[0].summary["rms_mm"]["nominal"]
+    curve = first.earlier.curves["stop"]
+    rms = 1e3 * np.sqrt(np.average(curve.std_m**2 + curve.mean_m**2, weights=curve.count))
+    assert rms == pytest.approx(nominal, rel=0.3)  # robustly weighted, and that is not
+    assert rms > 5 * runs[0].summary["rms_mm"]["fit"]
+
+
+def test_the_noise_floor_is_taken_apart_into_all_of_it(grown):
+    from calib.report.charts.fit import variance_mm
+
+    rms, parts = grown.run.summary["rms_mm"], variance_mm(grown)
+    total = np.sqrt(sum(v * v for v in parts.values()))
+    assert total == pytest.approx(max(rms["noise_floor"], rms["held_out"]), rel=1e-6)
+    assert parts["range noise"] > 0 and parts["pose of an unseen stop"] > 0
+
+
+# -------------------------------------------------------------------------------------- the budget
+
+
+@pytest.mark.parametrize(
+    "name", ["lidar", "arm_joint_offset", "arm_link_length", "ring_range_offset", "faro"]
+)
+def test_derivatives_are_differences_of_residuals(first, name):
+    """The columns of a variable, against residuals with it moved; beams keep what they meet."""
+    scan, values = first.problem.scans[0], first.values
+    J = beam_jacobian(scan, values)
+    association = scan.associate(values, near_edges=False)
+    kept = np.flatnonzero(scan.rows(values, association).weight > 0)
+    assert len(kept) == len(J[name])
+
+    def residuals(step):
+        kind = first.problem.variables[name].kind
+        moved = values | {name: retract(kind, values[name], step)}
+        return scan.rows(moved, association).residual_m[kept]
+
+    step = 1e-5 * np.random.default_rng(0).normal(size=J[name].shape[1])
+    difference = (residuals(step) - residuals(-step)) / 2
+    np.testing.assert_allclose(J[name] @ step, difference, atol=1e-4 * np.abs(difference).max())
+
+
+def test_a_budget_is_the_rms_of_what_one_variable_does(grown):
+    """Where the only thing unknown is every ring's zero, ranges are unsure by just as much."""
+    solution, sigma = grown.run.solution, 0.003
+    rings = np.array([n.startswith("ring_range_offset.") for n in solution.names])
+    told = Solution(
+        solution.shared, {}, [], solution.names, np.diag(np.where(rings, sigma**2, 0.0))
+    )
+    values = grown.values | {"ring_range_offset": np.full(32, 0.002)}
+    found = budget(grown.problem, values, told)
+    assert found.uncertain_m["ring_range_offset"] == pytest.approx(sigma)
+    assert found.moved_m["ring_range_offset"] == pytest.approx(0.002)
+    assert found.uncertain_m["lidar"] == 0.0
+    assert "faro" in found.uncertain_m and "faro" not in found.moved_m  # no paper says where
+
+
+# ---------------------------------------------------------------------------------- single figures
+
+
+@pytest.mark.parametrize("ending", ["png", "svg", "pdf"])
+def test_a_figure_is_written_for_a_paper(first, tmp_path, ending):
+    path = tmp_path / f"ladder.{ending}"
+    chart = plot(first, "ladder", path)
+    assert chart.id == "ladder" and [p.name for p in tmp_path.iterdir()] == [path.name]
+    if ending == "svg":
+        assert ElementTree.parse(path).getroot().tag.endswith("svg")
+    else:
+        assert path.read_bytes().startswith({"png": b"\x89PNG", "pdf": b"%PDF"}[ending])
+
+
+def test_the_command_line_lists_and_draws(runs, tmp_path, monkeypatch, capsys, first):
+    def rigcal(*arguments):
+        monkeypatch.setattr(sys, "argv", ["rigcal", *map(str, arguments)])
+        with pytest.raises(SystemExit) as stopped:
+            main()
+        return stopped.value.code, *capsys.readouterr()
+
+    code, out, _ = rigcal("plot", runs[0].folder, "--list", "--json")
+    listed = [chart["id"] for chart in json.loads(out)["charts"]]
+    assert code == 0 and listed == [chart.id for chart in charts_of(first).charts]
+    code, out, _ = rigcal("plot", runs[0].folder, "chain", "-o", tmp_path / "chain.png", "--json")
+    assert code == 0 and json.loads(out)["id"] == "chain" and (tmp_path / "chain.png").is_file()
+    code, out, err = rigcal("plot", runs[0].folder, "chainn", "-o", tmp_path / "x.png")
+    assert (code, out) == (2, "") and "did you mean chain?" in err
+    code, _, err = rigcal("plot", runs[1].folder, "findings", "-o", tmp_path / "x.png")
+    assert code == 2 and "has no figure 'findings': not diagnosed" in err
+    code, _, err = rigcal("plot", runs[0].folder, "chain", "-o", tmp_path / "x.jpg")
+    assert code == 2 and ".png, .svg, .pdf" in err
+    code, _, err = rigcal("plot", runs[0].folder)
+    assert code == 2 and "--list" in err
+    assert [p.name for p in tmp_path.iterdir()] == ["chain.png"]
+
+
+# ------------------------------------------------------------------------------ what may be wrong
+
+
+def without_table(run):
+    next((run / RESIDUALS).iterdir()).unlink()
+
+
+def without_column(run):
+    path = next((run / RESIDUALS).iterdir())
+    write_table(path, {n: c for n, c in read_table(path).items() if n != "weight"})
+
+
+def of_another_version(run):
+    summary = json.loads((run / SUMMARY).read_text())
+    del summary["misfit"]
+    write_json(run / SUMMARY, summary)
+
+
+def with_another_diagnosis(run):
+    (run / "diagnosis.json").write_text("{}")
+
+
+@pytest.mark.parametrize(
+    ("spoil", "told"),
+    [
+        (without_table, "the run is incomplete, fit it again"),
+        (without_column, "has no column weight"),
+        (of_another_version, "has no 'misfit'"),
+        (with_another_diagnosis, "diagnose the run again"),
+    ],
+)
+def test_a_run_that_is_spoilt_is_one_sentence_and_leaves_no_page(runs, tmp_path, spoil, told):
+    shutil.copytree(runs[0].folder, tmp_path / "run")
+    spoil(tmp_path / "run")
+    with pytest.raises(InputError, match=re.escape(told)):
+        report([Run.open(tmp_path / "run")], tmp_path / "page.html")
+    assert not (tmp_path / "page.html").exists()
+
+
+def test_a_recording_that_has_moved_is_one_sentence(folder, runs, tmp_path):
+    (folder / "rec").rename(folder / "elsewhere")
+    try:
+        with pytest.raises(InputError, match="is no longer there; put it back"):
+            report([runs[0]], tmp_path / "page.html")
+    finally:
+        (folder / "elsewhere").rename(folder / "rec")
+
+
+def test_a_page_cannot_take_the_place_of_a_folder(runs, folder):
+    with pytest.raises(InputError, match="cannot be written"):
+        plot(Evidence.of([runs[0]]), "ladder", folder_like(folder / "taken.png"))
+    assert (folder / "taken.png").is_dir()
+
+
+def folder_like(path: Path) -> Path:
+    path.mkdir()
+    return path
