@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -116,17 +115,17 @@ def grown_model(run: Run, added: Sequence[str]) -> Model:
 def _shaped(effect: Effect, run: Run) -> Effect:
     if not effect.shape_name or effect.name != effect.family:
         return effect
-    path = run.folder / DIAGNOSIS
+    found = run.diagnosis()
     try:
-        text = path.read_text(encoding="utf-8") if path.is_file() else '{"candidates": []}'
         # Best first, so that the best is what stays.
-        ranked = reversed(json.loads(text)["candidates"])
+        ranked = reversed(found["candidates"] if found else [])
         names = {c["effect"]: c.get("add", "") for c in ranked}
         shape = names.get(effect.family, "").partition("@")[2]
         return effect.at(float(shape) if shape else effect.shape)
     except (ValueError, KeyError, TypeError, AttributeError):
         raise InputError(
-            f"{path} is no diagnosis of this version; write {effect.name}@NUMBER, or diagnose again"
+            f"{run.folder / DIAGNOSIS} is no diagnosis of this version; write "
+            f"{effect.name}@NUMBER, or diagnose again"
         ) from None
 
 

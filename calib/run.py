@@ -25,6 +25,10 @@ SOLUTION, MODEL, SUMMARY, COVARIANCE, RESIDUALS, STATE, DIAGNOSIS = (
     "state.npz",
     "diagnosis.json",
 )
+_OF_DIAGNOSIS = {"verdict", "sentences", "candidates", "unexplained", "weak_directions", "curves"}
+_OF_CANDIDATE = {"effect", "add", "p_adjusted", "step", "dressed_up", "held_out_rms_mm"}
+_OF_CANDIDATE |= {"unabsorbed_rms_mm"}
+_OF_CURVE = {"covariates", "centres", "mean_mm", "band_mm"}
 _OF_STATE = "state/"  # before every name in that file: numpy reserves a few
 
 
@@ -147,6 +151,28 @@ class Run:
     def effects(self) -> tuple[str, ...]:
         """Names of its model's effects; of one in a Python file, its class."""
         return tuple(_effect_name(effect) for effect in self.model["effects"])
+
+    def diagnosis(self) -> dict[str, Any] | None:
+        """What `rigcal diagnose` found, as diagnosis.json has it; None before that.
+
+        Raises:
+            InputError: the file is broken, or of another version.
+        """
+        path = self.folder / DIAGNOSIS
+        if not path.is_file():
+            return None
+        try:
+            found = _json(path)
+            whole = [(_OF_CANDIDATE, c) for c in found["candidates"]]
+            whole += [(_OF_CURVE, c) for c in found["curves"]]
+            if all(each.keys() >= keys for keys, each in [(_OF_DIAGNOSIS, found), *whole]):
+                return found
+        except (ValueError, TypeError, KeyError, AttributeError):
+            pass
+        raise InputError(
+            f"{path} is no diagnosis of this version; diagnose the run again with "
+            f"'rigcal diagnose {self.folder}'"
+        )
 
     def state(self) -> dict[str, np.ndarray]:
         """Where the fit stood, as `fit.Estimate.state` gives it.

@@ -29,6 +29,19 @@ class Cells:
     mean_m: np.ndarray  # (C, 3)
     covariance_m2: np.ndarray  # (C, 3, 3)
 
+    @classmethod
+    def of(cls, points_m: np.ndarray, cell: np.ndarray) -> "Cells":
+        """Moments of the points (N, 3) in each cell (N,), every one of which has some."""
+        count = np.bincount(cell)
+
+        def mean(values: np.ndarray) -> np.ndarray:
+            return np.bincount(cell, values) / count
+
+        mean_m = np.stack([mean(axis) for axis in points_m.T], axis=-1)
+        away_m = (points_m - mean_m[cell]).T
+        covariance_m2 = np.stack([[mean(a * b) for b in away_m] for a in away_m])
+        return cls(count, mean_m, np.moveaxis(covariance_m2, -1, 0))
+
     @cached_property
     def _principal(self) -> tuple[np.ndarray, np.ndarray]:
         return np.linalg.eigh(self.covariance_m2)
@@ -203,12 +216,4 @@ def cell_moments(points_world_m: np.ndarray, cell_m: float = 0.3) -> Cells:
     index -= index.min(axis=0, initial=0)
     size = index.max(axis=0, initial=0) + 1
     _, cell = np.unique(np.ravel_multi_index(index.T, size), return_inverse=True)
-    count = np.bincount(cell)
-
-    def mean(values: np.ndarray) -> np.ndarray:
-        return np.bincount(cell, values) / count
-
-    mean_m = np.stack([mean(axis) for axis in points_world_m.T], axis=-1)
-    away_m = (points_world_m - mean_m[cell]).T
-    covariance_m2 = np.stack([[mean(a * b) for b in away_m] for a in away_m])
-    return Cells(count, mean_m, np.moveaxis(covariance_m2, -1, 0))
+    return Cells.of(points_world_m, cell)

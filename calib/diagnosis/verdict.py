@@ -51,8 +51,7 @@ class Diagnosis:
     def worth_adding(self) -> list[str]:
         """Names of the effects that were confirmed, in the order in which to add them; not those
         that something without a name is dressed up in."""
-        confirmed = [c for c in self.candidates if c["step"] and not c["dressed_up"]]
-        return [c["add"] for c in sorted(confirmed, key=lambda c: c["step"])]
+        return worth_adding(self.candidates)
 
     def _repr_html_(self) -> str:
         """As a notebook shows it."""
@@ -72,6 +71,12 @@ class Diagnosis:
             "misfit": dict(self.misfit),
             "curves": [curve.document() for curve in self.curves],
         }
+
+
+def worth_adding(candidates: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Names of the confirmed among a diagnosis' candidates; see `Diagnosis.worth_adding`."""
+    confirmed = [c for c in candidates if c["step"] and not c["dressed_up"]]
+    return [c["add"] for c in sorted(confirmed, key=lambda c: c["step"])]
 
 
 def conclude(

@@ -115,7 +115,7 @@ def import_files(
     understood, odd = [*found.understood, *cut.understood], [*found.odd, *cut.odd]
     columns, share = _thinned(cut, choices.most_stops)
     with replace_folder(out, "rig.yaml", "recording") as folder, _called(folder, out):
-        _write_parts(folder, found, choices.rig)
+        odd += _write_parts(folder, found, choices.rig)
         if choices.rig is not None:
             columns, said, more = rigfile.matched(choices.rig, columns)
         else:
@@ -223,9 +223,10 @@ def _thinned(cut: _Cut, most: int | None) -> tuple[Columns, scans.Share]:
     return {name: values[kept] for name, values in cut.columns.items()}, share
 
 
-def _write_parts(folder: Path, found: Gathered, rig: Path | None) -> None:
-    """Arm and reference under the names that the rig has for them; the rig itself where given."""
-    name = "arm.urdf"
+def _write_parts(folder: Path, found: Gathered, rig: Path | None) -> list[str]:
+    """Arm and reference under the names that the rig has for them, and the rig itself where given;
+    what looked odd."""
+    name, odd = "arm.urdf", []
     if rig is not None:
         name = str(section(rig, "arm").get("urdf", name))
         shutil.copyfile(rig, folder / "rig.yaml")
@@ -238,6 +239,12 @@ def _write_parts(folder: Path, found: Gathered, rig: Path | None) -> None:
             path.write_text(found.arm.urdf, encoding="utf-8")
     if found.surface:
         write_surface(found.surface, folder)
+        faces = section(rig, "reference").get("faces") if rig else None
+        if found.surface.label is None and faces and (folder / str(faces)).is_file():
+            odd.append(
+                f"the mesh has no labels; taken from {rig.parent / str(faces)}, beside the rig"
+            )
+    return odd
 
 
 def _files_of(rig: Path) -> list[str]:

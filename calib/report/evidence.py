@@ -21,7 +21,7 @@ from calib.report.budget import Budget, budget
 from calib.report.statistics import AZIMUTHS, BINS, PLACES, Axis, Statistics, Table, gather
 from calib.residuals.scan import ScanStop
 from calib.residuals.table import residual_table, table_path
-from calib.run import DIAGNOSIS, MODEL, RESIDUALS, SUMMARY, Run
+from calib.run import MODEL, RESIDUALS, SUMMARY, Run
 from chains.errors import InputError
 from sensors.recording import read_table
 
@@ -84,20 +84,7 @@ class Evidence:
     @cached_property
     def diagnosis(self) -> Mapping[str, Any] | None:
         """diagnosis.json; None where the run has not been diagnosed."""
-        import json
-
-        path = self.run.folder / DIAGNOSIS
-        if not path.is_file():
-            return None
-        try:
-            read = json.loads(path.read_text(encoding="utf-8"))
-            read["verdict"], read["sentences"], read["candidates"], read["weak_directions"]
-            return read
-        except (ValueError, KeyError, TypeError):
-            raise InputError(
-                f"{path} is no diagnosis of this version; diagnose the run again with "
-                f"'rigcal diagnose {self.run.folder}'"
-            ) from None
+        return self.run.diagnosis()
 
     @cached_property
     def found(self) -> list[Found]:

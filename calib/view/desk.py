@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,12 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from calib.diagnosis.verdict import worth_adding
 from calib.effects import CATALOGUE, find
 from calib.ladder import Rung, ladder
-from calib.run import DIAGNOSIS, Run
+from calib.run import Run
 from chains.errors import InputError
-
-_OF_CANDIDATE = ("add", "p_adjusted", "step", "dressed_up", "held_out_rms_mm", "unabsorbed_rms_mm")
 
 
 @dataclass(frozen=True)
@@ -43,28 +41,18 @@ class Findings:
         Raises:
             InputError: the file is of another version.
         """
-        path = run.folder / DIAGNOSIS
-        if not path.is_file():
+        found = run.diagnosis()
+        if found is None:
             return None
-        try:
-            found = json.loads(path.read_text(encoding="utf-8"))
-            single = (c for c in found["curves"] if len(c["covariates"]) == 1)
-            curves = {c["covariates"][0]: Curve.read(c) for c in single}
-            lists = (found[key] for key in ("sentences", "candidates", "unexplained"))
-            lacking = [k for c in found["candidates"] for k in _OF_CANDIDATE if k not in c]
-            if lacking:
-                raise KeyError(lacking[0])
-            return cls(found["verdict"], *lists, curves)
-        except (ValueError, KeyError, TypeError, IndexError) as error:
-            raise InputError(
-                f"{path} is no diagnosis of this version ({error}); diagnose the run again"
-            ) from None
+        single = (c for c in found["curves"] if len(c["covariates"]) == 1)
+        curves = {c["covariates"][0]: Curve.read(c) for c in single}
+        lists = (found[key] for key in ("sentences", "candidates", "unexplained"))
+        return cls(found["verdict"], *lists, curves)
 
     @property
     def worth_adding(self) -> list[str]:
         """Names of the effects that were confirmed, in the order in which to add them."""
-        told = [c for c in self.candidates if c["step"] and not c["dressed_up"]]
-        return [c["add"] for c in sorted(told, key=lambda c: c["step"])]
+        return worth_adding(self.candidates)
 
     def covariate_of(self, effect: str) -> str | None:
         """The covariate whose curve shows an effect best: its own, or what stands out most."""

@@ -23,9 +23,10 @@ _TIME = (
 )
 _USELESS = {
     *("x", "y", "z", "range", "distance", "azimuth", "elevation", "rgb", "rgba", "nx", "ny", "nz"),
-    *("normal_x", "normal_y", "normal_z", "red", "green", "blue", "scan", "count", "range_std_m"),
+    *("normal_x", "normal_y", "normal_z", "red", "green", "blue", "scan"),
     *("cartesianinvalidstate", "padding", "_"),
 }
+_AVERAGED = {"count", "range_std_m"}  # of holds, where a file has both
 _UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 _FARTHEST_M = 200.0
 
@@ -77,8 +78,9 @@ def fields_of(name: str, cloud: Cloud, options: Options) -> dict[str, str]:
             " name the right one by --column ring=FIELD"
         )
     taken = {*fields.values()}
+    useless = _USELESS if plain.keys() >= _AVERAGED else _USELESS | _AVERAGED
     for key, field in plain.items():
-        if field not in taken and key not in (*_USELESS, *_TIME, *fields):
+        if field not in taken and key not in (*useless, *_TIME, *fields):
             fields[key] = field
     return fields
 

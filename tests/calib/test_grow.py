@@ -19,6 +19,12 @@ from sensors.documents import read_yaml, write_json
 from . import rigs
 
 SMALL = Model(("ring_range_offset",), ("mount.tx",))
+NOTHING = {
+    "verdict": "adequate",
+    **{
+        name: [] for name in ("sentences", "candidates", "unexplained", "weak_directions", "curves")
+    },
+}
 FORMULA = """\
 name: lean
 site: range
@@ -26,6 +32,12 @@ unit: m
 sigma: 0.01
 basis: ["sin(2 * azimuth)", "cos(2 * azimuth)"]
 """
+
+
+def diagnosis(*candidates):
+    """A diagnosis with these candidates."""
+    empty = ("p_adjusted", "step", "dressed_up", "held_out_rms_mm", "unabsorbed_rms_mm")
+    return NOTHING | {"candidates": [dict.fromkeys(empty) | c for c in candidates]}
 
 
 @pytest.fixture(scope="module")
@@ -124,7 +136,7 @@ def test_a_shape_is_what_is_written_or_what_the_diagnosis_found_or_the_usual(fir
         {"effect": "range_cyclic", "add": "range_cyclic@0.5"},
         {"effect": "arm_joint_offset", "add": "arm_joint_offset"},
     ]
-    write_json(first.folder / "diagnosis.json", {"candidates": candidates})
+    write_json(first.folder / "diagnosis.json", diagnosis(*candidates))
     assert chosen(first, "range_cyclic") == ("range_cyclic@1.9",), "the best, which is the first"
     assert chosen(first, "range_cyclic@0.7") == ("range_cyclic@0.7",)
     assert chosen(first, "near_range_bias")[0].startswith("near_range_bias@")
@@ -137,10 +149,12 @@ def test_two_shapes_of_one_effect_are_two_effects(first):
     assert model.minus(["range_cyclic@0.7"]).names[1:] == ("range_cyclic@1.3",)
 
 
-@pytest.mark.parametrize("text", ["{", "[]", '{"candidates": [3]}', '{"candidates": [{}]}'])
+@pytest.mark.parametrize(
+    "text", ["{", "[]", "{}", json.dumps(NOTHING | {"candidates": [3]}), json.dumps(diagnosis({}))]
+)
 def test_a_diagnosis_that_cannot_be_read_is_said(first, text):
     (first.folder / "diagnosis.json").write_text(text)
-    with pytest.raises(InputError, match=r"diagnosis.json.* write range_cyclic@NUMBER"):
+    with pytest.raises(InputError, match=r"diagnosis.json is no diagnosis of this version"):
         grown_model(first, ["range_cyclic"])
 
 

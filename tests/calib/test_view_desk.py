@@ -100,7 +100,8 @@ def test_the_curve_is_the_effects_own_or_that_which_stands_out_most(first):
     assert found.curves["incidence_rad"].stands_out == pytest.approx(2.0)
 
 
-OLD = '{"verdict": "", "sentences": [], "candidates": [{}], "unexplained": [], "curves": []}'
+OLD = json.dumps({key: [] for key in ("sentences", "unexplained", "curves", "weak_directions")})
+OLD = OLD.replace("}", ', "verdict": "", "candidates": [{}]}')
 
 
 @pytest.mark.parametrize("text", [OLD, "{", "[]", '{"verdict": "adequate"}', '{"curves": [{}]}'])
