@@ -1,4 +1,4 @@
-# make demo   simulates a recording, calibrates it and exports the result, in demo/
+# make demo   simulates a recording, calibrates it, exports and reports the result, in demo/
 # make test   checks style and runs every test
 # make clean  removes what the two made
 
@@ -22,8 +22,10 @@ demo: system
 	@echo "== demo: the joint calibration"
 	$(BIN)/rigcal fit demo/recording -o demo/run
 	$(BIN)/rigcal compare demo/run
-	@echo "== demo: the result as YAML, in demo/export"
-	$(BIN)/rigcal export demo/run -o demo/export --format yaml
+	@echo "== demo: the result for other programs, in demo/export"
+	$(BIN)/rigcal export demo/run -o demo/export
+	@echo "== demo: the result for people; open demo/report.html, or type $(BIN)/rigcal view demo/run"
+	$(BIN)/rigcal report demo/run -o demo/report.html
 
 test: system browser .venv/.tested
 	@echo "== test: style"
@@ -43,7 +45,7 @@ system: .venv/.system
 	@$(if $(PYTHON),,echo "rigcal needs Python 3.11 to 3.14, and neither python3.11 nor python3 is one." >&2; exit 1)
 	@echo "== install: rigcal and what it needs, into .venv (about 1.2 GB, minutes the first time)"
 	$(PYTHON) -m venv .venv
-	$(PIP) --editable .
+	$(PIP) --editable '.[view]'
 	@touch $@
 
 .venv/.tested: .venv/.installed

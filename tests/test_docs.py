@@ -5,8 +5,10 @@ import json
 import os
 import re
 import shlex
+import signal
 import subprocess
 import sys
+from glob import glob
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +16,7 @@ import pytest
 
 from calib.effects import load_effects
 from calib.rig import load_rig
+from calib.simulate import load_spec, simulate
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -26,12 +29,11 @@ def blocks(language):
     return re.findall(rf"^```{language}\n(.*?)^```", README, flags=re.M | re.S)
 
 
-def execute(command, folder):
+def execute(command, folder, variables=None):
     """Run a program in a folder, and give what it printed."""
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-    done = subprocess.run(
-        command, cwd=folder, capture_output=True, text=True, env=os.environ | {"PATH": path}
-    )
+    env = os.environ | {"PATH": path} | (variables or {})
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, env=env)
     assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
     return done.stdout
 
@@ -39,16 +41,32 @@ def execute(command, folder):
 def commands():
     """README's command lines, split into words, comments left out."""
     lines = (
-        shlex.split(line, comments=True) for block in blocks("sh") for line in block.splitlines()
+        shlex.split(line, comments=True)
+        for block in blocks("sh")
+        for line in block.replace("\\\n", "").splitlines()
     )
     return [words for words in lines if words]
+
+
+def look(command, folder):
+    """Open the workbench, and leave it by Ctrl-C once it has said where it is."""
+    program = Path(sys.executable).parent / command[0]
+    with subprocess.Popen(
+        [program, *command[1:], "--no-open"], cwd=folder, stdout=subprocess.PIPE, text=True
+    ) as process:
+        said = process.stdout.readline()
+        process.send_signal(signal.SIGINT)
+        assert process.wait(60) == 0
+    assert re.search(r"http://(127\.0\.0\.1|localhost):\d+", said)
+    return said
 
 
 @pytest.fixture(scope="module")
 def loop(tmp_path_factory):
     """A folder in which README's commands have been run in order, and what they said."""
     folder = tmp_path_factory.mktemp("readme")
-    said = [execute(words, folder) for words in commands() if words[0] != "make"]
+    own = [words for words in commands() if words[0] != "make" and words[1] != "import"]
+    said = [(look if words[1] == "view" else execute)(words, folder) for words in own]
     return folder, "\n".join(said)
 
 
@@ -65,8 +83,11 @@ def test_make_targets_exist():
 def test_the_loop_runs_and_leaves_what_it_names(loop):
     folder, said = loop
     names = {path.name for path in folder.iterdir()}
-    assert names == {"rec", "rec.truth.json", "run", "grown", "extrinsics"}
-    assert (folder / "extrinsics" / "extrinsics.yaml").is_file()
+    made = {"run", "grown", "report.html", "corrected", "extrinsics"}
+    assert names == {"rec", "rec.truth.json", *made}
+    files = {path.name for path in (folder / "extrinsics").iterdir()}
+    assert {"extrinsics.yaml", "arm.urdf", "rig.urdf", "rings.csv"} <= files
+    assert "<svg" in (folder / "report.html").read_text(encoding="utf-8")
     assert re.search(r"mount -> lidar +[+-]\d+\.\d+ ± \d", said)
     assert re.search(r"rms after, of stops held out +mm +\d", said)
     assert "incidence_angle_bias.amount" in said
@@ -91,9 +112,29 @@ def shape(text):
 
 
 @pytest.mark.slow
+def test_the_import_in_readme_makes_a_recording(tmp_path):
+    """Of files that example 8 writes for this; the shell would expand the stars."""
+    simulate(
+        load_spec("tiny").model_copy(update={"sweeps": 1, "occluded_share": 0.0}),
+        tmp_path / "rec",
+        1,
+    )
+    program = "import sys; from pathlib import Path; from foreign_files import write_files\n"
+    program += "write_files(Path(sys.argv[1]), Path(sys.argv[2]))"
+    here = {"PYTHONPATH": str(ROOT / "examples")}
+    execute([sys.executable, "-c", program, str(tmp_path / "rec"), str(tmp_path)], ROOT, here)
+    (words,) = [words for words in commands() if words[:2] == ["rigcal", "import"]]
+    expanded = [sorted(glob(w, root_dir=tmp_path)) if "*" in w else [w] for w in words]
+    said = execute([word for part in expanded for word in part], tmp_path)
+    assert "what was understood" in said
+    stops = (tmp_path / "mine" / "stops.csv").read_text().splitlines()
+    assert len(stops) == len((tmp_path / "rec" / "stops.csv").read_text().splitlines())
+
+
+@pytest.mark.slow
 def test_recording_and_run_hold_the_files_in_their_tables(loop):
     folder, _ = loop
-    for title, made in (("A recording", "rec"), ("A run", "run")):
+    for title, made in (("A recording", ("rec",)), ("A run", ("run", "grown"))):
         rows = re.search(rf"## {title}\n.*?\n\|---\|---\|\n(.*?)\n\n", README, flags=re.S)[1]
         listed = [
             name for row in rows.splitlines() for name in re.findall("`([^`]+)`", row.split("|")[1])
@@ -102,7 +143,8 @@ def test_recording_and_run_hold_the_files_in_their_tables(loop):
         stop = next((folder / "rec" / "scans").iterdir()).stem
         for name in listed:
             path = name.replace("<stop>", stop)
-            found = [(folder / made / at / path).exists() for at in (".", "reference")]
+            at = [folder / one / within for one in made for within in (".", "reference")]
+            found = [(place / path).exists() for place in at]
             assert any(found), f"README lists {name}, which {made} has not"
 
 
@@ -222,6 +264,20 @@ def test_a_ur10_lacks_what_its_example_says(tmp_path, shared):
         rows = re.findall(r"(\S+) mm held out, (\S+) mm in series", series)
         own, others = np.array(rows, float).T
         assert len(rows) == 4 and own[-1] < 0.72 * own[0] and others[-1] < 0.85 * others[0]
+
+
+@pytest.mark.slow
+def test_the_report_says_red_before_and_green_after(tmp_path):
+    said = example(7, tmp_path)
+    assert re.search(r"^first.html: red, incidence_angle_bias is missing", said, flags=re.M)
+    assert re.search(r"^grown.html: (green|amber), The model is adequate", said, flags=re.M)
+    assert (tmp_path / "incidence.png").read_bytes()[1:4] == b"PNG"
+
+
+@pytest.mark.slow
+def test_imported_files_give_the_same_fit(tmp_path):
+    rows = re.findall(r"(\S+) mm and (\S+) mrad apart", example(8, tmp_path))
+    assert len(rows) == 6 and np.array(rows, float).max() < 0.01
 
 
 def test_without_its_data_the_ur10_example_says_so(tmp_path):
