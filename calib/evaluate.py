@@ -17,7 +17,6 @@ scatter by s about e, so a hold says the same raw or averaged.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +28,9 @@ from calib.fit import Progress, values_of
 from calib.forward import Values
 from calib.model import Model
 from calib.residuals.scan import Ranges, ScanStop
-from calib.residuals.surfaces import MeshSurface
+from calib.residuals.surfaces import Meeting, MeshSurface
 from calib.run import MODEL, Run
+from calib.tally import FLAT_M, Columns, Evaluated, Tally
 from chains.errors import InputError
 from sensors.documents import replace_folder, write_json, write_yaml
 from sensors.recording import write_table
@@ -48,38 +48,7 @@ COLUMNS = {
     "precision_m": "standard deviation of a return",
     "raw_signed_error_m raw_accuracy_m": "the same, before correction",
 }
-# Width of a bin, in the unit of its name, and how to get there from the points' column.
-BINS = {
-    "ring": ("ring", 1.0, 1.0),
-    "incidence_deg": ("incidence_rad", 5.0, np.degrees(1.0)),
-    "distance_m": ("distance_m", 0.5, 1.0),
-    "label": ("label", 1.0, 1.0),
-}
-NEAREST = 4096  # points of a stop whose nearest point of the mesh is sought: each costs many rays
-
-Columns = dict[str, np.ndarray]
-
-
-@dataclass(frozen=True)
-class Evaluated:
-    """One stop, evaluated.
-
-    Args:
-        rig, location, stop: whose it is.
-        sensor: the LiDAR's model.
-        points: the `COLUMNS` (H,) of the directions with a hit.
-        nearest: rows (M,) of some of them; nearest_m: (M,) how far their mean return lies from the
-            surface, negative before it as the sensor sees it; raw_nearest_m: uncorrected.
-    """
-
-    rig: str
-    location: str
-    stop: str
-    sensor: str
-    points: Columns
-    nearest: np.ndarray
-    nearest_m: np.ndarray
-    raw_nearest_m: np.ndarray
+NEAREST = 1024  # points of a stop whose nearest point of the mesh is sought: each costs many rays
 
 
 def evaluate_stop(scan: ScanStop, values: Values) -> Evaluated:
@@ -93,6 +62,8 @@ def evaluate_stop(scan: ScanStop, values: Values) -> Evaluated:
         scan.name,
         rig.lidar.name,
         _points(ranges),
+        _flat(scan.meeting, ranges),
+        ranges.direction,
         some,
         *(_nearest(scan, ranges, some, e[some]) for e in (ranges.corrected_m, ranges.raw_m)),
     )
@@ -130,6 +101,14 @@ def _points(ranges: Ranges) -> Columns:
     return {n: c.astype(np.uint16 if n in whole else np.float32) for n, c in columns.items()}
 
 
+def _flat(meeting: Meeting, ranges: Ranges) -> np.ndarray:
+    """Which flat surface (H,) the beams meet, -1 for none; planes found in scans are all flat."""
+    if not isinstance(meeting, MeshSurface):
+        return np.asarray(ranges.view["plane"])[ranges.hit]
+    surface = np.asarray(ranges.view["surface"])[ranges.hit]
+    return np.where(meeting.roughness_m[surface] < FLAT_M, surface, -1)
+
+
 def _nearest(scan: ScanStop, ranges: Ranges, some: np.ndarray, error_m: np.ndarray) -> np.ndarray:
     """Distance (M,) of mean returns from the surface: the nearest of a mesh, else their plane."""
     ahead_m = error_m[:, None] * ranges.direction[some]
@@ -137,85 +116,6 @@ def _nearest(scan: ScanStop, ranges: Ranges, some: np.ndarray, error_m: np.ndarr
         distance = scan.meeting.reference.distance_m(ranges.surface_m[some] + ahead_m)
         return np.copysign(distance, error_m)
     return -np.einsum("ni,ni->n", ahead_m, ranges.normal[some])
-
-
-class Tally:
-    """Means and spreads over returns of many stops, as sums: no stop need be kept.
-
-    Args:
-        raw: whether of the returns before correction.
-    """
-
-    def __init__(self, raw: bool = False) -> None:
-        self.prefix = "raw_" if raw else ""
-        self._whole = np.zeros(6)
-        self._nearest = np.zeros(6)
-        self._by: dict[str, dict[int, np.ndarray]] = {name: {} for name in BINS}
-
-    def add(self, done: Evaluated) -> None:
-        """Add a stop."""
-        points = done.points
-        error_m, accuracy_m = (
-            points[f"{self.prefix}{name}_m"].astype(float) for name in ("signed_error", "accuracy")
-        )
-        count, spread_m = points["count"].astype(float), points["precision_m"].astype(float)
-        sums = _sums(count, error_m, accuracy_m, spread_m)
-        self._whole += sums.sum(axis=0)
-        for name, (column, width, scale) in BINS.items():
-            bins, index = np.unique(
-                np.floor(points[column].astype(float) * scale / width).astype(int),
-                return_inverse=True,
-            )
-            added = np.zeros((len(bins), sums.shape[1]))
-            np.add.at(added, index, sums)
-            for value, row in zip(bins.tolist(), added, strict=True):
-                self._by[name][value] = self._by[name].get(value, 0.0) + row
-        some = done.nearest
-        away_m = done.raw_nearest_m if self.prefix else done.nearest_m
-        across_m = spread_m[some] * np.cos(points["incidence_rad"][some])
-        self._nearest += _sums(count[some], away_m, np.abs(away_m), across_m).sum(axis=0)
-
-    def document(self, labels: Mapping[int, str]) -> dict[str, Any]:
-        """What evaluation.json holds; lengths in mm, angles in degrees, bins by their middle."""
-        whole, nearest = _row(self._whole), _row(self._nearest)
-        return {
-            "returns": whole["n"],
-            "corrected": not self.prefix,
-            "signed_error_mm": {"mean": whole["mean_mm"], "std": whole["std_mm"]},
-            "accuracy_mm": whole["accuracy_mm"],
-            "precision_mm": whole["precision_mm"],
-            "cloud_to_mesh_mm": {"mean": nearest["mean_mm"], "std": nearest["std_mm"]},
-            "by": {name: self._rows(name, labels) for name in BINS},
-        }
-
-    def _rows(self, name: str, labels: Mapping[int, str]) -> list[dict[str, Any]]:
-        width, found = BINS[name][1], sorted(self._by[name].items())
-        if name == "label":
-            return [{"value": k, "name": labels.get(k, ""), **_row(row)} for k, row in found]
-        middle = 0.0 if name == "ring" else 0.5
-        return [{"value": (k + middle) * width, **_row(row)} for k, row in found]
-
-
-def _sums(
-    count: np.ndarray, error_m: np.ndarray, accuracy_m: np.ndarray, spread_m: np.ndarray
-) -> np.ndarray:
-    """(N, 6): returns, their errors, squares and sizes; spreads, and whether known."""
-    known = np.isfinite(spread_m)
-    spread = np.where(known, spread_m, 0.0)
-    squares = count * error_m**2 + (count - 1.0) * spread**2
-    return np.stack([count, count * error_m, squares, count * accuracy_m, spread, known], axis=1)
-
-
-def _row(sums: np.ndarray) -> dict[str, Any]:
-    n, total, squares, sizes, spread, known = sums.tolist()
-    mean = total / n
-    return {
-        "n": round(n),
-        "mean_mm": 1e3 * mean,
-        "std_mm": 1e3 * np.sqrt(max(0.0, squares / n - mean**2)),
-        "accuracy_mm": 1e3 * sizes / n,
-        "precision_mm": 1e3 * spread / known if known else None,
-    }
 
 
 def _each(scans: Sequence[ScanStop], values: Values, progress: Progress) -> Iterator[Evaluated]:
@@ -253,6 +153,29 @@ def evaluate(
     values = values_of(problem, run.state())
     stops = _each(problem.scans, values, progress)
     return write_evaluation(stops, Path(out or run.folder), raw, sources[0].rig.labels)
+
+
+def evaluate_all(
+    runs: Sequence[Run],
+    out: Path | str | None = None,
+    raw: bool = False,
+    progress: Progress = lambda what, done, total: None,
+) -> dict[str, dict[str, Any]]:
+    """Evaluate several runs as `evaluate` does one, each into ``out/<its name>`` if `out` is given.
+
+    Returns:
+        What each evaluation.json holds, by the run's folder.
+
+    Raises:
+        InputError: as `evaluate`; or two runs would be written to one folder.
+    """
+    names = [run.folder.resolve().name for run in runs]
+    for name in names if out and len(runs) > 1 else ():
+        if names.count(name) > 1:
+            raise InputError(f"{out}: two runs are called {name}; evaluate them one by one")
+    places = [out if len(runs) == 1 or out is None else Path(out) / name for name in names]
+    pairs = zip(runs, places, strict=True)
+    return {str(run.folder): evaluate(run, place, raw, progress) for run, place in pairs}
 
 
 def write_evaluation(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from rich.table import Table
@@ -16,6 +17,32 @@ HEADINGS = {
     "ring": "ring",
 }
 LISTED = 16  # rings of a sensor with more are not listed one by one
+
+
+def print_evaluations(found: Mapping[str, Mapping[str, Any]]) -> None:
+    """Print evaluations by run: the only one in full, several side by side."""
+    if len(found) == 1:
+        print_evaluation(next(iter(found.values())))
+        return
+    console = terminal()
+    table = columns_table("mm", *(Path(run).name for run in found))
+    for column in table.columns[1:]:
+        column.justify = "right"
+    for what, value in _LINES.items():
+        table.add_row(what, *(value(each) for each in found.values()))
+    console.print(table)
+
+
+_LINES = {
+    "returns": lambda e: f"{e['returns']}",
+    "range against the surface, mean": lambda e: mm(e["signed_error_mm"]["mean"], "+"),
+    "std": lambda e: mm(e["signed_error_mm"]["std"]),
+    "half of the central 68 %": lambda e: mm(e["signed_error_mm"]["half_68"]),
+    "mean size": lambda e: mm(e["accuracy_mm"]),
+    "precision": lambda e: mm(e["precision_mm"]),
+    "cloud to mesh, mean": lambda e: mm(e["cloud_to_mesh_mm"]["mean"], "+"),
+    "cloud to mesh, std": lambda e: mm(e["cloud_to_mesh_mm"]["std"]),
+}
 
 
 def print_evaluation(found: Mapping[str, Any]) -> None:
@@ -33,10 +60,23 @@ def print_evaluation(found: Mapping[str, Any]) -> None:
     table.add_row("cloud to mesh", mm(nearest["mean"], "+"), mm(nearest["std"]), "", "")
     table.add_row()
     console.print(table)
+    if found["planes"]:
+        console.print(_planes(found["planes"]))
     for name, heading in HEADINGS.items():
         rows = found["by"][name]
         if len(rows) > 1 and (name != "ring" or len(rows) <= LISTED):
             console.print(_by(heading, rows))
+
+
+def _planes(planes: Sequence[Mapping[str, Any]]) -> Table:
+    table = columns_table("plane of", "thickness", "stops", "returns")
+    for plane in planes:
+        cells = (mm(plane["thickness_mm"]), f"{plane['stops']}", f"{plane['n']}")
+        table.add_row(plane["label"], *cells)
+    for column in table.columns[1:]:
+        column.justify = "right"
+    table.add_row()
+    return table
 
 
 def _by(heading: str, rows: Sequence[Mapping[str, Any]]) -> Table:

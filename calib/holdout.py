@@ -79,10 +79,27 @@ def _without_planes(
 
 
 def predict(unseen: Problem, trained: Problem, estimate: Estimate) -> Errors:
-    """Residuals of a problem whose calibration comes from an estimate of another.
+    """Residuals of a problem whose calibration comes from an estimate of another; see `placed`."""
+    scans, bodies = unseen.scans, [b for b in unseen.blocks if isinstance(b, TrackedBody)]
+    predicted, told = placed(unseen, trained, estimate)
+    if not scans:
+        judged = [b for b in bodies if b not in unseen.blocks and b.stops.root in told]
+        return body_errors(judged, predicted.values, predicted.graph)
+    return sum((_scan(scan, predicted, scan.stops.root in told) for scan in scans), Errors())
+
+
+def placed(unseen: Problem, trained: Problem, estimate: Estimate) -> tuple[Estimate, set[str]]:
+    """Where stops stand whose calibration comes from an estimate of another problem.
 
     Poses of the unseen stops are found from their tracked bodies; where no body is seen, from
     their own beams with the calibration held.
+
+    Args:
+        unseen: the stops' problem; what does not place them is taken out of it.
+        trained, estimate: the other problem, and what was estimated from it.
+
+    Returns:
+        The estimate, and the poses' variables that tracked bodies or the other problem told.
     """
     shared = [n for n in trained.variables if n in unseen.variables]
     held = [trained.variables[n] for n in shared if trained.variables[n].kind != "direction"]
@@ -94,11 +111,7 @@ def predict(unseen: Problem, trained: Problem, estimate: Estimate) -> Errors:
     unseen.blocks = bodies if scans else [b for b in bodies if not b.stops.rig.joints_to(b.body)]
     told = {block.stops.root for block in unseen.blocks} | set(shared)
     unseen.scans = [scan for scan in scans if scan.stops.root not in told]
-    predicted = solve(unseen, prior)
-    if not scans:
-        judged = [b for b in bodies if b not in unseen.blocks and b.stops.root in told]
-        return body_errors(judged, predicted.values, predicted.graph)
-    return sum((_scan(scan, predicted, scan.stops.root in told) for scan in scans), Errors())
+    return solve(unseen, prior), told
 
 
 def _scan(scan: ScanStop, predicted: Estimate, told: bool) -> Errors:

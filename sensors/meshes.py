@@ -131,14 +131,22 @@ def open3d_cloud(columns: Mapping[str, np.ndarray]) -> Any:
 
 def ransac_plane(points_m: np.ndarray, within_m: float) -> np.ndarray:
     """Rows (M,) of the points (N, 3) that lie no further than `within_m` from the plane that most
-    do (RANSAC of Open3D, 1000 draws, the same each time)."""
+    do: RANSAC of Open3D, then least squares until the same points stay, whatever was drawn."""
     import open3d as o3d
 
     if len(points_m) < 3:
         raise InputError(f"{len(points_m)} points lie on no plane in particular; 3 are needed")
-    o3d.utility.random.seed(0)
+    o3d.utility.random.seed(0)  # its threads still draw in any order
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points_m))
-    return np.asarray(cloud.segment_plane(within_m, ransac_n=3, num_iterations=1000)[1])
+    found = np.sort(cloud.segment_plane(within_m, ransac_n=3, num_iterations=1000)[1])
+    for _ in range(20):
+        away_m = points_m - points_m[found].mean(axis=0)
+        normal = np.linalg.eigh(away_m[found].T @ away_m[found])[1][:, 0]
+        again = np.flatnonzero(np.abs(away_m @ normal) <= within_m)
+        if np.array_equal(again, found):
+            break
+        found = again
+    return found
 
 
 # ------------------------------------------------------------------------------------------ meshes

@@ -280,5 +280,15 @@ def test_imported_files_give_the_same_fit(tmp_path):
     assert len(rows) == 6 and np.array(rows, float).max() < 0.01
 
 
+@pytest.mark.slow
+def test_the_study_in_short_ranks_the_methods(tmp_path):
+    program = [sys.executable, str(ROOT / "examples/paper_study.py"), str(tmp_path), "--quick"]
+    said = execute(program, tmp_path)
+    errors = re.findall(r"^Ouster6 .* held out +(\S+) mm", said, flags=re.M)
+    errors = np.array(errors, float)  # paper, the study's sequence, joint graph, and with effects
+    assert len(errors) == 4 and errors[2:].max() < 0.5 * errors[:2].min()
+    assert "| joint graph" in (tmp_path / "study.md").read_text(encoding="utf-8")
+
+
 def test_without_its_data_the_ur10_example_says_so(tmp_path):
     assert "skipped: nowhere" in example(6, tmp_path, "nowhere")

@@ -13,7 +13,7 @@ from calib.graph import Variable
 from calib.residuals.beams import Association, Columns, Surface
 from chains import se3
 from sensors.lidar import Beams
-from sensors.planes import Planes
+from sensors.planes import Cells, Planes
 from sensors.reference import Reference
 from sensors.surfaces import transverse
 
@@ -56,6 +56,13 @@ class MeshSurface:
         walls_m2 = 2.0 * (length * width + width * height + height * length)
         scale = max(1.0, float(np.sqrt(walls_m2 / ROOM_M2)))
         return {kind: scale * size_m for kind, size_m in PATCHES_M.items()}
+
+    @cached_property
+    def roughness_m(self) -> np.ndarray:
+        """Standard deviation (S,) m of each surface's corners across the plane that fits best."""
+        mesh = self.reference
+        corners_m = mesh.vertices_m[mesh.triangles].reshape(-1, 3)
+        return Cells.of(corners_m, np.repeat(mesh.surface, 3)).spread_m[:, 0]
 
     def surface_of(self, kind: str, parts: np.ndarray) -> np.ndarray:
         """The surface that each of those parts is of; a surface is its own."""

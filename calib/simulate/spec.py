@@ -27,6 +27,10 @@ class Spec(Document):
         mixed_pixel_share: share of the returns whose range is a mixture or far off.
         occluded_share: share of the stops at which the mount's markers are not seen.
         level: the LiDAR's spin axis stays vertical.
+        poses: what the arm does from stop to stop: it goes anywhere; or one joint turns and all
+            others stay at 0, at each location the next one; or it is read while it moves.
+        acting: effects that act beside the default ones, or file of effects -> the value of each
+            parameter, as it is, in the effect's unit.
         room: furnished, or bare.
         noise: every instrument's noise, as a multiple of what the rig states.
         build_error: how far the hardware is from paper, as a multiple of what is usual.
@@ -49,6 +53,8 @@ class Spec(Document):
     mixed_pixel_share: float = pydantic.Field(default=0.004, ge=0, le=1)
     occluded_share: float = pydantic.Field(default=0.1, ge=0, le=1)
     level: bool = False
+    poses: Literal["anywhere", "one_joint", "moving"] = "anywhere"
+    acting: dict[str, float] = pydantic.Field(default_factory=dict)
     room: Literal["lab", "box"] = "lab"
     noise: float = pydantic.Field(default=1.0, ge=0)
     build_error: float = pydantic.Field(default=1.0, ge=0)
@@ -64,6 +70,10 @@ class Spec(Document):
             raise ValueError("without a tracker a lidar and a mesh are needed to place anything")
         if self.tracker == "points" and not self.arm:
             raise ValueError("points without an arm do not tell how the rig is turned; use poses")
+        if self.poses != "anywhere" and (self.lidar or not self.arm):
+            raise ValueError(f"poses {self.poses} are of an arm alone; give one, and no lidar")
+        if self.poses == "one_joint" and self.base_moves == "never":
+            raise ValueError("at each location another joint turns; base_moves: location or stop")
         return self
 
 
@@ -89,6 +99,8 @@ PRESETS: dict[str, Spec] = {
     "lidar-arm": Spec(tracker=None, targets=0, base_moves="location"),
     "planes": Spec(mesh=False, targets=0),
     "targets": Spec(lidar=None, stops_per_location=8, targets=8),
+    "one-joint": Spec(**{**_NO_LIDAR, "locations": 6, "poses": "one_joint"}),
+    "moving": Spec(**_NO_LIDAR, poses="moving"),
     "laser-tracker": Spec(**{**_NO_LIDAR, "tracker": "points", "base_moves": "never"}),
 }
 

@@ -22,6 +22,7 @@ from sensors.reference import Reference
 CLEAR_M, ABOVE_FLOOR_M, BASE_CLEAR_M = 0.6, 0.5, 0.45
 SETTLE = np.repeat([0.0002, 0.0003], 3)  # rad, m: how the base shifts when the arm moves
 GUESS = np.repeat([np.radians(1.0), 0.02], 3)  # rad, m: error of a guessed base pose
+RATE = 0.25  # rad/s: sd of a joint's speed while the arm moves
 TRIES = 200
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -74,7 +75,11 @@ def plan(rig: Rig, spec: Spec, mesh: Reference, rng: np.random.Generator) -> Pla
     Ts_faro_root = np.concatenate(roots)
     if spec.base_moves == "stop":
         Ts_faro_root = Ts_faro_root @ se3.exp(SETTLE * rng.standard_normal((len(location), 6)))
-    return Plan(location, np.concatenate(joints), Ts_faro_root, _columns(location, rng))
+    columns = _columns(location, rng)
+    if spec.poses == "moving":
+        rates = RATE * rng.standard_normal((len(location), len(rig.joint_names)))
+        columns |= {f"rate.{j}": r for j, r in zip(rig.joint_names, rates.T, strict=True)}
+    return Plan(location, np.concatenate(joints), Ts_faro_root, columns)
 
 
 def _bases(
@@ -84,12 +89,12 @@ def _bases(
     n = spec.stops_per_location * (spec.locations if spec.base_moves == "never" else 1)
     tip = rig.lidar_frame or "mount"
     several = not spec.arm and spec.base_moves == "stop"
-    tried = 0
+    tried = placed = 0
     while True:
         tried += 1
         if tried > TRIES:
             raise InputError(f"{n} stops clear of the furniture were not found; ask for fewer")
-        joints = _joints(rig, spec.level, 40 * n, rng)
+        joints = _joints(rig, spec, placed, 40 * n, rng)
         if spec.arm:
             T = _base(mesh, rng)
             roots = np.broadcast_to(T, (len(joints), 4, 4))
@@ -98,16 +103,19 @@ def _bases(
             roots = np.broadcast_to(held, (len(joints), 4, 4))
         clear = _clear(mesh, roots @ rig.tree.place(tip, joints).Ts_root_frame)
         if len(clear) >= n:
-            tried = 0
+            tried, placed = 0, placed + 1
             yield joints[clear[:n]], roots[clear[:n]]
 
 
-def _joints(rig: Rig, level: bool, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Joints (count, J) well within their limits; `level` keeps the arm's tip upright."""
+def _joints(rig: Rig, spec: Spec, placed: int, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Joints (count, J) well within their limits, as the spec has them where the base stands after
+    so many placings; `level` keeps the arm's tip upright."""
     moving = {e.joint.name: e.joint for e in rig.tree.edges if e.joint is not None}
     limits = np.array([[moving[j].lower, moving[j].upper] for j in rig.joint_names]).reshape(-1, 2)
     q = rng.uniform(*(0.85 * limits.T), (count, len(limits)))
-    if level and len(limits):
+    if spec.poses == "one_joint":
+        q[:, np.arange(len(limits)) != placed % len(limits)] = 0.0
+    if spec.level and len(limits):
         q[:, 3] = 0.0
         q[:, 4] = q[:, 1] - q[:, 2]
         q = q[(q[:, 4] > limits[4, 0]) & (q[:, 4] < limits[4, 1])]

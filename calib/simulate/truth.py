@@ -69,7 +69,7 @@ def draw(rig: Rig, spec: Spec, hide: Mapping[str, float], seed: int) -> Truth:
     those of the LiDAR by the mean offset and the pattern that its model is known for. A hidden
     effect of size s has ``theta = s * sigma * z``, z normal numbers scaled to a root mean square of
     1; so an effect of one parameter has ``theta = +-s * sigma``. A default effect that is hidden is
-    drawn in this way instead.
+    drawn in this way instead. Effects that the spec says act have their parameters at its value.
 
     Args:
         rig: the rig on paper.
@@ -83,9 +83,11 @@ def draw(rig: Rig, spec: Spec, hide: Mapping[str, float], seed: int) -> Truth:
     shared_seed = seed if spec.world_seed is None else spec.world_seed
     asked = [(effect, size) for text, size in hide.items() for effect in load_effects([text])]
     hidden = {effect.name: size for effect, size in asked}
+    given = [(e, value) for text, value in spec.acting.items() for e in load_effects([text])]
+    hidden_or_given = {*hidden, *(effect.name for effect, _ in given)}
     usual = [FrameOffset(name) for name in rig.frame_sigma]
-    usual += [find(name) for name in DEFAULT if name not in hidden]
-    effects = []
+    usual += [find(name) for name in DEFAULT if name not in hidden_or_given]
+    effects = [_acting(effect, rig, value) for effect, value in given]
     for effect in [*usual, *(effect for effect, _ in asked)]:
         rng = stream(seed if owned(effect, rig) else shared_seed, effect.name)
         sigma = np.array([p.sigma for p in effect.params(rig)])
@@ -102,6 +104,14 @@ def draw(rig: Rig, spec: Spec, hide: Mapping[str, float], seed: int) -> Truth:
         if len(theta):
             effects.append((effect, theta))
     return Truth(rig, tuple(effects), _opti_faro(stream(shared_seed, "opti")), hidden)
+
+
+def _acting(effect: Effect, rig: Rig, value: float) -> tuple[Effect, np.ndarray]:
+    """An effect, every parameter of it that may differ from 0 at one value."""
+    sigma = np.array([p.sigma for p in effect.params(rig)])
+    if not sigma.any():
+        raise InputError(f"effect '{effect.name}' has nothing to act on in rig {rig.name}")
+    return effect, np.where(sigma > 0, value, 0.0)
 
 
 def _pattern(rig: Rig, count: int, rng: np.random.Generator) -> np.ndarray:

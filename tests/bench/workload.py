@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -29,7 +29,7 @@ CELL_M = 0.106  # of the mesh: 50,000 triangles
 class Held(Recording):
     """A recording whose scans stay in memory."""
 
-    scans: dict[int, Scan]
+    scans: dict[int, Scan] = field(default_factory=dict)
 
     def scan(self, stop: int) -> Scan:
         """The scan of one stop."""

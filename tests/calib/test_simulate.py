@@ -174,7 +174,8 @@ def test_presets_hold_what_their_names_say(tmp_path, name):
     assert (source.reference is not None) == spec.mesh
     assert (recording.targets is not None) == bool(spec.targets)
     assert bool(rig.joint_names) == spec.arm == (tmp_path / name / "arm.urdf").exists()
-    assert set(recording.covariates) == {"temperature_c", "humidity"}
+    rates = {f"rate.{joint}" for joint in rig.joint_names} if spec.poses == "moving" else set()
+    assert set(recording.covariates) == {"temperature_c", "humidity"} | rates
     if spec.tracker == "points":
         assert len(recording.bodies) == 3
         assert all(np.isnan(b[:, 3:]).all() for b in recording.bodies.values())
@@ -247,3 +248,53 @@ def test_hiding_needs_something_to_act_on(tmp_path):
     with pytest.raises(InputError, match="seed -1 is negative"):
         simulate("tiny", tmp_path / "rec", -1)
     assert list(tmp_path.iterdir()) == []
+
+
+# ----------------------------------------------------------------------- what the arm does
+
+
+def test_one_joint_turns_at_each_location(tmp_path):
+    source, _ = made(tmp_path / "rec", changed(PRESETS["one-joint"], locations=7))
+    joints = source.recording.joints
+    turning = np.abs(joints) > 0
+    expected = np.arange(7) % 6  # after the last joint the first again
+    assert [set(np.flatnonzero(row)) for row in turning] == [
+        {int(j)} for j in np.repeat(expected, PRESETS["one-joint"].stops_per_location)
+    ]
+
+
+def test_what_acts_has_the_value_it_is_given(tmp_path):
+    spec = Spec(
+        locations=2,
+        stops_per_location=2,
+        column_step=128,
+        acting={"incidence_angle_bias": -0.004, "arm_link_length": 0.001},
+    )
+    source, truth = made(tmp_path / "rec", spec)
+    assert truth["effects"]["incidence_angle_bias"] == [-0.004]
+    lengths = truth["effects"]["arm_link_length"]
+    nonzero = [np.any(e.T_parent_child[:3, 3]) for e in source.rig.tree.edges]
+    by_name = dict(zip(source.rig.tree.edge_names, nonzero, strict=True))
+    assert lengths == [0.001 if by_name[n] else 0.0 for n in source.rig.arm_edges]
+
+
+def test_what_acts_needs_something_to_act_on(tmp_path):
+    spec = changed(PRESETS["lidar-tracker"], acting={"arm_gravity_sag": 1e-4})
+    with pytest.raises(InputError, match="'arm_gravity_sag' has nothing to act on"):
+        simulate(spec, tmp_path / "rec", 0)
+
+
+@pytest.mark.parametrize(
+    "fields, says",
+    [
+        ({"poses": "moving"}, "are of an arm alone"),
+        ({"lidar": None, "mesh": False, "arm": False, "poses": "one_joint"}, "are of an arm alone"),
+        (
+            {"lidar": None, "mesh": False, "poses": "one_joint", "base_moves": "never"},
+            "another joint turns",
+        ),
+    ],
+)
+def test_poses_that_cannot_be_are_refused(fields, says):
+    with pytest.raises(ValueError, match=says):
+        Spec(**fields)
