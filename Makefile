@@ -32,7 +32,7 @@ test: system browser .venv/.tested
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	@echo "== test: pytest"
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --dist loadfile  # what tests share, they share within a file
 
 clean:
 	@echo "== clean: removing the environment, the demo and what the tools left"

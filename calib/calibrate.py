@@ -197,6 +197,11 @@ def _fit(
         unseen = held_out(sources, model, by, count, progress, estimate.state)
     nominal = _nominal(problem, progress)
     seen = _write_residuals(problem, estimate, folder / RESIDUALS, progress)
+    if not seen.count and not problem.blocks:
+        raise InputError(
+            f"{sources[0].recording.folder}: no beam meets a surface and no tracked body was seen, "
+            "so there is nothing to fit to; 'rigcal check' says what is missing"
+        )
     worse = misfit(estimate.graph, estimate.values, seen)
     widened = max([1.0, *(x for x in worse.values() if x > TOLERATED)])
     solution = solution_of(problem, estimate, widened)

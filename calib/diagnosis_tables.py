@@ -28,11 +28,6 @@ if TYPE_CHECKING:
 
 LEADING = 8  # candidates that are shown; diagnosis.json has all
 WEAKEST = 4  # directions that are shown
-VERDICTS = {
-    "adequate": "the model is adequate",
-    "missing_effect": "an effect is missing",
-    "unexplained_structure": "structure that no effect explains",
-}
 
 
 def print_diagnosis(diagnosis: Diagnosis, residual: str = "range") -> None:
@@ -52,7 +47,7 @@ def print_diagnosis(diagnosis: Diagnosis, residual: str = "range") -> None:
         print_pairs(console, "what this data cannot tell apart", tied)
     if diagnosis.unexplained:
         console.print(unexplained_table(diagnosis.unexplained[:LEADING], residual))
-    if diagnosis.verdict == "adequate":
+    if diagnosis.verdict == "adequate" and not diagnosis.too_few:
         console.print(detectable_table(diagnosis.candidates))
     _print_untestable(console, diagnosis.untestable)
     _print_weak(console, diagnosis.weak_directions)
@@ -73,7 +68,7 @@ def print_explanation(explanation: Explanation) -> None:
 
 
 def _say_verdict(console: Console, diagnosis: Diagnosis) -> None:
-    console.print(f"verdict: {VERDICTS[diagnosis.verdict]}", style="bold")
+    console.print(f"verdict: {diagnosis.heading}", style="bold")
     for sentence in diagnosis.sentences:
         console.print(sentence)
     console.print()
@@ -151,10 +146,10 @@ def _print_untestable(console: Console, untestable: Mapping[str, str]) -> None:
 
 def _print_weak(console: Console, directions: Sequence[Mapping[str, Any]]) -> None:
     """What the data hardly determine, and what would."""
-    rows = [
-        (f"{', '.join(d['parameters'])} ± {d['sigma_mm']:.2f} mm", d["needs"])
-        for d in directions[:WEAKEST]
-    ]
+    rows = []
+    for d in directions[:WEAKEST]:
+        sigma = "" if d["sigma_mm"] is None else f" ± {d['sigma_mm']:.2f} mm"
+        rows.append((f"{', '.join(d['parameters'])}{sigma}", d["needs"]))
     if rows:
         print_pairs(console, "what the data hardly tell, and what would", rows)
 

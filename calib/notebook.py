@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 from calib.diagnosis_tables import (
     LEADING,
-    VERDICTS,
     candidates_table,
     detectable_table,
     unexplained_table,
@@ -58,9 +57,9 @@ def diagnosis_html(diagnosis: Diagnosis) -> str:
         tables.append(candidates_table(diagnosis.candidates[:LEADING], "residual"))
     if diagnosis.unexplained:
         tables.append(unexplained_table(diagnosis.unexplained[:LEADING], "residual"))
-    if diagnosis.verdict == "adequate":
+    if diagnosis.verdict == "adequate" and not diagnosis.too_few:
         tables.append(detectable_table(diagnosis.candidates))
-    return _html(f"verdict: {VERDICTS[diagnosis.verdict]}", diagnosis.sentences, tables)
+    return _html(f"verdict: {diagnosis.heading}", diagnosis.sentences, tables)
 
 
 def rung_html(rung: Rung) -> str:

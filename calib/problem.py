@@ -74,7 +74,8 @@ def build(
         meetings: per source, what beams meet, where another problem has found that already.
 
     Raises:
-        InputError: the recording has nothing to start from, or lacks what an effect needs.
+        InputError: the recording has nothing to start from, lacks what an effect needs, or leaves
+            nothing to estimate.
     """
     several = len({s.rig.name for s in sources}) > 1
     problem = Problem(sources, [model.terms(s.rig, several) for s in sources])
@@ -86,6 +87,11 @@ def build(
     for i, source in enumerate(sources):
         chosen = np.ones(len(source.recording.stops), bool) if use is None else use[i]
         _Builder(problem, i, source, "" if len(sources) == 1 else f"{i}/", chosen, model).build()
+    if not problem.calibration:
+        raise InputError(
+            f"{sources[0].rig.name}: there is nothing to estimate: no frame with a sigma, no arm "
+            "and no LiDAR, or all of it is held"
+        )
     return problem
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from calib.effects import FrameOffset
 from calib.fit import Estimate, Progress, solve
@@ -126,7 +126,7 @@ def _test(force: np.ndarray, spread: np.ndarray, precision: np.ndarray) -> _Test
     if not use.any():
         return None
     statistic = float((np.square(axes.T @ root @ force)[use] / told[use]).sum())
-    return _Test(float(chi2.sf(statistic, use.sum())), -statistic)
+    return _Test(float(chdtrc(use.sum(), statistic)), -statistic)
 
 
 def _link(

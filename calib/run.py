@@ -25,7 +25,8 @@ SOLUTION, MODEL, SUMMARY, COVARIANCE, RESIDUALS, STATE, DIAGNOSIS = (
     "state.npz",
     "diagnosis.json",
 )
-_OF_DIAGNOSIS = {"verdict", "sentences", "candidates", "unexplained", "weak_directions", "curves"}
+_OF_DIAGNOSIS = {"verdict", "heading", "too_few_stops", "sentences", "candidates"}
+_OF_DIAGNOSIS |= {"unexplained", "weak_directions", "curves"}
 _OF_CANDIDATE = {"effect", "add", "p_adjusted", "step", "dressed_up", "held_out_rms_mm"}
 _OF_CANDIDATE |= {"unabsorbed_rms_mm"}
 _OF_CURVE = {"covariates", "centres", "mean_mm", "band_mm"}
@@ -204,6 +205,12 @@ def read_solution(folder: Path) -> Solution:
 def write_state(folder: Path, state: Mapping[str, np.ndarray]) -> None:
     """Put where a fit stood into its run folder."""
     np.savez(folder / STATE, **{f"{_OF_STATE}{name}": value for name, value in state.items()})
+
+
+def worth_adding(candidates: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Names of the confirmed among a diagnosis' candidates; see `calib.diagnosis.Diagnosis`."""
+    confirmed = [c for c in candidates if c["step"] and not c["dressed_up"]]
+    return [c["add"] for c in sorted(confirmed, key=lambda c: c["step"])]
 
 
 def one_unit(units: Sequence[str]) -> str:

@@ -54,7 +54,9 @@ def read_mesh_file(path: Path) -> Mesh:
     """
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
-        raise InputError(f"{path}: a mesh is read from {', '.join(SUFFIXES)}, not {suffix!r}")
+        cloud = "; a scanner's cloud is a `survey`" if suffix in (".e57", ".pts", ".ptx") else ""
+        known = ", ".join(SUFFIXES)
+        raise InputError(f"{path}: a mesh is read from {known}, not {suffix!r}{cloud}")
     if not path.is_file():
         raise InputError(f"{path} does not exist; name a mesh")
     if path.stat().st_size == 0:

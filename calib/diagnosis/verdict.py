@@ -16,9 +16,14 @@ from calib.diagnosis.search import ALPHA, FEWEST, ODDS, Found, Search, angle_deg
 from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import formula, hangs_on, what_separates, words
 from calib.effects import CATALOGUE, Site
-from calib.run import one_unit
+from calib.run import one_unit, worth_adding
 
 UNNAMED = "unexplained_structure"
+VERDICTS = {
+    "adequate": "the model is adequate",
+    "missing_effect": "an effect is missing",
+    UNNAMED: "structure that no effect explains",
+}
 ABSORBED = 0.7  # share of the structure that named effects must explain to be the answer
 TOLD = 6  # untestable effects and rivals that a sentence names
 
@@ -36,6 +41,7 @@ class Diagnosis:
         untestable: effect -> what the recordings lack to test it.
         misfit: instrument -> how many times larger than their sigmas its residuals are.
         curves: mean residual against covariates.
+        too_few: whether the stops are too few to say anything, whatever the verdict.
     """
 
     verdict: str
@@ -46,6 +52,12 @@ class Diagnosis:
     untestable: Mapping[str, str]
     misfit: Mapping[str, float]
     curves: Sequence[Curve] = field(repr=False)
+    too_few: bool = False
+
+    @property
+    def heading(self) -> str:
+        """The verdict in words."""
+        return "none, the stops are too few" if self.too_few else VERDICTS[self.verdict]
 
     @property
     def worth_adding(self) -> list[str]:
@@ -63,6 +75,8 @@ class Diagnosis:
         """As written to diagnosis.json."""
         return {
             "verdict": self.verdict,
+            "heading": self.heading,
+            "too_few_stops": self.too_few,
             "sentences": list(self.sentences),
             "candidates": list(self.candidates),
             "unexplained": list(self.unexplained),
@@ -71,12 +85,6 @@ class Diagnosis:
             "misfit": dict(self.misfit),
             "curves": [curve.document() for curve in self.curves],
         }
-
-
-def worth_adding(candidates: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Names of the confirmed among a diagnosis' candidates; see `Diagnosis.worth_adding`."""
-    confirmed = [c for c in candidates if c["step"] and not c["dressed_up"]]
-    return [c["add"] for c in sorted(confirmed, key=lambda c: c["step"])]
 
 
 def conclude(
@@ -107,7 +115,12 @@ def conclude(
         untestable,
         misfit,
         curves(first.unnamed),
+        _stops(first) < FEWEST,
     )
+
+
+def _stops(look: Look) -> int:
+    return int(look.linear.stop.max()) + 1
 
 
 def _verdict(found: Search) -> str:
@@ -269,7 +282,7 @@ def _sentences(
     look = found.looks[0]
     residual = _residual(look)
     out = []
-    stops = int(look.linear.stop.max()) + 1
+    stops = _stops(look)
     if stops < FEWEST:
         out.append(
             f"Nothing can be said: {stops} stops are too few to name an effect, as all of them may "

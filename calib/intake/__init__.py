@@ -22,6 +22,7 @@ from calib.intake.gather import (
     gather,
     joint_track,
     once_each,
+    refuse_parts,
     section,
     sources,
 )  # fmt: skip
@@ -111,6 +112,7 @@ def import_files(
     if choices.rig is not None and not choices.rig.is_file():
         raise InputError(f"--rig {choices.rig}: there is no such file")
     found = gather(given, options, choices.rig, progress)
+    refuse_parts(found, choices.rig)
     cut = _from_rows(found) if found.stops is not None else _from_logs(found, choices)
     understood, odd = [*found.understood, *cut.understood], [*found.odd, *cut.odd]
     columns, share = _thinned(cut, choices.most_stops)
@@ -192,10 +194,7 @@ def _from_logs(found: Gathered, choices: Choices) -> _Cut:
 def _still(found: Gathered, timed: bool) -> _Cut:
     """Nothing but a LiDAR: one stop of all its turns, or one for every file without a clock."""
     if not found.sweeps:
-        raise InputError(
-            "the sources hold no logs, no table of stops and no LiDAR data; nothing can be made of "
-            "them"
-        )
+        raise InputError("the logs say neither where something was nor what the LiDAR saw")
     scans.one_lidar(found.sweeps)
     names = ["still"] if timed else [one.name for one in found.sweeps]
     if len(set(names)) < len(names):

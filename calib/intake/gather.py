@@ -30,6 +30,9 @@ from sensors.readers.base import (
 from sensors.readers.urdf import with_ends
 
 ARMS = ("urdf", "dh")  # read before all others, which look for the arm's joints
+TOLD_BY_FILE = ("bag", "hesai", "mesh", "ouster")  # which read --metadata
+PACKED = (".zip", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".zst", ".tar")
+ROOMS = ("mesh", "spheres", "survey")  # what stood around; nothing of the rig
 
 Given = tuple[str, Sequence[Path]]
 """A kind, and its files."""
@@ -80,6 +83,8 @@ def sources(words: Sequence[str]) -> list[Given]:
         for path in files:
             if path.is_file() and path.stat().st_size == 0:
                 raise InputError(f"{path} is empty (0 bytes); was its transfer cut short?")
+            if path.suffix.lower() in PACKED:
+                raise InputError(f"{path} is packed; unpack it, and name the files in it")
     return given
 
 
@@ -91,6 +96,16 @@ def gather(
     Raises:
         InputError: as readers do; two sources describe the same thing.
     """
+    if all(kind in ROOMS for kind, _ in given):
+        raise InputError(
+            f"{' and '.join(dict.fromkeys(kind for kind, _ in given))} alone makes no recording; "
+            "add what the LiDAR, the arm or a tracker measured, as a bag, clouds or a table"
+        )
+    if options.metadata and not any(kind in TOLD_BY_FILE for kind, _ in given):
+        raise InputError(
+            f"--metadata {options.metadata}: it is for {', '.join(TOLD_BY_FILE)}, and no such "
+            "source is given"
+        )
     if rig:
         options = _told_by_rig(rig, options)
     arms = [Found(arm=_arm_beside(rig))] if rig else []
@@ -149,6 +164,33 @@ def _arm_of(rig: Path) -> dict[str, str]:
     arm = section(rig, "arm")
     whole = {"urdf", "base", "tip"} <= arm.keys()
     return {key: str(arm[key]) for key in ("urdf", "base", "tip")} if whole else {}
+
+
+def refuse_parts(found: Gathered, rig: Path | None) -> None:
+    """Refuse sources of which no recording can be made.
+
+    Raises:
+        InputError: nothing was measured, or there is nothing that it could calibrate.
+    """
+    if not found.tracks and not found.sweeps and found.stops is None:
+        what = "an arm" if found.arm else "nothing"
+        raise InputError(
+            f"the sources hold {what}, and no logs, no table of stops and no LiDAR data; add what "
+            "was measured, as a bag, clouds or a table"
+        )
+    names = [t.name for t in found.tracks if t.kind in ("pose", "point")]
+    names += [n.rpartition(".")[0] for n in found.stops or () if n.endswith(".x")]
+    if found.surface and not names:
+        raise InputError(
+            "nothing says where the rig stood in the scanned room; add what a tracker saw, or a "
+            "table of stops with base_guess.x to base_guess.qz, or leave the room out"
+        )
+    if rig is None and found.arm is None and not found.sweeps:
+        raise InputError(
+            "no arm or LiDAR is there to be calibrated by "
+            f"{', '.join(dict.fromkeys(names)) or 'what was logged'}; add the source of one, as "
+            "`urdf FILE` or `dh FILE` for an arm"
+        )
 
 
 def _told_by_rig(rig: Path, options: Options) -> Options:
@@ -268,7 +310,7 @@ def joint_track(tracks: Sequence[Track], joints: Sequence[str]) -> list[Track]:
         missing = next((name for name in joints if name not in have), joints[0])
         raise InputError(
             f"no source has values of the arm's joint {missing}"
-            f"{nearest(missing, have or ['none'])}; say --column {missing}=THEIRS"
+            f"{nearest(missing, have) if have else ''}; say --column {missing}=THEIRS"
         )
     return out
 

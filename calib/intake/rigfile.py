@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from calib.intake.gather import Gathered, section
-from calib.intake.roles import Mounted, Roles, find_roles, poses_of
+from calib.intake.roles import Mounted, Roles, find_roles
 from chains import se3
 from chains.errors import InputError
 from sensors.documents import nearest, write_atomically
@@ -117,11 +117,6 @@ def _roles(found: Gathered, columns: Columns) -> Roles:
     """Where tracked bodies hang."""
     if found.edges and found.arm:
         return find_roles(columns, found.edges, found.joints, found.arm.base, found.arm.tip)
-    bodies = list(poses_of(columns))
-    if len(bodies) > 1 and not found.sweeps:
-        raise InputError(
-            f"bodies {', '.join(bodies)} were tracked, and no arm or LiDAR; give the source of one"
-        )
     return Roles([], True, [])
 
 

@@ -60,9 +60,10 @@ def budget(
         solution: its covariance.
         progress: called with what is being done, and how far it is.
     """
+    owner = {f"{v.name}.{dof}": v.name for v in problem.variables.values() for dof in v.dofs}
     at: dict[str, list[int]] = {}
     for i, name in enumerate(solution.names):
-        at.setdefault(name.rpartition(".")[0], []).append(i)
+        at.setdefault(owner[name], []).append(i)
     drawn = [n for n in at if problem.variables[n].kind == "vector"]  # a pose has no paper
     uncertain, moved = dict.fromkeys(at, 0.0), dict.fromkeys(drawn, 0.0)
     rows, stops = 0, 0

@@ -75,6 +75,8 @@ def _doubtful(run: Run, diagnosis: Mapping[str, Any] | None) -> Iterator[str]:
     rms = run.summary["rms_mm"]
     if diagnosis is None:
         yield f"not diagnosed; 'rigcal diagnose {run.folder}' asks what is missing"
+    elif diagnosis["too_few_stops"]:
+        yield "the stops are too few to say whether anything is missing"
     elif diagnosis["verdict"] == "unexplained_structure":
         yield "there is structure that no known effect explains"
     if rms.get("held_out") is None:

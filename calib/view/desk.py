@@ -9,10 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from calib.diagnosis.verdict import worth_adding
 from calib.effects import CATALOGUE, find
 from calib.ladder import Rung, ladder
-from calib.run import Run
+from calib.run import Run, worth_adding
 from chains.errors import InputError
 
 
@@ -21,14 +20,14 @@ class Findings:
     """A run's diagnosis, as diagnosis.json has it.
 
     Args:
-        verdict: of three.
+        heading: the verdict in words.
         sentences: the finding in words.
         candidates: effects that the model lacks, best first.
         unexplained: structure without a name.
         curves: mean residual against one covariate each, by its name.
     """
 
-    verdict: str
+    heading: str
     sentences: Sequence[str]
     candidates: Sequence[Mapping[str, Any]]
     unexplained: Sequence[Mapping[str, Any]]
@@ -47,7 +46,7 @@ class Findings:
         single = (c for c in found["curves"] if len(c["covariates"]) == 1)
         curves = {c["covariates"][0]: Curve.read(c) for c in single}
         lists = (found[key] for key in ("sentences", "candidates", "unexplained"))
-        return cls(found["verdict"], *lists, curves)
+        return cls(found["heading"], *lists, curves)
 
     @property
     def worth_adding(self) -> list[str]:

@@ -16,11 +16,6 @@ from calib.view.desk import Findings
 from calib.view.scene import Points
 
 SHOWN = 6  # candidates in the table; the menu has all
-VERDICTS = {
-    "adequate": "The model is adequate",
-    "missing_effect": "An effect is missing",
-    "unexplained_structure": "There is structure that no effect explains",
-}
 LEAST_P = 1e-12  # smaller ones are not told from each other
 LARGE = ((1e9, " billion"), (1e6, " million"), (1.0, ""))
 _FRAME = "padding:0 1.2em .4em .75em;font-size:12px;line-height:1.4;color:#222"
@@ -99,7 +94,7 @@ def findings(found: Findings | None) -> str:
     if found is None:
         return _framed("This run has not been diagnosed.")
     sentences = "".join(f'<p style="margin:.3em 0">{escape(text)}</p>' for text in found.sentences)
-    verdict = escape(VERDICTS.get(found.verdict, found.verdict))
+    verdict = escape(f"Verdict: {found.heading}")
     return _framed(f'<b data-is="verdict">{verdict}</b>{sentences}{_candidates(found)}')
 
 

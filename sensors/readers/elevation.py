@@ -18,6 +18,10 @@ _CLEAR = 3.0
 _LEAST_POINTS = 3
 """Fewer points with one elevation are stray and no ring."""
 _MOST_POINTS = 300_000
+_SAME_STEPS = 0.03
+"""How far a turn's number of azimuth steps may be off a model's, of itself."""
+_SPEEDS = (0.5, 1.0, 2.0)
+"""A turn has so many of a model's azimuth steps, as it turns at 20, 10 or 5 Hz."""
 _JITTER = 20
 """Points within which azimuth may cross the beginning of its turn to and fro."""
 
@@ -75,7 +79,7 @@ def ring_order(xyz_m: Array) -> Order | None:
     step = np.diff(middle)
     if not (np.all(step > 0) or np.all(step < 0)):
         return None
-    why = f"they are told by the order of the points, in {rings} turns, counted from the lowest up"
+    why = f"rings are told by the order of the points, in {rings} turns, counted from the lowest up"
     return Order(rings, bool(step[0] < 0), why)
 
 
@@ -107,7 +111,11 @@ def elevation_groups(xyz_m: Array, model: str | None = None) -> Groups | None:
     They are where every step between groups is three times the widest step within one, and either
     their elevations are those of a model of the catalogue (of `model`, if that is given) or they
     are as many as LiDARs have rings. Beams are tried from the origin and from where each model of
-    the catalogue has them start.
+    the catalogue has them start. Of several models with the same elevations, the number of azimuth
+    steps in a turn tells which it is.
+
+    Raises:
+        InputError: the steps fit none or several of them, and rings are numbered otherwise in each.
     """
     models = [model] if model else catalog()
     origins = {(0.0, 0.0), *(tuple(load_lidar(m).beam_origin_m.tolist()) for m in models)}
@@ -120,7 +128,18 @@ def elevation_groups(xyz_m: Array, model: str | None = None) -> Groups | None:
     if best is None:
         return None
     _, origin, middle = best
-    return _number(middle, np.array(origin), models)
+    return _number(middle, np.array(origin), models, xyz_m)
+
+
+def azimuth_step(xyz_m: Array) -> float:
+    """The usual step between neighbouring points (N, 3) of one cone, rad."""
+    elevation = np.arctan2(xyz_m[:, 2], np.hypot(xyz_m[:, 0], xyz_m[:, 1]))
+    azimuth = np.arctan2(xyz_m[:, 1], xyz_m[:, 0])
+    cone = np.rint(elevation / 1e-3)
+    order = np.lexsort((azimuth, cone))
+    step = np.diff(azimuth[order])[np.diff(cone[order]) == 0]
+    step = step[step > 2e-4]
+    return float(np.median(step[step < 2 * np.quantile(step, 0.2)])) if len(step) else 2 * np.pi
 
 
 def matching_models(rings: NDArray[np.int64], elevation_rad: Array) -> list[str]:
@@ -149,16 +168,44 @@ def _split(elevation: Array) -> tuple[float, Array]:
     return float(ratio.max()), np.array(groups)
 
 
-def _number(middle: Array, origin: Array, models: list[str]) -> Groups | None:
+def _number(middle: Array, origin: Array, models: list[str], xyz_m: Array) -> Groups | None:
     """Rings of the groups: those of the one model they fit, or counted from the lowest up."""
-    for name in models:
-        model = load_lidar(name)
-        nearest = np.abs(model.elevation_rad[:, None] - middle).argmin(axis=0)
-        miss = np.degrees(np.abs(model.elevation_rad[nearest] - middle))
-        if len(np.unique(nearest)) == len(middle) > model.rings // 2 and miss.max() < 0.1:
-            why = f"they are told by elevation, whose {len(middle)} groups are those of {name}"
-            return Groups(middle, nearest, origin, why)
+    alike = {name: rings for name in models if (rings := _rings_of(name, middle)) is not None}
+    if alike:
+        name, why = _one_of(alike, xyz_m)
+        why = f"rings are told by elevation, whose {len(middle)} groups are those of {why}"
+        elevation = load_lidar(name).elevation_rad.copy()  # of rings with next to no points
+        elevation[alike[name]] = middle
+        order = np.argsort(elevation)
+        return Groups(elevation[order], order, origin, why)
     if len(middle) not in RING_COUNTS:
         return None
-    why = f"they are told by elevation, in {len(middle)} clear groups, counted from the lowest up"
+    why = f"rings are told by elevation, in {len(middle)} clear groups, counted from the lowest up"
     return Groups(middle, np.arange(len(middle)), origin, why)
+
+
+def _one_of(alike: dict[str, NDArray[np.int64]], xyz_m: Array) -> tuple[str, str]:
+    """The model that numbers rings, and what to say of it; by azimuth steps if they differ."""
+    first, *others = alike
+    if all(np.array_equal(alike[first], alike[other]) for other in others):
+        return first, first
+    steps = 2 * np.pi / azimuth_step(xyz_m)
+    ratio = {name: steps / load_lidar(name).columns for name in alike}
+    same = [n for n in alike if any(abs(ratio[n] / k - 1) < _SAME_STEPS for k in _SPEEDS)]
+    if len(same) != 1:
+        raise InputError(
+            f"the elevations of the points are those of {' and of '.join(alike)}, which number"
+            f" their rings each in its own way, and {round(steps)} azimuth steps a turn do not tell"
+            " them apart; name the one by --lidar"
+        )
+    why = f"{' and of '.join(alike)}; of these, {same[0]} makes {round(steps)} steps a turn"
+    return same[0], why
+
+
+def _rings_of(name: str, middle: Array) -> NDArray[np.int64] | None:
+    """The ring of a model at each elevation (G,) rad; None where it is not this model."""
+    model = load_lidar(name)
+    nearest = np.abs(model.elevation_rad[:, None] - middle).argmin(axis=0)
+    miss = np.degrees(np.abs(model.elevation_rad[nearest] - middle))
+    fits = len(np.unique(nearest)) == len(middle) > model.rings // 2 and miss.max() < 0.1
+    return nearest if fits else None

@@ -39,7 +39,7 @@ class Model:
     """Where a model's packet has what; bytes."""
 
     name: str
-    catalog: str | None
+    catalog: str
     size: int
     header: int
     """Before the first block."""
@@ -81,10 +81,10 @@ MODELS = (
     Model("Pandar64", "hesai_pandar64", 1194, 8, 0, 6, 64, 3, 5, 0.3),
     Model("Pandar64", "hesai_pandar64", 1198, 8, 0, 6, 64, 3, 5, 0.3),
     Model("PandarQT64", "hesai_pandarqt64", 1072, 12, 0, 4, 64, 4, 9, 0.1),
-    Model("PandarQT128", None, 1127, 12, 0, 2, 128, 4, 9, 0.05),
-    Model("PandarXT-16", None, 568, 12, 0, 8, 16, 4, 9, 0.05),
+    Model("PandarQT128", "hesai_qt128", 1127, 12, 0, 2, 128, 4, 9, 0.05),
+    Model("PandarXT-16", "hesai_xt16", 568, 12, 0, 8, 16, 4, 9, 0.05),
     Model("PandarXT-32", "hesai_pandarxt32", 1080, 12, 0, 8, 32, 4, 9, 0.05),
-    Model("PandarXT-32M2X", None, 820, 12, 0, 6, 32, 4, 9, 0.5),
+    Model("PandarXT-32M2X", "hesai_xt32m2x", 820, 12, 0, 6, 32, 4, 9, 0.5),
 )
 _START = {"Pandar40P": b"\xff\xee", "Pandar64": b"\xee\xff\x40\x06"}
 _VERSION = {
@@ -94,6 +94,7 @@ _VERSION = {
     "PandarXT-32": (6, 1),
     "PandarXT-32M2X": (6, 1),
 }
+_FAR_OFF_DEG = 1.0  # of a unit's elevations from its model's, where 0.1 is usual
 # Metres along the beam's azimuth and to its left: HesaiLidar_SDK_2.0, udp3_1_ and udp6_1_parser.
 _OPTICAL_CENTRE_M = {
     "PandarQT64": (0.0298, 0.0072),
@@ -188,8 +189,8 @@ def hesai_found(
 ) -> Found:
     """Decode the packets of one sensor.
 
-    Raises InputError where no packet is of a model known here, where the table of angles does not
-    fit it, and where neither `--metadata` nor the catalogue has one.
+    Angles are those of `--metadata`, or else the catalogue's. Raises InputError where no packet is
+    of a model known here, and where the table of angles does not fit it.
     """
     model, returns, columns = _look(name, packets)
     elevation_rad, azimuth_rad, odd = _angles(name, model, options)
@@ -197,18 +198,23 @@ def hesai_found(
     sweeps = packet_sweeps(name, clock, packets, decoder, progress)
     assert sweeps is not None  # a packet of it was seen
     lidar = {
+        "model": options.lidar or model.catalog,
         "columns": columns,
         "elevation_deg": np.degrees(elevation_rad).round(6).tolist(),
         "azimuth_offset_deg": (-np.degrees(azimuth_rad)).round(6).tolist(),
         "beam_origin_m": [0.0, 0.0],
     }
-    if chosen := options.lidar or model.catalog:
-        lidar = {"model": chosen, **lidar}
     understood = [
         f"{name}: Hesai {model.name}, {model.channels} rings x {columns} columns,"
         f" {len(sweeps.time_s)} turns{rate(sweeps.time_s)}; x, y, z as the maker's driver has them,"
         " timed by arrival"
     ]
+    if options.lidar not in (None, model.catalog):
+        odd = (
+            *odd,
+            f"{name}: the packets are of a {model.name} ({model.catalog}), and --lidar"
+            f" {options.lidar} is taken for its ranges and noise",
+        )
     if returns > 1:
         understood.append(f"{name}: {returns} returns per direction; the farthest is kept")
     if model.name in _OPTICAL_CENTRE_M:
@@ -283,6 +289,7 @@ def _blocks(model: Model, packets: Bytes) -> NDArray:
 
 def _angles(name: str, model: Model, options: Options) -> tuple[Array, Array, tuple[str, ...]]:
     """Elevation and azimuth (channels,) rad, clockwise, and what is odd about them."""
+    lidar = load_lidar(model.catalog)
     if options.metadata is not None:
         elevation_deg, azimuth_deg = read_angles(options.metadata)
         if len(elevation_deg) != model.channels:
@@ -290,13 +297,13 @@ def _angles(name: str, model: Model, options: Options) -> tuple[Array, Array, tu
                 f"{options.metadata} has angles of {len(elevation_deg)} channels, but {name} comes"
                 f" from a {model.name}, which has {model.channels}"
             )
+        off_deg = np.abs(elevation_deg - np.degrees(lidar.elevation_rad)).mean()
+        if off_deg > _FAR_OFF_DEG:
+            raise InputError(
+                f"{options.metadata} is no table of a {model.name}'s angles, from which {name}"
+                f" comes: its elevations are {off_deg:.1f} deg off that model's on average"
+            )
         return np.radians(elevation_deg), np.radians(azimuth_deg), ()
-    if model.catalog is None:
-        raise InputError(
-            f"{name} comes from a Hesai {model.name}, whose table of angles is not known here; give"
-            " the sensor's own (CSV: channel, elevation, azimuth) by --metadata"
-        )
-    lidar = load_lidar(model.catalog)
     odd = (
         f"{name}: no table of angles was given, so the {model.name}'s nominal one is taken; the"
         " sensor's own (from its web page, or its driver's folder) by --metadata is better",

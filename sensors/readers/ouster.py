@@ -283,15 +283,22 @@ def ouster_said(name: str, sweeps: Sweeps, metadata: Metadata, options: Options)
 def read_ouster(files: Sequence[Path], options: Options, progress: Progress) -> Found:
     """Read OSF files, or PCAP files that follow each other, of one Ouster sensor.
 
-    The metadata of a PCAP is `--metadata`, or the JSON beside it whose name begins as the PCAP's.
+    The metadata of a PCAP is `--metadata`, a JSON among the files, or the JSON beside it whose name
+    begins as the PCAP's.
     Raises InputError as `ouster_found` and `read_metadata` do, and where no JSON is found.
     """
     from sensors.readers.osf import read_osf
 
     found = [read_osf(path, options) for path in files if path.suffix.lower() == ".osf"]
-    if pcaps := [path for path in files if path.suffix.lower() != ".osf"]:
+    told = [path for path in files if path.suffix.lower() == ".json"]
+    if len(told) > 1 or (told and options.metadata):
+        raise InputError(f"{told[-1]} is one JSON too many; give that of this sensor alone")
+    pcaps = [path for path in files if path.suffix.lower() not in (".osf", ".json")]
+    if told and not pcaps:
+        raise InputError(f"{told[0]} is a sensor's metadata, and its PCAP is not given")
+    if pcaps:
         capture = Capture(pcaps)  # no capture is a plainer mistake than no metadata
-        beside = options.metadata or _beside(pcaps[0])
+        beside = options.metadata or (told[0] if told else _beside(pcaps[0]))
         metadata = read_metadata(beside.name, read_text(beside))
         packets = capture_packets(capture, OusterDecoder(metadata).size, options)
         name, in_mb = capture.name, capture.progress(progress)

@@ -21,6 +21,7 @@ from sensors.readers.elevation import (
     RING_COUNTS,
     Groups,
     Order,
+    azimuth_step,
     elevation_groups,
     matching_models,
     ring_order,
@@ -183,23 +184,12 @@ def _columns(
         return cloud.shape[1]
     if "column" in fields:
         return int(cloud.fields[fields["column"]].max()) + 1
-    step = _azimuth_step(xyz_m)
+    step = azimuth_step(xyz_m)
     if options.lidar is not None:
         told = load_lidar(options.lidar).columns
         if abs(2 * np.pi / step / told - 1) < 0.05:
             return told
     return int(np.clip(np.rint(2 * np.pi / step), 1, 65535))
-
-
-def _azimuth_step(xyz_m: Array) -> float:
-    """The usual step between neighbouring points of one cone, rad."""
-    elevation = np.arctan2(xyz_m[:, 2], np.hypot(xyz_m[:, 0], xyz_m[:, 1]))
-    azimuth = np.arctan2(xyz_m[:, 1], xyz_m[:, 0])
-    cone = np.rint(elevation / 1e-3)
-    order = np.lexsort((azimuth, cone))
-    step = np.diff(azimuth[order])[np.diff(cone[order]) == 0]
-    step = step[step > 2e-4]
-    return float(np.median(step[step < 2 * np.quantile(step, 0.2)])) if len(step) else 2 * np.pi
 
 
 # -------------------------------------------------------------------------- the sensor, its clock

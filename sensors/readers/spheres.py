@@ -206,7 +206,7 @@ def _must_be_one(path: Path, fit: Fit, count: int) -> None:
         raise InputError(
             f"{path} is not the cloud of one sphere: the nearest has a radius of "
             f"{1000 * radius:.0f} mm, {100 * kept / count:.0f} % of the points on it and "
-            f"{1000 * rms:.1f} mm rms; cut it out, or give --sphere-radius-m"
+            f"{1000 * rms:.1f} mm rms; cut it out, or give --sphere-radius"
         )
 
 

@@ -84,6 +84,7 @@ def _read(path: Path, options: Options) -> Found:
     if not mapped:  # whatever else is a number may explain something
         numeric = [n for n in numeric if _is_number(cells, columns[n].index, sheet)]
     values, odd = sheet.numbers([columns[name].index for name in numeric], skip)
+    odd = (*odd, *_unmapped_poses(path, names, columns, mapped))
     table: Columns = dict(zip(numeric, values.T, strict=True))
     for name in [n for n in TEXT if n in columns]:
         table[name] = np.array(sheet.text(columns[name].index, skip)[: len(values)], np.str_)
@@ -182,6 +183,24 @@ def _all_joints(
             f"{path}: the arm's joint {missing[0]} is not among the columns"
             f"{nearest(missing[0], names)}; say --column {missing[0]}=THEIRS"
         )
+
+
+def _unmapped_poses(
+    path: Path, names: Sequence[str], columns: Mapping[str, _Column], mapped: bool
+) -> list[str]:
+    """What to say of columns that end in x, y, z as a pose's do, and that nobody called one."""
+    short = {split_unit(name)[0] for name in names}
+    known = {column.theirs for ours, column in columns.items() if ours.endswith(".x")}
+    found = [n[:-1] for n in names if re.fullmatch(r".+[_ :/-]x", split_unit(n)[0])]
+    found = [n for n in found if {f"{n}y", f"{n}z"} <= short and f"{n}x" not in known]
+    if mapped or not found:
+        return []
+    like = min(found, key=lambda n: (f"{n}rx" not in short, len(n)))
+    turned = " and --euler, if its angles are Euler's" if f"{like}rx" in short else ""
+    return [
+        f"{path.name}: columns {', '.join(f'{n}x, y, z' for n in found)} may be where something was"
+        f" tracked, and are taken for covariates; say --column BODY.*={like}*{turned}"
+    ]
 
 
 def _is_number(cells: Sequence[str], index: int, sheet: Sheet) -> bool:

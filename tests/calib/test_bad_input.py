@@ -77,7 +77,7 @@ TYPES = {
     "x": (table(SCAN, x=lambda x: x.astype(str)), SCAN, "column x is string", "float32"),
     "ring": (table(SCAN, ring=lambda r: r + 0.5), SCAN, "column ring is double", "uint16"),
     "key": (rig("lidar", "frme", value="x"), "rig.yaml:", "lidar.frme", "did you mean frame"),
-    "model": (rig("lidar", "model", value="hesai_xt32"), "did you mean hesai_pandarxt32"),
+    "model": (rig("lidar", "model", value="hesai_pandarx32"), "did you mean hesai_pandarxt32"),
     "name": (rig("name", value="a/b"), "rig.yaml:", "name", "a/b"),
 }
 POSES = {

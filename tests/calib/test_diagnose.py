@@ -191,6 +191,14 @@ def test_people_read_it_in_mm_and_within_100_columns(studies, capsys):
     assert "found from" not in out
 
 
+def test_people_read_of_what_was_not_seen_at_all(studies, capsys):
+    """Then it has no size in mm."""
+    _, found = studies["null"]
+    unseen = {"parameters": ["arm_end"], "sigma_mm": None, "needs": "stops that move it"}
+    print_diagnosis(replace(found, weak_directions=[unseen]))
+    assert "arm_end  stops that move it" in capsys.readouterr().out
+
+
 def test_of_an_adequate_model_people_read_what_would_have_been_found(studies, capsys):
     _, found = studies["null"]
     print_diagnosis(found)

@@ -21,6 +21,8 @@ from . import rigs
 SMALL = Model(("ring_range_offset",), ("mount.tx",))
 NOTHING = {
     "verdict": "adequate",
+    "heading": "the model is adequate",
+    "too_few_stops": False,
     **{
         name: [] for name in ("sentences", "candidates", "unexplained", "weak_directions", "curves")
     },

@@ -20,6 +20,7 @@ def odd(folder: Path, name: str) -> tuple[list[Path], Model]:
     model = Model()
     if name == "arm and tracker":
         specs = [Spec(lidar=None, mesh=False, targets=0, tracker="points", stops_per_location=6)]
+        model = Model(("arm_link_length", "arm_joint_offset", "arm_axis_tilt"))
     elif name == "no arm":
         specs = [Spec(**xt32, arm=False, occluded_share=0)]
     elif name == "no tracker":

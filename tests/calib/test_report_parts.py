@@ -49,7 +49,12 @@ def run_like(**changes) -> Run:
 
 def found(verdict="adequate", sigma_mm=0.5):
     weak = [{"parameters": ["a.x"], "sigma_mm": sigma_mm}]
-    return {"verdict": verdict, "sentences": ["It is so."], "weak_directions": weak}
+    return {
+        "verdict": verdict,
+        "too_few_stops": False,
+        "sentences": ["It is so."],
+        "weak_directions": weak,
+    }
 
 
 def rms(held_out):

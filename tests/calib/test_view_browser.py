@@ -86,7 +86,10 @@ def test_the_first_finding_is_added_and_the_ladder_falls(hidden):
         made = Run.open(f"{hidden.folder}+incidence_angle_bias")
         assert made.summary["rms_mm"]["held_out"] == pytest.approx(after[-1], abs=1e-3)
         button(watched, "Cancel").wait_for(state="hidden", timeout=FIT_MS)
-        assert watched.page.locator("[data-is=verdict]").inner_text() == "The model is adequate"
+        assert (
+            watched.page.locator("[data-is=verdict]").inner_text()
+            == "Verdict: the model is adequate"
+        )
         assert (made.folder / "diagnosis.json").is_file()
         button(watched, "Undo").click()
         watched.page.get_by_text("stays on disk").wait_for()

@@ -101,7 +101,9 @@ def test_the_curve_is_the_effects_own_or_that_which_stands_out_most(first):
 
 
 OLD = json.dumps({key: [] for key in ("sentences", "unexplained", "curves", "weak_directions")})
-OLD = OLD.replace("}", ', "verdict": "", "candidates": [{}]}')
+OLD = OLD.replace(
+    "}", ', "verdict": "", "heading": "", "too_few_stops": false, "candidates": [{}]}'
+)
 
 
 @pytest.mark.parametrize("text", [OLD, "{", "[]", '{"verdict": "adequate"}', '{"curves": [{}]}'])

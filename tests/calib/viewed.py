@@ -54,6 +54,8 @@ def diagnosed(folder: Path, **changes: object) -> dict:
     curve = {"centres": [[0.2, 0.6, 1.0]], "band_mm": [0.1, 0.1, 0.1]}
     found = {
         "verdict": "missing_effect",
+        "heading": "an effect is missing",
+        "too_few_stops": False,
         "weak_directions": [],
         "sentences": ["incidence_angle_bias is missing."],
         "candidates": [candidate("range_scale"), candidate("incidence_angle_bias", step=1)],

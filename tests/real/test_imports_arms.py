@@ -98,6 +98,19 @@ def test_a_take_of_motive(shared):
     assert np.median(np.diff(body.time_s)) == pytest.approx(1 / 120, abs=1e-6)
 
 
+@pytest.mark.parametrize("folder", ["tracking/motive_csv_sample", "arms/handeye_ethz"])
+def test_what_a_tracker_saw_is_no_rig_alone(folder, shared, tmp_path):
+    """A body, or two on each other, with no arm and no LiDAR: said so, and nothing is written."""
+    kind, files = "motive", sorted((shared / folder).glob("*.csv"))
+    if not files:
+        with zipfile.ZipFile(shared / folder / "prime_sense_color_w_vicon_1.zip") as archive:
+            archive.extractall(tmp_path)
+        kind, files = "tum", sorted(tmp_path.rglob("*.csv"))
+    with pytest.raises(InputError, match="no arm or LiDAR is there to be calibrated"):
+        import_files([(kind, files)], tmp_path / "rec")
+    assert not (tmp_path / "rec").exists()
+
+
 @pytest.mark.parametrize(("name", "joints"), [("lwa4p", 6), ("lwa4p_extended", 7)])
 def test_an_arm_that_is_only_macros(name, joints, shared, tmp_path):
     """Without ROS and its package of constants; joint 5 stands 5.263 mm aside in the LWA4P."""

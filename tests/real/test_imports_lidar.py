@@ -75,7 +75,7 @@ def test_hesai_packets_are_the_decoders_points(model, rings, columns, same, hesa
         assert len(np.unique(keys)) >= (0.95 if wanders else 1) * len(keys)
 
 
-@pytest.mark.parametrize("model", ["40p", "64", "qt64", "xt32"])
+@pytest.mark.parametrize("model", HESAI)
 def test_rings_told_by_elevation_are_those_of_the_packets(model, hesai):
     _, decoded, cloud = hesai(model)
     found = READERS["pcd"].read([cloud], Options(), quiet)
@@ -85,6 +85,23 @@ def test_rings_told_by_elevation_are_those_of_the_packets(model, hesai):
     same = gap_m < 1e-5
     np.testing.assert_array_equal(theirs["ring"][same], ring[nearest[same]])
     assert any("told by elevation" in line for line in found.odd)
+
+
+@pytest.mark.parametrize(
+    ("model", "wrong"),
+    [
+        ("qt64", "Pandar64_Angle Correction File"),
+        ("qt64", "Pandar64E3X_Firetime Correction File"),
+        ("qt128", "JT128_Angle Correction File"),
+        ("qt128", "QT128C2X_Channel_Cofig"),
+        ("xt32", "PandarXT-16_Angle Correction File"),
+    ],
+)
+def test_the_table_of_another_model_is_refused(model, wrong, shared):
+    """Though it has as many channels, or columns of numbers that are no angles."""
+    path = shared / "lidar/hesai_corrections" / f"{wrong}.csv"
+    with pytest.raises(InputError, match=r"deg off that model|no table of angles|angles of 16"):
+        READERS["bag"].read([shared / "lidar/hesai_nebula" / model], Options(metadata=path), quiet)
 
 
 # By ouster-sdk 1.0.1 on the same files: XYZLut without extrinsics, valid columns, ranges beyond

@@ -7,6 +7,7 @@ import pytest
 import yaml
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from calib.calibrate import calibrate
 from calib.cli import main
 from calib.intake import Choices, import_files, sources
 from calib.rig import load_rig
@@ -139,9 +140,10 @@ def test_left_handed_axes_are_named(files, tmp_path):
         ("table log.csv tum cup.txt dh arm.yaml", {}, {"still": 1e-9}, "--still"),
         ("table log.csv tum cup.txt dh arm.yaml", {}, {"min_hold_s": 60.0}, "--min-hold"),
         ("table log.csv tum cup.txt dh arm.yaml", {}, {"clock_offsets": {"cap": 1.0}}, "mean cup"),
-        ("dh arm.yaml", {}, {}, "joint j1"),
+        ("dh arm.yaml", {}, {}, "the sources hold an arm, and no logs"),
         ("table log.csv log.csv dh arm.yaml", {}, {}, "two logs follow joints"),
         ("tum cup.txt tum cup.txt table log.csv dh arm.yaml", {}, {}, "two logs follow cup"),
+        ("tum cup.txt", {}, {}, "no arm or LiDAR is there to be calibrated by cup"),
         ("tum cup.txt foot.txt", {}, {"clock_offsets": {"foot": 0.0}}, "no arm or LiDAR"),
     ],
 )
@@ -157,6 +159,58 @@ def test_an_empty_file_is_said_to_be(files, tmp_path):
     (tmp_path / "empty.csv").write_bytes(b"")
     with pytest.raises(InputError, match=r"empty.csv is empty \(0 bytes\)"):
         sources(["table", str(tmp_path / "empty.csv")])
+
+
+@pytest.mark.parametrize(
+    ("name", "said"), [("logs.zip", "logs.zip is packed; unpack it"), ("a.csv", "has no header")]
+)
+def test_a_packed_file_is_said_to_be(tmp_path, name, said):
+    (tmp_path / name).write_text("1,2,3\n")
+    with pytest.raises(InputError, match=said):
+        import_files(sources(["table", str(tmp_path / name)]), tmp_path / "rec")
+
+
+def test_metadata_that_no_source_reads_is_refused(files, tmp_path):
+    options = Options(metadata=files / "arm.yaml")
+    with pytest.raises(InputError, match=r"--metadata .*it is for bag, hesai, mesh, ouster"):
+        bring(files, tmp_path / "rec", "table log.csv tum cup.txt dh arm.yaml", options)
+
+
+@pytest.mark.parametrize("kind", ["mesh", "survey", "spheres"])
+def test_a_room_alone_is_refused_before_it_is_read(tmp_path, kind):
+    (tmp_path / "room.ply").write_text("ply")  # no whole file: it would be refused for that
+    with pytest.raises(InputError, match=f"{kind} alone makes no recording"):
+        import_files(sources([kind, str(tmp_path / "room.ply")]), tmp_path / "rec")
+
+
+def test_a_room_in_which_the_rig_stood_anywhere_is_refused(tmp_path):
+    """Said of the sources, and not of a stops.csv that nobody has written."""
+    (tmp_path / "room.obj").write_text("v 0 0 0\nv 9 0 0\nv 0 9 0\nf 1 2 3\n")
+    azimuth, ring = (a.ravel() for a in np.meshgrid(np.arange(0, 6.28, 0.1), np.arange(16)))
+    up = np.tan(np.radians(2 * ring - 15))
+    cloud = {"x": 3 * np.cos(azimuth), "y": 3 * np.sin(azimuth), "z": 3 * up, "ring": ring}
+    np.savez(tmp_path / "s.npz", **cloud)
+    given = [("mesh", [tmp_path / "room.obj"]), ("numpy", [tmp_path / "s.npz"])]
+    with pytest.raises(InputError, match="nothing says where the rig stood in the scanned room"):
+        import_files(given, tmp_path / "rec", Options(lidar="velodyne_vlp16"))
+
+
+def test_stops_of_nothing_that_could_be_calibrated(tmp_path):
+    """With a rig that has nothing either, and with an arm that nothing measures."""
+    (tmp_path / "heat.csv").write_text("stop,heat\na,1\nb,2\n")
+    (tmp_path / "rig.yaml").write_text("name: x\nbase: {moves: never}\n")
+    given = sources(["table", str(tmp_path / "heat.csv")])
+    with pytest.raises(InputError, match="no arm or LiDAR is there to be calibrated"):
+        import_files(given, tmp_path / "rec")
+    with pytest.raises(InputError, match="there is nothing to estimate"):
+        import_files(given, tmp_path / "rec", None, Choices(tmp_path / "rig.yaml"))
+    assert not (tmp_path / "rec").exists()
+    dh(tmp_path / "arm.yaml")
+    (tmp_path / "heat.csv").write_text(f"stop,{','.join(JOINTS)}\na,1,0,0,0\nb,2,1,0,0\n")
+    import_files([*given, ("dh", [tmp_path / "arm.yaml"])], tmp_path / "rec")
+    with pytest.raises(InputError, match="there is nothing to fit to"):
+        calibrate([tmp_path / "rec"], tmp_path / "run")
+    assert not (tmp_path / "run").exists()
 
 
 def test_many_stops_are_thinned_evenly(tmp_path, files):

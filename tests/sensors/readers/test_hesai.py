@@ -9,7 +9,7 @@ import pytest
 from chains.errors import InputError
 from sensors.lidar import load_lidar
 from sensors.readers.base import Options
-from sensors.readers.hesai import hesai_found, read_angles, read_hesai
+from sensors.readers.hesai import MODELS, hesai_found, read_angles, read_hesai
 
 from .captures import write_pcap
 
@@ -51,9 +51,16 @@ def turns(model: str, n: int, columns: int = 240, start: int = 0) -> list[tuple[
     ]
 
 
-def table(path: Path, channels: int) -> Path:
+def elevation_deg(model: str) -> np.ndarray:
+    """(channels,) of a unit: its model's, and a little off."""
+    (name,) = {m.catalog for m in MODELS if m.name == model}
+    nominal = np.degrees(load_lidar(name).elevation_rad)
+    return np.round(nominal + 0.3 * np.sin(np.arange(len(nominal))), 3)
+
+
+def table(path: Path, model: str) -> Path:
     """Angles of every channel, degrees."""
-    rows = [f"{k + 1},{20 - k * 0.3},{(k % 3 - 1) * 1.5}" for k in range(channels)]
+    rows = [f"{k + 1},{e},{(k % 3 - 1) * 1.5}" for k, e in enumerate(elevation_deg(model))]
     path.write_text("\ufeffChannel,Elevation,Azimuth\n" + "\n".join(rows) + "\n")
     return path
 
@@ -71,7 +78,7 @@ def decoded(packets: list, metadata: Path | None) -> list:
 @pytest.mark.parametrize("model", LAYOUTS)
 def test_every_model_by_its_geometry(model, tmp_path):
     channels = LAYOUTS[model][3]
-    angles = table(tmp_path / "angles.csv", channels)
+    angles = table(tmp_path / "angles.csv", model)
     for number, turn in enumerate(decoded(turns(model, 2), angles)):
         p = turn.points
         assert len(p["x"]) == 240 * channels
@@ -79,7 +86,7 @@ def test_every_model_by_its_geometry(model, tmp_path):
         xyz = np.stack([p[axis] for axis in "xyz"], axis=1).astype(float)
         range_m = np.linalg.norm(xyz, axis=1)
         np.testing.assert_allclose(range_m, step_m * (1000 + 10 * number + p["ring"]), rtol=1e-6)
-        elevation = np.radians(20 - 0.3 * p["ring"])
+        elevation = np.radians(elevation_deg(model)[p["ring"]])
         np.testing.assert_allclose(xyz[:, 2], range_m * np.sin(elevation), atol=1e-5)
         clockwise = np.arctan2(xyz[:, 0], xyz[:, 1])  # from y
         azimuth = clockwise - np.radians((p["ring"] % 3 - 1.0) * 1.5)
@@ -91,7 +98,7 @@ def test_every_model_by_its_geometry(model, tmp_path):
 
 
 def test_the_farthest_of_several_returns_is_kept(tmp_path):
-    angles = table(tmp_path / "angles.csv", 64)
+    angles = table(tmp_path / "angles.csv", "PandarQT64")
     near, far = np.full(64, 500), np.full(64, 700)
     far[10:] = 500
     pairs = [np.stack([near, far] * 2), np.stack([far, near] * 2)]  # whichever comes first
@@ -107,7 +114,7 @@ def test_the_farthest_of_several_returns_is_kept(tmp_path):
 
 
 def test_returns_from_the_window_are_left_out(tmp_path):
-    angles = table(tmp_path / "angles.csv", 64)
+    angles = table(tmp_path / "angles.csv", "PandarQT64")
     steps = np.full((4, 64), 1000)
     steps[0], steps[1] = 0, 20
     (turn,) = decoded([(0.0, packet("PandarQT64", np.arange(4) * 0.6, steps))], angles)
@@ -115,7 +122,7 @@ def test_returns_from_the_window_are_left_out(tmp_path):
 
 
 def test_turns_begin_at_azimuth_0_and_after_a_pause(tmp_path):
-    angles = table(tmp_path / "angles.csv", 32)
+    angles = table(tmp_path / "angles.csv", "PandarXT-32")
     packets = turns("PandarXT-32", 2, start=100)
     sizes = [len(turn.points["x"]) // 32 for turn in decoded(packets, angles)]
     assert sizes == [140, 240, 100]
@@ -126,7 +133,7 @@ def test_turns_begin_at_azimuth_0_and_after_a_pause(tmp_path):
 
 
 def test_packets_that_overtake_each_other_stay_in_their_turn(tmp_path):
-    angles = table(tmp_path / "angles.csv", 32)
+    angles = table(tmp_path / "angles.csv", "PandarXT-32")
     packets = turns("PandarXT-32", 3)
     for k in (10, 29, 59):  # within a turn, and across two ends
         packets[k], packets[k + 1] = packets[k + 1], packets[k]
@@ -139,7 +146,7 @@ def test_packets_that_overtake_each_other_stay_in_their_turn(tmp_path):
 
 
 def test_only_wanted_turns_are_decoded_and_each_is_itself(tmp_path):
-    angles = table(tmp_path / "angles.csv", 32)
+    angles = table(tmp_path / "angles.csv", "PandarXT-32")
     packets = turns("PandarXT-32", 5, start=7)
     found = hesai_found("p", "p", lambda: iter(packets), Options(metadata=angles), quiet)
     (sweeps,) = found.sweeps
@@ -172,6 +179,15 @@ def test_a_capture_is_read_with_nothing_but_itself(tmp_path):
     )
 
 
+@pytest.mark.parametrize("model", LAYOUTS)
+def test_every_model_has_angles_of_the_catalogue(model):
+    """Without a table: as many rings as channels, and it is said that they are nominal."""
+    found = hesai_found("p", "p", lambda: iter(turns(model, 1)), Options(), quiet)
+    lidar = load_lidar(found.lidar["model"])
+    assert lidar.rings == LAYOUTS[model][3] == len(found.lidar["elevation_deg"])
+    assert any("nominal" in line for line in found.odd)
+
+
 def test_two_sensors_in_one_capture_must_be_told_apart(tmp_path):
     packets = [(t, 2368 + k % 2, p) for k, (t, p) in enumerate(turns("PandarXT-32", 1))]
     path = write_pcap(tmp_path / "a.pcap", packets)
@@ -184,11 +200,12 @@ def test_two_sensors_in_one_capture_must_be_told_apart(tmp_path):
 
 
 def test_what_cannot_be_decoded_is_refused(tmp_path):
-    with pytest.raises(InputError, match="--metadata"):
-        hesai_found("p", "p", lambda: iter(turns("PandarXT-16", 1)), Options(), quiet)
-    wrong = Options(metadata=table(tmp_path / "angles.csv", 40))
+    wrong = Options(metadata=table(tmp_path / "angles.csv", "Pandar40P"))
     with pytest.raises(InputError, match="40 channels, but p comes from a PandarXT-32"):
         hesai_found("p", "p", lambda: iter(turns("PandarXT-32", 1)), wrong, quiet)
+    another = Options(metadata=table(tmp_path / "angles.csv", "Pandar64"))
+    with pytest.raises(InputError, match=r"no table of a PandarQT64's angles.*deg off"):
+        hesai_found("p", "p", lambda: iter(turns("PandarQT64", 1)), another, quiet)
     newer = [(0.0, b"\xee\xff\x01\x04" + bytes(857))]
     with pytest.raises(InputError, match=r"861 bytes, Hesai's protocol 1\.4"):
         hesai_found("p", "p", lambda: iter(newer), Options(), quiet)

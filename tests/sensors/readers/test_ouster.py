@@ -192,6 +192,18 @@ def test_the_metadata_beside_a_capture_is_found(tmp_path):
         read_ouster([capture], Options(metadata=other), quiet)
 
 
+def test_a_json_among_the_files_is_the_metadata(tmp_path):
+    capture, told = tmp_path / "a.pcap", tmp_path / "sensor.json"
+    write_pcap(capture, [(t, 7502, p) for t, p in packets("RNG19_RFL8_SIG16_NIR16", [1])])
+    told.write_text(json.dumps(facts("RNG19_RFL8_SIG16_NIR16")))
+    (sweeps,) = read_ouster([capture, told], Options(), quiet).sweeps
+    assert len(sweeps.time_s) == 1
+    with pytest.raises(InputError, match="one JSON too many"):
+        read_ouster([capture, told], Options(metadata=told), quiet)
+    with pytest.raises(InputError, match="its PCAP is not given"):
+        read_ouster([told], Options(), quiet)
+
+
 def test_packets_have_the_sizes_of_the_manual():
     """Of a 64-ring sensor: 12608 and 4352 bytes, as the manual lists them."""
     for profile, size in (("LEGACY", 12608), ("RNG15_RFL8_NIR8", 4352)):

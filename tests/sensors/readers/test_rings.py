@@ -81,21 +81,54 @@ def test_rows_of_one_elevation_are_rings():
     np.testing.assert_array_equal(points["column"], COLUMN)
     order = np.random.default_rng(1).permutation(len(POINTS))  # rows that mean nothing
     mixed = cloud(POINTS[order], shape=(16, 180))
-    seen = look("c", mixed, Options())
+    seen = look("c", mixed, Options(lidar="velodyne_vlp16"))
     np.testing.assert_array_equal(seen.layout.points(mixed)["ring"], RING[order])
     assert any("told by elevation" in line for line in seen.odd)
 
 
 @pytest.mark.parametrize(
-    "model", ["velodyne_vlp16", "hesai_pandarxt32", "hesai_pandarqt64", "hesai_pandar40p"]
+    "model",
+    [
+        *("hesai_pandar40p", "hesai_pandarqt64", "hesai_pandarxt32", "hesai_qt128", "hesai_xt16"),
+        *("hesai_xt32m2x", "velodyne_vlp16"),
+    ],
 )
 def test_rings_are_told_by_elevation(model):
     lidar = load_lidar(model)
-    points, ring, _ = box_scan(lidar.elevation_rad, 120)
+    points, ring, _ = box_scan(lidar.elevation_rad, lidar.columns // 2)
     given = cloud(points)
     seen = look("c", given, Options())
     np.testing.assert_array_equal(seen.layout.points(given)["ring"], ring)
     assert seen.lidar["model"] == model
+
+
+def test_two_models_with_one_set_of_elevations_are_told_by_azimuth_steps_or_asked_for():
+    """A VLP-16 and an XT16 look at -15 to 15 degrees, and number their rings the other way round"""
+    names = ("hesai_xt16", "velodyne_vlp16")
+    for name in names:
+        points, ring, _ = box_scan(VLP16.elevation_rad, load_lidar(name).columns)
+        seen = look("c", cloud(points), Options())
+        assert seen.lidar["model"] == name
+        downwards = name == "hesai_xt16"
+        expected = 15 - ring if downwards else ring
+        np.testing.assert_array_equal(seen.layout.points(cloud(points))["ring"], expected)
+        (line,) = [line for line in seen.odd if "told by elevation" in line]
+        assert all(other in line for other in names)
+    points, ring, _ = box_scan(VLP16.elevation_rad, 1200)
+    with pytest.raises(InputError, match=r"hesai_xt16 and of velodyne_vlp16.*1200 .*--lidar"):
+        look("c", cloud(points), Options())
+    seen = look("c", cloud(points), Options(lidar="velodyne_vlp16"))
+    np.testing.assert_array_equal(seen.layout.points(cloud(points))["ring"], ring)
+
+
+def test_a_ring_of_a_few_points_is_no_other_ring():
+    """Too few to be a group, and told by their model's elevation all the same."""
+    lidar = load_lidar("hesai_pandarqt64")
+    points, ring, column = box_scan(lidar.elevation_rad, lidar.columns)
+    kept = (ring != 20) | (column % 400 == 0)
+    given = cloud(points[kept])
+    seen = look("c", given, Options())
+    np.testing.assert_array_equal(seen.layout.points(given)["ring"], ring[kept])
 
 
 def test_rings_are_told_by_elevation_where_beams_start_aside():

@@ -105,3 +105,15 @@ def test_a_table_without_header_is_refused(tmp_path):
     (tmp_path / "t.csv").write_text("1,2,3\n4,5,6\n")
     with pytest.raises(InputError, match="no header"):
         read_table([tmp_path / "t.csv"], Options(), quiet)
+
+
+def test_columns_that_look_like_a_pose_are_pointed_out(tmp_path):
+    """Unmapped they are covariates, and nothing would be calibrated by them."""
+    names = [f"cup_{part}" for part in ("x", "y", "z", "rx", "ry", "rz")]
+    columns = {"stop": range(20), **dict.fromkeys(names, XYZ[:, 0]), "goal x": 1.0, "lax": 2.0}
+    path = write(tmp_path / "t.csv", columns)
+    (line,) = read_table([path], Options(), quiet).odd[:1]
+    assert "cup_x, y, z" in line and "--column BODY.*=cup_*" in line and "--euler" in line
+    assert "goal" not in line and "la" not in line.split("columns")[1].split("may")[0]
+    mapped = Options(columns={"cup.*": "cup_*"}, euler="XYZ", angle_unit="rad")
+    assert not any("BODY" in line for line in read_table([path], mapped, quiet).odd)
