@@ -380,7 +380,8 @@ class _Builder:
             ray = beams(recording.scan(k).xyz_m, lidar.beam_origin_m)
             stops = self.geometry[root, k]
             T = stops.in_reference(self.source.rig.lidar_frame, self.problem.initial).T[0]
-            finder.add(k, se3.apply(T, ray.origin_m + ray.range_m[:, None] * ray.direction))
+            points_m = ray.origin_m + ray.range_m[:, None] * ray.direction
+            finder.add(k, se3.apply(T, points_m), T[:3, 3])
         planes = finder.planes(min_points=100)
         if not len(planes.normal):
             raise InputError(

@@ -17,6 +17,9 @@ from scipy.spatial import KDTree
 MIN_CELL_POINTS = 12
 # Flat cells whose normals differ more than this are parts of different planes.
 SAME_NORMAL_RAD = np.radians(6.0)
+# What a sensor sees flatter than this is no plane: the points of a few rings, which fan out about
+# it, lie in one through the sensor itself.
+FLATTEST_RAD = np.radians(80.0)
 # How many of the nearest cells are looked at: enough for a corner, where several planes meet.
 NEAREST_CELLS = 8
 
@@ -131,14 +134,23 @@ class PlaneFinder:
         self._cells = Cells(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3, 3)))
         self._seen = [np.zeros((0, 2), dtype=np.int64)]
 
-    def add(self, stop_index: int, points_world_m: np.ndarray) -> None:
-        """Take in one stop's points (N, 3), placed in the world as well as is known so far."""
+    def add(self, stop_index: int, points_world_m: np.ndarray, sensor_world_m: np.ndarray) -> None:
+        """Take in one stop's points (N, 3), placed in the world as well as is known so far.
+
+        Args:
+            stop_index: whose they are.
+            points_world_m: (N, 3).
+            sensor_world_m: (3,) where they were seen from.
+        """
         cells = cell_moments(points_world_m, self.cell_m)
         thick_m, narrow_m, _ = cells.spread_m.T
+        away_m = cells.mean_m - sensor_world_m
+        facing = np.abs(np.einsum("ci,ci->c", cells.normal, away_m))
         cells = cells.take(
             (cells.count >= MIN_CELL_POINTS)
             & (thick_m < 1.5 * self.noise_m)
             & (narrow_m > np.maximum(3 * thick_m, self.cell_m / 10))
+            & (facing > np.cos(FLATTEST_RAD) * np.linalg.norm(away_m, axis=1))
         )
         same = self._same_place(cells)
         known = len(self._cells.count)

@@ -44,7 +44,7 @@ def room():
     for stop, station_m in enumerate(STATIONS_M):
         walls, _ = room_walls(rng, 8000)
         clutter = ball(rng, 3000, BALL_CENTRE_M, BALL_RADIUS_M)
-        finder.add(stop, seen_from(rng, station_m, np.concatenate([walls, clutter])))
+        finder.add(stop, seen_from(rng, station_m, np.concatenate([walls, clutter])), station_m)
     walls, wall = room_walls(rng, 4000)
     clutter = ball(rng, 3000, BALL_CENTRE_M, BALL_RADIUS_M)
     test_scan = seen_from(rng, STATIONS_M[0], np.concatenate([walls, clutter]))
@@ -96,9 +96,12 @@ def flat_square(rng, count, corner_m, u_m, v_m):
     return np.array(corner_m) + s * np.array(u_m) + t * np.array(v_m)
 
 
-def found_in(points_m, **settings):
+SENSOR_M = np.array([1.7, 2.3, 1.1])
+
+
+def found_in(points_m, sensor_m=SENSOR_M, **settings):
     finder = PlaneFinder(**settings)
-    finder.add(0, points_m)
+    finder.add(0, points_m, sensor_m)
     return finder.planes()
 
 
@@ -142,7 +145,7 @@ def test_planes_do_not_depend_on_where_the_world_begins():
     rng = np.random.default_rng(4)
     points, _ = room_walls(rng, 4000)
     shift_m = 300.0 * np.array([100.0, -40.0, 1.0])
-    here, there = found_in(points), found_in(points + shift_m)
+    here, there = found_in(points), found_in(points + shift_m, SENSOR_M + shift_m)
     assert np.array_equal(here.count, there.count)
     assert np.allclose(np.abs(np.sum(here.normal * there.normal, axis=1)), 1, atol=1e-9)
 
@@ -152,10 +155,24 @@ def test_a_plane_seen_from_too_few_stops_is_left_out():
     finder = PlaneFinder()
     wall = flat_square(rng, 9000, [0, 0, 0], [3, 0, 0], [0, 0, 2])
     floor = flat_square(rng, 9000, [0, 0.5, 0.05], [3, 0, 0], [0, 2, 0])
-    finder.add(0, np.concatenate([wall, floor]))
-    finder.add(1, wall)
+    finder.add(0, np.concatenate([wall, floor]), SENSOR_M)
+    finder.add(1, wall, SENSOR_M)
     assert len(finder.planes().count) == 2
     assert np.array_equal(finder.planes(min_stops=2).count, [18000])
+
+
+def test_rings_that_fan_out_about_the_sensor_are_no_plane():
+    """A few nearly level rings on scattered things fill a plane through the sensor."""
+    rng = np.random.default_rng(8)
+    azimuth, level = (
+        rng.uniform(0, 2 * np.pi, 40_000),
+        np.radians(rng.choice([-0.2, 0.0, 0.2], 40_000)),
+    )
+    ray = np.stack([np.cos(azimuth), np.sin(azimuth), np.tan(level)], axis=1)
+    fan = SENSOR_M + rng.uniform(1.0, 2.5, (40_000, 1)) * ray
+    assert len(found_in(fan).count) == 0
+    seen_from_above = found_in(fan, SENSOR_M + np.array([0.0, 0.0, 2.0]))
+    assert len(seen_from_above.count) == 1
 
 
 def test_without_any_flat_cell_there_is_no_plane():
