@@ -16,14 +16,14 @@ from pathlib import Path
 import numpy as np
 
 from calib import problem as problems
-from calib.calibrate import reopened
+from calib.calibrate import model_of, reopened
 from calib.effects import Effect, LazyColumn, Site, View
 from calib.fit import Progress, values_of
-from calib.model import Model, Source
+from calib.model import Source
 from calib.residuals.beams import site_error
 from calib.residuals.scan import turned
 from calib.rig import Rig, load_rig
-from calib.run import MODEL, Run
+from calib.run import Run
 from chains.errors import InputError
 from sensors.documents import nearest, replace_folder
 from sensors.lidar import Beams, beams
@@ -63,18 +63,9 @@ class Correction:
         """
         rig = _rig(run, rig_name)
         part = run.solution.part(rig.name)
-        model = Model.read(run.model, run.folder / MODEL)
-        of_beams = [e for e in model.effects if e.site is Site.BEAM and e.name in part.effects]
-        estimates = [part.effects[e.name] for e in of_beams]
-        names = [tuple(p.name for p in e.params(rig)) for e in of_beams]
-        known = [dict(zip(e.names, e.estimate, strict=True)) for e in estimates]
-        return cls(
-            rig,
-            [
-                (effect, np.array([found.get(name, 0.0) for name in every]))
-                for effect, every, found in zip(of_beams, names, known, strict=True)
-            ],
-        )
+        known = [e for e in model_of(run).effects if e.name in part.effects]
+        of_beams = [e for e in known if e.site is Site.BEAM]
+        return cls(rig, [(e, part.effects[e.name].estimate) for e in of_beams])
 
     def usable(self, columns: Collection[str]) -> tuple[Correction, dict[str, str]]:
         """What can be corrected where these columns are known, and what of it not, and why."""
@@ -186,13 +177,15 @@ def _unmet(source: Source) -> list[tuple[str, Known]]:
 
 def _met(run: Run, folder: Path) -> list[tuple[str, Known]]:
     """The same of a recording that the run was fitted to; and what its beams meet on the mesh."""
-    sources = [reopened(recording, run) for recording in run.model["recordings"]]
-    wanted = [s for s in sources if s.recording.folder.resolve() == folder.resolve()]
-    if not wanted or wanted[0].reference is None:
+    if folder.resolve() not in [path.resolve() for path in run.recordings]:
         return []
-    problem = problems.build(sources, Model.read(run.model, run.folder / MODEL))
+    sources = reopened(run)
+    wanted = next(s for s in sources if s.recording.folder.resolve() == folder.resolve())
+    if wanted.reference is None:
+        return []
+    problem = problems.build(sources, model_of(run))
     values = values_of(problem, run.state())
-    scans = [scan for scan in problem.scans if scan.recording is wanted[0].recording]
+    scans = [scan for scan in problem.scans if scan.recording is wanted.recording]
     return [(scan.name, lambda ray, scan=scan: scan.met(ray, values)) for scan in scans]
 
 

@@ -92,7 +92,7 @@ def grow(
         raise InputError(f"{out}: a run cannot replace the one that it grows from; give another -o")
     start = run.state()
     with _folder(out) as folder:
-        sources = [reopened(recording, run) for recording in run.model["recordings"]]
+        sources = reopened(run)
         _refuse_idle(model, run, sources)
         told = {key: run.model.get(key) for key in ("hold_out", "folds", "prior")}
         _fit(sources, model, folder, _Choices(**told, grown_from=run), progress, start)
@@ -109,7 +109,12 @@ def grown_model(run: Run, added: Sequence[str]) -> Model:
         InputError: an effect is unknown, or in the model already.
     """
     found = (_shaped(effect, run) for effect in load_effects(added))
-    return Model.read(run.model, run.folder / MODEL).plus(tuple(found))
+    return model_of(run).plus(tuple(found))
+
+
+def model_of(run: Run) -> Model:
+    """The model that a run was fitted with."""
+    return Model.read(run.model, run.folder / MODEL)
 
 
 def _shaped(effect: Effect, run: Run) -> Effect:
@@ -129,8 +134,16 @@ def _shaped(effect: Effect, run: Run) -> Effect:
         ) from None
 
 
-def reopened(recording: Mapping[str, str], run: Run) -> Source:
-    """A run's recording, as it was when the run was fitted to it."""
+def reopened(run: Run) -> list[Source]:
+    """A run's recordings, as they were when the run was fitted to them.
+
+    Raises:
+        InputError: one is gone, or has changed.
+    """
+    return [_reopened(recording, run) for recording in run.model["recordings"]]
+
+
+def _reopened(recording: Mapping[str, str], run: Run) -> Source:
     path = Path(recording["path"])
     if not path.is_dir():
         raise InputError(

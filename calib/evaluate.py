@@ -23,13 +23,12 @@ from typing import Any
 import numpy as np
 
 from calib import problem as problems
-from calib.calibrate import reopened
+from calib.calibrate import model_of, reopened
 from calib.fit import Progress, values_of
 from calib.forward import Values
-from calib.model import Model
 from calib.residuals.scan import Ranges, ScanStop
 from calib.residuals.surfaces import Meeting, MeshSurface
-from calib.run import MODEL, Run
+from calib.run import Run
 from calib.tally import FLAT_M, Columns, Evaluated, Tally
 from chains.errors import InputError
 from sensors.documents import replace_folder, write_json, write_yaml
@@ -144,8 +143,8 @@ def evaluate(
     Raises:
         InputError: the run's recordings are not what they were, or hold no scans.
     """
-    sources = [reopened(recording, run) for recording in run.model["recordings"]]
-    problem = problems.build(sources, Model.read(run.model, run.folder / MODEL))
+    sources = reopened(run)
+    problem = problems.build(sources, model_of(run))
     if not problem.scans:
         raise InputError(
             f"{run.folder}: its recordings hold no scans, so there is no LiDAR to evaluate"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import platform
+import re
 import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -30,6 +31,7 @@ _OF_DIAGNOSIS |= {"unexplained", "weak_directions", "curves"}
 _OF_CANDIDATE = {"effect", "add", "p_adjusted", "step", "dressed_up", "held_out_rms_mm"}
 _OF_CANDIDATE |= {"unabsorbed_rms_mm"}
 _OF_CURVE = {"covariates", "centres", "mean_mm", "band_mm"}
+RING = re.compile(r"ring_(\d+)")  # a parameter of a ring
 _OF_STATE = "state/"  # before every name in that file: numpy reserves a few
 
 

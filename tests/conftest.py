@@ -1,6 +1,7 @@
-"""What every test shares: one thread per BLAS call, and the folder of real data."""
+"""What every test shares: one thread per BLAS call, real data, and the command line."""
 
 import os
+import sys
 from pathlib import Path
 
 import pytest
@@ -18,3 +19,18 @@ def shared() -> Path:
     if not SHARED.is_dir():
         pytest.skip(f"the shared data folder is not here: {SHARED}")
     return SHARED
+
+
+@pytest.fixture
+def rigcal(monkeypatch, capfd):
+    """A function that runs a command here, and returns its exit code, stdout and stderr."""
+
+    from calib.cli import main
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["rigcal", *map(str, arguments)])
+        with pytest.raises(SystemExit) as exit_:
+            main()
+        return exit_.value.code, *capfd.readouterr()
+
+    return run

@@ -22,19 +22,6 @@ SPEC = "{lidar: hesai_pandarxt32, locations: 3, stops_per_location: 2, column_st
 COMMANDS = sorted(c.name or c.callback.__name__ for c in app.registered_commands)
 
 
-@pytest.fixture
-def rigcal(monkeypatch, capfd):
-    """A function that runs a command here, and returns its exit code, stdout and stderr."""
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["rigcal", *map(str, arguments)])
-        with pytest.raises(SystemExit) as exit_:
-            main()
-        return exit_.value.code, *capfd.readouterr()
-
-    return run
-
-
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     """A folder with a recording and a run, and what making them printed: folder, {command: out}."""

@@ -9,7 +9,7 @@ from itertools import chain
 import numpy as np
 
 from calib import problem as problems
-from calib.calibrate import reopened
+from calib.calibrate import model_of, reopened
 from calib.diagnosis.candidates import (
     ShapeStep,
     covariates,
@@ -25,7 +25,7 @@ from calib.effects import Effect, Site
 from calib.fit import Estimate, Progress, resume, solve
 from calib.model import Model, Source
 from calib.problem import Problem
-from calib.run import MODEL, Run
+from calib.run import Run
 from sensors.recording import Recording
 
 FINER = 9  # shapes tried between the two beside the best one
@@ -50,8 +50,7 @@ class Stand:
         Raises:
             InputError: its recordings are not what they were.
         """
-        sources = [reopened(recording, run) for recording in run.model["recordings"]]
-        model = Model.read(run.model, run.folder / MODEL)
+        sources, model = reopened(run), model_of(run)
         problem = problems.build(sources, model)
         return cls(sources, model, problem, resume(problem, run.state(), progress))
 

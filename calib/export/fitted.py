@@ -14,10 +14,10 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.calibrate import reopened
+from calib.calibrate import model_of, reopened
 from calib.effects import Effect, OneHot, Site, View
 from calib.export.written import Unheld, Written, head
-from calib.model import Model, owned
+from calib.model import owned
 from calib.rig import Rig
 from calib.run import FrameEstimate, Part, Run
 from chains import se3
@@ -170,16 +170,15 @@ class Fitted:
     def rigs(self) -> list[FittedRig]:
         """Every rig, from its recording; raises Unheld where one is gone or has changed."""
         try:
-            return [self._rig(recording) for recording in self.run.model["recordings"]]
+            return [self._rig(source.rig) for source in reopened(self.run)]
         except InputError as error:
             raise Unheld(str(error)) from None
 
-    def _rig(self, recording: Mapping[str, str]) -> FittedRig:
-        rig = reopened(recording, self.run).rig
+    def _rig(self, rig: Rig) -> FittedRig:
         several = len(self.run.model["recordings"]) > 1
         part = self.run.solution.part(rig.name if several else None)
-        model = Model.read(self.run.model, self.run.folder / "model.yaml")
-        effects = {effect.name: effect for effect in model.effects if effect.name in part.effects}
+        known = model_of(self.run).effects
+        effects = {effect.name: effect for effect in known if effect.name in part.effects}
         return FittedRig(self.run, rig, part, effects, several)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,7 +10,15 @@ import numpy as np
 from calib.effects import CATALOGUE
 from calib.export.fitted import Fitted
 from calib.export.written import Written
-from calib.run import EffectEstimate, FrameEstimate, Part, Run, effect_document, frame_document
+from calib.run import (
+    RING,
+    EffectEstimate,
+    FrameEstimate,
+    Part,
+    Run,
+    effect_document,
+    frame_document,
+)
 from chains import se3
 from chains.errors import InputError
 from sensors.documents import Document, Marks, Number, read_yaml, validate, write_yaml
@@ -31,7 +38,6 @@ CONVENTIONS = {
     "rings": "measured = true + offset",
     "recordings": "what belongs to one rig alone, by its name; all else holds for every rig",
 }
-RING = re.compile(r"ring_(\d+)")
 
 
 def write_extrinsics(fitted: Fitted, folder: Path) -> Written:

@@ -11,17 +11,17 @@ from typing import Any
 import numpy as np
 
 from calib import problem as problems
-from calib.calibrate import reopened
+from calib.calibrate import model_of, reopened
 from calib.estimates import Found, found
 from calib.fit import Progress, same_mesh, values_of
 from calib.ladder import Rung, ladder
-from calib.model import Model, Source
+from calib.model import Source
 from calib.problem import Problem
 from calib.report.budget import Budget, budget
 from calib.report.statistics import AZIMUTHS, BINS, PLACES, Axis, Statistics, Table, gather
 from calib.residuals.scan import ScanStop
 from calib.residuals.table import residual_table, table_path
-from calib.run import MODEL, RESIDUALS, SUMMARY, Run
+from calib.run import RESIDUALS, SUMMARY, Run
 from chains.errors import InputError
 from sensors.recording import read_table
 
@@ -64,7 +64,7 @@ class Evidence:
         known = {rung.run.folder for rung in climbed}
         rungs = [*(Rung(run, None) for run in runs if run.folder not in known), *climbed]
         last = rungs[-1].run
-        return cls(rungs, [reopened(r, last) for r in last.model["recordings"]], progress)
+        return cls(rungs, reopened(last), progress)
 
     @property
     def run(self) -> Run:
@@ -94,7 +94,7 @@ class Evidence:
     @cached_property
     def problem(self) -> Problem:
         """The run's variables, blocks and scans."""
-        return problems.build(self.sources, Model.read(self.run.model, self.run.folder / MODEL))
+        return problems.build(self.sources, model_of(self.run))
 
     @cached_property
     def values(self) -> dict[str, np.ndarray]:

@@ -175,8 +175,7 @@ def _kept(folder: Path) -> Run | None:
     """The run that an earlier call made here, if its recording is still the same."""
     try:
         run = Run.open(folder)
-        for recording in run.model["recordings"]:
-            reopened(recording, run)
+        reopened(run)
     except InputError:
         return None
     return run

@@ -15,12 +15,13 @@ import numpy as np
 
 from calib import holdout
 from calib import problem as problems
+from calib.calibrate import model_of
 from calib.errors import Errors, scan_errors
 from calib.evaluate import evaluate_stop
 from calib.fit import Progress, solve, values_of
 from calib.model import Model, Source
 from calib.problem import Problem
-from calib.run import MODEL, Run
+from calib.run import Run
 from calib.study import sequence
 from calib.tally import Evaluated
 from sensors.documents import replace_folder
@@ -123,7 +124,7 @@ class Case:
 
     def fitted(self, run: Run, tell: Progress) -> State:
         """A run's calibration, its stops where it put them, the others where tracker and arm do."""
-        model = Model.read(run.model, run.folder / MODEL)
+        model = model_of(run)
         trained = problems.build([Source.open(self.learnt_from)], model)
         estimate = solve(trained, progress=tell, start=run.state())
         unseen = problems.build([self.source], model, [self.left_out], trained.meetings)

@@ -13,13 +13,13 @@ from functools import cached_property
 import numpy as np
 
 from calib import problem as problems
-from calib.calibrate import reopened
+from calib.calibrate import model_of, reopened
 from calib.forward import Stops
-from calib.model import Model, Source
+from calib.model import Source
 from calib.residuals.scan import ScanStop
 from calib.residuals.table import table_path
 from calib.residuals.tracker import TrackedBody
-from calib.run import MODEL, RESIDUALS, Run
+from calib.run import RESIDUALS, Run
 from chains import se3
 from chains.errors import InputError
 from sensors.recording import read_table
@@ -99,8 +99,7 @@ class Scene:
         Raises:
             InputError: the recordings are gone or changed, or the run is of an earlier version.
         """
-        sources = [reopened(recording, run) for recording in run.model["recordings"]]
-        model = Model.read(run.model, run.folder / MODEL)
+        sources, model = reopened(run), model_of(run)
         # Poses need no surface, and planes would have to be looked for in every scan.
         nothing = dict.fromkeys(range(len(sources)), object())
         problem = problems.build(sources, model, meetings=nothing)

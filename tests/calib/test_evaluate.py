@@ -50,7 +50,7 @@ def poses(run):
 def problem_of(run):
     from calib.calibrate import reopened
 
-    sources = [reopened(recording, run) for recording in run.model["recordings"]]
+    sources = reopened(run)
     return sources[0], build(sources, Model.read(run.model, run.folder))
 
 

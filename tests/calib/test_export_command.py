@@ -1,13 +1,11 @@
 """`rigcal export` as its users meet it: what it prints, its JSON, its exit codes."""
 
 import json
-import sys
 
 import pytest
 import yaml
 
 from calib.calibrate import calibrate
-from calib.cli import main
 from calib.cli.files import export as command
 from calib.export import FORMATS
 
@@ -23,17 +21,10 @@ def folder(tmp_path_factory):
 
 
 @pytest.fixture
-def rigcal(folder, monkeypatch, capfd):
+def rigcal(rigcal, folder, monkeypatch):
     """A function that runs a command there, and returns its exit code, stdout and stderr."""
     monkeypatch.chdir(folder)
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["rigcal", *map(str, arguments)])
-        with pytest.raises(SystemExit) as exit_:
-            main()
-        return exit_.value.code, *capfd.readouterr()
-
-    return run
+    return rigcal
 
 
 def test_json_says_what_was_written_and_what_was_not(rigcal, folder):

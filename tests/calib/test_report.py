@@ -3,7 +3,6 @@
 import json
 import re
 import shutil
-import sys
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -11,7 +10,6 @@ import numpy as np
 import pytest
 
 from calib.calibrate import calibrate, grow, grown_model
-from calib.cli import main
 from calib.diagnosis import diagnose
 from calib.report import Evidence, charts_of, plot, report
 from calib.report.budget import beam_jacobian, budget
@@ -250,13 +248,7 @@ def test_a_figure_is_written_for_a_paper(first, tmp_path, ending):
         assert path.read_bytes().startswith({"png": b"\x89PNG", "pdf": b"%PDF"}[ending])
 
 
-def test_the_command_line_lists_and_draws(runs, tmp_path, monkeypatch, capsys, first):
-    def rigcal(*arguments):
-        monkeypatch.setattr(sys, "argv", ["rigcal", *map(str, arguments)])
-        with pytest.raises(SystemExit) as stopped:
-            main()
-        return stopped.value.code, *capsys.readouterr()
-
+def test_the_command_line_lists_and_draws(rigcal, runs, tmp_path, first):
     code, out, _ = rigcal("plot", runs[0].folder, "--list", "--json")
     listed = [chart["id"] for chart in json.loads(out)["charts"]]
     assert code == 0 and listed == [chart.id for chart in charts_of(first).charts]

@@ -80,7 +80,7 @@ def origins(run):
     from calib.fit import values_of
     from calib.model import Model
 
-    sources = [reopened(recording, run) for recording in run.model["recordings"]]
+    sources = reopened(run)
     problem = problems.build(sources, Model.read(run.model))
     values = values_of(problem, run.state())
     return {scan.name: scan.pose(values)[:3, 3] for scan in problem.scans}

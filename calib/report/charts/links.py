@@ -13,6 +13,7 @@ from calib.estimates import Found
 from calib.report.chart import Absent, Chart
 from calib.report.evidence import Evidence
 from calib.rig import Rig
+from calib.run import RING
 from calib.tables import LISTED, shown
 
 if TYPE_CHECKING:
@@ -246,7 +247,7 @@ def effects(evidence: Evidence) -> Iterator[Chart | Absent]:
 
 
 def _per_ring(found: Found) -> bool:
-    return all(p.startswith("ring_") for p in found.parameters)
+    return all(map(RING.fullmatch, found.parameters))
 
 
 def _rings_chart(found: Found, name: str) -> Chart:
