@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.calibrate import calibrate
 from calib.rig import Rig, load_rig
+from calib.runs.calibrate import calibrate
 from calib.simulate import load_spec, simulate
 from sensors.lidar import Beams, beams
 from sensors.recording import read_scan

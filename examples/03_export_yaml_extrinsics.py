@@ -16,9 +16,9 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from calib.calibrate import calibrate
 from calib.export import export
 from calib.rig import load_rig
+from calib.runs.calibrate import calibrate
 from calib.simulate import simulate
 
 

@@ -17,9 +17,9 @@ import sys
 import tempfile
 from pathlib import Path
 
-from calib.calibrate import calibrate, grow, grown_model
 from calib.diagnosis import diagnose
-from calib.run import Run
+from calib.runs.calibrate import calibrate, grow, grown_model
+from calib.runs.run import Run
 from calib.simulate import load_spec, simulate
 
 

@@ -32,13 +32,13 @@ import numpy as np
 from ur10_tmac import recording
 
 from calib import problem as problems
-from calib.calibrate import calibrate, grow, grown_model
 from calib.diagnosis import diagnose
-from calib.errors import body_errors
-from calib.fit import solve
-from calib.model import Model, Source
-from calib.prior import JointPrior
-from calib.run import Run
+from calib.problem.model import Model, Source
+from calib.problem.prior import JointPrior
+from calib.runs.calibrate import calibrate, grow, grown_model
+from calib.runs.run import Run
+from calib.solve.errors import body_errors
+from calib.solve.fit import solve
 
 GEOMETRY = Model(("arm_link_length", "arm_joint_offset", "arm_axis_tilt"))
 STEPS = ("arm_gravity_sag", "arm_gear_error@17", "arm_gear_error@34")

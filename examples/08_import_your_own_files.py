@@ -18,8 +18,8 @@ from pathlib import Path
 import numpy as np
 from foreign_files import write_files
 
-from calib.calibrate import calibrate
 from calib.intake import Choices, import_files
+from calib.runs.calibrate import calibrate
 from calib.simulate import load_spec, simulate
 from chains import se3
 from sensors.readers.base import Options

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.model import Source
+from calib.problem.model import Source
 from chains import se3
 from sensors.meshes import write_cloud
 from sensors.ply import write_ply

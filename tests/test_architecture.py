@@ -14,9 +14,9 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("chains", "sensors", "calib")  # each may import itself and those before it
 DOORS = {
     "PIL": "sensors/readers/osf.py",
-    "gtsam": "calib/graph.py",
+    "gtsam": "calib/solve/graph.py",
     "laspy": "sensors/readers/las.py",
-    "matplotlib": "calib/plots.py",
+    "matplotlib": "calib/report/plots.py",
     "open3d": "sensors/meshes.py",
     "pyarrow": "sensors/recording.py",
     "trimesh": "sensors/mesh_files.py",

@@ -129,7 +129,7 @@ def _tell(done: Imported, as_json: bool) -> None:
     if as_json:
         print_json(done.document())
         return
-    from calib.tables import print_check, print_pairs, terminal
+    from calib.show.tables import print_check, print_pairs, terminal
 
     console = terminal()
     print_pairs(console, "what was understood", [("", line) for line in done.understood])

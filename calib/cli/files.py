@@ -26,7 +26,7 @@ def export(
 ) -> None:
     """Write the result for others: YAML, URDF, ROS 2, ring tables, pictures, tables."""
     from calib.export import export as write
-    from calib.run import Run
+    from calib.runs.run import Run
 
     done = write(Run.open(run), out, formats or [])
     document = {
@@ -57,8 +57,8 @@ def apply(
     as_json: Json = False,
 ) -> None:
     """Write corrected clouds: what the run has learnt of its LiDAR is taken off."""
-    from calib.apply import apply as correct
-    from calib.run import Run
+    from calib.evaluate.apply import apply as correct
+    from calib.runs.run import Run
 
     with progress_bar() as progress:
         done = correct(Run.open(run), clouds, out, rig, progress)

@@ -16,7 +16,7 @@ from chains.errors import InputError
 def report(runs: Runs, out: Out, as_json: Json = False) -> None:
     """One page for a colleague: the verdict, what was found, and how good it is; no network."""
     from calib.report import report as write
-    from calib.run import Run
+    from calib.runs.run import Run
 
     opened = [Run.open(run) for run in runs]
     with progress_bar() as progress:
@@ -37,7 +37,7 @@ def plot(
     """One figure of a run's report, for a paper."""
     from calib.report import Evidence, charts_of
     from calib.report import plot as draw
-    from calib.run import Run
+    from calib.runs.run import Run
 
     with progress_bar() as progress:
         evidence = Evidence.of([Run.open(run)], progress)

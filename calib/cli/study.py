@@ -11,7 +11,7 @@ from calib.cli.app import Json, Out, Runs, app, effect_names, print_json, progre
 from chains.errors import InputError
 
 if TYPE_CHECKING:
-    from calib.run import Run
+    from calib.runs.run import Run
 
 Recordings = Annotated[list[Path], typer.Argument(help="Recording folders.", metavar="REC...")]
 Effects = Annotated[
@@ -49,14 +49,14 @@ def simulate(
 @app.command()
 def check(recording: Path, as_json: Json = False) -> None:
     """What is in a recording, what is wrong, and what can and cannot be estimated from it."""
-    from calib.check import check as run
+    from calib.solve.check import check as run
 
     with progress_bar() as progress:
         found = run(recording, progress)
     if as_json:
         print_json(found.document())
     else:
-        from calib.tables import print_check
+        from calib.show.tables import print_check
 
         print_check(found)
     if found.problems:
@@ -79,8 +79,8 @@ def fit(
     """Estimate the rig jointly; several recordings share what is the same hardware."""
     if hold_out not in ("location", "stop", "none"):
         raise InputError(f"--hold-out {hold_out}: give location, stop or none")
-    from calib.calibrate import calibrate
-    from calib.model import Model
+    from calib.problem.model import Model
+    from calib.runs.calibrate import calibrate
 
     chosen = Model.of(effects, fix or [])
     with progress_bar() as progress:
@@ -101,8 +101,8 @@ def add(
     as_json: Json = False,
 ) -> None:
     """The model of a run and more effects, refitted from that run to the same recordings."""
-    from calib.calibrate import grow, grown_model
-    from calib.run import Run
+    from calib.runs.calibrate import grow, grown_model
+    from calib.runs.run import Run
 
     earlier = Run.open(run)
     model = grown_model(earlier, effects)
@@ -120,7 +120,7 @@ def diagnose(
 ) -> None:
     """Where a run's model fails and which effect it lacks; written to RUN/diagnosis.json."""
     from calib.diagnosis import diagnose as find
-    from calib.run import Run
+    from calib.runs.run import Run
 
     fitted = Run.open(run)
     with progress_bar() as progress:
@@ -128,7 +128,7 @@ def diagnose(
     if as_json:
         print_json(found.document())
     else:
-        from calib.diagnosis_tables import print_diagnosis
+        from calib.show.diagnosis import print_diagnosis
 
         print_diagnosis(found, fitted.summary["residual"])
 
@@ -142,8 +142,8 @@ def explain(
     as_json: Json = False,
 ) -> None:
     """Fit, diagnose, add, until nothing worth adding is left; every rung is kept in DIR."""
-    from calib.explain import explain as climb
-    from calib.model import Model
+    from calib.problem.model import Model
+    from calib.runs.explain import explain as climb
 
     chosen = Model.of(effects, fix or [])
     with progress_bar() as progress:
@@ -151,7 +151,7 @@ def explain(
     if as_json:
         print_json(found.document())
     else:
-        from calib.diagnosis_tables import print_explanation
+        from calib.show.diagnosis import print_explanation
 
         print_explanation(found)
 
@@ -159,9 +159,9 @@ def explain(
 @app.command()
 def compare(runs: Runs, as_json: Json = False) -> None:
     """Errors and parameters of runs side by side, and the ladder by which they grew."""
-    from calib.ladder import ladder
-    from calib.run import Run
-    from calib.tables import comparison, print_comparison
+    from calib.runs.ladder import ladder
+    from calib.runs.run import Run
+    from calib.show.tables import comparison, print_comparison
 
     opened = [Run.open(run) for run in runs]
     if as_json:
@@ -185,7 +185,7 @@ def evaluate(
 ) -> None:
     """Accuracy and precision of every return, by ring, distance, incidence and label."""
     from calib.evaluate import evaluate_all
-    from calib.run import Run
+    from calib.runs.run import Run
 
     opened = [Run.open(run) for run in runs]
     with progress_bar() as progress:
@@ -193,7 +193,7 @@ def evaluate(
     if as_json:
         print_json(found if len(found) > 1 else next(iter(found.values())))
     else:
-        from calib.evaluation_tables import print_evaluations
+        from calib.show.evaluation import print_evaluations
 
         print_evaluations(found)
 
@@ -208,7 +208,7 @@ def effects(
 ) -> None:
     """The catalogue: formula, unit, size, what an effect is confounded with, source."""
     from calib.effects import CATALOGUE, find
-    from calib.tables import effect_page, print_catalogue
+    from calib.show.tables import effect_page, print_catalogue
 
     chosen = [find(name)] if name else list(CATALOGUE)
     if as_json:
@@ -235,6 +235,6 @@ def _tell(run: Run, as_json: bool) -> None:
     if as_json:
         print_json(run.summary | {"not_estimated": run.solution.not_estimated})
     else:
-        from calib.tables import print_run
+        from calib.show.tables import print_run
 
         print_run(run)

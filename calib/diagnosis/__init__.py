@@ -6,9 +6,9 @@ from calib.diagnosis.search import search
 from calib.diagnosis.stand import Stand
 from calib.diagnosis.verdict import Diagnosis, conclude
 from calib.diagnosis.weak import weak_directions
-from calib.fit import Progress
-from calib.holdout import held_out
-from calib.run import DIAGNOSIS, Run
+from calib.runs.run import DIAGNOSIS, Run
+from calib.solve.fit import Progress
+from calib.solve.holdout import held_out
 from sensors.documents import write_json
 
 __all__ = ["Diagnosis", "diagnose"]

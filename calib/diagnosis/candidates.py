@@ -13,7 +13,7 @@ import numpy as np
 
 from calib.effects import CATALOGUE, Effect, OneHot, Param, Site, View
 from calib.effects.basis import RANGE
-from calib.model import Model, Source
+from calib.problem.model import Model, Source
 from calib.rig import Rig
 
 BINS, PAIR_BINS = 12, 6

@@ -14,8 +14,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from calib.diagnosis.linear import LocalRows, Walk
-from calib.fit import Estimate
 from calib.problem import Problem
+from calib.solve.fit import Estimate
 
 WHOLE = 0.999  # of a direction's information: a cluster that has more of it is alone with it
 

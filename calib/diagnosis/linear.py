@@ -15,13 +15,13 @@ from typing import Self
 import numpy as np
 from scipy.sparse import csr_array, vstack
 
-from calib.fit import Estimate, Progress
-from calib.graph import Block, Graph
 from calib.problem import Problem
 from calib.residuals.beams import Rows, unknown_columns
 from calib.residuals.rows import Group, gram
 from calib.residuals.scan import ScanStop
 from calib.residuals.tracker import TrackedBody
+from calib.solve.fit import Estimate, Progress
+from calib.solve.graph import Block, Graph
 
 # What paper says of the hardware is no evidence against a candidate: its sigmas are widened so much
 # that what only they would tell apart counts as a gauge.

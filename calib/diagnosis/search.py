@@ -16,7 +16,7 @@ from calib.diagnosis.score import test as joint_test
 from calib.diagnosis.screen import Candidate, Screen
 from calib.diagnosis.stand import Look, Stand
 from calib.effects import Effect, Site
-from calib.fit import Progress
+from calib.solve.fit import Progress
 
 ALPHA = 0.04  # chance that a named effect is found where nothing is missing
 ALPHA_UNNAMED = 0.01  # and that structure is

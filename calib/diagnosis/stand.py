@@ -9,7 +9,6 @@ from itertools import chain
 import numpy as np
 
 from calib import problem as problems
-from calib.calibrate import model_of, reopened
 from calib.diagnosis.candidates import (
     ShapeStep,
     covariates,
@@ -22,10 +21,11 @@ from calib.diagnosis.linear import Linear, linearise
 from calib.diagnosis.score import Test, away_from_model, project, test
 from calib.diagnosis.screen import Candidate, Screen, screen
 from calib.effects import Effect, Site
-from calib.fit import Estimate, Progress, resume, solve
-from calib.model import Model, Source
 from calib.problem import Problem
-from calib.run import Run
+from calib.problem.model import Model, Source
+from calib.runs.calibrate import model_of, reopened
+from calib.runs.run import Run
+from calib.solve.fit import Estimate, Progress, resume, solve
 from sensors.recording import Recording
 
 FINER = 9  # shapes tried between the two beside the best one

@@ -16,7 +16,7 @@ from calib.diagnosis.search import ALPHA, FEWEST, ODDS, Found, Search, angle_deg
 from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import formula, hangs_on, what_separates, words
 from calib.effects import CATALOGUE, Site
-from calib.run import one_unit, worth_adding
+from calib.runs.run import one_unit, worth_adding
 
 UNNAMED = "unexplained_structure"
 VERDICTS = {
@@ -67,7 +67,7 @@ class Diagnosis:
 
     def _repr_html_(self) -> str:
         """As a notebook shows it."""
-        from calib.notebook import diagnosis_html
+        from calib.show.notebook import diagnosis_html
 
         return diagnosis_html(self)
 

@@ -10,7 +10,7 @@ from calib.diagnosis.score import away_from_model, information_left
 from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import what_separates
 from calib.effects import Effect
-from calib.run import Run
+from calib.runs.run import Run
 
 LEANS = 0.5  # of the prior's variance left in a direction that the data hardly determine
 SHARE = 0.35  # of a direction, for a parameter to be named

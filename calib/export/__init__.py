@@ -14,7 +14,7 @@ from calib.export.tree import write_tree
 from calib.export.urdf import write_urdf
 from calib.export.written import Unheld
 from calib.export.yaml_extrinsics import read_extrinsics, write_extrinsics
-from calib.run import Run
+from calib.runs.run import Run
 from chains.errors import InputError
 
 __all__ = ["FORMATS", "Exported", "export", "read_extrinsics"]

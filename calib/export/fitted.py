@@ -14,12 +14,12 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.calibrate import model_of, reopened
 from calib.effects import Effect, OneHot, Site, View
 from calib.export.written import Unheld, Written, head
-from calib.model import owned
+from calib.problem.model import owned
 from calib.rig import Rig
-from calib.run import FrameEstimate, Part, Run
+from calib.runs.calibrate import model_of, reopened
+from calib.runs.run import FrameEstimate, Part, Run
 from chains import se3
 from chains.errors import InputError
 

@@ -7,10 +7,10 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from calib.estimates import Found, found
 from calib.export.fitted import Fitted
 from calib.export.written import Written, head, write_text
-from calib.tables import LISTED, effect_cells, estimate_cell, shown
+from calib.runs.estimates import Found, found
+from calib.show.tables import LISTED, effect_cells, estimate_cell, shown
 
 CONVENTIONS = (
     "Links: how far T_parent_child lies from CAD, T_cad exp(twist), in the child's own axes; where",

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from calib.run import Run
+from calib.runs.run import Run
 from chains.errors import InputError
 from sensors.documents import write_atomically
 

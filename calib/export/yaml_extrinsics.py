@@ -10,7 +10,7 @@ import numpy as np
 from calib.effects import CATALOGUE
 from calib.export.fitted import Fitted
 from calib.export.written import Written
-from calib.run import (
+from calib.runs.run import (
     RING,
     EffectEstimate,
     FrameEstimate,

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from calib.check import Check, check
 from calib.intake import rigfile, scans, stops, targets
 from calib.intake.clocks import align
 from calib.intake.gather import (
@@ -28,6 +27,7 @@ from calib.intake.gather import (
 )  # fmt: skip
 from calib.intake.still import MIN_HOLD_S, find_holds
 from calib.rig import load_rig
+from calib.solve.check import Check, check
 from chains.errors import InputError
 from sensors.documents import replace_folder, write_atomically
 from sensors.meshes import write_surface

@@ -9,14 +9,14 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from calib import plots
-from calib.fit import Progress
+from calib.report import plots
 from calib.report.chart import Absent, Chart
 from calib.report.charts import SECTIONS
 from calib.report.evidence import Evidence
 from calib.report.page import Section, render
 from calib.report.verdict import Verdict, judge
-from calib.run import Run
+from calib.runs.run import Run
+from calib.solve.fit import Progress
 from chains.errors import InputError
 from sensors.documents import nearest, write_atomically
 

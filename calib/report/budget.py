@@ -17,12 +17,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.fit import Progress
 from calib.problem import Problem
 from calib.residuals.beams import Columns
 from calib.residuals.scan import ScanStop
 from calib.residuals.tracker import TrackedBody
-from calib.run import Solution
+from calib.runs.run import Solution
+from calib.solve.fit import Progress
 
 STOPS, ROWS = 24, 2000  # of each stop that is looked at, no more rows than that
 

@@ -6,10 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from calib import plots
+from calib.report import plots
 
 if TYPE_CHECKING:
-    from calib.plots import Figure
+    from calib.report.plots import Figure
 
 
 @dataclass(frozen=True)

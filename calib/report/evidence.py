@@ -11,17 +11,17 @@ from typing import Any
 import numpy as np
 
 from calib import problem as problems
-from calib.calibrate import model_of, reopened
-from calib.estimates import Found, found
-from calib.fit import Progress, same_mesh, values_of
-from calib.ladder import Rung, ladder
-from calib.model import Source
 from calib.problem import Problem
+from calib.problem.model import Source
 from calib.report.budget import Budget, budget
 from calib.report.statistics import AZIMUTHS, BINS, PLACES, Axis, Statistics, Table, gather
 from calib.residuals.scan import ScanStop
-from calib.residuals.table import residual_table, table_path
-from calib.run import RESIDUALS, SUMMARY, Run
+from calib.runs.calibrate import model_of, reopened
+from calib.runs.estimates import Found, found
+from calib.runs.ladder import Rung, ladder
+from calib.runs.residual_table import residual_table, table_path
+from calib.runs.run import RESIDUALS, SUMMARY, Run
+from calib.solve.fit import Progress, same_mesh, values_of
 from chains.errors import InputError
 from sensors.recording import read_table
 

@@ -14,7 +14,7 @@ from calib.report.chart import Absent, Chart
 from calib.report.charts.fit import error_mm
 from calib.report.evidence import Evidence, folder_name
 from calib.report.verdict import Verdict
-from calib.tables import chance, effect_page, estimate_cell, mm, shown
+from calib.show.tables import chance, effect_page, estimate_cell, mm, shown
 
 LEADING = 8  # candidates whose evidence is told
 LISTED = 12  # weak directions that are told

@@ -6,8 +6,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from calib.calibrate import TOLERATED
-from calib.run import Run
+from calib.runs.calibrate import TOLERATED
+from calib.runs.run import Run
 
 NEAR = 1.25  # times the noise floor: a held-out error as good as it
 FAR = 3.0  # times its sigmas, or the floor: residuals that something large is behind

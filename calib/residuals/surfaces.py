@@ -9,8 +9,8 @@ from typing import Protocol
 import numpy as np
 
 from calib.forward import Values
-from calib.graph import Variable
 from calib.residuals.beams import Association, Columns, Surface
+from calib.solve.graph import Variable
 from chains import se3
 from sensors.lidar import Beams
 from sensors.planes import Cells, Planes

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from calib.effects import Site, View
-from calib.model import stop_columns
+from calib.problem.model import stop_columns
 from calib.rig import Rig
 from calib.simulate.room import FLOOR_CENTRE_M
 from calib.simulate.spec import Spec

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.effects import DEFAULT, Effect, FrameOffset, OneHot, Site, View, find, load_effects
-from calib.model import owned
+from calib.problem.model import owned
 from calib.rig import Rig
 from calib.simulate.spec import Spec
 from chains import se3

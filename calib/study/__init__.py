@@ -15,13 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from calib.calibrate import calibrate, grow, grown_model, reopened
 from calib.diagnosis import diagnose
 from calib.evaluate import write_evaluation
-from calib.fit import Progress
-from calib.model import Source
-from calib.run import Run
+from calib.problem.model import Source
+from calib.runs.calibrate import calibrate, grow, grown_model, reopened
+from calib.runs.run import Run
 from calib.simulate import simulate
+from calib.solve.fit import Progress
 from calib.study import figures, tables
 from calib.study.case import Case, Columns, State, gather, well_seen
 from calib.study.conditions import FULL, QUICK, Scale, seed_of

@@ -13,17 +13,17 @@ from typing import Any
 
 import numpy as np
 
-from calib import holdout
 from calib import problem as problems
-from calib.calibrate import model_of
-from calib.errors import Errors, scan_errors
 from calib.evaluate import evaluate_stop
-from calib.fit import Progress, solve, values_of
-from calib.model import Model, Source
+from calib.evaluate.tally import Evaluated
 from calib.problem import Problem
-from calib.run import Run
+from calib.problem.model import Model, Source
+from calib.runs.calibrate import model_of
+from calib.runs.run import Run
+from calib.solve import holdout
+from calib.solve.errors import Errors, scan_errors
+from calib.solve.fit import Progress, solve, values_of
 from calib.study import sequence
-from calib.tally import Evaluated
 from sensors.documents import replace_folder
 
 Values = dict[str, np.ndarray]

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calib import plots
+from calib.report import plots
 from calib.study.case import STEEP_RAD, Columns
 
 if TYPE_CHECKING:
-    from calib.plots import Figure
+    from calib.report.plots import Figure
 
 BRIGHT = 0.4
 """Of the FARO's intensity: what Fig. 9 takes for high reflectivity."""

@@ -11,11 +11,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from calib import start
 from calib.effects import View
 from calib.effects.arm import ArmLinkLength
-from calib.model import Source
-from calib.problem import Problem
+from calib.problem import Problem, start
+from calib.problem.model import Source
 from calib.residuals.scan import ScanStop
 from chains import se3
 from chains.align import align_points

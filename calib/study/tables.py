@@ -9,12 +9,12 @@ import numpy as np
 
 from calib import problem as problems
 from calib.effects import FrameOffset, Site
+from calib.evaluate.tally import Evaluated, Tally
 from calib.forward import Values
-from calib.model import Model, Source
+from calib.problem.model import Model, Source
 from calib.residuals.tracker import TrackedBody
 from calib.study.case import Case, Columns, State, gather, well_seen
 from calib.study.sequence import LENGTHS, RINGS
-from calib.tally import Evaluated, Tally
 from chains import se3
 from sensors.meshes import ransac_plane
 

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from calib.effects import CATALOGUE, find
-from calib.ladder import Rung, ladder
-from calib.run import Run, worth_adding
+from calib.runs.ladder import Rung, ladder
+from calib.runs.run import Run, worth_adding
 from chains.errors import InputError
 
 

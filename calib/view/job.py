@@ -102,9 +102,9 @@ def _work(
 def _study(
     mouth: Connection, folder: Path, effect: str | Mapping[str, Any] | None, out: Path | None
 ) -> None:
-    from calib.calibrate import grow, grown_model
     from calib.diagnosis import diagnose
-    from calib.run import Run
+    from calib.runs.calibrate import grow, grown_model
+    from calib.runs.run import Run
     from sensors.documents import write_yaml
 
     def progress(what: str, done: int, total: int) -> None:

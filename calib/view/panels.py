@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.ladder import Rung
+from calib.runs.ladder import Rung
 from calib.view.colours import Scale, column
 from calib.view.desk import Findings
 from calib.view.scene import Points

@@ -13,13 +13,13 @@ from functools import cached_property
 import numpy as np
 
 from calib import problem as problems
-from calib.calibrate import model_of, reopened
 from calib.forward import Stops
-from calib.model import Source
+from calib.problem.model import Source
 from calib.residuals.scan import ScanStop
-from calib.residuals.table import table_path
 from calib.residuals.tracker import TrackedBody
-from calib.run import RESIDUALS, Run
+from calib.runs.calibrate import model_of, reopened
+from calib.runs.residual_table import table_path
+from calib.runs.run import RESIDUALS, Run
 from chains import se3
 from chains.errors import InputError
 from sensors.recording import read_table

@@ -21,9 +21,9 @@ from workload import one_thread, recorded, timed
 
 from calib import problem as problems
 from calib.evaluate import evaluate_stop, write_evaluation
-from calib.model import Model, Source
+from calib.evaluate.tally import Evaluated
 from calib.problem import Problem
-from calib.tally import Evaluated
+from calib.problem.model import Model, Source
 from chains import se3
 from sensors.lidar import beams
 from sensors.recording import write_table

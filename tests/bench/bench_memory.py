@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 from workload import BEAMS, recorded
 
-from calib.fit import solve
-from calib.model import Model, Source
 from calib.problem import Problem, build
+from calib.problem.model import Model, Source
 from calib.residuals.beams import Rows
+from calib.solve.fit import solve
 
 MB = 1e6
 

@@ -22,8 +22,8 @@ from workload import held, one_thread, recorded, timed
 from calib import problem as problems
 from calib.diagnosis.linear import LocalRows, Sums
 from calib.diagnosis.stand import Stand
-from calib.fit import solve
-from calib.model import Model
+from calib.problem.model import Model
+from calib.solve.fit import solve
 
 
 def fitted(folder: Path) -> Stand:

@@ -23,7 +23,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from calib.run import Run
+from calib.runs.run import Run
 from calib.view.scene import Scene
 from sensors.documents import read_yaml, write_yaml
 from sensors.recording import Recording, read_table, write_table

@@ -19,8 +19,8 @@ import numpy as np
 
 from calib.diagnosis.candidates import stops_view
 from calib.effects import CATALOGUE, DEFAULT, Effect, Site, find, load_effects
-from calib.model import Model, Source
 from calib.problem import Problem, build
+from calib.problem.model import Model, Source
 from calib.residuals.targets import HangingTarget
 from calib.residuals.tracker import TrackedBody
 from calib.simulate import Spec, simulate

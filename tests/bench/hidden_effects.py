@@ -29,8 +29,8 @@ from calib.diagnosis.stand import Stand
 from calib.diagnosis.suggest import hangs_on
 from calib.diagnosis.verdict import conclude
 from calib.effects import Effect
-from calib.fit import solve
-from calib.model import Source
+from calib.problem.model import Source
+from calib.solve.fit import solve
 from sensors.documents import plain
 
 from .hidden_baselines import answers

@@ -9,9 +9,9 @@ import gtsam
 import numpy as np
 from workload import Values, Work
 
-from calib.graph import Graph
 from calib.residuals.beams import Rows
 from calib.residuals.scan import ScanStop
+from calib.solve.graph import Graph
 from sensors.lidar import beams
 
 RINGS = "ring_range_offset"

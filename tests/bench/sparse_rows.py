@@ -11,10 +11,10 @@ from scipy.optimize import least_squares
 from scipy.sparse import csr_matrix, vstack
 from workload import Values, Work
 
-from calib.fit import CONVERGED, MAX_PASSES
-from calib.graph import Variable
 from calib.residuals.beams import CompressedScan, Rows, compress
 from calib.residuals.scan import ScanStop
+from calib.solve.fit import CONVERGED, MAX_PASSES
+from calib.solve.graph import Variable
 from chains import se3
 
 Part = tuple[np.ndarray, csr_matrix]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from calib import problem as problems
-from calib.model import Model, Source
+from calib.problem.model import Model, Source
 from sensors.recording import read_table
 
 HERE = Path(__file__).parent

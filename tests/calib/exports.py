@@ -7,9 +7,9 @@ import numpy as np
 
 from calib.effects import FrameOffset
 from calib.forward import Placed, Term, place
-from calib.model import Model, Source
+from calib.problem.model import Model, Source
 from calib.rig import Rig
-from calib.run import EffectEstimate, FrameEstimate, Part, Run, Solution, one_unit
+from calib.runs.run import EffectEstimate, FrameEstimate, Part, Run, Solution, one_unit
 from chains import se3
 
 

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from calib import effects
-from calib.model import Model, Source
 from calib.problem import Problem, build
+from calib.problem.model import Model, Source
 from calib.rig import Rig
 from calib.simulate import Spec
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calib.model import Source
+from calib.problem.model import Source
 from calib.simulate import Spec, simulate
 
 QUICK = {"locations": 2, "stops_per_location": 2, "column_step": 128}

@@ -6,11 +6,11 @@ import shutil
 import numpy as np
 import pytest
 
-from calib.apply import Correction, apply, incidence
-from calib.calibrate import calibrate
 from calib.effects import find
-from calib.model import Model, Source
-from calib.run import Run
+from calib.evaluate.apply import Correction, apply, incidence
+from calib.problem.model import Model, Source
+from calib.runs.calibrate import calibrate
+from calib.runs.run import Run
 from calib.simulate import Spec
 from chains.errors import InputError
 from sensors.meshes import read_cloud, write_cloud

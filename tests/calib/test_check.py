@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from calib import problem as problems
-from calib.check import check
-from calib.fit import solve
-from calib.inventory import PlacedScan, odd_beams
-from calib.model import Model, Source
-from calib.solution import solution_of
+from calib.problem.model import Model, Source
+from calib.rig.inventory import PlacedScan, odd_beams
+from calib.solve.check import check
+from calib.solve.fit import solve
+from calib.solve.solution import solution_of
 from chains.errors import InputError
 from sensors.recording import read_table
 

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.calibrate import calibrate, grow, grown_model
 from calib.diagnosis import diagnose
-from calib.diagnosis_tables import print_diagnosis
-from calib.run import Run
+from calib.runs.calibrate import calibrate, grow, grown_model
+from calib.runs.run import Run
+from calib.show.diagnosis import print_diagnosis
 from calib.simulate import Spec, simulate
 from chains.errors import InputError
 from sensors.recording import Recording

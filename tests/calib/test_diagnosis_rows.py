@@ -12,9 +12,9 @@ from calib.diagnosis.linear import PLACES
 from calib.diagnosis.score import project
 from calib.diagnosis.score import test as score_test
 from calib.diagnosis.stand import Stand
-from calib.fit import solve
-from calib.model import Model
+from calib.problem.model import Model
 from calib.simulate import Spec
+from calib.solve.fit import solve
 
 from .simulated import made
 

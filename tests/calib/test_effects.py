@@ -9,8 +9,8 @@ import pytest
 from calib import effects
 from calib.effects import Effect, FrameOffset, OneHot, Param, Site, SurfaceShift, View
 from calib.forward import Term, place
-from calib.model import Model, Source
 from calib.problem import build
+from calib.problem.model import Model, Source
 from calib.rig import load_rig
 from chains.errors import InputError
 

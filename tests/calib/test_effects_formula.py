@@ -8,8 +8,8 @@ from calib import effects
 from calib.effects import Site, View, load_effects, read
 from calib.effects.expression import Expression
 from calib.effects.formula import FormulaEffect
-from calib.model import Model, Source
 from calib.problem import build
+from calib.problem.model import Model, Source
 from chains.errors import InputError
 
 from . import rigs

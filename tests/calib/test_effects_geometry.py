@@ -8,7 +8,7 @@ from scipy.spatial.transform import RigidTransform
 
 from calib.effects import View, find
 from calib.forward import Term, place
-from calib.model import Source, stop_columns, tracked_poses
+from calib.problem.model import Source, stop_columns, tracked_poses
 from calib.rig import load_rig
 from calib.simulate import PRESETS, simulate
 from chains.errors import InputError

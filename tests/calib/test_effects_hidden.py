@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from calib.effects import CATALOGUE, DEFAULT, Site, View, load_effects
-from calib.fit import solve
-from calib.model import Model, Source
 from calib.problem import build
+from calib.problem.model import Model, Source
 from calib.residuals.beams import Columns
+from calib.solve.fit import solve
 from chains.errors import InputError
 
 from . import rigs

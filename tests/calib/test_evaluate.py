@@ -7,13 +7,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from calib.calibrate import calibrate
 from calib.evaluate import accuracy, evaluate
-from calib.fit import values_of
-from calib.model import Model
 from calib.problem import build
-from calib.run import Run
+from calib.problem.model import Model
+from calib.runs.calibrate import calibrate
+from calib.runs.run import Run
 from calib.simulate import Spec
+from calib.solve.fit import values_of
 from chains.errors import InputError
 from sensors.recording import read_table
 
@@ -48,7 +48,7 @@ def poses(run):
 
 
 def problem_of(run):
-    from calib.calibrate import reopened
+    from calib.runs.calibrate import reopened
 
     sources = reopened(run)
     return sources[0], build(sources, Model.read(run.model, run.folder))

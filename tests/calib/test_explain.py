@@ -6,11 +6,11 @@ from types import SimpleNamespace
 
 import pytest
 
-from calib import explain as module
-from calib.diagnosis_tables import print_explanation
-from calib.explain import EXPLANATION, MOST_RUNGS, explain
-from calib.model import Model
-from calib.run import Run
+from calib.problem.model import Model
+from calib.runs import explain as module
+from calib.runs.explain import EXPLANATION, MOST_RUNGS, explain
+from calib.runs.run import Run
+from calib.show.diagnosis import print_explanation
 from calib.simulate import simulate
 from chains.errors import InputError
 

@@ -8,7 +8,7 @@ import yaml
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from calib.export import FORMATS, export, read_extrinsics
-from calib.run import EffectEstimate, FrameEstimate, Part, Run, Solution
+from calib.runs.run import EffectEstimate, FrameEstimate, Part, Run, Solution
 from chains.errors import InputError
 
 

@@ -5,9 +5,9 @@ import json
 import pytest
 import yaml
 
-from calib.calibrate import calibrate
 from calib.cli.files import export as command
 from calib.export import FORMATS
+from calib.runs.calibrate import calibrate
 
 from . import rigs
 

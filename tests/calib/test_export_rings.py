@@ -10,7 +10,7 @@ import pytest
 
 from calib.effects import OneHot, View, load_effects
 from calib.export import export
-from calib.model import Model
+from calib.problem.model import Model
 from calib.rig import load_rig
 from chains.errors import InputError
 from sensors.lidar import load_lidar

@@ -9,7 +9,7 @@ import yourdfpy
 from calib.effects import CATALOGUE, load_effects
 from calib.export import export
 from calib.export.fitted import Fitted
-from calib.model import Source
+from calib.problem.model import Source
 from chains.errors import InputError
 
 from . import exports, rigs

@@ -7,9 +7,9 @@ from scipy.spatial.transform import RigidTransform
 
 from calib.effects import Effect, OneHot, Param, Site
 from calib.forward import Term, place
-from calib.graph import Variable
-from calib.model import Model
+from calib.problem.model import Model
 from calib.rig import load_rig
+from calib.solve.graph import Variable
 
 from . import rigs
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from calib.fit import solve
-from calib.graph import Graph, Variable
-from calib.model import Model, Source
 from calib.problem import build
+from calib.problem.model import Model, Source
 from calib.residuals.rows import tukey_weight
+from calib.solve.fit import solve
+from calib.solve.graph import Graph, Variable
 
 from . import rigs
 

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.calibrate import calibrate, grow, grown_model
 from calib.effects import Effect, find
-from calib.ladder import ladder
-from calib.model import Model
-from calib.run import EffectEstimate, Run
+from calib.problem.model import Model
+from calib.runs.calibrate import calibrate, grow, grown_model
+from calib.runs.ladder import ladder
+from calib.runs.run import EffectEstimate, Run
 from chains.errors import InputError
 from sensors.documents import read_yaml, write_json
 

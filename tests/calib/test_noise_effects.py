@@ -7,10 +7,10 @@ from calib import effects
 from calib import problem as problems
 from calib.diagnosis.search import judged
 from calib.diagnosis.stand import Stand
-from calib.fit import solve
-from calib.model import Model
+from calib.problem.model import Model
 from calib.residuals.spread import spread_rows
 from calib.simulate import Spec
+from calib.solve.fit import solve
 from sensors.recording import Scan
 
 from .simulated import made

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from calib.diagnosis.verdict import Diagnosis
-from calib.ladder import Rung
-from calib.run import EffectEstimate, FrameEstimate, Part, Run, Solution
-from calib.tables import print_run
+from calib.runs.ladder import Rung
+from calib.runs.run import EffectEstimate, FrameEstimate, Part, Run, Solution
+from calib.show.tables import print_run
 
 NAMES = ("lidar.rx", "lidar.ry", "lidar.rz", "lidar.tx", "lidar.ty", "lidar.tz")
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
-from calib import recalibrate
-from calib.graph import Variable
-from calib.prior import JointPrior
+from calib.problem.prior import JointPrior
+from calib.solve import recalibrate
+from calib.solve.graph import Variable
 
 NAMES = ("mount", "lidar", "arm", "unseen")
 DIM, CAD_SIGMA = 3, 1.0

@@ -9,12 +9,12 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from calib.calibrate import calibrate, grow, grown_model
 from calib.diagnosis import diagnose
 from calib.report import Evidence, charts_of, plot, report
 from calib.report.budget import beam_jacobian, budget
 from calib.report.statistics import Z_EDGES
-from calib.run import RESIDUALS, SUMMARY, Run, Solution
+from calib.runs.calibrate import calibrate, grow, grown_model
+from calib.runs.run import RESIDUALS, SUMMARY, Run, Solution
 from calib.simulate import Spec, simulate
 from chains.errors import InputError
 from sensors.documents import write_json

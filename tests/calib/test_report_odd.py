@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from calib.calibrate import calibrate
-from calib.model import Model
+from calib.problem.model import Model
 from calib.report import report
+from calib.runs.calibrate import calibrate
 from calib.simulate import Spec, simulate
 
 HUMID = '{name: humid_air, site: range, unit: "1", sigma: 0.01, basis: ["humidity * range"]}'

@@ -8,8 +8,8 @@ import pytest
 
 from calib.effects import Effect, OneHot, Param, Site, SurfaceShift
 from calib.forward import Term
-from calib.model import Model, Source
-from calib.problem import build, effect_variable
+from calib.problem.build import build, effect_variable
+from calib.problem.model import Model, Source
 from calib.residuals.beams import Association, SharedSum
 from calib.residuals.rows import tukey_weight
 from calib.residuals.scan import turned

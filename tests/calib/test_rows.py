@@ -5,8 +5,8 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import norm
 
-from calib.model import Model, Source
 from calib.problem import build
+from calib.problem.model import Model, Source
 from calib.residuals.rows import (
     TUKEY,
     Group,

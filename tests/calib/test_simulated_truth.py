@@ -8,7 +8,7 @@ from scipy.spatial.transform import RigidTransform
 
 import calib.effects
 from calib.effects import CATALOGUE, Effect, FrameOffset, Param, Site
-from calib.model import Source
+from calib.problem.model import Source
 from calib.rig import load_rig
 from calib.simulate import Spec, simulate
 from calib.simulate.room import build

@@ -12,10 +12,10 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calib.calibrate import calibrate
-from calib.fit import solve
-from calib.model import Model, Source
 from calib.problem import build
+from calib.problem.model import Model, Source
+from calib.runs.calibrate import calibrate
+from calib.solve.fit import solve
 from chains.errors import InputError
 
 from . import rigs, simulated

@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calib.model import Model, Source
+from calib.problem.model import Model, Source
 from calib.simulate import PRESETS, Spec, simulate
 from calib.study import Scale, sequence, study, tables
 from calib.study.case import Case, well_seen

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform
 
-from calib import tables
 from calib.effects import CATALOGUE
-from calib.run import EffectEstimate, FrameEstimate, Part, Run, Solution
+from calib.runs.run import EffectEstimate, FrameEstimate, Part, Run, Solution
+from calib.show import tables
 from sensors.documents import json_text
 
 from . import rigs

@@ -4,10 +4,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from calib.calibrate import calibrate
 from calib.cli import main
 from calib.evaluate import evaluate, evaluate_all
-from calib.run import Run
+from calib.runs.calibrate import calibrate
+from calib.runs.run import Run
 from calib.simulate import Spec
 from chains.errors import InputError
 
@@ -76,9 +76,9 @@ def test_planes_are_as_thick_as_their_points_say(run, evaluated):
 def origins(run):
     """Where the LiDAR was at each stop: of this one, beams start there."""
     from calib import problem as problems
-    from calib.calibrate import reopened
-    from calib.fit import values_of
-    from calib.model import Model
+    from calib.problem.model import Model
+    from calib.runs.calibrate import reopened
+    from calib.solve.fit import values_of
 
     sources = reopened(run)
     problem = problems.build(sources, Model.read(run.model))

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from calib.forward import place
-from calib.model import Model, Source
 from calib.problem import build
+from calib.problem.model import Model, Source
 from calib.residuals.targets import HangingTarget
 from calib.residuals.tracker import TrackedBody
 from chains import se3

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.calibrate import calibrate
 from calib.diagnosis import diagnose
-from calib.run import Run
+from calib.runs.calibrate import calibrate
+from calib.runs.run import Run
 from calib.simulate import simulate
 from calib.view.desk import Desk
 from calib.view.page import Page

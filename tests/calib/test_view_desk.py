@@ -13,8 +13,8 @@ from html.parser import HTMLParser
 
 import pytest
 
-from calib.ladder import Rung
-from calib.run import Run
+from calib.runs.ladder import Rung
+from calib.runs.run import Run
 from calib.view import panels
 from calib.view.desk import Desk, Findings
 from calib.view.job import Job
@@ -193,7 +193,7 @@ def test_a_job_that_is_stopped_leaves_nothing(first, tmp_path):
 
 @pytest.mark.slow
 def test_a_job_makes_the_run_that_rigcal_add_makes(first, tmp_path):
-    from calib.calibrate import grow, grown_model
+    from calib.runs.calibrate import grow, grown_model
 
     formula = {"name": "humid", "site": "range", "unit": "1", "sigma": 0.01, "basis": ["range"]}
     told = []

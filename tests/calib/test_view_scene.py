@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calib.run import Run
+from calib.runs.run import Run
 from calib.view import colours
 from calib.view.colours import RISING, SIGNED, coloured, nice
 from calib.view.scene import Points, Scene, camera, sunk

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform
 
-from calib.fit import solve
-from calib.holdout import held_out
-from calib.model import Model, Source
 from calib.problem import build
+from calib.problem.model import Model, Source
 from calib.residuals.surfaces import PlaneSurface
 from calib.simulate import Spec
+from calib.solve.fit import solve
+from calib.solve.holdout import held_out
 
 from . import rigs, simulated
 

@@ -4,8 +4,8 @@ import json
 import shutil
 from pathlib import Path
 
-from calib.calibrate import calibrate
-from calib.run import Run
+from calib.runs.calibrate import calibrate
+from calib.runs.run import Run
 from calib.simulate import Spec, simulate
 from sensors.documents import read_yaml, write_json, write_yaml
 

@@ -2,9 +2,9 @@
 
 import pytest
 
-from calib.calibrate import calibrate, grow, grown_model
 from calib.diagnosis import diagnose
-from calib.model import Model
+from calib.problem.model import Model
+from calib.runs.calibrate import calibrate, grow, grown_model
 
 from . import foreign
 

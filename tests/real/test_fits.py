@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from calib.calibrate import calibrate
-from calib.model import Model
+from calib.problem.model import Model
+from calib.runs.calibrate import calibrate
 from chains import se3
 
 from . import foreign

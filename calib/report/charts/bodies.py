@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calib import plots
+from calib.report import plots
 from calib.report.chart import Absent, Chart
 from calib.report.charts.residuals import nice
 from calib.report.evidence import Evidence
@@ -17,7 +17,7 @@ from calib.residuals.tracker import TrackedBody
 from chains import se3
 
 if TYPE_CHECKING:
-    from calib.plots import Figure
+    from calib.report.plots import Figure
 
 MOST = 1500  # arrows of a body that can be told apart
 LENGTH = 0.06  # of the picture, for the longest arrow; rounding makes it up to 2.5 times that

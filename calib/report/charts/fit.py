@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calib import plots
-from calib.ladder import Rung
+from calib.report import plots
 from calib.report.chart import Absent, Chart
 from calib.report.evidence import Evidence, folder_name
 from calib.report.statistics import Z_EDGES
+from calib.runs.ladder import Rung
 
 if TYPE_CHECKING:
-    from calib.plots import Figure
+    from calib.report.plots import Figure
 
 NEAR = 1.25  # times the noise floor
 STEEP = 8.0  # largest over smallest error from which a scale is logarithmic

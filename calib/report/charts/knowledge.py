@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calib import plots
+from calib.report import plots
 from calib.report.budget import Budget
 from calib.report.chart import Absent, Chart
 from calib.report.evidence import Evidence
-from calib.run import Solution
-from calib.tables import LISTED, small
+from calib.runs.run import Solution
+from calib.show.tables import LISTED, small
 
 if TYPE_CHECKING:
-    from calib.plots import Figure
+    from calib.report.plots import Figure
 
 LEADING = 10  # candidates that are drawn
 TIED = 0.5  # correlation from which a parameter matters

@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calib import plots
-from calib.estimates import Found
+from calib.report import plots
 from calib.report.chart import Absent, Chart
 from calib.report.evidence import Evidence
 from calib.rig import Rig
-from calib.run import RING
-from calib.tables import LISTED, shown
+from calib.runs.estimates import Found
+from calib.runs.run import RING
+from calib.show.tables import LISTED, shown
 
 if TYPE_CHECKING:
-    from calib.plots import Axes, Figure
+    from calib.report.plots import Axes, Figure
 
 FAR = 3.0  # sigmas of CAD
 SHIFT, TURN = slice(3, 6), slice(0, 3)

@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calib import plots
 from calib.diagnosis.suggest import words
+from calib.report import plots
 from calib.report.chart import Absent, Chart
 from calib.report.evidence import FIRST, Evidence
 from calib.report.statistics import Curve, Statistics
 
 if TYPE_CHECKING:
-    from calib.plots import Axes, Figure
+    from calib.report.plots import Axes, Figure
 
 NO_BEAMS = "there are no scans, so no residuals of beams"
 FRONT = {*FIRST, "stop", "elapsed_s", "recording"}  # what is not folded away, and temperature

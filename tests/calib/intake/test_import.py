@@ -7,10 +7,10 @@ import pytest
 import yaml
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calib.calibrate import calibrate
 from calib.cli import main
 from calib.intake import Choices, import_files, sources
 from calib.rig import load_rig
+from calib.runs.calibrate import calibrate
 from chains.errors import InputError
 from sensors.readers import READERS
 from sensors.readers.base import Options

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.graph import Graph
 from calib.residuals.beams import Association, Rows
 from calib.residuals.scan import ScanStop
 from calib.residuals.tracker import TrackedBody
+from calib.solve.graph import Graph
 from chains import se3
 
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from calib.model import Source
+from calib.problem.model import Source
 from chains import se3
 from chains.align import align_points, mean_pose
 from chains.errors import InputError

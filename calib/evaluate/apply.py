@@ -16,14 +16,14 @@ from pathlib import Path
 import numpy as np
 
 from calib import problem as problems
-from calib.calibrate import model_of, reopened
 from calib.effects import Effect, LazyColumn, Site, View
-from calib.fit import Progress, values_of
-from calib.model import Source
+from calib.problem.model import Source
 from calib.residuals.beams import site_error
 from calib.residuals.scan import turned
 from calib.rig import Rig, load_rig
-from calib.run import Run
+from calib.runs.calibrate import model_of, reopened
+from calib.runs.run import Run
+from calib.solve.fit import Progress, values_of
 from chains.errors import InputError
 from sensors.documents import nearest, replace_folder
 from sensors.lidar import Beams, beams

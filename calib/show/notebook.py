@@ -5,21 +5,21 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from calib.diagnosis_tables import (
+from calib.runs.estimates import found
+from calib.show.diagnosis import (
     LEADING,
     candidates_table,
     detectable_table,
     unexplained_table,
 )
-from calib.estimates import found
-from calib.tables import effects_table, error_table, ladder_table, links_table
+from calib.show.tables import effects_table, error_table, ladder_table, links_table
 
 if TYPE_CHECKING:
     from rich.table import Table
 
     from calib.diagnosis import Diagnosis
-    from calib.ladder import Rung
-    from calib.run import Run
+    from calib.runs.ladder import Rung
+    from calib.runs.run import Run
 
 _PAGE = """\
 <div><p><b>{{ title }}</b></p>

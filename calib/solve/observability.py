@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.linalg import qr
 
-from calib.graph import Variable
+from calib.solve.graph import Variable
 
 UNTOLD = 0.98  # of the prior's variance left: the data said next to nothing
 PARTNER = 0.1  # of the leading parameter's share, in units of the priors

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.model import Source
+from calib.problem.model import Source
 from calib.residuals.beams import Rows
 from calib.residuals.scan import ScanStop
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from calib.run import Run
+from calib.runs.run import Run
 from chains.errors import InputError
 
 
@@ -45,7 +45,7 @@ class Rung:
 
     def _repr_html_(self) -> str:
         """As a notebook shows it."""
-        from calib.notebook import rung_html
+        from calib.show.notebook import rung_html
 
         return rung_html(self)
 

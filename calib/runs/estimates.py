@@ -10,7 +10,7 @@ import numpy as np
 
 from calib.effects.rig import DOF
 from calib.rig import Rig, load_rig
-from calib.run import EffectEstimate, FrameEstimate, Run
+from calib.runs.run import EffectEstimate, FrameEstimate, Run
 from chains import se3
 from chains.errors import InputError
 

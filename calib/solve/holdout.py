@@ -7,14 +7,14 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from calib import problem as problems
-from calib.errors import Errors, body_errors, scan_errors
-from calib.fit import Estimate, Progress, solve
-from calib.model import Model, Source
-from calib.prior import JointPrior
 from calib.problem import Problem
+from calib.problem.model import Model, Source
+from calib.problem.prior import JointPrior
 from calib.residuals.scan import ScanStop
 from calib.residuals.surfaces import PlaneSurface
 from calib.residuals.tracker import TrackedBody
+from calib.solve.errors import Errors, body_errors, scan_errors
+from calib.solve.fit import Estimate, Progress, solve
 
 FOLDS = 5  # a fit leaves out about a fifth of the locations
 

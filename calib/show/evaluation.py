@@ -8,7 +8,7 @@ from typing import Any
 
 from rich.table import Table
 
-from calib.tables import columns_table, mm, terminal
+from calib.show.tables import columns_table, mm, terminal
 
 HEADINGS = {
     "incidence_deg": "incidence, degrees",

@@ -9,12 +9,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from calib.calibrate import calibrate, grow, recordings_document
 from calib.diagnosis import Diagnosis, diagnose
 from calib.effects import load_effects
-from calib.fit import Progress
-from calib.model import Model, Source
-from calib.run import Run
+from calib.problem.model import Model, Source
+from calib.runs.calibrate import calibrate, grow, recordings_document
+from calib.runs.run import Run
+from calib.solve.fit import Progress
 from chains.errors import InputError
 from sensors.documents import plain, write_json
 

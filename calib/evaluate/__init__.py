@@ -23,13 +23,13 @@ from typing import Any
 import numpy as np
 
 from calib import problem as problems
-from calib.calibrate import model_of, reopened
-from calib.fit import Progress, values_of
+from calib.evaluate.tally import FLAT_M, Columns, Evaluated, Tally
 from calib.forward import Values
 from calib.residuals.scan import Ranges, ScanStop
 from calib.residuals.surfaces import Meeting, MeshSurface
-from calib.run import Run
-from calib.tally import FLAT_M, Columns, Evaluated, Tally
+from calib.runs.calibrate import model_of, reopened
+from calib.runs.run import Run
+from calib.solve.fit import Progress, values_of
 from chains.errors import InputError
 from sensors.documents import replace_folder, write_json, write_yaml
 from sensors.recording import write_table

@@ -141,7 +141,7 @@ class Run:
 
     def _repr_html_(self) -> str:
         """As a notebook shows it."""
-        from calib.notebook import run_html
+        from calib.show.notebook import run_html
 
         return run_html(self)
 

@@ -13,15 +13,11 @@ import numpy as np
 
 from calib import problem as problems
 from calib.effects import Effect, load_effects
-from calib.errors import Errors, body_errors, misfit, row_errors, scan_errors
-from calib.fit import Estimate, Progress, solve
-from calib.holdout import held_out
-from calib.model import Model, Source
 from calib.problem import Problem
-from calib.recalibrate import Link, earlier, solve_from
-from calib.residuals.table import residual_table, table_path
+from calib.problem.model import Model, Source
 from calib.residuals.tracker import TrackedBody
-from calib.run import (
+from calib.runs.residual_table import residual_table, table_path
+from calib.runs.run import (
     COVARIANCE,
     DIAGNOSIS,
     MODEL,
@@ -32,7 +28,11 @@ from calib.run import (
     versions,
     write_state,
 )
-from calib.solution import solution_of
+from calib.solve.errors import Errors, body_errors, misfit, row_errors, scan_errors
+from calib.solve.fit import Estimate, Progress, solve
+from calib.solve.holdout import held_out
+from calib.solve.recalibrate import Link, earlier, solve_from
+from calib.solve.solution import solution_of
 from chains.errors import InputError
 from sensors.documents import replace_folder, write_json, write_yaml
 from sensors.recording import write_table

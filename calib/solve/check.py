@@ -9,15 +9,14 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from calib import inventory
 from calib import problem as problems
-from calib.fit import Estimate, Progress, preview
 from calib.forward import Values
-from calib.inventory import PlacedScan, ScanSums
-from calib.model import Model, Source
+from calib.problem.model import Model, Source
 from calib.residuals.scan import ScanStop
-from calib.rig import Rig, load_rig
-from calib.solution import solution_of
+from calib.rig import Rig, inventory, load_rig
+from calib.rig.inventory import PlacedScan, ScanSums
+from calib.solve.fit import Estimate, Progress, preview
+from calib.solve.solution import solution_of
 from chains.errors import InputError
 from sensors.recording import Recording, read_scan
 from sensors.reference import Reference

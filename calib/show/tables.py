@@ -11,13 +11,13 @@ from rich.console import Console
 from rich.padding import Padding
 from rich.table import Table
 
-from calib.estimates import Found, comparison, found
-from calib.ladder import Rung, ladder
+from calib.runs.estimates import Found, comparison, found
+from calib.runs.ladder import Rung, ladder
 
 if TYPE_CHECKING:
-    from calib.check import Check
     from calib.effects import Effect
-    from calib.run import Run
+    from calib.runs.run import Run
+    from calib.solve.check import Check
 
 WIDTH = 100
 LISTED = 12  # an effect of more parameters than these is summarised

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.linalg import cholesky, solve_triangular
 
 from calib.forward import Derivatives, Values
-from calib.graph import Variable
+from calib.solve.graph import Variable
 from chains import se3
 
 

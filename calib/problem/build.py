@@ -7,16 +7,16 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from calib import start
 from calib.effects import Site, View
 from calib.effects.rig import DOF
 from calib.forward import Stops, Term, place
-from calib.graph import Block, Variable
-from calib.model import Model, Source
+from calib.problem import start
+from calib.problem.model import Model, Source
 from calib.residuals.scan import ScanStop
 from calib.residuals.surfaces import Meeting, MeshSurface, PlaneSurface
 from calib.residuals.targets import HangingTarget
 from calib.residuals.tracker import TrackedBody
+from calib.solve.graph import Block, Variable
 from chains import se3
 from chains.errors import InputError
 from sensors.lidar import beams

@@ -10,8 +10,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from calib.ladder import Rung, ladder
-from calib.tables import (
+from calib.runs.ladder import Rung, ladder
+from calib.show.tables import (
     columns_table,
     estimate_cell,
     ladder_table,
@@ -24,7 +24,7 @@ from calib.tables import (
 
 if TYPE_CHECKING:
     from calib.diagnosis import Diagnosis
-    from calib.explain import Explanation
+    from calib.runs.explain import Explanation
 
 LEADING = 8  # candidates that are shown; diagnosis.json has all
 WEAKEST = 4  # directions that are shown

@@ -10,11 +10,11 @@ import numpy as np
 from scipy.special import chdtrc
 
 from calib.effects import FrameOffset
-from calib.fit import Estimate, Progress, solve
-from calib.graph import Variable
-from calib.prior import JointPrior, difference
 from calib.problem import Problem
-from calib.run import Solution
+from calib.problem.prior import JointPrior, difference
+from calib.runs.run import Solution
+from calib.solve.fit import Estimate, Progress, solve
+from calib.solve.graph import Variable
 from chains import se3
 from chains.errors import InputError
 

@@ -9,11 +9,11 @@ import numpy as np
 
 from calib.effects import SurfaceShift
 from calib.forward import Term
-from calib.graph import Block, Graph, Variable
-from calib.model import Source
-from calib.problem import Problem, effect_variable
+from calib.problem.build import Problem, effect_variable
+from calib.problem.model import Source
 from calib.residuals.beams import Association, SharedSum
 from calib.residuals.scan import ScanStop
+from calib.solve.graph import Block, Graph, Variable
 from chains import se3
 from chains.errors import InputError
 from sensors.reference import Reference

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from calib.effects import FrameOffset
-from calib.fit import Estimate
 from calib.forward import Term
-from calib.model import Source
-from calib.observability import not_estimated
 from calib.problem import Problem
-from calib.run import EffectEstimate, FrameEstimate, Part, Solution, one_unit
+from calib.problem.model import Source
+from calib.runs.run import EffectEstimate, FrameEstimate, Part, Solution, one_unit
+from calib.solve.fit import Estimate
+from calib.solve.observability import not_estimated
 from chains import se3
 
 

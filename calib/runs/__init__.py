@@ -1,0 +1,1 @@
+"""The folder that a fit leaves behind, and what grows from it."""
