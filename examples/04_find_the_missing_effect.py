@@ -17,8 +17,8 @@ import sys
 import tempfile
 from pathlib import Path
 
-from calib.diagnosis import diagnose
 from calib.runs.calibrate import calibrate, grow, grown_model
+from calib.runs.diagnose import diagnose
 from calib.runs.run import Run
 from calib.simulate import load_spec, simulate
 

@@ -16,8 +16,8 @@ import sys
 import tempfile
 from pathlib import Path
 
-from calib.diagnosis import diagnose
 from calib.runs.calibrate import calibrate, grow, grown_model
+from calib.runs.diagnose import diagnose
 from calib.simulate import Spec, simulate
 
 FORMULA = """\

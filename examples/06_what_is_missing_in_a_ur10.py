@@ -32,10 +32,10 @@ import numpy as np
 from ur10_tmac import recording
 
 from calib import problem as problems
-from calib.diagnosis import diagnose
 from calib.problem.model import Model, Source
 from calib.problem.prior import JointPrior
 from calib.runs.calibrate import calibrate, grow, grown_model
+from calib.runs.diagnose import diagnose
 from calib.runs.run import Run
 from calib.solve.errors import body_errors
 from calib.solve.fit import solve

@@ -17,9 +17,9 @@ import sys
 import tempfile
 from pathlib import Path
 
-from calib.diagnosis import diagnose
 from calib.report import Evidence, plot, report
 from calib.runs.calibrate import calibrate, grow, grown_model
+from calib.runs.diagnose import diagnose
 from calib.simulate import load_spec, simulate
 
 out = Path(sys.argv[1] if len(sys.argv) > 1 else tempfile.mkdtemp(prefix="rigcal-"))

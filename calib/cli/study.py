@@ -119,7 +119,7 @@ def diagnose(
     as_json: Json = False,
 ) -> None:
     """Where a run's model fails and which effect it lacks; written to RUN/diagnosis.json."""
-    from calib.diagnosis import diagnose as find
+    from calib.runs.diagnose import diagnose as find
     from calib.runs.run import Run
 
     fitted = Run.open(run)

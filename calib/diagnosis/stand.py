@@ -23,9 +23,7 @@ from calib.diagnosis.screen import Candidate, Screen, screen
 from calib.effects import Effect, Site
 from calib.problem import Problem
 from calib.problem.model import Model, Source
-from calib.runs.calibrate import model_of, reopened
-from calib.runs.run import Run
-from calib.solve.fit import Estimate, Progress, resume, solve
+from calib.solve.fit import Estimate, Progress, solve
 from sensors.recording import Recording
 
 FINER = 9  # shapes tried between the two beside the best one
@@ -42,17 +40,6 @@ class Stand:
     model: Model
     problem: Problem
     estimate: Estimate
-
-    @classmethod
-    def of(cls, run: Run, progress: Progress) -> Stand:
-        """Where a run stands.
-
-        Raises:
-            InputError: its recordings are not what they were.
-        """
-        sources, model = reopened(run), model_of(run)
-        problem = problems.build(sources, model)
-        return cls(sources, model, problem, resume(problem, run.state(), progress))
 
     def with_effects(self, added: Sequence[Effect], progress: Progress) -> Stand:
         """The model with more effects, fitted from here."""

@@ -16,7 +16,7 @@ from calib.diagnosis.search import ALPHA, FEWEST, ODDS, Found, Search, angle_deg
 from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import formula, hangs_on, what_separates, words
 from calib.effects import CATALOGUE, Site
-from calib.runs.run import one_unit, worth_adding
+from calib.solve.solution import one_unit
 
 UNNAMED = "unexplained_structure"
 VERDICTS = {
@@ -85,6 +85,12 @@ class Diagnosis:
             "misfit": dict(self.misfit),
             "curves": [curve.document() for curve in self.curves],
         }
+
+
+def worth_adding(candidates: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Names of the confirmed among a diagnosis' candidates; see `calib.diagnosis.Diagnosis`."""
+    confirmed = [c for c in candidates if c["step"] and not c["dressed_up"]]
+    return [c["add"] for c in sorted(confirmed, key=lambda c: c["step"])]
 
 
 def conclude(

@@ -10,7 +10,7 @@ from calib.diagnosis.score import away_from_model, information_left
 from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import what_separates
 from calib.effects import Effect
-from calib.runs.run import Run
+from calib.solve.solution import Solution
 
 LEANS = 0.5  # of the prior's variance left in a direction that the data hardly determine
 SHARE = 0.35  # of a direction, for a parameter to be named
@@ -18,19 +18,19 @@ STANDS_IN = 0.97  # of what a candidate does, that an effect of the model can ta
 MOST = 8
 
 
-def weak_directions(run: Run, look: Look) -> list[dict[str, Any]]:
+def weak_directions(solution: Solution, widened: float, look: Look) -> list[dict[str, Any]]:
     """Directions in which a solution leans on paper, then effects that may stand for others.
 
     Returns:
         For each its `parameters`, `sigma_mm` (of a length, or of an angle one metre out; none for
         effects), and what it `needs`.
     """
-    return [*leaning(run, look), *standing_in(look)]
+    return [*leaning(solution, widened, look), *standing_in(look)]
 
 
-def leaning(run: Run, look: Look) -> list[dict[str, Any]]:
+def leaning(solution: Solution, widened: float, look: Look) -> list[dict[str, Any]]:
     """The weakest directions of a run's solution, in units of what was known before."""
-    solution, problem = run.solution, look.stand.problem
+    problem = look.stand.problem
     prior = {}
     for name in problem.calibration:
         variable = problem.variables[name]
@@ -40,8 +40,11 @@ def leaning(run: Run, look: Look) -> list[dict[str, Any]]:
     if not len(usable):
         return []
     known, names = known[usable], [solution.names[i] for i in usable]
-    widened = max(1.0, float(run.summary["sigmas_widened_by"]))
-    scaled = solution.covariance[np.ix_(usable, usable)] / np.outer(known, known) / widened**2
+    scaled = (
+        solution.covariance[np.ix_(usable, usable)]
+        / np.outer(known, known)
+        / max(1.0, widened) ** 2
+    )
     values, axes = np.linalg.eigh(scaled)
     out = []
     for value, axis in zip(values[::-1], axes.T[::-1], strict=True):

@@ -27,7 +27,7 @@ from calib.evaluate.tally import FLAT_M, Columns, Evaluated, Tally
 from calib.forward import Values
 from calib.residuals.scan import Ranges, ScanStop
 from calib.residuals.surfaces import Meeting, MeshSurface
-from calib.runs.calibrate import model_of, reopened
+from calib.runs.reopen import model_of, reopened
 from calib.runs.run import Run
 from calib.solve.fit import Progress, values_of
 from chains.errors import InputError

@@ -21,7 +21,7 @@ from calib.problem.model import Source
 from calib.residuals.beams import site_error
 from calib.residuals.scan import turned
 from calib.rig import Rig, load_rig
-from calib.runs.calibrate import model_of, reopened
+from calib.runs.reopen import model_of, reopened
 from calib.runs.run import Run
 from calib.solve.fit import Progress, values_of
 from chains.errors import InputError

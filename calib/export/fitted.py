@@ -18,8 +18,9 @@ from calib.effects import Effect, OneHot, Site, View
 from calib.export.written import Unheld, Written, head
 from calib.problem.model import owned
 from calib.rig import Rig
-from calib.runs.calibrate import model_of, reopened
-from calib.runs.run import FrameEstimate, Part, Run
+from calib.runs.reopen import model_of, reopened
+from calib.runs.run import Run
+from calib.solve.solution import FrameEstimate, Part
 from chains import se3
 from chains.errors import InputError
 

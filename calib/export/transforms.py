@@ -11,7 +11,7 @@ import numpy as np
 
 from calib.export.fitted import FittedRig, for_every_rig
 from calib.export.written import SIGMAS, Unheld, Written, commented, write_text
-from calib.runs.run import FrameEstimate
+from calib.solve.solution import FrameEstimate
 from chains import se3
 from sensors.documents import yaml_text
 

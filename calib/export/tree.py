@@ -13,7 +13,7 @@ import numpy as np
 from calib.export.fitted import FittedRig, for_every_rig
 from calib.export.written import Written, write_text
 from calib.runs.estimates import found
-from calib.runs.run import FrameEstimate
+from calib.solve.solution import FrameEstimate
 from chains import se3
 
 ROW, STEP, LEFT, TOP = 30, 26, 24, 84

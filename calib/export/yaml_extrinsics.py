@@ -10,12 +10,11 @@ import numpy as np
 from calib.effects import CATALOGUE
 from calib.export.fitted import Fitted
 from calib.export.written import Written
-from calib.runs.run import (
-    RING,
+from calib.runs.run import RING, Run
+from calib.solve.solution import (
     EffectEstimate,
     FrameEstimate,
     Part,
-    Run,
     effect_document,
     frame_document,
 )

@@ -16,9 +16,9 @@ from calib.problem.model import Source
 from calib.report.budget import Budget, budget
 from calib.report.statistics import AZIMUTHS, BINS, PLACES, Axis, Statistics, Table, gather
 from calib.residuals.scan import ScanStop
-from calib.runs.calibrate import model_of, reopened
 from calib.runs.estimates import Found, found
 from calib.runs.ladder import Rung, ladder
+from calib.runs.reopen import model_of, reopened
 from calib.runs.residual_table import residual_table, table_path
 from calib.runs.run import RESIDUALS, SUMMARY, Run
 from calib.solve.fit import Progress, same_mesh, values_of

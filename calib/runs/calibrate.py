@@ -16,6 +16,7 @@ from calib.effects import Effect, load_effects
 from calib.problem import Problem
 from calib.problem.model import Model, Source
 from calib.residuals.tracker import TrackedBody
+from calib.runs.reopen import model_of, reopened
 from calib.runs.residual_table import residual_table, table_path
 from calib.runs.run import (
     COVARIANCE,
@@ -112,11 +113,6 @@ def grown_model(run: Run, added: Sequence[str]) -> Model:
     return model_of(run).plus(tuple(found))
 
 
-def model_of(run: Run) -> Model:
-    """The model that a run was fitted with."""
-    return Model.read(run.model, run.folder / MODEL)
-
-
 def _shaped(effect: Effect, run: Run) -> Effect:
     if not effect.shape_name or effect.name != effect.family:
         return effect
@@ -132,30 +128,6 @@ def _shaped(effect: Effect, run: Run) -> Effect:
             f"{run.folder / DIAGNOSIS} is no diagnosis of this version; write "
             f"{effect.name}@NUMBER, or diagnose again"
         ) from None
-
-
-def reopened(run: Run) -> list[Source]:
-    """A run's recordings, as they were when the run was fitted to them.
-
-    Raises:
-        InputError: one is gone, or has changed.
-    """
-    return [_reopened(recording, run) for recording in run.model["recordings"]]
-
-
-def _reopened(recording: Mapping[str, str], run: Run) -> Source:
-    path = Path(recording["path"])
-    if not path.is_dir():
-        raise InputError(
-            f"{path}, which {run.folder} was fitted to, is no longer there; put it back, or fit it "
-            f"where it is now with 'rigcal fit'"
-        )
-    source = Source.open(path)
-    if source.recording.digest() != recording["sha256"]:
-        raise InputError(
-            f"{path} has changed since {run.folder} was fitted to it; fit it anew with 'rigcal fit'"
-        )
-    return source
 
 
 def _refuse_idle(model: Model, run: Run, sources: Sequence[Source]) -> None:

@@ -10,7 +10,8 @@ import numpy as np
 
 from calib.effects.rig import DOF
 from calib.rig import Rig, load_rig
-from calib.runs.run import EffectEstimate, FrameEstimate, Run
+from calib.runs.run import Run
+from calib.solve.solution import EffectEstimate, FrameEstimate
 from chains import se3
 from chains.errors import InputError
 

@@ -9,10 +9,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from calib.diagnosis import Diagnosis, diagnose
+from calib.diagnosis import Diagnosis
 from calib.effects import load_effects
 from calib.problem.model import Model, Source
 from calib.runs.calibrate import calibrate, grow, recordings_document
+from calib.runs.diagnose import diagnose
 from calib.runs.run import Run
 from calib.solve.fit import Progress
 from chains.errors import InputError

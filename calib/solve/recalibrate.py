@@ -12,9 +12,9 @@ from scipy.special import chdtrc
 from calib.effects import FrameOffset
 from calib.problem import Problem
 from calib.problem.prior import JointPrior, difference
-from calib.runs.run import Solution
 from calib.solve.fit import Estimate, Progress, solve
 from calib.solve.graph import Variable
+from calib.solve.solution import Solution
 from chains import se3
 from chains.errors import InputError
 

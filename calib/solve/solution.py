@@ -2,16 +2,88 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
 import numpy as np
 
 from calib.effects import FrameOffset
 from calib.forward import Term
 from calib.problem import Problem
 from calib.problem.model import Source
-from calib.runs.run import EffectEstimate, FrameEstimate, Part, Solution, one_unit
 from calib.solve.fit import Estimate
 from calib.solve.observability import not_estimated
 from chains import se3
+
+
+@dataclass(frozen=True)
+class FrameEstimate:
+    """T_parent_child (4, 4), with the sigma of its origin in the parent's axes (3,) m and of its
+    orientation about the child's axes (3,) rad; 0 is exact."""
+
+    parent: str
+    T_parent_child: np.ndarray
+    sigma_m: np.ndarray
+    sigma_rad: np.ndarray
+
+
+@dataclass(frozen=True)
+class EffectEstimate:
+    """An effect's parameters (P,), with their sigma; 0 is held.
+
+    The unit is that of all, or a list with commas that has one for each, as `one_unit` writes it.
+    """
+
+    unit: str
+    names: tuple[str, ...]
+    estimate: np.ndarray
+    sigma: np.ndarray
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """(P,) of each parameter."""
+        each = tuple(self.unit.split(", "))
+        return each if len(each) == len(self.names) else (self.unit,) * len(self.names)
+
+
+@dataclass(frozen=True)
+class Part:
+    """Frames and effects of the shared hardware, or of one rig."""
+
+    frames: dict[str, FrameEstimate] = field(default_factory=dict)
+    effects: dict[str, EffectEstimate] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Solution:
+    """What a fit found.
+
+    Args:
+        shared: what holds for all recordings.
+        recordings: rig name -> what belongs to it alone; empty where there is one rig.
+        not_estimated: a `name` and a `why` for what the data could not tell.
+        names: (P,) calibration parameters, ``variable.parameter``.
+        covariance: (P, P) joint covariance, m and rad.
+    """
+
+    shared: Part
+    recordings: dict[str, Part]
+    not_estimated: list[dict[str, str]]
+    names: tuple[str, ...]
+    covariance: np.ndarray
+
+    def part(self, rig: str | None) -> Part:
+        """All frames and effects that hold for one rig."""
+        own = self.recordings.get(rig, Part()) if rig else Part()
+        return Part(self.shared.frames | own.frames, self.shared.effects | own.effects)
+
+    def document(self) -> dict[str, Any]:
+        """As written to solution.yaml."""
+        out = _part_document(self.shared) | {"not_estimated": self.not_estimated}
+        if self.recordings:
+            out["recordings"] = {name: _part_document(p) for name, p in self.recordings.items()}
+        return out
 
 
 def solution_of(problem: Problem, estimate: Estimate, widened: float = 1.0) -> Solution:
@@ -105,3 +177,36 @@ def _absent(problem: Problem) -> list[dict[str, str]]:
         )
         out.append({"name": "lidar", "why": why})
     return out
+
+
+def one_unit(units: Sequence[str]) -> str:
+    """Units of an effect's parameters as one text: that of all, or a list with one for each."""
+    return units[0] if len(set(units)) == 1 else ", ".join(units)
+
+
+def frame_document(frame: FrameEstimate) -> dict[str, Any]:
+    """A frame as the contract writes it."""
+    return {
+        "parent": frame.parent,
+        "xyz_m": frame.T_parent_child[:3, 3],
+        "quat_wxyz": se3.to_quat_wxyz(frame.T_parent_child),
+        "sigma_m": frame.sigma_m,
+        "sigma_rad": frame.sigma_rad,
+    }
+
+
+def effect_document(effect: EffectEstimate) -> dict[str, Any]:
+    """An effect's parameters as the contract writes them."""
+    return {
+        "unit": effect.unit,
+        "names": effect.names,
+        "estimate": effect.estimate,
+        "sigma": effect.sigma,
+    }
+
+
+def _part_document(part: Part) -> dict[str, Any]:
+    return {
+        "frames": {n: frame_document(f) for n, f in part.frames.items()},
+        "effects": {n: effect_document(e) for n, e in part.effects.items()},
+    }

@@ -18,7 +18,7 @@ from calib.evaluate import evaluate_stop
 from calib.evaluate.tally import Evaluated
 from calib.problem import Problem
 from calib.problem.model import Model, Source
-from calib.runs.calibrate import model_of
+from calib.runs.reopen import model_of
 from calib.runs.run import Run
 from calib.solve import holdout
 from calib.solve.errors import Errors, scan_errors

@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from calib.diagnosis.verdict import worth_adding
 from calib.effects import CATALOGUE, find
 from calib.runs.ladder import Rung, ladder
-from calib.runs.run import Run, worth_adding
+from calib.runs.run import Run
 from chains.errors import InputError
 
 

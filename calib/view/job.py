@@ -102,8 +102,8 @@ def _work(
 def _study(
     mouth: Connection, folder: Path, effect: str | Mapping[str, Any] | None, out: Path | None
 ) -> None:
-    from calib.diagnosis import diagnose
     from calib.runs.calibrate import grow, grown_model
+    from calib.runs.diagnose import diagnose
     from calib.runs.run import Run
     from sensors.documents import write_yaml
 

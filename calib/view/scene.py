@@ -17,7 +17,7 @@ from calib.forward import Stops
 from calib.problem.model import Source
 from calib.residuals.scan import ScanStop
 from calib.residuals.tracker import TrackedBody
-from calib.runs.calibrate import model_of, reopened
+from calib.runs.reopen import model_of, reopened
 from calib.runs.residual_table import table_path
 from calib.runs.run import RESIDUALS, Run
 from chains import se3

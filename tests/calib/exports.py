@@ -9,7 +9,8 @@ from calib.effects import FrameOffset
 from calib.forward import Placed, Term, place
 from calib.problem.model import Model, Source
 from calib.rig import Rig
-from calib.runs.run import EffectEstimate, FrameEstimate, Part, Run, Solution, one_unit
+from calib.runs.run import Run
+from calib.solve.solution import EffectEstimate, FrameEstimate, Part, Solution, one_unit
 from chains import se3
 
 

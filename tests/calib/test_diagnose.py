@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.diagnosis import diagnose
 from calib.runs.calibrate import calibrate, grow, grown_model
+from calib.runs.diagnose import diagnose
 from calib.runs.run import Run
 from calib.show.diagnosis import print_diagnosis
 from calib.simulate import Spec, simulate

@@ -48,7 +48,7 @@ def poses(run):
 
 
 def problem_of(run):
-    from calib.runs.calibrate import reopened
+    from calib.runs.reopen import reopened
 
     sources = reopened(run)
     return sources[0], build(sources, Model.read(run.model, run.folder))

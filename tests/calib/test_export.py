@@ -8,7 +8,8 @@ import yaml
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from calib.export import FORMATS, export, read_extrinsics
-from calib.runs.run import EffectEstimate, FrameEstimate, Part, Run, Solution
+from calib.runs.run import Run
+from calib.solve.solution import EffectEstimate, FrameEstimate, Part, Solution
 from chains.errors import InputError
 
 

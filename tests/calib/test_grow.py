@@ -12,7 +12,8 @@ from calib.effects import Effect, find
 from calib.problem.model import Model
 from calib.runs.calibrate import calibrate, grow, grown_model
 from calib.runs.ladder import ladder
-from calib.runs.run import EffectEstimate, Run
+from calib.runs.run import Run
+from calib.solve.solution import EffectEstimate
 from chains.errors import InputError
 from sensors.documents import read_yaml, write_json
 

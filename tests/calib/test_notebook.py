@@ -8,8 +8,9 @@ import pytest
 
 from calib.diagnosis.verdict import Diagnosis
 from calib.runs.ladder import Rung
-from calib.runs.run import EffectEstimate, FrameEstimate, Part, Run, Solution
+from calib.runs.run import Run
 from calib.show.tables import print_run
+from calib.solve.solution import EffectEstimate, FrameEstimate, Part, Solution
 
 NAMES = ("lidar.rx", "lidar.ry", "lidar.rz", "lidar.tx", "lidar.ty", "lidar.tz")
 

@@ -9,13 +9,14 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from calib.diagnosis import diagnose
 from calib.report import Evidence, charts_of, plot, report
 from calib.report.budget import beam_jacobian, budget
 from calib.report.statistics import Z_EDGES
 from calib.runs.calibrate import calibrate, grow, grown_model
-from calib.runs.run import RESIDUALS, SUMMARY, Run, Solution
+from calib.runs.diagnose import diagnose
+from calib.runs.run import RESIDUALS, SUMMARY, Run
 from calib.simulate import Spec, simulate
+from calib.solve.solution import Solution
 from chains.errors import InputError
 from sensors.documents import write_json
 from sensors.recording import read_table, write_table

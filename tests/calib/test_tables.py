@@ -9,8 +9,9 @@ import pytest
 from scipy.spatial.transform import RigidTransform
 
 from calib.effects import CATALOGUE
-from calib.runs.run import EffectEstimate, FrameEstimate, Part, Run, Solution
+from calib.runs.run import Run
 from calib.show import tables
+from calib.solve.solution import EffectEstimate, FrameEstimate, Part, Solution
 from sensors.documents import json_text
 
 from . import rigs

@@ -77,7 +77,7 @@ def origins(run):
     """Where the LiDAR was at each stop: of this one, beams start there."""
     from calib import problem as problems
     from calib.problem.model import Model
-    from calib.runs.calibrate import reopened
+    from calib.runs.reopen import reopened
     from calib.solve.fit import values_of
 
     sources = reopened(run)

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.diagnosis import diagnose
 from calib.runs.calibrate import calibrate
+from calib.runs.diagnose import diagnose
 from calib.runs.run import Run
 from calib.simulate import simulate
 from calib.view.desk import Desk

@@ -2,9 +2,9 @@
 
 import pytest
 
-from calib.diagnosis import diagnose
 from calib.problem.model import Model
 from calib.runs.calibrate import calibrate, grow, grown_model
+from calib.runs.diagnose import diagnose
 
 from . import foreign
 

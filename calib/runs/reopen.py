@@ -1,0 +1,39 @@
+"""What a run was fitted to, as it was then: its model and its recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from calib.problem.model import Model, Source
+from calib.runs.run import MODEL, Run
+from chains.errors import InputError
+
+
+def model_of(run: Run) -> Model:
+    """The model that a run was fitted with."""
+    return Model.read(run.model, run.folder / MODEL)
+
+
+def reopened(run: Run) -> list[Source]:
+    """A run's recordings, as they were when the run was fitted to them.
+
+    Raises:
+        InputError: one is gone, or has changed.
+    """
+    return [_reopened(recording, run) for recording in run.model["recordings"]]
+
+
+def _reopened(recording: Mapping[str, str], run: Run) -> Source:
+    path = Path(recording["path"])
+    if not path.is_dir():
+        raise InputError(
+            f"{path}, which {run.folder} was fitted to, is no longer there; put it back, or fit it "
+            f"where it is now with 'rigcal fit'"
+        )
+    source = Source.open(path)
+    if source.recording.digest() != recording["sha256"]:
+        raise InputError(
+            f"{path} has changed since {run.folder} was fitted to it; fit it anew with 'rigcal fit'"
+        )
+    return source
