@@ -12,7 +12,7 @@ import numpy as np
 
 from calib import problem as problems
 from calib.problem import Problem
-from calib.problem.model import Source
+from calib.problem.model import Source, same_mesh
 from calib.report.budget import Budget, budget
 from calib.report.statistics import AZIMUTHS, BINS, PLACES, Axis, Statistics, Table, gather
 from calib.residuals.scan import ScanStop
@@ -21,7 +21,7 @@ from calib.runs.ladder import Rung, ladder
 from calib.runs.reopen import model_of, reopened
 from calib.runs.residual_table import residual_table, table_path
 from calib.runs.run import RESIDUALS, SUMMARY, Run
-from calib.solve.fit import Progress, same_mesh, values_of
+from calib.solve.fit import Progress, values_of
 from chains.errors import InputError
 from sensors.recording import read_table
 

@@ -11,9 +11,9 @@ from scipy.special import chdtrc
 
 from calib.effects import FrameOffset
 from calib.problem import Problem
-from calib.problem.prior import JointPrior, difference
+from calib.problem.prior import JointPrior
+from calib.problem.unknowns import Unknown
 from calib.solve.fit import Estimate, Progress, solve
-from calib.solve.graph import Variable
 from calib.solve.solution import Solution
 from chains import se3
 from chains.errors import InputError
@@ -130,7 +130,7 @@ def _test(force: np.ndarray, spread: np.ndarray, precision: np.ndarray) -> _Test
 
 
 def _link(
-    variable: Variable, prior: JointPrior, estimate: Estimate, test: _Test | None, moved: bool
+    variable: Unknown, prior: JointPrior, estimate: Estimate, test: _Test | None, moved: bool
 ) -> Link:
     """The link, with the move that explains all changes best where it is the one that moved.
 
@@ -163,22 +163,22 @@ def _link(
 def _change(prior: JointPrior, estimate: Estimate) -> np.ndarray:
     """Now minus then of all that the prior holds, as one tangent."""
     values = ((v, prior.means[v.name], estimate.values[v.name]) for v in prior.held)
-    return np.concatenate([difference(*each) for each in values])
+    return np.concatenate([v.difference(then, now) for v, then, now in values])
 
 
-def _covariance(estimate: Estimate, held: Sequence[Variable]) -> np.ndarray:
+def _covariance(estimate: Estimate, held: Sequence[Unknown]) -> np.ndarray:
     """Covariance of some of the estimate's variables, in the order given."""
     blocks, order = _blocks(estimate.variables), np.arange(len(estimate.covariance))
     index = np.concatenate([order[blocks[v.name]] for v in held])
     return estimate.covariance[np.ix_(index, index)]
 
 
-def _blocks(variables: Sequence[Variable]) -> dict[str, slice]:
+def _blocks(variables: Sequence[Unknown]) -> dict[str, slice]:
     ends = np.cumsum([v.dim for v in variables])
     return {v.name: slice(end - v.dim, end) for v, end in zip(variables, ends, strict=True)}
 
 
-def _earlier_value(problem: Problem, variable: Variable, solution: Solution) -> np.ndarray | None:
+def _earlier_value(problem: Problem, variable: Unknown, solution: Solution) -> np.ndarray | None:
     for source, terms in zip(problem.sources, problem.terms, strict=True):
         part = solution.part(source.rig.name)
         for term in terms:

@@ -1,0 +1,271 @@
+"""From sums of stops to normal equations of what is kept, in either order of elimination."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.sparse import csr_array
+
+from calib.linear.clusters import Gradients
+from calib.linear.elimination import BY_TWIST, Eliminated, eliminate
+from calib.linear.layout import Layout
+from calib.linear.rows import TWIST, StopSums
+from calib.linear.system import Linearisation, Values
+from calib.problem.unknowns import Role
+
+
+class OwnRows(NamedTuple):
+    """Whitened rows about a stop's own unknowns: a tracked body's, or those of a prior.
+
+    Args:
+        A: (m, n) derivatives, columns: (n,) by which.
+        b: (m,) minus the residuals.
+        measured: False for a prior.
+    """
+
+    A: np.ndarray
+    b: np.ndarray
+    columns: np.ndarray
+    measured: bool
+
+    def gram(self, sigma: np.ndarray) -> np.ndarray:
+        """(n + 1, n + 1) over the columns, in units of their sigmas, and the right side."""
+        rows = np.column_stack([self.A * sigma[self.columns], self.b])
+        return rows.T @ rows
+
+
+class Assembly:
+    """What both orders share.
+
+    Args:
+        layout: which column is what.
+        own: stop -> rows about its own unknowns.
+        beams: how many stops have beams.
+    """
+
+    def __init__(self, layout: Layout, own: Mapping[int, Sequence[OwnRows]], beams: int) -> None:
+        self.layout, self.own, self.beams_count = layout, own, beams
+        self.chi2 = sum(float(rows.b @ rows.b) for each in own.values() for rows in each)
+        self.touched = np.zeros(layout.size, bool)
+        for rows in (r for each in own.values() for r in each if r.measured):
+            self.touched[rows.columns] |= np.any(rows.A != 0, axis=0)
+        self.weight_m2 = 0.0
+        self.eliminated: list[Eliminated] = []
+        self.twists: list[tuple[int, np.ndarray, np.ndarray]] = []
+
+    def add(self, sums: StopSums) -> None:
+        """Add the beams of a stop."""
+        self.weight_m2 += sums.weight_m2
+        self.chi2 += float(sums.dense[TWIST, TWIST])
+        seen = np.append(np.diag(sums.dense)[TWIST + 1 :], np.diag(sums.with_sparse)) > 0
+        self.touched[sums.columns] |= seen
+        self.touched[sums.chain_columns] |= np.any(sums.chain != 0, axis=0)
+
+    def _cell_priors(self, values: Values, columns: np.ndarray) -> np.ndarray:
+        """Right side (n,) of the priors of cells, whose derivative is one, in their units."""
+        whole = np.zeros(self.layout.size)
+        for name, at in self.layout.at.items():
+            if self.layout.unknowns[name].role is Role.SURFACE:
+                whole[at] = -values[name] / self.layout.unknowns[name].sigma
+        self.chi2 += float(whole[columns] @ whole[columns])
+        return whole[columns]
+
+    def _done(self, values: Values, kept: np.ndarray, gradients: Gradients | None) -> Linearisation:
+        return Linearisation(
+            layout=self.layout,
+            values=values,
+            kept=kept,
+            chi2=self.chi2,
+            touched=self.touched,
+            eliminated=self.eliminated,
+            twists=self.twists,
+            weight_m2=self.weight_m2,
+            gradients=gradients,
+        )
+
+
+class CellsFirst(Assembly):
+    """Cells are eliminated from [twists of all stops | cells | kept | b], then stops' unknowns."""
+
+    def __init__(self, layout: Layout, own: Mapping[int, Sequence[OwnRows]], beams: int) -> None:
+        super().__init__(layout, own, beams)
+        self.first = TWIST * beams
+        rest = np.concatenate([layout.cells, layout.kept])
+        self.at = np.full(layout.size, -1)
+        self.at[rest] = self.first + np.arange(len(rest))
+        self.finest = np.full(layout.size, -1)
+        self.finest[layout.finest] = np.arange(len(layout.finest))
+        self.b = self.first + len(rest)
+        self.rest = np.zeros((self.b + 1, self.b + 1))
+        self.diagonal = np.zeros(len(layout.finest))
+        self.cross = np.zeros((len(layout.finest), self.b + 1))
+
+    def add(self, sums: StopSums) -> None:
+        """Add the beams of a stop."""
+        super().add(sums)
+        start = TWIST * len(self.twists)
+        self.twists.append((sums.stop, sums.chain, sums.chain_columns))
+        own = [*range(start, start + TWIST), self.b]
+        dense = np.append(own, self.at[sums.dense_columns]).astype(int)
+        fine = self.finest[sums.sparse_columns]
+        some, cells = np.flatnonzero(fine < 0), np.flatnonzero(fine >= 0)
+        sparse = self.at[sums.sparse_columns[some]]
+        upper = sums.with_sparse
+        self.rest[np.ix_(dense, dense)] += sums.dense
+        self.rest[np.ix_(sparse, dense)] += sums.with_dense[some]
+        self.rest[np.ix_(dense, sparse)] += sums.with_dense[some].T
+        block = upper[np.ix_(some, some)]
+        self.rest[np.ix_(sparse, sparse)] += block + block.T - np.diag(np.diag(block))
+        fine = fine[cells]
+        self.diagonal[fine] += np.diag(upper)[cells]
+        self.cross[np.ix_(fine, dense)] += sums.with_dense[cells]
+        both = upper[np.ix_(cells, some)] + upper[np.ix_(some, cells)].T
+        self.cross[np.ix_(fine, sparse)] += both
+
+    def add_kept(self, rows: OwnRows) -> None:
+        """Add whitened rows about kept unknowns."""
+        at = np.append(self.at[rows.columns], self.b)
+        self.rest[np.ix_(at, at)] += rows.gram(np.ones(self.layout.size))
+        self.chi2 += float(rows.b @ rows.b)
+
+    def done(self, values: Values, gradients: Gradients | None) -> Linearisation:
+        """Eliminate all but the kept."""
+        layout = self.layout
+        over = np.concatenate([layout.cells, layout.kept, [layout.size]])
+        over = np.append(np.full(self.first, BY_TWIST), over).astype(int)
+        unit = np.ones(self.b + 1)
+        unit[self.first : self.b] = layout.sigma[over[self.first : -1]]
+        rest = self.rest * unit * unit[:, None]
+        if len(layout.finest):
+            own = layout.sigma[layout.finest]
+            cross = self.cross * own[:, None] * unit
+            cross[:, -1] += self._cell_priors(values, layout.finest)
+            factor, gain = eliminate(self.diagonal * own**2 + 1.0, cross, rest)
+            self.eliminated.append(Eliminated(layout.finest, over, factor, gain))
+        cells = np.arange(self.first, self.first + len(layout.cells))
+        left = np.setdiff1d(np.arange(self.b + 1), cells)
+        if len(cells):
+            rest[cells, cells] += 1.0
+            prior = self._cell_priors(values, layout.cells)
+            rest[cells, -1] += prior
+            rest[-1, cells] += prior
+            cross, block = rest[np.ix_(cells, left)], rest[np.ix_(cells, cells)]
+            rest = rest[np.ix_(left, left)]
+            factor, gain = eliminate(block, cross, rest)
+            self.eliminated.append(Eliminated(layout.cells, over[left], factor, gain))
+        return self._done(values, self._without_own(rest), gradients)
+
+    def _without_own(self, rest: np.ndarray) -> np.ndarray:
+        """From [twists | kept | b] to [kept | b]: through the chain, then stops' own unknowns."""
+        layout = self.layout
+        own = np.concatenate([np.zeros(0, int), *layout.own.values()])
+        columns = np.concatenate([own, layout.kept, [layout.size]])
+        at = np.full(layout.size + 1, -1)
+        at[columns] = np.arange(len(columns))
+        rows = np.repeat(np.arange(self.first), [d.shape[1] for _, d, _ in self._by_row()])
+        found = [np.tile(at[c], TWIST) for _, _, c in self.twists]
+        unit = layout.sigma
+        data = [(d * unit[c]).ravel() for _, d, c in self.twists]
+        kept = np.arange(len(layout.kept) + 1)
+        chain = csr_array(
+            (
+                np.concatenate([*data, np.ones(len(kept))]),
+                (
+                    np.concatenate([rows, self.first + kept]),
+                    np.concatenate([*found, len(own) + kept]),
+                ),
+            ),
+            shape=(len(rest), len(columns)),
+        )
+        whole = chain.T @ (chain.T @ rest).T
+        for each in (rows for found in self.own.values() for rows in found):
+            some = np.append(at[each.columns], len(columns) - 1)
+            whole[np.ix_(some, some)] += each.gram(unit)
+        if not len(own):
+            return whole
+        count = len(own)
+        left = np.ascontiguousarray(whole[count:, count:])
+        factor, gain = eliminate(whole[:count, :count], whole[:count, count:], left)
+        self.eliminated.append(Eliminated(own, columns[count:], factor, gain))
+        return left
+
+    def _by_row(self) -> list[tuple[int, np.ndarray, np.ndarray]]:
+        return [each for each in self.twists for _ in range(TWIST)]
+
+
+class StopsFirst(Assembly):
+    """Each stop's own unknowns are eliminated as it comes, all cells at the end."""
+
+    def __init__(self, layout: Layout, own: Mapping[int, Sequence[OwnRows]], beams: int) -> None:
+        super().__init__(layout, own, beams)
+        self.cells = np.concatenate([layout.finest, layout.cells])
+        self.columns = np.concatenate([self.cells, layout.kept, [layout.size]])
+        self.at = np.full(layout.size + 1, -1)
+        self.at[self.columns] = np.arange(len(self.columns))
+        self.total = np.zeros((len(self.columns), len(self.columns)))
+        self.waiting = dict(own)
+
+    def add(self, sums: StopSums) -> None:
+        """Add the beams of a stop, and eliminate what is its own."""
+        super().add(sums)
+        layout = self.layout
+        mine = np.unique(np.concatenate([sums.chain_columns, sums.columns, [layout.size]]))
+        at = np.full(layout.size + 1, -1)
+        at[mine] = np.arange(len(mine))
+        unit = np.append(layout.sigma, 1.0)
+        through = np.zeros((TWIST, len(mine)))
+        through[:, at[sums.chain_columns]] = sums.chain * unit[sums.chain_columns]
+        direct = np.append(layout.size, sums.columns).astype(int)
+        whole, place, scale = sums.whole(), at[direct], unit[direct]
+        out = through.T @ whole[:TWIST, :TWIST] @ through
+        cross = through.T @ (whole[:TWIST, TWIST:] * scale)
+        out[:, place] += cross
+        out[place] += cross.T
+        out[np.ix_(place, place)] += whole[TWIST:, TWIST:] * scale * scale[:, None]
+        self._finish(sums.stop, mine, out)
+
+    def add_kept(self, rows: OwnRows) -> None:
+        """Add whitened rows about kept unknowns."""
+        at = np.append(self.at[rows.columns], -1)
+        at[-1] = len(self.columns) - 1
+        self.total[np.ix_(at, at)] += rows.gram(self.layout.sigma)
+        self.chi2 += float(rows.b @ rows.b)
+
+    def _finish(self, stop: int, columns: np.ndarray, matrix: np.ndarray) -> None:
+        """Add a stop's own rows to its matrix over some columns, and eliminate what is its own."""
+        layout, rows = self.layout, self.waiting.pop(stop, ())
+        mine = np.unique(np.concatenate([columns, *(each.columns for each in rows)]))
+        at = np.full(layout.size + 1, -1)
+        at[mine] = np.arange(len(mine))
+        whole = np.zeros((len(mine), len(mine)))
+        whole[np.ix_(at[columns], at[columns])] = matrix
+        for each in rows:
+            some = np.append(at[each.columns], len(mine) - 1)
+            whole[np.ix_(some, some)] += each.gram(layout.sigma)
+        own = at[layout.own[stop]] if stop in layout.own else np.zeros(0, int)
+        left = np.setdiff1d(np.arange(len(mine)), own)
+        rest = whole[np.ix_(left, left)]
+        if len(own):
+            factor, gain = eliminate(whole[np.ix_(own, own)], whole[np.ix_(own, left)], rest)
+            self.eliminated.append(Eliminated(mine[own], mine[left], factor, gain))
+        to = self.at[mine[left]]
+        self.total[np.ix_(to, to)] += rest
+
+    def done(self, values: Values, gradients: Gradients | None) -> Linearisation:
+        """Eliminate all but the kept."""
+        size = self.layout.size
+        for stop in list(self.waiting):
+            self._finish(stop, np.array([size]), np.zeros((1, 1)))
+        count = len(self.cells)
+        if not count:
+            return self._done(values, self.total, gradients)
+        prior = self._cell_priors(values, self.cells)
+        self.total[:count, :count] += np.eye(count)
+        self.total[:count, -1] += prior
+        self.total[-1, :count] += prior
+        rest = self.total[count:, count:].copy()
+        factor, gain = eliminate(self.total[:count, :count], self.total[:count, count:], rest)
+        self.eliminated.append(Eliminated(self.cells, self.columns[count:], factor, gain))
+        return self._done(values, rest, gradients)

@@ -1,0 +1,87 @@
+"""One pass over all rows at a state, and what it adds up to."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from calib.linear.assembly import CellsFirst, OwnRows, StopsFirst
+from calib.linear.clusters import Gradients
+from calib.linear.layout import Layout
+from calib.linear.parallel import in_order
+from calib.linear.rows import StopRows, StopSums
+from calib.linear.system import Linearisation, Values
+from calib.problem import Problem
+from calib.problem.unknowns import Unknown
+from calib.residuals.beams import Association
+from calib.residuals.spread import SpreadRows
+from chains import se3
+
+Progress = Callable[[int, int], None]
+
+
+def linearise(
+    problem: Problem,
+    values: Values,
+    associations: Sequence[Association | None],
+    newton: bool = False,
+    layout: Layout | None = None,
+    gradients: Gradients | None = None,
+    progress: Progress = lambda done, total: None,
+) -> Linearisation:
+    """Linearise all rows of beams and tracked bodies at a state.
+
+    Args:
+        problem: what is estimated; surfaces' unknowns included where it has any.
+        values: the state.
+        associations: per scan, what its beams meet; found anew where None.
+        newton: whether curvature takes the place of weight; see `Rows.whitened`.
+        layout: of the problem, if there is one already.
+        gradients: takes those of the clusters of beams, where they are wanted.
+        progress: called with how many stops are done, and of how many.
+    """
+    layout = layout or Layout.of(problem)
+    count = len(problem.scans)
+    order = StopsFirst if layout.stops_first else CellsFirst
+    assembly = order(layout, own_rows(layout, values), count)
+
+    def work(i: int) -> tuple[StopSums, SpreadRows | None, tuple[np.ndarray, ...] | None]:
+        rows = StopRows.of(problem.scans[i], layout, values, associations[i], newton)
+        by_cluster = None
+        if gradients is not None:
+            parts, cluster = rows.places()
+            by_cluster = parts, *rows.gradient(cluster, len(parts))
+        return rows.sums(), rows.rows.spread, by_cluster
+
+    for i, (sums, spread, by_cluster) in enumerate(in_order(work, count)):
+        progress(i, count)
+        assembly.add(sums)
+        if by_cluster is not None:
+            gradients.add_beams(*by_cluster, sums.stop, problem.scans[i].room)
+        if spread is not None:
+            columns = layout.columns(list(spread.columns))
+            A = np.hstack(list(spread.columns.values()))
+            assembly.add_kept(OwnRows(A, -spread.residual, columns, True))
+    return assembly.done(values, gradients)
+
+
+def own_rows(layout: Layout, values: Values) -> dict[int, list[OwnRows]]:
+    """Stop -> rows of its tracked bodies, and of the priors of its own unknowns."""
+    found: dict[int, list[OwnRows]] = {stop: [] for stop in layout.own}
+    for stop, block in layout.blocks:
+        residual, d = block.evaluate(values, True)
+        found[stop].append(OwnRows(np.hstack(list(d.values())), -residual, layout.columns(d), True))
+    owner = {int(c): stop for stop, columns in layout.own.items() for c in columns}
+    for name, at in layout.at.items():
+        if at.start in owner:
+            A, b = prior_rows(layout.unknowns[name], values[name])
+            found[owner[at.start]].append(OwnRows(A, b, np.r_[at], False))
+    return found
+
+
+def prior_rows(unknown: Unknown, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Whitened derivative (n, n) and right side (n,) of a vector's or a pose's own prior."""
+    away = unknown.difference(unknown.mean, value)
+    turn = se3.right_jacobian_inverse(away) if unknown.kind == "pose" else np.eye(unknown.dim)
+    return turn / unknown.sigma[:, None], -away / unknown.sigma
