@@ -14,6 +14,7 @@ from calib.linear.layout import Layout
 from calib.linear.rows import TWIST, StopSums
 from calib.linear.system import Linearisation, Values
 from calib.problem.unknowns import Role
+from calib.residuals.compiled import add_at, add_both, add_sparse
 
 
 class OwnRows(NamedTuple):
@@ -59,7 +60,7 @@ class Assembly:
         """Add the beams of a stop."""
         self.weight_m2 += sums.weight_m2
         self.chi2 += float(sums.dense[TWIST, TWIST])
-        seen = np.append(np.diag(sums.dense)[TWIST + 1 :], np.diag(sums.with_sparse)) > 0
+        seen = np.append(np.diag(sums.dense)[TWIST + 1 :], sums.own) > 0
         self.touched[sums.columns] |= seen
         self.touched[sums.chain_columns] |= np.any(sums.chain != 0, axis=0)
 
@@ -109,25 +110,17 @@ class CellsFirst(Assembly):
         self.twists.append((sums.stop, sums.chain, sums.chain_columns))
         own = [*range(start, start + TWIST), self.b]
         dense = np.append(own, self.at[sums.dense_columns]).astype(int)
-        fine = self.finest[sums.sparse_columns]
-        some, cells = np.flatnonzero(fine < 0), np.flatnonzero(fine >= 0)
-        sparse = self.at[sums.sparse_columns[some]]
-        upper = sums.with_sparse
-        self.rest[np.ix_(dense, dense)] += sums.dense
-        self.rest[np.ix_(sparse, dense)] += sums.with_dense[some]
-        self.rest[np.ix_(dense, sparse)] += sums.with_dense[some].T
-        block = upper[np.ix_(some, some)]
-        self.rest[np.ix_(sparse, sparse)] += block + block.T - np.diag(np.diag(block))
-        fine = fine[cells]
-        self.diagonal[fine] += np.diag(upper)[cells]
-        self.cross[np.ix_(fine, dense)] += sums.with_dense[cells]
-        both = upper[np.ix_(cells, some)] + upper[np.ix_(some, cells)].T
-        self.cross[np.ix_(fine, sparse)] += both
+        sparse, fine = self.at[sums.sparse_columns], self.finest[sums.sparse_columns]
+        add_at(self.rest, dense, dense, sums.dense)
+        add_both(self.rest, sparse, dense, sums.with_dense)
+        add_at(self.cross, fine, dense, sums.with_dense)
+        parts = self.rest, self.cross, self.diagonal
+        add_sparse(sums.with_sparse, sums.own, sparse, fine, *parts)
 
     def add_kept(self, rows: OwnRows) -> None:
         """Add whitened rows about kept unknowns."""
         at = np.append(self.at[rows.columns], self.b)
-        self.rest[np.ix_(at, at)] += rows.gram(np.ones(self.layout.size))
+        add_at(self.rest, at, at, rows.gram(np.ones(self.layout.size)))
         self.chi2 += float(rows.b @ rows.b)
 
     def done(self, values: Values, gradients: Gradients | None) -> Linearisation:
@@ -182,7 +175,7 @@ class CellsFirst(Assembly):
         whole = chain.T @ (chain.T @ rest).T
         for each in (rows for found in self.own.values() for rows in found):
             some = np.append(at[each.columns], len(columns) - 1)
-            whole[np.ix_(some, some)] += each.gram(unit)
+            add_at(whole, some, some, each.gram(unit))
         if not len(own):
             return whole
         count = len(own)
@@ -223,14 +216,14 @@ class StopsFirst(Assembly):
         cross = through.T @ (whole[:TWIST, TWIST:] * scale)
         out[:, place] += cross
         out[place] += cross.T
-        out[np.ix_(place, place)] += whole[TWIST:, TWIST:] * scale * scale[:, None]
+        add_at(out, place, place, whole[TWIST:, TWIST:] * scale * scale[:, None])
         self._finish(sums.stop, mine, out)
 
     def add_kept(self, rows: OwnRows) -> None:
         """Add whitened rows about kept unknowns."""
         at = np.append(self.at[rows.columns], -1)
         at[-1] = len(self.columns) - 1
-        self.total[np.ix_(at, at)] += rows.gram(self.layout.sigma)
+        add_at(self.total, at, at, rows.gram(self.layout.sigma))
         self.chi2 += float(rows.b @ rows.b)
 
     def _finish(self, stop: int, columns: np.ndarray, matrix: np.ndarray) -> None:
@@ -243,7 +236,7 @@ class StopsFirst(Assembly):
         whole[np.ix_(at[columns], at[columns])] = matrix
         for each in rows:
             some = np.append(at[each.columns], len(mine) - 1)
-            whole[np.ix_(some, some)] += each.gram(layout.sigma)
+            add_at(whole, some, some, each.gram(layout.sigma))
         own = at[layout.own[stop]] if stop in layout.own else np.zeros(0, int)
         left = np.setdiff1d(np.arange(len(mine)), own)
         rest = whole[np.ix_(left, left)]
@@ -251,7 +244,7 @@ class StopsFirst(Assembly):
             factor, gain = eliminate(whole[np.ix_(own, own)], whole[np.ix_(own, left)], rest)
             self.eliminated.append(Eliminated(mine[own], mine[left], factor, gain))
         to = self.at[mine[left]]
-        self.total[np.ix_(to, to)] += rest
+        add_at(self.total, to, to, rest)
 
     def done(self, values: Values, gradients: Gradients | None) -> Linearisation:
         """Eliminate all but the kept."""

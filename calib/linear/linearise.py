@@ -28,6 +28,7 @@ def linearise(
     newton: bool = False,
     layout: Layout | None = None,
     gradients: Gradients | None = None,
+    beams: bool = True,
     progress: Progress = lambda done, total: None,
 ) -> Linearisation:
     """Linearise all rows of beams and tracked bodies at a state.
@@ -39,10 +40,11 @@ def linearise(
         newton: whether curvature takes the place of weight; see `Rows.whitened`.
         layout: of the problem, if there is one already.
         gradients: takes those of the clusters of beams, where they are wanted.
+        beams: False for tracked bodies alone.
         progress: called with how many stops are done, and of how many.
     """
     layout = layout or Layout.of(problem)
-    count = len(problem.scans)
+    count = len(problem.scans) if beams else 0
     order = StopsFirst if layout.stops_first else CellsFirst
     assembly = order(layout, own_rows(layout, values), count)
 
@@ -69,10 +71,12 @@ def linearise(
 def own_rows(layout: Layout, values: Values) -> dict[int, list[OwnRows]]:
     """Stop -> rows of its tracked bodies, and of the priors of its own unknowns."""
     found: dict[int, list[OwnRows]] = {stop: [] for stop in layout.own}
-    for stop, block in layout.blocks:
-        residual, d = block.evaluate(values, True)
-        found[stop].append(OwnRows(np.hstack(list(d.values())), -residual, layout.columns(d), True))
     owner = {int(c): stop for stop, columns in layout.own.items() for c in columns}
+    for together in layout.bodies:
+        for residual, d in together.evaluate(values):
+            stop = next(owner[k] for n in d if (k := layout.at[n].start) in owner)
+            rows = OwnRows(np.hstack(list(d.values())), -residual, layout.columns(list(d)), True)
+            found[stop].append(rows)
     for name, at in layout.at.items():
         if at.start in owner:
             A, b = prior_rows(layout.unknowns[name], values[name])

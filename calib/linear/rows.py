@@ -27,6 +27,7 @@ class StopRows:
         index: (N, g) which of all sparse columns a row touches in each of g groups; -1 for none.
         value: (N, g) its entry there.
         columns: (d + s,) columns of the layout that the dense and the sparse ones are.
+        last: where among the sparse columns the last group begins.
         chain: (6, n) derivative of the twist by what places the LiDAR, chain_columns: (n,) those.
         rows: what this is made of.
     """
@@ -37,6 +38,7 @@ class StopRows:
     index: np.ndarray
     value: np.ndarray
     columns: np.ndarray
+    last: int
     chain: np.ndarray
     chain_columns: np.ndarray
     rows: Rows
@@ -57,14 +59,14 @@ class StopRows:
         columns = [np.r_[layout.at[name]] for name in rows.dense]
         index = np.empty((len(weight), len(rows.sparse)), np.int32)
         value = np.empty(index.shape)
-        start = 0
+        start = last = 0
         for g, c in enumerate(rows.sparse):
             used = np.bincount(c.index + 1, minlength=len(c.components) + 1) > 0
             used[0] = False  # index -1: none
             number = np.where(used, np.cumsum(used) - 1 + start, -1)
             index[:, g], value[:, g] = number[c.index + 1], c.value
             columns.append(layout.at[c.variable].start + c.components[used[1:]])
-            start += int(used.sum())
+            last, start = start, start + int(used.sum())
         return cls(
             stop=layout.stops[key_of(scan)],
             dense=np.hstack([rows.by_twist, -residual[:, None], *rows.dense.values()]),
@@ -72,6 +74,7 @@ class StopRows:
             index=index,
             value=value,
             columns=np.concatenate([np.zeros(0, int), *columns]),
+            last=last,
             chain=np.hstack([d[0] for d in placed.d.values()]),
             chain_columns=layout.columns(list(placed.d)),
             rows=rows,
@@ -85,19 +88,19 @@ class StopRows:
     def sums(self) -> StopSums:
         """Their Gram matrix, in its parts."""
         weighted = self.dense * self.weight[:, None]
-        with_dense, with_sparse = cross_sums(
-            self.dense, self.weight, self.index, self.value, self.sparse
+        with_dense, with_sparse, own = cross_sums(
+            self.dense, self.weight, self.index, self.value, self.sparse, self.last
         )
-        dense = self.dense.T @ weighted
         return StopSums(
-            self.stop,
-            dense,
-            with_dense,
-            with_sparse,
-            self.columns,
-            self.chain,
-            self.chain_columns,
-            float(self.weight.sum()),
+            stop=self.stop,
+            dense=self.dense.T @ weighted,
+            with_dense=with_dense,
+            with_sparse=with_sparse,
+            own=own,
+            columns=self.columns,
+            chain=self.chain,
+            chain_columns=self.chain_columns,
+            weight_m2=float(self.weight.sum()),
         )
 
     def places(self) -> tuple[np.ndarray, np.ndarray]:
@@ -135,7 +138,8 @@ class StopSums:
         stop: its number in the layout.
         dense: (7 + d, 7 + d) over [twist | b | d columns].
         with_dense: (s, 7 + d) sparse by dense columns.
-        with_sparse: (s, s) sparse by sparse, upper blocks only, see `compiled.cross_sums`.
+        with_sparse: (l, s) sparse by sparse of different groups, see `compiled.cross_sums`.
+        own: (s,) each sparse column by itself.
         columns, chain, chain_columns: as of `StopRows`.
         weight_m2: sum of the weights over their variances, 1/m2.
     """
@@ -144,6 +148,7 @@ class StopSums:
     dense: np.ndarray
     with_dense: np.ndarray
     with_sparse: np.ndarray
+    own: np.ndarray
     columns: np.ndarray
     chain: np.ndarray
     chain_columns: np.ndarray
@@ -161,6 +166,8 @@ class StopSums:
 
     def whole(self) -> np.ndarray:
         """(7 + d + s, same) over [twist | b | d columns | s columns]."""
-        upper = self.with_sparse
-        both = upper + upper.T - np.diag(np.diag(upper))
+        both = np.diag(self.own)
+        count = len(self.with_sparse)
+        both[:count] += self.with_sparse
+        both[:, :count] += self.with_sparse.T
         return np.block([[self.dense, self.with_dense.T], [self.with_dense, both]])

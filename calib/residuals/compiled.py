@@ -76,23 +76,27 @@ def cross_sums(
     index: np.ndarray,
     value: np.ndarray,
     size: int,
-) -> tuple[np.ndarray, np.ndarray]:
+    last: int,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Weighted sums over rows of products with columns of which each row touches one per group.
 
     Args:
         dense: (N, m), C order.
         weight: (N,).
         index: (N, g) which of all `size` sparse columns a row touches in each group; -1 for none.
+            The columns of a group follow those of the groups before it.
         value: (N, g) its entry there.
         size: number of sparse columns, all groups together.
+        last: where the last group begins.
 
     Returns:
-        Sparse by dense (size, m), and sparse by sparse (size, size), its upper blocks only: the
-        product of two groups stands in the rows of the earlier one.
+        Sparse by dense (size, m); sparse by sparse (last, size) of different groups, in the rows of
+        the earlier one; and each sparse column by itself (size,).
     """
     count, groups = index.shape
     width = dense.shape[1]
-    with_dense, with_sparse = np.zeros((size, width)), np.zeros((size, size))
+    with_dense, with_sparse = np.zeros((size, width)), np.zeros((last, size))
+    diagonal = np.zeros(size)
     for i in range(count):
         w = weight[i]
         if w == 0.0:
@@ -104,11 +108,50 @@ def cross_sums(
             v = w * value[i, g]
             for j in range(width):
                 with_dense[row, j] += v * dense[i, j]
-            for h in range(g, groups):
+            diagonal[row] += v * value[i, g]
+            for h in range(g + 1, groups):
                 column = index[i, h]
                 if column >= 0:
                     with_sparse[row, column] += v * value[i, h]
-    return with_dense, with_sparse
+    return with_dense, with_sparse, diagonal
+
+
+@njit(cache=True, nogil=True)
+def add_sparse(
+    with_sparse: np.ndarray,
+    own: np.ndarray,
+    at: np.ndarray,
+    fine: np.ndarray,
+    rest: np.ndarray,
+    cross: np.ndarray,
+    diagonal: np.ndarray,
+) -> None:
+    """Add sums of sparse columns to normal equations that are kept in three parts.
+
+    Args:
+        with_sparse, own: (last, s) and (s,) as `cross_sums` gives them.
+        at: (s,) where each column stands in `rest`, for those that stand there.
+        fine: (s,) where it stands among those whose block is diagonal; -1 for the others.
+        rest: (n, n), cross: (C, n) and diagonal: (C,), added to.
+    """
+    rows, size = with_sparse.shape
+    for a in range(size):
+        if fine[a] >= 0:
+            diagonal[fine[a]] += own[a]
+        else:
+            rest[at[a], at[a]] += own[a]
+    for a in range(rows):
+        for b in range(size):
+            v = with_sparse[a, b]
+            if v == 0.0:
+                continue
+            if fine[a] >= 0:
+                cross[fine[a], at[b]] += v
+            elif fine[b] >= 0:
+                cross[fine[b], at[a]] += v
+            else:
+                rest[at[a], at[b]] += v
+                rest[at[b], at[a]] += v
 
 
 @njit(cache=True, nogil=True)
@@ -136,3 +179,24 @@ def cluster_sums(
             if index[i, g] >= 0:
                 out[c, width + index[i, g]] += w * value[i, g]
     return out
+
+
+@njit(cache=True, nogil=True)
+def add_at(target: np.ndarray, rows: np.ndarray, columns: np.ndarray, block: np.ndarray) -> None:
+    """``target[rows[i], columns[j]] += block[i, j]``; rows and columns of -1 are left out."""
+    for i in range(len(rows)):
+        if rows[i] >= 0:
+            for j in range(len(columns)):
+                if columns[j] >= 0:
+                    target[rows[i], columns[j]] += block[i, j]
+
+
+@njit(cache=True, nogil=True)
+def add_both(target: np.ndarray, rows: np.ndarray, columns: np.ndarray, block: np.ndarray) -> None:
+    """As `add_at`, and its transpose."""
+    for i in range(len(rows)):
+        if rows[i] >= 0:
+            for j in range(len(columns)):
+                if columns[j] >= 0:
+                    target[rows[i], columns[j]] += block[i, j]
+                    target[columns[j], rows[i]] += block[i, j]

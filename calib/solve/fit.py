@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -28,6 +29,7 @@ STRAYED = 3e-3  # m and rad: a scan that has moved further looks anew what its b
 LOOKS = 3  # how often, in a fit that starts from an earlier one
 # Of half the chi-square, by which a further step would lower it: less is 0.04 of a sigma.
 AT_OPTIMUM = 1e-3
+STEADY = 1e-9  # the same, of trackers and targets, whose steps cost little
 # Of a state, beside an unknown's NAME: the parameters of a vector, and the value at which the beams
 # looked what they meet.
 DOFS, SEEN = ".dofs", ".seen"
@@ -119,7 +121,7 @@ class Estimate:
         rows = np.eye(layout.size)[layout.columns(names)]
         return self.linear.covariance(rows, self._kept)
 
-    @property
+    @cached_property
     def _kept(self) -> np.ndarray:
         return self.graph.covariance(self.values, list(self.linear.layout.outer()))
 
@@ -224,20 +226,37 @@ class _Loop:
         self.passes = 0
         self.linear: Linearisation | None = None
         self.graph: Graph | None = None
-        self.gain = np.inf  # by which the last step was to lower half the chi-square
 
     def solve_without_scans(self) -> bool:
-        """Trackers and targets alone: a good start for the beams, or all there is."""
+        """Trackers and targets alone: a good start for the beams, or all there is.
+
+        Whether a further step would lower half the chi-square by next to nothing. Where plain steps
+        do not lead downhill, GTSAM's damped ones do.
+        """
+        for damped in (False, True):
+            if damped:
+                self.values = self._damped()
+            last = np.inf
+            for _ in range(MAX_PASSES):
+                before = self.values
+                self._linearise(beams=False)
+                self.passes += 1
+                cost = self.linear.chi2 / 2 + self.graph.error(before, measured=True)
+                if not cost <= last * (1 + 1e-9) + 1e-9:
+                    break
+                last = cost
+                _, fall = self._step()
+                if fall < STEADY:
+                    self.passes = 1 if self.problem.scans else self.passes
+                    return True
+        return fall < AT_OPTIMUM
+
+    def _damped(self) -> dict[str, np.ndarray]:
+        """The optimum of trackers and targets by Levenberg-Marquardt, from where the fit began."""
         without = frozenset(name for block in self.prior for name in block.variables)
         blocks = [*self.problem.blocks, *self.prior]
         graph = Graph(list(self.problem.variables.values()), blocks, without)
-        self.values, self.passes = graph.solve(self.values)
-        if self.problem.scans:
-            self.passes = 1
-            return True
-        self._linearise(associate=False, newton=False)
-        gain = self._expected()
-        return gain < AT_OPTIMUM
+        return graph.solve(values_of(self.problem, self.start.state))[0]
 
     def run(self, tolerance: float, associate: bool) -> bool:
         """Passes until the step is below tolerance; whether that was reached."""
@@ -245,7 +264,7 @@ class _Loop:
         for _ in range(MAX_PASSES):
             self._linearise(associate, newton)
             self.passes += 1
-            step = self._step()
+            step, _ = self._step()
             if step < tolerance:
                 return True
             # Where a row's curvature misleads, steps grow; its weight never does. It is tried again
@@ -303,7 +322,9 @@ class _Loop:
         """The result, with the covariance of the calibration."""
         variables = tuple(self.problem.variables[name] for name in self.problem.calibration)
         if self.problem.scans:
-            self._linearise(associate=False, newton=False)
+            self._linearise()
+        else:
+            self._linearise(beams=False)
         return Estimate(
             problem=self.problem,
             values=self.values,
@@ -321,38 +342,34 @@ class _Loop:
         held = [name for block in self.prior for name in block.variables]
         return Layout.of(self.problem, kept=held)
 
-    def _linearise(self, associate: bool, newton: bool) -> None:
+    def _linearise(self, associate: bool = False, newton: bool = False, beams: bool = True) -> None:
         """Linearise everything at the present state, and graph what is left of it."""
-        scans = self.problem.scans
-        met = [None] * len(scans) if associate else self.associations
         what = f"pass {self.passes + 1}"
         self.linear = linearise(
             self.problem,
             self.values,
-            met,
+            [None] * len(self.problem.scans) if associate else self.associations,
             newton,
             self.layout,
+            beams=beams,
             progress=lambda done, total: self.progress(what, done, total),
         )
         without = frozenset(name for block in self.prior for name in block.variables)
         blocks = [*self.layout.others, *self.prior, *KeptRows.of(self.linear)]
         self.graph = Graph(list(self.layout.outer().values()), blocks, without)
 
-    def _step(self) -> float:
-        """One step of the graph; the largest change of the calibration, in m or rad."""
+    def _step(self) -> tuple[float, float]:
+        """One step of the graph: the largest change of the calibration, in m or rad, and by how
+        much half the chi-square was to fall."""
         before = self.values
-        after, moved = self.graph.step(before)
+        after, moved, fall = self.graph.step(before)
         kept = np.concatenate([np.zeros(0), *(moved[n] for n in self.layout.outer())])
         own = self.linear.step(kept)
         unknowns = self.layout.unknowns
         self.values = before | after | {n: unknowns[n].moved(before[n], s) for n, s in own.items()}
         names = self.problem.calibration
-        return max(float(np.abs(unknowns[n].difference(before[n], after[n])).max()) for n in names)
-
-    def _expected(self) -> float:
-        """By how much another step would lower half the chi-square."""
-        eliminated = (self.linear.chi2 - self.linear.kept[-1, -1]) / 2
-        return eliminated + self.graph.expected_fall(self.values)
+        step = max(float(np.abs(unknowns[n].difference(before[n], after[n])).max()) for n in names)
+        return step, fall + (self.linear.chi2 - self.linear.kept[-1, -1]) / 2
 
 
 def values_of(problem: Problem, state: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -61,6 +61,11 @@ class KeptRows:
     def rows(self) -> int:
         return len(self.constant)
 
+    @property
+    def cost(self) -> float:
+        """Half their sum of squares, where they were linearised."""
+        return float(self.constant @ self.constant) / 2
+
     def evaluate(self, values: Values, derivatives: bool) -> tuple[np.ndarray, Derivatives | None]:
         """The rows where they were linearised; elsewhere nobody asks."""
         return self.constant, dict(self.by) if derivatives else None
@@ -94,9 +99,15 @@ class Graph:
         degree = Counter(name for block in blocks for name in block.variables)
         self._by_degree = sorted(self.variables, key=lambda name: degree[name])
 
-    def error(self, values: Values) -> float:
-        """Half the sum of squared whitened rows, priors included."""
-        return self._graph.error(self._to_gtsam(values))
+    def error(self, values: Values, measured: bool = False) -> float:
+        """Half the sum of squared whitened rows, priors included.
+
+        Args:
+            values: the state.
+            measured: whether what a linearisation says is left out.
+        """
+        kept = (b for b in self.blocks if measured and isinstance(b, KeptRows))
+        return self._graph.error(self._to_gtsam(values)) - sum(b.cost for b in kept)
 
     def solve(self, initial: Values, max_iterations: int = 50) -> tuple[dict[str, np.ndarray], int]:
         """The maximum a posteriori values, by Levenberg-Marquardt, and its iterations.
@@ -110,24 +121,24 @@ class Graph:
         params.setAbsoluteErrorTol(1e-9)
         # GTSAM's Cholesky gives up where data outweigh a prior by some 1e7; its QR does not.
         params.setLinearSolverType("MULTIFRONTAL_QR")
+        # Damping in units of what the rows tell of each unknown: with one number for metres,
+        # radians and rad/(N m) alike it gives up far from the optimum.
+        params.setDiagonalDamping(True)
+        params.setlambdaUpperBound(1e12)
         params.setOrdering(self._ordering())
         start = self._to_gtsam(initial)
         optimizer = gtsam.LevenbergMarquardtOptimizer(self._graph, start, params)
         return self._from_gtsam(optimizer.optimize()), optimizer.iterations()
 
-    def step(self, values: Values) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-        """One Gauss-Newton step: the values after it, and the tangent step of each unknown."""
-        at = self._to_gtsam(values)
-        found = self._graph.linearize(at).optimize(self._ordering(), gtsam.EliminateQR)
-        moved = {name: found.at(self._key[name]) for name in self.variables}
-        return self._from_gtsam(at.retract(found)), moved
-
-    def expected_fall(self, values: Values) -> float:
-        """By how much a Gauss-Newton step would lower half the chi-square."""
+    def step(self, values: Values) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], float]:
+        """One Gauss-Newton step: the values after it, the tangent step of each unknown, and by how
+        much half the chi-square was to fall."""
         at = self._to_gtsam(values)
         linear = self._graph.linearize(at)
         found = linear.optimize(self._ordering(), gtsam.EliminateQR)
-        return self._graph.error(at) - linear.error(found)
+        moved = {name: found.at(self._key[name]) for name in self.variables}
+        fall = self._graph.error(at) - linear.error(found)
+        return self._from_gtsam(at.retract(found)), moved, fall
 
     def covariance(self, values: Values, names: Sequence[str]) -> np.ndarray:
         """Joint marginal covariance of the named variables' tangents, in the order given.
