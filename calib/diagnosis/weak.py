@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.diagnosis.score import away_from_model, information_left
+from calib.diagnosis.score import projection
 from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import what_separates
 from calib.effects import Effect
@@ -81,12 +81,13 @@ def standing_in(look: Look) -> list[dict[str, Any]]:
     ours = {n: v for n, v in ours.items() if n in stand.model.names}
     out = []
     for name, (effect, variable) in ours.items():
-        names = [*linear.candidates, variable]
-        without = information_left(linear, names, away_from_model(linear, names))
+        theirs, model, taken = projection(linear, [*linear.candidates, variable])
+        cross = linear.information[np.ix_(model, theirs)]
+        without = np.diag(linear.information)[theirs] - np.sum(cross * taken, axis=0)
         for candidate in look.named.candidates:
-            own = np.ix_(candidate.test.columns, candidate.test.columns)
-            left = np.trace(look.named.scores.information[own])
-            if left < (1.0 - STANDS_IN) * np.trace(without[own]):
+            own = candidate.test.columns
+            left = np.diag(look.named.scores.information)[own].sum()
+            if left < (1.0 - STANDS_IN) * without[own].sum():
                 out.append(_stand_in(name, effect, candidate.effect))
     return out
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import csr_array
 
-from calib.linear.clusters import Gradients
 from calib.linear.elimination import BY_TWIST, Eliminated, eliminate
 from calib.linear.layout import Layout
 from calib.linear.rows import TWIST, StopSums
@@ -44,10 +43,14 @@ class Assembly:
         layout: which column is what.
         own: stop -> rows about its own unknowns.
         beams: how many stops have beams.
+        raw: whether the Gram matrix before eliminations is wanted.
     """
 
-    def __init__(self, layout: Layout, own: Mapping[int, Sequence[OwnRows]], beams: int) -> None:
-        self.layout, self.own, self.beams_count = layout, own, beams
+    def __init__(
+        self, layout: Layout, own: Mapping[int, Sequence[OwnRows]], beams: int, raw: bool
+    ) -> None:
+        self.layout, self.own = layout, own
+        self.raw = np.zeros((len(layout.kept), len(layout.kept))) if raw else None
         self.chi2 = sum(float(rows.b @ rows.b) for each in own.values() for rows in each)
         self.touched = np.zeros(layout.size, bool)
         for rows in (r for each in own.values() for r in each if r.measured):
@@ -64,6 +67,14 @@ class Assembly:
         self.touched[sums.columns] |= seen
         self.touched[sums.chain_columns] |= np.any(sums.chain != 0, axis=0)
 
+    def _add_raw(self, found: Iterable[OwnRows]) -> None:
+        """Add what rows say of kept columns."""
+        at = np.full(self.layout.size, -1)
+        at[self.layout.kept] = np.arange(len(self.layout.kept))
+        for rows in found:
+            gram = rows.gram(self.layout.sigma)[:-1, :-1]
+            add_at(self.raw, at[rows.columns], at[rows.columns], gram)
+
     def _cell_priors(self, values: Values, columns: np.ndarray) -> np.ndarray:
         """Right side (n,) of the priors of cells, whose derivative is one, in their units."""
         whole = np.zeros(self.layout.size)
@@ -73,25 +84,27 @@ class Assembly:
         self.chi2 += float(whole[columns] @ whole[columns])
         return whole[columns]
 
-    def _done(self, values: Values, kept: np.ndarray, gradients: Gradients | None) -> Linearisation:
+    def _done(self, values: Values, kept: np.ndarray) -> Linearisation:
         return Linearisation(
             layout=self.layout,
             values=values,
             kept=kept,
+            raw=self.raw,
             chi2=self.chi2,
             touched=self.touched,
             eliminated=self.eliminated,
             twists=self.twists,
             weight_m2=self.weight_m2,
-            gradients=gradients,
         )
 
 
 class CellsFirst(Assembly):
     """Cells are eliminated from [twists of all stops | cells | kept | b], then stops' unknowns."""
 
-    def __init__(self, layout: Layout, own: Mapping[int, Sequence[OwnRows]], beams: int) -> None:
-        super().__init__(layout, own, beams)
+    def __init__(
+        self, layout: Layout, own: Mapping[int, Sequence[OwnRows]], beams: int, raw: bool
+    ) -> None:
+        super().__init__(layout, own, beams, raw)
         self.first = TWIST * beams
         rest = np.concatenate([layout.cells, layout.kept])
         self.at = np.full(layout.size, -1)
@@ -123,7 +136,7 @@ class CellsFirst(Assembly):
         add_at(self.rest, at, at, rows.gram(np.ones(self.layout.size)))
         self.chi2 += float(rows.b @ rows.b)
 
-    def done(self, values: Values, gradients: Gradients | None) -> Linearisation:
+    def done(self, values: Values) -> Linearisation:
         """Eliminate all but the kept."""
         layout = self.layout
         over = np.concatenate([layout.cells, layout.kept, [layout.size]])
@@ -131,6 +144,12 @@ class CellsFirst(Assembly):
         unit = np.ones(self.b + 1)
         unit[self.first : self.b] = layout.sigma[over[self.first : -1]]
         rest = self.rest * unit * unit[:, None]
+        if self.raw is not None:
+            cells = np.arange(self.first, self.first + len(layout.cells))
+            through = self._through(np.zeros(0, int))
+            before = np.delete(np.delete(rest, cells, 0), cells, 1)
+            self.raw += (through.T @ (through.T @ before).T)[:-1, :-1]
+            self._add_raw(rows for found in self.own.values() for rows in found)
         if len(layout.finest):
             own = layout.sigma[layout.finest]
             cross = self.cross * own[:, None] * unit
@@ -148,31 +167,17 @@ class CellsFirst(Assembly):
             rest = rest[np.ix_(left, left)]
             factor, gain = eliminate(block, cross, rest)
             self.eliminated.append(Eliminated(layout.cells, over[left], factor, gain))
-        return self._done(values, self._without_own(rest), gradients)
+        return self._done(values, self._without_own(rest))
 
     def _without_own(self, rest: np.ndarray) -> np.ndarray:
         """From [twists | kept | b] to [kept | b]: through the chain, then stops' own unknowns."""
-        layout = self.layout
+        layout, unit = self.layout, self.layout.sigma
         own = np.concatenate([np.zeros(0, int), *layout.own.values()])
         columns = np.concatenate([own, layout.kept, [layout.size]])
         at = np.full(layout.size + 1, -1)
         at[columns] = np.arange(len(columns))
-        rows = np.repeat(np.arange(self.first), [d.shape[1] for _, d, _ in self._by_row()])
-        found = [np.tile(at[c], TWIST) for _, _, c in self.twists]
-        unit = layout.sigma
-        data = [(d * unit[c]).ravel() for _, d, c in self.twists]
-        kept = np.arange(len(layout.kept) + 1)
-        chain = csr_array(
-            (
-                np.concatenate([*data, np.ones(len(kept))]),
-                (
-                    np.concatenate([rows, self.first + kept]),
-                    np.concatenate([*found, len(own) + kept]),
-                ),
-            ),
-            shape=(len(rest), len(columns)),
-        )
-        whole = chain.T @ (chain.T @ rest).T
+        through = self._through(own)
+        whole = through.T @ (through.T @ rest).T
         for each in (rows for found in self.own.values() for rows in found):
             some = np.append(at[each.columns], len(columns) - 1)
             add_at(whole, some, some, each.gram(unit))
@@ -184,15 +189,34 @@ class CellsFirst(Assembly):
         self.eliminated.append(Eliminated(own, columns[count:], factor, gain))
         return left
 
-    def _by_row(self) -> list[tuple[int, np.ndarray, np.ndarray]]:
-        return [each for each in self.twists for _ in range(TWIST)]
+    def _through(self, own: np.ndarray) -> csr_array:
+        """[twists | kept | b] in terms of [own | kept | b], in units of sigmas; unknowns that are
+        in neither are left out."""
+        layout = self.layout
+        columns = np.concatenate([own, layout.kept])
+        at = np.full(layout.size, -1)
+        at[columns] = np.arange(len(columns))
+        rows, place, data = [], [], []
+        for i, (_, d, c) in enumerate(self.twists):
+            there = np.flatnonzero(at[c] >= 0)
+            rows.append(np.repeat(TWIST * i + np.arange(TWIST), len(there)))
+            place.append(np.tile(at[c[there]], TWIST))
+            data.append((d[:, there] * layout.sigma[c[there]]).ravel())
+        kept = np.arange(len(layout.kept) + 1)
+        entries = np.concatenate([*data, np.ones(len(kept))])
+        where = [np.concatenate([*rows, self.first + kept])]
+        where += [np.concatenate([*place, len(own) + kept])]
+        shape = (self.first + len(kept), len(own) + len(kept))
+        return csr_array((entries, tuple(where)), shape=shape)
 
 
 class StopsFirst(Assembly):
     """Each stop's own unknowns are eliminated as it comes, all cells at the end."""
 
-    def __init__(self, layout: Layout, own: Mapping[int, Sequence[OwnRows]], beams: int) -> None:
-        super().__init__(layout, own, beams)
+    def __init__(
+        self, layout: Layout, own: Mapping[int, Sequence[OwnRows]], beams: int, raw: bool
+    ) -> None:
+        super().__init__(layout, own, beams, raw)
         self.cells = np.concatenate([layout.finest, layout.cells])
         self.columns = np.concatenate([self.cells, layout.kept, [layout.size]])
         self.at = np.full(layout.size + 1, -1)
@@ -221,6 +245,8 @@ class StopsFirst(Assembly):
 
     def add_kept(self, rows: OwnRows) -> None:
         """Add whitened rows about kept unknowns."""
+        if self.raw is not None:
+            self._add_raw([rows])
         at = np.append(self.at[rows.columns], -1)
         at[-1] = len(self.columns) - 1
         add_at(self.total, at, at, rows.gram(self.layout.sigma))
@@ -229,6 +255,11 @@ class StopsFirst(Assembly):
     def _finish(self, stop: int, columns: np.ndarray, matrix: np.ndarray) -> None:
         """Add a stop's own rows to its matrix over some columns, and eliminate what is its own."""
         layout, rows = self.layout, self.waiting.pop(stop, ())
+        if self.raw is not None:
+            place = np.full(layout.size + 1, -1)
+            place[layout.kept] = np.arange(len(layout.kept))
+            add_at(self.raw, place[columns], place[columns], matrix)
+            self._add_raw(rows)
         mine = np.unique(np.concatenate([columns, *(each.columns for each in rows)]))
         at = np.full(layout.size + 1, -1)
         at[mine] = np.arange(len(mine))
@@ -246,14 +277,14 @@ class StopsFirst(Assembly):
         to = self.at[mine[left]]
         add_at(self.total, to, to, rest)
 
-    def done(self, values: Values, gradients: Gradients | None) -> Linearisation:
+    def done(self, values: Values) -> Linearisation:
         """Eliminate all but the kept."""
         size = self.layout.size
         for stop in list(self.waiting):
             self._finish(stop, np.array([size]), np.zeros((1, 1)))
         count = len(self.cells)
         if not count:
-            return self._done(values, self.total, gradients)
+            return self._done(values, self.total)
         prior = self._cell_priors(values, self.cells)
         self.total[:count, :count] += np.eye(count)
         self.total[:count, -1] += prior
@@ -261,4 +292,4 @@ class StopsFirst(Assembly):
         rest = self.total[count:, count:].copy()
         factor, gain = eliminate(self.total[:count, :count], self.total[:count, count:], rest)
         self.eliminated.append(Eliminated(self.cells, self.columns[count:], factor, gain))
-        return self._done(values, rest, gradients)
+        return self._done(values, rest)

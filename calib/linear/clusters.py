@@ -3,9 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, issparse, vstack
+
+
+class ClusteredRows(NamedTuple):
+    """Whitened rows, and what each errs with.
+
+    Args:
+        A: (m, n) derivatives, sparse where each row has one; columns: (n,) by which.
+        b: (m,) minus the residuals.
+        stop, place: (m,) numbers of the stop and of what is looked at; -1 for none.
+    """
+
+    A: np.ndarray | csr_array
+    b: np.ndarray
+    columns: np.ndarray
+    stop: np.ndarray
+    place: np.ndarray
 
 
 @dataclass
@@ -18,46 +35,37 @@ class Gradients:
 
     size: int
     places: dict[object, int] = field(default_factory=dict)
-    _rows: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)
+    _tables: list[csr_array] = field(default_factory=list)
     _clusters: list[np.ndarray] = field(default_factory=list)
 
     def place(self, key: object) -> int:
         """Number of a part of the room, or of anything else that errs alike for several stops."""
         return self.places.setdefault(key, len(self.places))
 
+    def numbers(self, room: object, parts: np.ndarray) -> np.ndarray:
+        """Numbers of parts of a room."""
+        return np.array([self.place((room, part)) for part in parts.tolist()], int)
+
     def add(
         self, gradient: np.ndarray, columns: np.ndarray, stop: np.ndarray, place: np.ndarray
     ) -> None:
         """Add clusters (C, n) over some columns (n,), of stops and places (C,), -1 for none."""
-        self._rows.append((gradient, columns))
+        found = csr_array(gradient)
+        entries = (found.data, columns[found.indices], found.indptr)
+        self._tables.append(csr_array(entries, shape=(len(stop), self.size)))
         self._clusters.append(np.stack([stop, place]))
 
-    def add_beams(
-        self,
-        parts: np.ndarray,
-        gradient: np.ndarray,
-        columns: np.ndarray,
-        stop: int,
-        room: object,
-    ) -> None:
-        """Add the beams of a stop, by what they meet: parts (C,) of a room."""
-        place = np.array([self.place((room, part)) for part in parts.tolist()])
-        self.add(gradient, columns, np.full(len(parts), stop), place)
-
-    def add_rows(
-        self, A: np.ndarray, b: np.ndarray, columns: np.ndarray, stop: np.ndarray, place: np.ndarray
-    ) -> None:
-        """Add whitened rows (m, n), of stops and places (m,)."""
-        pairs, cell = np.unique([stop, place], axis=1, return_inverse=True)
-        pick = csr_array((b, cell, np.arange(len(b) + 1)), shape=(len(b), pairs.shape[1]))
-        self.add(pick.T @ A, columns, *pairs)
+    def add_rows(self, rows: ClusteredRows) -> None:
+        """Add whitened rows; each of a sparse derivative is a cluster of its own."""
+        if issparse(rows.A):
+            self.add(rows.A.multiply(rows.b[:, None]), rows.columns, rows.stop, rows.place)
+            return
+        pairs, cell = np.unique([rows.stop, rows.place], axis=1, return_inverse=True)
+        count = len(rows.b)
+        pick = csr_array((rows.b, cell, np.arange(count + 1)), shape=(count, pairs.shape[1]))
+        self.add(pick.T @ rows.A, rows.columns, *pairs)
 
     def table(self) -> tuple[csr_array, np.ndarray, np.ndarray]:
         """All clusters (C, U), sparse; the stop and the place (C,) of each."""
         stop, place = np.concatenate(self._clusters, axis=1)
-        data = np.concatenate([g.ravel() for g, _ in self._rows])
-        indices = np.concatenate([np.tile(c, len(g)) for g, c in self._rows])
-        length = np.concatenate([np.full(len(g), len(c)) for g, c in self._rows])
-        indptr = np.append(0, np.cumsum(length))
-        table = csr_array((data, indices, indptr), shape=(len(stop), self.size))
-        return table, stop, place
+        return csr_array(vstack(self._tables)), stop, place

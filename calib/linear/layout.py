@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.problem import Problem
+from calib.problem.problem import Block, Problem
 from calib.problem.unknowns import Role, Unknown
 from calib.residuals.scan import ScanStop
 from calib.residuals.tracker import BodiesTogether, TrackedBody
@@ -38,6 +38,8 @@ class Layout:
         kept: (S,) columns of what is left, in order.
         bodies: tracked bodies of the problem that speak of stops' own unknowns.
         others: the problem's other blocks.
+        unbounded: unknowns that have no prior.
+        touched: unknown -> numbers of the stops whose place it has a part in; -1 for a target.
     """
 
     unknowns: Mapping[str, Unknown]
@@ -49,7 +51,9 @@ class Layout:
     cells: np.ndarray
     kept: np.ndarray
     bodies: Sequence[BodiesTogether]
-    others: Sequence[object]
+    others: Sequence[Block]
+    unbounded: frozenset[str]
+    touched: Mapping[str, frozenset[int]]
 
     @classmethod
     def of(
@@ -103,6 +107,8 @@ class Layout:
             kept=np.setdiff1d(np.arange(ends[-1]), eliminated),
             bodies=BodiesTogether.of(bodies),
             others=others,
+            unbounded=frozenset(unbounded),
+            touched={name: frozenset(seen) for name, seen in touched.items()},
         )
 
     @property
@@ -136,7 +142,7 @@ def key_of(scan: ScanStop) -> StopKey:
     return scan.recording.folder, scan.index
 
 
-def keys_of(block: object) -> Sequence[StopKey]:
+def keys_of(block: Block) -> Sequence[StopKey]:
     """Which stops a block speaks of; none for a target."""
     return block.stop_names if isinstance(block, TrackedBody) else ()
 

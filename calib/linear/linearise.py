@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from calib.linear.assembly import CellsFirst, OwnRows, StopsFirst
-from calib.linear.clusters import Gradients
+from calib.linear.clusters import ClusteredRows, Gradients
 from calib.linear.layout import Layout
 from calib.linear.parallel import in_order
 from calib.linear.rows import StopRows, StopSums
@@ -46,41 +46,54 @@ def linearise(
     layout = layout or Layout.of(problem)
     count = len(problem.scans) if beams else 0
     order = StopsFirst if layout.stops_first else CellsFirst
-    assembly = order(layout, own_rows(layout, values), count)
+    own = {stop: list(rows.values()) for stop, rows in own_rows(layout, values).items()}
+    assembly = order(layout, own, count, gradients is not None)
 
     def work(i: int) -> tuple[StopSums, SpreadRows | None, tuple[np.ndarray, ...] | None]:
         rows = StopRows.of(problem.scans[i], layout, values, associations[i], newton)
         by_cluster = None
         if gradients is not None:
             parts, cluster = rows.places()
-            by_cluster = parts, *rows.gradient(cluster, len(parts))
+            by_cluster = parts, cluster, *rows.gradient(cluster, len(parts))
         return rows.sums(), rows.rows.spread, by_cluster
 
     for i, (sums, spread, by_cluster) in enumerate(in_order(work, count)):
         progress(i, count)
         assembly.add(sums)
+        places = None
         if by_cluster is not None:
-            gradients.add_beams(*by_cluster, sums.stop, problem.scans[i].room)
+            parts, cluster, gradient, columns = by_cluster
+            places = gradients.numbers(problem.scans[i].room, parts)
+            gradients.add(gradient, columns, np.full(len(parts), sums.stop), places)
         if spread is not None:
-            columns = layout.columns(list(spread.columns))
-            A = np.hstack(list(spread.columns.values()))
-            assembly.add_kept(OwnRows(A, -spread.residual, columns, True))
-    return assembly.done(values, gradients)
+            rows = spread_rows(spread, layout)
+            assembly.add_kept(rows)
+            if places is not None:
+                stop = np.full(len(rows.b), sums.stop)
+                clustered = ClusteredRows(rows.A, rows.b, rows.columns, stop, places[cluster])
+                gradients.add_rows(clustered)
+    return assembly.done(values)
 
 
-def own_rows(layout: Layout, values: Values) -> dict[int, list[OwnRows]]:
-    """Stop -> rows of its tracked bodies, and of the priors of its own unknowns."""
-    found: dict[int, list[OwnRows]] = {stop: [] for stop in layout.own}
+def spread_rows(spread: SpreadRows, layout: Layout) -> OwnRows:
+    """Rows of the scatter within a hold, over kept unknowns."""
+    columns = layout.columns(list(spread.columns))
+    return OwnRows(np.hstack(list(spread.columns.values())), -spread.residual, columns, True)
+
+
+def own_rows(layout: Layout, values: Values) -> dict[int, dict[str, OwnRows]]:
+    """Stop -> rows of its tracked bodies, and of the priors of its own unknowns, by name."""
+    found: dict[int, dict[str, OwnRows]] = {stop: {} for stop in layout.own}
     owner = {int(c): stop for stop, columns in layout.own.items() for c in columns}
     for together in layout.bodies:
-        for residual, d in together.evaluate(values):
+        for block, (residual, d) in zip(together.blocks, together.evaluate(values), strict=True):
             stop = next(owner[k] for n in d if (k := layout.at[n].start) in owner)
-            rows = OwnRows(np.hstack(list(d.values())), -residual, layout.columns(list(d)), True)
-            found[stop].append(rows)
+            columns = layout.columns(list(d))
+            found[stop][block.name] = OwnRows(np.hstack(list(d.values())), -residual, columns, True)
     for name, at in layout.at.items():
         if at.start in owner:
             A, b = prior_rows(layout.unknowns[name], values[name])
-            found[owner[at.start]].append(OwnRows(A, b, np.r_[at], False))
+            found[owner[at.start]][name] = OwnRows(A, b, np.r_[at], False)
     return found
 
 

@@ -81,6 +81,11 @@ class StopRows:
         )
 
     @property
+    def b(self) -> np.ndarray:
+        """(N,) minus the residual, m."""
+        return self.dense[:, TWIST]
+
+    @property
     def sparse(self) -> int:
         """How many sparse columns there are."""
         return len(self.columns) - (self.dense.shape[1] - TWIST - 1)
@@ -111,9 +116,8 @@ class StopRows:
 
     def gradient(self, cluster: np.ndarray, clusters: int) -> tuple[np.ndarray, np.ndarray]:
         """``J^T W b`` (clusters, n) of the rows of each cluster (N,), and its columns (n,)."""
-        b = self.dense[:, TWIST]
         found = cluster_sums(
-            self.dense, self.weight * b, self.index, self.value, self.sparse, cluster, clusters
+            self.dense, self.weight * self.b, self.index, self.value, self.sparse, cluster, clusters
         )
         columns = np.concatenate([self.chain_columns, self.columns])
         return np.hstack([found[:, :TWIST] @ self.chain, found[:, TWIST + 1 :]]), columns

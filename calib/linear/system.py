@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.linear.clusters import Gradients
 from calib.linear.elimination import BY_TWIST, Eliminated
 from calib.linear.layout import Layout
 
@@ -29,24 +28,25 @@ class Linearisation:
         values: the state.
         kept: (S + 1, S + 1) over the layout's kept columns and the right side b, in units of the
             priors' sigmas; without the priors of the kept, and without the layout's other blocks.
+        raw: (S, S) the Gram matrix of the kept columns before anything was eliminated, where
+            gradients were asked for.
         chi2: of all rows in it, before anything was eliminated.
         touched: (U,) bool, whether any beam or tracked body depends on a column.
         eliminated: what was eliminated, in that order.
         twists: of each stop with beams its number, derivative of its twist, and the columns of
             that; empty unless cells were eliminated by twists.
         weight_m2: sum of the beams' weights over their variances, 1/m2.
-        gradients: of each cluster of rows, where they were asked for.
     """
 
     layout: Layout
     values: Values
     kept: np.ndarray
+    raw: np.ndarray | None
     chi2: float
     touched: np.ndarray
     eliminated: Sequence[Eliminated]
     twists: Sequence[tuple[int, np.ndarray, np.ndarray]]
     weight_m2: float
-    gradients: Gradients | None
 
     def directions(self, kept: np.ndarray) -> np.ndarray:
         """All unknowns (U, q), in units of their sigmas, that follow those kept (S + 1, q).
