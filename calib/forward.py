@@ -9,7 +9,7 @@ unknown is the derivative by site times the basis.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -142,6 +142,32 @@ class Stops:
             return outer
         T = se3.inverse(values[self.reference]) @ outer.T
         return Placed(T, outer.d | {self.reference: -se3.adjoint(se3.inverse(T))})
+
+
+def place_each(stops: Sequence[Stops], frame: str, values: Values) -> Iterator[Placed]:
+    """T_reference_frame of single stops, in one go for all that share their structure."""
+    groups: dict[object, list[int]] = {}
+    for k, each in enumerate(stops):
+        shared = tuple(n for n in each.variables if n not in each.own)
+        like = (id(each.rig), shared, each.reference, each.noise is None)
+        groups.setdefault(like, []).append(k)
+    found: dict[int, Placed] = {}
+    for numbers in groups.values():
+        some = [stops[k] for k in numbers]
+        whole = Stops.together(some)
+        own = {
+            name: np.stack([values[each.own[i]] for each in some])
+            for i, name in enumerate(whole.own)
+        }
+        placed = whole.in_reference(frame, {**values, **own})
+        for i, (k, each) in enumerate(zip(numbers, some, strict=True)):
+            names = dict(zip(whole.own, each.own, strict=True))
+            d = {
+                names.get(n, n): np.broadcast_to(x, (len(some), *x.shape[1:]))[[i]]
+                for n, x in placed.d.items()
+            }
+            found[k] = Placed(placed.T[[i]], d)
+    return (found[k] for k in range(len(stops)))
 
 
 def place(

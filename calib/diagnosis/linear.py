@@ -16,7 +16,7 @@ from scipy.sparse import csr_array, diags_array
 
 from calib.linear.clusters import ClusteredRows, Gradients
 from calib.linear.layout import Layout, keys_of
-from calib.linear.linearise import linearise, own_rows, spread_rows
+from calib.linear.linearise import lidars, linearise, own_rows, spread_rows
 from calib.linear.parallel import in_order
 from calib.linear.rows import StopRows
 from calib.linear.system import Linearisation
@@ -94,10 +94,11 @@ def rows_along(
     candidates = [name for name in wide.variables if name not in estimate.values]
     layout, scans = Layout.of(wide, unbounded=candidates), wide.scans
     directions = np.concatenate([away[name] for name in layout.at])
+    placed = lidars(scans, values)
     every, places = np.arange(directions.shape[1]), Gradients(layout.size)
 
     def work(i: int) -> list[ClusteredRows]:
-        rows = StopRows.of(scans[i], layout, values, estimate.associations[i])
+        rows = StopRows.of(scans[i], layout, values, placed[i], estimate.associations[i])
         root = np.sqrt(rows.weight)
         parts, cluster = rows.places()
         place = places.numbers(scans[i].room, parts)[cluster]

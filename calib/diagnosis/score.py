@@ -104,7 +104,9 @@ def project(linear: Linear, names: Sequence[str]) -> Scores:
         size = linear.wide.variables[name].dim
         at[name], start = slice(start, start + size), start + size
     theirs, away = linear.kept(names), away_from_model(linear, names)
-    cells = linear.gradient @ away
+    own = linear.layout.columns(names)
+    others = np.setdiff1d(np.flatnonzero(np.any(away != 0, axis=1)), own)
+    cells = linear.gradient[:, own].toarray() + linear.gradient[:, others] @ away[others]
     return Scores(
         at=at,
         score=cells.sum(axis=0),

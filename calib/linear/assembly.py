@@ -146,9 +146,8 @@ class CellsFirst(Assembly):
         rest = self.rest * unit * unit[:, None]
         if self.raw is not None:
             cells = np.arange(self.first, self.first + len(layout.cells))
-            through = self._through(np.zeros(0, int))
             before = np.delete(np.delete(rest, cells, 0), cells, 1)
-            self.raw += (through.T @ (through.T @ before).T)[:-1, :-1]
+            self.raw += self._chained(before, np.zeros(0, int))[:-1, :-1]
             self._add_raw(rows for found in self.own.values() for rows in found)
         if len(layout.finest):
             own = layout.sigma[layout.finest]
@@ -176,8 +175,7 @@ class CellsFirst(Assembly):
         columns = np.concatenate([own, layout.kept, [layout.size]])
         at = np.full(layout.size + 1, -1)
         at[columns] = np.arange(len(columns))
-        through = self._through(own)
-        whole = through.T @ (through.T @ rest).T
+        whole = self._chained(rest, own)
         for each in (rows for found in self.own.values() for rows in found):
             some = np.append(at[each.columns], len(columns) - 1)
             add_at(whole, some, some, each.gram(unit))
@@ -189,25 +187,29 @@ class CellsFirst(Assembly):
         self.eliminated.append(Eliminated(own, columns[count:], factor, gain))
         return left
 
-    def _through(self, own: np.ndarray) -> csr_array:
-        """[twists | kept | b] in terms of [own | kept | b], in units of sigmas; unknowns that are
-        in neither are left out."""
-        layout = self.layout
+    def _chained(self, rest: np.ndarray, own: np.ndarray) -> np.ndarray:
+        """From [twists | kept | b] to [own | kept | b], in units of sigmas; what else the twists
+        depend on is left out."""
+        layout, first = self.layout, self.first
         columns = np.concatenate([own, layout.kept])
         at = np.full(layout.size, -1)
         at[columns] = np.arange(len(columns))
-        rows, place, data = [], [], []
+        used = np.concatenate([np.zeros(0, int), *(c for _, _, c in self.twists)])
+        used = np.unique(at[used])
+        used = used[used >= 0]
+        chain = np.zeros((first, len(used)))
         for i, (_, d, c) in enumerate(self.twists):
             there = np.flatnonzero(at[c] >= 0)
-            rows.append(np.repeat(TWIST * i + np.arange(TWIST), len(there)))
-            place.append(np.tile(at[c[there]], TWIST))
-            data.append((d[:, there] * layout.sigma[c[there]]).ravel())
-        kept = np.arange(len(layout.kept) + 1)
-        entries = np.concatenate([*data, np.ones(len(kept))])
-        where = [np.concatenate([*rows, self.first + kept])]
-        where += [np.concatenate([*place, len(own) + kept])]
-        shape = (self.first + len(kept), len(own) + len(kept))
-        return csr_array((entries, tuple(where)), shape=shape)
+            to = np.searchsorted(used, at[c[there]])
+            chain[TWIST * i : TWIST * (i + 1), to] = d[:, there] * layout.sigma[c[there]]
+        chain = csr_array(chain)
+        whole = np.zeros((len(columns) + 1, len(columns) + 1))
+        whole[len(own) :, len(own) :] = rest[first:, first:]
+        inner = chain.T @ (chain.T @ rest[:first, :first]).T
+        add_at(whole, used, used, inner)
+        after = len(own) + np.arange(len(layout.kept) + 1)
+        add_both(whole, used, after, chain.T @ rest[:first, first:])
+        return whole
 
 
 class StopsFirst(Assembly):

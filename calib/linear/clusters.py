@@ -60,6 +60,9 @@ class Gradients:
         if issparse(rows.A):
             self.add(rows.A.multiply(rows.b[:, None]), rows.columns, rows.stop, rows.place)
             return
+        if np.ptp(rows.stop) == 0 == np.ptp(rows.place):
+            self.add((rows.b @ rows.A)[None], rows.columns, rows.stop[:1], rows.place[:1])
+            return
         pairs, cell = np.unique([rows.stop, rows.place], axis=1, return_inverse=True)
         count = len(rows.b)
         pick = csr_array((rows.b, cell, np.arange(count + 1)), shape=(count, pairs.shape[1]))

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_solve, cholesky
+from scipy.linalg import cho_solve, cholesky, solve_triangular
 from scipy.linalg.blas import dsyrk
 from scipy.linalg.lapack import dpstrf
 
@@ -60,16 +60,17 @@ def eliminate(
         rest -= _square(cross / root)
         return block, cross / block[:, None]
     factor = cholesky(block, lower=True, check_finite=False)
-    gain = cho_solve((factor, True), cross, check_finite=False)
-    taken = cross.T @ gain
-    rest -= (taken + taken.T) / 2
-    return factor, gain
+    half = solve_triangular(factor, cross, lower=True, check_finite=False)
+    rest -= _square(half)
+    return factor, solve_triangular(factor, half, lower=True, trans=1, check_finite=False)
 
 
 def _square(rows: np.ndarray) -> np.ndarray:
     """``rows.T @ rows``, computed once per pair of columns."""
-    upper = dsyrk(1.0, rows.T, trans=0, lower=0)
-    return upper + np.triu(upper, 1).T
+    upper = dsyrk(1.0, rows.T, trans=0, lower=0)  # zero below the diagonal
+    whole = upper + upper.T
+    np.einsum("ii->i", whole)[:] /= 2.0
+    return whole
 
 
 def square_root(matrix: np.ndarray) -> np.ndarray:

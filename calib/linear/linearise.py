@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from calib.forward import Placed, place_each
 from calib.linear.assembly import CellsFirst, OwnRows, StopsFirst
 from calib.linear.clusters import ClusteredRows, Gradients
 from calib.linear.layout import Layout
@@ -15,6 +16,7 @@ from calib.linear.system import Linearisation, Values
 from calib.problem import Problem
 from calib.problem.unknowns import Unknown
 from calib.residuals.beams import Association
+from calib.residuals.scan import ScanStop
 from calib.residuals.spread import SpreadRows
 from chains import se3
 
@@ -49,8 +51,10 @@ def linearise(
     own = {stop: list(rows.values()) for stop, rows in own_rows(layout, values).items()}
     assembly = order(layout, own, count, gradients is not None)
 
+    placed = lidars(problem.scans, values) if count else []
+
     def work(i: int) -> tuple[StopSums, SpreadRows | None, tuple[np.ndarray, ...] | None]:
-        rows = StopRows.of(problem.scans[i], layout, values, associations[i], newton)
+        rows = StopRows.of(problem.scans[i], layout, values, placed[i], associations[i], newton)
         by_cluster = None
         if gradients is not None:
             parts, cluster = rows.places()
@@ -73,6 +77,18 @@ def linearise(
                 clustered = ClusteredRows(rows.A, rows.b, rows.columns, stop, places[cluster])
                 gradients.add_rows(clustered)
     return assembly.done(values)
+
+
+def lidars(scans: Sequence[ScanStop], values: Values) -> list[Placed]:
+    """Where the LiDAR is at every stop, reference frame, with derivatives."""
+    frames = list(dict.fromkeys(scan.stops.rig.lidar_frame for scan in scans))
+    found: list[Placed | None] = [None] * len(scans)
+    for frame in frames:
+        some = [i for i, scan in enumerate(scans) if scan.stops.rig.lidar_frame == frame]
+        each = place_each([scans[i].stops for i in some], frame, values)
+        for i, placed in zip(some, each, strict=True):
+            found[i] = placed
+    return found
 
 
 def spread_rows(spread: SpreadRows, layout: Layout) -> OwnRows:

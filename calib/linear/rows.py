@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from calib.forward import Placed
 from calib.linear.layout import Layout, key_of
 from calib.residuals.beams import Association, Rows
 from calib.residuals.compiled import cluster_sums, cross_sums
@@ -49,13 +50,14 @@ class StopRows:
         scan: ScanStop,
         layout: Layout,
         values: Mapping[str, np.ndarray],
+        placed: Placed,
         association: Association | None,
         newton: bool = False,
     ) -> StopRows:
-        """The rows of a scan, linearised at a state; arguments as of `linearise`."""
-        rows = scan.rows(values, association)
+        """The rows of a scan, linearised at a state where its LiDAR is `placed`; other arguments
+        as of `linearise`."""
+        rows = scan.rows(values, association, placed.T[0])
         weight, residual = rows.whitened(newton)
-        placed = scan.stops.in_reference(scan.stops.rig.lidar_frame, values)
         columns = [np.r_[layout.at[name]] for name in rows.dense]
         index = np.empty((len(weight), len(rows.sparse)), np.int32)
         value = np.empty(index.shape)

@@ -149,6 +149,8 @@ def beam_derivative(beams: Beams, t: np.ndarray, slope: np.ndarray, turns: bool)
 
 def site_error(basis: np.ndarray | OneHot, theta: np.ndarray) -> np.ndarray:
     """``basis @ theta``: the error at the site, (N or 1, D)."""
+    if not theta.any():
+        return np.zeros((1, basis.values.shape[1] if isinstance(basis, OneHot) else basis.shape[1]))
     if isinstance(basis, OneHot):
         # Index -1 finds the zero appended.
         return basis.values * np.append(theta, 0.0)[basis.index][:, None]

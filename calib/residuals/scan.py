@@ -125,12 +125,21 @@ class ScanStop:
         _, ray = self._read()
         return self._associate(self.pose(values), ray, values, near_edges)
 
-    def rows(self, values: Values, association: Association | None = None) -> Rows:
-        """The stop's rows at a state; associated anew unless an association is given."""
-        return self._rows_from(self.pose(values), values, association)
+    def rows(
+        self,
+        values: Values,
+        association: Association | None = None,
+        T: np.ndarray | None = None,
+    ) -> Rows:
+        """The stop's rows at a state.
 
-    def _rows_from(self, T: np.ndarray, values: Values, association: Association | None) -> Rows:
+        Args:
+            values: the state.
+            association: what its beams meet; found anew where None.
+            T: (4, 4) T_reference_lidar there, where it is known already.
+        """
         scan, ray = self._read()
+        T = self.pose(values) if T is None else T
         if association is None:
             association = self._associate(T, ray, values, near_edges=False)
         return self._rows(self._seen(T, values, association, scan, ray), T)
