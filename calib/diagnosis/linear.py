@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from scipy.sparse import csr_array, diags_array
@@ -19,7 +18,6 @@ from calib.linear.layout import Layout, keys_of
 from calib.linear.linearise import lidars, linearise, own_rows, spread_rows
 from calib.linear.parallel import in_order
 from calib.linear.rows import StopRows
-from calib.linear.system import Linearisation
 from calib.problem.problem import Block, Problem
 from calib.residuals.tracker import TrackedBody
 from calib.solve.fit import Estimate, Progress
@@ -32,48 +30,39 @@ WIDENED = 100.0
 
 @dataclass(frozen=True)
 class Linear:
-    """Normal equations about a solution, stops' poses and surfaces' errors eliminated.
+    """Normal equations of S unknowns about a solution, and their right side by clusters of rows.
+
+    What belongs to stops and surfaces is eliminated from the equations, but not from the gradients:
+    these are over all U unknowns.
 
     Args:
-        wide: the model's problem with the candidates' unknowns added.
-        estimate: the model's solution.
         candidates: unknowns that the model does not have; they have no prior.
-        linear: the linearisation of beams and tracked bodies.
-        information: (S, S) of the kept unknowns, in the linearisation's units, everything
-            included; the priors of the hardware widened.
+        at: unknown -> its columns among the S, of those that were not eliminated.
+        columns: unknown -> its columns among the U.
+        information: (S, S) of all rows; the priors of the hardware widened.
         raw: (S, S) the same before anything was eliminated.
         gradient: (C, U) sparse, of each cluster of rows; their sum is the whole gradient.
         stop: (C,) which stop the rows of a cluster belong to, -1 for none.
         place: (C,) which part of the room they look at, -1 for none.
         weight_m2: sum of the beams' weights over their variances [1/m2]; without beams that of the
             tracked positions.
+        directions: of directions (S, q) those of all unknowns (U, q) that follow.
     """
 
-    wide: Problem
-    estimate: Estimate
     candidates: tuple[str, ...]
-    linear: Linearisation
+    at: Mapping[str, np.ndarray]
+    columns: Mapping[str, slice]
     information: np.ndarray
     raw: np.ndarray
     gradient: csr_array
     stop: np.ndarray
     place: np.ndarray
     weight_m2: float
+    directions: Callable[[np.ndarray], np.ndarray]
 
-    @property
-    def layout(self) -> Layout:
-        """Which column is what."""
-        return self.linear.layout
-
-    @cached_property
-    def _kept(self) -> np.ndarray:
-        at = np.full(self.layout.size, -1)
-        at[self.layout.kept] = np.arange(len(self.layout.kept))
-        return at
-
-    def kept(self, names: Sequence[str]) -> np.ndarray:
-        """Where unknowns stand among the kept ones."""
-        return self._kept[self.layout.columns(names)]
+    def among(self, names: Sequence[str]) -> np.ndarray:
+        """Columns of some unknowns among the S, in the order given."""
+        return np.concatenate([self.at[name] for name in names])
 
 
 def rows_along(
@@ -149,13 +138,9 @@ def linearise_with(
         gradients=gradients,
         progress=lambda done, total: progress("testing what is missing", done, total),
     )
-    information = linear.kept[:-1, :-1].copy()
+    information, raw = linear.kept[:-1, :-1].copy(), linear.raw.copy()
     at = np.full(layout.size, -1)
     at[layout.kept] = np.arange(len(layout.kept))
-    tracked_m2 = sum(
-        len(b.measured) / b.sigma_m**2 for b in wide.blocks if isinstance(b, TrackedBody)
-    )
-    raw = linear.raw.copy()
     for rows in other_rows(wide, layout, values, gradients):
         gradients.add_rows(rows)
         place = at[rows.columns]
@@ -163,18 +148,26 @@ def linearise_with(
             scaled = rows.A * layout.sigma[rows.columns]
             information[np.ix_(place, place)] += scaled.T @ scaled
             raw[np.ix_(place, place)] += scaled.T @ scaled
+    unit = layout.sigma[layout.kept]
+
+    def directions(kept: np.ndarray) -> np.ndarray:
+        """In the unknowns' own units, as the equations are."""
+        scaled = np.vstack([kept / unit[:, None], np.zeros((1, kept.shape[1]))])
+        return linear.directions(scaled) * layout.sigma[:, None]
+
+    bodies = [b for b in wide.blocks if isinstance(b, TrackedBody)]
     table, stop, place = gradients.table()
     return Linear(
-        wide=wide,
-        estimate=estimate,
         candidates=tuple(candidates),
-        linear=linear,
-        information=information,
-        raw=raw,
+        at={name: at[np.r_[layout.at[name]]] for name in layout.outer()},
+        columns=layout.at,
+        information=information / np.outer(unit, unit),
+        raw=raw / np.outer(unit, unit),
         gradient=table,
         stop=stop,
         place=place,
-        weight_m2=linear.weight_m2 or tracked_m2,
+        weight_m2=linear.weight_m2 or sum(len(b.measured) / b.sigma_m**2 for b in bodies),
+        directions=directions,
     )
 
 

@@ -67,11 +67,11 @@ def projection(linear: Linear, names: Sequence[str]) -> tuple[np.ndarray, np.nda
     take on; other candidates play no part.
 
     Returns:
-        Where the variables (Q,) and the model's unknowns (M,) stand among the kept, and how much of
-        each of these (M, Q) is to be taken off, in the linearisation's units.
+        Columns of the variables (Q,) and of the model's unknowns (M,), and how much of each of
+        these (M, Q) is to be taken off.
     """
-    theirs = linear.kept(names)
-    apart = linear.kept([*linear.candidates, *names])
+    theirs = linear.among(names)
+    apart = linear.among([*linear.candidates, *names])
     model = np.setdiff1d(np.arange(len(linear.information)), apart)
     block = linear.information[np.ix_(model, model)]
     scale = np.sqrt(np.maximum(np.diag(block), 1e-300))
@@ -84,9 +84,9 @@ def away_from_model(linear: Linear, names: Sequence[str]) -> np.ndarray:
     """Directions (U, Q) of variables with all that the model can take on of them taken off, stops'
     poses and surfaces' errors included."""
     theirs, model, taken = projection(linear, names)
-    kept = np.zeros((len(linear.information) + 1, len(theirs)))
+    kept = np.zeros((len(linear.information), len(theirs)))
     kept[theirs], kept[model] = np.eye(len(theirs)), -taken
-    return linear.linear.directions(kept) * linear.layout.sigma[:, None]
+    return linear.directions(kept)
 
 
 def information_left(linear: Linear, names: Sequence[str]) -> np.ndarray:
@@ -101,10 +101,10 @@ def project(linear: Linear, names: Sequence[str]) -> Scores:
     """Project variables off the model, be they candidates or of the model itself."""
     at, start = {}, 0
     for name in names:
-        size = linear.wide.variables[name].dim
+        size = len(linear.at[name])
         at[name], start = slice(start, start + size), start + size
-    theirs, away = linear.kept(names), away_from_model(linear, names)
-    own = linear.layout.columns(names)
+    theirs, away = linear.among(names), away_from_model(linear, names)
+    own = np.concatenate([np.r_[linear.columns[name]] for name in names])
     others = np.setdiff1d(np.flatnonzero(np.any(away != 0, axis=1)), own)
     cells = linear.gradient[:, own].toarray() + linear.gradient[:, others] @ away[others]
     return Scores(

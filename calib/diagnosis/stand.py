@@ -209,7 +209,7 @@ class Look:
         wide = stand.problem_of(stand.model.plus((candidate.effect,)))
         names = _variables(wide, {candidate.effect.name})[candidate.effect.name]
         away = away_from_model(self.linear, names) @ found.whiten
-        by_name = {name: away[at] for name, at in self.linear.layout.at.items()}
+        by_name = {name: away[at] for name, at in self.linear.columns.items()}
         shares = Shares()
 
         def tell(done: int, total: int) -> None:
