@@ -87,6 +87,15 @@ class Stops:
         """Of those, the ones that other stops may have under another name."""
         return (self.root,) if self.noise is None else (self.root, self.noise)
 
+    def some(self, index: np.ndarray, root: str) -> Stops:
+        """Those of the stops, with their root."""
+
+        def of(bases: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+            return {n: basis if len(basis) == 1 else basis[index] for n, basis in bases.items()}
+
+        bases = {"edge_bases": of(self.edge_bases), "joint_bases": of(self.joint_bases)}
+        return replace(self, joints=self.joints[index], root=root, **bases)
+
     @classmethod
     def together(cls, stops: Sequence[Stops]) -> Stops:
         """Stops that share all but their own unknowns, as one: values of `ROOT` (K, 4, 4) and of

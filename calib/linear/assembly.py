@@ -6,7 +6,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import csr_array
 
 from calib.linear.elimination import BY_TWIST, Eliminated, eliminate
 from calib.linear.layout import Layout
@@ -194,21 +193,23 @@ class CellsFirst(Assembly):
         columns = np.concatenate([own, layout.kept])
         at = np.full(layout.size, -1)
         at[columns] = np.arange(len(columns))
-        used = np.concatenate([np.zeros(0, int), *(c for _, _, c in self.twists)])
-        used = np.unique(at[used])
+        used = np.unique(at[np.concatenate([np.zeros(0, int), *(c for _, _, c in self.twists)])])
         used = used[used >= 0]
-        chain = np.zeros((first, len(used)))
+        beside = np.zeros((len(used), rest.shape[1]))  # chain' @ [twists | kept | b]
+        chains = []
         for i, (_, d, c) in enumerate(self.twists):
             there = np.flatnonzero(at[c] >= 0)
-            to = np.searchsorted(used, at[c[there]])
-            chain[TWIST * i : TWIST * (i + 1), to] = d[:, there] * layout.sigma[c[there]]
-        chain = csr_array(chain)
+            rows, twist = np.searchsorted(used, at[c[there]]), slice(TWIST * i, TWIST * (i + 1))
+            chains.append((rows, twist, (d[:, there] * layout.sigma[c[there]]).T))
+            beside[rows] += chains[-1][2] @ rest[twist]
+        inner = np.zeros((len(used), len(used)))
+        by_twist = np.ascontiguousarray(beside[:, :first].T)
+        for rows, twist, chain in chains:
+            inner[rows] += chain @ by_twist[twist]
         whole = np.zeros((len(columns) + 1, len(columns) + 1))
         whole[len(own) :, len(own) :] = rest[first:, first:]
-        inner = chain.T @ (chain.T @ rest[:first, :first]).T
         add_at(whole, used, used, inner)
-        after = len(own) + np.arange(len(layout.kept) + 1)
-        add_both(whole, used, after, chain.T @ rest[:first, first:])
+        add_both(whole, used, np.arange(len(own), len(whole)), beside[:, first:])
         return whole
 
 
