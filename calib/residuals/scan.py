@@ -19,6 +19,7 @@ from calib.residuals.beams import (
     Surface,
     beam_derivative,
     effect_columns,
+    range_columns,
     site_error,
     turns_beams,
 )
@@ -274,16 +275,17 @@ class ScanStop:
         self, seen: _Seen, T: np.ndarray, t: np.ndarray, slope: np.ndarray
     ) -> tuple[dict[str, np.ndarray], list[Columns]]:
         """By unknowns of effects and of found planes: dense ones, and one non-zero per row."""
-        bases = seen.bases.items()
-        turns = any(turns_beams(b) for _, (site, b) in bases if site is Site.BEAM)
-        by_site = {Site.BEAM: beam_derivative(seen.ray, t, slope, turns)}
-        if any(site is Site.REFERENCE for _, (site, _) in bases):
-            by_site[Site.REFERENCE] = slope @ -T[:3, :3].T
-        found = {
-            name: effect_columns(name, basis, by_site[site])
-            for name, (site, basis) in bases
-            if site is not Site.NOISE
-        }
+        by_site: dict[Site, np.ndarray] = {}
+        found = {}
+        for name, (site, basis) in seen.bases.items():
+            if site is Site.BEAM and not turns_beams(basis):
+                found[name] = range_columns(name, basis, len(t))
+            elif site is not Site.NOISE:
+                if site not in by_site:
+                    beam = site is Site.BEAM
+                    turn = -T[:3, :3].T
+                    by_site[site] = beam_derivative(seen.ray, t, slope) if beam else slope @ turn
+                found[name] = effect_columns(name, basis, by_site[site])
         dense = {name: c for name, c in found.items() if not isinstance(c, Columns)}
         sparse = [c for c in found.values() if isinstance(c, Columns)] + list(
             seen.surface.unknown()
