@@ -13,17 +13,17 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("chains", "sensors", "calib")  # each may import itself and those before it
 DOORS = {
-    "PIL": "sensors/readers/osf.py",
+    "PIL": "sensors/readers/packets/osf.py",
     "gtsam": "calib/solve/graph.py",
-    "laspy": "sensors/readers/las.py",
+    "laspy": "sensors/readers/clouds/las.py",
     "matplotlib": "calib/report/plots.py",
     "open3d": "sensors/meshes.py",
     "pyarrow": "sensors/recording.py",
     "trimesh": "sensors/mesh_files.py",
-    "pye57": "sensors/readers/e57.py",
-    "rosbags": "sensors/readers/ros.py",
+    "pye57": "sensors/readers/clouds/e57.py",
+    "rosbags": "sensors/readers/bags/ros.py",
     "viser": "calib/view/server.py",
-    "xacrodoc": "sensors/readers/xacros.py",
+    "xacrodoc": "chains/readers/xacro.py",
     "yaml": "sensors/documents.py",
 }
 NOT_AT_STARTUP = {"gtsam", "matplotlib", "open3d", "pyarrow", "pydantic", "scipy", "viser"}

@@ -11,7 +11,7 @@ from pathlib import Path
 from calib.export.fitted import FittedRig, for_every_rig
 from calib.export.written import SIGMAS, Unheld, Written, write_text
 from chains.frames import Edge
-from chains.urdf_out import empty_robot, with_comment, with_frames, with_origins
+from chains.readers.urdf_out import empty_robot, with_comment, with_frames, with_origins
 
 CONVENTIONS = (
     "A joint's origin is T_parent_child at a reported joint of 0: xyz in m, in the parent's axes;",

@@ -16,6 +16,7 @@ from chains.frames import Edge
 from sensors.documents import nearest, read_text, read_yaml
 from sensors.lidar import catalog
 from sensors.readers import READERS
+from sensors.readers.arms.urdf import with_ends
 from sensors.readers.base import (
     Arm,
     Columns,
@@ -27,7 +28,6 @@ from sensors.readers.base import (
     Sweeps,
     Track,
 )  # fmt: skip
-from sensors.readers.urdf import with_ends
 
 ARMS = ("urdf", "dh")  # read before all others, which look for the arm's joints
 TOLD_BY_FILE = ("bag", "hesai", "mesh", "ouster")  # which read --metadata

@@ -14,9 +14,9 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from calib.intake import Choices, import_files
-from sensors.readers.bag import read_bag
+from sensors.readers.bags.bag import read_bag
 from sensors.readers.base import Found, Options
-from sensors.readers.ouster import read_ouster
+from sensors.readers.packets.ouster import read_ouster
 from sensors.recording import write_table
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from calib.intake.clocks import align, estimate
 from calib.intake.gather import chain
 from calib.intake.motion import motions
-from chains.dh import Row, to_urdf
 from chains.errors import InputError
+from chains.readers.dh import Row, to_urdf
 from sensors.readers.base import POSE, Arm, Sweeps, Track
 
 from .moving import DH, JOINTS, T_TIP_CUP, T_WORLD_BASE, logged, plan, tip
