@@ -43,12 +43,6 @@ class Rung:
             return None if self.grown_from else []
         return [name for name in self.below.effects if name not in self.run.effects]
 
-    def _repr_html_(self) -> str:
-        """As a notebook shows it."""
-        from calib.show.notebook import rung_html
-
-        return rung_html(self)
-
     def document(self) -> dict[str, Any]:
         """As ``rigcal compare --json`` gives it."""
         rms = self.run.summary["rms_mm"]

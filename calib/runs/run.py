@@ -71,12 +71,6 @@ class Run:
                 f"{folder}: written by another version of rigcal, or edited ({error}); fit it again"
             ) from None
 
-    def _repr_html_(self) -> str:
-        """As a notebook shows it."""
-        from calib.show.notebook import run_html
-
-        return run_html(self)
-
     @property
     def recordings(self) -> list[Path]:
         """Where the recordings were that this run was fitted to."""
