@@ -17,7 +17,7 @@ from pathlib import Path
 # BLAS threads on shared cores cost many times what they save; set before numpy is imported.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from calib.study import FULL, QUICK, study
+from paper import FULL, QUICK, study
 
 
 def main() -> None:

@@ -23,8 +23,9 @@ from calib.runs.run import Run
 from calib.solve import holdout
 from calib.solve.errors import Errors, scan_errors
 from calib.solve.fit import Progress, solve, values_of
-from calib.study import sequence
 from sensors.documents import replace_folder
+
+from . import sequence
 
 Values = dict[str, np.ndarray]
 Columns = dict[str, np.ndarray]

@@ -13,16 +13,16 @@ from scipy.spatial.transform import Rotation
 
 from calib.problem.model import Model, Source
 from calib.simulate import PRESETS, Spec, simulate
-from calib.study import Scale, sequence, study, tables
-from calib.study.case import Case, well_seen
-from calib.study.conditions import DELAY_S, QUICK, TABLE_6
-from calib.study.figures import by_ring
-from calib.study.page import _table_6
 from chains import se3
 from chains.errors import InputError
+from examples.paper import Scale, sequence, study, tables
+from examples.paper.case import Case, well_seen
+from examples.paper.conditions import DELAY_S, QUICK, TABLE_6
+from examples.paper.figures import by_ring
+from examples.paper.page import _table_6
 from sensors.meshes import ransac_plane
 
-from .simulated import changed, made, nominal
+from ..calib.simulated import changed, made, nominal
 
 EXACT = {"noise": 0, "build_error": 0, "occluded_share": 0}
 CIRCLES = changed(PRESETS["one-joint"], **EXACT, stops_per_location=8)

@@ -6,7 +6,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from calib.study.conditions import (
+from sensors.documents import write_atomically
+
+from .conditions import (
     BIASED,
     REASONS,
     SENSORS,
@@ -17,7 +19,6 @@ from calib.study.conditions import (
     TABLE_6,
     Scale,
 )
-from sensors.documents import write_atomically
 
 INTRODUCTION = """\
 # The study, again

@@ -23,14 +23,15 @@ from calib.runs.reopen import reopened
 from calib.runs.run import Run
 from calib.simulate import simulate
 from calib.solve.fit import Progress
-from calib.study import figures, tables
-from calib.study.case import Case, Columns, State, gather, well_seen
-from calib.study.conditions import FULL, QUICK, Scale, seed_of
-from calib.study.page import write_page
-from calib.study.sequence import RINGS, offsets_by_ring, spheres_mm
-from calib.study.shape import shape
 from chains.errors import InputError
 from sensors.documents import write_json
+
+from . import figures, tables
+from .case import Case, Columns, State, gather, well_seen
+from .conditions import FULL, QUICK, Scale, seed_of
+from .page import write_page
+from .sequence import RINGS, offsets_by_ring, spheres_mm
+from .shape import shape
 
 __all__ = ["FULL", "QUICK", "Scale", "study"]
 

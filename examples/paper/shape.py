@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from calib.study.case import Columns
-from calib.study.conditions import BIASED, TABLE_5
-from calib.study.figures import by_distance, by_incidence, by_ring
+from .case import Columns
+from .conditions import BIASED, TABLE_5
+from .figures import by_distance, by_incidence, by_ring
 
 Claim = dict[str, Any]
 

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calib.report import plots
-from calib.study.case import STEEP_RAD, Columns
+
+from .case import STEEP_RAD, Columns
 
 if TYPE_CHECKING:
     from calib.report.plots import Figure

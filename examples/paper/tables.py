@@ -13,10 +13,11 @@ from calib.evaluate.tally import Evaluated, Tally
 from calib.forward import Values
 from calib.problem.model import Model, Source
 from calib.residuals.tracker import TrackedBody
-from calib.study.case import Case, Columns, State, gather, well_seen
-from calib.study.sequence import LENGTHS, RINGS
 from chains import se3
 from sensors.meshes import ransac_plane
+
+from .case import Case, Columns, State, gather, well_seen
+from .sequence import LENGTHS, RINGS
 
 BENDS = (Site.EDGE, Site.JOINTS)
 PLANES = {"wood": "wood_panel", "metal": "metal_cabinet"}
