@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from calib.runs.calibrate import calibrate
-from calib.simulate import load_spec, simulate
+from calib.simulation import load_spec, simulate
 from chains import se3
 from sensors.recording import read_table, write_table
 

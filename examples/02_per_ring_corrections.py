@@ -16,7 +16,7 @@ import numpy as np
 
 from calib.rig import Rig, load_rig
 from calib.runs.calibrate import calibrate
-from calib.simulate import load_spec, simulate
+from calib.simulation import load_spec, simulate
 from sensors.lidar import Beams, beams
 from sensors.recording import read_scan
 from sensors.reference import Reference

@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from calib.export import export
+from calib.exporters import export
 from calib.rig import load_rig
 from calib.runs.calibrate import calibrate
-from calib.simulate import simulate
+from calib.simulation import simulate
 
 
 def off(T: np.ndarray, T_true: np.ndarray) -> str:

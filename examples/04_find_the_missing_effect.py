@@ -20,7 +20,7 @@ from pathlib import Path
 from calib.runs.calibrate import calibrate, grow, grown_model
 from calib.runs.diagnose import diagnose
 from calib.runs.run import Run
-from calib.simulate import load_spec, simulate
+from calib.simulation import load_spec, simulate
 
 
 def errors(run: Run) -> str:

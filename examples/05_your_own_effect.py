@@ -18,7 +18,7 @@ from pathlib import Path
 
 from calib.runs.calibrate import calibrate, grow, grown_model
 from calib.runs.diagnose import diagnose
-from calib.simulate import Spec, simulate
+from calib.simulation import Spec, simulate
 
 FORMULA = """\
 name: humid_air

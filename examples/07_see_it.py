@@ -20,7 +20,7 @@ from pathlib import Path
 from calib.report import Evidence, plot, report
 from calib.runs.calibrate import calibrate, grow, grown_model
 from calib.runs.diagnose import diagnose
-from calib.simulate import load_spec, simulate
+from calib.simulation import load_spec, simulate
 
 out = Path(sys.argv[1] if len(sys.argv) > 1 else tempfile.mkdtemp(prefix="rigcal-"))
 small = {"room": "box", "locations": 3, "stops_per_location": 2, "column_step": 200}

@@ -20,7 +20,7 @@ from foreign_files import write_files
 
 from calib.intake import Choices, import_files
 from calib.runs.calibrate import calibrate
-from calib.simulate import load_spec, simulate
+from calib.simulation import load_spec, simulate
 from chains import se3
 from sensors.readers.base import Options
 

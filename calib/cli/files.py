@@ -25,7 +25,7 @@ def export(
     as_json: Json = False,
 ) -> None:
     """Write the result for others: YAML, URDF, ROS 2, ring tables, pictures, tables."""
-    from calib.export import export as write
+    from calib.exporters import export as write
     from calib.runs.run import Run
 
     done = write(Run.open(run), out, formats or [])
@@ -57,7 +57,7 @@ def apply(
     as_json: Json = False,
 ) -> None:
     """Write corrected clouds: what the run has learnt of its LiDAR is taken off."""
-    from calib.evaluate.apply import apply as correct
+    from calib.evaluation.apply import apply as correct
     from calib.runs.run import Run
 
     with progress_bar() as progress:

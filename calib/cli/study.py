@@ -35,7 +35,7 @@ def simulate(
     as_json: Json = False,
 ) -> None:
     """Write a recording, and the truth beside it."""
-    from calib.simulate import simulate as run
+    from calib.simulation import simulate as run
 
     with progress_bar() as progress:
         run(spec, out, seed, _sizes(hide or []), progress)
@@ -184,7 +184,7 @@ def evaluate(
     as_json: Json = False,
 ) -> None:
     """Accuracy and precision of every return, by ring, distance, incidence and label."""
-    from calib.evaluate import evaluate_all
+    from calib.evaluation import evaluate_all
     from calib.runs.run import Run
 
     opened = [Run.open(run) for run in runs]

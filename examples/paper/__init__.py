@@ -15,13 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from calib.evaluate import write_evaluation
+from calib.evaluation import write_evaluation
 from calib.problem.model import Source
 from calib.runs.calibrate import calibrate, grow, grown_model
 from calib.runs.diagnose import diagnose
 from calib.runs.reopen import reopened
 from calib.runs.run import Run
-from calib.simulate import simulate
+from calib.simulation import simulate
 from calib.solve.fit import Progress
 from chains.errors import InputError
 from sensors.documents import write_json

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from calib import problem as problems
-from calib.evaluate import evaluate_stop
-from calib.evaluate.tally import Evaluated
+from calib.evaluation import evaluate_stop
+from calib.evaluation.tally import Evaluated
 from calib.problem import Problem
 from calib.problem.model import Model, Source
 from calib.runs.reopen import model_of

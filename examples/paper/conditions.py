@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from calib.simulate import Spec, load_spec
+from calib.simulation import Spec, load_spec
 
 HERE = Path(__file__).parent
 SEED = 7

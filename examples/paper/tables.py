@@ -9,7 +9,7 @@ import numpy as np
 
 from calib import problem as problems
 from calib.effects import FrameOffset, Site
-from calib.evaluate.tally import Evaluated, Tally
+from calib.evaluation.tally import Evaluated, Tally
 from calib.forward import Values
 from calib.problem.model import Model, Source
 from calib.residuals.tracker import TrackedBody

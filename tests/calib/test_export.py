@@ -7,7 +7,7 @@ import pytest
 import yaml
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calib.export import FORMATS, export, read_extrinsics
+from calib.exporters import FORMATS, export, read_extrinsics
 from calib.runs.run import Run
 from calib.solve.solution import EffectEstimate, FrameEstimate, Part, Solution
 from chains.errors import InputError

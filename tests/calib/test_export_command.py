@@ -6,7 +6,7 @@ import pytest
 import yaml
 
 from calib.cli.files import export as command
-from calib.export import FORMATS
+from calib.exporters import FORMATS
 from calib.runs.calibrate import calibrate
 
 from . import rigs

@@ -15,7 +15,7 @@ from calib.report.statistics import Z_EDGES
 from calib.runs.calibrate import calibrate, grow, grown_model
 from calib.runs.diagnose import diagnose
 from calib.runs.run import RESIDUALS, SUMMARY, Run
-from calib.simulate import Spec, simulate
+from calib.simulation import Spec, simulate
 from calib.solve.solution import Solution
 from chains.errors import InputError
 from sensors.documents import write_json

@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from calib.problem.model import Model, Source
-from calib.simulate import PRESETS, Spec, simulate
+from calib.simulation import PRESETS, Spec, simulate
 from chains import se3
 from chains.errors import InputError
 from examples.paper import Scale, sequence, study, tables

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from calib.export.fitted import FittedRig, for_every_rig
-from calib.export.written import SIGMAS, Unheld, Written, write_text
+from calib.exporters.fitted import FittedRig, for_every_rig
+from calib.exporters.written import SIGMAS, Unheld, Written, write_text
 from chains.frames import Edge
 from chains.readers.urdf_out import empty_robot, with_comment, with_frames, with_origins
 

@@ -8,8 +8,8 @@ from typing import Any, Literal
 import numpy as np
 
 from calib.effects import CATALOGUE
-from calib.export.fitted import Fitted
-from calib.export.written import Written
+from calib.exporters.fitted import Fitted
+from calib.exporters.written import Written
 from calib.runs.run import RING, Run
 from calib.solve.solution import (
     EffectEstimate,

@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from calib.export.fitted import Fitted
-from calib.export.written import Written, head, write_text
+from calib.exporters.fitted import Fitted
+from calib.exporters.written import Written, head, write_text
 from calib.runs.estimates import Found, found
 from calib.show.tables import LISTED, effect_cells, estimate_cell, shown
 

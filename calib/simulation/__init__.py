@@ -6,13 +6,13 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from calib.rig import load_rig
-from calib.simulate import rig as rig_on_paper
-from calib.simulate.room import build
-from calib.simulate.scan import Scanner
-from calib.simulate.spec import PRESETS, Spec, load_spec
-from calib.simulate.stops import World, plan
-from calib.simulate.truth import draw, stream
-from calib.simulate.write import write_reference, write_stops, write_targets, write_truth
+from calib.simulation import rig as rig_on_paper
+from calib.simulation.room import build
+from calib.simulation.scan import Scanner
+from calib.simulation.spec import PRESETS, Spec, load_spec
+from calib.simulation.stops import World, plan
+from calib.simulation.truth import draw, stream
+from calib.simulation.write import write_reference, write_stops, write_targets, write_truth
 from chains.errors import InputError
 from sensors.documents import replace_folder, write_yaml
 from sensors.recording import write_table

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.simulate.spec import Spec
+from calib.simulation.spec import Spec
 
 # name, origin xyz (m), origin rpy (rad), axis z, limit (degrees), mass of the link behind it (kg),
 # and that link's centre of mass (m). Proportions of a Schunk LWA 4P; its limits rounded down.

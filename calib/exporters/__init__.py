@@ -6,14 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from calib.export.fitted import Fitted, Format
-from calib.export.rings import write_hesai, write_ouster, write_rings
-from calib.export.tables import write_latex, write_markdown
-from calib.export.transforms import write_autoware, write_kalibr, write_ros2
-from calib.export.tree import write_tree
-from calib.export.urdf import write_urdf
-from calib.export.written import Unheld
-from calib.export.yaml_extrinsics import read_extrinsics, write_extrinsics
+from calib.exporters.fitted import Fitted, Format
+from calib.exporters.rings import write_hesai, write_ouster, write_rings
+from calib.exporters.tables import write_latex, write_markdown
+from calib.exporters.transforms import write_autoware, write_kalibr, write_ros2
+from calib.exporters.tree import write_tree
+from calib.exporters.urdf import write_urdf
+from calib.exporters.written import Unheld
+from calib.exporters.yaml_extrinsics import read_extrinsics, write_extrinsics
 from calib.runs.run import Run
 from chains.errors import InputError
 

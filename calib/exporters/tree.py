@@ -10,8 +10,8 @@ from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
 
-from calib.export.fitted import FittedRig, for_every_rig
-from calib.export.written import Written, write_text
+from calib.exporters.fitted import FittedRig, for_every_rig
+from calib.exporters.written import Written, write_text
 from calib.runs.estimates import found
 from calib.solve.solution import FrameEstimate
 from chains import se3

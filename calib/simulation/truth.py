@@ -11,7 +11,7 @@ import numpy as np
 from calib.effects import DEFAULT, Effect, FrameOffset, OneHot, Site, View, find, load_effects
 from calib.problem.model import owned
 from calib.rig import Rig
-from calib.simulate.spec import Spec
+from calib.simulation.spec import Spec
 from chains import se3
 from chains.errors import InputError
 

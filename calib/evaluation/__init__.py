@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from calib import problem as problems
-from calib.evaluate.tally import FLAT_M, Columns, Evaluated, Tally
+from calib.evaluation.tally import FLAT_M, Columns, Evaluated, Tally
 from calib.forward import Values
 from calib.residuals.scan import Ranges, ScanStop
 from calib.residuals.surfaces import Meeting, MeshSurface

@@ -11,9 +11,9 @@ import numpy as np
 from calib.effects import Site, View
 from calib.problem.model import stop_columns
 from calib.rig import Rig
-from calib.simulate.room import FLOOR_CENTRE_M
-from calib.simulate.spec import Spec
-from calib.simulate.truth import Truth
+from calib.simulation.room import FLOOR_CENTRE_M
+from calib.simulation.spec import Spec
+from calib.simulation.truth import Truth
 from chains import se3
 from chains.errors import InputError
 from sensors.reference import Reference

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from calib.effects import Effect, OneHot, Site, View
-from calib.export.written import Unheld, Written, head
+from calib.exporters.written import Unheld, Written, head
 from calib.problem.model import owned
 from calib.rig import Rig
 from calib.runs.reopen import model_of, reopened

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from calib.export.fitted import FittedRig, for_every_rig
-from calib.export.written import SIGMAS, Unheld, Written, commented, write_text
+from calib.exporters.fitted import FittedRig, for_every_rig
+from calib.exporters.written import SIGMAS, Unheld, Written, commented, write_text
 from calib.solve.solution import FrameEstimate
 from chains import se3
 from sensors.documents import yaml_text

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from calib.effects.beams import BeamOriginOffset
-from calib.export.fitted import FittedRig, for_every_rig
-from calib.export.written import SIGMAS, Unheld, Written, commented, write_text
+from calib.exporters.fitted import FittedRig, for_every_rig
+from calib.exporters.written import SIGMAS, Unheld, Written, commented, write_text
 from sensors.documents import json_text
 
 COLUMNS = (("range", "m"), ("azimuth", "rad"), ("elevation", "rad"))

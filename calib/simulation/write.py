@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.simulate.room import LABEL_NAMES, write_ply
-from calib.simulate.spec import Spec
-from calib.simulate.stops import World, hang_targets
-from calib.simulate.truth import Truth
+from calib.simulation.room import LABEL_NAMES, write_ply
+from calib.simulation.spec import Spec
+from calib.simulation.stops import World, hang_targets
+from calib.simulation.truth import Truth
 from chains import se3
 from sensors.documents import write_json
 from sensors.recording import write_table

@@ -10,9 +10,9 @@ import numpy as np
 
 from calib.effects import LazyColumn, Site, View
 from calib.residuals.surfaces import MeshSurface
-from calib.simulate.room import Room
-from calib.simulate.spec import Spec
-from calib.simulate.truth import Truth
+from calib.simulation.room import Room
+from calib.simulation.spec import Spec
+from calib.simulation.truth import Truth
 from chains import se3
 from sensors.lidar import LidarModel
 from sensors.reference import Hits

@@ -31,7 +31,7 @@ class Evaluated:
     Args:
         rig, location, stop: whose it is.
         sensor: the LiDAR's model.
-        points: columns (H,), `calib.evaluate.COLUMNS`, of the directions with a hit.
+        points: columns (H,), `calib.evaluation.COLUMNS`, of the directions with a hit.
         surface: (H,) which flat surface each lies on, -1 for none.
         direction: (H, 3) of the beams, in the reference's frame, unit.
         nearest: rows (M,) of some of them; nearest_m: (M,) how far their mean return lies from the
