@@ -14,9 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
+import calib
 from calib.rig import Rig, load_rig
-from calib.runs.calibrate import calibrate
-from calib.simulation import load_spec, simulate
+from calib.simulation import load_spec
 from sensors.lidar import Beams, beams
 from sensors.recording import read_scan
 from sensors.reference import Reference
@@ -34,8 +34,8 @@ def range_errors(
 
 out = Path(sys.argv[1] if len(sys.argv) > 1 else tempfile.mkdtemp(prefix="rigcal-"))
 spec = load_spec("tiny").model_copy(update={"lidar": "hesai_pandarqt64"})
-simulate(spec, out / "recording", seed=3)
-run = calibrate([out / "recording"], out / "run", hold_out="none")
+calib.simulate(spec, out / "recording", seed=3)
+run = calib.fit([out / "recording"], out / "run", hold_out="none")
 
 truth = json.loads((out / "recording.truth.json").read_text())
 offsets = run.solution.shared.effects["ring_range_offset"]

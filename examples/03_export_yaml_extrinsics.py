@@ -16,10 +16,8 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from calib.exporters import export
+import calib
 from calib.rig import load_rig
-from calib.runs.calibrate import calibrate
-from calib.simulation import simulate
 
 
 def off(T: np.ndarray, T_true: np.ndarray) -> str:
@@ -29,9 +27,9 @@ def off(T: np.ndarray, T_true: np.ndarray) -> str:
 
 
 out = Path(sys.argv[1] if len(sys.argv) > 1 else tempfile.mkdtemp(prefix="rigcal-"))
-simulate("tiny", out / "recording", seed=1)
-run = calibrate([out / "recording"], out / "run", hold_out="none")
-file, _, urdf = export(run, out / "export", ["yaml", "urdf"]).files
+calib.simulate("tiny", out / "recording", seed=1)
+run = calib.fit([out / "recording"], out / "run", hold_out="none")
+file, _, urdf = calib.export(run, out / "export", ["yaml", "urdf"]).files
 
 extrinsics = yaml.safe_load(file.read_text())
 print(f"{file.name}, fitted to {extrinsics['provenance']['recordings'][0]['rig']}")

@@ -101,13 +101,11 @@ def add(
     as_json: Json = False,
 ) -> None:
     """The model of a run and more effects, refitted from that run to the same recordings."""
-    from calib.runs.calibrate import grow, grown_model
+    from calib.runs.add import add as grow
     from calib.runs.run import Run
 
-    earlier = Run.open(run)
-    model = grown_model(earlier, effects)
     with progress_bar() as progress:
-        _tell(grow(earlier, model, out, progress), as_json)
+        _tell(grow(Run.open(run), effects, out, progress), as_json)
 
 
 @app.command()
