@@ -181,13 +181,13 @@ class PlaneFinder:
         distance_m = np.einsum("mi,mi->m", normal, mean_m)
         side = np.where(distance_m < 0, -1.0, 1.0)
         return Planes(
-            normal * side[:, None],
-            distance_m * side,
-            pooled.count[kept].astype(np.int64),
-            cells.mean_m[part],
-            number[plane][part],
-            self.cell_m,
-            self.tolerance_m,
+            normal=normal * side[:, None],
+            distance_m=distance_m * side,
+            count=pooled.count[kept].astype(np.int64),
+            cell_mean_m=cells.mean_m[part],
+            cell_plane=number[plane][part],
+            cell_m=self.cell_m,
+            tolerance_m=self.tolerance_m,
         )
 
     def _same_place(self, cells: Cells) -> np.ndarray:

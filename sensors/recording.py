@@ -311,7 +311,15 @@ def _check_scan(path: Path, columns: Columns, rings: int | None) -> Scan:
         raise InputError(f"{path}: count is below 1; leave out directions without a return")
     intensity, spread = (extra.pop(name, unknown) for name in ("intensity", "range_std_m"))
     _check_spread(path, spread[np.isfinite(spread)])
-    return Scan(xyz[seen], ring, column, intensity, count, spread, extra)
+    return Scan(
+        xyz_m=xyz[seen],
+        ring=ring,
+        column=column,
+        intensity=intensity,
+        count=count,
+        range_std_m=spread,
+        extra=extra,
+    )
 
 
 def _check_spread(path: Path, spread_m: Array) -> None:

@@ -152,13 +152,13 @@ class Reference:
             normal[missed] = 0.0
             incidence_rad[missed] = np.pi / 2
         return Hits(
-            triangle,
-            range_m,
-            point_m,
-            normal,
-            incidence_rad,
-            self._label[triangle],
-            self._intensity[triangle],
+            triangle=triangle,
+            range_m=range_m,
+            point_m=point_m,
+            normal=normal,
+            incidence_rad=incidence_rad,
+            label=self._label[triangle],
+            intensity=self._intensity[triangle],
         )
 
     def near_edge(

@@ -97,7 +97,14 @@ def bring_in(
         sphere_radius_m=sphere_radius,
     )
     offsets = _pairs("--clock-offset", clock_offset, float)
-    choices = Choices(rig, offsets, still, min_hold, locations, most_stops)
+    choices = Choices(
+        rig=rig,
+        clock_offsets=offsets,
+        still=still,
+        min_hold_s=min_hold,
+        blocks=locations,
+        most_stops=most_stops,
+    )
     with progress_bar() as progress:
         done = import_files(sources(words), out, options, choices, progress)
     _tell(done, as_json)

@@ -54,17 +54,18 @@ def evaluate_stop(scan: ScanStop, values: Values) -> Evaluated:
     """Evaluate one stop, its rig standing where a state says."""
     ranges = scan.ranges(values)
     some = np.linspace(0, len(ranges.hit) - 1, min(NEAREST, len(ranges.hit))).astype(int)
-    recording, rig = scan.recording, scan.stops.rig
+    rig = scan.stops.rig
     return Evaluated(
-        rig.name,
-        str(recording.location[scan.index]),
-        scan.name,
-        rig.lidar.name,
-        _points(ranges),
-        _flat(scan.meeting, ranges),
-        ranges.direction,
-        some,
-        *(_nearest(scan, ranges, some, e[some]) for e in (ranges.corrected_m, ranges.raw_m)),
+        rig=rig.name,
+        location=str(scan.recording.location[scan.index]),
+        stop=scan.name,
+        sensor=rig.lidar.name,
+        points=_points(ranges),
+        surface=_flat(scan.meeting, ranges),
+        direction=ranges.direction,
+        nearest=some,
+        nearest_m=_nearest(scan, ranges, some, ranges.corrected_m[some]),
+        raw_nearest_m=_nearest(scan, ranges, some, ranges.raw_m[some]),
     )
 
 

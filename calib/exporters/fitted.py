@@ -180,7 +180,7 @@ class Fitted:
         part = self.run.solution.part(rig.name if several else None)
         known = model_of(self.run).effects
         effects = {effect.name: effect for effect in known if effect.name in part.effects}
-        return FittedRig(self.run, rig, part, effects, several)
+        return FittedRig(run=self.run, rig=rig, part=part, effects=effects, several=several)
 
 
 Format = Callable[[Fitted, Path], Written]

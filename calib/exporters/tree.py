@@ -99,7 +99,15 @@ def _rows(fit: FittedRig) -> Iterator[_Row]:
             joint = edge.joint
             loose = joint is not None
             place = f"joint {joint.name}, {joint.kind}" if joint else _place(fit.origins[edge.name])
-        yield _Row(frame, depth, above, place, _sigma(estimate), loose, told.get(frame, True))
+        yield _Row(
+            frame=frame,
+            depth=depth,
+            above=above,
+            place=place,
+            sigma=_sigma(estimate),
+            loose=loose,
+            told=told.get(frame, True),
+        )
         waiting += [(child, depth + 1, count) for child in reversed(under.get(frame, []))]
         count += 1
 

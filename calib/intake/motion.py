@@ -67,7 +67,13 @@ def motions(track: Track, edges: Sequence[Edge], window_s: float) -> list[Motion
 
     def motion(kind: str, moves: Array) -> Motion:
         middle_s = (time_s[1:] + time_s[:-1]) / 2
-        return Motion(track.name, track.clock, kind, middle_s, smooth(time_s, moves, window_s))
+        return Motion(
+            name=track.name,
+            clock=track.clock,
+            kind=kind,
+            time_s=middle_s,
+            rate=smooth(time_s, moves, window_s),
+        )
 
     step_s = np.diff(time_s)[:, None]
     if track.kind == "gyro":

@@ -187,11 +187,11 @@ class Evidence:
         for k, scan in enumerate(scans):
             self.progress(what, k, len(scans))
             yield Table(
-                self._columns(run, scan),
-                self._stop(scan, k),
-                rooms[self._source(scan)],
-                scan.lidar.sigma_angle_rad,
-                scan.reference_sigma_m,
+                columns=self._columns(run, scan),
+                stop=self._stop(scan, k),
+                room=rooms[self._source(scan)],
+                sigma_angle_rad=scan.lidar.sigma_angle_rad,
+                sigma_reference_m=scan.reference_sigma_m,
             )
 
     def _columns(self, run: Run | None, scan: ScanStop) -> dict[str, np.ndarray]:

@@ -143,7 +143,9 @@ class _Sums:
             mean, at = total / weight, x / count
             std = np.sqrt(np.maximum(squares / weight - mean**2, 0.0))
             band = self._band(mean, weight)
-        return Curve(self.axis, count.astype(int), at, mean, std, band)
+        return Curve(
+            axis=self.axis, count=count.astype(int), at=at, mean_m=mean, std_m=std, band_m=band
+        )
 
     def _band(self, mean: np.ndarray, weight: np.ndarray) -> np.ndarray:
         from scipy.stats import t
@@ -221,11 +223,12 @@ def gather(
         shown = (cells[1] / cells[0]).reshape(rings, azimuths)
     parts = dict(zip(("range noise", "angle noise", "reference"), variance, strict=True))
     return Statistics(
-        {s.axis.name: s.curve() for s in sums if s.rows[0].any()},
-        shown,
-        z,
-        *map(int, counts),
-        {name: value / max(counts[1], 1) for name, value in parts.items()},
+        curves={s.axis.name: s.curve() for s in sums if s.rows[0].any()},
+        map_m=shown,
+        z=z,
+        rows=int(counts[0]),
+        kept=int(counts[1]),
+        variance_m2={name: value / max(counts[1], 1) for name, value in parts.items()},
     )
 
 

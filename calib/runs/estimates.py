@@ -128,25 +128,25 @@ def _frame(
     if T_cad is not None:
         moved = se3.log(se3.inverse(T_cad) @ frame.T_parent_child)
     return Found(
-        variable,
-        frame.parent,
-        DOF,
-        DOF_UNITS,
-        moved,
-        np.array([sigma.get(f"{variable}.{dof}", 0.0) for dof in DOF]),
-        _told(variable, DOF, untold),
+        variable=variable,
+        parent=frame.parent,
+        parameters=DOF,
+        units=DOF_UNITS,
+        estimate=moved,
+        sigma=np.array([sigma.get(f"{variable}.{dof}", 0.0) for dof in DOF]),
+        told=_told(variable, DOF, untold),
     )
 
 
 def _effect(variable: str, effect: EffectEstimate, untold: Iterable[Mapping[str, str]]) -> Found:
     return Found(
-        variable,
-        None,
-        effect.names,
-        effect.units,
-        effect.estimate,
-        effect.sigma,
-        _told(variable, effect.names, untold),
+        variable=variable,
+        parent=None,
+        parameters=effect.names,
+        units=effect.units,
+        estimate=effect.estimate,
+        sigma=effect.sigma,
+        told=_told(variable, effect.names, untold),
     )
 
 

@@ -127,7 +127,13 @@ def read_solution(folder: Path) -> Solution:
     with np.load(folder / COVARIANCE) as stored:
         names, covariance = tuple(stored["names"].tolist()), stored["covariance"]
     recordings = {n: _read_part(p) for n, p in data.get("recordings", {}).items()}
-    return Solution(_read_part(data), recordings, data["not_estimated"], names, covariance)
+    return Solution(
+        shared=_read_part(data),
+        recordings=recordings,
+        not_estimated=data["not_estimated"],
+        names=names,
+        covariance=covariance,
+    )
 
 
 def write_state(folder: Path, state: Mapping[str, np.ndarray]) -> None:

@@ -203,7 +203,15 @@ def _furniture(rng: np.random.Generator) -> list[Panel]:
         _box((-3.985, -1.4, 1.6), (0.02, 0.8, 1.1), "paper"),
         _box((-2.7, -2.985, 1.5), (0.7, 0.02, 0.5), "sticker"),
         _box((3.985, 1.9, 1.5), (0.02, 0.5, 0.7), "sticker"),
-        [Panel(np.array([0.2, -2.85, 0.05]), 2.4 * X, 2.6 * Z, "curtain", 0.03)],
+        [
+            Panel(
+                corner_m=np.array([0.2, -2.85, 0.05]),
+                along_m=2.4 * X,
+                up_m=2.6 * Z,
+                material="curtain",
+                wave_m=0.03,
+            )
+        ],
     ]
     leaning = ["foam", "whiteboard", "plastic_white", "cardboard", "plastic_red", "wood_panel"]
     places = [(-3.0, 2.0), (-3.1, -0.9), (-1.4, -2.4), (2.9, -0.7), (1.6, 2.3), (3.0, 1.7)]

@@ -107,7 +107,7 @@ def coloured(points: Points, name: str, label_names: Mapping[int, str]) -> tuple
         stops = RISING
     place = (values - low) / max(high - low, 1e-12)
     return _between(place, stops), Scale(
-        shown.title, shown.unit, float(low), float(high), stops, {}
+        title=shown.title, unit=shown.unit, low=float(low), high=float(high), stops=stops, names={}
     )
 
 
@@ -124,7 +124,9 @@ def _by_name(labels: np.ndarray, names: Mapping[int, str]) -> tuple[np.ndarray, 
     colours = [UNKNOWN if n < 0 else NAMED[i % len(NAMED)] for i, n in enumerate(found)]
     titles = [names.get(int(n), f"label {n}") for n in found]
     legend = dict(zip(titles, colours, strict=True))
-    return _rgb(colours)[index], Scale("label", "", None, None, (), legend)
+    return _rgb(colours)[index], Scale(
+        title="label", unit="", low=None, high=None, stops=(), names=legend
+    )
 
 
 def _between(place: np.ndarray, stops: tuple[str, ...]) -> np.ndarray:

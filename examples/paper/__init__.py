@@ -122,7 +122,9 @@ def _recorded(sensor: str, scale: Scale, folder: Path, tell: Progress) -> Case:
     simulate(scale.one_joint(), folder / "circles", seed)
     simulate(scale.moving(), folder / "moving", seed)
     circles, moving = (Source.open(folder / name) for name in ("circles", "moving"))
-    return Case(sensor, folder / "recording", circles, moving, folder)
+    return Case(
+        sensor=sensor, folder=folder / "recording", circles=circles, moving=moving, work=folder
+    )
 
 
 def _judged(case: Case, explained: bool, tell: Progress) -> _One:

@@ -45,7 +45,16 @@ def run(tmp_path):
     }
     summary = {"residual": "range", "rms_mm": {"fit": 3.25, "held_out": None}}
     return Run(
-        tmp_path / "run", model, summary, Solution(shared, own, untold, (), np.zeros((0, 0)))
+        tmp_path / "run",
+        model,
+        summary,
+        Solution(
+            shared=shared,
+            recordings=own,
+            not_estimated=untold,
+            names=(),
+            covariance=np.zeros((0, 0)),
+        ),
     )
 
 

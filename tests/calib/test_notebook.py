@@ -27,11 +27,11 @@ def run():
                                np.linspace(-0.001, 0.001, 20), np.full(20, 1e-5)),
     }  # fmt: skip
     solution = Solution(
-        Part({"lidar": frame}, effects),
-        {},
-        [{"name": "lidar.tz", "why": "no <floor> in sight"}],
-        NAMES,
-        np.diag(np.full(6, 9e-8)),
+        shared=Part({"lidar": frame}, effects),
+        recordings={},
+        not_estimated=[{"name": "lidar.tz", "why": "no <floor> in sight"}],
+        names=NAMES,
+        covariance=np.diag(np.full(6, 9e-8)),
     )
     rms = {"fit": 0.86, "held_out": 1.42, "noise_floor": 1.74}
     summary = {
@@ -80,7 +80,14 @@ def candidate(name):
 def test_a_diagnosis_shows_its_verdict_sentences_and_candidates():
     sentences = ["incidence_angle_bias is missing: 2.97 mm < rms & so on."]
     found = Diagnosis(
-        "missing_effect", sentences, [candidate("incidence_angle_bias")], [], [], {}, {}, []
+        verdict="missing_effect",
+        sentences=sentences,
+        candidates=[candidate("incidence_angle_bias")],
+        unexplained=[],
+        weak_directions=[],
+        untestable={},
+        misfit={},
+        curves=[],
     )
     html = diagnosis_html(found)
     said = "".join(parsed(html).itertext())

@@ -23,7 +23,13 @@ def table(rng: np.random.Generator, stop: float, rows: int = 400, surfaces: int 
         "sigma_m": rng.uniform(0.001, 0.003, rows),
         "weight": weight,
     }
-    return Table(columns, {"stop": stop, "temperature_c": 20.0 + stop}, 0, 0.0005, 0.0004)
+    return Table(
+        columns=columns,
+        stop={"stop": stop, "temperature_c": 20.0 + stop},
+        room=0,
+        sigma_angle_rad=0.0005,
+        sigma_reference_m=0.0004,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +97,9 @@ def test_a_sigma_is_taken_apart_into_what_it_was_made_of():
     reference = 0.0004 / np.cos(columns["incidence_rad"])
     columns["sigma_m"] = np.sqrt(0.0015**2 + angle**2 + reference**2)
     kept = columns["weight"] > 0
-    found = gathered([Table(columns, {}, 0, 0.0005, 0.0004)]).variance_m2
+    found = gathered(
+        [Table(columns=columns, stop={}, room=0, sigma_angle_rad=0.0005, sigma_reference_m=0.0004)]
+    ).variance_m2
     expected = {
         "range noise": 0.0015**2,
         "angle noise": np.mean(angle[kept] ** 2),

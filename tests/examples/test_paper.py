@@ -91,7 +91,7 @@ def exact(tmp_path_factory):
     moving = changed(PRESETS["moving"], **EXACT, locations=2, stops_per_location=3)
     late = {str(tables.__file__).replace("tables.py", "late.py"): DELAY_S}
     late, _ = made(folder / "moving", changed(moving, acting=late))
-    return Case("XT", folder / "recording", circles, late, folder)
+    return Case(sensor="XT", folder=folder / "recording", circles=circles, moving=late, work=folder)
 
 
 @pytest.mark.parametrize("by_tracker", [True, False])

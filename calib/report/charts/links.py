@@ -87,7 +87,15 @@ def _children(
             if not held:
                 names = (f"{mine.variable}.{dof}" for dof in mine.parameters)
                 sigma = np.array([prior.get(n, 0.0) for n in names])
-            out.append(Link(edge.child, depth, "held as in CAD", None if held else mine, sigma))
+            out.append(
+                Link(
+                    name=edge.child,
+                    depth=depth,
+                    what="held as in CAD",
+                    found=None if held else mine,
+                    cad_sigma=sigma,
+                )
+            )
             _children(rig, edge.child, depth + 1, found, prior, out)
 
 

@@ -191,7 +191,11 @@ def _tracks(name: str, topic: str, log: _Log) -> Found:
             said.append(f"{of_what}: stands still at {x:.4f} {y:.4f} {z:.4f} m; not a track")
             continue
         time_s, misfit = _times(of_what, stamps_s, arrivals_s)
-        tracks.append(Track(body or topic, kind, name, time_s, names, values))
+        tracks.append(
+            Track(
+                name=body or topic, kind=kind, clock=name, time_s=time_s, names=names, values=values
+            )
+        )
         columns = f" ({', '.join(names)})" if kind in ("joints", "covariate") else ""
         said.append(f"{of_what}: {kind}{columns}, {len(time_s)} rows{rate(time_s)}")
         odd += misfit

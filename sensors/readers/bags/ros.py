@@ -107,7 +107,13 @@ def messages(
         stream = reader.messages(connections=connections, start=start_ns, stop=stop_ns)
         try:
             for connection, arrival_ns, raw in stream:
-                yield Message(connection.topic, connection.msgtype, arrival_ns, raw, reader)
+                yield Message(
+                    topic=connection.topic,
+                    kind=connection.msgtype,
+                    arrival_ns=arrival_ns,
+                    raw=raw,
+                    reader=reader,
+                )
         except InputError:
             raise
         except Exception as error:

@@ -100,7 +100,9 @@ def look(name: str, cloud: Cloud, options: Options) -> Look:
     odd: list[str] = []
     how, first_ring, groups, rows = _rings(name, cloud, fields, xyz_m, seen, options, odd)
     columns = _columns(cloud, fields, rows, xyz_m, options)
-    layout = Layout(fields, scale, first_ring, groups, rows, columns)
+    layout = Layout(
+        fields=fields, scale=scale, first_ring=first_ring, groups=groups, rows=rows, columns=columns
+    )
     ring = layout.points(cloud)["ring"].astype(np.int64)
     origin = fit_beam_origin(xyz_m, ring)
     lidar, said = _lidar(name, xyz_m, ring, layout, origin, options, odd)
@@ -113,7 +115,9 @@ def look(name: str, cloud: Cloud, options: Options) -> Look:
         *said,
     )
     middle_s = _time(name, cloud, fields, seen, xyz_m, ring, odd)
-    return Look(layout, lidar, understood, tuple(odd), middle_s)
+    return Look(
+        layout=layout, lidar=lidar, understood=understood, odd=tuple(odd), middle_s=middle_s
+    )
 
 
 # ---------------------------------------------------------------------------------- rings, columns

@@ -8,9 +8,15 @@ from pathlib import Path
 import numpy as np
 
 from chains.errors import InputError
-from sensors.labels import Labels, Palette, labels_of_colours, labels_of_numbers, read_palette
-from sensors.mesh_files import Mesh, read_mesh_file
 from sensors.readers.base import Array, Found, Options, Progress, Surface
+from sensors.readers.meshes.labels import (
+    Labels,
+    Palette,
+    labels_of_colours,
+    labels_of_numbers,
+    read_palette,
+)
+from sensors.readers.meshes.mesh_files import Mesh, read_mesh_file
 from sensors.readers.meshes.placing import find_placing
 from sensors.surfaces import triangle_planes
 
@@ -61,11 +67,11 @@ def _read_one(
     vertices_m = placing.points(mesh.vertices)
     intensity = _intensity(mesh)
     surface = Surface(
-        vertices_m,
-        mesh.triangles,
-        None if labels is None else labels.label,
-        intensity,
-        {} if labels is None else labels.names,
+        vertices_m=vertices_m,
+        triangles=mesh.triangles,
+        label=None if labels is None else labels.label,
+        intensity=intensity,
+        names={} if labels is None else labels.names,
     )
     return surface, _describe(path, surface, placing.understood, source), odd
 
@@ -123,11 +129,11 @@ def _together(parts: Sequence[Surface]) -> Surface:
     none = [np.full(len(part.triangles), np.nan) for part in parts]
     bright = [n if p.intensity is None else p.intensity for p, n in zip(parts, none, strict=True)]
     return Surface(
-        np.concatenate([part.vertices_m for part in parts]),
-        np.concatenate([p.triangles + n for p, n in zip(parts, first, strict=False)]),
-        np.concatenate(labels),
-        None if all(part.intensity is None for part in parts) else np.concatenate(bright),
-        dict(enumerate(names)),
+        vertices_m=np.concatenate([part.vertices_m for part in parts]),
+        triangles=np.concatenate([p.triangles + n for p, n in zip(parts, first, strict=False)]),
+        label=np.concatenate(labels),
+        intensity=None if all(part.intensity is None for part in parts) else np.concatenate(bright),
+        names=dict(enumerate(names)),
     )
 
 

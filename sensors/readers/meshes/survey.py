@@ -12,7 +12,7 @@ from sensors.meshes import read_cloud
 from sensors.readers.base import Array, Found, Options, Progress, Surface
 from sensors.readers.meshes.placing import WIDEST_M, Placing, find_placing
 from sensors.readers.meshes.pts import Block, read_pts, read_ptx
-from sensors.reconstruction import Rebuilt, Thinner, rebuild
+from sensors.readers.meshes.reconstruction import Rebuilt, Thinner, rebuild
 
 SUFFIXES = (".e57", ".pts", ".ptx", ".xyz", ".ply", ".pcd")
 _COARSE_M = 0.03

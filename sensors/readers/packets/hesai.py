@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from chains.errors import InputError
 from sensors.lidar import load_lidar
 from sensors.readers.base import Array, Columns, Found, Options, Progress
+from sensors.readers.packets.hesai_models import MODELS, Model, find_model
 from sensors.readers.packets.pcap import Capture
 from sensors.readers.packets.turns import (
     Bytes,
@@ -33,67 +34,6 @@ from sensors.readers.packets.turns import (
     steps_of_phase,
 )
 
-
-@dataclass(frozen=True)
-class Model:
-    """Where a model's packet has what; bytes."""
-
-    name: str
-    catalog: str
-    size: int
-    header: int
-    """Before the first block."""
-    block_header: int
-    """Of a block, before its azimuth."""
-    blocks: int
-    channels: int
-    unit: int
-    """Of a channel: range (2), intensity (1), and what is left."""
-    range_step_at: int | None
-    """Of the range's step in mm; None = 4 mm."""
-    shortest_m: float
-    """Nearer returns come from the window."""
-
-    @property
-    def block(self) -> np.dtype:
-        """One block."""
-        pixel = np.dtype(
-            {
-                "names": ["range", "intensity"],
-                "formats": ["<u2", "u1"],
-                "offsets": [0, 2],
-                "itemsize": self.unit,
-            }
-        )
-        head = self.block_header
-        return np.dtype(
-            {
-                "names": ["azimuth", "pixel"],
-                "formats": ["<u2", (pixel, self.channels)],
-                "offsets": [head, head + 2],
-                "itemsize": head + 2 + self.channels * self.unit,
-            }
-        )
-
-
-MODELS = (
-    Model("Pandar40P", "hesai_pandar40p", 1262, 0, 2, 10, 40, 3, None, 0.3),
-    Model("Pandar64", "hesai_pandar64", 1194, 8, 0, 6, 64, 3, 5, 0.3),
-    Model("Pandar64", "hesai_pandar64", 1198, 8, 0, 6, 64, 3, 5, 0.3),
-    Model("PandarQT64", "hesai_pandarqt64", 1072, 12, 0, 4, 64, 4, 9, 0.1),
-    Model("PandarQT128", "hesai_qt128", 1127, 12, 0, 2, 128, 4, 9, 0.05),
-    Model("PandarXT-16", "hesai_xt16", 568, 12, 0, 8, 16, 4, 9, 0.05),
-    Model("PandarXT-32", "hesai_pandarxt32", 1080, 12, 0, 8, 32, 4, 9, 0.05),
-    Model("PandarXT-32M2X", "hesai_xt32m2x", 820, 12, 0, 6, 32, 4, 9, 0.5),
-)
-_START = {"Pandar40P": b"\xff\xee", "Pandar64": b"\xee\xff\x40\x06"}
-_VERSION = {
-    "PandarQT64": (3, 1),
-    "PandarQT128": (3, 2),
-    "PandarXT-16": (6, 1),
-    "PandarXT-32": (6, 1),
-    "PandarXT-32M2X": (6, 1),
-}
 _FAR_OFF_DEG = 1.0  # of a unit's elevations from its model's, where 0.1 is usual
 # Metres along the beam's azimuth and to its left: HesaiLidar_SDK_2.0, udp3_1_ and udp6_1_parser.
 _OPTICAL_CENTRE_M = {
@@ -171,17 +111,6 @@ def returns_per_direction(azimuth: NDArray) -> int:
             if np.all(groups == groups[:, :, :1]):
                 return n
     return 1
-
-
-def find_model(payload: bytes) -> Model | None:
-    """The model that sent a packet, None where it is no point packet of a model known here."""
-    for model in MODELS:
-        start = _START.get(model.name)
-        if start is None:
-            start = b"\xee\xff" + bytes(_VERSION[model.name])
-        if len(payload) == model.size and payload.startswith(start):
-            return model
-    return None
 
 
 def hesai_found(

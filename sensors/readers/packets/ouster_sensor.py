@@ -45,14 +45,55 @@ class Profile:
 
 
 PROFILES = {
-    "LEGACY": Profile(0, 16, 12, 4, 0, "<u4", 0xFFFFF, 0.001, (4, "<u2"), (8, "<u2")),
+    "LEGACY": Profile(
+        header=0,
+        column_header=16,
+        pixel=12,
+        column_footer=4,
+        footer=0,
+        range_type="<u4",
+        range_mask=0xFFFFF,
+        range_step_m=0.001,
+        reflectivity=(4, "<u2"),
+        near_infrared=(8, "<u2"),
+    ),
     "RNG19_RFL8_SIG16_NIR16": Profile(
-        32, 12, 12, 0, 32, "<u4", 0x7FFFF, 0.001, (4, "u1"), (8, "<u2")
+        header=32,
+        column_header=12,
+        pixel=12,
+        column_footer=0,
+        footer=32,
+        range_type="<u4",
+        range_mask=0x7FFFF,
+        range_step_m=0.001,
+        reflectivity=(4, "u1"),
+        near_infrared=(8, "<u2"),
     ),
     "RNG19_RFL8_SIG16_NIR16_DUAL": Profile(
-        32, 12, 16, 0, 32, "<u4", 0x7FFFF, 0.001, (3, "u1"), (12, "<u2"), dual=True
+        header=32,
+        column_header=12,
+        pixel=16,
+        column_footer=0,
+        footer=32,
+        range_type="<u4",
+        range_mask=0x7FFFF,
+        range_step_m=0.001,
+        reflectivity=(3, "u1"),
+        near_infrared=(12, "<u2"),
+        dual=True,
     ),
-    "RNG15_RFL8_NIR8": Profile(32, 12, 4, 0, 32, "<u2", 0x7FFF, 0.008, (2, "u1"), (3, "u1")),
+    "RNG15_RFL8_NIR8": Profile(
+        header=32,
+        column_header=12,
+        pixel=4,
+        column_footer=0,
+        footer=32,
+        range_type="<u2",
+        range_mask=0x7FFF,
+        range_step_m=0.008,
+        reflectivity=(2, "u1"),
+        near_infrared=(3, "u1"),
+    ),
 }
 # What the maker's tools take where the metadata is silent, by product line; the first generation
 # of OS1 never stated it.

@@ -146,7 +146,14 @@ def _track(
         values, kind = conventions.poses(where, xyz, quat), "pose"
     if conventions.axis_up(options.up, "y"):
         values = conventions.z_up(values)
-    return Track(part.name, kind, path.stem, column[1], POSE[: values.shape[1]], values)
+    return Track(
+        name=part.name,
+        kind=kind,
+        clock=path.stem,
+        time_s=column[1],
+        names=POSE[: values.shape[1]],
+        values=values,
+    )
 
 
 def _up(options: Options) -> str:
@@ -190,7 +197,14 @@ def _tracking_tools(sheet: Sheet, options: Options) -> Found:
         pose[mine[:, 0].astype(int)] = mine[:, 2:]
         pose = conventions.poses(f"{path}: {name}", pose[:, :3] * unit, pose[:, 3:], "x")
         pose = conventions.z_up(pose) if conventions.axis_up(options.up, "y") else pose
-        track = Track(name, "pose", path.stem, np.array(time_s), POSE, pose)
+        track = Track(
+            name=name,
+            kind="pose",
+            clock=path.stem,
+            time_s=np.array(time_s),
+            names=POSE,
+            values=pose,
+        )
         tracks.append(track)
         said.append(f"{path.name}: pose {name}, seen in {_seen(track):.0%} of the frames")
     first = f"{path.name}: Tracking Tools' format 1.1, {len(time_s):,} frames, {_up(options)}"

@@ -74,11 +74,20 @@ def _read(path: Path, options: Options, first: str) -> Found:
     values = table[order, 1:]
     rate = _rate(time_s[order])
     if gyro:
-        track = Track(path.stem, "gyro", path.stem, time_s[order], ("x", "y", "z"), values)
+        track = Track(
+            name=path.stem,
+            kind="gyro",
+            clock=path.stem,
+            time_s=time_s[order],
+            names=("x", "y", "z"),
+            values=values,
+        )
         line = f"{path.name}: a gyro, {rate}, {said}, rad/s"
         return Found(tracks=(track,), understood=(line,), odd=odd)
     pose, words = _pose(path, values, first, options)
-    track = Track(path.stem, "pose", path.stem, time_s[order], POSE, pose)
+    track = Track(
+        name=path.stem, kind="pose", clock=path.stem, time_s=time_s[order], names=POSE, values=pose
+    )
     line = f"{path.name}: body {path.stem}, {rate}, {said}, {words}"
     return Found(tracks=(track,), understood=(line,), odd=odd)
 

@@ -62,7 +62,12 @@ def _blocks(sheet: Sheet) -> Iterator[_Block]:
         if cells[0].lower() in _TITLES and not any(cells[1:]):
             if block is not None:
                 yield block
-            block, head = _Block(cells[0].lower(), np.nan, [], [], [], []), []
+            block, head = (
+                _Block(
+                    title=cells[0].lower(), rate_hz=np.nan, names=[], axes=[], units=[], rows=[]
+                ),
+                [],
+            )
         elif block is not None and len(head) < 4:
             head.append(cells)
             if len(head) == 4:
@@ -132,7 +137,7 @@ def _body(
     xyz = table[:, at : at + 3] * _length(where, block.units[at], options)
     pose = conventions.poses(where, xyz, quat)
     pose = conventions.z_up(pose) if options.up == "y" else pose
-    return Track(name, "pose", path.stem, time_s, POSE, pose)
+    return Track(name=name, kind="pose", clock=path.stem, time_s=time_s, names=POSE, values=pose)
 
 
 def _rotation(where: str, values: Array, unit: str, options: Options) -> Array:
@@ -157,7 +162,9 @@ def _marker(
     where = f"{path}: {name}"
     xyz = table[:, k : k + 3] * _length(where, block.units[k], options)
     xyz = conventions.z_up(xyz) if options.up == "y" else xyz
-    return Track(name, "point", path.stem, time_s, POSE[:3], xyz)
+    return Track(
+        name=name, kind="point", clock=path.stem, time_s=time_s, names=POSE[:3], values=xyz
+    )
 
 
 def _length(where: str, unit: str, options: Options) -> float:

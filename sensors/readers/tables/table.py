@@ -361,7 +361,14 @@ def _tracks(
     if (order[1:] < order[:-1]).any():
         odd = (*odd, f"{path.name}: times fall in places; rows are taken in the order of time")
     bodies = dict.fromkeys(n.rpartition(".")[0] for n in table if n.endswith(".x"))
-    track = Track("", "covariate", path.stem, time_s[order], (), np.zeros((0, 0)))
+    track = Track(
+        name="",
+        kind="covariate",
+        clock=path.stem,
+        time_s=time_s[order],
+        names=(),
+        values=np.zeros((0, 0)),
+    )
 
     def cut(name: str, kind: str, columns: Sequence[str], names: Sequence[str]) -> Track:
         values = np.stack([table.pop(column) for column in columns], axis=1)[order]

@@ -10,11 +10,11 @@ from sensors.reference import Reference
 def test_a_surface_written_is_the_reference_read(tmp_path):
     corners = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.1]]) + 4e5
     surface = Surface(
-        corners,
-        np.array([[0, 1, 2], [0, 2, 3]]),
-        np.array([2, 7], np.uint16),
-        np.array([0.25, 0.5]),
-        {2: "wall"},
+        vertices_m=corners,
+        triangles=np.array([[0, 1, 2], [0, 2, 3]]),
+        label=np.array([2, 7], np.uint16),
+        intensity=np.array([0.25, 0.5]),
+        names={2: "wall"},
     )
     write_surface(surface, tmp_path)
     files = [tmp_path / "reference" / f for f in ("mesh.ply", "faces.parquet", "labels.yaml")]

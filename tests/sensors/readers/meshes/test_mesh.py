@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from chains.errors import InputError
-from sensors.labels import Palette, labels_of_colours, most_frequent
 from sensors.ply import write_ply
 from sensors.readers.base import Options
+from sensors.readers.meshes.labels import Palette, labels_of_colours, most_frequent
 from sensors.readers.meshes.mesh import read_meshes
 
 RED, BLUE, GREY = (200, 30, 30), (30, 30, 200), (120, 120, 120)

@@ -9,8 +9,8 @@ from chains.errors import InputError
 from sensors.meshes import distance_to_mesh, write_cloud
 from sensors.readers.base import Options
 from sensors.readers.meshes.pts import read_pts, read_ptx
+from sensors.readers.meshes.reconstruction import Thinner
 from sensors.readers.meshes.survey import read_survey
-from sensors.reconstruction import Thinner
 from sensors.reference import Reference
 
 SCANNERS = np.array([[0.0, 0.0, 0.0], [0.5, 0.4, 0.1]])

@@ -9,7 +9,8 @@ import pytest
 from chains.errors import InputError
 from sensors.lidar import load_lidar
 from sensors.readers.base import Options
-from sensors.readers.packets.hesai import MODELS, hesai_found, read_angles, read_hesai
+from sensors.readers.packets.hesai import hesai_found, read_angles, read_hesai
+from sensors.readers.packets.hesai_models import MODELS
 
 from .captures import write_pcap
 

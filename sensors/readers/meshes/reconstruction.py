@@ -165,7 +165,15 @@ def rebuild(
     distance_m = distance_to_mesh(vertices, kept, local_m)
     middle = vertices[kept].mean(axis=1)
     bright = None if intensity is None else intensity[tree.query(middle, 4)[1]].mean(axis=1)
-    return Rebuilt(vertices + centre_m, kept, bright, spacing_m, cell_m, float(trimmed), distance_m)
+    return Rebuilt(
+        vertices_m=vertices + centre_m,
+        triangles=kept,
+        intensity=bright,
+        spacing_m=spacing_m,
+        cell_m=cell_m,
+        trimmed=float(trimmed),
+        distance_m=distance_m,
+    )
 
 
 def _settle(

@@ -89,7 +89,7 @@ def _read_ply(path: Path) -> Mesh:
         colours = colours[:, None]
     elif (of_vertices := _rgb(vertex)) is not None:
         colours = of_vertices[triangles]
-    return Mesh(vertices, triangles, vertex, face, colours)
+    return Mesh(vertices=vertices, triangles=triangles, vertex=vertex, face=face, colours=colours)
 
 
 def _fans(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
