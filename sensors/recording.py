@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from chains.errors import InputError
 from sensors.documents import write_atomically
 from sensors.holds import Columns, average_hold
-from sensors.stops import POSE, Array, Table, Targets, read_targets
+from sensors.stops import POSE, Array, CsvTable, Targets, read_targets
 
 if TYPE_CHECKING:
     import pandas
@@ -127,7 +127,7 @@ class Recording:
         path = folder / "stops.csv"
         if not path.exists():
             raise InputError(f"{path} does not exist; a recording has a row for every stop there")
-        table = Table(path, key="stop", text=("location",))
+        table = CsvTable(path, key="stop", text=("location",))
         stops = table.names()
         return cls(
             folder=folder,

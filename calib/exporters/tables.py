@@ -9,7 +9,7 @@ from pathlib import Path
 
 from calib.exporters.fitted import Fitted
 from calib.exporters.written import Written, head, write_text
-from calib.runs.estimates import Found, found
+from calib.runs.estimates import VariableEstimate, found
 from calib.show.tables import LISTED, effect_cells, estimate_cell, shown
 
 CONVENTIONS = (
@@ -30,7 +30,7 @@ _LATEX = {
 
 
 @dataclass(frozen=True)
-class _Table:
+class _TextTable:
     title: str
     header: tuple[str, ...]
     rows: list[tuple[str, ...]]
@@ -47,7 +47,7 @@ def write_markdown(fitted: Fitted, folder: Path) -> Written:
 
 
 def _write(
-    fitted: Fitted, path: Path, line: str, render: Callable[[_Table], Iterable[str]]
+    fitted: Fitted, path: Path, line: str, render: Callable[[_TextTable], Iterable[str]]
 ) -> Written:
     rows = found(fitted.run)
     long = [row.variable for row in rows if row.parent is None and len(row.parameters) > LISTED]
@@ -63,7 +63,7 @@ def _write(
     return Written([path], not_held)
 
 
-def _tables(rows: list[Found]) -> list[_Table]:
+def _tables(rows: list[VariableEstimate]) -> list[_TextTable]:
     links = [cells for row in rows if row.parent is not None for cells in _link(row)]
     effects = [
         (row.variable, parameter, cell, unit, "" if told else "yes")
@@ -72,13 +72,15 @@ def _tables(rows: list[Found]) -> list[_Table]:
         for parameter, cell, unit, told in effect_cells(row)
     ]
     tables = [
-        _Table("Links", ("link", "x", "y", "z", "unit", "not told alone"), links),
-        _Table("Effects", ("effect", "parameter", "estimate", "unit", "not told alone"), effects),
+        _TextTable("Links", ("link", "x", "y", "z", "unit", "not told alone"), links),
+        _TextTable(
+            "Effects", ("effect", "parameter", "estimate", "unit", "not told alone"), effects
+        ),
     ]
     return [table for table in tables if table.rows]
 
 
-def _link(row: Found) -> Iterable[tuple[str, ...]]:
+def _link(row: VariableEstimate) -> Iterable[tuple[str, ...]]:
     for part, unit in ((slice(3, 6), "m"), (slice(0, 3), "rad")):
         cells = map(estimate_cell, row.estimate[part], row.sigma[part], (unit,) * 3)
         untold = " ".join(
@@ -87,7 +89,7 @@ def _link(row: Found) -> Iterable[tuple[str, ...]]:
         yield (f"{row.parent} → {row.variable}", *cells, shown(unit)[1], untold)
 
 
-def _latex(table: _Table) -> Iterable[str]:
+def _latex(table: _TextTable) -> Iterable[str]:
     yield f"\\begin{{tabular}}{{{'l' * len(table.header)}}} % {table.title}"
     yield "\\hline"
     yield _latex_row(table.header)
@@ -102,7 +104,7 @@ def _latex_row(cells: Iterable[str]) -> str:
     return " & ".join(re.sub(r"^-(?=\d)", "$-$", cell) for cell in escaped) + r" \\"
 
 
-def _markdown(table: _Table) -> Iterable[str]:
+def _markdown(table: _TextTable) -> Iterable[str]:
     yield f"## {table.title}\n"
     yield _markdown_row(table.header)
     yield _markdown_row("---" for _ in table.header)

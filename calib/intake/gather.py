@@ -20,11 +20,11 @@ from sensors.readers.arms.urdf import with_ends
 from sensors.readers.base import (
     Arm,
     Columns,
-    Found,
+    Contents,
     Options,
     Progress,
+    ScannedSurface,
     Spheres,
-    Surface,
     Sweeps,
     Track,
 )  # fmt: skip
@@ -40,7 +40,7 @@ Given = tuple[str, Sequence[Path]]
 
 @dataclass(frozen=True)
 class Gathered:
-    """What all sources hold; the fields are those of `Found`, `edges` the arm's chain."""
+    """What all sources hold; the fields are those of `Contents`, `edges` the arm's chain."""
 
     tracks: list[Track]
     sweeps: list[Sweeps]
@@ -48,7 +48,7 @@ class Gathered:
     lidar: Mapping[str, Any] | None
     arm: Arm | None
     edges: list[Edge]
-    surface: Surface | None
+    surface: ScannedSurface | None
     spheres: Spheres | None
     understood: list[str]
     odd: list[str]
@@ -108,7 +108,7 @@ def gather(
         )
     if rig:
         options = _told_by_rig(rig, options)
-    arms = [Found(arm=_arm_beside(rig))] if rig else []
+    arms = [Contents(arm=_arm_beside(rig))] if rig else []
     arms += [_read(kind, files, options, progress) for kind, files in given if kind in ARMS]
     arm = _only([f.arm for f in arms if f.arm], "describe an arm", [k for k, _ in given])
     edges = chain(arm)
@@ -135,7 +135,7 @@ def gather(
     )
 
 
-def _read(kind: str, files: Sequence[Path], options: Options, progress: Progress) -> Found:
+def _read(kind: str, files: Sequence[Path], options: Options, progress: Progress) -> Contents:
     return READERS[kind].read(files, options, progress)
 
 

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from sensors.ply import write_ply
-from sensors.readers.base import Surface
+from sensors.readers.base import ScannedSurface
 from sensors.recording import write_table
 
 
-def write_surface(surface: Surface, folder: str | Path) -> None:
+def write_surface(surface: ScannedSurface, folder: str | Path) -> None:
     """Write `reference/` into a recording's folder: mesh.ply, faces.parquet, labels.yaml.
 
     Label and intensity are columns of faces.parquet where the surface has them; labels without a

@@ -36,7 +36,7 @@ class Contents:
 
 
 @dataclass(frozen=True)
-class Written:
+class WrittenReport:
     """A report as written."""
 
     file: Path
@@ -79,7 +79,7 @@ def report(
     runs: Sequence[Run],
     out: Path | str,
     progress: Progress = lambda what, done, total: None,
-) -> Written:
+) -> WrittenReport:
     """Write a page about runs: the last rung of their ladder, and how it was reached.
 
     Args:
@@ -105,7 +105,7 @@ def report(
     page = render(evidence, verdict, sections, contents.absent)
     with _file(out) as temporary:
         temporary.write_text(page, encoding="utf-8")
-    return Written(Path(out), verdict, contents)
+    return WrittenReport(Path(out), verdict, contents)
 
 
 def plot(evidence: Evidence, name: str, out: Path | str) -> Chart:

@@ -14,9 +14,9 @@ from calib import problem as problems
 from calib.problem import Problem
 from calib.problem.model import Source
 from calib.report.budget import Budget, budget
-from calib.report.statistics import AZIMUTHS, BINS, PLACES, Axis, Statistics, Table, gather
+from calib.report.statistics import AZIMUTHS, BINS, PLACES, Axis, Statistics, StopResiduals, gather
 from calib.residuals.scan import ScanStop
-from calib.runs.estimates import Found, found
+from calib.runs.estimates import VariableEstimate, found
 from calib.runs.ladder import Rung, ladder
 from calib.runs.reopen import model_of, reopened
 from calib.runs.residual_table import residual_table, table_path
@@ -87,7 +87,7 @@ class Evidence:
         return self.run.diagnosis()
 
     @cached_property
-    def found(self) -> list[Found]:
+    def found(self) -> list[VariableEstimate]:
         """Links and effects of the run, as plain rows."""
         return found(self.run)
 
@@ -180,13 +180,13 @@ class Evidence:
         what = "residuals before"
         return gather(self._tables(self.below, what), self.axes, self.rings, self.azimuths)
 
-    def _tables(self, run: Run | None, what: str) -> Iterator[Table]:
+    def _tables(self, run: Run | None, what: str) -> Iterator[StopResiduals]:
         meshes = [source.reference for source in self.sources]
         rooms = [next(i for i, m in enumerate(meshes) if same_mesh(m, mesh)) for mesh in meshes]
         scans = self.problem.scans
         for k, scan in enumerate(scans):
             self.progress(what, k, len(scans))
-            yield Table(
+            yield StopResiduals(
                 columns=self._columns(run, scan),
                 stop=self._stop(scan, k),
                 room=rooms[self._source(scan)],

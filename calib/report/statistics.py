@@ -56,7 +56,7 @@ class Axis:
 
 
 @dataclass(frozen=True)
-class Table:
+class StopResiduals:
     """The residuals of one stop.
 
     Args:
@@ -74,7 +74,7 @@ class Table:
 
 
 @dataclass(frozen=True)
-class Curve:
+class ResidualCurve:
     """Residuals by the bins (B,) of a covariate: robustly weighted mean and spread.
 
     Args:
@@ -136,14 +136,14 @@ class _Sums:
             self.places = np.pad(self.places, ((0, 0), (0, 0), (0, missing)))
         self.places[:, :, theirs] += sums
 
-    def curve(self) -> Curve:
+    def curve(self) -> ResidualCurve:
         """What the sums say."""
         count, weight, total, squares, x = self.rows
         with np.errstate(invalid="ignore", divide="ignore"):
             mean, at = total / weight, x / count
             std = np.sqrt(np.maximum(squares / weight - mean**2, 0.0))
             band = self._band(mean, weight)
-        return Curve(
+        return ResidualCurve(
             axis=self.axis, count=count.astype(int), at=at, mean_m=mean, std_m=std, band_m=band
         )
 
@@ -181,7 +181,7 @@ class Statistics:
         variance_m2: what a row's sigma is made of: range noise, angle noise, reference.
     """
 
-    curves: Mapping[str, Curve]
+    curves: Mapping[str, ResidualCurve]
     map_m: np.ndarray
     z: np.ndarray
     rows: int
@@ -190,7 +190,7 @@ class Statistics:
 
 
 def gather(
-    tables: Iterable[Table], axes: Iterable[Axis], rings: int, azimuths: int = AZIMUTHS
+    tables: Iterable[StopResiduals], axes: Iterable[Axis], rings: int, azimuths: int = AZIMUTHS
 ) -> Statistics:
     """One pass over the residuals of a run.
 
@@ -240,7 +240,7 @@ def _numbered(columns: Mapping[str, np.ndarray], room: int, among: dict[Any, int
     return np.array(numbers, int)[local]
 
 
-def _variance(columns: Mapping[str, np.ndarray], table: Table) -> np.ndarray:
+def _variance(columns: Mapping[str, np.ndarray], table: StopResiduals) -> np.ndarray:
     """Sums of (noise, angle, reference) variances m2, as the rows' sigmas hold them."""
     incidence = columns["incidence_rad"].astype(float)
     angle = np.square(table.sigma_angle_rad * columns["range_m"] * np.tan(incidence)).sum()

@@ -19,7 +19,7 @@ DOF_UNITS = ("rad",) * 3 + ("m",) * 3
 
 
 @dataclass(frozen=True)
-class Found:
+class VariableEstimate:
     """A frame or an effect of a run, parameter by parameter.
 
     Args:
@@ -42,7 +42,7 @@ class Found:
     told: np.ndarray
 
 
-def found(run: Run) -> list[Found]:
+def found(run: Run) -> list[VariableEstimate]:
     """Frames, then effects; what all recordings share comes first.
 
     CAD is read from the recordings where they still are.
@@ -123,11 +123,11 @@ def _frame(
     T_cad: np.ndarray | None,
     sigma: Mapping[str, float],
     untold: Iterable[Mapping[str, str]],
-) -> Found:
+) -> VariableEstimate:
     moved = np.full(6, np.nan)
     if T_cad is not None:
         moved = se3.log(se3.inverse(T_cad) @ frame.T_parent_child)
-    return Found(
+    return VariableEstimate(
         variable=variable,
         parent=frame.parent,
         parameters=DOF,
@@ -138,8 +138,10 @@ def _frame(
     )
 
 
-def _effect(variable: str, effect: EffectEstimate, untold: Iterable[Mapping[str, str]]) -> Found:
-    return Found(
+def _effect(
+    variable: str, effect: EffectEstimate, untold: Iterable[Mapping[str, str]]
+) -> VariableEstimate:
+    return VariableEstimate(
         variable=variable,
         parent=None,
         parameters=effect.names,
@@ -154,7 +156,7 @@ def _kinds(runs: Sequence[Run], error: str) -> list[str]:
     return list(dict.fromkeys(kind for run in runs for kind in run.summary[error]))
 
 
-def _side_by_side(runs: Sequence[Sequence[Found]]) -> dict[str, dict[str, Any]]:
+def _side_by_side(runs: Sequence[Sequence[VariableEstimate]]) -> dict[str, dict[str, Any]]:
     """Variable -> parameter -> unit, and estimate and sigma per run."""
     out: dict[str, dict[str, Any]] = {}
     for i, rows in enumerate(runs):

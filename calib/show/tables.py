@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.padding import Padding
 from rich.table import Table
 
-from calib.runs.estimates import Found, comparison, found
+from calib.runs.estimates import VariableEstimate, comparison, found
 from calib.runs.ladder import Rung, ladder
 
 if TYPE_CHECKING:
@@ -185,7 +185,7 @@ def print_pairs(console: Console, title: str, rows: Iterable[tuple[str, str]]) -
     console.print(Padding(table, (0, 0, 1, 2)))
 
 
-def links_table(rows: Sequence[Found]) -> Table:
+def links_table(rows: Sequence[VariableEstimate]) -> Table:
     """How far every frame lies from CAD, in its own axes, mm and mrad."""
     table = columns_table("moved from CAD, own axes", "x", "y", "z", "", "not told by the data")
     for row in rows:
@@ -198,7 +198,7 @@ def links_table(rows: Sequence[Found]) -> Table:
     return table
 
 
-def effects_table(rows: Sequence[Found]) -> Table:
+def effects_table(rows: Sequence[VariableEstimate]) -> Table:
     """Every parameter of every effect; of one with many, a summary."""
     table = columns_table("effect", "parameter", "estimate", "", "")
     for row in rows:
@@ -210,7 +210,7 @@ def effects_table(rows: Sequence[Found]) -> Table:
     return table
 
 
-def effect_cells(row: Found) -> Iterable[tuple[str, str, str, bool]]:
+def effect_cells(row: VariableEstimate) -> Iterable[tuple[str, str, str, bool]]:
     """Parameter, its cell, unit and whether it was told: one by one, or of each unit a summary."""
     if len(row.parameters) > LISTED:
         for unit in dict.fromkeys(row.units):
@@ -225,7 +225,7 @@ def effect_cells(row: Found) -> Iterable[tuple[str, str, str, bool]]:
             yield parameter, estimate_cell(*numbers, unit), shown(unit)[1], told
 
 
-def _summary_cell(row: Found, free: np.ndarray, unit: str) -> tuple[str, str]:
+def _summary_cell(row: VariableEstimate, free: np.ndarray, unit: str) -> tuple[str, str]:
     scale, unit = shown(unit)
     values = scale * row.estimate[free]
     if not len(values):

@@ -25,7 +25,7 @@ PROBES_PER_MIXED = 12
 
 
 @dataclass(frozen=True)
-class Beams:
+class EmittedBeams:
     """N beams: ring, column, and where each truly points, in the LiDAR's frame."""
 
     ring: np.ndarray
@@ -33,8 +33,8 @@ class Beams:
     azimuth_rad: np.ndarray
     elevation_rad: np.ndarray
 
-    def __getitem__(self, rows: np.ndarray) -> Beams:
-        return Beams(*(v[rows] for v in vars(self).values()))
+    def __getitem__(self, rows: np.ndarray) -> EmittedBeams:
+        return EmittedBeams(*(v[rows] for v in vars(self).values()))
 
 
 @dataclass(frozen=True)
@@ -101,14 +101,14 @@ class Scanner:
             **extra,
         }
 
-    def _meet(self, T_faro_lidar: np.ndarray) -> tuple[Beams, Hits]:
+    def _meet(self, T_faro_lidar: np.ndarray) -> tuple[EmittedBeams, Hits]:
         """The beams that return, and what they hit."""
         lidar = self.lidar
         columns = np.arange(0, lidar.columns, self.spec.column_step)
         ring, column = (a.ravel() for a in np.meshgrid(np.arange(lidar.rings), columns))
         u = lidar.directions(ring, column)
         azimuth, elevation = np.arctan2(u[:, 1], u[:, 0]), np.arcsin(u[:, 2])
-        beams = Beams(ring, column, azimuth, elevation)
+        beams = EmittedBeams(ring, column, azimuth, elevation)
         hits = self._cast(T_faro_lidar, azimuth, elevation)
         near, far = lidar.min_range_m, lidar.max_range_m
         back = (hits.range_m > near) & (hits.range_m < far) & (hits.incidence_rad < NO_RETURN_RAD)
@@ -128,7 +128,7 @@ class Scanner:
 
     def _view(
         self,
-        beams: Beams,
+        beams: EmittedBeams,
         hits: Hits,
         intensity: np.ndarray,
         stop: Mapping[str, np.ndarray],
@@ -163,7 +163,11 @@ class Scanner:
         return -outwards_m / np.cos(hits.incidence_rad)
 
     def _mix(
-        self, range_m: np.ndarray, T_faro_lidar: np.ndarray, beams: Beams, rng: np.random.Generator
+        self,
+        range_m: np.ndarray,
+        T_faro_lidar: np.ndarray,
+        beams: EmittedBeams,
+        rng: np.random.Generator,
     ) -> np.ndarray:
         """Spoil a share of the ranges: half at depth edges, if there are so many, between the two
         surfaces that the beam's footprint touches, the others off by 0.1 m or so."""

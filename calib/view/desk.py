@@ -32,7 +32,7 @@ class Findings:
     sentences: Sequence[str]
     candidates: Sequence[Mapping[str, Any]]
     unexplained: Sequence[Mapping[str, Any]]
-    curves: Mapping[str, Curve]
+    curves: Mapping[str, DiagnosisCurve]
 
     @classmethod
     def read(cls, run: Run) -> Findings | None:
@@ -45,7 +45,7 @@ class Findings:
         if found is None:
             return None
         single = (c for c in found["curves"] if len(c["covariates"]) == 1)
-        curves = {c["covariates"][0]: Curve.read(c) for c in single}
+        curves = {c["covariates"][0]: DiagnosisCurve.read(c) for c in single}
         lists = (found[key] for key in ("sentences", "candidates", "unexplained"))
         return cls(found["heading"], *lists, curves)
 
@@ -64,7 +64,7 @@ class Findings:
 
 
 @dataclass(frozen=True)
-class Curve:
+class DiagnosisCurve:
     """Mean range residual (B,) in the bins of a covariate, with the band of chance; mm."""
 
     centres: np.ndarray
@@ -72,7 +72,7 @@ class Curve:
     band_mm: np.ndarray
 
     @classmethod
-    def read(cls, document: Mapping[str, Any]) -> Curve:
+    def read(cls, document: Mapping[str, Any]) -> DiagnosisCurve:
         """As diagnosis.json has it; what is null there is NaN."""
         parts = document["centres"][0], document["mean_mm"], document["band_mm"]
         return cls(*(np.array(part, float) for part in parts))

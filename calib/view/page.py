@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from calib.view import colours, panels
-from calib.view.desk import Curve, Desk, Findings
+from calib.view.desk import Desk, DiagnosisCurve, Findings
 from calib.view.job import Job
 from calib.view.scene import Scene
 from calib.view.stage import AXES, PANEL_PX, RIG, ROOM, Stage
@@ -305,10 +305,10 @@ class Page:
         menu.value = chosen if chosen in options else options[0]
 
 
-def _curve(curve: Curve | None, over: str = "", scale: float = 1.0) -> tuple[Any, Any]:
+def _curve(curve: DiagnosisCurve | None, over: str = "", scale: float = 1.0) -> tuple[Any, Any]:
     """Data and series of a curve with its band; of none, two points."""
     if curve is None:
-        curve = Curve(*(np.zeros(2),) * 3)
+        curve = DiagnosisCurve(*(np.zeros(2),) * 3)
     data = (curve.centres * scale, curve.mean_mm, curve.band_mm, -curve.band_mm)
     edge = {"stroke": "#888888", "width": 1, "dash": (4, 4), "points": {"show": False}}
     series = (

@@ -17,7 +17,7 @@ from chains.se3 import Array
 
 
 @dataclass(frozen=True)
-class Row:
+class DhRow:
     """One joint: a, d in m, alpha, theta in rad; what its link weighs, in its frame.
 
     That frame turns with the joint, its z along the axis and its origin where the joint's is.
@@ -35,7 +35,7 @@ class Row:
     centre_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
-def origins(rows: Sequence[Row], modified: bool) -> tuple[list[Array], Array]:
+def origins(rows: Sequence[DhRow], modified: bool) -> tuple[list[Array], Array]:
     """T_parent_joint (4, 4) of every joint at its zero, and T_last_tip behind the last."""
     found, before = [], np.eye(4)
     for row in rows:
@@ -51,7 +51,7 @@ def origins(rows: Sequence[Row], modified: bool) -> tuple[list[Array], Array]:
 
 
 def to_urdf(
-    name: str, rows: Sequence[Row], modified: bool, base: str = "arm_base", tip: str = "arm_end"
+    name: str, rows: Sequence[DhRow], modified: bool, base: str = "arm_base", tip: str = "arm_end"
 ) -> str:
     """The URDF text of an arm, from link `base` to link `tip`; metres and radians."""
     robot = ElementTree.Element("robot", name=name)

@@ -5,7 +5,7 @@ import json
 import pytest
 import yaml
 
-from calib.cli.files import export as command
+from calib.cli.exporting import export as command
 from calib.exporters import FORMATS
 from calib.runs.calibrate import calibrate
 

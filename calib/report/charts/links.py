@@ -12,7 +12,7 @@ from calib.report import plots
 from calib.report.chart import Absent, Chart
 from calib.report.evidence import Evidence
 from calib.rig import Rig
-from calib.runs.estimates import Found
+from calib.runs.estimates import VariableEstimate
 from calib.runs.run import RING
 from calib.show.tables import LISTED, shown
 
@@ -24,7 +24,7 @@ SHIFT, TURN = slice(3, 6), slice(0, 3)
 
 
 @dataclass(frozen=True)
-class Link:
+class ChainLink:
     """A frame as the chain shows it.
 
     Args:
@@ -38,7 +38,7 @@ class Link:
     name: str
     depth: int
     what: str = ""
-    found: Found | None = None
+    found: VariableEstimate | None = None
     cad_sigma: np.ndarray | None = None
 
     @property
@@ -50,15 +50,17 @@ class Link:
         return float(np.nanmax(z)) if np.isfinite(z).any() else None
 
 
-def _links(evidence: Evidence, rig: Rig) -> list[Link]:
+def _links(evidence: Evidence, rig: Rig) -> list[ChainLink]:
     """The frames of one rig, parents before children, the arm drawn together."""
     found = {f.variable: f for f in evidence.found if f.parent is not None}
     found |= {n.removeprefix(f"{rig.name}/"): f for n, f in found.items()}
-    out = [Link(rig.world, 0, "the tracker's frame" if rig.tracker else "the reference's frame")]
+    out = [
+        ChainLink(rig.world, 0, "the tracker's frame" if rig.tracker else "the reference's frame")
+    ]
     if rig.reference_frame in found and rig.reference_frame != rig.world:
         far = found[rig.reference_frame]
-        out.append(Link(rig.reference_frame, 1, "the scanned mesh and the targets", far))
-    out.append(Link(rig.tree.root, 1, f"stands elsewhere {MOVES[rig.moves]}"))
+        out.append(ChainLink(rig.reference_frame, 1, "the scanned mesh and the targets", far))
+    out.append(ChainLink(rig.tree.root, 1, f"stands elsewhere {MOVES[rig.moves]}"))
     _children(rig, rig.tree.root, 2, found, evidence.prior_sigma, out)
     return out
 
@@ -70,14 +72,14 @@ def _children(
     rig: Rig,
     parent: str,
     depth: int,
-    found: dict[str, Found],
+    found: dict[str, VariableEstimate],
     prior: dict[str, float],
-    out: list[Link],
+    out: list[ChainLink],
 ) -> None:
     arm = [edge for edge in rig.tree.edges if edge.name in rig.arm_edges]
     if arm and arm[0].parent == parent:
         joints = len(rig.joint_names)
-        out.append(Link(arm[-1].child, depth, f"the arm: {joints} joints, from its URDF"))
+        out.append(ChainLink(arm[-1].child, depth, f"the arm: {joints} joints, from its URDF"))
         _children(rig, arm[-1].child, depth + 1, found, prior, out)
     for edge in rig.tree.edges:
         if edge.parent == parent and edge.name in rig.frame_sigma:
@@ -88,7 +90,7 @@ def _children(
                 names = (f"{mine.variable}.{dof}" for dof in mine.parameters)
                 sigma = np.array([prior.get(n, 0.0) for n in names])
             out.append(
-                Link(
+                ChainLink(
                     name=edge.child,
                     depth=depth,
                     what="held as in CAD",
@@ -127,7 +129,7 @@ def chain(evidence: Evidence) -> Iterator[Chart | Absent]:
         )
 
 
-def _chain(links: Sequence[Link]) -> Figure:
+def _chain(links: Sequence[ChainLink]) -> Figure:
     figure, grid = plots.axes(plots.WIDE, 0.7 + 0.42 * len(links))
     ax = grid[0, 0]
     ax.set_axis_off()
@@ -150,7 +152,7 @@ def _chain(links: Sequence[Link]) -> Figure:
     return figure
 
 
-def _estimate(ax: Axes, row: int, link: Link, far: bool) -> None:
+def _estimate(ax: Axes, row: int, link: ChainLink, far: bool) -> None:
     if link.found is None or np.isnan(link.found.estimate).any():
         ax.text(47, row, link.what, va="center", style="italic", color="#555555")
         if link.found is not None:
@@ -200,7 +202,7 @@ def moves(evidence: Evidence) -> Iterator[Chart | Absent]:
     )
 
 
-def _moves(rows: Sequence[tuple[Found, np.ndarray]]) -> Figure:
+def _moves(rows: Sequence[tuple[VariableEstimate, np.ndarray]]) -> Figure:
     figure, grid = plots.axes(plots.WIDE, 0.8 + 0.5 * len(rows), 1, 2, sharey=True, sharex=True)
     names, shades = [f.variable for f, _ in rows], (plots.AFTER, plots.LINES[4], plots.FLOOR)
     for ax, part, what in zip(grid[0], (SHIFT, TURN), ("origin", "axes"), strict=True):
@@ -254,11 +256,11 @@ def effects(evidence: Evidence) -> Iterator[Chart | Absent]:
         yield _many_chart(f, f"parameters-{i}")
 
 
-def _per_ring(found: Found) -> bool:
+def _per_ring(found: VariableEstimate) -> bool:
     return all(map(RING.fullmatch, found.parameters))
 
 
-def _rings_chart(found: Found, name: str) -> Chart:
+def _rings_chart(found: VariableEstimate, name: str) -> Chart:
     return Chart(
         name,
         f"{found.variable}: rings differ by {_spread(found)}",
@@ -268,7 +270,7 @@ def _rings_chart(found: Found, name: str) -> Chart:
     )
 
 
-def _many_chart(found: Found, name: str) -> Chart:
+def _many_chart(found: VariableEstimate, name: str) -> Chart:
     return Chart(
         name,
         f"{found.variable}: its parameters differ by {_spread(found)}",
@@ -279,7 +281,7 @@ def _many_chart(found: Found, name: str) -> Chart:
     )
 
 
-def _spread(found: Found) -> str:
+def _spread(found: VariableEstimate) -> str:
     scale, unit = shown(found.units[0])
     values = scale * found.estimate[found.sigma > 0]
     sigma = scale * np.median(found.sigma[found.sigma > 0])
@@ -287,7 +289,7 @@ def _spread(found: Found) -> str:
     return f"{values.std():.2f} {unit} rms, {ends}, known to {sigma:.2f}"
 
 
-def _curve(found: Found, along: str) -> Figure:
+def _curve(found: VariableEstimate, along: str) -> Figure:
     figure, grid = plots.axes(plots.HALF, 2.7)
     ax, (scale, unit) = grid[0, 0], shown(found.units[0])
     x = np.arange(len(found.parameters))
@@ -300,7 +302,7 @@ def _curve(found: Found, along: str) -> Figure:
     return figure
 
 
-def _few(drawn: Sequence[Found]) -> Figure:
+def _few(drawn: Sequence[VariableEstimate]) -> Figure:
     count = sum(int((f.sigma > 0).sum()) for f in drawn)
     heights = [max(1, int((f.sigma > 0).sum())) for f in drawn]
     figure, grid = plots.axes(

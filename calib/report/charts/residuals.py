@@ -11,7 +11,7 @@ from calib.diagnosis.suggest import words
 from calib.report import plots
 from calib.report.chart import Absent, Chart
 from calib.report.evidence import FIRST, Evidence
-from calib.report.statistics import Curve, Statistics
+from calib.report.statistics import ResidualCurve, Statistics
 
 if TYPE_CHECKING:
     from calib.report.plots import Axes, Figure
@@ -68,7 +68,7 @@ def spoken(covariate: str) -> str:
     return known if known != covariate else _bare(covariate).replace("_", " ")
 
 
-def outside(curve: Curve) -> tuple[int, int, bool]:
+def outside(curve: ResidualCurve) -> tuple[int, int, bool]:
     """How many bins lie outside their band about zero, of how many; whether chance does not."""
     from scipy.stats import binom
 
@@ -77,7 +77,7 @@ def outside(curve: Curve) -> tuple[int, int, bool]:
     return out, int(known.sum()), bool(binom.sf(out - 1, known.sum(), 0.05) < BY_CHANCE)
 
 
-def _title(name: str, now: Curve, was: Curve | None, before: str) -> str:
+def _title(name: str, now: ResidualCurve, was: ResidualCurve | None, before: str) -> str:
     out, bins, hangs = outside(now)
     earlier = ""
     if was is not None:
@@ -92,7 +92,7 @@ def _title(name: str, now: Curve, was: Curve | None, before: str) -> str:
     return f"No clear trace of {what} is left ({inside}{earlier})"
 
 
-def _curve(now: Curve, was: Curve | None, before: str) -> Figure:
+def _curve(now: ResidualCurve, was: ResidualCurve | None, before: str) -> Figure:
     figure, grid = plots.axes(plots.HALF, 4.3, 3, sharex=True, height_ratios=(2.0, 2.0, 1.0))
     top, middle, bottom = grid[:, 0]
     if was is not None:
@@ -116,20 +116,20 @@ def _curve(now: Curve, was: Curve | None, before: str) -> Figure:
     return figure
 
 
-def _reach(curve: Curve) -> float:
+def _reach(curve: ResidualCurve) -> float:
     """How far, in mm, means and bands reach of things that are seen often; seldom ones may leave
     the picture."""
     often = np.isfinite(curve.mean_m) & (curve.count >= SELDOM * curve.count.sum())
     return 1.15e3 * float((np.abs(curve.mean_m) + np.nan_to_num(curve.band_m))[often].max())
 
 
-def _x(curve: Curve) -> np.ndarray:
+def _x(curve: ResidualCurve) -> np.ndarray:
     if curve.axis.names:
         return np.arange(curve.axis.bins, dtype=float)
     return _unit(curve.axis.name)[1] * curve.at
 
 
-def _draw(ax: Axes, curve: Curve, colour: str, label: str | None) -> None:
+def _draw(ax: Axes, curve: ResidualCurve, colour: str, label: str | None) -> None:
     """Means with their bands: a line, or dots where bins are things."""
     x, mean, half = _x(curve), 1e3 * curve.mean_m, 1e3 * curve.band_m
     if curve.axis.names:
@@ -141,13 +141,13 @@ def _draw(ax: Axes, curve: Curve, colour: str, label: str | None) -> None:
     ax.plot(x[order], mean[order], ".-", ms=4, color=colour, label=label)
 
 
-def _line(ax: Axes, curve: Curve, values_m: np.ndarray, colour: str) -> None:
+def _line(ax: Axes, curve: ResidualCurve, values_m: np.ndarray, colour: str) -> None:
     known = np.isfinite(values_m)
     style = "o" if curve.axis.names else "-"
     ax.plot(_x(curve)[known], 1e3 * values_m[known], style, ms=4, lw=1.2, color=colour)
 
 
-def _name_bins(ax: Axes, curve: Curve) -> None:
+def _name_bins(ax: Axes, curve: ResidualCurve) -> None:
     unit = _unit(curve.axis.name)[0]
     ax.set_xlabel(f"{spoken(curve.axis.name)}, {unit}" if unit else spoken(curve.axis.name))
     names = curve.axis.names

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from chains.errors import InputError
-from chains.readers.dh import Row, to_urdf
+from chains.readers.dh import DhRow, to_urdf
 from sensors.documents import nearest, read_yaml
-from sensors.readers.base import Arm, Found, Options, Progress
+from sensors.readers.base import Arm, Contents, Options, Progress
 from sensors.readers.tables.sheets import ANGLES, LENGTHS, is_number, open_sheet, split_unit
 
 _CONVENTIONS = ("standard", "modified")
@@ -27,7 +27,7 @@ _KEYS = ("name", *_LENGTHS, *_ANGLES, "type", "lower", "upper", "mass_kg", "cent
 _LONGEST_M = 10.0
 
 
-def read_dh(files: Sequence[Path], options: Options, progress: Progress) -> Found:
+def read_dh(files: Sequence[Path], options: Options, progress: Progress) -> Contents:
     """Read one table of Denavit and Hartenberg.
 
     Raises:
@@ -51,7 +51,7 @@ def read_dh(files: Sequence[Path], options: Options, progress: Progress) -> Foun
     name = str(head.get("name", path.stem))
     base, tip = options.base or "arm_base", options.tip or "arm_end"
     line = f"{path.name}: an arm of {len(rows)} joints, {convention} Denavit-Hartenberg: "
-    return Found(
+    return Contents(
         arm=Arm(to_urdf(name, rows, convention == "modified", base, tip), base, tip),
         understood=(line + ", ".join(row.name for row in rows),),
     )
@@ -83,7 +83,7 @@ def _value(cell: str, comma: bool) -> Any:
     return float(cell.replace(",", ".") if comma else cell)
 
 
-def _row(path: Path, k: int, record: Mapping[str, Any], options: Options) -> Row:
+def _row(path: Path, k: int, record: Mapping[str, Any], options: Options) -> DhRow:
     """One row in SI units."""
     where = f"{path}: row {k + 1}"
     values: dict[str, Any] = {}
@@ -111,14 +111,14 @@ def _row(path: Path, k: int, record: Mapping[str, Any], options: Options) -> Row
     return _made(where, k, values)
 
 
-def _made(where: str, k: int, values: Mapping[str, Any]) -> Row:
+def _made(where: str, k: int, values: Mapping[str, Any]) -> DhRow:
     kind = str(values.get("type", "revolute"))
     if kind not in ("revolute", "prismatic"):
         raise InputError(f"{where}: type is {kind}; a joint is revolute or prismatic")
     centre = values.get("centre_m", (0.0, 0.0, 0.0))
     if np.shape(centre) != (3,):
         raise InputError(f"{where}: centre_m is {centre}; three numbers are wanted")
-    return Row(
+    return DhRow(
         name=str(values.get("name", f"joint_{k + 1}")),
         a_m=values["a"],
         alpha_rad=values["alpha"],

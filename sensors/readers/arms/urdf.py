@@ -13,10 +13,10 @@ from chains.errors import InputError
 from chains.readers import xacro
 from chains.readers.urdf import apply_note, arm_ends, group_ends, joint_names, parse_robot
 from sensors.documents import read_text, read_yaml
-from sensors.readers.base import Arm, Found, Options, Progress
+from sensors.readers.base import Arm, Contents, Options, Progress
 
 
-def read_urdf(files: Sequence[Path], options: Options, progress: Progress) -> Found:
+def read_urdf(files: Sequence[Path], options: Options, progress: Progress) -> Contents:
     """Read an arm: one URDF or xacro file, and what others say of the same arm.
 
     Raises:
@@ -48,7 +48,7 @@ def read_urdf(files: Sequence[Path], options: Options, progress: Progress) -> Fo
     )
     if notes:
         text = ElementTree.tostring(robot, encoding="unicode")
-    return Found(arm=Arm(text, base, tip), understood=tuple(said), odd=odd)
+    return Contents(arm=Arm(text, base, tip), understood=tuple(said), odd=odd)
 
 
 def with_ends(where: str, arm: Arm, options: Options) -> Arm:

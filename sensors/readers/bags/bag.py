@@ -21,13 +21,13 @@ from numpy.typing import NDArray
 
 from chains.errors import InputError
 from sensors.documents import read_text
-from sensors.readers.bags.messages import LOGS, Source, cloud_of, payloads_of
+from sensors.readers.bags.messages import LOGS, Channel, cloud_of, payloads_of
 from sensors.readers.bags.ros import OUSTER, Message, Topic, bag_files, messages, topics_of
-from sensors.readers.base import Array, Found, Options, Progress, Sweep, Sweeps, Track, together
+from sensors.readers.base import Array, Contents, Options, Progress, Sweep, Sweeps, Track, together
 from sensors.readers.clouds.fields import Cloud
-from sensors.readers.clouds.rings import look
-from sensors.readers.packets.hesai import hesai_found, rate
-from sensors.readers.packets.ouster import ouster_found, read_metadata
+from sensors.readers.clouds.rings import find_format
+from sensors.readers.packets.hesai import decode_hesai, rate
+from sensors.readers.packets.ouster import decode_ouster, read_metadata
 from sensors.readers.packets.turns import Packets
 
 _CLOUD = "sensor_msgs/msg/PointCloud2"
@@ -44,16 +44,16 @@ _SAME_CLOCK_S = 1.0
 class _Log:
     """What one pass through the bag gathers."""
 
-    rows: dict[tuple[str, Source], array] = field(default_factory=lambda: defaultdict(_doubles))
+    rows: dict[tuple[str, Channel], array] = field(default_factory=lambda: defaultdict(_doubles))
     """By topic and source (rows, 2 + columns), flat: stamp, arrival, values."""
     arrivals_ns: list[int] = field(default_factory=list)
     """Of clouds."""
     stamps_s: list[float] = field(default_factory=list)
     texts: list[str] = field(default_factory=list)
 
-    def sources(self, topic: str) -> dict[tuple[str, str], list[tuple[Source, Array]]]:
+    def sources(self, topic: str) -> dict[tuple[str, str], list[tuple[Channel, Array]]]:
         """Of one topic by body and parent: the sources with their rows (N, 2 + columns)."""
-        parts: dict[tuple[str, str], list[tuple[Source, Array]]] = defaultdict(list)
+        parts: dict[tuple[str, str], list[tuple[Channel, Array]]] = defaultdict(list)
         for (name, source), flat in self.rows.items():
             if name == topic:
                 table = np.frombuffer(flat).reshape(-1, 2 + len(source.names))
@@ -65,7 +65,7 @@ def _doubles() -> array:
     return array("d")
 
 
-def read_bag(files: Sequence[Path], options: Options, progress: Progress) -> Found:
+def read_bag(files: Sequence[Path], options: Options, progress: Progress) -> Contents:
     """Read bags that belong together: their one LiDAR, and every log of joints, poses and rates.
 
     `options.topics` decides among topics of one sort: naming a cloud leaves out other clouds, and
@@ -82,7 +82,9 @@ def read_bag(files: Sequence[Path], options: Options, progress: Progress) -> Fou
         found.append(_lidar(name, paths, lidar, log, options, progress))
     found += [_tracks(name, topic.name, log) for topic in logs]
     unused = [str(t) for t in topics if t not in logs and t != lidar]
-    rest = Found(understood=(f"{name}: not used: {', '.join(unused)}",)) if unused else Found()
+    rest = (
+        Contents(understood=(f"{name}: not used: {', '.join(unused)}",)) if unused else Contents()
+    )
     return together([*found, rest])
 
 
@@ -178,7 +180,7 @@ def _times(name: str, stamps_s: Array, arrivals_s: Array) -> tuple[Array, tuple[
     return stamps_s, ()
 
 
-def _tracks(name: str, topic: str, log: _Log) -> Found:
+def _tracks(name: str, topic: str, log: _Log) -> Contents:
     """The tracks of one topic, each body's its own; static transforms are only told."""
     tracks: list[Track] = []
     said: list[str] = []
@@ -201,11 +203,11 @@ def _tracks(name: str, topic: str, log: _Log) -> Found:
         odd += misfit
     if not said:
         odd.append(f"{topic}: its messages hold no values")
-    return Found(tracks=tuple(tracks), understood=tuple(said), odd=tuple(odd))
+    return Contents(tracks=tuple(tracks), understood=tuple(said), odd=tuple(odd))
 
 
 def _merged(
-    sources: list[tuple[Source, Array]],
+    sources: list[tuple[Channel, Array]],
 ) -> tuple[Any, tuple[str, ...], Array, Array, Array]:
     """Kind, columns, stamps, arrivals and values of one body; NaN where a message lacked a column.
 
@@ -238,7 +240,7 @@ def _lidar(
     log: _Log,
     options: Options,
     progress: Progress,
-) -> Found:
+) -> Contents:
     if topic.kind == _CLOUD:
         return _clouds(name, paths, topic, log, options)
     seen = [0]
@@ -248,7 +250,7 @@ def _lidar(
         progress(what, seen[0], topic.count)
 
     if topic.kind in _HESAI:
-        return hesai_found(topic.name, name, packets, options, progress_in_messages)
+        return decode_hesai(topic.name, name, packets, options, progress_in_messages)
     if options.metadata is not None:
         metadata = read_metadata(options.metadata.name, read_text(options.metadata))
     else:
@@ -259,7 +261,7 @@ def _lidar(
                 " sensor's JSON by --metadata"
             )
         metadata = read_metadata("the bag's own metadata", text)
-    return ouster_found(topic.name, name, packets, metadata, options, progress_in_messages)
+    return decode_ouster(topic.name, name, packets, metadata, options, progress_in_messages)
 
 
 def _packets(paths: list[Path], topic: Topic, seen: list[int]) -> Packets:
@@ -272,7 +274,7 @@ def _packets(paths: list[Path], topic: Topic, seen: list[int]) -> Packets:
     return packets
 
 
-def _clouds(name: str, paths: list[Path], topic: Topic, log: _Log, options: Options) -> Found:
+def _clouds(name: str, paths: list[Path], topic: Topic, log: _Log, options: Options) -> Contents:
     arrivals_ns = np.array(log.arrivals_ns)
     time_s, odd = _times(topic.name, np.array(log.stamps_s), arrivals_ns / 1e9)
     stream = _cloud_stream(paths, topic, arrivals_ns)
@@ -280,7 +282,7 @@ def _clouds(name: str, paths: list[Path], topic: Topic, log: _Log, options: Opti
     first = next((c for _, c in stream(everything) if _has_points(c)), None)
     if first is None:
         raise InputError(f"{name}: the {topic.count} clouds of {topic.name} hold no points")
-    seen = look(topic.name, first, options)
+    seen = find_format(topic.name, first, options)
     time_s = time_s + seen.middle_s
 
     def read(wanted: NDArray[np.bool_]) -> Iterator[Sweep]:
@@ -289,7 +291,7 @@ def _clouds(name: str, paths: list[Path], topic: Topic, log: _Log, options: Opti
 
     stamp = f"their stamps{f' + {seen.middle_s:.3f} s' if seen.middle_s else ''}"
     line = f"{topic.name}: {len(time_s)} clouds{rate(time_s)}; the middle of a turn is {stamp}"
-    return Found(
+    return Contents(
         sweeps=(Sweeps(topic.name, name, time_s, read),),
         lidar=seen.lidar,
         understood=(line, *seen.understood),

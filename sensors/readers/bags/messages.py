@@ -16,7 +16,7 @@ _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"
 _XYZ = ("x", "y", "z")
 
 
-class Source(NamedTuple):
+class Channel(NamedTuple):
     """Whose values they are."""
 
     kind: str
@@ -29,10 +29,10 @@ class Source(NamedTuple):
     """The frame that a transform's body is in."""
 
 
-class Row(NamedTuple):
+class Sample(NamedTuple):
     """One message's values."""
 
-    source: Source
+    source: Channel
     stamp_s: float
     """What its header says."""
     values: tuple[float, ...]
@@ -52,28 +52,28 @@ def _pose(position: Any, orientation: Any) -> tuple[float, ...]:
 
 
 def _row(kind: str, names: tuple[str, ...], values: Callable[[Any], tuple[float, ...]]) -> Callable:
-    source = Source(kind, names)
-    return lambda message: [Row(source, _stamp(message.header), values(message))]
+    source = Channel(kind, names)
+    return lambda message: [Sample(source, _stamp(message.header), values(message))]
 
 
-def _joints(message: Any) -> list[Row]:
+def _joints(message: Any) -> list[Sample]:
     if not len(message.position):
         return []
-    source = Source("joints", tuple(message.name))
-    return [Row(source, _stamp(message.header), tuple(message.position))]
+    source = Channel("joints", tuple(message.name))
+    return [Sample(source, _stamp(message.header), tuple(message.position))]
 
 
-def _transform(message: Any) -> list[Row]:
+def _transform(message: Any) -> list[Sample]:
     frames = message.child_frame_id.lstrip("/"), message.header.frame_id.lstrip("/")
     pose = _pose(message.transform.translation, message.transform.rotation)
-    return [Row(Source("pose", POSE, *frames), _stamp(message.header), pose)]
+    return [Sample(Channel("pose", POSE, *frames), _stamp(message.header), pose)]
 
 
-def _transforms(message: Any) -> list[Row]:
+def _transforms(message: Any) -> list[Sample]:
     return [row for one in message.transforms for row in _transform(one)]
 
 
-LOGS: dict[str, Callable[[Any], list[Row]]] = {
+LOGS: dict[str, Callable[[Any], list[Sample]]] = {
     "sensor_msgs/msg/JointState": _joints,
     "geometry_msgs/msg/PoseStamped": _row(
         "pose", POSE, lambda m: _pose(m.pose.position, m.pose.orientation)

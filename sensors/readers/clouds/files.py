@@ -10,34 +10,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chains.errors import InputError
-from sensors.readers.base import Columns, Found, Options, Progress, Sweep, Sweeps
+from sensors.readers.base import Columns, Contents, Options, Progress, Sweep, Sweeps
 from sensors.readers.clouds.fields import Cloud
-from sensors.readers.clouds.rings import look
+from sensors.readers.clouds.rings import find_format
 
 Named = tuple[str, Cloud]
 
 
-def read_pcd(files: Sequence[Path], options: Options, progress: Progress) -> Found:
+def read_pcd(files: Sequence[Path], options: Options, progress: Progress) -> Contents:
     """Read PCD files, a cloud each; rows of an organised cloud may be its rings."""
     return _found(files, _pcd, options, progress)
 
 
-def read_ply(files: Sequence[Path], options: Options, progress: Progress) -> Found:
+def read_ply(files: Sequence[Path], options: Options, progress: Progress) -> Contents:
     """Read PLY files, a cloud each."""
     return _found(files, _ply, options, progress)
 
 
-def read_las(files: Sequence[Path], options: Options, progress: Progress) -> Found:
+def read_las(files: Sequence[Path], options: Options, progress: Progress) -> Contents:
     """Read LAS or LAZ files, a cloud each, in the LiDAR's own frame."""
     return _found(files, _las, options, progress)
 
 
-def read_e57(files: Sequence[Path], options: Options, progress: Progress) -> Found:
+def read_e57(files: Sequence[Path], options: Options, progress: Progress) -> Contents:
     """Read E57 files, a cloud for each of their scans, in the scanner's own frame."""
     return _found(files, _e57, options, progress)
 
 
-def read_numpy(files: Sequence[Path], options: Options, progress: Progress) -> Found:
+def read_numpy(files: Sequence[Path], options: Options, progress: Progress) -> Contents:
     """Read .npy and .npz files, a cloud each.
 
     A structured array, or the arrays of an .npz, are fields by their names; a plain array (N, C)
@@ -46,12 +46,12 @@ def read_numpy(files: Sequence[Path], options: Options, progress: Progress) -> F
     return _found(files, _numpy, options, progress)
 
 
-def read_kitti(files: Sequence[Path], options: Options, progress: Progress) -> Found:
+def read_kitti(files: Sequence[Path], options: Options, progress: Progress) -> Contents:
     """Read KITTI's .bin files: x y z intensity as float32, without rings."""
     return _found(files, lambda p: _floats(p, ("x", "y", "z", "intensity")), options, progress)
 
 
-def read_nuscenes(files: Sequence[Path], options: Options, progress: Progress) -> Found:
+def read_nuscenes(files: Sequence[Path], options: Options, progress: Progress) -> Contents:
     """Read nuScenes' .pcd.bin files: x y z intensity ring as float32."""
     names = ("x", "y", "z", "intensity", "ring")
     return _found(files, lambda p: _floats(p, names), options, progress)
@@ -65,7 +65,7 @@ def _found(
     clouds: Callable[[Path], Iterator[Named]],
     options: Options,
     progress: Progress,
-) -> Found:
+) -> Contents:
     """Look at the first cloud, then hand out each as the one turn of its stop."""
     seen, layout = None, None
     sweeps: list[Sweeps] = []
@@ -73,7 +73,7 @@ def _found(
         progress("looking at clouds", done, len(files))
         for number, (name, cloud) in enumerate(clouds(path)):
             if seen is None:
-                seen = look(path.name, cloud, options)
+                seen = find_format(path.name, cloud, options)
                 layout, first = seen.layout, set(cloud.fields)
             lacking = {*"xyz", *layout.fields.values()} - set(cloud.fields)
             if lacking:
@@ -85,7 +85,7 @@ def _found(
     assert seen is not None  # a source has a file, and an empty file is an InputError
     progress("looking at clouds", len(files), len(files))
     count = f"{len(sweeps)} clouds without a clock, each a stop named after its file"
-    return Found(
+    return Contents(
         sweeps=tuple(sweeps),
         lidar=seen.lidar,
         understood=(*seen.understood, count),

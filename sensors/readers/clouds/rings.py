@@ -77,7 +77,7 @@ class Layout:
 
 
 @dataclass(frozen=True)
-class Look:
+class CloudFormat:
     """What the first cloud of a source tells: how to read all, and what to say."""
 
     layout: Layout
@@ -88,7 +88,7 @@ class Look:
     """From the cloud's stamp to the middle of its turn."""
 
 
-def look(name: str, cloud: Cloud, options: Options) -> Look:
+def find_format(name: str, cloud: Cloud, options: Options) -> CloudFormat:
     """Decide how the clouds of a source are read.
 
     Raises InputError where lengths look like millimetres and no `--length-unit` says so, where a
@@ -115,7 +115,7 @@ def look(name: str, cloud: Cloud, options: Options) -> Look:
         *said,
     )
     middle_s = _time(name, cloud, fields, seen, xyz_m, ring, odd)
-    return Look(
+    return CloudFormat(
         layout=layout, lidar=lidar, understood=understood, odd=tuple(odd), middle_s=middle_s
     )
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from chains.errors import InputError
-from sensors.readers.base import Array, Found, Options, Progress, Surface
+from sensors.readers.base import Array, Contents, Options, Progress, ScannedSurface
 from sensors.readers.meshes.labels import (
     Labels,
     Palette,
@@ -28,7 +28,7 @@ _INTENSITIES = ("intensity", "reflectance", "reflectivity", "remission")
 _PALETTES = (".yaml", ".yml", ".csv")
 
 
-def read_meshes(paths: Sequence[Path], options: Options, progress: Progress) -> Found:
+def read_meshes(paths: Sequence[Path], options: Options, progress: Progress) -> Contents:
     """Read one mesh, or several that make up one room, as the reference surface.
 
     Labels are the first of: a number per face, a number per vertex, colours of the texture, the
@@ -44,12 +44,12 @@ def read_meshes(paths: Sequence[Path], options: Options, progress: Progress) -> 
         parts.append(surface)
         lines += said
         odd += strange
-    return Found(surface=_together(parts), understood=tuple(lines), odd=tuple(odd))
+    return Contents(surface=_together(parts), understood=tuple(lines), odd=tuple(odd))
 
 
 def _read_one(
     path: Path, options: Options, palette: Palette, alone: bool
-) -> tuple[Surface, list[str], list[str]]:
+) -> tuple[ScannedSurface, list[str], list[str]]:
     mesh = read_mesh_file(path)
     gltf = path.suffix.lower() in (".glb", ".gltf")
     used = mesh.vertices[np.unique(mesh.triangles)]
@@ -66,7 +66,7 @@ def _read_one(
         odd += [f"{path.name}: {sentence}" for sentence in labels.odd]
     vertices_m = placing.points(mesh.vertices)
     intensity = _intensity(mesh)
-    surface = Surface(
+    surface = ScannedSurface(
         vertices_m=vertices_m,
         triangles=mesh.triangles,
         label=None if labels is None else labels.label,
@@ -115,7 +115,7 @@ def _named(columns: Mapping[str, np.ndarray], names: Sequence[str]) -> str | Non
     return next((plain[name] for name in names if name in plain), None)
 
 
-def _together(parts: Sequence[Surface]) -> Surface:
+def _together(parts: Sequence[ScannedSurface]) -> ScannedSurface:
     """One surface of several; labels of one name are one label."""
     if len(parts) == 1:
         return parts[0]
@@ -128,7 +128,7 @@ def _together(parts: Sequence[Surface]) -> Surface:
         labels.append(number[part.label])
     none = [np.full(len(part.triangles), np.nan) for part in parts]
     bright = [n if p.intensity is None else p.intensity for p, n in zip(parts, none, strict=True)]
-    return Surface(
+    return ScannedSurface(
         vertices_m=np.concatenate([part.vertices_m for part in parts]),
         triangles=np.concatenate([p.triangles + n for p, n in zip(parts, first, strict=False)]),
         label=np.concatenate(labels),
@@ -137,7 +137,7 @@ def _together(parts: Sequence[Surface]) -> Surface:
     )
 
 
-def _describe(path: Path, surface: Surface, placing: str, source: str) -> list[str]:
+def _describe(path: Path, surface: ScannedSurface, placing: str, source: str) -> list[str]:
     corners_m = surface.vertices_m[surface.triangles]
     size = np.ptp(corners_m.reshape(-1, 3), axis=0)
     area_m2 = triangle_planes(corners_m)[1]

@@ -24,7 +24,7 @@ BLOCK_LINES = 1 << 18
 
 
 @dataclass(frozen=True)
-class Block:
+class PointBlock:
     """Some points of one scan, in the units and axes of their file.
 
     Args:
@@ -42,7 +42,7 @@ class Block:
     origin: Array | None = None
 
 
-def read_pts(path: Path) -> Iterator[Block]:
+def read_pts(path: Path) -> Iterator[PointBlock]:
     """Read a PTS file, or lines x y z … without a count; InputError with the line that is wrong."""
     _check(path)
     with open(path, "rb") as file:
@@ -53,11 +53,11 @@ def read_pts(path: Path) -> Iterator[Block]:
             if count is not None:
                 lines.take(1)
             for rows in lines.rows(count):
-                yield Block(scan, rows[:, :3], _intensity(rows))
+                yield PointBlock(scan, rows[:, :3], _intensity(rows))
             scan += 1
 
 
-def read_ptx(path: Path) -> Iterator[Block]:
+def read_ptx(path: Path) -> Iterator[PointBlock]:
     """Read a PTX file; InputError with the line that is wrong."""
     _check(path)
     with open(path, "rb") as file:
@@ -74,7 +74,7 @@ def read_ptx(path: Path) -> Iterator[Block]:
             for rows in lines.rows(int(head[0][0] * head[1][0])):
                 rows = rows[rows[:, :3].any(axis=1)]
                 points = rows[:, :3] @ T_row[:3, :3] + T_row[3, :3]
-                yield Block(scan, points, _intensity(rows), origin=T_row[3, :3])
+                yield PointBlock(scan, points, _intensity(rows), origin=T_row[3, :3])
             scan += 1
 
 

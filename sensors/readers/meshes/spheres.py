@@ -11,7 +11,7 @@ import numpy as np
 from chains.align import fit_sphere
 from chains.errors import InputError
 from sensors.meshes import surface_normals
-from sensors.readers.base import Array, Found, Options, Progress, Spheres
+from sensors.readers.base import Array, Contents, Options, Progress, Spheres
 from sensors.readers.meshes.placing import find_placing
 from sensors.readers.meshes.survey import SUFFIXES as CLOUDS
 from sensors.readers.meshes.survey import read_blocks
@@ -24,7 +24,7 @@ _SEEN_CAP = 0.25  # of the half that faces the scanner, what must be there to be
 _AXIS = re.compile(r"(?:.*[ _.])?([xyz])(?:[ _-]?(?:coord.*|pos.*|value))?$", re.IGNORECASE)
 
 
-def read_spheres(paths: Sequence[Path], options: Options, progress: Progress) -> Found:
+def read_spheres(paths: Sequence[Path], options: Options, progress: Progress) -> Contents:
     """Read the centres of spheres, in the scanner's frame.
 
     A table (CSV, TXT) has a row for each: a name and x y z; of one with a column of types, rows
@@ -45,7 +45,7 @@ def read_spheres(paths: Sequence[Path], options: Options, progress: Progress) ->
     if twice is not None:
         raise InputError(f"{paths[-1]}: a sphere {twice} is there twice; rename one")
     spheres = Spheres(tuple(names), np.concatenate(centres))
-    return Found(spheres=spheres, understood=tuple(lines), odd=tuple(odd))
+    return Contents(spheres=spheres, understood=tuple(lines), odd=tuple(odd))
 
 
 # ----------------------------------------------------------------------------------------- tables

@@ -9,16 +9,16 @@ import numpy as np
 
 from chains.errors import InputError
 from sensors.meshes import read_cloud
-from sensors.readers.base import Array, Found, Options, Progress, Surface
+from sensors.readers.base import Array, Contents, Options, Progress, ScannedSurface
 from sensors.readers.meshes.placing import WIDEST_M, Placing, find_placing
-from sensors.readers.meshes.pts import Block, read_pts, read_ptx
+from sensors.readers.meshes.pts import PointBlock, read_pts, read_ptx
 from sensors.readers.meshes.reconstruction import Rebuilt, Thinner, rebuild
 
 SUFFIXES = (".e57", ".pts", ".ptx", ".xyz", ".ply", ".pcd")
 _COARSE_M = 0.03
 
 
-def read_survey(paths: Sequence[Path], options: Options, progress: Progress) -> Found:
+def read_survey(paths: Sequence[Path], options: Options, progress: Progress) -> Contents:
     """Read the scans of one room, registered to each other, and mesh them.
 
     Points are thinned, their normals face the scanner that saw them, the surface is Poisson's,
@@ -40,8 +40,8 @@ def read_survey(paths: Sequence[Path], options: Options, progress: Progress) -> 
     except InputError as error:
         raise InputError(f"{paths[0]}: {error}") from None
     lines, odd = _describe(built, clouds, len(points_m))
-    return Found(
-        surface=Surface(built.vertices_m, built.triangles, intensity=built.intensity),
+    return Contents(
+        surface=ScannedSurface(built.vertices_m, built.triangles, intensity=built.intensity),
         understood=(*clouds.understood, *lines),
         odd=(*clouds.odd, *whence, *odd),
     )
@@ -81,7 +81,7 @@ class _Clouds:
             f"{self.thinner.count - before} points; {placing.understood}"
         )
 
-    def _add(self, path: Path, scan: int, block: Block, placing: Placing) -> None:
+    def _add(self, path: Path, scan: int, block: PointBlock, placing: Placing) -> None:
         columns = np.full((len(block.points), 4), np.nan)
         if block.intensity is not None:
             columns[:, 0] = block.intensity
@@ -119,7 +119,7 @@ class _Clouds:
         )
 
 
-def read_blocks(path: Path) -> Iterator[Block]:
+def read_blocks(path: Path) -> Iterator[PointBlock]:
     """The points of a cloud in the units and axes of its file, block by block.
 
     Raises InputError for a file that is missing, broken or of no kind known here.
@@ -136,7 +136,7 @@ def read_blocks(path: Path) -> Iterator[Block]:
     else:
         columns = read_cloud(path)
         normals = [columns.get(name) for name in ("nx", "ny", "nz")]
-        yield Block(
+        yield PointBlock(
             0,
             np.stack([columns[axis] for axis in "xyz"], axis=1),
             next((v for n, v in columns.items() if "intensity" in n.lower()), None),
@@ -144,13 +144,13 @@ def read_blocks(path: Path) -> Iterator[Block]:
         )
 
 
-def _read_e57(path: Path) -> Iterator[Block]:
+def _read_e57(path: Path) -> Iterator[PointBlock]:
     from sensors.readers.clouds.e57 import read_e57
 
     for number, scan in enumerate(read_e57(path)):
         # Points in rows and columns are as one scanner saw them: from the origin of their frame.
         origin = scan.pose[:3, 3] if scan.posed or "row" in scan.columns else None
-        yield Block(number, scan.xyz_in_file(), scan.columns.get("intensity"), origin=origin)
+        yield PointBlock(number, scan.xyz_in_file(), scan.columns.get("intensity"), origin=origin)
 
 
 def _describe(built: Rebuilt, clouds: _Clouds, thinned: int) -> tuple[list[str], list[str]]:

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from chains.errors import InputError
 from sensors.lidar import load_lidar
-from sensors.readers.base import Array, Columns, Found, Options, Progress
-from sensors.readers.packets.hesai_models import MODELS, Model, find_model
+from sensors.readers.base import Array, Columns, Contents, Options, Progress
+from sensors.readers.packets.hesai_models import MODELS, HesaiModel, find_model
 from sensors.readers.packets.pcap import Capture
 from sensors.readers.packets.turns import (
     Bytes,
@@ -48,7 +48,7 @@ _OPTICAL_CENTRE_M = {
 class HesaiDecoder:
     """The packets of one model whose channels point to (channels,) elevation and azimuth, rad."""
 
-    model: Model
+    model: HesaiModel
     elevation_rad: Array
     azimuth_rad: Array
     columns: int
@@ -113,9 +113,9 @@ def returns_per_direction(azimuth: NDArray) -> int:
     return 1
 
 
-def hesai_found(
+def decode_hesai(
     name: str, clock: str, packets: Packets, options: Options, progress: Progress
-) -> Found:
+) -> Contents:
     """Decode the packets of one sensor.
 
     Angles are those of `--metadata`, or else the catalogue's. Raises InputError where no packet is
@@ -154,10 +154,10 @@ def hesai_found(
             " its correction is left off, as in the maker's driver unless told: beams start in the"
             " origin",
         )
-    return Found(sweeps=(sweeps,), lidar=lidar, understood=tuple(understood), odd=odd)
+    return Contents(sweeps=(sweeps,), lidar=lidar, understood=tuple(understood), odd=odd)
 
 
-def read_hesai(files: Sequence[Path], options: Options, progress: Progress) -> Found:
+def read_hesai(files: Sequence[Path], options: Options, progress: Progress) -> Contents:
     """Read PCAP files, which follow each other; `--metadata` is the table of angles (CSV)."""
     capture = Capture(files)
     model = next(filter(None, (find_model(datagram.payload) for datagram in capture)), None)
@@ -166,7 +166,7 @@ def read_hesai(files: Sequence[Path], options: Options, progress: Progress) -> F
         raise InputError(_unknown(capture.name, seen))
     packets = capture_packets(capture, model.size, options)
     name, in_mb = capture.name, capture.progress(progress)
-    return captured(capture, hesai_found(name, name, packets, options, in_mb))
+    return captured(capture, decode_hesai(name, name, packets, options, in_mb))
 
 
 def _unknown(name: str, seen: set[str]) -> str:
@@ -184,7 +184,7 @@ def rate(time_s: Array) -> str:
     return f" at {1 / step_s:.3g} Hz" if step_s > 0 else ""
 
 
-def _look(name: str, packets: Packets) -> tuple[Model, int, int]:
+def _look(name: str, packets: Packets) -> tuple[HesaiModel, int, int]:
     """The model, returns per direction, and azimuth steps of a turn, from the first packets."""
     model, first, seen = None, [], set()
     for _, payload in packets():
@@ -210,13 +210,13 @@ def _describe(payload: bytes) -> str:
     return f"packets of {len(payload)} bytes{version}"
 
 
-def _blocks(model: Model, packets: Bytes) -> NDArray:
+def _blocks(model: HesaiModel, packets: Bytes) -> NDArray:
     """(P, blocks) of `model.block`."""
     body = packets[:, model.header : model.header + model.blocks * model.block.itemsize]
     return np.ascontiguousarray(body).view(model.block)
 
 
-def _angles(name: str, model: Model, options: Options) -> tuple[Array, Array, tuple[str, ...]]:
+def _angles(name: str, model: HesaiModel, options: Options) -> tuple[Array, Array, tuple[str, ...]]:
     """Elevation and azimuth (channels,) rad, clockwise, and what is odd about them."""
     lidar = load_lidar(model.catalog)
     if options.metadata is not None:

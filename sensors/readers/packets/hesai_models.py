@@ -11,7 +11,7 @@ import numpy as np
 
 
 @dataclass(frozen=True)
-class Model:
+class HesaiModel:
     """Where a model's packet has what; bytes."""
 
     name: str
@@ -53,7 +53,7 @@ class Model:
 
 
 MODELS = (
-    Model(
+    HesaiModel(
         name="Pandar40P",
         catalog="hesai_pandar40p",
         size=1262,
@@ -65,7 +65,7 @@ MODELS = (
         range_step_at=None,
         shortest_m=0.3,
     ),
-    Model(
+    HesaiModel(
         name="Pandar64",
         catalog="hesai_pandar64",
         size=1194,
@@ -77,7 +77,7 @@ MODELS = (
         range_step_at=5,
         shortest_m=0.3,
     ),
-    Model(
+    HesaiModel(
         name="Pandar64",
         catalog="hesai_pandar64",
         size=1198,
@@ -89,7 +89,7 @@ MODELS = (
         range_step_at=5,
         shortest_m=0.3,
     ),
-    Model(
+    HesaiModel(
         name="PandarQT64",
         catalog="hesai_pandarqt64",
         size=1072,
@@ -101,7 +101,7 @@ MODELS = (
         range_step_at=9,
         shortest_m=0.1,
     ),
-    Model(
+    HesaiModel(
         name="PandarQT128",
         catalog="hesai_qt128",
         size=1127,
@@ -113,7 +113,7 @@ MODELS = (
         range_step_at=9,
         shortest_m=0.05,
     ),
-    Model(
+    HesaiModel(
         name="PandarXT-16",
         catalog="hesai_xt16",
         size=568,
@@ -125,7 +125,7 @@ MODELS = (
         range_step_at=9,
         shortest_m=0.05,
     ),
-    Model(
+    HesaiModel(
         name="PandarXT-32",
         catalog="hesai_pandarxt32",
         size=1080,
@@ -137,7 +137,7 @@ MODELS = (
         range_step_at=9,
         shortest_m=0.05,
     ),
-    Model(
+    HesaiModel(
         name="PandarXT-32M2X",
         catalog="hesai_xt32m2x",
         size=820,
@@ -160,7 +160,7 @@ _VERSION = {
 }
 
 
-def find_model(payload: bytes) -> Model | None:
+def find_model(payload: bytes) -> HesaiModel | None:
     """The model that sent a packet, None where it is no point packet of a model known here."""
     for model in MODELS:
         start = _START.get(model.name)

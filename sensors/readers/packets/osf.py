@@ -22,11 +22,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chains.errors import InputError
-from sensors.readers.base import Columns, Found, Options, Sweep, Sweeps
+from sensors.readers.base import Columns, Contents, Options, Sweep, Sweeps
 from sensors.readers.packets.ouster_sensor import (
     Metadata,
+    describe_ouster,
     ouster_points,
-    ouster_said,
     read_metadata,
 )
 from sensors.recording import unpack_zstd
@@ -36,14 +36,14 @@ _CHANNELS = {1: "range", 3: "signal", 5: "intensity", 7: "near_infrared"}
 
 
 @dataclass(frozen=True)
-class _Table:
+class _Flatbuffer:
     """A table of a flatbuffer; fields by their number in the schema."""
 
     data: mmap.mmap | bytes
     at: int
 
     @classmethod
-    def root(cls, data: mmap.mmap | bytes, at: int) -> _Table:
+    def root(cls, data: mmap.mmap | bytes, at: int) -> _Flatbuffer:
         """The root of a buffer at `at`, which begins with its size."""
         return cls(data, at + 4 + struct.unpack_from("<I", data, at + 4)[0])
 
@@ -75,20 +75,20 @@ class _Table:
         at, count = self.vector(number)
         return np.frombuffer(self.data, dtype, count, at)
 
-    def tables(self, number: int) -> Iterator[_Table]:
+    def tables(self, number: int) -> Iterator[_Flatbuffer]:
         at, count = self.vector(number)
         for k in range(count):
             place = at + 4 * k
-            yield _Table(self.data, place + struct.unpack_from("<I", self.data, place)[0])
+            yield _Flatbuffer(self.data, place + struct.unpack_from("<I", self.data, place)[0])
 
 
 @dataclass(frozen=True)
 class _Message:
     time_s: float
-    scan: _Table
+    scan: _Flatbuffer
 
 
-def read_osf(path: Path, options: Options) -> Found:
+def read_osf(path: Path, options: Options) -> Contents:
     """Read an OSF file: the turns of its sensor.
 
     Raises InputError where the file is empty, cut short, no OSF, or coded in a way not known here,
@@ -105,7 +105,7 @@ def read_osf(path: Path, options: Options) -> Found:
         facts = json.loads(sensors[key])
     _decode(path, metadata, facts, messages[key][0].scan)  # what cannot be decoded says so here
     sweeps = _sweeps(path, metadata, facts, messages[key])
-    return ouster_said(path.stem, sweeps, metadata, options)
+    return describe_ouster(path.stem, sweeps, metadata, options)
 
 
 def _choose(path: Path, sensors: dict[int, bytes], options: Options) -> tuple[int, Metadata]:
@@ -152,26 +152,26 @@ def _open(path: Path) -> mmap.mmap:
 
 def _contents(data: mmap.mmap) -> tuple[dict[int, bytes], dict[int, list[_Message]]]:
     """Per sensor its metadata (JSON), and its turns in the order of time."""
-    header = _Table.root(data, 0)
+    header = _Flatbuffer.root(data, 0)
     metadata_at, length = header.scalar(2, "Q", 1), header.scalar(3, "Q", 1)
     if length != len(data):
         raise ValueError(f"it should have {length} bytes and has {len(data)}")
     first_chunk = 8 + struct.unpack_from("<I", data, 0)[0]
-    metadata = _Table.root(data, metadata_at)
+    metadata = _Flatbuffer.root(data, metadata_at)
     sensors, streams = {}, {}
     for entry in metadata.tables(4):
         kind, number = entry.bytes(1).decode(), entry.scalar(0, "I")
         if kind.endswith("/LidarSensor"):
-            sensors[number] = _Table.root(entry.bytes(2), 0).bytes(0)
+            sensors[number] = _Flatbuffer.root(entry.bytes(2), 0).bytes(0)
         elif kind.endswith("/LidarScanStream"):
-            streams[number] = _Table.root(entry.bytes(2), 0).scalar(0, "I")
+            streams[number] = _Flatbuffer.root(entry.bytes(2), 0).scalar(0, "I")
     messages: dict[int, list[_Message]] = {}
     for offset in metadata.array(3, "<u8,<u8,<u8")["f2"]:
-        for message in _Table.root(data, first_chunk + int(offset)).tables(0):
+        for message in _Flatbuffer.root(data, first_chunk + int(offset)).tables(0):
             sensor = streams.get(message.scalar(1, "I"))
             if sensor is not None:
                 at, _ = message.vector(2)
-                stamped = _Message(message.scalar(0, "Q") / 1e9, _Table.root(data, at))
+                stamped = _Message(message.scalar(0, "Q") / 1e9, _Flatbuffer.root(data, at))
                 messages.setdefault(sensor, []).append(stamped)
     for turns in messages.values():
         turns.sort(key=lambda message: message.time_s)
@@ -188,7 +188,7 @@ def _sweeps(path: Path, metadata: Metadata, facts: dict, messages: list[_Message
     return Sweeps(path.stem, path.stem, time_s, read)
 
 
-def _decode(path: Path, metadata: Metadata, facts: dict, scan: _Table) -> Columns:
+def _decode(path: Path, metadata: Metadata, facts: dict, scan: _Flatbuffer) -> Columns:
     """The points of one turn; only columns that the sensor calls valid."""
     with _damage(path):
         images = {

@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 
 from chains.errors import InputError
 from sensors.documents import read_text
-from sensors.readers.base import Array, Columns, Found, Options, Progress, together
+from sensors.readers.base import Array, Columns, Contents, Options, Progress, together
 from sensors.readers.packets.osf import read_osf
 from sensors.readers.packets.ouster_sensor import (
     PROFILES,
     Metadata,
     Profile,
+    describe_ouster,
     ouster_points,
-    ouster_said,
     read_metadata,
 )
 from sensors.readers.packets.pcap import Capture
@@ -97,14 +97,14 @@ class OusterDecoder:
         )
 
 
-def ouster_found(
+def decode_ouster(
     name: str,
     clock: str,
     packets: Packets,
     metadata: Metadata,
     options: Options,
     progress: Progress,
-) -> Found:
+) -> Contents:
     """Decode the packets of one sensor; InputError where none has the size its metadata tells."""
     decoder = OusterDecoder(metadata)
     sweeps = packet_sweeps(name, clock, packets, decoder, progress)
@@ -113,15 +113,15 @@ def ouster_found(
             f"{name} has no packets of {decoder.size} bytes, which {metadata.name} tells to expect"
             f" (profile {metadata.profile}, {metadata.rings} rings); is it the right sensor's?"
         )
-    return ouster_said(name, sweeps, metadata, options)
+    return describe_ouster(name, sweeps, metadata, options)
 
 
-def read_ouster(files: Sequence[Path], options: Options, progress: Progress) -> Found:
+def read_ouster(files: Sequence[Path], options: Options, progress: Progress) -> Contents:
     """Read OSF files, or PCAP files that follow each other, of one Ouster sensor.
 
     The metadata of a PCAP is `--metadata`, a JSON among the files, or the JSON beside it whose name
     begins as the PCAP's.
-    Raises InputError as `ouster_found` and `read_metadata` do, and where no JSON is found.
+    Raises InputError as `decode_ouster` and `read_metadata` do, and where no JSON is found.
     """
     found = [read_osf(path, options) for path in files if path.suffix.lower() == ".osf"]
     told = [path for path in files if path.suffix.lower() == ".json"]
@@ -136,7 +136,7 @@ def read_ouster(files: Sequence[Path], options: Options, progress: Progress) -> 
         metadata = read_metadata(beside.name, read_text(beside))
         packets = capture_packets(capture, OusterDecoder(metadata).size, options)
         name, in_mb = capture.name, capture.progress(progress)
-        decoded = ouster_found(name, name, packets, metadata, options, in_mb)
+        decoded = decode_ouster(name, name, packets, metadata, options, in_mb)
         found.append(captured(capture, decoded))
     return together(found)
 

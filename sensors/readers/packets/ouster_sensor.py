@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from chains.errors import InputError
 from sensors.lidar import LidarModel, catalog, load_lidar
-from sensors.readers.base import Array, Columns, Found, Options, Sweeps
+from sensors.readers.base import Array, Columns, Contents, Options, Sweeps
 
 
 @dataclass(frozen=True)
@@ -211,7 +211,7 @@ def ouster_points(
     }
 
 
-def ouster_said(name: str, sweeps: Sweeps, metadata: Metadata, options: Options) -> Found:
+def describe_ouster(name: str, sweeps: Sweeps, metadata: Metadata, options: Options) -> Contents:
     """The sweeps with what is to be told of them and of the sensor."""
     lidar = metadata.lidar | ({"model": options.lidar} if options.lidar else {})
     understood = [
@@ -222,7 +222,7 @@ def ouster_said(name: str, sweeps: Sweeps, metadata: Metadata, options: Options)
     ]
     if PROFILES[metadata.profile].dual:
         understood.append(f"{name}: two returns per direction; the first (strongest) is taken")
-    return Found(sweeps=(sweeps,), lidar=lidar, understood=tuple(understood), odd=metadata.odd)
+    return Contents(sweeps=(sweeps,), lidar=lidar, understood=tuple(understood), odd=metadata.odd)
 
 
 def _flat(name: str, text: str) -> dict[str, Any]:

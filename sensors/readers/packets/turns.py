@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chains.errors import InputError
-from sensors.readers.base import Array, Columns, Found, Options, Progress, Sweep, Sweeps
+from sensors.readers.base import Array, Columns, Contents, Options, Progress, Sweep, Sweeps
 from sensors.readers.packets.pcap import Capture
 
 Packets = Callable[[], Iterator[tuple[float, bytes]]]
@@ -126,7 +126,7 @@ def capture_packets(capture: Capture, size: int, options: Options) -> Packets:
     return packets
 
 
-def captured(capture: Capture, found: Found) -> Found:
+def captured(capture: Capture, found: Contents) -> Contents:
     """What was found in a capture, and whether it was cut short."""
     if not capture.cut_short:
         return found

@@ -16,13 +16,13 @@ import numpy as np
 from chains.errors import InputError
 from sensors.documents import read_yaml
 from sensors.readers import conventions
-from sensors.readers.base import POSE, Columns, Found, Options, Progress
+from sensors.readers.base import POSE, Columns, Contents, Options, Progress
 from sensors.readers.tables.sheets import seconds
 
 
 def read_industrial_calibration(
     files: Sequence[Path], options: Options, progress: Progress
-) -> Found:
+) -> Contents:
     """Read measurements, each a stop, in the order of time.
 
     Raises:
@@ -45,7 +45,7 @@ def read_industrial_calibration(
     stops: Columns = {"time_s": time_s, **dict(zip(names, np.array(joints, float).T, strict=True))}
     stops |= {f"target.{part}": pose[:, k] for k, part in enumerate(POSE)}
     line = f"{files[0].name}: {len(stamps)} stops, {said}; target is seen from the camera, in m"
-    return Found(stops=stops, understood=(line,))
+    return Contents(stops=stops, understood=(line,))
 
 
 def _rows(path: Path) -> dict[float, Mapping[str, Any]]:

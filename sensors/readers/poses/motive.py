@@ -16,7 +16,7 @@ import numpy as np
 
 from chains.errors import InputError
 from sensors.readers import conventions
-from sensors.readers.base import POSE, Array, Found, Options, Progress, Track, together
+from sensors.readers.base import POSE, Array, Contents, Options, Progress, Track, together
 from sensors.readers.tables.sheets import Sheet, open_sheet
 
 _LENGTHS = {"meters": 1.0, "centimeters": 1e-2, "millimeters": 1e-3, "inches": 0.0254}
@@ -25,7 +25,7 @@ _MOST_TAIL = 8  # rows of the header below the first
 
 
 @dataclass(frozen=True)
-class _Part:
+class _Asset:
     """A body or marker, and in which columns its numbers stand: axis -> column."""
 
     kind: str
@@ -34,7 +34,7 @@ class _Part:
     rotation: Mapping[str, int]
 
 
-def read_motive(files: Sequence[Path], options: Options, progress: Progress) -> Found:
+def read_motive(files: Sequence[Path], options: Options, progress: Progress) -> Contents:
     """Read takes: rigid bodies as poses, labelled markers of no body as points.
 
     Raises:
@@ -60,7 +60,7 @@ def read_motive(files: Sequence[Path], options: Options, progress: Progress) -> 
 # ------------------------------------------------------------------------------------- Motive
 
 
-def _motive(sheet: Sheet, head: Sequence[str], options: Options) -> Found:
+def _motive(sheet: Sheet, head: Sequence[str], options: Options) -> Contents:
     path, cells = sheet.path, sheet.cells(head[0])
     facts = dict(zip(cells[::2], cells[1::2], strict=False))
     last, parts = _parts(sheet, head)
@@ -98,10 +98,10 @@ def _motive(sheet: Sheet, head: Sequence[str], options: Options) -> Found:
     if facts.get("Coordinate Space", "Global") != "Global":
         space = facts["Coordinate Space"]
         odd = (*odd, f"{path.name}: the coordinate space is {space}; export in Global")
-    return Found(tracks=tuple(tracks), understood=tuple(said), odd=odd)
+    return Contents(tracks=tuple(tracks), understood=tuple(said), odd=odd)
 
 
-def _parts(sheet: Sheet, head: Sequence[str]) -> tuple[int, list[_Part]]:
+def _parts(sheet: Sheet, head: Sequence[str]) -> tuple[int, list[_Asset]]:
     """The number of the last line of the header, and what the columns hold."""
     rows = [
         (n, sheet.cells(line)) for n, line in enumerate(head[: _MOST_TAIL + 2], 1) if line.strip()
@@ -114,9 +114,9 @@ def _parts(sheet: Sheet, head: Sequence[str]) -> tuple[int, list[_Part]]:
     width = len(rows[last][1])
     above = [row + [""] * (width - len(row)) for _, row in rows[1:last]]
     kinds, names, quantities, axes = above[0], above[1], above[-1], rows[last][1]
-    parts: dict[tuple[str, str], _Part] = {}
+    parts: dict[tuple[str, str], _Asset] = {}
     for k in range(2, width):
-        part = parts.setdefault((kinds[k], names[k]), _Part(kinds[k], names[k], {}, {}))
+        part = parts.setdefault((kinds[k], names[k]), _Asset(kinds[k], names[k], {}, {}))
         where = {"Position": part.position, "Rotation": part.rotation}.get(quantities[k])
         if where is not None:
             where.setdefault(axes[k].upper(), k)
@@ -133,7 +133,7 @@ def _unit(path: Path, facts: Mapping[str, str], options: Options) -> tuple[str, 
 
 
 def _track(
-    path: Path, part: _Part, column: Mapping[int, Array], turn: str, scale: float, options: Options
+    path: Path, part: _Asset, column: Mapping[int, Array], turn: str, scale: float, options: Options
 ) -> Track:
     where = f"{path}: {part.name}"
     xyz = np.stack([column[part.position[axis]] for axis in "XYZ"], axis=1) * scale
@@ -169,7 +169,7 @@ def _seen(track: Track) -> float:
 # ------------------------------------------------------------------------------------- 1.1
 
 
-def _tracking_tools(sheet: Sheet, options: Options) -> Found:
+def _tracking_tools(sheet: Sheet, options: Options) -> Contents:
     """Format 1.1: a row ``frame, index, time, bodies, (number, pose)...`` names whom it saw."""
     path, names, time_s, seen = sheet.path, {}, [], []
     for number, row in _rows(sheet):
@@ -208,7 +208,7 @@ def _tracking_tools(sheet: Sheet, options: Options) -> Found:
         tracks.append(track)
         said.append(f"{path.name}: pose {name}, seen in {_seen(track):.0%} of the frames")
     first = f"{path.name}: Tracking Tools' format 1.1, {len(time_s):,} frames, {_up(options)}"
-    return Found(tracks=tuple(tracks), understood=(first, *said))
+    return Contents(tracks=tuple(tracks), understood=(first, *said))
 
 
 def _rows(sheet: Sheet) -> Iterator[tuple[int, list[str]]]:

@@ -13,13 +13,13 @@ import numpy as np
 
 from chains.errors import InputError
 from sensors.readers import conventions
-from sensors.readers.base import POSE, Array, Found, Options, Progress, Track, together
+from sensors.readers.base import POSE, Array, Contents, Options, Progress, Track, together
 from sensors.readers.tables.sheets import LENGTHS, is_number, open_sheet, seconds
 
 _GYRO = "w_RS_S_x"
 
 
-def read_tum(files: Sequence[Path], options: Options, progress: Progress) -> Found:
+def read_tum(files: Sequence[Path], options: Options, progress: Progress) -> Contents:
     """Read TUM trajectories, separated by blanks or commas; each file is a body.
 
     Raises:
@@ -28,7 +28,7 @@ def read_tum(files: Sequence[Path], options: Options, progress: Progress) -> Fou
     return _each(files, options, progress, "x")
 
 
-def read_euroc(files: Sequence[Path], options: Options, progress: Progress) -> Found:
+def read_euroc(files: Sequence[Path], options: Options, progress: Progress) -> Contents:
     """Read EuRoC's ground truth, each file a body, or its IMU's data, of which the gyro is taken.
 
     Raises:
@@ -37,7 +37,7 @@ def read_euroc(files: Sequence[Path], options: Options, progress: Progress) -> F
     return _each(files, options, progress, "w")
 
 
-def _each(files: Sequence[Path], options: Options, progress: Progress, first: str) -> Found:
+def _each(files: Sequence[Path], options: Options, progress: Progress, first: str) -> Contents:
     found = []
     for i, path in enumerate(files):
         progress("reading trajectories", i, len(files))
@@ -45,7 +45,7 @@ def _each(files: Sequence[Path], options: Options, progress: Progress, first: st
     return together(found)
 
 
-def _read(path: Path, options: Options, first: str) -> Found:
+def _read(path: Path, options: Options, first: str) -> Contents:
     sheet, head = open_sheet(path)
     title = next((line for line in head if line.strip()), "")
     number, line = next(sheet.lines(), (0, ""))
@@ -83,13 +83,13 @@ def _read(path: Path, options: Options, first: str) -> Found:
             values=values,
         )
         line = f"{path.name}: a gyro, {rate}, {said}, rad/s"
-        return Found(tracks=(track,), understood=(line,), odd=odd)
+        return Contents(tracks=(track,), understood=(line,), odd=odd)
     pose, words = _pose(path, values, first, options)
     track = Track(
         name=path.stem, kind="pose", clock=path.stem, time_s=time_s[order], names=POSE, values=pose
     )
     line = f"{path.name}: body {path.stem}, {rate}, {said}, {words}"
-    return Found(tracks=(track,), understood=(line,), odd=odd)
+    return Contents(tracks=(track,), understood=(line,), odd=odd)
 
 
 def _pose(path: Path, values: Array, first: str, options: Options) -> tuple[Array, str]:

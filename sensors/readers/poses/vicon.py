@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from chains.errors import InputError
 from sensors.readers import conventions
-from sensors.readers.base import POSE, Array, Found, Options, Progress, Track, together
+from sensors.readers.base import POSE, Array, Contents, Options, Progress, Track, together
 from sensors.readers.tables.sheets import ANGLES, LENGTHS, Sheet, open_sheet
 
 _BODIES = ("segments", "objects")
@@ -35,7 +35,7 @@ class _Block:
     rows: list[list[str]]
 
 
-def read_vicon(files: Sequence[Path], options: Options, progress: Progress) -> Found:
+def read_vicon(files: Sequence[Path], options: Options, progress: Progress) -> Contents:
     """Read exports of Nexus or Tracker: bodies as poses, markers that have a label as points.
 
     Raises:
@@ -91,7 +91,7 @@ def _rate(path: Path, number: int, cell: str) -> float:
     return rate
 
 
-def _read(path: Path, block: _Block, options: Options) -> Found:
+def _read(path: Path, block: _Block, options: Options) -> Contents:
     odd: tuple[str, ...] = ()
     width = max(map(len, (block.names, block.axes)))
     if block.rows and len(block.rows[-1]) < len(block.axes) - 1:
@@ -117,7 +117,7 @@ def _read(path: Path, block: _Block, options: Options) -> Found:
         else:
             tracks.append(_marker(path, name, k, block, table, time_s, options))
     said = f"{path.name}: {block.title} of {len(table):,} frames at {block.rate_hz:g} Hz: "
-    return Found(tuple(tracks), understood=(said + ", ".join(t.name for t in tracks),), odd=odd)
+    return Contents(tuple(tracks), understood=(said + ", ".join(t.name for t in tracks),), odd=odd)
 
 
 def _body(

@@ -18,7 +18,7 @@ import numpy as np
 from chains.errors import InputError
 from sensors.documents import nearest
 from sensors.readers import conventions
-from sensors.readers.base import POSE, Array, Columns, Found, Options, Progress, Track
+from sensors.readers.base import POSE, Array, Columns, Contents, Options, Progress, Track
 from sensors.readers.tables.sheets import (
     ANGLES,
     LENGTHS,
@@ -45,7 +45,7 @@ class _Column:
     unit: str | None
 
 
-def read_table(files: Sequence[Path], options: Options, progress: Progress) -> Found:
+def read_table(files: Sequence[Path], options: Options, progress: Progress) -> Contents:
     """Read tables, each a log on a clock of its own or a list of stops.
 
     Raises:
@@ -63,7 +63,7 @@ def read_table(files: Sequence[Path], options: Options, progress: Progress) -> F
     for k, table in enumerate(stops):
         if len(stops) > 1:
             table["stop"] = np.array([f"{k}_{name}" for name in table["stop"]])
-    return Found(
+    return Contents(
         tracks=tuple(track for part in found for track in part.tracks),
         stops={k: np.concatenate([s[k] for s in stops]) for k in stops[0]} if stops else None,
         understood=tuple(line for part in found for line in part.understood),
@@ -71,7 +71,7 @@ def read_table(files: Sequence[Path], options: Options, progress: Progress) -> F
     )
 
 
-def _read(path: Path, options: Options) -> Found:
+def _read(path: Path, options: Options) -> Contents:
     sheet, head = open_sheet(path)
     names, skip = _header(sheet, head)
     columns = _ours(path, names, options)
@@ -337,7 +337,7 @@ def _are_stops(
 def _stops(
     path: Path, table: Columns, time: tuple[Array | None, str], said: tuple[str, ...],
     odd: tuple[str, ...],
-) -> Found:  # fmt: skip
+) -> Contents:  # fmt: skip
     """The rows as stops, in the order of time where there is one."""
     time_s, words = time
     rows = len(next(iter(table.values())))
@@ -348,13 +348,13 @@ def _stops(
     names = np.array([f"row{k:05d}" for k in range(rows)])
     stops = {"stop": names, "time_s": time_s} | table
     said = (*said, f"{path.name}: a row is a stop: {rows:,} stops")
-    return Found(stops={k: v[order] for k, v in stops.items()}, understood=said, odd=odd)
+    return Contents(stops={k: v[order] for k, v in stops.items()}, understood=said, odd=odd)
 
 
 def _tracks(
     path: Path, table: Columns, time: tuple[Array | None, str], joints: Sequence[str],
     said: tuple[str, ...], odd: tuple[str, ...],
-) -> Found:  # fmt: skip
+) -> Contents:  # fmt: skip
     """The rows as a log: bodies, joints and covariates, all on the file's clock."""
     time_s, words = time
     order = np.argsort(time_s, kind="stable")
@@ -384,4 +384,4 @@ def _tracks(
     span = float(np.ptp(time_s))
     rate = f"{(len(time_s) - 1) / span:.3g} Hz over {span:.0f} s" if span else "one instant"
     said = (*said, f"{path.name}: a log at {rate}, {words}: {', '.join(t.name for t in tracks)}")
-    return Found(tracks=tuple(tracks), understood=said, odd=odd)
+    return Contents(tracks=tuple(tracks), understood=said, odd=odd)

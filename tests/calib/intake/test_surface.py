@@ -3,13 +3,13 @@
 import numpy as np
 
 from calib.intake.surface import write_surface
-from sensors.readers.base import Surface
+from sensors.readers.base import ScannedSurface
 from sensors.reference import Reference
 
 
 def test_a_surface_written_is_the_reference_read(tmp_path):
     corners = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.1]]) + 4e5
-    surface = Surface(
+    surface = ScannedSurface(
         vertices_m=corners,
         triangles=np.array([[0, 1, 2], [0, 2, 3]]),
         label=np.array([2, 7], np.uint16),

@@ -5,13 +5,13 @@ import pytest
 
 from chains.arm import read_arm, read_masses
 from chains.frames import FrameTree
-from chains.readers.dh import Row, to_urdf
+from chains.readers.dh import DhRow, to_urdf
 
 ROWS = (
-    Row("a", 0.1, 0.7, 0.3, theta_rad=0.2, mass_kg=2.5, centre_m=(0.1, 0.0, -0.2)),
-    Row("b", -0.6, -1.2, 0.0),
-    Row("c", 0.05, np.pi / 2, -0.15, theta_rad=-0.9, kind="prismatic"),
-    Row("d", 0.0, 0.3, 0.08, theta_rad=np.pi),
+    DhRow("a", 0.1, 0.7, 0.3, theta_rad=0.2, mass_kg=2.5, centre_m=(0.1, 0.0, -0.2)),
+    DhRow("b", -0.6, -1.2, 0.0),
+    DhRow("c", 0.05, np.pi / 2, -0.15, theta_rad=-0.9, kind="prismatic"),
+    DhRow("d", 0.0, 0.3, 0.08, theta_rad=np.pi),
 )
 
 

@@ -6,11 +6,11 @@ import pytest
 from chains.arm import read_arm
 from chains.errors import InputError
 from chains.frames import FrameTree
-from chains.readers.dh import Row, to_urdf
+from chains.readers.dh import DhRow, to_urdf
 from sensors.readers.arms.dh import read_dh
 from sensors.readers.base import Options
 
-ROWS = (Row("j1", 0.1, np.pi / 2, 0.4), Row("j2", -0.6, 0, 0.05, theta_rad=np.pi / 4))
+ROWS = (DhRow("j1", 0.1, np.pi / 2, 0.4), DhRow("j2", -0.6, 0, 0.05, theta_rad=np.pi / 4))
 WRITTEN = {
     "a.yaml": """\
 convention: standard

@@ -8,7 +8,7 @@ from sensors.lidar import load_lidar
 from sensors.readers.base import Options
 from sensors.readers.clouds.fields import Cloud
 from sensors.readers.clouds.origin import fit_beam_origin
-from sensors.readers.clouds.rings import look
+from sensors.readers.clouds.rings import find_format
 
 from ..room import box_scan
 
@@ -28,7 +28,7 @@ def cloud(points=POINTS, shape=None, **fields) -> Cloud:
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
 def test_ring_goes_by_any_name(name, dtype):
     given = cloud(**{name: RING.astype(dtype), "intensity": COLUMN, "reflectivity": RING})
-    points = look("c", given, Options()).layout.points(given)
+    points = find_format("c", given, Options()).layout.points(given)
     np.testing.assert_array_equal(points["ring"], RING)
     np.testing.assert_array_equal(points["column"], COLUMN)
     np.testing.assert_array_equal(points["intensity"], COLUMN)
@@ -39,49 +39,49 @@ def test_ring_goes_by_any_name(name, dtype):
 
 def test_a_named_column_is_the_ring():
     given = cloud(strange=RING, ring=np.zeros(len(RING), int))
-    points = look("c", given, Options(columns={"ring": "strange"})).layout.points(given)
+    points = find_format("c", given, Options(columns={"ring": "strange"})).layout.points(given)
     np.testing.assert_array_equal(points["ring"], RING)
     with pytest.raises(InputError, match="no field nothing"):
-        look("c", given, Options(columns={"ring": "nothing"}))
+        find_format("c", given, Options(columns={"ring": "nothing"}))
     with pytest.raises(InputError, match="no whole numbers"):
-        look("c", cloud(line=RING + 0.5), Options())
+        find_format("c", cloud(line=RING + 0.5), Options())
 
 
 def test_rings_from_1_are_counted_from_0_and_that_is_said():
     given = cloud(ring=RING + 1)
-    seen = look("c", given, Options())
+    seen = find_format("c", given, Options())
     np.testing.assert_array_equal(seen.layout.points(given)["ring"], RING)
     assert any("count from 1 to 16" in line for line in seen.odd)
-    told = look("c", given, Options(first_ring=0))
+    told = find_format("c", given, Options(first_ring=0))
     np.testing.assert_array_equal(told.layout.points(given)["ring"], RING + 1)
     above = RING > 0  # the lowest ring sees nothing: still counted from 0
     given = cloud(POINTS[above], ring=RING[above])
     np.testing.assert_array_equal(
-        look("c", given, Options()).layout.points(given)["ring"], RING[above]
+        find_format("c", given, Options()).layout.points(given)["ring"], RING[above]
     )
     with pytest.raises(InputError, match="--first-ring"):
-        look("c", cloud(ring=RING), Options(first_ring=1))
+        find_format("c", cloud(ring=RING), Options(first_ring=1))
 
 
 def test_points_without_a_return_are_left_out():
     points = POINTS.copy()
     points[::3], points[1::3] = 0, np.nan
     given = cloud(points, ring=RING, intensity=COLUMN)
-    kept = look("c", given, Options()).layout.points(given)
+    kept = find_format("c", given, Options()).layout.points(given)
     np.testing.assert_array_equal(kept["ring"], RING[2::3])
     np.testing.assert_array_equal(kept["intensity"], COLUMN[2::3])
     with pytest.raises(InputError, match="no returns"):
-        look("c", cloud(np.zeros_like(POINTS), ring=RING), Options())
+        find_format("c", cloud(np.zeros_like(POINTS), ring=RING), Options())
 
 
 def test_rows_of_one_elevation_are_rings():
     given = cloud(shape=(16, 180))
-    points = look("c", given, Options()).layout.points(given)
+    points = find_format("c", given, Options()).layout.points(given)
     np.testing.assert_array_equal(points["ring"], RING)
     np.testing.assert_array_equal(points["column"], COLUMN)
     order = np.random.default_rng(1).permutation(len(POINTS))  # rows that mean nothing
     mixed = cloud(POINTS[order], shape=(16, 180))
-    seen = look("c", mixed, Options(lidar="velodyne_vlp16"))
+    seen = find_format("c", mixed, Options(lidar="velodyne_vlp16"))
     np.testing.assert_array_equal(seen.layout.points(mixed)["ring"], RING[order])
     assert any("told by elevation" in line for line in seen.odd)
 
@@ -97,7 +97,7 @@ def test_rings_are_told_by_elevation(model):
     lidar = load_lidar(model)
     points, ring, _ = box_scan(lidar.elevation_rad, lidar.columns // 2)
     given = cloud(points)
-    seen = look("c", given, Options())
+    seen = find_format("c", given, Options())
     np.testing.assert_array_equal(seen.layout.points(given)["ring"], ring)
     assert seen.lidar["model"] == model
 
@@ -107,7 +107,7 @@ def test_two_models_with_one_set_of_elevations_are_told_by_azimuth_steps_or_aske
     names = ("hesai_xt16", "velodyne_vlp16")
     for name in names:
         points, ring, _ = box_scan(VLP16.elevation_rad, load_lidar(name).columns)
-        seen = look("c", cloud(points), Options())
+        seen = find_format("c", cloud(points), Options())
         assert seen.lidar["model"] == name
         downwards = name == "hesai_xt16"
         expected = 15 - ring if downwards else ring
@@ -116,8 +116,8 @@ def test_two_models_with_one_set_of_elevations_are_told_by_azimuth_steps_or_aske
         assert all(other in line for other in names)
     points, ring, _ = box_scan(VLP16.elevation_rad, 1200)
     with pytest.raises(InputError, match=r"hesai_xt16 and of velodyne_vlp16.*1200 .*--lidar"):
-        look("c", cloud(points), Options())
-    seen = look("c", cloud(points), Options(lidar="velodyne_vlp16"))
+        find_format("c", cloud(points), Options())
+    seen = find_format("c", cloud(points), Options(lidar="velodyne_vlp16"))
     np.testing.assert_array_equal(seen.layout.points(cloud(points))["ring"], ring)
 
 
@@ -127,7 +127,7 @@ def test_a_ring_of_a_few_points_is_no_other_ring():
     points, ring, column = box_scan(lidar.elevation_rad, lidar.columns)
     kept = (ring != 20) | (column % 400 == 0)
     given = cloud(points[kept])
-    seen = look("c", given, Options())
+    seen = find_format("c", given, Options())
     np.testing.assert_array_equal(seen.layout.points(given)["ring"], ring[kept])
 
 
@@ -135,7 +135,7 @@ def test_rings_are_told_by_elevation_where_beams_start_aside():
     """Seen from the axis an Ouster's rings blur in a small room, and from its beams they do not."""
     points, ring, _ = box_scan(OS0.elevation_rad, 128, OS0.beam_origin_m[0])
     given = cloud(points)
-    seen = look("c", given, Options())
+    seen = find_format("c", given, Options())
     np.testing.assert_array_equal(seen.layout.points(given)["ring"], ring)
 
 
@@ -155,7 +155,7 @@ def test_rings_are_told_by_the_order_of_the_points(downwards, forwards):
     if downwards:
         order = order[np.argsort(-RING[order], kind="stable")]
     given = cloud(points[order])
-    seen = look("c", given, Options())
+    seen = find_format("c", given, Options())
     np.testing.assert_array_equal(seen.layout.points(given)["ring"], ring[order])
     assert any("order of the points" in line for line in seen.odd)
     fewer = cloud(points[order][RING[order] > 3])
@@ -166,17 +166,17 @@ def test_rings_are_told_by_the_order_of_the_points(downwards, forwards):
 def test_rings_that_are_not_clear_are_refused():
     rng = np.random.default_rng(0)
     with pytest.raises(InputError, match=r"no field for the ring .*--column ring=FIELD"):
-        look("c", cloud(rng.normal(size=(5000, 3))), Options())
+        find_format("c", cloud(rng.normal(size=(5000, 3))), Options())
     blurred = rng.permutation(POINTS + rng.normal(size=POINTS.shape) * 0.05)
     with pytest.raises(InputError, match="clear groups"):
-        look("c", cloud(blurred), Options())
+        find_format("c", cloud(blurred), Options())
 
 
 def test_millimetres_are_refused_until_they_are_told():
     given = cloud(POINTS * 1000, ring=RING)
     with pytest.raises(InputError, match="--length-unit mm"):
-        look("c", given, Options())
-    points = look("c", given, Options(length_unit="mm")).layout.points(given)
+        find_format("c", given, Options())
+    points = find_format("c", given, Options(length_unit="mm")).layout.points(given)
     np.testing.assert_allclose(points["x"], POINTS[:, 0], rtol=1e-6)
 
 
@@ -202,11 +202,11 @@ def test_lasers_at_heights_of_their_own_tell_no_origin():
 
 def test_a_correction_left_off_is_said():
     points, ring, _ = box_scan(OS0.elevation_rad, 256)  # as if every beam started in the axis
-    seen = look("c", cloud(points, ring=ring), Options(lidar="ouster_os0_32"))
+    seen = find_format("c", cloud(points, ring=ring), Options(lidar="ouster_os0_32"))
     assert any("left its correction off" in line for line in seen.odd)
     assert seen.lidar["beam_origin_m"] == [0.0, 0.0]
     points, ring, _ = box_scan(OS0.elevation_rad, 256, OS0.beam_origin_m[0])
-    seen = look("c", cloud(points, ring=ring), Options(lidar="ouster_os0_32"))
+    seen = find_format("c", cloud(points, ring=ring), Options(lidar="ouster_os0_32"))
     assert not any("left its correction off" in line for line in seen.odd)
     assert seen.lidar["beam_origin_m"][0] == pytest.approx(OS0.beam_origin_m[0], abs=2e-5)
 
@@ -214,7 +214,7 @@ def test_a_correction_left_off_is_said():
 def test_points_in_the_frame_of_the_housing_are_moved_to_the_centre():
     points, ring, _ = box_scan(OS0.elevation_rad, 256, OS0.beam_origin_m[0])
     given = cloud(points + np.array([0, 0, 0.03618]), ring=ring)
-    seen = look("c", given, Options())
+    seen = find_format("c", given, Options())
     assert any("36.2 mm above the origin" in line for line in seen.odd)
     np.testing.assert_allclose(seen.layout.points(given)["z"], points[:, 2], atol=1e-5)
 
@@ -222,25 +222,27 @@ def test_points_in_the_frame_of_the_housing_are_moved_to_the_centre():
 @pytest.mark.parametrize(("unit", "scale"), [("s", 1), ("us", 1e6), ("ns", 1e9)])
 def test_the_middle_of_a_turn_is_in_seconds(unit, scale):
     offset = COLUMN / 180 * 0.1
-    seen = look("c", cloud(ring=RING, t=(offset * scale)), Options())
+    seen = find_format("c", cloud(ring=RING, t=(offset * scale)), Options())
     assert seen.middle_s == pytest.approx(0.05, abs=1e-3)
     absolute = cloud(ring=RING, timestamp=(1.7e9 + offset))
     absolute = Cloud(absolute.fields, None, stamp_s=1.7e9)
-    assert look("c", absolute, Options()).middle_s == pytest.approx(0.05, abs=1e-3)
+    assert find_format("c", absolute, Options()).middle_s == pytest.approx(0.05, abs=1e-3)
 
 
 def test_axes_that_turn_the_wrong_way_are_said():
     offset = COLUMN / 180 * 0.1
     assert not any(
-        "right-handed" in o for o in look("c", cloud(ring=RING, t=offset), Options()).odd
+        "right-handed" in o for o in find_format("c", cloud(ring=RING, t=offset), Options()).odd
     )
     mirrored = cloud(POINTS * [1, -1, 1], ring=RING, t=offset)
-    assert any("right-handed" in o for o in look("c", mirrored, Options()).odd)
+    assert any("right-handed" in o for o in find_format("c", mirrored, Options()).odd)
 
 
 def test_a_model_that_several_could_be_is_asked_for():
     strange = np.radians(np.linspace(-7, 31, 16))
     points, ring, _ = box_scan(strange, 180)
-    seen = look("c", cloud(points, ring=ring), Options())
+    seen = find_format("c", cloud(points, ring=ring), Options())
     assert "model" not in seen.lidar and any("--lidar" in line for line in seen.odd)
-    assert look("c", cloud(points, ring=ring), Options(lidar="velodyne_vlp16")).lidar["model"]
+    assert find_format("c", cloud(points, ring=ring), Options(lidar="velodyne_vlp16")).lidar[
+        "model"
+    ]

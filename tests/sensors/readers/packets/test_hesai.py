@@ -9,7 +9,7 @@ import pytest
 from chains.errors import InputError
 from sensors.lidar import load_lidar
 from sensors.readers.base import Options
-from sensors.readers.packets.hesai import hesai_found, read_angles, read_hesai
+from sensors.readers.packets.hesai import decode_hesai, read_angles, read_hesai
 from sensors.readers.packets.hesai_models import MODELS
 
 from .captures import write_pcap
@@ -71,7 +71,7 @@ def quiet(what: str, done: int, total: int) -> None:
 
 
 def decoded(packets: list, metadata: Path | None) -> list:
-    found = hesai_found("p", "p", lambda: iter(packets), Options(metadata=metadata), quiet)
+    found = decode_hesai("p", "p", lambda: iter(packets), Options(metadata=metadata), quiet)
     (sweeps,) = found.sweeps
     return list(sweeps.read(np.ones(len(sweeps.time_s), bool)))
 
@@ -149,7 +149,7 @@ def test_packets_that_overtake_each_other_stay_in_their_turn(tmp_path):
 def test_only_wanted_turns_are_decoded_and_each_is_itself(tmp_path):
     angles = table(tmp_path / "angles.csv", "PandarXT-32")
     packets = turns("PandarXT-32", 5, start=7)
-    found = hesai_found("p", "p", lambda: iter(packets), Options(metadata=angles), quiet)
+    found = decode_hesai("p", "p", lambda: iter(packets), Options(metadata=angles), quiet)
     (sweeps,) = found.sweeps
     every = list(sweeps.read(np.ones(6, bool)))
     wanted = np.array([False, True, False, True, True, False])
@@ -183,7 +183,7 @@ def test_a_capture_is_read_with_nothing_but_itself(tmp_path):
 @pytest.mark.parametrize("model", LAYOUTS)
 def test_every_model_has_angles_of_the_catalogue(model):
     """Without a table: as many rings as channels, and it is said that they are nominal."""
-    found = hesai_found("p", "p", lambda: iter(turns(model, 1)), Options(), quiet)
+    found = decode_hesai("p", "p", lambda: iter(turns(model, 1)), Options(), quiet)
     lidar = load_lidar(found.lidar["model"])
     assert lidar.rings == LAYOUTS[model][3] == len(found.lidar["elevation_deg"])
     assert any("nominal" in line for line in found.odd)
@@ -203,13 +203,13 @@ def test_two_sensors_in_one_capture_must_be_told_apart(tmp_path):
 def test_what_cannot_be_decoded_is_refused(tmp_path):
     wrong = Options(metadata=table(tmp_path / "angles.csv", "Pandar40P"))
     with pytest.raises(InputError, match="40 channels, but p comes from a PandarXT-32"):
-        hesai_found("p", "p", lambda: iter(turns("PandarXT-32", 1)), wrong, quiet)
+        decode_hesai("p", "p", lambda: iter(turns("PandarXT-32", 1)), wrong, quiet)
     another = Options(metadata=table(tmp_path / "angles.csv", "Pandar64"))
     with pytest.raises(InputError, match=r"no table of a PandarQT64's angles.*deg off"):
-        hesai_found("p", "p", lambda: iter(turns("PandarQT64", 1)), another, quiet)
+        decode_hesai("p", "p", lambda: iter(turns("PandarQT64", 1)), another, quiet)
     newer = [(0.0, b"\xee\xff\x01\x04" + bytes(857))]
     with pytest.raises(InputError, match=r"861 bytes, Hesai's protocol 1\.4"):
-        hesai_found("p", "p", lambda: iter(newer), Options(), quiet)
+        decode_hesai("p", "p", lambda: iter(newer), Options(), quiet)
     path = write_pcap(tmp_path / "a.pcap", [(0.0, 1, b"x" * 900)])
     with pytest.raises(InputError, match="packets of 900 bytes"):
         read_hesai([path], Options(), quiet)

@@ -10,7 +10,7 @@ import pytest
 from chains.errors import InputError
 from sensors.lidar import beams
 from sensors.readers.base import Options
-from sensors.readers.packets.ouster import OusterDecoder, ouster_found, read_metadata, read_ouster
+from sensors.readers.packets.ouster import OusterDecoder, decode_ouster, read_metadata, read_ouster
 
 from .captures import write_pcap
 
@@ -89,7 +89,7 @@ def quiet(what: str, done: int, total: int) -> None:
 
 def decoded(packets: list, facts: dict) -> list:
     metadata = read_metadata("m.json", json.dumps(facts))
-    found = ouster_found("p", "p", lambda: iter(packets), metadata, Options(), quiet)
+    found = decode_ouster("p", "p", lambda: iter(packets), metadata, Options(), quiet)
     (sweeps,) = found.sweeps
     return list(sweeps.read(np.ones(len(sweeps.time_s), bool)))
 
