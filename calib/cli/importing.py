@@ -64,7 +64,7 @@ Most = Annotated[int | None, _flag("most-stops", "Keep N of more stops, evenly s
 
 
 @app.command("import", cls=_ListsKinds)
-def bring_in(
+def import_command(
     words: Words, out: Out, rig: Rig = None, body: Body = None, column: Column = None,
     topic: Topic = None, length_unit: Length = None, angle_unit: Angle = None, euler: Euler = None,
     rows: Rows = None, dh: Dh = None, up: Up = None, first_ring: First = None,
