@@ -42,8 +42,8 @@ offsets = run.solution.shared.effects["ring_range_offset"]
 true_m = truth["effects"]["ring_range_offset"]
 print("ring  offset mm      truth mm")
 for ring in range(0, 64, 8):
-    found = f"{1e3 * offsets.estimate[ring]:+6.2f} ± {1e3 * offsets.sigma[ring]:.2f}"
-    print(f"{ring:4}  {found}  {1e3 * true_m[ring]:+6.2f}")
+    estimate = f"{1e3 * offsets.estimate[ring]:+6.2f} ± {1e3 * offsets.sigma[ring]:.2f}"
+    print(f"{ring:4}  {estimate}  {1e3 * true_m[ring]:+6.2f}")
 
 rig = load_rig(out / "recording")
 stop, pose = next(iter(truth["stops"].items()))

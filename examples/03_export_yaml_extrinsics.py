@@ -37,11 +37,11 @@ for name, frame in extrinsics["frames"].items():
     xyz_m = ", ".join(f"{v:.4f}" for v in frame["xyz_m"])
     print(f"  {frame['parent']} -> {name}: {xyz_m} m, sigma {1e3 * max(frame['sigma_m']):.2f} mm")
 
-found = {n: np.array(f["T_parent_child"]) for n, f in extrinsics["frames"].items()}
+fitted = {n: np.array(f["T_parent_child"]) for n, f in extrinsics["frames"].items()}
 cad = {edge.name: edge.T_parent_child for edge in load_rig(out / "recording").tree.edges}
 truth = json.loads((out / "recording.truth.json").read_text())
 true = {name: np.array(T) for name, T in truth["frames"].items()}
-T_true, *others = (np.linalg.inv(T["mount_markers"]) @ T["lidar"] for T in (true, cad, found))
+T_true, *others = (np.linalg.inv(T["mount_markers"]) @ T["lidar"] for T in (true, cad, fitted))
 print("mount_markers -> lidar")
 for name, T in zip(("CAD", "fit"), others, strict=True):
     print(f"  {name}: {off(T, T_true)}")

@@ -57,5 +57,5 @@ for each in calib.diagnose(run, refits=False).unexplained[:3]:
 for kind in ("yaml", "py"):
     grown = calib.add(run, str(out / f"mine.{kind}"), out / f"with-{kind}")
     effect = grown.solution.shared.effects[grown.effects[-1]]
-    found = f"{effect.estimate[0]:+.4f} ± {effect.sigma[0]:.4f}"
-    print(f"mine.{kind}: {grown.summary['rms_mm']['held_out']:.2f} mm held out, amount {found}")
+    amount = f"{effect.estimate[0]:+.4f} ± {effect.sigma[0]:.4f}"
+    print(f"mine.{kind}: {grown.summary['rms_mm']['held_out']:.2f} mm held out, amount {amount}")

@@ -134,15 +134,15 @@ def ransac_plane(points_m: np.ndarray, within_m: float) -> np.ndarray:
         raise InputError(f"{len(points_m)} points lie on no plane in particular; 3 are needed")
     o3d.utility.random.seed(0)  # its threads still draw in any order
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points_m))
-    found = np.sort(cloud.segment_plane(within_m, ransac_n=3, num_iterations=1000)[1])
+    inliers = np.sort(cloud.segment_plane(within_m, ransac_n=3, num_iterations=1000)[1])
     for _ in range(20):
-        away_m = points_m - points_m[found].mean(axis=0)
-        normal = np.linalg.eigh(away_m[found].T @ away_m[found])[1][:, 0]
+        away_m = points_m - points_m[inliers].mean(axis=0)
+        normal = np.linalg.eigh(away_m[inliers].T @ away_m[inliers])[1][:, 0]
         again = np.flatnonzero(np.abs(away_m @ normal) <= within_m)
-        if np.array_equal(again, found):
+        if np.array_equal(again, inliers):
             break
-        found = again
-    return found
+        inliers = again
+    return inliers
 
 
 # ------------------------------------------------------------------------------------------ meshes

@@ -112,8 +112,8 @@ class Planes:
         off_m = np.einsum("nki,ni->nk", self.normal[plane], points_world_m)
         off_m = np.where(plane < 0, np.inf, np.abs(off_m - self.distance_m[plane]))
         best = off_m.argmin(axis=1)[:, None]
-        found = np.take_along_axis(off_m, best, axis=1) <= self.tolerance_m
-        return np.where(found, np.take_along_axis(plane, best, axis=1), -1)[:, 0]
+        within = np.take_along_axis(off_m, best, axis=1) <= self.tolerance_m
+        return np.where(within, np.take_along_axis(plane, best, axis=1), -1)[:, 0]
 
 
 class PlaneFinder:

@@ -279,9 +279,9 @@ def _check_types(path: Path, file: "ParquetFile") -> list[str]:
         if name not in kinds:
             raise InputError(f"{path}: column {name} is missing; a scan has {', '.join(_KINDS)}")
         if kinds[name] == "" or kinds[name] not in kind:
-            found = file.schema_arrow.field(name).type
+            stored = file.schema_arrow.field(name).type
             should = "float32, in metres" if kind == "f" else "uint16"
-            raise InputError(f"{path}: column {name} is {found}; it should be {should}")
+            raise InputError(f"{path}: column {name} is {stored}; it should be {should}")
     return [name for name, kind in kinds.items() if kind]
 
 

@@ -52,14 +52,14 @@ def check(recording: Path, as_json: Json = False) -> None:
     from calib.solve.check import check as run
 
     with progress_bar() as progress:
-        found = run(recording, progress)
+        checked = run(recording, progress)
     if as_json:
-        print_json(found.document())
+        print_json(checked.document())
     else:
         from calib.show.tables import print_check
 
-        print_check(found)
-    if found.problems:
+        print_check(checked)
+    if checked.problems:
         raise SystemExit(2)
 
 
@@ -122,13 +122,13 @@ def diagnose(
 
     fitted = Run.open(run)
     with progress_bar() as progress:
-        found = find(fitted, progress, refits)
+        diagnosis = find(fitted, progress, refits)
     if as_json:
-        print_json(found.document())
+        print_json(diagnosis.document())
     else:
         from calib.show.diagnosis import print_diagnosis
 
-        print_diagnosis(found, fitted.summary["residual"])
+        print_diagnosis(diagnosis, fitted.summary["residual"])
 
 
 @app.command()
@@ -145,13 +145,13 @@ def explain(
 
     chosen = Model.of(effects, fix or [])
     with progress_bar() as progress:
-        found = climb(recordings, out, chosen, progress)
+        explanation = climb(recordings, out, chosen, progress)
     if as_json:
-        print_json(found.document())
+        print_json(explanation.document())
     else:
         from calib.show.diagnosis import print_explanation
 
-        print_explanation(found)
+        print_explanation(explanation)
 
 
 @app.command()
@@ -187,13 +187,13 @@ def evaluate(
 
     opened = [Run.open(run) for run in runs]
     with progress_bar() as progress:
-        found = evaluate_all(opened, out, raw, progress)
+        evaluations = evaluate_all(opened, out, raw, progress)
     if as_json:
-        print_json(found if len(found) > 1 else next(iter(found.values())))
+        print_json(evaluations if len(evaluations) > 1 else next(iter(evaluations.values())))
     else:
         from calib.show.evaluation import print_evaluations
 
-        print_evaluations(found)
+        print_evaluations(evaluations)
 
 
 @app.command()

@@ -112,17 +112,17 @@ def import_command(
 
 def _pairs(flag: str, items: Sequence[str] | None, kind: Callable[[str], T]) -> dict[str, T]:
     """Options of the form NAME=VALUE, by name."""
-    found = {}
+    values = {}
     for item in items or ():
         name, equals, value = item.partition("=")
         try:
             if not name or not equals or not value:
                 raise ValueError
-            found[name] = kind(value)
+            values[name] = kind(value)
         except ValueError:
             what = "a number" if kind is float else "something"
             raise InputError(f"{flag} {item}: give NAME=VALUE, with {what} on the right") from None
-    return found
+    return values
 
 
 def _one_of(flag: str, value: T | None, allowed: Sequence[T]) -> T | None:

@@ -223,12 +223,12 @@ def _correct(
 def _incidence(xyz_m: np.ndarray, rig: Rig, met_rad: np.ndarray | None) -> np.ndarray:
     """Incidence (N,) on what the beams are known to meet, or else on their neighbours' planes."""
     if met_rad is None:
-        found = incidence(xyz_m, rig)
+        incidence_rad = incidence(xyz_m, rig)
     elif np.isnan(met_rad).any():
-        found = np.where(np.isnan(met_rad), incidence(xyz_m, rig), met_rad)
+        incidence_rad = np.where(np.isnan(met_rad), incidence(xyz_m, rig), met_rad)
     else:
-        found = met_rad
-    return np.minimum(found, FLATTEST_RAD)
+        incidence_rad = met_rad
+    return np.minimum(incidence_rad, FLATTEST_RAD)
 
 
 def incidence(xyz_m: np.ndarray, rig: Rig) -> np.ndarray:
@@ -271,14 +271,16 @@ def _check_rings(rig: Rig, path: Path, columns: Columns, seen: np.ndarray) -> No
 
 def _rig(run: Run, name: str | None) -> Rig:
     """The rig whose LiDAR is meant."""
-    found = {r["rig"]: Path(r["path"]) for r in run.model["recordings"]}
-    if name is None and len(found) > 1:
+    folders = {r["rig"]: Path(r["path"]) for r in run.model["recordings"]}
+    if name is None and len(folders) > 1:
         raise InputError(
-            f"{run.folder} has several rigs: say whose LiDAR with --rig, {', '.join(found)}"
+            f"{run.folder} has several rigs: say whose LiDAR with --rig, {', '.join(folders)}"
         )
-    if name is not None and name not in found:
-        raise InputError(f"--rig {name}: {run.folder} has no such rig{nearest(name, list(found))}")
-    path = found[name] if name else next(iter(found.values()))
+    if name is not None and name not in folders:
+        raise InputError(
+            f"--rig {name}: {run.folder} has no such rig{nearest(name, list(folders))}"
+        )
+    path = folders[name] if name else next(iter(folders.values()))
     if not path.is_dir():
         raise InputError(
             f"{path}, which {run.folder} was fitted to, is no longer there; put it back"

@@ -106,12 +106,12 @@ class Tally:
         second = xyz[:, UPPER[0]] * xyz[:, UPPER[1]] * n[:, None]
         moments = np.column_stack([n, n[:, None] * xyz, second, within])
         surface = done.surface[rows]
-        found = _by_bin(surface, moments)
-        label = np.zeros(len(found), int)
+        planes = _by_bin(surface, moments)
+        label = np.zeros(len(planes), int)
         label[surface] = points["label"][rows]
         mine = self._planes.setdefault(done.rig, {})
-        for s in np.flatnonzero(found[:, 0]).tolist():
-            mine[s] = mine.get(s, 0.0) + np.append(found[s], 1.0)
+        for s in np.flatnonzero(planes[:, 0]).tolist():
+            mine[s] = mine.get(s, 0.0) + np.append(planes[s], 1.0)
             self._label[done.rig, s] = int(label[s])
 
     def document(self, labels: Mapping[int, str]) -> dict[str, Any]:
@@ -140,15 +140,15 @@ class Tally:
 
     def _rows(self, name: str, labels: Mapping[int, str]) -> list[dict[str, Any]]:
         width = BINS[name][1]
-        found = [(k, row) for k, row in enumerate(self._by[name]) if row[0]]
+        filled = [(k, row) for k, row in enumerate(self._by[name]) if row[0]]
         if name == "label":
-            return [{"value": k, "name": labels.get(k, ""), **_row(row)} for k, row in found]
+            return [{"value": k, "name": labels.get(k, ""), **_row(row)} for k, row in filled]
         middle = 0.0 if name == "ring" else 0.5
-        return [{"value": (k + middle) * width, **_row(row)} for k, row in found]
+        return [{"value": (k + middle) * width, **_row(row)} for k, row in filled]
 
     def _thickness(self, labels: Mapping[int, str]) -> list[dict[str, Any]]:
         """Standard deviation of returns across the plane that fits them best, most seen first."""
-        found = [
+        planes = [
             {
                 "rig": rig,
                 "surface": s,
@@ -160,7 +160,7 @@ class Tally:
             for rig, mine in self._planes.items()
             for s, moments in mine.items()
         ]
-        return sorted(found, key=lambda plane: -plane["n"])[:PLANES]
+        return sorted(planes, key=lambda plane: -plane["n"])[:PLANES]
 
 
 def thickness(moments: np.ndarray) -> float:

@@ -54,26 +54,26 @@ class FittedRig:
     @cached_property
     def fixed(self) -> dict[str, np.ndarray]:
         """Effects that bend the rig alike at every stop: (E, 6) twists, or (J,) of joints."""
-        found = {}
+        shifts = {}
         for name, effect in self.effects.items():
             if effect.site in (Site.EDGE, Site.JOINTS):
                 basis = _known(effect, self._view(_PROBES, {}))
                 if basis is not None and not np.ptp(basis, axis=0).any():
-                    found[name] = basis[0] @ self.part.effects[name].estimate
-        return found
+                    shifts[name] = basis[0] @ self.part.effects[name].estimate
+        return shifts
 
     @cached_property
     def frames(self) -> dict[str, FrameEstimate]:
         """Every frame of rig.yaml and the worlds, as the fit has it, fixed effects included."""
         twists = self._sum(Site.EDGE, (len(self.rig.tree.edges), 6))
-        found = dict(self.part.frames)
+        frames = dict(self.part.frames)
         for edge, twist in zip(self.rig.tree.edges, twists, strict=True):
-            if edge.name in found and twist.any():
-                frame = found[edge.name]
+            if edge.name in frames and twist.any():
+                frame = frames[edge.name]
                 moved = se3.log(se3.inverse(edge.T_parent_child) @ frame.T_parent_child)
                 T = edge.T_parent_child @ se3.exp(moved + twist)
-                found[edge.name] = FrameEstimate(frame.parent, T, frame.sigma_m, frame.sigma_rad)
-        return found
+                frames[edge.name] = FrameEstimate(frame.parent, T, frame.sigma_m, frame.sigma_rad)
+        return frames
 
     @cached_property
     def origins(self) -> dict[str, np.ndarray]:
@@ -84,22 +84,22 @@ class FittedRig:
         """
         twists = self._sum(Site.EDGE, (len(self.rig.tree.edges), 6))
         offsets = self._sum(Site.JOINTS, (len(self.rig.joint_names),))
-        found = {}
+        origins = {}
         for edge, twist in zip(self.rig.tree.edges, twists, strict=True):
             if edge.name in self.rig.arm_edges:
                 T = edge.T_parent_child @ se3.exp(twist)
                 if edge.joint is not None:
                     turn = offsets[self.rig.joint_names.index(edge.joint.name)]
                     T = T @ se3.exp(turn * edge.joint.screw)
-                found[edge.name] = T
-        return found
+                origins[edge.name] = T
+        return origins
 
     @cached_property
     def by_ring(self) -> dict[str, np.ndarray]:
         """Effects that shift every ring for good: basis (R, 3, P), of range, azimuth, elevation."""
         if self.rig.lidar is None:
             return {}
-        rings, found = self.rig.lidar.rings, {}
+        rings, bases = self.rig.lidar.rings, {}
         columns = {
             "ring": np.tile(np.arange(rings), 2),
             "elevation_rad": np.tile(self.rig.lidar.elevation_rad, 2),
@@ -108,8 +108,8 @@ class FittedRig:
             if effect.site is Site.BEAM:
                 basis = _known(effect, self._view(2 * rings, columns))
                 if basis is not None and np.array_equal(basis[:rings], basis[rings:]):
-                    found[name] = basis[:rings]
-        return found
+                    bases[name] = basis[:rings]
+        return bases
 
     def ring_errors(self) -> tuple[np.ndarray, np.ndarray]:
         """(R, 3) range m, azimuth and elevation rad of every ring, measured less true, and sigma.
@@ -153,8 +153,8 @@ class FittedRig:
         return View(self.rig, rows, columns, joints)
 
     def _sum(self, site: Site, shape: tuple[int, ...]) -> np.ndarray:
-        found = (value for name, value in self.fixed.items() if self.effects[name].site is site)
-        return sum(found, np.zeros(shape))
+        values = (value for name, value in self.fixed.items() if self.effects[name].site is site)
+        return sum(values, np.zeros(shape))
 
     def _variable(self, name: str) -> str:
         own = self.several and owned(self.effects[name], self.rig)

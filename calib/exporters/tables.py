@@ -9,7 +9,7 @@ from pathlib import Path
 
 from calib.exporters.fitted import Fitted
 from calib.exporters.written import Written, head, write_text
-from calib.runs.estimates import VariableEstimate, found
+from calib.runs.estimates import VariableEstimate, variable_estimates
 from calib.show.tables import LISTED, effect_cells, estimate_cell, shown
 
 CONVENTIONS = (
@@ -49,7 +49,7 @@ def write_markdown(fitted: Fitted, folder: Path) -> Written:
 def _write(
     fitted: Fitted, path: Path, line: str, render: Callable[[_TextTable], Iterable[str]]
 ) -> Written:
-    rows = found(fitted.run)
+    rows = variable_estimates(fitted.run)
     long = [row.variable for row in rows if row.parent is None and len(row.parameters) > LISTED]
     not_held = [
         "poses: extrinsics.yaml has them",

@@ -12,7 +12,7 @@ import numpy as np
 
 from calib.exporters.fitted import FittedRig, for_every_rig
 from calib.exporters.written import Written, write_text
-from calib.runs.estimates import found
+from calib.runs.estimates import variable_estimates
 from calib.solve.solution import FrameEstimate
 from chains import se3
 
@@ -77,7 +77,7 @@ def _rows(fit: FittedRig) -> Iterator[_Row]:
     """Every frame, after the one that it hangs from."""
     tree, frames, rig = fit.rig.tree, fit.frames, fit.rig
     mine = {name: name for name in frames} | {f"{rig.name}/{name}": name for name in frames}
-    told = {mine.get(row.variable): bool(row.told.all()) for row in found(fit.run)}
+    told = {mine.get(row.variable): bool(row.told.all()) for row in variable_estimates(fit.run)}
     under: dict[str, list[str]] = {}
     for name, frame in frames.items():
         if name not in tree.frames:

@@ -69,9 +69,9 @@ def charts_of(evidence: Evidence) -> Contents:
     sections: dict[str, list[Chart]] = {}
     absent: list[Absent] = []
     for title, makers in SECTIONS.items():
-        found = [each for make in makers for each in make(evidence)]
-        sections[title] = [each for each in found if isinstance(each, Chart)]
-        absent += [each for each in found if isinstance(each, Absent)]
+        results = [each for make in makers for each in make(evidence)]
+        sections[title] = [each for each in results if isinstance(each, Chart)]
+        absent += [each for each in results if isinstance(each, Absent)]
     return Contents(sections, absent)
 
 

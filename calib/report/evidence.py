@@ -16,7 +16,7 @@ from calib.problem.model import Source
 from calib.report.budget import Budget, budget
 from calib.report.statistics import AZIMUTHS, BINS, PLACES, Axis, Statistics, StopResiduals, gather
 from calib.residuals.scan import ScanStop
-from calib.runs.estimates import VariableEstimate, found
+from calib.runs.estimates import VariableEstimate, variable_estimates
 from calib.runs.ladder import Rung, ladder
 from calib.runs.reopen import model_of, reopened
 from calib.runs.residual_table import residual_table, table_path
@@ -30,7 +30,7 @@ SAMPLED = 8  # tables from which the bins of covariates are taken
 # Columns of a table that are no covariate: they name a place, or are what is explained.
 NOT_COVARIATES = {*PLACES, "region", "patch", "column", "residual_m", "sigma_m", "weight"}
 NEEDED = {"ring", "column", "azimuth_rad", "range_m", "incidence_rad"}
-TOLD = {"rms_mm", "misfit", "converged", "residual", "stops", "points"}  # of a summary
+SUMMARY_KEYS = {"rms_mm", "misfit", "converged", "residual", "stops", "points"}  # of a summary
 NEEDED |= {"residual_m", "sigma_m", "weight"}
 FIRST = ("incidence_rad", "range_m", "ring", "azimuth_rad", "elevation_rad", "intensity", "label")
 
@@ -87,9 +87,9 @@ class Evidence:
         return self.run.diagnosis()
 
     @cached_property
-    def found(self) -> list[VariableEstimate]:
+    def estimates(self) -> list[VariableEstimate]:
         """Links and effects of the run, as plain rows."""
-        return found(self.run)
+        return variable_estimates(self.run)
 
     @cached_property
     def problem(self) -> Problem:
@@ -228,7 +228,7 @@ class Evidence:
 
 def _check(run: Run) -> None:
     """A run of another version may lack what a report tells."""
-    lacking = sorted(TOLD - run.summary.keys())
+    lacking = sorted(SUMMARY_KEYS - run.summary.keys())
     if lacking:
         raise InputError(
             f"{run.folder / SUMMARY} has no '{lacking[0]}': written by another version of rigcal, "

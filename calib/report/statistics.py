@@ -235,8 +235,8 @@ def gather(
 def _numbered(columns: Mapping[str, np.ndarray], room: int, among: dict[Any, int]) -> np.ndarray:
     """(N,) which place each row looks at, numbered among those of all stops."""
     kind = next(name for name in PLACES if name in columns)
-    found, local = np.unique(columns[kind], return_inverse=True)
-    numbers = [among.setdefault((room, p), len(among)) for p in found.tolist()]
+    distinct, local = np.unique(columns[kind], return_inverse=True)
+    numbers = [among.setdefault((room, p), len(among)) for p in distinct.tolist()]
     return np.array(numbers, int)[local]
 
 

@@ -42,7 +42,7 @@ class VariableEstimate:
     told: np.ndarray
 
 
-def found(run: Run) -> list[VariableEstimate]:
+def variable_estimates(run: Run) -> list[VariableEstimate]:
     """Frames, then effects; what all recordings share comes first.
 
     CAD is read from the recordings where they still are.
@@ -76,7 +76,7 @@ def comparison(runs: Sequence[Run]) -> dict[str, Any]:
             }
             for error in ("rms_mm", "mean_mm", "std_mm")
         },
-        "parameters": _side_by_side([found(run) for run in runs]),
+        "parameters": _side_by_side([variable_estimates(run) for run in runs]),
     }
 
 

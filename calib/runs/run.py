@@ -91,11 +91,11 @@ class Run:
         if not path.is_file():
             return None
         try:
-            found = _json(path)
-            whole = [(_OF_CANDIDATE, c) for c in found["candidates"]]
-            whole += [(_OF_CURVE, c) for c in found["curves"]]
-            if all(each.keys() >= keys for keys, each in [(_OF_DIAGNOSIS, found), *whole]):
-                return found
+            document = _json(path)
+            whole = [(_OF_CANDIDATE, c) for c in document["candidates"]]
+            whole += [(_OF_CURVE, c) for c in document["curves"]]
+            if all(each.keys() >= keys for keys, each in [(_OF_DIAGNOSIS, document), *whole]):
+                return document
         except (ValueError, TypeError, KeyError, AttributeError):
             pass
         raise InputError(
@@ -144,8 +144,8 @@ def write_state(folder: Path, state: Mapping[str, np.ndarray]) -> None:
 def versions() -> dict[str, str]:
     """Of what made a run: for provenance."""
     names = ("rigcal", "gtsam", "numpy", "scipy")
-    found = {n: importlib.metadata.version(n) for n in names}
-    return found | {"python": platform.python_version()}
+    numbers = {n: importlib.metadata.version(n) for n in names}
+    return numbers | {"python": platform.python_version()}
 
 
 def _effect_name(document: str | Mapping[str, Any]) -> str:

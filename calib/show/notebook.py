@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from calib.diagnosis import Diagnosis
-from calib.runs.estimates import found
+from calib.runs.estimates import variable_estimates
 from calib.runs.ladder import Rung
 from calib.runs.run import Run
 from calib.show.diagnosis import (
@@ -45,7 +45,7 @@ _PAGE = """\
 
 def run_html(run: Run) -> str:
     """A run: every link and effect with its sigma in mm and mrad, the errors, what is not told."""
-    rows = found(run)
+    rows = variable_estimates(run)
     effects = [row for row in rows if row.parent is None]
     tables = [links_table([row for row in rows if row.parent is not None])]
     tables += [effects_table(effects)] if effects else []

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.padding import Padding
 from rich.table import Table
 
-from calib.runs.estimates import VariableEstimate, comparison, found
+from calib.runs.estimates import VariableEstimate, comparison, variable_estimates
 from calib.runs.ladder import Rung, ladder
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ def print_check(check: Check) -> None:
 
 def print_run(run: Run) -> None:
     """Print a run: every link and effect with its sigma, the errors, and what was not told."""
-    console, rows = terminal(), found(run)
+    console, rows = terminal(), variable_estimates(run)
     summary = run.summary
     console.print(str(run.folder), style="bold", soft_wrap=True)
     console.print(f"{_outcome(summary)}\n")

@@ -67,9 +67,9 @@ def plan(rig: Rig, spec: Spec, mesh: Reference, rng: np.random.Generator) -> Pla
     for location in range(spec.locations):
         if spec.base_moves != "never" or location == 0:
             base = next(bases)
-        found, at = base
+        reached, at = base
         take = slice(location * S, (location + 1) * S) if spec.base_moves == "never" else slice(S)
-        joints.append(found[take])
+        joints.append(reached[take])
         roots.append(at[take])
     location = np.repeat(np.arange(spec.locations), S)
     Ts_faro_root = np.concatenate(roots)

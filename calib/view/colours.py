@@ -120,9 +120,9 @@ def nice(value: float) -> float:
 
 
 def _by_name(labels: np.ndarray, names: Mapping[int, str]) -> tuple[np.ndarray, Scale]:
-    found, index = np.unique(labels, return_inverse=True)
-    colours = [UNKNOWN if n < 0 else NAMED[i % len(NAMED)] for i, n in enumerate(found)]
-    titles = [names.get(int(n), f"label {n}") for n in found]
+    distinct, index = np.unique(labels, return_inverse=True)
+    colours = [UNKNOWN if n < 0 else NAMED[i % len(NAMED)] for i, n in enumerate(distinct)]
+    titles = [names.get(int(n), f"label {n}") for n in distinct]
     legend = dict(zip(titles, colours, strict=True))
     return _rgb(colours)[index], Scale(
         title="label", unit="", low=None, high=None, stops=(), names=legend

@@ -204,14 +204,14 @@ class Scene:
     def _stops(self) -> dict[tuple[int, int], tuple[Stops, int]]:
         """(recording, stop) -> the geometry that places it, and its row there; in their order."""
         number = {s.recording.folder: i for i, s in enumerate(self.sources)}
-        found: dict[tuple[int, int], tuple[Stops, int]] = {}
+        placed: dict[tuple[int, int], tuple[Stops, int]] = {}
         for block in self.problem.blocks:
             if isinstance(block, TrackedBody):
                 for row, (folder, k) in enumerate(block.stop_names):
-                    found[number[folder], k] = block.stops, row
+                    placed[number[folder], k] = block.stops, row
         for scan in self.problem.scans:
-            found[number[scan.recording.folder], scan.index] = scan.stops, 0
-        return dict(sorted(found.items(), key=lambda item: item[0]))
+            placed[number[scan.recording.folder], scan.index] = scan.stops, 0
+        return dict(sorted(placed.items(), key=lambda item: item[0]))
 
 
 def _beam_ends(columns: Mapping[str, np.ndarray], beam_origin_m: np.ndarray) -> np.ndarray:

@@ -37,17 +37,17 @@ class DhRow:
 
 def origins(rows: Sequence[DhRow], modified: bool) -> tuple[list[Array], Array]:
     """T_parent_joint (4, 4) of every joint at its zero, and T_last_tip behind the last."""
-    found, before = [], np.eye(4)
+    placed, before = [], np.eye(4)
     for row in rows:
         link = se3.from_xyz_rpy([row.a_m, 0, 0], [row.alpha_rad, 0, 0])
         turn = se3.from_xyz_rpy([0, 0, 0], [0, 0, row.theta_rad])
         shift = se3.from_xyz_rpy([0, 0, row.d_m], [0, 0, 0])
         along = row.kind == "prismatic"  # all but the motion along z commutes with it
         fixed = turn @ shift if along else turn
-        found.append(before @ link @ fixed if modified else before @ fixed)
+        placed.append(before @ link @ fixed if modified else before @ fixed)
         after = np.eye(4) if along else shift
         before = after if modified else after @ link
-    return found, before
+    return placed, before
 
 
 def to_urdf(

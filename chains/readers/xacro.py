@@ -18,7 +18,7 @@ import numpy as np
 
 from chains.errors import InputError
 
-_MOST = 200  # things that may be missing
+_MOST_MISSING = 200  # things that may be missing
 _NOWHERE = "nowhere-to-be-found"
 
 
@@ -67,7 +67,7 @@ def _compiled(path: Path, document: minidom.Document) -> tuple[str, list[str]]:
     from xacrodoc import XacroDoc, packages
 
     missing, macros = [], []
-    for _ in range(_MOST):
+    for _ in range(_MOST_MISSING):
         try:
             with contextlib.redirect_stderr(io.StringIO()):
                 doc = XacroDoc.from_string(
@@ -91,7 +91,7 @@ def _compiled(path: Path, document: minidom.Document) -> tuple[str, list[str]]:
             else:
                 raise InputError(f"{path} cannot be written out: {said.splitlines()[0]}") from None
         packages.update_package_cache({missing[-1]: path.parent / _NOWHERE / missing[-1]})
-    raise InputError(f"{path} cannot be written out: more than {_MOST} things are missing")
+    raise InputError(f"{path} cannot be written out: more than {_MOST_MISSING} things are missing")
 
 
 def _left_out(document: minidom.Document, missing: list[str], macros: list[str]) -> list[str]:

@@ -65,15 +65,15 @@ def study(
     out = Path(out)
     done = dict(_each(scale, out, workers, progress))
     each = {sensor: done[sensor] for sensor in scale.sensors}
-    found: dict[str, Any] = {"sensors": {sensor: one.row for sensor, one in each.items()}}
+    results: dict[str, Any] = {"sensors": {sensor: one.row for sensor, one in each.items()}}
     seen = {sensor: one.points for sensor, one in each.items()}
     rings = {sensor: one.rings for sensor, one in each.items()}
     labels = next(iter(each.values())).labels
     captions = figures.draw(seen, labels, rings, out / "figures")
-    found["shape"] = shape(found, seen, rings)
-    write_json(out / "study.json", found)
-    write_page(out / "study.md", found, captions, scale)
-    return found
+    results["shape"] = shape(results, seen, rings)
+    write_json(out / "study.json", results)
+    write_page(out / "study.md", results, captions, scale)
+    return results
 
 
 @dataclass(frozen=True)
@@ -167,10 +167,10 @@ def _runs(case: Case, explained: bool, tell: Progress) -> dict[str, Run]:
         return {GRAPH: run}
     grown = _kept(case.work / "grown")
     if grown is None:
-        found = diagnose(run, tell, refits=False).worth_adding
-        if not found:
+        missing = diagnose(run, tell, refits=False).worth_adding
+        if not missing:
             return {GRAPH: run}
-        grown = grow(run, grown_model(run, found), case.work / "grown", tell)
+        grown = grow(run, grown_model(run, missing), case.work / "grown", tell)
     added = [name for name in grown.effects if name not in run.effects]
     return {GRAPH: run, f"{GRAPH} + {', '.join(added)}": grown}
 

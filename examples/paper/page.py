@@ -81,17 +81,17 @@ at the judged stops, lengths of the arm, range zeros of the rings, and these abo
 
 
 def write_page(
-    path: Path, found: Mapping[str, Any], captions: Mapping[str, str], scale: Scale
+    path: Path, results: Mapping[str, Any], captions: Mapping[str, str], scale: Scale
 ) -> None:
     """Write the page.
 
     Args:
         path: of the Markdown file; figures lie in ``figures/`` beside it.
-        found: as `calib.study.study` returns.
+        results: as `study` returns.
         captions: file name -> caption of the figures.
         scale: what was simulated.
     """
-    each = found["sensors"]
+    each = results["sensors"]
     first = next(iter(each.values()))
     acting = "\n".join(f"- `{name}`: {why}" for name, why in REASONS.items())
     parts = [
@@ -99,7 +99,7 @@ def write_page(
             locations=scale.locations, stops=scale.stops, step=scale.column_step, acting=acting
         ),
         "## Does it come out as in the study?\n",
-        _table(("", "claim", "figures"), map(_claim, found["shape"])),
+        _table(("", "claim", "figures"), map(_claim, results["shape"])),
         METHODS.format(**first["stops"]),
         *(f"**{sensor}**\n\n{_methods(row['methods'])}" for sensor, row in each.items()),
         _table_3(each, first["spheres_mm"]),

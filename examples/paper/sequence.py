@@ -21,7 +21,7 @@ from chains.align import align_points
 from chains.errors import InputError
 
 STEP_M = 1e-4
-TOLD = 0.05  # of the best-known length's effect on the radii: below it a length is not told
+LEAST_EFFECT = 0.05  # of the best-known length's effect on the radii: below it a length is not told
 LENGTHS, RINGS = "arm_link_length", "ring_range_offset"
 
 
@@ -79,7 +79,7 @@ def lengths_from_circles(source: Source) -> np.ndarray:
         steps = STEP_M * np.eye(len(lengths_m))
         slope = np.stack([radii(lengths_m + s) - radii(lengths_m - s) for s in steps], axis=1)
         slope /= 2 * STEP_M
-        change, *_ = np.linalg.lstsq(slope, measured - radii(lengths_m), rcond=TOLD)
+        change, *_ = np.linalg.lstsq(slope, measured - radii(lengths_m), rcond=LEAST_EFFECT)
         lengths_m = lengths_m + change
     return lengths_m
 

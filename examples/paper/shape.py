@@ -15,7 +15,7 @@ Claim = dict[str, Any]
 
 
 def shape(
-    found: Mapping[str, Any],
+    results: Mapping[str, Any],
     points: Mapping[str, Columns],
     rings: Mapping[str, Mapping[str, np.ndarray]],
 ) -> list[Claim]:
@@ -23,7 +23,7 @@ def shape(
 
     Claims about LiDARs that were not simulated are left out.
     """
-    each = found["sensors"]
+    each = results["sensors"]
     claims = [*_means(each), *_degrading(points), *_planes(each)]
     if BIASED in each:
         claims += _ring_offsets(each[BIASED], points[BIASED], len(rings[BIASED]["true"]))

@@ -81,8 +81,8 @@ def thickness_mm(points: Columns, rows: np.ndarray) -> float | None:
     if len(rows) < 50:
         return None
     xyz = np.stack([points[f"{axis}_m"][rows] for axis in "xyz"], axis=1).astype(float)
-    found = ransac_plane(xyz, WITHIN_M)
-    xyz, rows = xyz[found], rows[found]
+    inliers = ransac_plane(xyz, WITHIN_M)
+    xyz, rows = xyz[inliers], rows[inliers]
     n = points["count"][rows].astype(int)
     within = np.nan_to_num(points["precision_m"][rows]) * np.cos(points["incidence_rad"][rows])
     across_m2 = np.linalg.eigvalsh(np.cov(xyz.T, fweights=n))[0]
@@ -125,8 +125,8 @@ def planes(case: Case, by_tracker: Columns, by_arm: Columns, by_graph: Columns) 
 
 def _most(values: np.ndarray) -> Any:
     """The value that is there most often."""
-    found, count = np.unique(values, return_counts=True)
-    return found[count.argmax()]
+    distinct, count = np.unique(values, return_counts=True)
+    return distinct[count.argmax()]
 
 
 # ------------------------------------------------------------------ Tables 5 and 6: mean and spread
@@ -188,9 +188,9 @@ def cloud_to_mesh(stops: Iterable[Evaluated]) -> tuple[Row, Columns]:
     for done in stops:
         tally.add(done)
         kept.append(done)
-    found = tally.document({})
+    evaluation = tally.document({})
     keys = ("signed_error_mm", "cloud_to_mesh_mm", "accuracy_mm", "precision_mm")
-    return {key: found[key] for key in keys}, gather(kept)
+    return {key: evaluation[key] for key in keys}, gather(kept)
 
 
 # ----------------------------------------------------------- what each method buys, on unseen stops
@@ -203,21 +203,21 @@ def judged(case: Case, state: State, tell: Any) -> tuple[Row, Columns]:
     for done in state.evaluated(names, tell):
         tally.add(done)
         kept.append(done)
-    found = tally.document({})
+    evaluation = tally.document({})
     row = {
         "held_out_rms": state.held_out(names).rms_mm,
-        "mean": found["signed_error_mm"]["mean"],
-        "std": found["signed_error_mm"]["std"],
-        "half_68": found["signed_error_mm"]["half_68"],
-        "cloud_to_mesh": found["cloud_to_mesh_mm"],
-        "plane": _wall(found["planes"]),
+        "mean": evaluation["signed_error_mm"]["mean"],
+        "std": evaluation["signed_error_mm"]["std"],
+        "half_68": evaluation["signed_error_mm"]["half_68"],
+        "cloud_to_mesh": evaluation["cloud_to_mesh_mm"],
+        "plane": _wall(evaluation["planes"]),
     }
     return row | against_truth(case, state), gather(kept)
 
 
-def _wall(found: list[Row]) -> float:
+def _wall(planes: list[Row]) -> float:
     """Mean thickness of the planes of most returns, weighted by these."""
-    return float(np.average([p["thickness_mm"] for p in found], weights=[p["n"] for p in found]))
+    return float(np.average([p["thickness_mm"] for p in planes], weights=[p["n"] for p in planes]))
 
 
 def against_truth(case: Case, state: State) -> Row:

@@ -40,9 +40,9 @@ def poses(where: str, xyz_m: ArrayLike, rotation: ArrayLike, first: str = "w") -
             f"{where}: row {row + 1} has a quaternion of length {length[row]:.3g}, and a rotation "
             "has 1; are these the right columns, in the right order?"
         )
-    found = np.full((len(xyz), 7), np.nan)
-    found[seen, :3], found[seen, 3:] = xyz[seen], quat[seen] / length[seen, None]
-    return found
+    pose = np.full((len(xyz), 7), np.nan)
+    pose[seen, :3], pose[seen, 3:] = xyz[seen], quat[seen] / length[seen, None]
+    return pose
 
 
 def quaternions(where: str, angles_rad: ArrayLike, order: str | None) -> Array:
@@ -57,9 +57,9 @@ def quaternions(where: str, angles_rad: ArrayLike, order: str | None) -> Array:
         InputError: no order is given, or none of the twelve.
     """
     if order is None or order.lower() not in _ORDERS or order not in (order.lower(), order.upper()):
-        found = "no order is given" if order is None else f"'{order}' is no order"
+        fault = "no order is given" if order is None else f"'{order}' is no order"
         raise InputError(
-            f"{where}: rotations are Euler angles, and {found}; say --euler XYZ (about the moved "
+            f"{where}: rotations are Euler angles, and {fault}; say --euler XYZ (about the moved "
             "axes), xyz (about the fixed ones), or another order"
         )
     angles = np.asarray(angles_rad, float)

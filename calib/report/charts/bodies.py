@@ -19,7 +19,7 @@ from chains import se3
 if TYPE_CHECKING:
     from calib.report.plots import Figure
 
-MOST = 1500  # arrows of a body that can be told apart
+MOST_ARROWS = 1500  # arrows of a body that can be told apart
 LENGTH = 0.06  # of the picture, for the longest arrow; rounding makes it up to 2.5 times that
 
 
@@ -111,7 +111,7 @@ def _draw(bodies: Mapping[str, Arrows], scale: float, frame: str) -> Figure:
     figure, grid = plots.axes(plots.WIDE, 3.9, 1, 2)
     for ax, (i, k), what in zip(grid[0], ((0, 1), (0, 2)), ("above", "the side"), strict=True):
         for (name, arrows), colour in zip(bodies.items(), _colours(len(bodies)), strict=True):
-            some = slice(None, None, len(arrows.at_m) // MOST + 1)
+            some = slice(None, None, len(arrows.at_m) // MOST_ARROWS + 1)
             at, off = arrows.at_m[some], arrows.off_m[some]
             ax.plot(at[:, i], at[:, k], ".", ms=3, color=colour, label=name)
             ax.quiver(at[:, i], at[:, k], off[:, i], off[:, k], color=colour, angles="xy",

@@ -77,15 +77,15 @@ def read_bag(files: Sequence[Path], options: Options, progress: Progress) -> Con
     topics = topics_of(paths)
     lidar, logs = _choose(name, topics, options)
     log = _pass(paths, lidar, logs, topics, progress)
-    found = []
+    parts = []
     if lidar is not None:
-        found.append(_lidar(name, paths, lidar, log, options, progress))
-    found += [_tracks(name, topic.name, log) for topic in logs]
+        parts.append(_lidar(name, paths, lidar, log, options, progress))
+    parts += [_tracks(name, topic.name, log) for topic in logs]
     unused = [str(t) for t in topics if t not in logs and t != lidar]
     rest = (
         Contents(understood=(f"{name}: not used: {', '.join(unused)}",)) if unused else Contents()
     )
-    return together([*found, rest])
+    return together([*parts, rest])
 
 
 # ------------------------------------------------------------------------- topics

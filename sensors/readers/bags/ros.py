@@ -72,15 +72,15 @@ def bag_files(paths: Sequence[Path]) -> list[Path]:
 
     Raises InputError where one is missing, empty or no bag, and where ROS 1 meets ROS 2.
     """
-    found = [file for path in paths for file in _files_of(path)]
-    for file in found:
+    bags = [file for path in paths for file in _files_of(path)]
+    for file in bags:
         if file.is_file() and not file.stat().st_size:
             raise InputError(f"{file} is empty (0 bytes); a bag was wanted")
-    if len({file.suffix == ".bag" for file in found}) > 1:
+    if len({file.suffix == ".bag" for file in bags}) > 1:
         raise InputError(
             "bags of ROS 1 and ROS 2 are no one source; write the kind before each: bag A bag B"
         )
-    return found
+    return bags
 
 
 def topics_of(paths: Sequence[Path]) -> list[Topic]:

@@ -144,14 +144,14 @@ def azimuth_step(xyz_m: Array) -> float:
 
 def matching_models(rings: NDArray[np.int64], elevation_rad: Array) -> list[str]:
     """Models of the catalogue whose rings look where these do: on average within half a degree."""
-    found = []
+    alike = []
     for name in catalog():
         model = load_lidar(name)
         if rings[-1] < model.rings <= 2 * len(rings):
             miss = np.abs(model.elevation_rad[rings] - elevation_rad)
             if np.degrees(miss.mean()) < 0.5:
-                found.append(name)
-    return found
+                alike.append(name)
+    return alike
 
 
 def _split(elevation: Array) -> tuple[float, Array]:

@@ -69,9 +69,9 @@ def fields_of(name: str, cloud: Cloud, options: Options) -> dict[str, str]:
                 f" are {', '.join(cloud.fields)}"
             )
         known = {"ring": _RING, "column": _COLUMN, "intensity": _INTENSITY, "time": _TIME}[ours]
-        found = theirs or next((plain[n] for n in known if n in plain), None)
-        if found is not None and not (ours == "ring" and options.rings_from_elevation):
-            fields[ours] = found
+        chosen = theirs or next((plain[n] for n in known if n in plain), None)
+        if chosen is not None and not (ours == "ring" and options.rings_from_elevation):
+            fields[ours] = chosen
     if "ring" in fields and not _whole(numeric[fields["ring"]]):
         raise InputError(
             f"{name}: field {fields['ring']} holds no whole numbers, so it cannot be the ring;"

@@ -166,12 +166,12 @@ def _image(part: Any) -> tuple[np.ndarray | None, tuple[str, ...]]:
 
 def _colours(parts: Sequence[Any], images: Sequence[np.ndarray | None]) -> np.ndarray | None:
     """Colours (F, S, 3) of all parts; None where no part has any but its material's."""
-    found = [_colours_of(part, image) for part, image in zip(parts, images, strict=True)]
-    if all(colours is None for colours in found):
+    painted = [_colours_of(part, image) for part, image in zip(parts, images, strict=True)]
+    if all(colours is None for colours in painted):
         return None
     count = len(_SAMPLES)
     filled = []
-    for part, colours in zip(parts, found, strict=True):
+    for part, colours in zip(parts, painted, strict=True):
         if colours is None:
             plain = getattr(getattr(part.visual, "material", None), "main_color", (102, 102, 102))
             colours = np.tile(np.asarray(plain[:3], np.uint8), (len(part.faces), 1, 1))

@@ -147,10 +147,10 @@ class _Lines:
         values = _parse(b"".join(lines))
         if values.size != len(lines) * columns:
             for k, line in enumerate(lines, number):
-                found = len(_numbers(line, self.path, k))
-                if found != columns:
+                cells = len(_numbers(line, self.path, k))
+                if cells != columns:
                     raise InputError(
-                        f"{self.path}:{k}: {found} numbers, but the lines above have {columns}; is "
+                        f"{self.path}:{k}: {cells} numbers, but the lines above have {columns}; is "
                         "the file cut off?"
                     )
         return values.reshape(-1, columns)

@@ -36,9 +36,9 @@ def read_spheres(paths: Sequence[Path], options: Options, progress: Progress) ->
     for n, path in enumerate(paths):
         progress("reading spheres", n, len(paths))
         cloud = path.suffix.lower() in CLOUDS
-        found, said, strange = (_of_cloud if cloud else _of_table)(path, options)
-        names += found.names
-        centres.append(found.centre_m)
+        fitted, said, strange = (_of_cloud if cloud else _of_table)(path, options)
+        names += fitted.names
+        centres.append(fitted.centre_m)
         lines += said
         odd += strange
     twice = next((name for name in names if names.count(name) > 1), None)
@@ -104,14 +104,14 @@ def _axes(
 ) -> tuple[list[int], str | None]:
     """The columns of x, y and z and their unit: by the header, else the first three of numbers."""
     parts = [split_unit(cell) for cell in header]
-    found = {}
+    columns = {}
     for column, (name, unit) in enumerate(parts):
         axis = _AXIS.match(name)
         if axis:
-            found.setdefault(axis[1].lower(), (column, unit))
-    if found.keys() == set("xyz"):
-        units = {unit for _, unit in found.values()}
-        return [found[axis][0] for axis in "xyz"], units.pop() if len(units) == 1 else None
+            columns.setdefault(axis[1].lower(), (column, unit))
+    if columns.keys() == set("xyz"):
+        units = {unit for _, unit in columns.values()}
+        return [columns[axis][0] for axis in "xyz"], units.pop() if len(units) == 1 else None
     count = len(sheet.cells(head[skip]))
     if len(header) == count:
         raise InputError(f"{path} has the columns {', '.join(header)}; x, y and z are wanted")
@@ -226,7 +226,7 @@ def find_spheres(points_m: Array, radius_m: float) -> list[np.ndarray]:
     needed = max(_FEWEST_POINTS, _SEEN_CAP * cap / 4)
     some = _crowded(votes, 0.1 * radius_m, needed / 8)
     count = places.query_ball_point(some, 0.1 * radius_m, return_length=True)
-    found: list[np.ndarray] = []
+    clusters: list[np.ndarray] = []
     centres: list[Array] = []
     for k in np.argsort(-count):
         if count[k] < needed:
@@ -239,8 +239,8 @@ def find_spheres(points_m: Array, radius_m: float) -> list[np.ndarray]:
         if len(index) < _FEWEST_POINTS:
             continue
         centres.append(some[k])
-        found.append(index)
-    return found
+        clusters.append(index)
+    return clusters
 
 
 def _crowded(places: Array, cell_m: float, least: float) -> Array:

@@ -123,7 +123,7 @@ def read_ouster(files: Sequence[Path], options: Options, progress: Progress) -> 
     begins as the PCAP's.
     Raises InputError as `decode_ouster` and `read_metadata` do, and where no JSON is found.
     """
-    found = [read_osf(path, options) for path in files if path.suffix.lower() == ".osf"]
+    sources = [read_osf(path, options) for path in files if path.suffix.lower() == ".osf"]
     told = [path for path in files if path.suffix.lower() == ".json"]
     if len(told) > 1 or (told and options.metadata):
         raise InputError(f"{told[-1]} is one JSON too many; give that of this sensor alone")
@@ -137,8 +137,8 @@ def read_ouster(files: Sequence[Path], options: Options, progress: Progress) -> 
         packets = capture_packets(capture, OusterDecoder(metadata).size, options)
         name, in_mb = capture.name, capture.progress(progress)
         decoded = decode_ouster(name, name, packets, metadata, options, in_mb)
-        found.append(captured(capture, decoded))
-    return together(found)
+        sources.append(captured(capture, decoded))
+    return together(sources)
 
 
 def _beside(path: Path) -> Path:

@@ -86,8 +86,8 @@ def _check(path: Path) -> None:
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}") from None
     if magic not in (*_PCAP, _PCAPNG):
-        found = "is no packet capture" if magic else "is empty"
-        raise InputError(f"{path} {found}; it should be PCAP or PCAPNG, as tcpdump writes")
+        fault = "is no packet capture" if magic else "is empty"
+        raise InputError(f"{path} {fault}; it should be PCAP or PCAPNG, as tcpdump writes")
 
 
 def _magic(file: BinaryIO) -> bytes:

@@ -126,13 +126,13 @@ def capture_packets(capture: Capture, size: int, options: Options) -> Packets:
     return packets
 
 
-def captured(capture: Capture, found: Contents) -> Contents:
+def captured(capture: Capture, contents: Contents) -> Contents:
     """What was found in a capture, and whether it was cut short."""
     if not capture.cut_short:
-        return found
+        return contents
     names = " and ".join(path.name for path in capture.cut_short)
     said = f"{names} ends within a packet: it was cut short; what is whole is read"
-    return replace(found, odd=(*found.odd, said))
+    return replace(contents, odd=(*contents.odd, said))
 
 
 def stacked(payloads: list[bytes], size: int) -> Bytes:

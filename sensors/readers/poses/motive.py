@@ -40,21 +40,21 @@ def read_motive(files: Sequence[Path], options: Options, progress: Progress) -> 
     Raises:
         InputError: a file is no export of Motive or Tracking Tools, or its axes are left-handed.
     """
-    found = []
+    takes = []
     for i, path in enumerate(files):
         progress("reading takes", i, len(files))
         sheet, head = open_sheet(path)
         start = head[0].strip().lower()
         if start.startswith("format version"):
-            found.append(_motive(sheet, head, options))
+            takes.append(_motive(sheet, head, options))
         elif start.startswith(("comment", "info", "righthanded", "lefthanded")):
-            found.append(_tracking_tools(sheet, options))
+            takes.append(_tracking_tools(sheet, options))
         else:
             raise InputError(
                 f"{path} is no CSV of Motive: its first line starts with '{head[0][:30]}', and "
                 "should with 'Format Version'; is it a table?"
             )
-    return together(found)
+    return together(takes)
 
 
 # ------------------------------------------------------------------------------------- Motive

@@ -38,11 +38,11 @@ def read_euroc(files: Sequence[Path], options: Options, progress: Progress) -> C
 
 
 def _each(files: Sequence[Path], options: Options, progress: Progress, first: str) -> Contents:
-    found = []
+    trajectories = []
     for i, path in enumerate(files):
         progress("reading trajectories", i, len(files))
-        found.append(_read(path, options, first))
-    return together(found)
+        trajectories.append(_read(path, options, first))
+    return together(trajectories)
 
 
 def _read(path: Path, options: Options, first: str) -> Contents:

@@ -41,7 +41,7 @@ def read_vicon(files: Sequence[Path], options: Options, progress: Progress) -> C
     Raises:
         InputError: a file is no such export, or what its rotations are is not said.
     """
-    found = []
+    exports = []
     for i, path in enumerate(files):
         progress("reading takes", i, len(files))
         sheet, _ = open_sheet(path)
@@ -50,8 +50,8 @@ def read_vicon(files: Sequence[Path], options: Options, progress: Progress) -> C
             raise InputError(
                 f"{path} is no CSV of Vicon: no line of it reads Segments, Objects or Trajectories"
             )
-        found += [_read(path, block, options) for block in blocks]
-    return together(found)
+        exports += [_read(path, block, options) for block in blocks]
+    return together(exports)
 
 
 def _blocks(sheet: Sheet) -> Iterator[_Block]:

@@ -136,10 +136,10 @@ def is_number(cell: str, decimal_comma: bool = False) -> bool:
 
 def split_unit(header: str) -> tuple[str, str | None]:
     """A header without its unit, and the unit: ``x [mm]``, ``x (mm)`` and ``x_mm`` are in mm."""
-    found = _UNIT.match(header.strip())
-    if not found or not (found[2] or found[4]):
+    match = _UNIT.match(header.strip())
+    if not match or not (match[2] or match[4]):
         return header.strip(), None
-    name, unit = (found[1], found[2]) if found[2] else (found[3], found[4])
+    name, unit = (match[1], match[2]) if match[2] else (match[3], match[4])
     unit = {"degree": "deg", "degrees": "deg", "meters": "m"}.get(unit.lower(), unit.lower())
     known = unit in LENGTHS or unit in ANGLES or unit in TIMES
     return (name.strip(), unit) if known else (header.strip(), None)

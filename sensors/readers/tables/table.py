@@ -51,11 +51,11 @@ def read_table(files: Sequence[Path], options: Options, progress: Progress) -> C
     Raises:
         InputError: a file, line or column is wrong, or what it means is ambiguous.
     """
-    found = []
+    tables = []
     for i, path in enumerate(files):
         progress("reading tables", i, len(files))
-        found.append(_read(path, options))
-    stops = [part.stops for part in found if part.stops is not None]
+        tables.append(_read(path, options))
+    stops = [part.stops for part in tables if part.stops is not None]
     if any(part.keys() != stops[0].keys() for part in stops[1:]):
         raise InputError(
             f"{files[0]} and the tables after it have other columns of stops; give one"
@@ -64,10 +64,10 @@ def read_table(files: Sequence[Path], options: Options, progress: Progress) -> C
         if len(stops) > 1:
             table["stop"] = np.array([f"{k}_{name}" for name in table["stop"]])
     return Contents(
-        tracks=tuple(track for part in found for track in part.tracks),
+        tracks=tuple(track for part in tables for track in part.tracks),
         stops={k: np.concatenate([s[k] for s in stops]) for k in stops[0]} if stops else None,
-        understood=tuple(line for part in found for line in part.understood),
-        odd=tuple(line for part in found for line in part.odd),
+        understood=tuple(line for part in tables for line in part.understood),
+        odd=tuple(line for part in tables for line in part.odd),
     )
 
 
@@ -128,25 +128,25 @@ def _header(sheet: Sheet, head: Sequence[str]) -> tuple[list[str], int]:
 def _ours(path: Path, names: Sequence[str], options: Options) -> dict[str, _Column]:
     """Our columns by name: those mapped, those that bear our names, and, without a map, all."""
     own = {name: split_unit(name) for name in names}
-    found: dict[str, _Column] = {}
+    chosen: dict[str, _Column] = {}
     for ours, theirs in _spelled_out(options.columns, names).items():
         column = theirs if theirs in own else split_unit(theirs)[0]
         if column in own:
             unit = own[theirs][1] if theirs in own else split_unit(theirs)[1]
-            found[ours] = _Column(names.index(column), column, unit)
-    mapped = bool(found)
+            chosen[ours] = _Column(names.index(column), column, unit)
+    mapped = bool(chosen)
     for ours in ("time_s", *TEXT, *options.joints):
         column = _called(ours, own)
-        if ours not in found and column is not None:
-            found[ours] = _Column(names.index(column), column, own[column][1])
-    taken = {column.theirs for column in found.values()}
+        if ours not in chosen and column is not None:
+            chosen[ours] = _Column(names.index(column), column, own[column][1])
+    taken = {column.theirs for column in chosen.values()}
     for name in (n for n in names if n not in taken):
         base, part = split_unit(name)[0].rpartition(".")[::2]
         if (part in (*POSE, *EULER) and base) or not mapped:
             short, unit = own[name] if part in (*POSE, *EULER) else (name, None)
-            found[short] = _Column(names.index(name), name, unit)
-    _all_joints(path, found, names, options.joints)
-    return found
+            chosen[short] = _Column(names.index(name), name, unit)
+    _all_joints(path, chosen, names, options.joints)
+    return chosen
 
 
 def _spelled_out(columns: Mapping[str, str], names: Sequence[str]) -> dict[str, str]:
@@ -174,10 +174,10 @@ def _called(ours: str, own: Mapping[str, tuple[str, str | None]]) -> str | None:
 
 
 def _all_joints(
-    path: Path, found: Mapping[str, _Column], names: Sequence[str], joints: Mapping[str, str]
+    path: Path, chosen: Mapping[str, _Column], names: Sequence[str], joints: Mapping[str, str]
 ) -> None:
     """Refuse a table that has some of the arm's joints and lacks others."""
-    missing = [joint for joint in joints if joint not in found]
+    missing = [joint for joint in joints if joint not in chosen]
     if missing and len(missing) < len(joints):
         raise InputError(
             f"{path}: the arm's joint {missing[0]} is not among the columns"
@@ -191,15 +191,15 @@ def _unmapped_poses(
     """What to say of columns that end in x, y, z as a pose's do, and that nobody called one."""
     short = {split_unit(name)[0] for name in names}
     known = {column.theirs for ours, column in columns.items() if ours.endswith(".x")}
-    found = [n[:-1] for n in names if re.fullmatch(r".+[_ :/-]x", split_unit(n)[0])]
-    found = [n for n in found if {f"{n}y", f"{n}z"} <= short and f"{n}x" not in known]
-    if mapped or not found:
+    triples = [n[:-1] for n in names if re.fullmatch(r".+[_ :/-]x", split_unit(n)[0])]
+    triples = [n for n in triples if {f"{n}y", f"{n}z"} <= short and f"{n}x" not in known]
+    if mapped or not triples:
         return []
-    like = min(found, key=lambda n: (f"{n}rx" not in short, len(n)))
+    like = min(triples, key=lambda n: (f"{n}rx" not in short, len(n)))
     turned = " and --euler, if its angles are Euler's" if f"{like}rx" in short else ""
     return [
-        f"{path.name}: columns {', '.join(f'{n}x, y, z' for n in found)} may be where something was"
-        f" tracked, and are taken for covariates; say --column BODY.*={like}*{turned}"
+        f"{path.name}: columns {', '.join(f'{n}x, y, z' for n in triples)} may be where something"
+        f" was tracked, and are taken for covariates; say --column BODY.*={like}*{turned}"
     ]
 
 
