@@ -7,7 +7,7 @@ import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -116,7 +116,7 @@ class Recording:
         joint_names: Sequence[str],
         bodies: Sequence[str],
         rings: int | None = None,
-    ) -> "Recording":
+    ) -> Self:
         """Read and check the stops and targets of a recording, without reading any scan.
 
         Raises InputError, one sentence with file, row and column, for what is missing, has the

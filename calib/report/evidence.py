@@ -14,7 +14,15 @@ from calib import problem as problems
 from calib.problem import Problem
 from calib.problem.model import Source
 from calib.report.budget import Budget, budget
-from calib.report.statistics import AZIMUTHS, BINS, PLACES, Axis, Statistics, StopResiduals, gather
+from calib.report.statistics import (
+    AZIMUTHS,
+    BINS,
+    PLACES,
+    Axis,
+    Statistics,
+    StopResiduals,
+    residual_statistics,
+)
 from calib.residuals.scan import ScanStop
 from calib.runs.estimates import VariableEstimate, variable_estimates
 from calib.runs.ladder import Rung, ladder
@@ -172,13 +180,17 @@ class Evidence:
     @cached_property
     def after(self) -> Statistics:
         """The residuals of the run."""
-        return gather(self._tables(self.run, "residuals"), self.axes, self.rings, self.azimuths)
+        return residual_statistics(
+            self._tables(self.run, "residuals"), self.axes, self.rings, self.azimuths
+        )
 
     @cached_property
     def earlier(self) -> Statistics:
         """The residuals of the run below, or where there is none with everything as in CAD."""
         what = "residuals before"
-        return gather(self._tables(self.below, what), self.axes, self.rings, self.azimuths)
+        return residual_statistics(
+            self._tables(self.below, what), self.axes, self.rings, self.azimuths
+        )
 
     def _tables(self, run: Run | None, what: str) -> Iterator[StopResiduals]:
         meshes = [source.reference for source in self.sources]

@@ -189,7 +189,7 @@ class Statistics:
     variance_m2: Mapping[str, float]
 
 
-def gather(
+def residual_statistics(
     tables: Iterable[StopResiduals], axes: Iterable[Axis], rings: int, azimuths: int = AZIMUTHS
 ) -> Statistics:
     """One pass over the residuals of a run.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Self
 
 from calib.rig.description import load_rig
 from sensors import recording
@@ -19,7 +20,7 @@ class Recording(recording.Recording):
         joint_names: Sequence[str] | None = None,
         bodies: Sequence[str] | None = None,
         rings: int | None = None,
-    ) -> Recording:
+    ) -> Self:
         """Read and check the stops and targets of a recording, without reading any scan.
 
         Args:

@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from calib.report.statistics import Axis, StopResiduals, gather
+from calib.report.statistics import Axis, StopResiduals, residual_statistics
 
 RINGS, AZIMUTHS = 8, 12
 RNG = np.random.default_rng
@@ -48,7 +48,7 @@ def frame(tables: list[StopResiduals]) -> pd.DataFrame:
 
 
 def gathered(tables, *axes):
-    return gather(tables, axes, RINGS, AZIMUTHS)
+    return residual_statistics(tables, axes, RINGS, AZIMUTHS)
 
 
 @pytest.mark.parametrize("name", ["range_m", "ring", "temperature_c"])

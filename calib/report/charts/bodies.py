@@ -10,10 +10,10 @@ import numpy as np
 
 from calib.report import plots
 from calib.report.chart import Absent, Chart
-from calib.report.charts.residuals import nice
 from calib.report.evidence import Evidence
 from calib.residuals.targets import HangingTarget
 from calib.residuals.tracker import TrackedBody
+from calib.show.scale import round_up
 from chains import se3
 
 if TYPE_CHECKING:
@@ -104,7 +104,7 @@ def magnification(groups: Sequence[Arrows]) -> float:
     at = np.concatenate([g.at_m for g in groups])
     longest = max(float(np.linalg.norm(g.off_m, axis=1).max()) for g in groups)
     extent = max(float(np.ptp(at, axis=0).max()), 1e-3)
-    return nice(LENGTH * extent / max(longest, 1e-9))
+    return round_up(LENGTH * extent / max(longest, 1e-9))
 
 
 def _draw(bodies: Mapping[str, Arrows], scale: float, frame: str) -> Figure:

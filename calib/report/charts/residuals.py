@@ -12,6 +12,7 @@ from calib.report import plots
 from calib.report.chart import Absent, Chart
 from calib.report.evidence import FIRST, Evidence
 from calib.report.statistics import ResidualCurve, Statistics
+from calib.show.scale import round_up
 
 if TYPE_CHECKING:
     from calib.report.plots import Axes, Figure
@@ -184,7 +185,7 @@ def _map_mm(statistics: Statistics) -> np.ndarray:
 def _ring_map(was: np.ndarray, now: np.ndarray, before: str) -> Figure:
     figure, grid = plots.axes(plots.WIDE, 3.4, 1, 2, sharey=True)
     for ax, values, title in zip(grid[0], (was, now), (before, "now"), strict=True):
-        limit = nice(float(np.nanquantile(np.abs(values), 0.98)))
+        limit = round_up(float(np.nanquantile(np.abs(values), 0.98)))
         picture = plots.signed_map(ax, values, (-180, 180, -0.5, len(values) - 0.5), limit)
         bar = figure.colorbar(picture, ax=ax, orientation="horizontal", aspect=35, extend="both")
         bar.set_label("mean residual, mm")
@@ -193,11 +194,3 @@ def _ring_map(was: np.ndarray, now: np.ndarray, before: str) -> Figure:
         ax.set_xticks(range(-180, 181, 90))
     grid[0, 0].set_ylabel("ring")
     return figure
-
-
-def nice(value: float) -> float:
-    """The next of 1, 2, 5 times a power of ten."""
-    if not value > 0:
-        return 1.0
-    power = 10.0 ** np.floor(np.log10(value))
-    return float(next(m for m in (1, 2, 5, 10) if m * power >= value * (1 - 1e-9)) * power)

@@ -49,7 +49,7 @@ class E57Scan:
         return xyz @ self.pose[:3, :3].T + self.pose[:3, 3]
 
 
-def read_e57(path: str | Path) -> Iterator[E57Scan]:
+def read_e57_scans(path: str | Path) -> Iterator[E57Scan]:
     """Yield the scans of an E57 file, one in memory at a time.
 
     Raises InputError where the file is missing, empty, cut short or no E57, holds no scans, and

@@ -129,15 +129,15 @@ def _ply(path: Path) -> Iterator[Named]:
 
 
 def _las(path: Path) -> Iterator[Named]:
-    from sensors.readers.clouds.las import read_las
+    from sensors.readers.clouds.las import read_las_points
 
-    yield path.stem, Cloud(read_las(path))
+    yield path.stem, Cloud(read_las_points(path))
 
 
 def _e57(path: Path) -> Iterator[Named]:
-    from sensors.readers.clouds.e57 import read_e57
+    from sensors.readers.clouds.e57 import read_e57_scans
 
-    for number, scan in enumerate(read_e57(path)):
+    for number, scan in enumerate(read_e57_scans(path)):
         yield f"{path.stem}_{number:03d}" if number else path.stem, Cloud(scan.columns)
 
 

@@ -10,7 +10,7 @@ from chains.errors import InputError
 from sensors.readers.base import Columns
 
 
-def read_las(path: str | Path) -> Columns:
+def read_las_points(path: str | Path) -> Columns:
     """Read the points of a LAS or LAZ file: x y z in its own unit, and every other dimension.
 
     Raises InputError where the file is missing, empty, cut short or none, and where laspy, or

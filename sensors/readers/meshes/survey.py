@@ -145,9 +145,9 @@ def read_blocks(path: Path) -> Iterator[PointBlock]:
 
 
 def _read_e57(path: Path) -> Iterator[PointBlock]:
-    from sensors.readers.clouds.e57 import read_e57
+    from sensors.readers.clouds.e57 import read_e57_scans
 
-    for number, scan in enumerate(read_e57(path)):
+    for number, scan in enumerate(read_e57_scans(path)):
         # Points in rows and columns are as one scanner saw them: from the origin of their frame.
         origin = scan.pose[:3, 3] if scan.posed or "row" in scan.columns else None
         yield PointBlock(number, scan.xyz_in_file(), scan.columns.get("intensity"), origin=origin)

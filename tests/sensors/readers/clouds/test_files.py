@@ -12,7 +12,7 @@ from chains.errors import InputError
 from sensors.lidar import load_lidar
 from sensors.readers import READERS
 from sensors.readers.base import Options
-from sensors.readers.clouds.e57 import read_e57
+from sensors.readers.clouds.e57 import read_e57_scans
 
 from ..room import box_scan
 
@@ -136,7 +136,7 @@ def test_every_file_is_a_stop_of_one_layout(tmp_path):
 
 def test_the_scans_of_an_e57_know_where_their_scanner_stood(tmp_path):
     write_e57(tmp_path / "a.e57")
-    (scan,) = read_e57(tmp_path / "a.e57")
+    (scan,) = read_e57_scans(tmp_path / "a.e57")
     assert scan.posed
     np.testing.assert_allclose(scan.pose[:3, 3], [10, 20, 30])
     with pye57.E57(str(tmp_path / "a.e57")) as file:  # pye57 applies the pose itself
