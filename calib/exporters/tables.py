@@ -10,7 +10,7 @@ from pathlib import Path
 from calib.exporters.fitted import Fitted
 from calib.exporters.written import Written, head, write_text
 from calib.runs.estimates import VariableEstimate, variable_estimates
-from calib.show.tables import LISTED, effect_cells, estimate_cell, shown
+from calib.show.tables import LISTED_PARAMETERS, effect_cells, estimate_cell, shown
 
 CONVENTIONS = (
     "Links: how far T_parent_child lies from CAD, T_cad exp(twist), in the child's own axes; where",
@@ -50,7 +50,11 @@ def _write(
     fitted: Fitted, path: Path, line: str, render: Callable[[_TextTable], Iterable[str]]
 ) -> Written:
     rows = variable_estimates(fitted.run)
-    long = [row.variable for row in rows if row.parent is None and len(row.parameters) > LISTED]
+    long = [
+        row.variable
+        for row in rows
+        if row.parent is None and len(row.parameters) > LISTED_PARAMETERS
+    ]
     not_held = [
         "poses: extrinsics.yaml has them",
         *(f"each value of {name}: extrinsics.yaml has them" for name in long),

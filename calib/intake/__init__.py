@@ -36,7 +36,9 @@ from sensors.stops import write_columns
 
 __all__ = ["Choices", "Imported", "import_files", "sources"]
 
-FEW = 500  # stops; with more, what can be estimated is left to `rigcal check`, for its time
+MOST_CHECKED = (
+    500  # stops; with more, what can be estimated is left to `rigcal check`, for its time
+)
 
 
 @dataclass(frozen=True)
@@ -136,7 +138,7 @@ def import_files(
         odd += more
         if rods is not None:
             write_columns(folder / "targets.csv", rods)
-        checked = check(folder, progress, graph=len(columns["stop"]) <= FEW)
+        checked = check(folder, progress, graph=len(columns["stop"]) <= MOST_CHECKED)
         if checked.problems:
             raise InputError(checked.problems[0])
     return Imported(out, understood, odd, checked)

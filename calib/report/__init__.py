@@ -24,7 +24,7 @@ __all__ = ["Evidence", "Written", "charts_of", "plot", "report"]
 
 
 @dataclass(frozen=True)
-class Contents:
+class ReportContents:
     """The figures of a run, by section, and those that it does not have."""
 
     sections: dict[str, list[Chart]]
@@ -41,7 +41,7 @@ class WrittenReport:
 
     file: Path
     verdict: Verdict
-    contents: Contents
+    contents: ReportContents
 
     @property
     def summary(self) -> str:
@@ -60,7 +60,7 @@ class WrittenReport:
         }
 
 
-def charts_of(evidence: Evidence) -> Contents:
+def charts_of(evidence: Evidence) -> ReportContents:
     """Every figure that a run has; none is drawn yet.
 
     Raises:
@@ -72,7 +72,7 @@ def charts_of(evidence: Evidence) -> Contents:
         results = [each for make in makers for each in make(evidence)]
         sections[title] = [each for each in results if isinstance(each, Chart)]
         absent += [each for each in results if isinstance(each, Absent)]
-    return Contents(sections, absent)
+    return ReportContents(sections, absent)
 
 
 def report(

@@ -33,7 +33,7 @@ from calib.solve.fit import Progress, same_mesh, values_of
 from chains.errors import InputError
 from sensors.recording import read_table
 
-FEW = 4  # bins of a stop's covariate, at least
+FEWEST_BINS = 4  # bins of a stop's covariate, at least
 SAMPLED = 8  # tables from which the bins of covariates are taken
 # Columns of a table that are no covariate: they name a place, or are what is explained.
 NOT_COVARIATES = {*PLACES, "region", "patch", "column", "residual_m", "sigma_m", "weight"}
@@ -163,7 +163,7 @@ class Evidence:
             numbers = sorted({*known, *np.unique(values).astype(int).tolist()})
             return Axis.of_things(name, numbers, [known.get(n, str(n)) for n in numbers])
         if len(values) == len(self.problem.scans):  # a value per stop: several stops in each bin
-            return Axis.of_values(name, values, min(BINS, max(FEW, len(values) // 3)))
+            return Axis.of_values(name, values, min(BINS, max(FEWEST_BINS, len(values) // 3)))
         return Axis.of_values(name, values)
 
     @property

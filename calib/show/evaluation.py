@@ -16,7 +16,7 @@ HEADINGS = {
     "label": "material",
     "ring": "ring",
 }
-LISTED = 16  # rings of a sensor with more are not listed one by one
+LISTED_RINGS = 16  # rings of a sensor with more are not listed one by one
 
 
 def print_evaluations(evaluations: Mapping[str, Mapping[str, Any]]) -> None:
@@ -64,7 +64,7 @@ def print_evaluation(evaluation: Mapping[str, Any]) -> None:
         console.print(_planes(evaluation["planes"]))
     for name, heading in HEADINGS.items():
         rows = evaluation["by"][name]
-        if len(rows) > 1 and (name != "ring" or len(rows) <= LISTED):
+        if len(rows) > 1 and (name != "ring" or len(rows) <= LISTED_RINGS):
             console.print(_by(heading, rows))
 
 

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 
 from calib.runs.ladder import Rung
+from calib.show.tables import LEAST_P
 from calib.view.colours import Scale, column
 from calib.view.desk import Findings
 from calib.view.scene import Points
 
-SHOWN = 6  # candidates in the table; the menu has all
-LEAST_P = 1e-12  # smaller ones are not told from each other
+SHOWN_CANDIDATES = 6  # candidates in the table; the menu has all
 LARGE = ((1e9, " billion"), (1e6, " million"), (1.0, ""))
 _FRAME = "padding:0 1.2em .4em .75em;font-size:12px;line-height:1.4;color:#222"
 _QUIET = "color:#555"
@@ -108,7 +108,7 @@ def _candidates(diagnosed: Findings) -> str:
         for text, side in (("effect", "left"), ("mm", "right"), ("by chance", "left"))
     )
     head += '<th style="text-align:left;font-weight:600">held out</th>'
-    rows = "".join(_candidate(each, diagnosed) for each in diagnosed.candidates[:SHOWN])
+    rows = "".join(_candidate(each, diagnosed) for each in diagnosed.candidates[:SHOWN_CANDIDATES])
     return f'<table data-is="findings" style="width:100%"><tr>{head}</tr>{rows}</table>'
 
 

@@ -11,13 +11,13 @@ from calib.report import plots
 from calib.report.budget import Budget
 from calib.report.chart import Absent, Chart
 from calib.report.evidence import Evidence
-from calib.show.tables import LISTED, small
+from calib.show.tables import LISTED_PARAMETERS, small
 from calib.solve.solution import Solution
 
 if TYPE_CHECKING:
     from calib.report.plots import Figure
 
-LEADING = 10  # candidates that are drawn
+DRAWN_CANDIDATES = 10  # candidates that are drawn
 TIED = 0.5  # correlation from which a parameter matters
 MOST_PARAMETERS = 30  # parameters in the map
 NEGLIGIBLE = 1e-6  # m: contributions below are not drawn
@@ -41,7 +41,7 @@ def findings(evidence: Evidence) -> Iterator[Chart | Absent]:
         "How much each effect that the model lacks would explain of what the model cannot take on, "
         "best first, with its p-value after all that was looked at. Blue ones are confirmed; of "
         "the others, many explain the same as a confirmed one, less well.",
-        lambda: _findings(candidates[:LEADING]),
+        lambda: _findings(candidates[:DRAWN_CANDIDATES]),
     )
 
 
@@ -144,7 +144,7 @@ def _summarised(names: Sequence[str]) -> tuple[list[str], np.ndarray]:
         owners.setdefault(name.rpartition(".")[0], []).append(i)
     out, rows = [], []
     for owner, at in owners.items():
-        if len(at) > LISTED:
+        if len(at) > LISTED_PARAMETERS:
             out.append(f"mean of {owner}")
             rows.append(np.isin(np.arange(len(names)), at) / len(at))
         else:

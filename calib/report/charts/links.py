@@ -14,7 +14,7 @@ from calib.report.evidence import Evidence
 from calib.rig import Rig
 from calib.runs.estimates import VariableEstimate
 from calib.runs.run import RING
-from calib.show.tables import LISTED, shown
+from calib.show.tables import LISTED_PARAMETERS, shown
 
 if TYPE_CHECKING:
     from calib.report.plots import Axes, Figure
@@ -227,8 +227,8 @@ def _moves(rows: Sequence[tuple[VariableEstimate, np.ndarray]]) -> Figure:
 def effects(evidence: Evidence) -> Iterator[Chart | Absent]:
     """Effects of few parameters as dots, of many as curves; per-ring corrections are of these."""
     drawn = [f for f in evidence.estimates if f.parent is None and (f.sigma > 0).any()]
-    few = [f for f in drawn if len(f.parameters) <= LISTED]
-    many = [f for f in drawn if len(f.parameters) > LISTED]
+    few = [f for f in drawn if len(f.parameters) <= LISTED_PARAMETERS]
+    many = [f for f in drawn if len(f.parameters) > LISTED_PARAMETERS]
     if few:
         z = {
             f"{f.variable}.{p}": abs(e / s)

@@ -19,7 +19,12 @@ if TYPE_CHECKING:
 
 NO_BEAMS = "there are no scans, so no residuals of beams"
 FRONT = {*FIRST, "stop", "elapsed_s", "recording"}  # what is not folded away, and temperature
-UNITS = {"_rad": ("deg", 180.0 / np.pi), "_m": ("m", 1.0), "_s": ("min", 1 / 60), "_c": ("°C", 1.0)}
+AXIS_UNITS = {
+    "_rad": ("deg", 180.0 / np.pi),
+    "_m": ("m", 1.0),
+    "_s": ("min", 1 / 60),
+    "_c": ("°C", 1.0),
+}
 BY_CHANCE = 0.02  # how seldom so many bins may lie outside their bands by chance
 SELDOM = 0.01  # of the rows: things seen less decide no scale
 MOST_NAMES = 40  # names of things along an axis
@@ -52,7 +57,7 @@ def curve_id(covariate: str) -> str:
 
 
 def _bare(covariate: str) -> str:
-    for suffix in UNITS:
+    for suffix in AXIS_UNITS:
         if covariate.endswith(suffix):
             return covariate.removesuffix(suffix)
     return covariate
@@ -60,7 +65,7 @@ def _bare(covariate: str) -> str:
 
 def _unit(covariate: str) -> tuple[str, float]:
     """Unit and factor in which a covariate is shown."""
-    return next((u for suffix, u in UNITS.items() if covariate.endswith(suffix)), ("", 1.0))
+    return next((u for suffix, u in AXIS_UNITS.items() if covariate.endswith(suffix)), ("", 1.0))
 
 
 def spoken(covariate: str) -> str:
