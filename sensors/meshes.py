@@ -7,17 +7,13 @@ import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from chains.errors import InputError
 from sensors.documents import write_atomically
 from sensors.ply import Columns, read_ply, write_ply
-from sensors.recording import write_table
-
-if TYPE_CHECKING:  # the readers of sensors.readers import this file
-    from sensors.readers.base import Surface
 
 _GROUPS = {
     "positions": ("x", "y", "z"),
@@ -138,15 +134,15 @@ def ransac_plane(points_m: np.ndarray, within_m: float) -> np.ndarray:
         raise InputError(f"{len(points_m)} points lie on no plane in particular; 3 are needed")
     o3d.utility.random.seed(0)  # its threads still draw in any order
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points_m))
-    found = np.sort(cloud.segment_plane(within_m, ransac_n=3, num_iterations=1000)[1])
+    inliers = np.sort(cloud.segment_plane(within_m, ransac_n=3, num_iterations=1000)[1])
     for _ in range(20):
-        away_m = points_m - points_m[found].mean(axis=0)
-        normal = np.linalg.eigh(away_m[found].T @ away_m[found])[1][:, 0]
+        away_m = points_m - points_m[inliers].mean(axis=0)
+        normal = np.linalg.eigh(away_m[inliers].T @ away_m[inliers])[1][:, 0]
         again = np.flatnonzero(np.abs(away_m @ normal) <= within_m)
-        if np.array_equal(again, found):
+        if np.array_equal(again, inliers):
             break
-        found = again
-    return found
+        inliers = again
+    return inliers
 
 
 # ------------------------------------------------------------------------------------------ meshes
@@ -216,30 +212,6 @@ def distance_to_mesh(
     """Distance (N,) of points (N, 3) to the nearest triangle, m, in float32."""
     scene = ray_caster(vertices_m, triangles)
     return scene.compute_distance(points_m.astype(np.float32)).numpy().astype(np.float64)
-
-
-def write_surface(surface: Surface, folder: str | Path) -> None:
-    """Write `reference/` into a recording's folder: mesh.ply, faces.parquet, labels.yaml.
-
-    Label and intensity are columns of faces.parquet where the surface has them; labels without a
-    name are called label_<n>. Without either, the mesh is all there is.
-    """
-    reference = Path(folder) / "reference"
-    reference.mkdir(parents=True, exist_ok=True)
-    xyz = dict(zip("xyz", np.asarray(surface.vertices_m, np.float64).T, strict=True))
-    corners = {"vertex_indices": np.asarray(surface.triangles, np.int32)}
-    write_ply(reference / "mesh.ply", {"vertex": xyz, "face": corners})
-    faces = {}
-    if surface.label is not None:
-        faces["label"] = surface.label.astype(np.uint16)
-        names = {int(n): surface.names.get(int(n), f"label_{n}") for n in np.unique(surface.label)}
-        (reference / "labels.yaml").write_text(
-            "".join(f"{number}: {name}\n" for number, name in names.items()), encoding="utf-8"
-        )
-    if surface.intensity is not None:
-        faces["intensity"] = surface.intensity.astype(np.float32)
-    if faces:
-        write_table(reference / "faces.parquet", faces)
 
 
 @contextmanager

@@ -65,12 +65,6 @@ class Diagnosis:
         that something without a name is dressed up in."""
         return worth_adding(self.candidates)
 
-    def _repr_html_(self) -> str:
-        """As a notebook shows it."""
-        from calib.show.notebook import diagnosis_html
-
-        return diagnosis_html(self)
-
     def document(self) -> dict[str, Any]:
         """As written to diagnosis.json."""
         return {

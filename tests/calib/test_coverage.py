@@ -17,7 +17,7 @@ RIGS = int(os.environ.get("RIGCAL_COVERAGE_RIGS", "24"))
 def _fit_one(seed: int, folder: str) -> tuple[np.ndarray, np.ndarray, float, float]:
     """Errors over sigma of links and of rings, and the held-out and expected mean squares."""
     from calib.runs.calibrate import calibrate
-    from calib.simulate import simulate
+    from calib.simulation import simulate
     from chains import se3
 
     recording = Path(folder) / f"rig{seed}"
