@@ -202,7 +202,14 @@ def place(
         site: {t.variable: t.basis(view) for t in terms if t.effect.site is site}
         for site in (Site.EDGE, Site.JOINTS)
     }
-    return Stops(rig, joints, at[Site.EDGE], at[Site.JOINTS], root, reference)
+    return Stops(
+        rig=rig,
+        joints=joints,
+        edge_bases=at[Site.EDGE],
+        joint_bases=at[Site.JOINTS],
+        root=root,
+        reference=reference,
+    )
 
 
 def _flat(basis: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ from calib.solve.solution import Solution
 LEANS = 0.5  # of the prior's variance left in a direction that the data hardly determine
 SHARE = 0.35  # of a direction, for a parameter to be named
 STANDS_IN = 0.97  # of what a candidate does, that an effect of the model can take on
-MOST = 8
+MOST_DIRECTIONS = 8
 
 
 def weak_directions(solution: Solution, widened: float, look: Look) -> list[dict[str, Any]]:
@@ -48,7 +48,7 @@ def leaning(solution: Solution, widened: float, look: Look) -> list[dict[str, An
     values, axes = np.linalg.eigh(scaled)
     out = []
     for value, axis in zip(values[::-1], axes.T[::-1], strict=True):
-        if value < LEANS or len(out) == MOST:
+        if value < LEANS or len(out) == MOST_DIRECTIONS:
             break
         named = [int(i) for i in np.argsort(-np.abs(axis)) if abs(axis[i]) > SHARE]
         if named:

@@ -9,7 +9,7 @@ import numpy as np
 from calib.forward import Stops, place
 from calib.problem import start
 from calib.problem.model import Model
-from calib.problem.problem import Part, Problem
+from calib.problem.problem import Problem, SourceStops
 from calib.problem.unknowns import UNKNOWN_POSE, Role, Unknown, pose_unknown
 from chains import se3
 from chains.errors import InputError
@@ -28,7 +28,7 @@ class Places:
     """
 
     problem: Problem
-    part: Part
+    part: SourceStops
     model: Model
     groups: dict[str, np.ndarray] = field(init=False)
     stops: dict[tuple[str, int], np.ndarray] = field(init=False)

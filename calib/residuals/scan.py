@@ -161,15 +161,15 @@ class ScanStop:
         origin_m = se3.apply(T, seen.ray.origin_m[hit])
         measured_m = ray.range_m[hit]
         return Ranges(
-            T,
-            scan,
-            seen.view,
-            hit,
-            origin_m + predicted_m[:, None] * direction,
-            direction,
-            normal,
-            measured_m - nominal_m[hit],
-            measured_m - seen.error_at(Site.BEAM, hit)[:, 0] - predicted_m,
+            T_reference_lidar=T,
+            scan=scan,
+            view=seen.view,
+            hit=hit,
+            surface_m=origin_m + predicted_m[:, None] * direction,
+            direction=direction,
+            normal=normal,
+            raw_m=measured_m - nominal_m[hit],
+            corrected_m=measured_m - seen.error_at(Site.BEAM, hit)[:, 0] - predicted_m,
         )
 
     def met(self, ray: Beams, values: Values) -> dict[str, np.ndarray]:
@@ -205,7 +205,16 @@ class ScanStop:
             surface = self.meeting.meet(T, ray, values, association)
         shifts = (np.append(values[n], 0.0)[index] for n, index in association.cells.items())
         cells = [(n, index, len(values[n])) for n, index in association.cells.items()]
-        return _Seen(scan, ray, surface, view, bases, error, sum(shifts, 0.0), cells)
+        return _Seen(
+            scan=scan,
+            ray=ray,
+            surface=surface,
+            view=view,
+            bases=bases,
+            error=error,
+            shift_m=sum(shifts, 0.0),
+            cells=cells,
+        )
 
     def _read(self) -> tuple[Scan, Beams]:
         return self.store.read(self.index)
@@ -258,17 +267,17 @@ class ScanStop:
         ]
         growth = {n: b[:, 0] for n, (site, b) in seen.bases.items() if site is Site.NOISE}
         return Rows(
-            residual,
-            sigma,
-            np.where(usable, tukey_weight(z, scale), 0.0),
-            reference * np.sqrt(1.0 - LOCAL_SHARE),
-            scale,
-            twist_derivative(ray.origin_m, ray.direction, t, slope),
-            dense,
-            sparse,
-            seen.view,
-            usable,
-            spread_rows(scan, single, usable, growth),
+            residual_m=residual,
+            sigma_m=sigma,
+            weight=np.where(usable, tukey_weight(z, scale), 0.0),
+            reference_sigma_m=reference * np.sqrt(1.0 - LOCAL_SHARE),
+            scale=scale,
+            by_twist=twist_derivative(ray.origin_m, ray.direction, t, slope),
+            dense=dense,
+            sparse=sparse,
+            view=seen.view,
+            usable=usable,
+            spread=spread_rows(scan, single, usable, growth),
         )
 
     def _derivatives(

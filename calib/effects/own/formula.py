@@ -11,7 +11,7 @@ import pydantic
 
 from calib.effects.base import Effect, Param, Site, View
 from calib.effects.basis import finite
-from calib.effects.expression import Expression
+from calib.effects.own.expression import Expression
 from calib.effects.rig import DOF
 from calib.rig import Rig
 from chains.errors import InputError

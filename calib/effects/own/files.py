@@ -12,7 +12,7 @@ from types import ModuleType
 from typing import Any
 
 from calib.effects.base import Effect, Site
-from calib.effects.formula import FormulaEffect
+from calib.effects.own.formula import FormulaEffect
 from chains.errors import InputError
 from sensors.documents import nearest, read_yaml
 
