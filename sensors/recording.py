@@ -212,7 +212,7 @@ def write_table(path: str | Path, columns: Mapping[str, np.ndarray]) -> None:
     import pyarrow
     import pyarrow.parquet
 
-    table = pyarrow.table({name: np.ascontiguousarray(values) for name, values in columns.items()})
+    table = pyarrow.table({name: _arrow(values) for name, values in columns.items()})
     with write_atomically(path) as temporary:
         pyarrow.parquet.write_table(table, temporary, compression="zstd")
 
@@ -252,8 +252,28 @@ def _columns(path: Path, table: "pyarrow.Table | pyarrow.RecordBatch") -> Column
     for name in {"ring", "column", "scan"}.intersection(table.schema.names):
         if table[name].null_count:
             raise InputError(f"{path}: column {name} has empty cells; every return needs one")
-    arrays = {name: table[name].to_numpy(zero_copy_only=False) for name in table.schema.names}
+    arrays = {name: _numpy(table[name]) for name in table.schema.names}
     return {name: a.astype(np.str_) if a.dtype == object else a for name, a in arrays.items()}
+
+
+def _numpy(column: "pyarrow.ChunkedArray | pyarrow.Array") -> NDArray[Any]:
+    """A column as an array; numbers without gaps not by pyarrow's way, which imports pandas where
+    there is one."""
+    chunks = getattr(column, "chunks", [column])
+    if chunks and not column.null_count and _kind(column.type) in ("f", "i", "u"):
+        return np.concatenate([np.from_dlpack(chunk) for chunk in chunks])
+    return column.to_numpy(zero_copy_only=False)
+
+
+def _arrow(values: NDArray[Any]) -> "pyarrow.Array":
+    """An array as a column, the same way back."""
+    import pyarrow
+
+    values = np.ascontiguousarray(values)
+    if values.dtype.kind not in "fiu":
+        return pyarrow.array(values)
+    kind = pyarrow.from_numpy_dtype(values.dtype)
+    return pyarrow.Array.from_buffers(kind, len(values), [None, pyarrow.py_buffer(values)])
 
 
 def _batches(path: Path, file: "ParquetFile", names: Sequence[str]) -> Iterator[Columns]:

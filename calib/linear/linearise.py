@@ -109,7 +109,7 @@ def own_rows(layout: Layout, values: Values) -> dict[int, dict[str, OwnRows]]:
     for name, at in layout.at.items():
         if at.start in owner:
             A, b = prior_rows(layout.unknowns[name], values[name])
-            found[owner[at.start]][name] = OwnRows(A, b, np.r_[at], False)
+            found[owner[at.start]][name] = OwnRows(A, b, np.arange(at.start, at.stop), False)
     return found
 
 

@@ -58,7 +58,7 @@ class StopRows:
         as of `linearise`."""
         rows = scan.rows(values, association, placed.T[0])
         weight, residual = rows.whitened(newton)
-        columns = [np.r_[layout.at[name]] for name in rows.dense]
+        columns = [layout.columns(list(rows.dense))]
         index = np.empty((len(weight), len(rows.sparse)), np.int32)
         value = np.empty(index.shape)
         start = last = 0
