@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calib.cli.app import Json, Out, Runs, app, effect_names, print_json, progress_bar, say
+from calib.cli.app import Json, Out, Runs, Workers, app, effect_names, print_json, progress_bar, say
+from calib.linear.parallel import workers as threads
 from chains.errors import InputError
 
 if TYPE_CHECKING:
@@ -74,6 +75,7 @@ def fit(
     prior: Annotated[
         Path | None, typer.Option(metavar="RUN", help="An earlier run instead of CAD.")
     ] = None,
+    workers: Workers = None,
     as_json: Json = False,
 ) -> None:
     """Estimate the rig jointly; several recordings share what is the same hardware."""
@@ -83,7 +85,7 @@ def fit(
     from calib.runs.calibrate import calibrate
 
     chosen = Model.of(effects, fix or [])
-    with progress_bar() as progress:
+    with threads(workers), progress_bar() as progress:
         run = calibrate(recordings, out, chosen, hold_out, folds, prior, progress)
     _tell(run, as_json)
 
@@ -98,13 +100,14 @@ def add(
         ),
     ],
     out: Out,
+    workers: Workers = None,
     as_json: Json = False,
 ) -> None:
     """The model of a run and more effects, refitted from that run to the same recordings."""
     from calib.runs.add import add as grow
     from calib.runs.run import Run
 
-    with progress_bar() as progress:
+    with threads(workers), progress_bar() as progress:
         _tell(grow(Run.open(run), effects, out, progress), as_json)
 
 
@@ -114,6 +117,7 @@ def diagnose(
     refits: Annotated[
         bool, typer.Option("--refits/--no-refits", help="Whether to take the held-out falls.")
     ] = True,
+    workers: Workers = None,
     as_json: Json = False,
 ) -> None:
     """Where a run's model fails and which effect it lacks; written to RUN/diagnosis.json."""
@@ -121,7 +125,7 @@ def diagnose(
     from calib.runs.run import Run
 
     fitted = Run.open(run)
-    with progress_bar() as progress:
+    with threads(workers), progress_bar() as progress:
         diagnosis = find(fitted, progress, refits)
     if as_json:
         print_json(diagnosis.document())
@@ -137,6 +141,7 @@ def explain(
     out: Out,
     effects: Effects = None,
     fix: Fix = None,
+    workers: Workers = None,
     as_json: Json = False,
 ) -> None:
     """Fit, diagnose, add, until nothing worth adding is left; every rung is kept in DIR."""
@@ -144,7 +149,7 @@ def explain(
     from calib.runs.explain import explain as climb
 
     chosen = Model.of(effects, fix or [])
-    with progress_bar() as progress:
+    with threads(workers), progress_bar() as progress:
         explanation = climb(recordings, out, chosen, progress)
     if as_json:
         print_json(explanation.document())
