@@ -95,6 +95,19 @@ def test_packages_import_only_those_before_them():
     )
 
 
+def test_the_simulator_shares_nothing_of_the_fit():
+    """A world that shares the model's surfaces and rows tests nothing."""
+    none(
+        [
+            f"{path} imports {name}"
+            for path, tree in PACKAGE_SOURCES.items()
+            if path.startswith("calib/simulation/")
+            for name in imports(path, ast.walk(tree), set())
+            if name.startswith(("calib.residuals", "calib.linear", "calib.solve"))
+        ]
+    )
+
+
 def test_every_folder_of_code_is_a_package():
     """A folder without ``__init__.py`` works in a checkout and is missing from the wheel."""
     none(

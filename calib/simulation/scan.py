@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property, partial
 
 import numpy as np
 
 from calib.effects import LazyColumn, Site, View
-from calib.residuals.surfaces import MeshSurface
 from calib.simulation.room import Room
 from calib.simulation.spec import Spec
 from calib.simulation.truth import Truth
@@ -44,11 +42,6 @@ class Scanner:
     truth: Truth
     room: Room
     spec: Spec
-
-    @cached_property
-    def surface(self) -> MeshSurface:
-        """The mesh as measured, divided as a fit divides it."""
-        return MeshSurface(self.room.measured, 0.0)
 
     @property
     def lidar(self) -> LidarModel:
@@ -134,7 +127,7 @@ class Scanner:
         stop: Mapping[str, np.ndarray],
         joints: np.ndarray,
     ) -> View:
-        mesh = self.surface.reference
+        mesh = self.room.measured
         columns: dict[str, LazyColumn] = {
             **stop,
             "ring": beams.ring,
@@ -150,8 +143,6 @@ class Scanner:
             "point_m": hits.point_m,
             "surface": lambda: mesh.surface[hits.triangle],
         }
-        for kind, size_m in self.surface.patches_m.items():
-            columns[kind] = partial(mesh.patch, hits, size_m)
         return View(self.truth.rig, len(hits.range_m), columns, joints)
 
     def _displaced(self, hits: Hits, view: View) -> np.ndarray:
