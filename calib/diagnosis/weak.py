@@ -14,7 +14,7 @@ from calib.solve.observability import UNTOLD, echelon
 from calib.solve.solution import Solution
 
 LEANS = 0.5  # of the prior's variance left in a direction that the data hardly determine
-SHARE = 0.35  # of a direction, for a parameter to be named
+SHARE = 0.2  # of a direction of unit length, in priors' sigmas, for a parameter to be named
 STANDS_IN = 0.97  # of what a candidate does, that an effect of the model can take on
 MOST_DIRECTIONS = 8
 
