@@ -1,6 +1,7 @@
-"""What every test shares: one thread per BLAS call, real data, and the command line."""
+"""What every test shares: one thread per BLAS call, an end, real data, and the command line."""
 
 import os
+import signal
 import sys
 from pathlib import Path
 
@@ -10,7 +11,21 @@ import pytest
 for library in ("MKL", "OMP", "OPENBLAS"):
     os.environ[f"{library}_NUM_THREADS"] = "1"
 
+# A job that a shell starts in the background ignores Ctrl-C, and so would all its children, among
+# them those that tests end by Ctrl-C. A handler is not inherited, and this one ignores it as well.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, lambda *_: None)
+
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
+LIMIT_S = {"slow": 300, "long": 3600}  # of others: see pyproject.toml
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Give tests that may take longer a longer time limit."""
+    for item in items:
+        for mark, limit_s in LIMIT_S.items():
+            if item.get_closest_marker(mark):
+                item.add_marker(pytest.mark.timeout(limit_s), append=False)
 
 
 @pytest.fixture(scope="session")
