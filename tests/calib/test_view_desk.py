@@ -24,8 +24,8 @@ from tests.programs import RIGCAL, execute, started
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory) -> Run:
-    return small_run(tmp_path_factory.mktemp("desk"))
+def made(once) -> Run:
+    return Run.open(once(small_run) / "run")
 
 
 @pytest.fixture
