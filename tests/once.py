@@ -46,7 +46,8 @@ class Once:
         folder = shutil.copytree(kept, self.place(make.__name__), dirs_exist_ok=True)
         for path in folder.rglob("*"):
             if path.suffix in NAMES_FOLDERS:
-                path.write_text(path.read_text().replace(str(kept), str(folder)))
+                text = path.read_text("utf-8").replace(str(kept), str(folder))
+                path.write_text(text, "utf-8")
         return folder
 
 
