@@ -11,7 +11,7 @@ from pathlib import Path
 
 from .programs import ROOT
 
-SOURCES = ("chains", "sensors", "calib", "tests")
+SOURCES = ("chains", "sensors", "calib", "examples", "tests")
 NAMES_FOLDERS = (".yaml", ".json")  # a run names its recordings and the run that it grew from
 
 
