@@ -9,7 +9,7 @@ unknown is the derivative by site times the basis.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,6 +19,7 @@ from calib.rig import Rig
 from chains import se3
 
 Values = Mapping[str, np.ndarray]
+ROOT, NOISE = "root of each", "noise of each"  # of stops taken together
 Derivatives = dict[str, np.ndarray]
 
 
@@ -59,6 +60,7 @@ class Stops:
         joint_bases: variable -> (K or 1, J, P), the joint error per unit.
         root: variable of T_world_root.
         reference: variable of T_world_reference, or None where both are one frame.
+        noise: that of the joint bases which is what the encoders misreport at these stops alone.
     """
 
     rig: Rig
@@ -67,22 +69,65 @@ class Stops:
     joint_bases: Mapping[str, np.ndarray]
     root: str
     reference: str | None
+    noise: str | None = None
 
     def with_joint_noise(self, variable: str) -> Stops:
         """The same stops, with what their encoders misreport as one more unknown."""
         noise = np.eye(self.joints.shape[1])[None]
-        return replace(self, joint_bases={**self.joint_bases, variable: noise})
+        bases = {**self.joint_bases, variable: noise}
+        return replace(self, joint_bases=bases, noise=variable)
 
     @property
     def variables(self) -> tuple[str, ...]:
         """What places the rig in the world."""
         return (self.root, *self.edge_bases, *self.joint_bases)
 
+    @property
+    def own(self) -> tuple[str, ...]:
+        """Of those, the ones that other stops may have under another name."""
+        return (self.root,) if self.noise is None else (self.root, self.noise)
+
+    def some(self, index: np.ndarray, root: str) -> Stops:
+        """Those of the stops, with their root."""
+
+        def of(bases: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+            return {n: basis if len(basis) == 1 else basis[index] for n, basis in bases.items()}
+
+        bases = {"edge_bases": of(self.edge_bases), "joint_bases": of(self.joint_bases)}
+        return replace(self, joints=self.joints[index], root=root, **bases)
+
+    @classmethod
+    def together(cls, stops: Sequence[Stops]) -> Stops:
+        """Stops that share all but their own unknowns, as one: values of `ROOT` (K, 4, 4) and of
+        `NOISE` (K, J) then stand for theirs."""
+        first = stops[0]
+
+        def stacked(bases: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
+            shared = [name for name in bases[0] if name != first.noise]
+            each = {
+                n: [
+                    np.broadcast_to(b[n], (len(s.joints), *b[n].shape[1:]))
+                    for b, s in zip(bases, stops, strict=True)
+                ]
+                for n in shared
+            }
+            return {n: np.concatenate(parts) for n, parts in each.items()}
+
+        out = cls(
+            first.rig,
+            np.concatenate([s.joints for s in stops]),
+            stacked([s.edge_bases for s in stops]),
+            stacked([s.joint_bases for s in stops]),
+            root=ROOT,
+            reference=first.reference,
+        )
+        return out if first.noise is None else out.with_joint_noise(NOISE)
+
     def in_root(self, frame: str, values: Values) -> Placed:
         """T_root_frame under all effects of edges and joints."""
         joints, twists = self.joints, np.zeros((1, len(self.rig.tree.edges), 6))
         for name, basis in self.joint_bases.items():
-            joints = joints + basis @ values[name]
+            joints = joints + np.matvec(basis, values[name])
         for name, basis in self.edge_bases.items():
             twists = twists + basis @ values[name]
         placed = self.rig.tree.place(frame, joints, twists)
@@ -108,6 +153,32 @@ class Stops:
         return Placed(T, outer.d | {self.reference: -se3.adjoint(se3.inverse(T))})
 
 
+def place_each(stops: Sequence[Stops], frame: str, values: Values) -> Iterator[Placed]:
+    """T_reference_frame of single stops, in one go for all that share their structure."""
+    groups: dict[object, list[int]] = {}
+    for k, each in enumerate(stops):
+        shared = tuple(n for n in each.variables if n not in each.own)
+        like = (id(each.rig), shared, each.reference, each.noise is None)
+        groups.setdefault(like, []).append(k)
+    found: dict[int, Placed] = {}
+    for numbers in groups.values():
+        some = [stops[k] for k in numbers]
+        whole = Stops.together(some)
+        own = {
+            name: np.stack([values[each.own[i]] for each in some])
+            for i, name in enumerate(whole.own)
+        }
+        placed = whole.in_reference(frame, {**values, **own})
+        for i, (k, each) in enumerate(zip(numbers, some, strict=True)):
+            names = dict(zip(whole.own, each.own, strict=True))
+            d = {
+                names.get(n, n): np.broadcast_to(x, (len(some), *x.shape[1:]))[[i]]
+                for n, x in placed.d.items()
+            }
+            found[k] = Placed(placed.T[[i]], d)
+    return (found[k] for k in range(len(stops)))
+
+
 def place(
     rig: Rig,
     terms: Sequence[Term],
@@ -131,7 +202,14 @@ def place(
         site: {t.variable: t.basis(view) for t in terms if t.effect.site is site}
         for site in (Site.EDGE, Site.JOINTS)
     }
-    return Stops(rig, joints, at[Site.EDGE], at[Site.JOINTS], root, reference)
+    return Stops(
+        rig=rig,
+        joints=joints,
+        edge_bases=at[Site.EDGE],
+        joint_bases=at[Site.JOINTS],
+        root=root,
+        reference=reference,
+    )
 
 
 def _flat(basis: np.ndarray) -> np.ndarray:

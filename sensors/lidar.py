@@ -69,19 +69,19 @@ class LidarModel:
         flat = np.cos(elevation)
         return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], -1)
 
-    def sigma_range(self, range_m: ArrayLike, incidence_rad: ArrayLike) -> Array:
-        """Return the single-shot standard deviation of range (N,) m.
+    def range_variance(self, range_m: ArrayLike, cosine: ArrayLike) -> Array:
+        """Return the single-shot variance of range (N,) m2, by the cosine of incidence g.
 
         sigma^2 = s0^2 + (k r)^2 + (kappa r tan g)^2 + quantum^2 / 12, g held below 1.5 rad.
         """
-        r = np.asarray(range_m, float)
-        slant = r * np.tan(np.clip(incidence_rad, 0, GRAZING_RAD))
-        return np.sqrt(
-            self.sigma_range_m**2
-            + (self.sigma_range_per_m * r) ** 2
-            + (self.sigma_range_incidence * slant) ** 2
-            + self.quantum_m**2 / 12
-        )
+        c2 = np.maximum(np.square(cosine), np.cos(GRAZING_RAD) ** 2)
+        slant2 = self.sigma_range_incidence**2 * (1.0 / c2 - 1.0)
+        growth = self.sigma_range_per_m**2 + slant2
+        return self.sigma_range_m**2 + self.quantum_m**2 / 12 + growth * np.square(range_m)
+
+    def sigma_range(self, range_m: ArrayLike, incidence_rad: ArrayLike) -> Array:
+        """Return the single-shot standard deviation of range (N,) m; see `range_variance`."""
+        return np.sqrt(self.range_variance(range_m, np.cos(incidence_rad)))
 
 
 @dataclass(frozen=True)

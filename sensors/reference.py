@@ -103,6 +103,12 @@ class Reference:
             raise InputError(f"{files}: {error}") from None
 
     @property
+    def planes(self) -> np.ndarray:
+        """Plane [n, n.p] (F + 1, 4) of each triangle; the last, and any without area, is met by no
+        beam."""
+        return self._plane
+
+    @property
     def label(self) -> np.ndarray:
         """Label (F,) of each triangle."""
         return self._label[:-1]
@@ -152,13 +158,13 @@ class Reference:
             normal[missed] = 0.0
             incidence_rad[missed] = np.pi / 2
         return Hits(
-            triangle,
-            range_m,
-            point_m,
-            normal,
-            incidence_rad,
-            self._label[triangle],
-            self._intensity[triangle],
+            triangle=triangle,
+            range_m=range_m,
+            point_m=point_m,
+            normal=normal,
+            incidence_rad=incidence_rad,
+            label=self._label[triangle],
+            intensity=self._intensity[triangle],
         )
 
     def near_edge(
@@ -199,15 +205,25 @@ class Reference:
         """
         return connected_surfaces(self.vertices_m, self.triangles, self._normal, self.label)
 
-    def patch(self, hits: Hits, size_m: float = 0.7) -> np.ndarray:
+    def patch(self, triangle: np.ndarray, point_m: np.ndarray, size_m: float = 0.7) -> np.ndarray:
         """Patch (N,) int64 of each hit: a cell of about `size_m` of its surface's tangent plane.
 
         Patches are counted over all surfaces; -1 where the beam missed.
+
+        Args:
+            triangle: (N,) that was hit; -1 for none.
+            point_m: (N, 3) where.
+            size_m: about how wide a patch is.
         """
-        patch = np.full(len(hits.triangle), -1, dtype=np.int64)
-        hit = np.flatnonzero(hits.triangle >= 0)
-        patch[hit] = self._grid.patch(self.surface[hits.triangle[hit]], hits.point_m[hit], size_m)
+        patch = np.full(len(triangle), -1, dtype=np.int64)
+        hit = np.flatnonzero(triangle >= 0)
+        patch[hit] = self._grid.patch(self.surface[triangle[hit]], point_m[hit], size_m)
         return patch
+
+    def facts(self, triangle: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Label, intensity and surface (N,) of triangles (N,); -1, NaN and -1 of triangle -1."""
+        surface = np.where(triangle >= 0, self.surface[triangle], -1)
+        return self._label[triangle], self._intensity[triangle], surface
 
     def patch_surface(self, size_m: float = 0.7) -> np.ndarray:
         """Surface (P,) int64 of every patch that `patch` can return for that size."""
@@ -242,17 +258,17 @@ class Reference:
         rays = np.empty((len(directions), 6), dtype=np.float32)
         rays[:, :3] = origins_m - self._centre_m
         rays[:, 3:] = directions
-        found = self._scene.cast_rays(rays, nthreads=nthreads)["primitive_ids"].numpy()
-        return self._solid[np.minimum(found, len(self._solid) - 1)]
+        primitive = self._scene.cast_rays(rays, nthreads=nthreads)["primitive_ids"].numpy()
+        return self._solid[np.minimum(primitive, len(self._solid) - 1)]
 
     def distance_m(self, points_m: np.ndarray) -> np.ndarray:
         """Distance (N,) of points (N, 3) in the reference frame from the nearest triangle."""
         points = (points_m - self._centre_m).astype(np.float32)
-        found = self._scene.compute_closest_points(points)
-        triangle = self._solid[found["primitive_ids"].numpy()]
+        closest = self._scene.compute_closest_points(points)
+        triangle = self._solid[closest["primitive_ids"].numpy()]
         # Float32 says which triangle and where on it; the offset across its plane is a double.
         across = _dot(self._plane.take(triangle, axis=0), points_m) - self._plane[triangle, 3]
-        beside = points - found["points"].numpy()
+        beside = points - closest["points"].numpy()
         beside -= _dot(self._plane.take(triangle, axis=0), beside)[:, None] * self._normal[triangle]
         return np.hypot(across, np.linalg.norm(beside, axis=1))
 

@@ -10,7 +10,7 @@ import pytest
 
 from calib.effects import load_effects
 from calib.rig import load_rig
-from calib.simulate import load_spec, simulate
+from calib.simulation import load_spec, simulate
 
 from .programs import ROOT, rigcal, script, started
 

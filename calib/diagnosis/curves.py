@@ -60,7 +60,7 @@ def _curve(screen: Screen, effect: Binned, columns: np.ndarray, drawn: np.ndarra
     weight = np.where(weight > 1e-9 * weight.max(), weight, np.nan)
     stop, place = np.square(scores.by_stop[:, columns]), np.square(scores.by_place[:, columns])
     one_way = np.maximum(stop.sum(axis=0), place.sum(axis=0))
-    two_way = stop.sum(axis=0) + place.sum(axis=0) - np.diag(scores.both)[columns]
+    two_way = stop.sum(axis=0) + place.sum(axis=0) - np.square(scores.both[:, columns]).sum(axis=0)
     clusters = (stop > 0).sum(axis=0)
     model = screen.common * np.diag(scores.information)[columns]
     variance = clusters * np.maximum(one_way, two_way) + COMMON * model

@@ -10,54 +10,30 @@ cluster's own share of the information, so it is one more pass, for one candidat
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from calib.diagnosis.linear import LocalRows, Walk
-from calib.problem import Problem
-from calib.solve.fit import Estimate
+from calib.linear.clusters import ClusteredRows
 
 WHOLE = 0.999  # of a direction's information: a cluster that has more of it is alone with it
 
 
-class Shares(Walk):
-    """Each cluster's share of a candidate's score and of its information.
+@dataclass
+class Shares:
+    """Each cluster's share of a candidate's whitened score and of its information."""
 
-    Args:
-        wide, estimate, candidates: as of `linear.linearise`.
-        away: variable -> (dim, r) of the candidate's directions, projected off the model and
-            whitened, in that variable.
-    """
+    cells: dict[tuple[int, int], list[np.ndarray]] = field(default_factory=dict)
 
-    def __init__(
-        self,
-        wide: Problem,
-        estimate: Estimate,
-        candidates: Sequence[str],
-        away: dict[str, np.ndarray],
-    ) -> None:
-        super().__init__(wide, estimate, candidates)
-        self.away = np.concatenate([away[name] for name in self.at])
-        self._cells: dict[tuple[int, int], list[np.ndarray]] = {}
-
-    def beams(self, beams: LocalRows) -> None:
-        along = beams.along(self.away) * np.sqrt(beams.weight)[:, None]
-        b = np.sqrt(beams.weight) * beams.b
-        stop = np.full(len(b), beams.stop)
-        self._add(along, b, stop, beams.places[beams.cluster])
-
-    def others(
-        self, A: np.ndarray, b: np.ndarray, columns: np.ndarray, stop: np.ndarray, place: np.ndarray
-    ) -> None:
-        self._add(A @ self.away[columns], b, stop, place)
-
-    def _add(self, rows: np.ndarray, b: np.ndarray, stop: np.ndarray, place: np.ndarray) -> None:
-        pairs, cell = np.unique([stop, place], axis=1, return_inverse=True)
-        order = np.argsort(cell, kind="stable")
-        bounds = np.searchsorted(cell[order], np.arange(pairs.shape[1] + 1))
-        for pair, i, k in zip(pairs.T.tolist(), bounds, bounds[1:], strict=False):
-            mine, right = rows[order[i:k]], b[order[i:k]]
-            self._sum(self._cells, tuple(pair), mine.T @ right, mine.T @ mine)
+    def add(self, rows: ClusteredRows) -> None:
+        """Add rows along the candidate's directions, projected off the model and whitened."""
+        order = np.lexsort([rows.place, rows.stop])
+        stop, place = rows.stop[order], rows.place[order]
+        bounds = np.flatnonzero((np.diff(stop) != 0) | (np.diff(place) != 0)) + 1
+        for some in np.split(order, bounds):
+            mine, right = rows.A[some], rows.b[some]
+            cell = int(rows.stop[some[0]]), int(rows.place[some[0]])
+            self._sum(self.cells, cell, mine.T @ right, mine.T @ mine)
 
     @staticmethod
     def _sum(to: dict, key: object, score: np.ndarray, information: np.ndarray) -> None:
@@ -69,9 +45,9 @@ class Shares(Walk):
 
     def covariance(self) -> np.ndarray:
         """Covariance (r, r) of the whitened score: by stops, plus by places, less by both."""
-        total = sum(score for score, _ in self._cells.values())
+        total = sum(score for score, _ in self.cells.values())
         ways = {"stop": {}, "place": {}, "both": {}}
-        for (stop, place), (score, information) in self._cells.items():
+        for (stop, place), (score, information) in self.cells.items():
             if stop >= 0:
                 self._sum(ways["stop"], stop, score, information)
             if place >= 0:

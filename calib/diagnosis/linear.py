@@ -1,286 +1,210 @@
-"""One pass over all rows: the normal equations of model and candidates, and who says what.
+"""All rows at the solution of a fit, with candidates beside the model, and who says what.
 
-At the solution of a fit every row is linear in what the model estimates and in what it does not:
+At the solution every row is linear in what the model estimates and in what it does not:
 ``b = J d + Z g + noise``, whitened. The tests need two things of a million such rows: the Gram
 matrix of ``[J | Z]``, and the gradient ``[J | Z]^T b`` of each cluster of rows that err together.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Self
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import csr_array, vstack
+from scipy.sparse import csr_array, diags_array
 
-from calib.problem import Problem
-from calib.residuals.beams import Rows, unknown_columns
-from calib.residuals.rows import Group, gram
-from calib.residuals.scan import ScanStop
+from calib.linear.clusters import ClusteredRows, Gradients
+from calib.linear.layout import Layout, keys_of
+from calib.linear.linearise import lidars, linearise, own_rows, spread_rows
+from calib.linear.parallel import in_order
+from calib.linear.rows import StopRows
+from calib.problem.problem import Block, Problem
 from calib.residuals.tracker import TrackedBody
 from calib.solve.fit import Estimate, Progress
-from calib.solve.graph import Block, Graph
+from calib.solve.graph import Graph
 
 # What paper says of the hardware is no evidence against a candidate: its sigmas are widened so much
 # that what only they would tell apart counts as a gauge.
 WIDENED = 100.0
-PLACES = ("surface", "plane")  # beams that meet the same one share its error
 
 
 @dataclass(frozen=True)
 class Linear:
-    """Normal equations of U unknowns about a solution, and their right side by clusters of rows.
+    """Normal equations of S unknowns about a solution, and their right side by clusters of rows.
+
+    What belongs to stops and surfaces is eliminated from the equations, but not from the gradients:
+    these are over all U unknowns.
 
     Args:
-        candidates: variables that the model does not have.
-        at: variable -> its columns among the unknowns.
-        information: (U, U) Gram matrix of all whitened rows, the model's priors included.
-        gradient: (C, U) sparse, of each cluster; their sum is the whole gradient.
+        candidates: unknowns that the model does not have; they have no prior.
+        at: unknown -> its columns among the S, of those that were not eliminated.
+        columns: unknown -> its columns among the U.
+        information: (S, S) of all rows; the priors of the hardware widened.
+        raw: (S, S) the same before anything was eliminated.
+        gradient: (C, U) sparse, of each cluster of rows; their sum is the whole gradient.
         stop: (C,) which stop the rows of a cluster belong to, -1 for none.
         place: (C,) which part of the room they look at, -1 for none.
         weight_m2: sum of the beams' weights over their variances [1/m2]; without beams that of the
             tracked positions.
+        directions: of directions (S, q) those of all unknowns (U, q) that follow.
     """
 
     candidates: tuple[str, ...]
-    at: dict[str, slice]
+    at: Mapping[str, np.ndarray]
+    columns: Mapping[str, slice]
     information: np.ndarray
+    raw: np.ndarray
     gradient: csr_array
     stop: np.ndarray
     place: np.ndarray
     weight_m2: float
+    directions: Callable[[np.ndarray], np.ndarray]
+
+    def among(self, names: Sequence[str]) -> np.ndarray:
+        """Columns of some unknowns among the S, in the order given."""
+        return np.concatenate([self.at[name] for name in names])
 
 
-def linearise(
+def rows_along(
+    wide: Problem,
+    estimate: Estimate,
+    away: Mapping[str, np.ndarray],
+    progress: Callable[[int, int], None],
+) -> Iterator[ClusteredRows]:
+    """All rows along some directions, weighted; no more than a few stops' in memory.
+
+    Args:
+        wide: the model's problem with candidates' unknowns added.
+        estimate: the model's solution.
+        away: unknown -> (dim, r) the directions in it, of those of the problem and of surfaces.
+        progress: called with how many stops are done, and of how many.
+    """
+    wide, values = beside(wide, estimate)
+    candidates = [name for name in wide.variables if name not in estimate.values]
+    layout, scans = Layout.of(wide, unbounded=candidates), wide.scans
+    directions = np.concatenate([away[name] for name in layout.at])
+    placed = lidars(scans, values)
+    every, places = np.arange(directions.shape[1]), Gradients(layout.size)
+
+    def work(i: int) -> list[ClusteredRows]:
+        rows = StopRows.of(scans[i], layout, values, placed[i], estimate.associations[i])
+        root = np.sqrt(rows.weight)
+        parts, cluster = rows.places()
+        place = places.numbers(scans[i].room, parts)[cluster]
+        stop = np.full(len(root), rows.stop)
+        A, b = rows.along(directions) * root[:, None], root * rows.b
+        found = [ClusteredRows(A, b, every, stop, place)]
+        if rows.rows.spread is not None:
+            more = spread_rows(rows.rows.spread, layout)
+            A, b = more.A @ directions[more.columns], more.b
+            found.append(ClusteredRows(A, b, every, stop, place))
+        return found
+
+    for i, found in enumerate(in_order(work, len(scans))):
+        progress(i, len(scans))
+        yield from found
+    for rows in other_rows(wide, layout, values, places):
+        yield rows._replace(A=rows.A @ directions[rows.columns], columns=every)
+
+
+def beside(wide: Problem, estimate: Estimate) -> tuple[Problem, dict[str, np.ndarray]]:
+    """A problem with candidates at a model's solution: with the surfaces' unknowns of that, and
+    the candidates at zero."""
+    cells = estimate.problem.cells
+    wide = wide.with_cells([estimate.problem.variables[name] for name in cells], cells)
+    absent = {n: u.mean for n, u in wide.variables.items() if n not in estimate.values}
+    return wide, absent | estimate.values
+
+
+def linearise_with(
     wide: Problem, estimate: Estimate, candidates: Sequence[str], progress: Progress
 ) -> Linear:
     """Linearise a problem that holds candidates beside the model, at the model's solution.
 
     Args:
-        wide: the model's problem with the candidates' variables added.
+        wide: the model's problem with the candidates' unknowns added.
         estimate: the model's solution.
-        candidates: variables that the model does not have; they have no prior here.
+        candidates: unknowns that the model does not have; they have no prior here.
         progress: called with what is being done, how many stops are done, and of how many.
     """
-    return Sums(wide, estimate, candidates).walk(progress, "testing what is missing").total()
+    wide, values = beside(wide, estimate)
+    layout = Layout.of(wide, unbounded=candidates)
+    gradients = Gradients(layout.size)
+    linear = linearise(
+        wide,
+        values,
+        estimate.associations,
+        layout=layout,
+        gradients=gradients,
+        progress=lambda done, total: progress("testing what is missing", done, total),
+    )
+    information, raw = linear.kept[:-1, :-1].copy(), linear.raw.copy()
+    at = np.full(layout.size, -1)
+    at[layout.kept] = np.arange(len(layout.kept))
+    for rows in other_rows(wide, layout, values, gradients):
+        gradients.add_rows(rows)
+        place = at[rows.columns]
+        if (place >= 0).all():  # the others are in the linearisation
+            scaled = rows.A * layout.sigma[rows.columns]
+            information[np.ix_(place, place)] += scaled.T @ scaled
+            raw[np.ix_(place, place)] += scaled.T @ scaled
+    unit = layout.sigma[layout.kept]
+
+    def directions(kept: np.ndarray) -> np.ndarray:
+        """In the unknowns' own units, as the equations are."""
+        scaled = np.vstack([kept / unit[:, None], np.zeros((1, kept.shape[1]))])
+        return linear.directions(scaled) * layout.sigma[:, None]
+
+    bodies = [b for b in wide.blocks if isinstance(b, TrackedBody)]
+    table, stop, place = gradients.table()
+    return Linear(
+        candidates=tuple(candidates),
+        at={name: at[np.r_[layout.at[name]]] for name in layout.outer()},
+        columns=layout.at,
+        information=information / np.outer(unit, unit),
+        raw=raw / np.outer(unit, unit),
+        gradient=table,
+        stop=stop,
+        place=place,
+        weight_m2=linear.weight_m2 or sum(len(b.measured) / b.sigma_m**2 for b in bodies),
+        directions=directions,
+    )
 
 
-class Walk(ABC):
-    """Visits all rows, linearised at a model's solution, cluster by cluster.
-
-    Args:
-        wide, estimate, candidates: as of `linearise`.
-    """
-
-    def __init__(self, wide: Problem, estimate: Estimate, candidates: Sequence[str]) -> None:
-        variables = list((wide.variables | estimate.graph.variables).values())
-        self.wide, self.estimate, self.candidates = wide, estimate, tuple(candidates)
-        self.values = {n: wide.variables[n].mean for n in candidates} | estimate.values
-        self.graph = Graph(variables, wide.blocks, frozenset(candidates))
-        ends = np.cumsum([0, *(v.dim for v in variables)]).tolist()
-        self.unknowns = ends[-1]
-        self.at = {v.name: slice(i, k) for v, i, k in zip(variables, ends, ends[1:], strict=False)}
-        self._stops: dict[object, int] = {}
-        self._places: dict[object, int] = {}
-        self._known_to: dict[str, set[int]] = {}
-        self._tracked_m2 = 0.0
-
-    @abstractmethod
-    def beams(self, beams: LocalRows) -> None:
-        """Take in a stop's beams."""
-
-    @abstractmethod
-    def others(
-        self, A: np.ndarray, b: np.ndarray, columns: np.ndarray, stop: np.ndarray, place: np.ndarray
-    ) -> None:
-        """Take in whitened rows (m, n) over some columns, with the stop and place of each."""
-
-    def walk(self, progress: Progress, what: str) -> Self:
-        """Visit beams, then trackers and targets, then priors."""
-        scans = self.wide.scans
-        for i, scan in enumerate(scans):
-            progress(what, i, len(scans))
-            terms = self.estimate.scans[i].terms
-            surfaces = [t for t in terms if t.variable not in self.wide.variables]
-            room = next((t.variable.partition("/")[0] for t in surfaces), None)
-            whole = replace(scan, terms=[*scan.terms, *surfaces])
-            rows = whole.rows(self.values, self.estimate.associations[i])
-            local = self._local(whole, rows, room or str(scan.recording.folder))
-            self.beams(local)
-            if rows.spread is not None:
-                columns = np.concatenate([self._columns(n) for n in rows.spread.columns])
-                A = np.hstack(list(rows.spread.columns.values()))
-                stop, place = np.full(len(A), local.stop), local.places[local.cluster]
-                self.others(A, -rows.spread.residual, columns, stop, place)
-        priors = []
-        for block, by, b in self.graph.linear_rows(self.values):
-            if block is None:
-                priors.append((*by.items(), b))
-            else:
-                self._block(block, by, b)
-        for (name, A), b in priors:
-            scale = 1.0 / WIDENED if name in self.wide.calibration else 1.0
-            self.others(scale * A, scale * b, self._columns(name), *self._prior_clusters(name))
-        return self
-
-    def _local(self, scan: ScanStop, rows: Rows, room: str) -> LocalRows:
-        parts, groups = unknown_columns(rows)
-        placed = scan.stops.in_reference(scan.stops.rig.lidar_frame, self.values)
-        columns = [*map(self._columns, placed.d)]
-        columns += [self._columns(p.variable)[p.components] for p in parts]
-        kind = next(name for name in PLACES if name in rows.view.columns)
-        found, cluster = np.unique(rows.view[kind], return_inverse=True)
-        stop = _number(self._stops, (scan.recording.folder, scan.index))
-        for name in scan.stops.variables:
-            self._known_to.setdefault(name, set()).add(stop)
-        return LocalRows(
-            np.hstack([rows.by_twist, *rows.dense.values()]),
-            groups,
-            rows.weight / np.square(rows.sigma_m),
-            -rows.residual_m,
-            np.hstack([d[0] for d in placed.d.values()]),
-            np.concatenate(columns),
-            cluster,
-            stop,
-            np.array([_number(self._places, (room, p)) for p in found.tolist()]),
-        )
-
-    def _block(self, block: Block, by: Mapping[str, np.ndarray], b: np.ndarray) -> None:
-        """Rows of a tracked body, which err with their stops, or of a target."""
-        stop = place = np.full(len(b), -1)
-        if isinstance(block, TrackedBody):
-            numbers = [_number(self._stops, name) for name in block.stop_names]
-            stop = np.repeat(numbers, len(b) // len(numbers))
-            self._tracked_m2 += len(numbers) / block.sigma_m**2
-        else:
-            place = np.full(len(b), _number(self._places, block.name))
-        for name in by:
-            self._known_to.setdefault(name, set()).update(np.unique(stop).tolist())
-        columns = np.concatenate([self._columns(name) for name in by])
-        self.others(np.hstack(list(by.values())), b, columns, stop, place)
-
-    def _prior_clusters(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        """Stop and place of a prior's rows: of the one stop, or the surface, whose error it
-        bounds; any other row stands alone."""
-        known = self._known_to.get(name, set())
-        room, _, kind = name.partition("/reference_")
-        dofs = self.graph.variables[name].dofs
-        nowhere = np.full(len(dofs), -1)
-        if len(known) == 1 and -1 not in known:
-            return np.full(len(dofs), *known), nowhere
-        if kind:
-            parts = np.array([int(dof.rpartition("_")[2]) for dof in dofs])
-            surfaces = self.wide.meetings[int(room)].surface_of(kind, parts).tolist()
-            return nowhere, np.array([_number(self._places, (room, s)) for s in surfaces])
-        return nowhere, np.array([_number(self._places, (name, dof)) for dof in dofs])
-
-    def _columns(self, variable: str) -> np.ndarray:
-        return np.arange(self.at[variable].start, self.at[variable].stop)
+def other_rows(
+    wide: Problem, layout: Layout, values: Mapping[str, np.ndarray], places: Gradients
+) -> Iterator[ClusteredRows]:
+    """Rows of tracked bodies, targets and priors, with the stop and place that each errs with."""
+    for stop, found in own_rows(layout, values).items():
+        for rows in found.values():
+            every = np.full(len(rows.b), stop), np.full(len(rows.b), -1)
+            yield ClusteredRows(rows.A, rows.b, rows.columns, *every)
+    for name, cells in wide.cells.items():
+        sigma = wide.variables[name].sigma
+        A, b = csr_array(diags_array(1.0 / sigma)), -values[name] / sigma
+        place = places.numbers(cells.room, cells.surface)
+        yield ClusteredRows(A, b, np.r_[layout.at[name]], np.full(len(b), -1), place)
+    graph = Graph(list(layout.outer().values()), layout.others, layout.unbounded)
+    for block, by, b in graph.linear_rows(values):
+        A, columns = np.hstack(list(by.values())), layout.columns(list(by))
+        if block is None and next(iter(by)) in wide.calibration:
+            A, b = A / WIDENED, b / WIDENED
+        yield ClusteredRows(A, b, columns, *_clusters(block, list(by), wide, layout, places))
 
 
-@dataclass(frozen=True)
-class LocalRows:
-    """The beams of one stop over [twist | dense | sparse] columns.
-
-    Args:
-        dense: (N, 6 + d) derivatives by the lidar's twist and by unknowns.
-        groups: columns of which each row touches one.
-        weight: (N,) robust weight over variance, 1/m2.
-        b: (N,) minus the residual, m.
-        chain: (6, n) derivative of the twist by what places the lidar.
-        columns: (n + d + sparse,) which unknowns those are, and the other columns.
-        cluster: (N,) which of the places a row meets.
-        stop: number of the stop.
-        places: (G,) numbers of the places.
-    """
-
-    dense: np.ndarray
-    groups: Sequence[Group]
-    weight: np.ndarray
-    b: np.ndarray
-    chain: np.ndarray
-    columns: np.ndarray
-    cluster: np.ndarray
-    stop: int
-    places: np.ndarray
-
-    def chained(self, rows: np.ndarray) -> np.ndarray:
-        """Rows over [twist | others] as rows over `columns`."""
-        return np.hstack([rows[:, :6] @ self.chain, rows[:, 6:]])
-
-    def along(self, directions: np.ndarray) -> np.ndarray:
-        """The rows (N, q) along directions (U, q) in all unknowns."""
-        mine = directions[self.columns]
-        twist, rest = self.chain @ mine[: self.chain.shape[1]], mine[self.chain.shape[1] :]
-        dense = self.dense.shape[1] - 6
-        out = self.dense @ np.vstack([twist, rest[:dense]])
-        start = dense
-        for g in self.groups:
-            theirs = rest[start : start + g.size]
-            value = np.where(g.index >= 0, g.value, 0.0)
-            out += value[:, None] * theirs[np.maximum(g.index, 0)]
-            start += g.size
-        return out
-
-
-class Sums(Walk):
-    """Adds rows up to normal equations."""
-
-    def __init__(self, wide: Problem, estimate: Estimate, candidates: Sequence[str]) -> None:
-        super().__init__(wide, estimate, candidates)
-        self._information = np.zeros((self.unknowns, self.unknowns))
-        self._gradients: list[csr_array] = []
-        self._clusters: list[np.ndarray] = []
-        self._weight_m2 = 0.0
-
-    def total(self) -> Linear:
-        """What was added up."""
-        stop, place = np.concatenate(self._clusters, axis=1)
-        gradient = csr_array(vstack(self._gradients))
-        weight_m2 = self._weight_m2 or self._tracked_m2
-        return Linear(self.candidates, self.at, self._information, gradient, stop, place, weight_m2)
-
-    def beams(self, beams: LocalRows) -> None:
-        local = beams.chained(gram(beams.dense, list(beams.groups), beams.weight))
-        self._information[np.ix_(beams.columns, beams.columns)] += beams.chained(local.T)
-        gradient = beams.chained(_by_cluster(beams))
-        self._add(gradient, beams.columns, np.full(len(gradient), beams.stop), beams.places)
-        self._weight_m2 += float(beams.weight.sum())
-
-    def others(
-        self, A: np.ndarray, b: np.ndarray, columns: np.ndarray, stop: np.ndarray, place: np.ndarray
-    ) -> None:
-        self._information[np.ix_(columns, columns)] += A.T @ A
-        (stop, place), cell = np.unique([stop, place], axis=1, return_inverse=True)
-        pick = csr_array((b, cell, np.arange(len(b) + 1)), shape=(len(b), len(stop)))
-        self._add(pick.T @ A, columns, stop, place)
-
-    def _add(
-        self, gradient: np.ndarray, columns: np.ndarray, stop: np.ndarray, place: np.ndarray
-    ) -> None:
-        found = csr_array(gradient)
-        found = csr_array(
-            (found.data, columns[found.indices], found.indptr),
-            shape=(len(stop), self.unknowns),
-        )
-        self._gradients.append(found)
-        self._clusters.append(np.stack([stop, place]))
-
-
-def _number(among: dict[object, int], key: object) -> int:
-    return among.setdefault(key, len(among))
-
-
-def _by_cluster(beams: LocalRows) -> np.ndarray:
-    """``[dense | groups]^T W b`` of each cluster of rows, (G, columns)."""
-    rows, count = len(beams.b), len(beams.places)
-    b = beams.weight * beams.b
-    pick = csr_array((b, beams.cluster, np.arange(rows + 1)), shape=(rows, count))
-    out = [pick.T @ beams.dense]
-    for g in beams.groups:
-        flat = np.where(g.index >= 0, beams.cluster * g.size + g.index, 0)
-        value = np.where(g.index >= 0, g.value * b, 0.0)
-        out.append(np.bincount(flat, value, count * g.size).reshape(count, g.size))
-    return np.hstack(out)
+def _clusters(
+    block: Block | None, names: Sequence[str], wide: Problem, layout: Layout, places: Gradients
+) -> tuple[np.ndarray, np.ndarray]:
+    """Stop and place of each row of a block of the graph, or of a prior: of the one stop that its
+    unknown is touched by; any other of its rows stands alone."""
+    if isinstance(block, TrackedBody):
+        numbers = [layout.stops[key] for key in keys_of(block)]
+        return np.repeat(numbers, block.rows // len(numbers)), np.full(block.rows, -1)
+    if block is not None:
+        return np.full(block.rows, -1), np.full(block.rows, places.place(block.name))
+    (name,) = names
+    dofs, known = wide.variables[name].dofs, layout.touched.get(name, frozenset())
+    nowhere = np.full(len(dofs), -1)
+    if len(known) == 1 and -1 not in known:
+        return np.full(len(dofs), *known), nowhere
+    return nowhere, np.array([places.place((name, dof)) for dof in dofs], int)

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy import optimize, special, stats
+from scipy import special
 from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import csr_array
 
@@ -41,7 +41,7 @@ class Scores:
         information: (Q, Q) left after projection.
         whole: (Q, Q) before it.
         by_stop: (K, Q) and by_place (M, Q): shares of the score.
-        both: (Q, Q) sum of squares over the cells of stop and place.
+        both: (C, Q) shares of the cells of stop and place.
         weight_m2: of all beams, 1/m2.
     """
 
@@ -62,25 +62,38 @@ class Scores:
         return np.random.default_rng(0).standard_normal((DRAWS, len(shares))) @ shares
 
 
-def away_from_model(linear: Linear, names: Sequence[str]) -> np.ndarray:
-    """Directions (U, Q) of variables, be they candidates or of the model itself, with all that the
-    model can take on of them taken off; other candidates play no part."""
-    theirs = _columns(linear, names)
-    apart = _columns(linear, [*linear.candidates, *names])
+def projection(linear: Linear, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Variables, be they candidates or of the model itself, projected off all that the model can
+    take on; other candidates play no part.
+
+    Returns:
+        Columns of the variables (Q,) and of the model's unknowns (M,), and how much of each of
+        these (M, Q) is to be taken off.
+    """
+    theirs = linear.among(names)
+    apart = linear.among([*linear.candidates, *names])
     model = np.setdiff1d(np.arange(len(linear.information)), apart)
-    scale = np.sqrt(np.maximum(np.diag(linear.information), 1e-300))
-    root = linear.information[np.ix_(model, model)] / np.outer(scale[model], scale[model])
-    cross = linear.information[np.ix_(model, theirs)] / scale[model, None]
-    away = np.zeros((len(linear.information), len(theirs)))
-    away[theirs] = np.eye(len(theirs))
-    away[model] = -cho_solve(cho_factor(root + 1e-13 * np.eye(len(model))), cross)
-    away[model] /= scale[model, None]
-    return away
+    block = linear.information[np.ix_(model, model)]
+    scale = np.sqrt(np.maximum(np.diag(block), 1e-300))
+    root = block / np.outer(scale, scale) + 1e-13 * np.eye(len(model))
+    cross = linear.information[np.ix_(model, theirs)] / scale[:, None]
+    return theirs, model, cho_solve(cho_factor(root), cross) / scale[:, None]
 
 
-def information_left(linear: Linear, names: Sequence[str], away: np.ndarray) -> np.ndarray:
-    """Information (Q, Q) of variables along their directions `away` from the model."""
-    left = linear.information[_columns(linear, names)] @ away
+def away_from_model(linear: Linear, names: Sequence[str]) -> np.ndarray:
+    """Directions (U, Q) of variables with all that the model can take on of them taken off, stops'
+    poses and surfaces' errors included."""
+    theirs, model, taken = projection(linear, names)
+    kept = np.zeros((len(linear.information), len(theirs)))
+    kept[theirs], kept[model] = np.eye(len(theirs)), -taken
+    return linear.directions(kept)
+
+
+def information_left(linear: Linear, names: Sequence[str]) -> np.ndarray:
+    """Information (Q, Q) that is left of variables once projected."""
+    theirs, model, taken = projection(linear, names)
+    left = linear.information[np.ix_(theirs, theirs)]
+    left = left - linear.information[np.ix_(theirs, model)] @ taken
     return (left + left.T) / 2
 
 
@@ -88,25 +101,22 @@ def project(linear: Linear, names: Sequence[str]) -> Scores:
     """Project variables off the model, be they candidates or of the model itself."""
     at, start = {}, 0
     for name in names:
-        size = linear.at[name].stop - linear.at[name].start
+        size = len(linear.at[name])
         at[name], start = slice(start, start + size), start + size
-    theirs, away = _columns(linear, names), away_from_model(linear, names)
-    cells = linear.gradient @ away
-    both = cells[(linear.stop >= 0) & (linear.place >= 0)]
+    theirs, away = linear.among(names), away_from_model(linear, names)
+    own = np.concatenate([np.r_[linear.columns[name]] for name in names])
+    others = np.setdiff1d(np.flatnonzero(np.any(away != 0, axis=1)), own)
+    cells = linear.gradient[:, own].toarray() + linear.gradient[:, others] @ away[others]
     return Scores(
-        at,
-        cells.sum(axis=0),
-        information_left(linear, names, away),
-        linear.information[np.ix_(theirs, theirs)],
-        _sums(cells, linear.stop),
-        _sums(cells, linear.place),
-        both.T @ both,
-        linear.weight_m2,
+        at=at,
+        score=cells.sum(axis=0),
+        information=information_left(linear, names),
+        whole=linear.raw[np.ix_(theirs, theirs)],
+        by_stop=_sums(cells, linear.stop),
+        by_place=_sums(cells, linear.place),
+        both=cells[(linear.stop >= 0) & (linear.place >= 0)],
+        weight_m2=linear.weight_m2,
     )
-
-
-def _columns(linear: Linear, names: Sequence[str]) -> np.ndarray:
-    return np.concatenate([np.r_[linear.at[name]] for name in names])
 
 
 def _sums(cells: np.ndarray, index: np.ndarray) -> np.ndarray:
@@ -155,7 +165,7 @@ class Test:
         first, nu = self._moments(common)
         d = max(1.0, self.clusters - 1.0 + COMMON)
         value = self.statistic if statistic is None else statistic
-        return float(stats.f.sf(value / first, nu, d))
+        return float(special.fdtrc(nu, d, value / first))
 
     def _moments(self, common: float) -> tuple[float, float]:
         """Mean of the statistic under the null, and its effective degrees of freedom."""
@@ -186,12 +196,8 @@ class Test:
             return np.inf
         first, nu = self._moments(common)
         d = max(1.0, self.clusters - 1.0 + COMMON)
-        limit = stats.f.isf(alpha, nu, d)
-
-        def missing(log_size: float) -> float:
-            return float(stats.ncf.sf(limit, nu, d, np.exp(log_size))) - POWER
-
-        noncentral = np.exp(optimize.brentq(missing, np.log(0.1), np.log(1e5)))
+        limit = special.fdtri(nu, d, 1.0 - alpha)
+        noncentral = special.ncfdtrinc(nu, d, 1.0 - POWER, limit)
         # Along a direction of unit length the information is this much, on average.
         each = np.trace(np.linalg.pinv(self.whiten @ self.whiten.T)) / len(self.score)
         return float(np.sqrt(noncentral * first / nu / each))
@@ -199,9 +205,9 @@ class Test:
 
 def log_tail(x: float, q: float) -> float:
     """Log of the upper tail of chi-square with q degrees of freedom, however far out."""
-    found = float(stats.chi2.logsf(x, q))
-    if np.isfinite(found):
-        return found
+    tail = special.chdtrc(q, x)
+    if tail > 0.0:
+        return float(np.log(tail))
     half = x / 2
     return float((q / 2 - 1) * np.log(half) - half - special.gammaln(q / 2))
 
@@ -216,10 +222,17 @@ def test(scores: Scores, columns: np.ndarray) -> Test:
     whiten = (axes[:, seen] / np.sqrt(values[seen])) / size[:, None]
     score = scores.score[columns]
     statistic = float(np.sum(np.square(whiten.T @ score)))
-    stop, place = (part[:, columns] @ whiten for part in (scores.by_stop, scores.by_place))
-    both = whiten.T @ scores.both[np.ix_(columns, columns)] @ whiten
+    parts = (scores.by_stop, scores.by_place, scores.both)
+    stop, place, both = (part[:, columns] @ whiten for part in parts)
     one_way = stop.T @ stop, place.T @ place
-    two_way = one_way[0] + one_way[1] - both
+    two_way = one_way[0] + one_way[1] - both.T @ both
     covariance = max(two_way, *one_way, key=np.trace)
     clusters = int((np.abs(stop).max(axis=1, initial=0.0) > 0).sum())
-    return Test(columns, statistic, whiten, covariance, clusters, score)
+    return Test(
+        columns=columns,
+        statistic=statistic,
+        whiten=whiten,
+        covariance=covariance,
+        clusters=clusters,
+        score=score,
+    )

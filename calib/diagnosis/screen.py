@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
 
 from calib.diagnosis.score import Scores, Test, test
 from calib.effects import Effect
@@ -97,12 +96,12 @@ def screen(
     together = looked(np.min(least, axis=0)) if least else 1.0
     candidates = [
         Candidate(
-            effect,
-            tests[effect.name],
-            float(p),
-            float(_adjust(p, together)),
-            tests[effect.name].evidence(common),
-            looks * together,
+            effect=effect,
+            test=tests[effect.name],
+            p_value=float(p),
+            p_adjusted=float(_adjust(p, together)),
+            evidence=tests[effect.name].evidence(common),
+            looks=looks * together,
         )
         for effect, p, looks in found
     ]
@@ -115,7 +114,9 @@ def _by_chance(scores: Scores, tests: Mapping[str, Test]) -> dict[str, np.ndarra
     out = {}
     for name, t in tests.items():
         statistic = np.sum(np.square(drawn[:, t.columns] @ t.whiten), axis=1)
-        out[name] = stats.rankdata(-statistic) / (len(drawn) + 1)
+        rank = np.empty(len(drawn))
+        rank[np.argsort(-statistic, kind="stable")] = np.arange(1, len(drawn) + 1)
+        out[name] = rank / (len(drawn) + 1)
     return out
 
 

@@ -17,17 +17,17 @@ from calib.diagnosis.candidates import (
     structure,
 )
 from calib.diagnosis.jackknife import Shares
-from calib.diagnosis.linear import Linear, linearise
+from calib.diagnosis.linear import Linear, linearise_with, rows_along
 from calib.diagnosis.score import Test, away_from_model, project, test
 from calib.diagnosis.screen import Candidate, Screen, screen
 from calib.effects import Effect, Site
 from calib.problem import Problem
 from calib.problem.model import Model, Source
-from calib.solve.fit import Estimate, Progress, solve
+from calib.solve.fit import DOFS, SEEN, Estimate, Progress, Start, solve
 from sensors.recording import Recording
 
 FINER = 9  # shapes tried between the two beside the best one
-WORTH = 9.0  # squared sigmas by which another shape must fit better
+BETTER_SHAPE = 9.0  # squared sigmas by which another shape must fit better
 LARGEST = 0.4  # change of a shape's logarithm at once
 SAMPLED = 8  # scans from which the bins of covariates are taken
 
@@ -43,9 +43,9 @@ class Stand:
 
     def with_effects(self, added: Sequence[Effect], progress: Progress) -> Stand:
         """The model with more effects, fitted from here."""
-        return self._refitted(self.model.plus(tuple(added)), self.estimate.state, progress)
+        return self._refitted(self.model.plus(tuple(added)), self.estimate.start, progress)
 
-    def _refitted(self, model: Model, start: Mapping[str, np.ndarray], progress: Progress) -> Stand:
+    def _refitted(self, model: Model, start: Start, progress: Progress) -> Stand:
         problem = self.problem_of(model)
         estimate = solve(problem, progress=progress, start=start)
         return Stand(self.sources, model, problem, estimate)
@@ -65,7 +65,9 @@ class Stand:
         named = screen(scores, [e for e in known if e.site is not Site.NOISE], at)
         rest = screen(scores, unnamed, at, named.common if named.candidates else None)
         noise = screen(scores, [e for e in known if e.site is Site.NOISE], at, 1.0)
-        return Look(self, linear, named, rest, noise, columns)
+        return Look(
+            stand=self, linear=linear, named=named, unnamed=rest, noise=noise, columns=columns
+        )
 
     def linearise(
         self, candidates: Sequence[Effect], progress: Progress
@@ -73,7 +75,7 @@ class Stand:
         """All rows with these candidates beside the model, and each one's columns among theirs."""
         wide = self.problem_of(self.model.plus(tuple(candidates)))
         variables = _variables(wide, {e.name for e in candidates})
-        linear = linearise(wide, self.estimate, [*chain(*variables.values())], progress)
+        linear = linearise_with(wide, self.estimate, [*chain(*variables.values())], progress)
         at, start = {}, 0
         for name, theirs in variables.items():
             size = sum(wide.variables[v].dim for v in theirs)
@@ -112,14 +114,26 @@ class Stand:
         swapped = {}
         for effect, step in zip(shaped, steps, strict=True):
             found = test(scores, at[step.name])
-            if found.dof and found.statistic > WORTH:
+            if found.dof and found.statistic > BETTER_SHAPE:
                 by = np.exp(np.clip(found.estimate()[0], -LARGEST, LARGEST))
                 swapped[effect.name] = effect.at(float(f"{effect.shape * by:.6g}"))
         if not swapped:
             return self, {}
         model = Model(tuple(swapped.get(e.name, e) for e in self.model.effects), self.model.fixed)
-        start = {_renamed(name, swapped): value for name, value in self.estimate.state.items()}
+        start = replace(self.estimate.start, state=self._state_with(swapped))
         return self._refitted(model, start, progress), swapped
+
+    def _state_with(self, swapped: Mapping[str, Effect]) -> dict[str, np.ndarray]:
+        """The state, for a model in which some effects have other shapes."""
+        renamed = {
+            t.variable: t.variable.removesuffix(t.effect.name) + swapped[t.effect.name].name
+            for terms in self.problem.terms
+            for t in terms
+            if t.effect.name in swapped
+        }
+        endings = ("", DOFS, SEEN)
+        every = {f"{old}{end}": f"{new}{end}" for old, new in renamed.items() for end in endings}
+        return {every.get(name, name): value for name, value in self.estimate.state.items()}
 
     def theta(self, effect: Effect, whole: bool) -> np.ndarray:
         """Parameters of an effect of the model: the `whole` effect's, or those that are free."""
@@ -134,9 +148,15 @@ class Stand:
 
     def sigma(self, effect: Effect) -> np.ndarray:
         """Sigma of each free parameter of an effect of the model, as the graph has it."""
+        mine = {
+            t.variable
+            for terms in self.problem.terms
+            for t in terms
+            if t.effect.name == effect.name
+        }
         start = 0
         for variable in self.estimate.variables:
-            if variable.name.rpartition("/")[2] == effect.name:
+            if variable.name in mine:
                 at = np.arange(start, start + variable.dim)
                 return np.sqrt(np.diag(self.estimate.covariance)[at])
             start += variable.dim
@@ -191,18 +211,15 @@ class Look:
         wide = stand.problem_of(stand.model.plus((candidate.effect,)))
         names = _variables(wide, {candidate.effect.name})[candidate.effect.name]
         away = away_from_model(self.linear, names) @ found.whiten
-        by_variable = {name: away[at] for name, at in self.linear.at.items()}
-        shares = Shares(wide, stand.estimate, names, by_variable)
-        covariance = shares.walk(progress, "judging what stands out").covariance()
-        return replace(found, covariance=covariance)
+        by_name = {name: away[at] for name, at in self.linear.columns.items()}
+        shares = Shares()
 
+        def tell(done: int, total: int) -> None:
+            progress("judging what stands out", done, total)
 
-def _renamed(name: str, swapped: dict[str, Effect]) -> str:
-    """A name of a state once effects have other shapes: EFFECT, RIG/EFFECT, EFFECT.dofs, …"""
-    for old, effect in swapped.items():
-        if old in name.split("/")[-1]:
-            return name.replace(old, effect.name)
-    return name
+        for rows in rows_along(wide, stand.estimate, by_name, tell):
+            shares.add(rows)
+        return replace(found, covariance=shares.covariance())
 
 
 def _variables(problem: Problem, effects: set[str]) -> dict[str, list[str]]:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.diagnosis.score import away_from_model, information_left
+from calib.diagnosis.score import projection
 from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import what_separates
 from calib.effects import Effect
@@ -15,7 +15,7 @@ from calib.solve.solution import Solution
 LEANS = 0.5  # of the prior's variance left in a direction that the data hardly determine
 SHARE = 0.35  # of a direction, for a parameter to be named
 STANDS_IN = 0.97  # of what a candidate does, that an effect of the model can take on
-MOST = 8
+MOST_DIRECTIONS = 8
 
 
 def weak_directions(solution: Solution, widened: float, look: Look) -> list[dict[str, Any]]:
@@ -48,7 +48,7 @@ def leaning(solution: Solution, widened: float, look: Look) -> list[dict[str, An
     values, axes = np.linalg.eigh(scaled)
     out = []
     for value, axis in zip(values[::-1], axes.T[::-1], strict=True):
-        if value < LEANS or len(out) == MOST:
+        if value < LEANS or len(out) == MOST_DIRECTIONS:
             break
         named = [int(i) for i in np.argsort(-np.abs(axis)) if abs(axis[i]) > SHARE]
         if named:
@@ -81,12 +81,13 @@ def standing_in(look: Look) -> list[dict[str, Any]]:
     ours = {n: v for n, v in ours.items() if n in stand.model.names}
     out = []
     for name, (effect, variable) in ours.items():
-        names = [*linear.candidates, variable]
-        without = information_left(linear, names, away_from_model(linear, names))
+        theirs, model, taken = projection(linear, [*linear.candidates, variable])
+        cross = linear.information[np.ix_(model, theirs)]
+        without = np.diag(linear.information)[theirs] - np.sum(cross * taken, axis=0)
         for candidate in look.named.candidates:
-            own = np.ix_(candidate.test.columns, candidate.test.columns)
-            left = np.trace(look.named.scores.information[own])
-            if left < (1.0 - STANDS_IN) * np.trace(without[own]):
+            own = candidate.test.columns
+            left = np.diag(look.named.scores.information)[own].sum()
+            if left < (1.0 - STANDS_IN) * without[own].sum():
                 out.append(_stand_in(name, effect, candidate.effect))
     return out
 

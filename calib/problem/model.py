@@ -13,6 +13,7 @@ import numpy as np
 from calib import effects
 from calib.effects import Effect, FrameOffset
 from calib.forward import Term
+from calib.residuals.store import BeamStore
 from calib.rig import Rig, load_rig
 from chains import se3
 from chains.align import align_points
@@ -187,6 +188,11 @@ class Source:
         return cls(rig, recording, mesh)
 
     @cached_property
+    def store(self) -> BeamStore:
+        """Its scans as beams; of a rig with a LiDAR."""
+        return BeamStore(self.recording, self.rig.lidar.beam_origin_m)
+
+    @cached_property
     def columns(self) -> dict[str, np.ndarray]:
         """Per-stop columns (K, ...) that effects may look at; see `stop_columns`."""
         recording = self.recording
@@ -194,6 +200,13 @@ class Source:
         if self.rig.tracker:
             columns["tracked"] = tracked_poses(self.rig, recording)
         return {**columns, **recording.covariates}
+
+
+def same_mesh(a: Reference | None, b: Reference | None) -> bool:
+    """Whether two references are one: their errors are then the same too."""
+    if a is None or b is None or a is b:
+        return a is b
+    return np.array_equal(a.vertices_m, b.vertices_m) and np.array_equal(a.triangles, b.triangles)
 
 
 def stop_columns(rig: Rig, joints: np.ndarray, time_s: np.ndarray) -> dict[str, np.ndarray]:

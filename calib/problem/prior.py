@@ -9,13 +9,8 @@ import numpy as np
 from scipy.linalg import cholesky, solve_triangular
 
 from calib.forward import Derivatives, Values
-from calib.solve.graph import Variable
+from calib.problem.unknowns import Unknown
 from chains import se3
-
-
-def difference(variable: Variable, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """How b differs from a, as a tangent at a: (dim,). Vectors and poses only."""
-    return se3.log(se3.inverse(a) @ b) if variable.kind == "pose" else b - a
 
 
 @dataclass(frozen=True)
@@ -28,7 +23,7 @@ class JointPrior:
         covariance: (P, P) of their tangents.
     """
 
-    held: Sequence[Variable]
+    held: Sequence[Unknown]
     means: Mapping[str, np.ndarray]
     covariance: np.ndarray
 
@@ -45,7 +40,7 @@ class JointPrior:
 
     def evaluate(self, values: Values, derivatives: bool) -> tuple[np.ndarray, Derivatives | None]:
         """Whitened differences from the means."""
-        moved = [difference(v, self.means[v.name], values[v.name]) for v in self.held]
+        moved = [v.difference(self.means[v.name], values[v.name]) for v in self.held]
         root = self._root()
         residual = root @ np.concatenate(moved)
         if not derivatives:

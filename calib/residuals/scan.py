@@ -1,13 +1,12 @@
-"""One stop's scan as rows: read, associated, weighted honestly, compressed.
+"""One stop's scan as rows: read, associated, weighted honestly.
 
-A stop is computed from the recording and a state alone, so stops can be computed anywhere, and no
-more than one of them is ever in memory per worker.
+A stop is computed from the recording and a state alone, so stops can be computed anywhere.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,22 +15,22 @@ from calib.forward import Stops, Term, Values
 from calib.residuals.beams import (
     Association,
     Columns,
-    CompressedScan,
     Rows,
     Surface,
     beam_derivative,
-    compress,
     effect_columns,
+    range_columns,
     site_error,
     turns_beams,
-    twist_derivative,
 )
-from calib.residuals.rows import robust_scale, tukey_weight
+from calib.residuals.compiled import twist_derivative
+from calib.residuals.robust import robust_scale, tukey_weight
 from calib.residuals.spread import spread_rows
+from calib.residuals.store import BeamStore
 from calib.residuals.surfaces import Meeting
 from chains import se3
 from chains.errors import InputError
-from sensors.lidar import Beams, LidarModel, beams
+from sensors.lidar import Beams, LidarModel
 from sensors.recording import Recording, Scan
 
 SIZE = {Site.BEAM: 3, Site.REFERENCE: 3, Site.NOISE: 1}
@@ -76,6 +75,8 @@ class _Seen:
     view: View
     bases: Mapping[str, tuple[Site, np.ndarray | OneHot]]
     error: Mapping[Site, np.ndarray]
+    shift_m: np.ndarray | float  # (N,) of the surfaces along their normals, by unknowns of theirs
+    cells: Sequence[tuple[str, np.ndarray, int]]  # those unknowns: (N,) component, number of them
 
     def error_at(self, site: Site, rows: np.ndarray) -> np.ndarray:
         """The error (R, D) at some rows."""
@@ -97,6 +98,8 @@ class ScanStop:
         columns: (1,) covariates of the stop.
         meeting: mesh or planes.
         reference_sigma_m: how far the reference may be off its surface.
+        store: its recording's scans as beams.
+        room: the mesh, or the recording whose planes these are.
     """
 
     name: str
@@ -107,6 +110,8 @@ class ScanStop:
     columns: Mapping[str, np.ndarray]
     meeting: Meeting
     reference_sigma_m: float
+    store: BeamStore
+    room: int | str
 
     @property
     def lidar(self) -> LidarModel:
@@ -121,15 +126,24 @@ class ScanStop:
         _, ray = self._read()
         return self._associate(self.pose(values), ray, values, near_edges)
 
-    def rows(self, values: Values, association: Association | None = None) -> Rows:
-        """The stop's rows at a state; associated anew unless an association is given."""
-        return self._rows_from(self.pose(values), values, association)
+    def rows(
+        self,
+        values: Values,
+        association: Association | None = None,
+        T: np.ndarray | None = None,
+    ) -> Rows:
+        """The stop's rows at a state.
 
-    def _rows_from(self, T: np.ndarray, values: Values, association: Association | None) -> Rows:
+        Args:
+            values: the state.
+            association: what its beams meet; found anew where None.
+            T: (4, 4) T_reference_lidar there, where it is known already.
+        """
         scan, ray = self._read()
+        T = self.pose(values) if T is None else T
         if association is None:
             association = self._associate(T, ray, values, near_edges=False)
-        return self._rows(T, self._seen(T, values, association, scan, ray))
+        return self._rows(self._seen(T, values, association, scan, ray), T)
 
     def ranges(self, values: Values) -> Ranges:
         """Every beam that meets the surface, before and after what the effects correct."""
@@ -139,22 +153,23 @@ class ScanStop:
         seen = self._seen(T, values, found, scan, ray)
         nominal_m = np.asarray(seen.view["range_m"])
         hit = np.flatnonzero(seen.surface.usable & np.isfinite(nominal_m))
-        normal, direction = seen.surface.normal[hit], seen.ray.direction[hit] @ T[:3, :3].T
+        normal = seen.surface.columns["normal"]()[hit]
+        direction = seen.ray.direction[hit] @ T[:3, :3].T
         moved = np.einsum("ni,ni->n", normal, seen.error_at(Site.REFERENCE, hit))
         moved /= np.einsum("ni,ni->n", normal, direction)
         predicted_m = seen.surface.predicted_m[hit] + moved
         origin_m = se3.apply(T, seen.ray.origin_m[hit])
         measured_m = ray.range_m[hit]
         return Ranges(
-            T,
-            scan,
-            seen.view,
-            hit,
-            origin_m + predicted_m[:, None] * direction,
-            direction,
-            normal,
-            measured_m - nominal_m[hit],
-            measured_m - seen.error_at(Site.BEAM, hit)[:, 0] - predicted_m,
+            T_reference_lidar=T,
+            scan=scan,
+            view=seen.view,
+            hit=hit,
+            surface_m=origin_m + predicted_m[:, None] * direction,
+            direction=direction,
+            normal=normal,
+            raw_m=measured_m - nominal_m[hit],
+            corrected_m=measured_m - seen.error_at(Site.BEAM, hit)[:, 0] - predicted_m,
         )
 
     def met(self, ray: Beams, values: Values) -> dict[str, np.ndarray]:
@@ -188,20 +203,21 @@ class ScanStop:
         if error[Site.BEAM][:, 1:].any():
             ray = turned(ray, -error[Site.BEAM][:, 1], -error[Site.BEAM][:, 2])
             surface = self.meeting.meet(T, ray, values, association)
-        return _Seen(scan, ray, surface, view, bases, error)
-
-    def compress(
-        self, values: Values, association: Association | None = None, newton: bool = False
-    ) -> CompressedScan:
-        """The stop's rows, compressed, linearised at a state; `newton` as of `beams.compress`."""
-        T = self.pose(values)
-        rows = self._rows_from(T, values, association)
-        frame = self.stops.rig.lidar_frame
-        return compress(self.name, rows, self.stops, frame, T, values, newton)
+        shifts = (np.append(values[n], 0.0)[index] for n, index in association.cells.items())
+        cells = [(n, index, len(values[n])) for n, index in association.cells.items()]
+        return _Seen(
+            scan=scan,
+            ray=ray,
+            surface=surface,
+            view=view,
+            bases=bases,
+            error=error,
+            shift_m=sum(shifts, 0.0),
+            cells=cells,
+        )
 
     def _read(self) -> tuple[Scan, Beams]:
-        scan = self.recording.scan(self.index)
-        return scan, beams(scan.xyz_m, self.lidar.beam_origin_m)
+        return self.store.read(self.index)
 
     def _associate(
         self, T: np.ndarray, ray: Beams, values: Values, near_edges: bool
@@ -229,55 +245,65 @@ class ScanStop:
         }
         return View(self.stops.rig, len(scan.ring), columns, self.stops.joints)
 
-    def _rows(self, T: np.ndarray, seen: _Seen) -> Rows:
-        scan, ray, surface = seen.scan, seen.ray, seen.surface
-        view, bases, error = seen.view, seen.bases, seen.error
-        usable, t, n = surface.usable, surface.predicted_m.copy(), surface.normal @ T[:3, :3]
-        lost = np.flatnonzero(~usable)
-        t[lost] = 1.0
-        n[lost] = ray.direction[lost]
-        cosine = np.abs(np.einsum("ni,ni->n", n, ray.direction))
-        n /= np.where(usable, -cosine, cosine)[:, None]
+    def _rows(self, seen: _Seen, T: np.ndarray) -> Rows:
+        scan, ray, surface, error = seen.scan, seen.ray, seen.surface, seen.error
+        usable = surface.usable
+        cosine = np.where(usable, surface.cosine, 1.0)
+        slope = np.where(usable[:, None], surface.slope, 0.0)
+        t = np.where(usable, surface.predicted_m, 1.0) - seen.shift_m / cosine
         if error[Site.REFERENCE].any():
-            t += np.einsum("ni,ni->n", n @ T[:3, :3].T, error[Site.REFERENCE])
-        hit = ray.origin_m + t[:, None] * ray.direction
-        turns = any(turns_beams(b) for site, b in bases.values() if site is Site.BEAM)
-        by_site = {Site.BEAM: beam_derivative(ray, t, hit, n, turns)}
-        if any(site is Site.REFERENCE for site, _ in bases.values()):
-            by_site[Site.REFERENCE] = n @ -T[:3, :3].T
-        residual = ray.range_m - t - error[Site.BEAM][:, 0]
-        residual[lost] = 0.0
+            t += np.einsum("ni,ni->n", slope @ T[:3, :3].T, error[Site.REFERENCE])
+        residual = np.where(usable, ray.range_m - t - error[Site.BEAM][:, 0], 0.0)
         reference = self.reference_sigma_m / cosine
-        single = self._single_variance(t, cosine) * np.exp(2.0 * error[Site.NOISE][:, 0])
+        single = self.lidar.range_variance(t, cosine) * np.exp(2.0 * error[Site.NOISE][:, 0])
         variance = self._beam_variance(scan, single, t, cosine, usable)
         sigma = np.sqrt(variance + LOCAL_SHARE * reference**2)
         z = residual / sigma
         scale = robust_scale(z[usable])
-        columns = {
-            name: effect_columns(name, basis, by_site[site])
-            for name, (site, basis) in bases.items()
-            if site is not Site.NOISE
-        }
-        growth = {name: b[:, 0] for name, (site, b) in bases.items() if site is Site.NOISE}
-        for c in (*columns.values(), *surface.unknown):
-            (c.value if isinstance(c, Columns) else c)[lost] = 0.0  # 0 * inf would be NaN
+        dense, sparse = self._derivatives(seen, T, t, slope)
+        sparse += [
+            Columns(name, np.where(usable, index, -1), 1.0 / cosine, np.arange(size))
+            for name, index, size in seen.cells
+        ]
+        growth = {n: b[:, 0] for n, (site, b) in seen.bases.items() if site is Site.NOISE}
         return Rows(
-            residual,
-            sigma,
-            np.where(usable, tukey_weight(z, scale), 0.0),
-            reference * np.sqrt(1.0 - LOCAL_SHARE),
-            scale,
-            twist_derivative(hit, n),
-            {name: c for name, c in columns.items() if not isinstance(c, Columns)},
-            [c for c in columns.values() if isinstance(c, Columns)] + list(surface.unknown),
-            view,
-            usable,
-            spread_rows(scan, single, usable, growth),
+            residual_m=residual,
+            sigma_m=sigma,
+            weight=np.where(usable, tukey_weight(z, scale), 0.0),
+            reference_sigma_m=reference * np.sqrt(1.0 - LOCAL_SHARE),
+            scale=scale,
+            by_twist=twist_derivative(ray.origin_m, ray.direction, t, slope),
+            dense=dense,
+            sparse=sparse,
+            view=seen.view,
+            usable=usable,
+            spread=spread_rows(scan, single, usable, growth),
         )
 
-    def _single_variance(self, t: np.ndarray, cosine: np.ndarray) -> np.ndarray:
-        """Variance of one range (N,), as the LiDAR's model has it."""
-        return np.square(self.lidar.sigma_range(t, np.arccos(np.minimum(cosine, 1.0))))
+    def _derivatives(
+        self, seen: _Seen, T: np.ndarray, t: np.ndarray, slope: np.ndarray
+    ) -> tuple[dict[str, np.ndarray], list[Columns]]:
+        """By unknowns of effects and of found planes: dense ones, and one non-zero per row."""
+        by_site: dict[Site, np.ndarray] = {}
+        found = {}
+        for name, (site, basis) in seen.bases.items():
+            if site is Site.BEAM and not turns_beams(basis):
+                found[name] = range_columns(name, basis, len(t))
+            elif site is not Site.NOISE:
+                if site not in by_site:
+                    beam = site is Site.BEAM
+                    turn = -T[:3, :3].T
+                    by_site[site] = beam_derivative(seen.ray, t, slope) if beam else slope @ turn
+                found[name] = effect_columns(name, basis, by_site[site])
+        dense = {name: c for name, c in found.items() if not isinstance(c, Columns)}
+        sparse = [c for c in found.values() if isinstance(c, Columns)] + list(
+            seen.surface.unknown()
+        )
+        lost = np.flatnonzero(~seen.surface.usable)
+        if len(lost):  # 0 * inf would be NaN
+            sparse = [replace(c, value=_without(c.value, lost)) for c in sparse]
+            dense = {name: _without(c, lost) for name, c in dense.items()}
+        return dense, sparse
 
     def _beam_variance(
         self,
@@ -292,7 +318,6 @@ class ScanStop:
         The spread measured over a hold leans on the datasheet's, scaled to this stop, as if that
         were `PRIOR_COUNT` sweeps more: a spread of few sweeps is itself too uncertain a weight.
         """
-        incidence = np.arccos(np.minimum(cosine, 1.0))
         measured = np.square(scan.range_std_m)
         known = np.isfinite(measured) & (scan.count > 1) & usable
         if known.any():
@@ -300,8 +325,15 @@ class ScanStop:
             dof = np.where(known, scan.count - 1.0, 0.0)
             measured = np.where(known, measured, 0.0)
             single = (PRIOR_COUNT * single + dof * measured) / (PRIOR_COUNT + dof)
-        angle = self.lidar.sigma_angle_rad * t * np.tan(incidence)
-        return single / scan.count + angle**2
+        tangent2 = 1.0 / np.square(cosine) - 1.0
+        return single / scan.count + (self.lidar.sigma_angle_rad * t) ** 2 * tangent2
+
+
+def _without(values: np.ndarray, lost: np.ndarray) -> np.ndarray:
+    """Values (N, ...) with 0 at the lost rows."""
+    out = np.array(values)
+    out[lost] = 0.0
+    return out
 
 
 def _finite(basis: np.ndarray | OneHot, usable: np.ndarray) -> np.ndarray | OneHot:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.residuals.rows import robust_scale, tukey_weight
+from calib.residuals.robust import robust_scale, tukey_weight
 from sensors.recording import Scan
 
 

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
+from calib.effects import LazyColumn
 from calib.forward import Values
 from calib.residuals.beams import Association, Columns, Surface
-from calib.solve.graph import Variable
+from calib.residuals.compiled import meet_planes
 from chains import se3
 from sensors.lidar import Beams
 from sensors.planes import Cells, Planes
@@ -70,6 +73,10 @@ class MeshSurface:
             return parts
         return self.reference.patch_surface(self.patches_m[kind])[parts]
 
+    def surfaces(self, association: Association) -> np.ndarray:
+        """The surface (N,) that each beam meets, -1 for none."""
+        return self.reference.facts(association.part)[2]
+
     def associate(
         self, T: np.ndarray, beams: Beams, values: Values, near_edges: bool
     ) -> Association:
@@ -90,7 +97,7 @@ class MeshSurface:
         spoilt |= self.reference.near_edge(origins, directions, hits, self.footprint_rad)
         triangle = np.where(spoilt, -1, hits.triangle).astype(np.int32)
         patches = {
-            kind: self.reference.patch(hits, size_m).astype(np.int32)
+            kind: self.reference.patch(hits.triangle, hits.point_m, size_m).astype(np.int32)
             for kind, size_m in self.patches_m.items()
         }
         return Association(triangle, patches)
@@ -99,20 +106,19 @@ class MeshSurface:
         self, T: np.ndarray, beams: Beams, values: Values, association: Association
     ) -> Surface:
         """The triangle's plane that each beam meets under this association."""
-        hits = self.reference.hits(association.part, *_in_reference(T, beams))
-        surface = self.reference.surface
-        columns = {
-            "label": hits.label,
-            "reference_intensity": hits.intensity,
-            "surface": lambda: np.where(hits.triangle >= 0, surface[hits.triangle], -1),
-            "normal": hits.normal,
-            "point_m": hits.point_m,
-            "incidence_rad": hits.incidence_rad,
+        met = _Met(T, beams, self.reference.planes, association.part)
+        facts = _once(lambda: self.reference.facts(met.part))
+        columns = met.columns | {
+            "label": lambda: facts()[0],
+            "reference_intensity": lambda: facts()[1],
+            "surface": lambda: facts()[2],
         }
         for kind, size_m in self.patches_m.items():
-            columns[kind] = partial(self.reference.patch, hits, size_m)
-        columns |= association.patches
-        return Surface(hits.range_m, hits.normal, hits.incidence_rad < PARALLEL_RAD, columns)
+            columns[kind] = partial(self._patch, met, size_m)
+        return met.surface(columns | association.patches)
+
+    def _patch(self, met: _Met, size_m: float) -> np.ndarray:
+        return self.reference.patch(met.part, met.point_m, size_m)
 
 
 @dataclass(frozen=True)
@@ -129,20 +135,6 @@ class PlaneSurface:
 
     planes: Planes
     variable: str
-
-    @property
-    def unknown(self) -> Variable:
-        """The planes' numbers as a variable of the graph, free within half a radian and a metre."""
-        count = len(self.planes.normal)
-        kinds = ("tilt_1", "tilt_2", "distance")
-        return Variable(
-            self.variable,
-            "vector",
-            np.zeros(3 * count),
-            np.tile([0.5, 0.5, 1.0], count),
-            tuple(f"plane_{m}.{kind}" for m in range(count) for kind in kinds),
-            ("rad", "rad", "m") * count,
-        )
 
     @cached_property
     def axes(self) -> np.ndarray:
@@ -161,45 +153,98 @@ class PlaneSurface:
         self, T: np.ndarray, beams: Beams, values: Values, association: Association
     ) -> Surface:
         """The plane that each beam meets under this association."""
-        origins, directions = _in_reference(T, beams)
-        part = association.part
         theta = values[self.variable].reshape(-1, 3)
-        axes = self.axes
-        tilted = self.planes.normal + np.einsum("mk,mki->mi", theta[:, :2], axes)
+        tilted = self.planes.normal + np.einsum("mk,mki->mi", theta[:, :2], self.axes)
         length = np.linalg.norm(tilted, axis=1)
-        unit = tilted / length[:, None]
-        n, d = unit[part], (self.planes.distance_m + theta[:, 2])[part]
-        along = np.einsum("ni,ni->n", n, directions)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            t = (d - np.einsum("ni,ni->n", n, origins)) / along
-            hit = origins + t[:, None] * directions
-        incidence = np.arccos(np.minimum(np.abs(along), 1.0))
-        usable = (part >= 0) & (t > 0) & np.isfinite(t) & (incidence < PARALLEL_RAD)
-        facing = np.where(along > 0, -1.0, 1.0)[:, None] * n
-        columns = {"plane": part, "normal": facing, "point_m": hit, "incidence_rad": incidence}
-        unknown = [self._by_tilt(k, part, hit, n, along, length, axes) for k in (0, 1)]
-        unknown.append(self._columns(2, part, -1.0 / along))
-        return Surface(t, facing, usable, columns, unknown)
+        distance = self.planes.distance_m + theta[:, 2]
+        none = [[0.0, 0.0, 0.0, np.inf]]
+        plane = np.vstack([np.column_stack([tilted / length[:, None], distance]), none])
+        met = _Met(T, beams, plane, association.part)
+        columns = met.columns | {"plane": association.part}
+        return met.surface(columns, lambda: self._by_numbers(met, length))
 
-    def _by_tilt(
-        self,
-        k: int,
-        part: np.ndarray,
-        hit: np.ndarray,
-        n: np.ndarray,
-        along: np.ndarray,
-        length: np.ndarray,
-        axes: np.ndarray,
-    ) -> Columns:
-        # d r / d n = hit / n.u, and n moves along the axis, less what renormalising takes back.
-        axis = axes[:, k][part]
-        across = axis - np.einsum("ni,ni->n", axis, n)[:, None] * n
-        value = np.einsum("ni,ni->n", hit, across) / (along * length[part])
-        return self._columns(k, part, value)
+    def _by_numbers(self, met: _Met, length: np.ndarray) -> list[Columns]:
+        """Derivatives by the three numbers of each plane: ``d r / d n = hit / n.u``, and n moves
+        along an axis, less what renormalising takes back."""
+        part = met.association_part
+        n = met.plane[part, :3]
+        along = np.einsum("ni,ni->n", n, met.beams.direction @ met.T[:3, :3].T)
+        out = []
+        for k in (0, 1):
+            axis = self.axes[:, k][part]
+            across = axis - np.einsum("ni,ni->n", axis, n)[:, None] * n
+            value = np.einsum("ni,ni->n", met.point_m, across) / (along * length[part])
+            out.append(self._columns(k, part, value))
+        return [*out, self._columns(2, part, -1.0 / along)]
 
     def _columns(self, k: int, part: np.ndarray, value: np.ndarray) -> Columns:
         components = 3 * np.arange(len(self.planes.normal)) + k
         return Columns(self.variable, part, value, components)
+
+
+class _Met:
+    """Beams against the planes that they meet; what is seldom asked is computed when asked.
+
+    Args:
+        T: (4, 4) T_reference_lidar.
+        beams: N beams.
+        plane: (M + 1, 4), the last met by no beam.
+        part: (N,) which plane each beam meets; -1 for none.
+    """
+
+    def __init__(self, T: np.ndarray, beams: Beams, plane: np.ndarray, part: np.ndarray) -> None:
+        self.T, self.beams, self.plane, self.association_part = T, beams, plane, part
+        self.range_m, self.cosine, self.slope = meet_planes(
+            T, beams.origin_m, beams.direction, plane, part
+        )
+
+    @cached_property
+    def part(self) -> np.ndarray:
+        """(N,) the plane, -1 where it is not ahead."""
+        return np.where(np.isfinite(self.range_m), self.association_part, -1)
+
+    @cached_property
+    def point_m(self) -> np.ndarray:
+        """(N, 3) where beams meet it, reference frame; infinite where they do not."""
+        origins, directions = _in_reference(self.T, self.beams)
+        with np.errstate(invalid="ignore"):
+            point = origins + self.range_m[:, None] * directions
+        return np.where(np.isfinite(self.range_m)[:, None], point, np.inf)
+
+    @cached_property
+    def normal(self) -> np.ndarray:
+        """(N, 3) unit, facing the sensor, reference frame; zero where there is none."""
+        return (self.slope * -self.cosine[:, None]) @ self.T[:3, :3].T
+
+    @property
+    def columns(self) -> dict[str, LazyColumn]:
+        """What effects may ask of it."""
+        return {
+            "normal": lambda: self.normal,
+            "point_m": lambda: self.point_m,
+            "incidence_rad": _once(lambda: np.arccos(self.cosine)),
+        }
+
+    def surface(
+        self,
+        columns: Mapping[str, LazyColumn],
+        unknown: Callable[[], Sequence[Columns]] = tuple,
+    ) -> Surface:
+        """As rows want it."""
+        usable = self.cosine > np.cos(PARALLEL_RAD)
+        return Surface(
+            predicted_m=self.range_m,
+            cosine=self.cosine,
+            slope=self.slope,
+            usable=usable,
+            columns=columns,
+            unknown=unknown,
+        )
+
+
+def _once(compute: Callable[[], Any]) -> Callable[[], Any]:
+    """The function, computing once."""
+    return functools.cache(compute)
 
 
 def _in_reference(T: np.ndarray, beams: Beams) -> tuple[np.ndarray, np.ndarray]:

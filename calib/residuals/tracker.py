@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -72,6 +72,63 @@ class TrackedBody:
             return residual, None
         by_twist = (by_twist * weight[:, None])[:, keep]
         return residual, {n: (by_twist @ d).reshape(len(residual), -1) for n, d in d_seen.items()}
+
+
+@dataclass(frozen=True)
+class BodiesTogether:
+    """Blocks of one body at single stops, evaluated in one go.
+
+    Args:
+        blocks: as they are in the problem.
+        whole: all of them as one block, see `Stops.together`.
+    """
+
+    blocks: Sequence[TrackedBody]
+    whole: TrackedBody
+
+    @classmethod
+    def of(cls, blocks: Sequence[TrackedBody]) -> list[BodiesTogether]:
+        """Blocks, grouped by what they share."""
+        groups: dict[object, list[TrackedBody]] = {}
+        for block in blocks:
+            shared = tuple(n for n in block.variables if n not in block.stops.own)
+            like = (block.body, block.is_point, id(block.stops.rig), len(block.measured), shared)
+            groups.setdefault((*like, block.stops.noise is None), []).append(block)
+        return [cls(found, _whole(found)) for found in groups.values()]
+
+    def evaluate(self, values: Values) -> Iterator[tuple[np.ndarray, Derivatives]]:
+        """Rows and derivatives of each block, as `TrackedBody.evaluate` gives them."""
+        own = {
+            name: np.concatenate([np.repeat(values[v][None], len(b.measured), 0) for v, b in pairs])
+            for name, pairs in self._own().items()
+        }
+        residual, d = self.whole.evaluate({**values, **own}, True)
+        count = len(self.blocks)
+        rows = residual.reshape(count, -1)
+        by = {name: x.reshape(count, rows.shape[1], -1) for name, x in d.items()}
+        for k, block in enumerate(self.blocks):
+            named = dict(zip(self.whole.stops.own, block.stops.own, strict=True))
+            yield rows[k], {named.get(name, name): x[k] for name, x in by.items()}
+
+    def _own(self) -> dict[str, list[tuple[str, TrackedBody]]]:
+        names = self.whole.stops.own
+        return {n: [(b.stops.own[i], b) for b in self.blocks] for i, n in enumerate(names)}
+
+
+def _whole(blocks: Sequence[TrackedBody]) -> TrackedBody:
+    first = blocks[0]
+    bases = {
+        n: np.concatenate(
+            [np.broadcast_to(b.bases[n], (len(b.measured), *x.shape[1:])) for b in blocks]
+        )
+        for n, x in first.bases.items()
+    }
+    return replace(
+        first,
+        stops=Stops.together([b.stops for b in blocks]),
+        measured=np.concatenate([b.measured for b in blocks]),
+        bases=bases,
+    )
 
 
 def _pose_error(predicted: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,7 +30,7 @@ from calib.runs.run import (
     write_state,
 )
 from calib.solve.errors import Errors, body_errors, misfit, row_errors, scan_errors
-from calib.solve.fit import Estimate, Progress, solve
+from calib.solve.fit import Estimate, Progress, Start, solve
 from calib.solve.holdout import held_out
 from calib.solve.recalibrate import Link, earlier, solve_from
 from calib.solve.solution import solution_of
@@ -91,7 +91,7 @@ def grow(
     """
     if Path(out).resolve() == run.folder.resolve():
         raise InputError(f"{out}: a run cannot replace the one that it grows from; give another -o")
-    start = run.state()
+    start = Start(run.state())
     with _folder(out) as folder:
         sources = reopened(run)
         _refuse_idle(model, run, sources)
@@ -165,7 +165,7 @@ def _fit(
     folder: Path,
     choices: _Choices,
     progress: Progress,
-    start: Mapping[str, np.ndarray] | None = None,
+    start: Start | None = None,
 ) -> None:
     """Estimate, judge by what was held out, and write the run."""
     began = time.monotonic()
@@ -179,7 +179,7 @@ def _fit(
     unseen = Errors()
     if choices.hold_out != "none":
         by, count = choices.hold_out, choices.folds
-        unseen = held_out(sources, model, by, count, progress, estimate.state)
+        unseen = held_out(sources, model, by, count, progress, estimate.start)
     nominal = _nominal(problem, progress)
     seen = _write_residuals(problem, estimate, folder / RESIDUALS, progress)
     if not seen.count and not problem.blocks:
@@ -187,7 +187,7 @@ def _fit(
             f"{sources[0].recording.folder}: no beam meets a surface and no tracked body was seen, "
             "so there is nothing to fit to; 'rigcal check' says what is missing"
         )
-    worse = misfit(estimate.graph, estimate.values, seen)
+    worse = misfit(estimate, seen)
     widened = max([1.0, *(x for x in worse.values() if x > TOLERATED)])
     solution = solution_of(problem, estimate, widened)
     write_yaml(folder / SOLUTION, solution.document())
@@ -260,7 +260,7 @@ def _summary(
         },
         "mean_mm": {"nominal": nominal.mean_mm, "fit": seen.mean_mm, "held_out": unseen.mean_mm},
         "std_mm": {"nominal": nominal.std_mm, "fit": seen.std_mm, "held_out": unseen.std_mm},
-        "cost": estimate.graph.error(estimate.values),
+        "cost": estimate.cost,
         "dof": rows - free + sum(v.dim for v in estimate.variables),
         "iterations": estimate.iterations,
         "converged": estimate.converged,

@@ -9,7 +9,7 @@ from calib.diagnosis.weak import weak_directions
 from calib.problem import build
 from calib.runs.reopen import model_of, reopened
 from calib.runs.run import DIAGNOSIS, Run
-from calib.solve.fit import Progress, resume
+from calib.solve.fit import Progress, Start, resume
 from calib.solve.holdout import held_out
 from sensors.documents import write_json
 
@@ -44,7 +44,7 @@ def diagnose(
                 run.model["hold_out"],
                 run.model["folds"],
                 progress,
-                fitted.estimate.state,
+                fitted.estimate.start,
             )
             falls[step.effect.name] = (before, unseen.rms_mm, unseen.floor_mm)
             before = unseen.rms_mm
@@ -66,4 +66,4 @@ def stand_of(run: Run, progress: Progress) -> Stand:
     """
     sources, model = reopened(run), model_of(run)
     problem = build(sources, model)
-    return Stand(sources, model, problem, resume(problem, run.state(), progress))
+    return Stand(sources, model, problem, resume(problem, Start(run.state()), progress))

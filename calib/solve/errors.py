@@ -7,10 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from calib.problem.unknowns import Role, Unknown
 from calib.residuals.beams import Association, Rows
 from calib.residuals.scan import ScanStop
 from calib.residuals.tracker import TrackedBody
-from calib.solve.graph import Graph
+from calib.solve.fit import Estimate
 from chains import se3
 
 
@@ -54,7 +55,7 @@ def scan_errors(
     scan: ScanStop,
     values: Mapping[str, np.ndarray],
     association: Association | None,
-    graph: Graph | None,
+    predicted: Estimate | None,
 ) -> Errors:
     """Range residuals of a stop's inliers.
 
@@ -62,13 +63,13 @@ def scan_errors(
         scan: the stop.
         values: the state.
         association: what each beam meets; found anew where None.
-        graph: where the stop's pose was predicted and not fitted to this scan, the graph whose
-            marginals say how well; its share belongs to what is expected.
+        predicted: where the stop's pose was predicted and not fitted to this scan, the estimate
+            whose marginals say how well; its share belongs to what is expected.
     """
     rows = scan.rows(values, association)
-    if graph is None:
+    if predicted is None:
         return row_errors(rows)
-    return row_errors(rows, _predicted_variance(scan, values, graph, rows.by_twist))
+    return row_errors(rows, _predicted_variance(scan, values, predicted, rows.by_twist))
 
 
 def row_errors(rows: Rows, predicted_m2: np.ndarray | float = 0.0) -> Errors:
@@ -85,17 +86,19 @@ def row_errors(rows: Rows, predicted_m2: np.ndarray | float = 0.0) -> Errors:
 
 
 def _predicted_variance(
-    scan: ScanStop, values: Mapping[str, np.ndarray], graph: Graph, by_twist: np.ndarray
+    scan: ScanStop, values: Mapping[str, np.ndarray], predicted: Estimate, by_twist: np.ndarray
 ) -> np.ndarray:
     placed = scan.stops.in_reference(scan.stops.rig.lidar_frame, values)
     names = list(placed.d)
     d = np.hstack([placed.d[name][0] for name in names])
-    twist = d @ graph.covariance(values, names) @ d.T
+    twist = d @ predicted.covariance_of(names) @ d.T
     return np.einsum("ni,ij,nj->n", by_twist, twist, by_twist)
 
 
 def body_errors(
-    blocks: Sequence[TrackedBody], values: Mapping[str, np.ndarray], graph: Graph | None
+    blocks: Sequence[TrackedBody],
+    values: Mapping[str, np.ndarray],
+    predicted: Estimate | None,
 ) -> Errors:
     """Distances between tracked and predicted positions of bodies; arguments as above."""
     out = Errors()
@@ -105,15 +108,15 @@ def body_errors(
         seen = placed.T @ se3.exp(added)
         distance = np.linalg.norm(block.measured[:, :3, 3] - seen[:, :3, 3], axis=1)
         expected = 3.0 * block.sigma_m**2 * len(distance)
-        if graph is not None:
+        if predicted is not None:
             names = list(placed.d)
             d = np.concatenate([placed.d[name][:, 3:] for name in names], axis=2)
-            expected += np.einsum("kip,pq,kiq->", d, graph.covariance(values, names), d)
+            expected += np.einsum("kip,pq,kiq->", d, predicted.covariance_of(names), d)
         out += Errors(len(distance), float(distance.sum()), float(distance @ distance), expected)
     return out
 
 
-def misfit(graph: Graph, values: Mapping[str, np.ndarray], beams: Errors) -> dict[str, float]:
+def misfit(estimate: Estimate, beams: Errors) -> dict[str, float]:
     """How many times larger than their sigmas allow the residuals are, by kind of instrument.
 
     For trackers and targets the root of chi-square over its degrees of freedom, their own unknowns
@@ -122,32 +125,31 @@ def misfit(graph: Graph, values: Mapping[str, np.ndarray], beams: Errors) -> dic
     effect that is missing in the LiDAR may be laid on beams or on surfaces, and shows in either.
 
     Args:
-        graph: as solved.
-        values: the solution.
+        estimate: the solution.
         beams: of all scans, as fitted.
     """
+    values, unknowns = estimate.values, estimate.problem.variables
     out = {}
     for kind in ("tracker", "target"):
-        blocks = [b for b in graph.blocks if b.kind == kind]
+        blocks = [b for b in estimate.problem.blocks if b.kind == kind]
         if blocks:
             chi2 = sum(float(np.sum(np.square(b.evaluate(values, False)[0]))) for b in blocks)
-            own = {n for b in blocks for n in b.variables if "@" in n or ":" in n or n == "gravity"}
-            if kind == "tracker" and beams.count:
-                own = {n for n in own if "root@" not in n}  # the beams hold where the rig stands
-            joints = {n for n in own if "joints@" in n}
-            free = sum(graph.variables[n].dim for n in own - joints)
-            chi2 += sum(_prior_cost(graph, values, n) for n in joints)
+            seen = [unknowns[n] for n in {n: None for b in blocks for n in b.variables}]
+            # Beams, where there are any, hold where the rig stands.
+            own = {Role.TARGET} if kind == "tracker" and beams.count else {Role.TARGET, Role.PLACE}
+            free = sum(u.dim for u in seen if u.role in own)
+            joints = (u for u in seen if u.role is Role.JOINTS)
+            chi2 += sum(_prior_cost(u, values[u.name]) for u in joints)
             dof = max(1, sum(b.rows for b in blocks) - free)
             out[kind] = float(np.sqrt(chi2 / dof))
-    if beams.count and any(b.kind == "beams" for b in graph.blocks):
+    if beams.count and estimate.scans:
         out["beams"] = float(np.sqrt(beams.squares_m2 / beams.expected_m2))
-    moved = [n for n in graph.variables if "/reference_" in n]
-    if moved:
-        worst = max(_prior_cost(graph, values, n) / graph.variables[n].dim for n in moved)
+    surfaces = [u for u in unknowns.values() if u.role is Role.SURFACE]
+    if surfaces:
+        worst = max(_prior_cost(u, values[u.name]) / u.dim for u in surfaces)
         out["reference"] = float(np.sqrt(worst))
     return out
 
 
-def _prior_cost(graph: Graph, values: Mapping[str, np.ndarray], name: str) -> float:
-    v = graph.variables[name]
-    return float(np.sum(np.square((values[name] - v.mean) / v.sigma)))
+def _prior_cost(unknown: Unknown, value: np.ndarray) -> float:
+    return float(np.sum(np.square((value - unknown.mean) / unknown.sigma)))

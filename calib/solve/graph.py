@@ -9,70 +9,80 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol
 
 import gtsam
 import numpy as np
 from scipy.linalg import solve_triangular
 
-Kind = Literal["vector", "pose", "direction"]
+from calib.forward import Derivatives
+from calib.linear.elimination import square_root
+from calib.linear.system import Linearisation
+from calib.problem.problem import Block
+from calib.problem.unknowns import Kind, Unknown
+
 Values = Mapping[str, np.ndarray]
 
 
 @dataclass(frozen=True)
-class Variable:
-    """One unknown of the graph.
+class KeptRows:
+    """What a linearisation says of the kept unknowns, as whitened rows of the graph: linear.
 
     Args:
-        name: unique.
-        kind: "vector" (n,), "pose" (4, 4), or "direction", a unit vector (3,).
-        mean: what was known before, in the shape of the kind.
-        sigma: (dim,) how well it was known, per tangent direction; never zero.
-        dofs: (dim,) a name per tangent direction.
-        units: (dim,) "m" or "rad" or another unit, per tangent direction.
+        constant: (m,) residuals at the state of linearisation.
+        by: unknown -> (m, dim).
     """
 
-    name: str
-    kind: Kind
-    mean: np.ndarray
-    sigma: np.ndarray
-    dofs: tuple[str, ...]
-    units: tuple[str, ...]
+    constant: np.ndarray
+    by: dict[str, np.ndarray]
+
+    name = "all stops"
+    kind = "beams"
+
+    @classmethod
+    def of(cls, linear: Linearisation) -> list[KeptRows]:
+        """Those rows; none where nothing in it speaks of any kept unknown."""
+        layout = linear.layout
+        root = square_root(linear.kept)
+        place = np.full(layout.size, -1)
+        place[layout.kept] = np.arange(len(layout.kept))
+        by = {
+            name: root[:, place[layout.at[name]]] / layout.sigma[layout.at[name]]
+            for name, unknown in layout.outer().items()
+            if unknown.kind != "direction"
+        }
+        spoken = {name: d for name, d in by.items() if d.any()}
+        return [cls(-root[:, -1], spoken)] if spoken else []
 
     @property
-    def dim(self) -> int:
-        return len(self.sigma)
+    def variables(self) -> tuple[str, ...]:
+        return tuple(self.by)
 
+    @property
+    def rows(self) -> int:
+        return len(self.constant)
 
-class Block(Protocol):
-    """Whitened rows of one kind that should be zero but for unit noise.
+    @property
+    def cost(self) -> float:
+        """Half their sum of squares, where they were linearised."""
+        return float(self.constant @ self.constant) / 2
 
-    ``evaluate`` gives residuals (m,) and, when asked, the derivative by each variable: (m, n) for a
-    vector, (m, 6) for a pose by its right increment, (m, 3) for a direction by its components.
-    """
-
-    name: str
-    kind: str
-    variables: tuple[str, ...]
-    rows: int
-
-    def evaluate(
-        self, values: Values, derivatives: bool
-    ) -> tuple[np.ndarray, dict[str, np.ndarray] | None]: ...
+    def evaluate(self, values: Values, derivatives: bool) -> tuple[np.ndarray, Derivatives | None]:
+        """The rows where they were linearised; elsewhere nobody asks."""
+        return self.constant, dict(self.by) if derivatives else None
 
 
 class Graph:
     """Blocks and priors as one `gtsam.NonlinearFactorGraph`.
 
     Args:
-        variables: every unknown; each has a prior, weak where little is known.
+        variables: the unknowns; each has a prior, weak where little is known.
         blocks: the rows.
         without_prior: variables that have none of their own, as a block stands for it.
     """
 
     def __init__(
         self,
-        variables: Sequence[Variable],
+        variables: Sequence[Unknown],
         blocks: Sequence[Block],
         without_prior: frozenset[str] = frozenset(),
     ) -> None:
@@ -89,9 +99,15 @@ class Graph:
         degree = Counter(name for block in blocks for name in block.variables)
         self._by_degree = sorted(self.variables, key=lambda name: degree[name])
 
-    def error(self, values: Values) -> float:
-        """Half the sum of squared whitened rows, priors included."""
-        return self._graph.error(self._to_gtsam(values))
+    def error(self, values: Values, measured: bool = False) -> float:
+        """Half the sum of squared whitened rows, priors included.
+
+        Args:
+            values: the state.
+            measured: whether what a linearisation says is left out.
+        """
+        kept = (b for b in self.blocks if measured and isinstance(b, KeptRows))
+        return self._graph.error(self._to_gtsam(values)) - sum(b.cost for b in kept)
 
     def solve(self, initial: Values, max_iterations: int = 50) -> tuple[dict[str, np.ndarray], int]:
         """The maximum a posteriori values, by Levenberg-Marquardt, and its iterations.
@@ -105,16 +121,24 @@ class Graph:
         params.setAbsoluteErrorTol(1e-9)
         # GTSAM's Cholesky gives up where data outweigh a prior by some 1e7; its QR does not.
         params.setLinearSolverType("MULTIFRONTAL_QR")
+        # Damping in units of what the rows tell of each unknown: with one number for metres,
+        # radians and rad/(N m) alike it gives up far from the optimum.
+        params.setDiagonalDamping(True)
+        params.setlambdaUpperBound(1e12)
         params.setOrdering(self._ordering())
         start = self._to_gtsam(initial)
         optimizer = gtsam.LevenbergMarquardtOptimizer(self._graph, start, params)
         return self._from_gtsam(optimizer.optimize()), optimizer.iterations()
 
-    def step(self, values: Values) -> dict[str, np.ndarray]:
-        """The values one Gauss-Newton step on."""
+    def step(self, values: Values) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], float]:
+        """One Gauss-Newton step: the values after it, the tangent step of each unknown, and by how
+        much half the chi-square was to fall."""
         at = self._to_gtsam(values)
         linear = self._graph.linearize(at)
-        return self._from_gtsam(at.retract(linear.optimize(self._ordering(), gtsam.EliminateQR)))
+        found = linear.optimize(self._ordering(), gtsam.EliminateQR)
+        moved = {name: found.at(self._key[name]) for name in self.variables}
+        fall = self._graph.error(at) - linear.error(found)
+        return self._from_gtsam(at.retract(found)), moved, fall
 
     def covariance(self, values: Values, names: Sequence[str]) -> np.ndarray:
         """Joint marginal covariance of the named variables' tangents, in the order given.
@@ -155,23 +179,13 @@ class Graph:
             by = dict(zip(keys, np.split(A, ends[:-1], axis=1), strict=True))
             yield (self.blocks[i - priors] if i >= priors else None), by, b
 
-    def touched(self, values: Values, names: Sequence[str]) -> np.ndarray:
-        """Whether any row but a prior depends on each parameter of those variables: (P,) bool."""
-        seen = {name: np.zeros(self.variables[name].dim, bool) for name in names}
-        for block in self.blocks:
-            if block.kind != "prior" and seen.keys() & set(block.variables):
-                derivative = block.evaluate(values, derivatives=True)[1]
-                for name in seen.keys() & derivative.keys():
-                    seen[name] |= np.abs(derivative[name]).max(axis=0) > 0
-        return np.concatenate([seen[name] for name in names])
-
     def _ordering(self, last: Sequence[str] = ()) -> gtsam.Ordering:
         ordering = gtsam.Ordering()
         for name in [*(n for n in self._by_degree if n not in last), *last]:
             ordering.push_back(self._key[name])
         return ordering
 
-    def _prior(self, v: Variable) -> gtsam.NonlinearFactor:
+    def _prior(self, v: Unknown) -> gtsam.NonlinearFactor:
         if not np.all(np.asarray(v.sigma) > 0):
             # GTSAM would take it for a constraint, and call all of this variable's marginals zero.
             raise ValueError(f"variable '{v.name}' has a sigma of 0; leave out what is held")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from calib.residuals.scan import ScanStop
 from calib.residuals.surfaces import PlaneSurface
 from calib.residuals.tracker import TrackedBody
 from calib.solve.errors import Errors, body_errors, scan_errors
-from calib.solve.fit import Estimate, Progress, solve
+from calib.solve.fit import Estimate, Progress, Start, solve
 
 FOLDS = 5  # a fit leaves out about a fifth of the locations
 
@@ -42,7 +42,7 @@ def held_out(
     by: str,
     count: int,
     progress: Progress,
-    start: Mapping[str, np.ndarray] | None = None,
+    start: Start | None = None,
 ) -> Errors:
     """Residuals of stops left out of the fit, their poses told by tracker and arm alone.
 
@@ -52,7 +52,7 @@ def held_out(
         by: "location" or "stop".
         count: how many folds to evaluate.
         progress: as of `fit.solve`.
-        start: the state of a fit of all stops: each fold's fit is near it, and starts from there.
+        start: a fit of all stops: each fold's fit is near it, and starts from there.
     """
     out = Errors()
     for number, fold in enumerate(folds(sources, by)[:count], 1):
@@ -67,15 +67,13 @@ def held_out(
     return out
 
 
-def _without_planes(
-    trained: Problem, start: Mapping[str, np.ndarray] | None
-) -> dict[str, np.ndarray] | None:
-    """A state less the planes found in the scans: other scans, other planes."""
-    if start is None:
-        return None
-    found = (m for m in trained.meetings.values() if isinstance(m, PlaneSurface))
+def _without_planes(trained: Problem, start: Start | None) -> Start | None:
+    """A start less the planes found in the scans: other scans, other planes."""
+    found = [m for m in trained.meetings.values() if isinstance(m, PlaneSurface)]
+    if start is None or not found:
+        return start
     planes = {meeting.variable for meeting in found}
-    return {name: value for name, value in start.items() if name not in planes}
+    return Start({name: x for name, x in start.state.items() if name not in planes})
 
 
 def predict(unseen: Problem, trained: Problem, estimate: Estimate) -> Errors:
@@ -84,7 +82,7 @@ def predict(unseen: Problem, trained: Problem, estimate: Estimate) -> Errors:
     predicted, told = placed(unseen, trained, estimate)
     if not scans:
         judged = [b for b in bodies if b not in unseen.blocks and b.stops.root in told]
-        return body_errors(judged, predicted.values, predicted.graph)
+        return body_errors(judged, predicted.values, predicted)
     return sum((_scan(scan, predicted, scan.stops.root in told) for scan in scans), Errors())
 
 
@@ -104,7 +102,7 @@ def placed(unseen: Problem, trained: Problem, estimate: Estimate) -> tuple[Estim
     shared = [n for n in trained.variables if n in unseen.variables]
     held = [trained.variables[n] for n in shared if trained.variables[n].kind != "direction"]
     names = [v.name for v in held]
-    covariance = estimate.graph.covariance(estimate.values, names)
+    covariance = estimate.covariance_of(names)
     prior = JointPrior(held, {n: estimate.values[n] for n in names}, covariance)
     scans, bodies = unseen.scans, [b for b in unseen.blocks if isinstance(b, TrackedBody)]
     # Without a LiDAR, bodies before the joints tell where the rig is; those beyond are judged.
@@ -116,4 +114,4 @@ def placed(unseen: Problem, trained: Problem, estimate: Estimate) -> tuple[Estim
 
 def _scan(scan: ScanStop, predicted: Estimate, told: bool) -> Errors:
     association = scan.associate(predicted.values, near_edges=True)
-    return scan_errors(scan, predicted.values, association, predicted.graph if told else None)
+    return scan_errors(scan, predicted.values, association, predicted if told else None)

@@ -7,14 +7,14 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.linalg import qr
 
-from calib.solve.graph import Variable
+from calib.problem.unknowns import Unknown
 
 UNTOLD = 0.98  # of the prior's variance left: the data said next to nothing
 PARTNER = 0.1  # of the leading parameter's share, in units of the priors
 
 
 def not_estimated(
-    variables: Sequence[Variable],
+    variables: Sequence[Unknown],
     covariance: np.ndarray,
     effects: frozenset[str],
     touched: np.ndarray,

@@ -11,15 +11,15 @@ from scipy.special import chdtrc
 
 from calib.effects import FrameOffset
 from calib.problem import Problem
-from calib.problem.prior import JointPrior, difference
+from calib.problem.prior import JointPrior
+from calib.problem.unknowns import Unknown
 from calib.solve.fit import Estimate, Progress, solve
-from calib.solve.graph import Variable
 from calib.solve.solution import Solution
 from chains import se3
 from chains.errors import InputError
 
 ALARM = 0.01  # chance that anything is called moved when nothing has
-TOLD = 0.9  # of the earlier variance left: less than that, and the new data say something
+LEFT_VARIANCE = 0.9  # of the earlier variance left: less than that, and the new data say something
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ def _test(force: np.ndarray, spread: np.ndarray, precision: np.ndarray) -> _Test
     """Of a force ~ N(0, spread), along the axes that anything but the prior holds."""
     root = np.linalg.inv(np.linalg.cholesky(precision))
     told, axes = np.linalg.eigh(root @ spread @ root.T)
-    use = told > 1.0 - TOLD
+    use = told > 1.0 - LEFT_VARIANCE
     if not use.any():
         return None
     statistic = float((np.square(axes.T @ root @ force)[use] / told[use]).sum())
@@ -130,7 +130,7 @@ def _test(force: np.ndarray, spread: np.ndarray, precision: np.ndarray) -> _Test
 
 
 def _link(
-    variable: Variable, prior: JointPrior, estimate: Estimate, test: _Test | None, moved: bool
+    variable: Unknown, prior: JointPrior, estimate: Estimate, test: _Test | None, moved: bool
 ) -> Link:
     """The link, with the move that explains all changes best where it is the one that moved.
 
@@ -150,35 +150,35 @@ def _link(
     else:
         change, covariance = change[k], covariance[k, k]
     return Link(
-        variable.name,
-        moved,
-        test.p if test else None,
-        change,
-        np.sqrt(np.diag(covariance)),
-        variable.dofs,
-        variable.units,
+        name=variable.name,
+        moved=moved,
+        p_value=test.p if test else None,
+        change=change,
+        sigma=np.sqrt(np.diag(covariance)),
+        parameters=variable.dofs,
+        units=variable.units,
     )
 
 
 def _change(prior: JointPrior, estimate: Estimate) -> np.ndarray:
     """Now minus then of all that the prior holds, as one tangent."""
     values = ((v, prior.means[v.name], estimate.values[v.name]) for v in prior.held)
-    return np.concatenate([difference(*each) for each in values])
+    return np.concatenate([v.difference(then, now) for v, then, now in values])
 
 
-def _covariance(estimate: Estimate, held: Sequence[Variable]) -> np.ndarray:
+def _covariance(estimate: Estimate, held: Sequence[Unknown]) -> np.ndarray:
     """Covariance of some of the estimate's variables, in the order given."""
     blocks, order = _blocks(estimate.variables), np.arange(len(estimate.covariance))
     index = np.concatenate([order[blocks[v.name]] for v in held])
     return estimate.covariance[np.ix_(index, index)]
 
 
-def _blocks(variables: Sequence[Variable]) -> dict[str, slice]:
+def _blocks(variables: Sequence[Unknown]) -> dict[str, slice]:
     ends = np.cumsum([v.dim for v in variables])
     return {v.name: slice(end - v.dim, end) for v, end in zip(variables, ends, strict=True)}
 
 
-def _earlier_value(problem: Problem, variable: Variable, solution: Solution) -> np.ndarray | None:
+def _earlier_value(problem: Problem, variable: Unknown, solution: Solution) -> np.ndarray | None:
     for source, terms in zip(problem.sources, problem.terms, strict=True):
         part = solution.part(source.rig.name)
         for term in terms:

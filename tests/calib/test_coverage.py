@@ -11,7 +11,7 @@ import pytest
 
 from calib.runs.calibrate import calibrate
 from calib.runs.run import Run
-from calib.simulate import simulate
+from calib.simulation import simulate
 from chains import se3
 
 from ..once import Once

@@ -13,7 +13,7 @@ from calib.diagnosis.score import project
 from calib.diagnosis.score import test as score_test
 from calib.diagnosis.stand import Stand
 from calib.problem.model import Model
-from calib.simulate import Spec
+from calib.simulation import Spec
 from calib.solve.fit import solve
 
 from .simulated import made

@@ -21,7 +21,12 @@ def world(monkeypatch):
     rng = np.random.default_rng(5)
     variables = [
         Variable(
-            name, "vector", np.zeros(DIM), np.full(DIM, CAD_SIGMA), ("a", "b", "c"), ("m",) * 3
+            name=name,
+            kind="vector",
+            mean=np.zeros(DIM),
+            sigma=np.full(DIM, CAD_SIGMA),
+            dofs=("a", "b", "c"),
+            units=("m",) * 3,
         )
         for name in NAMES
     ]

@@ -13,7 +13,7 @@ import pytest
 from calib.runs.calibrate import calibrate
 from calib.runs.diagnose import diagnose
 from calib.runs.run import Run
-from calib.simulate import simulate
+from calib.simulation import simulate
 from calib.view.desk import Desk
 from calib.view.page import Page
 from calib.view.server import address, serve, stop

@@ -1,0 +1,74 @@
+"""Gradients by cluster: what rows that err together say together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from scipy.sparse import csr_array, issparse, vstack
+
+
+class ClusteredRows(NamedTuple):
+    """Whitened rows, and what each errs with.
+
+    Args:
+        A: (m, n) derivatives, sparse where each row has one; columns: (n,) by which.
+        b: (m,) minus the residuals.
+        stop, place: (m,) numbers of the stop and of what is looked at; -1 for none.
+    """
+
+    A: np.ndarray | csr_array
+    b: np.ndarray
+    columns: np.ndarray
+    stop: np.ndarray
+    place: np.ndarray
+
+
+@dataclass
+class Gradients:
+    """``J^T W b`` of clusters of rows: beams of a stop on a surface, bodies at a stop, ...
+
+    Args:
+        size: number of columns, U.
+    """
+
+    size: int
+    places: dict[object, int] = field(default_factory=dict)
+    _tables: list[csr_array] = field(default_factory=list)
+    _clusters: list[np.ndarray] = field(default_factory=list)
+
+    def place(self, key: object) -> int:
+        """Number of a part of the room, or of anything else that errs alike for several stops."""
+        return self.places.setdefault(key, len(self.places))
+
+    def numbers(self, room: object, parts: np.ndarray) -> np.ndarray:
+        """Numbers of parts of a room."""
+        return np.array([self.place((room, part)) for part in parts.tolist()], int)
+
+    def add(
+        self, gradient: np.ndarray, columns: np.ndarray, stop: np.ndarray, place: np.ndarray
+    ) -> None:
+        """Add clusters (C, n) over some columns (n,), of stops and places (C,), -1 for none."""
+        found = csr_array(gradient)
+        entries = (found.data, columns[found.indices], found.indptr)
+        self._tables.append(csr_array(entries, shape=(len(stop), self.size)))
+        self._clusters.append(np.stack([stop, place]))
+
+    def add_rows(self, rows: ClusteredRows) -> None:
+        """Add whitened rows; each of a sparse derivative is a cluster of its own."""
+        if issparse(rows.A):
+            self.add(rows.A.multiply(rows.b[:, None]), rows.columns, rows.stop, rows.place)
+            return
+        if np.ptp(rows.stop) == 0 == np.ptp(rows.place):
+            self.add((rows.b @ rows.A)[None], rows.columns, rows.stop[:1], rows.place[:1])
+            return
+        pairs, cell = np.unique([rows.stop, rows.place], axis=1, return_inverse=True)
+        count = len(rows.b)
+        pick = csr_array((rows.b, cell, np.arange(count + 1)), shape=(count, pairs.shape[1]))
+        self.add(pick.T @ rows.A, rows.columns, *pairs)
+
+    def table(self) -> tuple[csr_array, np.ndarray, np.ndarray]:
+        """All clusters (C, U), sparse; the stop and the place (C,) of each."""
+        stop, place = np.concatenate(self._clusters, axis=1)
+        return csr_array(vstack(self._tables)), stop, place

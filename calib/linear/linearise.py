@@ -1,0 +1,120 @@
+"""One pass over all rows at a state, and what it adds up to."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from calib.forward import Placed, place_each
+from calib.linear.assembly import CellsFirst, OwnRows, StopsFirst
+from calib.linear.clusters import ClusteredRows, Gradients
+from calib.linear.layout import Layout
+from calib.linear.parallel import in_order
+from calib.linear.rows import StopRows, StopSums
+from calib.linear.system import Linearisation, Values
+from calib.problem import Problem
+from calib.problem.unknowns import Unknown
+from calib.residuals.beams import Association
+from calib.residuals.scan import ScanStop
+from calib.residuals.spread import SpreadRows
+from chains import se3
+
+Progress = Callable[[int, int], None]
+
+
+def linearise(
+    problem: Problem,
+    values: Values,
+    associations: Sequence[Association | None],
+    newton: bool = False,
+    layout: Layout | None = None,
+    gradients: Gradients | None = None,
+    beams: bool = True,
+    progress: Progress = lambda done, total: None,
+) -> Linearisation:
+    """Linearise all rows of beams and tracked bodies at a state.
+
+    Args:
+        problem: what is estimated; surfaces' unknowns included where it has any.
+        values: the state.
+        associations: per scan, what its beams meet; found anew where None.
+        newton: whether curvature takes the place of weight; see `Rows.whitened`.
+        layout: of the problem, if there is one already.
+        gradients: takes those of the clusters of beams, where they are wanted.
+        beams: False for tracked bodies alone.
+        progress: called with how many stops are done, and of how many.
+    """
+    layout = layout or Layout.of(problem)
+    count = len(problem.scans) if beams else 0
+    order = StopsFirst if layout.stops_first else CellsFirst
+    own = {stop: list(rows.values()) for stop, rows in own_rows(layout, values).items()}
+    assembly = order(layout, own, count, gradients is not None)
+
+    placed = lidars(problem.scans, values) if count else []
+
+    def work(i: int) -> tuple[StopSums, SpreadRows | None, tuple[np.ndarray, ...] | None]:
+        rows = StopRows.of(problem.scans[i], layout, values, placed[i], associations[i], newton)
+        by_cluster = None
+        if gradients is not None:
+            parts, cluster = rows.places()
+            by_cluster = parts, cluster, *rows.gradient(cluster, len(parts))
+        return rows.sums(), rows.rows.spread, by_cluster
+
+    for i, (sums, spread, by_cluster) in enumerate(in_order(work, count)):
+        progress(i, count)
+        assembly.add(sums)
+        places = None
+        if by_cluster is not None:
+            parts, cluster, gradient, columns = by_cluster
+            places = gradients.numbers(problem.scans[i].room, parts)
+            gradients.add(gradient, columns, np.full(len(parts), sums.stop), places)
+        if spread is not None:
+            rows = spread_rows(spread, layout)
+            assembly.add_kept(rows)
+            if places is not None:
+                stop = np.full(len(rows.b), sums.stop)
+                clustered = ClusteredRows(rows.A, rows.b, rows.columns, stop, places[cluster])
+                gradients.add_rows(clustered)
+    return assembly.done(values)
+
+
+def lidars(scans: Sequence[ScanStop], values: Values) -> list[Placed]:
+    """Where the LiDAR is at every stop, reference frame, with derivatives."""
+    frames = list(dict.fromkeys(scan.stops.rig.lidar_frame for scan in scans))
+    found: list[Placed | None] = [None] * len(scans)
+    for frame in frames:
+        some = [i for i, scan in enumerate(scans) if scan.stops.rig.lidar_frame == frame]
+        each = place_each([scans[i].stops for i in some], frame, values)
+        for i, placed in zip(some, each, strict=True):
+            found[i] = placed
+    return found
+
+
+def spread_rows(spread: SpreadRows, layout: Layout) -> OwnRows:
+    """Rows of the scatter within a hold, over kept unknowns."""
+    columns = layout.columns(list(spread.columns))
+    return OwnRows(np.hstack(list(spread.columns.values())), -spread.residual, columns, True)
+
+
+def own_rows(layout: Layout, values: Values) -> dict[int, dict[str, OwnRows]]:
+    """Stop -> rows of its tracked bodies, and of the priors of its own unknowns, by name."""
+    found: dict[int, dict[str, OwnRows]] = {stop: {} for stop in layout.own}
+    owner = {int(c): stop for stop, columns in layout.own.items() for c in columns}
+    for together in layout.bodies:
+        for block, (residual, d) in zip(together.blocks, together.evaluate(values), strict=True):
+            stop = next(owner[k] for n in d if (k := layout.at[n].start) in owner)
+            columns = layout.columns(list(d))
+            found[stop][block.name] = OwnRows(np.hstack(list(d.values())), -residual, columns, True)
+    for name, at in layout.at.items():
+        if at.start in owner:
+            A, b = prior_rows(layout.unknowns[name], values[name])
+            found[owner[at.start]][name] = OwnRows(A, b, np.arange(at.start, at.stop), False)
+    return found
+
+
+def prior_rows(unknown: Unknown, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Whitened derivative (n, n) and right side (n,) of a vector's or a pose's own prior."""
+    away = unknown.difference(unknown.mean, value)
+    turn = se3.right_jacobian_inverse(away) if unknown.kind == "pose" else np.eye(unknown.dim)
+    return turn / unknown.sigma[:, None], -away / unknown.sigma

@@ -1,0 +1,50 @@
+"""Work over stops, side by side: results come in order, whatever the number of threads."""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import TypeVar
+
+T = TypeVar("T")
+_WORKERS: ContextVar[int | None] = ContextVar("workers", default=None)
+
+
+@contextmanager
+def workers(count: int | None) -> Iterator[None]:
+    """Use so many threads within; all cores where None."""
+    token = _WORKERS.set(count)
+    try:
+        yield
+    finally:
+        _WORKERS.reset(token)
+
+
+def cores() -> int:
+    """How many cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def in_order(work: Callable[[int], T], count: int) -> Iterator[T]:
+    """``work(0), work(1), …``, a few of them at a time ahead of who takes them."""
+    threads = min(_WORKERS.get() or cores(), count)
+    if threads < 2:
+        yield from (work(i) for i in range(count))
+        return
+    with ThreadPoolExecutor(threads) as pool:
+        waiting = deque(pool.submit(work, i) for i in range(min(2 * threads, count)))
+        try:
+            for i in range(len(waiting), count + len(waiting)):
+                found = waiting.popleft().result()
+                if i < count:
+                    waiting.append(pool.submit(work, i))
+                yield found
+        finally:
+            for future in waiting:
+                future.cancel()

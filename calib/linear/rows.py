@@ -1,0 +1,183 @@
+"""One stop's beams as linear rows over the columns of a layout, and their sums."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.forward import Placed
+from calib.linear.layout import Layout, key_of
+from calib.residuals.beams import Association, Rows
+from calib.residuals.compiled import cluster_sums, cross_sums
+from calib.residuals.scan import ScanStop
+
+PLACES = ("surface", "plane")  # beams that meet the same one share its error
+TWIST = 6  # columns of a stop's rows that come first; minus the residual is the next
+
+
+@dataclass(frozen=True)
+class StopRows:
+    """The beams of one stop, linear in the twist of the LiDAR and in unknowns.
+
+    Args:
+        stop: its number in the layout.
+        dense: (N, 7 + d) [twist | minus the residual, m | d columns of unknowns].
+        weight: (N,) over variance, 1/m2.
+        index: (N, g) which of all sparse columns a row touches in each of g groups; -1 for none.
+        value: (N, g) its entry there.
+        columns: (d + s,) columns of the layout that the dense and the sparse ones are.
+        last: where among the sparse columns the last group begins.
+        chain: (6, n) derivative of the twist by what places the LiDAR, chain_columns: (n,) those.
+        rows: what this is made of.
+    """
+
+    stop: int
+    dense: np.ndarray
+    weight: np.ndarray
+    index: np.ndarray
+    value: np.ndarray
+    columns: np.ndarray
+    last: int
+    chain: np.ndarray
+    chain_columns: np.ndarray
+    rows: Rows
+
+    @classmethod
+    def of(
+        cls,
+        scan: ScanStop,
+        layout: Layout,
+        values: Mapping[str, np.ndarray],
+        placed: Placed,
+        association: Association | None,
+        newton: bool = False,
+    ) -> StopRows:
+        """The rows of a scan, linearised at a state where its LiDAR is `placed`; other arguments
+        as of `linearise`."""
+        rows = scan.rows(values, association, placed.T[0])
+        weight, residual = rows.whitened(newton)
+        columns = [layout.columns(list(rows.dense))]
+        index = np.empty((len(weight), len(rows.sparse)), np.int32)
+        value = np.empty(index.shape)
+        start = last = 0
+        for g, c in enumerate(rows.sparse):
+            used = np.bincount(c.index + 1, minlength=len(c.components) + 1) > 0
+            used[0] = False  # index -1: none
+            number = np.where(used, np.cumsum(used) - 1 + start, -1)
+            index[:, g], value[:, g] = number[c.index + 1], c.value
+            columns.append(layout.at[c.variable].start + c.components[used[1:]])
+            last, start = start, start + int(used.sum())
+        return cls(
+            stop=layout.stops[key_of(scan)],
+            dense=np.hstack([rows.by_twist, -residual[:, None], *rows.dense.values()]),
+            weight=weight,
+            index=index,
+            value=value,
+            columns=np.concatenate([np.zeros(0, int), *columns]),
+            last=last,
+            chain=np.hstack([d[0] for d in placed.d.values()]),
+            chain_columns=layout.columns(list(placed.d)),
+            rows=rows,
+        )
+
+    @property
+    def b(self) -> np.ndarray:
+        """(N,) minus the residual, m."""
+        return self.dense[:, TWIST]
+
+    @property
+    def sparse(self) -> int:
+        """How many sparse columns there are."""
+        return len(self.columns) - (self.dense.shape[1] - TWIST - 1)
+
+    def sums(self) -> StopSums:
+        """Their Gram matrix, in its parts."""
+        weighted = self.dense * self.weight[:, None]
+        with_dense, with_sparse, own = cross_sums(
+            self.dense, self.weight, self.index, self.value, self.sparse, self.last
+        )
+        return StopSums(
+            stop=self.stop,
+            dense=self.dense.T @ weighted,
+            with_dense=with_dense,
+            with_sparse=with_sparse,
+            own=own,
+            columns=self.columns,
+            chain=self.chain,
+            chain_columns=self.chain_columns,
+            weight_m2=float(self.weight.sum()),
+        )
+
+    def places(self) -> tuple[np.ndarray, np.ndarray]:
+        """What the rows meet, (G,) surfaces or planes, and which of these each row meets (N,)."""
+        view = self.rows.view
+        kind = next(name for name in PLACES if name in view.columns)
+        met = view[kind] + 1  # counting, as there are few of them: -1 is nothing
+        parts = np.flatnonzero(np.bincount(met))
+        number = np.zeros(parts[-1] + 1, int)
+        number[parts] = np.arange(len(parts))
+        return parts - 1, number[met]
+
+    def gradient(self, cluster: np.ndarray, clusters: int) -> tuple[np.ndarray, np.ndarray]:
+        """``J^T W b`` (clusters, n) of the rows of each cluster (N,), and its columns (n,)."""
+        found = cluster_sums(
+            self.dense, self.weight * self.b, self.index, self.value, self.sparse, cluster, clusters
+        )
+        columns = np.concatenate([self.chain_columns, self.columns])
+        return np.hstack([found[:, :TWIST] @ self.chain, found[:, TWIST + 1 :]]), columns
+
+    def along(self, directions: np.ndarray) -> np.ndarray:
+        """The rows (N, q) along directions (U, q) in all unknowns."""
+        mine, wide = directions[self.columns], self.dense.shape[1] - TWIST - 1
+        twist = self.chain @ directions[self.chain_columns]
+        out = self.dense[:, :TWIST] @ twist + self.dense[:, TWIST + 1 :] @ mine[:wide]
+        padded = np.vstack([mine[wide:], np.zeros((1, directions.shape[1]))])  # index -1: none
+        for g in range(self.index.shape[1]):
+            value = np.where(self.index[:, g] >= 0, self.value[:, g], 0.0)
+            out += value[:, None] * padded[self.index[:, g]]
+        return out
+
+
+@dataclass(frozen=True)
+class StopSums:
+    """The Gram matrix of one stop's weighted rows.
+
+    Args:
+        stop: its number in the layout.
+        dense: (7 + d, 7 + d) over [twist | b | d columns].
+        with_dense: (s, 7 + d) sparse by dense columns.
+        with_sparse: (l, s) sparse by sparse of different groups, see `compiled.cross_sums`.
+        own: (s,) each sparse column by itself.
+        columns, chain, chain_columns: as of `StopRows`.
+        weight_m2: sum of the weights over their variances, 1/m2.
+    """
+
+    stop: int
+    dense: np.ndarray
+    with_dense: np.ndarray
+    with_sparse: np.ndarray
+    own: np.ndarray
+    columns: np.ndarray
+    chain: np.ndarray
+    chain_columns: np.ndarray
+    weight_m2: float
+
+    @property
+    def dense_columns(self) -> np.ndarray:
+        """(d,) columns of the layout."""
+        return self.columns[: self.dense.shape[1] - TWIST - 1]
+
+    @property
+    def sparse_columns(self) -> np.ndarray:
+        """(s,) columns of the layout."""
+        return self.columns[self.dense.shape[1] - TWIST - 1 :]
+
+    def whole(self) -> np.ndarray:
+        """(7 + d + s, same) over [twist | b | d columns | s columns]."""
+        both = np.diag(self.own)
+        count = len(self.with_sparse)
+        both[:count] += self.with_sparse
+        both[:, :count] += self.with_sparse.T
+        return np.block([[self.dense, self.with_dense.T], [self.with_dense, both]])

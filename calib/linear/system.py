@@ -1,0 +1,99 @@
+"""The linearisation: normal equations of all rows at a state, eliminated down to what is kept.
+
+Each stop's rows become sums once. The finest cells of surfaces are then eliminated (their block is
+diagonal), the other cells, and each stop's own unknowns; or, where there are more stops than cells,
+each stop's own unknowns as it comes and all cells at the end. What is left is small and exact: the
+step, the covariance and every test are read off it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.linear.elimination import BY_TWIST, Eliminated
+from calib.linear.layout import Layout
+
+Values = Mapping[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Linearisation:
+    """Normal equations at a state, down to the kept unknowns of a layout.
+
+    Args:
+        layout: which column is what.
+        values: the state.
+        kept: (S + 1, S + 1) over the layout's kept columns and the right side b, in units of the
+            priors' sigmas; without the priors of the kept, and without the layout's other blocks.
+        raw: (S, S) the Gram matrix of the kept columns before anything was eliminated, where
+            gradients were asked for.
+        chi2: of all rows in it, before anything was eliminated.
+        touched: (U,) bool, whether any beam or tracked body depends on a column.
+        eliminated: what was eliminated, in that order.
+        twists: of each stop with beams its number, derivative of its twist, and the columns of
+            that; empty unless cells were eliminated by twists.
+        weight_m2: sum of the beams' weights over their variances, 1/m2.
+    """
+
+    layout: Layout
+    values: Values
+    kept: np.ndarray
+    raw: np.ndarray | None
+    chi2: float
+    touched: np.ndarray
+    eliminated: Sequence[Eliminated]
+    twists: Sequence[tuple[int, np.ndarray, np.ndarray]]
+    weight_m2: float
+
+    def directions(self, kept: np.ndarray) -> np.ndarray:
+        """All unknowns (U, q), in units of their sigmas, that follow those kept (S + 1, q).
+
+        The last row is -1 for a solution, 0 for a direction without the right side.
+        """
+        layout = self.layout
+        out = np.zeros((layout.size + 1, kept.shape[1]))
+        out[layout.kept], out[-1] = kept[:-1], kept[-1]
+        by_twist = None
+        for each in reversed(self.eliminated):
+            if len(each.over) and each.over[0] == BY_TWIST:
+                if by_twist is None:
+                    by_twist = self._twists(out)
+                others = out[each.over[len(by_twist) :]]
+                out[each.columns] = -each.gain @ np.vstack([by_twist, others])
+            else:
+                out[each.columns] = -each.gain @ out[each.over]
+        return out[:-1]
+
+    def _twists(self, out: np.ndarray) -> np.ndarray:
+        sigma = np.append(self.layout.sigma, 1.0)
+        moved = [d @ (sigma[c, None] * out[c]) for _, d, c in self.twists]
+        return np.concatenate(moved) if moved else np.zeros((0, out.shape[1]))
+
+    def step(self, kept: np.ndarray) -> dict[str, np.ndarray]:
+        """Tangent step of each eliminated unknown, given that of the kept (S,) in their units."""
+        scaled = np.append(kept / self.layout.sigma[self.layout.kept], -1.0)
+        moved = self.directions(scaled[:, None])[:, 0] * self.layout.sigma
+        return {name: moved[self.layout.at[name]] for name in self.layout.inner()}
+
+    def covariance(self, rows: np.ndarray, kept: np.ndarray) -> np.ndarray:
+        """Covariance (q, q) of ``rows @ unknowns``.
+
+        Args:
+            rows: (q, U) over all unknowns, own ones of stops and kept ones.
+            kept: (S, S) covariance of the kept.
+        """
+        sigma = self.layout.sigma
+        left = np.hstack([rows * sigma, np.zeros((len(rows), 1))])
+        out = np.zeros((len(rows), len(rows)))
+        for each in self.eliminated:
+            mine = left[:, each.columns]
+            if mine.any():
+                if len(each.over) and each.over[0] == BY_TWIST:
+                    raise ValueError("the covariance of cells is not computed")
+                out += mine @ each.solve(mine.T)
+                np.subtract.at(left, (slice(None), each.over), mine @ each.gain)
+        last = left[:, self.layout.kept] / sigma[self.layout.kept]
+        return out + last @ kept @ last.T

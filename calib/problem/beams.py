@@ -1,0 +1,97 @@
+"""Scans against what their beams meet: the mesh, or planes found in the scans."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calib.effects import Site
+from calib.problem.model import same_mesh
+from calib.problem.places import Places
+from calib.problem.problem import Problem, SourceStops
+from calib.problem.unknowns import Role, Unknown
+from calib.residuals.scan import ScanStop
+from calib.residuals.surfaces import Meeting, MeshSurface, PlaneSurface
+from chains import se3
+from chains.errors import InputError
+from sensors.planes import PlaneFinder, Planes
+
+OF_BEAMS = (Site.BEAM, Site.REFERENCE, Site.NOISE)
+
+
+def add_beams(problem: Problem, part: SourceStops, places: Places) -> None:
+    """Add every scan of a recording, and the planes' unknowns where there is no mesh."""
+    source = part.source
+    meeting = _meeting(problem, part, places)
+    terms = [t for t in part.terms if t.effect.site in OF_BEAMS]
+    sigma_m = source.rig.reference.sigma_m if source.rig.reference and source.reference else 0.0
+    for k, stops in places.scanned():
+        problem.scans.append(
+            ScanStop(
+                name=source.recording.stops[k],
+                recording=source.recording,
+                index=k,
+                stops=stops,
+                terms=terms,
+                columns={name: values[[k]] for name, values in source.columns.items()},
+                meeting=meeting,
+                reference_sigma_m=sigma_m,
+                store=source.store,
+                room=_room(problem, part),
+            )
+        )
+
+
+def _room(problem: Problem, part: SourceStops) -> int | str:
+    """The first source with the same mesh; without one the recording itself."""
+    if part.source.reference is None:
+        return str(part.source.recording.folder)
+    meshes = [s.reference for s in problem.sources]
+    return next(i for i, mesh in enumerate(meshes) if same_mesh(mesh, part.source.reference))
+
+
+def _meeting(problem: Problem, part: SourceStops, places: Places) -> Meeting:
+    """What the beams meet: the mesh, or else planes found in the scans."""
+    found = problem.meetings.get(part.number)
+    if found is None:
+        lidar, reference = part.source.rig.lidar, part.source.reference
+        found = (
+            MeshSurface(reference, 1.5 * lidar.beam_divergence_rad)
+            if reference is not None
+            else PlaneSurface(_find_planes(problem, part, places), f"{part.prefix}planes")
+        )
+        problem.meetings[part.number] = found
+    if isinstance(found, PlaneSurface):
+        problem.add(_planes_unknown(found))
+    return found
+
+
+def _planes_unknown(found: PlaneSurface) -> Unknown:
+    """The planes' numbers, free within half a radian and a metre."""
+    count = len(found.planes.normal)
+    kinds = ("tilt_1", "tilt_2", "distance")
+    return Unknown(
+        found.variable,
+        "vector",
+        mean=np.zeros(3 * count),
+        sigma=np.tile([0.5, 0.5, 1.0], count),
+        dofs=tuple(f"plane_{m}.{kind}" for m in range(count) for kind in kinds),
+        units=("rad", "rad", "m") * count,
+        role=Role.PLANE,
+    )
+
+
+def _find_planes(problem: Problem, part: SourceStops, places: Places) -> Planes:
+    recording, rig = part.source.recording, part.source.rig
+    finder = PlaneFinder(noise_m=rig.lidar.sigma_range_m)
+    for k, stops in places.scanned():
+        _, ray = part.source.store.read(k)
+        T = stops.in_reference(rig.lidar_frame, problem.initial).T[0]
+        points_m = ray.origin_m + ray.range_m[:, None] * ray.direction
+        finder.add(k, se3.apply(T, points_m), T[:3, 3])
+    planes = finder.planes(min_points=100)
+    if not len(planes.normal):
+        raise InputError(
+            f"{recording.folder}: there is no mesh, and no flat patch in the scans to fit to; "
+            f"add reference/mesh.ply, or scan walls"
+        )
+    return planes

@@ -1,0 +1,103 @@
+"""Rows of the tracker: bodies at stops, and targets on their rods."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calib.effects import Site, View
+from calib.problem import start
+from calib.problem.places import Places
+from calib.problem.problem import Problem, SourceStops
+from calib.problem.unknowns import Role, Unknown
+from calib.residuals.targets import HangingTarget
+from calib.residuals.tracker import TrackedBody
+
+
+def add_bodies(problem: Problem, part: SourceStops, places: Places) -> None:
+    """Add a block for every tracked body and group of stops that share all unknowns."""
+    tracker, recording = part.source.rig.tracker, part.source.recording
+    bases = _tracker_bases(part)
+    for b, body in enumerate(tracker.bodies if tracker else ()):
+        poses = start.body_poses(part.source, body)
+        point = start.is_point(part.source, body)
+        for (root, _), index in places.stops.items():
+            seen = index[np.isfinite(poses[index, 0, 3])]
+            if not len(seen):
+                continue
+            problem.blocks.append(
+                TrackedBody(
+                    name=f"{body} at {recording.stops[seen[0]]}",
+                    stops=places.bind(root, seen),
+                    body=body,
+                    measured=poses[seen],
+                    sigma_m=tracker.sigma_m,
+                    sigma_rad=tracker.sigma_rad,
+                    is_point=point,
+                    bases={v: _rows(basis, seen)[:, b] for v, basis in bases.items()},
+                    stop_names=[(recording.folder, int(k)) for k in seen],
+                )
+            )
+
+
+def _tracker_bases(part: SourceStops) -> dict[str, np.ndarray]:
+    """What the tracker adds to every body at every stop, (K or 1, B, 6, P) by unknown."""
+    source = part.source
+    view = View(source.rig, len(source.recording.stops), source.columns, source.recording.joints)
+    terms = (t for t in part.terms if t.effect.site is Site.TRACKER)
+    return {t.variable: t.basis(view) for t in terms}
+
+
+def _rows(basis: np.ndarray, index: np.ndarray) -> np.ndarray:
+    return basis if len(basis) == 1 else basis[index]
+
+
+def add_targets(problem: Problem, part: SourceStops, places: Places) -> None:
+    """Add gravity, and a block with its marker's place for every target."""
+    targets, spec = part.source.recording.targets, part.source.rig.target
+    if targets is None or spec is None or places.reference is None:
+        return
+    gravity = start.gravity(part.source)
+    dofs, units = ("across_1", "across_2"), ("rad", "rad")
+    problem.add(
+        Unknown(
+            name="gravity",
+            kind="direction",
+            mean=gravity,
+            sigma=np.ones(2),
+            dofs=dofs,
+            units=units,
+            role=Role.TARGET,
+        )
+    )
+    view = View(part.source.rig, len(targets.names), {}, np.zeros((1, 0)))
+    terms = [t for t in part.terms if t.effect.site is Site.TARGET]
+    shifts = {t.variable: t.basis(view) for t in terms}
+    for m, name in enumerate(targets.names):
+        marker = Unknown(
+            f"{part.prefix}target:{name}",
+            "vector",
+            mean=targets.lower_m[m],
+            sigma=np.full(3, 10.0),  # m: anywhere in the room
+            dofs=("x", "y", "z"),
+            units=("m",) * 3,
+            role=Role.TARGET,
+        )
+        problem.add(marker)
+        problem.blocks.append(
+            HangingTarget(
+                name=f"target {name}",
+                marker=marker.name,
+                gravity="gravity",
+                reference=places.reference,
+                faro_m=targets.faro_m[m],
+                upper_m=targets.upper_m[m],
+                lower_m=targets.lower_m[m],
+                below_m=spec.sphere_below_lower_marker_m,
+                sigma_sphere_m=spec.sigma_sphere_m,
+                sigma_marker_m=spec.sigma_marker_m,
+                shift={
+                    v: np.broadcast_to(b, (len(targets.names), *b.shape[1:]))[m]
+                    for v, b in shifts.items()
+                },
+            )
+        )

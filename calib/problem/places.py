@@ -1,0 +1,171 @@
+"""Where the rig stands and how its arm was bent: the unknowns that place every stop."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from calib.forward import Stops, place
+from calib.problem import start
+from calib.problem.model import Model
+from calib.problem.problem import Problem, SourceStops
+from calib.problem.unknowns import UNKNOWN_POSE, Role, Unknown, pose_unknown
+from chains import se3
+from chains.errors import InputError
+
+GUESSED_POSE = np.repeat([0.2, 0.3], 3)  # rad, m: a base_guess is set up by hand
+
+
+@dataclass
+class Places:
+    """Adds what places the stops of one recording to a problem, and binds its geometry.
+
+    Args:
+        problem: added to.
+        part: the recording, and which of its stops take part.
+        model: what is estimated.
+    """
+
+    problem: Problem
+    part: SourceStops
+    model: Model
+    groups: dict[str, np.ndarray] = field(init=False)
+    stops: dict[tuple[str, int], np.ndarray] = field(init=False)
+    reference: str | None = field(init=False)
+    _all: Stops = field(init=False)
+    _geometry: dict[tuple[str, int], Stops] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.groups = self._groups()
+        self.reference = self._reference()
+        source = self.part.source
+        joints, columns = source.recording.joints, source.columns
+        self._all = place(source.rig, self.part.terms, joints, columns, "", self.reference)
+        self.stops = {
+            (name, k): index
+            for name, stops in self.groups.items()
+            for k, index in self._split(stops)
+        }
+        for name, stops in self.groups.items():
+            self._add_root(name, stops)
+        self._geometry = {key: self.bind(key[0], index) for key, index in self.stops.items()}
+
+    def scanned(self) -> list[tuple[int, Stops]]:
+        """The stops with a scan: number, and geometry."""
+        has_scan = self.part.source.recording.has_scan
+        return [(k, self._geometry[root, k]) for root, k in self.stops if k >= 0 and has_scan[k]]
+
+    def _groups(self) -> dict[str, np.ndarray]:
+        """Unknown of the root -> the stops that share it."""
+        recording, moves = self.part.source.recording, self.part.source.rig.moves
+        labels = {
+            "stop": np.array(recording.stops),
+            "location": recording.location,
+            "never": np.full(len(recording.stops), "all"),
+        }[moves]
+        index = np.flatnonzero(self.part.chosen)
+        names = dict.fromkeys(labels[index])
+        return {f"{self.part.prefix}root@{name}": index[labels[index] == name] for name in names}
+
+    def _split(self, stops: np.ndarray) -> list[tuple[int, np.ndarray]]:
+        """Stops that share every unknown stay together; those with joints of their own do not."""
+        if self.part.source.rig.sigma_joint_rad and self.part.source.rig.joint_names:
+            return [(int(k), np.array([k])) for k in stops]
+        scanned = self.part.source.recording.has_scan[stops]
+        alone = [(int(k), np.array([k])) for k in stops[scanned]]
+        together = stops[~scanned]
+        return alone + ([(-1, together)] if len(together) else [])
+
+    def _reference(self) -> str | None:
+        """Unknown of T_world_reference, or None where the reference's frame is the world."""
+        rig, recording = self.part.source.rig, self.part.source.recording
+        wanted = recording.targets is not None or (
+            self.part.has_lidar and self.part.source.reference
+        )
+        if rig.tracker is None or not wanted:
+            return None
+        name = rig.reference_frame
+        if name in self.model.fixed:
+            raise InputError(
+                f"--fix {name}: its place is not known before a fit, so it cannot be held."
+            )
+        if name in self.problem.variables:
+            return name
+        T = start.reference_from_targets(self.part.source)
+        if T is None:
+            T = self._reference_from_guess()
+        self.problem.calibration.append(name)
+        return self.problem.add(pose_unknown(name, T))
+
+    def _reference_from_guess(self) -> np.ndarray:
+        source = self.part.source
+        for k in np.flatnonzero(self.part.chosen):
+            guess, seen = start.guessed_pose(source, [k]), start.root_pose(source, [k])
+            if guess is not None and seen is not None:
+                return seen @ se3.inverse(guess)
+        raise InputError(
+            f"{source.recording.folder}: nothing ties '{source.rig.reference_frame}' to "
+            f"'{source.rig.world}'; add targets.csv, or base_guess columns to stops.csv."
+        )
+
+    def _add_root(self, name: str, stops: np.ndarray) -> None:
+        """T_world_root: unknown but for the room, or guessed, or, where nothing says, given."""
+        source = self.part.source
+        tracked = start.root_pose(source, stops)
+        guess = start.guessed_pose(source, stops)
+        if guess is not None and self.reference:
+            guess = self.problem.initial[self.reference] @ guess
+        sigma = UNKNOWN_POSE
+        if tracked is not None:
+            T = tracked
+        elif guess is not None:
+            T, sigma = guess, GUESSED_POSE
+        elif len(self.groups) == 1 and self.part.source.reference is None:
+            # Nothing says where the rig is, and nothing else has a place: any choice will do.
+            T, sigma = np.eye(4), np.full(6, 1e-3)
+        else:
+            T = self._neighbour(stops)
+            if T is None:
+                stop = source.recording.stops[stops[0]]
+                raise InputError(
+                    f"{source.recording.folder / 'stops.csv'}: '{stop}': nothing tracks the rig"
+                    f" and there is no base_guess to start from; add base_guess.x … base_guess.qz"
+                )
+        self.problem.add(pose_unknown(name, T, sigma, Role.PLACE))
+
+    def _neighbour(self, stops: np.ndarray) -> np.ndarray | None:
+        """T_world_root of another stop at the same location, or of the nearest in time."""
+        recording = self.part.source.recording
+        k = int(stops[0])
+        order = np.lexsort(
+            (
+                np.abs(recording.time_s - recording.time_s[k]),
+                recording.location != recording.location[k],
+            )
+        )
+        poses = (start.root_pose(self.part.source, [j]) for j in order)
+        return next((T for T in poses if T is not None), None)
+
+    def bind(self, root: str, index: np.ndarray) -> Stops:
+        """The geometry of some stops that share a root."""
+        source = self.part.source
+        stops = self._all.some(index, root)
+        sigma = source.rig.sigma_joint_rad
+        if not sigma or not source.rig.joint_names:
+            return stops
+        name = f"{self.part.prefix}joints@{source.recording.stops[index[0]]}"
+        count = len(source.rig.joint_names)
+        units = tuple("rad" if kind == "revolute" else "m" for kind in source.rig.joint_kinds)
+        self.problem.add(
+            Unknown(
+                name,
+                "vector",
+                mean=np.zeros(count),
+                sigma=np.full(count, sigma),
+                dofs=source.rig.joint_names,
+                units=units,
+                role=Role.JOINTS,
+            )
+        )
+        return stops.with_joint_noise(name)

@@ -1,0 +1,117 @@
+"""A problem: all unknowns of a model on its recordings, and all rows that speak of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Protocol
+
+import numpy as np
+
+from calib.forward import Derivatives, Term, Values
+from calib.problem.model import Source
+from calib.problem.unknowns import Unknown
+from calib.residuals.scan import ScanStop
+from calib.residuals.surfaces import Meeting
+
+
+class Block(Protocol):
+    """Whitened rows of one kind that should be zero but for unit noise.
+
+    ``evaluate`` gives residuals (m,) and, when asked, the derivative by each unknown: (m, n) for a
+    vector, (m, 6) for a pose by its right increment, (m, 3) for a direction by its components.
+    """
+
+    name: str
+    kind: str
+    variables: tuple[str, ...]
+    rows: int
+
+    def evaluate(
+        self, values: Values, derivatives: bool
+    ) -> tuple[np.ndarray, Derivatives | None]: ...
+
+
+@dataclass(frozen=True)
+class SourceStops:
+    """One recording in a problem.
+
+    Args:
+        number: which of the problem's sources it is.
+        source: the recording.
+        terms: the model's effects on its rig.
+        chosen: (K,) bool, which stops take part.
+        prefix: before the names of its own unknowns; empty where it is the only recording.
+    """
+
+    number: int
+    source: Source
+    terms: Sequence[Term]
+    chosen: np.ndarray
+    prefix: str
+
+    @property
+    def has_lidar(self) -> bool:
+        """Whether any of those stops was scanned."""
+        scanned = self.source.recording.has_scan[self.chosen]
+        return self.source.rig.lidar is not None and bool(scanned.any())
+
+
+@dataclass(frozen=True)
+class SurfaceCells:
+    """Parts of a mesh that stand off the room, each by an unknown way along its normal.
+
+    Args:
+        column: what kind of part: surface, region or patch.
+        parts: (P,) those that any beam meets, ascending.
+        surface: (P,) the surface that each is of.
+        room: the mesh.
+    """
+
+    column: str
+    parts: np.ndarray
+    surface: np.ndarray
+    room: int
+
+
+@dataclass
+class Problem:
+    """Unknowns, their start, and blocks; `calibration` names what a user wants to know.
+
+    Args:
+        sources: the recordings.
+        terms: per source, the model's effects.
+        variables: the unknowns, by name.
+        initial: values to start from.
+        calibration: unknowns that describe the hardware, in the order in which they are shown.
+        blocks: tracker and target rows.
+        scans: one per stop with a scan.
+        meetings: per source, what its beams meet.
+        cells: unknowns of surfaces, once what beams meet is settled.
+    """
+
+    sources: Sequence[Source]
+    terms: list[list[Term]]
+    variables: dict[str, Unknown] = field(default_factory=dict)
+    initial: dict[str, np.ndarray] = field(default_factory=dict)
+    calibration: list[str] = field(default_factory=list)
+    blocks: list[Block] = field(default_factory=list)
+    scans: list[ScanStop] = field(default_factory=list)
+    meetings: dict[int, Meeting] = field(default_factory=dict)
+    cells: Mapping[str, SurfaceCells] = field(default_factory=dict)
+
+    def add(self, unknown: Unknown, value: np.ndarray | None = None) -> str:
+        """Add an unknown once; it starts at `value`, or at its mean."""
+        if unknown.name not in self.variables:
+            self.variables[unknown.name] = unknown
+            self.initial[unknown.name] = unknown.mean if value is None else value
+        return unknown.name
+
+    def with_cells(self, unknowns: Sequence[Unknown], cells: Mapping[str, SurfaceCells]) -> Problem:
+        """The problem with unknowns of its surfaces."""
+        return replace(
+            self,
+            variables=self.variables | {u.name: u for u in unknowns},
+            initial=self.initial | {u.name: u.mean for u in unknowns},
+            cells=cells,
+        )

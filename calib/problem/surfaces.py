@@ -1,0 +1,86 @@
+"""Errors of the mesh, common to the points of a surface or cell, as unknowns.
+
+Mesh error is smooth over whole surfaces, so a fit carries one displacement along the normal per
+surface, per region and per patch: without them neighbouring points would count as independent
+facts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from calib.problem.problem import Problem, SurfaceCells
+from calib.problem.unknowns import Role, Unknown
+from calib.residuals.beams import Association
+
+# Variance of the steps between surfaces, and between their cells, as shares of the reference's. It
+# is more than all of it: steps must stand for the slopes of an error that is smooth over metres.
+# From the coverage of ring zeros in simulated worlds: with cells of 0.7 m alone it was 1.3 to 1.5
+# times too small.
+SURFACE_SHARES = {"surface": 0.6, "region": 0.6, "patch": 2.0}
+
+
+def with_surfaces(
+    problem: Problem, associations: Sequence[Association]
+) -> tuple[Problem, list[Association]]:
+    """A problem with the unknowns of the surfaces that its beams meet.
+
+    Args:
+        problem: without them.
+        associations: per scan, what its beams meet, with their patches.
+
+    Returns:
+        The problem, and the associations with each beam's cells.
+    """
+    numbered = [dict(a.cells) for a in associations]
+    unknowns: list[Unknown] = []
+    cells: dict[str, SurfaceCells] = {}
+    for room, scans in _by_room(problem).items():
+        first = problem.scans[scans[0]]
+        if not first.reference_sigma_m:
+            continue
+        for column, share in SURFACE_SHARES.items():
+            parts_of = {i: _parts(problem, associations[i], i, column) for i in scans}
+            last = max(int(p.max(initial=-1)) for p in parts_of.values())
+            seen = sum(np.bincount(p + 1, minlength=last + 2) for p in parts_of.values())
+            parts = np.flatnonzero(seen[1:])  # counted from -1: nothing is met
+            number = np.full(last + 2, -1, np.int32)  # the last stands for -1
+            number[parts] = np.arange(len(parts))
+            name, sigma_m = f"{room}/reference_{column}", first.reference_sigma_m * np.sqrt(share)
+            unknowns.append(_unknown(name, room, column, parts, sigma_m))
+            cells[name] = SurfaceCells(column, parts, first.meeting.surface_of(column, parts), room)
+            for i in scans:
+                numbered[i][name] = number[parts_of[i]]
+    found = [replace(a, cells=n) for a, n in zip(associations, numbered, strict=True)]
+    return problem.with_cells(unknowns, cells), found
+
+
+def _unknown(name: str, room: int, column: str, parts: np.ndarray, sigma_m: float) -> Unknown:
+    return Unknown(
+        name,
+        "vector",
+        mean=np.zeros(len(parts)),
+        sigma=np.full(len(parts), sigma_m),
+        dofs=tuple(f"{column}_{part}" for part in parts),
+        units=("m",) * len(parts),
+        role=Role.SURFACE,
+        owner=room,
+    )
+
+
+def _parts(problem: Problem, association: Association, scan: int, column: str) -> np.ndarray:
+    if column in association.patches:
+        return np.where(association.part >= 0, association.patches[column], -1)
+    return problem.scans[scan].meeting.surfaces(association)
+
+
+def _by_room(problem: Problem) -> dict[int, list[int]]:
+    """The scans on each mesh, of whatever recording."""
+    found: dict[int, list[int]] = {}
+    for i, scan in enumerate(problem.scans):
+        if scan.reference_sigma_m:
+            found.setdefault(scan.room, []).append(i)
+    return found

@@ -1,0 +1,74 @@
+"""An unknown of the graph: what it is, what was known of it before, and whose it is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import Literal
+
+import numpy as np
+
+from calib.effects.rig import DOF
+from chains import se3
+
+Kind = Literal["vector", "pose", "direction"]
+# What is known of a pose before any data: the room it is in.
+UNKNOWN_POSE = np.repeat([3.0, 10.0], 3)
+POSE_UNITS = ("rad",) * 3 + ("m",) * 3
+
+
+class Role(Enum):
+    """What an unknown stands for."""
+
+    CALIBRATION = "calibration"  # what a user wants to know: frames, effects, the reference's place
+    PLACE = "place"  # where the rig's root stands at a stop, at a location, or always
+    JOINTS = "joints"  # what the encoders misreport at one stop
+    TARGET = "target"  # a rod's marker, and gravity
+    PLANE = "plane"  # planes found in the scans
+    SURFACE = "surface"  # how far parts of the mesh stand off the room
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """One unknown of the graph.
+
+    Args:
+        name: unique.
+        kind: "vector" (n,), "pose" (4, 4), or "direction", a unit vector (3,).
+        mean: what was known before, in the shape of the kind.
+        sigma: (dim,) how well it was known, per tangent direction; never zero.
+        dofs: (dim,) a name per tangent direction.
+        units: (dim,) "m" or "rad" or another unit, per tangent direction.
+        role: what it stands for.
+        owner: of SURFACE, the mesh: unknowns of one mesh bear the same number.
+    """
+
+    name: str
+    kind: Kind
+    mean: np.ndarray
+    sigma: np.ndarray
+    dofs: tuple[str, ...]
+    units: tuple[str, ...]
+    role: Role = Role.CALIBRATION
+    owner: int = 0
+
+    @property
+    def dim(self) -> int:
+        return len(self.sigma)
+
+    def moved(self, value: np.ndarray, step: np.ndarray) -> np.ndarray:
+        """A vector or pose after a step (dim,) of its tangent: ``T exp(step)``, ``x + step``."""
+        return value @ se3.exp(step) if self.kind == "pose" else value + step
+
+    def difference(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """How a vector or pose b differs from a, as a tangent (dim,) at a."""
+        return se3.log(se3.inverse(a) @ b) if self.kind == "pose" else b - a
+
+
+def pose_unknown(
+    name: str, mean: np.ndarray, sigma: np.ndarray = UNKNOWN_POSE, role: Role = Role.CALIBRATION
+) -> Unknown:
+    """A pose known to `sigma` about `mean`."""
+    return Unknown(
+        name=name, kind="pose", mean=mean, sigma=sigma, dofs=DOF, units=POSE_UNITS, role=role
+    )

@@ -1,0 +1,202 @@
+"""Compiled loops over beams (the numba door): where each meets its plane, and sums of its rows.
+
+They release the interpreter, so stops run side by side. numba keeps what it compiled beside this
+file, so a second start pays nothing. Each is checked against numpy in the tests.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def meet_planes(
+    T_reference_lidar: np.ndarray,
+    origin_m: np.ndarray,
+    direction: np.ndarray,
+    plane: np.ndarray,
+    part: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where N beams meet the planes of their parts.
+
+    Args:
+        T_reference_lidar: (4, 4).
+        origin_m, direction: (N, 3) of the beams, lidar axes.
+        plane: (M + 1, 4) planes [n, n.p] in the reference's frame; the last is met by no beam.
+        part: (N,) which plane; -1 for none.
+
+    Returns:
+        Range (N,) m, infinite where there is no plane ahead; cosine (N,) of incidence, 0 there;
+        and the normal over its product with the direction (N, 3), lidar axes, 0 there.
+    """
+    count, T = len(part), T_reference_lidar
+    range_m, cosine, slope = np.empty(count), np.empty(count), np.empty((count, 3))
+    for i in range(count):
+        k = part[i] if part[i] >= 0 else len(plane) - 1
+        a, b, c = plane[k, 0], plane[k, 1], plane[k, 2]
+        x = T[0, 0] * a + T[1, 0] * b + T[2, 0] * c
+        y = T[0, 1] * a + T[1, 1] * b + T[2, 1] * c
+        z = T[0, 2] * a + T[1, 2] * b + T[2, 2] * c
+        offset = plane[k, 3] - (a * T[0, 3] + b * T[1, 3] + c * T[2, 3])
+        offset -= x * origin_m[i, 0] + y * origin_m[i, 1] + z * origin_m[i, 2]
+        along = x * direction[i, 0] + y * direction[i, 1] + z * direction[i, 2]
+        t = offset / along
+        if t > 0.0 and t < np.inf:
+            range_m[i], cosine[i] = t, min(abs(along), 1.0)
+            slope[i, 0], slope[i, 1], slope[i, 2] = x / along, y / along, z / along
+        else:
+            range_m[i], cosine[i] = np.inf, 0.0
+            slope[i, 0], slope[i, 1], slope[i, 2] = 0.0, 0.0, 0.0
+    return range_m, cosine, slope
+
+
+@njit(cache=True, nogil=True)
+def twist_derivative(
+    origin_m: np.ndarray, direction: np.ndarray, range_m: np.ndarray, slope: np.ndarray
+) -> np.ndarray:
+    """``d residual / d twist = [h x s, s]`` (N, 6) by the lidar's right increment, where the beam
+    hits, h, and the normal over its product with the direction, s (N, 3), in the lidar's axes."""
+    count = len(range_m)
+    out = np.empty((count, 6))
+    for i in range(count):
+        x = origin_m[i, 0] + range_m[i] * direction[i, 0]
+        y = origin_m[i, 1] + range_m[i] * direction[i, 1]
+        z = origin_m[i, 2] + range_m[i] * direction[i, 2]
+        a, b, c = slope[i, 0], slope[i, 1], slope[i, 2]
+        out[i, 0], out[i, 1], out[i, 2] = y * c - z * b, z * a - x * c, x * b - y * a
+        out[i, 3], out[i, 4], out[i, 5] = a, b, c
+    return out
+
+
+@njit(cache=True, nogil=True)
+def cross_sums(
+    dense: np.ndarray,
+    weight: np.ndarray,
+    index: np.ndarray,
+    value: np.ndarray,
+    size: int,
+    last: int,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Weighted sums over rows of products with columns of which each row touches one per group.
+
+    Args:
+        dense: (N, m), C order.
+        weight: (N,).
+        index: (N, g) which of all `size` sparse columns a row touches in each group; -1 for none.
+            The columns of a group follow those of the groups before it.
+        value: (N, g) its entry there.
+        size: number of sparse columns, all groups together.
+        last: where the last group begins.
+
+    Returns:
+        Sparse by dense (size, m); sparse by sparse (last, size) of different groups, in the rows of
+        the earlier one; and each sparse column by itself (size,).
+    """
+    count, groups = index.shape
+    width = dense.shape[1]
+    with_dense, with_sparse = np.zeros((size, width)), np.zeros((last, size))
+    diagonal = np.zeros(size)
+    for i in range(count):
+        w = weight[i]
+        if w == 0.0:
+            continue
+        for g in range(groups):
+            row = index[i, g]
+            if row < 0:
+                continue
+            v = w * value[i, g]
+            for j in range(width):
+                with_dense[row, j] += v * dense[i, j]
+            diagonal[row] += v * value[i, g]
+            for h in range(g + 1, groups):
+                column = index[i, h]
+                if column >= 0:
+                    with_sparse[row, column] += v * value[i, h]
+    return with_dense, with_sparse, diagonal
+
+
+@njit(cache=True, nogil=True)
+def add_sparse(
+    with_sparse: np.ndarray,
+    own: np.ndarray,
+    at: np.ndarray,
+    fine: np.ndarray,
+    rest: np.ndarray,
+    cross: np.ndarray,
+    diagonal: np.ndarray,
+) -> None:
+    """Add sums of sparse columns to normal equations that are kept in three parts.
+
+    Args:
+        with_sparse, own: (last, s) and (s,) as `cross_sums` gives them.
+        at: (s,) where each column stands in `rest`, for those that stand there.
+        fine: (s,) where it stands among those whose block is diagonal; -1 for the others.
+        rest: (n, n), cross: (C, n) and diagonal: (C,), added to.
+    """
+    rows, size = with_sparse.shape
+    for a in range(size):
+        if fine[a] >= 0:
+            diagonal[fine[a]] += own[a]
+        else:
+            rest[at[a], at[a]] += own[a]
+    for a in range(rows):
+        mine, row = fine[a], at[a]
+        for b in range(size):
+            v = with_sparse[a, b]
+            if v != 0.0:
+                if mine >= 0:
+                    cross[mine, at[b]] += v
+                elif fine[b] >= 0:
+                    cross[fine[b], row] += v
+                else:
+                    rest[row, at[b]] += v
+                    rest[at[b], row] += v
+
+
+@njit(cache=True, nogil=True)
+def cluster_sums(
+    dense: np.ndarray,
+    weight: np.ndarray,
+    index: np.ndarray,
+    value: np.ndarray,
+    size: int,
+    cluster: np.ndarray,
+    clusters: int,
+) -> np.ndarray:
+    """Weighted sums (clusters, m + size) of rows by the cluster (N,) that each is in; the other
+    arguments are those of `cross_sums`."""
+    count, groups = index.shape
+    width = dense.shape[1]
+    out = np.zeros((clusters, width + size))
+    for i in range(count):
+        w, c = weight[i], cluster[i]
+        if w == 0.0:
+            continue
+        for j in range(width):
+            out[c, j] += w * dense[i, j]
+        for g in range(groups):
+            if index[i, g] >= 0:
+                out[c, width + index[i, g]] += w * value[i, g]
+    return out
+
+
+@njit(cache=True, nogil=True)
+def add_at(target: np.ndarray, rows: np.ndarray, columns: np.ndarray, block: np.ndarray) -> None:
+    """``target[rows[i], columns[j]] += block[i, j]``; rows and columns of -1 are left out."""
+    for i in range(len(rows)):
+        if rows[i] >= 0:
+            for j in range(len(columns)):
+                if columns[j] >= 0:
+                    target[rows[i], columns[j]] += block[i, j]
+
+
+@njit(cache=True, nogil=True)
+def add_both(target: np.ndarray, rows: np.ndarray, columns: np.ndarray, block: np.ndarray) -> None:
+    """As `add_at`, and its transpose."""
+    for i in range(len(rows)):
+        if rows[i] >= 0:
+            for j in range(len(columns)):
+                if columns[j] >= 0:
+                    target[rows[i], columns[j]] += block[i, j]
+                    target[columns[j], rows[i]] += block[i, j]
