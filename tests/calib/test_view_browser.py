@@ -54,8 +54,8 @@ def button(watched: Watched, name: str):
 
 
 @pytest.fixture(scope="module")
-def small(tmp_path_factory) -> Run:
-    run = small_run(tmp_path_factory.mktemp("small"))
+def small(once) -> Run:
+    run = Run.open(once(small_run) / "run")
     diagnosed(run.folder)
     return run
 

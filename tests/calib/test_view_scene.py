@@ -18,8 +18,8 @@ from tests.calib.viewed import small_run
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory) -> Run:
-    return small_run(tmp_path_factory.mktemp("scene"))
+def run(once) -> Run:
+    return Run.open(once(small_run) / "run")
 
 
 @pytest.fixture(scope="module")

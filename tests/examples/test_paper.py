@@ -1,10 +1,7 @@
 """The study's own methods and tables against closed forms, exact recordings and other libraries."""
 
 import re
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -23,6 +20,7 @@ from examples.paper.page import _table_6
 from sensors.meshes import ransac_plane
 
 from ..calib.simulated import changed, made, nominal
+from ..programs import ROOT, script
 
 EXACT = {"noise": 0, "build_error": 0, "occluded_share": 0}
 CIRCLES = changed(PRESETS["one-joint"], **EXACT, stops_per_location=8)
@@ -299,8 +297,5 @@ def test_every_lidar_has_its_own_mount_on_the_same_arm(tmp_path):
     assert np.allclose(se3.inverse(np.array(a["T_faro_opti"])), se3.inverse(b["T_faro_opti"]))
 
 
-def test_the_example_can_be_asked_what_it_does():
-    example = Path(__file__).parents[2] / "examples" / "paper_study.py"
-    done = subprocess.run([sys.executable, example, "--help"], capture_output=True, text=True)
-    assert done.returncode == 0
-    assert "--quick" in done.stdout
+def test_the_example_can_be_asked_what_it_does(tmp_path):
+    assert "--quick" in script(ROOT / "examples" / "paper_study.py", ["--help"], tmp_path)
