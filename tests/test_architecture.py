@@ -26,6 +26,7 @@ DOORS = {
     "gtsam": "calib/solve/graph.py",
     "laspy": "sensors/readers/clouds/las.py",
     "matplotlib": "calib/report/plots.py",
+    "numba": "calib/residuals/compiled.py",
     "open3d": "sensors/meshes.py",
     "pyarrow": "sensors/recording.py",
     "trimesh": "sensors/readers/meshes/mesh_files.py",
@@ -35,7 +36,7 @@ DOORS = {
     "xacrodoc": "chains/readers/xacro.py",
     "yaml": "sensors/documents.py",
 }
-NOT_AT_STARTUP = {"gtsam", "matplotlib", "open3d", "pyarrow", "pydantic", "scipy", "viser"}
+NOT_AT_STARTUP = {"gtsam", "matplotlib", "numba", "open3d", "pyarrow", "pydantic", "scipy", "viser"}
 LONGEST_FILE, LONGEST_FUNCTION = 400, 60
 MOST_FILES = 12  # a room, beside its __init__.py
 MOST_PARAMETERS, MOST_POSITIONAL = 12, 4
