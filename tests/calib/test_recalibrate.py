@@ -7,8 +7,8 @@ import pytest
 from scipy.stats import kstest
 
 from calib.problem.prior import JointPrior
+from calib.problem.unknowns import Unknown
 from calib.solve import recalibrate
-from calib.solve.graph import Variable
 
 NAMES = ("mount", "lidar", "arm", "unseen")
 DIM, CAD_SIGMA = 3, 1.0
@@ -20,9 +20,7 @@ def world(monkeypatch):
     """A linear world: links of which sums are seen, once before and once after."""
     rng = np.random.default_rng(5)
     variables = [
-        Variable(
-            name, "vector", np.zeros(DIM), np.full(DIM, CAD_SIGMA), ("a", "b", "c"), ("m",) * 3
-        )
+        Unknown(name, "vector", np.zeros(DIM), np.full(DIM, CAD_SIGMA), ("a", "b", "c"), ("m",) * 3)
         for name in NAMES
     ]
     J = rng.normal(size=(40, SIZE)) / 0.03
