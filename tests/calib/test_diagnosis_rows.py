@@ -1,5 +1,6 @@
 """The rows behind a diagnosis: the linearised normal equations, and what clusters share of them."""
 
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +13,8 @@ from calib.diagnosis.linear import rows_along
 from calib.diagnosis.score import away_from_model, project
 from calib.diagnosis.score import test as score_test
 from calib.diagnosis.stand import Stand
-from calib.linear.rows import PLACES
+from calib.linear.parallel import workers
+from calib.linear.rows import PLACES, StopRows
 from calib.problem.model import Model
 from calib.simulate import Spec
 from calib.solve.fit import solve
@@ -58,6 +60,25 @@ def sizes(A):
     """What all rows tell of each unknown; one where no row feels it."""
     size = np.linalg.norm(A, axis=0)
     return np.where(size > 0, size, 1.0)
+
+
+def test_places_are_numbered_in_the_order_of_stops_however_many_threads(stand, monkeypatch):
+    """The first stop takes longest, and each meets a place of its own."""
+
+    def places(rows):
+        time.sleep(0.05 if rows.stop == 0 else 0.0)
+        return np.array([rows.stop]), np.zeros(len(rows.b), int)
+
+    monkeypatch.setattr(StopRows, "places", places)
+    wide, nothing = problem_with(stand, ()), lambda done, total: None
+    away = {name: np.zeros((v.dim, 1)) for name, v in stand.estimate.problem.variables.items()}
+
+    def found(count):
+        with workers(count):
+            return [rows.place for rows in rows_along(wide, stand.estimate, away, nothing)]
+
+    for alone, together in zip(found(1), found(4), strict=True):
+        np.testing.assert_array_equal(together, alone)
 
 
 def problem_with(stand, names):
