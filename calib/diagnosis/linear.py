@@ -86,23 +86,23 @@ def rows_along(
     placed = lidars(scans, values)
     every, places = np.arange(directions.shape[1]), Gradients(layout.size)
 
-    def work(i: int) -> list[ClusteredRows]:
+    def work(i: int) -> tuple[np.ndarray, np.ndarray, list[ClusteredRows]]:
         rows = StopRows.of(scans[i], layout, values, placed[i], estimate.associations[i])
         root = np.sqrt(rows.weight)
         parts, cluster = rows.places()
-        place = places.numbers(scans[i].room, parts)[cluster]
         stop = np.full(len(root), rows.stop)
         A, b = rows.along(directions) * root[:, None], root * rows.b
-        found = [ClusteredRows(A, b, every, stop, place)]
+        found = [ClusteredRows(A, b, every, stop, cluster)]
         if rows.rows.spread is not None:
             more = spread_rows(rows.rows.spread, layout)
             A, b = more.A @ directions[more.columns], more.b
-            found.append(ClusteredRows(A, b, every, stop, place))
-        return found
+            found.append(ClusteredRows(A, b, every, stop, cluster))
+        return parts, cluster, found
 
-    for i, found in enumerate(in_order(work, len(scans))):
+    for i, (parts, cluster, found) in enumerate(in_order(work, len(scans))):
         progress(i, len(scans))
-        yield from found
+        place = places.numbers(scans[i].room, parts)[cluster]  # here: threads would race for them
+        yield from (rows._replace(place=place) for rows in found)
     for rows in other_rows(wide, layout, values, places):
         yield rows._replace(A=rows.A @ directions[rows.columns], columns=every)
 

@@ -46,7 +46,7 @@ from calib.effects.range import (
     TemperatureDrift,
     WarmupDrift,
 )
-from calib.effects.reference import FaroScale, MovedSurface, SurfaceShift
+from calib.effects.reference import FaroScale, MovedSurface
 from calib.effects.rig import BaseFlex, FrameOffset, MountBending, MountCreep, MountSlip
 from calib.effects.targets import TargetRodTilt, TargetSphereOffset
 from calib.effects.tracker import OptitrackDistortion, OptitrackScale
@@ -109,7 +109,6 @@ __all__ = [
     "OneHot",
     "Param",
     "Site",
-    "SurfaceShift",
     "View",
     "find",
     "load_effects",

@@ -82,6 +82,7 @@ def _points(ranges: Ranges) -> Columns:
     view, scan, hit = ranges.view, ranges.scan, ranges.hit
     spread_m, nothing = scan.range_std_m[hit], np.full(len(view["ring"]), np.nan)
     about_mean_m = spread_m * np.sqrt(1.0 - 1.0 / scan.count[hit])
+    stated = "reference_intensity" in view.columns
     at = ranges.surface_m + ranges.corrected_m[:, None] * ranges.direction
     columns = {f"{axis}_m": at[:, k] for k, axis in enumerate("xyz")}
     columns |= {"ring": scan.ring[hit], "column": scan.column[hit], "count": scan.count[hit]}
@@ -89,7 +90,7 @@ def _points(ranges: Ranges) -> Columns:
         "distance_m": view["range_m"][hit],
         "incidence_rad": view["incidence_rad"][hit],
         "label": (view["label"] if "label" in view.columns else np.zeros(len(nothing)))[hit],
-        "reference_intensity": view.columns.get("reference_intensity", nothing)[hit],
+        "reference_intensity": (view["reference_intensity"] if stated else nothing)[hit],
         "intensity": scan.intensity[hit],
         "signed_error_m": ranges.corrected_m,
         "accuracy_m": accuracy(ranges.corrected_m, about_mean_m),

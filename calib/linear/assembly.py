@@ -84,6 +84,11 @@ class Assembly:
             gram = rows.gram(self.layout.sigma)[:-1, :-1]
             add_at(self.raw, at[rows.columns], at[rows.columns], gram)
 
+    def add_kept(self, rows: OwnRows) -> None:
+        """Add whitened rows about kept unknowns."""
+        self.chi2 += float(rows.b @ rows.b)
+        self.touched[rows.columns] |= np.any(rows.A != 0, axis=0)
+
     def _cell_priors(self, values: Values, columns: np.ndarray) -> np.ndarray:
         """Right side (n,) of the priors of cells, whose derivative is one, in their units."""
         whole = np.zeros(self.layout.size)
@@ -141,9 +146,9 @@ class CellsFirst(Assembly):
 
     def add_kept(self, rows: OwnRows) -> None:
         """Add whitened rows about kept unknowns."""
+        super().add_kept(rows)
         at = np.append(self.at[rows.columns], self.b)
         add_at(self.rest, at, at, rows.gram(np.ones(self.layout.size)))
-        self.chi2 += float(rows.b @ rows.b)
 
     def done(self, values: Values) -> Linearisation:
         """Eliminate all but the kept."""
@@ -161,7 +166,9 @@ class CellsFirst(Assembly):
         if len(layout.finest):
             own = layout.sigma[layout.finest]
             cross = self.cross * own[:, None] * unit
-            cross[:, -1] += self._cell_priors(values, layout.finest)
+            prior = self._cell_priors(values, layout.finest)
+            cross[:, -1] += prior
+            rest[-1, -1] += prior @ prior
             factor, gain = eliminate(self.diagonal * own**2 + 1.0, cross, rest)
             self.eliminated.append(Eliminated(layout.finest, over, factor, gain))
         cells = np.arange(self.first, self.first + len(layout.cells))
@@ -171,6 +178,7 @@ class CellsFirst(Assembly):
             prior = self._cell_priors(values, layout.cells)
             rest[cells, -1] += prior
             rest[-1, cells] += prior
+            rest[-1, -1] += prior @ prior
             cross, block = rest[np.ix_(cells, left)], rest[np.ix_(cells, cells)]
             rest = rest[np.ix_(left, left)]
             factor, gain = eliminate(block, cross, rest)
@@ -270,12 +278,12 @@ class StopsFirst(Assembly):
 
     def add_kept(self, rows: OwnRows) -> None:
         """Add whitened rows about kept unknowns."""
+        super().add_kept(rows)
         if self.raw is not None:
             self._add_raw([rows])
         at = np.append(self.at[rows.columns], -1)
         at[-1] = len(self.columns) - 1
         add_at(self.total, at, at, rows.gram(self.layout.sigma))
-        self.chi2 += float(rows.b @ rows.b)
 
     def _finish(self, stop: int, columns: np.ndarray, matrix: np.ndarray) -> None:
         """Add a stop's own rows to its matrix over some columns, and eliminate what is its own."""
@@ -314,6 +322,7 @@ class StopsFirst(Assembly):
         self.total[:count, :count] += np.eye(count)
         self.total[:count, -1] += prior
         self.total[-1, :count] += prior
+        self.total[-1, -1] += prior @ prior
         rest = self.total[count:, count:].copy()
         factor, gain = eliminate(self.total[:count, :count], self.total[:count, count:], rest)
         self.eliminated.append(Eliminated(self.cells, self.columns[count:], factor, gain))

@@ -169,6 +169,7 @@ class PlaneSurface:
         part = met.association_part
         n = met.plane[part, :3]
         along = np.einsum("ni,ni->n", n, met.beams.direction @ met.T[:3, :3].T)
+        along[along == 0.0] = np.inf  # nothing is met
         out = []
         for k in (0, 1):
             axis = self.axes[:, k][part]

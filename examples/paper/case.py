@@ -22,7 +22,7 @@ from calib.runs.reopen import model_of
 from calib.runs.run import Run
 from calib.solve import holdout
 from calib.solve.errors import Errors, scan_errors
-from calib.solve.fit import Progress, solve, values_of
+from calib.solve.fit import Progress, Start, solve, values_of
 from sensors.documents import replace_folder
 
 from . import sequence
@@ -127,7 +127,7 @@ class Case:
         """A run's calibration, its stops where it put them, the others where tracker and arm do."""
         model = model_of(run)
         trained = problems.build([Source.open(self.learnt_from)], model)
-        estimate = solve(trained, progress=tell, start=run.state())
+        estimate = solve(trained, progress=tell, start=Start(run.state()))
         unseen = problems.build([self.source], model, [self.left_out], trained.meetings)
         others, _ = holdout.placed(unseen, trained, estimate)
         whole = problems.build([self.source], model, meetings=trained.meetings)

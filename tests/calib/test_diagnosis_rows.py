@@ -1,5 +1,6 @@
 """The rows behind a diagnosis: the linearised normal equations, and what clusters share of them."""
 
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -8,10 +9,12 @@ import pytest
 from calib import effects
 from calib import problem as problems
 from calib.diagnosis.jackknife import Shares
-from calib.diagnosis.linear import PLACES
-from calib.diagnosis.score import project
+from calib.diagnosis.linear import rows_along
+from calib.diagnosis.score import away_from_model, project
 from calib.diagnosis.score import test as score_test
 from calib.diagnosis.stand import Stand
+from calib.linear.parallel import workers
+from calib.linear.rows import PLACES, StopRows
 from calib.problem.model import Model
 from calib.simulation import Spec
 from calib.solve.fit import solve
@@ -43,10 +46,74 @@ def linear(stand):
     return stand.linearise([effects.find(name) for name in ADDED], quiet)[0]
 
 
-def test_the_fit_is_where_its_own_gradient_vanishes(linear):
+@pytest.fixture(scope="module")
+def every_row(stand, linear):
+    """All rows, one by one, along every unknown."""
+    wide = problem_with(stand, ADDED)
+    unit = np.eye(linear.gradient.shape[1])
+    away = {name: unit[at] for name, at in linear.columns.items()}
+    found = list(rows_along(wide, stand.estimate, away, lambda done, total: None))
+    return np.vstack([rows.A for rows in found]), np.concatenate([rows.b for rows in found])
+
+
+def sizes(A):
+    """What all rows tell of each unknown; one where no row feels it."""
+    size = np.linalg.norm(A, axis=0)
+    return np.where(size > 0, size, 1.0)
+
+
+def test_places_are_numbered_in_the_order_of_stops_however_many_threads(stand, monkeypatch):
+    """The first stop takes longest, and each meets a place of its own."""
+
+    def places(rows):
+        time.sleep(0.05 if rows.stop == 0 else 0.0)
+        return np.array([rows.stop]), np.zeros(len(rows.b), int)
+
+    monkeypatch.setattr(StopRows, "places", places)
+    wide, nothing = problem_with(stand, ()), lambda done, total: None
+    away = {name: np.zeros((v.dim, 1)) for name, v in stand.estimate.problem.variables.items()}
+
+    def found(count):
+        with workers(count):
+            return [rows.place for rows in rows_along(wide, stand.estimate, away, nothing)]
+
+    for alone, together in zip(found(1), found(4), strict=True):
+        np.testing.assert_array_equal(together, alone)
+
+
+def problem_with(stand, names):
+    return stand.problem_of(stand.model.plus(tuple(effects.find(name) for name in names)))
+
+
+def test_gradients_by_cluster_add_up_to_that_of_all_rows(linear, every_row):
+    A, b = every_row
     total = np.asarray(linear.gradient.sum(axis=0)).ravel()
-    scale = np.sqrt(np.diag(linear.information))
-    for name, at in linear.at.items():
+    scale = sizes(A)
+    np.testing.assert_allclose(total / scale, A.T @ b / scale, atol=1e-8)
+
+
+def test_the_equations_are_those_of_all_rows_with_the_others_eliminated(linear, every_row):
+    """Raw, the plain sum; then the Schur complement on what is kept; and the way back."""
+    A, _ = every_row
+    kept = np.concatenate([np.r_[linear.columns[name]] for name in linear.at])
+    order = linear.among(list(linear.at))
+    scale = sizes(A)
+    unit = (A / scale).T @ (A / scale)
+    gone = np.setdiff1d(np.arange(len(unit)), kept)
+    back = np.linalg.solve(unit[np.ix_(gone, gone)], unit[np.ix_(gone, kept)])
+    schur = unit[np.ix_(kept, kept)] - unit[np.ix_(kept, gone)] @ back
+    square, both = np.ix_(order, order), np.outer(scale[kept], scale[kept])
+    np.testing.assert_allclose(linear.raw[square] / both, unit[np.ix_(kept, kept)], atol=1e-9)
+    np.testing.assert_allclose(linear.information[square] / both, schur, atol=1e-9)
+    directions = linear.directions(np.eye(len(linear.information))[:, order] / scale[kept])
+    np.testing.assert_allclose(directions[gone] * scale[gone, None], -back, atol=1e-7)
+    np.testing.assert_allclose(directions[kept] * scale[kept, None], np.eye(len(kept)), atol=1e-12)
+
+
+def test_the_fit_is_where_its_own_gradient_vanishes(linear, every_row):
+    total = np.asarray(linear.gradient.sum(axis=0)).ravel()
+    scale = sizes(every_row[0])
+    for name, at in linear.columns.items():
         # In sigmas of independent rows; priors from paper are left out here, all others are in.
         if name.startswith(("root@", "joints@", "0/reference")):
             assert np.abs(total[at] / scale[at]).max() < 0.05, name
@@ -76,7 +143,7 @@ def test_gradients_are_derivatives_of_the_cost(stand, linear):
     change = (rows(step).residual_m - rows(-step).residual_m) / (2 * step)
     weight = at.weight / np.square(at.sigma_m)
     expected = -np.sum(weight * change * at.residual_m)
-    column = linear.at[term.variable].start
+    column = linear.columns[term.variable].start
     cells = (linear.stop == 0) & (linear.place >= 0)
     found = linear.gradient[cells][:, [column]].sum()
     assert found == pytest.approx(expected, rel=1e-5)
@@ -93,21 +160,20 @@ def test_beams_cluster_by_surface_and_trackers_by_stop(stand, linear):
 def test_shares_of_clusters_add_up_to_the_whole(looked, name):
     candidate = next(c for c in looked.named.candidates if c.effect.name == name)
     shares = shares_of(looked, candidate)
-    total = sum(information for _, information in shares._cells.values())
+    total = sum(information for _, information in shares.cells.values())
     np.testing.assert_allclose(total, np.eye(candidate.test.dof), atol=1e-5)
-    score = sum(score for score, _ in shares._cells.values())
+    score = sum(score for score, _ in shares.cells.values())
     assert np.sum(np.square(score)) == pytest.approx(candidate.test.statistic, rel=1e-4)
 
 
 def shares_of(look, candidate):
-    from calib.diagnosis.score import away_from_model
-
-    stand = look.stand
-    wide = problems.build(stand.sources, stand.model.plus((candidate.effect,)))
     names = [candidate.effect.name]
     away = away_from_model(look.linear, names) @ candidate.test.whiten
-    by_variable = {name: away[at] for name, at in look.linear.at.items()}
-    return Shares(wide, stand.estimate, names, by_variable).walk(quiet, "")
+    by_name = {name: away[at] for name, at in look.linear.columns.items()}
+    wide, shares = problem_with(look.stand, names), Shares()
+    for rows in rows_along(wide, look.stand.estimate, by_name, lambda done, total: None):
+        shares.add(rows)
+    return shares
 
 
 def test_a_signal_no_longer_widens_the_clusters_that_judge_it(looked):
@@ -119,16 +185,14 @@ def test_a_signal_no_longer_widens_the_clusters_that_judge_it(looked):
 
 
 def test_what_one_cluster_alone_says_is_not_believed():
-    shares = Shares.__new__(Shares)
     one = np.ones((1, 1))
     # Twenty stops with a little each, and one that has nearly all of the information and signal.
     cells = {(k, -1): [np.array([0.1 * (-1) ** k]), 0.002 * one] for k in range(20)}
     cells[20, -1] = [np.array([6.0]), 0.96 * one]
-    shares._cells = cells
-    assert shares.covariance()[0, 0] > 10.0
+    assert Shares(cells).covariance()[0, 0] > 10.0
     # The same signal, spread evenly over all of them, is believed.
-    shares._cells = {(k, -1): [np.array([6.0 / 21]), one / 21] for k in range(21)}
-    assert shares.covariance()[0, 0] < 1e-12
+    cells = {(k, -1): [np.array([6.0 / 21]), one / 21] for k in range(21)}
+    assert Shares(cells).covariance()[0, 0] < 1e-12
 
 
 def test_a_gauge_is_named_not_observable(looked):

@@ -1,13 +1,12 @@
 """Effects: what a basis claims is what the geometry, or the measurement, does."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from calib import effects
-from calib.effects import Effect, FrameOffset, OneHot, Param, Site, SurfaceShift, View
+from calib.effects import Effect, FrameOffset, OneHot, Param, Site, View
 from calib.forward import Term, place
 from calib.problem import build
 from calib.problem.model import Model, Source
@@ -16,6 +15,7 @@ from chains.errors import InputError
 
 from . import rigs
 from .hidden import coarse, hide
+from .rescanned import rescanned
 
 
 @pytest.fixture(scope="module")
@@ -174,42 +174,19 @@ def test_a_range_offset_reads_long(problem):
     association = scan.associate(values, near_edges=False)
     offset = np.linspace(-0.02, 0.03, rigs.RINGS)
     before = scan.rows(values, association)
-    longer = replace(scan, recording=reaching(scan, lambda ring: offset[ring]))
+    longer = reaching(scan, lambda ring: offset[ring])
     after = longer.rows({**values, "ring_range_offset": offset}, association)
     np.testing.assert_allclose(after.residual_m, before.residual_m, atol=1e-9)
     assert np.abs(longer.rows(values, association).residual_m - before.residual_m).max() > 0.02
 
 
-def test_a_shifted_surface_stands_off_along_its_normal(problem):
-    """true = mesh + d n, n towards the sensor: the shifted mesh gives the same residuals."""
-    scan, values = problem.scans[0], problem.initial
-    association = scan.associate(values, near_edges=False)
-    before = scan.rows(values, association)
-    surfaces = np.unique(before.view["surface"])
-    theta = np.linspace(-0.02, 0.03, len(surfaces))
-    effect = SurfaceShift("shift", "surface", surfaces, 0.01)
-    shifting = replace(scan, terms=[*scan.terms, Term(effect, "shift", np.arange(len(surfaces)))])
-    after = shifting.rows({**values, "shift": theta}, association)
-    # Nearer by d / cos(incidence), so what is measured reads longer by as much.
-    nearer = theta[np.searchsorted(surfaces, before.view["surface"])]
-    expected = before.residual_m + nearer / np.cos(before.view["incidence_rad"])
-    np.testing.assert_allclose(after.residual_m, expected, atol=1e-9)
-
-
-def test_a_part_that_an_effect_does_not_name_stays(problem):
-    effect = SurfaceShift("shift", "surface", np.array([1, 4]), 0.01)
-    view = problem.scans[0].rows(problem.initial).view
-    found, surface = effect.basis(view), view["surface"]
-    np.testing.assert_array_equal(found.index, np.select([surface == 1, surface == 4], [0, 1], -1))
-
-
 def reaching(scan, more_m):
-    """A recording whose beams reach further by `more_m` of their ring, in the same directions."""
+    """The stop, its beams reaching further by `more_m` of their ring, in the same directions."""
     read, origin_m = scan.recording.scan(scan.index), rigs.fan()[0]
     direction = rigs.fan()[1]
     longer = read.xyz_m + np.asarray(more_m(read.ring))[:, None] * direction
     assert np.linalg.norm(read.xyz_m - origin_m, axis=1).min() > 0.1
-    return SimpleNamespace(scan=lambda index: replace(read, xyz_m=longer))
+    return rescanned(scan, replace(read, xyz_m=longer))
 
 
 class Nosy(Effect):
@@ -233,7 +210,7 @@ def test_covariates_are_predicted_not_measured(problem):
     scan = replace(scan, terms=[*scan.terms, Term(Nosy(), "nosy", np.arange(6))])
     association = scan.associate(values, near_edges=False)
     noise = np.random.default_rng(0).normal(0, 0.02, rigs.RINGS * rigs.COLUMNS)
-    noisy = replace(scan, recording=reaching(scan, lambda ring: noise))
+    noisy = reaching(scan, lambda ring: noise)
     before, after = scan.rows(values, association), noisy.rows(values, association)
     assert np.abs(after.residual_m - before.residual_m).max() > 0.02
     np.testing.assert_allclose(after.dense["nosy"], before.dense["nosy"], atol=1e-9)

@@ -8,8 +8,8 @@ from scipy.spatial.transform import RigidTransform
 from calib.effects import Effect, OneHot, Param, Site
 from calib.forward import Term, place
 from calib.problem.model import Model
+from calib.problem.unknowns import pose_unknown
 from calib.rig import load_rig
-from calib.solve.graph import Variable
 
 from . import rigs
 
@@ -154,8 +154,10 @@ def test_retract_moves_poses_as_the_chain_assumes():
     """The differences above move poses by gtsam's exponential, on the right."""
     twist = np.array([0.3, -0.2, 0.5, 1.0, 2.0, 3.0])
     T = rigs.T_OPTI_FARO
-    variable = Variable("T", "pose", T.as_matrix(), np.ones(6), ("",) * 6, ("",) * 6)
+    unknown = pose_unknown("T", T.as_matrix(), np.ones(6))
     expected = (T * RigidTransform.from_exp_coords(twist)).as_matrix()
     np.testing.assert_allclose(
-        rigs.retract(variable.kind, variable.mean, twist), expected, atol=1e-12
+        rigs.retract(unknown.kind, unknown.mean, twist), expected, atol=1e-12
     )
+    np.testing.assert_allclose(unknown.moved(unknown.mean, twist), expected, atol=1e-12)
+    np.testing.assert_allclose(unknown.difference(unknown.mean, expected), twist, atol=1e-12)

@@ -10,16 +10,24 @@ from scipy.optimize import least_squares
 
 from calib.problem import build
 from calib.problem.model import Model, Source
-from calib.residuals.rows import tukey_weight
+from calib.problem.unknowns import Unknown, pose_unknown
+from calib.residuals.robust import tukey_weight
 from calib.solve.fit import solve
-from calib.solve.graph import Graph, Variable
+from calib.solve.graph import Graph
 
 from . import rigs
 
 
 def vector(name, size, mean=0.0, sigma=10.0):
     dofs = tuple(map(str, range(size)))
-    return Variable(name, "vector", np.full(size, mean), np.full(size, sigma), dofs, ("m",) * size)
+    return Unknown(
+        name=name,
+        kind="vector",
+        mean=np.full(size, mean),
+        sigma=np.full(size, sigma),
+        dofs=dofs,
+        units=("m",) * size,
+    )
 
 
 @dataclass(frozen=True)
@@ -75,7 +83,7 @@ def test_our_weights_are_those_of_one_robust_factor_per_row_and_gtsams_stacked_o
     root = np.sqrt(tukey_weight(-z))
     weighted = Rows(("x",), len(z), lambda v: (root * (v["x"] - z), {"x": root[:, None]}))
     x = vector("x", 1)
-    ours = Graph([x], [weighted], frozenset({"x"})).step({"x": np.zeros(1)})["x"][0]
+    ours = Graph([x], [weighted], frozenset({"x"})).step({"x": np.zeros(1)})[0]["x"][0]
     per_row = gtsam_step([custom(z[i : i + 1], tukey(1)) for i in range(len(z))])
     assert ours == pytest.approx(per_row, abs=1e-12)
     assert abs(ours) < 0.2
@@ -132,7 +140,14 @@ def test_a_sigma_of_zero_is_refused():
     graph.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(), noise))
     values.insert(0, gtsam.Pose3())
     assert not gtsam.Marginals(graph, values).marginalCovariance(0).any()
-    exact = Variable("x", "vector", np.zeros(2), np.array([0.01, 0.0]), ("a", "b"), ("m", "m"))
+    exact = Unknown(
+        name="x",
+        kind="vector",
+        mean=np.zeros(2),
+        sigma=np.array([0.01, 0.0]),
+        dofs=("a", "b"),
+        units=("m", "m"),
+    )
     with pytest.raises(ValueError, match="'x'"):
         Graph([exact], [])
 
@@ -239,8 +254,15 @@ def test_solve_finds_what_scipy_finds():
     """A pose, a direction and a vector together, in a problem of large residuals."""
     rng = np.random.default_rng(3)
     points, seen = rng.normal(size=(8, 3)), rng.normal(size=(8, 3))
-    pose = Variable("T", "pose", np.eye(4), np.full(6, 2.0), ("",) * 6, ("",) * 6)
-    down = Variable("g", "direction", np.array([0, 0, -1.0]), np.full(2, 1e3), ("",) * 2, ("",) * 2)
+    pose = pose_unknown("T", np.eye(4), np.full(6, 2.0))
+    down = Unknown(
+        name="g",
+        kind="direction",
+        mean=np.array([0, 0, -1.0]),
+        sigma=np.full(2, 1e3),
+        dofs=("",) * 2,
+        units=("",) * 2,
+    )
     scale = vector("s", 3, sigma=1.0)
 
     def residual(values):

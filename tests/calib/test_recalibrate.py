@@ -7,8 +7,8 @@ import pytest
 from scipy.stats import kstest
 
 from calib.problem.prior import JointPrior
+from calib.problem.unknowns import Unknown
 from calib.solve import recalibrate
-from calib.solve.graph import Variable
 
 NAMES = ("mount", "lidar", "arm", "unseen")
 DIM, CAD_SIGMA = 3, 1.0
@@ -20,7 +20,7 @@ def world(monkeypatch):
     """A linear world: links of which sums are seen, once before and once after."""
     rng = np.random.default_rng(5)
     variables = [
-        Variable(
+        Unknown(
             name=name,
             kind="vector",
             mean=np.zeros(DIM),

@@ -1,4 +1,4 @@
-"""Beams: every derivative against differences, every compression against the rows themselves."""
+"""Beams: every derivative against differences, every sum against the rows themselves."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -6,18 +6,22 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from calib.effects import Effect, OneHot, Param, Site, SurfaceShift
+from calib.effects import Effect, OneHot, Param, Site
 from calib.forward import Term
-from calib.problem.build import build, effect_variable
+from calib.linear.layout import Layout
+from calib.linear.rows import StopRows
+from calib.problem.build import build, effect_unknown
 from calib.problem.model import Model, Source
-from calib.residuals.beams import Association, SharedSum
-from calib.residuals.rows import tukey_weight
+from calib.problem.surfaces import with_surfaces
+from calib.residuals.beams import Association
+from calib.residuals.robust import tukey_weight
 from calib.residuals.scan import turned
 from calib.residuals.surfaces import PlaneSurface
 from sensors.lidar import Beams, beams
 from sensors.planes import Planes
 
 from . import rigs
+from .rescanned import rescanned
 
 
 class Warp(Effect):
@@ -66,11 +70,11 @@ def on_planes(folder):
     walls = np.repeat(np.arange(6), rigs.WALL_STEPS**2 * 2)
     vertices, triangles = rigs.room()
     found = Planes(
-        np.repeat(np.eye(3), 2, axis=0),
-        np.ravel([[0, size] for size in rigs.ROOM_M]),
-        np.full(6, 100),
-        vertices[triangles].mean(axis=1),
-        walls,
+        normal=np.repeat(np.eye(3), 2, axis=0),
+        distance_m=np.ravel([[0, size] for size in rigs.ROOM_M]),
+        count=np.full(6, 100),
+        cell_mean_m=vertices[triangles].mean(axis=1),
+        cell_plane=walls,
         cell_m=1.0,
         tolerance_m=0.3,
     )
@@ -81,19 +85,22 @@ def on_planes(folder):
 def bent(problem, surfaces):
     """The problem with every kind of beam and surface error switched on, away from its start."""
     source = problem.sources[0]
-    chosen = [Warp(), RingElevation()]
-    if surfaces:
-        view = problem.scans[0].rows(problem.initial).view
-        chosen += [
-            SurfaceShift(column, column, np.unique(view[column]), 0.001)
-            for column in ("surface", "region", "patch")
-        ]
-    terms = [Term(e, e.name, np.arange(len(e.params(source.rig)))) for e in chosen]
+    terms = [
+        Term(e, e.name, np.arange(len(e.params(source.rig)))) for e in (Warp(), RingElevation())
+    ]
     for term in terms:
-        problem.add(effect_variable(term, source))
+        problem.add(effect_unknown(term, source))
     problem.scans = [replace(s, terms=[*s.terms, *terms]) for s in problem.scans]
     values = rigs.shaken(problem.variables, problem.initial, 0.01)
     association = [s.associate(values, near_edges=False) for s in problem.scans]
+    if surfaces:
+        pairs = zip(problem.scans, association, strict=True)
+        views = [scan.rows(values, a).view for scan, a in pairs]
+        patches = ({kind: view[kind] for kind in ("region", "patch")} for view in views)
+        with_patches = [replace(a, patches=p) for a, p in zip(association, patches, strict=True)]
+        problem, association = with_surfaces(problem, with_patches)
+        cells = {name: problem.variables[name] for name in problem.cells}
+        values |= rigs.shaken(cells, problem.initial, 0.01)
     return SimpleNamespace(problem=problem, values=values, association=association)
 
 
@@ -124,7 +131,8 @@ def test_beam_derivatives_by_everything(meeting, stop, request):
     sure = rows.weight > 0
     found = by_variable(scan, rows, case.values)
     extra = {"warp", "ring_elevation", "ring_range_offset"}
-    extra |= {"surface", "patch", "faro"} if meeting == "on_mesh" else {"planes"}
+    cells = {f"0/reference_{kind}" for kind in ("surface", "region", "patch")}
+    extra |= {"faro", *cells} if meeting == "on_mesh" else {"planes"}
     assert extra <= set(found)
     for name, d in found.items():
         expected = rigs.differences(
@@ -167,7 +175,7 @@ def test_perfect_beams_on_the_walls_have_no_residual(on_mesh):
         measured = turned(true, *turns)
     xyz = measured.origin_m + (range_m + reach_m)[:, None] * measured.direction
     read = replace(scan.recording.scan(0), xyz_m=xyz, ring=ring)
-    seeing = replace(scan, recording=SimpleNamespace(scan=lambda _: read))
+    seeing = rescanned(scan, read)
     part = scan.meeting.associate(scan.pose(values), true, values, near_edges=True)
     rows = seeing.rows(values, part)
     assert rows.usable.sum() > 300
@@ -181,8 +189,9 @@ def test_sigma_is_that_of_the_data_sheet_the_angle_and_the_reference(on_mesh):
     single = replace(
         read, count=np.ones(len(read.ring)), range_std_m=np.full(len(read.ring), np.nan)
     )
-    alone = replace(scan, recording=SimpleNamespace(scan=lambda _: single))
+    alone = rescanned(scan, single)
     quiet = on_mesh.values | {t.variable: np.zeros(len(t.free)) for t in scan.terms}
+    quiet |= {name: np.zeros_like(quiet[name]) for name in on_mesh.problem.cells}
     rows = alone.rows(quiet, on_mesh.association[1])
     lidar, t, g = scan.lidar, rows.view["range_m"], rows.view["incidence_rad"]
     noise = lidar.sigma_range_m**2 + (lidar.sigma_range_incidence * t * np.tan(g)) ** 2
@@ -203,7 +212,7 @@ def test_a_wild_beam_loses_its_own_weight_and_no_others(on_mesh):
     far = np.flatnonzero(rows.weight > 0.9)[0]
     xyz = read.xyz_m.copy()
     xyz[far] *= 1.5
-    wild = replace(scan, recording=SimpleNamespace(scan=lambda _: replace(read, xyz_m=xyz)))
+    wild = rescanned(scan, replace(read, xyz_m=xyz))
     after = wild.rows(on_mesh.values, on_mesh.association[0])
     others = np.arange(len(z)) != far
     assert after.weight[far] == 0
@@ -214,9 +223,9 @@ def test_a_stop_that_meets_nothing_says_nothing(on_mesh):
     """All its beams may graze, or pass close to edges; the other stops still count."""
     scan = on_mesh.problem.scans[0]
     nothing = Association(np.full(len(on_mesh.association[0].part), -1))
-    compressed = scan.compress(on_mesh.values, nothing)
-    residual, d = compressed.pose.evaluate(on_mesh.values, True)
-    assert not residual.any() and not any(column.any() for column in d.values())
+    rows = stop_rows(on_mesh, scan, nothing)
+    assert not rows.sums().whole().any()
+    assert not rows.gradient(np.zeros(len(rows.b), int), 1)[0].any()
 
 
 class Far(Effect):
@@ -244,101 +253,147 @@ def test_a_beam_whose_plane_fell_behind_it_is_left_out(on_mesh):
     left = scan.rows(values, Association(part))
     assert np.isfinite(left.residual_m).all()
     assert left.weight[behind] == left.weight[1] == 0
-    residual, d = scan.compress(values, Association(part)).pose.evaluate(values, True)
-    assert np.isfinite(residual).all() and all(np.isfinite(column).all() for column in d.values())
+    source, problem = on_mesh.problem.sources[0], on_mesh.problem
+    far = problem.with_cells([effect_unknown(scan.terms[0], source)], problem.cells)
+    case = SimpleNamespace(problem=far, values=values)
+    assert np.isfinite(stop_rows(case, scan, Association(part)).sums().whole()).all()
 
 
-# ------------------------------------------------------------------------------------- compression
+# ------------------------------------------------------------------------------------------- shifts
 
 
-def compressed(case, stops, newton=False):
-    """What the graph sees of some stops."""
-    poses, shared = [], SharedSum()
+def test_a_shifted_surface_stands_off_along_its_normal(on_mesh):
+    """true = mesh + d n, n towards the sensor: nearer, so what is measured reads longer."""
+    scan, values = replace(on_mesh.problem.scans[0], terms=[]), on_mesh.values
+    plain = replace(on_mesh.association[0], cells={})
+    before = scan.rows(values, plain)
+    surfaces, index = np.unique(before.view["surface"], return_inverse=True)
+    theta = np.linspace(-0.02, 0.03, len(surfaces))
+    after = scan.rows({**values, "shift": theta}, replace(plain, cells={"shift": index}))
+    expected = before.residual_m + theta[index] / np.cos(before.view["incidence_rad"])
+    np.testing.assert_allclose(after.residual_m, expected, atol=1e-9)
+
+
+def test_a_part_that_no_unknown_names_stays(on_mesh):
+    scan, values = on_mesh.problem.scans[0], on_mesh.values
+    plain = replace(on_mesh.association[0], cells={})
+    before = scan.rows(values, plain)
+    surface = before.view["surface"]
+    index = np.select([surface == 1, surface == 4], [0, 1], -1)
+    moved = scan.rows({**values, "shift": np.ones(2)}, replace(plain, cells={"shift": index}))
+    still = index < 0
+    np.testing.assert_array_equal(moved.residual_m[still], before.residual_m[still])
+    assert np.abs(moved.residual_m - before.residual_m)[~still].min() > 0.9
+    (shift,) = (c for c in moved.sparse if c.variable == "shift")
+    np.testing.assert_array_equal(shift.index, index)
+
+
+def test_every_beam_moves_with_the_cells_that_it_meets_and_with_no_other(on_mesh):
+    for scan, association in zip(on_mesh.problem.scans, on_mesh.association, strict=True):
+        view = scan.rows(on_mesh.values, association).view
+        for name, cells in on_mesh.problem.cells.items():
+            index = association.cells[name]
+            np.testing.assert_array_equal(cells.parts[index], view[cells.column])
+            np.testing.assert_array_equal(cells.surface[index], view["surface"])
+
+
+# --------------------------------------------------------------------------------------------- sums
+
+
+def stop_rows(case, scan, association, newton=False):
+    """One stop's linear rows over the unknowns of a case."""
+    placed = scan.stops.in_reference("lidar", case.values)
+    return StopRows.of(scan, Layout.of(case.problem), case.values, placed, association, newton)
+
+
+def summed(case, stops, newton=False):
+    """The normal equations (U + 1, U + 1) of some stops' sums; the right side is last."""
+    size = sum(u.dim for u in case.problem.variables.values())
+    total = np.zeros((size + 1, size + 1))
     for k in stops:
-        scan = case.problem.scans[k].compress(case.values, case.association[k], newton)
-        poses.append(scan.pose)
-        shared.add(scan)
-    return [*poses, *shared.rows()]
+        rows = stop_rows(case, case.problem.scans[k], case.association[k], newton)
+        sums, count = rows.sums(), 7 + len(rows.columns)
+        through = np.zeros((count, size + 1))
+        through[:6, sums.chain_columns] = sums.chain
+        through[np.arange(6, count), np.append(size, sums.columns)] = 1.0
+        total += through.T @ sums.whole() @ through
+    return total
 
 
-def normal_equations(blocks, names, values):
-    """J^T J, J^T r and r^T r over the named variables."""
-    sizes = {name: 6 if np.ndim(values[name]) == 2 else len(values[name]) for name in names}
-    first = dict(zip(names, np.cumsum([0, *sizes.values()])[:-1], strict=True))
-    A = np.zeros((sum(sizes.values()) + 1,) * 2)
-    for residual, d in blocks:
-        J = np.zeros((len(residual), len(A)))
-        for name, columns in d.items():
-            J[:, first[name] : first[name] + sizes[name]] += columns
-        J[:, -1] = residual
-        A += J.T @ J
-    return A
+def whole(case, stop):
+    """Derivative (N, U) of a stop's rows by all unknowns, minus their residuals (N,), and their
+    weights over variance (N,)."""
+    scan, association = case.problem.scans[stop], case.association[stop]
+    rows = scan.rows(case.values, association)
+    d = by_variable(scan, rows, case.values)
+    count, unknowns = len(rows.residual_m), case.problem.variables.values()
+    A = np.hstack([d.get(u.name, np.zeros((count, u.dim))) for u in unknowns])
+    return A, -rows.residual_m, rows.weight / rows.sigma_m**2
 
 
 @pytest.mark.parametrize("meeting", ["on_mesh", "on_planes"])
 @pytest.mark.parametrize("stops", [[2], [0, 1, 2, 3]])
-def test_compressed_rows_have_the_normal_equations_of_all_rows(meeting, stops, request):
+def test_sums_are_the_normal_equations_of_all_rows(meeting, stops, request):
     case = request.getfixturevalue(meeting)
-    whole = []
+    expected = 0.0
     for k in stops:
-        scan = case.problem.scans[k]
-        rows = scan.rows(case.values, case.association[k])
-        root = np.sqrt(rows.weight) / rows.sigma_m
-        d = by_variable(scan, rows, case.values)
-        whole.append(
-            (root * rows.residual_m, {n: root[:, None] * columns for n, columns in d.items()})
-        )
-    names = list(dict.fromkeys(name for _, d in whole for name in d))
-    expected = normal_equations(whole, names, case.values)
-    blocks = compressed(case, stops)
-    found = normal_equations([b.evaluate(case.values, True) for b in blocks], names, case.values)
+        A, b, weight = whole(case, k)
+        rows = np.column_stack([A, b])
+        expected = expected + rows.T @ (weight[:, None] * rows)
     size = np.sqrt(np.maximum(np.diag(expected), 1e-30))
     np.testing.assert_allclose(
-        found / np.outer(size, size), expected / np.outer(size, size), atol=1e-10
+        summed(case, stops) / np.outer(size, size), expected / np.outer(size, size), atol=1e-10
     )
-    rows_few = sum(b.rows for b in blocks)
-    assert rows_few <= 6 * len(stops) + 1 + sum(len(case.values[n]) for n in blocks[-1].variables)
+
+
+@pytest.mark.parametrize("meeting", ["on_mesh", "on_planes"])
+def test_gradients_by_cluster_are_those_of_their_rows(meeting, request):
+    case = request.getfixturevalue(meeting)
+    A, b, weight = whole(case, 1)
+    rows = stop_rows(case, case.problem.scans[1], case.association[1])
+    cluster = np.random.default_rng(0).integers(0, 5, len(b))
+    found, columns = rows.gradient(cluster, 5)
+    full = np.zeros((5, A.shape[1]))
+    full[:, columns] = found
+    expected = (cluster == np.arange(5)[:, None]) * (weight * b) @ A
+    scale = np.maximum(np.sqrt(np.square(A).T @ weight), 1e-12)
+    np.testing.assert_allclose(full / scale, expected / scale, atol=1e-9)
+
+
+@pytest.mark.parametrize("meeting", ["on_mesh", "on_planes"])
+def test_rows_along_directions_are_the_rows_times_these(meeting, request):
+    case = request.getfixturevalue(meeting)
+    A, b, weight = whole(case, 3)
+    rows = stop_rows(case, case.problem.scans[3], case.association[3])
+    directions = np.random.default_rng(0).standard_normal((A.shape[1], 3))
+    felt = weight > 0
+    np.testing.assert_allclose(rows.along(directions)[felt], (A @ directions)[felt], atol=1e-9)
+    np.testing.assert_array_equal(rows.b, b)
+    np.testing.assert_allclose(rows.weight, weight, rtol=1e-12)
 
 
 @pytest.mark.parametrize("meeting", ["on_mesh", "on_planes"])
 def test_newtons_curvature_leaves_the_gradient_as_it_is(meeting, request):
     case = request.getfixturevalue(meeting)
-    plain, newton = (compressed(case, [0, 2], newton) for newton in (False, True))
-    names = list(dict.fromkeys(name for block in plain for name in block.variables))
-    A, B = (
-        normal_equations([b.evaluate(case.values, True) for b in blocks], names, case.values)
-        for blocks in (plain, newton)
-    )
+    A, B = (summed(case, [0, 2], newton) for newton in (False, True))
     size = np.sqrt(np.maximum(np.diag(A), 1e-30))[:-1]
     np.testing.assert_allclose(B[:-1, -1] / size, A[:-1, -1] / size, atol=1e-9 * A[-1, -1] ** 0.5)
     assert np.abs(B - A)[:-1, :-1].max() > 0.01 * np.abs(A).max()
 
 
-@pytest.mark.parametrize("meeting", ["on_mesh", "on_planes"])
-def test_compressed_rows_derivatives_hold_away_from_linearisation(meeting, request):
-    case = request.getfixturevalue(meeting)
-    away = rigs.shaken(case.problem.variables, case.values, 0.05, seed=9)
-    for block in compressed(case, [3]):
-        rigs.assert_block_derivatives(block, case.problem.variables, away)
-
-
 def test_a_corridor_leaves_its_own_direction_open(on_mesh):
-    """Rows of few directions compress too: rank 1 and 3, and no more rows than that say."""
+    """Beams that meet one kind of wall say three things of where the LiDAR is, and no more."""
     case = on_mesh
-    scan = case.problem.scans[0]
+    scan = replace(case.problem.scans[0], terms=[])
     rows = scan.rows(case.values, case.association[0])
     wall = np.abs(rows.view["normal"] @ rows.view["normal"][0]) > 0.99
     association = Association(np.where(wall, case.association[0].part, -1))
-    plain = replace(scan, terms=[])
-    quiet = plain.rows(case.values, association)
-    block = plain.compress(case.values, association).pose
+    quiet = scan.rows(case.values, association)
     J = quiet.by_twist * (np.sqrt(quiet.weight) / quiet.sigma_m)[:, None]
+    sums = stop_rows(case, scan, association).sums()
     size = np.linalg.norm(J, axis=0)
-    assert np.linalg.matrix_rank(J / size, tol=1e-9) == 3
-    _, d = block.evaluate(case.values, True)
-    placed = plain.stops.in_reference("lidar", case.values)
-    for name, columns in placed.d.items():
-        expected = columns[0].T @ J.T @ J @ columns[0]
-        np.testing.assert_allclose(
-            d[name].T @ d[name], expected, atol=1e-10 * np.abs(expected).max()
-        )
+    unit = np.outer(size, size)
+    np.testing.assert_allclose(sums.dense[:6, :6] / unit, J.T @ J / unit, atol=1e-12)
+    assert np.linalg.matrix_rank(sums.dense[:6, :6] / unit, tol=1e-9) == 3
+    placed = scan.stops.in_reference("lidar", case.values)
+    np.testing.assert_array_equal(sums.chain, np.hstack([d[0] for d in placed.d.values()]))

@@ -13,6 +13,7 @@ from calib.diagnosis.jackknife import Shares
 from calib.diagnosis.linear import Linear
 from calib.diagnosis.screen import looked, screen
 from calib.diagnosis.search import rivals
+from calib.linear.clusters import ClusteredRows
 
 STOPS, PLACES, EACH = 30, 25, 6
 THEIRS = {"one": 1, "twin": 1, "several": 3, "gauge": 1, "rings": 40}
@@ -48,17 +49,30 @@ class World:
             self.b += self.columns[name] @ np.full(THEIRS[name], size)
 
     def linear(self):
-        """Normal equations once a fit has taken off what the model explains."""
+        """Normal equations once a fit has taken off what the model explains; nothing is eliminated
+        from them."""
         names = list(self.columns)
         J = np.hstack([self.model, *self.columns.values()])
         ends = np.cumsum([2, *(THEIRS[n] for n in names)])
-        at = {"model": slice(0, 2)}
-        at |= {n: slice(int(i), int(k)) for n, i, k in zip(names, ends, ends[1:], strict=False)}
+        columns = {"model": slice(0, 2)}
+        pairs = zip(names, ends, ends[1:], strict=False)
+        columns |= {n: slice(int(i), int(k)) for n, i, k in pairs}
         _, cell = np.unique(self.stop * PLACES + self.place, return_inverse=True)
         fitted = self.b - self.model @ np.linalg.lstsq(self.model, self.b, rcond=None)[0]
         pick = csr_array((fitted, (cell, np.arange(len(cell)))))
         stop, place = np.divmod(np.arange(STOPS * PLACES), PLACES)
-        return Linear(tuple(names), at, J.T @ J, csr_array(pick @ J), stop, place, float(len(J)))
+        return Linear(
+            candidates=tuple(names),
+            at={name: np.r_[at] for name, at in columns.items()},
+            columns=columns,
+            information=J.T @ J,
+            raw=J.T @ J,
+            gradient=csr_array(pick @ J),
+            stop=stop,
+            place=place,
+            weight_m2=float(len(J)),
+            directions=lambda kept: kept,
+        )
 
 
 def scores(world):
@@ -77,9 +91,9 @@ def judged(world, name):
     column = world.columns[name]
     away = column - world.model @ np.linalg.lstsq(world.model, column, rcond=None)[0]
     left = world.b - world.model @ np.linalg.lstsq(world.model, world.b, rcond=None)[0]
-    shares = Shares.__new__(Shares)
-    shares._cells = {}
-    shares._add(away @ found.whiten, left, world.stop, world.place)
+    along, every = away @ found.whiten, np.arange(found.dof)
+    shares = Shares()
+    shares.add(ClusteredRows(along, left, every, world.stop, world.place))
     return replace(found, covariance=shares.covariance())
 
 

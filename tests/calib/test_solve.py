@@ -30,7 +30,7 @@ class Dense:
 
     def __init__(self, source, estimate):
         self.source, self.estimate = source, estimate
-        self.variables = list(estimate.graph.variables.values())
+        self.variables = list(estimate.problem.variables.values())
         ends = np.cumsum([0, *(v.dim for v in self.variables)])
         self.at = {v.name: slice(a, a + v.dim) for v, a in zip(self.variables, ends, strict=False)}
         self.size = int(ends[-1])
@@ -105,7 +105,7 @@ class Dense:
         """An effect's parameters (N, P), those that are held included."""
         found = np.zeros((len(next(iter(values.values()))), len(dofs)))
         if name in values:
-            free = [dofs.index(dof) for dof in self.estimate.graph.variables[name].dofs]
+            free = [dofs.index(dof) for dof in self.estimate.problem.variables[name].dofs]
             found[:, free] = values[name]
         return found
 
@@ -135,7 +135,7 @@ class Dense:
         for column in ("surface", "region", "patch"):
             name = f"0/reference_{column}"
             if name in values:
-                dofs = self.estimate.graph.variables[name].dofs
+                dofs = self.estimate.problem.variables[name].dofs
                 parts = [int(dof.split("_")[-1]) for dof in dofs]
                 off += values[name][:, np.searchsorted(parts, stop[column])]
         # A surface that stands off does so towards the sensor.
@@ -281,9 +281,9 @@ def test_a_reference_far_from_its_origin_gives_the_same_answer(fitted, tmp_path)
 def test_the_surface_has_an_unknown_for_every_part_met_and_no_other(fitted):
     _, estimate = fitted
     parts = range(6)  # four walls, floor and ceiling
-    found = estimate.graph.variables["0/reference_surface"].dofs
+    found = estimate.problem.variables["0/reference_surface"].dofs
     assert found == tuple(f"surface_{part}" for part in parts)
-    assert not any("-" in dof for dof in estimate.graph.variables["0/reference_patch"].dofs)
+    assert not any("-" in dof for dof in estimate.problem.variables["0/reference_patch"].dofs)
 
 
 def test_a_rig_that_nothing_places_in_its_mesh_is_refused(tmp_path):

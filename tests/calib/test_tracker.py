@@ -39,7 +39,16 @@ def tracked(problem, values):
         measured = chain.in_world("mount_markers", values).T @ se3.exp(apart)
         if is_point:
             measured[:, :3, :3] = np.eye(3)
-        return TrackedBody("body", chain, "mount_markers", measured, 2e-4, 3e-4, is_point, bases)
+        return TrackedBody(
+            name="body",
+            stops=chain,
+            body="mount_markers",
+            measured=measured,
+            sigma_m=2e-4,
+            sigma_rad=3e-4,
+            is_point=is_point,
+            bases=bases,
+        )
 
     return block
 

@@ -153,6 +153,15 @@ def test_range_noise_follows_its_formula():
     assert np.isfinite(lidar.sigma_range(5.0, np.pi / 2))
 
 
+def test_range_noise_grows_no_further_beyond_grazing():
+    """Its variance asks the cosine of incidence; 1.5 rad is where tan stops."""
+    lidar = load_lidar("ouster_os0_128_rev6")
+    r, g = np.array([0.0, 2.0, 7.0])[:, None], np.array([0.0, 0.7, 1.4999, 1.5001, np.pi / 2])
+    slant = 0.0008 * r * np.tan(np.minimum(g, 1.5))
+    expected = 0.006**2 + (0.0008 * r) ** 2 + slant**2 + 0.003**2 / 12
+    np.testing.assert_allclose(lidar.range_variance(r, np.cos(g)), expected, rtol=1e-9)
+
+
 def test_a_readout_step_scatters_as_the_noise_model_says():
     lidar = load_lidar("hesai_pandarxt32", {"sigma_range_m": 0.0, "sigma_range_incidence": 0.0})
     true_m = np.random.default_rng(1).uniform(2, 3, 200_000)

@@ -167,7 +167,7 @@ def test_triangles_without_area_are_holes():
     assert np.all(forced.range_m == np.inf)
     assert not np.isnan(forced.point_m).any()
     assert np.array_equal(reference.area_m2[:3], np.zeros(3))
-    assert np.all(reference.patch(hits) >= 0)
+    assert np.all(reference.patch(hits.triangle, hits.point_m) >= 0)
 
 
 def test_a_reference_travels_after_it_has_cast(room):
@@ -239,7 +239,7 @@ def test_a_floor_goes_on_where_a_wall_stands_on_it():
 
 def test_patches_are_even_cells_of_one_surface(room):
     hits = room.cast(STATION_M, random_directions(20000))
-    patch, owner = room.patch(hits, 0.5), room.patch_surface(0.5)
+    patch, owner = room.patch(hits.triangle, hits.point_m, 0.5), room.patch_surface(0.5)
     assert np.array_equal(owner[patch], room.surface[hits.triangle])
     assert len(owner) == 2 * (8 * 6 + 8 * 5 + 6 * 5)
     assert np.array_equal(np.unique(patch), np.arange(len(owner)))
@@ -254,7 +254,7 @@ def test_patches_of_a_plane_extended_and_of_misses(room):
     directions = random_directions(100)
     hits = room.cast(STATION_M, directions)
     beyond = room.hits(hits.triangle, STATION_M + np.array([50.0, 0, 0]), directions)
-    patch = room.patch(beyond)
+    patch = room.patch(beyond.triangle, beyond.point_m)
     missed = beyond.triangle < 0
     assert missed.any()
     assert (~missed).any()
@@ -262,6 +262,26 @@ def test_patches_of_a_plane_extended_and_of_misses(room):
     assert np.array_equal(
         room.patch_surface()[patch[~missed]], room.surface[beyond.triangle[~missed]]
     )
+
+
+def test_facts_are_those_of_the_triangle_and_of_none(room):
+    hits = room.cast(STATION_M, random_directions(50))
+    triangle = np.append(hits.triangle, -1)
+    label, intensity, surface = room.facts(triangle)
+    np.testing.assert_array_equal(label, np.append(room.label[hits.triangle], -1))
+    np.testing.assert_array_equal(intensity, np.append(room.intensity[hits.triangle], np.nan))
+    np.testing.assert_array_equal(surface, np.append(room.surface[hits.triangle], -1))
+
+
+def test_planes_hold_their_triangles_corners_and_the_last_is_met_by_nothing(room):
+    corners_m = room.vertices_m[room.triangles]
+    normal, distance_m = room.planes[:-1, :3], room.planes[:-1, 3]
+    np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1.0)
+    across_m = np.einsum("fi,fki->fk", normal, corners_m) - distance_m[:, None]
+    np.testing.assert_allclose(across_m, 0.0, atol=1e-9)
+    assert len(room.planes) == len(room.triangles) + 1
+    nowhere = room.hits(np.array([-1]), STATION_M, np.array([[1.0, 0.0, 0.0]]))
+    assert nowhere.triangle == -1 and np.isinf(nowhere.range_m)
 
 
 # ---- depth edges

@@ -1,0 +1,267 @@
+"""The linearisation against dense rows: what is kept, the step, the covariance, and gradients."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from calib.effects import DEFAULT
+from calib.linear.clusters import Gradients
+from calib.linear.layout import Layout
+from calib.linear.linearise import linearise
+from calib.linear.parallel import workers
+from calib.linear.system import Linearisation
+from calib.problem import build
+from calib.problem.model import Model, Source
+from calib.problem.prior import JointPrior
+from calib.simulation import Spec
+from calib.solve.fit import Estimate, preview
+from calib.solve.graph import Graph, KeptRows
+
+from .. import rigs, simulated
+from .dense import Dense
+
+MODEL = Model((*DEFAULT, "noise_range", "optitrack_scale", "faro_scale"))
+PERFECT = {"frame": "faro", "mesh": "reference/mesh.ply", "sigma_m": 0}
+PLAIN_ARM = {"urdf": "arm.urdf", "base": "arm_base", "tip": "arm_end", "sigma_joint_rad": 0}
+BOXES = {  # changes of rig.yaml
+    "stop by stop": {"base": {"moves": "stop"}},
+    "by location": {},
+    "never moved, no joint noise": {"base": {"moves": "never"}, "arm": PLAIN_ARM},
+    "no joint noise": {"base": {"moves": "stop"}, "arm": PLAIN_ARM},
+    "no tracker": {"tracker": None, "target": None, "base": {"moves": "stop"}},
+    "perfect mesh": {"reference": PERFECT},
+    "no lidar": {"lidar": None},
+}
+SIMULATED = {
+    "simulated": Spec(locations=2, stops_per_location=2, column_step=128),
+    "planes": Spec(mesh=False, targets=0, locations=3, stops_per_location=2, column_step=100),
+}
+CASES = (*BOXES, *SIMULATED, "a stop without scan", "two recordings", "an earlier estimate")
+ORDERS = ("cells first", "stops first")
+
+
+@dataclass
+class Case:
+    """A problem at a state near no optimum, linearised densely."""
+
+    start: Estimate
+    dense: Dense
+    prior: JointPrior | None
+
+    @property
+    def held(self) -> tuple[str, ...]:
+        return self.prior.variables if self.prior else ()
+
+    def linear(self, newton: bool = False, gradients: Gradients | None = None) -> Linearisation:
+        problem, given = self.start.problem, self.start.associations
+        layout = Layout.of(problem, kept=self.held)
+        return linearise(problem, self.dense.values, given, newton, layout, gradients)
+
+    def estimate(self, linear: Linearisation) -> Estimate:
+        """As a fit would leave it."""
+        blocks = [*linear.layout.others, *KeptRows.of(linear)]
+        blocks += [self.prior] if self.prior else []
+        unknowns = list(linear.layout.outer().values())
+        graph = Graph(unknowns, blocks, frozenset(self.held))
+        return replace(self.start, values=self.dense.values, graph=graph, linear=linear)
+
+
+def sources(name, folder):
+    if name in SIMULATED:
+        return [simulated.made(folder / "rec", SIMULATED[name])[0]]
+    if name == "two recordings":
+        return [Source.open(rigs.write(folder / str(k), seed=k)) for k in (1, 2)]
+    box = rigs.write(folder / "box", seed=6, **BOXES.get(name, {}))
+    if name == "a stop without scan":
+        (box / "scans/s1.parquet").unlink()
+    return [Source.open(box)]
+
+
+def tied(problem):
+    """Two frames and where one stop stood, known together from before."""
+    held = [problem.variables[name] for name in ("mount", "root@a", "joints@s3")]
+    spread = np.diag(np.concatenate([u.sigma for u in held]))
+    mixed = spread @ np.random.default_rng(0).normal(size=(len(spread), 40))
+    return JointPrior(held, {u.name: u.mean for u in held}, mixed @ mixed.T / 40)
+
+
+@pytest.fixture(scope="module", params=CASES)
+def case(request, tmp_path_factory):
+    problem = build(sources(request.param, tmp_path_factory.mktemp("linear")), MODEL)
+    start = preview(problem)
+    prior = tied(problem) if request.param == "an earlier estimate" else None
+    whole = start.problem
+    sigma = {name: u.sigma for name, u in whole.variables.items()}
+    rng = np.random.default_rng(1)
+    steps = {n: np.minimum(s, 1e-3) * rng.uniform(-1, 1, len(s)) for n, s in sigma.items()}
+    values = {
+        n: rigs.retract(u.kind, start.values[n], steps[n]) for n, u in whole.variables.items()
+    }
+    blocks = (prior,) if prior else ()
+    return Case(start, Dense(whole, values, start.associations, held=blocks), prior)
+
+
+@pytest.fixture(params=ORDERS)
+def order(request, monkeypatch):
+    monkeypatch.setattr(Layout, "stops_first", request.param == "stops first")
+    return request.param
+
+
+def in_linearisation(case):
+    """The kinds of rows that a linearisation holds: beams, bodies of stops, and priors of what is
+    eliminated."""
+    inner = set(case.dense.inner(case.held))
+
+    def wanted(kind):
+        what, _, names = kind.partition(":")
+        return what == "beams" or (
+            what in ("body", "prior") and bool(inner & set(names.split(",")))
+        )
+
+    return wanted
+
+
+def apart(case):
+    """Columns that are kept, and that are eliminated."""
+    inner = case.dense.inner(case.held)
+    gone = np.concatenate([np.zeros(0, int), *(case.dense.at[name] for name in inner)])
+    return np.setdiff1d(np.arange(len(case.dense.sigma)), gone), gone
+
+
+def sizes(matrix):
+    size = np.sqrt(np.maximum(np.diag(matrix), 0.0))
+    return np.where(size > 0, size, 1.0)
+
+
+def test_what_is_kept_is_the_schur_complement_of_dense_rows(case, order):
+    gradients = Gradients(len(case.dense.sigma))
+    linear = case.linear(gradients=gradients)
+    A, b = case.dense.some(in_linearisation(case))
+    kept, gone = apart(case)
+    np.testing.assert_array_equal(linear.layout.kept, kept)
+    rows = np.column_stack([A[:, kept], b])
+    taken = np.linalg.lstsq(A[:, gone], rows, rcond=None)[0]
+    beyond = rows - A[:, gone] @ taken
+    size = sizes(rows.T @ rows)
+    unit = np.outer(size, size)
+    np.testing.assert_allclose(linear.kept / unit, beyond.T @ beyond / unit, atol=1e-9)
+    raw = (rows.T @ rows)[:-1, :-1] / unit[:-1, :-1]
+    np.testing.assert_allclose(linear.raw / unit[:-1, :-1], raw, atol=1e-9)
+    assert linear.chi2 == pytest.approx(b @ b, rel=1e-9)
+    # And the way back to what was eliminated: of directions, and of one with the right side.
+    ahead = np.random.default_rng(2).normal(size=(len(kept) + 1, 3)) / size[:, None]
+    back = linear.directions(ahead)
+    np.testing.assert_allclose(back[kept], ahead[:-1], rtol=1e-12)
+    limit = 1e-9 * np.abs(taken @ ahead).max(initial=1.0)
+    np.testing.assert_allclose(back[gone], -taken @ ahead, atol=limit)
+
+
+def test_what_is_touched_and_how_sure_beams_are(case, order):
+    linear = case.linear()
+    wanted = in_linearisation(case)
+    A, _ = case.dense.some(lambda kind: wanted(kind) and not kind.startswith("prior"))
+    np.testing.assert_array_equal(linear.touched, np.any(A != 0, axis=0))
+    pairs = zip(case.start.problem.scans, case.start.associations, strict=True)
+    rows = [scan.rows(case.dense.values, a) for scan, a in pairs]
+    expected = sum(np.sum(r.weight / np.square(r.sigma_m)) for r in rows)
+    assert linear.weight_m2 == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize("newton", [False, True])
+def test_the_step_of_every_unknown_is_that_of_dense_rows(case, order, newton):
+    """To a millionth of its sigma, and with it by how much the cost was to fall."""
+    dense = replace(case.dense, newton=newton)
+    linear = case.linear(newton)
+    estimate = case.estimate(linear)
+    after, moved, fall = estimate.graph.step(dense.values)
+    outer = linear.layout.outer()
+    kept = np.concatenate([moved[name] for name in outer])
+    moved = {**{name: moved[name] for name in outer}, **linear.step(kept)}
+    found = np.concatenate([moved[name] for name in dense.at])
+    sigma = np.sqrt(np.diag(dense.covariance))
+    expected = dense.step
+    assert np.abs(expected / sigma).max() > 0.1
+    assert np.abs((found - expected) / sigma).max() < 1e-6
+    cost = np.sum(np.square(dense.b)) - np.sum(np.square(dense.b - dense.A @ expected))
+    fall += (linear.chi2 - linear.kept[-1, -1]) / 2
+    assert fall == pytest.approx(cost / 2, rel=1e-6)
+    for name in outer:
+        kind = case.start.problem.variables[name].kind
+        stepped = rigs.retract(kind, dense.values[name], moved[name])
+        np.testing.assert_allclose(after[name], stepped, atol=1e-9)
+
+
+def test_covariances_are_those_of_dense_rows(case, order):
+    """Of what is kept, of a stop's own, and of both together."""
+    linear = case.linear()
+    estimate, dense = case.estimate(linear), case.dense
+    sigma = np.sqrt(np.diag(dense.covariance))
+    correlation = dense.covariance / np.outer(sigma, sigma)
+    own = [n for n in dense.inner(case.held) if not n.partition("/")[2].startswith("reference_")]
+    outer = list(linear.layout.outer())
+    for names in (outer[::-1], own[:3], [*own[-2:], *outer[1:3], *own[:1]]):
+        if names:
+            at = dense.columns(names)
+            found = estimate.covariance_of(names) / np.outer(sigma[at], sigma[at])
+            np.testing.assert_allclose(found, correlation[np.ix_(at, at)], atol=1e-6)
+
+
+def test_the_cost_is_half_the_sum_of_all_squares(case, order):
+    estimate = case.estimate(case.linear())
+    assert estimate.cost == pytest.approx(case.dense.b @ case.dense.b / 2, rel=1e-9)
+
+
+def test_gradients_by_cluster_are_those_of_their_rows(case, order):
+    gradients = Gradients(len(case.dense.sigma))
+    case.linear(gradients=gradients)
+    chosen = np.flatnonzero(case.dense.kind == "beams")
+    if not len(chosen):
+        assert gradients._tables == []
+        return
+    expected = {}
+    for i in chosen:
+        row = case.dense.A[i] * case.dense.b[i]
+        expected[case.dense.cluster[i]] = expected.get(case.dense.cluster[i], 0.0) + row
+    table, stop, place = gradients.table()
+    of = {number: key for key, number in gradients.places.items()}
+    found = {}
+    for i, (k, p) in enumerate(zip(stop.tolist(), place.tolist(), strict=True)):
+        found[k, *of[p]] = found.get((k, *of[p]), 0.0) + table[[i]].toarray()[0]
+    assert found.keys() == expected.keys()
+    size = np.maximum(np.linalg.norm(case.dense.A[chosen], axis=0), 1e-12)
+    for key, gradient in expected.items():
+        np.testing.assert_allclose(found[key] / size, gradient / size, atol=1e-8)
+    total = case.dense.A[chosen].T @ case.dense.b[chosen]
+    np.testing.assert_allclose(table.sum(axis=0) / size, total / size, atol=1e-8)
+
+
+def test_both_orders_say_the_same(case, monkeypatch):
+    found = []
+    for stops_first in (False, True):
+        monkeypatch.setattr(Layout, "stops_first", stops_first)
+        gradients = Gradients(len(case.dense.sigma))
+        found.append(case.linear(gradients=gradients))
+    a, b = found
+    assert len(a.twists) == len(case.start.problem.scans) and not b.twists
+    size = np.append(sizes(a.raw), np.sqrt(a.chi2))
+    unit = np.outer(size, size)
+    np.testing.assert_allclose(a.kept / unit, b.kept / unit, atol=1e-10)
+    np.testing.assert_allclose(a.raw / unit[:-1, :-1], b.raw / unit[:-1, :-1], atol=1e-12)
+    assert a.chi2 == pytest.approx(b.chi2, rel=1e-12)
+
+
+def test_the_number_of_threads_changes_no_bit(case, order):
+    def found(count):
+        gradients = Gradients(len(case.dense.sigma))
+        with workers(count):
+            linear = case.linear(gradients=gradients)
+        table = gradients.table() if case.start.problem.scans else ()
+        arrays = [linear.kept, linear.raw, linear.chi2, linear.weight_m2, linear.touched]
+        arrays += [a for e in linear.eliminated for a in (e.columns, e.over, e.factor, e.gain)]
+        return arrays + [a.toarray() if hasattr(a, "toarray") else a for a in table]
+
+    alone = found(1)
+    for count in (2, 5):
+        for a, b in zip(alone, found(count), strict=True):
+            np.testing.assert_array_equal(a, b)

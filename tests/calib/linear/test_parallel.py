@@ -1,0 +1,100 @@
+"""Work side by side: order, exceptions, and how much lies about."""
+
+import threading
+import time
+
+import pytest
+
+from calib.linear.parallel import in_order, workers
+
+COUNTS = (1, 2, 5)
+
+
+@pytest.mark.parametrize("count", COUNTS)
+@pytest.mark.parametrize("size", [0, 1, 3, 40])
+def test_results_come_in_order_whoever_is_done_first(count, size):
+    def work(i):
+        time.sleep(0.003 * (i % 3 == 0))
+        return i
+
+    with workers(count):
+        assert list(in_order(work, size)) == list(range(size))
+
+
+@pytest.mark.parametrize("count", COUNTS)
+@pytest.mark.parametrize("bad", [0, 7, 29])
+def test_an_exception_of_any_one_is_passed_on_in_its_turn_and_the_rest_is_not_begun(count, bad):
+    begun = []
+
+    def work(i):
+        begun.append(i)
+        if i == bad:
+            raise ZeroDivisionError(i)
+        return i
+
+    taken = []
+    with workers(count), pytest.raises(ZeroDivisionError, match=str(bad)):
+        for found in in_order(work, 30):
+            taken.append(found)
+    assert taken == list(range(bad))
+    assert max(begun) <= bad + 2 * count
+
+
+@pytest.mark.parametrize("count", COUNTS)
+def test_who_leaves_early_leaves_nothing_running(count):
+    begun, running = [], threading.active_count()
+
+    def work(i):
+        begun.append(i)
+        return i
+
+    with workers(count):
+        results = in_order(work, 1000)
+        assert next(results) == 0
+        results.close()
+    assert threading.active_count() == running
+    assert max(begun) <= 2 * count
+
+
+class Result:
+    """Knows how many of its kind are alive."""
+
+    alive = most = 0
+    lock = threading.Lock()
+
+    def __init__(self):
+        with Result.lock:
+            Result.alive += 1
+            Result.most = max(Result.most, Result.alive)
+
+    def __del__(self):
+        with Result.lock:
+            Result.alive -= 1
+
+
+@pytest.mark.parametrize("count", COUNTS)
+def test_no_more_than_a_few_results_are_held(count):
+    Result.alive = Result.most = 0
+    with workers(count):
+        for result in in_order(lambda i: Result(), 200):
+            time.sleep(0.0005)  # whoever takes them is slower than who makes them
+            del result
+    assert Result.alive == 0
+    assert Result.most <= 2 * count + 2
+
+
+@pytest.mark.parametrize("count", COUNTS)
+def test_no_more_than_so_many_work_at_once_and_as_many_do(count):
+    lock, now, most = threading.Lock(), [0], [0]
+
+    def work(i):
+        with lock:
+            now[0] += 1
+            most[0] = max(most[0], now[0])
+        time.sleep(0.01)
+        with lock:
+            now[0] -= 1
+
+    with workers(count):
+        list(in_order(work, 4 * count))
+    assert most[0] == count
