@@ -89,7 +89,9 @@ def _points(ranges: Ranges) -> Columns:
         "distance_m": view["range_m"][hit],
         "incidence_rad": view["incidence_rad"][hit],
         "label": (view["label"] if "label" in view.columns else np.zeros(len(nothing)))[hit],
-        "reference_intensity": view.columns.get("reference_intensity", nothing)[hit],
+        "reference_intensity": (
+            view["reference_intensity"] if "reference_intensity" in view.columns else nothing
+        )[hit],
         "intensity": scan.intensity[hit],
         "signed_error_m": ranges.corrected_m,
         "accuracy_m": accuracy(ranges.corrected_m, about_mean_m),
