@@ -80,6 +80,11 @@ def report(what: str, rows: int, a_s: float, b_s: float, goal: str) -> None:
     print(f"{what:60} {rows:9d} {a_s:9.3f} {b_s:9.3f} {a_s / b_s:8.1f}   {goal}", flush=True)
 
 
+def heading() -> None:
+    """The first line of the table."""
+    print("{:60} {:>9} {:>9} {:>9} {:>8}   goal".format("a / b", "rows", "a, s", "b, s", "a / b"))
+
+
 def main() -> None:
     """Run all and print a table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -88,8 +93,7 @@ def main() -> None:
     wanted = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder, one_thread():
         work = Work.of(held(recorded(Path(folder), wanted.rows, stops=8)))
-        heading = ("a / b", "rows", "a, s", "b, s", "a / b")
-        print("{:60} {:>9} {:>9} {:>9} {:>8}   goal".format(*heading))
+        heading()
         casts(work, wanted.repeats)
         threads(work, wanted.repeats)
         factor_per_point(work, wanted.repeats)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 from collections.abc import Iterator
 from importlib import import_module
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 
 HERE = Path(__file__).parent
+SMALLEST = "{lidar: hesai_pandarxt32, locations: 3, stops_per_location: 3, column_step: 100}"
 ROWS, STOPS = 8000, 4
 
 
@@ -95,3 +97,19 @@ def test_the_screen_adds_up_what_blas_does(bench, work):
         np.testing.assert_allclose(
             ours / np.outer(scale, scale), whole.T @ whole / np.outer(scale, scale), atol=1e-9
         )
+
+
+@pytest.mark.slow
+def test_the_loop_agrees_with_itself(tmp_path):
+    (tmp_path / "smallest.yaml").write_text(SMALLEST, encoding="utf-8")
+    script = [sys.executable, HERE / "bench_loop.py", "--against", HERE.parents[1]]
+    asked = ["--presets", tmp_path / "smallest.yaml", "--repeats", "1"]
+    told = subprocess.check_output([*script, *asked], text=True)
+    lines = {words[1]: line for line in told.splitlines() if len(words := line.split()) > 7}
+    for verb in ("fit", "add"):
+        assert lines[verb].endswith(" 0 sigma apart"), told
+    for verb in ("diagnose", "explain"):
+        assert lines[verb].endswith(" same verdict"), told
+    for verb in ("fit", "diagnose", "add", "explain", "report"):
+        assert 0.1 < float(lines[verb].split()[4]) < 10, told
+    assert "eliminating" in told and "whole / its casts" in told
