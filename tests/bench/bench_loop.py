@@ -19,7 +19,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,19 +28,26 @@ from bench_speed import casts, heading
 from loop_parts import PARTS, REST, STARTING
 from workload import Work, held, one_thread, recorded
 
+from calib.diagnosis.verdict import worth_adding
+from calib.runs.run import Run
+from chains import se3
+
 HERE = Path(__file__).resolve().parents[2]
 MAIN = "from calib.cli import main; main()"
 HIDDEN = "incidence_angle_bias"  # what an explanation finds; added where nothing is worth adding
 GOALS = {"fit": ">= 5", "diagnose": ">= 8", "add": ">= 5", "explain": ">= 8"}  # of the default
+SIDES = ("ours", "theirs")
+Side = tuple[Path, Path]  # a checkout, and the folder that it writes into
 LINE = "{:16} {:10} {:>9} {:>9} {:>7} {:>9} {:>9} {:>7}   {:7} {}"
 
 
-def rigcal(checkout: Path, *words: object) -> tuple[float, float]:
-    """Run a command as a user does: its seconds by the clock, and of CPU."""
+def rigcal(checkout: Path, folder: Path, *words: object) -> tuple[float, float]:
+    """Run a command in a folder as a user does: its seconds by the clock, and of CPU."""
     before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     subprocess.run(
         [sys.executable, "-c", MAIN, *map(str, words)],
-        env=os.environ | {"PYTHONPATH": str(checkout)},
+        cwd=folder,
+        env=_with(checkout),
         stdout=subprocess.DEVNULL,
         check=True,
     )
@@ -48,64 +55,53 @@ def rigcal(checkout: Path, *words: object) -> tuple[float, float]:
     return wall, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
-def turns(
-    sides: Sequence[tuple[Path, Path]],
-    repeats: int,
-    words: Callable[[Path], Sequence[object]],
-    fresh: str = "",
-) -> np.ndarray:
-    """Medians (2, 2) of clock and CPU of both sides' (checkout, folder), by turns; `fresh` is what
-    each time is removed before."""
-    seconds: list[list[tuple[float, float]]] = [[], []]
+def _with(checkout: Path) -> dict[str, str]:
+    return os.environ | {"PYTHONPATH": str(checkout)}
+
+
+def turns(sides: Sequence[Side], repeats: int, *words: object) -> np.ndarray:
+    """Medians of clock and CPU of a command on each side, (sides, 2)."""
+    seconds: list[list[tuple[float, float]]] = [[] for _ in sides]
     for _ in range(repeats):
         for mine, (checkout, folder) in zip(seconds, sides, strict=True):
-            if fresh:
-                shutil.rmtree(folder / fresh, ignore_errors=True)
-            mine.append(rigcal(checkout, *words(folder)))
+            shutil.rmtree(folder / "ladder", ignore_errors=True)  # it would be taken up again
+            mine.append(rigcal(checkout, folder, *words))
     return np.median(seconds, axis=1)
+
+
+def sides_of(against: Path, folder: Path) -> list[Side]:
+    """Both checkouts, with a folder each."""
+    for name in SIDES:
+        (folder / name).mkdir(parents=True)
+    return [(c, folder / name) for c, name in zip((HERE, against), SIDES, strict=True)]
 
 
 def loop(preset: str, hide: str, against: Path, folder: Path, repeats: int) -> None:
     """All verbs on a preset."""
-    plain, hiding = folder / "plain", folder / "hiding"
-    rigcal(HERE, "simulate", preset, "-o", plain)
-    rigcal(HERE, "simulate", preset, "-o", hiding, "--hide", hide)
-    sides = [(HERE, folder / "ours"), (against, folder / "theirs")]
-    ours, theirs = (side for _, side in sides)
+    sides = sides_of(against, folder)
+    rigcal(HERE, folder, "simulate", preset, "-o", "plain")
+    rigcal(HERE, folder, "simulate", preset, "-o", "hiding", "--hide", hide)
 
-    def line(verb: str, told: str, *words: object, fresh: str = "") -> None:
-        seconds = turns(sides, repeats, lambda side: (verb, *(_at(side, w) for w in words)), fresh)
+    def line(told: str, verb: str, *words: object) -> None:
+        seconds = turns(sides, repeats, verb, *words)
         goal = GOALS.get(verb, "") if preset == "default" else ""
-        row(Path(preset).stem, verb, seconds, goal, told and agreement(ours, theirs, told))
+        row(Path(preset).stem, verb, seconds, goal, told and agreement(folder, told))
 
-    line("fit", "run", plain, "-o", "./run")
-    line("diagnose", "run/diagnosis.json", "./run")
-    line("add", "grown", "./run", _worth_adding(ours), "-o", "./grown")
-    line("explain", "ladder/explanation.json", hiding, "-o", "./ladder", fresh="ladder")
-    line("report", "", "./run", "-o", "./page.html")
-
-
-def _at(side: Path, word: object) -> object:
-    return side / word[2:] if isinstance(word, str) and word.startswith("./") else word
-
-
-def _worth_adding(side: Path) -> str:
-    found = json.loads((side / "run/diagnosis.json").read_text(encoding="utf-8"))["candidates"]
-    steps = {c["step"]: c["add"] for c in found if c["step"]}
-    return steps[min(steps)] if steps else HIDDEN
+    line("run", "fit", "../plain", "-o", "run")
+    line("run/diagnosis.json", "diagnose", "run")
+    found = json.loads((folder / "ours/run/diagnosis.json").read_text(encoding="utf-8"))
+    effect = (worth_adding(found["candidates"]) or [HIDDEN])[0]
+    line("grown", "add", "run", effect, "-o", "grown")
+    line("ladder/explanation.json", "explain", "../hiding", "-o", "ladder")
+    line("", "report", "run", "-o", "page.html")
 
 
 def large(rows: int, against: Path, folder: Path, repeats: int) -> None:
-    """A fit of many rows."""
-    recording = recorded(folder, rows, stops=8)
-    sides = [(HERE, folder / "ours"), (against, folder / "theirs")]
-    # The other side takes minutes: once is enough.
-    each = [
-        turns([side], n, lambda out: ("fit", recording, "-o", out / "run"))[0]
-        for side, n in zip(sides, (repeats, 1), strict=True)
-    ]
-    told = agreement(*(side for _, side in sides), "run")
-    row(f"{rows} rows", "fit", np.array(each), "", told)
+    """A fit of many rows; the other side's once, as it takes minutes."""
+    ours, theirs = sides_of(against, folder)
+    words = ("fit", recorded(folder, rows, stops=8), "-o", "run")
+    each = [turns([ours], repeats, *words), turns([theirs], 1, *words)]
+    row(f"{rows} rows", "fit", np.concatenate(each), "", agreement(folder, "run"))
 
 
 def row(preset: str, verb: str, seconds: np.ndarray, goal: str, told: str) -> None:
@@ -114,12 +110,13 @@ def row(preset: str, verb: str, seconds: np.ndarray, goal: str, told: str) -> No
     print(LINE.format(preset, verb, *wall, *cpu, goal, told).rstrip(), flush=True)
 
 
-def agreement(ours: Path, theirs: Path, part: str) -> str:
+def agreement(folder: Path, part: str) -> str:
     """How far the estimates of both sides' runs differ, or whether their findings do."""
+    ours, theirs = (folder / name / part for name in SIDES)
     if not part.endswith(".json"):
-        return f"{differs(ours / part, theirs / part):.3g} sigma apart"
-    a, b = (json.loads((side / part).read_text(encoding="utf-8")) for side in (ours, theirs))
-    return "same verdict" if _findings(a) == _findings(b) else "ANOTHER VERDICT"
+        return f"{differs(ours, theirs):.3g} sigma apart"
+    a, b = (_findings(json.loads(path.read_text(encoding="utf-8"))) for path in (ours, theirs))
+    return "same verdict" if a == b else "ANOTHER VERDICT"
 
 
 def _findings(document: dict[str, Any]) -> tuple[Any, ...]:
@@ -130,9 +127,6 @@ def _findings(document: dict[str, Any]) -> tuple[Any, ...]:
 
 def differs(a: Path, b: Path) -> float:
     """The largest difference of two runs' estimates, in sigmas."""
-    from calib.runs.run import Run
-    from chains import se3
-
     found, (a, b) = [], (Run.open(run).solution.shared for run in (a, b))
     for name, frame in a.frames.items():
         away = se3.log(se3.inverse(frame.T_parent_child) @ b.frames[name].T_parent_child)
@@ -157,15 +151,15 @@ def profile(folder: Path, preset: str, repeats: int) -> None:
 
 
 def _parts(verb: str, recording: Path, run: Path) -> dict[str, float]:
-    script = Path(__file__).with_name("loop_parts.py")
-    return json.loads(subprocess.check_output([sys.executable, script, verb, recording, run]))
+    script = [sys.executable, Path(__file__).with_name("loop_parts.py")]
+    return json.loads(subprocess.check_output([*script, verb, recording, run], env=_with(HERE)))
 
 
 def main() -> None:
     """Run both sides and print a table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--against", type=Path, default=HERE, help="another checkout")
-    parser.add_argument("--presets", nargs="*", default=["tiny", "default"], help="or YAML files")
+    parser.add_argument("--presets", nargs="*", default=["tiny", "default"])
     parser.add_argument("--hide", default=f"{HIDDEN}=3", help="what is to be explained")
     parser.add_argument("--rows", type=int, default=0, help="of one large fit more; 0 for none")
     parser.add_argument("--repeats", type=int, default=3, help="of each, for the median")

@@ -15,6 +15,8 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
+from calib.diagnosis import stand
+from calib.linear import linearise
 from calib.linear.assembly import CellsFirst, StopsFirst
 from calib.linear.parallel import workers
 from calib.linear.rows import StopRows
@@ -32,11 +34,13 @@ PARTS: dict[str, tuple[tuple[Any, str], ...]] = {
     "reading": ((Source, "open"), (BeamStore, "read"), (Run, "open")),
     "casting": ((Reference, "first_triangle"),),
     "depth edges": ((Reference, "near_edge"),),
+    "placing": ((linearise, "lidars"), (linearise, "own_rows")),
     "rows": ((StopRows, "of"),),
     "sums": ((StopRows, "sums"), (StopRows, "gradient"), (CellsFirst, "add")),
     "eliminating": ((CellsFirst, "done"), (StopsFirst, "add"), (StopsFirst, "done")),
     "graph": (*((Graph, n) for n in ("__init__", "step", "solve", "error")), (KeptRows, "of")),
     "covariance": ((Graph, "covariance"), (Linearisation, "covariance")),
+    "testing": (*((stand, n) for n in ("project", "screen")), (diagnose, "weak_directions")),
     "writing": tuple((calibrate, n) for n in ("write_table", "write_yaml", "write_json")),
 }
 
