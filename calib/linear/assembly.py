@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
@@ -13,7 +12,7 @@ from calib.linear.layout import Layout
 from calib.linear.rows import TWIST, StopSums
 from calib.linear.system import Linearisation, Values
 from calib.problem.unknowns import Role
-from calib.residuals.compiled import add_at, add_both, add_sparse
+from calib.residuals.compiled import add_at, add_both, add_gram, add_sparse
 
 # A product by blocks of one in so many is faster than the whole (measured, 24 and 90 stops).
 DENSE = 8
@@ -34,15 +33,17 @@ class OwnRows:
     columns: np.ndarray
     measured: bool
 
-    @cached_property
-    def _gram(self) -> np.ndarray:
-        rows = np.column_stack([self.A, self.b])
-        return rows.T @ rows
+    def add_to(self, target: np.ndarray, at: np.ndarray, sigma: np.ndarray, b: int = -1) -> None:
+        """Add their Gram matrix to another.
 
-    def gram(self, sigma: np.ndarray) -> np.ndarray:
-        """(n + 1, n + 1) over the columns, in units of their sigmas, and the right side."""
-        unit = np.append(sigma[self.columns], 1.0)
-        return self._gram * unit * unit[:, None]
+        Args:
+            target: (N, N), added to.
+            at: (U,) where columns stand in it, -1 for those that do not.
+            sigma: (U,) units of the columns.
+            b: where the right side stands; -1 if it does not.
+        """
+        rows = np.column_stack([self.A * sigma[self.columns], self.b])
+        add_gram(target, np.append(at[self.columns], b), rows)
 
 
 class Assembly:
@@ -81,8 +82,7 @@ class Assembly:
         at = np.full(self.layout.size, -1)
         at[self.layout.kept] = np.arange(len(self.layout.kept))
         for rows in found:
-            gram = rows.gram(self.layout.sigma)[:-1, :-1]
-            add_at(self.raw, at[rows.columns], at[rows.columns], gram)
+            rows.add_to(self.raw, at, self.layout.sigma)
 
     def add_kept(self, rows: OwnRows) -> None:
         """Add whitened rows about kept unknowns."""
@@ -147,8 +147,7 @@ class CellsFirst(Assembly):
     def add_kept(self, rows: OwnRows) -> None:
         """Add whitened rows about kept unknowns."""
         super().add_kept(rows)
-        at = np.append(self.at[rows.columns], self.b)
-        add_at(self.rest, at, at, rows.gram(np.ones(self.layout.size)))
+        rows.add_to(self.rest, self.at, np.ones(self.layout.size), self.b)
 
     def done(self, values: Values) -> Linearisation:
         """Eliminate all but the kept."""
@@ -194,8 +193,7 @@ class CellsFirst(Assembly):
         at[columns] = np.arange(len(columns))
         whole = self._chained(rest, own)
         for each in (rows for found in self.own.values() for rows in found):
-            some = np.append(at[each.columns], len(columns) - 1)
-            add_at(whole, some, some, each.gram(unit))
+            each.add_to(whole, at, unit, len(columns) - 1)
         if not len(own):
             return whole
         count = len(own)
@@ -281,9 +279,7 @@ class StopsFirst(Assembly):
         super().add_kept(rows)
         if self.raw is not None:
             self._add_raw([rows])
-        at = np.append(self.at[rows.columns], -1)
-        at[-1] = len(self.columns) - 1
-        add_at(self.total, at, at, rows.gram(self.layout.sigma))
+        rows.add_to(self.total, self.at, self.layout.sigma, len(self.columns) - 1)
 
     def _finish(self, stop: int, columns: np.ndarray, matrix: np.ndarray) -> None:
         """Add a stop's own rows to its matrix over some columns, and eliminate what is its own."""
@@ -299,8 +295,7 @@ class StopsFirst(Assembly):
         whole = np.zeros((len(mine), len(mine)))
         whole[np.ix_(at[columns], at[columns])] = matrix
         for each in rows:
-            some = np.append(at[each.columns], len(mine) - 1)
-            add_at(whole, some, some, each.gram(layout.sigma))
+            each.add_to(whole, at, layout.sigma, len(mine) - 1)
         own = at[layout.own[stop]] if stop in layout.own else np.zeros(0, int)
         left = np.setdiff1d(np.arange(len(mine)), own)
         rest = whole[np.ix_(left, left)]

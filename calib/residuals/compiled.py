@@ -200,3 +200,21 @@ def add_both(target: np.ndarray, rows: np.ndarray, columns: np.ndarray, block: n
                 if columns[j] >= 0:
                     target[rows[i], columns[j]] += block[i, j]
                     target[columns[j], rows[i]] += block[i, j]
+
+
+@njit(cache=True, nogil=True)
+def add_gram(target: np.ndarray, at: np.ndarray, rows: np.ndarray) -> None:
+    """``target[at[i], at[j]] += rows[:, i] . rows[:, j]``; those at -1 are left out."""
+    count, width = rows.shape
+    for i in range(width):
+        if at[i] < 0:
+            continue
+        for j in range(i, width):
+            if at[j] < 0:
+                continue
+            total = 0.0
+            for k in range(count):
+                total += rows[k, i] * rows[k, j]
+            target[at[i], at[j]] += total
+            if j > i:
+                target[at[j], at[i]] += total
