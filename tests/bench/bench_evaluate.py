@@ -16,7 +16,7 @@ import tracemalloc
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from workload import one_thread, recorded, timed
+from workload import recorded, threads, timed
 
 from calib import problem as problems
 from calib.evaluation import evaluate_stop, write_evaluation
@@ -67,7 +67,7 @@ def main() -> None:
     parser.add_argument("--rows", type=int, default=1_000_000)
     parser.add_argument("--repeats", type=int, default=3, help="of each, for the median")
     wanted = parser.parse_args()
-    with tempfile.TemporaryDirectory() as temporary, one_thread():
+    with tempfile.TemporaryDirectory() as temporary, threads(1):
         folder = Path(temporary)
         source = Source.open(recorded(folder, wanted.rows, stops=8))
         problem = problems.build([source], Model())

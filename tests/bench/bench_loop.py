@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 from bench_speed import casts, heading
 from loop_parts import PARTS, REST, STARTING
-from workload import Work, held, one_thread, recorded
+from workload import Work, held, recorded, threads
 
 from calib.diagnosis.verdict import worth_adding
 from calib.runs.run import Run
@@ -137,16 +137,16 @@ def differs(a: Path, b: Path) -> float:
     return float(np.max(np.abs(away[sigma > 0]) / sigma[sigma > 0]))
 
 
-def profile(folder: Path, preset: str, repeats: int) -> None:
+def profile(folder: Path, repeats: int) -> None:
     """A fit and a diagnosis by their parts, and an iteration against its casts."""
     verbs, recording = ("fit", "diagnose"), folder / "plain"
     found = {verb: _parts(verb, recording, folder / "profiled") for verb in verbs}
-    print(f"\n{Path(preset).stem}, CPU s on one thread" + "".join(f"{v:>10}" for v in verbs))
+    print(f"\n{folder.name}, CPU s on one thread" + "".join(f"{v:>10}" for v in verbs))
     for part in (STARTING, *PARTS, REST):
         print(f"  {part:28}" + "".join(f"{found[v].get(part, 0.0):10.2f}" for v in verbs))
     print(f"  {'all':28}" + "".join(f"{sum(found[v].values()):10.2f}" for v in verbs) + "\n")
     heading()
-    with one_thread():
+    with threads(1):
         casts(Work.of(held(recording)), repeats)
 
 
@@ -170,11 +170,11 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         for preset in wanted.presets:
-            name = Path(preset).stem
-            loop(preset, wanted.hide, against, folder / name, wanted.repeats)
+            loop(preset, wanted.hide, against, folder / Path(preset).stem, wanted.repeats)
         if wanted.rows:
             large(wanted.rows, against, folder / "large", wanted.repeats)
-        profile(folder / name, preset, wanted.repeats)
+        for preset in wanted.presets[-1:]:
+            profile(folder / Path(preset).stem, wanted.repeats)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from unittest import mock
 
 import numpy as np
 from scipy.linalg.blas import dsyrk
-from workload import held, one_thread, recorded, timed
+from workload import held, recorded, threads, timed
 
 from calib import problem as problems
 from calib.diagnosis.stand import Stand
@@ -92,7 +92,7 @@ def main() -> None:
     parser.add_argument("--rows", type=int, default=200_000)
     parser.add_argument("--stops", type=int, default=8)
     args = parser.parse_args()
-    with one_thread(), tempfile.TemporaryDirectory() as folder:
+    with threads(1), tempfile.TemporaryDirectory() as folder:
         recording = recorded(Path(folder), args.rows, args.stops)
         against_blas(fitted(recording))
         against_fit(recording)

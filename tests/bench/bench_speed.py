@@ -17,9 +17,8 @@ from pathlib import Path
 import numpy as np
 from point_factors import PointFactors
 from sparse_rows import SparseRows, frozen, optimum
-from workload import Work, held, one_thread, recorded, timed
+from workload import Work, held, recorded, threads, timed
 
-from calib.linear.parallel import workers
 from chains import se3
 from sensors.lidar import beams
 
@@ -67,11 +66,11 @@ def casts(work: Work, repeats: int) -> None:
     report("step: whole / its casts", work.rows, timed(work.whole_step, repeats)[1], cast, "<= 1.5")
 
 
-def threads(work: Work, repeats: int) -> None:
+def two_threads(work: Work, repeats: int) -> None:
     """A whole step on one thread against one on two; by the clock, so of a machine at rest."""
-    with workers(2):
-        two = timed(work.whole_step, repeats, time.perf_counter)[1]
     one = timed(work.whole_step, repeats, time.perf_counter)[1]
+    with threads(2):
+        two = timed(work.whole_step, repeats, time.perf_counter)[1]
     report("step: whole, on one thread / on two", work.rows, one, two, ">= 1.7")
 
 
@@ -91,11 +90,11 @@ def main() -> None:
     parser.add_argument("--rows", type=int, default=1_000_000)
     parser.add_argument("--repeats", type=int, default=5, help="of each, for the median")
     wanted = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder, one_thread():
+    with tempfile.TemporaryDirectory() as folder, threads(1):
         work = Work.of(held(recorded(Path(folder), wanted.rows, stops=8)))
         heading()
         casts(work, wanted.repeats)
-        threads(work, wanted.repeats)
+        two_threads(work, wanted.repeats)
         factor_per_point(work, wanted.repeats)
         sparse_least_squares(work)
 

@@ -28,6 +28,7 @@ from sensors.reference import Reference
 
 Values = dict[str, np.ndarray]
 BEAMS = 128 * 1024  # of an OS0-128 per turn
+FIRST_TRIANGLE = Reference.first_triangle
 CELL_M = 0.106  # of the mesh: 50,000 triangles
 
 
@@ -127,15 +128,14 @@ def held(folder: Path) -> Source:
 
 
 @contextmanager
-def one_thread() -> Iterator[None]:
-    """Stops one by one, and rays and BLAS on one thread; they take all otherwise."""
-    first_triangle = Reference.first_triangle
+def threads(count: int) -> Iterator[None]:
+    """So many stops at a time, and rays on so many threads; BLAS on one."""
 
-    def alone(self, origins_m, directions, nthreads=0):
-        return first_triangle(self, origins_m, directions, nthreads=1)
+    def cast(self, origins_m, directions, nthreads=0):
+        return FIRST_TRIANGLE(self, origins_m, directions, nthreads=count)
 
-    alone = mock.patch.object(Reference, "first_triangle", alone)
-    with threadpool_limits(1), workers(1), alone:
+    rays = mock.patch.object(Reference, "first_triangle", cast)
+    with threadpool_limits(1), workers(count), rays:
         yield
 
 
