@@ -1,6 +1,7 @@
-# make demo   simulates a recording, calibrates it, exports and reports the result, in demo/
-# make test   checks style and runs every test
-# make clean  removes what the two made
+# make demo       simulates a recording, calibrates it, exports and reports the result, in demo/
+# make test       checks style and runs every test but the long ones
+# make test-long  runs the long ones: how often intervals hold, what else is found by its name
+# make clean      removes what these made
 
 PYTHON = $(firstword $(foreach p,python3.11 python3,$(shell $(p) -c \
 	'import sys; (3, 11) <= sys.version_info < (3, 15) and print("$(p)")' 2>/dev/null)))
@@ -8,10 +9,12 @@ LIBRARIES = libusb-1.0-0 libgl1 libgomp1 libx11-6
 BIN = .venv/bin
 OPEN3D_LOADS = $(BIN)/python -c 'import sys; sys.tracebacklimit = 0; import open3d'
 PIP = $(BIN)/python -m pip install --quiet --disable-pip-version-check
+# What tests of a file share is made once; files stay in the order that tests/conftest.py gives them.
+PYTEST = $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 BROWSER = $(firstword $(foreach b,chromium chromium-browser google-chrome,$(shell command -v $(b))))
 
-.PHONY: demo test system browser clean
+.PHONY: demo test test-long system browser clean
 
 demo: system
 	@echo "== demo: a simulated recording of the default rig"
@@ -32,7 +35,11 @@ test: system browser .venv/.tested
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	@echo "== test: pytest"
-	$(BIN)/python -m pytest -n 2 --dist loadfile  # what tests share, they share within a file
+	$(PYTEST)
+
+test-long: system browser .venv/.tested
+	@echo "== test-long: pytest"
+	$(PYTEST) -m long
 
 clean:
 	@echo "== clean: removing the environment, the demo and what the tools left"

@@ -1,1 +1,65 @@
-"""Inference: the only package that knows about error, probability and results."""
+"""Inference: the only package that knows about error, probability and results.
+
+What a script or a notebook needs is here by name, `calib.fit` say; each is loaded when it is first
+used. Rooms have other names than these: importing one would put it in their place.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from calib.evaluation import evaluate
+    from calib.evaluation.apply import apply
+    from calib.exporters import export
+    from calib.problem.model import Model
+    from calib.rig.recording import Recording
+    from calib.runs.add import add
+    from calib.runs.calibrate import calibrate as fit
+    from calib.runs.diagnose import diagnose
+    from calib.runs.explain import explain
+    from calib.runs.run import Run
+    from calib.simulation import simulate
+
+__all__ = [
+    "Model",
+    "Recording",
+    "Run",
+    "add",
+    "apply",
+    "diagnose",
+    "evaluate",
+    "explain",
+    "export",
+    "fit",
+    "simulate",
+]
+
+_HOME = {
+    "Model": "calib.problem.model:Model",
+    "Recording": "calib.rig.recording:Recording",
+    "Run": "calib.runs.run:Run",
+    "add": "calib.runs.add:add",
+    "apply": "calib.evaluation.apply:apply",
+    "diagnose": "calib.runs.diagnose:diagnose",
+    "evaluate": "calib.evaluation:evaluate",
+    "explain": "calib.runs.explain:explain",
+    "export": "calib.exporters:export",
+    "fit": "calib.runs.calibrate:calibrate",
+    "simulate": "calib.simulation:simulate",
+}
+_SHOWN = {"Run", "add", "diagnose", "explain", "fit"}  # a notebook shows their results as tables
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module, _, attribute = _HOME[name].partition(":")
+    value = getattr(import_module(module), attribute)
+    if name in _SHOWN:
+        import_module("calib.show.notebook")
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

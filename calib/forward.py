@@ -87,6 +87,15 @@ class Stops:
         """Of those, the ones that other stops may have under another name."""
         return (self.root,) if self.noise is None else (self.root, self.noise)
 
+    def some(self, index: np.ndarray, root: str) -> Stops:
+        """Those of the stops, with their root."""
+
+        def of(bases: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+            return {n: basis if len(basis) == 1 else basis[index] for n, basis in bases.items()}
+
+        bases = {"edge_bases": of(self.edge_bases), "joint_bases": of(self.joint_bases)}
+        return replace(self, joints=self.joints[index], root=root, **bases)
+
     @classmethod
     def together(cls, stops: Sequence[Stops]) -> Stops:
         """Stops that share all but their own unknowns, as one: values of `ROOT` (K, 4, 4) and of
@@ -193,7 +202,14 @@ def place(
         site: {t.variable: t.basis(view) for t in terms if t.effect.site is site}
         for site in (Site.EDGE, Site.JOINTS)
     }
-    return Stops(rig, joints, at[Site.EDGE], at[Site.JOINTS], root, reference)
+    return Stops(
+        rig=rig,
+        joints=joints,
+        edge_bases=at[Site.EDGE],
+        joint_bases=at[Site.JOINTS],
+        root=root,
+        reference=reference,
+    )
 
 
 def _flat(basis: np.ndarray) -> np.ndarray:

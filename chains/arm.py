@@ -146,7 +146,13 @@ def _edge(joint: Element) -> Edge:
             f"joint '{name}' sits {length_m:g} m from its parent; URDF lengths are in metres "
             f"(millimetres?)"
         )
-    return Edge(name, _link(joint, "parent"), _link(joint, "child"), T_parent_child, _motion(joint))
+    return Edge(
+        name=name,
+        parent=_link(joint, "parent"),
+        child=_link(joint, "child"),
+        T_parent_child=T_parent_child,
+        joint=_motion(joint),
+    )
 
 
 def _origin(joint: Element) -> Array:
@@ -178,7 +184,7 @@ def _motion(joint: Element) -> Joint | None:
     upper = float(_numbers(joint, "limit", "upper", [0])[0])
     if lower > upper:
         raise InputError(f"joint '{name}': limit lower {lower:g} lies above upper {upper:g}")
-    return Joint(name, _KIND[kind], axis / length, lower, upper)
+    return Joint(name=name, kind=_KIND[kind], axis=axis / length, lower=lower, upper=upper)
 
 
 def _link(joint: Element, role: str) -> str:

@@ -1,4 +1,7 @@
-"""The one exception that speaks to users."""
+"""The one exception that speaks to users, and how it names what they probably meant."""
+
+import difflib
+from collections.abc import Collection
 
 
 class InputError(ValueError):
@@ -8,3 +11,9 @@ class InputError(ValueError):
     right. The command line prints it alone and exits with 2; every other exception is a fault of
     the program.
     """
+
+
+def nearest(name: str, known: Collection[str]) -> str:
+    """Return the rest of a sentence about an unknown name: the one probably meant, or all."""
+    close = difflib.get_close_matches(name, list(known), n=1)
+    return f"; did you mean {close[0]}?" if close else f"; known are {', '.join(known)}"

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.runs.calibrate import calibrate
-from calib.simulate import load_spec, simulate
+import calib
+from calib.simulation import load_spec
 from chains import se3
 from sensors.recording import read_table, write_table
 
@@ -39,14 +39,14 @@ def bump(recording: Path) -> None:
 
 out = Path(sys.argv[1] if len(sys.argv) > 1 else tempfile.mkdtemp(prefix="rigcal-"))
 monday, friday = out / "monday", out / "friday"
-simulate(load_spec("tiny").model_copy(update={"locations": 8}), monday, seed=1)
+calib.simulate(load_spec("tiny").model_copy(update={"locations": 8}), monday, seed=1)
 shutil.copytree(monday, friday, dirs_exist_ok=True)
 keep(monday, ("L00", "L01", "L02", "L03"))
 keep(friday, ("L04", "L05", "L06", "L07"))
 bump(friday)
 
-calibrate([monday], out / "monday-run", hold_out="none")
-run = calibrate([friday], out / "friday-run", hold_out="none", prior=out / "monday-run")
+calib.fit([monday], out / "monday-run", hold_out="none")
+run = calib.fit([friday], out / "friday-run", hold_out="none", prior=out / "monday-run")
 
 for link in run.summary["links"]:
     print(f"{link['name']:18}", "has moved" if link["moved"] else "has not moved")

@@ -14,9 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
+import calib
 from calib.rig import Rig, load_rig
-from calib.runs.calibrate import calibrate
-from calib.simulate import load_spec, simulate
+from calib.simulation import load_spec
 from sensors.lidar import Beams, beams
 from sensors.recording import read_scan
 from sensors.reference import Reference
@@ -34,16 +34,16 @@ def range_errors(
 
 out = Path(sys.argv[1] if len(sys.argv) > 1 else tempfile.mkdtemp(prefix="rigcal-"))
 spec = load_spec("tiny").model_copy(update={"lidar": "hesai_pandarqt64"})
-simulate(spec, out / "recording", seed=3)
-run = calibrate([out / "recording"], out / "run", hold_out="none")
+calib.simulate(spec, out / "recording", seed=3)
+run = calib.fit([out / "recording"], out / "run", hold_out="none")
 
 truth = json.loads((out / "recording.truth.json").read_text())
 offsets = run.solution.shared.effects["ring_range_offset"]
 true_m = truth["effects"]["ring_range_offset"]
 print("ring  offset mm      truth mm")
 for ring in range(0, 64, 8):
-    found = f"{1e3 * offsets.estimate[ring]:+6.2f} ± {1e3 * offsets.sigma[ring]:.2f}"
-    print(f"{ring:4}  {found}  {1e3 * true_m[ring]:+6.2f}")
+    estimate = f"{1e3 * offsets.estimate[ring]:+6.2f} ± {1e3 * offsets.sigma[ring]:.2f}"
+    print(f"{ring:4}  {estimate}  {1e3 * true_m[ring]:+6.2f}")
 
 rig = load_rig(out / "recording")
 stop, pose = next(iter(truth["stops"].items()))

@@ -16,10 +16,8 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from calib.export import export
+import calib
 from calib.rig import load_rig
-from calib.runs.calibrate import calibrate
-from calib.simulate import simulate
 
 
 def off(T: np.ndarray, T_true: np.ndarray) -> str:
@@ -29,9 +27,9 @@ def off(T: np.ndarray, T_true: np.ndarray) -> str:
 
 
 out = Path(sys.argv[1] if len(sys.argv) > 1 else tempfile.mkdtemp(prefix="rigcal-"))
-simulate("tiny", out / "recording", seed=1)
-run = calibrate([out / "recording"], out / "run", hold_out="none")
-file, _, urdf = export(run, out / "export", ["yaml", "urdf"]).files
+calib.simulate("tiny", out / "recording", seed=1)
+run = calib.fit([out / "recording"], out / "run", hold_out="none")
+file, _, urdf = calib.export(run, out / "export", ["yaml", "urdf"]).files
 
 extrinsics = yaml.safe_load(file.read_text())
 print(f"{file.name}, fitted to {extrinsics['provenance']['recordings'][0]['rig']}")
@@ -39,11 +37,11 @@ for name, frame in extrinsics["frames"].items():
     xyz_m = ", ".join(f"{v:.4f}" for v in frame["xyz_m"])
     print(f"  {frame['parent']} -> {name}: {xyz_m} m, sigma {1e3 * max(frame['sigma_m']):.2f} mm")
 
-found = {n: np.array(f["T_parent_child"]) for n, f in extrinsics["frames"].items()}
+fitted = {n: np.array(f["T_parent_child"]) for n, f in extrinsics["frames"].items()}
 cad = {edge.name: edge.T_parent_child for edge in load_rig(out / "recording").tree.edges}
 truth = json.loads((out / "recording.truth.json").read_text())
 true = {name: np.array(T) for name, T in truth["frames"].items()}
-T_true, *others = (np.linalg.inv(T["mount_markers"]) @ T["lidar"] for T in (true, cad, found))
+T_true, *others = (np.linalg.inv(T["mount_markers"]) @ T["lidar"] for T in (true, cad, fitted))
 print("mount_markers -> lidar")
 for name, T in zip(("CAD", "fit"), others, strict=True):
     print(f"  {name}: {off(T, T_true)}")

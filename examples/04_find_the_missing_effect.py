@@ -4,8 +4,8 @@ The fit itself gives no alarm: its error is below the noise floor, as rings, mou
 the room have bent themselves around what the model does not know. Stops that it never saw tell:
 there the error is several times the floor. The diagnosis tests every effect of the catalogue beside
 the model, names the one that the data ask for, says how sure it is and what else could look alike,
-and what adding it would do to the held-out error. `grow` then adds it, starting from the fit that
-there is, and a second diagnosis has nothing left to say.
+and what adding it would do to the held-out error. `calib.add` then adds it, starting from the fit
+that there is, and a second diagnosis has nothing left to say.
 
 In a terminal: `rigcal fit`, `rigcal diagnose`, `rigcal add`, `rigcal compare`; or all of them at
 once, as often as it pays, with `rigcal explain`.
@@ -17,13 +17,11 @@ import sys
 import tempfile
 from pathlib import Path
 
-from calib.runs.calibrate import calibrate, grow, grown_model
-from calib.runs.diagnose import diagnose
-from calib.runs.run import Run
-from calib.simulate import load_spec, simulate
+import calib
+from calib.simulation import load_spec
 
 
-def errors(run: Run) -> str:
+def errors(run: calib.Run) -> str:
     """The error of stops that a run saw, of those that it did not, and the noise floor."""
     rms = run.summary["rms_mm"]
     seen = f"{rms['fit']:.2f} mm seen, {rms['held_out']:.2f} mm held out"
@@ -33,22 +31,22 @@ def errors(run: Run) -> str:
 out = Path(sys.argv[1] if len(sys.argv) > 1 else tempfile.mkdtemp(prefix="rigcal-"))
 small = {"room": "box", "locations": 3, "stops_per_location": 2, "column_step": 200}
 spec = load_spec("tiny").model_copy(update=small)
-simulate(spec, out / "recording", seed=1, hide={"incidence_angle_bias": 3.0})
+calib.simulate(spec, out / "recording", seed=1, hide={"incidence_angle_bias": 3.0})
 
-run = calibrate([out / "recording"], out / "first")
+run = calib.fit([out / "recording"], out / "first")
 print(errors(run))
 
-found = diagnose(run)
-print(*found.sentences, sep="\n")
-for candidate in found.candidates[:4]:
+diagnosis = calib.diagnose(run)
+print(*diagnosis.sentences, sep="\n")
+for candidate in diagnosis.candidates[:4]:
     explains, p = candidate["unabsorbed_rms_mm"], candidate["p_adjusted"]
     print(f"  {candidate['effect']:22} explains {explains:.2f} mm, p = {p:.1g}")
 
-grown = grow(run, grown_model(run, found.worth_adding), out / "grown")
+grown = calib.add(run, diagnosis.worth_adding, out / "grown")
 print(errors(grown))
-for name in found.worth_adding:
+for name in diagnosis.worth_adding:
     effect = grown.solution.shared.effects[name]
     print(f"{name}: {1e3 * effect.estimate[0]:+.2f} ± {1e3 * effect.sigma[0]:.2f} mm")
 
-again = diagnose(grown)
+again = calib.diagnose(grown)
 print(again.sentences[0])

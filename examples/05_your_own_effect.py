@@ -16,9 +16,8 @@ import sys
 import tempfile
 from pathlib import Path
 
-from calib.runs.calibrate import calibrate, grow, grown_model
-from calib.runs.diagnose import diagnose
-from calib.simulate import Spec, simulate
+import calib
+from calib.simulation import Spec
 
 FORMULA = """\
 name: humid_air
@@ -49,14 +48,14 @@ out = Path(sys.argv[1] if len(sys.argv) > 1 else tempfile.mkdtemp(prefix="rigcal
 spec = Spec(
     lidar="hesai_pandarxt32", room="box", locations=4, stops_per_location=2, column_step=200
 )
-simulate(spec, out / "recording", seed=2, hide={str(out / "mine.yaml"): 1.5})
+calib.simulate(spec, out / "recording", seed=2, hide={str(out / "mine.yaml"): 1.5})
 
-run = calibrate([out / "recording"], out / "without")
+run = calib.fit([out / "recording"], out / "without")
 print(f"without: {run.summary['rms_mm']['held_out']:.2f} mm held out")
-for each in diagnose(run, refits=False).unexplained[:3]:
+for each in calib.diagnose(run, refits=False).unexplained[:3]:
     print(f"left over: {each['rms_mm']:.2f} mm hang on {' x '.join(each['covariates'])}")
 for kind in ("yaml", "py"):
-    grown = grow(run, grown_model(run, [str(out / f"mine.{kind}")]), out / f"with-{kind}")
+    grown = calib.add(run, str(out / f"mine.{kind}"), out / f"with-{kind}")
     effect = grown.solution.shared.effects[grown.effects[-1]]
-    found = f"{effect.estimate[0]:+.4f} ± {effect.sigma[0]:.4f}"
-    print(f"mine.{kind}: {grown.summary['rms_mm']['held_out']:.2f} mm held out, amount {found}")
+    amount = f"{effect.estimate[0]:+.4f} ± {effect.sigma[0]:.4f}"
+    print(f"mine.{kind}: {grown.summary['rms_mm']['held_out']:.2f} mm held out, amount {amount}")

@@ -31,22 +31,20 @@ from pathlib import Path
 import numpy as np
 from ur10_tmac import recording
 
+import calib
 from calib import problem as problems
-from calib.problem.model import Model, Source
+from calib.problem.model import Source
 from calib.problem.prior import JointPrior
-from calib.runs.calibrate import calibrate, grow, grown_model
-from calib.runs.diagnose import diagnose
-from calib.runs.run import Run
 from calib.solve.errors import body_errors
 from calib.solve.fit import solve
 
-GEOMETRY = Model(("arm_link_length", "arm_joint_offset", "arm_axis_tilt"))
+GEOMETRY = calib.Model(("arm_link_length", "arm_joint_offset", "arm_axis_tilt"))
 STEPS = ("arm_gravity_sag", "arm_gear_error@17", "arm_gear_error@34")
 
 
-def elsewhere_mm(run: Run, folder: Path) -> float:
+def elsewhere_mm(run: calib.Run, folder: Path) -> float:
     """The error on other poses with the arm as a run found it, only base and tool being free."""
-    problem = problems.build([Source.open(folder)], Model.read(run.model))
+    problem = problems.build([Source.open(folder)], calib.Model.read(run.model))
     held = [v for n, v in problem.variables.items() if n in run.solution.shared.effects]
     means = {}
     for variable in held:
@@ -66,11 +64,11 @@ if not (data / "Series_A").is_dir():
 A, D = (recording(data, series, out / series, 1000) for series in "AD")
 
 for folder, other in ((A, D), (D, A)):
-    run = calibrate([folder], out / f"{folder.name}-geometry", GEOMETRY)
-    print(f"series {folder.name}", *diagnose(run, refits=False).sentences[:3], sep="\n  ")
+    run = calib.fit([folder], out / f"{folder.name}-geometry", GEOMETRY)
+    print(f"series {folder.name}", *calib.diagnose(run, refits=False).sentences[:3], sep="\n  ")
     for step in (None, *STEPS):
         if step:
-            run = grow(run, grown_model(run, [step]), out / f"{folder.name}-{step}")
+            run = calib.add(run, step, out / f"{folder.name}-{step}")
         held_out = run.summary["rms_mm"]["held_out"]
         print(f"  {step or 'geometry':17} {held_out:.3f} mm held out,", end=" ")
         print(f"{elsewhere_mm(run, other):.3f} mm in series {other.name}, but for base and tool")

@@ -17,20 +17,19 @@ import sys
 import tempfile
 from pathlib import Path
 
+import calib
 from calib.report import Evidence, plot, report
-from calib.runs.calibrate import calibrate, grow, grown_model
-from calib.runs.diagnose import diagnose
-from calib.simulate import load_spec, simulate
+from calib.simulation import load_spec
 
 out = Path(sys.argv[1] if len(sys.argv) > 1 else tempfile.mkdtemp(prefix="rigcal-"))
 small = {"room": "box", "locations": 3, "stops_per_location": 2, "column_step": 200}
 spec = load_spec("tiny").model_copy(update=small)
-simulate(spec, out / "recording", seed=1, hide={"incidence_angle_bias": 3.0})
+calib.simulate(spec, out / "recording", seed=1, hide={"incidence_angle_bias": 3.0})
 
-run = calibrate([out / "recording"], out / "first")
-found = diagnose(run)
-grown = grow(run, grown_model(run, found.worth_adding), out / "grown")
-diagnose(grown)
+run = calib.fit([out / "recording"], out / "first")
+diagnosis = calib.diagnose(run)
+grown = calib.add(run, diagnosis.worth_adding, out / "grown")
+calib.diagnose(grown)
 
 for each, page in ((run, out / "first.html"), (grown, out / "grown.html")):
     written = report([each], page)

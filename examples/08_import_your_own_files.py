@@ -18,15 +18,16 @@ from pathlib import Path
 import numpy as np
 from foreign_files import write_files
 
+import calib
 from calib.intake import Choices, import_files
-from calib.runs.calibrate import calibrate
-from calib.simulate import load_spec, simulate
+from calib.simulation import load_spec
 from chains import se3
 from sensors.readers.base import Options
 
 out = Path(sys.argv[1] if len(sys.argv) > 1 else tempfile.mkdtemp(prefix="rigcal-"))
 recorded, files, imported = out / "recording", out / "files", out / "imported"
-simulate(load_spec("tiny").model_copy(update={"occluded_share": 0.0, "sweeps": 1}), recorded, 1)
+spec = load_spec("tiny").model_copy(update={"occluded_share": 0.0, "sweeps": 1})
+calib.simulate(spec, recorded, seed=1)
 write_files(recorded, files)
 
 given = [
@@ -40,7 +41,7 @@ given = [
 done = import_files(given, imported, Options(angle_unit="deg"), Choices(files / "rig.yaml"))
 print(*done.understood, *(f"odd: {line}" for line in done.odd), sep="\n")
 
-direct, of_files = (calibrate([r], f"{r}-run", hold_out="none") for r in (recorded, imported))
+direct, of_files = (calib.fit([r], f"{r}-run", hold_out="none") for r in (recorded, imported))
 for name, frame in direct.solution.shared.frames.items():
     other = of_files.solution.shared.frames[name]
     gap = se3.log(se3.inverse(frame.T_parent_child) @ other.T_parent_child)

@@ -17,7 +17,7 @@ from pathlib import Path
 # BLAS threads on shared cores cost many times what they save; set before numpy is imported.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from calib.study import FULL, QUICK, study
+from paper import FULL, QUICK, study
 
 
 def main() -> None:
@@ -29,10 +29,10 @@ def main() -> None:
     )
     asked = parser.parse_args()
     out = asked.out or Path(tempfile.mkdtemp(prefix="rigcal-"))
-    found = study(out, QUICK if asked.quick else FULL, 1 if asked.quick else 2, tell)
-    for claim in found["shape"]:
+    results = study(out, QUICK if asked.quick else FULL, 1 if asked.quick else 2, tell)
+    for claim in results["shape"]:
         print("yes" if claim["holds"] else "NO ", f"{claim['claim']}: {claim['figures']}")
-    for sensor, row in found["sensors"].items():
+    for sensor, row in results["sensors"].items():
         for method, line in row["methods"].items():
             print(f"{sensor:8} {method:40} held out {line['held_out_rms']:6.2f} mm")
     print(f"wrote {out / 'study.md'}")

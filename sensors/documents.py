@@ -5,7 +5,6 @@ all or nothing: a file appears whole, under its own name, or not at all. This is
 """
 
 import csv
-import difflib
 import json
 import math
 import os
@@ -22,7 +21,7 @@ import numpy as np
 import pydantic
 import yaml
 
-from chains.errors import InputError
+from chains.errors import InputError, nearest
 
 Marks = dict[tuple[str | int, ...], int]
 """Line (from 1) of every key and item of a YAML document, by its path in the data."""
@@ -206,12 +205,6 @@ def _sentence(problem: dict, model: type, path: str | Path, marks: Marks) -> str
     if problem["type"] == "value_error":
         return f"{where}: {key + ': ' if key else ''}{message}"
     return f"{where}: {key}: {message[0].lower()}{message[1:]}, not {problem['input']!r}"
-
-
-def nearest(name: str, known: Collection[str]) -> str:
-    """Return the rest of a sentence about an unknown name: the one probably meant, or all."""
-    close = difflib.get_close_matches(name, list(known), n=1)
-    return f"; did you mean {close[0]}?" if close else f"; known are {', '.join(known)}"
 
 
 def _keys(model: Any, loc: tuple) -> list[str]:

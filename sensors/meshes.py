@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import re
-from collections.abc import Iterator, Mapping
+import sys
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 
 from chains.errors import InputError
 from sensors.documents import write_atomically
 from sensors.ply import Columns, read_ply, write_ply
-from sensors.recording import write_table
-
-if TYPE_CHECKING:  # the readers of sensors.readers import this file
-    from sensors.readers.base import Surface
 
 _GROUPS = {
     "positions": ("x", "y", "z"),
@@ -25,6 +24,34 @@ _GROUPS = {
     "colors": ("red", "green", "blue"),
 }
 """The columns that Open3D holds as one array of three."""
+
+
+def _open3d() -> ModuleType:
+    """Open3D, opened late and without its plots for notebooks: these bring a web server along,
+    which is half of the time that it takes to start."""
+    plots = "open3d.visualization.draw_plotly"
+    if "open3d" not in sys.modules and plots not in sys.modules:
+        sys.modules[plots] = _LaterPlots(plots)
+        try:
+            import open3d
+        finally:
+            del sys.modules[plots]
+    import open3d
+
+    return open3d
+
+
+class _LaterPlots(ModuleType):
+    """Stands for Open3D's plots until one is drawn."""
+
+    def __getattr__(self, name: str) -> Callable[..., Any]:
+        if name.startswith("__"):
+            raise AttributeError(name)
+
+        def draw(*arguments: Any, **options: Any) -> Any:
+            return getattr(importlib.import_module(self.__name__), name)(*arguments, **options)
+
+        return draw
 
 
 # ------------------------------------------------------------------------------------------ clouds
@@ -62,7 +89,7 @@ def write_cloud(path: str | Path, columns: Mapping[str, np.ndarray]) -> None:
 
 def _read_pcd(path: Path) -> Columns:
     count = _count_of_pcd(path)
-    import open3d as o3d
+    o3d = _open3d()
 
     with _quiet():
         try:
@@ -98,7 +125,7 @@ def _count_of_pcd(path: Path) -> int:
 
 
 def _write_pcd(path: Path, columns: Mapping[str, np.ndarray]) -> None:
-    import open3d as o3d
+    o3d = _open3d()
 
     cloud = open3d_cloud(columns)
     with write_atomically(path) as temporary, _quiet():
@@ -112,7 +139,7 @@ def _write_pcd(path: Path, columns: Mapping[str, np.ndarray]) -> None:
 
 def open3d_cloud(columns: Mapping[str, np.ndarray]) -> Any:
     """The columns (N,) as an `open3d.t.geometry.PointCloud`, every field an attribute (N, 1)."""
-    import open3d as o3d
+    o3d = _open3d()
 
     cloud, left = o3d.t.geometry.PointCloud(), dict(columns)
     # Open3D writes beyond its memory where normals are of another type than positions.
@@ -132,21 +159,21 @@ def open3d_cloud(columns: Mapping[str, np.ndarray]) -> Any:
 def ransac_plane(points_m: np.ndarray, within_m: float) -> np.ndarray:
     """Rows (M,) of the points (N, 3) that lie no further than `within_m` from the plane that most
     do: RANSAC of Open3D, then least squares until the same points stay, whatever was drawn."""
-    import open3d as o3d
+    o3d = _open3d()
 
     if len(points_m) < 3:
         raise InputError(f"{len(points_m)} points lie on no plane in particular; 3 are needed")
     o3d.utility.random.seed(0)  # its threads still draw in any order
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points_m))
-    found = np.sort(cloud.segment_plane(within_m, ransac_n=3, num_iterations=1000)[1])
+    inliers = np.sort(cloud.segment_plane(within_m, ransac_n=3, num_iterations=1000)[1])
     for _ in range(20):
-        away_m = points_m - points_m[found].mean(axis=0)
-        normal = np.linalg.eigh(away_m[found].T @ away_m[found])[1][:, 0]
+        away_m = points_m - points_m[inliers].mean(axis=0)
+        normal = np.linalg.eigh(away_m[inliers].T @ away_m[inliers])[1][:, 0]
         again = np.flatnonzero(np.abs(away_m @ normal) <= within_m)
-        if np.array_equal(again, found):
+        if np.array_equal(again, inliers):
             break
-        found = again
-    return found
+        inliers = again
+    return inliers
 
 
 # ------------------------------------------------------------------------------------------ meshes
@@ -160,7 +187,7 @@ def read_mesh(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: no such mesh; give a PLY, OBJ or STL file.")
-    import open3d as o3d
+    o3d = _open3d()
 
     # The tensor reader would round doubles to float32; this one keeps them.
     with _quiet():
@@ -172,7 +199,7 @@ def read_mesh(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
 
 def ray_caster(vertices_m: np.ndarray, triangles: np.ndarray) -> Any:
     """A scene (Embree) that casts rays against vertices (V, 3) and triangles (F, 3), in float32."""
-    import open3d as o3d
+    o3d = _open3d()
 
     scene = o3d.t.geometry.RaycastingScene()
     scene.add_triangles(vertices_m.astype(np.float32), triangles.astype(np.uint32))
@@ -181,7 +208,7 @@ def ray_caster(vertices_m: np.ndarray, triangles: np.ndarray) -> Any:
 
 def surface_normals(points_m: np.ndarray) -> np.ndarray:
     """Unit normals (N, 3) of points (N, 3), of whichever sign: of the plane through 30 of them."""
-    import open3d as o3d
+    o3d = _open3d()
 
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points_m))
     cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(20))
@@ -199,7 +226,7 @@ def poisson_mesh(
         Vertices (V, 3), triangles (F, 3), and how dense the points are round each vertex (V,): one
         more where they are half as far apart.
     """
-    import open3d as o3d
+    o3d = _open3d()
 
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points_m))
     cloud.normals = o3d.utility.Vector3dVector(normals)
@@ -218,34 +245,10 @@ def distance_to_mesh(
     return scene.compute_distance(points_m.astype(np.float32)).numpy().astype(np.float64)
 
 
-def write_surface(surface: Surface, folder: str | Path) -> None:
-    """Write `reference/` into a recording's folder: mesh.ply, faces.parquet, labels.yaml.
-
-    Label and intensity are columns of faces.parquet where the surface has them; labels without a
-    name are called label_<n>. Without either, the mesh is all there is.
-    """
-    reference = Path(folder) / "reference"
-    reference.mkdir(parents=True, exist_ok=True)
-    xyz = dict(zip("xyz", np.asarray(surface.vertices_m, np.float64).T, strict=True))
-    corners = {"vertex_indices": np.asarray(surface.triangles, np.int32)}
-    write_ply(reference / "mesh.ply", {"vertex": xyz, "face": corners})
-    faces = {}
-    if surface.label is not None:
-        faces["label"] = surface.label.astype(np.uint16)
-        names = {int(n): surface.names.get(int(n), f"label_{n}") for n in np.unique(surface.label)}
-        (reference / "labels.yaml").write_text(
-            "".join(f"{number}: {name}\n" for number, name in names.items()), encoding="utf-8"
-        )
-    if surface.intensity is not None:
-        faces["intensity"] = surface.intensity.astype(np.float32)
-    if faces:
-        write_table(reference / "faces.parquet", faces)
-
-
 @contextmanager
 def _quiet() -> Iterator[None]:
     """Keep what libraries print of a broken file off the terminal: the error raised says it."""
-    import open3d as o3d
+    o3d = _open3d()
 
     nowhere, kept = os.open(os.devnull, os.O_WRONLY), (os.dup(1), os.dup(2))
     try:

@@ -112,8 +112,8 @@ class Planes:
         off_m = np.einsum("nki,ni->nk", self.normal[plane], points_world_m)
         off_m = np.where(plane < 0, np.inf, np.abs(off_m - self.distance_m[plane]))
         best = off_m.argmin(axis=1)[:, None]
-        found = np.take_along_axis(off_m, best, axis=1) <= self.tolerance_m
-        return np.where(found, np.take_along_axis(plane, best, axis=1), -1)[:, 0]
+        within = np.take_along_axis(off_m, best, axis=1) <= self.tolerance_m
+        return np.where(within, np.take_along_axis(plane, best, axis=1), -1)[:, 0]
 
 
 class PlaneFinder:
@@ -181,13 +181,13 @@ class PlaneFinder:
         distance_m = np.einsum("mi,mi->m", normal, mean_m)
         side = np.where(distance_m < 0, -1.0, 1.0)
         return Planes(
-            normal * side[:, None],
-            distance_m * side,
-            pooled.count[kept].astype(np.int64),
-            cells.mean_m[part],
-            number[plane][part],
-            self.cell_m,
-            self.tolerance_m,
+            normal=normal * side[:, None],
+            distance_m=distance_m * side,
+            count=pooled.count[kept].astype(np.int64),
+            cell_mean_m=cells.mean_m[part],
+            cell_plane=number[plane][part],
+            cell_m=self.cell_m,
+            tolerance_m=self.tolerance_m,
         )
 
     def _same_place(self, cells: Cells) -> np.ndarray:

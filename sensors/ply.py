@@ -48,10 +48,10 @@ def read_ply(path: str | Path) -> dict[str, Columns]:
     path = Path(path)
     order, elements, start = _read_header(path)
     data = _as_numbers(path, start) if order == "=" else _as_bytes(path, start)
-    found, offset = {}, 0
+    tables, offset = {}, 0
     for element in elements:
-        found[element.name], offset = _read_element(path, data, offset, element, order)
-    return found
+        tables[element.name], offset = _read_element(path, data, offset, element, order)
+    return tables
 
 
 def write_ply(path: str | Path, elements: Mapping[str, Mapping[str, np.ndarray]]) -> None:

@@ -7,7 +7,7 @@ import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from chains.errors import InputError
 from sensors.documents import write_atomically
 from sensors.holds import Columns, average_hold
-from sensors.stops import POSE, Array, Table, Targets, read_targets
+from sensors.stops import POSE, Array, CsvTable, Targets, read_targets
 
 if TYPE_CHECKING:
     import pandas
@@ -116,7 +116,7 @@ class Recording:
         joint_names: Sequence[str],
         bodies: Sequence[str],
         rings: int | None = None,
-    ) -> "Recording":
+    ) -> Self:
         """Read and check the stops and targets of a recording, without reading any scan.
 
         Raises InputError, one sentence with file, row and column, for what is missing, has the
@@ -127,7 +127,7 @@ class Recording:
         path = folder / "stops.csv"
         if not path.exists():
             raise InputError(f"{path} does not exist; a recording has a row for every stop there")
-        table = Table(path, key="stop", text=("location",))
+        table = CsvTable(path, key="stop", text=("location",))
         stops = table.names()
         return cls(
             folder=folder,
@@ -212,7 +212,7 @@ def write_table(path: str | Path, columns: Mapping[str, np.ndarray]) -> None:
     import pyarrow
     import pyarrow.parquet
 
-    table = pyarrow.table({name: np.ascontiguousarray(values) for name, values in columns.items()})
+    table = pyarrow.table({name: _arrow(values) for name, values in columns.items()})
     with write_atomically(path) as temporary:
         pyarrow.parquet.write_table(table, temporary, compression="zstd")
 
@@ -252,8 +252,28 @@ def _columns(path: Path, table: "pyarrow.Table | pyarrow.RecordBatch") -> Column
     for name in {"ring", "column", "scan"}.intersection(table.schema.names):
         if table[name].null_count:
             raise InputError(f"{path}: column {name} has empty cells; every return needs one")
-    arrays = {name: table[name].to_numpy(zero_copy_only=False) for name in table.schema.names}
+    arrays = {name: _numpy(table[name]) for name in table.schema.names}
     return {name: a.astype(np.str_) if a.dtype == object else a for name, a in arrays.items()}
+
+
+def _numpy(column: "pyarrow.ChunkedArray | pyarrow.Array") -> NDArray[Any]:
+    """A column as an array; numbers without gaps not by pyarrow's way, which imports pandas where
+    there is one."""
+    chunks = getattr(column, "chunks", [column])
+    if chunks and not column.null_count and _kind(column.type) in ("f", "i", "u"):
+        return np.concatenate([np.from_dlpack(chunk) for chunk in chunks])
+    return column.to_numpy(zero_copy_only=False)
+
+
+def _arrow(values: NDArray[Any]) -> "pyarrow.Array":
+    """An array as a column, the same way back."""
+    import pyarrow
+
+    values = np.ascontiguousarray(values)
+    if values.dtype.kind not in "fiu":
+        return pyarrow.array(values)
+    kind = pyarrow.from_numpy_dtype(values.dtype)
+    return pyarrow.Array.from_buffers(kind, len(values), [None, pyarrow.py_buffer(values)])
 
 
 def _batches(path: Path, file: "ParquetFile", names: Sequence[str]) -> Iterator[Columns]:
@@ -279,9 +299,9 @@ def _check_types(path: Path, file: "ParquetFile") -> list[str]:
         if name not in kinds:
             raise InputError(f"{path}: column {name} is missing; a scan has {', '.join(_KINDS)}")
         if kinds[name] == "" or kinds[name] not in kind:
-            found = file.schema_arrow.field(name).type
+            stored = file.schema_arrow.field(name).type
             should = "float32, in metres" if kind == "f" else "uint16"
-            raise InputError(f"{path}: column {name} is {found}; it should be {should}")
+            raise InputError(f"{path}: column {name} is {stored}; it should be {should}")
     return [name for name, kind in kinds.items() if kind]
 
 
@@ -311,7 +331,15 @@ def _check_scan(path: Path, columns: Columns, rings: int | None) -> Scan:
         raise InputError(f"{path}: count is below 1; leave out directions without a return")
     intensity, spread = (extra.pop(name, unknown) for name in ("intensity", "range_std_m"))
     _check_spread(path, spread[np.isfinite(spread)])
-    return Scan(xyz[seen], ring, column, intensity, count, spread, extra)
+    return Scan(
+        xyz_m=xyz[seen],
+        ring=ring,
+        column=column,
+        intensity=intensity,
+        count=count,
+        range_std_m=spread,
+        extra=extra,
+    )
 
 
 def _check_spread(path: Path, spread_m: Array) -> None:

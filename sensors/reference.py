@@ -158,13 +158,13 @@ class Reference:
             normal[missed] = 0.0
             incidence_rad[missed] = np.pi / 2
         return Hits(
-            triangle,
-            range_m,
-            point_m,
-            normal,
-            incidence_rad,
-            self._label[triangle],
-            self._intensity[triangle],
+            triangle=triangle,
+            range_m=range_m,
+            point_m=point_m,
+            normal=normal,
+            incidence_rad=incidence_rad,
+            label=self._label[triangle],
+            intensity=self._intensity[triangle],
         )
 
     def near_edge(
@@ -258,17 +258,17 @@ class Reference:
         rays = np.empty((len(directions), 6), dtype=np.float32)
         rays[:, :3] = origins_m - self._centre_m
         rays[:, 3:] = directions
-        found = self._scene.cast_rays(rays, nthreads=nthreads)["primitive_ids"].numpy()
-        return self._solid[np.minimum(found, len(self._solid) - 1)]
+        primitive = self._scene.cast_rays(rays, nthreads=nthreads)["primitive_ids"].numpy()
+        return self._solid[np.minimum(primitive, len(self._solid) - 1)]
 
     def distance_m(self, points_m: np.ndarray) -> np.ndarray:
         """Distance (N,) of points (N, 3) in the reference frame from the nearest triangle."""
         points = (points_m - self._centre_m).astype(np.float32)
-        found = self._scene.compute_closest_points(points)
-        triangle = self._solid[found["primitive_ids"].numpy()]
+        closest = self._scene.compute_closest_points(points)
+        triangle = self._solid[closest["primitive_ids"].numpy()]
         # Float32 says which triangle and where on it; the offset across its plane is a double.
         across = _dot(self._plane.take(triangle, axis=0), points_m) - self._plane[triangle, 3]
-        beside = points - found["points"].numpy()
+        beside = points - closest["points"].numpy()
         beside -= _dot(self._plane.take(triangle, axis=0), beside)[:, None] * self._normal[triangle]
         return np.hypot(across, np.linalg.norm(beside, axis=1))
 

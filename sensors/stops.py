@@ -32,7 +32,7 @@ class Targets:
     """(M, 3) lower marker of the rod."""
 
 
-class Table:
+class CsvTable:
     """A CSV table whose columns are taken one by one, each checked; `rest` gives the others."""
 
     def __init__(self, path: Path, key: str, text: Sequence[str] = ()) -> None:
@@ -150,7 +150,7 @@ def read_targets(path: Path) -> Targets | None:
     """Read targets.csv, None where there is none; InputError for fewer than 3 targets."""
     if not path.exists():
         return None
-    table = Table(path, key="target")
+    table = CsvTable(path, key="target")
     names = table.names()
     if len(names) < 3:
         raise InputError(f"{path} has {len(names)} rows; it takes 3 targets to fix a transform")

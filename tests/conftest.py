@@ -1,16 +1,37 @@
-"""What every test shares: one thread per BLAS call, real data, and the command line."""
+"""What every test shares: one thread per BLAS call, an end, real data, and the command line."""
 
 import os
+import signal
 import sys
+from collections import Counter
 from pathlib import Path
 
 import pytest
+
+from .once import Once
 
 # Before any test imports numpy: several BLAS threads on few cores are far slower than one.
 for library in ("MKL", "OMP", "OPENBLAS"):
     os.environ[f"{library}_NUM_THREADS"] = "1"
 
+# A job that a shell starts in the background ignores Ctrl-C, and so would all its children, among
+# them those that tests end by Ctrl-C. A handler is not inherited, and this one ignores it as well.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, lambda *_: None)
+
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
+LIMIT_S = {"slow": 600, "long": 3600}  # of others: see pyproject.toml
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Give tests that take longer a longer time limit, and begin with files that hold most."""
+    slow = Counter()
+    for item in items:
+        for mark, limit_s in LIMIT_S.items():
+            if item.get_closest_marker(mark):
+                item.add_marker(pytest.mark.timeout(limit_s), append=False)
+                slow[item.path] += 1
+    items.sort(key=lambda item: -slow[item.path])
 
 
 @pytest.fixture(scope="session")
@@ -19,6 +40,14 @@ def shared() -> Path:
     if not SHARED.is_dir():
         pytest.skip(f"the shared data folder is not here: {SHARED}")
     return SHARED
+
+
+@pytest.fixture(scope="session")
+def once(tmp_path_factory) -> Once:
+    """Makes a folder once for all tests and workers of this session, and gives out copies."""
+    base = tmp_path_factory.getbasetemp()
+    shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+    return Once(shared / "once", tmp_path_factory.mktemp)
 
 
 @pytest.fixture

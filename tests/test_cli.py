@@ -6,7 +6,6 @@ import pty
 import re
 import shutil
 import signal
-import subprocess
 import sys
 import threading
 from contextlib import contextmanager
@@ -17,7 +16,8 @@ import pytest
 from calib.cli import main
 from calib.cli.app import app
 
-ROOT = Path(__file__).resolve().parents[1]
+from .programs import LIMIT_S, RIGCAL, execute, started
+
 SPEC = "{lidar: hesai_pandarxt32, locations: 3, stops_per_location: 2, column_step: 200}"
 COMMANDS = sorted(c.name or c.callback.__name__ for c in app.registered_commands)
 
@@ -32,8 +32,7 @@ def made(tmp_path_factory):
         ["simulate", folder / "spec.yaml", "-o", folder / "rec", "--seed", 1],
         ["fit", folder / "rec", "-o", folder / "run", "--hold-out", "none"],
     ):
-        started = program(command, *arguments, "--json")
-        done = subprocess.run(started, cwd=ROOT, capture_output=True, text=True)
+        done = execute([*RIGCAL, command, *arguments, "--json"])
         assert (done.returncode, done.stderr) == (0, "")
         printed[command] = done.stdout
     return folder, printed
@@ -45,19 +44,10 @@ def folder(made):
     return made[0]
 
 
-def program(*arguments):
-    """What starts a command in a process of its own."""
-    return [sys.executable, "-c", "from calib.cli import main; main()", *map(str, arguments)]
-
-
 @contextmanager
 def at_a_terminal(*arguments):
     """A process whose stderr is a terminal, and a list that fills with what it shows there."""
     terminal, stderr = pty.openpty()
-    process = subprocess.Popen(
-        program(*arguments), cwd=ROOT, stdout=subprocess.PIPE, stderr=stderr, text=True
-    )
-    os.close(stderr)
     shown = []
 
     def read():
@@ -67,16 +57,13 @@ def at_a_terminal(*arguments):
         except OSError:  # the process has closed its side
             pass
 
-    reader = threading.Thread(target=read)
-    reader.start()
-    try:
+    reader = threading.Thread(target=read, daemon=True)
+    with started([*RIGCAL, *arguments], stderr=stderr) as process:
+        os.close(stderr)
+        reader.start()
         yield process, shown
-    finally:
-        process.kill()
-        process.wait()
-        process.stdout.close()
-        reader.join()
-        os.close(terminal)
+    reader.join(LIMIT_S)
+    os.close(terminal)
 
 
 def contents(folder):
@@ -262,7 +249,7 @@ def test_without_json_people_are_told_on_stdout(rigcal, folder, monkeypatch, com
 def test_progress_is_shown_at_a_terminal_and_never_on_stdout(folder):
     with at_a_terminal("check", folder / "rec", "--json") as (process, shown):
         out = process.stdout.read()
-        assert process.wait() == 0
+        assert process.wait(LIMIT_S) == 0
     assert "━" in "".join(shown), "a bar"
     assert json.loads(out)["problems"] == []
 

@@ -3,12 +3,11 @@
 import ast
 import json
 import re
-import sys
 
 import numpy as np
 import pytest
 
-from .programs import ROOT, execute
+from .programs import ROOT, script
 
 EXAMPLES = sorted((ROOT / "examples").glob("[0-9]*.py"))
 LONGEST = 60
@@ -25,7 +24,7 @@ def test_an_example_is_a_screen_long_and_says_what_it_is(path):
 def example(number, folder, *more):
     """What an example prints."""
     (path,) = (ROOT / "examples").glob(f"{number:02}_*.py")
-    return execute([sys.executable, str(path), str(folder), *map(str, more)], folder)
+    return script(path, [folder, *more], folder)
 
 
 @pytest.mark.slow
@@ -113,8 +112,7 @@ def test_imported_files_give_the_same_fit(tmp_path):
 
 @pytest.mark.slow
 def test_the_study_in_short_ranks_the_methods(tmp_path):
-    program = [sys.executable, str(ROOT / "examples/paper_study.py"), str(tmp_path), "--quick"]
-    said = execute(program, tmp_path)
+    said = script(ROOT / "examples/paper_study.py", [tmp_path, "--quick"], tmp_path)
     errors = re.findall(r"^Ouster6 .* held out +(\S+) mm", said, flags=re.M)
     errors = np.array(errors, float)  # paper, the study's sequence, joint graph, and with effects
     assert len(errors) == 4 and errors[2:].max() < 0.5 * errors[:2].min()

@@ -3,18 +3,16 @@
 import re
 import shlex
 import signal
-import subprocess
-import sys
 from glob import glob
-from pathlib import Path
+from importlib import import_module
 
 import pytest
 
 from calib.effects import load_effects
 from calib.rig import load_rig
-from calib.simulate import load_spec, simulate
+from calib.simulation import load_spec, simulate
 
-from .programs import ROOT, execute
+from .programs import ROOT, rigcal, script, started
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 
@@ -36,10 +34,7 @@ def commands():
 
 def look(command, folder):
     """Open the workbench, and leave it by Ctrl-C once it has said where it is."""
-    program = Path(sys.executable).parent / command[0]
-    with subprocess.Popen(
-        [program, *command[1:], "--no-open"], cwd=folder, stdout=subprocess.PIPE, text=True
-    ) as process:
+    with started([*command, "--no-open"], folder) as process:
         said = process.stdout.readline()
         process.send_signal(signal.SIGINT)
         assert process.wait(60) == 0
@@ -52,7 +47,9 @@ def loop(tmp_path_factory):
     """A folder in which README's commands have been run in order, and what they said."""
     folder = tmp_path_factory.mktemp("readme")
     own = [words for words in commands() if words[0] != "make" and words[1] != "import"]
-    said = [(look if words[1] == "view" else execute)(words, folder) for words in own]
+    said = [
+        look(words, folder) if words[1] == "view" else rigcal(words[1:], folder) for words in own
+    ]
     return folder, "\n".join(said)
 
 
@@ -61,7 +58,7 @@ def test_every_command_line_is_one_of_two_programs():
 
 
 def test_make_targets_exist():
-    targets = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), flags=re.M))
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), flags=re.M))
     assert {words[1] for words in commands() if words[0] == "make"} <= targets
 
 
@@ -98,20 +95,18 @@ def shape(text):
 
 
 @pytest.mark.slow
-def test_the_import_in_readme_makes_a_recording(tmp_path):
+def test_the_import_in_readme_makes_a_recording(tmp_path, monkeypatch):
     """Of files that example 8 writes for this; the shell would expand the stars."""
     simulate(
         load_spec("tiny").model_copy(update={"sweeps": 1, "occluded_share": 0.0}),
         tmp_path / "rec",
         1,
     )
-    program = "import sys; from pathlib import Path; from foreign_files import write_files\n"
-    program += "write_files(Path(sys.argv[1]), Path(sys.argv[2]))"
-    here = {"PYTHONPATH": str(ROOT / "examples")}
-    execute([sys.executable, "-c", program, str(tmp_path / "rec"), str(tmp_path)], ROOT, here)
+    monkeypatch.syspath_prepend(str(ROOT / "examples"))
+    import_module("foreign_files").write_files(tmp_path / "rec", tmp_path)
     (words,) = [words for words in commands() if words[:2] == ["rigcal", "import"]]
     expanded = [sorted(glob(w, root_dir=tmp_path)) if "*" in w else [w] for w in words]
-    said = execute([word for part in expanded for word in part], tmp_path)
+    said = rigcal([word for part in expanded for word in part][1:], tmp_path)
     assert "what was understood" in said
     stops = (tmp_path / "mine" / "stops.csv").read_text().splitlines()
     assert len(stops) == len((tmp_path / "rec" / "stops.csv").read_text().splitlines())
@@ -156,7 +151,8 @@ def test_the_effect_in_readme_is_one(loop):
 @pytest.mark.slow
 def test_python_in_readme_runs(tmp_path):
     (program,) = blocks("python")
-    said = execute([sys.executable, "-c", program], tmp_path)
+    (tmp_path / "program.py").write_text(program)
+    said = script(tmp_path / "program.py", [], tmp_path)
     assert "incidence_angle_bias is missing" in said
     assert (tmp_path / "extrinsics" / "extrinsics.yaml").is_file()
 

@@ -10,7 +10,8 @@ from typing import NoReturn
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
-from calib.cli import bring, files, look, study  # noqa: E402, F401 - their commands register themselves
+# Each of these registers its commands.
+from calib.cli import calibrating, exporting, importing, reporting  # noqa: E402, F401
 from calib.cli.app import app  # noqa: E402
 from chains.errors import InputError  # noqa: E402
 

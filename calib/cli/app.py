@@ -73,6 +73,15 @@ def effect_names(incomplete: str) -> list[str]:
 Json = Annotated[bool, typer.Option("--json", help="Print the machine-readable result alone.")]
 Out = Annotated[Path, typer.Option("-o", "--out", help="Where to write.")]
 Runs = Annotated[list[Path], typer.Argument(metavar="RUN...", help="Run folders.")]
+Workers = Annotated[
+    int | None,
+    typer.Option(
+        min=1,
+        metavar="N",
+        help="Threads over stops, all cores if not given; the result is the same.",
+        show_default=False,
+    ),
+]
 
 
 def say(document: dict[str, Any], text: str, as_json: bool) -> None:

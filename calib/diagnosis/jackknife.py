@@ -27,12 +27,13 @@ class Shares:
 
     def add(self, rows: ClusteredRows) -> None:
         """Add rows along the candidate's directions, projected off the model and whitened."""
-        pairs, cell = np.unique([rows.stop, rows.place], axis=1, return_inverse=True)
-        order = np.argsort(cell, kind="stable")
-        bounds = np.searchsorted(cell[order], np.arange(pairs.shape[1] + 1))
-        for pair, i, k in zip(pairs.T.tolist(), bounds, bounds[1:], strict=False):
-            mine, right = rows.A[order[i:k]], rows.b[order[i:k]]
-            self._sum(self.cells, tuple(pair), mine.T @ right, mine.T @ mine)
+        order = np.lexsort([rows.place, rows.stop])
+        stop, place = rows.stop[order], rows.place[order]
+        bounds = np.flatnonzero((np.diff(stop) != 0) | (np.diff(place) != 0)) + 1
+        for some in np.split(order, bounds):
+            mine, right = rows.A[some], rows.b[some]
+            cell = int(rows.stop[some[0]]), int(rows.place[some[0]])
+            self._sum(self.cells, cell, mine.T @ right, mine.T @ mine)
 
     @staticmethod
     def _sum(to: dict, key: object, score: np.ndarray, information: np.ndarray) -> None:

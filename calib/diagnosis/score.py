@@ -228,4 +228,11 @@ def test(scores: Scores, columns: np.ndarray) -> Test:
     two_way = one_way[0] + one_way[1] - both.T @ both
     covariance = max(two_way, *one_way, key=np.trace)
     clusters = int((np.abs(stop).max(axis=1, initial=0.0) > 0).sum())
-    return Test(columns, statistic, whiten, covariance, clusters, score)
+    return Test(
+        columns=columns,
+        statistic=statistic,
+        whiten=whiten,
+        covariance=covariance,
+        clusters=clusters,
+        score=score,
+    )

@@ -96,12 +96,12 @@ def screen(
     together = looked(np.min(least, axis=0)) if least else 1.0
     candidates = [
         Candidate(
-            effect,
-            tests[effect.name],
-            float(p),
-            float(_adjust(p, together)),
-            tests[effect.name].evidence(common),
-            looks * together,
+            effect=effect,
+            test=tests[effect.name],
+            p_value=float(p),
+            p_adjusted=float(_adjust(p, together)),
+            evidence=tests[effect.name].evidence(common),
+            looks=looks * together,
         )
         for effect, p, looks in found
     ]

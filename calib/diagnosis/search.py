@@ -20,7 +20,7 @@ from calib.solve.fit import Progress
 
 ALPHA = 0.04  # chance that a named effect is found where nothing is missing
 ALPHA_UNNAMED = 0.01  # and that structure is
-MOST = 3  # an explanation that needs more names than this is none
+MOST_NAMES = 3  # an explanation that needs more names than this is none
 INSTEAD = 0.5  # of the leading structure's evidence, for another covariate to be named too
 FEWEST = 4  # stops, below which nothing is claimed
 TRIES = 3  # how many suspects are judged before a look is called quiet
@@ -29,7 +29,7 @@ ODDS = np.log(20.0)  # of a rival: within these it can stand in for the best
 
 
 @dataclass(frozen=True)
-class Found:
+class NamedEffect:
     """An effect that the data confirm.
 
     Args:
@@ -51,7 +51,7 @@ class Found:
     def effect(self) -> Effect:
         return self.candidate.effect
 
-    def with_effect(self, effect: Effect | None) -> Found:
+    def with_effect(self, effect: Effect | None) -> NamedEffect:
         """With another shape of its effect, if there is one."""
         if effect is None:
             return self
@@ -72,7 +72,7 @@ class Search:
     """
 
     looks: Sequence[Look]
-    found: Sequence[Found]
+    found: Sequence[NamedEffect]
     unnamed: Sequence[Candidate]
     scatter: Candidate | None
     at_first: Sequence[Candidate] = ()
@@ -84,7 +84,7 @@ class Search:
         return step.candidate.test.evidence(common) < max(bins, default=0.0) - ODDS
 
 
-def search(stand: Stand, progress: Progress, most: int = MOST) -> Search:
+def search(stand: Stand, progress: Progress, most: int = MOST_NAMES) -> Search:
     """Name what is missing, one effect after another, then ask whether that is all.
 
     Args:
@@ -110,7 +110,7 @@ def search(stand: Stand, progress: Progress, most: int = MOST) -> Search:
     return done
 
 
-def _named(look: Look, progress: Progress) -> Found | None:
+def _named(look: Look, progress: Progress) -> NamedEffect | None:
     """The best candidate that is confirmed, fitted."""
     for candidate in suspects(look.named, ALPHA):
         test, p = judged(look, candidate, progress)
@@ -118,7 +118,14 @@ def _named(look: Look, progress: Progress) -> Found | None:
             effect = look.stand.finest(candidate.effect, progress)
             after = look.stand.with_effects([effect], progress).look(progress)
             others = rivals(look.named, candidate, max(after.named.common, test.inflation))
-            return Found(replace(candidate, effect=effect), look, after, test, p, others)
+            return NamedEffect(
+                candidate=replace(candidate, effect=effect),
+                before=look,
+                after=after,
+                judged=test,
+                p_adjusted=p,
+                rivals=others,
+            )
     return None
 
 

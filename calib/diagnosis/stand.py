@@ -27,7 +27,7 @@ from calib.solve.fit import DOFS, SEEN, Estimate, Progress, Start, solve
 from sensors.recording import Recording
 
 FINER = 9  # shapes tried between the two beside the best one
-WORTH = 9.0  # squared sigmas by which another shape must fit better
+BETTER_SHAPE = 9.0  # squared sigmas by which another shape must fit better
 LARGEST = 0.4  # change of a shape's logarithm at once
 SAMPLED = 8  # scans from which the bins of covariates are taken
 
@@ -65,7 +65,9 @@ class Stand:
         named = screen(scores, [e for e in known if e.site is not Site.NOISE], at)
         rest = screen(scores, unnamed, at, named.common if named.candidates else None)
         noise = screen(scores, [e for e in known if e.site is Site.NOISE], at, 1.0)
-        return Look(self, linear, named, rest, noise, columns)
+        return Look(
+            stand=self, linear=linear, named=named, unnamed=rest, noise=noise, columns=columns
+        )
 
     def linearise(
         self, candidates: Sequence[Effect], progress: Progress
@@ -112,7 +114,7 @@ class Stand:
         swapped = {}
         for effect, step in zip(shaped, steps, strict=True):
             found = test(scores, at[step.name])
-            if found.dof and found.statistic > WORTH:
+            if found.dof and found.statistic > BETTER_SHAPE:
                 by = np.exp(np.clip(found.estimate()[0], -LARGEST, LARGEST))
                 swapped[effect.name] = effect.at(float(f"{effect.shape * by:.6g}"))
         if not swapped:

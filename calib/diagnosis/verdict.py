@@ -12,7 +12,7 @@ from calib.diagnosis.candidates import lacking
 from calib.diagnosis.curves import Curve, curves
 from calib.diagnosis.score import log_tail
 from calib.diagnosis.screen import Candidate, Screen
-from calib.diagnosis.search import ALPHA, FEWEST, ODDS, Found, Search, angle_deg
+from calib.diagnosis.search import ALPHA, FEWEST, ODDS, NamedEffect, Search, angle_deg
 from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import formula, hangs_on, what_separates, words
 from calib.effects import CATALOGUE, Site
@@ -25,7 +25,7 @@ VERDICTS = {
     UNNAMED: "structure that no effect explains",
 }
 ABSORBED = 0.7  # share of the structure that named effects must explain to be the answer
-TOLD = 6  # untestable effects and rivals that a sentence names
+LISTED = 6  # untestable effects and rivals that a sentence names
 
 
 @dataclass(frozen=True)
@@ -64,12 +64,6 @@ class Diagnosis:
         """Names of the effects that were confirmed, in the order in which to add them; not those
         that something without a name is dressed up in."""
         return worth_adding(self.candidates)
-
-    def _repr_html_(self) -> str:
-        """As a notebook shows it."""
-        from calib.show.notebook import diagnosis_html
-
-        return diagnosis_html(self)
 
     def document(self) -> dict[str, Any]:
         """As written to diagnosis.json."""
@@ -113,15 +107,15 @@ def conclude(
     unexplained = [_unexplained(c, screen) for screen, c in _without_a_name(found, verdict)]
     untestable = _untestable(first)
     return Diagnosis(
-        verdict,
-        _sentences(verdict, found, candidates, unexplained, untestable),
-        candidates,
-        unexplained,
-        weak,
-        untestable,
-        misfit,
-        curves(first.unnamed),
-        _stops(first) < FEWEST,
+        verdict=verdict,
+        sentences=_sentences(verdict, found, candidates, unexplained, untestable),
+        candidates=candidates,
+        unexplained=unexplained,
+        weak_directions=weak,
+        untestable=untestable,
+        misfit=misfit,
+        curves=curves(first.unnamed),
+        too_few=_stops(first) < FEWEST,
     )
 
 
@@ -236,7 +230,7 @@ def _explained(before: float | None, after: float | None, floor: float | None) -
     return (before**2 - after**2) / max(before**2 - floor**2, before**2 - after**2, 1e-12)
 
 
-def _rivals(step: Found) -> list[dict[str, Any]]:
+def _rivals(step: NamedEffect) -> list[dict[str, Any]]:
     screen = step.before.named
     scale = max(step.after.named.common, step.judged.inflation)
     own = step.candidate.test.evidence(scale)
@@ -319,12 +313,12 @@ def _sentences(
         )
     gone = [name for name, why in untestable.items() if why.startswith("the recordings")]
     if gone:
-        more = f" and {len(gone) - TOLD} more" if len(gone) > TOLD else ""
-        out.append(f"Could not be tested on these recordings: {', '.join(gone[:TOLD])}{more}.")
+        more = f" and {len(gone) - LISTED} more" if len(gone) > LISTED else ""
+        out.append(f"Could not be tested on these recordings: {', '.join(gone[:LISTED])}{more}.")
     return out
 
 
-def _step_sentences(step: Found, candidate: Mapping[str, Any]) -> list[str]:
+def _step_sentences(step: NamedEffect, candidate: Mapping[str, Any]) -> list[str]:
     if candidate["dressed_up"]:
         return [
             f"{step.effect.name} takes on a part of it, as a name will; bins without any name "
@@ -338,7 +332,7 @@ def _step_sentences(step: Found, candidate: Mapping[str, Any]) -> list[str]:
         f"model cannot take on (p = {max(step.p_adjusted, 1e-99):.1g} after all that was looked "
         f"at){fall}."
     ]
-    for rival in candidate["rivals"][:TOLD]:
+    for rival in candidate["rivals"][:LISTED]:
         out.append(
             f"This data cannot tell it from {rival['effect']} (odds {rival['odds']:.1f} to 1); "
             f"{rival['separate']} would."

@@ -10,12 +10,13 @@ from calib.diagnosis.score import projection
 from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import what_separates
 from calib.effects import Effect
+from calib.solve.observability import UNTOLD, echelon
 from calib.solve.solution import Solution
 
 LEANS = 0.5  # of the prior's variance left in a direction that the data hardly determine
-SHARE = 0.35  # of a direction, for a parameter to be named
+SHARE = 0.2  # of a direction of unit length, in priors' sigmas, for a parameter to be named
 STANDS_IN = 0.97  # of what a candidate does, that an effect of the model can take on
-MOST = 8
+MOST_DIRECTIONS = 8
 
 
 def weak_directions(solution: Solution, widened: float, look: Look) -> list[dict[str, Any]]:
@@ -46,9 +47,14 @@ def leaning(solution: Solution, widened: float, look: Look) -> list[dict[str, An
         / max(1.0, widened) ** 2
     )
     values, axes = np.linalg.eigh(scaled)
+    untold = values > UNTOLD
+    gauges, _ = echelon(axes[:, untold], np.ones(len(known)))
+    gauges = gauges / np.linalg.norm(gauges, axis=0)
+    weak = [*((1.0, axis) for axis in gauges.T)]
+    weak += sorted(zip(values[~untold], axes.T[~untold], strict=True), key=lambda pair: -pair[0])
     out = []
-    for value, axis in zip(values[::-1], axes.T[::-1], strict=True):
-        if value < LEANS or len(out) == MOST:
+    for value, axis in weak[:MOST_DIRECTIONS]:
+        if value < LEANS:
             break
         named = [int(i) for i in np.argsort(-np.abs(axis)) if abs(axis[i]) > SHARE]
         if named:

@@ -30,6 +30,7 @@ from calib.effects.beams import (
     SpinAxisWobble,
 )
 from calib.effects.noise import NoiseIncidence, NoiseIntensity, NoiseRange
+from calib.effects.own.files import from_document, from_file, is_file
 from calib.effects.range import (
     AzimuthRangeHarmonic,
     IncidenceAngleBias,
@@ -49,7 +50,6 @@ from calib.effects.reference import FaroScale, MovedSurface
 from calib.effects.rig import BaseFlex, FrameOffset, MountBending, MountCreep, MountSlip
 from calib.effects.targets import TargetRodTilt, TargetSphereOffset
 from calib.effects.tracker import OptitrackDistortion, OptitrackScale
-from calib.effects.user import from_document, from_file, is_file
 from chains.errors import InputError
 
 CATALOGUE: tuple[Effect, ...] = (

@@ -26,17 +26,19 @@ from calib.intake.gather import (
     sources,
 )  # fmt: skip
 from calib.intake.still import MIN_HOLD_S, find_holds
+from calib.intake.surface import write_surface
 from calib.rig import load_rig
 from calib.solve.check import Check, check
 from chains.errors import InputError
 from sensors.documents import replace_folder, write_atomically
-from sensors.meshes import write_surface
 from sensors.readers.base import Columns, Options, Progress
 from sensors.stops import write_columns
 
 __all__ = ["Choices", "Imported", "import_files", "sources"]
 
-FEW = 500  # stops; with more, what can be estimated is left to `rigcal check`, for its time
+MOST_CHECKED = (
+    500  # stops; with more, what can be estimated is left to `rigcal check`, for its time
+)
 
 
 @dataclass(frozen=True)
@@ -111,18 +113,18 @@ def import_files(
     options, choices, out = options or Options(), choices or Choices(), Path(out)
     if choices.rig is not None and not choices.rig.is_file():
         raise InputError(f"--rig {choices.rig}: there is no such file")
-    found = gather(given, options, choices.rig, progress)
-    refuse_parts(found, choices.rig)
-    cut = _from_rows(found) if found.stops is not None else _from_logs(found, choices)
-    understood, odd = [*found.understood, *cut.understood], [*found.odd, *cut.odd]
+    gathered = gather(given, options, choices.rig, progress)
+    refuse_parts(gathered, choices.rig)
+    cut = _from_rows(gathered) if gathered.stops is not None else _from_logs(gathered, choices)
+    understood, odd = [*gathered.understood, *cut.understood], [*gathered.odd, *cut.odd]
     columns, share = _thinned(cut, choices.most_stops)
     with replace_folder(out, "rig.yaml", "recording") as folder, _called(folder, out):
-        odd += _write_parts(folder, found, choices.rig)
+        odd += _write_parts(folder, gathered, choices.rig)
         if choices.rig is not None:
             columns, said, more = rigfile.matched(choices.rig, columns)
         else:
             name = re.sub(r"[/\\]", "-", out.name) or "rig"
-            columns, said, more = rigfile.first_rig(folder, name, found, columns, options.lidar)
+            columns, said, more = rigfile.first_rig(folder, name, gathered, columns, options.lidar)
         rig = load_rig(folder)
         base = next((b for b in (rig.tracker.bodies if rig.tracker else ())
                      if b not in rig.beyond_arm), None)  # fmt: skip
@@ -132,11 +134,11 @@ def import_files(
         write_columns(folder / "stops.csv", _ordered(columns))
         if share:
             scans.write(folder / "scans", columns["stop"].tolist(), share, progress)
-        rods, more = targets.join(found.spheres, found.tracks)
+        rods, more = targets.join(gathered.spheres, gathered.tracks)
         odd += more
         if rods is not None:
             write_columns(folder / "targets.csv", rods)
-        checked = check(folder, progress, graph=len(columns["stop"]) <= FEW)
+        checked = check(folder, progress, graph=len(columns["stop"]) <= MOST_CHECKED)
         if checked.problems:
             raise InputError(checked.problems[0])
     return Imported(out, understood, odd, checked)
@@ -151,58 +153,60 @@ def _called(folder: Path, name: Path) -> Iterator[None]:
         raise InputError(str(error).replace(str(folder), str(name))) from None
 
 
-def _from_rows(found: Gathered) -> _Cut:
+def _from_rows(gathered: Gathered) -> _Cut:
     """Stops that a table lists, and clouds that are named after them."""
-    columns = dict(found.stops)
+    columns = dict(gathered.stops)
     count = len(next(iter(columns.values())))
     columns.setdefault("stop", np.array([f"row{k:05d}" for k in range(count)]))
     columns.setdefault("time_s", np.arange(count, dtype=float))
-    missing = [name for name in found.joints if name not in columns]
+    missing = [name for name in gathered.joints if name not in columns]
     if missing:
         raise InputError(
             f"the table of stops has no column of the arm's joint {missing[0]}; say --column "
             f"{missing[0]}=THEIRS"
         )
-    share, odd = scans.by_name(found.sweeps, columns["stop"].tolist()) if found.sweeps else ([], [])
-    if found.tracks:
-        names = ", ".join(dict.fromkeys(track.name for track in found.tracks))
+    share, odd = (
+        scans.by_name(gathered.sweeps, columns["stop"].tolist()) if gathered.sweeps else ([], [])
+    )
+    if gathered.tracks:
+        names = ", ".join(dict.fromkeys(track.name for track in gathered.tracks))
         odd = [*odd, f"the logs {names} are left out: a table lists the stops already"]
     return _Cut(columns, share, [], odd)
 
 
-def _from_logs(found: Gathered, choices: Choices) -> _Cut:
+def _from_logs(gathered: Gathered, choices: Choices) -> _Cut:
     """Holds found in logs; or, where nothing was logged, what the LiDAR saw as one stop or more."""
-    tracks = [t for t in joint_track(found.tracks, found.joints) if not targets.is_rod(t)] \
-        if found.tracks or found.joints else []  # fmt: skip
+    tracks = [t for t in joint_track(gathered.tracks, gathered.joints) if not targets.is_rod(t)] \
+        if gathered.tracks or gathered.joints else []  # fmt: skip
     once_each(tracks)
-    timed = bool(found.sweeps) and finite_times(found.sweeps)
+    timed = bool(gathered.sweeps) and finite_times(gathered.sweeps)
     if not tracks:
-        return _still(found, timed)
-    clocks = align(tracks, found.sweeps if timed else [], found.edges, choices.clock_offsets)
-    holds = find_holds(clocks.tracks, found.edges, choices.still, choices.min_hold_s)
+        return _still(gathered, timed)
+    clocks = align(tracks, gathered.sweeps if timed else [], gathered.edges, choices.clock_offsets)
+    holds = find_holds(clocks.tracks, gathered.edges, choices.still, choices.min_hold_s)
     columns, odd = stops.table(clocks.tracks, holds.spans_s)
     share: scans.Share = []
     if timed:
         share, more = scans.by_time(clocks.sweeps, holds.spans_s)
         odd += more
-    elif found.sweeps:
-        share, more = scans.by_name(found.sweeps, columns["stop"].tolist())
+    elif gathered.sweeps:
+        share, more = scans.by_name(gathered.sweeps, columns["stop"].tolist())
         odd += more
     return _Cut(columns, share, [*clocks.understood, *holds.understood], [*clocks.odd, *odd])
 
 
-def _still(found: Gathered, timed: bool) -> _Cut:
+def _still(gathered: Gathered, timed: bool) -> _Cut:
     """Nothing but a LiDAR: one stop of all its turns, or one for every file without a clock."""
-    if not found.sweeps:
+    if not gathered.sweeps:
         raise InputError("the logs say neither where something was nor what the LiDAR saw")
-    scans.one_lidar(found.sweeps)
-    names = ["still"] if timed else [one.name for one in found.sweeps]
+    scans.one_lidar(gathered.sweeps)
+    names = ["still"] if timed else [one.name for one in gathered.sweeps]
     if len(set(names)) < len(names):
         raise InputError(f"two clouds are named {max(names, key=names.count)}; rename one")
     share = [
-        (one, np.full(len(one.time_s), 0 if timed else k)) for k, one in enumerate(found.sweeps)
+        (one, np.full(len(one.time_s), 0 if timed else k)) for k, one in enumerate(gathered.sweeps)
     ]
-    start_s = float(found.sweeps[0].time_s[0]) if timed else 0.0
+    start_s = float(gathered.sweeps[0].time_s[0]) if timed else 0.0
     columns = {"stop": np.array(names), "time_s": start_s + np.arange(len(names), dtype=float)}
     what = "all turns of the LiDAR are one stop" if timed else "every cloud is a stop"
     return _Cut(columns, share, [], [f"nothing says when the rig stood still: {what}"])
@@ -222,7 +226,7 @@ def _thinned(cut: _Cut, most: int | None) -> tuple[Columns, scans.Share]:
     return {name: values[kept] for name, values in cut.columns.items()}, share
 
 
-def _write_parts(folder: Path, found: Gathered, rig: Path | None) -> list[str]:
+def _write_parts(folder: Path, gathered: Gathered, rig: Path | None) -> list[str]:
     """Arm and reference under the names that the rig has for them, and the rig itself where given;
     what looked odd."""
     name, odd = "arm.urdf", []
@@ -233,13 +237,13 @@ def _write_parts(folder: Path, found: Gathered, rig: Path | None) -> list[str]:
             if (rig.parent / file).is_file():
                 (folder / file).parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(rig.parent / file, folder / file)
-    if found.arm:
+    if gathered.arm:
         with write_atomically(folder / name) as path:
-            path.write_text(found.arm.urdf, encoding="utf-8")
-    if found.surface:
-        write_surface(found.surface, folder)
+            path.write_text(gathered.arm.urdf, encoding="utf-8")
+    if gathered.surface:
+        write_surface(gathered.surface, folder)
         faces = section(rig, "reference").get("faces") if rig else None
-        if found.surface.label is None and faces and (folder / str(faces)).is_file():
+        if gathered.surface.label is None and faces and (folder / str(faces)).is_file():
             odd.append(
                 f"the mesh has no labels; taken from {rig.parent / str(faces)}, beside the rig"
             )

@@ -113,8 +113,8 @@ def _offset(
 ) -> float:  # fmt: skip
     """What is added to a clock, from motion where there is some, else from nothing but overlap."""
     pairs = [(c, a, b) for a in mine for c, b in others if {a.kind, b.kind} <= _alike(a.kind)]
-    found = [(estimate(a, replace(b, time_s=b.time_s + known[c])), c, a, b) for c, a, b in pairs]
-    told = [entry for entry in found if entry[0] is not None]
+    offsets = [(estimate(a, replace(b, time_s=b.time_s + known[c])), c, a, b) for c, a, b in pairs]
+    told = [entry for entry in offsets if entry[0] is not None]
     if not told:
         return _by_overlap(clock, spans, known, main, out)
     best, _, a, b = max(told, key=lambda entry: entry[0].likeness)
@@ -256,7 +256,7 @@ def _scatter(a: Array, b: Array, lag: int, step_s: float) -> tuple[float, float]
     start, end = max(0, -lag), min(len(a), len(b) - lag)
     reach = max(2, round(0.25 / step_s))
     edges = np.linspace(start, end, PARTS + 1).astype(int)
-    found = []
+    shifts_s = []
     for low, high in itertools.pairwise(edges):
         low, high = max(low, reach - lag, 0), min(high, len(b) - lag - reach)
         if (high - low) * step_s < LEAST_S / 2:
@@ -267,13 +267,13 @@ def _scatter(a: Array, b: Array, lag: int, step_s: float) -> tuple[float, float]
         )
         if np.isfinite(like).all() and like.max() > LEAST_LIKE:
             k = int(like.argmax())
-            found.append((shifts[k] + _vertex(like, k)) * step_s)
-    if len(found) < 3:
+            shifts_s.append((shifts[k] + _vertex(like, k)) * step_s)
+    if len(shifts_s) < 3:
         return step_s, 0.0
-    found = np.array(found)
-    spread = 1.4826 * np.median(np.abs(found - np.median(found)))
+    shifts_s = np.array(shifts_s)
+    spread = 1.4826 * np.median(np.abs(shifts_s - np.median(shifts_s)))
     least = step_s / 20  # no more is believed of a parabola
-    return max(float(spread / np.sqrt(len(found))), least), _drift(found)
+    return max(float(spread / np.sqrt(len(shifts_s))), least), _drift(shifts_s)
 
 
 def _drift(offset_s: Array) -> float:

@@ -16,18 +16,18 @@ from chains.frames import Edge
 from sensors.documents import nearest, read_text, read_yaml
 from sensors.lidar import catalog
 from sensors.readers import READERS
+from sensors.readers.arms.urdf import with_ends
 from sensors.readers.base import (
     Arm,
     Columns,
-    Found,
+    Contents,
     Options,
     Progress,
+    ScannedSurface,
     Spheres,
-    Surface,
     Sweeps,
     Track,
 )  # fmt: skip
-from sensors.readers.urdf import with_ends
 
 ARMS = ("urdf", "dh")  # read before all others, which look for the arm's joints
 TOLD_BY_FILE = ("bag", "hesai", "mesh", "ouster")  # which read --metadata
@@ -40,7 +40,7 @@ Given = tuple[str, Sequence[Path]]
 
 @dataclass(frozen=True)
 class Gathered:
-    """What all sources hold; the fields are those of `Found`, `edges` the arm's chain."""
+    """What all sources hold; the fields are those of `Contents`, `edges` the arm's chain."""
 
     tracks: list[Track]
     sweeps: list[Sweeps]
@@ -48,7 +48,7 @@ class Gathered:
     lidar: Mapping[str, Any] | None
     arm: Arm | None
     edges: list[Edge]
-    surface: Surface | None
+    surface: ScannedSurface | None
     spheres: Spheres | None
     understood: list[str]
     odd: list[str]
@@ -66,8 +66,8 @@ def sources(words: Sequence[str]) -> list[Given]:
         InputError: the first word is no kind, a kind has no files, or a file does not exist.
     """
     if not words or words[0] not in READERS:
-        found = f"'{words[0]}' is no kind of file" if words else "no kind of file is given"
-        raise InputError(f"{found}{nearest(words[0] if words else '', READERS)}")
+        fault = f"'{words[0]}' is no kind of file" if words else "no kind of file is given"
+        raise InputError(f"{fault}{nearest(words[0] if words else '', READERS)}")
     given: list[tuple[str, list[Path]]] = []
     for word in words:
         if word in READERS and not (given and Path(word).is_file()):
@@ -108,7 +108,7 @@ def gather(
         )
     if rig:
         options = _told_by_rig(rig, options)
-    arms = [Found(arm=_arm_beside(rig))] if rig else []
+    arms = [Contents(arm=_arm_beside(rig))] if rig else []
     arms += [_read(kind, files, options, progress) for kind, files in given if kind in ARMS]
     arm = _only([f.arm for f in arms if f.arm], "describe an arm", [k for k, _ in given])
     edges = chain(arm)
@@ -119,23 +119,23 @@ def gather(
         arm = _only([f.arm for f in rest if f.arm], "describe an arm", [k for k, _ in given])
         arm = with_ends("the description of the arm", arm, options) if arm else None
         edges = chain(arm)
-    found = [*arms, *rest]
+    contents = [*arms, *rest]
     names = [kind for kind, _ in given]
     return Gathered(
-        tracks=[_renamed(t, options.bodies) for f in found for t in f.tracks],
-        sweeps=[s for f in found for s in f.sweeps],
-        stops=_one_table([f.stops for f in found if f.stops is not None], options.bodies),
-        lidar=_one_lidar([f.lidar for f in found if f.lidar is not None]),
+        tracks=[_renamed(t, options.bodies) for f in contents for t in f.tracks],
+        sweeps=[s for f in contents for s in f.sweeps],
+        stops=_one_table([f.stops for f in contents if f.stops is not None], options.bodies),
+        lidar=_one_lidar([f.lidar for f in contents if f.lidar is not None]),
         arm=arm,
         edges=edges,
-        surface=_only([f.surface for f in found if f.surface], "hold a surface", names),
-        spheres=_only([f.spheres for f in found if f.spheres], "hold spheres", names),
-        understood=[line for f in found for line in f.understood],
-        odd=[line for f in found for line in f.odd],
+        surface=_only([f.surface for f in contents if f.surface], "hold a surface", names),
+        spheres=_only([f.spheres for f in contents if f.spheres], "hold spheres", names),
+        understood=[line for f in contents for line in f.understood],
+        odd=[line for f in contents for line in f.odd],
     )
 
 
-def _read(kind: str, files: Sequence[Path], options: Options, progress: Progress) -> Found:
+def _read(kind: str, files: Sequence[Path], options: Options, progress: Progress) -> Contents:
     return READERS[kind].read(files, options, progress)
 
 
@@ -155,8 +155,8 @@ def chain(arm: Arm | None) -> list[Edge]:
 def section(rig: Path, name: str) -> dict[str, Any]:
     """A section of a rig.yaml; empty where there is none that could be one."""
     data, _ = read_yaml(rig)
-    found = data.get(name) if isinstance(data, dict) else None
-    return found if isinstance(found, dict) else {}
+    part = data.get(name) if isinstance(data, dict) else None
+    return part if isinstance(part, dict) else {}
 
 
 def _arm_of(rig: Path) -> dict[str, str]:
@@ -166,26 +166,26 @@ def _arm_of(rig: Path) -> dict[str, str]:
     return {key: str(arm[key]) for key in ("urdf", "base", "tip")} if whole else {}
 
 
-def refuse_parts(found: Gathered, rig: Path | None) -> None:
+def refuse_parts(gathered: Gathered, rig: Path | None) -> None:
     """Refuse sources of which no recording can be made.
 
     Raises:
         InputError: nothing was measured, or there is nothing that it could calibrate.
     """
-    if not found.tracks and not found.sweeps and found.stops is None:
-        what = "an arm" if found.arm else "nothing"
+    if not gathered.tracks and not gathered.sweeps and gathered.stops is None:
+        what = "an arm" if gathered.arm else "nothing"
         raise InputError(
             f"the sources hold {what}, and no logs, no table of stops and no LiDAR data; add what "
             "was measured, as a bag, clouds or a table"
         )
-    names = [t.name for t in found.tracks if t.kind in ("pose", "point")]
-    names += [n.rpartition(".")[0] for n in found.stops or () if n.endswith(".x")]
-    if found.surface and not names:
+    names = [t.name for t in gathered.tracks if t.kind in ("pose", "point")]
+    names += [n.rpartition(".")[0] for n in gathered.stops or () if n.endswith(".x")]
+    if gathered.surface and not names:
         raise InputError(
             "nothing says where the rig stood in the scanned room; add what a tracker saw, or a "
             "table of stops with base_guess.x to base_guess.qz, or leave the room out"
         )
-    if rig is None and found.arm is None and not found.sweeps:
+    if rig is None and gathered.arm is None and not gathered.sweeps:
         raise InputError(
             "no arm or LiDAR is there to be calibrated by "
             f"{', '.join(dict.fromkeys(names)) or 'what was logged'}; add the source of one, as "
@@ -214,11 +214,11 @@ def _arm_beside(rig: Path) -> Arm | None:
     return Arm(read_text(path), arm["base"], arm["tip"])
 
 
-def _only(found: Sequence[Any], what: str, kinds: Sequence[str]) -> Any:
+def _only(those: Sequence[Any], what: str, kinds: Sequence[str]) -> Any:
     """The last of what should be one: a source given outdoes what lies beside rig.yaml."""
-    if len(found) > 2 or (len(found) == 2 and what != "describe an arm"):
-        raise InputError(f"{len(found)} of the sources ({', '.join(kinds)}) {what}; give one")
-    return found[-1] if found else None
+    if len(those) > 2 or (len(those) == 2 and what != "describe an arm"):
+        raise InputError(f"{len(those)} of the sources ({', '.join(kinds)}) {what}; give one")
+    return those[-1] if those else None
 
 
 def _one_table(tables: Sequence[Columns], bodies: Mapping[str, str]) -> Columns | None:
@@ -253,15 +253,15 @@ def _renamed(track: Track, bodies: Mapping[str, str]) -> Track:
     return replace(track, name=bodies.get(track.name, track.name))
 
 
-def _one_lidar(found: Sequence[Mapping[str, Any]]) -> Mapping[str, Any] | None:
+def _one_lidar(lidars: Sequence[Mapping[str, Any]]) -> Mapping[str, Any] | None:
     """What sources say of the LiDAR; two that name different models are two LiDARs."""
-    models = list(dict.fromkeys(one["model"] for one in found if one.get("model")))
+    models = list(dict.fromkeys(one["model"] for one in lidars if one.get("model")))
     if len(models) > 1:
         raise InputError(
             f"the sources are of several LiDARs, {', '.join(models)}; a recording has one"
         )
     merged: dict[str, Any] = {}
-    for one in found:
+    for one in lidars:
         merged |= {key: value for key, value in one.items() if value is not None}
     return merged or None
 

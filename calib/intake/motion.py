@@ -67,23 +67,29 @@ def motions(track: Track, edges: Sequence[Edge], window_s: float) -> list[Motion
 
     def motion(kind: str, moves: Array) -> Motion:
         middle_s = (time_s[1:] + time_s[:-1]) / 2
-        return Motion(track.name, track.clock, kind, middle_s, smooth(time_s, moves, window_s))
+        return Motion(
+            name=track.name,
+            clock=track.clock,
+            kind=kind,
+            time_s=middle_s,
+            rate=smooth(time_s, moves, window_s),
+        )
 
     step_s = np.diff(time_s)[:, None]
     if track.kind == "gyro":
         return [motion("turn", (values[1:] + values[:-1]) / 2 * step_s)]
-    found = []
+    parts = []
     if track.kind == "pose":
-        found.append(motion("turn", _turned(Rotation.from_quat(values[:, 3:], scalar_first=True))))
+        parts.append(motion("turn", _turned(Rotation.from_quat(values[:, 3:], scalar_first=True))))
     if track.kind == "joints":
         names = [edge.joint.name for edge in edges if edge.joint is not None]
         if names and set(names) <= set(track.names):
             T = place(edges, values[:, [track.names.index(name) for name in names]])
-            found.append(motion("turn", _turned(Rotation.from_matrix(T[:, :3, :3]))))
-        found.append(motion("joints", np.diff(values, axis=0)))
+            parts.append(motion("turn", _turned(Rotation.from_matrix(T[:, :3, :3]))))
+        parts.append(motion("joints", np.diff(values, axis=0)))
     else:
-        found.append(motion("shift", np.diff(values[:, :3], axis=0)))
-    return found
+        parts.append(motion("shift", np.diff(values[:, :3], axis=0)))
+    return parts
 
 
 def _turned(turn: Rotation) -> Array:

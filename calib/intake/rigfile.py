@@ -58,14 +58,14 @@ def _renamed(columns: Columns, old: str, new: str) -> Columns:
 
 
 def first_rig(
-    folder: Path, name: str, found: Gathered, columns: Columns, model: str | None
+    folder: Path, name: str, gathered: Gathered, columns: Columns, model: str | None
 ) -> tuple[Columns, list[str], list[str]]:
     """Write a first rig.yaml from the data; frames that CAD knows better are marked as guesses.
 
     Args:
         folder: the recording's, which holds the arm and the reference already.
         name: of the rig.
-        found: what all sources hold.
+        gathered: what all sources hold.
         columns: the stops.
         model: of the LiDAR, where a flag names it.
 
@@ -75,31 +75,31 @@ def first_rig(
     Raises:
         InputError: a LiDAR's model is not known, or the data do not tell where a body hangs.
     """
-    roles = _roles(found, columns)
+    roles = _roles(gathered, columns)
     lines = [
         "# Written by rigcal import. A guess was found in the data: write there what CAD says.",
         f"name: {name}",
     ]
-    lidar = _lidar(found, model) if found.sweeps else None
+    lidar = _lidar(gathered, model) if gathered.sweeps else None
     if lidar:
         lines.append(f"lidar: {_flow(lidar)}")
-    if found.arm:
-        arm = {"urdf": "arm.urdf", "base": found.arm.base, "tip": found.arm.tip}
+    if gathered.arm:
+        arm = {"urdf": "arm.urdf", "base": gathered.arm.base, "tip": gathered.arm.tip}
         lines.append(f"arm: {_flow(arm | {'sigma_joint_rad': 0})}")
     frames = [line for mounted in roles.mounted for line in _frame(mounted)]
     odd = list(roles.odd)
-    if lidar and (parent := _carrier(found, roles, columns)):
+    if lidar and (parent := _carrier(gathered, roles, columns)):
         at = "as if it were there: nothing says where it hangs"
         frames += _frame(Mounted("lidar", parent, np.eye(4), at))
         odd.append(f"frame lidar is written as if it coincided with {parent}; write CAD there")
     bodies = [m.body for m in roles.mounted] or (bodies_of(columns) if frames else [])
     lines += ["frames:", *frames] if frames else []
-    lines.append(f"base: {{moves: {'stop' if roles.base_moves or not found.arm else 'never'}}}")
+    lines.append(f"base: {{moves: {'stop' if roles.base_moves or not gathered.arm else 'never'}}}")
     if bodies:
         lines.append(
             f"tracker: {{frame: opti, bodies: [{', '.join(map(_word, bodies))}], {_TRACKER}}}"
         )
-    if found.surface:
+    if gathered.surface:
         names = {"mesh": "mesh.ply", "faces": "faces.parquet", "labels": "labels.yaml"}
         files = {
             k: f"reference/{f}" for k, f in names.items() if (folder / "reference" / f).exists()
@@ -113,17 +113,19 @@ def first_rig(
     return kept, said, odd
 
 
-def _roles(found: Gathered, columns: Columns) -> Roles:
+def _roles(gathered: Gathered, columns: Columns) -> Roles:
     """Where tracked bodies hang."""
-    if found.edges and found.arm:
-        return find_roles(columns, found.edges, found.joints, found.arm.base, found.arm.tip)
+    if gathered.edges and gathered.arm:
+        return find_roles(
+            columns, gathered.edges, gathered.joints, gathered.arm.base, gathered.arm.tip
+        )
     return Roles([], True, [])
 
 
-def _carrier(found: Gathered, roles: Roles, columns: Columns) -> str | None:
+def _carrier(gathered: Gathered, roles: Roles, columns: Columns) -> str | None:
     """What carries the LiDAR: the body on the arm's tip, the tip, or the one body there is."""
-    if found.arm:
-        return found.arm.tip
+    if gathered.arm:
+        return gathered.arm.tip
     bodies = bodies_of(columns)
     if len(bodies) > 1:
         raise InputError(
@@ -132,8 +134,8 @@ def _carrier(found: Gathered, roles: Roles, columns: Columns) -> str | None:
     return bodies[0] if bodies else None
 
 
-def _lidar(found: Gathered, model: str | None) -> dict[str, Any]:
-    facts = dict(found.lidar or {})
+def _lidar(gathered: Gathered, model: str | None) -> dict[str, Any]:
+    facts = dict(gathered.lidar or {})
     name = model or facts.get("model")
     if name is None or (name not in catalog() and not str(name).endswith((".yaml", ".yml"))):
         said = "is not known" if name is None else f"'{name}' is not in the catalogue"

@@ -42,11 +42,11 @@ class Roles:
 def poses_of(columns: Columns) -> dict[str, Array]:
     """Tracked bodies: name -> T_world_body (K, 4, 4), NaN where it was not seen."""
     bodies = [name[:-3] for name in columns if name.endswith(".qw") and name != "base_guess.qw"]
-    found = {}
+    poses = {}
     for body in bodies:
         row = np.stack([columns[f"{body}.{part}"] for part in POSE], axis=1)
-        found[body] = se3.from_xyz_quat(row[:, :3], row[:, 3:])
-    return found
+        poses[body] = se3.from_xyz_quat(row[:, :3], row[:, 3:])
+    return poses
 
 
 def find_roles(

@@ -89,11 +89,11 @@ def learned(rate: Array) -> float:
 
 def _fastest(track: Track, edges: Sequence[Edge]) -> tuple[Array, Array, str] | None:
     """Times and the size of all rates of a track, a metre counting for a radian."""
-    found = motions(track, edges if track.kind != "joints" else (), WINDOW_S)
-    if not found:
+    moves = motions(track, edges if track.kind != "joints" else (), WINDOW_S)
+    if not moves:
         return None
-    rate = np.concatenate([_unbiased(motion) for motion in found], axis=1)
-    return found[0].time_s, np.linalg.norm(rate, axis=1), track.name
+    rate = np.concatenate([_unbiased(motion) for motion in moves], axis=1)
+    return moves[0].time_s, np.linalg.norm(rate, axis=1), track.name
 
 
 def _unbiased(motion: Motion) -> Array:

@@ -111,10 +111,10 @@ def locations(columns: Columns, base: str | None, blocks: int | None) -> tuple[C
 def _places(pose: Array) -> Array:
     """Number (K,) of the place at which each pose (K, 7) is; where not seen, that before it."""
     places: list[Array] = []
-    found = np.zeros(len(pose), int)
+    location = np.zeros(len(pose), int)
     for k, row in enumerate(pose):
         if not np.isfinite(row).all():
-            found[k] = found[k - 1] if k else 0
+            location[k] = location[k - 1] if k else 0
             continue
         near = [
             np.linalg.norm(row[:3] - at[:3]) < APART_M
@@ -124,5 +124,5 @@ def _places(pose: Array) -> Array:
         if not any(near):
             places.append(row)
             near.append(True)
-        found[k] = near.index(True)
-    return found
+        location[k] = near.index(True)
+    return location

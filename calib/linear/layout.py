@@ -89,7 +89,7 @@ class Layout:
         }
         own: dict[int, list[np.ndarray]] = {}
         for name in (n for n in unknowns if owner.get(n, -1) >= 0):
-            own.setdefault(owner[name], []).append(np.r_[at[name]])
+            own.setdefault(owner[name], []).append(_join(at, [name]))
         finest, cells = (_join(at, names) for names in _cells(unknowns))
         inner = [*own.values(), [finest], [cells]]
         eliminated = np.concatenate([c for part in inner for c in part]).astype(int)
@@ -159,4 +159,5 @@ def _cells(unknowns: Mapping[str, Unknown]) -> tuple[list[str], list[str]]:
 
 
 def _join(at: Mapping[str, slice], names: Sequence[str]) -> np.ndarray:
-    return np.concatenate([np.zeros(0, int), *(np.r_[at[name]] for name in names)])
+    every = (np.arange(at[name].start, at[name].stop) for name in names)
+    return np.concatenate([np.zeros(0, int), *every])

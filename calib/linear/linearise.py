@@ -14,7 +14,6 @@ from calib.linear.parallel import in_order
 from calib.linear.rows import StopRows, StopSums
 from calib.linear.system import Linearisation, Values
 from calib.problem import Problem
-from calib.problem.unknowns import Unknown
 from calib.residuals.beams import Association
 from calib.residuals.scan import ScanStop
 from calib.residuals.spread import SpreadRows
@@ -106,15 +105,27 @@ def own_rows(layout: Layout, values: Values) -> dict[int, dict[str, OwnRows]]:
             stop = next(owner[k] for n in d if (k := layout.at[n].start) in owner)
             columns = layout.columns(list(d))
             found[stop][block.name] = OwnRows(np.hstack(list(d.values())), -residual, columns, True)
-    for name, at in layout.at.items():
-        if at.start in owner:
-            A, b = prior_rows(layout.unknowns[name], values[name])
-            found[owner[at.start]][name] = OwnRows(A, b, np.r_[at], False)
+    mine = [name for name, at in layout.at.items() if at.start in owner]
+    for name, rows in prior_rows(layout, mine, values).items():
+        found[owner[layout.at[name].start]][name] = rows
     return found
 
 
-def prior_rows(unknown: Unknown, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Whitened derivative (n, n) and right side (n,) of a vector's or a pose's own prior."""
-    away = unknown.difference(unknown.mean, value)
-    turn = se3.right_jacobian_inverse(away) if unknown.kind == "pose" else np.eye(unknown.dim)
-    return turn / unknown.sigma[:, None], -away / unknown.sigma
+def prior_rows(layout: Layout, names: Sequence[str], values: Values) -> dict[str, OwnRows]:
+    """Rows of the own priors of vectors and poses, by unknown."""
+    found = {}
+    poses = [name for name in names if layout.unknowns[name].kind == "pose"]
+    place = {name: k for k, name in enumerate(poses)}
+    if poses:
+        means = np.stack([layout.unknowns[name].mean for name in poses])
+        away = se3.log(se3.inverse(means) @ np.stack([values[name] for name in poses]))
+        turns = se3.right_jacobian_inverse(away)
+    for name in names:
+        unknown, columns = layout.unknowns[name], layout.columns([name])
+        if unknown.kind == "pose":
+            k = place[name]
+            A, b = turns[k] / unknown.sigma[:, None], -away[k] / unknown.sigma
+        else:
+            A, b = np.diag(1.0 / unknown.sigma), (unknown.mean - values[name]) / unknown.sigma
+        found[name] = OwnRows(A, b, columns, measured=False)
+    return found

@@ -24,9 +24,16 @@ def workers(count: int | None) -> Iterator[None]:
         _WORKERS.reset(token)
 
 
+def cores() -> int:
+    """How many cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 def in_order(work: Callable[[int], T], count: int) -> Iterator[T]:
     """``work(0), work(1), …``, a few of them at a time ahead of who takes them."""
-    threads = min(_WORKERS.get() or os.cpu_count() or 1, count)
+    threads = min(_WORKERS.get() or cores(), count)
     if threads < 2:
         yield from (work(i) for i in range(count))
         return

@@ -58,7 +58,7 @@ class StopRows:
         as of `linearise`."""
         rows = scan.rows(values, association, placed.T[0])
         weight, residual = rows.whitened(newton)
-        columns = [np.r_[layout.at[name]] for name in rows.dense]
+        columns = [layout.columns(list(rows.dense))]
         index = np.empty((len(weight), len(rows.sparse)), np.int32)
         value = np.empty(index.shape)
         start = last = 0
@@ -114,7 +114,11 @@ class StopRows:
         """What the rows meet, (G,) surfaces or planes, and which of these each row meets (N,)."""
         view = self.rows.view
         kind = next(name for name in PLACES if name in view.columns)
-        return np.unique(view[kind], return_inverse=True)
+        met = view[kind] + 1  # counting, as there are few of them: -1 is nothing
+        parts = np.flatnonzero(np.bincount(met))
+        number = np.zeros(parts[-1] + 1, int)
+        number[parts] = np.arange(len(parts))
+        return parts - 1, number[met]
 
     def gradient(self, cluster: np.ndarray, clusters: int) -> tuple[np.ndarray, np.ndarray]:
         """``J^T W b`` (clusters, n) of the rows of each cluster (N,), and its columns (n,)."""

@@ -7,7 +7,7 @@ import numpy as np
 from calib.effects import Site
 from calib.problem.model import same_mesh
 from calib.problem.places import Places
-from calib.problem.problem import Part, Problem
+from calib.problem.problem import Problem, SourceStops
 from calib.problem.unknowns import Role, Unknown
 from calib.residuals.scan import ScanStop
 from calib.residuals.surfaces import Meeting, MeshSurface, PlaneSurface
@@ -18,7 +18,7 @@ from sensors.planes import PlaneFinder, Planes
 OF_BEAMS = (Site.BEAM, Site.REFERENCE, Site.NOISE)
 
 
-def add_beams(problem: Problem, part: Part, places: Places) -> None:
+def add_beams(problem: Problem, part: SourceStops, places: Places) -> None:
     """Add every scan of a recording, and the planes' unknowns where there is no mesh."""
     source = part.source
     meeting = _meeting(problem, part, places)
@@ -41,7 +41,7 @@ def add_beams(problem: Problem, part: Part, places: Places) -> None:
         )
 
 
-def _room(problem: Problem, part: Part) -> int | str:
+def _room(problem: Problem, part: SourceStops) -> int | str:
     """The first source with the same mesh; without one the recording itself."""
     if part.source.reference is None:
         return str(part.source.recording.folder)
@@ -49,7 +49,7 @@ def _room(problem: Problem, part: Part) -> int | str:
     return next(i for i, mesh in enumerate(meshes) if same_mesh(mesh, part.source.reference))
 
 
-def _meeting(problem: Problem, part: Part, places: Places) -> Meeting:
+def _meeting(problem: Problem, part: SourceStops, places: Places) -> Meeting:
     """What the beams meet: the mesh, or else planes found in the scans."""
     found = problem.meetings.get(part.number)
     if found is None:
@@ -80,7 +80,7 @@ def _planes_unknown(found: PlaneSurface) -> Unknown:
     )
 
 
-def _find_planes(problem: Problem, part: Part, places: Places) -> Planes:
+def _find_planes(problem: Problem, part: SourceStops, places: Places) -> Planes:
     recording, rig = part.source.recording, part.source.rig
     finder = PlaneFinder(noise_m=rig.lidar.sigma_range_m)
     for k, stops in places.scanned():

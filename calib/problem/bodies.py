@@ -7,15 +7,16 @@ import numpy as np
 from calib.effects import Site, View
 from calib.problem import start
 from calib.problem.places import Places
-from calib.problem.problem import Part, Problem
+from calib.problem.problem import Problem, SourceStops
 from calib.problem.unknowns import Role, Unknown
 from calib.residuals.targets import HangingTarget
 from calib.residuals.tracker import TrackedBody
 
 
-def add_bodies(problem: Problem, part: Part, places: Places) -> None:
+def add_bodies(problem: Problem, part: SourceStops, places: Places) -> None:
     """Add a block for every tracked body and group of stops that share all unknowns."""
     tracker, recording = part.source.rig.tracker, part.source.recording
+    bases = _tracker_bases(part)
     for b, body in enumerate(tracker.bodies if tracker else ()):
         poses = start.body_poses(part.source, body)
         point = start.is_point(part.source, body)
@@ -32,28 +33,42 @@ def add_bodies(problem: Problem, part: Part, places: Places) -> None:
                     sigma_m=tracker.sigma_m,
                     sigma_rad=tracker.sigma_rad,
                     is_point=point,
-                    bases={v: basis[:, b] for v, basis in _tracker_bases(part, seen).items()},
+                    bases={v: _rows(basis, seen)[:, b] for v, basis in bases.items()},
                     stop_names=[(recording.folder, int(k)) for k in seen],
                 )
             )
 
 
-def _tracker_bases(part: Part, index: np.ndarray) -> dict[str, np.ndarray]:
+def _tracker_bases(part: SourceStops) -> dict[str, np.ndarray]:
+    """What the tracker adds to every body at every stop, (K or 1, B, 6, P) by unknown."""
     source = part.source
-    columns = {name: values[index] for name, values in source.columns.items()}
-    view = View(source.rig, len(index), columns, source.recording.joints[index])
+    view = View(source.rig, len(source.recording.stops), source.columns, source.recording.joints)
     terms = (t for t in part.terms if t.effect.site is Site.TRACKER)
     return {t.variable: t.basis(view) for t in terms}
 
 
-def add_targets(problem: Problem, part: Part, places: Places) -> None:
+def _rows(basis: np.ndarray, index: np.ndarray) -> np.ndarray:
+    return basis if len(basis) == 1 else basis[index]
+
+
+def add_targets(problem: Problem, part: SourceStops, places: Places) -> None:
     """Add gravity, and a block with its marker's place for every target."""
     targets, spec = part.source.recording.targets, part.source.rig.target
     if targets is None or spec is None or places.reference is None:
         return
     gravity = start.gravity(part.source)
     dofs, units = ("across_1", "across_2"), ("rad", "rad")
-    problem.add(Unknown("gravity", "direction", gravity, np.ones(2), dofs, units, Role.TARGET))
+    problem.add(
+        Unknown(
+            name="gravity",
+            kind="direction",
+            mean=gravity,
+            sigma=np.ones(2),
+            dofs=dofs,
+            units=units,
+            role=Role.TARGET,
+        )
+    )
     view = View(part.source.rig, len(targets.names), {}, np.zeros((1, 0)))
     terms = [t for t in part.terms if t.effect.site is Site.TARGET]
     shifts = {t.variable: t.basis(view) for t in terms}

@@ -11,7 +11,7 @@ from calib.problem.beams import add_beams
 from calib.problem.bodies import add_bodies, add_targets
 from calib.problem.model import Model, Source
 from calib.problem.places import Places
-from calib.problem.problem import Part, Problem
+from calib.problem.problem import Problem, SourceStops
 from calib.problem.unknowns import Unknown
 from calib.residuals.surfaces import Meeting
 from chains.errors import InputError
@@ -45,7 +45,9 @@ def build(
     for i, source in enumerate(sources):
         chosen = np.ones(len(source.recording.stops), bool) if use is None else use[i]
         prefix = "" if len(sources) == 1 else f"{i}/"
-        part = Part(i, source, problem.terms[i], chosen, prefix)
+        part = SourceStops(
+            number=i, source=source, terms=problem.terms[i], chosen=chosen, prefix=prefix
+        )
         places = Places(problem, part, model)
         add_bodies(problem, part, places)
         add_targets(problem, part, places)

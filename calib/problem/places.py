@@ -9,7 +9,7 @@ import numpy as np
 from calib.forward import Stops, place
 from calib.problem import start
 from calib.problem.model import Model
-from calib.problem.problem import Part, Problem
+from calib.problem.problem import Problem, SourceStops
 from calib.problem.unknowns import UNKNOWN_POSE, Role, Unknown, pose_unknown
 from chains import se3
 from chains.errors import InputError
@@ -28,16 +28,20 @@ class Places:
     """
 
     problem: Problem
-    part: Part
+    part: SourceStops
     model: Model
     groups: dict[str, np.ndarray] = field(init=False)
     stops: dict[tuple[str, int], np.ndarray] = field(init=False)
     reference: str | None = field(init=False)
+    _all: Stops = field(init=False)
     _geometry: dict[tuple[str, int], Stops] = field(init=False)
 
     def __post_init__(self) -> None:
         self.groups = self._groups()
         self.reference = self._reference()
+        source = self.part.source
+        joints, columns = source.recording.joints, source.columns
+        self._all = place(source.rig, self.part.terms, joints, columns, "", self.reference)
         self.stops = {
             (name, k): index
             for name, stops in self.groups.items()
@@ -146,11 +150,7 @@ class Places:
     def bind(self, root: str, index: np.ndarray) -> Stops:
         """The geometry of some stops that share a root."""
         source = self.part.source
-        columns = {name: values[index] for name, values in source.columns.items()}
-        terms = self.part.terms
-        stops = place(
-            source.rig, terms, source.recording.joints[index], columns, root, self.reference
-        )
+        stops = self._all.some(index, root)
         sigma = source.rig.sigma_joint_rad
         if not sigma or not source.rig.joint_names:
             return stops

@@ -33,7 +33,7 @@ class Block(Protocol):
 
 
 @dataclass(frozen=True)
-class Part:
+class SourceStops:
     """One recording in a problem.
 
     Args:

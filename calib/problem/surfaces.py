@@ -12,7 +12,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib.effects.basis import place_of
 from calib.problem.problem import Problem, SurfaceCells
 from calib.problem.unknowns import Role, Unknown
 from calib.residuals.beams import Association
@@ -45,13 +44,16 @@ def with_surfaces(
             continue
         for column, share in SURFACE_SHARES.items():
             parts_of = {i: _parts(problem, associations[i], i, column) for i in scans}
-            parts = np.unique(np.concatenate([np.unique(p) for p in parts_of.values()]))
-            parts = parts[parts >= 0]
+            last = max(int(p.max(initial=-1)) for p in parts_of.values())
+            seen = sum(np.bincount(p + 1, minlength=last + 2) for p in parts_of.values())
+            parts = np.flatnonzero(seen[1:])  # counted from -1: nothing is met
+            number = np.full(last + 2, -1, np.int32)  # the last stands for -1
+            number[parts] = np.arange(len(parts))
             name, sigma_m = f"{room}/reference_{column}", first.reference_sigma_m * np.sqrt(share)
             unknowns.append(_unknown(name, room, column, parts, sigma_m))
             cells[name] = SurfaceCells(column, parts, first.meeting.surface_of(column, parts), room)
             for i in scans:
-                numbered[i][name] = place_of(parts_of[i], parts).astype(np.int32)
+                numbered[i][name] = number[parts_of[i]]
     found = [replace(a, cells=n) for a, n in zip(associations, numbered, strict=True)]
     return problem.with_cells(unknowns, cells), found
 

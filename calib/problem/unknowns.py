@@ -69,4 +69,6 @@ def pose_unknown(
     name: str, mean: np.ndarray, sigma: np.ndarray = UNKNOWN_POSE, role: Role = Role.CALIBRATION
 ) -> Unknown:
     """A pose known to `sigma` about `mean`."""
-    return Unknown(name, "pose", mean, sigma, DOF, POSE_UNITS, role)
+    return Unknown(
+        name=name, kind="pose", mean=mean, sigma=sigma, dofs=DOF, units=POSE_UNITS, role=role
+    )

@@ -24,7 +24,7 @@ __all__ = ["Evidence", "Written", "charts_of", "plot", "report"]
 
 
 @dataclass(frozen=True)
-class Contents:
+class ReportContents:
     """The figures of a run, by section, and those that it does not have."""
 
     sections: dict[str, list[Chart]]
@@ -36,12 +36,12 @@ class Contents:
 
 
 @dataclass(frozen=True)
-class Written:
+class WrittenReport:
     """A report as written."""
 
     file: Path
     verdict: Verdict
-    contents: Contents
+    contents: ReportContents
 
     @property
     def summary(self) -> str:
@@ -60,7 +60,7 @@ class Written:
         }
 
 
-def charts_of(evidence: Evidence) -> Contents:
+def charts_of(evidence: Evidence) -> ReportContents:
     """Every figure that a run has; none is drawn yet.
 
     Raises:
@@ -69,17 +69,17 @@ def charts_of(evidence: Evidence) -> Contents:
     sections: dict[str, list[Chart]] = {}
     absent: list[Absent] = []
     for title, makers in SECTIONS.items():
-        found = [each for make in makers for each in make(evidence)]
-        sections[title] = [each for each in found if isinstance(each, Chart)]
-        absent += [each for each in found if isinstance(each, Absent)]
-    return Contents(sections, absent)
+        results = [each for make in makers for each in make(evidence)]
+        sections[title] = [each for each in results if isinstance(each, Chart)]
+        absent += [each for each in results if isinstance(each, Absent)]
+    return ReportContents(sections, absent)
 
 
 def report(
     runs: Sequence[Run],
     out: Path | str,
     progress: Progress = lambda what, done, total: None,
-) -> Written:
+) -> WrittenReport:
     """Write a page about runs: the last rung of their ladder, and how it was reached.
 
     Args:
@@ -105,7 +105,7 @@ def report(
     page = render(evidence, verdict, sections, contents.absent)
     with _file(out) as temporary:
         temporary.write_text(page, encoding="utf-8")
-    return Written(Path(out), verdict, contents)
+    return WrittenReport(Path(out), verdict, contents)
 
 
 def plot(evidence: Evidence, name: str, out: Path | str) -> Chart:

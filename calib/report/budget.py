@@ -91,16 +91,16 @@ def _jacobians(
         chosen = np.linspace(0, len(problem.scans) - 1, STOPS).round().astype(int)
         for k, i in enumerate(np.unique(chosen).tolist()):
             progress("derivatives", k, len(chosen))
-            found = beam_jacobian(problem.scans[i], values)
-            yield found, len(next(iter(found.values())))
+            jacobian = beam_jacobian(problem.scans[i], values)
+            yield jacobian, len(next(iter(jacobian.values())))
         return
     for block in problem.blocks:
         if isinstance(block, TrackedBody):
             _, d = block.evaluate(values, derivatives=True)
             width = 3 if block.is_point else 6
             of_position = np.arange(block.rows) % width >= width - 3
-            found = {name: block.sigma_m * each[of_position] for name, each in d.items()}
-            yield found, len(block.measured)
+            jacobian = {name: block.sigma_m * each[of_position] for name, each in d.items()}
+            yield jacobian, len(block.measured)
 
 
 def beam_jacobian(scan: ScanStop, values: Mapping[str, np.ndarray]) -> Jacobian:

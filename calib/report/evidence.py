@@ -14,9 +14,17 @@ from calib import problem as problems
 from calib.problem import Problem
 from calib.problem.model import Source, same_mesh
 from calib.report.budget import Budget, budget
-from calib.report.statistics import AZIMUTHS, BINS, PLACES, Axis, Statistics, Table, gather
+from calib.report.statistics import (
+    AZIMUTHS,
+    BINS,
+    PLACES,
+    Axis,
+    Statistics,
+    StopResiduals,
+    residual_statistics,
+)
 from calib.residuals.scan import ScanStop
-from calib.runs.estimates import Found, found
+from calib.runs.estimates import VariableEstimate, variable_estimates
 from calib.runs.ladder import Rung, ladder
 from calib.runs.reopen import model_of, reopened
 from calib.runs.residual_table import residual_table, table_path
@@ -25,12 +33,12 @@ from calib.solve.fit import Progress, values_of
 from chains.errors import InputError
 from sensors.recording import read_table
 
-FEW = 4  # bins of a stop's covariate, at least
+FEWEST_BINS = 4  # bins of a stop's covariate, at least
 SAMPLED = 8  # tables from which the bins of covariates are taken
 # Columns of a table that are no covariate: they name a place, or are what is explained.
 NOT_COVARIATES = {*PLACES, "region", "patch", "column", "residual_m", "sigma_m", "weight"}
 NEEDED = {"ring", "column", "azimuth_rad", "range_m", "incidence_rad"}
-TOLD = {"rms_mm", "misfit", "converged", "residual", "stops", "points"}  # of a summary
+SUMMARY_KEYS = {"rms_mm", "misfit", "converged", "residual", "stops", "points"}  # of a summary
 NEEDED |= {"residual_m", "sigma_m", "weight"}
 FIRST = ("incidence_rad", "range_m", "ring", "azimuth_rad", "elevation_rad", "intensity", "label")
 
@@ -87,9 +95,9 @@ class Evidence:
         return self.run.diagnosis()
 
     @cached_property
-    def found(self) -> list[Found]:
+    def estimates(self) -> list[VariableEstimate]:
         """Links and effects of the run, as plain rows."""
-        return found(self.run)
+        return variable_estimates(self.run)
 
     @cached_property
     def problem(self) -> Problem:
@@ -155,7 +163,7 @@ class Evidence:
             numbers = sorted({*known, *np.unique(values).astype(int).tolist()})
             return Axis.of_things(name, numbers, [known.get(n, str(n)) for n in numbers])
         if len(values) == len(self.problem.scans):  # a value per stop: several stops in each bin
-            return Axis.of_values(name, values, min(BINS, max(FEW, len(values) // 3)))
+            return Axis.of_values(name, values, min(BINS, max(FEWEST_BINS, len(values) // 3)))
         return Axis.of_values(name, values)
 
     @property
@@ -172,26 +180,30 @@ class Evidence:
     @cached_property
     def after(self) -> Statistics:
         """The residuals of the run."""
-        return gather(self._tables(self.run, "residuals"), self.axes, self.rings, self.azimuths)
+        return residual_statistics(
+            self._tables(self.run, "residuals"), self.axes, self.rings, self.azimuths
+        )
 
     @cached_property
     def earlier(self) -> Statistics:
         """The residuals of the run below, or where there is none with everything as in CAD."""
         what = "residuals before"
-        return gather(self._tables(self.below, what), self.axes, self.rings, self.azimuths)
+        return residual_statistics(
+            self._tables(self.below, what), self.axes, self.rings, self.azimuths
+        )
 
-    def _tables(self, run: Run | None, what: str) -> Iterator[Table]:
+    def _tables(self, run: Run | None, what: str) -> Iterator[StopResiduals]:
         meshes = [source.reference for source in self.sources]
         rooms = [next(i for i, m in enumerate(meshes) if same_mesh(m, mesh)) for mesh in meshes]
         scans = self.problem.scans
         for k, scan in enumerate(scans):
             self.progress(what, k, len(scans))
-            yield Table(
-                self._columns(run, scan),
-                self._stop(scan, k),
-                rooms[self._source(scan)],
-                scan.lidar.sigma_angle_rad,
-                scan.reference_sigma_m,
+            yield StopResiduals(
+                columns=self._columns(run, scan),
+                stop=self._stop(scan, k),
+                room=rooms[self._source(scan)],
+                sigma_angle_rad=scan.lidar.sigma_angle_rad,
+                sigma_reference_m=scan.reference_sigma_m,
             )
 
     def _columns(self, run: Run | None, scan: ScanStop) -> dict[str, np.ndarray]:
@@ -228,7 +240,7 @@ class Evidence:
 
 def _check(run: Run) -> None:
     """A run of another version may lack what a report tells."""
-    lacking = sorted(TOLD - run.summary.keys())
+    lacking = sorted(SUMMARY_KEYS - run.summary.keys())
     if lacking:
         raise InputError(
             f"{run.folder / SUMMARY} has no '{lacking[0]}': written by another version of rigcal, "

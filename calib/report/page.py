@@ -16,8 +16,8 @@ from calib.report.evidence import Evidence, folder_name
 from calib.report.verdict import Verdict
 from calib.show.tables import chance, effect_page, estimate_cell, mm, shown
 
-LEADING = 8  # candidates whose evidence is told
-LISTED = 12  # weak directions that are told
+TOLD_CANDIDATES = 8  # candidates whose evidence is told
+LISTED_DIRECTIONS = 12  # weak directions that are told
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ def _numbers(evidence: Evidence) -> list[tuple[str, str]]:
 def _candidates(evidence: Evidence) -> list[dict[str, str]]:
     """Candidates that are confirmed, or beyond chance, each with its evidence in words."""
     about = {effect.family: effect_page(effect)["what"] for effect in CATALOGUE}
-    found = evidence.diagnosis["candidates"] if evidence.diagnosis else []
+    candidates = evidence.diagnosis["candidates"] if evidence.diagnosis else []
     return [
         {
             "name": c["add"],
@@ -107,7 +107,7 @@ def _candidates(evidence: Evidence) -> list[dict[str, str]]:
             "confirmed": bool(c["step"]) and not c["dressed_up"],
             "told": "; ".join(_told(c)),
         }
-        for c in [c for c in found if c["step"] or c["p_adjusted"] < ALPHA][:LEADING]
+        for c in [c for c in candidates if c["step"] or c["p_adjusted"] < ALPHA][:TOLD_CANDIDATES]
     ]
 
 
@@ -146,14 +146,14 @@ def _detectable(evidence: Evidence) -> list[tuple[str, str]]:
 
 def _weak(evidence: Evidence) -> list[tuple[str, str, str]]:
     """What the data hardly tell: names, how much they may be off, what would determine them."""
-    found = evidence.diagnosis["weak_directions"] if evidence.diagnosis else []
+    directions = evidence.diagnosis["weak_directions"] if evidence.diagnosis else []
     return [
         (
             " and ".join(w["parameters"]),
             "" if w["sigma_mm"] is None else f"± {w['sigma_mm']:.2f} mm",
             w["needs"],
         )
-        for w in found[:LISTED]
+        for w in directions[:LISTED_DIRECTIONS]
     ]
 
 

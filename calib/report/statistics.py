@@ -56,7 +56,7 @@ class Axis:
 
 
 @dataclass(frozen=True)
-class Table:
+class StopResiduals:
     """The residuals of one stop.
 
     Args:
@@ -74,7 +74,7 @@ class Table:
 
 
 @dataclass(frozen=True)
-class Curve:
+class ResidualCurve:
     """Residuals by the bins (B,) of a covariate: robustly weighted mean and spread.
 
     Args:
@@ -136,14 +136,16 @@ class _Sums:
             self.places = np.pad(self.places, ((0, 0), (0, 0), (0, missing)))
         self.places[:, :, theirs] += sums
 
-    def curve(self) -> Curve:
+    def curve(self) -> ResidualCurve:
         """What the sums say."""
         count, weight, total, squares, x = self.rows
         with np.errstate(invalid="ignore", divide="ignore"):
             mean, at = total / weight, x / count
             std = np.sqrt(np.maximum(squares / weight - mean**2, 0.0))
             band = self._band(mean, weight)
-        return Curve(self.axis, count.astype(int), at, mean, std, band)
+        return ResidualCurve(
+            axis=self.axis, count=count.astype(int), at=at, mean_m=mean, std_m=std, band_m=band
+        )
 
     def _band(self, mean: np.ndarray, weight: np.ndarray) -> np.ndarray:
         from scipy.stats import t
@@ -179,7 +181,7 @@ class Statistics:
         variance_m2: what a row's sigma is made of: range noise, angle noise, reference.
     """
 
-    curves: Mapping[str, Curve]
+    curves: Mapping[str, ResidualCurve]
     map_m: np.ndarray
     z: np.ndarray
     rows: int
@@ -187,8 +189,8 @@ class Statistics:
     variance_m2: Mapping[str, float]
 
 
-def gather(
-    tables: Iterable[Table], axes: Iterable[Axis], rings: int, azimuths: int = AZIMUTHS
+def residual_statistics(
+    tables: Iterable[StopResiduals], axes: Iterable[Axis], rings: int, azimuths: int = AZIMUTHS
 ) -> Statistics:
     """One pass over the residuals of a run.
 
@@ -221,23 +223,24 @@ def gather(
         shown = (cells[1] / cells[0]).reshape(rings, azimuths)
     parts = dict(zip(("range noise", "angle noise", "reference"), variance, strict=True))
     return Statistics(
-        {s.axis.name: s.curve() for s in sums if s.rows[0].any()},
-        shown,
-        z,
-        *map(int, counts),
-        {name: value / max(counts[1], 1) for name, value in parts.items()},
+        curves={s.axis.name: s.curve() for s in sums if s.rows[0].any()},
+        map_m=shown,
+        z=z,
+        rows=int(counts[0]),
+        kept=int(counts[1]),
+        variance_m2={name: value / max(counts[1], 1) for name, value in parts.items()},
     )
 
 
 def _numbered(columns: Mapping[str, np.ndarray], room: int, among: dict[Any, int]) -> np.ndarray:
     """(N,) which place each row looks at, numbered among those of all stops."""
     kind = next(name for name in PLACES if name in columns)
-    found, local = np.unique(columns[kind], return_inverse=True)
-    numbers = [among.setdefault((room, p), len(among)) for p in found.tolist()]
+    distinct, local = np.unique(columns[kind], return_inverse=True)
+    numbers = [among.setdefault((room, p), len(among)) for p in distinct.tolist()]
     return np.array(numbers, int)[local]
 
 
-def _variance(columns: Mapping[str, np.ndarray], table: Table) -> np.ndarray:
+def _variance(columns: Mapping[str, np.ndarray], table: StopResiduals) -> np.ndarray:
     """Sums of (noise, angle, reference) variances m2, as the rows' sigmas hold them."""
     incidence = columns["incidence_rad"].astype(float)
     angle = np.square(table.sigma_angle_rad * columns["range_m"] * np.tan(incidence)).sum()

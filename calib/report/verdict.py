@@ -9,8 +9,8 @@ from typing import Any
 from calib.runs.calibrate import TOLERATED
 from calib.runs.run import Run
 
-NEAR = 1.25  # times the noise floor: a held-out error as good as it
-FAR = 3.0  # times its sigmas, or the floor: residuals that something large is behind
+AT_THE_FLOOR = 1.25  # times the noise floor: a held-out error as good as it
+FAR_OFF = 3.0  # times its sigmas, or the floor: residuals that something large is behind
 MEANING = {"green": "use it", "amber": "use it with care", "red": "do not use it yet"}
 
 
@@ -65,9 +65,9 @@ def _wrong(run: Run, diagnosis: Mapping[str, Any] | None) -> Iterator[str]:
     if not run.summary["converged"]:
         yield "the fit has not converged"
     for kind, times in run.summary["misfit"].items():
-        if times > FAR:
+        if times > FAR_OFF:
             yield _misfit(kind, times)
-    if (times := _over_floor(run)) > FAR:
+    if (times := _over_floor(run)) > FAR_OFF:
         yield f"the held-out error is {times:.1f} times the noise floor"
 
 
@@ -81,13 +81,13 @@ def _doubtful(run: Run, diagnosis: Mapping[str, Any] | None) -> Iterator[str]:
         yield "there is structure that no known effect explains"
     if rms.get("held_out") is None:
         yield "no stops were held out, so nothing says how well it predicts"
-    if NEAR < (times := _over_floor(run)) <= FAR:
+    if AT_THE_FLOOR < (times := _over_floor(run)) <= FAR_OFF:
         yield f"the held-out error is {times:.1f} times the noise floor"
     for kind, times in run.summary["misfit"].items():
-        if TOLERATED < times <= FAR:
+        if TOLERATED < times <= FAR_OFF:
             yield _misfit(kind, times)
     for weak in (diagnosis or {}).get("weak_directions", ()):
-        if (weak["sigma_mm"] or 0.0) > FAR * rms["noise_floor"]:
+        if (weak["sigma_mm"] or 0.0) > FAR_OFF * rms["noise_floor"]:
             names = " and ".join(weak["parameters"])
             yield f"{names} may still be off by {weak['sigma_mm']:.1f} mm (one sigma)"
 

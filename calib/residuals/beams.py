@@ -124,22 +124,18 @@ class Rows:
         return weight / np.square(self.sigma_m), residual
 
 
-def beam_derivative(beams: Beams, t: np.ndarray, slope: np.ndarray, turns: bool) -> np.ndarray:
+def beam_derivative(beams: Beams, t: np.ndarray, slope: np.ndarray) -> np.ndarray:
     """d residual by range, azimuth and elevation error (N, 3).
 
     With s the normal over its product with the direction u, ``s.e = (s_z - u_z) / hypot(u_x, u_y)``
-    for the elevation's unit vector e. Without `turns`, where no effect turns a beam, the angles'
-    columns are not computed but zero.
+    for the elevation's unit vector e.
 
     Args:
         beams: N beams.
         t: (N,) m, predicted.
         slope: (N, 3) s, lidar axes.
-        turns: whether the angles are wanted.
     """
     u = beams.direction
-    if not turns:
-        return np.broadcast_to([-1.0, 0.0, 0.0], (len(t), 3))
     hit = beams.origin_m + t[:, None] * u
     flat = np.maximum(np.hypot(u[:, 0], u[:, 1]), 1e-12)
     by_azimuth = slope[:, 0] * hit[:, 1] - slope[:, 1] * hit[:, 0]
@@ -164,16 +160,17 @@ def turns_beams(basis: np.ndarray | OneHot) -> bool:
     return bool(np.any(values[:, 1:]))
 
 
+def range_columns(variable: str, basis: np.ndarray | OneHot, rows: int) -> np.ndarray | Columns:
+    """Derivative of the rows by the parameters of an effect that turns no beam."""
+    if isinstance(basis, OneHot):
+        return Columns(variable, basis.index, -basis.values[:, 0], np.arange(basis.size))
+    return np.broadcast_to(-basis[:, 0], (rows, basis.shape[2]))
+
+
 def effect_columns(
     variable: str, basis: np.ndarray | OneHot, by_site: np.ndarray
 ) -> np.ndarray | Columns:
     """Derivative of the rows by an effect's parameters: ``d r / d site @ basis``."""
-    if by_site.strides[0] == 0 and not by_site[0, 1:].any():  # a range error alone, as is usual
-        along = by_site[0, 0]
-        if isinstance(basis, OneHot):
-            value = along * basis.values[:, 0]
-            return Columns(variable, basis.index, value, np.arange(basis.size))
-        return np.broadcast_to(along * basis[:, 0], (len(by_site), basis.shape[2]))
     if isinstance(basis, OneHot):
         value = np.einsum("nd,nd->n", by_site, basis.values)
         return Columns(variable, basis.index, value, np.arange(basis.size))

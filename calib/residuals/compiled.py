@@ -141,17 +141,17 @@ def add_sparse(
         else:
             rest[at[a], at[a]] += own[a]
     for a in range(rows):
+        mine, row = fine[a], at[a]
         for b in range(size):
             v = with_sparse[a, b]
-            if v == 0.0:
-                continue
-            if fine[a] >= 0:
-                cross[fine[a], at[b]] += v
-            elif fine[b] >= 0:
-                cross[fine[b], at[a]] += v
-            else:
-                rest[at[a], at[b]] += v
-                rest[at[b], at[a]] += v
+            if v != 0.0:
+                if mine >= 0:
+                    cross[mine, at[b]] += v
+                elif fine[b] >= 0:
+                    cross[fine[b], row] += v
+                else:
+                    rest[row, at[b]] += v
+                    rest[at[b], row] += v
 
 
 @njit(cache=True, nogil=True)

@@ -19,6 +19,7 @@ from calib.residuals.beams import (
     Surface,
     beam_derivative,
     effect_columns,
+    range_columns,
     site_error,
     turns_beams,
 )
@@ -160,15 +161,15 @@ class ScanStop:
         origin_m = se3.apply(T, seen.ray.origin_m[hit])
         measured_m = ray.range_m[hit]
         return Ranges(
-            T,
-            scan,
-            seen.view,
-            hit,
-            origin_m + predicted_m[:, None] * direction,
-            direction,
-            normal,
-            measured_m - nominal_m[hit],
-            measured_m - seen.error_at(Site.BEAM, hit)[:, 0] - predicted_m,
+            T_reference_lidar=T,
+            scan=scan,
+            view=seen.view,
+            hit=hit,
+            surface_m=origin_m + predicted_m[:, None] * direction,
+            direction=direction,
+            normal=normal,
+            raw_m=measured_m - nominal_m[hit],
+            corrected_m=measured_m - seen.error_at(Site.BEAM, hit)[:, 0] - predicted_m,
         )
 
     def met(self, ray: Beams, values: Values) -> dict[str, np.ndarray]:
@@ -204,7 +205,16 @@ class ScanStop:
             surface = self.meeting.meet(T, ray, values, association)
         shifts = (np.append(values[n], 0.0)[index] for n, index in association.cells.items())
         cells = [(n, index, len(values[n])) for n, index in association.cells.items()]
-        return _Seen(scan, ray, surface, view, bases, error, sum(shifts, 0.0), cells)
+        return _Seen(
+            scan=scan,
+            ray=ray,
+            surface=surface,
+            view=view,
+            bases=bases,
+            error=error,
+            shift_m=sum(shifts, 0.0),
+            cells=cells,
+        )
 
     def _read(self) -> tuple[Scan, Beams]:
         return self.store.read(self.index)
@@ -257,33 +267,34 @@ class ScanStop:
         ]
         growth = {n: b[:, 0] for n, (site, b) in seen.bases.items() if site is Site.NOISE}
         return Rows(
-            residual,
-            sigma,
-            np.where(usable, tukey_weight(z, scale), 0.0),
-            reference * np.sqrt(1.0 - LOCAL_SHARE),
-            scale,
-            twist_derivative(ray.origin_m, ray.direction, t, slope),
-            dense,
-            sparse,
-            seen.view,
-            usable,
-            spread_rows(scan, single, usable, growth),
+            residual_m=residual,
+            sigma_m=sigma,
+            weight=np.where(usable, tukey_weight(z, scale), 0.0),
+            reference_sigma_m=reference * np.sqrt(1.0 - LOCAL_SHARE),
+            scale=scale,
+            by_twist=twist_derivative(ray.origin_m, ray.direction, t, slope),
+            dense=dense,
+            sparse=sparse,
+            view=seen.view,
+            usable=usable,
+            spread=spread_rows(scan, single, usable, growth),
         )
 
     def _derivatives(
         self, seen: _Seen, T: np.ndarray, t: np.ndarray, slope: np.ndarray
     ) -> tuple[dict[str, np.ndarray], list[Columns]]:
         """By unknowns of effects and of found planes: dense ones, and one non-zero per row."""
-        bases = seen.bases.items()
-        turns = any(turns_beams(b) for _, (site, b) in bases if site is Site.BEAM)
-        by_site = {Site.BEAM: beam_derivative(seen.ray, t, slope, turns)}
-        if any(site is Site.REFERENCE for _, (site, _) in bases):
-            by_site[Site.REFERENCE] = slope @ -T[:3, :3].T
-        found = {
-            name: effect_columns(name, basis, by_site[site])
-            for name, (site, basis) in bases
-            if site is not Site.NOISE
-        }
+        by_site: dict[Site, np.ndarray] = {}
+        found = {}
+        for name, (site, basis) in seen.bases.items():
+            if site is Site.BEAM and not turns_beams(basis):
+                found[name] = range_columns(name, basis, len(t))
+            elif site is not Site.NOISE:
+                if site not in by_site:
+                    beam = site is Site.BEAM
+                    turn = -T[:3, :3].T
+                    by_site[site] = beam_derivative(seen.ray, t, slope) if beam else slope @ turn
+                found[name] = effect_columns(name, basis, by_site[site])
         dense = {name: c for name, c in found.items() if not isinstance(c, Columns)}
         sparse = [c for c in found.values() if isinstance(c, Columns)] + list(
             seen.surface.unknown()

@@ -233,7 +233,14 @@ class _Met:
     ) -> Surface:
         """As rows want it."""
         usable = self.cosine > np.cos(PARALLEL_RAD)
-        return Surface(self.range_m, self.cosine, self.slope, usable, columns, unknown)
+        return Surface(
+            predicted_m=self.range_m,
+            cosine=self.cosine,
+            slope=self.slope,
+            usable=usable,
+            columns=columns,
+            unknown=unknown,
+        )
 
 
 def _once(compute: Callable[[], Any]) -> Callable[[], Any]:

@@ -19,7 +19,7 @@ DOF_UNITS = ("rad",) * 3 + ("m",) * 3
 
 
 @dataclass(frozen=True)
-class Found:
+class VariableEstimate:
     """A frame or an effect of a run, parameter by parameter.
 
     Args:
@@ -42,7 +42,7 @@ class Found:
     told: np.ndarray
 
 
-def found(run: Run) -> list[Found]:
+def variable_estimates(run: Run) -> list[VariableEstimate]:
     """Frames, then effects; what all recordings share comes first.
 
     CAD is read from the recordings where they still are.
@@ -76,7 +76,7 @@ def comparison(runs: Sequence[Run]) -> dict[str, Any]:
             }
             for error in ("rms_mm", "mean_mm", "std_mm")
         },
-        "parameters": _side_by_side([found(run) for run in runs]),
+        "parameters": _side_by_side([variable_estimates(run) for run in runs]),
     }
 
 
@@ -123,30 +123,32 @@ def _frame(
     T_cad: np.ndarray | None,
     sigma: Mapping[str, float],
     untold: Iterable[Mapping[str, str]],
-) -> Found:
+) -> VariableEstimate:
     moved = np.full(6, np.nan)
     if T_cad is not None:
         moved = se3.log(se3.inverse(T_cad) @ frame.T_parent_child)
-    return Found(
-        variable,
-        frame.parent,
-        DOF,
-        DOF_UNITS,
-        moved,
-        np.array([sigma.get(f"{variable}.{dof}", 0.0) for dof in DOF]),
-        _told(variable, DOF, untold),
+    return VariableEstimate(
+        variable=variable,
+        parent=frame.parent,
+        parameters=DOF,
+        units=DOF_UNITS,
+        estimate=moved,
+        sigma=np.array([sigma.get(f"{variable}.{dof}", 0.0) for dof in DOF]),
+        told=_told(variable, DOF, untold),
     )
 
 
-def _effect(variable: str, effect: EffectEstimate, untold: Iterable[Mapping[str, str]]) -> Found:
-    return Found(
-        variable,
-        None,
-        effect.names,
-        effect.units,
-        effect.estimate,
-        effect.sigma,
-        _told(variable, effect.names, untold),
+def _effect(
+    variable: str, effect: EffectEstimate, untold: Iterable[Mapping[str, str]]
+) -> VariableEstimate:
+    return VariableEstimate(
+        variable=variable,
+        parent=None,
+        parameters=effect.names,
+        units=effect.units,
+        estimate=effect.estimate,
+        sigma=effect.sigma,
+        told=_told(variable, effect.names, untold),
     )
 
 
@@ -154,7 +156,7 @@ def _kinds(runs: Sequence[Run], error: str) -> list[str]:
     return list(dict.fromkeys(kind for run in runs for kind in run.summary[error]))
 
 
-def _side_by_side(runs: Sequence[Sequence[Found]]) -> dict[str, dict[str, Any]]:
+def _side_by_side(runs: Sequence[Sequence[VariableEstimate]]) -> dict[str, dict[str, Any]]:
     """Variable -> parameter -> unit, and estimate and sigma per run."""
     out: dict[str, dict[str, Any]] = {}
     for i, rows in enumerate(runs):

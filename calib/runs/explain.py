@@ -21,7 +21,9 @@ from sensors.documents import plain, write_json
 
 EXPLANATION = "explanation.json"
 MOST_RUNGS = 8
-WORTH = 0.01  # of what the held-out error has above the noise floor: what an effect must take away
+LEAST_FALL = (
+    0.01  # of what the held-out error has above the noise floor: what an effect must take away
+)
 
 
 @dataclass(frozen=True)
@@ -79,11 +81,11 @@ def explain(
     except BaseException:
         _remove_if_empty(out)
         raise
-    found = diagnose(climb.run, climb.tell, refits=False)
-    while len(climb.runs) < MOST_RUNGS and climb.improve(found.worth_adding):
-        found = diagnose(climb.run, climb.tell, refits=False)
+    diagnosis = diagnose(climb.run, climb.tell, refits=False)
+    while len(climb.runs) < MOST_RUNGS and climb.improve(diagnosis.worth_adding):
+        diagnosis = diagnose(climb.run, climb.tell, refits=False)
     climb.clear_above()
-    result = Explanation(climb.runs, climb.steps, climb.refused, found)
+    result = Explanation(climb.runs, climb.steps, climb.refused, diagnosis)
     write_json(out / EXPLANATION, result.document())
     return result
 
@@ -164,7 +166,7 @@ class _Climb:
         run = self._finished(folder, model, self.run)
         if run is None:
             run = grow(self.run, model, folder, self.tell)
-        if _falls(self.run, run, WORTH if added else 0.0):
+        if _falls(self.run, run, LEAST_FALL if added else 0.0):
             self._keep(run, added, dropped)
         else:
             shutil.rmtree(folder)
@@ -217,5 +219,5 @@ def _falls(before: Run, after: Run, share: float) -> bool:
 
 
 def _held_out(run: Run) -> float:
-    found = run.summary["rms_mm"]["held_out"]
-    return run.summary["rms_mm"]["fit"] if found is None else found
+    held_out = run.summary["rms_mm"]["held_out"]
+    return run.summary["rms_mm"]["fit"] if held_out is None else held_out

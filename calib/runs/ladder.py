@@ -26,8 +26,8 @@ class Rung:
     @property
     def grown_from(self) -> Path | None:
         """Where the run below was when this one grew from it."""
-        found = self.run.model.get("grown_from")
-        return Path(found) if found else None
+        folder = self.run.model.get("grown_from")
+        return Path(folder) if folder else None
 
     @property
     def added(self) -> list[str] | None:
@@ -42,12 +42,6 @@ class Rung:
         if self.below is None:
             return None if self.grown_from else []
         return [name for name in self.below.effects if name not in self.run.effects]
-
-    def _repr_html_(self) -> str:
-        """As a notebook shows it."""
-        from calib.show.notebook import rung_html
-
-        return rung_html(self)
 
     def document(self) -> dict[str, Any]:
         """As ``rigcal compare --json`` gives it."""
@@ -83,11 +77,11 @@ def ladder(runs: Sequence[Run]) -> list[Rung]:
 def _down(run: Run, known: dict[Path, Run] | None = None) -> Iterator[Run]:
     """The run, what it grew from, what that grew from, and so on; each once."""
     seen: set[Path] = set()
-    found: Run | None = run
-    while found is not None and found.folder.resolve() not in seen:
-        seen.add(found.folder.resolve())
-        yield found
-        found = _below(found, known or {})
+    lower: Run | None = run
+    while lower is not None and lower.folder.resolve() not in seen:
+        seen.add(lower.folder.resolve())
+        yield lower
+        lower = _below(lower, known or {})
 
 
 def _below(run: Run, known: dict[Path, Run]) -> Run | None:

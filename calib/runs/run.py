@@ -71,12 +71,6 @@ class Run:
                 f"{folder}: written by another version of rigcal, or edited ({error}); fit it again"
             ) from None
 
-    def _repr_html_(self) -> str:
-        """As a notebook shows it."""
-        from calib.show.notebook import run_html
-
-        return run_html(self)
-
     @property
     def recordings(self) -> list[Path]:
         """Where the recordings were that this run was fitted to."""
@@ -97,11 +91,11 @@ class Run:
         if not path.is_file():
             return None
         try:
-            found = _json(path)
-            whole = [(_OF_CANDIDATE, c) for c in found["candidates"]]
-            whole += [(_OF_CURVE, c) for c in found["curves"]]
-            if all(each.keys() >= keys for keys, each in [(_OF_DIAGNOSIS, found), *whole]):
-                return found
+            document = _json(path)
+            whole = [(_OF_CANDIDATE, c) for c in document["candidates"]]
+            whole += [(_OF_CURVE, c) for c in document["curves"]]
+            if all(each.keys() >= keys for keys, each in [(_OF_DIAGNOSIS, document), *whole]):
+                return document
         except (ValueError, TypeError, KeyError, AttributeError):
             pass
         raise InputError(
@@ -133,7 +127,13 @@ def read_solution(folder: Path) -> Solution:
     with np.load(folder / COVARIANCE) as stored:
         names, covariance = tuple(stored["names"].tolist()), stored["covariance"]
     recordings = {n: _read_part(p) for n, p in data.get("recordings", {}).items()}
-    return Solution(_read_part(data), recordings, data["not_estimated"], names, covariance)
+    return Solution(
+        shared=_read_part(data),
+        recordings=recordings,
+        not_estimated=data["not_estimated"],
+        names=names,
+        covariance=covariance,
+    )
 
 
 def write_state(folder: Path, state: Mapping[str, np.ndarray]) -> None:
@@ -144,8 +144,8 @@ def write_state(folder: Path, state: Mapping[str, np.ndarray]) -> None:
 def versions() -> dict[str, str]:
     """Of what made a run: for provenance."""
     names = ("rigcal", "gtsam", "numpy", "scipy")
-    found = {n: importlib.metadata.version(n) for n in names}
-    return found | {"python": platform.python_version()}
+    numbers = {n: importlib.metadata.version(n) for n in names}
+    return numbers | {"python": platform.python_version()}
 
 
 def _effect_name(document: str | Mapping[str, Any]) -> str:

@@ -16,20 +16,20 @@ HEADINGS = {
     "label": "material",
     "ring": "ring",
 }
-LISTED = 16  # rings of a sensor with more are not listed one by one
+LISTED_RINGS = 16  # rings of a sensor with more are not listed one by one
 
 
-def print_evaluations(found: Mapping[str, Mapping[str, Any]]) -> None:
+def print_evaluations(evaluations: Mapping[str, Mapping[str, Any]]) -> None:
     """Print evaluations by run: the only one in full, several side by side."""
-    if len(found) == 1:
-        print_evaluation(next(iter(found.values())))
+    if len(evaluations) == 1:
+        print_evaluation(next(iter(evaluations.values())))
         return
     console = terminal()
-    table = columns_table("mm", *(Path(run).name for run in found))
+    table = columns_table("mm", *(Path(run).name for run in evaluations))
     for column in table.columns[1:]:
         column.justify = "right"
     for what, value in _LINES.items():
-        table.add_row(what, *(value(each) for each in found.values()))
+        table.add_row(what, *(value(each) for each in evaluations.values()))
     console.print(table)
 
 
@@ -45,26 +45,26 @@ _LINES = {
 }
 
 
-def print_evaluation(found: Mapping[str, Any]) -> None:
+def print_evaluation(evaluation: Mapping[str, Any]) -> None:
     """Print an evaluation: as a whole, then by what it may depend on."""
     console = terminal()
-    how = "corrected by the model" if found["corrected"] else "as measured"
-    console.print(f"{found['returns']} returns, {how}; mm", style="bold")
-    signed, nearest = found["signed_error_mm"], found["cloud_to_mesh_mm"]
+    how = "corrected by the model" if evaluation["corrected"] else "as measured"
+    console.print(f"{evaluation['returns']} returns, {how}; mm", style="bold")
+    signed, nearest = evaluation["signed_error_mm"], evaluation["cloud_to_mesh_mm"]
     table = _table("")
     table.add_row(
         "range against the surface",
         *(mm(signed["mean"], "+"), mm(signed["std"])),
-        *(mm(found["accuracy_mm"]), mm(found["precision_mm"])),
+        *(mm(evaluation["accuracy_mm"]), mm(evaluation["precision_mm"])),
     )
     table.add_row("cloud to mesh", mm(nearest["mean"], "+"), mm(nearest["std"]), "", "")
     table.add_row()
     console.print(table)
-    if found["planes"]:
-        console.print(_planes(found["planes"]))
+    if evaluation["planes"]:
+        console.print(_planes(evaluation["planes"]))
     for name, heading in HEADINGS.items():
-        rows = found["by"][name]
-        if len(rows) > 1 and (name != "ring" or len(rows) <= LISTED):
+        rows = evaluation["by"][name]
+        if len(rows) > 1 and (name != "ring" or len(rows) <= LISTED_RINGS):
             console.print(_by(heading, rows))
 
 

@@ -1,11 +1,18 @@
-"""What a notebook shows of results: the tables of the terminal, as HTML."""
+"""What a notebook shows of results: the tables of the terminal, as HTML.
+
+Importing this gives runs, rungs and diagnoses their `_repr_html_`: results know nothing of how they
+are shown. `calib` imports it with the first of them that is asked of it.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from calib.runs.estimates import found
+from calib.diagnosis import Diagnosis
+from calib.runs.estimates import variable_estimates
+from calib.runs.ladder import Rung
+from calib.runs.run import Run
 from calib.show.diagnosis import (
     LEADING,
     candidates_table,
@@ -16,10 +23,6 @@ from calib.show.tables import effects_table, error_table, ladder_table, links_ta
 
 if TYPE_CHECKING:
     from rich.table import Table
-
-    from calib.diagnosis import Diagnosis
-    from calib.runs.ladder import Rung
-    from calib.runs.run import Run
 
 _PAGE = """\
 <div><p><b>{{ title }}</b></p>
@@ -42,7 +45,7 @@ _PAGE = """\
 
 def run_html(run: Run) -> str:
     """A run: every link and effect with its sigma in mm and mrad, the errors, what is not told."""
-    rows = found(run)
+    rows = variable_estimates(run)
     effects = [row for row in rows if row.parent is None]
     tables = [links_table([row for row in rows if row.parent is not None])]
     tables += [effects_table(effects)] if effects else []
@@ -83,3 +86,7 @@ def _rows(table: Table) -> dict[str, Any]:
         "columns": table.columns,
         "rows": [list(zip(row, table.columns, strict=True)) for row in filled],
     }
+
+
+for _kind, _html_of in ((Run, run_html), (Rung, rung_html), (Diagnosis, diagnosis_html)):
+    _kind._repr_html_ = _html_of

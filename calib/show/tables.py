@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.padding import Padding
 from rich.table import Table
 
-from calib.runs.estimates import Found, comparison, found
+from calib.runs.estimates import VariableEstimate, comparison, variable_estimates
 from calib.runs.ladder import Rung, ladder
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from calib.solve.check import Check
 
 WIDTH = 100
-LISTED = 12  # an effect of more parameters than these is summarised
+LISTED_PARAMETERS = 12  # an effect of more parameters than these is summarised
 ABREAST = 3  # runs in one table
 LEAST_P = 1e-12  # smaller ones are not told from each other
 ERROR_LABELS = {
@@ -29,7 +29,7 @@ ERROR_LABELS = {
     "held_out": "after, of stops held out",
     "noise_floor": "noise floor, if the model were right",
 }
-SHOWN = {"m": (1e3, "mm"), "rad": (1e3, "mrad"), "1": (1.0, "")}
+DISPLAY_UNITS = {"m": (1e3, "mm"), "rad": (1e3, "mrad"), "1": (1.0, "")}
 
 
 def print_check(check: Check) -> None:
@@ -46,7 +46,7 @@ def print_check(check: Check) -> None:
 
 def print_run(run: Run) -> None:
     """Print a run: every link and effect with its sigma, the errors, and what was not told."""
-    console, rows = terminal(), found(run)
+    console, rows = terminal(), variable_estimates(run)
     summary = run.summary
     console.print(str(run.folder), style="bold", soft_wrap=True)
     console.print(f"{_outcome(summary)}\n")
@@ -132,10 +132,10 @@ def print_catalogue(effects: Sequence[Effect], whole: bool) -> None:
 def shown(unit: str) -> tuple[float, str]:
     """Factor and unit in which a unit is shown, m/K as m is."""
     length, per, rest = unit.partition("/")
-    if per and length in SHOWN and length != "1":
-        scale, name = SHOWN[length]
+    if per and length in DISPLAY_UNITS and length != "1":
+        scale, name = DISPLAY_UNITS[length]
         return scale, f"{name}/{rest}"
-    return SHOWN.get(unit, (1.0, unit))
+    return DISPLAY_UNITS.get(unit, (1.0, unit))
 
 
 def estimate_cell(estimate: float, sigma: float, unit: str) -> str:
@@ -185,7 +185,7 @@ def print_pairs(console: Console, title: str, rows: Iterable[tuple[str, str]]) -
     console.print(Padding(table, (0, 0, 1, 2)))
 
 
-def links_table(rows: Sequence[Found]) -> Table:
+def links_table(rows: Sequence[VariableEstimate]) -> Table:
     """How far every frame lies from CAD, in its own axes, mm and mrad."""
     table = columns_table("moved from CAD, own axes", "x", "y", "z", "", "not told by the data")
     for row in rows:
@@ -198,7 +198,7 @@ def links_table(rows: Sequence[Found]) -> Table:
     return table
 
 
-def effects_table(rows: Sequence[Found]) -> Table:
+def effects_table(rows: Sequence[VariableEstimate]) -> Table:
     """Every parameter of every effect; of one with many, a summary."""
     table = columns_table("effect", "parameter", "estimate", "", "")
     for row in rows:
@@ -210,9 +210,9 @@ def effects_table(rows: Sequence[Found]) -> Table:
     return table
 
 
-def effect_cells(row: Found) -> Iterable[tuple[str, str, str, bool]]:
+def effect_cells(row: VariableEstimate) -> Iterable[tuple[str, str, str, bool]]:
     """Parameter, its cell, unit and whether it was told: one by one, or of each unit a summary."""
-    if len(row.parameters) > LISTED:
+    if len(row.parameters) > LISTED_PARAMETERS:
         for unit in dict.fromkeys(row.units):
             free = (row.sigma > 0) & (np.array(row.units) == unit)
             cells = _summary_cell(row, free, unit)
@@ -225,7 +225,7 @@ def effect_cells(row: Found) -> Iterable[tuple[str, str, str, bool]]:
             yield parameter, estimate_cell(*numbers, unit), shown(unit)[1], told
 
 
-def _summary_cell(row: Found, free: np.ndarray, unit: str) -> tuple[str, str]:
+def _summary_cell(row: VariableEstimate, free: np.ndarray, unit: str) -> tuple[str, str]:
     scale, unit = shown(unit)
     values = scale * row.estimate[free]
     if not len(values):
@@ -277,7 +277,7 @@ def _change(link: Mapping[str, Any]) -> str:
             f"{link['parameters'][i]} {estimate_cell(link['change'][i], link['sigma'][i], unit)}"
             for i in mine
         ]
-        if len(mine) > LISTED:
+        if len(mine) > LISTED_PARAMETERS:
             rms = np.sqrt(np.mean(np.square([link["change"][i] for i in mine])))
             cells = [f"{len(mine)} values by {shown(unit)[0] * rms:.2f} rms"]
         texts.append(f"{', '.join(cells)} {shown(unit)[1]}".rstrip())
@@ -314,7 +314,7 @@ def _comparison_table(runs: Sequence[Run]) -> Table:
                 cells = (mm(value, "+" if error == "mean_mm" else "") for value in values)
                 table.add_row(f"{error[:-3]} {label}", "mm", *cells)
     for variable, parameters in compared["parameters"].items():
-        if len(parameters) > LISTED:
+        if len(parameters) > LISTED_PARAMETERS:
             _add_spread(table, variable, list(parameters.values()))
             continue
         for name, entry in parameters.items():

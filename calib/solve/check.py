@@ -23,7 +23,7 @@ from sensors.reference import Reference
 from sensors.stops import read_targets
 
 MOST_SCANS = 20  # of which one linearisation tells what can be estimated
-TOLD = 0.99  # of the prior's sigma left: less than that, and the data say something
+LEFT_SIGMA = 0.99  # of the prior's sigma left: less than that, and the data say something
 
 T = TypeVar("T")
 
@@ -193,12 +193,12 @@ def _place(scan: ScanStop, values: Values) -> PlacedScan:
     rows = scan.rows(values)
     met = rows.weight > 0
     return PlacedScan(
-        scan.name,
-        scan.pose(values),
-        float(rows.usable.mean()),
-        rows.view["range_m"][met],
-        rows.view["incidence_rad"][met],
-        float(np.median(np.abs(rows.residual_m[rows.usable]))),
+        name=scan.name,
+        T=scan.pose(values),
+        share=float(rows.usable.mean()),
+        range_m=rows.view["range_m"][met],
+        incidence_rad=rows.view["incidence_rad"][met],
+        residual_m=float(np.median(np.abs(rows.residual_m[rows.usable]))),
     )
 
 
@@ -211,7 +211,7 @@ def _expected(estimate: Estimate) -> dict[str, dict[str, tuple[float, float]]]:
     for v in estimate.variables:
         now, units = sigma[start : start + v.dim], np.array(v.units)
         for unit in dict.fromkeys(v.units):
-            told = now[(units == unit) & (now < TOLD * v.sigma)]
+            told = now[(units == unit) & (now < LEFT_SIGMA * v.sigma)]
             if len(told):
                 name, scale = shown.get(unit, (unit, 1.0))
                 least, largest = (float(scale * f(told)) for f in (np.min, np.max))

@@ -67,7 +67,7 @@ class KeptRows:
         return float(self.constant @ self.constant) / 2
 
     def evaluate(self, values: Values, derivatives: bool) -> tuple[np.ndarray, Derivatives | None]:
-        """The rows where they were linearised; elsewhere nobody asks."""
+        """The rows as they were linearised: a Gauss-Newton step asks for nothing else."""
         return self.constant, dict(self.by) if derivatives else None
 
 

@@ -41,10 +41,7 @@ def not_estimated(
     if not untold.shape[1]:
         return []
     owner = np.repeat([v.name for v in variables], [v.dim for v in variables])
-    preference = np.where(np.isin(owner, list(effects)), 1.0, 0.3)
-    _, _, order = qr((untold * preference[:, None]).T, mode="economic", pivoting=True)
-    leading = order[: untold.shape[1]]
-    directions = untold @ np.linalg.inv(untold[leading])
+    directions, leading = echelon(untold, np.where(np.isin(owner, list(effects)), 1.0, 0.3))
     found: dict[tuple[str, str], list[str]] = {}
     for column, lead in sorted(zip(directions.T, leading, strict=True), key=lambda pair: pair[1]):
         share = np.abs(column)
@@ -56,6 +53,20 @@ def not_estimated(
         {"name": _name(variable, dofs, whole[variable]), "why": why}
         for (variable, why), dofs in found.items()
     ]
+
+
+def echelon(space: np.ndarray, preference: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The directions (P, r) that span a space (P, r) and have one leading parameter each, in which
+    no other has a part; and which these (r,) are. Where eigenvalues are equal their eigenvectors
+    are any mixture, but these are always the same.
+
+    Args:
+        space: orthonormal directions.
+        preference: (P,) for a parameter to lead.
+    """
+    _, _, order = qr((space * preference[:, None]).T, mode="economic", pivoting=True)
+    leading = order[: space.shape[1]]
+    return space @ np.linalg.inv(space[leading]), leading
 
 
 def _name(variable: str, dofs: list[str], all_dofs: tuple[str, ...]) -> str:

@@ -19,7 +19,7 @@ from chains import se3
 from chains.errors import InputError
 
 ALARM = 0.01  # chance that anything is called moved when nothing has
-TOLD = 0.9  # of the earlier variance left: less than that, and the new data say something
+LEFT_VARIANCE = 0.9  # of the earlier variance left: less than that, and the new data say something
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ def _test(force: np.ndarray, spread: np.ndarray, precision: np.ndarray) -> _Test
     """Of a force ~ N(0, spread), along the axes that anything but the prior holds."""
     root = np.linalg.inv(np.linalg.cholesky(precision))
     told, axes = np.linalg.eigh(root @ spread @ root.T)
-    use = told > 1.0 - TOLD
+    use = told > 1.0 - LEFT_VARIANCE
     if not use.any():
         return None
     statistic = float((np.square(axes.T @ root @ force)[use] / told[use]).sum())
@@ -150,13 +150,13 @@ def _link(
     else:
         change, covariance = change[k], covariance[k, k]
     return Link(
-        variable.name,
-        moved,
-        test.p if test else None,
-        change,
-        np.sqrt(np.diag(covariance)),
-        variable.dofs,
-        variable.units,
+        name=variable.name,
+        moved=moved,
+        p_value=test.p if test else None,
+        change=change,
+        sigma=np.sqrt(np.diag(covariance)),
+        parameters=variable.dofs,
+        units=variable.units,
     )
 
 

@@ -124,7 +124,13 @@ def solution_of(problem: Problem, estimate: Estimate, widened: float = 1.0) -> S
     )
     untold = not_estimated(estimate.variables, estimate.covariance, effects, estimate.touched())
     names = tuple(f"{v.name}.{dof}" for v in estimate.variables for dof in v.dofs)
-    return Solution(shared, recordings, untold + _absent(problem), names, told)
+    return Solution(
+        shared=shared,
+        recordings=recordings,
+        not_estimated=untold + _absent(problem),
+        names=names,
+        covariance=told,
+    )
 
 
 def _frame(source: Source, term: Term, theta: np.ndarray, covariance: np.ndarray) -> FrameEstimate:

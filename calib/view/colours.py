@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from calib.show.scale import round_up
 from calib.view.scene import Points
 
 # Blue to vermilion about a grey that shows on white walls: told apart by every kind of sight.
@@ -99,7 +100,7 @@ def coloured(points: Points, name: str, label_names: Mapping[int, str]) -> tuple
     values = values * shown.scale
     known = values[np.isfinite(values)]
     if name == "residual_m":
-        high = nice(float(np.quantile(np.abs(known), SHARE)) if len(known) else 0.0)
+        high = round_up(float(np.quantile(np.abs(known), SHARE)) if len(known) else 0.0)
         low, stops = -high, SIGNED
     else:
         edge = (1 - SHARE) / 2
@@ -107,24 +108,18 @@ def coloured(points: Points, name: str, label_names: Mapping[int, str]) -> tuple
         stops = RISING
     place = (values - low) / max(high - low, 1e-12)
     return _between(place, stops), Scale(
-        shown.title, shown.unit, float(low), float(high), stops, {}
+        title=shown.title, unit=shown.unit, low=float(low), high=float(high), stops=stops, names={}
     )
 
 
-def nice(value: float) -> float:
-    """The next of 1, 2, 5, 10, 20, … upwards; 1 of 0."""
-    if not value > 0:
-        return 1.0
-    ten = 10.0 ** np.floor(np.log10(value))
-    return float(next(n * ten for n in (1.0, 2.0, 5.0, 10.0) if value <= n * ten * (1 + 1e-9)))
-
-
 def _by_name(labels: np.ndarray, names: Mapping[int, str]) -> tuple[np.ndarray, Scale]:
-    found, index = np.unique(labels, return_inverse=True)
-    colours = [UNKNOWN if n < 0 else NAMED[i % len(NAMED)] for i, n in enumerate(found)]
-    titles = [names.get(int(n), f"label {n}") for n in found]
+    distinct, index = np.unique(labels, return_inverse=True)
+    colours = [UNKNOWN if n < 0 else NAMED[i % len(NAMED)] for i, n in enumerate(distinct)]
+    titles = [names.get(int(n), f"label {n}") for n in distinct]
     legend = dict(zip(titles, colours, strict=True))
-    return _rgb(colours)[index], Scale("label", "", None, None, (), legend)
+    return _rgb(colours)[index], Scale(
+        title="label", unit="", low=None, high=None, stops=(), names=legend
+    )
 
 
 def _between(place: np.ndarray, stops: tuple[str, ...]) -> np.ndarray:

@@ -32,7 +32,7 @@ class Findings:
     sentences: Sequence[str]
     candidates: Sequence[Mapping[str, Any]]
     unexplained: Sequence[Mapping[str, Any]]
-    curves: Mapping[str, Curve]
+    curves: Mapping[str, DiagnosisCurve]
 
     @classmethod
     def read(cls, run: Run) -> Findings | None:
@@ -41,13 +41,13 @@ class Findings:
         Raises:
             InputError: the file is of another version.
         """
-        found = run.diagnosis()
-        if found is None:
+        document = run.diagnosis()
+        if document is None:
             return None
-        single = (c for c in found["curves"] if len(c["covariates"]) == 1)
-        curves = {c["covariates"][0]: Curve.read(c) for c in single}
-        lists = (found[key] for key in ("sentences", "candidates", "unexplained"))
-        return cls(found["heading"], *lists, curves)
+        single = (c for c in document["curves"] if len(c["covariates"]) == 1)
+        curves = {c["covariates"][0]: DiagnosisCurve.read(c) for c in single}
+        lists = (document[key] for key in ("sentences", "candidates", "unexplained"))
+        return cls(document["heading"], *lists, curves)
 
     @property
     def worth_adding(self) -> list[str]:
@@ -64,7 +64,7 @@ class Findings:
 
 
 @dataclass(frozen=True)
-class Curve:
+class DiagnosisCurve:
     """Mean range residual (B,) in the bins of a covariate, with the band of chance; mm."""
 
     centres: np.ndarray
@@ -72,7 +72,7 @@ class Curve:
     band_mm: np.ndarray
 
     @classmethod
-    def read(cls, document: Mapping[str, Any]) -> Curve:
+    def read(cls, document: Mapping[str, Any]) -> DiagnosisCurve:
         """As diagnosis.json has it; what is null there is NaN."""
         parts = document["centres"][0], document["mean_mm"], document["band_mm"]
         return cls(*(np.array(part, float) for part in parts))
@@ -152,17 +152,17 @@ class Desk:
         self.runs[self.chosen] = below
         return f"Back at {self.chosen}; {left.folder} stays on disk."
 
-    def addable(self, found: Findings | None) -> dict[str, str | Mapping[str, Any]]:
+    def addable(self, findings: Findings | None) -> dict[str, str | Mapping[str, Any]]:
         """Effects that the model lacks, those found first: name -> what `rigcal add` takes.
 
         What has no name is a formula, as a document of an effect's file.
         """
         offered: dict[str, str | Mapping[str, Any]] = {}
-        if found is not None:
-            offered |= {name: name for name in found.worth_adding}
-            formulas = (each["formula"] for each in found.unexplained if each.get("formula"))
+        if findings is not None:
+            offered |= {name: name for name in findings.worth_adding}
+            formulas = (each["formula"] for each in findings.unexplained if each.get("formula"))
             offered |= {formula["name"]: formula for formula in formulas}
-            offered |= {c["add"]: c["add"] for c in found.candidates}
+            offered |= {c["add"]: c["add"] for c in findings.candidates}
         families = {name.partition("@")[0] for name in (*offered, *self.run.effects)}
         offered |= {e.name: e.name for e in CATALOGUE if e.family not in families}
         return {name: what for name, what in offered.items() if name not in self.run.effects}

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from calib.view import colours, panels
-from calib.view.desk import Curve, Desk, Findings
+from calib.view.desk import Desk, DiagnosisCurve, Findings
 from calib.view.job import Job
 from calib.view.scene import Scene
 from calib.view.stage import AXES, PANEL_PX, RIG, ROOM, Stage
@@ -32,7 +32,7 @@ class Page:
     def __init__(self, server: Any, desk: Desk) -> None:
         self.server, self.desk = server, desk
         self.stage = Stage(server)
-        self.found: Findings | None = None
+        self.findings: Findings | None = None
         self.job: Job | None = None
         self._columns: dict[str, str] = {}  # heading -> column that points can be coloured by
         self._covariates: dict[str, str] = {}  # heading -> covariate that has a curve
@@ -212,24 +212,24 @@ class Page:
     # ------------------------------------------------------------------------------- the findings
 
     def _show_findings(self) -> None:
-        self.found = None
+        self.findings = None
         try:
-            self.found = Findings.read(self.desk.run)
+            self.findings = Findings.read(self.desk.run)
         finally:
-            self._findings.content = panels.findings(self.found)
-            self._diagnose.visible = self.found is None
-            self._fill(self._effect, list(self.desk.addable(self.found)) or [NOTHING])
-            worth = self.found is not None and bool(self.found.worth_adding)
+            self._findings.content = panels.findings(self.findings)
+            self._diagnose.visible = self.findings is None
+            self._fill(self._effect, list(self.desk.addable(self.findings)) or [NOTHING])
+            worth = self.findings is not None and bool(self.findings.worth_adding)
             self._add.color = None if worth else "gray"
             self._choose_curve()
 
     def _choose_curve(self) -> None:
         """The curve that shows the chosen effect best."""
-        names = list(self.found.curves) if self.found else []
+        names = list(self.findings.curves) if self.findings else []
         self._over.visible = self._curve.visible = bool(names)
         self._covariates = {colours.column(n).heading: n for n in names}
         if names:
-            best = colours.column(self.found.covariate_of(self._effect.value)).heading
+            best = colours.column(self.findings.covariate_of(self._effect.value)).heading
             self._fill(self._over, list(self._covariates), best)
             self._draw_curve()
 
@@ -237,12 +237,12 @@ class Page:
         name = self._covariates[self._over.value]
         scale = colours.column(name).scale
         self._curve.data, self._curve.series = _curve(
-            self.found.curves[name], self._over.value, scale
+            self.findings.curves[name], self._over.value, scale
         )
 
     def _on_add(self) -> None:
         name = self._effect.value
-        what = self.desk.addable(self.found).get(name)
+        what = self.desk.addable(self.findings).get(name)
         if what is None:
             raise InputError(f"'{name}' is not an effect that can be added to this run")
         self._start(Job(self.desk.run.folder, what, self.desk.folder_for(name)))
@@ -305,10 +305,10 @@ class Page:
         menu.value = chosen if chosen in options else options[0]
 
 
-def _curve(curve: Curve | None, over: str = "", scale: float = 1.0) -> tuple[Any, Any]:
+def _curve(curve: DiagnosisCurve | None, over: str = "", scale: float = 1.0) -> tuple[Any, Any]:
     """Data and series of a curve with its band; of none, two points."""
     if curve is None:
-        curve = Curve(*(np.zeros(2),) * 3)
+        curve = DiagnosisCurve(*(np.zeros(2),) * 3)
     data = (curve.centres * scale, curve.mean_mm, curve.band_mm, -curve.band_mm)
     edge = {"stroke": "#888888", "width": 1, "dash": (4, 4), "points": {"show": False}}
     series = (

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 
 from calib.runs.ladder import Rung
+from calib.show.tables import LEAST_P
 from calib.view.colours import Scale, column
 from calib.view.desk import Findings
 from calib.view.scene import Points
 
-SHOWN = 6  # candidates in the table; the menu has all
-LEAST_P = 1e-12  # smaller ones are not told from each other
+SHOWN_CANDIDATES = 6  # candidates in the table; the menu has all
 LARGE = ((1e9, " billion"), (1e6, " million"), (1.0, ""))
 _FRAME = "padding:0 1.2em .4em .75em;font-size:12px;line-height:1.4;color:#222"
 _QUIET = "color:#555"
@@ -89,32 +89,34 @@ def point(points: Points, index: int, label_names: Mapping[int, str]) -> str:
     return _framed(f'<table data-is="point">{pairs}</table>')
 
 
-def findings(found: Findings | None) -> str:
+def findings(diagnosed: Findings | None) -> str:
     """The verdict in sentences, and the candidates in their order."""
-    if found is None:
+    if diagnosed is None:
         return _framed("This run has not been diagnosed.")
-    sentences = "".join(f'<p style="margin:.3em 0">{escape(text)}</p>' for text in found.sentences)
-    verdict = escape(f"Verdict: {found.heading}")
-    return _framed(f'<b data-is="verdict">{verdict}</b>{sentences}{_candidates(found)}')
+    sentences = "".join(
+        f'<p style="margin:.3em 0">{escape(text)}</p>' for text in diagnosed.sentences
+    )
+    verdict = escape(f"Verdict: {diagnosed.heading}")
+    return _framed(f'<b data-is="verdict">{verdict}</b>{sentences}{_candidates(diagnosed)}')
 
 
-def _candidates(found: Findings) -> str:
-    if not found.candidates:
+def _candidates(diagnosed: Findings) -> str:
+    if not diagnosed.candidates:
         return ""
     head = "".join(
         f'<th style="text-align:{side};font-weight:600;padding-right:.6em">{text}</th>'
         for text, side in (("effect", "left"), ("mm", "right"), ("by chance", "left"))
     )
     head += '<th style="text-align:left;font-weight:600">held out</th>'
-    rows = "".join(_candidate(each, found) for each in found.candidates[:SHOWN])
+    rows = "".join(_candidate(each, diagnosed) for each in diagnosed.candidates[:SHOWN_CANDIDATES])
     return f'<table data-is="findings" style="width:100%"><tr>{head}</tr>{rows}</table>'
 
 
-def _candidate(each: Mapping[str, Any], found: Findings) -> str:
+def _candidate(each: Mapping[str, Any], diagnosed: Findings) -> str:
     size = each["unabsorbed_rms_mm"]
     held = [each["held_out_rms_mm"][k] for k in ("before", "after")]
     held_out = f"{held[0]:.2f} → {held[1]:.2f}" if None not in held else ""
-    worth = "color:#222" if each["add"] in found.worth_adding else _QUIET
+    worth = "color:#222" if each["add"] in diagnosed.worth_adding else _QUIET
     return (
         f'<tr style="{worth}"><td>{escape(each["add"]).replace("_", "_<wbr>")}</td>'
         f'<td style="text-align:right;padding-right:.6em">{"" if size is None else f"{size:.2f}"}'

@@ -26,7 +26,7 @@ from sensors.recording import read_table
 
 MOST_POINTS = 150_000  # more than a screen can tell apart
 MOST_TRIANGLES = 300_000
-NEAR = 0.01  # of its distance from the eye: what a click may miss a point by
+CLICK_REACH = 0.01  # of its distance from the eye: what a click may miss a point by
 _NEEDED = ("ring", "column", "range_m", "incidence_rad", "azimuth_rad", "elevation_rad")
 _NEEDED += ("residual_m", "sigma_m", "weight")
 
@@ -72,7 +72,9 @@ class Points:
         beside = np.sqrt(np.maximum(np.einsum("ni,ni->n", reach, reach) - along**2, 0.0))
         with np.errstate(divide="ignore", invalid="ignore"):
             off = np.where(along > 0, beside / along, np.inf)
-        meant = np.flatnonzero(off < max(NEAR / 4, min(NEAR, off.min(initial=np.inf) * 1.5)))
+        meant = np.flatnonzero(
+            off < max(CLICK_REACH / 4, min(CLICK_REACH, off.min(initial=np.inf) * 1.5))
+        )
         return int(among[meant[np.argmin(along[meant])]]) if len(meant) else None
 
 
@@ -204,14 +206,14 @@ class Scene:
     def _stops(self) -> dict[tuple[int, int], tuple[Stops, int]]:
         """(recording, stop) -> the geometry that places it, and its row there; in their order."""
         number = {s.recording.folder: i for i, s in enumerate(self.sources)}
-        found: dict[tuple[int, int], tuple[Stops, int]] = {}
+        placed: dict[tuple[int, int], tuple[Stops, int]] = {}
         for block in self.problem.blocks:
             if isinstance(block, TrackedBody):
                 for row, (folder, k) in enumerate(block.stop_names):
-                    found[number[folder], k] = block.stops, row
+                    placed[number[folder], k] = block.stops, row
         for scan in self.problem.scans:
-            found[number[scan.recording.folder], scan.index] = scan.stops, 0
-        return dict(sorted(found.items(), key=lambda item: item[0]))
+            placed[number[scan.recording.folder], scan.index] = scan.stops, 0
+        return dict(sorted(placed.items(), key=lambda item: item[0]))
 
 
 def _beam_ends(columns: Mapping[str, np.ndarray], beam_origin_m: np.ndarray) -> np.ndarray:

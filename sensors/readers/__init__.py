@@ -1,8 +1,10 @@
 """Readers of foreign files: one format, one file. A new one is a function and a line here."""
 
-from sensors.readers.bag import read_bag
+from sensors.readers.arms.dh import read_dh
+from sensors.readers.arms.urdf import read_urdf
+from sensors.readers.bags.bag import read_bag
 from sensors.readers.base import Reader
-from sensors.readers.clouds import (
+from sensors.readers.clouds.files import (
     read_e57,
     read_kitti,
     read_las,
@@ -11,18 +13,16 @@ from sensors.readers.clouds import (
     read_pcd,
     read_ply,
 )
-from sensors.readers.dh import read_dh
-from sensors.readers.hesai import read_hesai
-from sensors.readers.industrial_calibration import read_industrial_calibration
-from sensors.readers.mesh import read_meshes
-from sensors.readers.motive import read_motive
-from sensors.readers.ouster import read_ouster
-from sensors.readers.spheres import read_spheres
-from sensors.readers.survey import read_survey
-from sensors.readers.table import read_table
-from sensors.readers.trajectory import read_euroc, read_tum
-from sensors.readers.urdf import read_urdf
-from sensors.readers.vicon import read_vicon
+from sensors.readers.meshes.mesh import read_meshes
+from sensors.readers.meshes.spheres import read_spheres
+from sensors.readers.meshes.survey import read_survey
+from sensors.readers.packets.hesai import read_hesai
+from sensors.readers.packets.ouster import read_ouster
+from sensors.readers.poses.industrial_calibration import read_industrial_calibration
+from sensors.readers.poses.motive import read_motive
+from sensors.readers.poses.trajectory import read_euroc, read_tum
+from sensors.readers.poses.vicon import read_vicon
+from sensors.readers.tables.table import read_table
 
 READERS: dict[str, Reader] = {
     reader.kind: reader

@@ -1,10 +1,10 @@
 """What foreign files say before it is cut into stops, and the interface of every reader.
 
-A reader turns files of one kind into a `Found`: logs against a clock (`Track`), turns of the LiDAR
-(`Sweeps`), rows that are stops already, an arm, a surface, sphere centres. It converts to SI units,
-z up and rings from 0, says what it understood and what looked odd, and raises InputError where
-something essential is ambiguous, naming the flag that decides it. What is cut into stops, brought
-onto one clock and written as a recording is no reader's business.
+A reader turns files of one kind into their `Contents`: logs against a clock (`Track`), turns of the
+LiDAR (`Sweeps`), rows that are stops already, an arm, a surface, sphere centres. It converts to SI
+units, z up and rings from 0, says what it understood and what looked odd, and raises InputError
+where something essential is ambiguous, naming the flag that decides it. What is cut into stops,
+brought onto one clock and written as a recording is no reader's business.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ class Arm:
 
 
 @dataclass(frozen=True)
-class Surface:
+class ScannedSurface:
     """A scanned surface in the scanner's frame.
 
     Args:
@@ -115,8 +115,8 @@ class Spheres:
 
 
 @dataclass(frozen=True)
-class Found:
-    """What a reader found in its files.
+class Contents:
+    """What the files of one kind hold.
 
     Args:
         tracks: logs against a clock.
@@ -135,7 +135,7 @@ class Found:
     stops: Columns | None = None
     lidar: Mapping[str, Any] | None = None
     arm: Arm | None = None
-    surface: Surface | None = None
+    surface: ScannedSurface | None = None
     spheres: Spheres | None = None
     understood: tuple[str, ...] = ()
     odd: tuple[str, ...] = ()
@@ -200,16 +200,16 @@ class Reader:
 
     kind: str
     reads: str
-    read: Callable[[Sequence[Path], Options, Progress], Found]
+    read: Callable[[Sequence[Path], Options, Progress], Contents]
     extra: str | None = None
 
 
-def together(found: Sequence[Found]) -> Found:
-    """What the files of one source say, as one `Found`; of the LiDAR, what the first file says."""
-    return Found(
-        tracks=tuple(track for f in found for track in f.tracks),
-        sweeps=tuple(sweeps for f in found for sweeps in f.sweeps),
-        lidar=next((f.lidar for f in found if f.lidar is not None), None),
-        understood=tuple(line for f in found for line in f.understood),
-        odd=tuple(dict.fromkeys(line for f in found for line in f.odd)),
+def together(files: Sequence[Contents]) -> Contents:
+    """What the files of one source hold, as one; of the LiDAR, what the first says."""
+    return Contents(
+        tracks=tuple(track for file in files for track in file.tracks),
+        sweeps=tuple(sweeps for file in files for sweeps in file.sweeps),
+        lidar=next((file.lidar for file in files if file.lidar is not None), None),
+        understood=tuple(line for file in files for line in file.understood),
+        odd=tuple(dict.fromkeys(line for file in files for line in file.odd)),
     )

@@ -20,8 +20,8 @@ from threadpoolctl import threadpool_limits
 from workload import one_thread, recorded, timed
 
 from calib import problem as problems
-from calib.evaluate import evaluate_stop, write_evaluation
-from calib.evaluate.tally import Evaluated
+from calib.evaluation import evaluate_stop, write_evaluation
+from calib.evaluation.tally import Evaluated
 from calib.problem import Problem
 from calib.problem.model import Model, Source
 from chains import se3

@@ -23,7 +23,7 @@ from bench_memory import own_peak_mb
 from calib.report import report
 from calib.runs.calibrate import calibrate
 from calib.runs.run import MODEL, RESIDUALS, Run
-from calib.simulate import Spec, simulate
+from calib.simulation import Spec, simulate
 from sensors.documents import read_yaml, write_yaml
 from sensors.recording import Recording, read_table, write_table
 

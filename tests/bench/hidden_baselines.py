@@ -20,7 +20,7 @@ from calib.diagnosis.score import GAUGE, Scores, project, test
 from calib.diagnosis.stand import Look
 from calib.effects import Effect
 
-MOST = 4  # names that a selection goes on to
+MOST_NAMES = 4  # names that a selection goes on to
 LEVEL = 0.05
 PATH = np.geomspace(0.9, 0.02, 14)  # of the smallest penalty that leaves nothing
 STEPS = 150
@@ -75,7 +75,7 @@ def without_mesh_errors(look: Look) -> Scores:
 def forward(scores: Scores, at: Columns, rows: int) -> list[str]:
     """Forward selection by BIC, rows as independent."""
     chosen, columns, before = [], np.zeros(0, int), 0.0
-    while len(chosen) < MOST:
+    while len(chosen) < MOST_NAMES:
         best, gain = None, 0.0
         for effect, own in at.items():
             if effect.family in chosen:

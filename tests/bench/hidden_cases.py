@@ -23,8 +23,8 @@ from calib.problem import Problem, build
 from calib.problem.model import Model, Source
 from calib.residuals.targets import HangingTarget
 from calib.residuals.tracker import TrackedBody
-from calib.simulate import Spec, simulate
-from calib.simulate.truth import draw
+from calib.simulation import Spec, simulate
+from calib.simulation.truth import draw
 from chains import se3
 from sensors.documents import write_yaml
 

@@ -37,7 +37,7 @@ from .hidden_baselines import answers
 from .hidden_cases import FAMILIES, Case, Hidden, case, cases, record, written
 from .hidden_table import table
 
-TOLD = 0.5  # of a prior's sigma: a parameter known no better says nothing of its interval
+LEFT_SIGMA = 0.5  # of a prior's sigma: a parameter known no better says nothing of its interval
 
 
 def silent(what: str, done: int, total: int) -> None:
@@ -179,7 +179,7 @@ def _estimate(found: Search, effect: Effect, truth: dict[str, Any]) -> dict[str,
     by_fit = np.sqrt(np.diag(stand.estimate.covariance)[chosen])
     scores = project(look.linear, [term.variable])
     by_test = test(scores, np.arange(len(theta))).sigma(look.named.common)
-    told = by_fit < TOLD * variable.sigma
+    told = by_fit < LEFT_SIGMA * variable.sigma
     off = (stand.estimate.values[term.variable] - theta)[told]
     return {"by_fit": (off / by_fit[told]).tolist(), "by_test": (off / by_test[told]).tolist()}
 

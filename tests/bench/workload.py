@@ -15,7 +15,7 @@ from calib.problem import Problem, build
 from calib.problem.model import Model, Source
 from calib.residuals.beams import Association, CompressedScan, SharedSum
 from calib.residuals.scan import ScanStop
-from calib.simulate import Spec, room, simulate
+from calib.simulation import Spec, room, simulate
 from calib.solve.graph import Graph
 from sensors.recording import Recording, Scan
 from sensors.reference import Reference

@@ -47,7 +47,13 @@ def found_by_chance(
     }  # fmt: skip
     untold = [{"name": "mount.tz", "why": "tied to arm_link_length.tip: both change alike"}]
     summary = {"residual": "range", "rms_mm": {"fit": 3.25, "held_out": None}}
-    solution = Solution(shared, own, untold, tuple(names), root @ root.T)
+    solution = Solution(
+        shared=shared,
+        recordings=own,
+        not_estimated=untold,
+        names=tuple(names),
+        covariance=root @ root.T,
+    )
     return Run(folders[0].parent / "run", document, summary, solution)
 
 

@@ -9,7 +9,7 @@ from calib import effects
 from calib.problem import Problem, build
 from calib.problem.model import Model, Source
 from calib.rig import Rig
-from calib.simulate import Spec
+from calib.simulation import Spec
 
 from .simulated import changed, made
 

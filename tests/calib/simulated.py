@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from calib.problem.model import Source
-from calib.simulate import Spec, simulate
+from calib.simulation import Spec, simulate
 
 QUICK = {"locations": 2, "stops_per_location": 2, "column_step": 128}
 EXACT = Spec(**QUICK, noise=0, build_error=0, mesh_error_m=0, mixed_pixel_share=0, occluded_share=0)

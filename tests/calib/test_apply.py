@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from calib.effects import find
-from calib.evaluate.apply import Correction, apply, incidence
+from calib.evaluation.apply import Correction, apply, incidence
 from calib.problem.model import Model, Source
 from calib.runs.calibrate import calibrate
 from calib.runs.run import Run
-from calib.simulate import Spec
+from calib.simulation import Spec
 from chains.errors import InputError
 from sensors.meshes import read_cloud, write_cloud
 from sensors.recording import read_scan, read_table, write_table

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from calib.cli import main
-from calib.simulate import Spec, simulate
+from calib.simulation import Spec, simulate
 
 from .broken import (
     all_of,

@@ -255,7 +255,14 @@ def placed(roll_rad, incidence_deg=(5, 70), residual_m=0.01):
     """Scans of stops that turn about z and lean by `roll_rad`, one each."""
     spread = np.radians(np.linspace(*incidence_deg, 50))
     return [
-        PlacedScan(f"s{k}", pose([k, 0, 0], [roll, 0, k]), 1.0, np.ones(50), spread, residual_m)
+        PlacedScan(
+            name=f"s{k}",
+            T=pose([k, 0, 0], [roll, 0, k]),
+            share=1.0,
+            range_m=np.ones(50),
+            incidence_rad=spread,
+            residual_m=residual_m,
+        )
         for k, roll in enumerate(roll_rad)
     ]
 

@@ -13,7 +13,7 @@ from calib.runs.calibrate import calibrate, grow, grown_model
 from calib.runs.diagnose import diagnose
 from calib.runs.run import Run
 from calib.show.diagnosis import print_diagnosis
-from calib.simulate import Spec, simulate
+from calib.simulation import Spec, simulate
 from chains.errors import InputError
 from sensors.recording import Recording
 

@@ -16,7 +16,7 @@ from calib.diagnosis.stand import Stand
 from calib.linear.parallel import workers
 from calib.linear.rows import PLACES, StopRows
 from calib.problem.model import Model
-from calib.simulate import Spec
+from calib.simulation import Spec
 from calib.solve.fit import solve
 
 from .simulated import made

@@ -6,8 +6,8 @@ import yaml
 
 from calib import effects
 from calib.effects import Site, View, load_effects, read
-from calib.effects.expression import Expression
-from calib.effects.formula import FormulaEffect
+from calib.effects.own.expression import Expression
+from calib.effects.own.formula import FormulaEffect
 from calib.problem import build
 from calib.problem.model import Model, Source
 from chains.errors import InputError

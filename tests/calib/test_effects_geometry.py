@@ -10,7 +10,7 @@ from calib.effects import View, find
 from calib.forward import Term, place
 from calib.problem.model import Source, stop_columns, tracked_poses
 from calib.rig import load_rig
-from calib.simulate import PRESETS, simulate
+from calib.simulation import PRESETS, simulate
 from chains.errors import InputError
 from sensors.lidar import beams
 

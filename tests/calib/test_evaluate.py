@@ -7,12 +7,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from calib.evaluate import accuracy, evaluate
+from calib.evaluation import accuracy, evaluate
 from calib.problem import build
 from calib.problem.model import Model
 from calib.runs.calibrate import calibrate
 from calib.runs.run import Run
-from calib.simulate import Spec
+from calib.simulation import Spec
 from calib.solve.fit import values_of
 from chains.errors import InputError
 from sensors.recording import read_table

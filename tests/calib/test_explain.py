@@ -11,7 +11,7 @@ from calib.runs import explain as module
 from calib.runs.explain import EXPLANATION, MOST_RUNGS, explain
 from calib.runs.run import Run
 from calib.show.diagnosis import print_explanation
-from calib.simulate import simulate
+from calib.simulation import simulate
 from chains.errors import InputError
 
 from .test_diagnose import HIDDEN, SEED, SMALL

@@ -7,7 +7,7 @@ import pytest
 import yaml
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calib.export import FORMATS, export, read_extrinsics
+from calib.exporters import FORMATS, export, read_extrinsics
 from calib.runs.run import Run
 from calib.solve.solution import EffectEstimate, FrameEstimate, Part, Solution
 from chains.errors import InputError
@@ -45,7 +45,16 @@ def run(tmp_path):
     }
     summary = {"residual": "range", "rms_mm": {"fit": 3.25, "held_out": None}}
     return Run(
-        tmp_path / "run", model, summary, Solution(shared, own, untold, (), np.zeros((0, 0)))
+        tmp_path / "run",
+        model,
+        summary,
+        Solution(
+            shared=shared,
+            recordings=own,
+            not_estimated=untold,
+            names=(),
+            covariance=np.zeros((0, 0)),
+        ),
     )
 
 

@@ -5,8 +5,8 @@ import json
 import pytest
 import yaml
 
-from calib.cli.files import export as command
-from calib.export import FORMATS
+from calib.cli.exporting import export as command
+from calib.exporters import FORMATS
 from calib.runs.calibrate import calibrate
 
 from . import rigs

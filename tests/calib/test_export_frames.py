@@ -11,7 +11,7 @@ import yaml
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from calib.effects import load_effects
-from calib.export import export
+from calib.exporters import export
 from calib.rig import load_rig
 
 from . import exports, rigs

@@ -9,7 +9,7 @@ import pandas
 import pytest
 
 from calib.effects import OneHot, View, load_effects
-from calib.export import export
+from calib.exporters import export
 from calib.problem.model import Model
 from calib.rig import load_rig
 from chains.errors import InputError

@@ -7,8 +7,8 @@ import yaml
 import yourdfpy
 
 from calib.effects import CATALOGUE, load_effects
-from calib.export import export
-from calib.export.fitted import Fitted
+from calib.exporters import export
+from calib.exporters.fitted import Fitted
 from calib.problem.model import Source
 from chains.errors import InputError
 

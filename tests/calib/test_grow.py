@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import calib
 from calib.effects import Effect, find
 from calib.problem.model import Model
 from calib.runs.calibrate import calibrate, grow, grown_model
@@ -49,8 +50,7 @@ def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("grow")
     rigs.write(folder / "rec", seed=4)
     first = calibrate([folder / "rec"], folder / "first", SMALL, "stop", folds=2)
-    model = grown_model(first, ["arm_joint_offset", "mount_slip@150"])
-    return first, grow(first, model, folder / "second")
+    return first, calib.add(first, ["arm_joint_offset", "mount_slip@150"], folder / "second")
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from calib.diagnosis.search import judged
 from calib.diagnosis.stand import Stand
 from calib.problem.model import Model
 from calib.residuals.spread import spread_rows
-from calib.simulate import Spec
+from calib.simulation import Spec
 from calib.solve.fit import solve
 from sensors.recording import Scan
 

@@ -9,6 +9,7 @@ import pytest
 from calib.diagnosis.verdict import Diagnosis
 from calib.runs.ladder import Rung
 from calib.runs.run import Run
+from calib.show.notebook import diagnosis_html, run_html, rung_html
 from calib.show.tables import print_run
 from calib.solve.solution import EffectEstimate, FrameEstimate, Part, Solution
 
@@ -26,11 +27,11 @@ def run():
                                np.linspace(-0.001, 0.001, 20), np.full(20, 1e-5)),
     }  # fmt: skip
     solution = Solution(
-        Part({"lidar": frame}, effects),
-        {},
-        [{"name": "lidar.tz", "why": "no <floor> in sight"}],
-        NAMES,
-        np.diag(np.full(6, 9e-8)),
+        shared=Part({"lidar": frame}, effects),
+        recordings={},
+        not_estimated=[{"name": "lidar.tz", "why": "no <floor> in sight"}],
+        names=NAMES,
+        covariance=np.diag(np.full(6, 9e-8)),
     )
     rms = {"fit": 0.86, "held_out": 1.42, "noise_floor": 1.74}
     summary = {
@@ -52,7 +53,7 @@ def cells(html):
 
 
 def test_a_run_shows_what_the_terminal_shows(run, capsys):
-    rows = cells(run._repr_html_())
+    rows = cells(run_html(run))
     print_run(run)
     printed = " ".join(capsys.readouterr().out.split())
     for row in rows:
@@ -61,7 +62,7 @@ def test_a_run_shows_what_the_terminal_shows(run, capsys):
     assert ["ring<offset>", "a & b", "+1.20 ± 0.10", "mm", ""] in rows
     assert any("1.42" in row for row in rows)
     assert not any(row for row in rows if not any(row))
-    said = "".join(parsed(run._repr_html_()).itertext())
+    said = "".join(parsed(run_html(run)).itertext())
     assert "runs/a&b" in said
     assert "not told: lidar.tz: no <floor> in sight" in said
 
@@ -79,9 +80,16 @@ def candidate(name):
 def test_a_diagnosis_shows_its_verdict_sentences_and_candidates():
     sentences = ["incidence_angle_bias is missing: 2.97 mm < rms & so on."]
     found = Diagnosis(
-        "missing_effect", sentences, [candidate("incidence_angle_bias")], [], [], {}, {}, []
+        verdict="missing_effect",
+        sentences=sentences,
+        candidates=[candidate("incidence_angle_bias")],
+        unexplained=[],
+        weak_directions=[],
+        untestable={},
+        misfit={},
+        curves=[],
     )
-    html = found._repr_html_()
+    html = diagnosis_html(found)
     said = "".join(parsed(html).itertext())
     assert "verdict: an effect is missing" in said
     assert sentences[0] in said
@@ -91,6 +99,12 @@ def test_a_diagnosis_shows_its_verdict_sentences_and_candidates():
 
 
 def test_a_rung_shows_its_errors(run):
-    rows = cells(Rung(run, None)._repr_html_())
+    rows = cells(rung_html(Rung(run, None)))
     assert rows[0] == ["ladder", "model", "held out, mm", "fit, mm", "noise floor, mm"]
     assert rows[1] == ["a&b", "start", "1.42", "0.86", "1.74"]
+
+
+def test_results_are_shown_by_notebooks(run):
+    assert run._repr_html_() == run_html(run)
+    assert Rung(run, None)._repr_html_() == rung_html(Rung(run, None))
+    assert Diagnosis._repr_html_ is diagnosis_html

@@ -20,7 +20,14 @@ def world(monkeypatch):
     """A linear world: links of which sums are seen, once before and once after."""
     rng = np.random.default_rng(5)
     variables = [
-        Unknown(name, "vector", np.zeros(DIM), np.full(DIM, CAD_SIGMA), ("a", "b", "c"), ("m",) * 3)
+        Unknown(
+            name=name,
+            kind="vector",
+            mean=np.zeros(DIM),
+            sigma=np.full(DIM, CAD_SIGMA),
+            dofs=("a", "b", "c"),
+            units=("m",) * 3,
+        )
         for name in NAMES
     ]
     J = rng.normal(size=(40, SIZE)) / 0.03

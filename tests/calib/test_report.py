@@ -15,7 +15,7 @@ from calib.report.statistics import Z_EDGES
 from calib.runs.calibrate import calibrate, grow, grown_model
 from calib.runs.diagnose import diagnose
 from calib.runs.run import RESIDUALS, SUMMARY, Run
-from calib.simulate import Spec, simulate
+from calib.simulation import Spec, simulate
 from calib.solve.solution import Solution
 from chains.errors import InputError
 from sensors.documents import write_json
@@ -225,7 +225,11 @@ def test_a_budget_is_the_rms_of_what_one_variable_does(grown):
     solution, sigma = grown.run.solution, 0.003
     rings = np.array([n.startswith("ring_range_offset.") for n in solution.names])
     told = Solution(
-        solution.shared, {}, [], solution.names, np.diag(np.where(rings, sigma**2, 0.0))
+        shared=solution.shared,
+        recordings={},
+        not_estimated=[],
+        names=solution.names,
+        covariance=np.diag(np.where(rings, sigma**2, 0.0)),
     )
     values = grown.values | {"ring_range_offset": np.full(32, 0.002)}
     found = budget(grown.problem, values, told)

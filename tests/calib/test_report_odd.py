@@ -8,7 +8,7 @@ import pytest
 from calib.problem.model import Model
 from calib.report import report
 from calib.runs.calibrate import calibrate
-from calib.simulate import Spec, simulate
+from calib.simulation import Spec, simulate
 
 HUMID = '{name: humid_air, site: range, unit: "1", sigma: 0.01, basis: ["humidity * range"]}'
 

@@ -19,12 +19,24 @@ def test_correlations_are_those_of_the_covariance_and_large_effects_are_summed_u
     covariance[0, 1] = covariance[1, 0] = 0.9
     covariance[3:, 3:] += 1.0
     covariance[2, 3:] = covariance[3:, 2] = -0.7
-    chosen, matrix = tied(Solution(None, {}, [], names, covariance), None)
+    chosen, matrix = tied(
+        Solution(shared=None, recordings={}, not_estimated=[], names=names, covariance=covariance),
+        None,
+    )
     assert chosen == ["a.x", "a.y", "b.z", "mean of rings"]
     assert matrix[0, 1] == pytest.approx(0.9)
     assert matrix[2, 3] == pytest.approx(-0.7 / np.sqrt(1 + 1 / 20))
     weak = {"weak_directions": [{"parameters": ["b.z"]}]}
-    alone = tied(Solution(None, {}, [], names[:3], covariance[:3, :3]), weak)
+    alone = tied(
+        Solution(
+            shared=None,
+            recordings={},
+            not_estimated=[],
+            names=names[:3],
+            covariance=covariance[:3, :3],
+        ),
+        weak,
+    )
     assert alone[0] == ["a.x", "a.y", "b.z"]
 
 

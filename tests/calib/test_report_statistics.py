@@ -4,13 +4,15 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from calib.report.statistics import Axis, Table, gather
+from calib.report.statistics import Axis, StopResiduals, residual_statistics
 
 RINGS, AZIMUTHS = 8, 12
 RNG = np.random.default_rng
 
 
-def table(rng: np.random.Generator, stop: float, rows: int = 400, surfaces: int = 6) -> Table:
+def table(
+    rng: np.random.Generator, stop: float, rows: int = 400, surfaces: int = 6
+) -> StopResiduals:
     """A stop of random rows; one in ten was thrown out by the fit."""
     weight = np.where(rng.random(rows) < 0.1, 0.0, rng.uniform(0.2, 1.0, rows))
     columns = {
@@ -23,24 +25,30 @@ def table(rng: np.random.Generator, stop: float, rows: int = 400, surfaces: int 
         "sigma_m": rng.uniform(0.001, 0.003, rows),
         "weight": weight,
     }
-    return Table(columns, {"stop": stop, "temperature_c": 20.0 + stop}, 0, 0.0005, 0.0004)
+    return StopResiduals(
+        columns=columns,
+        stop={"stop": stop, "temperature_c": 20.0 + stop},
+        room=0,
+        sigma_angle_rad=0.0005,
+        sigma_reference_m=0.0004,
+    )
 
 
 @pytest.fixture(scope="module")
-def tables() -> list[Table]:
+def tables() -> list[StopResiduals]:
     rng = RNG(1)
     return [table(rng, float(k), rows=300 + 50 * k) for k in range(5)]
 
 
 @pytest.fixture(scope="module")
-def frame(tables: list[Table]) -> pd.DataFrame:
+def frame(tables: list[StopResiduals]) -> pd.DataFrame:
     """All rows that count, as pandas has them."""
     parts = [pd.DataFrame(dict(t.columns)).assign(**t.stop) for t in tables]
     return pd.concat(parts).query("weight > 0")
 
 
 def gathered(tables, *axes):
-    return gather(tables, axes, RINGS, AZIMUTHS)
+    return residual_statistics(tables, axes, RINGS, AZIMUTHS)
 
 
 @pytest.mark.parametrize("name", ["range_m", "ring", "temperature_c"])
@@ -91,7 +99,13 @@ def test_a_sigma_is_taken_apart_into_what_it_was_made_of():
     reference = 0.0004 / np.cos(columns["incidence_rad"])
     columns["sigma_m"] = np.sqrt(0.0015**2 + angle**2 + reference**2)
     kept = columns["weight"] > 0
-    found = gathered([Table(columns, {}, 0, 0.0005, 0.0004)]).variance_m2
+    found = gathered(
+        [
+            StopResiduals(
+                columns=columns, stop={}, room=0, sigma_angle_rad=0.0005, sigma_reference_m=0.0004
+            )
+        ]
+    ).variance_m2
     expected = {
         "range noise": 0.0015**2,
         "angle noise": np.mean(angle[kept] ** 2),
@@ -101,7 +115,7 @@ def test_a_sigma_is_taken_apart_into_what_it_was_made_of():
         np.testing.assert_allclose(found[name], variance, rtol=1e-9)
 
 
-def clustered(rng: np.random.Generator, stops: int = 12, surfaces: int = 12) -> list[Table]:
+def clustered(rng: np.random.Generator, stops: int = 12, surfaces: int = 12) -> list[StopResiduals]:
     """Rows whose errors are those of their stop and of their surface, and hardly their own."""
     of_surface = rng.normal(0.0, 0.001, surfaces)
     out = []
@@ -109,7 +123,7 @@ def clustered(rng: np.random.Generator, stops: int = 12, surfaces: int = 12) -> 
         made = table(rng, float(k), rows=500, surfaces=surfaces)
         residual = rng.normal(0.0, 0.001) + of_surface[made.columns["surface"]]
         residual = residual + rng.normal(0.0, 0.0005, 500)
-        out.append(Table({**made.columns, "residual_m": residual}, made.stop))
+        out.append(StopResiduals({**made.columns, "residual_m": residual}, made.stop))
     return out
 
 
@@ -142,7 +156,9 @@ def test_what_hangs_on_a_covariate_is_measured_without_what_chance_gives():
         bent = []
         for t in made:
             wave = np.where(t.columns["incidence_rad"] > 0.6, size_m, -size_m)
-            bent.append(Table({**t.columns, "residual_m": t.columns["residual_m"] + wave}, t.stop))
+            bent.append(
+                StopResiduals({**t.columns, "residual_m": t.columns["residual_m"] + wave}, t.stop)
+            )
         sizes.append(gathered(bent, axis).curves["incidence_rad"].rms_m)
     assert sizes[0] < 0.0001
     np.testing.assert_allclose(sizes[1], 0.004, rtol=0.05)

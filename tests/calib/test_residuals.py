@@ -70,11 +70,11 @@ def on_planes(folder):
     walls = np.repeat(np.arange(6), rigs.WALL_STEPS**2 * 2)
     vertices, triangles = rigs.room()
     found = Planes(
-        np.repeat(np.eye(3), 2, axis=0),
-        np.ravel([[0, size] for size in rigs.ROOM_M]),
-        np.full(6, 100),
-        vertices[triangles].mean(axis=1),
-        walls,
+        normal=np.repeat(np.eye(3), 2, axis=0),
+        distance_m=np.ravel([[0, size] for size in rigs.ROOM_M]),
+        count=np.full(6, 100),
+        cell_mean_m=vertices[triangles].mean(axis=1),
+        cell_plane=walls,
         cell_m=1.0,
         tolerance_m=0.3,
     )

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from calib.problem.model import Source
-from calib.simulate import PRESETS, Spec, load_spec, simulate
+from calib.simulation import PRESETS, Spec, load_spec, simulate
 from chains.errors import InputError
 from sensors.recording import read_table
 

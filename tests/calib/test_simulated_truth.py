@@ -10,9 +10,9 @@ import calib.effects
 from calib.effects import CATALOGUE, Effect, FrameOffset, Param, Site
 from calib.problem.model import Source
 from calib.rig import load_rig
-from calib.simulate import Spec, simulate
-from calib.simulate.room import build
-from calib.simulate.truth import draw, stream
+from calib.simulation import Spec, simulate
+from calib.simulation.room import build
+from calib.simulation.truth import draw, stream
 
 from .hidden import coarse
 from .simulated import BELOW_M, EXACT, changed, made, nominal, off_mesh, pose, rays, seen

@@ -70,7 +70,13 @@ def run(box, tmp_path):
         "prior": None,
     }
     covariance = np.diag(np.tile(np.square(SIGMA), 2))
-    solution = Solution(Part(frames, effects), {}, untold, names, covariance)
+    solution = Solution(
+        shared=Part(frames, effects),
+        recordings={},
+        not_estimated=untold,
+        names=names,
+        covariance=covariance,
+    )
     return Run(tmp_path / "first", model, SUMMARY, solution)
 
 

@@ -5,10 +5,10 @@ import pandas as pd
 import pytest
 
 from calib.cli import main
-from calib.evaluate import evaluate, evaluate_all
+from calib.evaluation import evaluate, evaluate_all
 from calib.runs.calibrate import calibrate
 from calib.runs.run import Run
-from calib.simulate import Spec
+from calib.simulation import Spec
 from chains.errors import InputError
 
 from .simulated import QUICK, made

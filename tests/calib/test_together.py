@@ -11,7 +11,7 @@ from calib.linear.linearise import lidars
 from calib.problem import build
 from calib.problem.model import Model, Source
 from calib.residuals.tracker import BodiesTogether, TrackedBody
-from calib.simulate import Spec
+from calib.simulation import Spec
 
 from . import rigs, simulated
 

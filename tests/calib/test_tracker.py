@@ -39,7 +39,16 @@ def tracked(problem, values):
         measured = chain.in_world("mount_markers", values).T @ se3.exp(apart)
         if is_point:
             measured[:, :3, :3] = np.eye(3)
-        return TrackedBody("body", chain, "mount_markers", measured, 2e-4, 3e-4, is_point, bases)
+        return TrackedBody(
+            name="body",
+            stops=chain,
+            body="mount_markers",
+            measured=measured,
+            sigma_m=2e-4,
+            sigma_rad=3e-4,
+            is_point=is_point,
+            bases=bases,
+        )
 
     return block
 
@@ -86,7 +95,18 @@ def test_tracked_body_rows_are_measured_less_predicted_in_sigmas(values, tracked
 def hanging(shift=None):
     rng = np.random.default_rng(6)
     where = rng.normal(size=(3, 3))
-    return HangingTarget("rod", "p", "g", "faro", *where, 0.18, 6e-4, 2e-4, shift or {})
+    seen = dict(zip(("faro_m", "upper_m", "lower_m"), where, strict=True))
+    return HangingTarget(
+        name="rod",
+        marker="p",
+        gravity="g",
+        reference="faro",
+        **seen,
+        below_m=0.18,
+        sigma_sphere_m=6e-4,
+        sigma_marker_m=2e-4,
+        shift=shift or {},
+    )
 
 
 def test_hanging_target_derivatives():

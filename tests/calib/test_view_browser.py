@@ -13,7 +13,7 @@ import pytest
 from calib.runs.calibrate import calibrate
 from calib.runs.diagnose import diagnose
 from calib.runs.run import Run
-from calib.simulate import simulate
+from calib.simulation import simulate
 from calib.view.desk import Desk
 from calib.view.page import Page
 from calib.view.server import address, serve, stop
@@ -54,8 +54,8 @@ def button(watched: Watched, name: str):
 
 
 @pytest.fixture(scope="module")
-def small(tmp_path_factory) -> Run:
-    run = small_run(tmp_path_factory.mktemp("small"))
+def small(once) -> Run:
+    run = Run.open(once(small_run) / "run")
     diagnosed(run.folder)
     return run
 

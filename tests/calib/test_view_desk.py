@@ -5,7 +5,6 @@ import re
 import shutil
 import signal
 import socket
-import subprocess
 import sys
 import time
 import urllib.request
@@ -21,11 +20,12 @@ from calib.view.job import Job
 from calib.view.server import serve, stop
 from chains.errors import InputError
 from tests.calib.viewed import candidate, diagnosed, grown, small_run
+from tests.programs import RIGCAL, execute, started
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory) -> Run:
-    return small_run(tmp_path_factory.mktemp("desk"))
+def made(once) -> Run:
+    return Run.open(once(small_run) / "run")
 
 
 @pytest.fixture
@@ -217,15 +217,9 @@ def test_a_job_makes_the_run_that_rigcal_add_makes(first, tmp_path):
 # ------------------------------------------------------------------------------------ command line
 
 
-def start(*arguments: object) -> subprocess.Popen:
-    program = "from calib.cli import main; main()"
-    command = [sys.executable, "-c", program, "view", *map(str, arguments)]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-
-
 def test_view_serves_this_machine_alone_and_ends_with_ctrl_c(first):
-    process = start(first.folder, "--no-open", "--json")
-    try:
+    command = [*RIGCAL, "view", first.folder, "--no-open"]
+    with started([*command, "--json"]) as process:
         text = ""
         while "}" not in text:
             text += process.stdout.readline()
@@ -236,15 +230,13 @@ def test_view_serves_this_machine_alone_and_ends_with_ctrl_c(first):
         assert b"<html" in page[:500].lower()
         with pytest.raises(OSError):  # nobody listens at this machine's other addresses
             socket.create_connection(("127.0.0.2", int(port)), timeout=5)
-        taken = start(first.folder, "--no-open", "--port", port)
-        assert taken.wait(60) == 2
-        assert f"--port {port} is taken" in taken.stderr.read()
+        taken = execute([*command, "--port", port])
+        assert taken.returncode == 2
+        assert f"--port {port} is taken" in taken.stderr
         time.sleep(1)
         process.send_signal(signal.SIGINT)
         assert process.wait(30) == 0
         assert process.stdout.read() == ""
-    finally:
-        process.kill()
 
 
 def test_no_page_can_open_a_tunnel_to_the_outside(monkeypatch):
@@ -264,7 +256,7 @@ def test_a_missing_library_is_said(monkeypatch):
 
 
 def test_view_of_no_run_is_one_sentence(tmp_path):
-    process = start(tmp_path)
-    assert process.wait(60) == 2
-    said = process.stderr.read().strip().splitlines()
+    done = execute([*RIGCAL, "view", tmp_path])
+    assert done.returncode == 2
+    said = done.stderr.strip().splitlines()
     assert len(said) == 1 and "no run there" in said[0] and "rigcal fit" in said[0]

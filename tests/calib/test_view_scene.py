@@ -7,8 +7,9 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from calib.runs.run import Run
+from calib.show.scale import round_up
 from calib.view import colours
-from calib.view.colours import RISING, SIGNED, coloured, nice
+from calib.view.colours import RISING, SIGNED, coloured
 from calib.view.scene import Points, Scene, camera, sunk
 from chains.errors import InputError
 from sensors.recording import read_table, write_table
@@ -17,8 +18,8 @@ from tests.calib.viewed import small_run
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory) -> Run:
-    return small_run(tmp_path_factory.mktemp("scene"))
+def run(once) -> Run:
+    return Run.open(once(small_run) / "run")
 
 
 @pytest.fixture(scope="module")
@@ -245,7 +246,7 @@ def test_labels_have_names_and_colours_of_their_own():
     "value, wanted", [(0.0, 1), (0.3, 0.5), (1.0, 1), (1.01, 2), (4.2, 5), (70, 100), (2e-4, 2e-4)]
 )
 def test_limits_are_round(value, wanted):
-    assert nice(value) == pytest.approx(wanted)
+    assert round_up(value) == pytest.approx(wanted)
 
 
 def test_columns_without_a_number_are_not_offered():

@@ -7,7 +7,7 @@ from scipy.spatial.transform import RigidTransform
 from calib.problem import build
 from calib.problem.model import Model, Source
 from calib.residuals.surfaces import PlaneSurface
-from calib.simulate import Spec
+from calib.simulation import Spec
 from calib.solve.fit import Start, solve
 from calib.solve.holdout import held_out
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from calib.runs.calibrate import calibrate
 from calib.runs.run import Run
-from calib.simulate import Spec, simulate
+from calib.simulation import Spec, simulate
 from sensors.documents import read_yaml, write_json, write_yaml
 
 SMALL = {

@@ -12,7 +12,13 @@ RNG = np.random.default_rng(2)
 
 
 def edge(name, parent, child, joint=None):
-    return Edge(name, parent, child, se3.exp(RNG.normal(size=6)), joint)
+    return Edge(
+        name=name,
+        parent=parent,
+        child=child,
+        T_parent_child=se3.exp(RNG.normal(size=6)),
+        joint=joint,
+    )
 
 
 def unit(vector):

@@ -14,9 +14,9 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from calib.intake import Choices, import_files
-from sensors.readers.bag import read_bag
-from sensors.readers.base import Found, Options
-from sensors.readers.ouster import read_ouster
+from sensors.readers.bags.bag import read_bag
+from sensors.readers.base import Contents, Options
+from sensors.readers.packets.ouster import read_ouster
 from sensors.recording import write_table
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
@@ -95,7 +95,7 @@ def ouster(source: Path, out: Path, capture: str = "OS-0-128-U1_v2.3.0_1024x10")
     return still(found, "still-os0-128-rev6", out)
 
 
-def still(found: Found, name: str, out: Path) -> Path:
+def still(found: Contents, name: str, out: Path) -> Path:
     """A rig that is only a LiDAR, with one stop: every turn that a reader found."""
     (sweeps,) = found.sweeps
     turns = [turn.points for turn in sweeps.read(np.ones(len(sweeps.time_s), bool))]

@@ -13,7 +13,7 @@ from calib.intake.clocks import align
 from chains.arm import read_arm
 from chains.errors import InputError
 from sensors.readers import READERS
-from sensors.readers.base import Found, Options
+from sensors.readers.base import Contents, Options
 
 from . import foreign
 from .foreign import quiet
@@ -34,7 +34,7 @@ def test_no_file_ends_in_a_traceback(kind, folder, shared, tmp_path):
         for part in (content, content[: len(content) // 2], content[:100]):
             cut.write_bytes(part)
             try:
-                assert isinstance(READERS[kind].read([cut], Options(), quiet), Found)
+                assert isinstance(READERS[kind].read([cut], Options(), quiet), Contents)
             except InputError as error:
                 assert "\n" not in str(error)
 

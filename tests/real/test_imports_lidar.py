@@ -8,7 +8,7 @@ from chains.errors import InputError
 from sensors.meshes import read_cloud
 from sensors.readers import READERS
 from sensors.readers.base import Options
-from sensors.readers.origin import fit_beam_origin
+from sensors.readers.clouds.origin import fit_beam_origin
 
 from .foreign import HESAI, quiet
 

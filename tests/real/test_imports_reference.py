@@ -7,7 +7,7 @@ import pytest
 
 from sensors.meshes import distance_to_mesh
 from sensors.readers.base import Options
-from sensors.readers.survey import read_blocks, read_survey
+from sensors.readers.meshes.survey import read_blocks, read_survey
 
 PUMP = Path(__file__).parents[3] / "shared/data/reference/e57_pump/pumpAVisualReferenceImage.e57"
 pytestmark = [

@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 
 from chains.errors import InputError
-from sensors.meshes import open3d_cloud, read_cloud, write_cloud, write_surface
-from sensors.readers.base import Surface
-from sensors.reference import Reference
+from sensors.meshes import open3d_cloud, read_cloud, write_cloud
 
 KINDS = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
 
@@ -83,22 +81,3 @@ def test_a_cloud_becomes_open3ds_with_its_attributes():
     assert np.array_equal(made.point["positions"].numpy()[:, 1], columns["y"])
     assert made.point["ring"].numpy().dtype == np.uint16
     assert np.array_equal(made.point["ring"].numpy().ravel(), columns["ring"])
-
-
-def test_a_surface_written_is_the_reference_read(tmp_path):
-    corners = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.1]]) + 4e5
-    surface = Surface(
-        corners,
-        np.array([[0, 1, 2], [0, 2, 3]]),
-        np.array([2, 7], np.uint16),
-        np.array([0.25, 0.5]),
-        {2: "wall"},
-    )
-    write_surface(surface, tmp_path)
-    files = [tmp_path / "reference" / f for f in ("mesh.ply", "faces.parquet", "labels.yaml")]
-    back = Reference.read(*files)
-    assert np.array_equal(back.vertices_m, corners)
-    assert np.array_equal(back.triangles, surface.triangles)
-    assert back.label.tolist() == [2, 7]
-    assert back.intensity.tolist() == [0.25, 0.5]
-    assert back.label_names == {2: "wall", 7: "label_7"}

@@ -10,16 +10,16 @@ import numpy as np
 
 from calib.report import plots
 from calib.report.chart import Absent, Chart
-from calib.report.charts.residuals import nice
 from calib.report.evidence import Evidence
 from calib.residuals.targets import HangingTarget
 from calib.residuals.tracker import TrackedBody
+from calib.show.scale import round_up
 from chains import se3
 
 if TYPE_CHECKING:
     from calib.report.plots import Figure
 
-MOST = 1500  # arrows of a body that can be told apart
+MOST_ARROWS = 1500  # arrows of a body that can be told apart
 LENGTH = 0.06  # of the picture, for the longest arrow; rounding makes it up to 2.5 times that
 
 
@@ -104,14 +104,14 @@ def magnification(groups: Sequence[Arrows]) -> float:
     at = np.concatenate([g.at_m for g in groups])
     longest = max(float(np.linalg.norm(g.off_m, axis=1).max()) for g in groups)
     extent = max(float(np.ptp(at, axis=0).max()), 1e-3)
-    return nice(LENGTH * extent / max(longest, 1e-9))
+    return round_up(LENGTH * extent / max(longest, 1e-9))
 
 
 def _draw(bodies: Mapping[str, Arrows], scale: float, frame: str) -> Figure:
     figure, grid = plots.axes(plots.WIDE, 3.9, 1, 2)
     for ax, (i, k), what in zip(grid[0], ((0, 1), (0, 2)), ("above", "the side"), strict=True):
         for (name, arrows), colour in zip(bodies.items(), _colours(len(bodies)), strict=True):
-            some = slice(None, None, len(arrows.at_m) // MOST + 1)
+            some = slice(None, None, len(arrows.at_m) // MOST_ARROWS + 1)
             at, off = arrows.at_m[some], arrows.off_m[some]
             ax.plot(at[:, i], at[:, k], ".", ms=3, color=colour, label=name)
             ax.quiver(at[:, i], at[:, k], off[:, i], off[:, k], color=colour, angles="xy",

@@ -11,12 +11,12 @@ from calib.report import plots
 from calib.report.chart import Absent, Chart
 from calib.report.evidence import Evidence, folder_name
 from calib.report.statistics import Z_EDGES
+from calib.report.verdict import AT_THE_FLOOR
 from calib.runs.ladder import Rung
 
 if TYPE_CHECKING:
     from calib.report.plots import Figure
 
-NEAR = 1.25  # times the noise floor
 STEEP = 8.0  # largest over smallest error from which a scale is logarithmic
 
 
@@ -43,7 +43,7 @@ def ladder(evidence: Evidence) -> Iterator[Chart | Absent]:
     floor = evidence.run.summary["rms_mm"]["noise_floor"]
     first = error_mm(evidence.rungs[0])[1]
     way = f" from {first:.2f}" if len(evidence.rungs) > 1 else ""
-    near = "down to" if last <= NEAR * floor else "still above"
+    near = "down to" if last <= AT_THE_FLOOR * floor else "still above"
     yield Chart(
         "ladder",
         f"The {kind} error went{way} to {last:.2f} mm, {near} the noise floor of {floor:.2f} mm"

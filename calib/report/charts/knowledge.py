@@ -11,15 +11,15 @@ from calib.report import plots
 from calib.report.budget import Budget
 from calib.report.chart import Absent, Chart
 from calib.report.evidence import Evidence
-from calib.show.tables import LISTED, small
+from calib.show.tables import LISTED_PARAMETERS, small
 from calib.solve.solution import Solution
 
 if TYPE_CHECKING:
     from calib.report.plots import Figure
 
-LEADING = 10  # candidates that are drawn
+DRAWN_CANDIDATES = 10  # candidates that are drawn
 TIED = 0.5  # correlation from which a parameter matters
-MOST = 30  # parameters in the map
+MOST_PARAMETERS = 30  # parameters in the map
 NEGLIGIBLE = 1e-6  # m: contributions below are not drawn
 
 
@@ -41,7 +41,7 @@ def findings(evidence: Evidence) -> Iterator[Chart | Absent]:
         "How much each effect that the model lacks would explain of what the model cannot take on, "
         "best first, with its p-value after all that was looked at. Blue ones are confirmed; of "
         "the others, many explain the same as a confirmed one, less well.",
-        lambda: _findings(candidates[:LEADING]),
+        lambda: _findings(candidates[:DRAWN_CANDIDATES]),
     )
 
 
@@ -62,12 +62,12 @@ def _findings(candidates: Sequence[dict[str, Any]]) -> Figure:
 
 def budget(evidence: Evidence) -> Iterator[Chart | Absent]:
     """What each link and effect contributes to what is measured."""
-    found = evidence.budget
+    spent = evidence.budget
     what = "range" if evidence.has_beams else "tracked position"
-    looked = f"{found.rows} tracked positions"
+    looked = f"{spent.rows} tracked positions"
     if evidence.has_beams:
-        looked = f"{found.rows} beams of {found.stops} stops"
-    moved = {n: v for n, v in found.moved_m.items() if v > NEGLIGIBLE}
+        looked = f"{spent.rows} beams of {spent.stops} stops"
+    moved = {n: v for n, v in spent.moved_m.items() if v > NEGLIGIBLE}
     if moved:
         most = max(moved, key=moved.get)
         told = f"What changed {what}s most is {most}: by {1e3 * moved[most]:.2f} mm rms"
@@ -80,14 +80,14 @@ def budget(evidence: Evidence) -> Iterator[Chart | Absent]:
         f"by how much a {what} may still be off for what is not known of it, all others held. What "
         f"links trade with each other counts in each, so these may exceed the error of the whole. "
         f"rms over {looked}.",
-        lambda: _budget(found, what),
+        lambda: _budget(spent, what),
         wide=True,
     )
 
 
-def _budget(found: Budget, what: str) -> Figure:
-    sides = (found.moved_m, found.uncertain_m)
-    names = [n for n in found.uncertain_m if max(s.get(n, 0.0) for s in sides) > NEGLIGIBLE]
+def _budget(spent: Budget, what: str) -> Figure:
+    sides = (spent.moved_m, spent.uncertain_m)
+    names = [n for n in spent.uncertain_m if max(s.get(n, 0.0) for s in sides) > NEGLIGIBLE]
     figure, grid = plots.axes(plots.WIDE, 1.0 + 0.3 * max(len(names), 1), 1, 2, sharey=True)
     labels = (f"changed the {what} by, mm rms", "leaves it unsure by, mm rms")
     for ax, side, label, colour in zip(grid[0], sides, labels, (plots.LINES[5], plots.AFTER),
@@ -132,7 +132,7 @@ def tied(solution: Solution, diagnosis: Any) -> tuple[list[str], np.ndarray]:
     strongest = np.abs(matrix - np.eye(len(names))).max(axis=1, initial=0.0)
     weak = {p for d in (diagnosis or {}).get("weak_directions", ()) for p in d["parameters"]}
     strength = [2.0 if n in weak else s for n, s in zip(names, strongest, strict=True)]
-    chosen = [i for i in np.argsort(strength)[::-1][:MOST] if strength[i] > TIED]
+    chosen = [i for i in np.argsort(strength)[::-1][:MOST_PARAMETERS] if strength[i] > TIED]
     chosen = sorted(int(i) for i in chosen)
     return [names[i] for i in chosen], matrix[np.ix_(chosen, chosen)]
 
@@ -144,7 +144,7 @@ def _summarised(names: Sequence[str]) -> tuple[list[str], np.ndarray]:
         owners.setdefault(name.rpartition(".")[0], []).append(i)
     out, rows = [], []
     for owner, at in owners.items():
-        if len(at) > LISTED:
+        if len(at) > LISTED_PARAMETERS:
             out.append(f"mean of {owner}")
             rows.append(np.isin(np.arange(len(names)), at) / len(at))
         else:

@@ -12,9 +12,9 @@ from calib.report import plots
 from calib.report.chart import Absent, Chart
 from calib.report.evidence import Evidence
 from calib.rig import Rig
-from calib.runs.estimates import Found
+from calib.runs.estimates import VariableEstimate
 from calib.runs.run import RING
-from calib.show.tables import LISTED, shown
+from calib.show.tables import LISTED_PARAMETERS, shown
 
 if TYPE_CHECKING:
     from calib.report.plots import Axes, Figure
@@ -24,42 +24,44 @@ SHIFT, TURN = slice(3, 6), slice(0, 3)
 
 
 @dataclass(frozen=True)
-class Link:
+class ChainLink:
     """A frame as the chain shows it.
 
     Args:
         name: of the frame.
         depth: how many links it hangs below the world.
         what: what ties it to its parent, where no estimate does.
-        found: the estimate; None where the link was not estimated.
+        fitted: the estimate; None where the link was not estimated.
         cad_sigma: (6,) how sure CAD was; NaN where it says nothing, 0 where it is exact.
     """
 
     name: str
     depth: int
     what: str = ""
-    found: Found | None = None
+    fitted: VariableEstimate | None = None
     cad_sigma: np.ndarray | None = None
 
     @property
     def moved(self) -> float | None:
         """The largest of the six moves, in sigmas of CAD."""
-        if self.found is None or self.cad_sigma is None:
+        if self.fitted is None or self.cad_sigma is None:
             return None
-        z = np.abs(self.found.estimate) / np.where(self.cad_sigma > 0, self.cad_sigma, np.inf)
+        z = np.abs(self.fitted.estimate) / np.where(self.cad_sigma > 0, self.cad_sigma, np.inf)
         return float(np.nanmax(z)) if np.isfinite(z).any() else None
 
 
-def _links(evidence: Evidence, rig: Rig) -> list[Link]:
+def _links(evidence: Evidence, rig: Rig) -> list[ChainLink]:
     """The frames of one rig, parents before children, the arm drawn together."""
-    found = {f.variable: f for f in evidence.found if f.parent is not None}
-    found |= {n.removeprefix(f"{rig.name}/"): f for n, f in found.items()}
-    out = [Link(rig.world, 0, "the tracker's frame" if rig.tracker else "the reference's frame")]
-    if rig.reference_frame in found and rig.reference_frame != rig.world:
-        far = found[rig.reference_frame]
-        out.append(Link(rig.reference_frame, 1, "the scanned mesh and the targets", far))
-    out.append(Link(rig.tree.root, 1, f"stands elsewhere {MOVES[rig.moves]}"))
-    _children(rig, rig.tree.root, 2, found, evidence.prior_sigma, out)
+    fitted = {f.variable: f for f in evidence.estimates if f.parent is not None}
+    fitted |= {n.removeprefix(f"{rig.name}/"): f for n, f in fitted.items()}
+    out = [
+        ChainLink(rig.world, 0, "the tracker's frame" if rig.tracker else "the reference's frame")
+    ]
+    if rig.reference_frame in fitted and rig.reference_frame != rig.world:
+        far = fitted[rig.reference_frame]
+        out.append(ChainLink(rig.reference_frame, 1, "the scanned mesh and the targets", far))
+    out.append(ChainLink(rig.tree.root, 1, f"stands elsewhere {MOVES[rig.moves]}"))
+    _children(rig, rig.tree.root, 2, fitted, evidence.prior_sigma, out)
     return out
 
 
@@ -70,25 +72,33 @@ def _children(
     rig: Rig,
     parent: str,
     depth: int,
-    found: dict[str, Found],
+    fitted: dict[str, VariableEstimate],
     prior: dict[str, float],
-    out: list[Link],
+    out: list[ChainLink],
 ) -> None:
     arm = [edge for edge in rig.tree.edges if edge.name in rig.arm_edges]
     if arm and arm[0].parent == parent:
         joints = len(rig.joint_names)
-        out.append(Link(arm[-1].child, depth, f"the arm: {joints} joints, from its URDF"))
-        _children(rig, arm[-1].child, depth + 1, found, prior, out)
+        out.append(ChainLink(arm[-1].child, depth, f"the arm: {joints} joints, from its URDF"))
+        _children(rig, arm[-1].child, depth + 1, fitted, prior, out)
     for edge in rig.tree.edges:
         if edge.parent == parent and edge.name in rig.frame_sigma:
-            mine = found.get(edge.child)
+            mine = fitted.get(edge.child)
             held = mine is None or not mine.sigma.any()
             sigma = None
             if not held:
                 names = (f"{mine.variable}.{dof}" for dof in mine.parameters)
                 sigma = np.array([prior.get(n, 0.0) for n in names])
-            out.append(Link(edge.child, depth, "held as in CAD", None if held else mine, sigma))
-            _children(rig, edge.child, depth + 1, found, prior, out)
+            out.append(
+                ChainLink(
+                    name=edge.child,
+                    depth=depth,
+                    what="held as in CAD",
+                    fitted=None if held else mine,
+                    cad_sigma=sigma,
+                )
+            )
+            _children(rig, edge.child, depth + 1, fitted, prior, out)
 
 
 def chain(evidence: Evidence) -> Iterator[Chart | Absent]:
@@ -119,7 +129,7 @@ def chain(evidence: Evidence) -> Iterator[Chart | Absent]:
         )
 
 
-def _chain(links: Sequence[Link]) -> Figure:
+def _chain(links: Sequence[ChainLink]) -> Figure:
     figure, grid = plots.axes(plots.WIDE, 0.7 + 0.42 * len(links))
     ax = grid[0, 0]
     ax.set_axis_off()
@@ -142,16 +152,16 @@ def _chain(links: Sequence[Link]) -> Figure:
     return figure
 
 
-def _estimate(ax: Axes, row: int, link: Link, far: bool) -> None:
-    if link.found is None or np.isnan(link.found.estimate).any():
+def _estimate(ax: Axes, row: int, link: ChainLink, far: bool) -> None:
+    if link.fitted is None or np.isnan(link.fitted.estimate).any():
         ax.text(47, row, link.what, va="center", style="italic", color="#555555")
-        if link.found is not None:
-            sizes = (1e3 * np.linalg.norm(link.found.sigma[part]) for part in (SHIFT, TURN))
+        if link.fitted is not None:
+            sizes = (1e3 * np.linalg.norm(link.fitted.sigma[part]) for part in (SHIFT, TURN))
             text = "known to {:.2f} mm, {:.2f} mrad".format(*sizes)
             ax.text(84, row, text, va="center", fontsize=8, ha="left", color="#555555")
         return
     for x, part in ((47, SHIFT), (66, TURN)):
-        length, sigma = _length(link.found.estimate[part], link.found.sigma[part])
+        length, sigma = _length(link.fitted.estimate[part], link.fitted.sigma[part])
         ax.text(x, row, f"{length:.2f} ± {sigma:.2f}", va="center")
     if link.moved is not None:
         ax.plot([84, 84 + min(link.moved, 8.0)], [row, row], lw=7, solid_capstyle="butt",
@@ -170,7 +180,7 @@ def moves(evidence: Evidence) -> Iterator[Chart | Absent]:
     """Every link's six numbers against CAD."""
     prior = evidence.prior_sigma
     rows = []
-    for f in evidence.found:
+    for f in evidence.estimates:
         if f.parent is None or np.isnan(f.estimate).any():
             continue
         known = np.array([prior.get(f"{f.variable}.{dof}", 0.0) for dof in f.parameters])
@@ -192,7 +202,7 @@ def moves(evidence: Evidence) -> Iterator[Chart | Absent]:
     )
 
 
-def _moves(rows: Sequence[tuple[Found, np.ndarray]]) -> Figure:
+def _moves(rows: Sequence[tuple[VariableEstimate, np.ndarray]]) -> Figure:
     figure, grid = plots.axes(plots.WIDE, 0.8 + 0.5 * len(rows), 1, 2, sharey=True, sharex=True)
     names, shades = [f.variable for f, _ in rows], (plots.AFTER, plots.LINES[4], plots.FLOOR)
     for ax, part, what in zip(grid[0], (SHIFT, TURN), ("origin", "axes"), strict=True):
@@ -216,9 +226,9 @@ def _moves(rows: Sequence[tuple[Found, np.ndarray]]) -> Figure:
 
 def effects(evidence: Evidence) -> Iterator[Chart | Absent]:
     """Effects of few parameters as dots, of many as curves; per-ring corrections are of these."""
-    drawn = [f for f in evidence.found if f.parent is None and (f.sigma > 0).any()]
-    few = [f for f in drawn if len(f.parameters) <= LISTED]
-    many = [f for f in drawn if len(f.parameters) > LISTED]
+    drawn = [f for f in evidence.estimates if f.parent is None and (f.sigma > 0).any()]
+    few = [f for f in drawn if len(f.parameters) <= LISTED_PARAMETERS]
+    many = [f for f in drawn if len(f.parameters) > LISTED_PARAMETERS]
     if few:
         z = {
             f"{f.variable}.{p}": abs(e / s)
@@ -246,53 +256,53 @@ def effects(evidence: Evidence) -> Iterator[Chart | Absent]:
         yield _many_chart(f, f"parameters-{i}")
 
 
-def _per_ring(found: Found) -> bool:
-    return all(map(RING.fullmatch, found.parameters))
+def _per_ring(fitted: VariableEstimate) -> bool:
+    return all(map(RING.fullmatch, fitted.parameters))
 
 
-def _rings_chart(found: Found, name: str) -> Chart:
+def _rings_chart(fitted: VariableEstimate, name: str) -> Chart:
     return Chart(
         name,
-        f"{found.variable}: rings differ by {_spread(found)}",
+        f"{fitted.variable}: rings differ by {_spread(fitted)}",
         "The estimate of each ring with its 95 % band. Where the band holds zero, no correction is "
         "called for; elsewhere take the value off what the ring measures.",
-        lambda: _curve(found, "ring"),
+        lambda: _curve(fitted, "ring"),
     )
 
 
-def _many_chart(found: Found, name: str) -> Chart:
+def _many_chart(fitted: VariableEstimate, name: str) -> Chart:
     return Chart(
         name,
-        f"{found.variable}: its parameters differ by {_spread(found)}",
+        f"{fitted.variable}: its parameters differ by {_spread(fitted)}",
         "The estimate of each parameter, in the order of solution.yaml, with its 95 % band; zero "
         "is what paper says.",
-        lambda: _curve(found, "parameter"),
+        lambda: _curve(fitted, "parameter"),
         tail=True,
     )
 
 
-def _spread(found: Found) -> str:
-    scale, unit = shown(found.units[0])
-    values = scale * found.estimate[found.sigma > 0]
-    sigma = scale * np.median(found.sigma[found.sigma > 0])
+def _spread(fitted: VariableEstimate) -> str:
+    scale, unit = shown(fitted.units[0])
+    values = scale * fitted.estimate[fitted.sigma > 0]
+    sigma = scale * np.median(fitted.sigma[fitted.sigma > 0])
     ends = f"from {values.min():+.2f} to {values.max():+.2f}"
     return f"{values.std():.2f} {unit} rms, {ends}, known to {sigma:.2f}"
 
 
-def _curve(found: Found, along: str) -> Figure:
+def _curve(fitted: VariableEstimate, along: str) -> Figure:
     figure, grid = plots.axes(plots.HALF, 2.7)
-    ax, (scale, unit) = grid[0, 0], shown(found.units[0])
-    x = np.arange(len(found.parameters))
-    value, half = scale * found.estimate, 1.96 * scale * found.sigma
+    ax, (scale, unit) = grid[0, 0], shown(fitted.units[0])
+    x = np.arange(len(fitted.parameters))
+    value, half = scale * fitted.estimate, 1.96 * scale * fitted.sigma
     plots.band(ax, x, value, half, plots.AFTER)
     ax.plot(x, value, ".-", ms=4, lw=1, color=plots.AFTER)
     ax.axhline(0, color=plots.PALE, linewidth=1)
     ax.set_xlabel(along)
-    ax.set_ylabel(f"{found.variable}, {unit}".rstrip(", "))
+    ax.set_ylabel(f"{fitted.variable}, {unit}".rstrip(", "))
     return figure
 
 
-def _few(drawn: Sequence[Found]) -> Figure:
+def _few(drawn: Sequence[VariableEstimate]) -> Figure:
     count = sum(int((f.sigma > 0).sum()) for f in drawn)
     heights = [max(1, int((f.sigma > 0).sum())) for f in drawn]
     figure, grid = plots.axes(

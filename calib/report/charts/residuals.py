@@ -11,14 +11,20 @@ from calib.diagnosis.suggest import words
 from calib.report import plots
 from calib.report.chart import Absent, Chart
 from calib.report.evidence import FIRST, Evidence
-from calib.report.statistics import Curve, Statistics
+from calib.report.statistics import ResidualCurve, Statistics
+from calib.show.scale import round_up
 
 if TYPE_CHECKING:
     from calib.report.plots import Axes, Figure
 
 NO_BEAMS = "there are no scans, so no residuals of beams"
 FRONT = {*FIRST, "stop", "elapsed_s", "recording"}  # what is not folded away, and temperature
-UNITS = {"_rad": ("deg", 180.0 / np.pi), "_m": ("m", 1.0), "_s": ("min", 1 / 60), "_c": ("°C", 1.0)}
+AXIS_UNITS = {
+    "_rad": ("deg", 180.0 / np.pi),
+    "_m": ("m", 1.0),
+    "_s": ("min", 1 / 60),
+    "_c": ("°C", 1.0),
+}
 BY_CHANCE = 0.02  # how seldom so many bins may lie outside their bands by chance
 SELDOM = 0.01  # of the rows: things seen less decide no scale
 MOST_NAMES = 40  # names of things along an axis
@@ -51,7 +57,7 @@ def curve_id(covariate: str) -> str:
 
 
 def _bare(covariate: str) -> str:
-    for suffix in UNITS:
+    for suffix in AXIS_UNITS:
         if covariate.endswith(suffix):
             return covariate.removesuffix(suffix)
     return covariate
@@ -59,7 +65,7 @@ def _bare(covariate: str) -> str:
 
 def _unit(covariate: str) -> tuple[str, float]:
     """Unit and factor in which a covariate is shown."""
-    return next((u for suffix, u in UNITS.items() if covariate.endswith(suffix)), ("", 1.0))
+    return next((u for suffix, u in AXIS_UNITS.items() if covariate.endswith(suffix)), ("", 1.0))
 
 
 def spoken(covariate: str) -> str:
@@ -68,7 +74,7 @@ def spoken(covariate: str) -> str:
     return known if known != covariate else _bare(covariate).replace("_", " ")
 
 
-def outside(curve: Curve) -> tuple[int, int, bool]:
+def outside(curve: ResidualCurve) -> tuple[int, int, bool]:
     """How many bins lie outside their band about zero, of how many; whether chance does not."""
     from scipy.stats import binom
 
@@ -77,7 +83,7 @@ def outside(curve: Curve) -> tuple[int, int, bool]:
     return out, int(known.sum()), bool(binom.sf(out - 1, known.sum(), 0.05) < BY_CHANCE)
 
 
-def _title(name: str, now: Curve, was: Curve | None, before: str) -> str:
+def _title(name: str, now: ResidualCurve, was: ResidualCurve | None, before: str) -> str:
     out, bins, hangs = outside(now)
     earlier = ""
     if was is not None:
@@ -92,7 +98,7 @@ def _title(name: str, now: Curve, was: Curve | None, before: str) -> str:
     return f"No clear trace of {what} is left ({inside}{earlier})"
 
 
-def _curve(now: Curve, was: Curve | None, before: str) -> Figure:
+def _curve(now: ResidualCurve, was: ResidualCurve | None, before: str) -> Figure:
     figure, grid = plots.axes(plots.HALF, 4.3, 3, sharex=True, height_ratios=(2.0, 2.0, 1.0))
     top, middle, bottom = grid[:, 0]
     if was is not None:
@@ -116,20 +122,20 @@ def _curve(now: Curve, was: Curve | None, before: str) -> Figure:
     return figure
 
 
-def _reach(curve: Curve) -> float:
+def _reach(curve: ResidualCurve) -> float:
     """How far, in mm, means and bands reach of things that are seen often; seldom ones may leave
     the picture."""
     often = np.isfinite(curve.mean_m) & (curve.count >= SELDOM * curve.count.sum())
     return 1.15e3 * float((np.abs(curve.mean_m) + np.nan_to_num(curve.band_m))[often].max())
 
 
-def _x(curve: Curve) -> np.ndarray:
+def _x(curve: ResidualCurve) -> np.ndarray:
     if curve.axis.names:
         return np.arange(curve.axis.bins, dtype=float)
     return _unit(curve.axis.name)[1] * curve.at
 
 
-def _draw(ax: Axes, curve: Curve, colour: str, label: str | None) -> None:
+def _draw(ax: Axes, curve: ResidualCurve, colour: str, label: str | None) -> None:
     """Means with their bands: a line, or dots where bins are things."""
     x, mean, half = _x(curve), 1e3 * curve.mean_m, 1e3 * curve.band_m
     if curve.axis.names:
@@ -141,13 +147,13 @@ def _draw(ax: Axes, curve: Curve, colour: str, label: str | None) -> None:
     ax.plot(x[order], mean[order], ".-", ms=4, color=colour, label=label)
 
 
-def _line(ax: Axes, curve: Curve, values_m: np.ndarray, colour: str) -> None:
+def _line(ax: Axes, curve: ResidualCurve, values_m: np.ndarray, colour: str) -> None:
     known = np.isfinite(values_m)
     style = "o" if curve.axis.names else "-"
     ax.plot(_x(curve)[known], 1e3 * values_m[known], style, ms=4, lw=1.2, color=colour)
 
 
-def _name_bins(ax: Axes, curve: Curve) -> None:
+def _name_bins(ax: Axes, curve: ResidualCurve) -> None:
     unit = _unit(curve.axis.name)[0]
     ax.set_xlabel(f"{spoken(curve.axis.name)}, {unit}" if unit else spoken(curve.axis.name))
     names = curve.axis.names
@@ -184,7 +190,7 @@ def _map_mm(statistics: Statistics) -> np.ndarray:
 def _ring_map(was: np.ndarray, now: np.ndarray, before: str) -> Figure:
     figure, grid = plots.axes(plots.WIDE, 3.4, 1, 2, sharey=True)
     for ax, values, title in zip(grid[0], (was, now), (before, "now"), strict=True):
-        limit = nice(float(np.nanquantile(np.abs(values), 0.98)))
+        limit = round_up(float(np.nanquantile(np.abs(values), 0.98)))
         picture = plots.signed_map(ax, values, (-180, 180, -0.5, len(values) - 0.5), limit)
         bar = figure.colorbar(picture, ax=ax, orientation="horizontal", aspect=35, extend="both")
         bar.set_label("mean residual, mm")
@@ -193,11 +199,3 @@ def _ring_map(was: np.ndarray, now: np.ndarray, before: str) -> Figure:
         ax.set_xticks(range(-180, 181, 90))
     grid[0, 0].set_ylabel("ring")
     return figure
-
-
-def nice(value: float) -> float:
-    """The next of 1, 2, 5 times a power of ten."""
-    if not value > 0:
-        return 1.0
-    power = 10.0 ** np.floor(np.log10(value))
-    return float(next(m for m in (1, 2, 5, 10) if m * power >= value * (1 - 1e-9)) * power)

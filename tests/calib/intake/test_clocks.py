@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from calib.intake.clocks import align, estimate
 from calib.intake.gather import chain
 from calib.intake.motion import motions
-from chains.dh import Row, to_urdf
 from chains.errors import InputError
+from chains.readers.dh import DhRow, to_urdf
 from sensors.readers.base import POSE, Arm, Sweeps, Track
 
 from .moving import DH, JOINTS, T_TIP_CUP, T_WORLD_BASE, logged, plan, tip
@@ -22,13 +22,20 @@ END_S = float(SPANS[-1, 1])
 
 @pytest.fixture(scope="module")
 def edges():
-    rows = [Row(n, a, alpha, d) for n, (a, alpha, d) in zip(JOINTS, DH, strict=True)]
+    rows = [DhRow(n, a, alpha, d) for n, (a, alpha, d) in zip(JOINTS, DH, strict=True)]
     return chain(Arm(to_urdf("arm", rows, False), "arm_base", "arm_end"))
 
 
 def joints(offset_s=0.0, clock="joints", rate_hz=50):
     time_s = np.arange(0, END_S, 1 / rate_hz)
-    return Track(clock, "joints", clock, time_s - offset_s, JOINTS, logged(HELD, SPANS, time_s))
+    return Track(
+        name=clock,
+        kind="joints",
+        clock=clock,
+        time_s=time_s - offset_s,
+        names=JOINTS,
+        values=logged(HELD, SPANS, time_s),
+    )
 
 
 def cup(offset_s, clock="take", rate_hz=100, noise=2e-4, within=(0, 1)):
@@ -36,7 +43,9 @@ def cup(offset_s, clock="take", rate_hz=100, noise=2e-4, within=(0, 1)):
     pose = T_WORLD_BASE * tip(logged(HELD, SPANS, time_s)) * T_TIP_CUP
     turn = pose.rotation * Rotation.from_rotvec(noise * RNG.normal(size=(len(time_s), 3)))
     values = np.hstack([pose.translation, turn.as_quat(scalar_first=True)])
-    return Track("cup", "pose", clock, time_s - offset_s, POSE, values)
+    return Track(
+        name="cup", kind="pose", clock=clock, time_s=time_s - offset_s, names=POSE, values=values
+    )
 
 
 def other_motion():
@@ -74,14 +83,28 @@ def test_gyro_and_pose_share_their_turns(edges):
     time_s = np.arange(0, END_S, 0.01)
     turn = tip(logged(HELD, SPANS, time_s)).rotation
     rate = (turn[:-1].inv() * turn[1:]).as_rotvec() / 0.01 + [0.01, -0.02, 0.005]
-    gyro = Track("imu", "gyro", "imu", time_s[:-1] + 0.005 + 7.0, ("x", "y", "z"), rate)
+    gyro = Track(
+        name="imu",
+        kind="gyro",
+        clock="imu",
+        time_s=time_s[:-1] + 0.005 + 7.0,
+        names=("x", "y", "z"),
+        values=rate,
+    )
     found = align([cup(0.0), gyro], [], (), {})
     assert abs(found.tracks[1].time_s[0] - 0.005) < 5e-3
 
 
 def test_without_an_arm_joints_and_a_point_are_matched(edges):
     pose = cup(3.0)
-    point = Track("cup", "point", "take", pose.time_s, POSE[:3], pose.values[:, :3])
+    point = Track(
+        name="cup",
+        kind="point",
+        clock="take",
+        time_s=pose.time_s,
+        names=POSE[:3],
+        values=pose.values[:, :3],
+    )
     found = align([joints(), point], [], (), {})
     assert abs(found.tracks[1].time_s[0]) < 0.05
 
@@ -109,7 +132,9 @@ def test_motion_that_repeats_is_ambiguous(edges):
     time_s = np.arange(0, 78, 0.01)
     values = logged(held, spans, time_s)
     pair = [
-        Track(name, "joints", name, time_s + late, JOINTS, values)
+        Track(
+            name=name, kind="joints", clock=name, time_s=time_s + late, names=JOINTS, values=values
+        )
         for name, late in (("a", 0.0), ("b", 4.0))
     ]
     with pytest.raises(InputError, match="--clock-offset b=SECONDS"):

@@ -74,10 +74,17 @@ def test_targets_are_joined_by_name():
     centre = np.arange(12.0).reshape(4, 3)
     spheres = Spheres(("T1", "T2", "T3", "T4"), centre)
     points = [
-        Track(f"T{k}{mark}{part}", "point", "c", np.arange(3.0), POSE[:3],
-              np.array([[k, 0, 2.0], [k, 0, 2.0], [np.nan] * 3]) - [0, 0, part == "lower"])
-        for k in (1, 2, 3) for part, mark in (("upper", ":"), ("lower", " "))
-    ]  # fmt: skip
+        Track(
+            name=f"T{k}{mark}{part}",
+            kind="point",
+            clock="c",
+            time_s=np.arange(3.0),
+            names=POSE[:3],
+            values=np.array([[k, 0, 2.0], [k, 0, 2.0], [np.nan] * 3]) - [0, 0, part == "lower"],
+        )
+        for k in (1, 2, 3)
+        for part, mark in (("upper", ":"), ("lower", " "))
+    ]
     found, odd = targets.join(spheres, points)
     assert found["target"].tolist() == ["T1", "T2", "T3"] and "T4" in odd[0]
     assert found["faro_y"].tolist() == [1, 4, 7]

@@ -19,7 +19,7 @@ RNG = np.random.default_rng(2)
 
 def joints(noise=1e-5):
     values = VALUES + noise * RNG.normal(size=VALUES.shape)
-    return Track("log", "joints", "c", TIME_S, JOINTS, values)
+    return Track(name="log", kind="joints", clock="c", time_s=TIME_S, names=JOINTS, values=values)
 
 
 def cup(noise_m=1e-4, noise_rad=2e-4):
@@ -27,14 +27,16 @@ def cup(noise_m=1e-4, noise_rad=2e-4):
     turn = pose.rotation * Rotation.from_rotvec(noise_rad * RNG.normal(size=(len(TIME_S), 3)))
     xyz = pose.translation + noise_m * RNG.normal(size=(len(TIME_S), 3))
     values = np.hstack([xyz, turn.as_quat(scalar_first=True)])
-    return Track("cup", "pose", "c", TIME_S, POSE, values)
+    return Track(name="cup", kind="pose", clock="c", time_s=TIME_S, names=POSE, values=values)
 
 
 def gyro():
     turn = tip(VALUES).rotation
     rate = (turn[:-1].inv() * turn[1:]).as_rotvec() / 0.01
     rate += [0.02, -0.03, 0.01] + 2e-3 * RNG.normal(size=rate.shape)
-    return Track("imu", "gyro", "c", TIME_S[1:], ("x", "y", "z"), rate)
+    return Track(
+        name="imu", kind="gyro", clock="c", time_s=TIME_S[1:], names=("x", "y", "z"), values=rate
+    )
 
 
 def inside(found):
@@ -57,7 +59,7 @@ def test_all_that_moves_must_be_still():
     xyz = np.zeros((len(TIME_S), 7))
     xyz[:, 3] = 1
     xyz[:, 0] = np.clip((TIME_S - middle) / 0.2, 0, 1)
-    base = Track("base", "pose", "c", TIME_S, POSE, xyz)
+    base = Track(name="base", kind="pose", clock="c", time_s=TIME_S, names=POSE, values=xyz)
     found = find_holds([joints(), base], (), min_hold_s=0.5).spans_s
     assert not np.any((found[:, 0] < middle) & (found[:, 1] > middle + 0.2))
 
@@ -71,7 +73,9 @@ def test_a_body_out_of_sight_breaks_no_hold():
 def test_means_are_those_of_what_was_held():
     spans = find_holds([joints(), cup()], ()).spans_s
     minutes, heat = np.array([0.0, 100.0]), np.array([[20.0], [21.0]])
-    slow = Track("air", "covariate", "c", minutes, ("heat",), heat)
+    slow = Track(
+        name="air", kind="covariate", clock="c", time_s=minutes, names=("heat",), values=heat
+    )
     columns, odd = table([joints(), cup(), slow], spans)
     assert not odd
     found = np.stack([columns[name] for name in JOINTS], axis=1)

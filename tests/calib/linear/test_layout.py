@@ -8,7 +8,7 @@ from calib.linear.layout import Layout
 from calib.problem import build
 from calib.problem.model import Model, Source
 from calib.problem.unknowns import Role
-from calib.simulate import Spec
+from calib.simulation import Spec
 from calib.solve.fit import preview
 
 from .. import rigs, simulated

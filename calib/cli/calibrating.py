@@ -1,0 +1,243 @@
+"""The loop on the command line: simulate, check, fit, diagnose, add, compare."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from calib.cli.app import Json, Out, Runs, Workers, app, effect_names, print_json, progress_bar, say
+from calib.linear.parallel import workers as threads
+from chains.errors import InputError
+
+if TYPE_CHECKING:
+    from calib.runs.run import Run
+
+Recordings = Annotated[list[Path], typer.Argument(help="Recording folders.", metavar="REC...")]
+Effects = Annotated[
+    str | None, typer.Option(help="Effects of the model, or files of them, with commas.")
+]
+Fix = Annotated[
+    list[str] | None, typer.Option(metavar="NAME", help="Hold a frame, effect or parameter.")
+]
+
+
+@app.command()
+def simulate(
+    spec: Annotated[
+        str, typer.Argument(help="A preset, or a YAML file that says what to simulate.")
+    ],
+    out: Out,
+    seed: Annotated[int, typer.Option(help="Same seed, same recording.")] = 0,
+    hide: Annotated[
+        list[str] | None, typer.Option(metavar="EFFECT=SIZE", help="An effect to hide in it.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Write a recording, and the truth beside it."""
+    from calib.simulation import simulate as run
+
+    with progress_bar() as progress:
+        run(spec, out, seed, _sizes(hide or []), progress)
+    say(
+        {"recording": str(out), "truth": f"{out}.truth.json"},
+        f"wrote {out} and {out}.truth.json",
+        as_json,
+    )
+
+
+@app.command()
+def check(recording: Path, as_json: Json = False) -> None:
+    """What is in a recording, what is wrong, and what can and cannot be estimated from it."""
+    from calib.solve.check import check as run
+
+    with progress_bar() as progress:
+        checked = run(recording, progress)
+    if as_json:
+        print_json(checked.document())
+    else:
+        from calib.show.tables import print_check
+
+        print_check(checked)
+    if checked.problems:
+        raise SystemExit(2)
+
+
+@app.command()
+def fit(
+    recordings: Recordings,
+    out: Out,
+    effects: Effects = None,
+    fix: Fix = None,
+    hold_out: Annotated[str, typer.Option(help="location, stop or none.")] = "location",
+    folds: Annotated[int, typer.Option(help="Folds of the held-out error.", min=1, max=5)] = 1,
+    prior: Annotated[
+        Path | None, typer.Option(metavar="RUN", help="An earlier run instead of CAD.")
+    ] = None,
+    workers: Workers = None,
+    as_json: Json = False,
+) -> None:
+    """Estimate the rig jointly; several recordings share what is the same hardware."""
+    if hold_out not in ("location", "stop", "none"):
+        raise InputError(f"--hold-out {hold_out}: give location, stop or none")
+    from calib.problem.model import Model
+    from calib.runs.calibrate import calibrate
+
+    chosen = Model.of(effects, fix or [])
+    with threads(workers), progress_bar() as progress:
+        run = calibrate(recordings, out, chosen, hold_out, folds, prior, progress)
+    _tell(run, as_json)
+
+
+@app.command()
+def add(
+    run: Path,
+    effects: Annotated[
+        list[str],
+        typer.Argument(
+            help="Effects, or files of them.", metavar="EFFECT...", autocompletion=effect_names
+        ),
+    ],
+    out: Out,
+    workers: Workers = None,
+    as_json: Json = False,
+) -> None:
+    """The model of a run and more effects, refitted from that run to the same recordings."""
+    from calib.runs.add import add as grow
+    from calib.runs.run import Run
+
+    with threads(workers), progress_bar() as progress:
+        _tell(grow(Run.open(run), effects, out, progress), as_json)
+
+
+@app.command()
+def diagnose(
+    run: Path,
+    refits: Annotated[
+        bool, typer.Option("--refits/--no-refits", help="Whether to take the held-out falls.")
+    ] = True,
+    workers: Workers = None,
+    as_json: Json = False,
+) -> None:
+    """Where a run's model fails and which effect it lacks; written to RUN/diagnosis.json."""
+    from calib.runs.diagnose import diagnose as find
+    from calib.runs.run import Run
+
+    fitted = Run.open(run)
+    with threads(workers), progress_bar() as progress:
+        diagnosis = find(fitted, progress, refits)
+    if as_json:
+        print_json(diagnosis.document())
+    else:
+        from calib.show.diagnosis import print_diagnosis
+
+        print_diagnosis(diagnosis, fitted.summary["residual"])
+
+
+@app.command()
+def explain(
+    recordings: Recordings,
+    out: Out,
+    effects: Effects = None,
+    fix: Fix = None,
+    workers: Workers = None,
+    as_json: Json = False,
+) -> None:
+    """Fit, diagnose, add, until nothing worth adding is left; every rung is kept in DIR."""
+    from calib.problem.model import Model
+    from calib.runs.explain import explain as climb
+
+    chosen = Model.of(effects, fix or [])
+    with threads(workers), progress_bar() as progress:
+        explanation = climb(recordings, out, chosen, progress)
+    if as_json:
+        print_json(explanation.document())
+    else:
+        from calib.show.diagnosis import print_explanation
+
+        print_explanation(explanation)
+
+
+@app.command()
+def compare(runs: Runs, as_json: Json = False) -> None:
+    """Errors and parameters of runs side by side, and the ladder by which they grew."""
+    from calib.runs.ladder import ladder
+    from calib.runs.run import Run
+    from calib.show.tables import comparison, print_comparison
+
+    opened = [Run.open(run) for run in runs]
+    if as_json:
+        rungs = [rung.document() for rung in ladder(opened)]
+        print_json(comparison(opened) | {"ladder": rungs})
+    else:
+        print_comparison(opened)
+
+
+@app.command()
+def evaluate(
+    runs: Runs,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "-o", "--out", help="Where to write, of several runs in a folder each; else the run."
+        ),
+    ] = None,
+    raw: Annotated[bool, typer.Option("--raw", help="Of the returns before correction.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Accuracy and precision of every return, by ring, distance, incidence and label."""
+    from calib.evaluation import evaluate_all
+    from calib.runs.run import Run
+
+    opened = [Run.open(run) for run in runs]
+    with progress_bar() as progress:
+        evaluations = evaluate_all(opened, out, raw, progress)
+    if as_json:
+        print_json(evaluations if len(evaluations) > 1 else next(iter(evaluations.values())))
+    else:
+        from calib.show.evaluation import print_evaluations
+
+        print_evaluations(evaluations)
+
+
+@app.command()
+def effects(
+    name: Annotated[
+        str | None,
+        typer.Argument(help="One effect; all if not given.", autocompletion=effect_names),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """The catalogue: formula, unit, size, what an effect is confounded with, source."""
+    from calib.effects import CATALOGUE, find
+    from calib.show.tables import effect_page, print_catalogue
+
+    chosen = [find(name)] if name else list(CATALOGUE)
+    if as_json:
+        print_json([effect_page(e) for e in chosen])
+    else:
+        print_catalogue(chosen, whole=name is not None)
+
+
+def _sizes(hide: list[str]) -> dict[str, float]:
+    sizes = {}
+    for item in hide:
+        name, _, size = item.partition("=")
+        try:
+            sizes[name] = float(size)
+        except ValueError:
+            raise InputError(
+                f"--hide {item}: give EFFECT=SIZE with a number, range_scale=1 say"
+            ) from None
+    return sizes
+
+
+def _tell(run: Run, as_json: bool) -> None:
+    """Print what a fit found."""
+    if as_json:
+        print_json(run.summary | {"not_estimated": run.solution.not_estimated})
+    else:
+        from calib.show.tables import print_run
+
+        print_run(run)

@@ -1,0 +1,76 @@
+"""Files for other programs on the command line: export."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from calib.cli.app import Json, Out, app, progress_bar, say
+
+
+@app.command()
+def export(
+    run: Path,
+    out: Out,
+    formats: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--format",
+            help="yaml, urdf, ros2, autoware, kalibr, rings, hesai, ouster, tree, latex, markdown; "
+            "all that have anything to hold if not given.",
+        ),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Write the result for others: YAML, URDF, ROS 2, ring tables, pictures, tables."""
+    from calib.exporters import export as write
+    from calib.runs.run import Run
+
+    done = write(Run.open(run), out, formats or [])
+    document = {
+        "files": [str(file) for file in done.files],
+        "not_held": done.not_held,
+        "left_out": done.left_out,
+    }
+    lines = [f"wrote {file}" for file in done.files]
+    for name, why in done.left_out.items():
+        lines.append(f"left out {name}: {why}")
+    for name, sentences in done.not_held.items():
+        if what := ", ".join(sentence.partition(":")[0] for sentence in sentences):
+            lines.append(f"{name} does not hold {what}")
+    lines.append("Why, in whole sentences: --json, and the head of each file that has comments.")
+    say(document, "\n".join(lines), as_json)
+
+
+@app.command()
+def apply(
+    run: Path,
+    clouds: Annotated[
+        list[Path], typer.Argument(metavar="CLOUD...", help="PCD, PLY, Parquet, or recordings.")
+    ],
+    out: Out,
+    rig: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Whose LiDAR, where the run has several.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Write corrected clouds: what the run has learnt of its LiDAR is taken off."""
+    from calib.evaluation.apply import apply as correct
+    from calib.runs.run import Run
+
+    with progress_bar() as progress:
+        done = correct(Run.open(run), clouds, out, rig, progress)
+    document = {
+        "clouds": [
+            {"file": str(a.path), "points": a.points, "moved_rms_mm": 1e3 * a.rms_m}
+            | {"not_corrected": a.left_out}
+            for a in done
+        ]
+    }
+    lines = []
+    for a in done:
+        lines.append(f"wrote {a.path}: {a.points} points, moved by {1e3 * a.rms_m:.2f} mm rms")
+        lines += [f"  not corrected: {name}, which {why}" for name, why in a.left_out.items()]
+    say(document, "\n".join(lines), as_json)

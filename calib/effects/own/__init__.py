@@ -1,0 +1,1 @@
+"""Effects of a user's own: formulas in YAML, classes in Python."""

@@ -1,0 +1,165 @@
+"""Effects that a user writes as formulas, without a line of code."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Self
+
+import numpy as np
+import pydantic
+
+from calib.effects.base import Effect, Param, Site, View
+from calib.effects.basis import finite
+from calib.effects.own.expression import Expression
+from calib.effects.rig import DOF
+from calib.rig import Rig
+from chains.errors import InputError
+from sensors.documents import Document, Marks, Number, nearest, validate
+
+AXES = {"range": 0, "azimuth": 1, "elevation": 2}
+Text = Annotated[str, pydantic.Field(min_length=1)]
+Sigma = Annotated[Number, pydantic.Field(gt=0)]
+
+
+class FormulaFile(Document):
+    """An effect as its YAML says it.
+
+    Attributes:
+        name: letters, digits and _.
+        site: `range`, `azimuth`, `elevation` or `noise` of a beam; a joint's name, or
+            ``joint:<name>``; or ``<frame>.<dof>``, ``mount.tz`` say, in the frame's own axes.
+        unit: of the parameters: the site's per unit of the formulas.
+        sigma: how large a parameter may plausibly be.
+        basis: a formula per parameter: the error at the site per unit of it.
+        parameters: their names; numbered where there are none.
+        what, typical, source: for its page.
+    """
+
+    name: Annotated[str, pydantic.Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
+    site: Text
+    unit: str
+    sigma: Sigma
+    basis: Annotated[tuple[Text, ...], pydantic.Field(min_length=1)]
+    parameters: tuple[Text, ...] = ()
+    what: str = ""
+    typical: str = ""
+    source: str = ""
+
+    @pydantic.field_validator("basis", mode="before")
+    @classmethod
+    def _several(cls, basis: Any) -> Any:
+        return (basis,) if isinstance(basis, str) else basis
+
+    @pydantic.model_validator(mode="after")
+    def _named(self) -> Self:
+        if self.parameters and len(self.parameters) != len(self.basis):
+            raise ValueError(
+                f"{len(self.parameters)} parameters are named, and basis has {len(self.basis)} "
+                f"formulas; name one for each"
+            )
+        if len(set(self.parameters)) < len(self.parameters):
+            raise ValueError("two parameters have one name; give each its own")
+        return self
+
+
+class FormulaEffect(Effect):
+    """An effect of the user's own, as formulas of what the recording knows."""
+
+    def __init__(self, file: FormulaFile) -> None:
+        self.file, self.name = file, file.name
+        self.site = self._site()
+        owner = f"effect '{file.name}'"
+        self.expressions = tuple(Expression(text, owner) for text in file.basis)
+        self.covariates = tuple(dict.fromkeys(n for e in self.expressions for n in e.names))
+        self.unit, self.typical, self.source = file.unit, file.typical, file.source or "its user"
+        named = zip(self.parameters, file.basis, strict=True)
+        self.formula = f"{file.site} + " + " + ".join(f"{p} * ({text})" for p, text in named)
+        if file.what:
+            self.__doc__ = file.what
+
+    @classmethod
+    def read(cls, document: Mapping[str, Any], path: str | Path, marks: Marks) -> Self:
+        """The effect that a mapping describes.
+
+        Raises:
+            InputError: a key is missing, unknown or wrong, or a formula is no arithmetic.
+        """
+        return cls(validate(FormulaFile, document, path, marks))
+
+    def document(self) -> dict[str, Any]:
+        """The mapping that describes it."""
+        found = self.file.model_dump(exclude_defaults=True)
+        return {k: list(v) if isinstance(v, tuple) else v for k, v in found.items()}
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Their names, in the formulas' order."""
+        count = len(self.file.basis)
+        numbered = ("amount",) if count == 1 else tuple(f"p{i + 1}" for i in range(count))
+        return self.file.parameters or numbered
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        if self.site is Site.JOINTS:
+            self._joint(rig)
+        elif self.site is Site.EDGE:
+            self._edge(rig)
+        elif rig.lidar is None:
+            return ()
+        return tuple(Param(name, self.file.unit, self.file.sigma) for name in self.parameters)
+
+    def basis(self, view: View) -> np.ndarray:
+        values = [finite(np.atleast_1d(self._value(e, view))) for e in self.expressions]
+        columns = np.stack(np.broadcast_arrays(*values), axis=-1)
+        rows, count = columns.shape
+        if self.site is Site.NOISE:
+            return columns[:, None]
+        if self.site is Site.JOINTS:
+            basis = np.zeros((rows, len(view.rig.joint_names), count))
+            basis[:, self._joint(view.rig)] = columns
+        elif self.site is Site.EDGE:
+            basis = np.zeros((rows, len(view.rig.tree.edges), 6, count))
+            basis[:, *self._edge(view.rig)] = columns
+        else:
+            basis = np.zeros((rows, 3, count))
+            basis[:, AXES[self.file.site]] = columns
+        return basis
+
+    def _value(self, expression: Expression, view: View) -> np.ndarray:
+        def column(name: str) -> np.ndarray:
+            if name not in view.columns:
+                # Columns of several numbers a row are for code, not for formulas.
+                known = [n for n, c in view.columns.items() if callable(c) or np.ndim(c) == 1]
+                raise expression.wrong(f"there is no column {name} here{nearest(name, known)}")
+            values = np.asarray(view[name])
+            if values.ndim != 1:
+                raise expression.wrong(f"column {name} has more than one number a row")
+            return values.astype(float)
+
+        return expression.value(column)
+
+    def _site(self) -> Site:
+        if self.file.site in AXES:
+            return Site.BEAM
+        if self.file.site == "noise":
+            return Site.NOISE
+        return Site.EDGE if self.file.site.rpartition(".")[2] in DOF else Site.JOINTS
+
+    def _joint(self, rig: Rig) -> int:
+        """Index of the joint that it acts on."""
+        name = self.file.site.removeprefix("joint:")
+        if name not in rig.joint_names:
+            frames = [f"{edge}.tz" for edge in rig.tree.edge_names]
+            raise self._no_site([*AXES, "noise", *rig.joint_names, *frames])
+        return rig.joint_names.index(name)
+
+    def _edge(self, rig: Rig) -> tuple[int, int]:
+        """Index of the edge that it acts on, and of the degree of freedom."""
+        name, _, dof = self.file.site.rpartition(".")
+        if name not in rig.tree.edge_names:
+            raise self._no_site([f"{edge}.{dof}" for edge in rig.tree.edge_names])
+        return rig.tree.edge_names.index(name), DOF.index(dof)
+
+    def _no_site(self, known: list[str]) -> InputError:
+        what = f"effect '{self.name}': there is no site {self.file.site} on this rig"
+        return InputError(what + nearest(self.file.site, known))

@@ -1,0 +1,31 @@
+"""The model of a run and more effects: ``rigcal add``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from calib.runs.calibrate import grow, grown_model
+from calib.runs.run import Run
+from calib.solve.fit import Progress
+
+
+def add(
+    run: Run,
+    effects: str | Sequence[str],
+    out: Path | str,
+    progress: Progress = lambda what, done, total: None,
+) -> Run:
+    """Fit a run's model and more effects to the same recordings, from where that run stood.
+
+    Args:
+        run: the run to grow from; see `calib.runs.calibrate.grow`.
+        effects: names in the catalogue, or files of effects; one, several with commas, or a list.
+        out: the run folder to make; an earlier run there is replaced, anything else is refused.
+        progress: called with what is being done, and how far it is.
+
+    Raises:
+        InputError: an effect is unknown or in the model already, or the run's recordings are not
+            what they were.
+    """
+    return grow(run, grown_model(run, effects), out, progress)

@@ -1,0 +1,81 @@
+"""A recording of hardware that never was: the forward model run backwards, and its truth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from calib.rig import load_rig
+from calib.simulation import rig as rig_on_paper
+from calib.simulation.room import build
+from calib.simulation.scan import Scanner
+from calib.simulation.spec import PRESETS, Spec, load_spec
+from calib.simulation.stops import World, plan
+from calib.simulation.truth import draw, stream
+from calib.simulation.write import write_reference, write_stops, write_targets, write_truth
+from chains.errors import InputError
+from sensors.documents import replace_folder, write_yaml
+from sensors.recording import write_table
+
+__all__ = ["PRESETS", "Spec", "load_spec", "simulate"]
+
+Progress = Callable[[str, int, int], None]
+
+
+def simulate(
+    spec: str | Spec,
+    out: Path | str,
+    seed: int = 0,
+    hide: Mapping[str, float] | None = None,
+    progress: Progress | None = None,
+) -> None:
+    """Write a simulated recording, and the truth beside it as ``<out>.truth.json``.
+
+    The hardware is drawn from the priors of its rig.yaml; every effect acts through its own basis,
+    so whatever the catalogue holds can be hidden. The same spec and seed give the same files.
+
+    Args:
+        spec: a preset, the path of a YAML file, or a spec.
+        out: the recording's folder; another recording there is replaced.
+        seed: 0 or more.
+        hide: effect, or file of effects -> size, in sigmas of its parameters (see `truth.draw`).
+        progress: called with what is done, how much of it, and how much there is.
+
+    Raises:
+        InputError: the spec, the seed or an effect's name is wrong, or `out` is something else.
+    """
+    spec = load_spec(spec) if isinstance(spec, str) else spec
+    if seed < 0:
+        raise InputError(f"seed {seed} is negative; give 0 or more")
+    out = Path(out)
+    with replace_folder(out, "rig.yaml", "recording") as folder:
+        _record(spec, folder, seed, dict(hide or {}), progress or (lambda what, done, total: None))
+        (folder / "truth.json").replace(out.with_name(f"{out.name}.truth.json"))
+
+
+def _record(
+    spec: Spec, folder: Path, seed: int, hide: dict[str, float], progress: Progress
+) -> None:
+    world_seed = seed if spec.world_seed is None else spec.world_seed
+    room = build(spec.room, spec.mesh_error_m, stream(world_seed, "room"))
+    if spec.mesh:
+        write_reference(folder / "reference", room.measured)
+    if spec.arm:
+        (folder / "arm.urdf").write_text(rig_on_paper.urdf(), encoding="utf-8")
+    write_yaml(folder / "rig.yaml", rig_on_paper.document(spec))
+    rig = load_rig(folder)
+    truth = draw(rig, spec, hide, seed)
+    stops = plan(rig, spec, room.true, stream(seed, "plan"))
+    world = World.of(truth, stops, spec.noise, stream(seed, "encoders"))
+    write_stops(folder / "stops.csv", world, spec, stream(seed, "tracker"))
+    if spec.targets:
+        write_targets(folder / "targets.csv", truth, spec, stream(world_seed, "targets"))
+    if spec.lidar:
+        scanner, Ts_faro_lidar = Scanner(truth, room, spec), world.in_faro(rig.lidar_frame)
+        for k, name in enumerate(stops.names):
+            columns = {c: v[k : k + 1] for c, v in world.columns.items()}
+            rng = stream(seed, f"scan {name}")
+            scan = scanner.scan(Ts_faro_lidar[k], columns, stops.joints[k : k + 1], rng)
+            write_table(folder / "scans" / f"{name}.parquet", scan)
+            progress("simulating", k, len(stops.names))
+    write_truth(folder / "truth.json", world, spec, seed)

@@ -1,0 +1,1 @@
+"""Descriptions of an arm, read and written: URDF, xacro, Denavit and Hartenberg."""

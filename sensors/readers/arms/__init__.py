@@ -1,0 +1,1 @@
+"""Descriptions of an arm; what they mean is told in `chains.readers`."""

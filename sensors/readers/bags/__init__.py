@@ -1,0 +1,1 @@
+"""ROS bags: their clouds, packets, joints and poses."""

@@ -1,0 +1,1 @@
+"""Clouds in files, one for each stop; the rings and origins of their beams."""

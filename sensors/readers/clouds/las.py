@@ -1,0 +1,41 @@
+"""LAS and LAZ files. This is the laspy door."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from chains.errors import InputError
+from sensors.readers.base import Columns
+
+
+def read_las_points(path: str | Path) -> Columns:
+    """Read the points of a LAS or LAZ file: x y z in its own unit, and every other dimension.
+
+    Raises InputError where the file is missing, empty, cut short or none, and where laspy, or
+    lazrs for LAZ, is not installed.
+    """
+    try:
+        import laspy
+    except ImportError:
+        raise InputError("reading LAS needs laspy: pip install 'rigcal[las]'") from None
+    path = Path(path)
+    try:
+        if not path.stat().st_size:
+            raise InputError(f"{path} is empty (0 bytes); a LAS file was wanted")
+        las = laspy.read(path)
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}") from None
+    except InputError:
+        raise
+    except Exception as error:  # laspy, lazrs and numpy each have their own for a broken file
+        raise InputError(f"{path} is no whole LAS file: {error}") from None
+    if len(las.points) != las.header.point_count:
+        raise InputError(
+            f"{path} should hold {las.header.point_count} points and holds {len(las.points)}; get"
+            " the whole file"
+        )
+    names = [n for n in las.point_format.dimension_names if n not in ("X", "Y", "Z")]
+    columns = {axis: np.asarray(las[axis]) for axis in "xyz"}
+    return columns | {n: v for n in names if np.ndim(v := np.asarray(las[n])) == 1 and v.any()}

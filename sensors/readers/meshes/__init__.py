@@ -1,0 +1,1 @@
+"""The surveyed room: meshes, a surveying scanner's clouds, calibration spheres."""

@@ -1,0 +1,1 @@
+"""Packets of LiDARs, out of captures, decoded into turns."""

@@ -1,0 +1,1 @@
+"""Bodies and markers as trackers and trajectories have them."""

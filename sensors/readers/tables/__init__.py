@@ -1,0 +1,1 @@
+"""Tables of anyone's: how cells are separated, what their units are, what their columns mean."""

@@ -1,0 +1,6 @@
+"""The examples are no installed package: they are found in the checkout."""
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
