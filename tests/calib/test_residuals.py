@@ -259,6 +259,15 @@ def test_a_beam_whose_plane_fell_behind_it_is_left_out(on_mesh):
     assert np.isfinite(stop_rows(case, scan, Association(part)).sums().whole()).all()
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_beam_that_meets_no_plane_says_nothing_and_divides_by_nothing(on_planes):
+    part = on_planes.association[0].part.copy()
+    part[:50] = -1
+    rows = on_planes.problem.scans[0].rows(on_planes.values, Association(part))
+    assert not rows.usable[:50].any() and not rows.weight[:50].any()
+    assert all(np.isfinite(c.value).all() and not c.value[:50].any() for c in rows.sparse)
+
+
 # ------------------------------------------------------------------------------------------- shifts
 
 
