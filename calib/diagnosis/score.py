@@ -55,6 +55,12 @@ class Scores:
     weight_m2: float
 
     @cached_property
+    def shares(self) -> tuple[np.ndarray, ...]:
+        """By stop, by place, and by both, of those that have any."""
+        every = (self.by_stop, self.by_place, self.both)
+        return tuple(part[np.any(part != 0, axis=1)] for part in every)
+
+    @cached_property
     def draws(self) -> np.ndarray:
         """Scores (R, Q) as chance might have dealt them: every cluster's share, times a normal
         number of its own (the multiplier bootstrap)."""
@@ -222,8 +228,7 @@ def test(scores: Scores, columns: np.ndarray) -> Test:
     whiten = (axes[:, seen] / np.sqrt(values[seen])) / size[:, None]
     score = scores.score[columns]
     statistic = float(np.sum(np.square(whiten.T @ score)))
-    parts = (scores.by_stop, scores.by_place, scores.both)
-    stop, place, both = (part[:, columns] @ whiten for part in parts)
+    stop, place, both = (part[:, columns] @ whiten for part in scores.shares)
     one_way = stop.T @ stop, place.T @ place
     two_way = one_way[0] + one_way[1] - both.T @ both
     covariance = max(two_way, *one_way, key=np.trace)

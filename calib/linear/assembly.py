@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -18,7 +19,8 @@ from calib.residuals.compiled import add_at, add_both, add_sparse
 DENSE = 8
 
 
-class OwnRows(NamedTuple):
+@dataclass(frozen=True)
+class OwnRows:
     """Whitened rows about a stop's own unknowns: a tracked body's, or those of a prior.
 
     Args:
@@ -32,10 +34,15 @@ class OwnRows(NamedTuple):
     columns: np.ndarray
     measured: bool
 
+    @cached_property
+    def _gram(self) -> np.ndarray:
+        rows = np.column_stack([self.A, self.b])
+        return rows.T @ rows
+
     def gram(self, sigma: np.ndarray) -> np.ndarray:
         """(n + 1, n + 1) over the columns, in units of their sigmas, and the right side."""
-        rows = np.column_stack([self.A * sigma[self.columns], self.b])
-        return rows.T @ rows
+        unit = np.append(sigma[self.columns], 1.0)
+        return self._gram * unit * unit[:, None]
 
 
 class Assembly:

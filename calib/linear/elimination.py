@@ -57,15 +57,15 @@ def eliminate(
     """
     if block.ndim == 1:
         root = np.sqrt(block)[:, None]
-        rest -= _square(cross / root)
+        rest -= square(cross / root)
         return block, cross / block[:, None]
     factor = cholesky(block, lower=True, check_finite=False)
     half = solve_triangular(factor, cross, lower=True, check_finite=False)
-    rest -= _square(half)
+    rest -= square(half)
     return factor, solve_triangular(factor, half, lower=True, trans=1, check_finite=False)
 
 
-def _square(rows: np.ndarray) -> np.ndarray:
+def square(rows: np.ndarray) -> np.ndarray:
     """``rows.T @ rows``, computed once per pair of columns."""
     upper = dsyrk(1.0, rows.T, trans=0, lower=0)  # zero below the diagonal
     whole = upper + upper.T

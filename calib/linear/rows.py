@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.forward import Placed
+from calib.linear.elimination import square
 from calib.linear.layout import Layout, key_of
 from calib.residuals.beams import Association, Rows
 from calib.residuals.compiled import cluster_sums, cross_sums
@@ -94,13 +95,13 @@ class StopRows:
 
     def sums(self) -> StopSums:
         """Their Gram matrix, in its parts."""
-        weighted = self.dense * self.weight[:, None]
+        weighted = self.dense * np.sqrt(self.weight)[:, None]
         with_dense, with_sparse, own = cross_sums(
             self.dense, self.weight, self.index, self.value, self.sparse, self.last
         )
         return StopSums(
             stop=self.stop,
-            dense=self.dense.T @ weighted,
+            dense=square(weighted),
             with_dense=with_dense,
             with_sparse=with_sparse,
             own=own,

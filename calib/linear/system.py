@@ -68,9 +68,11 @@ class Linearisation:
         return out[:-1]
 
     def _twists(self, out: np.ndarray) -> np.ndarray:
-        sigma = np.append(self.layout.sigma, 1.0)
-        moved = [d @ (sigma[c, None] * out[c]) for _, d, c in self.twists]
-        return np.concatenate(moved) if moved else np.zeros((0, out.shape[1]))
+        used = np.unique(np.concatenate([np.zeros(0, int), *(c for _, _, c in self.twists)]))
+        chain = np.zeros((6 * len(self.twists), len(used)))
+        for i, (_, d, c) in enumerate(self.twists):
+            chain[6 * i : 6 * (i + 1), np.searchsorted(used, c)] = d
+        return chain @ (self.layout.sigma[used, None] * out[used])
 
     def step(self, kept: np.ndarray) -> dict[str, np.ndarray]:
         """Tangent step of each eliminated unknown, given that of the kept (S,) in their units."""

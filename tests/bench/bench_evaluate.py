@@ -16,7 +16,6 @@ import tracemalloc
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from threadpoolctl import threadpool_limits
 from workload import one_thread, recorded, timed
 
 from calib import problem as problems
@@ -68,7 +67,7 @@ def main() -> None:
     parser.add_argument("--rows", type=int, default=1_000_000)
     parser.add_argument("--repeats", type=int, default=3, help="of each, for the median")
     wanted = parser.parse_args()
-    with tempfile.TemporaryDirectory() as temporary, threadpool_limits(1), one_thread():
+    with tempfile.TemporaryDirectory() as temporary, one_thread():
         folder = Path(temporary)
         source = Source.open(recorded(folder, wanted.rows, stops=8))
         problem = problems.build([source], Model())

@@ -1,4 +1,4 @@
-"""How much memory a fit takes: stops come and go, so three times as many hardly need more.
+"""How much memory a fit takes: of a stop that is done, little stays.
 
     python tests/bench/bench_memory.py [--stops 4] [--rows 131072]
 
@@ -16,10 +16,11 @@ from pathlib import Path
 import numpy as np
 from workload import BEAMS, recorded
 
+from calib.linear.linearise import lidars
+from calib.linear.rows import StopRows, StopSums
 from calib.problem import Problem, build
 from calib.problem.model import Model, Source
-from calib.residuals.beams import Rows
-from calib.solve.fit import solve
+from calib.solve.fit import preview, solve
 
 MB = 1e6
 
@@ -30,19 +31,18 @@ def problem(recording: Path, stops: int) -> Problem:
     return build([source], Model(), [np.arange(len(source.recording.stops)) < stops])
 
 
-def rows_mb(recording: Path) -> float:
-    """What the rows of one stop take, with their derivatives."""
-    first = problem(recording, 1)
-    graph = solve(first)
-    scan = graph.scans[0]
-    return size(scan.rows(graph.values, graph.associations[0])) / MB
+def sums_mb(recording: Path) -> float:
+    """What the sums of one stop's rows take."""
+    found = preview(problem(recording, 1))
+    (scan,), (association,) = found.scans, found.associations
+    (placed,) = lidars(found.scans, found.values)
+    rows = StopRows.of(scan, found.linear.layout, found.values, placed, association)
+    return size(rows.sums()) / MB
 
 
-def size(rows: Rows) -> int:
-    """Bytes of one stop's residuals, weights and derivatives."""
-    vectors = [rows.residual_m, rows.sigma_m, rows.weight, rows.by_twist, *rows.dense.values()]
-    vectors += [array for c in rows.sparse for array in (c.index, c.value)]
-    return sum(array.nbytes for array in vectors)
+def size(sums: StopSums) -> int:
+    """Bytes of one stop's sums."""
+    return sum(array.nbytes for array in vars(sums).values() if isinstance(array, np.ndarray))
 
 
 def peak_mb(recording: Path, stops: int) -> float:
@@ -74,9 +74,9 @@ def main() -> None:
         recording = recorded(Path(folder), many * wanted.rows, many)
         a, b = peak_mb(recording, few), peak_mb(recording, many)
         print(f"{few} stops: {a:.0f} MB at most; {many} stops: {b:.0f} MB")
-        print(
-            f"a stop more: {(b - a) / (many - few):.1f} MB; its rows: {rows_mb(recording):.1f} MB"
-        )
+        own = sums_mb(recording)
+        print(f"a stop more: {(b - a) / (many - few):.1f} MB; its sums: {own:.1f} MB", end="")
+        print(f"   goal <= {own + 1:.1f}")
 
 
 if __name__ == "__main__":

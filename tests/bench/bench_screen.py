@@ -16,12 +16,11 @@ from unittest import mock
 
 import numpy as np
 from scipy.linalg.blas import dsyrk
-from threadpoolctl import threadpool_limits
 from workload import held, one_thread, recorded, timed
 
 from calib import problem as problems
-from calib.diagnosis.linear import LocalRows, Sums
 from calib.diagnosis.stand import Stand
+from calib.linear.rows import StopRows, StopSums
 from calib.problem.model import Model
 from calib.solve.fit import solve
 
@@ -33,15 +32,15 @@ def fitted(folder: Path) -> Stand:
     return Stand([source], Model(), problem, solve(problem))
 
 
-def captured(stand: Stand) -> list[tuple[Sums, LocalRows]]:
+def captured(stand: Stand) -> list[StopRows]:
     """The rows of every stop with all candidates, as a diagnosis adds them up."""
-    found, add = [], Sums.beams
+    found, sums = [], StopRows.sums
 
-    def keep(sums: Sums, beams: LocalRows) -> None:
-        found.append((sums, beams))
-        add(sums, beams)
+    def keep(rows: StopRows) -> StopSums:
+        found.append(rows)
+        return sums(rows)
 
-    with mock.patch.object(Sums, "beams", keep):
+    with mock.patch.object(StopRows, "sums", keep):
         stand.look(silent)
     return found
 
@@ -50,27 +49,28 @@ def silent(what: str, done: int, total: int) -> None:
     """No progress."""
 
 
-def stacked(beams: LocalRows) -> np.ndarray:
+def stacked(rows: StopRows) -> np.ndarray:
     """The same columns (N, P) written out, whitened, as BLAS wants them."""
-    blocks = [beams.dense]
-    for g in beams.groups:
-        block = np.zeros((len(beams.b), g.size))
-        known = np.flatnonzero(g.index >= 0)
-        block[known, g.index[known]] = g.value[known]
-        blocks.append(block)
-    return np.asfortranarray(np.sqrt(beams.weight)[:, None] * np.hstack(blocks))
+    count, wide = rows.dense.shape
+    whole = np.zeros((count, wide + rows.sparse), order="F")
+    whole[:, :wide] = rows.dense
+    for index, value in zip(rows.index.T, rows.value.T, strict=True):
+        known = np.flatnonzero(index >= 0)
+        whole[known, wide + index[known]] = value[known]
+    whole *= np.sqrt(rows.weight)[:, None]
+    return whole
 
 
 def against_blas(stand: Stand) -> None:
     """The screen's sums over all rows against BLAS's Gram matrix of the same columns."""
     ours = blas = 0.0
-    rows = 0
-    for sums, beams in captured(stand):
-        rows += len(beams.b)
-        ours += timed(lambda s=sums, b=beams: s.beams(b))[1]
-        whole = stacked(beams)
+    count = 0
+    for rows in captured(stand):
+        count += len(rows.b)
+        ours += timed(rows.sums)[1]
+        whole = stacked(rows)
         blas += timed(lambda w=whole: dsyrk(1.0, w, trans=1))[1]
-    print(f"{rows} rows, {whole.shape[1]} columns at the last stop")
+    print(f"{count} rows, {whole.shape[1]} columns at the last stop")
     report("sums of all candidates / BLAS syrk", ours, blas, "<= 1.4")
 
 
@@ -92,7 +92,7 @@ def main() -> None:
     parser.add_argument("--rows", type=int, default=200_000)
     parser.add_argument("--stops", type=int, default=8)
     args = parser.parse_args()
-    with threadpool_limits(limits=1), one_thread(), tempfile.TemporaryDirectory() as folder:
+    with one_thread(), tempfile.TemporaryDirectory() as folder:
         recording = recorded(Path(folder), args.rows, args.stops)
         against_blas(fitted(recording))
         against_fit(recording)

@@ -8,7 +8,7 @@ effect alone. Boosted trees would need scikit-learn, which nothing here depends 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +17,7 @@ from scipy.sparse import csr_array
 
 from calib.diagnosis.candidates import known_effects
 from calib.diagnosis.score import GAUGE, Scores, project, test
-from calib.diagnosis.stand import Look
+from calib.diagnosis.stand import Look, Stand
 from calib.effects import Effect
 
 MOST_NAMES = 4  # names that a selection goes on to
@@ -36,40 +36,34 @@ def answers(look: Look) -> dict[str, list[str]]:
     at = {e: np.r_[scores.at[e.name]] for e in known if e.name in scores.at}
     at = {e: columns for e, columns in at.items() if test(scores, columns).dof}
     rows = sum(len(a.part) for a in stand.estimate.associations)
-    naive = without_mesh_errors(look)
+    naive = without_mesh_errors(stand, list(at))
+    bare = {e: np.r_[naive.at[e.name]] for e in at}
     found = (
-        forward(naive, at, rows),
+        forward(naive, bare, rows),
         stop_clustered(scores, at),
         leave_location_out(scores, at, look),
-        lasso(naive, at, rows),
+        lasso(naive, bare, rows),
     )
     return dict(zip(NAMES, found, strict=True))
 
 
-def without_mesh_errors(look: Look) -> Scores:
+def without_mesh_errors(stand: Stand, effects: Sequence[Effect]) -> Scores:
     """The scores as they are where no error of the mesh is an unknown; not by clusters."""
-    linear, values = look.linear, look.stand.estimate.values
-    surfaces = [name for name in linear.at if "/reference_" in name]
-    gone = np.concatenate([np.r_[linear.at[name]] for name in surfaces])
-    taken = np.concatenate([values[name] for name in surfaces])
-    # What the mesh's errors took on is in the residual again.
-    gradient = np.asarray(linear.gradient.sum(axis=0)) + linear.information[:, gone] @ taken
-    kept = np.setdiff1d(np.arange(len(gradient)), gone)
-    at, start = {}, 0
-    for name, columns in linear.at.items():
-        if name not in surfaces:
-            size = columns.stop - columns.start
-            at[name], start = slice(start, start + size), start + size
-    none = np.full(1, -1)
-    alone = replace(
-        linear,
-        at=at,
-        information=linear.information[np.ix_(kept, kept)],
-        gradient=csr_array(gradient[kept][None]),
-        stop=none,
-        place=none,
+    fit = stand.estimate
+    bare = replace(
+        fit,
+        problem=replace(fit.problem, cells={}),
+        # What the mesh's errors took on is in the residual again.
+        associations=[replace(a, cells={}) for a in fit.associations],
     )
-    return project(alone, alone.candidates)
+    linear, _ = replace(stand, estimate=bare).linearise(effects, silent)
+    none = np.full(1, -1)
+    whole = csr_array(linear.gradient.sum(axis=0)[None])
+    return project(replace(linear, gradient=whole, stop=none, place=none), linear.candidates)
+
+
+def silent(what: str, done: int, total: int) -> None:
+    """No progress is shown."""
 
 
 def forward(scores: Scores, at: Columns, rows: int) -> list[str]:

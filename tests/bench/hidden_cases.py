@@ -147,7 +147,15 @@ def case(family: str, number: int) -> Case:
         level=family == "rival",
     )
     model = Model(WITHOUT_RINGS) if family == "rival" else Model()
-    return Case(family, number, spec, seed, _hidden(family, number, rng), FAMILIES[family], model)
+    return Case(
+        family=family,
+        number=number,
+        spec=spec,
+        seed=seed,
+        hidden=_hidden(family, number, rng),
+        size_mm=FAMILIES[family],
+        model=model,
+    )
 
 
 def _hidden(family: str, number: int, rng: np.random.Generator) -> tuple[str, ...]:

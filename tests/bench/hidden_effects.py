@@ -33,15 +33,11 @@ from calib.problem.model import Source
 from calib.solve.fit import solve
 from sensors.documents import plain
 
-from .hidden_baselines import answers
+from .hidden_baselines import answers, silent
 from .hidden_cases import FAMILIES, Case, Hidden, case, cases, record, written
 from .hidden_table import table
 
 LEFT_SIGMA = 0.5  # of a prior's sigma: a parameter known no better says nothing of its interval
-
-
-def silent(what: str, done: int, total: int) -> None:
-    """No progress is shown."""
 
 
 def run(case: Case, baselines: bool = True) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""The usual graph: one `gtsam.CustomFactor` per point, over the variables of the compressed one."""
+"""The usual graph: one `gtsam.CustomFactor` per point, over all unknowns of a workload."""
 
 from __future__ import annotations
 
@@ -20,24 +20,27 @@ RINGS = "ring_range_offset"
 class PointFactors:
     """The graph of a workload, linearised at its start; what beams meet is kept.
 
-    In its favour, each ring's offset is a key of its own, and where the rig's chain puts the LiDAR
-    is computed beforehand, once per stop. With `given`, residuals and derivatives are too, so that
-    a callback does no more than hand them over.
+    In its favour, each ring's offset and each error of the mesh is a key of its own, and where the
+    rig's chain puts the LiDAR is computed beforehand, once per stop. With `given`, residuals and
+    derivatives are too, so that a callback does no more than hand them over.
     """
 
     def __init__(self, work: Work, given: bool) -> None:
         self.work, self.given = work, given
-        variables = work.problem.variables
-        self.rest = Graph([v for v in variables.values() if v.name != RINGS], work.problem.blocks)
-        self.rings = len(variables) + np.arange(variables[RINGS].dim)  # their keys
+        unknowns, singles = work.problem.variables, (RINGS, *work.problem.cells)
+        rest = [u for u in unknowns.values() if u.name not in singles]
+        self.rest = Graph(rest, work.problem.blocks)
+        ends = len(rest) + np.cumsum([0, *(unknowns[name].dim for name in singles)])
+        self.keys = {n: a + np.arange(unknowns[n].dim) for n, a in zip(singles, ends, strict=False)}
 
     @cached_property
     def graph(self) -> gtsam.NonlinearFactorGraph:
         """Priors, trackers and targets as ever, then point by point."""
         graph = gtsam.NonlinearFactorGraph(self.rest._graph)
-        for key, sigma in zip(self.rings, self.work.problem.variables[RINGS].sigma, strict=True):
-            noise = gtsam.noiseModel.Isotropic.Sigma(1, sigma)
-            graph.add(gtsam.PriorFactorVector(key, np.zeros(1), noise))
+        for name, keys in self.keys.items():
+            for key, sigma in zip(keys, self.work.problem.variables[name].sigma, strict=True):
+                noise = gtsam.noiseModel.Isotropic.Sigma(1, sigma)
+                graph.add(gtsam.PriorFactorVector(key, np.zeros(1), noise))
         for i in range(len(self.work.problem.scans)):
             for factor in self._factors(i):
                 graph.add(factor)
@@ -49,32 +52,38 @@ class PointFactors:
         placed = scan.stops.in_reference(self.work.source.rig.lidar_frame, values)
         chain = {name: d[0] for name, d in placed.d.items() if d.any()}
         keys = [self.rest._key[name] for name in chain]
-        (ring,) = rows.sparse
+        own = np.column_stack([self.keys[c.variable][c.components[c.index]] for c in rows.sparse])
+        known = np.column_stack([c.index >= 0 for c in rows.sparse])
         make = _given if self.given else _computed
-        callbacks = make(rows, scan, placed.T[0], list(chain.values()))
+        callbacks = make(rows, scan, placed.T[0], list(chain.values()), known)
         noise = gtsam.noiseModel.Unit.Create(1)
-        for key, callback in zip(self.rings[ring.components[ring.index]], callbacks, strict=True):
-            yield gtsam.CustomFactor(noise, [*keys, key], callback)
+        for mine, there, callback in zip(own, known, callbacks, strict=True):
+            yield gtsam.CustomFactor(noise, [*keys, *mine[there]], callback)
 
     def step(self) -> Values:
         """One Gauss-Newton step from the start, as GTSAM does it by default."""
         at = self.rest._to_gtsam(self.work.start)
-        for key, offset in zip(self.rings, self.work.start[RINGS], strict=True):
-            at.insert(key, np.array([offset]))
+        for name, keys in self.keys.items():
+            for key, value in zip(keys, self.work.start[name], strict=True):
+                at.insert(key, np.array([value]))
         after = at.retract(self.graph.linearize(at).optimize())
-        rings = np.concatenate([after.atVector(key) for key in self.rings])
-        return self.rest._from_gtsam(after) | {RINGS: rings}
+        singles = {
+            name: np.concatenate([after.atVector(key) for key in keys])
+            for name, keys in self.keys.items()
+        }
+        return self.rest._from_gtsam(after) | singles
 
 
 def _given(
-    rows: Rows, scan: ScanStop, T: np.ndarray, chain: list[np.ndarray]
+    rows: Rows, scan: ScanStop, T: np.ndarray, chain: list[np.ndarray], known: np.ndarray
 ) -> Iterator[Callable]:
     root = (np.sqrt(rows.weight) / rows.sigma_m)[:, None]
     residual = root * rows.residual_m[:, None]
-    derivatives = [*(root * rows.by_twist @ d for d in chain), -root]
+    derivatives = [root * rows.by_twist @ d for d in chain]
+    own = root * np.column_stack([c.value for c in rows.sparse])
     for n in range(len(root)):
-        row = gtsam.JacobianVector([d[n : n + 1] for d in derivatives])
-        yield partial(_hand_over, residual[n], row)
+        row = [d[n : n + 1] for d in derivatives] + list(own[n, known[n]].reshape(-1, 1, 1))
+        yield partial(_hand_over, residual[n], gtsam.JacobianVector(row))
 
 
 def _hand_over(residual, row, factor, values, jacobians):
@@ -84,30 +93,34 @@ def _hand_over(residual, row, factor, values, jacobians):
 
 
 def _computed(
-    rows: Rows, scan: ScanStop, T: np.ndarray, chain: list[np.ndarray]
+    rows: Rows, scan: ScanStop, T: np.ndarray, chain: list[np.ndarray], known: np.ndarray
 ) -> Iterator[Callable]:
     root = np.sqrt(rows.weight) / rows.sigma_m
     ray = beams(scan.recording.scan(scan.index).xyz_m, scan.lidar.beam_origin_m)
     normal, point = rows.view["normal"], np.where(rows.usable[:, None], rows.view["point_m"], 0)
+    ring = np.array([c.variable == RINGS for c in rows.sparse])
     for n in range(len(root)):
         beam = ray.origin_m[n], ray.direction[n], ray.range_m[n]
-        yield partial(_compute, T, chain, beam, normal[n], normal[n] @ point[n], root[n])
+        plane = normal[n], normal[n] @ point[n]
+        yield partial(_compute, T, chain, ring[known[n]], beam, *plane, root[n])
 
 
-def _compute(T, chain, beam, normal, distance, root, factor, values, jacobians):
+def _compute(T, chain, ring, beam, normal, distance, root, factor, values, jacobians):
     if root == 0.0:
         normal = -T[:3, :3] @ beam[1]
     origin, direction, range_m = beam
     n = normal @ T[:3, :3]
     along = n @ direction
     t = (distance - normal @ T[:3, 3] - n @ origin) / along
+    own = np.where(ring, -1.0, 1.0 / abs(along))  # a ring's offset, or a shift along the normal
+    shift = own @ [values.atVector(key)[0] for key in factor.keys()[len(chain) :]]
     n = n / along
-    ring = values.atVector(factor.keys()[-1])[0]
     if jacobians is not None:
         x, y, z = origin + t * direction
         a, b, c = n
         by_twist = root * np.array([[y * c - z * b, z * a - x * c, x * b - y * a, a, b, c]])
         for i, d in enumerate(chain):
             jacobians[i] = by_twist @ d
-        jacobians[len(chain)] = np.array([[-root]])
-    return np.array([root * (range_m - t - ring)])
+        for i, d in enumerate(own):
+            jacobians[len(chain) + i] = np.array([[root * d]])
+    return np.array([root * (range_m - t + shift)])

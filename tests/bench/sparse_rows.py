@@ -3,66 +3,71 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
-from functools import partial
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import least_squares
-from scipy.sparse import csr_matrix, vstack
+from scipy.sparse import block_diag, csr_array, eye_array, vstack
 from workload import Values, Work
 
-from calib.residuals.beams import CompressedScan, Rows, compress
+from calib.forward import Placed
+from calib.linear.linearise import lidars
+from calib.problem.unknowns import Unknown
+from calib.residuals.beams import Rows
 from calib.residuals.scan import ScanStop
 from calib.solve.fit import CONVERGED, MAX_PASSES
-from calib.solve.graph import Variable
 from chains import se3
 
-Part = tuple[np.ndarray, csr_matrix]
+Part = tuple[np.ndarray, csr_array]
 
 
-class FrozenRows:
-    """A workload's rows, with their weights and what beams meet kept: plain least squares."""
+@dataclass(frozen=True)
+class FrozenScan(ScanStop):
+    """A stop whose rows keep the weights and sigmas that they had.
 
-    def __init__(self, work: Work) -> None:
-        self.work = work
-        self.weights = []
-        for scan, association in zip(work.problem.scans, work.associations, strict=True):
-            rows = scan.rows(work.start, association)
-            self.weights.append({"weight": rows.weight, "sigma_m": rows.sigma_m})
+    Args:
+        weights: those.
+    """
 
-    def rows(self, i: int, values: Values) -> Rows:
-        """The rows of one stop at a state."""
-        scan = self.work.problem.scans[i]
-        return replace(scan.rows(values, self.work.associations[i]), **self.weights[i])
+    weights: Mapping[str, np.ndarray]
 
-    def optimum(self) -> Values:
-        """Steps of the compressed graph, until one is as small as that which ends a fit."""
-        values = self.work.start
-        for _ in range(MAX_PASSES):
-            before = values
-            values = self.work.step(before, partial(self._compressed, before))
-            if max(np.abs(values[name] - before[name]).max() for name in values) < CONVERGED:
-                return values
-        raise RuntimeError(f"no convergence in {MAX_PASSES} steps")
+    def rows(self, *state: object) -> Rows:
+        """The rows at a state."""
+        return replace(super().rows(*state), **self.weights)
 
-    def _compressed(self, values: Values, i: int, scan: ScanStop) -> CompressedScan:
-        frame, T = self.work.source.rig.lidar_frame, scan.pose(values)
-        return compress(scan.name, self.rows(i, values), scan.stops, frame, T, values, False)
+
+def frozen(work: Work) -> Work:
+    """The work as plain least squares: weights and what beams meet are kept."""
+    scans = []
+    for scan, association in zip(work.problem.scans, work.associations, strict=True):
+        rows = scan.rows(work.start, association)
+        weights = {"weight": rows.weight, "sigma_m": rows.sigma_m}
+        scans.append(FrozenScan(**vars(scan), weights=weights))
+    return replace(work, problem=replace(work.problem, scans=scans))
+
+
+def optimum(work: Work) -> Values:
+    """Our steps, until one is as small as that which ends a fit."""
+    values = work.start
+    for _ in range(MAX_PASSES):
+        before, values = values, work.step(values, work.associations)
+        if max(np.abs(values[name] - before[name]).max() for name in values) < CONVERGED:
+            return values
+    raise RuntimeError(f"no convergence in {MAX_PASSES} steps")
 
 
 class SparseRows:
-    """The same rows as scipy takes them, by the tangent x of all variables at the start."""
+    """The rows of a frozen work as scipy takes them, by the tangent x of all unknowns at the start.
 
-    def __init__(self, frozen: FrozenRows) -> None:
-        self.frozen, self.work = frozen, frozen.work
-        self.variables = self.work.problem.variables
-        dims = [v.dim for v in self.variables.values()]
-        self.size = sum(dims)
-        starts = np.cumsum([0, *dims])
-        self.at = {
-            name: start + np.arange(dim)
-            for name, start, dim in zip(self.variables, starts, dims, strict=False)
-        }
+    Derivatives are by each unknown's own increment (by a direction's components), then by x.
+    """
+
+    def __init__(self, work: Work) -> None:
+        self.work, self.unknowns = work, work.problem.variables
+        self.at = _slices({n: u.dim for n, u in self.unknowns.items()})
+        wide = {n: 3 if u.kind == "direction" else u.dim for n, u in self.unknowns.items()}
+        self.own = _slices(wide)
+        self.size, self.width = sum(u.dim for u in self.unknowns.values()), sum(wide.values())
         self._last: tuple[bytes, Part] | None = None
 
     def optimum(self) -> np.ndarray:
@@ -70,7 +75,7 @@ class SparseRows:
         return least_squares(
             lambda x: self.rows(x)[0],
             np.zeros(self.size),
-            lambda x: self.rows(x)[1],
+            lambda x: self.rows(x)[1] @ self._charts(x),
             method="trf",
             tr_solver="lsmr",
             x_scale="jac",
@@ -78,63 +83,67 @@ class SparseRows:
 
     def values(self, x: np.ndarray) -> Values:
         """The state at x."""
-        return {n: _moved(v, self.work.start[n], x[self.at[n]]) for n, v in self.variables.items()}
+        return {n: _moved(u, self.work.start[n], x[self.at[n]]) for n, u in self.unknowns.items()}
 
     def distance(self, x: np.ndarray, values: Values) -> float:
         """How many sigmas the state at x is from another, all unknowns taken together."""
-        mine, charts = self.values(x), self._charts(x)
-        dx = [
-            np.linalg.lstsq(charts[name], _increment(v, mine[name], values[name]))[0]
-            for name, v in self.variables.items()
-        ]
-        return float(np.linalg.norm(self.rows(x)[1] @ np.concatenate(dx)))
+        mine = self.values(x).items()
+        away = [_increment(self.unknowns[n], value, values[n]) for n, value in mine]
+        return float(np.linalg.norm(self.rows(x)[1] @ np.concatenate(away)))
 
     def rows(self, x: np.ndarray) -> Part:
-        """Whitened rows and their Jacobian; kept, as scipy asks for both at one place."""
+        """Whitened rows and their derivatives; kept, as scipy asks for both at one place."""
         if self._last is None or self._last[0] != x.tobytes():
-            values, charts = self.values(x), self._charts(x)
-            parts = [self._prior(v, values[name], charts) for name, v in self.variables.items()]
-            for block in self.work.problem.blocks:
+            values, problem = self.values(x), self.work.problem
+            parts = [self._prior(u, values[name]) for name, u in self.unknowns.items()]
+            for block in problem.blocks:
                 residual, d = block.evaluate(values, derivatives=True)
-                parts.append((residual, self._sparse(d, charts)))
-            parts += [self._beams(i, values, charts) for i in range(len(self.work.problem.scans))]
-            residuals, jacobians = zip(*parts, strict=True)
-            self._last = x.tobytes(), (np.concatenate(residuals), vstack(jacobians, "csr"))
+                columns = np.concatenate([np.r_[self.own[name]] for name in d])
+                parts.append((residual, self._csr(np.hstack(list(d.values())), columns)))
+            placed = lidars(problem.scans, values)
+            parts += [self._beams(i, values, placed[i]) for i in range(len(placed))]
+            residuals, derivatives = zip(*parts, strict=True)
+            self._last = x.tobytes(), (np.concatenate(residuals), vstack(derivatives, "csr"))
         return self._last[1]
 
-    def _charts(self, x: np.ndarray) -> Values:
-        """Derivative of each variable's own increment by its part of x."""
-        start = self.work.start
-        return {n: _chart(v, start[n], x[self.at[n]]) for n, v in self.variables.items()}
+    def _charts(self, x: np.ndarray) -> csr_array:
+        """Derivative of the unknowns' own increments by x."""
+        start, unknowns = self.work.start, self.unknowns.items()
+        return block_diag([_chart(u, start[n], x[self.at[n]]) for n, u in unknowns], "csr")
 
-    def _prior(self, v: Variable, value: np.ndarray, charts: Values) -> Part:
+    def _prior(self, u: Unknown, value: np.ndarray) -> Part:
         # As GTSAM does, the derivative by a pose's increment is taken for one.
-        across = _across(v.mean).T if v.kind == "direction" else np.eye(v.dim)
-        residual = across @ _increment(v, v.mean, value) / v.sigma
-        return residual, self._sparse({v.name: across / v.sigma[:, None]}, charts)
+        across = csr_array(_across(u.mean).T) if u.kind == "direction" else eye_array(u.dim)
+        derivative = (across / u.sigma[:, None]).tocoo()
+        columns = derivative.col + self.own[u.name].start
+        at = (derivative.data, (derivative.row, columns))
+        residual = across @ _increment(u, u.mean, value) / u.sigma
+        return residual, csr_array(at, shape=(u.dim, self.width))
 
-    def _beams(self, i: int, values: Values, charts: Values) -> Part:
-        scan, rows = self.work.problem.scans[i], self.frozen.rows(i, values)
+    def _beams(self, i: int, values: Values, placed: Placed) -> Part:
+        rows = self.work.problem.scans[i].rows(values, self.work.associations[i])
         root = np.sqrt(rows.weight) / rows.sigma_m
-        d = scan.stops.in_reference(self.work.source.rig.lidar_frame, values).d
-        d = {name: block[0] for name, block in d.items() if block.any()}
-        chain = np.hstack([d[name] @ charts[name] for name in d])
-        (ring,) = rows.sparse
-        columns = np.empty((len(root), chain.shape[1] + 1), np.int32)
-        columns[:, :-1] = np.concatenate([self.at[name] for name in d])
-        columns[:, -1] = self.at[ring.variable][ring.components[ring.index]]
-        derivative = np.column_stack([rows.by_twist @ chain, ring.value]) * root[:, None]
-        return root * rows.residual_m, self._csr(derivative, columns)
+        d = {name: block[0] for name, block in placed.d.items() if block.any()}
+        chain = np.concatenate([np.r_[self.own[name]] for name in d])
+        columns = np.empty((len(root), len(chain) + len(rows.sparse)), np.int32)
+        columns[:, : len(chain)] = chain
+        for g, c in enumerate(rows.sparse, len(chain)):
+            columns[:, g] = self.own[c.variable].start + c.components[c.index]
+        sparse = [np.where(c.index >= 0, c.value, 0.0) for c in rows.sparse]
+        derivative = np.column_stack([rows.by_twist @ np.hstack(list(d.values())), *sparse])
+        return root * rows.residual_m, self._csr(derivative * root[:, None], columns)
 
-    def _sparse(self, d: Mapping[str, np.ndarray], charts: Values) -> csr_matrix:
-        derivative = np.hstack([d[name] @ charts[name] for name in d])
-        columns = np.concatenate([self.at[name] for name in d])
-        return self._csr(derivative, np.broadcast_to(columns, derivative.shape))
-
-    def _csr(self, derivative: np.ndarray, columns: np.ndarray) -> csr_matrix:
+    def _csr(self, derivative: np.ndarray, columns: np.ndarray) -> csr_array:
+        """Rows of as many entries each, in these columns."""
         count, each = derivative.shape
         starts = each * np.arange(count + 1)
-        return csr_matrix((derivative.ravel(), columns.ravel(), starts), shape=(count, self.size))
+        columns = np.broadcast_to(columns, derivative.shape).ravel()
+        return csr_array((derivative.ravel(), columns, starts), shape=(count, self.width))
+
+
+def _slices(sizes: Mapping[str, int]) -> dict[str, slice]:
+    ends = np.cumsum([0, *sizes.values()]).tolist()
+    return {n: slice(a, b) for n, a, b in zip(sizes, ends, ends[1:], strict=False)}
 
 
 def _across(direction: np.ndarray) -> np.ndarray:
@@ -142,23 +151,23 @@ def _across(direction: np.ndarray) -> np.ndarray:
     return np.linalg.svd(direction[None])[2][1:].T
 
 
-def _moved(v: Variable, value: np.ndarray, x: np.ndarray) -> np.ndarray:
-    if v.kind == "pose":
+def _moved(u: Unknown, value: np.ndarray, x: np.ndarray) -> np.ndarray:
+    if u.kind == "pose":
         return value @ se3.exp(x)
-    if v.kind == "direction":
+    if u.kind == "direction":
         moved = value + _across(value) @ x
         return moved / np.linalg.norm(moved)
     return value + x
 
 
-def _chart(v: Variable, value: np.ndarray, x: np.ndarray) -> np.ndarray:
-    if v.kind == "pose":
+def _chart(u: Unknown, value: np.ndarray, x: np.ndarray) -> np.ndarray | csr_array:
+    if u.kind == "pose":
         return se3.right_jacobian(x)
-    if v.kind == "direction":
-        g = _moved(v, value, x)
+    if u.kind == "direction":
+        g = _moved(u, value, x)
         return (np.eye(3) - np.outer(g, g)) @ _across(value) / np.sqrt(1 + x @ x)
-    return np.eye(v.dim)
+    return eye_array(u.dim)
 
 
-def _increment(v: Variable, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return se3.log(se3.inverse(a) @ b) if v.kind == "pose" else b - a
+def _increment(u: Unknown, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return se3.log(se3.inverse(a) @ b) if u.kind == "pose" else b - a

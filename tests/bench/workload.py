@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 from unittest import mock
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
+from calib.linear.layout import Layout
+from calib.linear.linearise import linearise
+from calib.linear.parallel import in_order, workers
 from calib.problem import Problem, build
 from calib.problem.model import Model, Source
-from calib.residuals.beams import Association, CompressedScan, SharedSum
-from calib.residuals.scan import ScanStop
+from calib.residuals.beams import Association
 from calib.simulation import Spec, room, simulate
-from calib.solve.graph import Graph
+from calib.solve.fit import preview
+from calib.solve.graph import Graph, KeptRows
 from sensors.recording import Recording, Scan
 from sensors.reference import Reference
 
@@ -38,7 +44,8 @@ class Held(Recording):
 
 @dataclass(frozen=True)
 class Work:
-    """A problem, where trackers and targets alone lead to, and what beams meet there."""
+    """A problem with its surfaces' unknowns, where trackers and targets alone lead to, and what
+    beams meet there."""
 
     source: Source
     problem: Problem
@@ -48,11 +55,8 @@ class Work:
     @classmethod
     def of(cls, source: Source) -> Work:
         """The default model on a recording."""
-        problem = build([source], Model())
-        graph = Graph(list(problem.variables.values()), problem.blocks)
-        start = graph.solve(problem.initial)[0]
-        associations = [s.associate(start, near_edges=True) for s in problem.scans]
-        return cls(source, problem, start, associations)
+        found = preview(build([source], Model()))
+        return cls(source, found.problem, found.values, found.associations)
 
     @property
     def rows(self) -> int:
@@ -66,24 +70,33 @@ class Work:
         thin = {k: _every(scan, every) for k, scan in recording.scans.items()}
         return Work.of(replace(self.source, recording=replace(recording, scans=thin)))
 
-    def step(self, values: Values, compressed: Callable[[int, ScanStop], CompressedScan]) -> Values:
-        """One Gauss-Newton step of a fit: every stop compressed, then the graph solved."""
-        poses, shared = [], SharedSum()
-        for i, scan in enumerate(self.problem.scans):
-            rows = compressed(i, scan)
-            poses.append(rows.pose)
-            shared.add(rows)
-        blocks = [*self.problem.blocks, *poses, *shared.rows()]
-        return Graph(list(self.problem.variables.values()), blocks).step(values)
+    def step(self, values: Values, associations: Sequence[Association]) -> Values:
+        """One Gauss-Newton step of a fit: linearised, down to the graph, and back to all."""
+        linear = linearise(self.problem, values, associations, layout=self.layout)
+        outer, unknowns = self.layout.outer(), self.layout.unknowns
+        blocks = [*self.layout.others, *KeptRows.of(linear)]
+        after, moved, _ = Graph(list(outer.values()), blocks).step(values)
+        inner = linear.step(np.concatenate([moved[name] for name in outer]))
+        inner = {name: unknowns[name].moved(values[name], step) for name, step in inner.items()}
+        return {**values, **after, **inner}
+
+    @cached_property
+    def layout(self) -> Layout:
+        """As a fit makes it once."""
+        return Layout.of(self.problem)
 
     def frozen_step(self) -> Values:
         """A step from the start; what beams meet is kept."""
-        kept = self.associations
-        return self.step(self.start, lambda i, scan: scan.compress(self.start, kept[i]))
+        return self.step(self.start, self.associations)
 
     def whole_step(self) -> Values:
-        """A step from the start, casts included."""
-        return self.step(self.start, lambda i, scan: scan.compress(self.start))
+        """A step from the start, casts included; they meet the surfaces that they met before."""
+        return self.step(self.start, list(in_order(self.cast, len(self.associations))))
+
+    def cast(self, i: int) -> Association:
+        """What the beams of a stop meet at the start, found anew."""
+        found = self.problem.scans[i].associate(self.start, near_edges=False)
+        return replace(found, cells=self.associations[i].cells)
 
 
 def _every(scan: Scan, n: int) -> Scan:
@@ -113,21 +126,28 @@ def held(folder: Path) -> Source:
     return replace(source, recording=Held(**vars(source.recording), scans=scans))
 
 
-def one_thread() -> Any:
-    """Rays on one thread, as numpy is; Open3D takes all otherwise."""
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Stops one by one, and rays and BLAS on one thread; they take all otherwise."""
     first_triangle = Reference.first_triangle
 
     def alone(self, origins_m, directions, nthreads=0):
         return first_triangle(self, origins_m, directions, nthreads=1)
 
-    return mock.patch.object(Reference, "first_triangle", alone)
+    alone = mock.patch.object(Reference, "first_triangle", alone)
+    with threadpool_limits(1), workers(1), alone:
+        yield
 
 
-def timed(run: Callable[[], Any], repeats: int = 1) -> tuple[Any, float]:
+def timed(
+    run: Callable[[], Any],
+    repeats: int = 1,
+    clock: Callable[[], float] = time.process_time,
+) -> tuple[Any, float]:
     """What it returns, and the median of its CPU seconds, which a busy machine changes little."""
     seconds = []
     for _ in range(repeats):
-        start = time.process_time()
+        start = clock()
         found = run()
-        seconds.append(time.process_time() - start)
+        seconds.append(clock() - start)
     return found, float(np.median(seconds))

@@ -18,14 +18,16 @@ from calib.solve.graph import Graph
 from . import rigs
 
 
-def unknown(name, kind, mean, sigma):
-    dofs = tuple(map(str, range(len(sigma))))
-    units = ("m",) * len(sigma)
-    return Unknown(name=name, kind=kind, mean=mean, sigma=sigma, dofs=dofs, units=units)
-
-
 def vector(name, size, mean=0.0, sigma=10.0):
-    return unknown(name, "vector", np.full(size, mean), np.full(size, sigma))
+    dofs = tuple(map(str, range(size)))
+    return Unknown(
+        name=name,
+        kind="vector",
+        mean=np.full(size, mean),
+        sigma=np.full(size, sigma),
+        dofs=dofs,
+        units=("m",) * size,
+    )
 
 
 @dataclass(frozen=True)
@@ -138,7 +140,14 @@ def test_a_sigma_of_zero_is_refused():
     graph.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(), noise))
     values.insert(0, gtsam.Pose3())
     assert not gtsam.Marginals(graph, values).marginalCovariance(0).any()
-    exact = unknown("x", "vector", np.zeros(2), np.array([0.01, 0.0]))
+    exact = Unknown(
+        name="x",
+        kind="vector",
+        mean=np.zeros(2),
+        sigma=np.array([0.01, 0.0]),
+        dofs=("a", "b"),
+        units=("m", "m"),
+    )
     with pytest.raises(ValueError, match="'x'"):
         Graph([exact], [])
 
@@ -246,7 +255,14 @@ def test_solve_finds_what_scipy_finds():
     rng = np.random.default_rng(3)
     points, seen = rng.normal(size=(8, 3)), rng.normal(size=(8, 3))
     pose = pose_unknown("T", np.eye(4), np.full(6, 2.0))
-    down = unknown("g", "direction", np.array([0, 0, -1.0]), np.full(2, 1e3))
+    down = Unknown(
+        name="g",
+        kind="direction",
+        mean=np.array([0, 0, -1.0]),
+        sigma=np.full(2, 1e3),
+        dofs=("",) * 2,
+        units=("",) * 2,
+    )
     scale = vector("s", 3, sigma=1.0)
 
     def residual(values):

@@ -94,14 +94,15 @@ def test_tracked_body_rows_are_measured_less_predicted_in_sigmas(values, tracked
 
 def hanging(shift=None):
     rng = np.random.default_rng(6)
-    where = rng.normal(size=(3, 3))
-    seen = dict(zip(("faro_m", "upper_m", "lower_m"), where, strict=True))
+    faro_m, upper_m, lower_m = rng.normal(size=(3, 3))
     return HangingTarget(
         name="rod",
         marker="p",
         gravity="g",
         reference="faro",
-        **seen,
+        faro_m=faro_m,
+        upper_m=upper_m,
+        lower_m=lower_m,
         below_m=0.18,
         sigma_sphere_m=6e-4,
         sigma_marker_m=2e-4,
