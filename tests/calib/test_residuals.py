@@ -6,120 +6,27 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from calib.effects import Effect, OneHot, Param, Site
+from calib.effects import Effect, Param, Site
 from calib.forward import Term
-from calib.linear.layout import Layout
-from calib.linear.rows import StopRows
-from calib.problem.build import build, effect_unknown
-from calib.problem.model import Model, Source
-from calib.problem.surfaces import with_surfaces
+from calib.problem.build import effect_unknown
 from calib.residuals.beams import Association
 from calib.residuals.robust import tukey_weight
 from calib.residuals.scan import turned
-from calib.residuals.surfaces import PlaneSurface
 from sensors.lidar import Beams, beams
-from sensors.planes import Planes
 
-from . import rigs
+from . import bent, rigs
+from .bent import by_variable, stop_rows
 from .rescanned import rescanned
 
 
-class Warp(Effect):
-    """Range, azimuth and elevation all lie, and in a way that turns with the beam."""
-
-    name, site = "warp", Site.BEAM
-
-    def params(self, rig):
-        return tuple(Param(f"{what}_{k}", "", 0.01) for what in ("r", "a", "e") for k in (0, 1))
-
-    def basis(self, view):
-        turn = np.stack([np.ones(view.rows), np.cos(view["azimuth_rad"])], axis=1)
-        basis = np.zeros((view.rows, 3, 6))
-        for site in range(3):
-            basis[:, site, 2 * site : 2 * site + 2] = turn
-        return basis
-
-
-class RingElevation(Effect):
-    """Every other ring points too high: one parameter each, the rest right."""
-
-    name, site = "ring_elevation", Site.BEAM
-
-    def params(self, rig):
-        return tuple(Param(f"ring_{k}", "rad", 0.01) for k in range(rigs.RINGS // 2))
-
-    def basis(self, view):
-        ring = view["ring"]
-        index = np.where(ring % 2, -1, ring // 2)
-        return OneHot(index, np.tile([0.0, 0.0, 1.0], (view.rows, 1)), rigs.RINGS // 2)
+@pytest.fixture(scope="module")
+def on_mesh(tmp_path_factory):
+    return bent.on_mesh(tmp_path_factory.mktemp("mesh"))
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    return tmp_path_factory.mktemp("residuals")
-
-
-@pytest.fixture(scope="module")
-def on_mesh(folder):
-    return bent(build([Source.open(rigs.write(folder / "mesh"))], Model()), surfaces=True)
-
-
-@pytest.fixture(scope="module")
-def on_planes(folder):
-    source = Source.open(rigs.write(folder / "planes", reference=None))
-    walls = np.repeat(np.arange(6), rigs.WALL_STEPS**2 * 2)
-    vertices, triangles = rigs.room()
-    found = Planes(
-        normal=np.repeat(np.eye(3), 2, axis=0),
-        distance_m=np.ravel([[0, size] for size in rigs.ROOM_M]),
-        count=np.full(6, 100),
-        cell_mean_m=vertices[triangles].mean(axis=1),
-        cell_plane=walls,
-        cell_m=1.0,
-        tolerance_m=0.3,
-    )
-    met = {0: PlaneSurface(found, "planes")}
-    return bent(build([source], Model(), meetings=met), surfaces=False)
-
-
-def bent(problem, surfaces):
-    """The problem with every kind of beam and surface error switched on, away from its start."""
-    source = problem.sources[0]
-    terms = [
-        Term(e, e.name, np.arange(len(e.params(source.rig)))) for e in (Warp(), RingElevation())
-    ]
-    for term in terms:
-        problem.add(effect_unknown(term, source))
-    problem.scans = [replace(s, terms=[*s.terms, *terms]) for s in problem.scans]
-    values = rigs.shaken(problem.variables, problem.initial, 0.01)
-    association = [s.associate(values, near_edges=False) for s in problem.scans]
-    if surfaces:
-        pairs = zip(problem.scans, association, strict=True)
-        views = [scan.rows(values, a).view for scan, a in pairs]
-        patches = ({kind: view[kind] for kind in ("region", "patch")} for view in views)
-        with_patches = [replace(a, patches=p) for a, p in zip(association, patches, strict=True)]
-        problem, association = with_surfaces(problem, with_patches)
-        cells = {name: problem.variables[name] for name in problem.cells}
-        values |= rigs.shaken(cells, problem.initial, 0.01)
-    return SimpleNamespace(problem=problem, values=values, association=association)
-
-
-def dense(columns, count, dim):
-    """Columns with one non-zero per row, in full."""
-    out = np.zeros((count, dim))
-    touched = np.flatnonzero(columns.index >= 0)
-    out[touched, columns.components[columns.index[touched]]] = columns.value[touched]
-    return out
-
-
-def by_variable(scan, rows, values):
-    """Derivative (N, dim) of a stop's residuals by everything they depend on."""
-    placed = scan.stops.in_reference("lidar", values)
-    d = {name: rows.by_twist @ columns[0] for name, columns in placed.d.items()} | dict(rows.dense)
-    for c in rows.sparse:
-        full = dense(c, len(rows.residual_m), len(values[c.variable]))
-        d[c.variable] = d.get(c.variable, 0.0) + full
-    return d
+def on_planes(tmp_path_factory):
+    return bent.on_planes(tmp_path_factory.mktemp("planes"))
 
 
 @pytest.mark.parametrize(("meeting", "stop"), [("on_mesh", 3), ("on_planes", 0)])
@@ -259,6 +166,15 @@ def test_a_beam_whose_plane_fell_behind_it_is_left_out(on_mesh):
     assert np.isfinite(stop_rows(case, scan, Association(part)).sums().whole()).all()
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_beam_that_meets_no_plane_says_nothing_and_divides_by_nothing(on_planes):
+    part = on_planes.association[0].part.copy()
+    part[:50] = -1
+    rows = on_planes.problem.scans[0].rows(on_planes.values, Association(part))
+    assert not rows.usable[:50].any() and not rows.weight[:50].any()
+    assert all(np.isfinite(c.value).all() and not c.value[:50].any() for c in rows.sparse)
+
+
 # ------------------------------------------------------------------------------------------- shifts
 
 
@@ -295,105 +211,3 @@ def test_every_beam_moves_with_the_cells_that_it_meets_and_with_no_other(on_mesh
             index = association.cells[name]
             np.testing.assert_array_equal(cells.parts[index], view[cells.column])
             np.testing.assert_array_equal(cells.surface[index], view["surface"])
-
-
-# --------------------------------------------------------------------------------------------- sums
-
-
-def stop_rows(case, scan, association, newton=False):
-    """One stop's linear rows over the unknowns of a case."""
-    placed = scan.stops.in_reference("lidar", case.values)
-    return StopRows.of(scan, Layout.of(case.problem), case.values, placed, association, newton)
-
-
-def summed(case, stops, newton=False):
-    """The normal equations (U + 1, U + 1) of some stops' sums; the right side is last."""
-    size = sum(u.dim for u in case.problem.variables.values())
-    total = np.zeros((size + 1, size + 1))
-    for k in stops:
-        rows = stop_rows(case, case.problem.scans[k], case.association[k], newton)
-        sums, count = rows.sums(), 7 + len(rows.columns)
-        through = np.zeros((count, size + 1))
-        through[:6, sums.chain_columns] = sums.chain
-        through[np.arange(6, count), np.append(size, sums.columns)] = 1.0
-        total += through.T @ sums.whole() @ through
-    return total
-
-
-def whole(case, stop):
-    """Derivative (N, U) of a stop's rows by all unknowns, minus their residuals (N,), and their
-    weights over variance (N,)."""
-    scan, association = case.problem.scans[stop], case.association[stop]
-    rows = scan.rows(case.values, association)
-    d = by_variable(scan, rows, case.values)
-    count, unknowns = len(rows.residual_m), case.problem.variables.values()
-    A = np.hstack([d.get(u.name, np.zeros((count, u.dim))) for u in unknowns])
-    return A, -rows.residual_m, rows.weight / rows.sigma_m**2
-
-
-@pytest.mark.parametrize("meeting", ["on_mesh", "on_planes"])
-@pytest.mark.parametrize("stops", [[2], [0, 1, 2, 3]])
-def test_sums_are_the_normal_equations_of_all_rows(meeting, stops, request):
-    case = request.getfixturevalue(meeting)
-    expected = 0.0
-    for k in stops:
-        A, b, weight = whole(case, k)
-        rows = np.column_stack([A, b])
-        expected = expected + rows.T @ (weight[:, None] * rows)
-    size = np.sqrt(np.maximum(np.diag(expected), 1e-30))
-    np.testing.assert_allclose(
-        summed(case, stops) / np.outer(size, size), expected / np.outer(size, size), atol=1e-10
-    )
-
-
-@pytest.mark.parametrize("meeting", ["on_mesh", "on_planes"])
-def test_gradients_by_cluster_are_those_of_their_rows(meeting, request):
-    case = request.getfixturevalue(meeting)
-    A, b, weight = whole(case, 1)
-    rows = stop_rows(case, case.problem.scans[1], case.association[1])
-    cluster = np.random.default_rng(0).integers(0, 5, len(b))
-    found, columns = rows.gradient(cluster, 5)
-    full = np.zeros((5, A.shape[1]))
-    full[:, columns] = found
-    expected = (cluster == np.arange(5)[:, None]) * (weight * b) @ A
-    scale = np.maximum(np.sqrt(np.square(A).T @ weight), 1e-12)
-    np.testing.assert_allclose(full / scale, expected / scale, atol=1e-9)
-
-
-@pytest.mark.parametrize("meeting", ["on_mesh", "on_planes"])
-def test_rows_along_directions_are_the_rows_times_these(meeting, request):
-    case = request.getfixturevalue(meeting)
-    A, b, weight = whole(case, 3)
-    rows = stop_rows(case, case.problem.scans[3], case.association[3])
-    directions = np.random.default_rng(0).standard_normal((A.shape[1], 3))
-    felt = weight > 0
-    np.testing.assert_allclose(rows.along(directions)[felt], (A @ directions)[felt], atol=1e-9)
-    np.testing.assert_array_equal(rows.b, b)
-    np.testing.assert_allclose(rows.weight, weight, rtol=1e-12)
-
-
-@pytest.mark.parametrize("meeting", ["on_mesh", "on_planes"])
-def test_newtons_curvature_leaves_the_gradient_as_it_is(meeting, request):
-    case = request.getfixturevalue(meeting)
-    A, B = (summed(case, [0, 2], newton) for newton in (False, True))
-    size = np.sqrt(np.maximum(np.diag(A), 1e-30))[:-1]
-    np.testing.assert_allclose(B[:-1, -1] / size, A[:-1, -1] / size, atol=1e-9 * A[-1, -1] ** 0.5)
-    assert np.abs(B - A)[:-1, :-1].max() > 0.01 * np.abs(A).max()
-
-
-def test_a_corridor_leaves_its_own_direction_open(on_mesh):
-    """Beams that meet one kind of wall say three things of where the LiDAR is, and no more."""
-    case = on_mesh
-    scan = replace(case.problem.scans[0], terms=[])
-    rows = scan.rows(case.values, case.association[0])
-    wall = np.abs(rows.view["normal"] @ rows.view["normal"][0]) > 0.99
-    association = Association(np.where(wall, case.association[0].part, -1))
-    quiet = scan.rows(case.values, association)
-    J = quiet.by_twist * (np.sqrt(quiet.weight) / quiet.sigma_m)[:, None]
-    sums = stop_rows(case, scan, association).sums()
-    size = np.linalg.norm(J, axis=0)
-    unit = np.outer(size, size)
-    np.testing.assert_allclose(sums.dense[:6, :6] / unit, J.T @ J / unit, atol=1e-12)
-    assert np.linalg.matrix_rank(sums.dense[:6, :6] / unit, tol=1e-9) == 3
-    placed = scan.stops.in_reference("lidar", case.values)
-    np.testing.assert_array_equal(sums.chain, np.hstack([d[0] for d in placed.d.values()]))

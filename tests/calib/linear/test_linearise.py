@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from calib.effects import DEFAULT
+from calib.linear import assembly
 from calib.linear.clusters import Gradients
 from calib.linear.layout import Layout
 from calib.linear.linearise import linearise
@@ -38,7 +39,8 @@ SIMULATED = {
     "planes": Spec(mesh=False, targets=0, locations=3, stops_per_location=2, column_step=100),
 }
 CASES = (*BOXES, *SIMULATED, "a stop without scan", "two recordings", "an earlier estimate")
-ORDERS = ("cells first", "stops first")
+# Order of elimination, and whether the chain behind twists is taken stop by stop or as a whole.
+ORDERS = {"cells first": (False, 10**9), "by blocks": (False, 0), "stops first": (True, 0)}
 
 
 @dataclass
@@ -104,7 +106,9 @@ def case(request, tmp_path_factory):
 
 @pytest.fixture(params=ORDERS)
 def order(request, monkeypatch):
-    monkeypatch.setattr(Layout, "stops_first", request.param == "stops first")
+    stops_first, dense = ORDERS[request.param]
+    monkeypatch.setattr(Layout, "stops_first", stops_first)
+    monkeypatch.setattr(assembly, "DENSE", dense)
     return request.param
 
 

@@ -40,6 +40,23 @@ def test_an_exception_of_any_one_is_passed_on_in_its_turn_and_the_rest_is_not_be
     assert max(begun) <= bad + 2 * count
 
 
+def test_what_waits_when_one_fails_is_cancelled():
+    """Two threads: one fails and takes up the third, the other is busy; the fourth never begins."""
+    begun, busy = [], threading.Event()
+
+    def work(i):
+        begun.append(i)
+        if i == 0:
+            busy.wait()
+            raise ZeroDivisionError
+        busy.set()
+        time.sleep(0.3)
+
+    with workers(2), pytest.raises(ZeroDivisionError):
+        list(in_order(work, 30))
+    assert set(begun) <= {0, 1, 2}
+
+
 @pytest.mark.parametrize("count", COUNTS)
 def test_who_leaves_early_leaves_nothing_running(count):
     begun, running = [], threading.active_count()
