@@ -99,7 +99,7 @@ def test_the_screen_adds_up_what_blas_does(bench, work):
         )
 
 
-@pytest.mark.slow
+@pytest.mark.long  # two sides of a whole loop, each command a process
 def test_the_loop_agrees_with_itself(tmp_path):
     (tmp_path / "smallest.yaml").write_text(SMALLEST, encoding="utf-8")
     script = [sys.executable, HERE / "bench_loop.py", "--against", HERE.parents[1]]
