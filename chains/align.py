@@ -2,7 +2,6 @@
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 from chains.errors import InputError
 from chains.se3 import Array
@@ -33,12 +32,20 @@ def align_points(
                 "the points lie on one line, so the turn about it is not determined; "
                 "add a point off the line"
             )
-    rotation, _ = Rotation.align_vectors(a - mean_a, b - mean_b, weights=w)
+    R = nearest_rotation((a - mean_a).T @ (w[:, None] * (b - mean_b)))
     T_a_b = np.eye(4)
-    T_a_b[:3, :3] = rotation.as_matrix()
-    T_a_b[:3, 3] = mean_a - rotation.apply(mean_b)
-    squares = np.sum((a - mean_a - rotation.apply(b - mean_b)) ** 2, axis=1)
+    T_a_b[:3, :3] = R
+    T_a_b[:3, 3] = mean_a - R @ mean_b
+    squares = np.sum((a - mean_a - (b - mean_b) @ R.T) ** 2, axis=1)
     return T_a_b, float(np.sqrt(np.average(squares, weights=w)))
+
+
+def nearest_rotation(M: Array) -> Array:
+    """Return the rotation R (3, 3) with the largest trace(R^T M): of points, by which one set is
+    turned into the other (Kabsch, Acta Cryst. A32, 1976); of a mean of rotations, their mean."""
+    U, _, Vt = np.linalg.svd(M)
+    U[:, 2] *= np.sign(np.linalg.det(U @ Vt))
+    return U @ Vt
 
 
 def mean_pose(Ts: ArrayLike) -> Array:
@@ -48,7 +55,7 @@ def mean_pose(Ts: ArrayLike) -> Array:
     """
     Ts = np.asarray(Ts, float)
     T = np.eye(4)
-    T[:3, :3] = Rotation.from_matrix(Ts[:, :3, :3]).mean().as_matrix()
+    T[:3, :3] = nearest_rotation(Ts[:, :3, :3].mean(axis=0))
     T[:3, 3] = Ts[:, :3, 3].mean(axis=0)
     return T
 

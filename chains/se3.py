@@ -10,7 +10,6 @@ from math import factorial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
 
@@ -84,8 +83,10 @@ def so3_exp(w: ArrayLike) -> Array:
 
 def so3_log(R: ArrayLike) -> Array:
     """Return the rotation vectors (..., 3) of R (..., 3, 3), of length at most pi."""
-    R = np.asarray(R, float)
-    return Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec().reshape(R.shape[:-1])
+    q = _quat_wxyz(np.asarray(R, float))
+    half = np.sqrt(np.vecdot(q[..., 1:], q[..., 1:]))
+    some = np.where(half > 0.0, half, 1.0)  # sine of half the angle; where it is 0, so is the turn
+    return (2.0 * np.arctan2(half, q[..., 0]) / some)[..., None] * q[..., 1:]
 
 
 def so3_left_jacobian_inverse(w: ArrayLike) -> Array:
@@ -177,9 +178,9 @@ def from_xyz_rpy(xyz: ArrayLike, rpy: ArrayLike) -> Array:
 
     Fixed axes x, y, z: R = Rz(yaw) Ry(pitch) Rx(roll).
     """
-    rpy = np.asarray(rpy, float)
-    R = Rotation.from_euler("xyz", rpy.reshape(-1, 3)).as_matrix()
-    return _transform(R.reshape(*rpy.shape, 3), np.asarray(xyz, float))
+    turns = np.asarray(rpy, float)[..., None] * _EYE3
+    Rx, Ry, Rz = np.moveaxis(so3_exp(turns), -3, 0)
+    return _transform(Rz @ Ry @ Rx, np.asarray(xyz, float))
 
 
 def to_rpy(T: ArrayLike) -> Array:
@@ -210,6 +211,24 @@ def from_xyz_quat(xyz: ArrayLike, quat_wxyz: ArrayLike) -> Array:
 
 def to_quat_wxyz(T: ArrayLike) -> Array:
     """Return the unit quaternions (..., 4) of T (..., 4, 4) as w x y z with w >= 0."""
-    T = np.asarray(T, float)
-    rotation = Rotation.from_matrix(T[..., :3, :3].reshape(-1, 3, 3))
-    return rotation.as_quat(canonical=True, scalar_first=True).reshape(*T.shape[:-2], 4)
+    return _quat_wxyz(np.asarray(T, float)[..., :3, :3])
+
+
+def _quat_wxyz(R: Array) -> Array:
+    """Unit quaternions (..., 4) of rotations (..., 3, 3), w >= 0.
+
+    All entries of ``4 q q^T`` are sums of those of R; its longest row is q times a number far from
+    zero (Shepperd, J. Guidance and Control 1, 1978).
+    """
+    (a, b, c), (d, e, f), (g, h, i) = np.moveaxis(R, (-2, -1), (0, 1))
+    rows = [
+        [1 + a + e + i, h - f, c - g, d - b],
+        [h - f, 1 + a - e - i, b + d, c + g],
+        [c - g, b + d, 1 - a + e - i, f + h],
+        [d - b, c + g, f + h, 1 - a - e + i],
+    ]
+    outer = np.moveaxis(np.array(rows), (0, 1), (-2, -1))
+    longest = np.argmax(np.einsum("...ii->...i", outer), axis=-1)
+    q = np.take_along_axis(outer, longest[..., None, None], axis=-2)[..., 0, :]
+    q = q / np.sqrt(np.vecdot(q, q))[..., None]
+    return np.where(q[..., :1] < 0.0, -q, q)

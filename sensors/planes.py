@@ -5,13 +5,18 @@ directions and no further than noise along the third. Flat cells of all stops th
 first the same place seen from several stops, then neighbours, until whole planes are left.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import KDTree
+
+if TYPE_CHECKING:
+    from scipy.spatial import KDTree
 
 # Fewer points than this do not tell a flat cell from a bent one.
 MIN_CELL_POINTS = 12
@@ -24,6 +29,12 @@ FLATTEST_RAD = np.radians(80.0)
 NEAREST_CELLS = 8
 
 
+def _tree(points_m: np.ndarray) -> KDTree:
+    from scipy.spatial import KDTree  # late, as a fit to a mesh needs none
+
+    return KDTree(points_m)
+
+
 @dataclass(frozen=True)
 class Cells:
     """First and second moments of the points in C cells."""
@@ -33,7 +44,7 @@ class Cells:
     covariance_m2: np.ndarray  # (C, 3, 3)
 
     @classmethod
-    def of(cls, points_m: np.ndarray, cell: np.ndarray) -> "Cells":
+    def of(cls, points_m: np.ndarray, cell: np.ndarray) -> Cells:
         """Moments of the points (N, 3) in each cell (N,), every one of which has some."""
         count = np.bincount(cell)
 
@@ -59,11 +70,11 @@ class Cells:
         """Direction (C, 3) of least spread, unit, of either sign."""
         return self._principal[1][:, :, 0]
 
-    def take(self, index: np.ndarray) -> "Cells":
+    def take(self, index: np.ndarray) -> Cells:
         """The cells of an index or mask."""
         return Cells(self.count[index], self.mean_m[index], self.covariance_m2[index])
 
-    def join(self, other: "Cells") -> "Cells":
+    def join(self, other: Cells) -> Cells:
         """These cells, then those."""
         return Cells(
             np.concatenate([self.count, other.count]),
@@ -71,7 +82,7 @@ class Cells:
             np.concatenate([self.covariance_m2, other.covariance_m2]),
         )
 
-    def pool(self, group: np.ndarray) -> "Cells":
+    def pool(self, group: np.ndarray) -> Cells:
         """Moments of all points of each group (G,), given the group (C,) of each cell.
 
         `cov = sum n (cov_i + d_i d_i') / sum n` with `d_i` from the group's mean to the cell's.
@@ -105,7 +116,7 @@ class Planes:
         """
         if not len(self.cell_mean_m):
             return np.full(len(points_world_m), -1)
-        _, near = KDTree(self.cell_mean_m).query(
+        _, near = _tree(self.cell_mean_m).query(
             points_world_m, NEAREST_CELLS, distance_upper_bound=0.75 * self.cell_m, workers=-1
         )
         plane = np.append(self.cell_plane, -1)[near]
@@ -161,7 +172,7 @@ class PlaneFinder:
     def planes(self, min_points: int = 200, min_stops: int = 1) -> Planes:
         """Planes of at least so many points, seen from at least so many stops; largest first."""
         cells = self._cells
-        pairs = KDTree(cells.mean_m).query_pairs(1.5 * self.cell_m, output_type="ndarray")
+        pairs = _tree(cells.mean_m).query_pairs(1.5 * self.cell_m, output_type="ndarray")
         a, b = pairs[self._apart_m(cells.take(pairs[:, 0]), cells.take(pairs[:, 1])) < np.inf].T
         graph = coo_array((np.ones(len(a), dtype=bool), (a, b)), shape=(len(cells.count),) * 2)
         plane = connected_components(graph, directed=False)[1].astype(np.int64)
@@ -195,7 +206,7 @@ class PlaneFinder:
         known = len(self._cells.count)
         if not known or not len(cells.count):
             return np.full(len(cells.count), -1)
-        _, near = KDTree(self._cells.mean_m).query(
+        _, near = _tree(self._cells.mean_m).query(
             cells.mean_m, NEAREST_CELLS, distance_upper_bound=self.cell_m / 2
         )
         new, column = np.nonzero(near < known)
