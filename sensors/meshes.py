@@ -187,6 +187,8 @@ def read_mesh(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: no such mesh; give a PLY, OBJ or STL file.")
+    if path.suffix.lower() == ".ply" and (triangles := _ply_triangles(path)):
+        return triangles
     o3d = _open3d()
 
     # The tensor reader would round doubles to float32; this one keeps them.
@@ -195,6 +197,19 @@ def read_mesh(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
     if not mesh.has_triangles():
         raise InputError(f"{path}: no triangles in it, or broken; give a PLY, OBJ or STL mesh.")
     return np.asarray(mesh.vertices), np.asarray(mesh.triangles)
+
+
+def _ply_triangles(path: Path) -> tuple[np.ndarray, np.ndarray] | None:
+    """Vertices and triangles of a PLY file, without Open3D's start; None where not all of its
+    faces are triangles."""
+    elements = read_ply(path)
+    vertex, face = elements.get("vertex", {}), elements.get("face", {})
+    corners = face.get("vertex_indices", face.get("vertex_index", np.zeros((0, 3), int)))
+    whole = {"x", "y", "z"} <= vertex.keys() and len(corners) and corners.shape[1] == 3
+    if not whole or corners.min() < 0 or corners.max() >= len(vertex["x"]):
+        return None
+    xyz = np.stack([vertex[axis] for axis in "xyz"], axis=1).astype(float)
+    return xyz, corners.astype(np.int32)
 
 
 def ray_caster(vertices_m: np.ndarray, triangles: np.ndarray) -> Any:

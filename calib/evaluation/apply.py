@@ -186,7 +186,7 @@ def _met(run: Run, folder: Path) -> list[tuple[str, Known]]:
     problem = problems.build(sources, model_of(run))
     values = values_of(problem, run.state())
     scans = [scan for scan in problem.scans if scan.recording is wanted.recording]
-    return [(scan.name, lambda ray, scan=scan: scan.met(ray, values)) for scan in scans]
+    return [(scan.name, lambda ray, scan=scan: scan.what_meets(ray, values)) for scan in scans]
 
 
 def _correct(

@@ -126,6 +126,11 @@ class ScanStop:
         _, ray = self._read()
         return self._associate(self.pose(values), ray, values, near_edges)
 
+    def met(self, values: Values, part: np.ndarray) -> Association:
+        """What is to be kept of what the beams met, the parts (N,), at a state."""
+        _, ray = self._read()
+        return self.meeting.divided(self.pose(values), ray, part)
+
     def rows(
         self,
         values: Values,
@@ -172,7 +177,7 @@ class ScanStop:
             corrected_m=measured_m - seen.error_at(Site.BEAM, hit)[:, 0] - predicted_m,
         )
 
-    def met(self, ray: Beams, values: Values) -> dict[str, np.ndarray]:
+    def what_meets(self, ray: Beams, values: Values) -> dict[str, np.ndarray]:
         """What is known (N,) of any beams of this stop: range, incidence and label of what they
         meet, and (1,) the stop's own columns; of beams that meet nothing, their own range, an
         incidence of NaN and label -1."""

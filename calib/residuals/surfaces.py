@@ -31,6 +31,8 @@ ROOM_M2 = 200.0
 class Meeting(Protocol):
     """Something that beams meet. First associate, then meet: an association can be kept."""
 
+    def divided(self, T: np.ndarray, beams: Beams, part: np.ndarray) -> Association: ...
+
     def associate(
         self, T: np.ndarray, beams: Beams, values: Values, near_edges: bool
     ) -> Association: ...
@@ -95,12 +97,16 @@ class MeshSurface:
         hits = self.reference.hits(triangle, origins, directions)
         spoilt = hits.incidence_rad > GRAZING_RAD
         spoilt |= self.reference.near_edge(origins, directions, hits, self.footprint_rad)
-        triangle = np.where(spoilt, -1, hits.triangle).astype(np.int32)
+        return self.divided(T, beams, np.where(spoilt, -1, hits.triangle).astype(np.int32))
+
+    def divided(self, T: np.ndarray, beams: Beams, part: np.ndarray) -> Association:
+        """The triangles (N,) that beams meet from there, and the patches of them."""
+        met = _Met(T, beams, self.reference.planes, part)
         patches = {
-            kind: self.reference.patch(hits.triangle, hits.point_m, size_m).astype(np.int32)
+            kind: self._patch(met, size_m).astype(np.int32)
             for kind, size_m in self.patches_m.items()
         }
-        return Association(triangle, patches)
+        return Association(part, patches)
 
     def meet(
         self, T: np.ndarray, beams: Beams, values: Values, association: Association
@@ -141,6 +147,10 @@ class PlaneSurface:
         """(M, 2, 3) two unit vectors in each plane as found."""
         side = transverse(self.planes.normal)
         return np.stack([side, np.cross(self.planes.normal, side)], axis=1)
+
+    def divided(self, T: np.ndarray, beams: Beams, part: np.ndarray) -> Association:
+        """The planes (N,) that beams meet, which have no patches."""
+        return Association(part)
 
     def associate(
         self, T: np.ndarray, beams: Beams, values: Values, near_edges: bool

@@ -16,7 +16,7 @@ from calib.effects import Effect, load_effects
 from calib.problem import Problem
 from calib.problem.model import Model, Source
 from calib.residuals.tracker import TrackedBody
-from calib.runs.reopen import model_of, reopened
+from calib.runs.reopen import model_of, reopened, start_of, stored_met
 from calib.runs.residual_table import residual_table, table_path
 from calib.runs.run import (
     COVARIANCE,
@@ -91,9 +91,9 @@ def grow(
     """
     if Path(out).resolve() == run.folder.resolve():
         raise InputError(f"{out}: a run cannot replace the one that it grows from; give another -o")
-    start = Start(run.state())
     with _folder(out) as folder:
         sources = reopened(run)
+        start = start_of(run, sources)
         _refuse_idle(model, run, sources)
         told = {key: run.model.get(key) for key in ("hold_out", "folds", "prior")}
         _fit(sources, model, folder, _Choices(**told, grown_from=run), progress, start)
@@ -192,7 +192,7 @@ def _fit(
     solution = solution_of(problem, estimate, widened)
     write_yaml(folder / SOLUTION, solution.document())
     np.savez(folder / COVARIANCE, names=np.array(solution.names), covariance=solution.covariance)
-    write_state(folder, estimate.state)
+    write_state(folder, estimate.state, stored_met(estimate.start, sources))
     write_yaml(folder / MODEL, _model_document(sources, model, choices))
     summary = _summary(problem, estimate, nominal, seen, unseen)
     summary |= {"misfit": worse, "sigmas_widened_by": widened}

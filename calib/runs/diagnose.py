@@ -7,9 +7,9 @@ from calib.diagnosis.stand import Stand
 from calib.diagnosis.verdict import Diagnosis, conclude
 from calib.diagnosis.weak import weak_directions
 from calib.problem import build
-from calib.runs.reopen import model_of, reopened
+from calib.runs.reopen import model_of, reopened, start_of
 from calib.runs.run import DIAGNOSIS, Run
-from calib.solve.fit import Progress, Start, resume
+from calib.solve.fit import Progress, resume
 from calib.solve.holdout import held_out
 from sensors.documents import write_json
 
@@ -66,4 +66,4 @@ def stand_of(run: Run, progress: Progress) -> Stand:
     """
     sources, model = reopened(run), model_of(run)
     problem = build(sources, model)
-    return Stand(sources, model, problem, resume(problem, Start(run.state()), progress))
+    return Stand(sources, model, problem, resume(problem, start_of(run, sources), progress))

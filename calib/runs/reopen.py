@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+
+import numpy as np
 
 from calib.problem.model import Model, Source
 from calib.runs.run import MODEL, Run
+from calib.solve.fit import Start
 from chains.errors import InputError
 
 
@@ -22,6 +25,27 @@ def reopened(run: Run) -> list[Source]:
         InputError: one is gone, or has changed.
     """
     return [_reopened(recording, run) for recording in run.model["recordings"]]
+
+
+def start_of(run: Run, sources: Sequence[Source]) -> Start:
+    """Where a run's fit stood, for another fit of its recordings.
+
+    Raises:
+        InputError: the run is of an earlier version.
+    """
+    folders = [source.recording.folder for source in sources]
+    met = {}
+    for name, part in run.met().items():
+        number, stop = map(int, name.split("/"))
+        met[folders[number], stop] = part
+    return Start(run.state(), met)
+
+
+def stored_met(start: Start, sources: Sequence[Source]) -> dict[str, np.ndarray]:
+    """What beams met, as a run keeps it: of recordings with a mesh."""
+    number = {s.recording.folder: i for i, s in enumerate(sources) if s.reference is not None}
+    known = ((folder, stop, part) for (folder, stop), part in start.met.items())
+    return {f"{number[folder]}/{stop}": part for folder, stop, part in known if folder in number}
 
 
 def _reopened(recording: Mapping[str, str], run: Run) -> Source:

@@ -33,7 +33,7 @@ _OF_CANDIDATE = {"effect", "add", "p_adjusted", "step", "dressed_up", "held_out_
 _OF_CANDIDATE |= {"unabsorbed_rms_mm"}
 _OF_CURVE = {"covariates", "centres", "mean_mm", "band_mm"}
 RING = re.compile(r"ring_(\d+)")  # a parameter of a ring
-_OF_STATE = "state/"  # before every name in that file: numpy reserves a few
+_OF_STATE, _OF_MET = "state/", "met/"  # before every name in that file: numpy reserves a few
 
 
 @dataclass(frozen=True)
@@ -109,6 +109,17 @@ class Run:
         Raises:
             InputError: the run has none.
         """
+        return self._stored(_OF_STATE)
+
+    def met(self) -> dict[str, np.ndarray]:
+        """What beams met: ``RECORDING/STOP``, both as numbers, and the triangle of each beam.
+
+        Raises:
+            InputError: as of `state`.
+        """
+        return self._stored(_OF_MET)
+
+    def _stored(self, prefix: str) -> dict[str, np.ndarray]:
         path = self.folder / STATE
         if not path.is_file():
             raise InputError(
@@ -116,7 +127,8 @@ class Run:
             )
         try:
             with np.load(path) as stored:
-                return {name.removeprefix(_OF_STATE): stored[name] for name in stored.files}
+                names = [name for name in stored.files if name.startswith(prefix)]
+                return {name.removeprefix(prefix): stored[name] for name in names}
         except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
             raise InputError(f"{path} cannot be read ({error}); fit the run again") from None
 
@@ -136,9 +148,12 @@ def read_solution(folder: Path) -> Solution:
     )
 
 
-def write_state(folder: Path, state: Mapping[str, np.ndarray]) -> None:
-    """Put where a fit stood into its run folder."""
-    np.savez(folder / STATE, **{f"{_OF_STATE}{name}": value for name, value in state.items()})
+def write_state(
+    folder: Path, state: Mapping[str, np.ndarray], met: Mapping[str, np.ndarray]
+) -> None:
+    """Put where a fit stood, and what its beams met, into its run folder; see `Run`."""
+    values = {f"{_OF_STATE}{name}": value for name, value in state.items()}
+    np.savez_compressed(folder / STATE, **values, **{f"{_OF_MET}{n}": x for n, x in met.items()})
 
 
 def versions() -> dict[str, str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -41,11 +41,11 @@ class Start:
 
     Args:
         state: `Estimate.state` of that; what it does not know starts at its mean.
-        met: stop -> what its beams met there, if that is known still.
+        met: stop -> which part of the surface each of its beams met (N,), where that is known.
     """
 
     state: Mapping[str, np.ndarray] = field(default_factory=dict)
-    met: Mapping[StopKey, Association] = field(default_factory=dict)
+    met: Mapping[StopKey, np.ndarray] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ class Estimate:
     def start(self) -> Start:
         """Where another fit of much the same problem may start from."""
         pairs = zip(self.scans, self.associations, strict=True)
-        return Start(self.state, {key_of(scan): replace(a, cells={}) for scan, a in pairs})
+        return Start(self.state, {key_of(scan): met.part for scan, met in pairs})
 
     @property
     def state(self) -> dict[str, np.ndarray]:
@@ -297,7 +297,7 @@ class _Loop:
     def fix_association(
         self,
         seen: Mapping[str, np.ndarray] | None = None,
-        met: Mapping[StopKey, Association] | None = None,
+        met: Mapping[StopKey, np.ndarray] | None = None,
     ) -> None:
         """Keep what each beam meets, here or at other values; drop beams beside a depth edge. Then
         errors of the surfaces that they meet become unknowns."""
@@ -306,8 +306,10 @@ class _Loop:
         scans, found = self.problem.scans, []
 
         def work(i: int) -> Association:
-            known = met.get(key_of(scans[i]))
-            return known or scans[i].associate(self.seen, near_edges=True)
+            part = met.get(key_of(scans[i]))
+            if part is None:
+                return scans[i].associate(self.seen, near_edges=True)
+            return scans[i].met(self.seen, part)
 
         for i, association in enumerate(in_order(work, len(scans))):
             self.progress("looking for depth edges", i, len(scans))
