@@ -184,6 +184,7 @@ class Reference:
         Returns:
             (N,) bool, False where the beam itself missed.
         """
+        origins_m = np.broadcast_to(origins_m, directions.shape)
         plane = self._plane.take(hits.triangle, axis=0)
         near = np.zeros(len(directions), dtype=bool)
         side = np.tan(np.asarray(angle_rad)).reshape(-1, 1) * transverse(directions)
@@ -191,9 +192,11 @@ class Reference:
         for turn in (side, -side, up, -up):
             turned = directions + turn
             turned /= np.linalg.norm(turned, axis=1, keepdims=True)
-            landed_m = self.cast(origins_m, turned).point_m
-            with np.errstate(invalid="ignore"):
-                near |= ~(np.abs(_dot(plane, landed_m) - plane[:, 3]) <= DEPTH_STEP_M)
+            landed = self._plane.take(self.first_triangle(origins_m, turned), axis=0)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                range_m = (landed[:, 3] - _dot(landed, origins_m)) / _dot(landed, turned)
+                off_m = _dot(plane, origins_m) + range_m * _dot(plane, turned) - plane[:, 3]
+                near |= ~(np.abs(off_m) <= DEPTH_STEP_M)
         return near & (hits.triangle >= 0)
 
     @cached_property

@@ -11,7 +11,7 @@ from calib.forward import Placed
 from calib.linear.elimination import square
 from calib.linear.layout import Layout, key_of
 from calib.residuals.beams import Association, Rows
-from calib.residuals.compiled import cluster_sums, cross_sums
+from calib.residuals.compiled import cluster_sums, cross_sums, renumber
 from calib.residuals.scan import ScanStop
 
 PLACES = ("surface", "plane")  # beams that meet the same one share its error
@@ -64,12 +64,10 @@ class StopRows:
         value = np.empty(index.shape)
         start = last = 0
         for g, c in enumerate(rows.sparse):
-            used = np.bincount(c.index + 1, minlength=len(c.components) + 1) > 0
-            used[0] = False  # index -1: none
-            number = np.where(used, np.cumsum(used) - 1 + start, -1)
-            index[:, g], value[:, g] = number[c.index + 1], c.value
-            columns.append(layout.at[c.variable].start + c.components[used[1:]])
-            last, start = start, start + int(used.sum())
+            used = renumber(c.index, len(c.components), start, index[:, g])
+            value[:, g] = c.value
+            columns.append(layout.at[c.variable].start + c.components[used])
+            last, start = start, start + len(used)
         return cls(
             stop=layout.stops[key_of(scan)],
             dense=np.hstack([rows.by_twist, -residual[:, None], *rows.dense.values()]),

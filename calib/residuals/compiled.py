@@ -70,6 +70,31 @@ def twist_derivative(
 
 
 @njit(cache=True, nogil=True)
+def renumber(index: np.ndarray, size: int, first: int, out: np.ndarray) -> np.ndarray:
+    """Number the columns that any row touches, from `first` on.
+
+    Args:
+        index: (N,) which of `size` columns a row touches; -1 for none.
+        size: how many there are.
+        first: number of the first.
+        out: (N,) takes the number of each row's column, -1 for none.
+
+    Returns:
+        The columns that are touched (K,), ascending.
+    """
+    number = np.full(size, -1, np.int32)
+    for i in range(len(index)):
+        if index[i] >= 0:
+            number[index[i]] = 0
+    touched = np.flatnonzero(number == 0)
+    for k in range(len(touched)):
+        number[touched[k]] = first + k
+    for i in range(len(index)):
+        out[i] = number[index[i]] if index[i] >= 0 else -1
+    return touched
+
+
+@njit(cache=True, nogil=True)
 def cross_sums(
     dense: np.ndarray,
     weight: np.ndarray,

@@ -185,3 +185,14 @@ def test_blocks_are_added_at_their_places_and_nowhere_for_minus_one(both):
                     expected[column, row] += block[i, k]
     (compiled.add_both if both else compiled.add_at)(target, at, to, block)
     np.testing.assert_array_equal(target, expected)
+
+
+def test_columns_are_numbered_as_they_are_touched():
+    rng = np.random.default_rng(4)
+    index = rng.choice([-1, 2, 3, 7], 50).astype(np.int32)
+    out = np.empty((50, 2), np.int32)
+    touched = compiled.renumber(index, 9, 5, out[:, 1])
+    np.testing.assert_array_equal(touched, np.unique(index[index >= 0]))
+    met = index >= 0
+    np.testing.assert_array_equal(out[met, 1], 5 + np.searchsorted(touched, index[met]))
+    assert (out[~met, 1] == -1).all()
