@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
-from calib.linear.elimination import BY_TWIST, Eliminated, eliminate
+from calib.linear.elimination import BY_TWIST, Eliminated, eliminate, square
 from calib.linear.layout import Layout
 from calib.linear.rows import TWIST, StopSums
 from calib.linear.system import Linearisation, Values
@@ -161,7 +162,7 @@ class CellsFirst(Assembly):
             cells = np.arange(self.first, self.first + len(layout.cells))
             before = np.delete(np.delete(rest, cells, 0), cells, 1)
             self.raw += self._chained(before, np.zeros(0, int))[:-1, :-1]
-            self._add_raw(rows for found in self.own.values() for rows in found)
+            self.raw += self._own_rows[1][:-1, :-1]
         if len(layout.finest):
             own = layout.sigma[layout.finest]
             cross = self.cross * own[:, None] * unit
@@ -184,19 +185,41 @@ class CellsFirst(Assembly):
             self.eliminated.append(Eliminated(layout.cells, over[left], factor, gain))
         return self._done(values, self._without_own(rest))
 
+    @cached_property
+    def _own_rows(
+        self,
+    ) -> tuple[np.ndarray, np.ndarray, list[tuple[np.ndarray, slice, np.ndarray]]]:
+        """All rows about stops' own unknowns, in units of sigmas, over [kept | b], and their Gram
+        matrix; and of each its own columns, which of the rows it is, and their derivatives."""
+        layout, found = self.layout, [rows for each in self.own.values() for rows in each]
+        at = np.full(layout.size, -1)
+        at[layout.kept] = np.arange(len(layout.kept))
+        stacked = np.zeros((sum(len(rows.b) for rows in found), len(layout.kept) + 1))
+        about_own, start = [], 0
+        for rows in found:
+            here = slice(start, start + len(rows.b))
+            A, place = rows.A * layout.sigma[rows.columns], at[rows.columns]
+            stacked[here, place[place >= 0]] = A[:, place >= 0]
+            stacked[here, -1] = rows.b
+            about_own.append((rows.columns[place < 0], here, A[:, place < 0]))
+            start = here.stop
+        return stacked, square(stacked), about_own
+
     def _without_own(self, rest: np.ndarray) -> np.ndarray:
         """From [twists | kept | b] to [kept | b]: through the chain, then stops' own unknowns."""
-        layout, unit = self.layout, self.layout.sigma
+        layout = self.layout
         own = np.concatenate([np.zeros(0, int), *layout.own.values()])
         columns = np.concatenate([own, layout.kept, [layout.size]])
         at = np.full(layout.size + 1, -1)
         at[columns] = np.arange(len(columns))
-        whole = self._chained(rest, own)
-        for each in (rows for found in self.own.values() for rows in found):
-            each.add_to(whole, at, unit, len(columns) - 1)
-        if not len(own):
+        whole, count = self._chained(rest, own), len(own)
+        stacked, gram, about_own = self._own_rows
+        whole[count:, count:] += gram
+        for mine, rows, A in about_own:  # of own by kept, one side is enough
+            add_at(whole, at[mine], at[mine], A.T @ A)
+            whole[at[mine], count:] += A.T @ stacked[rows]
+        if not count:
             return whole
-        count = len(own)
         left = np.ascontiguousarray(whole[count:, count:])
         factor, gain = eliminate(whole[:count, :count], whole[:count, count:], left)
         self.eliminated.append(Eliminated(own, columns[count:], factor, gain))
