@@ -176,3 +176,12 @@ def effect_columns(
         return Columns(variable, basis.index, value, np.arange(basis.size))
     basis = np.broadcast_to(basis, (len(by_site), *basis.shape[1:]))
     return np.einsum("nd,ndp->np", by_site, basis)
+
+
+def growth_columns(basis: np.ndarray | OneHot, rows: int) -> np.ndarray:
+    """Derivative (rows, P) of the log sigma by the parameters of an effect on the noise."""
+    if not isinstance(basis, OneHot):
+        return np.broadcast_to(basis[:, 0], (rows, basis.shape[2]))
+    out = np.zeros((rows, basis.size + 1))  # the last stands for index -1: none
+    out[np.arange(rows), basis.index] = basis.values[:, 0]
+    return out[:, :-1]

@@ -19,6 +19,7 @@ from calib.residuals.beams import (
     Surface,
     beam_derivative,
     effect_columns,
+    growth_columns,
     range_columns,
     site_error,
     turns_beams,
@@ -265,7 +266,11 @@ class ScanStop:
             Columns(name, np.where(usable, index, -1), 1.0 / cosine, np.arange(size))
             for name, index, size in seen.cells
         ]
-        growth = {n: b[:, 0] for n, (site, b) in seen.bases.items() if site is Site.NOISE}
+        growth = {
+            name: growth_columns(basis, len(t))
+            for name, (site, basis) in seen.bases.items()
+            if site is Site.NOISE
+        }
         return Rows(
             residual_m=residual,
             sigma_m=sigma,
