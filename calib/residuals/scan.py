@@ -37,6 +37,7 @@ from sensors.recording import Recording, Scan
 SIZE = {Site.BEAM: 3, Site.REFERENCE: 3, Site.NOISE: 1}
 PRIOR_COUNT = 20.0  # a measured spread of fewer sweeps than this leans on the datasheet
 MET = ("label", "incidence_rad")
+PARTS = ("surface", "region", "patch", "plane")  # of what is met: no column of a user's
 LOCAL_SHARE = 0.05  # of the reference's variance, between neighbouring points of one patch
 
 
@@ -233,9 +234,9 @@ class ScanStop:
         return found
 
     def _view(self, scan: Scan, ray: Beams, surface: Surface) -> View:
+        given = {n: c for n, c in {**self.columns, **scan.extra}.items() if n not in PARTS}
         columns: dict[str, LazyColumn] = {
-            **self.columns,
-            **scan.extra,
+            **given,
             **surface.columns,
             "ring": scan.ring,
             "column": scan.column,
