@@ -113,8 +113,8 @@ class Rows:
     def whitened(self, newton: bool) -> tuple[np.ndarray, np.ndarray]:
         """Weight over variance (N,) 1/m2, and the residual (N,) m that goes with it.
 
-        With `newton` the rows' curvature takes the place of their weight, at the same gradient:
-        fewer steps to the optimum, but not its covariance.
+        With `newton` the cost's curvature takes the place of the weight, and residuals are scaled
+        so that the gradient stays: fewer steps to the optimum, but not its covariance.
         """
         weight, residual = self.weight, self.residual_m
         if newton:
