@@ -19,7 +19,8 @@ from calib.rig import Rig
 from chains import se3
 
 Values = Mapping[str, np.ndarray]
-ROOT, NOISE = "root of each", "noise of each"  # of stops taken together
+# Names of stops' own unknowns where several stops are taken together: a value for each stop.
+ROOT, NOISE = "root of each", "noise of each"
 Derivatives = dict[str, np.ndarray]
 
 
@@ -60,7 +61,7 @@ class Stops:
         joint_bases: variable -> (K or 1, J, P), the joint error per unit.
         root: variable of T_world_root.
         reference: variable of T_world_reference, or None where both are one frame.
-        noise: that of the joint bases which is what the encoders misreport at these stops alone.
+        noise: variable of the joint errors of these stops alone, one of `joint_bases`, or None.
     """
 
     rig: Rig
@@ -84,7 +85,7 @@ class Stops:
 
     @property
     def own(self) -> tuple[str, ...]:
-        """Of those, the ones that other stops may have under another name."""
+        """Of those, what each stop may have for itself: its root, and its joint errors."""
         return (self.root,) if self.noise is None else (self.root, self.noise)
 
     def some(self, index: np.ndarray, root: str) -> Stops:
@@ -98,8 +99,8 @@ class Stops:
 
     @classmethod
     def together(cls, stops: Sequence[Stops]) -> Stops:
-        """Stops that share all but their own unknowns, as one: values of `ROOT` (K, 4, 4) and of
-        `NOISE` (K, J) then stand for theirs."""
+        """Stops that share all but their own unknowns, as one. Its own are called `ROOT` and
+        `NOISE`, with values (K, 4, 4) and (K, J): one for each stop."""
         first = stops[0]
 
         def stacked(bases: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
@@ -154,7 +155,7 @@ class Stops:
 
 
 def place_each(stops: Sequence[Stops], frame: str, values: Values) -> Iterator[Placed]:
-    """T_reference_frame of single stops, in one go for all that share their structure."""
+    """T_reference_frame of single stops, computed together for all that share their structure."""
     groups: dict[object, list[int]] = {}
     for k, each in enumerate(stops):
         shared = tuple(n for n in each.variables if n not in each.own)

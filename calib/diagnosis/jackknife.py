@@ -1,10 +1,11 @@
 """One candidate judged by leaving out cluster after cluster.
 
-A signal that the model lacks widens the clusters that judge it; and one odd cluster can make a
-candidate that acts in few of them look sure of itself. Both are cured by asking what each cluster
-says beyond what the candidate explains of it, divided by what the others leave it to say: the
-cluster jackknife (MacKinnon, Nielsen and Webb 2022, CV3), by stops and by surfaces. It needs each
-cluster's own share of the information, so it is one more pass, for one candidate.
+The scatter of the clusters' scores judges a candidate. A true effect widens that scatter itself,
+and one odd cluster can make a candidate that acts in few clusters look certain. So each cluster is
+compared with what the others predict: with the whitened score ``s = sum s_c`` and information
+``sum I_c = 1``, its part is ``(1 - I_c)^-1 (s_c - I_c s)``. This is the cluster jackknife
+(MacKinnon, Nielsen and Webb 2022, CV3), by stops and by surfaces. It needs each cluster's own share
+of the information, so it is one more pass over the rows, for one candidate.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ class Shares:
 
 
 def _spread(cells: Sequence[list[np.ndarray]], total: np.ndarray) -> np.ndarray:
-    """Sum of squares of what each cluster says beyond its due."""
+    """Sum over clusters of the squares of ``(1 - I_c)^-1 (s_c - I_c s)``; see the module."""
     out = np.zeros((len(total), len(total)))
     for score, information in cells:
         values, axes = np.linalg.eigh(information)

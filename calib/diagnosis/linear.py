@@ -1,4 +1,4 @@
-"""All rows at the solution of a fit, with candidates beside the model, and who says what.
+"""All rows at the solution of a fit, with candidates beside the model, and the cluster of each.
 
 At the solution every row is linear in what the model estimates and in what it does not:
 ``b = J d + Z g + noise``, whitened. The tests need two things of a million such rows: the Gram
@@ -23,8 +23,8 @@ from calib.residuals.tracker import TrackedBody
 from calib.solve.fit import Estimate, Progress
 from calib.solve.graph import Graph
 
-# What paper says of the hardware is no evidence against a candidate: its sigmas are widened so much
-# that what only they would tell apart counts as a gauge.
+# Priors of the hardware (CAD, data sheets) are no evidence against a candidate. Their sigmas are
+# widened by this factor: what only a prior could tell from a candidate then counts as a gauge.
 WIDENED = 100.0
 
 
@@ -46,7 +46,8 @@ class Linear:
         place: (C,) which part of the room they look at, -1 for none.
         weight_m2: sum of the beams' weights over their variances [1/m2]; without beams that of the
             tracked positions.
-        directions: of directions (S, q) those of all unknowns (U, q) that follow.
+        directions: from directions (S, q) in the unknowns that were not eliminated to those in all
+            unknowns (U, q): the eliminated ones follow the others.
     """
 
     candidates: tuple[str, ...]
@@ -195,8 +196,9 @@ def other_rows(
 def _clusters(
     block: Block | None, names: Sequence[str], wide: Problem, layout: Layout, places: Gradients
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Stop and place of each row of a block of the graph, or of a prior: of the one stop that its
-    unknown is touched by; any other of its rows stands alone."""
+    """Stop and place of each row of a block of the graph or, where that is None, of a prior. The
+    prior of an unknown that one stop alone touches belongs to that stop; each row of any other
+    prior is a cluster of its own."""
     if isinstance(block, TrackedBody):
         numbers = [layout.stops[key] for key in keys_of(block)]
         return np.repeat(numbers, block.rows // len(numbers)), np.full(block.rows, -1)

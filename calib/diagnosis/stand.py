@@ -1,4 +1,4 @@
-"""Where a fit stands, and what one look from there shows."""
+"""A fitted model, and the tests of all that it lacks, from one linearisation there."""
 
 from __future__ import annotations
 

@@ -1,2 +1,35 @@
-"""The linearisation: what all rows say at a state, as sums, and its elimination down to what a
-user wants to know."""
+"""The linearisation: what all rows say at a state, reduced to what a user wants to know.
+
+**Normal equations.** At a state, whitened rows ``A x = b`` (b is minus the residual) are fully
+described by the Gram matrix of ``[A | b]``: ``H = A^T A``, ``h = A^T b`` and ``b^T b``. It is a sum
+over rows, so each stop's million beams become one small matrix (`rows`), stops side by side on
+threads (`parallel`), and no row is looked at again. A stop's beams know where the LiDAR is only
+through its twist, 6 columns; the chain rule, ``d twist / d unknowns``, is applied to the sums.
+
+**Units.** Every column is scaled by the prior sigma of its unknown. A prior then adds 1 to the
+diagonal of what is eliminated, so that its blocks can always be factored, and metres and radians
+are comparable. Unknowns without a prior (``unbounded``: candidates of a diagnosis) are not scaled.
+
+**Three kinds of unknowns** (`layout`). *Own* unknowns of a stop, its pose and joint errors, are
+touched by that stop alone. *Cells* are displacements of parts of the mesh, of three sizes: surface,
+region, patch. A beam meets one patch, so no row touches two of the finest cells: their block of H
+is diagonal, however many there are. All others, the calibration above all, are *kept*.
+
+**Elimination** (`elimination`) takes own unknowns and cells out by the Schur complement,
+``H_kk - H_ke H_ee^-1 H_ek``: what remains says of the kept unknowns exactly what all rows say, and
+the gain ``H_ee^-1 H_ek`` leads back to those eliminated. The result does not depend on the order
+(`assembly`), the work does:
+
+- `CellsFirst`, where stops are few: the finest cells by a division, then the other cells, all while
+  stops still are twists; then the chain rule, and the stops' own unknowns.
+- `StopsFirst`, where stops are many: each stop's own unknowns as soon as its sums are there, so
+  that no matrix grows with the number of stops; all cells at the end.
+
+The `Linearisation` (`system`) that is left holds ``kept``: the normal equations of the kept
+unknowns and b, without their priors and without rows that touch kept unknowns only (targets, bodies
+whose pose several stops share): `calib.solve.graph` adds those and solves. For tests of what is
+missing, ``J^T W b`` is also kept apart for each cluster of rows that err together (`clusters`).
+
+`linearise` is the way in. A new order of elimination is a subclass of `Assembly` with ``add``,
+``add_kept`` and ``done``, chosen by `Layout.stops_first`.
+"""

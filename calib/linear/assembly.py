@@ -1,4 +1,10 @@
-"""From sums of stops to normal equations of what is kept, in either order of elimination."""
+"""From sums of stops to normal equations of what is kept, in either order of elimination.
+
+`CellsFirst` holds one matrix over ``[twists of all stops | coarser cells | kept | b]``, and beside
+it the finest cells as a diagonal and their products with all columns of that matrix. `StopsFirst`
+holds one over ``[finest cells | coarser cells | kept | b]``, from which each stop's own unknowns
+are gone. Both give the same result; see `calib.linear` for which is taken when.
+"""
 
 from __future__ import annotations
 
@@ -15,13 +21,14 @@ from calib.linear.system import Linearisation, Values
 from calib.problem.unknowns import Role
 from calib.residuals.compiled import add_at, add_both, add_gram, add_sparse
 
-# A product by blocks of one in so many is faster than the whole (measured, 24 and 90 stops).
+# Where fewer than one entry in so many can differ from 0, a product stop by stop is faster than the
+# whole one (measured, 24 and 90 stops).
 DENSE = 8
 
 
 @dataclass(frozen=True)
 class OwnRows:
-    """Whitened rows about a stop's own unknowns: a tracked body's, or those of a prior.
+    """Whitened rows that are no beams: of a tracked body, of a prior, or of a hold's scatter.
 
     Args:
         A: (m, n) derivatives, columns: (n,) by which.
@@ -48,7 +55,8 @@ class OwnRows:
 
 
 class Assembly:
-    """What both orders share.
+    """What both orders share: give it each stop's sums by `add`, other rows about kept unknowns by
+    `add_kept`, then call ``done``.
 
     Args:
         layout: which column is what.
@@ -91,7 +99,7 @@ class Assembly:
         self.touched[rows.columns] |= np.any(rows.A != 0, axis=0)
 
     def _cell_priors(self, values: Values, columns: np.ndarray) -> np.ndarray:
-        """Right side (n,) of the priors of cells, whose derivative is one, in their units."""
+        """Right side (n,) of the priors of cells, in units of their sigmas: the derivative is 1."""
         whole = np.zeros(self.layout.size)
         for name, at in self.layout.at.items():
             if self.layout.unknowns[name].role is Role.SURFACE:
@@ -226,8 +234,8 @@ class CellsFirst(Assembly):
         return left
 
     def _chained(self, rest: np.ndarray, own: np.ndarray) -> np.ndarray:
-        """From [twists | kept | b] to [own | kept | b], in units of sigmas; what else the twists
-        depend on is left out."""
+        """From [twists | kept | b] to [own | kept | b] by the chain rule, in units of sigmas.
+        Unknowns that place a LiDAR and are neither in `own` nor kept are left out."""
         layout, first = self.layout, self.first
         columns = np.concatenate([own, layout.kept])
         at = np.full(layout.size, -1)
@@ -251,8 +259,14 @@ class CellsFirst(Assembly):
 def _times(
     chains: Sequence[tuple[np.ndarray, slice, np.ndarray]], size: int, by_twist: np.ndarray
 ) -> np.ndarray:
-    """The chain's transpose (size, T) times a matrix (T, n): stop by stop where each has a part in
-    few of the rows, else as one product."""
+    """The transpose (size, T) of the chains of all stops times a matrix (T, n): stop by stop where
+    each chain fills few of the rows, else as one product.
+
+    Args:
+        chains: per stop the rows (r,) that it fills, its columns, and what is there (r, 6).
+        size: how many rows there are.
+        by_twist: the matrix.
+    """
     if DENSE * sum(len(rows) for rows, _, _ in chains) < size * len(chains):
         out = np.zeros((size, by_twist.shape[1]))
         for rows, twist, chain in chains:

@@ -1,4 +1,4 @@
-"""Gradients by cluster: what rows that err together say together."""
+"""The gradient ``J^T W b`` of each cluster of rows: those that err together count as one."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from scipy.sparse import csr_array, issparse, vstack
 
 
 class ClusteredRows(NamedTuple):
-    """Whitened rows, and what each errs with.
+    """Whitened rows, and the cluster of each: rows of one stop and place err together.
 
     Args:
         A: (m, n) derivatives, sparse where each row has one; columns: (n,) by which.

@@ -2,7 +2,8 @@
 
 With ``H x = h`` and unknowns e eliminated first, ``x_e = H_ee^-1 (h_e - H_er x_r)``, and what is
 left says ``(H_rr - H_re H_ee^-1 H_er) x_r = h_r - H_re H_ee^-1 h_e``: the Schur complement. All
-is in units of the priors' sigmas, so that every block has eigenvalues of 1 or more.
+is in units of the priors' sigmas: the prior alone gives H_ee eigenvalues of about 1, so it can be
+factored whatever the data leave open.
 """
 
 from __future__ import annotations
@@ -14,18 +15,19 @@ from scipy.linalg import cho_solve, cholesky, solve_triangular
 from scipy.linalg.blas import dsyrk
 from scipy.linalg.lapack import dpstrf
 
-BY_TWIST = -2  # among what eliminated cells depend on: a stop's twist, not an unknown
+BY_TWIST = -2  # in `Eliminated.over`: a column of a stop's twist, which is no unknown
 
 
 @dataclass(frozen=True)
 class Eliminated:
     """Unknowns that were eliminated, in terms of those that were left.
 
-    ``x_e = -gain @ x_over``, where the last of `over` stands for the right side, and is -1.
+    ``x_e = -gain @ x_over``. The last of `over` is the right side, whose x is -1 for a solution.
 
     Args:
         columns: (e,) which unknowns.
-        over: (r,) which others they depend on, twists first; U for the right side.
+        over: (r,) columns of the others they depend on: `BY_TWIST` for each of the twists, which
+            come first, and U, the number of unknowns, for the right side.
         factor: (e, e) lower Cholesky factor of their block, or (e,) its diagonal.
         gain: (e, r).
     """
@@ -76,8 +78,8 @@ def square(rows: np.ndarray) -> np.ndarray:
 def square_root(matrix: np.ndarray) -> np.ndarray:
     """R with ``R.T @ R = matrix``, for a symmetric semidefinite matrix of any rank.
 
-    A plain Cholesky fails here always: one stop's rows cannot tell its pose from its mount. The
-    matrix is scaled to unit diagonal and factored with pivoting (LAPACK dpstrf).
+    Data alone leave some directions open, where a plain Cholesky fails: a mount against the next,
+    say. The matrix is scaled to unit diagonal and factored with pivoting (LAPACK dpstrf).
 
     Returns:
         (n, n) with zero rows beyond the rank.

@@ -1,9 +1,9 @@
-"""The columns of a linearisation: where each unknown stands, and in which order all are eliminated.
+"""The columns of a linearisation: where each unknown stands, and which are eliminated.
 
 Unknowns are of three kinds. *Own* unknowns of a stop (where the rig stands, what its encoders
 misreport) are touched by that stop alone. *Cells* say how far parts of the mesh stand off the room;
-of the finest cells a row touches one each, so their block of the normal equations is diagonal.
-All others are *kept*: they go to the factor graph.
+no row touches two of the finest cells, so their block of the normal equations is diagonal. All
+others are *kept*: they go to the factor graph.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from calib.residuals.scan import ScanStop
 from calib.residuals.tracker import BodiesTogether, TrackedBody
 
 StopKey = tuple[object, int]
-# So many unknowns of stops are factored in one block in less time (measured: 10 ms) than the
-# hundred small ones that they would be.
+# Up to this many, unknowns of stops are factored faster in one block (measured: 10 ms) than in a
+# hundred small ones.
 ONE_BLOCK = 600
 
 
@@ -31,15 +31,16 @@ class Layout:
     Args:
         unknowns: all, by name.
         at: unknown -> its columns.
-        sigma: (U,) how well each was known before, the unit in which it is eliminated.
+        sigma: (U,) how well each was known before, which is its unit; 1 where there is no prior.
         stops: recording's folder and number of a stop -> its number here.
         own: stop -> columns of its own unknowns.
-        finest: (C,) columns of the finest cells, cells: (D,) of all others.
-        kept: (S,) columns of what is left, in order.
-        bodies: tracked bodies of the problem that speak of stops' own unknowns.
-        others: the problem's other blocks.
+        finest: (C,) columns of the finest cells of each mesh; cells: (D,) of all others.
+        kept: (S,) columns that are not eliminated, ascending.
+        bodies: the problem's blocks of tracked bodies that depend on stops' own unknowns.
+        others: the problem's other blocks; the graph takes them as they are.
         unbounded: unknowns that have no prior.
-        touched: unknown -> numbers of the stops whose place it has a part in; -1 for a target.
+        touched: unknown -> numbers of the stops whose place, or tracked bodies, depend on it; -1
+            for a target.
     """
 
     unknowns: Mapping[str, Unknown]
@@ -133,7 +134,7 @@ class Layout:
 
     @property
     def stops_first(self) -> bool:
-        """Whether stops are eliminated before cells: where there are more of them."""
+        """Whether stops are eliminated before cells: where they have more unknowns, and many."""
         return 6 * len(self.stops) > max(len(self.finest), ONE_BLOCK)
 
 

@@ -1,4 +1,4 @@
-"""One pass over all rows at a state, and what it adds up to."""
+"""One pass over all rows at a state, stop by stop, into a `Linearisation`."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ def cores() -> int:
 
 
 def in_order(work: Callable[[int], T], count: int) -> Iterator[T]:
-    """``work(0), work(1), …``, a few of them at a time ahead of who takes them."""
+    """``work(0), work(1), …`` in this order, at most two per thread ahead of who takes them."""
     threads = min(_WORKERS.get() or cores(), count)
     if threads < 2:
         yield from (work(i) for i in range(count))

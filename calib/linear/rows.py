@@ -1,4 +1,9 @@
-"""One stop's beams as linear rows over the columns of a layout, and their sums."""
+"""One stop's beams as linear rows over the columns of a layout, and their sums.
+
+Of the columns most are dense: the twist of the LiDAR, minus the residual, effects. Others come in
+groups of which a row touches one column only: ring offsets, surfaces, patches. Their products are
+summed without zeros. Sums here are in the unknowns' own units; `assembly` scales them.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +34,7 @@ class StopRows:
         index: (N, g) which of all sparse columns a row touches in each of g groups; -1 for none.
         value: (N, g) its entry there.
         columns: (d + s,) columns of the layout that the dense and the sparse ones are.
-        last: where among the sparse columns the last group begins.
+        last: where among the sparse columns the last group begins; see `compiled.cross_sums`.
         chain: (6, n) derivative of the twist by what places the LiDAR, chain_columns: (n,) those.
         rows: what this is made of.
     """

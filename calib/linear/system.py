@@ -1,9 +1,6 @@
-"""The linearisation: normal equations of all rows at a state, eliminated down to what is kept.
+"""The result of a linearisation: normal equations of what is kept, and the way back to the rest.
 
-Each stop's rows become sums once. The finest cells of surfaces are then eliminated (their block is
-diagonal), the other cells, and each stop's own unknowns; or, where there are more stops than cells,
-each stop's own unknowns as it comes and all cells at the end. What is left is small and exact: the
-step, the covariance and every test are read off it.
+The step, the covariance and every test are read off it.
 """
 
 from __future__ import annotations
@@ -26,15 +23,16 @@ class Linearisation:
     Args:
         layout: which column is what.
         values: the state.
-        kept: (S + 1, S + 1) over the layout's kept columns and the right side b, in units of the
-            priors' sigmas; without the priors of the kept, and without the layout's other blocks.
+        kept: (S + 1, S + 1) Gram matrix over the layout's kept columns and, last, the right side b,
+            in units of the priors' sigmas; without the priors of the kept, and without the layout's
+            other blocks. Its last diagonal entry is what of chi2 the eliminated cannot take away.
         raw: (S, S) the Gram matrix of the kept columns before anything was eliminated, where
             gradients were asked for.
         chi2: of all rows in it, before anything was eliminated.
         touched: (U,) bool, whether any beam or tracked body depends on a column.
         eliminated: what was eliminated, in that order.
-        twists: of each stop with beams its number, derivative of its twist, and the columns of
-            that; empty unless cells were eliminated by twists.
+        twists: per stop with beams its number, the derivative (6, n) of its LiDAR's twist, and the
+            columns (n,) of that; empty unless cells were eliminated while stops were twists.
         weight_m2: sum of the beams' weights over their variances, 1/m2.
     """
 
@@ -49,9 +47,10 @@ class Linearisation:
     weight_m2: float
 
     def directions(self, kept: np.ndarray) -> np.ndarray:
-        """All unknowns (U, q), in units of their sigmas, that follow those kept (S + 1, q).
+        """All unknowns (U, q) that follow from those kept (S + 1, q), in units of their sigmas.
 
-        The last row is -1 for a solution, 0 for a direction without the right side.
+        The last row of `kept` is what the right side is multiplied by: -1 for a solution, 0 for a
+        direction, of which the right side is no part.
         """
         layout = self.layout
         out = np.zeros((layout.size + 1, kept.shape[1]))
@@ -84,7 +83,7 @@ class Linearisation:
         """Covariance (q, q) of ``rows @ unknowns``.
 
         Args:
-            rows: (q, U) over all unknowns, own ones of stops and kept ones.
+            rows: (q, U) over all unknowns; 0 at cells, unless stops were eliminated first.
             kept: (S, S) covariance of the kept.
         """
         sigma = self.layout.sigma

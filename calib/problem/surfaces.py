@@ -16,10 +16,10 @@ from calib.problem.problem import Problem, SurfaceCells
 from calib.problem.unknowns import Role, Unknown
 from calib.residuals.beams import Association
 
-# Variance of the steps between surfaces, and between their cells, as shares of the reference's. It
-# is more than all of it: steps must stand for the slopes of an error that is smooth over metres.
-# From the coverage of ring zeros in simulated worlds: with cells of 0.7 m alone it was 1.3 to 1.5
-# times too small.
+# Variance of the displacements, as shares of the reference's. They add up to more than 1: an error
+# that is smooth over metres has slopes, for which steps between cells must stand. Chosen by how
+# often intervals of ring zeros hold in simulated worlds: with cells of 0.7 m alone, their sigmas
+# were 1.3 to 1.5 times too small.
 SURFACE_SHARES = {"surface": 0.6, "region": 0.6, "patch": 2.0}
 
 

@@ -1,4 +1,4 @@
-"""An unknown of the graph: what it is, what was known of it before, and whose it is."""
+"""An unknown: what it is, what was known of it before, and whose it is."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Role(Enum):
 
 @dataclass(frozen=True)
 class Unknown:
-    """One unknown of the graph.
+    """One unknown of a problem.
 
     Args:
         name: unique.

@@ -113,8 +113,8 @@ class Rows:
     def whitened(self, newton: bool) -> tuple[np.ndarray, np.ndarray]:
         """Weight over variance (N,) 1/m2, and the residual (N,) m that goes with it.
 
-        With `newton` the rows' curvature takes the place of their weight, at the same gradient:
-        fewer steps to the optimum, but not its covariance.
+        With `newton` the cost's curvature takes the place of the weight, and residuals are scaled
+        so that the gradient stays: fewer steps to the optimum, but not its covariance.
         """
         weight, residual = self.weight, self.residual_m
         if newton:
@@ -176,3 +176,12 @@ def effect_columns(
         return Columns(variable, basis.index, value, np.arange(basis.size))
     basis = np.broadcast_to(basis, (len(by_site), *basis.shape[1:]))
     return np.einsum("nd,ndp->np", by_site, basis)
+
+
+def growth_columns(basis: np.ndarray | OneHot, rows: int) -> np.ndarray:
+    """Derivative (rows, P) of the log sigma by the parameters of an effect on the noise."""
+    if not isinstance(basis, OneHot):
+        return np.broadcast_to(basis[:, 0], (rows, basis.shape[2]))
+    out = np.zeros((rows, basis.size + 1))  # the last stands for index -1: none
+    out[np.arange(rows), basis.index] = basis.values[:, 0]
+    return out[:, :-1]

@@ -27,7 +27,7 @@ def tukey_curvature(z: np.ndarray, scale: float = 1.0) -> np.ndarray:
 
 
 def tukey_cost(z: np.ndarray, scale: float = 1.0) -> float:
-    """Half the robust chi-square, ``sum rho(z)`` with ``rho'' (0) = 1``."""
+    """Half the robust chi-square, ``sum rho(z)`` with ``rho''(0) = 1``."""
     c2 = (TUKEY * scale) ** 2
     inside = np.maximum(1.0 - np.square(z) / c2, 0.0)
     return float(np.sum(c2 / 6.0 * (1.0 - inside**3)))

@@ -19,6 +19,7 @@ from calib.residuals.beams import (
     Surface,
     beam_derivative,
     effect_columns,
+    growth_columns,
     range_columns,
     site_error,
     turns_beams,
@@ -36,6 +37,7 @@ from sensors.recording import Recording, Scan
 SIZE = {Site.BEAM: 3, Site.REFERENCE: 3, Site.NOISE: 1}
 PRIOR_COUNT = 20.0  # a measured spread of fewer sweeps than this leans on the datasheet
 MET = ("label", "incidence_rad")
+PARTS = ("surface", "region", "patch", "plane")  # of what is met: no column of a user's
 LOCAL_SHARE = 0.05  # of the reference's variance, between neighbouring points of one patch
 
 
@@ -237,9 +239,9 @@ class ScanStop:
         return found
 
     def _view(self, scan: Scan, ray: Beams, surface: Surface) -> View:
+        given = {n: c for n, c in {**self.columns, **scan.extra}.items() if n not in PARTS}
         columns: dict[str, LazyColumn] = {
-            **self.columns,
-            **scan.extra,
+            **given,
             **surface.columns,
             "ring": scan.ring,
             "column": scan.column,
@@ -270,7 +272,11 @@ class ScanStop:
             Columns(name, np.where(usable, index, -1), 1.0 / cosine, np.arange(size))
             for name, index, size in seen.cells
         ]
-        growth = {n: b[:, 0] for n, (site, b) in seen.bases.items() if site is Site.NOISE}
+        growth = {
+            name: growth_columns(basis, len(t))
+            for name, (site, basis) in seen.bases.items()
+            if site is Site.NOISE
+        }
         return Rows(
             residual_m=residual,
             sigma_m=sigma,

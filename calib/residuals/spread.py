@@ -1,4 +1,4 @@
-"""The scatter within a hold: what it says of how the noise grows, as rows of the graph.
+"""The scatter within a hold: what it says of how the noise grows, as rows of the fit.
 
 A direction measured n times has a variance ``s^2`` about its mean; if its noise is ``sigma``, then
 ``s^2 / sigma^2 - 1`` scatters about 0 with variance ``2 / (n - 1)``. An effect on the noise,

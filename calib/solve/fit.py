@@ -24,12 +24,12 @@ from chains.errors import InputError
 Progress = Callable[[str, int, int], None]
 MAX_PASSES = 40
 SETTLED = 1e-4  # m and rad: after that, which triangle a beam meets is kept
-CONVERGED = 1e-6  # m and rad: a tenth of the smallest sigma in sight, and steps shrink fast
+CONVERGED = 1e-6  # m and rad: a tenth of the smallest sigmas, and the next step is smaller still
 STRAYED = 3e-3  # m and rad: a scan that has moved further looks anew what its beams meet
 LOOKS = 3  # how often, in a fit that starts from an earlier one
-# Of half the chi-square, by which a further step would lower it: less is 0.04 of a sigma.
+# By how much a further step would lower half the chi-square: 1e-3 is a step of 0.04 sigma.
 AT_OPTIMUM = 1e-3
-STEADY = 1e-9  # the same, of trackers and targets, whose steps cost little
+STEADY = 1e-9  # the same, of trackers and targets alone, whose steps cost little
 # Of a state, beside an unknown's NAME: the parameters of a vector, and the value at which the beams
 # looked what they meet.
 DOFS, SEEN = ".dofs", ".seen"
@@ -61,8 +61,9 @@ class Estimate:
         associations: per scan, which part of the surface each beam met.
         iterations: passes over the scans (or of the solver, where there are none).
         converged: whether a further step would change next to nothing.
-        graph: the factor graph of all but what was eliminated before it, linearised last.
-        linear: the linearisation in it.
+        graph: the factor graph of the kept unknowns, as it was last linearised; None of a fit that
+            was resumed.
+        linear: the linearisation whose rows are in it; None likewise.
         seen: the values at which the scans were associated; empty where there are none.
     """
 
@@ -299,8 +300,13 @@ class _Loop:
         seen: Mapping[str, np.ndarray] | None = None,
         met: Mapping[StopKey, np.ndarray] | None = None,
     ) -> None:
-        """Keep what each beam meets, here or at other values; drop beams beside a depth edge. Then
-        errors of the surfaces that they meet become unknowns."""
+        """Settle what each beam meets, and add the unknowns of the surfaces met.
+
+        Args:
+            seen: the values at which beams look; the present ones where None.
+            met: what beams are known to meet; the others look anew, and those beside a depth edge
+                are dropped. Where None and `seen` is given, what the start knows.
+        """
         self.seen = dict(seen or self.values)
         met = self.start.met if met is None and seen is not None else met or {}
         scans, found = self.problem.scans, []

@@ -25,7 +25,7 @@ Values = Mapping[str, np.ndarray]
 
 @dataclass(frozen=True)
 class KeptRows:
-    """What a linearisation says of the kept unknowns, as whitened rows of the graph: linear.
+    """What a linearisation says of the kept unknowns, as whitened linear rows of the graph.
 
     Args:
         constant: (m,) residuals at the state of linearisation.
@@ -95,7 +95,7 @@ class Graph:
                 self._graph.add(self._prior(variable))
         for block in blocks:
             self._graph.add(self._factor(block))
-        # What few blocks touch goes first: a stop's own unknowns, then what stops share.
+        # What few blocks touch is eliminated first: a target's place, then what all share.
         degree = Counter(name for block in blocks for name in block.variables)
         self._by_degree = sorted(self.variables, key=lambda name: degree[name])
 

@@ -7,6 +7,7 @@ from calib import effects
 from calib import problem as problems
 from calib.diagnosis.search import judged
 from calib.diagnosis.stand import Stand
+from calib.effects import Effect, OneHot, Param, Site
 from calib.problem.model import Model
 from calib.residuals.spread import spread_rows
 from calib.simulation import Spec
@@ -85,3 +86,38 @@ def test_rows_are_the_derivative_of_the_scatter():
 def test_a_direction_seen_once_says_nothing_of_scatter():
     spread_m, usable = np.full(5, np.nan), np.ones(5, bool)
     assert spread_rows(scan(spread_m, 1), np.ones(5), usable, {"g": np.ones((5, 1))}) is None
+
+
+class RingNoise(Effect):
+    """Every ring scatters in its own way; the basis as the test says."""
+
+    name, site, covariates = "ring_noise", Site.NOISE, ("ring",)
+
+    def __init__(self, of):
+        self.of = of
+
+    def params(self, rig):
+        return tuple(Param(f"ring_{i}", "1", 0.4) for i in range(rig.lidar.rings))
+
+    def basis(self, view):
+        return self.of(view)
+
+
+def test_the_basis_of_a_noise_effect_may_be_of_any_kind(tmp_path):
+    source, _ = made(tmp_path / "rec", SMALL, 2)
+    rings = source.rig.lidar.rings
+    kinds = {
+        "dense": lambda view: np.eye(rings)[view["ring"].astype(int)][:, None],
+        "one of each row": lambda view: OneHot(
+            view["ring"].astype(int), np.ones((view.rows, 1)), rings
+        ),
+        "one row for all": lambda view: np.ones((1, 1, rings)),
+    }
+    columns = {}
+    for kind, basis in kinds.items():
+        problem = problems.build([source], Model().plus((RingNoise(basis),)))
+        columns[kind] = problem.scans[0].rows(problem.initial).spread.columns["ring_noise"]
+    assert np.abs(columns["dense"]).max() > 1.0
+    np.testing.assert_allclose(columns["one of each row"], columns["dense"])
+    # Each stop's own level is taken off, so what is common to a stop says nothing.
+    np.testing.assert_allclose(columns["one row for all"], 0.0, atol=1e-12)

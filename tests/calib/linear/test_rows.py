@@ -1,11 +1,12 @@
 """Sums of a stop's rows, gradients and rows along directions, against the rows themselves."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
 from calib.residuals.beams import Association
+from calib.residuals.store import BeamStore
 
 from .. import bent
 from ..bent import by_variable, stop_rows
@@ -112,3 +113,26 @@ def test_a_corridor_leaves_its_own_direction_open(on_mesh):
     assert np.linalg.matrix_rank(sums.dense[:6, :6] / unit, tol=1e-9) == 3
     placed = scan.stops.in_reference("lidar", case.values)
     np.testing.assert_array_equal(sums.chain, np.hstack([d[0] for d in placed.d.values()]))
+
+
+@dataclass
+class OtherColumns:
+    """A store whose scans have more columns than were written."""
+
+    store: BeamStore
+    columns: dict
+
+    def read(self, stop):
+        scan, beams = self.store.read(stop)
+        return replace(scan, extra={**scan.extra, **self.columns}), beams
+
+
+def test_a_column_of_the_users_is_not_taken_for_what_beams_meet(on_planes):
+    scan, association = on_planes.problem.scans[0], on_planes.association[0]
+    columns = {"surface": np.linspace(-2.5, 3.5, len(association.part))}
+    named = replace(scan, store=OtherColumns(scan.store, columns))
+    expected = stop_rows(on_planes, scan, association).places()
+    for mine, theirs in zip(
+        stop_rows(on_planes, named, association).places(), expected, strict=True
+    ):
+        np.testing.assert_array_equal(mine, theirs)
