@@ -20,7 +20,8 @@ from calib.linear.parallel import in_order
 from calib.linear.rows import StopRows
 from calib.problem.problem import Block, Problem
 from calib.residuals.tracker import TrackedBody
-from calib.solve.fit import Estimate, Progress
+from calib.solve.estimate import Estimate
+from calib.solve.fit import Progress
 from calib.solve.graph import Graph
 
 # Priors of the hardware (CAD, data sheets) are no evidence against a candidate. Their sigmas are

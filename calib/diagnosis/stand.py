@@ -23,7 +23,8 @@ from calib.diagnosis.screen import Candidate, Screen, screen
 from calib.effects import Effect, Site
 from calib.problem import Problem
 from calib.problem.model import Model, Source
-from calib.solve.fit import DOFS, SEEN, Estimate, Progress, Start, solve
+from calib.solve.estimate import DOFS, SEEN, Estimate, Start
+from calib.solve.fit import Progress, solve
 from sensors.recording import Recording
 
 FINER = 9  # shapes tried between the two beside the best one

@@ -29,7 +29,8 @@ from calib.residuals.scan import Ranges, ScanStop
 from calib.residuals.surfaces import Meeting, MeshSurface
 from calib.runs.reopen import model_of, reopened
 from calib.runs.run import Run
-from calib.solve.fit import Progress, values_of
+from calib.solve.estimate import values_of
+from calib.solve.fit import Progress
 from chains.errors import InputError
 from sensors.documents import replace_folder, write_json, write_yaml
 from sensors.recording import write_table

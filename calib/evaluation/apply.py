@@ -23,7 +23,8 @@ from calib.residuals.scan import turned
 from calib.rig import Rig, load_rig
 from calib.runs.reopen import model_of, reopened
 from calib.runs.run import Run
-from calib.solve.fit import Progress, values_of
+from calib.solve.estimate import values_of
+from calib.solve.fit import Progress
 from chains.errors import InputError
 from sensors.documents import nearest, replace_folder
 from sensors.lidar import Beams, beams

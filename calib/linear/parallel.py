@@ -32,15 +32,20 @@ def cores() -> int:
 
 
 def in_order(work: Callable[[int], T], count: int) -> Iterator[T]:
-    """``work(0), work(1), …`` in this order, at most two per thread ahead of who takes them."""
+    """``work(0), work(1), …`` in this order, at most two per thread ahead of who takes them.
+
+    The first is done before there are threads: what all share and compute when first asked (the ray
+    caster, the surfaces of a mesh, the compiled loops) is there when they start.
+    """
     threads = min(_WORKERS.get() or cores(), count)
     if threads < 2:
         yield from (work(i) for i in range(count))
         return
+    yield work(0)
     with ThreadPoolExecutor(threads) as pool:
-        waiting = deque(pool.submit(work, i) for i in range(min(2 * threads, count)))
+        waiting = deque(pool.submit(work, i) for i in range(1, min(2 * threads + 1, count)))
         try:
-            for i in range(len(waiting), count + len(waiting)):
+            for i in range(1 + len(waiting), count + len(waiting)):
                 found = waiting.popleft().result()
                 if i < count:
                     waiting.append(pool.submit(work, i))

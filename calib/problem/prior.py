@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
@@ -41,7 +42,7 @@ class JointPrior:
     def evaluate(self, values: Values, derivatives: bool) -> tuple[np.ndarray, Derivatives | None]:
         """Whitened differences from the means."""
         moved = [v.difference(self.means[v.name], values[v.name]) for v in self.held]
-        root = self._root()
+        root = self._root
         residual = root @ np.concatenate(moved)
         if not derivatives:
             return residual, None
@@ -59,6 +60,7 @@ class JointPrior:
         covariance = self.covariance + np.diag(np.square(np.concatenate(moved)))
         return JointPrior(self.held, self.means, covariance)
 
+    @cached_property
     def _root(self) -> np.ndarray:
         """R with R.T @ R = inverse(covariance), scaled first: sigmas differ by orders."""
         sigma = np.sqrt(np.diag(self.covariance))

@@ -29,7 +29,8 @@ from calib.runs.ladder import Rung, ladder
 from calib.runs.reopen import model_of, reopened
 from calib.runs.residual_table import residual_table, table_path
 from calib.runs.run import RESIDUALS, SUMMARY, Run
-from calib.solve.fit import Progress, values_of
+from calib.solve.estimate import values_of
+from calib.solve.fit import Progress
 from chains.errors import InputError
 from sensors.recording import read_table
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from threading import Lock
+from typing import Any
 
 from sensors.lidar import Beams, beams
 from sensors.recording import Recording, Scan
@@ -23,6 +25,7 @@ class BeamStore:
     beam_origin_m: tuple[float, float]
     _kept: dict[int, tuple[Scan, Beams]] = field(default_factory=dict, repr=False)
     _bytes: float = 0.0
+    _lock: Lock = field(default_factory=Lock, repr=False)
 
     def read(self, stop: int) -> tuple[Scan, Beams]:
         """The scan of one stop, by its index, and its beams.
@@ -35,14 +38,18 @@ class BeamStore:
         scan = self.recording.scan(stop)
         found = scan, beams(scan.xyz_m, self.beam_origin_m)
         size = _size(found)
-        if self._bytes + size <= KEPT_BYTES:
-            self._kept[stop] = found
-            self._bytes += size
+        with self._lock:
+            if stop not in self._kept and self._bytes + size <= KEPT_BYTES:
+                self._kept[stop] = found
+                self._bytes += size
         return found
 
     def __getstate__(self) -> dict[str, object]:
         """Without what was read: another process reads for itself."""
-        return {**self.__dict__, "_kept": {}, "_bytes": 0.0}
+        return {"recording": self.recording, "beam_origin_m": self.beam_origin_m}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__init__(**state)
 
 
 def _size(found: tuple[Scan, Beams]) -> float:

@@ -30,7 +30,8 @@ from calib.runs.run import (
     write_state,
 )
 from calib.solve.errors import Errors, body_errors, misfit, row_errors, scan_errors
-from calib.solve.fit import Estimate, Progress, Start, solve
+from calib.solve.estimate import Estimate, Start
+from calib.solve.fit import Progress, solve
 from calib.solve.holdout import held_out
 from calib.solve.recalibrate import Link, earlier, solve_from
 from calib.solve.solution import solution_of

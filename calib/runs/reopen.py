@@ -9,7 +9,7 @@ import numpy as np
 
 from calib.problem.model import Model, Source
 from calib.runs.run import MODEL, Run
-from calib.solve.fit import Start
+from calib.solve.estimate import Start
 from chains.errors import InputError
 
 

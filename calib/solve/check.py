@@ -15,7 +15,8 @@ from calib.problem.model import Model, Source
 from calib.residuals.scan import ScanStop
 from calib.rig import Rig, inventory, load_rig
 from calib.rig.inventory import PlacedScan, ScanSums
-from calib.solve.fit import Estimate, Progress, preview
+from calib.solve.estimate import Estimate
+from calib.solve.fit import Progress, preview
 from calib.solve.solution import solution_of
 from chains.errors import InputError
 from sensors.recording import Recording, read_scan

@@ -11,7 +11,7 @@ from calib.problem.unknowns import Role, Unknown
 from calib.residuals.beams import Association, Rows
 from calib.residuals.scan import ScanStop
 from calib.residuals.tracker import TrackedBody
-from calib.solve.fit import Estimate
+from calib.solve.estimate import Estimate
 from chains import se3
 
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
@@ -14,9 +12,8 @@ from calib.linear.parallel import in_order
 from calib.linear.system import Linearisation
 from calib.problem.problem import Block, Problem
 from calib.problem.surfaces import with_surfaces
-from calib.problem.unknowns import Unknown
 from calib.residuals.beams import Association
-from calib.residuals.scan import ScanStop
+from calib.solve.estimate import SEEN, Estimate, Start, started, values_of
 from calib.solve.graph import Graph, KeptRows
 from chains import se3
 from chains.errors import InputError
@@ -30,101 +27,6 @@ LOOKS = 3  # how often, in a fit that starts from an earlier one
 # By how much a further step would lower half the chi-square: 1e-3 is a step of 0.04 sigma.
 AT_OPTIMUM = 1e-3
 STEADY = 1e-9  # the same, of trackers and targets alone, whose steps cost little
-# Of a state, beside an unknown's NAME: the parameters of a vector, and the value at which the beams
-# looked what they meet.
-DOFS, SEEN = ".dofs", ".seen"
-
-
-@dataclass(frozen=True)
-class Start:
-    """Where a fit starts from: an earlier one of much the same problem.
-
-    Args:
-        state: `Estimate.state` of that; what it does not know starts at its mean.
-        met: stop -> which part of the surface each of its beams met (N,), where that is known.
-    """
-
-    state: Mapping[str, np.ndarray] = field(default_factory=dict)
-    met: Mapping[StopKey, np.ndarray] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """What a fit found.
-
-    Args:
-        problem: what was estimated, the unknowns of surfaces included.
-        values: every unknown, at the optimum.
-        variables: the calibration's, in order.
-        covariance: (P, P) joint marginal of their tangents, with stop, surface and patch errors as
-            unknowns of the graph.
-        associations: per scan, which part of the surface each beam met.
-        iterations: passes over the scans (or of the solver, where there are none).
-        converged: whether a further step would change next to nothing.
-        graph: the factor graph of the kept unknowns, as it was last linearised; None of a fit that
-            was resumed.
-        linear: the linearisation whose rows are in it; None likewise.
-        seen: the values at which the scans were associated; empty where there are none.
-    """
-
-    problem: Problem
-    values: dict[str, np.ndarray]
-    variables: tuple[Unknown, ...]
-    covariance: np.ndarray
-    associations: Sequence[Association]
-    iterations: int
-    converged: bool
-    graph: Graph | None
-    linear: Linearisation | None
-    seen: dict[str, np.ndarray]
-
-    @property
-    def scans(self) -> Sequence[ScanStop]:
-        """The stops with beams."""
-        return self.problem.scans
-
-    @property
-    def cost(self) -> float:
-        """Half the weighted chi-square, priors included."""
-        taken = self.linear.chi2 - self.linear.kept[-1, -1]
-        return self.graph.error(self.values) + taken / 2
-
-    @property
-    def start(self) -> Start:
-        """Where another fit of much the same problem may start from."""
-        pairs = zip(self.scans, self.associations, strict=True)
-        return Start(self.state, {key_of(scan): met.part for scan, met in pairs})
-
-    @property
-    def state(self) -> dict[str, np.ndarray]:
-        """All values; per vector ``NAME.dofs``, its parameters; and ``NAME.seen``, the value at
-        which the scans were associated."""
-        vectors = (v for v in self.problem.variables.values() if v.kind == "vector")
-        dofs = {f"{v.name}{DOFS}": np.array(v.dofs, np.str_) for v in vectors}
-        return self.values | dofs | {f"{name}{SEEN}": x for name, x in self.seen.items()}
-
-    def touched(self) -> np.ndarray:
-        """Whether any measurement depends on each parameter of the calibration: (P,) bool."""
-        layout, seen = self.linear.layout, self.linear.touched.copy()
-        for block in layout.others:
-            derivative = block.evaluate(self.values, derivatives=True)[1]
-            for name in derivative.keys() & layout.at.keys():
-                if self.problem.variables[name].kind != "direction":
-                    seen[layout.at[name]] |= np.abs(derivative[name]).max(axis=0) > 0
-        return seen[layout.columns([v.name for v in self.variables])]
-
-    def covariance_of(self, names: Sequence[str]) -> np.ndarray:
-        """Joint marginal covariance of unknowns that are no surface's, in the order given."""
-        layout = self.linear.layout
-        outer = layout.outer()
-        if all(name in outer for name in names):
-            return self.graph.covariance(self.values, names)
-        rows = np.eye(layout.size)[layout.columns(names)]
-        return self.linear.covariance(rows, self._kept)
-
-    @cached_property
-    def _kept(self) -> np.ndarray:
-        return self.graph.covariance(self.values, list(self.linear.layout.outer()))
 
 
 def solve(
@@ -237,15 +139,16 @@ class _Loop:
         for damped in (False, True):
             if damped:
                 self.values = self._damped()
-            last = np.inf
+            best, last = self.values, np.inf
             for _ in range(MAX_PASSES):
                 before = self.values
                 self._linearise(beams=False)
                 self.passes += 1
                 cost = self.linear.chi2 / 2 + self.graph.error(before, measured=True)
                 if not cost <= last * (1 + 1e-9) + 1e-9:
+                    self.values = best
                     break
-                last = cost
+                best, last = before, cost
                 _, fall = self._step()
                 if fall < STEADY:
                     self.passes = 1 if self.problem.scans else self.passes
@@ -293,7 +196,7 @@ class _Loop:
     def seen_before(self) -> dict[str, np.ndarray]:
         """Where the start was when it took what its beams met."""
         known = self.problem.variables.items()
-        return {n: _started(v, self.start.state, self.values[n], SEEN) for n, v in known}
+        return {n: started(v, self.start.state, self.values[n], SEEN) for n, v in known}
 
     def fix_association(
         self,
@@ -323,7 +226,7 @@ class _Loop:
         self.problem, self.associations = with_surfaces(self.given, found)
         for name in self.problem.cells:
             unknown = self.problem.variables[name]
-            self.values[name] = _started(unknown, self.start.state, unknown.mean)
+            self.values[name] = started(unknown, self.start.state, unknown.mean)
         self.layout = self._layout()
 
     def estimate(self, converged: bool) -> Estimate:
@@ -378,23 +281,3 @@ class _Loop:
         names = self.problem.calibration
         step = max(float(np.abs(unknowns[n].difference(before[n], after[n])).max()) for n in names)
         return step, fall + (self.linear.chi2 - self.linear.kept[-1, -1]) / 2
-
-
-def values_of(problem: Problem, state: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Where a state puts a problem's unknowns; those that it lacks are where they start."""
-    known = problem.variables.items()
-    return {n: _started(v, state, problem.initial[n]) for n, v in known}
-
-
-def _started(
-    unknown: Unknown, start: Mapping[str, np.ndarray], otherwise: np.ndarray, kind: str = ""
-) -> np.ndarray:
-    """The unknown's value in a state, parameter by parameter where it names them."""
-    found, dofs = start.get(f"{unknown.name}{kind}"), start.get(f"{unknown.name}{DOFS}")
-    if found is None or (dofs is None and found.shape != otherwise.shape):
-        return otherwise
-    if dofs is None:
-        return found
-    known = dict(zip(dofs.tolist(), found, strict=True))
-    pairs = zip(unknown.dofs, otherwise, strict=True)
-    return np.array([known.get(dof, value) for dof, value in pairs], float)

@@ -10,11 +10,13 @@ from calib import problem as problems
 from calib.problem import Problem
 from calib.problem.model import Model, Source
 from calib.problem.prior import JointPrior
+from calib.problem.problem import Block
 from calib.residuals.scan import ScanStop
 from calib.residuals.surfaces import PlaneSurface
 from calib.residuals.tracker import TrackedBody
 from calib.solve.errors import Errors, body_errors, scan_errors
-from calib.solve.fit import Estimate, Progress, Start, solve
+from calib.solve.estimate import Estimate, Start
+from calib.solve.fit import Progress, solve
 
 FOLDS = 5  # a fit leaves out about a fifth of the locations
 
@@ -81,9 +83,14 @@ def predict(unseen: Problem, trained: Problem, estimate: Estimate) -> Errors:
     scans, bodies = unseen.scans, [b for b in unseen.blocks if isinstance(b, TrackedBody)]
     predicted, told = placed(unseen, trained, estimate)
     if not scans:
-        judged = [b for b in bodies if b not in unseen.blocks and b.stops.root in told]
+        judged = [b for b in bodies if not _among(b, unseen.blocks) and b.stops.root in told]
         return body_errors(judged, predicted.values, predicted)
     return sum((_scan(scan, predicted, scan.stops.root in told) for scan in scans), Errors())
+
+
+def _among(block: Block, blocks: Sequence[Block]) -> bool:
+    """Whether it is one of them, itself."""
+    return any(block is each for each in blocks)
 
 
 def placed(unseen: Problem, trained: Problem, estimate: Estimate) -> tuple[Estimate, set[str]]:

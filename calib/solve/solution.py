@@ -12,7 +12,7 @@ from calib.effects import FrameOffset
 from calib.forward import Term
 from calib.problem import Problem
 from calib.problem.model import Source
-from calib.solve.fit import Estimate
+from calib.solve.estimate import Estimate
 from calib.solve.observability import not_estimated
 from chains import se3
 

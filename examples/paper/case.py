@@ -22,7 +22,8 @@ from calib.runs.reopen import model_of
 from calib.runs.run import Run
 from calib.solve import holdout
 from calib.solve.errors import Errors, scan_errors
-from calib.solve.fit import Progress, Start, solve, values_of
+from calib.solve.estimate import Start, values_of
+from calib.solve.fit import Progress, solve
 from sensors.documents import replace_folder
 
 from . import sequence

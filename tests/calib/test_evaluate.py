@@ -13,7 +13,7 @@ from calib.problem.model import Model
 from calib.runs.calibrate import calibrate
 from calib.runs.run import Run
 from calib.simulation import Spec
-from calib.solve.fit import values_of
+from calib.solve.estimate import values_of
 from chains.errors import InputError
 from sensors.recording import read_table
 

@@ -78,7 +78,7 @@ def origins(run):
     from calib import problem as problems
     from calib.problem.model import Model
     from calib.runs.reopen import reopened
-    from calib.solve.fit import values_of
+    from calib.solve.estimate import values_of
 
     sources = reopened(run)
     problem = problems.build(sources, Model.read(run.model))

@@ -8,7 +8,8 @@ from calib.problem import build
 from calib.problem.model import Model, Source
 from calib.residuals.surfaces import PlaneSurface
 from calib.simulation import Spec
-from calib.solve.fit import Start, solve
+from calib.solve.estimate import Start
+from calib.solve.fit import solve
 from calib.solve.holdout import held_out
 
 from . import rigs, simulated

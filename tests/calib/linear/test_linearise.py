@@ -16,7 +16,8 @@ from calib.problem import build
 from calib.problem.model import Model, Source
 from calib.problem.prior import JointPrior
 from calib.simulation import Spec
-from calib.solve.fit import Estimate, preview
+from calib.solve.estimate import Estimate
+from calib.solve.fit import preview
 from calib.solve.graph import Graph, KeptRows
 
 from .. import rigs, simulated

@@ -41,20 +41,30 @@ def test_an_exception_of_any_one_is_passed_on_in_its_turn_and_the_rest_is_not_be
 
 
 def test_what_waits_when_one_fails_is_cancelled():
-    """Two threads: one fails and takes up the third, the other is busy; the fourth never begins."""
+    """Two threads, once the first is done: one fails and takes up another, the other is busy; what
+    waits behind these never begins."""
     begun, busy = [], threading.Event()
 
     def work(i):
         begun.append(i)
-        if i == 0:
+        if i == 1:
             busy.wait()
             raise ZeroDivisionError
-        busy.set()
-        time.sleep(0.3)
+        if i > 1:
+            busy.set()
+            time.sleep(0.3)
 
     with workers(2), pytest.raises(ZeroDivisionError):
         list(in_order(work, 30))
-    assert set(begun) <= {0, 1, 2}
+    assert set(begun) <= {0, 1, 2, 3}
+
+
+def test_the_first_is_done_before_there_are_threads():
+    """What all of them share is computed once, by whoever calls."""
+    caller, seen = threading.current_thread(), {}
+    with workers(2):
+        list(in_order(lambda i: seen.setdefault(i, threading.current_thread()), 6))
+    assert seen[0] is caller and caller not in {seen[i] for i in range(1, 6)}
 
 
 @pytest.mark.parametrize("count", COUNTS)

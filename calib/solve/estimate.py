@@ -1,0 +1,135 @@
+"""What a fit found, and where another one may start from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from calib.linear.layout import StopKey, key_of
+from calib.linear.system import Linearisation
+from calib.problem.problem import Problem
+from calib.problem.unknowns import Unknown
+from calib.residuals.beams import Association
+from calib.residuals.scan import ScanStop
+from calib.solve.graph import Graph
+
+# Of a state, beside an unknown's NAME: the parameters of a vector, and the value at which the beams
+# looked what they meet.
+DOFS, SEEN = ".dofs", ".seen"
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where a fit starts from: an earlier one of much the same problem.
+
+    Args:
+        state: `Estimate.state` of that; what it does not know starts at its mean.
+        met: stop -> which part of the surface each of its beams met (N,), where that is known.
+    """
+
+    state: Mapping[str, np.ndarray] = field(default_factory=dict)
+    met: Mapping[StopKey, np.ndarray] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What a fit found.
+
+    Args:
+        problem: what was estimated, the unknowns of surfaces included.
+        values: every unknown, at the optimum.
+        variables: the calibration's, in order.
+        covariance: (P, P) joint marginal of their tangents, with stop, surface and patch errors as
+            unknowns of the graph.
+        associations: per scan, which part of the surface each beam met.
+        iterations: passes over the scans (or of the solver, where there are none).
+        converged: whether a further step would change next to nothing.
+        graph: the factor graph of the kept unknowns, as it was last linearised; None of a fit that
+            was resumed.
+        linear: the linearisation whose rows are in it; None likewise.
+        seen: the values at which the scans were associated; empty where there are none.
+    """
+
+    problem: Problem
+    values: dict[str, np.ndarray]
+    variables: tuple[Unknown, ...]
+    covariance: np.ndarray
+    associations: Sequence[Association]
+    iterations: int
+    converged: bool
+    graph: Graph | None
+    linear: Linearisation | None
+    seen: dict[str, np.ndarray]
+
+    @property
+    def scans(self) -> Sequence[ScanStop]:
+        """The stops with beams."""
+        return self.problem.scans
+
+    @property
+    def cost(self) -> float:
+        """Half the weighted chi-square, priors included."""
+        taken = self.linear.chi2 - self.linear.kept[-1, -1]
+        return self.graph.error(self.values) + taken / 2
+
+    @property
+    def start(self) -> Start:
+        """Where another fit of much the same problem may start from."""
+        pairs = zip(self.scans, self.associations, strict=True)
+        return Start(self.state, {key_of(scan): met.part for scan, met in pairs})
+
+    @property
+    def state(self) -> dict[str, np.ndarray]:
+        """All values; per vector ``NAME.dofs``, its parameters; and ``NAME.seen``, the value at
+        which the scans were associated."""
+        vectors = (v for v in self.problem.variables.values() if v.kind == "vector")
+        dofs = {f"{v.name}{DOFS}": np.array(v.dofs, np.str_) for v in vectors}
+        return self.values | dofs | {f"{name}{SEEN}": x for name, x in self.seen.items()}
+
+    def touched(self) -> np.ndarray:
+        """Whether any measurement depends on each parameter of the calibration: (P,) bool."""
+        layout, seen = self.linear.layout, self.linear.touched.copy()
+        for block in layout.others:
+            derivative = block.evaluate(self.values, derivatives=True)[1]
+            for name in derivative.keys() & layout.at.keys():
+                if self.problem.variables[name].kind != "direction":
+                    seen[layout.at[name]] |= np.abs(derivative[name]).max(axis=0) > 0
+        return seen[layout.columns([v.name for v in self.variables])]
+
+    def covariance_of(self, names: Sequence[str]) -> np.ndarray:
+        """Joint marginal covariance of unknowns that are no surface's, in the order given."""
+        layout = self.linear.layout
+        outer = layout.outer()
+        if all(name in outer for name in names):
+            return self.graph.covariance(self.values, names)
+        columns = layout.columns(names)
+        rows = np.zeros((len(columns), layout.size))
+        rows[np.arange(len(columns)), columns] = 1.0
+        return self.linear.covariance(rows, self._kept)
+
+    @cached_property
+    def _kept(self) -> np.ndarray:
+        return self.graph.covariance(self.values, list(self.linear.layout.outer()))
+
+
+def values_of(problem: Problem, state: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Where a state puts a problem's unknowns; those that it lacks are where they start."""
+    known = problem.variables.items()
+    return {n: started(v, state, problem.initial[n]) for n, v in known}
+
+
+def started(
+    unknown: Unknown, start: Mapping[str, np.ndarray], otherwise: np.ndarray, kind: str = ""
+) -> np.ndarray:
+    """The unknown's value in a state, parameter by parameter where it names them."""
+    found, dofs = start.get(f"{unknown.name}{kind}"), start.get(f"{unknown.name}{DOFS}")
+    if found is None or (dofs is None and found.shape != otherwise.shape):
+        return otherwise
+    if dofs is None:
+        return found
+    known = dict(zip(dofs.tolist(), found, strict=True))
+    pairs = zip(unknown.dofs, otherwise, strict=True)
+    return np.array([known.get(dof, value) for dof, value in pairs], float)
