@@ -201,8 +201,11 @@ def read_mesh(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
 
 def _ply_triangles(path: Path) -> tuple[np.ndarray, np.ndarray] | None:
     """Vertices and triangles of a PLY file, without Open3D's start; None where not all of its
-    faces are triangles."""
-    elements = read_ply(path)
+    faces are triangles, or something is wrong with it."""
+    try:
+        elements = read_ply(path)
+    except InputError:
+        return None
     vertex, face = elements.get("vertex", {}), elements.get("face", {})
     corners = face.get("vertex_indices", face.get("vertex_index", np.zeros((0, 3), int)))
     whole = {"x", "y", "z"} <= vertex.keys() and len(corners) and corners.shape[1] == 3
