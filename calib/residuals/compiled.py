@@ -6,11 +6,26 @@ file, so a second start pays nothing. Each is checked against numpy in the tests
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any, TypeVar
+
 import numpy as np
 from numba import njit
 
+F = TypeVar("F", bound=Callable[..., Any])
+OPTIONS = {"nogil": True, "error_model": "numpy"}  # a division by zero is infinite, as numpy has it
 
-@njit(cache=True, nogil=True, error_model="numpy")
+
+def compiled(function: F) -> F:
+    """The function, compiled when first called, and kept on disk for the next start; where no
+    folder can be written to it is compiled at every start."""
+    try:
+        return njit(cache=True, **OPTIONS)(function)
+    except RuntimeError:  # numba finds no place for its cache
+        return njit(**OPTIONS)(function)
+
+
+@compiled
 def meet_planes(
     T_reference_lidar: np.ndarray,
     origin_m: np.ndarray,
@@ -51,7 +66,7 @@ def meet_planes(
     return range_m, cosine, slope
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def twist_derivative(
     origin_m: np.ndarray, direction: np.ndarray, range_m: np.ndarray, slope: np.ndarray
 ) -> np.ndarray:
@@ -69,7 +84,7 @@ def twist_derivative(
     return out
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def renumber(index: np.ndarray, size: int, first: int, out: np.ndarray) -> np.ndarray:
     """Number the columns that any row touches, from `first` on.
 
@@ -94,7 +109,7 @@ def renumber(index: np.ndarray, size: int, first: int, out: np.ndarray) -> np.nd
     return touched
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def cross_sums(
     dense: np.ndarray,
     weight: np.ndarray,
@@ -141,7 +156,7 @@ def cross_sums(
     return with_dense, with_sparse, diagonal
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def add_sparse(
     with_sparse: np.ndarray,
     own: np.ndarray,
@@ -179,7 +194,7 @@ def add_sparse(
                     rest[at[b], row] += v
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def cluster_sums(
     dense: np.ndarray,
     weight: np.ndarray,
@@ -206,7 +221,7 @@ def cluster_sums(
     return out
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def add_at(target: np.ndarray, rows: np.ndarray, columns: np.ndarray, block: np.ndarray) -> None:
     """``target[rows[i], columns[j]] += block[i, j]``; rows and columns of -1 are left out."""
     for i in range(len(rows)):
@@ -216,7 +231,7 @@ def add_at(target: np.ndarray, rows: np.ndarray, columns: np.ndarray, block: np.
                     target[rows[i], columns[j]] += block[i, j]
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def add_both(target: np.ndarray, rows: np.ndarray, columns: np.ndarray, block: np.ndarray) -> None:
     """As `add_at`, and its transpose."""
     for i in range(len(rows)):
@@ -227,7 +242,7 @@ def add_both(target: np.ndarray, rows: np.ndarray, columns: np.ndarray, block: n
                     target[columns[j], rows[i]] += block[i, j]
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def add_gram(target: np.ndarray, at: np.ndarray, rows: np.ndarray) -> None:
     """``target[at[i], at[j]] += rows[:, i] . rows[:, j]``; those at -1 are left out."""
     count, width = rows.shape

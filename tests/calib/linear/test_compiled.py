@@ -196,3 +196,9 @@ def test_columns_are_numbered_as_they_are_touched():
     met = index >= 0
     np.testing.assert_array_equal(out[met, 1], 5 + np.searchsorted(touched, index[met]))
     assert (out[~met, 1] == -1).all()
+
+
+def test_what_cannot_be_kept_on_disk_is_compiled_all_the_same():
+    where = {}
+    exec("def twice(x):\n    return 2.0 * x", where)  # of no file, beside which it could be kept
+    assert compiled.compiled(where["twice"])(1.5) == 3.0
