@@ -172,16 +172,19 @@ class Recording:
 
     def digest(self) -> str:
         """Return the SHA-256 (hex) of the names and contents of the recording's files."""
-        sha = hashlib.sha256()
-        files = {path for part in _PARTS for path in self.folder.glob(part) if path.is_file()}
-        for path in sorted(files):
-            sha.update(
-                f"{path.relative_to(self.folder).as_posix()}\0{path.stat().st_size}\0".encode()
-            )
-            with open(path, "rb") as file:
-                while block := file.read(1 << 20):
-                    sha.update(block)
-        return sha.hexdigest()
+        return digest(self.folder)
+
+
+def digest(folder: str | Path) -> str:
+    """Return the SHA-256 (hex) of the names and contents of a recording's files."""
+    folder, sha = Path(folder), hashlib.sha256()
+    files = {path for part in _PARTS for path in folder.glob(part) if path.is_file()}
+    for path in sorted(files):
+        sha.update(f"{path.relative_to(folder).as_posix()}\0{path.stat().st_size}\0".encode())
+        with open(path, "rb") as file:
+            while block := file.read(1 << 20):
+                sha.update(block)
+    return sha.hexdigest()
 
 
 def read_scan(path: str | Path, rings: int | None = None) -> Scan:

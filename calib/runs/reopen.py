@@ -11,6 +11,10 @@ from calib.problem.model import Model, Source
 from calib.runs.run import MODEL, Run
 from calib.solve.estimate import Start
 from chains.errors import InputError
+from sensors.recording import digest
+
+OPENED = 4  # recordings that stay open in a process: to grow and diagnose runs of them again
+_opened: dict[tuple[Path, str], Source] = {}
 
 
 def model_of(run: Run) -> Model:
@@ -55,9 +59,13 @@ def _reopened(recording: Mapping[str, str], run: Run) -> Source:
             f"{path}, which {run.folder} was fitted to, is no longer there; put it back, or fit it "
             f"where it is now with 'rigcal fit'"
         )
-    source = Source.open(path)
-    if source.recording.digest() != recording["sha256"]:
+    known = _opened.get((path, recording["sha256"]))
+    source = known or Source.open(path)
+    if digest(path) != recording["sha256"]:
         raise InputError(
             f"{path} has changed since {run.folder} was fitted to it; fit it anew with 'rigcal fit'"
         )
+    if known is None and len(_opened) == OPENED:
+        _opened.clear()
+    _opened[path, recording["sha256"]] = source
     return source

@@ -13,6 +13,7 @@ from calib.effects import Effect, find
 from calib.problem.model import Model
 from calib.runs.calibrate import calibrate, grow, grown_model
 from calib.runs.ladder import ladder
+from calib.runs.reopen import reopened
 from calib.runs.run import Run
 from calib.solve.solution import EffectEstimate
 from chains.errors import InputError
@@ -225,6 +226,17 @@ def test_recordings_must_be_what_they_were(first, tmp_path):
     with pytest.raises(InputError, match=r"no longer there.*rigcal fit"):
         grow(run, model, tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_a_recording_stays_open_only_while_it_is_what_it_was(first, tmp_path):
+    copy = shutil.copytree(first.recordings[0], tmp_path / "rec")
+    told = first.model["recordings"][0] | {"path": str(copy)}
+    run = replace(first, model=first.model | {"recordings": [told]})
+    assert reopened(run)[0] is reopened(run)[0]
+    stops = (copy / "stops.csv").read_text()
+    (copy / "stops.csv").write_text(stops.replace("s3,b", "s3,c"))
+    with pytest.raises(InputError, match="has changed since"):
+        reopened(run)
 
 
 def test_a_run_without_a_state_is_of_an_earlier_version(first, tmp_path):
