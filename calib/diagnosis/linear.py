@@ -14,7 +14,7 @@ import numpy as np
 from scipy.sparse import csr_array, diags_array
 
 from calib.linear.clusters import ClusteredRows, Gradients
-from calib.linear.layout import Layout, keys_of
+from calib.linear.layout import Layout, keys_of, positions
 from calib.linear.linearise import lidars, linearise, own_rows, spread_rows
 from calib.linear.parallel import in_order
 from calib.linear.rows import StopRows
@@ -141,8 +141,7 @@ def linearise_with(
         progress=lambda done, total: progress("testing what is missing", done, total),
     )
     information, raw = linear.kept[:-1, :-1].copy(), linear.raw.copy()
-    at = np.full(layout.size, -1)
-    at[layout.kept] = np.arange(len(layout.kept))
+    at = positions(layout.size, layout.kept)
     for rows in other_rows(wide, layout, values, gradients):
         gradients.add_rows(rows)
         place = at[rows.columns]

@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 
 from calib.linear.elimination import BY_TWIST, Eliminated, eliminate, square
-from calib.linear.layout import Layout
+from calib.linear.layout import Layout, positions
 from calib.linear.rows import TWIST, StopSums
 from calib.linear.system import Linearisation, Values
 from calib.problem.unknowns import Role
@@ -88,8 +88,7 @@ class Assembly:
 
     def _add_raw(self, found: Iterable[OwnRows]) -> None:
         """Add what rows say of kept columns."""
-        at = np.full(self.layout.size, -1)
-        at[self.layout.kept] = np.arange(len(self.layout.kept))
+        at = positions(self.layout.size, self.layout.kept)
         for rows in found:
             rows.add_to(self.raw, at, self.layout.sigma)
 
@@ -132,8 +131,7 @@ class CellsFirst(Assembly):
         rest = np.concatenate([layout.cells, layout.kept])
         self.at = np.full(layout.size, -1)
         self.at[rest] = self.first + np.arange(len(rest))
-        self.finest = np.full(layout.size, -1)
-        self.finest[layout.finest] = np.arange(len(layout.finest))
+        self.finest = positions(layout.size, layout.finest)
         self.b = self.first + len(rest)
         self.rest = np.zeros((self.b + 1, self.b + 1))
         self.diagonal = np.zeros(len(layout.finest))
@@ -200,8 +198,7 @@ class CellsFirst(Assembly):
         """All rows about stops' own unknowns, in units of sigmas, over [kept | b], and their Gram
         matrix; and of each its own columns, which of the rows it is, and their derivatives."""
         layout, found = self.layout, [rows for each in self.own.values() for rows in each]
-        at = np.full(layout.size, -1)
-        at[layout.kept] = np.arange(len(layout.kept))
+        at = positions(layout.size, layout.kept)
         stacked = np.zeros((sum(len(rows.b) for rows in found), len(layout.kept) + 1))
         about_own, start = [], 0
         for rows in found:
@@ -218,8 +215,7 @@ class CellsFirst(Assembly):
         layout = self.layout
         own = np.concatenate([np.zeros(0, int), *layout.own.values()])
         columns = np.concatenate([own, layout.kept, [layout.size]])
-        at = np.full(layout.size + 1, -1)
-        at[columns] = np.arange(len(columns))
+        at = positions(layout.size + 1, columns)
         whole, count = self._chained(rest, own), len(own)
         stacked, gram, about_own = self._own_rows
         whole[count:, count:] += gram
@@ -238,8 +234,7 @@ class CellsFirst(Assembly):
         Unknowns that place a LiDAR and are neither in `own` nor kept are left out."""
         layout, first = self.layout, self.first
         columns = np.concatenate([own, layout.kept])
-        at = np.full(layout.size, -1)
-        at[columns] = np.arange(len(columns))
+        at = positions(layout.size, columns)
         used = np.unique(at[np.concatenate([np.zeros(0, int), *(c for _, _, c in self.twists)])])
         used = used[used >= 0]
         chains = []
@@ -287,8 +282,7 @@ class StopsFirst(Assembly):
         super().__init__(layout, own, beams, raw)
         self.cells = np.concatenate([layout.finest, layout.cells])
         self.columns = np.concatenate([self.cells, layout.kept, [layout.size]])
-        self.at = np.full(layout.size + 1, -1)
-        self.at[self.columns] = np.arange(len(self.columns))
+        self.at = positions(layout.size + 1, self.columns)
         self.total = np.zeros((len(self.columns), len(self.columns)))
         self.waiting = dict(own)
 
@@ -297,8 +291,7 @@ class StopsFirst(Assembly):
         super().add(sums)
         layout = self.layout
         mine = np.unique(np.concatenate([sums.chain_columns, sums.columns, [layout.size]]))
-        at = np.full(layout.size + 1, -1)
-        at[mine] = np.arange(len(mine))
+        at = positions(layout.size + 1, mine)
         unit = np.append(layout.sigma, 1.0)
         through = np.zeros((TWIST, len(mine)))
         through[:, at[sums.chain_columns]] = sums.chain * unit[sums.chain_columns]
@@ -322,13 +315,11 @@ class StopsFirst(Assembly):
         """Add a stop's own rows to its matrix over some columns, and eliminate what is its own."""
         layout, rows = self.layout, self.waiting.pop(stop, ())
         if self.raw is not None:
-            place = np.full(layout.size + 1, -1)
-            place[layout.kept] = np.arange(len(layout.kept))
+            place = positions(layout.size + 1, layout.kept)
             add_at(self.raw, place[columns], place[columns], matrix)
             self._add_raw(rows)
         mine = np.unique(np.concatenate([columns, *(each.columns for each in rows)]))
-        at = np.full(layout.size + 1, -1)
-        at[mine] = np.arange(len(mine))
+        at = positions(layout.size + 1, mine)
         whole = np.zeros((len(mine), len(mine)))
         whole[np.ix_(at[columns], at[columns])] = matrix
         for each in rows:

@@ -138,6 +138,13 @@ class Layout:
         return 6 * len(self.stops) > max(len(self.finest), ONE_BLOCK)
 
 
+def positions(size: int, columns: np.ndarray) -> np.ndarray:
+    """Where each of so many columns (size,) stands among some of them (n,); -1 for the others."""
+    at = np.full(size, -1)
+    at[columns] = np.arange(len(columns))
+    return at
+
+
 def key_of(scan: ScanStop) -> StopKey:
     """Which stop a scan is of."""
     return scan.recording.folder, scan.index

@@ -95,6 +95,6 @@ class Linearisation:
                 if len(each.over) and each.over[0] == BY_TWIST:
                     raise ValueError("the covariance of cells is not computed")
                 out += mine @ each.solve(mine.T)
-                np.subtract.at(left, (slice(None), each.over), mine @ each.gain)
+                left[:, each.over] -= mine @ each.gain
         last = left[:, self.layout.kept] / sigma[self.layout.kept]
         return out + last @ kept @ last.T

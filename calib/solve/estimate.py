@@ -72,8 +72,7 @@ class Estimate:
     @property
     def cost(self) -> float:
         """Half the weighted chi-square, priors included."""
-        taken = self.linear.chi2 - self.linear.kept[-1, -1]
-        return self.graph.error(self.values) + taken / 2
+        return cost_of(self.linear, self.graph, self.values)
 
     @property
     def start(self) -> Start:
@@ -113,6 +112,12 @@ class Estimate:
     @cached_property
     def _kept(self) -> np.ndarray:
         return self.graph.covariance(self.values, list(self.linear.layout.outer()))
+
+
+def cost_of(linear: Linearisation, graph: Graph, values: Mapping[str, np.ndarray]) -> float:
+    """Half the weighted chi-square at the state of a linearisation, priors included: of its own
+    rows, and of those of the graph that it is in."""
+    return linear.chi2 / 2 + graph.error(values, measured=True)
 
 
 def values_of(problem: Problem, state: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -13,7 +13,7 @@ from calib.linear.system import Linearisation
 from calib.problem.problem import Block, Problem
 from calib.problem.surfaces import with_surfaces
 from calib.residuals.beams import Association
-from calib.solve.estimate import SEEN, Estimate, Start, started, values_of
+from calib.solve.estimate import SEEN, Estimate, Start, cost_of, started, values_of
 from calib.solve.graph import Graph, KeptRows
 from chains import se3
 from chains.errors import InputError
@@ -122,6 +122,7 @@ class _Loop:
         self.given, self.problem = problem, problem
         self.progress, self.start = progress, start or Start()
         self.prior = [prior] if prior else []
+        self.held = frozenset(name for block in self.prior for name in block.variables)
         self.values = values_of(problem, self.start.state)
         self.layout = self._layout()
         self.seen: dict[str, np.ndarray] = {}
@@ -144,7 +145,7 @@ class _Loop:
                 before = self.values
                 self._linearise(beams=False)
                 self.passes += 1
-                cost = self.linear.chi2 / 2 + self.graph.error(before, measured=True)
+                cost = cost_of(self.linear, self.graph, before)
                 if not cost <= last * (1 + 1e-9) + 1e-9:
                     self.values = best
                     break
@@ -157,9 +158,8 @@ class _Loop:
 
     def _damped(self) -> dict[str, np.ndarray]:
         """The optimum of trackers and targets by Levenberg-Marquardt, from where the fit began."""
-        without = frozenset(name for block in self.prior for name in block.variables)
         blocks = [*self.problem.blocks, *self.prior]
-        graph = Graph(list(self.problem.variables.values()), blocks, without)
+        graph = Graph(list(self.problem.variables.values()), blocks, self.held)
         return graph.solve(values_of(self.problem, self.start.state))[0]
 
     def run(self, tolerance: float, associate: bool) -> bool:
@@ -232,10 +232,7 @@ class _Loop:
     def estimate(self, converged: bool) -> Estimate:
         """The result, with the covariance of the calibration."""
         variables = tuple(self.problem.variables[name] for name in self.problem.calibration)
-        if self.problem.scans:
-            self._linearise()
-        else:
-            self._linearise(beams=False)
+        self._linearise()
         return Estimate(
             problem=self.problem,
             values=self.values,
@@ -250,8 +247,7 @@ class _Loop:
         )
 
     def _layout(self) -> Layout:
-        held = [name for block in self.prior for name in block.variables]
-        return Layout.of(self.problem, kept=held)
+        return Layout.of(self.problem, kept=self.held)
 
     def _linearise(self, associate: bool = False, newton: bool = False, beams: bool = True) -> None:
         """Linearise everything at the present state, and graph what is left of it."""
@@ -265,9 +261,8 @@ class _Loop:
             beams=beams,
             progress=lambda done, total: self.progress(what, done, total),
         )
-        without = frozenset(name for block in self.prior for name in block.variables)
         blocks = [*self.layout.others, *self.prior, *KeptRows.of(self.linear)]
-        self.graph = Graph(list(self.layout.outer().values()), blocks, without)
+        self.graph = Graph(list(self.layout.outer().values()), blocks, self.held)
 
     def _step(self) -> tuple[float, float]:
         """One step of the graph: the largest change of the calibration, in m or rad, and by how

@@ -16,6 +16,7 @@ from scipy.linalg import solve_triangular
 
 from calib.forward import Derivatives
 from calib.linear.elimination import square_root
+from calib.linear.layout import positions
 from calib.linear.system import Linearisation
 from calib.problem.problem import Block
 from calib.problem.unknowns import Kind, Unknown
@@ -43,8 +44,7 @@ class KeptRows:
         """Those rows; none where nothing in it speaks of any kept unknown."""
         layout = linear.layout
         root = square_root(linear.kept)
-        place = np.full(layout.size, -1)
-        place[layout.kept] = np.arange(len(layout.kept))
+        place = positions(layout.size, layout.kept)
         by = {
             name: root[:, place[layout.at[name]]] / layout.sigma[layout.at[name]]
             for name, unknown in layout.outer().items()
