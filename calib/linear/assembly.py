@@ -22,7 +22,7 @@ from calib.problem.unknowns import Role
 from calib.residuals.compiled import add_at, add_both, add_gram, add_sparse
 
 # Where fewer than one entry in so many can differ from 0, a product stop by stop is faster than the
-# whole one (measured, 24 and 90 stops).
+# whole one (measured: one in 7, 24 stops, 3.1 ms against 1.8; one in 23, 90 stops, 8.5 against 21).
 DENSE = 8
 
 
