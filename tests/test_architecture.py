@@ -48,7 +48,8 @@ ROOMS = {
     "sensors": ("readers",),
     "sensors.readers": ("tables", "clouds", "poses", "meshes", "arms", "packets", "bags"),
     "calib": (
-        *("rig", "effects", "forward", "residuals", "problem", "linear", "solve", "diagnosis"),
+        *("rig", "effects", "forward", "residuals", "problem", "linear", "solve", "blunders"),
+        "diagnosis",
         *("runs", "show", "simulation", "evaluation", "intake", "exporters", "report", "view"),
         "cli",
     ),

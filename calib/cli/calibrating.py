@@ -21,6 +21,12 @@ Effects = Annotated[
 Fix = Annotated[
     list[str] | None, typer.Option(metavar="NAME", help="Hold a frame, effect or parameter.")
 ]
+Without = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="STOP:BODY", help="Leave out what a mishap spoiled, as 'diagnose' names it."
+    ),
+]
 
 
 @app.command()
@@ -70,6 +76,7 @@ def fit(
     out: Out,
     effects: Effects = None,
     fix: Fix = None,
+    without: Without = None,
     hold_out: Annotated[str, typer.Option(help="location, stop or none.")] = "location",
     folds: Annotated[int, typer.Option(help="Folds of the held-out error.", min=1, max=5)] = 1,
     prior: Annotated[
@@ -84,7 +91,7 @@ def fit(
     from calib.problem.model import Model
     from calib.runs.calibrate import calibrate
 
-    chosen = Model.of(effects, fix or [])
+    chosen = Model.of(effects, fix or [], without or [])
     with threads(workers), progress_bar() as progress:
         run = calibrate(recordings, out, chosen, hold_out, folds, prior, progress)
     _tell(run, as_json)
@@ -141,6 +148,7 @@ def explain(
     out: Out,
     effects: Effects = None,
     fix: Fix = None,
+    without: Without = None,
     workers: Workers = None,
     as_json: Json = False,
 ) -> None:
@@ -148,7 +156,7 @@ def explain(
     from calib.problem.model import Model
     from calib.runs.explain import explain as climb
 
-    chosen = Model.of(effects, fix or [])
+    chosen = Model.of(effects, fix or [], without or [])
     with threads(workers), progress_bar() as progress:
         explanation = climb(recordings, out, chosen, progress)
     if as_json:

@@ -18,11 +18,13 @@ from calib.linear.layout import Layout, keys_of, positions
 from calib.linear.linearise import lidars, linearise, own_rows, spread_rows
 from calib.linear.parallel import in_order
 from calib.linear.rows import StopRows
+from calib.linear.system import Linearisation
 from calib.problem.problem import Block, Problem
 from calib.residuals.tracker import TrackedBody
 from calib.solve.estimate import Estimate
 from calib.solve.fit import Progress
 from calib.solve.graph import Graph
+from calib.solve.reweight import weighted_as
 
 # Priors of the hardware (CAD, data sheets) are no evidence against a candidate. Their sigmas are
 # widened by this factor: what only a prior could tell from a candidate then counts as a gauge.
@@ -47,6 +49,7 @@ class Linear:
         place: (C,) which part of the room they look at, -1 for none.
         weight_m2: sum of the beams' weights over their variances [1/m2]; without beams that of the
             tracked positions.
+        whole: the linearisation that these are made of.
         directions: from directions (S, q) in the unknowns that were not eliminated to those in all
             unknowns (U, q): the eliminated ones follow the others.
     """
@@ -60,6 +63,7 @@ class Linear:
     stop: np.ndarray
     place: np.ndarray
     weight_m2: float
+    whole: Linearisation
     directions: Callable[[np.ndarray], np.ndarray]
 
     def among(self, names: Sequence[str]) -> np.ndarray:
@@ -110,9 +114,9 @@ def rows_along(
 
 
 def beside(wide: Problem, estimate: Estimate) -> tuple[Problem, dict[str, np.ndarray]]:
-    """A problem with candidates at a model's solution: with the surfaces' unknowns of that, and
-    the candidates at zero."""
-    cells = estimate.problem.cells
+    """A problem with candidates at a model's solution: with the surfaces' unknowns and the robust
+    weights of that, and the candidates at zero."""
+    cells, wide = estimate.problem.cells, weighted_as(wide, estimate.problem)
     wide = wide.with_cells([estimate.problem.variables[name] for name in cells], cells)
     absent = {n: u.mean for n, u in wide.variables.items() if n not in estimate.values}
     return wide, absent | estimate.values
@@ -168,6 +172,7 @@ def linearise_with(
         stop=stop,
         place=place,
         weight_m2=linear.weight_m2 or sum(len(b.measured) / b.sigma_m**2 for b in bodies),
+        whole=linear,
         directions=directions,
     )
 

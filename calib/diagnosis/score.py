@@ -22,6 +22,7 @@ from scipy import special
 from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import csr_array
 
+from calib.blunders.chance import log_tail
 from calib.diagnosis.linear import Linear
 
 GAUGE = 1e-6  # share of a direction's information that is left, below which there is none
@@ -207,15 +208,6 @@ class Test:
         # Along a direction of unit length the information is this much, on average.
         each = np.trace(np.linalg.pinv(self.whiten @ self.whiten.T)) / len(self.score)
         return float(np.sqrt(noncentral * first / nu / each))
-
-
-def log_tail(x: float, q: float) -> float:
-    """Log of the upper tail of chi-square with q degrees of freedom, however far out."""
-    tail = special.chdtrc(q, x)
-    if tail > 0.0:
-        return float(np.log(tail))
-    half = x / 2
-    return float((q / 2 - 1) * np.log(half) - half - special.gammaln(q / 2))
 
 
 def test(scores: Scores, columns: np.ndarray) -> Test:

@@ -1,7 +1,9 @@
 """From one look to a named effect: the best explanation is judged, then fitted, then looked past.
 
 What is left once it is fitted is looked at again: an effect that nobody has named dresses up as
-several that somebody has.
+several that somebody has. A blunder is an explanation like any other: where it is the best, its
+rows are left out, the model is fitted without them, and looked at again (detection, identification
+and adaptation: Teunissen 1990).
 """
 
 from __future__ import annotations
@@ -11,11 +13,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.diagnosis.score import Test, log_tail
+from calib.blunders.chance import after_looks, log_tail
+from calib.blunders.judged import Blunder, LeftOut
+from calib.diagnosis.score import Test
 from calib.diagnosis.score import test as joint_test
 from calib.diagnosis.screen import Candidate, Screen
 from calib.diagnosis.stand import Look, Stand
 from calib.effects import Effect, Site
+from calib.residuals.groups import CAD, MESH
 from calib.solve.fit import Progress
 
 ALPHA = 0.04  # chance that a named effect is found where nothing is missing
@@ -24,7 +29,8 @@ MOST_NAMES = 3  # an explanation that needs more names than this is none
 INSTEAD = 0.5  # of the leading structure's evidence, for another covariate to be named too
 FEWEST = 4  # stops, below which nothing is claimed
 TRIES = 3  # how many suspects are judged before a look is called quiet
-FINER = 9  # shapes tried between the two beside the best one
+ADAPTED = 8  # how often blunders are left out and the model is looked at again
+AS_FAR = 0.1  # of the leading blunder's evidence: others at other places are left out with it
 ODDS = np.log(20.0)  # of a rival: within these it can stand in for the best
 
 
@@ -63,8 +69,9 @@ class Search:
     """What was found, step by step.
 
     Args:
-        looks: from the fit as it was, and after each effect found.
+        looks: from the fit as it was, or without the blunders found in it, and after each effect.
         found: named effects, in the order in which they were added.
+        blunders: what was left out, in that order.
         unnamed: structure that is confirmed after all of them, strongest first.
         scatter: the effect on the scatter that is confirmed, if one is.
         at_first: structure that is confirmed before any of them; empty, as not asked for, unless
@@ -73,6 +80,7 @@ class Search:
 
     looks: Sequence[Look]
     found: Sequence[NamedEffect]
+    blunders: Sequence[LeftOut]
     unnamed: Sequence[Candidate]
     scatter: Candidate | None
     at_first: Sequence[Candidate] = ()
@@ -92,9 +100,10 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NAMES) -> Search:
         progress: as of `fit.solve`.
         most: how many effects are named at most.
     """
-    looks, found = [stand.look(progress)], []
-    while len(found) < most:
-        step = _named(looks[-1], progress)
+    looks, found, left = [stand.look(progress)], [], []
+    while True:
+        looks[-1] = _adapted(looks[-1], left, progress)
+        step = _named(looks[-1], progress) if len(found) < most else None
         if step is None:
             break
         found.append(step)
@@ -104,10 +113,50 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NAMES) -> Search:
             looks[-1] = stand.look(progress)
             found = [f.with_effect(swapped.get(f.effect.name)) for f in found]
     last = looks[-1]
-    done = Search(looks, found, structures(last, progress), _scatter(last, progress))
+    unnamed = structures(last, progress)
+    done = Search(looks, found, left, unnamed, _scatter(last, progress))
     if found and done.dressed_up(0):
         return replace(done, at_first=structures(looks[0], progress))
     return done
+
+
+def _adapted(look: Look, left: list[LeftOut], progress: Progress) -> Look:
+    """A look without the blunders that explain more than any effect or structure would; these are
+    added to those left out."""
+    for _ in range(ADAPTED):
+        wild = _wild(look)
+        if not wild:
+            break
+        after = look.stand.without([b.group for b in wild], progress).look(progress)
+        loud = {b.group for b in after.blunders if b.found}
+        for each in wild:
+            near = (b for b in look.blunders if each.evidence - b.evidence < ODDS)
+            others = [b for b in near if b.found and b.group not in loud and b not in wild]
+            left.append(LeftOut(each, [b for b in others if len(wild) == 1 or _meet(each, b)]))
+        look = after
+    return look
+
+
+def _meet(a: Blunder, b: Blunder) -> bool:
+    """Whether two groups are of one place, or either of them is of none."""
+    fixed = {CAD, MESH}
+    return a.group.where == b.group.where or not fixed.isdisjoint({a.group.where, b.group.where})
+
+
+def _wild(look: Look) -> list[Blunder]:
+    """Blunders to leave out now: the worst of each place, as far out as the worst of all."""
+    found = [b for b in look.blunders if b.found]
+    if not found:
+        return []
+    every = (*look.named.candidates, *look.unnamed.candidates)
+    best = max((c.evidence - np.log(c.looks) for c in every), default=0.0)
+    if found[0].evidence - np.log(found[0].looks) < best:
+        return []
+    worst: dict[tuple[str, str], Blunder] = {}
+    for each in found:
+        if each.evidence > AS_FAR * found[0].evidence:
+            worst.setdefault((each.group.recording, each.group.where), each)
+    return list(worst.values())
 
 
 def _named(look: Look, progress: Progress) -> NamedEffect | None:
@@ -172,7 +221,7 @@ def judged(look: Look, candidate: Candidate, progress: Progress) -> tuple[Test, 
     # What candidates have in common may be another effect's signal; it need not be this one's.
     common = (look.noise if candidate.effect.site is Site.NOISE else look.named).common
     p = found.p_value(min(common, max(found.inflation, 1.0)))
-    return found, float(-np.expm1(candidate.looks * np.log1p(-min(p, 1 - 1e-15))))
+    return found, after_looks(p, candidate.looks)
 
 
 def suspects(screen: Screen, alpha: float) -> Iterator[Candidate]:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import chain
 
 import numpy as np
 
 from calib import problem as problems
+from calib.blunders.judged import Blunder, judge
 from calib.diagnosis.candidates import (
     ShapeStep,
     covariates,
@@ -23,6 +25,8 @@ from calib.diagnosis.screen import Candidate, Screen, screen
 from calib.effects import Effect, Site
 from calib.problem import Problem
 from calib.problem.model import Model, Source
+from calib.problem.without import leave_out
+from calib.residuals.groups import Group
 from calib.solve.estimate import DOFS, SEEN, Estimate, Start
 from calib.solve.fit import Progress, solve
 from sensors.recording import Recording
@@ -45,6 +49,16 @@ class Stand:
     def with_effects(self, added: Sequence[Effect], progress: Progress) -> Stand:
         """The model with more effects, fitted from here."""
         return self._refitted(self.model.plus(tuple(added)), self.estimate.start, progress)
+
+    def without(self, groups: Sequence[Group], progress: Progress) -> Stand:
+        """The model fitted from here, with some groups of rows left out."""
+        tokens = [group.token for group in groups]
+        sources, model = leave_out(self.sources, tokens), self.model.leaving_out(tokens)
+        anew = any(group.kind == "surface" for group in groups)  # beams then meet other things
+        start = self.estimate.start
+        problem = problems.build(sources, model, meetings=None if anew else self.problem.meetings)
+        estimate = solve(problem, progress=progress, start=Start(start.state) if anew else start)
+        return Stand(sources, model, problem, estimate)
 
     def _refitted(self, model: Model, start: Start, progress: Progress) -> Stand:
         problem = self.problem_of(model)
@@ -205,6 +219,11 @@ class Look:
     unnamed: Screen
     noise: Screen
     columns: frozenset[str]
+
+    @cached_property
+    def blunders(self) -> list[Blunder]:
+        """All groups of rows, those that chance explains least first."""
+        return judge(self.linear.whole, self.stand.estimate.problem)
 
     def judged(self, candidate: Candidate, progress: Progress) -> Test:
         """A candidate's test with its clusters jackknifed: see `jackknife`."""

@@ -8,21 +8,32 @@ from typing import Any
 
 import numpy as np
 
+from calib.blunders import told
+from calib.blunders.chance import log_tail
+from calib.blunders.judged import LeftOut
 from calib.diagnosis.candidates import lacking
 from calib.diagnosis.curves import Curve, curves
-from calib.diagnosis.score import log_tail
 from calib.diagnosis.screen import Candidate, Screen
-from calib.diagnosis.search import ALPHA, FEWEST, ODDS, NamedEffect, Search, angle_deg
+from calib.diagnosis.search import (
+    ALPHA,
+    FEWEST,
+    ODDS,
+    NamedEffect,
+    Search,
+    angle_deg,
+)
 from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import formula, hangs_on, what_separates, words
 from calib.effects import CATALOGUE, Site
+from calib.rig import Rig
 from calib.solve.solution import one_unit
 
-UNNAMED = "unexplained_structure"
+UNNAMED, BAD = "unexplained_structure", "bad_data"
 VERDICTS = {
     "adequate": "the model is adequate",
     "missing_effect": "an effect is missing",
     UNNAMED: "structure that no effect explains",
+    BAD: "something in the recording is wrong",
 }
 ABSORBED = 0.7  # share of the structure that named effects must explain to be the answer
 LISTED = 6  # untestable effects and rivals that a sentence names
@@ -33,12 +44,14 @@ class Diagnosis:
     """What is missing from a model.
 
     Args:
-        verdict: "adequate", "missing_effect" or "unexplained_structure".
+        verdict: "adequate", "missing_effect", "unexplained_structure" or "bad_data".
         sentences: the finding in words, the verdict first.
         candidates: the catalogue's effects that the model lacks, best first.
         unexplained: structure that no effect accounts for, strongest first.
         weak_directions: what the data hardly determine, and what would.
         untestable: effect -> what the recordings lack to test it.
+        blunders: groups of rows that were left out, as nothing but a mishap explains them.
+        detectable: group -> unit -> the smallest mishap that would be found.
         misfit: instrument -> how many times larger than their sigmas its residuals are.
         curves: mean residual against covariates.
         too_few: whether the stops are too few to say anything, whatever the verdict.
@@ -50,6 +63,8 @@ class Diagnosis:
     unexplained: Sequence[Mapping[str, Any]]
     weak_directions: Sequence[Mapping[str, Any]]
     untestable: Mapping[str, str]
+    blunders: Sequence[Mapping[str, Any]]
+    detectable: Mapping[str, Mapping[str, float]] = field(repr=False)
     misfit: Mapping[str, float]
     curves: Sequence[Curve] = field(repr=False)
     too_few: bool = False
@@ -76,6 +91,8 @@ class Diagnosis:
             "unexplained": list(self.unexplained),
             "weak_directions": list(self.weak_directions),
             "untestable": dict(self.untestable),
+            "blunders": list(self.blunders),
+            "detectable": dict(self.detectable),
             "misfit": dict(self.misfit),
             "curves": [curve.document() for curve in self.curves],
         }
@@ -106,17 +123,27 @@ def conclude(
     candidates = [_candidate(c, verdict, found, held_out) for c in _ranked(found)]
     unexplained = [_unexplained(c, screen) for screen, c in _without_a_name(found, verdict)]
     untestable = _untestable(first)
+    blunders = [told.document(left, _rig(left, first)) for left in found.blunders]
     return Diagnosis(
         verdict=verdict,
-        sentences=_sentences(verdict, found, candidates, unexplained, untestable),
+        sentences=_sentences(verdict, found, candidates, unexplained, untestable, blunders),
         candidates=candidates,
         unexplained=unexplained,
         weak_directions=weak,
         untestable=untestable,
+        blunders=blunders,
+        detectable={str(b.group.token): dict(b.detectable) for b in first.blunders},
         misfit=misfit,
         curves=curves(first.unnamed),
         too_few=_stops(first) < FEWEST,
     )
+
+
+def _rig(left: LeftOut, look: Look) -> Rig:
+    """On paper, of the recording that a blunder is in."""
+    named = left.blunder.group.recording
+    rigs = {s.recording.folder.name: s.rig for s in look.stand.sources}
+    return rigs.get(named) or look.stand.sources[0].rig
 
 
 def _stops(look: Look) -> int:
@@ -124,6 +151,8 @@ def _stops(look: Look) -> int:
 
 
 def _verdict(found: Search) -> str:
+    if found.blunders:
+        return BAD
     if not found.found:
         return UNNAMED if found.unnamed else "adequate"
     named = _names_hold(found) and (not found.unnamed or _absorbed(found) > ABSORBED)
@@ -278,6 +307,7 @@ def _sentences(
     candidates: Sequence[Mapping[str, Any]],
     unexplained: Sequence[Mapping[str, Any]],
     untestable: Mapping[str, str],
+    blunders: Sequence[Mapping[str, Any]],
 ) -> list[str]:
     look = found.looks[0]
     residual = _residual(look)
@@ -293,6 +323,9 @@ def _sentences(
             f"The model is adequate: of {len(look.named.candidates)} known effects and "
             f"{len(look.unnamed.candidates)} kinds of structure none stands out from chance."
         )
+    out += [each["sentence"] for each in blunders[:LISTED]]
+    if len(blunders) > LISTED:
+        out.append(f"And {len(blunders) - LISTED} more, in diagnosis.json.")
     for step in found.found:
         out += _step_sentences(step, next(c for c in candidates if c["add"] == step.effect.name))
     if verdict == UNNAMED:

@@ -16,7 +16,7 @@ import numpy as np
 
 from calib.linear.elimination import BY_TWIST, Eliminated, eliminate, square
 from calib.linear.layout import Layout, positions
-from calib.linear.rows import TWIST, StopSums
+from calib.linear.rows import TWIST, StopSums, TwistSums
 from calib.linear.system import Linearisation, Values
 from calib.problem.unknowns import Role
 from calib.residuals.compiled import add_at, add_both, add_gram, add_sparse
@@ -77,6 +77,7 @@ class Assembly:
         self.weight_m2 = 0.0
         self.eliminated: list[Eliminated] = []
         self.twists: list[tuple[int, np.ndarray, np.ndarray]] = []
+        self.scans: dict[int, TwistSums] = {}
 
     def add(self, sums: StopSums) -> None:
         """Add the beams of a stop."""
@@ -85,6 +86,8 @@ class Assembly:
         seen = np.append(np.diag(sums.dense)[TWIST + 1 :], sums.own) > 0
         self.touched[sums.columns] |= seen
         self.touched[sums.chain_columns] |= np.any(sums.chain != 0, axis=0)
+        if self.raw is not None:
+            self.scans[sums.stop] = sums.of_twist()
 
     def _add_raw(self, found: Iterable[OwnRows]) -> None:
         """Add what rows say of kept columns."""
@@ -116,6 +119,7 @@ class Assembly:
             touched=self.touched,
             eliminated=self.eliminated,
             twists=self.twists,
+            scans=self.scans,
             weight_m2=self.weight_m2,
         )
 

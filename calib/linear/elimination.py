@@ -37,6 +37,11 @@ class Eliminated:
     factor: np.ndarray
     gain: np.ndarray
 
+    @property
+    def twists(self) -> int:
+        """How many of `over` are columns of twists."""
+        return int(np.searchsorted(self.over != BY_TWIST, True))
+
     def solve(self, right: np.ndarray) -> np.ndarray:
         """``H_ee^-1 @ right``, of (e, q)."""
         if self.factor.ndim == 1:

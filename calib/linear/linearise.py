@@ -124,8 +124,9 @@ def prior_rows(layout: Layout, names: Sequence[str], values: Values) -> dict[str
         unknown, columns = layout.unknowns[name], layout.columns([name])
         if unknown.kind == "pose":
             k = place[name]
-            A, b = turns[k] / unknown.sigma[:, None], -away[k] / unknown.sigma
+            A, b = turns[k] / unknown.prior_sigma[:, None], -away[k] / unknown.prior_sigma
         else:
-            A, b = np.diag(1.0 / unknown.sigma), (unknown.mean - values[name]) / unknown.sigma
+            sigma = unknown.prior_sigma
+            A, b = np.diag(1.0 / sigma), (unknown.mean - values[name]) / sigma
         found[name] = OwnRows(A, b, columns, measured=False)
     return found

@@ -178,6 +178,17 @@ class StopSums:
         """(s,) columns of the layout."""
         return self.columns[self.dense.shape[1] - TWIST - 1 :]
 
+    def of_twist(self) -> TwistSums:
+        """What they say of the LiDAR's twist alone."""
+        direct = np.hstack([self.dense[:TWIST, TWIST + 1 :], self.with_dense[:, :TWIST].T])
+        information = self.dense[:TWIST, :TWIST]
+        return TwistSums(
+            information=information,
+            score=self.dense[:TWIST, TWIST],
+            cross=np.hstack([information @ self.chain, direct]),
+            columns=np.concatenate([self.chain_columns, self.columns]),
+        )
+
     def whole(self) -> np.ndarray:
         """(7 + d + s, same) over [twist | b | d columns | s columns]."""
         both = np.diag(self.own)
@@ -185,3 +196,18 @@ class StopSums:
         both[:count] += self.with_sparse
         both[:, :count] += self.with_sparse.T
         return np.block([[self.dense, self.with_dense.T], [self.with_dense, both]])
+
+
+@dataclass(frozen=True)
+class TwistSums:
+    """What a stop's beams say of a twist of its LiDAR that nothing else shares.
+
+    Args:
+        information: (6, 6), score: (6,) of that twist.
+        cross: (6, n) its products with unknowns, columns: (n,) which; one may stand twice.
+    """
+
+    information: np.ndarray
+    score: np.ndarray
+    cross: np.ndarray
+    columns: np.ndarray

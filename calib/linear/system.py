@@ -10,8 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.linear.elimination import BY_TWIST, Eliminated
+from calib.linear.elimination import Eliminated
 from calib.linear.layout import Layout
+from calib.linear.rows import TwistSums
 
 Values = Mapping[str, np.ndarray]
 
@@ -33,6 +34,8 @@ class Linearisation:
         eliminated: what was eliminated, in that order.
         twists: per stop with beams its number, the derivative (6, n) of its LiDAR's twist, and the
             columns (n,) of that; empty unless cells were eliminated while stops were twists.
+        scans: stop -> what its beams say of its LiDAR's twist alone; empty unless gradients were
+            asked for.
         weight_m2: sum of the beams' weights over their variances, 1/m2.
     """
 
@@ -44,6 +47,7 @@ class Linearisation:
     touched: np.ndarray
     eliminated: Sequence[Eliminated]
     twists: Sequence[tuple[int, np.ndarray, np.ndarray]]
+    scans: Mapping[int, TwistSums]
     weight_m2: float
 
     def directions(self, kept: np.ndarray) -> np.ndarray:
@@ -57,10 +61,10 @@ class Linearisation:
         out[layout.kept], out[-1] = kept[:-1], kept[-1]
         by_twist = None
         for each in reversed(self.eliminated):
-            if len(each.over) and each.over[0] == BY_TWIST:
+            if each.twists:
                 if by_twist is None:
                     by_twist = self._twists(out)
-                others = out[each.over[len(by_twist) :]]
+                others = out[each.over[each.twists :]]
                 out[each.columns] = -each.gain @ np.vstack([by_twist, others])
             else:
                 out[each.columns] = -each.gain @ out[each.over]
@@ -83,18 +87,31 @@ class Linearisation:
         """Covariance (q, q) of ``rows @ unknowns``.
 
         Args:
-            rows: (q, U) over all unknowns; 0 at cells, unless stops were eliminated first.
+            rows: (q, U) over all unknowns.
             kept: (S, S) covariance of the kept.
         """
         sigma = self.layout.sigma
         left = np.hstack([rows * sigma, np.zeros((len(rows), 1))])
         out = np.zeros((len(rows), len(rows)))
+        by_twist = np.zeros((len(rows), 6 * len(self.twists)))
         for each in self.eliminated:
-            mine = left[:, each.columns]
-            if mine.any():
-                if len(each.over) and each.over[0] == BY_TWIST:
-                    raise ValueError("the covariance of cells is not computed")
-                out += mine @ each.solve(mine.T)
-                left[:, each.over] -= mine @ each.gain
+            if each.twists == 0 and by_twist.any():
+                self._through(by_twist, left)
+            some = np.flatnonzero(np.any(left[:, each.columns] != 0, axis=1))
+            if not len(some):
+                continue
+            mine = left[np.ix_(some, each.columns)]
+            out[np.ix_(some, some)] += mine @ each.solve(mine.T)
+            further = mine @ each.gain
+            by_twist[some, : each.twists] -= further[:, : each.twists]
+            left[np.ix_(some, each.over[each.twists :])] -= further[:, each.twists :]
+        self._through(by_twist, left)
         last = left[:, self.layout.kept] / sigma[self.layout.kept]
         return out + last @ kept @ last.T
+
+    def _through(self, by_twist: np.ndarray, left: np.ndarray) -> None:
+        """Move what stands by the twists of all stops (q, 6 K) to the unknowns behind them."""
+        for i, (_, d, columns) in enumerate(self.twists):
+            mine = by_twist[:, 6 * i : 6 * (i + 1)]
+            left[:, columns] += mine @ d * self.layout.sigma[columns]
+        by_twist[:] = 0.0

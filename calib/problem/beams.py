@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from calib.effects import Site
-from calib.problem.model import same_mesh
+from calib.problem.model import Source, same_mesh
 from calib.problem.places import Places
 from calib.problem.problem import Problem, SourceStops
 from calib.problem.unknowns import Role, Unknown
@@ -55,7 +55,7 @@ def _meeting(problem: Problem, part: SourceStops, places: Places) -> Meeting:
     if found is None:
         lidar, reference = part.source.rig.lidar, part.source.reference
         found = (
-            MeshSurface(reference, 1.5 * lidar.beam_divergence_rad)
+            MeshSurface(reference, 1.5 * lidar.beam_divergence_rad, _left_out(part.source))
             if reference is not None
             else PlaneSurface(_find_planes(problem, part, places), f"{part.prefix}planes")
         )
@@ -63,6 +63,11 @@ def _meeting(problem: Problem, part: SourceStops, places: Places) -> Meeting:
     if isinstance(found, PlaneSurface):
         problem.add(_planes_unknown(found))
     return found
+
+
+def _left_out(source: Source) -> frozenset[int]:
+    """Numbers of the surfaces of its mesh that are left out."""
+    return frozenset(int(what.removeprefix("surface_")) for _, what in source.lacks("surface"))
 
 
 def _planes_unknown(found: PlaneSurface) -> Unknown:

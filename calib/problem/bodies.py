@@ -9,7 +9,8 @@ from calib.problem import start
 from calib.problem.places import Places
 from calib.problem.problem import Problem, SourceStops
 from calib.problem.unknowns import Role, Unknown
-from calib.residuals.targets import HangingTarget
+from calib.residuals.groups import Group
+from calib.residuals.targets import PARTS, HangingTarget
 from calib.residuals.tracker import TrackedBody
 
 
@@ -35,6 +36,7 @@ def add_bodies(problem: Problem, part: SourceStops, places: Places) -> None:
                     is_point=point,
                     bases={v: _rows(basis, seen)[:, b] for v, basis in bases.items()},
                     stop_names=[(recording.folder, int(k)) for k in seen],
+                    groups=tuple(Group("body", recording.stops[k], body, part.label) for k in seen),
                 )
             )
 
@@ -56,7 +58,10 @@ def add_targets(problem: Problem, part: SourceStops, places: Places) -> None:
     targets, spec = part.source.recording.targets, part.source.rig.target
     if targets is None or spec is None or places.reference is None:
         return
-    gravity = start.gravity(part.source)
+    gravity, lower_m = start.gravity(part.source), start.lower_markers(targets)
+    upper_m = np.where(np.isfinite(targets.upper_m), targets.upper_m, lower_m)
+    parts = (targets.lower_m, targets.upper_m, targets.faro_m)
+    whole = np.stack([np.isfinite(part).all(axis=1) for part in parts], axis=1)
     dofs, units = ("across_1", "across_2"), ("rad", "rad")
     problem.add(
         Unknown(
@@ -76,7 +81,7 @@ def add_targets(problem: Problem, part: SourceStops, places: Places) -> None:
         marker = Unknown(
             f"{part.prefix}target:{name}",
             "vector",
-            mean=targets.lower_m[m],
+            mean=lower_m[m],
             sigma=np.full(3, 10.0),  # m: anywhere in the room
             dofs=("x", "y", "z"),
             units=("m",) * 3,
@@ -89,9 +94,9 @@ def add_targets(problem: Problem, part: SourceStops, places: Places) -> None:
                 marker=marker.name,
                 gravity="gravity",
                 reference=places.reference,
-                faro_m=targets.faro_m[m],
-                upper_m=targets.upper_m[m],
-                lower_m=targets.lower_m[m],
+                faro_m=np.nan_to_num(targets.faro_m[m]),
+                upper_m=upper_m[m],
+                lower_m=lower_m[m],
                 below_m=spec.sphere_below_lower_marker_m,
                 sigma_sphere_m=spec.sigma_sphere_m,
                 sigma_marker_m=spec.sigma_marker_m,
@@ -99,5 +104,7 @@ def add_targets(problem: Problem, part: SourceStops, places: Places) -> None:
                     v: np.broadcast_to(b, (len(targets.names), *b.shape[1:]))[m]
                     for v, b in shifts.items()
                 },
+                groups=tuple(Group("target", name, what, part.label) for what in PARTS),
+                weight=None if whole[m].all() else whole[m].astype(float),
             )
         )

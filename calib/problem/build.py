@@ -13,8 +13,11 @@ from calib.problem.model import Model, Source
 from calib.problem.places import Places
 from calib.problem.problem import Problem, SourceStops
 from calib.problem.unknowns import Unknown
+from calib.residuals.groups import CAD
 from calib.residuals.surfaces import Meeting
 from chains.errors import InputError
+
+FREE = 1.0  # m or rad: what is known of a value on paper that is left out, the rig's own size
 
 
 def build(
@@ -62,14 +65,16 @@ def build(
 
 
 def effect_unknown(term: Term, source: Source) -> Unknown:
-    """The vector of an effect's free parameters, about zero."""
+    """The vector of an effect's free parameters, about zero; what is left out of paper is free."""
     params = term.effect.params(source.rig)
     params = [params[i] for i in term.free]
+    lacks, name = source.lacks("frame"), term.effect.name
+    free = [not lacks.isdisjoint({(CAD, name), (CAD, f"{name}.{p.name}")}) for p in params]
     return Unknown(
         term.variable,
         "vector",
         mean=np.zeros(len(params)),
-        sigma=np.array([p.sigma for p in params]),
+        sigma=np.where(free, FREE, [p.sigma for p in params]),
         dofs=tuple(p.name for p in params),
         units=tuple(p.unit for p in params),
     )

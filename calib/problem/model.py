@@ -13,6 +13,7 @@ import numpy as np
 from calib import effects
 from calib.effects import Effect, FrameOffset
 from calib.forward import Term
+from calib.residuals.groups import Group, Kind
 from calib.residuals.store import BeamStore
 from calib.rig import Rig, load_rig
 from chains import se3
@@ -31,25 +32,26 @@ class Model:
         effects: those to estimate; the name of one in the catalogue stands for it.
         fixed: names kept at their nominal value: a frame or effect, or one parameter of it as
             ``name.parameter``, ``lidar.tz`` say.
+        without: what of the recordings is left out, as `Group.token` names it.
     """
 
     effects: tuple[Effect, ...] = effects.DEFAULT
     fixed: tuple[str, ...] = ()
+    without: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         chosen = (effects.find(e) if isinstance(e, str) else e for e in self.effects)
         object.__setattr__(self, "effects", tuple(chosen))
 
     @classmethod
-    def of(cls, chosen: str | None, fixed: Sequence[str]) -> Model:
+    def of(cls, chosen: str | None, fixed: Sequence[str], without: Sequence[str] = ()) -> Model:
         """The model that a command line names: effects with commas, or the default ones.
 
         Raises:
             InputError: an effect that there is not, in the catalogue or in a file.
         """
-        if chosen is None:
-            return cls(fixed=tuple(fixed))
-        return cls(effects.load_effects(chosen), tuple(fixed))
+        named = effects.DEFAULT if chosen is None else effects.load_effects(chosen)
+        return cls(named, tuple(fixed), tuple(without))
 
     @classmethod
     def read(cls, document: Mapping[str, Any], path: Path | str = "model.yaml") -> Model:
@@ -59,11 +61,15 @@ class Model:
             InputError: an effect that there is not, or no longer.
         """
         found = tuple(effects.read(effect, path) for effect in document["effects"])
-        return cls(found, tuple(document["fixed"]))
+        return cls(found, tuple(document["fixed"]), tuple(document.get("without", ())))
 
     def document(self) -> dict[str, Any]:
         """As model.yaml holds it."""
-        return {"effects": [e.document() for e in self.effects], "fixed": list(self.fixed)}
+        return {
+            "effects": [e.document() for e in self.effects],
+            "fixed": list(self.fixed),
+            "without": list(self.without),
+        }
 
     def plus(self, added: Sequence[Effect]) -> Model:
         """The model with more effects.
@@ -78,6 +84,10 @@ class Model:
             have.add((effect.family, effect.shape))
         return replace(self, effects=(*self.effects, *added))
 
+    def leaving_out(self, tokens: Sequence[str]) -> Model:
+        """The model with more left out of its recordings."""
+        return replace(self, without=(*self.without, *(t for t in tokens if t not in self.without)))
+
     def minus(self, names: Sequence[str]) -> Model:
         """The model without some effects, and without what it held of them.
 
@@ -91,7 +101,7 @@ class Model:
         # A shape may have a point in it, as what is held has between an effect and a parameter.
         gone = tuple(f"{name}." for name in names)
         fixed = (n for n in self.fixed if n not in names and not n.startswith(gone))
-        return Model(kept, tuple(fixed))
+        return Model(kept, tuple(fixed), self.without)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -166,11 +176,12 @@ def owned(effect: Effect, rig: Rig) -> bool:
 
 @dataclass(frozen=True)
 class Source:
-    """A recording opened for a fit: its rig, its stops, its reference."""
+    """A recording opened for a fit: its rig, its stops, its reference, and what is left out."""
 
     rig: Rig
     recording: Recording
     reference: Reference | None
+    without: tuple[Group, ...] = ()
 
     @classmethod
     def open(cls, folder: Path | str) -> Source:
@@ -186,6 +197,18 @@ class Source:
         spec = rig.reference
         mesh = Reference.read(spec.mesh, spec.faces, spec.labels) if spec and spec.mesh else None
         return cls(rig, recording, mesh)
+
+    def changed(self, recording: Recording, without: Group) -> Source:
+        """The same with a changed recording, something being left out; what scans were read stay
+        read."""
+        out = replace(self, recording=recording, without=(*self.without, without))
+        if self.rig.lidar is not None:
+            out.__dict__["store"] = self.store
+        return out
+
+    def lacks(self, kind: Kind) -> set[tuple[str, str]]:
+        """Where and what of one kind is left out."""
+        return {(group.where, group.what) for group in self.without if group.kind == kind}
 
     @cached_property
     def store(self) -> BeamStore:

@@ -11,10 +11,13 @@ from calib.problem import start
 from calib.problem.model import Model
 from calib.problem.problem import Problem, SourceStops
 from calib.problem.unknowns import UNKNOWN_POSE, Role, Unknown, pose_unknown
+from calib.residuals.groups import JOINTS
 from chains import se3
 from chains.errors import InputError
 
 GUESSED_POSE = np.repeat([0.2, 0.3], 3)  # rad, m: a base_guess is set up by hand
+UNREAD = 1.0  # rad or m: a joint whose reading at a stop is left out
+EXACT = 1e-7  # rad or m: an encoder without error beside one that is left out
 
 
 @dataclass
@@ -72,9 +75,11 @@ class Places:
         """Stops that share every unknown stay together; those with joints of their own do not."""
         if self.part.source.rig.sigma_joint_rad and self.part.source.rig.joint_names:
             return [(int(k), np.array([k])) for k in stops]
-        scanned = self.part.source.recording.has_scan[stops]
-        alone = [(int(k), np.array([k])) for k in stops[scanned]]
-        together = stops[~scanned]
+        recording = self.part.source.recording
+        unread = {stop for stop, _ in self.part.source.lacks("joints")}
+        single = recording.has_scan[stops] | [recording.stops[k] in unread for k in stops]
+        alone = [(int(k), np.array([k])) for k in stops[single]]
+        together = stops[~single]
         return alone + ([(-1, together)] if len(together) else [])
 
     def _reference(self) -> str | None:
@@ -151,8 +156,8 @@ class Places:
         """The geometry of some stops that share a root."""
         source = self.part.source
         stops = self._all.some(index, root)
-        sigma = source.rig.sigma_joint_rad
-        if not sigma or not source.rig.joint_names:
+        sigma = self._joint_sigma(index)
+        if not sigma.any():
             return stops
         name = f"{self.part.prefix}joints@{source.recording.stops[index[0]]}"
         count = len(source.rig.joint_names)
@@ -162,10 +167,21 @@ class Places:
                 name,
                 "vector",
                 mean=np.zeros(count),
-                sigma=np.full(count, sigma),
+                sigma=np.where(sigma > 0, sigma, EXACT),
                 dofs=source.rig.joint_names,
                 units=units,
                 role=Role.JOINTS,
             )
         )
         return stops.with_joint_noise(name)
+
+    def _joint_sigma(self, index: np.ndarray) -> np.ndarray:
+        """How well the encoders (J,) are known at stops that share all unknowns; readings that are
+        left out are free."""
+        source = self.part.source
+        lacks = source.lacks("joints")
+        (stop, *others), names = [source.recording.stops[k] for k in index], source.rig.joint_names
+        if others or not lacks:
+            return np.full(len(names), source.rig.sigma_joint_rad)
+        free = [not lacks.isdisjoint({(stop, JOINTS), (stop, name)}) for name in names]
+        return np.where(free, UNREAD, source.rig.sigma_joint_rad)

@@ -51,6 +51,11 @@ class SourceStops:
     prefix: str
 
     @property
+    def label(self) -> str:
+        """Before the names of its groups of rows: empty where it is the only recording."""
+        return self.source.recording.folder.name if self.prefix else ""
+
+    @property
     def has_lidar(self) -> bool:
         """Whether any of those stops was scanned."""
         scanned = self.source.recording.has_scan[self.chosen]

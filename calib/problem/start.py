@@ -10,6 +10,7 @@ from calib.problem.model import Source
 from chains import se3
 from chains.align import align_points, mean_pose
 from chains.errors import InputError
+from sensors.stops import Targets
 
 
 def root_pose(source: Source, stops: Sequence[int]) -> np.ndarray | None:
@@ -49,10 +50,10 @@ def reference_from_targets(source: Source) -> np.ndarray | None:
     targets, spec = source.recording.targets, source.rig.target
     if targets is None or spec is None:
         return None
-    down = gravity(source)
-    sphere = targets.lower_m + spec.sphere_below_lower_marker_m * down
+    sphere = lower_markers(targets) + spec.sphere_below_lower_marker_m * gravity(source)
+    known = np.isfinite(targets.faro_m).all(axis=1)
     try:
-        return align_points(sphere, targets.faro_m)[0]
+        return align_points(sphere[known], targets.faro_m[known])[0]
     except InputError as error:
         raise InputError(
             f"{source.recording.folder / 'targets.csv'}: {error}, and hang targets around an area"
@@ -61,9 +62,21 @@ def reference_from_targets(source: Source) -> np.ndarray | None:
 
 def gravity(source: Source) -> np.ndarray:
     """Unit vector (3,) along which the rods hang, in the world frame."""
-    targets = source.recording.targets
-    down = np.mean(targets.lower_m - targets.upper_m, axis=0)
+    down = _rods(source.recording.targets).mean(axis=0)
     return down / np.linalg.norm(down)
+
+
+def lower_markers(targets: Targets) -> np.ndarray:
+    """Lower marker (M, 3) of each rod, world frame; one that was left out is where it hangs from
+    its upper marker on the other rods."""
+    hung = targets.upper_m + _rods(targets).mean(axis=0)
+    return np.where(np.isfinite(targets.lower_m), targets.lower_m, hung)
+
+
+def _rods(targets: Targets) -> np.ndarray:
+    """From upper to lower marker, of the rods that have both."""
+    rods = targets.lower_m - targets.upper_m
+    return rods[np.isfinite(rods).all(axis=1)]
 
 
 def guessed_pose(source: Source, stops: Sequence[int]) -> np.ndarray | None:

@@ -41,6 +41,7 @@ class Unknown:
         units: (dim,) "m" or "rad" or another unit, per tangent direction.
         role: what it stands for.
         owner: of SURFACE, the mesh: unknowns of one mesh bear the same number.
+        weight: robust weight of what was known before, 0 to 1.
     """
 
     name: str
@@ -51,10 +52,16 @@ class Unknown:
     units: tuple[str, ...]
     role: Role = Role.CALIBRATION
     owner: int = 0
+    weight: float = 1.0
 
     @property
     def dim(self) -> int:
         return len(self.sigma)
+
+    @property
+    def prior_sigma(self) -> np.ndarray:
+        """(dim,) of the rows that hold it to its mean: larger where these have less weight."""
+        return self.sigma / np.sqrt(self.weight)
 
     def moved(self, value: np.ndarray, step: np.ndarray) -> np.ndarray:
         """A vector or pose after a step (dim,) of its tangent: ``T exp(step)``, ``x + step``."""

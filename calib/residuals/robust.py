@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.special import chdtri
 
 TUKEY = 4.685  # 95 % efficiency on normal rows (Holland and Welsch 1977)
+# Chance that a group of good rows lies further out than where Huber's weights begin: of a recording
+# with a hundred groups, one in a hundred has any weight below 1.
+BEYOND = 1e-4
+BULK = 4  # groups, below which their median is no measure of their bulk: half could be wild
 
 
 def tukey_weight(z: np.ndarray, scale: float = 1.0) -> np.ndarray:
@@ -36,3 +41,23 @@ def tukey_cost(z: np.ndarray, scale: float = 1.0) -> float:
 def robust_scale(z: np.ndarray) -> float:
     """How many times wider than its sigma the bulk of the rows is; at least 1 (from the MAD)."""
     return max(1.0, 1.4826 * float(np.median(np.abs(z)))) if len(z) else 1.0
+
+
+def huber_weight(norm: np.ndarray, dof: np.ndarray) -> np.ndarray:
+    """Weight of each group of whitened rows under Huber's loss of its norm: ``min(1, k / norm)``.
+
+    A group's influence is bounded, and none is thrown away: where two groups contradict each other
+    and nothing else speaks, neither is taken to be right (Huber 1964). A group begins to lose
+    weight at a norm k that chance exceeds with a probability of 1e-4, times how much wider than
+    their sigmas the bulk of groups of its kind is.
+
+    Args:
+        norm: (G,) root of the sum of squares of each group's rows; groups of one kind.
+        dof: (G,) how many rows each has.
+    """
+    if not len(norm):
+        return np.ones(0)
+    bulk = (
+        max(1.0, float(np.median(norm / np.sqrt(chdtri(dof, 0.5))))) if len(norm) >= BULK else 1.0
+    )
+    return np.minimum(1.0, bulk * np.sqrt(chdtri(dof, BEYOND)) / np.maximum(norm, 1e-300))

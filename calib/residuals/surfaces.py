@@ -49,10 +49,12 @@ class MeshSurface:
     Args:
         reference: the mesh.
         footprint_rad: how far beside a beam a depth edge spoils it.
+        without: surfaces that are left out: a beam that meets one is not used.
     """
 
     reference: Reference
     footprint_rad: float
+    without: frozenset[int] = frozenset()
 
     @cached_property
     def patches_m(self) -> dict[str, float]:
@@ -92,6 +94,9 @@ class MeshSurface:
         """
         origins, directions = _in_reference(T, beams)
         triangle = self.reference.first_triangle(origins, directions)
+        if self.without:
+            gone = np.isin(self.reference.facts(triangle)[2], [*self.without])
+            triangle = np.where(gone, -1, triangle).astype(np.int32)
         if not near_edges:
             return Association(triangle)
         hits = self.reference.hits(triangle, origins, directions)

@@ -7,6 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.forward import Derivatives, Values
+from calib.residuals.groups import Group
+
+PARTS = ("lower", "upper", "sphere")  # of a target, three rows each
 
 
 @dataclass(frozen=True)
@@ -25,6 +28,8 @@ class HangingTarget:
         below_m: L, sphere centre below the lower marker.
         sigma_sphere_m, sigma_marker_m: per axis.
         shift: (3, P) per variable: where the sphere truly sits beyond that, world frame.
+        groups: (3,) the names of the rows of each of `PARTS`.
+        weight: (3,) of the rows of each, robust, and 0 for a part that was left out; 1 where None.
     """
 
     name: str
@@ -38,6 +43,8 @@ class HangingTarget:
     sigma_sphere_m: float
     sigma_marker_m: float
     shift: dict[str, np.ndarray]
+    groups: tuple[Group, ...] = ()
+    weight: np.ndarray | None = None
 
     kind = "target"
     rows = 9
@@ -61,7 +68,11 @@ class HangingTarget:
                 (self.faro_m - in_faro) / self.sigma_sphere_m,
             ]
         )
-        return residual, self._derivatives(g, rod, R_t, in_faro) if derivatives else None
+        root = 1.0 if self.weight is None else np.sqrt(np.repeat(self.weight, 3))
+        if not derivatives:
+            return root * residual, None
+        found = self._derivatives(g, rod, R_t, in_faro)
+        return root * residual, {n: d * np.c_[root] for n, d in found.items()}
 
     def _derivatives(
         self, g: np.ndarray, rod: np.ndarray, R_t: np.ndarray, in_faro: np.ndarray

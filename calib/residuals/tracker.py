@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.effects import Site
 from calib.forward import Derivatives, Stops, Values
+from calib.residuals.groups import Group
 from chains import se3
 
 
@@ -30,6 +30,8 @@ class TrackedBody:
         is_point: True when the tracker gives no orientation.
         bases: variable -> (K or 1, 6, P), what the tracker adds to the body's pose, per unit.
         stop_names: (K,) recording and number of each stop: rows of one err together.
+        groups: (K,) the names of those rows.
+        weight: (K,) robust weight of each stop's rows; 1 where None.
     """
 
     name: str
@@ -41,8 +43,9 @@ class TrackedBody:
     is_point: bool
     bases: dict[str, np.ndarray]
     stop_names: Sequence[tuple[Path, int]] = ()
+    groups: tuple[Group, ...] = ()
+    weight: np.ndarray | None = None
 
-    site = Site.TRACKER
     kind = "tracker"
 
     @property
@@ -67,10 +70,12 @@ class TrackedBody:
         rows, by_twist = _pose_error(seen, self.measured)
         weight = 1.0 / np.repeat([self.sigma_rad, self.sigma_m], 3)
         keep = slice(3, 6) if self.is_point else slice(0, 6)
+        if self.weight is not None:
+            weight = weight * np.sqrt(self.weight)[:, None]
         residual = (rows * weight)[:, keep].ravel()
         if not derivatives:
             return residual, None
-        by_twist = (by_twist * weight[:, None])[:, keep]
+        by_twist = (by_twist * weight[..., None])[:, keep]
         return residual, {n: (by_twist @ d).reshape(len(residual), -1) for n, d in d_seen.items()}
 
 
@@ -123,11 +128,13 @@ def _whole(blocks: Sequence[TrackedBody]) -> TrackedBody:
         )
         for n, x in first.bases.items()
     }
+    weights = [np.ones(len(b.measured)) if b.weight is None else b.weight for b in blocks]
     return replace(
         first,
         stops=Stops.together([b.stops for b in blocks]),
         measured=np.concatenate([b.measured for b in blocks]),
         bases=bases,
+        weight=None if all(b.weight is None for b in blocks) else np.concatenate(weights),
     )
 
 

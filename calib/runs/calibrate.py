@@ -15,6 +15,7 @@ from calib import problem as problems
 from calib.effects import Effect, load_effects
 from calib.problem import Problem
 from calib.problem.model import Model, Source
+from calib.problem.without import leave_out
 from calib.residuals.tracker import TrackedBody
 from calib.runs.reopen import model_of, reopened, start_of, stored_met
 from calib.runs.residual_table import residual_table, table_path
@@ -68,7 +69,7 @@ def calibrate(
     """
     with _folder(out) as folder:
         _refuse_twice([Path(r).resolve() for r in recordings])
-        sources = [Source.open(r) for r in recordings]
+        sources = leave_out([Source.open(r) for r in recordings], model.without)
         _fit(sources, model, folder, _Choices(hold_out, folds, prior), progress)
     return Run.open(out)
 
@@ -93,7 +94,8 @@ def grow(
     if Path(out).resolve() == run.folder.resolve():
         raise InputError(f"{out}: a run cannot replace the one that it grows from; give another -o")
     with _folder(out) as folder:
-        sources = reopened(run)
+        more = [token for token in model.without if token not in run.model.get("without", ())]
+        sources = leave_out(reopened(run), more)
         start = start_of(run, sources)
         _refuse_idle(model, run, sources)
         told = {key: run.model.get(key) for key in ("hold_out", "folds", "prior")}

@@ -9,6 +9,7 @@ from calib.diagnosis.weak import weak_directions
 from calib.problem import build
 from calib.runs.reopen import model_of, reopened, start_of
 from calib.runs.run import DIAGNOSIS, Run
+from calib.solve.errors import Errors
 from calib.solve.fit import Progress, resume
 from calib.solve.holdout import held_out
 from sensors.documents import write_json
@@ -36,18 +37,13 @@ def diagnose(
         found = search(stand, progress)
         falls = {}
         before = run.summary["rms_mm"]["held_out"]
-        for step in found.found if refits and run.model["hold_out"] != "none" else ():
-            fitted = step.after.stand
-            unseen = held_out(
-                fitted.sources,
-                fitted.model,
-                run.model["hold_out"],
-                run.model["folds"],
-                progress,
-                fitted.estimate.start,
-            )
-            falls[step.effect.name] = (before, unseen.rms_mm, unseen.floor_mm)
-            before = unseen.rms_mm
+        if refits and run.model["hold_out"] != "none":
+            if found.blunders and found.found:
+                before = _unseen(found.looks[0].stand, run, progress).rms_mm
+            for step in found.found:
+                unseen = _unseen(step.after.stand, run, progress)
+                falls[step.effect.name] = (before, unseen.rms_mm, unseen.floor_mm)
+                before = unseen.rms_mm
     result = conclude(
         found,
         falls,
@@ -56,6 +52,12 @@ def diagnose(
     )
     write_json(run.folder / DIAGNOSIS, result.document())
     return result
+
+
+def _unseen(stand: Stand, run: Run, progress: Progress) -> Errors:
+    """Residuals of stops that a model was not fitted to, left out as the run left them out."""
+    by, count = run.model["hold_out"], run.model["folds"]
+    return held_out(stand.sources, stand.model, by, count, progress, stand.estimate.start)
 
 
 def stand_of(run: Run, progress: Progress) -> Stand:

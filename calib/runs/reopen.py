@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from calib.problem.model import Model, Source
+from calib.problem.without import leave_out
 from calib.runs.run import MODEL, Run
 from calib.solve.estimate import Start
 from chains.errors import InputError
@@ -23,12 +24,13 @@ def model_of(run: Run) -> Model:
 
 
 def reopened(run: Run) -> list[Source]:
-    """A run's recordings, as they were when the run was fitted to them.
+    """A run's recordings, as they were when the run was fitted to them, without what it left out.
 
     Raises:
         InputError: one is gone, or has changed.
     """
-    return [_reopened(recording, run) for recording in run.model["recordings"]]
+    found = [_reopened(recording, run) for recording in run.model["recordings"]]
+    return leave_out(found, run.model.get("without", ()))
 
 
 def start_of(run: Run, sources: Sequence[Source]) -> Start:

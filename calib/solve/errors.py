@@ -12,6 +12,7 @@ from calib.residuals.beams import Association, Rows
 from calib.residuals.scan import ScanStop
 from calib.residuals.tracker import TrackedBody
 from calib.solve.estimate import Estimate
+from calib.solve.reweight import unweighted
 from chains import se3
 
 
@@ -133,7 +134,8 @@ def misfit(estimate: Estimate, beams: Errors) -> dict[str, float]:
     for kind in ("tracker", "target"):
         blocks = [b for b in estimate.problem.blocks if b.kind == kind]
         if blocks:
-            chi2 = sum(float(np.sum(np.square(b.evaluate(values, False)[0]))) for b in blocks)
+            rows = (unweighted(b).evaluate(values, False)[0] for b in blocks)
+            chi2 = sum(float(r @ r) for r in rows)
             seen = [unknowns[n] for n in {n: None for b in blocks for n in b.variables}]
             # Beams, where there are any, hold where the rig stands.
             own = {Role.TARGET} if kind == "tracker" and beams.count else {Role.TARGET, Role.PLACE}

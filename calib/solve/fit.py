@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from calib.problem.surfaces import with_surfaces
 from calib.residuals.beams import Association
 from calib.solve.estimate import SEEN, Estimate, Start, cost_of, started, values_of
 from calib.solve.graph import Graph, KeptRows
+from calib.solve.reweight import reweighted
 from chains import se3
 from chains.errors import InputError
 
@@ -23,6 +25,7 @@ MAX_PASSES = 40
 SETTLED = 1e-4  # m and rad: after that, which triangle a beam meets is kept
 CONVERGED = 1e-6  # m and rad: a tenth of the smallest sigmas, and the next step is smaller still
 STRAYED = 3e-3  # m and rad: a scan that has moved further looks anew what its beams meet
+REWEIGHTED = 10  # how often weights are taken anew; they halve their distance each time or better
 LOOKS = 3  # how often, in a fit that starts from an earlier one
 # By how much a further step would lower half the chi-square: 1e-3 is a step of 0.04 sigma.
 AT_OPTIMUM = 1e-3
@@ -58,19 +61,21 @@ def solve(
         raise InputError("nothing is left to estimate: fix fewer names, or choose an effect")
     loop = _Loop(problem, prior, progress, start)
     if loop.start.state and problem.scans:
-        return loop.estimate(loop.run_on(tolerance))
-    converged = loop.solve_without_scans()
+        converged = loop.run_on(tolerance)
+        return loop.estimate(loop.reweigh(converged, tolerance))
+    converged = loop.reweigh(loop.solve_without_scans())
     if not problem.scans:
         return loop.estimate(converged)
     loop.run(SETTLED, associate=True)
     loop.fix_association()
-    return loop.estimate(loop.run(tolerance, associate=False))
+    converged = loop.run(tolerance, associate=False)
+    return loop.estimate(loop.reweigh(converged, tolerance))
 
 
 def preview(problem: Problem, progress: Progress = lambda what, done, total: None) -> Estimate:
     """What a fit would know, from one linearisation at the start: its covariance, near enough."""
     loop = _Loop(problem, None, progress)
-    loop.solve_without_scans()
+    loop.reweigh(loop.solve_without_scans())
     if problem.scans:
         loop.fix_association()
     return loop.estimate(converged=False)
@@ -94,6 +99,7 @@ def resume(
     loop = _Loop(problem, None, progress, start)
     if problem.scans:
         loop.fix_association(loop.seen_before())
+    loop.take_weights()
     variables = tuple(problem.variables[name] for name in problem.calibration)
     return Estimate(
         problem=loop.problem,
@@ -161,6 +167,31 @@ class _Loop:
         blocks = [*self.problem.blocks, *self.prior]
         graph = Graph(list(self.problem.variables.values()), blocks, self.held)
         return graph.solve(values_of(self.problem, self.start.state))[0]
+
+    def reweigh(self, converged: bool, tolerance: float | None = None) -> bool:
+        """Go on with robust weights until these settle, where any group of rows asks for one.
+
+        Args:
+            converged: whether the fit has, with the weights that it had.
+            tolerance: as of `run`; of trackers and targets alone where None.
+        """
+        for _ in range(REWEIGHTED):
+            if not self.take_weights():
+                break
+            scans = tolerance is not None
+            converged = self.run(tolerance, False) if scans else self.solve_without_scans()
+        return converged
+
+    def take_weights(self) -> bool:
+        """Give every group of rows the weight that its residuals ask for; whether any changed."""
+        given = reweighted(self.given, self.values, self.held)
+        if given is self.given:
+            return False
+        self.given = given
+        variables = self.problem.variables | given.variables
+        self.problem = replace(self.problem, blocks=given.blocks, variables=variables)
+        self.layout = self._layout()
+        return True
 
     def run(self, tolerance: float, associate: bool) -> bool:
         """Passes until the step is below tolerance; whether that was reached."""

@@ -91,8 +91,8 @@ class Dense:
         J = np.eye(unknown.dim)
         if unknown.kind != "vector":
             J = rigs.differences(residual, self.values, name, unknown.kind)
-        b = -residual(self.values) / unknown.sigma
-        self._add(b, {name: J / unknown.sigma[:, None]}, f"prior:{name}")
+        b = -residual(self.values) / unknown.prior_sigma
+        self._add(b, {name: J / unknown.prior_sigma[:, None]}, f"prior:{name}")
 
     def _beams(self, number: int) -> None:
         """The rows of a stop, and which stop, mesh and surface (or plane) each errs with."""

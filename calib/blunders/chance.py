@@ -1,0 +1,20 @@
+"""How unlikely something is by chance."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import special
+
+
+def log_tail(x: float, q: float) -> float:
+    """Log of the upper tail of chi-square with q degrees of freedom, however far out."""
+    tail = special.chdtrc(q, x)
+    if tail > 0.0:
+        return float(np.log(tail))
+    half = x / 2
+    return float((q / 2 - 1) * np.log(half) - half - special.gammaln(q / 2))
+
+
+def after_looks(p: float, looks: float) -> float:
+    """Chance that the smallest of so many independent p-values is as small (Sidak 1967)."""
+    return float(-np.expm1(looks * np.log1p(-min(p, 1 - 1e-15))))

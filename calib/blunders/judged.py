@@ -1,0 +1,130 @@
+"""Which groups of rows chance does not put so far out: blunders, named, sized, told apart.
+
+How far out a group lies is measured against others of its kind: a tracker five times worse than its
+sigma makes all bodies stick out, and none a blunder.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import special
+
+from calib.blunders.chance import after_looks, log_tail
+from calib.blunders.shifts import Shift, shifts
+from calib.linear.system import Linearisation
+from calib.problem.problem import Problem
+from calib.residuals.groups import JOINTS, Group
+
+ALPHA = 0.01  # chance that any group is called a blunder where none is
+POWER = 0.8  # with which a blunder of the smallest detectable size is found
+# How much the median of squares tells of their scale, against their mean, for Gaussian rows.
+MEDIAN = 0.37
+BULK = 4  # groups of a kind, below which these are taken at their sigmas
+KNOWN = 1e6  # degrees of freedom of a scale that is taken as known
+# Of groups that nothing tells apart, that which goes wrong most often is named first: bodies are
+# touched, knocked and occluded, scans mixed up; all joints of an arm are seldom wrong at once.
+LIKELY = ("body", "scan", "target", "frame", "surface", "joints", "rings")
+ALONG = 0.95  # of an offset's length, along one axis, to be said to lie along it
+
+
+@dataclass(frozen=True)
+class Blunder:
+    """A group of rows, and whether chance puts it so far out.
+
+    Args:
+        shift: by how much.
+        p_value: how often chance alone does, given how far out others of its kind are.
+        p_adjusted: the same, all groups looked at being paid for.
+        evidence: minus the log of the p-value of independent rows, at the scale of its kind.
+        detectable: unit -> size that is found with 80 % power.
+        looks: how many groups were looked at.
+    """
+
+    shift: Shift
+    p_value: float
+    p_adjusted: float
+    evidence: float
+    detectable: Mapping[str, float]
+    looks: int
+
+    @property
+    def group(self) -> Group:
+        return self.shift.group
+
+    @property
+    def found(self) -> bool:
+        """Whether it is to be named."""
+        return self.p_adjusted < ALPHA
+
+    def leading(self) -> tuple[float, float, str, str]:
+        """Size, its sigma, the unit, and along which axis; empty where it is along no single one.
+        Of shifts in several units, that which is more sigmas."""
+        shift, best = self.shift, (0.0, 0.0, np.inf, "m", "")
+        for unit in dict.fromkeys(shift.units):
+            at = np.flatnonzero(np.array(shift.units) == unit)
+            offset, covariance = shift.offset[at], shift.covariance[np.ix_(at, at)]
+            size = float(np.linalg.norm(offset))
+            if not size:
+                continue
+            sigma = float(np.sqrt(offset @ covariance @ offset)) / size
+            k = int(np.argmax(np.abs(offset)))
+            axis = shift.axes[at[k]] if abs(offset[k]) > ALONG * size else ""
+            best = max(best, (size / max(sigma, 1e-300), size, sigma, unit, axis))
+        return best[1:]
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """A blunder, and what else could be wrong in its place.
+
+    Args:
+        blunder: as it stood out when it was left out.
+        rivals: groups that explain as much, and nothing once it is left out.
+    """
+
+    blunder: Blunder
+    rivals: Sequence[Blunder]
+
+
+def judge(whole: Linearisation, problem: Problem) -> list[Blunder]:
+    """All groups of rows, those that chance explains least first; arguments as of `shifts`."""
+    kinds: dict[object, list[Shift]] = {}
+    for shift in shifts(whole, problem):
+        if shift.dof:
+            kinds.setdefault(_alike(shift.group), []).append(shift)
+    looks = sum(len(some) for some in kinds.values())
+    found = [b for some in kinds.values() for b in _judged(some, looks)]
+    return sorted(found, key=lambda b: (-round(b.evidence, 3), LIKELY.index(b.group.kind)))
+
+
+def _alike(group: Group) -> tuple[str, str]:
+    """Groups that are as likely as each other to be somewhat off."""
+    if group.kind == "body":
+        return group.kind, group.what
+    return group.kind, JOINTS if group.what == JOINTS else ""
+
+
+def _judged(some: Sequence[Shift], looks: int) -> Iterator[Blunder]:
+    """Groups of one kind: in units of how far out their bulk is."""
+    dof = np.array([shift.dof for shift in some])
+    ratio = np.array([shift.statistic for shift in some]) / special.chdtri(dof, 0.5)
+    bulk = max(1.0, float(np.median(ratio))) if len(some) >= BULK else 1.0
+    for shift in some:
+        known = MEDIAN * (dof.sum() - shift.dof) if len(some) >= BULK else KNOWN
+        scaled = shift.statistic / bulk
+        p = float(special.fdtrc(shift.dof, known, scaled / shift.dof))
+        limit = special.fdtri(shift.dof, known, (1.0 - ALPHA) ** (1.0 / looks))
+        enough = special.ncfdtrinc(shift.dof, known, 1.0 - POWER, limit)
+        units, told = np.array(shift.units), np.diag(shift.information)
+        told = {unit: told[units == unit].mean() for unit in dict.fromkeys(shift.units)}
+        yield Blunder(
+            shift=shift,
+            p_value=p,
+            p_adjusted=after_looks(p, looks),
+            evidence=-log_tail(scaled, shift.dof),
+            detectable={u: float(np.sqrt(enough * bulk / t)) for u, t in told.items() if t > 0},
+            looks=looks,
+        )

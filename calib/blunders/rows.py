@@ -1,0 +1,213 @@
+"""The groups of rows that a mishap could spoil, each with its rows at the solution of a fit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.effects import Effect, FrameOffset
+from calib.linear.layout import Layout
+from calib.linear.system import Linearisation
+from calib.problem.problem import Block, Problem
+from calib.problem.unknowns import Role, Unknown
+from calib.problem.without import ROD, of_the_arm
+from calib.residuals.groups import CAD, JOINTS, MESH, SCAN, Group
+from calib.residuals.targets import HangingTarget
+from calib.residuals.tracker import BodiesTogether, TrackedBody
+
+POSE = ("about x", "about y", "about z", "x", "y", "z")
+# Block (none for a prior), whitened derivative by each unknown, and right side: see `Graph`.
+GraphRows = Sequence[tuple[Block | None, Mapping[str, np.ndarray], np.ndarray]]
+
+
+@dataclass(frozen=True)
+class GroupRows:
+    """Rows, and the groups that some of them make.
+
+    Args:
+        A: (m, n) whitened derivatives, columns: (n,) by which unknowns; of a scan its products
+            with them.
+        b: (m,) minus the residuals; of a scan the score of a twist that it alone has.
+        weight: (m,) robust.
+        sigma: (m,) of each row.
+        axes, units: (m,) of each row.
+        groups: group -> which rows.
+        turn: (m, m) from the rows' axes to those in which an offset is told.
+        information: (m, m) of that twist; None of what is no scan.
+    """
+
+    A: np.ndarray
+    columns: np.ndarray
+    b: np.ndarray
+    weight: np.ndarray
+    sigma: np.ndarray
+    axes: Sequence[str]
+    units: Sequence[str]
+    groups: Mapping[Group, np.ndarray]
+    turn: np.ndarray | None = None
+    information: np.ndarray | None = None
+
+    @property
+    def at(self) -> tuple[str, str]:
+        """Recording, and stop or target: groups of one place may contradict each other alone."""
+        group = next(iter(self.groups))
+        return group.recording, group.where
+
+
+def group_rows(
+    whole: Linearisation, problem: Problem, graph_rows: GraphRows
+) -> Iterator[GroupRows]:
+    """All of them.
+
+    Args:
+        whole: the linearisation there, with its scans.
+        problem: that was fitted.
+        graph_rows: those of the linearisation's kept unknowns that are not in it.
+    """
+    yield from _bodies(whole)
+    yield from _targets(whole, graph_rows)
+    yield from _paper(whole, problem)
+    yield from _scans(whole, problem)
+
+
+def _bodies(whole: Linearisation) -> Iterator[GroupRows]:
+    """Every body at every stop where it was seen; offsets in the tracker's axes."""
+    layout = whole.layout
+    blocks = [b for together in layout.bodies for b in together.blocks]
+    blocks += [b for b in layout.others if isinstance(b, TrackedBody)]
+    plain = [replace(b, weight=None) for b in blocks]
+    weight = {id(p): b.weight for p, b in zip(plain, blocks, strict=True)}
+    for together in BodiesTogether.of(plain):
+        for block, (residual, d) in zip(
+            together.blocks, together.evaluate(whole.values), strict=True
+        ):
+            per = len(residual) // len(block.measured)
+            A, columns = np.hstack(list(d.values())), layout.columns(list(d))
+            weights = weight[id(block)]
+            weights = np.ones(len(block.measured)) if weights is None else weights
+            for k, group in enumerate(block.groups):
+                here = slice(per * k, per * (k + 1))
+                turn = np.eye(6)
+                turn[3:, 3:] = block.measured[k, :3, :3]
+                yield GroupRows(
+                    A=A[here],
+                    columns=columns,
+                    b=-residual[here],
+                    weight=np.full(per, weights[k]),
+                    sigma=np.repeat([block.sigma_rad, block.sigma_m], 3)[-per:],
+                    axes=POSE[-per:],
+                    units=("rad",) * (per - 3) + ("m",) * 3,
+                    groups={group: np.arange(per)},
+                    turn=turn[-per:, -per:],
+                )
+
+
+def _targets(whole: Linearisation, graph_rows: GraphRows) -> Iterator[GroupRows]:
+    """Parts of targets, and whole rods."""
+    for block, by, b in graph_rows:
+        if not isinstance(block, HangingTarget):
+            continue
+        weight = np.repeat(np.ones(3) if block.weight is None else block.weight, 3)
+        root = np.sqrt(np.where(weight > 0, weight, 1.0))
+        parts = {g: 3 * i + np.arange(3) for i, g in enumerate(block.groups) if weight[3 * i] > 0}
+        rod = {replace(block.groups[0], what=ROD): np.concatenate(list(parts.values()))}
+        yield GroupRows(
+            A=np.hstack(list(by.values())) / root[:, None],
+            columns=whole.layout.columns(list(by)),
+            b=b / root,
+            weight=np.square(root),
+            sigma=np.repeat([block.sigma_marker_m, block.sigma_marker_m, block.sigma_sphere_m], 3),
+            axes=("x", "y", "z") * 3,
+            units=("m",) * 9,
+            groups=parts | rod if len(parts) > 1 else parts,
+        )
+
+
+def _paper(whole: Linearisation, problem: Problem) -> Iterator[GroupRows]:
+    """What is known beforehand: joint readings at a stop, frames, the URDF, the mesh's surfaces."""
+    layout, geometry = whole.layout, _geometry(problem)
+    stops = _stop_names(layout, problem)
+    for name, unknown in layout.unknowns.items():
+        if name in layout.unbounded or unknown.kind != "vector":
+            continue
+        groups: dict[Group, np.ndarray] = {}
+        if unknown.role is Role.JOINTS:
+            (stop,) = layout.touched[name]
+            groups = _joints(unknown, *stops[stop])
+        elif unknown.role is Role.SURFACE and problem.cells[name].column == "surface":
+            parts = problem.cells[name].parts.tolist()
+            groups = {Group("surface", MESH, f"surface_{p}"): _at(i) for i, p in enumerate(parts)}
+        elif name in geometry:
+            groups = _geometric(unknown, geometry[name])
+        if groups:
+            yield GroupRows(
+                A=np.diag(1.0 / unknown.sigma),
+                columns=layout.columns([name]),
+                b=(unknown.mean - whole.values[name]) / unknown.sigma,
+                weight=np.full(unknown.dim, unknown.weight),
+                sigma=-unknown.sigma,  # a prior's row is what is estimated less what was said
+                axes=unknown.dofs,
+                units=unknown.units,
+                groups=groups,
+            )
+
+
+def _joints(unknown: Unknown, where: str, recording: str) -> dict[Group, np.ndarray]:
+    """All joints of a stop, and each."""
+    single = [Group("joints", where, dof, recording) for dof in unknown.dofs]
+    groups = {Group("joints", where, JOINTS, recording): np.arange(unknown.dim)}
+    return groups | {g: _at(i) for i, g in enumerate(single) if unknown.dim > 1}
+
+
+def _geometric(unknown: Unknown, effect: Effect) -> dict[Group, np.ndarray]:
+    """A frame as a whole; a length or a joint's zero, each."""
+    if isinstance(effect, FrameOffset):
+        return {Group("frame", CAD, effect.name): np.arange(unknown.dim)}
+    dofs = enumerate(unknown.dofs)
+    return {Group("frame", CAD, f"{effect.name}.{dof}"): _at(i) for i, dof in dofs}
+
+
+def _at(i: int) -> np.ndarray:
+    return np.array([i])
+
+
+def _geometry(problem: Problem) -> dict[str, Effect]:
+    """Unknown -> its effect, of frames and of what the URDF says of the arm."""
+    known = {effect.name for effect in of_the_arm()}
+    return {
+        term.variable: term.effect
+        for terms in problem.terms
+        for term in terms
+        if isinstance(term.effect, FrameOffset) or term.effect.name in known
+    }
+
+
+def _scans(whole: Linearisation, problem: Problem) -> Iterator[GroupRows]:
+    """Every scan, through the place of its LiDAR."""
+    names = _stop_names(whole.layout, problem)
+    for stop, sums in whole.scans.items():
+        where, recording = names[stop]
+        yield GroupRows(
+            A=sums.cross,
+            columns=sums.columns,
+            b=sums.score,
+            weight=np.ones(6),
+            sigma=np.ones(6),
+            axes=POSE,
+            units=("rad",) * 3 + ("m",) * 3,
+            groups={Group("scan", where, SCAN, recording): np.arange(6)},
+            information=sums.information,
+        )
+
+
+def _stop_names(layout: Layout, problem: Problem) -> dict[int, tuple[str, str]]:
+    """Name of each stop, and of its recording where there are several."""
+    several = len(problem.sources) > 1
+    return {
+        layout.stops[s.recording.folder, k]: (stop, s.recording.folder.name if several else "")
+        for s in problem.sources
+        for k, stop in enumerate(s.recording.stops)
+        if (s.recording.folder, k) in layout.stops
+    }

@@ -1,0 +1,205 @@
+"""By how much each group of rows is off what all other rows say of it.
+
+Each group (a body at a stop, the joints there, a scan, a part of a target, a value on paper) is
+held against the estimate that leaves it out. With whitened rows ``b = A d`` of a group and the
+covariance C of all unknowns as fitted, ``H = A C A^T``, and
+
+    e = (I - H)^-1 b        its residual under the fit without it
+    V = (I - H)^-1          the covariance of e
+    T = e^T V^-1 e = b^T (I - H)^-1 b
+
+(Baarda 1968, A testing procedure for use in geodetic networks). Directions in which I - H is 0 are
+held by the group alone: nothing contradicts it there. A scan is held against all others through a
+twist of its LiDAR at that stop, which is the score test of the six columns of a mean shift. Robust
+weights of other stops stay as they are, so that one wild row does not hide the next.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+
+from calib.blunders.rows import GraphRows, GroupRows, group_rows
+from calib.linear.layout import positions
+from calib.linear.system import Linearisation
+from calib.problem.problem import Problem
+from calib.residuals.groups import Group
+from calib.solve.graph import Graph
+
+# Of I - w H: below this a direction is held by the group alone (rounding of C is some 1e-9 of it).
+UNCHECKED = 1e-6
+TOGETHER = 400  # rows whose covariance is computed at once: bounds the memory
+
+
+@dataclass(frozen=True)
+class Shift:
+    """A group of rows against all others.
+
+    Args:
+        group: which.
+        statistic: T, in squared sigmas.
+        dof: in how many directions anything contradicts it.
+        offset: (q,) by how much it is off what all others say: as measured, less as predicted.
+        covariance: (q, q) of the offset.
+        information: (q, q) of an offset, all else being estimated.
+        axes: (q,) names of the directions.
+        units: (q,) "m" or "rad" each.
+    """
+
+    group: Group
+    statistic: float
+    dof: int
+    offset: np.ndarray
+    covariance: np.ndarray
+    information: np.ndarray
+    axes: Sequence[str]
+    units: Sequence[str]
+
+
+def shifts(whole: Linearisation, problem: Problem) -> Iterator[Shift]:
+    """Every group of rows against all others.
+
+    Args:
+        whole: all rows at the solution of a fit, with its scans.
+        problem: of that fit; candidates beside it change nothing.
+    """
+    layout = whole.layout
+    graph = Graph(list(layout.outer().values()), layout.others, layout.unbounded)
+    graph_rows = list(graph.linear_rows(whole.values))
+    kept = _kept_covariance(whole, graph_rows)
+    step = _step(whole, graph_rows, kept)
+    sets: dict[tuple[str, str], list[GroupRows]] = {}
+    for rows in group_rows(whole, problem, graph_rows):
+        sets.setdefault(rows.at, []).append(rows)
+    for some in _batches(list(sets.values())):
+        yield from _against(whole, kept, step, some)
+
+
+def _batches(sets: Sequence[Sequence[GroupRows]]) -> Iterator[list[Sequence[GroupRows]]]:
+    """Sets of groups, no more at once than memory should hold."""
+    batch, count = [], 0
+    for some in sets:
+        batch.append(some)
+        count += sum(len(rows.A) for rows in some)
+        if count > TOGETHER:
+            yield batch
+            batch, count = [], 0
+    if batch:
+        yield batch
+
+
+def _against(
+    whole: Linearisation, kept: np.ndarray, step: np.ndarray, sets: Sequence[Sequence[GroupRows]]
+) -> Iterator[Shift]:
+    """Groups against all other rows, after one more step (U,) of all unknowns."""
+    ends = np.cumsum([0, *(len(rows.A) for some in sets for rows in some)])
+    every = [rows for some in sets for rows in some]
+    A = np.zeros((ends[-1], whole.layout.size))
+    for rows, start in zip(every, ends, strict=False):
+        np.add.at(A[start : start + len(rows.A)].T, rows.columns, rows.A.T)
+    H, b = whole.covariance(A, kept), np.concatenate([rows.b for rows in every]) - A @ step
+    first = 0
+    for some in sets:
+        mine = slice(first, first + sum(len(rows.A) for rows in some))
+        first = mine.stop
+        yield from _of_set(some, *_at_their_sigmas(some, H[mine, mine], b[mine]))
+
+
+def _at_their_sigmas(
+    some: Sequence[GroupRows], H: np.ndarray, b: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """H and b had these rows not lost any weight: only so is the one that did judged as the others
+    that it contradicts. Rows g that get the weight 1 - w back change what is known by
+    ``C' = C - C A_g^T (1 / (1 - w) + A_g C A_g^T)^-1 A_g C``."""
+    back = np.concatenate([1.0 - rows.weight for rows in some])
+    g = np.flatnonzero(back > 0)
+    if not len(g):
+        return H, b
+    gain = np.linalg.solve(np.diag(1.0 / back[g]) + H[np.ix_(g, g)], H[g])
+    H = H - H[:, g] @ gain
+    return H, b - H[:, g] @ (back[g] * b[g])
+
+
+def _of_set(some: Sequence[GroupRows], H: np.ndarray, b: np.ndarray) -> Iterator[Shift]:
+    first = 0
+    for rows in some:
+        here = slice(first, first + len(rows.A))
+        first = here.stop
+        for group, at in rows.groups.items():
+            if rows.information is not None:
+                yield _of_scan(group, rows, b[here], H[here, here])
+            else:
+                yield _of_rows(group, rows, at, b[here][at], H[here, here][np.ix_(at, at)])
+
+
+def _of_scan(group: Group, rows: GroupRows, score: np.ndarray, explained: np.ndarray) -> Shift:
+    """The score test of a twist that the stop's beams alone have."""
+    left = rows.information - explained
+    size = np.sqrt(np.maximum(np.diag(rows.information), 1e-300))
+    values, axes = np.linalg.eigh(left / np.outer(size, size))
+    seen = values > UNCHECKED
+    whiten = axes[:, seen] / np.sqrt(values[seen]) / size[:, None]
+    score = whiten.T @ score
+    return Shift(
+        group=group,
+        statistic=float(score @ score),
+        dof=int(seen.sum()),
+        offset=whiten @ score,
+        covariance=whiten @ whiten.T,
+        information=left if seen.all() else np.zeros_like(left),
+        axes=rows.axes,
+        units=rows.units,
+    )
+
+
+def _of_rows(group: Group, rows: GroupRows, at: np.ndarray, b: np.ndarray, H: np.ndarray) -> Shift:
+    """The residual of a group under the fit without it; see the module."""
+    values, axes = np.linalg.eigh(np.eye(len(at)) - H)
+    seen = values > UNCHECKED
+    basis = axes[:, seen]
+    along = (basis.T @ b) / values[seen]
+    turn = basis if rows.turn is None else rows.turn[np.ix_(at, at)] @ basis
+    out = rows.sigma[at][:, None] * turn
+    told = turn / rows.sigma[at][:, None]
+    return Shift(
+        group=group,
+        statistic=float(along @ (values[seen] * along)),
+        dof=int(seen.sum()),
+        offset=-out @ along,
+        covariance=(out / values[seen]) @ out.T,
+        information=(told * values[seen]) @ told.T,
+        axes=[rows.axes[i] for i in at],
+        units=[rows.units[i] for i in at],
+    )
+
+
+def _kept_covariance(whole: Linearisation, graph_rows: GraphRows) -> np.ndarray:
+    """Covariance (S, S) of what was kept, with every prior at its word; 0 for candidates."""
+    layout = whole.layout
+    information, at = whole.kept[:-1, :-1].copy(), positions(layout.size, layout.kept)
+    for _, by, _ in graph_rows:
+        columns = layout.columns(list(by))
+        rows = np.hstack(list(by.values())) * layout.sigma[columns]
+        information[np.ix_(at[columns], at[columns])] += rows.T @ rows
+    candidates = at[layout.columns(sorted(layout.unbounded))]
+    model = np.setdiff1d(np.arange(len(information)), candidates)
+    out = np.zeros_like(information)
+    block = cho_factor(information[np.ix_(model, model)])
+    out[np.ix_(model, model)] = cho_solve(block, np.eye(len(model)))
+    return out * np.outer(layout.sigma[layout.kept], layout.sigma[layout.kept])
+
+
+def _step(whole: Linearisation, graph_rows: GraphRows, kept: np.ndarray) -> np.ndarray:
+    """The step (U,) to the optimum of all rows as they were linearised and weighted: next to
+    nothing where the fit had converged."""
+    layout = whole.layout
+    at, right = positions(layout.size, layout.kept), whole.kept[:-1, -1].copy()
+    for _, by, b in graph_rows:
+        columns = layout.columns(list(by))
+        right[at[columns]] += (np.hstack(list(by.values())) * layout.sigma[columns]).T @ b
+    unit = layout.sigma[layout.kept]
+    scaled = (kept @ (right / unit)) / unit
+    return whole.directions(np.append(scaled, -1.0)[:, None])[:, 0] * layout.sigma

@@ -1,0 +1,97 @@
+"""Blunders in numbers for scripts and in sentences for people."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from calib.blunders.judged import LeftOut
+from calib.rig import Rig
+
+SHOWN = {"m": ("mm", 1e3), "rad": ("mrad", 1e3)}
+LARGE = 1000.0  # mm or mrad, from which on metres and radians are read more easily
+SIGN = 0.05  # of twice a value on paper, within which it is off as a wrong sign would have it
+
+
+def document(left: LeftOut, rig: Rig) -> dict[str, Any]:
+    """A blunder as diagnosis.json has it.
+
+    Args:
+        left: it, and what else could be wrong in its place.
+        rig: on paper.
+    """
+    blunder, group, shift = left.blunder, left.blunder.group, left.blunder.shift
+    size, sigma, unit, axis = blunder.leading()
+    return {
+        "kind": group.kind,
+        "name": group.what,
+        "where": group.where,
+        "stop": group.stop,
+        "recording": group.recording or None,
+        "size": size,
+        "unit": unit,
+        "sigma": sigma,
+        "axis": axis or None,
+        "wrong_sign": _wrong_sign(left, rig),
+        "offset": {
+            "names": list(shift.axes),
+            "units": list(shift.units),
+            "estimate": shift.offset,
+            "sigma": np.sqrt(np.maximum(np.diag(shift.covariance), 0.0)),
+        },
+        "p_value": blunder.p_value,
+        "p_adjusted": blunder.p_adjusted,
+        "detectable": dict(blunder.detectable),
+        "indistinguishable_from": [other.group.token for other in left.rivals],
+        "without": group.token,
+        "sentence": _sentence(left, _wrong_sign(left, rig)),
+    }
+
+
+def leaving_out(recordings: list[str], blunders: list[Mapping[str, Any]]) -> str:
+    """The command that fits without some blunders, ready to be typed."""
+    import shlex
+
+    without = " ".join(f"--without {shlex.quote(each['without'])}" for each in blunders)
+    return f"rigcal fit {shlex.join(recordings)} -o RUN {without}"
+
+
+def _sentence(left: LeftOut, wrong_sign: str | None) -> str:
+    size, sigma, unit, axis = left.blunder.leading()
+    along = f" {axis}" if axis.startswith("about") else f" in {axis}" if axis else ""
+    along = "" if axis == left.blunder.group.what.rpartition(".")[2] else along
+    sign = f", as if the sign of its {wrong_sign} were wrong" if wrong_sign else ""
+    out = f"{left.blunder.group} is {_off(size, sigma, unit)} off{along}, against everything else"
+    if left.rivals:
+        others = ", or ".join(str(other.group) for other in left.rivals)
+        return f"{out}{sign}; or it is {others}: nothing measured here tells them apart."
+    return f"{out}{sign}."
+
+
+def _off(size: float, sigma: float, unit: str) -> str:
+    name, scale = SHOWN.get(unit, (unit, 1.0))
+    if scale * size >= LARGE:
+        return f"{size:.3g} {unit}"
+    return f"{scale * size:.3g} ± {scale * sigma:.2g} {name}"
+
+
+def _wrong_sign(left: LeftOut, rig: Rig) -> str | None:
+    """Which coordinate of a frame on paper is off by twice its own value, if one is."""
+    group, shift = left.blunder.group, left.blunder.shift
+    tree = rig.tree
+    if group.kind != "frame" or group.what not in tree.edge_names:
+        return None
+    T_parent_child = tree.edges[tree.edge_names.index(group.what)].T_parent_child
+    child, sigma = np.zeros(3), np.zeros(3)
+    for k, axis in enumerate(("tx", "ty", "tz")):
+        if axis in shift.axes:
+            at = list(shift.axes).index(axis)
+            child[k], sigma[k] = shift.offset[at], np.sqrt(shift.covariance[at, at])
+    offset, paper = T_parent_child[:3, :3] @ child, T_parent_child[:3, 3]
+    limit = 3.0 * sigma.max() + SIGN * 2 * np.abs(paper)
+    like = (np.abs(offset - 2 * paper) < limit) & (np.abs(paper) > 5.0 * sigma.max())
+    others_fine = [np.abs(np.delete(offset, i)).max() < limit[i] for i in range(3)]
+    found = [axis for i, axis in enumerate("xyz") if like[i] and others_fine[i]]
+    return found[0] if len(found) == 1 else None

@@ -1,0 +1,123 @@
+"""Leaving out what a mishap spoiled: ``--without WHERE:WHAT``.
+
+A recording without a body at a stop is a recording in which that body was not seen, so everything
+that follows (where a fit starts, what is held out, what is tested) needs to know nothing of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from calib.effects import DEFAULT, Effect, Site, find
+from calib.problem.model import Source
+from calib.residuals.groups import CAD, JOINTS, MESH, SCAN, Group
+from calib.residuals.targets import PARTS
+from chains.errors import InputError
+from sensors.documents import nearest
+from sensors.recording import Recording
+from sensors.stops import Targets
+
+ROD = "rod"  # of a target: all of it
+
+
+def leave_out(sources: Sequence[Source], tokens: Sequence[str]) -> list[Source]:
+    """The recordings without what some tokens name; see `Group.token`.
+
+    Raises:
+        InputError: a token names nothing that any recording has, or something in several.
+    """
+    out = list(sources)
+    for token in tokens:
+        found = [(i, group) for i, s in enumerate(out) for group in _matching(s, token)]
+        shared = found and found[0][1].where in (CAD, MESH)
+        if not found or (len(found) > 1 and not shared):
+            raise InputError(_refusal(sources, token, len(found)))
+        for i, group in found:
+            out[i] = _left_out(out[i], group)
+    return out
+
+
+def _matching(source: Source, token: str) -> list[Group]:
+    """What a token names in a recording: one group, or none."""
+    folder = source.recording.folder.name
+    token = token.removeprefix(f"{folder}/")
+    return [group for group in _groups(source) if group.token == token]
+
+
+def _groups(source: Source) -> list[Group]:
+    """All that can be left out of a recording."""
+    rig, recording = source.rig, source.recording
+    out = []
+    for k, stop in enumerate(recording.stops):
+        out += [Group("body", stop, b) for b in recording.bodies if _seen(recording, b)[k]]
+        out += [Group("scan", stop, SCAN)] if recording.has_scan[k] else []
+        if rig.joint_names:
+            out += [Group("joints", stop, what) for what in (JOINTS, *rig.joint_names)]
+    for target in recording.targets.names if recording.targets else ():
+        out += [Group("target", target, what) for what in (*PARTS, ROD)]
+    out += [Group("frame", CAD, frame) for frame in rig.frame_sigma]
+    out += [Group("frame", CAD, f"{e}.{p}") for e, p in on_paper(source)]
+    if source.reference is not None:
+        surfaces = np.unique(source.reference.surface).tolist()
+        out += [Group("surface", MESH, f"surface_{number}") for number in surfaces]
+    return out
+
+
+def on_paper(source: Source) -> list[tuple[str, str]]:
+    """Effect and parameter of what the URDF says of the arm: lengths, and where joints are zero."""
+    return [(e.name, p.name) for e in of_the_arm() for p in e.params(source.rig) if p.sigma]
+
+
+def of_the_arm() -> list[Effect]:
+    """What every model has of an arm: how far its drawing, and its zeros, are off."""
+    return [e for e in map(find, DEFAULT) if e.site in (Site.EDGE, Site.JOINTS)]
+
+
+def _seen(recording: Recording, body: str) -> np.ndarray:
+    return np.isfinite(recording.bodies[body][:, :3]).all(axis=1)
+
+
+def _left_out(source: Source, group: Group) -> Source:
+    recording = source.recording
+    if group.kind == "body":
+        at = recording.stops.index(group.where)
+        seen = recording.bodies[group.what].copy()
+        seen[at] = np.nan
+        recording = replace(recording, bodies=recording.bodies | {group.what: seen})
+    elif group.kind == "scan":
+        has_scan = recording.has_scan.copy()
+        has_scan[recording.stops.index(group.where)] = False
+        recording = replace(recording, has_scan=has_scan)
+    elif group.kind == "target":
+        recording = replace(recording, targets=_targets(recording.targets, group))
+    return source.changed(recording, group)
+
+
+def _targets(targets: Targets, group: Group) -> Targets | None:
+    """The targets without a part of one, which is NaN, or without one."""
+    at = targets.names.index(group.where)
+    if group.what == ROD:
+        kept = np.delete(np.arange(len(targets.names)), at)
+        if not len(kept):
+            return None
+        parts = {f: getattr(targets, f)[kept] for f in ("faro_m", "upper_m", "lower_m")}
+        return Targets([targets.names[i] for i in kept], **parts)
+    name = {"sphere": "faro_m"}.get(group.what, f"{group.what}_m")
+    part = getattr(targets, name).copy()
+    part[at] = np.nan
+    return replace(targets, **{name: part})
+
+
+def _refusal(sources: Sequence[Source], token: str, count: int) -> str:
+    if count > 1:
+        folders = " or ".join(f"{s.recording.folder.name}/{token}" for s in sources)
+        return f"--without {token}: several recordings have that; say which: {folders}"
+    known = [group.token for s in sources for group in _groups(s)]
+    return (
+        f"--without {token}: no recording has that{nearest(token, known)}; write STOP:BODY, "
+        "STOP:scan, STOP:joints, STOP:JOINT, TARGET:sphere, lower, upper or rod, cad:FRAME, "
+        "cad:EFFECT.PARAMETER or mesh:surface_N"
+    )

@@ -1,0 +1,49 @@
+"""Groups of rows that one mishap spoils together, and the names that people call them by."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+Kind = Literal["body", "joints", "scan", "target", "frame", "rings", "surface"]
+SCAN, JOINTS = "scan", "joints"  # what of a stop, beside its bodies and single joints
+CAD, MESH = "cad", "mesh"  # where, of what belongs to no stop and no target
+
+
+@dataclass(frozen=True)
+class Group:
+    """Rows that one mishap spoils together.
+
+    Args:
+        kind: what kind of thing it is, as diagnosis.json has it.
+        where: the stop or target; `CAD` for what rig.yaml or the URDF says, `MESH` for a surface.
+        what: the body, `SCAN`, `JOINTS` or one joint; the part of the target; the frame or
+            ``effect.parameter``; the surface.
+        recording: name of its folder, where there are several recordings.
+    """
+
+    kind: Kind
+    where: str
+    what: str
+    recording: str = ""
+
+    @property
+    def stop(self) -> str | None:
+        """The stop that it is of."""
+        return self.where if self.kind in ("body", "joints", "scan") else None
+
+    @property
+    def token(self) -> str:
+        """As ``--without`` takes it: ``WHERE:WHAT``, the recording before it where that matters."""
+        return f"{self.recording}/{self.where}:{self.what}".removeprefix("/")
+
+    def __str__(self) -> str:
+        what = {SCAN: "the scan", JOINTS: "the joints"}.get(self.what, self.what)
+        of = f"{self.recording}, {self.where}".removeprefix(", ")
+        if self.kind == "target":
+            return f"target {of}: its {what}"
+        if self.kind == "frame":
+            return f"what paper says of {what}"
+        if self.kind == "surface":
+            return f"{what} of the mesh"
+        return f"{of}: {what}"
