@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -48,14 +47,6 @@ def document(left: LeftOut, rig: Rig) -> dict[str, Any]:
         "without": group.token,
         "sentence": _sentence(left, _wrong_sign(left, rig)),
     }
-
-
-def leaving_out(recordings: list[str], blunders: list[Mapping[str, Any]]) -> str:
-    """The command that fits without some blunders, ready to be typed."""
-    import shlex
-
-    without = " ".join(f"--without {shlex.quote(each['without'])}" for each in blunders)
-    return f"rigcal fit {shlex.join(recordings)} -o RUN {without}"
 
 
 def _sentence(left: LeftOut, wrong_sign: str | None) -> str:

@@ -100,22 +100,25 @@ def fit(
 @app.command()
 def add(
     run: Path,
+    out: Out,
     effects: Annotated[
-        list[str],
+        list[str] | None,
         typer.Argument(
             help="Effects, or files of them.", metavar="EFFECT...", autocompletion=effect_names
         ),
-    ],
-    out: Out,
+    ] = None,
+    without: Without = None,
     workers: Workers = None,
     as_json: Json = False,
 ) -> None:
     """The model of a run and more effects, refitted from that run to the same recordings."""
+    if not effects and not without:
+        raise InputError("give an effect to add, or what to leave out with --without")
     from calib.runs.add import add as grow
     from calib.runs.run import Run
 
     with threads(workers), progress_bar() as progress:
-        _tell(grow(Run.open(run), effects, out, progress), as_json)
+        _tell(grow(Run.open(run), effects or [], out, progress, without or []), as_json)
 
 
 @app.command()

@@ -55,6 +55,7 @@ class Diagnosis:
         misfit: instrument -> how many times larger than their sigmas its residuals are.
         curves: mean residual against covariates.
         too_few: whether the stops are too few to say anything, whatever the verdict.
+        command: what fits the same without the blunders, ready to be typed; empty without any.
     """
 
     verdict: str
@@ -68,6 +69,7 @@ class Diagnosis:
     misfit: Mapping[str, float]
     curves: Sequence[Curve] = field(repr=False)
     too_few: bool = False
+    command: str = ""
 
     @property
     def heading(self) -> str:
@@ -92,6 +94,7 @@ class Diagnosis:
             "weak_directions": list(self.weak_directions),
             "untestable": dict(self.untestable),
             "blunders": list(self.blunders),
+            "command": self.command or None,
             "detectable": dict(self.detectable),
             "misfit": dict(self.misfit),
             "curves": [curve.document() for curve in self.curves],
@@ -323,6 +326,8 @@ def _sentences(
             f"The model is adequate: of {len(look.named.candidates)} known effects and "
             f"{len(look.unnamed.candidates)} kinds of structure none stands out from chance."
         )
+    if without := look.stand.model.without[: len(look.stand.model.without) - len(blunders)]:
+        out.append(f"Left out before: {', '.join(without)}.")
     out += [each["sentence"] for each in blunders[:LISTED]]
     if len(blunders) > LISTED:
         out.append(f"And {len(blunders) - LISTED} more, in diagnosis.json.")

@@ -15,6 +15,7 @@ def add(
     effects: str | Sequence[str],
     out: Path | str,
     progress: Progress = lambda what, done, total: None,
+    without: Sequence[str] = (),
 ) -> Run:
     """Fit a run's model and more effects to the same recordings, from where that run stood.
 
@@ -23,9 +24,10 @@ def add(
         effects: names in the catalogue, or files of effects; one, several with commas, or a list.
         out: the run folder to make; an earlier run there is replaced, anything else is refused.
         progress: called with what is being done, and how far it is.
+        without: what more is left out of the recordings, as ``--without`` names it.
 
     Raises:
         InputError: an effect is unknown or in the model already, or the run's recordings are not
             what they were.
     """
-    return grow(run, grown_model(run, effects), out, progress)
+    return grow(run, grown_model(run, effects).leaving_out(without), out, progress)

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import shlex
+from collections.abc import Sequence
+from dataclasses import replace
+
 from calib.diagnosis.search import search
 from calib.diagnosis.stand import Stand
 from calib.diagnosis.verdict import Diagnosis, conclude
 from calib.diagnosis.weak import weak_directions
+from calib.effects import DEFAULT
 from calib.problem import build
 from calib.runs.reopen import model_of, reopened, start_of
 from calib.runs.run import DIAGNOSIS, Run
@@ -44,14 +49,29 @@ def diagnose(
                 unseen = _unseen(step.after.stand, run, progress)
                 falls[step.effect.name] = (before, unseen.rms_mm, unseen.floor_mm)
                 before = unseen.rms_mm
+    tokens = [left.blunder.group.token for left in found.blunders]
     result = conclude(
         found,
         falls,
         run.summary["misfit"],
         weak_directions(run.solution, float(run.summary["sigmas_widened_by"]), found.looks[0]),
     )
+    result = replace(result, command=command_without(run, tokens) if tokens else "")
     write_json(run.folder / DIAGNOSIS, result.document())
     return result
+
+
+def command_without(run: Run, tokens: Sequence[str]) -> str:
+    """The command that fits a run's model to the same without some groups of rows."""
+    left_out = [*run.model.get("without", ()), *tokens]
+    without = [part for token in left_out for part in ("--without", token)]
+    effects = run.model["effects"]
+    out = ["-o", f"{run.folder}-without"]
+    if any(not isinstance(effect, str) for effect in effects):  # of files, or with a shape
+        return shlex.join(["rigcal", "add", str(run.folder), *out, *without[-2 * len(tokens) :]])
+    chosen = [] if tuple(effects) == DEFAULT else ["--effects", ",".join(effects)]
+    fixed = [part for name in run.model["fixed"] for part in ("--fix", name)]
+    return shlex.join(["rigcal", "fit", *map(str, run.recordings), *out, *chosen, *fixed, *without])
 
 
 def _unseen(stand: Stand, run: Run, progress: Progress) -> Errors:

@@ -32,7 +32,7 @@ class Explanation:
 
     Args:
         runs: from the first fit to the last, each grown from the one before.
-        steps: per run what was added or dropped, and its held-out error.
+        steps: per run what was added, dropped or left out, and its held-out error.
         refused: effects that were found and did not lower the held-out error.
         diagnosis: of the last run.
     """
@@ -60,9 +60,10 @@ def explain(
 ) -> Explanation:
     """Grow a model until it is adequate, or what is left has no name; every rung is kept.
 
-    What is found is added only if the held-out error falls, by a hundredth of what it has above the
-    noise floor or more, and dropped again if later steps leave it nothing to lower. Rungs that an
-    interrupted call has finished are taken up again.
+    What a mishap spoiled is left out first, as a rung of its own. What is found is added only if
+    the held-out error falls, by a hundredth of what it has above the noise floor or more, and
+    dropped again if later steps leave it nothing to lower. Rungs that an interrupted call has
+    finished are taken up again.
 
     Args:
         recordings: folders.
@@ -82,7 +83,7 @@ def explain(
         _remove_if_empty(out)
         raise
     diagnosis = diagnose(climb.run, climb.tell, refits=False)
-    while len(climb.runs) < MOST_RUNGS and climb.improve(diagnosis.worth_adding):
+    while len(climb.runs) < MOST_RUNGS and climb.improve(diagnosis):
         diagnosis = diagnose(climb.run, climb.tell, refits=False)
     climb.clear_above()
     result = Explanation(climb.runs, climb.steps, climb.refused, diagnosis)
@@ -132,8 +133,13 @@ class _Climb:
             run = calibrate(self.recordings, folder, model, progress=self.tell)
         self._keep(run, [], [])
 
-    def improve(self, names: Sequence[str]) -> bool:
-        """Add what lowers the held-out error, drop what that made idle; whether any was added."""
+    def improve(self, diagnosis: Diagnosis) -> bool:
+        """Leave out blunders; or else add what lowers the held-out error, and drop what that made
+        idle. Whether anything was changed."""
+        if diagnosis.blunders:
+            self._leave_out([each["without"] for each in diagnosis.blunders])
+            return True
+        names = diagnosis.worth_adding
         earlier = [name for step in self.steps for name in step["added"]]
         before = len(self.runs)
         for name in names:
@@ -157,6 +163,12 @@ class _Climb:
         if name not in self.refused and effects[0].family not in families:
             self._try(self._model.plus(effects), [name], [])
 
+    def _leave_out(self, tokens: list[str]) -> None:
+        """A rung with the same model, and less data: its errors say nothing against it."""
+        folder, model = self._next(), self._model.leaving_out(tokens)
+        run = self._finished(folder, model, self.run) or grow(self.run, model, folder, self.tell)
+        self._keep(run, [], [], tokens)
+
     @property
     def _model(self) -> Model:
         return Model.read(self.run.model)
@@ -172,7 +184,9 @@ class _Climb:
             shutil.rmtree(folder)
             self.refused += added
 
-    def _keep(self, run: Run, added: list[str], dropped: list[str]) -> None:
+    def _keep(
+        self, run: Run, added: list[str], dropped: list[str], left_out: Sequence[str] = ()
+    ) -> None:
         self.runs.append(run)
         rms = run.summary["rms_mm"]
         self.steps.append(
@@ -180,6 +194,7 @@ class _Climb:
                 "run": str(run.folder),
                 "added": added,
                 "dropped": dropped,
+                "left_out": list(left_out),
                 "held_out_rms_mm": rms["held_out"],
                 "fit_rms_mm": rms["fit"],
                 "noise_floor_mm": rms["noise_floor"],

@@ -72,6 +72,10 @@ def _say_verdict(console: Console, diagnosis: Diagnosis) -> None:
     for sentence in diagnosis.sentences:
         console.print(sentence)
     console.print()
+    if diagnosis.command:
+        console.print("Mend it in the recording; or leave it out:")
+        console.print(diagnosis.command, style="bold", soft_wrap=True)
+        console.print()
 
 
 def candidates_table(candidates: Sequence[Mapping[str, Any]], residual: str) -> Table:
