@@ -91,13 +91,15 @@ def _crept(track: Track, start_s: float, end_s: float) -> float:
 def locations(columns: Columns, base: str | None, blocks: int | None) -> tuple[Columns, str]:
     """The stops with a column `location`, and how they got it.
 
-    As their files say; or else as many equal `blocks` in the order of time as wanted; or else
-    where the tracked `base` stood, a new location where it is 5 cm or 50 mrad from the others.
+    As their files say; or else as many equal `blocks` as wanted in the order of time, or of rows
+    where no time is known; or else where the tracked `base` stood, a new location where it is
+    5 cm or 50 mrad from the others.
     """
     count = len(columns["stop"])
     if blocks:
         at = blocks * np.arange(count) // count
-        words = f"{min(blocks, count)} blocks in the order of time"
+        order = "time" if "time_s" in columns else "rows"
+        words = f"{min(blocks, count)} blocks in the order of {order}"
     elif "location" in columns:
         return columns, "as the table says"
     elif base is not None and f"{base}.qw" in columns:

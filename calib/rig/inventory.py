@@ -89,8 +89,8 @@ def of_rig(rig: Rig) -> Iterator[Line]:
 def of_stops(recording: Recording) -> Iterator[Line]:
     """Stops, locations, and how often each body is seen."""
     count, locations = len(recording.stops), len(set(recording.location))
-    minutes = np.ptp(recording.time_s) / 60
-    yield "stops", f"{count} at {counted(locations, 'location')}, over {minutes:.0f} min"
+    when = f"over {np.ptp(recording.time_s) / 60:.0f} min" if recording.timed else "no times"
+    yield "stops", f"{count} at {counted(locations, 'location')}, {when}"
     for body, seen in _seen(recording).items():
         yield body, f"seen at {seen.sum()} of {count} stops"
     if recording.base_guess is not None:

@@ -82,9 +82,7 @@ def _runs(at: list[int], dofs: tuple[str, ...]) -> str:
     """The names with commas; three or more that follow each other as first … last."""
     runs = np.split(at, np.flatnonzero(np.diff(at) != 1) + 1)
     parts = [
-        f"{dofs[run[0]]} … {dofs[run[-1]]}"
-        if len(run) > 2
-        else ", ".join(dofs[i] for i in run)
+        f"{dofs[run[0]]} … {dofs[run[-1]]}" if len(run) > 2 else ", ".join(dofs[i] for i in run)
         for run in runs
     ]
     return ", ".join(parts)

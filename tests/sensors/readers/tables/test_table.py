@@ -66,11 +66,37 @@ def test_a_log_has_bodies_joints_and_covariates_each_apart(tmp_path):
     assert {track.clock for track in found.tracks} == {"t"}
 
 
-def test_stops_without_times_are_counted_and_that_is_said(tmp_path):
+def test_times_that_are_missing_are_not_made_up(tmp_path):
     columns = {"Timestamp": np.full(20, 2.02103e13), "j1": XYZ[:, 0], "j2": XYZ[:, 1]}
     found = read_table([write(tmp_path / "t.csv", columns)], Options(joints=JOINTS), quiet)
-    assert found.stops["time_s"].tolist() == list(range(20))
-    assert "Timestamp" in found.odd[0]
+    assert "time_s" not in found.stops and "Timestamp" in found.odd[0]
+    np.testing.assert_array_equal(found.stops["j1"], XYZ[:, 0])
+    del columns["Timestamp"]
+    found = read_table([write(tmp_path / "t.csv", columns)], Options(joints=JOINTS), quiet)
+    assert "time_s" not in found.stops and "no column of times" in found.odd[0]
+
+
+@pytest.mark.parametrize("time", ["stamp", "time_s", None])
+def test_a_joint_called_like_the_time_is_no_time(tmp_path, time):
+    """A URDF's joint T, an angle: stops were sorted by it."""
+    columns = {"T": XYZ[:, 0], "t": XYZ[:, 1], **({time: 10.0 * np.arange(20)} if time else {})}
+    path = write(tmp_path / "t.csv", columns)
+    found = read_table([path], Options(joints=dict.fromkeys("Tt", "revolute")), quiet)
+    np.testing.assert_array_equal(found.stops["T"], XYZ[:, 0])
+    np.testing.assert_array_equal(found.stops["t"], XYZ[:, 1])
+    if time:
+        assert found.stops["time_s"].tolist() == columns[time].tolist()
+    else:
+        assert "time_s" not in found.stops
+
+
+def test_a_temperature_T_is_no_time(tmp_path):
+    columns = {"T": 20 + XYZ[:, 0], "j1": XYZ[:, 1], "j2": XYZ[:, 2]}
+    found = read_table([write(tmp_path / "t.csv", columns)], Options(joints=JOINTS), quiet)
+    np.testing.assert_array_equal(found.stops["T"], columns["T"])
+    columns["t"] = 10.0 * np.arange(20)
+    found = read_table([write(tmp_path / "t.csv", columns)], Options(joints=JOINTS), quiet)
+    assert found.stops["time_s"].tolist() == columns["t"].tolist()
 
 
 def test_rows_out_of_order_are_put_in_order_and_keep_their_number(tmp_path):
