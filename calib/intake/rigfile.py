@@ -148,7 +148,7 @@ def _lidar(gathered: Gathered, model: str | None) -> dict[str, Any]:
 def _frame(mounted: Mounted) -> list[str]:
     T = mounted.T_parent_body
     at = {"parent": mounted.parent, "xyz_m": _round(T[:3, 3]), "rpy_rad": _round(se3.to_rpy(T))}
-    sigma = {"sigma_m": GUESS_M, "sigma_rad": GUESS_RAD}
+    sigma = {"sigma_m": GUESS_M, "sigma_rad": 0.0 if mounted.point else GUESS_RAD}
     return [f"  # guess: {mounted.why}", f"  {_word(mounted.body)}: {_flow(at | sigma)}"]
 
 

@@ -135,7 +135,7 @@ class Places:
         self.problem.add(pose_unknown(name, T, sigma, Role.PLACE))
 
     def _neighbour(self, stops: np.ndarray) -> np.ndarray | None:
-        """T_world_root of another stop at the same location, or of the nearest in time; else in the rows."""
+        """T_world_root of another stop at the same location, or of the nearest in time or row."""
         recording = self.part.source.recording
         k = int(stops[0])
         when = recording.time_s if recording.timed else np.arange(len(recording.stops))
