@@ -29,7 +29,11 @@ def table(tracks: Sequence[Track], spans_s: Array) -> tuple[Columns, list[str]]:
         means = np.array([_mean(track, *span) for span in spans_s])
         prefix = f"{track.name}." if track.kind in ("pose", "point") else ""
         for name, values in zip(track.names, means.T, strict=True):
-            columns.setdefault(prefix + name, values)
+            column = prefix + name
+            if column in columns and track.kind == "covariate":
+                column = f"{track.name.strip('/').replace('/', '_')}.{name}"
+                odd.append(f"{name} is logged twice; that of {track.name} is named {column}")
+            columns.setdefault(column, values)
         if track.kind in ("joints", "pose", "point"):
             crept = np.array([_crept(track, *span) for span in spans_s]) > CREEP
             if crept.any():

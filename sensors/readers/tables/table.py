@@ -80,7 +80,7 @@ def _read(path: Path, options: Options) -> Contents:
     cells = sheet.cells(first)
     dated = "time_s" in columns and not _is_number(cells, columns["time_s"].index, sheet)
     numeric = [n for n in numeric if not (dated and n == "time_s")]
-    mapped = any(name in columns for name in options.columns)
+    mapped = any(name in columns for name in _spelled_out(options.columns, names))
     if not mapped:  # whatever else is a number may explain something
         numeric = [n for n in numeric if _is_number(cells, columns[n].index, sheet)]
     values, odd = sheet.numbers([columns[name].index for name in numeric], skip)
@@ -95,7 +95,8 @@ def _read(path: Path, options: Options) -> Contents:
     joints = [name for name in options.joints if name in table]
     table, words = _in_si(path, table, columns, joints, options)
     said += words
-    left = [n for n in names if n not in {c.theirs for c in columns.values()}]
+    taken = {c.theirs for name, c in columns.items() if name in (*numeric, *TEXT, "time_s")}
+    left = [n for n in names if n not in taken]
     said += [f"{path.name}: not taken: {', '.join(left)}"] if left else []
     if _are_stops(path, table, time, options.rows):
         return _stops(path, table, time, tuple(said), odd)

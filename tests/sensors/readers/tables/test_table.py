@@ -143,3 +143,17 @@ def test_columns_that_look_like_a_pose_are_pointed_out(tmp_path):
     assert "goal" not in line and "la" not in line.split("columns")[1].split("may")[0]
     mapped = Options(columns={"cup.*": "cup_*"}, euler="XYZ", angle_unit="rad")
     assert not any("BODY" in line for line in read_table([path], mapped, quiet).odd)
+
+
+def test_what_is_not_taken_is_said_and_nothing_else(tmp_path):
+    """A column of words, and a triple beside one that is mapped: both were told to be taken."""
+    columns = {"stop": range(20), "note": ["fine"] * 20, "heat": XYZ[:, 0]}
+    found = read_table([write(tmp_path / "t.csv", columns)], Options(), quiet)
+    assert "heat" in found.stops and "note" not in found.stops
+    assert "t.csv: not taken: note" in found.understood
+    names = [f"{body}_{axis}" for body in ("cup", "goal") for axis in "xyz"]
+    columns = {"stop": range(20), **dict.fromkeys(names, XYZ[:, 0])}
+    options = Options(columns={"cup.*": "cup_*"})
+    found = read_table([write(tmp_path / "t.csv", columns)], options, quiet)
+    assert "t.csv: not taken: goal_x, goal_y, goal_z" in found.understood
+    assert not any("taken for covariates" in line for line in found.odd)
