@@ -56,17 +56,20 @@ def tip(folder, arm, joints):
 
 def test_the_longest_chain_is_the_arm(tmp_path):
     found = read(tmp_path, {"arm.urdf": ARM})
+    assert (found.arm.base, found.arm.tip) == ("a", "hand")
     assert "q1, q2; from hand hang tool" in found.understood[0]
 
 
 def test_flags_name_other_ends(tmp_path):
     found = read(tmp_path, {"arm.urdf": ARM}, base="foot", tip="tool")
+    assert (found.arm.base, found.arm.tip) == ("foot", "tool")
 
 
 def test_an_srdf_names_the_ends(tmp_path):
     chain = '<chain base_link="foot" tip_link="tool"/>'
     srdf = f'<robot name="r"><group name="g">{chain}</group></robot>'
     found = read(tmp_path, {"arm.urdf": ARM, "arm.srdf": srdf})
+    assert (found.arm.base, found.arm.tip) == ("foot", "tool")
 
 
 def test_limits_are_narrowed(tmp_path):
@@ -86,6 +89,7 @@ def test_offsets_move_the_zeros(tmp_path):
 
 def test_a_file_of_macros_is_called_and_what_is_missing_is_named(tmp_path):
     found = read(tmp_path, {"arm.xacro": MACRO})
+    assert (found.arm.base, found.arm.tip) == ("arm_0", "arm_end")
     np.testing.assert_allclose(tip(tmp_path, found.arm, [0.0])[:3, 3], [0, 0, 0.3], atol=1e-12)
     said = " ".join(found.odd)
     for part in ("--package nowhere=", "common.xacro", "default_inertial", "name = arm"):
