@@ -65,6 +65,7 @@ def test_every_part_is_described(found):
         "per-stop covariates": "temperature_c",
         "scans": "4 of 400 points, up to 4 sweeps averaged",
         "rings": "16 of 16 seen",
+        "intensity": "up to 255 of 255",
         "targets": "4 within 3.0 x 2.0 x 0.9 m",
         "mesh": "300 triangles in 6 surfaces, 4.0 x 3.0 x 2.5 m",
         "labels": "label_0",
