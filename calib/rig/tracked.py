@@ -19,11 +19,13 @@ from sensors.recording import Recording
 MOVED = 1e-3  # rad or m by which a joint has moved, if it has
 UNKNOWN = 0.005  # rad and m that arms' joints and links are off by; those measured, by 0.003
 JITTER = 1e-4  # rad by which joints scatter at least, as of industrial arms
-OUTLIER = 8.0  # sigmas; of 22 sound recordings 4.6 at most, or 7.4 where joints sag, untold, by mm
+OUTLIER = 8.0  # sigmas; of 21 sound recordings 3.7 at most, 7.4 where a load changes how joints sag
 LOST = 0.05  # m and rad left by all that CAD and the arm may be off by: not this arm, or not so
 TURNED_RAD, FITS_RAD = 0.1, 0.03  # turns that are not the arm's, and turns that are
+MOST_TAKEN = 0.5  # of the rows by what is unknown: more, and what is left of the others says little
 SWAPPED = 0.2  # of the misfit, left where two bodies are exchanged
 MOST_COMPARED = 100  # stops, each with each
+MOST_FITTED = 1000  # stops, to which what is unknown is fitted; all are held against it
 ORDERS = {"qx, qy, qz, qw": (3, 0, 1, 2), "qz, qw, qx, qy": (1, 2, 3, 0)}
 
 
@@ -202,11 +204,11 @@ def _outliers(rig: Rig, pair: _Pair) -> Iterator[tuple[int, Array, bool]]:
     A = np.concatenate(columns, axis=2) / noise[:, None]
     prior = np.full(A.shape[2], LOST)
     prior[: pair.d_twist.shape[2]] = _edge_sigmas(rig)
-    left = _robust(A * prior, gap / noise)
-    spread = np.array([np.median(np.linalg.norm(left[:, s], axis=1)) / 1.538 for s in _HALVES])
-    if (spread * noise[[0, 3]] > LOST).any():
-        return
+    left, taken = _robust(A * prior, gap / noise)
     size = np.array([np.linalg.norm(left[:, s], axis=1) for s in _HALVES]).T
+    spread = np.median(size, axis=0) / 1.538 / np.sqrt(1.0 - min(taken, 0.99))
+    if taken > MOST_TAKEN or (spread * noise[[0, 3]] > LOST).any():
+        return
     for k in np.flatnonzero((size > OUTLIER * np.maximum(spread, 1.0)).any(axis=1)):
         exchanged = len(pair.names) == 2 and (
             _size(_gap(nominal[k], se3.inverse(seen[k]))) < SWAPPED * _size(gap[k])
@@ -238,19 +240,22 @@ def _from_places(pair: _Pair) -> Array:
     return nominal
 
 
-def _robust(A: Array, b: Array) -> Array:
-    """What is left of b (K, 6) after A (K, 6, P), of unknowns with a sigma of 1."""
-    weight, left = np.ones(len(b)), b
-    rows, P = A.reshape(-1, A.shape[2]), A.shape[2]
+def _robust(A: Array, b: Array) -> tuple[Array, float]:
+    """What is left of b (K, 6) after A (K, 6, P), of unknowns with a sigma of 1, and which share
+    of the rows they took on: the mean diagonal of what makes fitted rows of seen ones."""
+    some = slice(None, None, -(-len(b) // MOST_FITTED))
+    rows, seen, P = A[some].reshape(-1, A.shape[2]), b[some], A.shape[2]
+    weight = np.ones(len(seen))
     for _ in range(30):
         weighted = rows * np.repeat(weight, 6)[:, None]
-        x = np.linalg.solve(rows.T @ weighted + np.eye(P), weighted.T @ b.ravel())
-        left = b - A @ x
-        size = np.linalg.norm(left, axis=1)
+        inner = rows.T @ weighted
+        x = np.linalg.solve(inner + np.eye(P), weighted.T @ seen.ravel())
+        size = np.linalg.norm(seen - (rows @ x).reshape(-1, 6), axis=1)
         before, weight = weight, 1.0 / (1.0 + np.square(size / max(3.0 * np.median(size), 3.0)))
         if np.abs(weight - before).max() < 1e-3:
             break
-    return left
+    taken = float(np.trace(np.linalg.solve(inner + np.eye(P), inner))) / len(rows)
+    return b - A @ x, taken
 
 
 def _at_one_stop(rig: Rig, stop: str, found: list[tuple[_Pair, Array, bool]]) -> Suspect:
