@@ -112,8 +112,19 @@ def odd_scans(rig: Rig, recording: Recording, scans: ScanSums) -> Iterator[str |
     numbered = odd_rings(rig.lidar, ring_elevations(scans.elevation_rad, scans.rings))
     if numbered is not None:
         yield Suspect("rings", rig.lidar.name, numbered.sentence, size=numbered.off_rad, unit="rad")
+    yield from _at_once(recording)
     yield from _twice(scans)
     yield from _intensities(scans)
+
+
+def _at_once(recording: Recording) -> Iterator[Suspect]:
+    """Stops with scans at one and the same time."""
+    at = np.flatnonzero(recording.has_scan & recording.timed)
+    _, same, count = np.unique(recording.time_s[at], return_inverse=True, return_counts=True)
+    for each in np.flatnonzero(count > 1):
+        stops = tuple(recording.stops[k] for k in at[same == each])
+        said = f"the scans of {' and '.join(stops)} were made at one time, time_s; is one a copy?"
+        yield Suspect("scan", stops[0], said, stops=stops)
 
 
 def _twice(scans: ScanSums) -> Iterator[Suspect]:

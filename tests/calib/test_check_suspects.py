@@ -207,6 +207,15 @@ def test_scans_and_columns_that_are_there_twice(scans):
     assert found.stops == (b, c) and "column t" in found.sentence
 
 
+def test_scans_at_one_time(scans):
+    rig, recording, read = scans
+    time_s = recording.time_s.copy()
+    time_s[5] = time_s[4]
+    found = only(said((rig, replace(recording, time_s=time_s), read)))
+    assert found.stops == tuple(recording.stops[4:6]) and "at one time" in found.sentence
+    assert said((rig, replace(recording, time_s=time_s * np.nan), read)) == []
+
+
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
