@@ -19,7 +19,7 @@ from chains.frames import Edge, FrameTree, Joint, unknown_name
 from chains.se3 import Array
 
 G = 9.80665  # m/s^2
-_LONGEST_LINK_M = 10.0
+_LONGEST_LINK_M = 10.0  # more is taken for millimetres, of a centre of mass as well
 _KIND: dict[str | None, Literal["revolute", "prismatic"]] = {
     "revolute": "revolute",
     "continuous": "revolute",
@@ -73,6 +73,12 @@ def read_masses(urdf_path: str | Path, base: str, tip: str) -> list[Mass]:
             if kg < 0:
                 raise InputError(f"link '{link.get('name')}' weighs {kg:g} kg; 0 or more is wanted")
             centre_m, name = _numbers(link, "inertial/origin", "xyz", [0, 0, 0]), link.get("name")
+            away_m = np.linalg.norm(centre_m)
+            if kg and away_m > _LONGEST_LINK_M:
+                raise InputError(
+                    f"link '{name}': its centre of mass (inertial/origin xyz) lies {away_m:g} m "
+                    f"from the link; URDF lengths are in metres (millimetres?)"
+                )
             climbed: set[str] = set()
             while kg and name not in chain and name in above and name not in climbed:
                 climbed.add(name)

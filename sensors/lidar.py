@@ -20,6 +20,9 @@ Count = Annotated[int, pydantic.Field(ge=1, strict=True)]
 CATALOG = Path(__file__).parent / "catalog"
 GRAZING_RAD = 1.5
 """Incidence beyond which the spread grows no further: tan(90 deg) is no measurement."""
+LARGEST_REFLECTANCE = 2.0
+"""An intensity that goes no higher is a reflectance, 1 of white and more of what mirrors; makers'
+others count to 255 or 65535."""
 
 
 @dataclass(frozen=True)

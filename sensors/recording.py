@@ -93,6 +93,7 @@ class Recording:
     """(K,) unique names, which name the scan files too."""
     location: NDArray[np.str_]
     time_s: Array
+    """(K,) of the stops; NaN throughout where stops.csv has no such column."""
     joints: Array
     """(K, J) what the encoders reported, rad or m."""
     bodies: dict[str, Array]
@@ -133,7 +134,7 @@ class Recording:
             folder=folder,
             stops=stops,
             location=table.text("location"),
-            time_s=table.numbers("time_s", "every stop has its time in seconds"),
+            time_s=table.times("time_s"),
             joints=table.joints(joint_names),
             bodies={body: table.pose(body) for body in bodies},
             base_guess=table.pose("base_guess") if "base_guess.x" in table else None,
@@ -143,6 +144,11 @@ class Recording:
             rings=rings,
             joint_names=tuple(joint_names),
         )
+
+    @property
+    def timed(self) -> bool:
+        """Whether anything says when the stops were made."""
+        return bool(np.isfinite(self.time_s).all())
 
     def to_pandas(self) -> "pandas.DataFrame":
         """The stops as a `pandas.DataFrame` with the columns of stops.csv, in m, rad and s.
@@ -154,7 +160,7 @@ class Recording:
             {
                 "stop": np.array(self.stops),
                 "location": self.location,
-                "time_s": self.time_s,
+                **({"time_s": self.time_s} if self.timed else {}),
                 **dict(zip(self.joint_names, self.joints.T, strict=True)),
                 **{
                     f"{body}.{part}": pose[:, i]

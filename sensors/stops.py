@@ -68,6 +68,15 @@ class CsvTable:
         self.refuse(wrong, lambda row: f"{name} is {values[row]:g}; {units}")
         return values
 
+    def times(self, name: str) -> Array:
+        """Take a column of times in s; NaN throughout where there is none, or nothing in it."""
+        unknown = np.full(len(self._names), np.nan)
+        column = self._columns.get(name, unknown)
+        if column.dtype.kind == "f" and np.isnan(column).all():
+            self._columns.pop(name, None)
+            return unknown
+        return self.numbers(name, "either every stop has its time in seconds, or none")
+
     def joints(self, names: Sequence[str]) -> Array:
         """Take the joints (K, J) by name, in rad or m."""
         why = "the arm's URDF has this joint, so every stop needs its value"

@@ -158,7 +158,6 @@ def _from_rows(gathered: Gathered) -> _Cut:
     columns = dict(gathered.stops)
     count = len(next(iter(columns.values())))
     columns.setdefault("stop", np.array([f"row{k:05d}" for k in range(count)]))
-    columns.setdefault("time_s", np.arange(count, dtype=float))
     missing = [name for name in gathered.joints if name not in columns]
     if missing:
         raise InputError(
@@ -206,8 +205,9 @@ def _still(gathered: Gathered, timed: bool) -> _Cut:
     share = [
         (one, np.full(len(one.time_s), 0 if timed else k)) for k, one in enumerate(gathered.sweeps)
     ]
-    start_s = float(gathered.sweeps[0].time_s[0]) if timed else 0.0
-    columns = {"stop": np.array(names), "time_s": start_s + np.arange(len(names), dtype=float)}
+    columns: Columns = {"stop": np.array(names)}
+    if timed:
+        columns["time_s"] = gathered.sweeps[0].time_s[:1]
     what = "all turns of the LiDAR are one stop" if timed else "every cloud is a stop"
     return _Cut(columns, share, [], [f"nothing says when the rig stood still: {what}"])
 
@@ -259,6 +259,6 @@ def _files_of(rig: Path) -> list[str]:
 
 
 def _ordered(columns: Columns) -> Columns:
-    """stop, location and time first, as people look for them."""
-    first = ("stop", "location", "time_s")
+    """stop, location and, where it is known, time first, as people look for them."""
+    first = [name for name in ("stop", "location", "time_s") if name in columns]
     return {n: columns[n] for n in first} | {n: v for n, v in columns.items() if n not in first}

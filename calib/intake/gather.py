@@ -284,7 +284,8 @@ def once_each(tracks: Sequence[Track]) -> None:
 
 
 def joint_track(tracks: Sequence[Track], joints: Sequence[str]) -> list[Track]:
-    """The tracks, those with all of the arm's joints as joints, in the arm's order.
+    """The tracks, those with all of the arm's joints as joints, in the arm's order; what else they
+    and logs of other joints tell, a gripper's opening say, as covariates.
 
     Raises:
         InputError: no log has them all.
@@ -299,12 +300,14 @@ def joint_track(tracks: Sequence[Track], joints: Sequence[str]) -> list[Track]:
             out.append(
                 replace(track, kind="joints", names=tuple(joints), values=track.values[:, order])
             )
-            rest = [k for k in range(len(track.names)) if k not in order]
-            if rest and track.kind == "covariate":
-                names = tuple(track.names[k] for k in rest)
-                out.append(replace(track, names=names, values=track.values[:, rest]))
             met = True
-        elif track.kind != "joints":
+        if track.kind in ("joints", "covariate"):
+            rest = [k for k, name in enumerate(track.names) if name not in joints]
+            if rest:
+                names = tuple(track.names[k] for k in rest)
+                values = track.values[:, rest]
+                out.append(replace(track, kind="covariate", names=names, values=values))
+        else:
             out.append(track)
     if not met:
         missing = next((name for name in joints if name not in have), joints[0])

@@ -16,7 +16,7 @@ from chains import se3
 from chains.errors import InputError
 from sensors.documents import nearest, write_atomically
 from sensors.lidar import catalog
-from sensors.readers.base import Columns
+from sensors.readers.base import POSE, Columns
 
 GUESS_M, GUESS_RAD = 0.1, 0.3
 _TRACKER = "sigma_m: 0.0002, sigma_rad: 0.0003"
@@ -47,7 +47,13 @@ def matched(rig: Path, columns: Columns) -> tuple[Columns, list[str], list[str]]
             f"frames of the rig are {', '.join(wanted)}: say --body NAME=FRAME"
         )
     odd = [f"{name} was tracked and is no body of {rig.name}; it is left out" for name in spare]
-    return {n: v for n, v in columns.items() if n.rpartition(".")[0] not in spare}, [], odd
+    return _without(columns, spare), [], odd
+
+
+def _without(columns: Columns, bodies: Sequence[str]) -> Columns:
+    """The columns without the poses of some bodies."""
+    poses = {f"{body}.{part}" for body in bodies for part in POSE}
+    return {name: values for name, values in columns.items() if name not in poses}
 
 
 def _renamed(columns: Columns, old: str, new: str) -> Columns:
@@ -108,7 +114,7 @@ def first_rig(
     with write_atomically(folder / "rig.yaml") as path:
         path.write_text("\n".join([*lines, ""]), encoding="utf-8")
     spare = [body for body in bodies_of(columns) if body not in bodies]
-    kept = {n: v for n, v in columns.items() if n.rpartition(".")[0] not in spare}
+    kept = _without(columns, spare)
     said = [f"rig: {m.body} hangs on {m.parent}, {m.why}" for m in roles.mounted]
     return kept, said, odd
 
@@ -148,7 +154,7 @@ def _lidar(gathered: Gathered, model: str | None) -> dict[str, Any]:
 def _frame(mounted: Mounted) -> list[str]:
     T = mounted.T_parent_body
     at = {"parent": mounted.parent, "xyz_m": _round(T[:3, 3]), "rpy_rad": _round(se3.to_rpy(T))}
-    sigma = {"sigma_m": GUESS_M, "sigma_rad": GUESS_RAD}
+    sigma = {"sigma_m": GUESS_M, "sigma_rad": 0.0 if mounted.point else GUESS_RAD}
     return [f"  # guess: {mounted.why}", f"  {_word(mounted.body)}: {_flow(at | sigma)}"]
 
 

@@ -29,7 +29,11 @@ def table(tracks: Sequence[Track], spans_s: Array) -> tuple[Columns, list[str]]:
         means = np.array([_mean(track, *span) for span in spans_s])
         prefix = f"{track.name}." if track.kind in ("pose", "point") else ""
         for name, values in zip(track.names, means.T, strict=True):
-            columns.setdefault(prefix + name, values)
+            column = prefix + name
+            if column in columns and track.kind == "covariate":
+                column = f"{track.name.strip('/').replace('/', '_')}.{name}"
+                odd.append(f"{name} is logged twice; that of {track.name} is named {column}")
+            columns.setdefault(column, values)
         if track.kind in ("joints", "pose", "point"):
             crept = np.array([_crept(track, *span) for span in spans_s]) > CREEP
             if crept.any():
@@ -91,13 +95,15 @@ def _crept(track: Track, start_s: float, end_s: float) -> float:
 def locations(columns: Columns, base: str | None, blocks: int | None) -> tuple[Columns, str]:
     """The stops with a column `location`, and how they got it.
 
-    As their files say; or else as many equal `blocks` in the order of time as wanted; or else
-    where the tracked `base` stood, a new location where it is 5 cm or 50 mrad from the others.
+    As their files say; or else as many equal `blocks` as wanted in the order of time, or of rows
+    where no time is known; or else where the tracked `base` stood, a new location where it is
+    5 cm or 50 mrad from the others.
     """
     count = len(columns["stop"])
     if blocks:
         at = blocks * np.arange(count) // count
-        words = f"{min(blocks, count)} blocks in the order of time"
+        order = "time" if "time_s" in columns else "rows"
+        words = f"{min(blocks, count)} blocks in the order of {order}"
     elif "location" in columns:
         return columns, "as the table says"
     elif base is not None and f"{base}.qw" in columns:

@@ -235,21 +235,23 @@ def same_mesh(a: Reference | None, b: Reference | None) -> bool:
 def stop_columns(rig: Rig, joints: np.ndarray, time_s: np.ndarray) -> dict[str, np.ndarray]:
     """What follows from when and how the arm came to each of K stops, (K,) each.
 
-    ``time_s``; ``elapsed_s`` since the first stop; each joint by its name as reported, rad or m;
-    and ``moved.<joint>``, which way it last turned: -1, 0 or 1, nothing being known of the first.
+    Each joint by its name as reported, rad or m; and, where the times are known: ``time_s``;
+    ``elapsed_s`` since the first stop; ``moved.<joint>``, which way a joint last turned: -1, 0 or
+    1, nothing being known of the first.
 
     Args:
         rig: whose joints they are.
         joints: (K, J) reported.
-        time_s: (K,) of the stops.
+        time_s: (K,) of the stops; NaN where nothing says when they were made.
     """
+    columns = dict(zip(rig.joint_names, joints.T, strict=True))
+    if not np.isfinite(time_s).all():
+        return columns
     order = np.argsort(time_s, kind="stable")
     way = np.zeros(np.shape(joints))
     way[order[1:]] = np.sign(np.diff(joints[order], axis=0))
-    columns = {"time_s": time_s, "elapsed_s": time_s - time_s.min(initial=np.inf)}
-    for j, name in enumerate(rig.joint_names):
-        columns |= {name: joints[:, j], f"moved.{name}": way[:, j]}
-    return columns
+    columns |= {"time_s": time_s, "elapsed_s": time_s - time_s.min(initial=np.inf)}
+    return columns | {f"moved.{name}": w for name, w in zip(rig.joint_names, way.T, strict=True)}
 
 
 def tracked_poses(rig: Rig, recording: Recording) -> np.ndarray:

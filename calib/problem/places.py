@@ -140,15 +140,11 @@ class Places:
         self.problem.add(pose_unknown(name, T, sigma, Role.PLACE))
 
     def _neighbour(self, stops: np.ndarray) -> np.ndarray | None:
-        """T_world_root of another stop at the same location, or of the nearest in time."""
+        """T_world_root of another stop at the same location, or of the nearest in time or row."""
         recording = self.part.source.recording
         k = int(stops[0])
-        order = np.lexsort(
-            (
-                np.abs(recording.time_s - recording.time_s[k]),
-                recording.location != recording.location[k],
-            )
-        )
+        when = recording.time_s if recording.timed else np.arange(len(recording.stops))
+        order = np.lexsort((np.abs(when - when[k]), recording.location != recording.location[k]))
         poses = (start.root_pose(self.part.source, [j]) for j in order)
         return next((T for T in poses if T is not None), None)
 

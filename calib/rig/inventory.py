@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
-from calib.rig import Rig, TargetSpec
-from chains import se3
-from chains.align import align_points
-from chains.errors import InputError
-from sensors.recording import Recording, Scan
+from calib.rig import Rig
+from calib.rig.suspect import listed
+from sensors.recording import Recording
 from sensors.reference import Reference
 from sensors.stops import Targets
 
@@ -21,38 +18,10 @@ STILL = 0.05  # rad or m that a joint travels: too little to tell its own errors
 LIMIT_SLACK = 1e-3  # rad or m beyond a joint's limit
 LEVEL_RAD = np.radians(3.0)
 NARROW_RAD = np.radians(30.0)
-ASKEW_RAD = np.radians(3.0)
-APART_M = 0.01
 COARSE_M = 0.05  # no instrument here is as bad as that
 FAR_OFF_M = 0.3  # median residual at the start: more than CAD is wrong by
 
 Line = tuple[str, str]
-
-
-@dataclass
-class ScanSums:
-    """What the readable scans hold, summed up while only one of them is in memory.
-
-    Args:
-        points: scan -> number of points.
-        sweeps: the most returns that were averaged into a point.
-        rings: (R,) points by ring.
-        columns: names of the per-point covariates.
-    """
-
-    points: dict[str, int] = field(default_factory=dict)
-    sweeps: int = 0
-    rings: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
-    columns: dict[str, None] = field(default_factory=dict)
-
-    def add(self, name: str, scan: Scan) -> None:
-        """Take in one scan."""
-        self.points[name] = len(scan.ring)
-        self.sweeps = max(self.sweeps, int(scan.count.max()))
-        rings = np.bincount(scan.ring, minlength=len(self.rings))
-        rings[: len(self.rings)] += self.rings
-        self.rings = rings
-        self.columns |= dict.fromkeys(scan.extra)
 
 
 @dataclass(frozen=True)
@@ -89,8 +58,8 @@ def of_rig(rig: Rig) -> Iterator[Line]:
 def of_stops(recording: Recording) -> Iterator[Line]:
     """Stops, locations, and how often each body is seen."""
     count, locations = len(recording.stops), len(set(recording.location))
-    minutes = np.ptp(recording.time_s) / 60
-    yield "stops", f"{count} at {counted(locations, 'location')}, over {minutes:.0f} min"
+    when = f"over {np.ptp(recording.time_s) / 60:.0f} min" if recording.timed else "no times"
+    yield "stops", f"{count} at {counted(locations, 'location')}, {when}"
     for body, seen in _seen(recording).items():
         yield body, f"seen at {seen.sum()} of {count} stops"
     if recording.base_guess is not None:
@@ -98,17 +67,6 @@ def of_stops(recording: Recording) -> Iterator[Line]:
         yield "base_guess", f"given at {given} of {count} stops"
     if recording.covariates:
         yield "per-stop covariates", ", ".join(recording.covariates)
-
-
-def of_scans(scans: ScanSums) -> Iterator[Line]:
-    """Scans, their points, rings and covariates."""
-    low, high = min(scans.points.values()), max(scans.points.values())
-    points = f"{low:,}" if low == high else f"{low:,} to {high:,}"
-    sweeps = f", up to {scans.sweeps} sweeps averaged" if scans.sweeps > 1 else ""
-    yield "scans", f"{len(scans.points)} of {points} points{sweeps}"
-    yield "rings", f"{np.count_nonzero(scans.rings)} of {len(scans.rings)} seen"
-    if scans.columns:
-        yield "per-point covariates", ", ".join(scans.columns)
 
 
 def of_targets(targets: Targets) -> Iterator[Line]:
@@ -161,7 +119,7 @@ def odd_stops(rig: Rig, recording: Recording) -> Iterator[str]:
         if at.sum() < len(at) / 2:
             yield f"{body} is seen at {at.sum()} of {len(at)} stops only; look for what hides it"
     if seen and (unseen := names[~np.any(list(seen.values()), axis=0)]).size:
-        yield f"no tracked body is seen at {_listed(unseen)}; what they tell rests on their scans"
+        yield f"no tracked body is seen at {listed(unseen)}; what they tell rests on their scans"
 
 
 def odd_joints(rig: Rig, recording: Recording) -> Iterator[str]:
@@ -169,56 +127,15 @@ def odd_joints(rig: Rig, recording: Recording) -> Iterator[str]:
     names = np.array(recording.stops)
     values = dict(zip(rig.joint_names, recording.joints.T, strict=True))
     if still := [name for name, at in values.items() if np.ptp(at) < STILL]:
-        yield f"{_listed(still)} hardly moved, too little to tell their own errors; move them"
+        yield f"{listed(still)} hardly moved, too little to tell their own errors; move them"
     for joint in (edge.joint for edge in rig.tree.edges if edge.joint is not None):
         at, unit = values[joint.name], "rad" if joint.kind == "revolute" else "m"
         beyond = (at < joint.lower - LIMIT_SLACK) | (at > joint.upper + LIMIT_SLACK)
         if beyond.any():
             yield (
                 f"{joint.name} is beyond its limits of {joint.lower:g} to {joint.upper:g} {unit} "
-                f"at {_listed(names[beyond])}; check its sign, zero and unit"
+                f"at {listed(names[beyond])}; check its sign, zero and unit"
             )
-
-
-def odd_scans(rig: Rig, recording: Recording, scans: ScanSums) -> Iterator[str]:
-    """Scans without stop, stops without scan, rings without points."""
-    if stray := sorted(scans.points.keys() - set(recording.stops)):
-        yield f"scans/ holds {_listed(stray)}, but stops.csv has no such stop; they are not used"
-    if not scans.points:
-        return
-    if rig.lidar is None:
-        yield "there are scans, but no 'lidar' in rig.yaml, so they are not used"
-        return
-    if not recording.has_scan.all():
-        missing = np.array(recording.stops)[~recording.has_scan]
-        yield f"there is no scan of {_listed(missing)}, though of other stops"
-    if (silent := np.flatnonzero(scans.rings == 0)).size:
-        yield f"no point comes from ring {_listed(silent)}; rings are counted from 0"
-
-
-def odd_targets(targets: Targets, spec: TargetSpec) -> Iterator[str]:
-    """Rods that hang askew, and spheres that both instruments see at different places."""
-    names, rods = np.array(targets.names), targets.lower_m - targets.upper_m
-    rods /= np.linalg.norm(rods, axis=1, keepdims=True)
-    down = np.median(rods, axis=0)
-    down /= np.linalg.norm(down)
-    askew = rods @ down < np.cos(ASKEW_RAD)
-    if askew.any():
-        yield (
-            f"the rod of {_listed(names[askew])} does not hang as the others do; are its markers "
-            "swapped?"
-        )
-    sphere_m = targets.lower_m + spec.sphere_below_lower_marker_m * down
-    try:
-        T_world_reference, _ = align_points(sphere_m, targets.faro_m)
-    except InputError:
-        return
-    off_m = np.linalg.norm(sphere_m - se3.apply(T_world_reference, targets.faro_m), axis=1)
-    if off_m.max() > APART_M:
-        yield (
-            f"tracker and scanner place {names[off_m.argmax()]} {1e3 * off_m.max():.0f} mm apart, "
-            f"the others up to {1e3 * np.sort(off_m)[-2]:.0f} mm; is it the same target in both?"
-        )
 
 
 def odd_beams(placed: Sequence[PlacedScan]) -> Iterator[str]:
@@ -239,7 +156,7 @@ def odd_beams(placed: Sequence[PlacedScan]) -> Iterator[str]:
     off = [p.name for p in placed if p.residual_m > FAR_OFF_M]
     if off:
         yield (
-            f"at {_listed(off)} half of the beams end more than {FAR_OFF_M:g} m from the surface "
+            f"at {listed(off)} half of the beams end more than {FAR_OFF_M:g} m from the surface "
             "that they should meet; check base_guess, tracker and targets"
         )
 
@@ -260,9 +177,3 @@ def _size(points_m: np.ndarray) -> str:
 def _nine_tenths(parts: Sequence[np.ndarray]) -> np.ndarray:
     """The range (2,) in which nine tenths of the values lie."""
     return np.quantile(np.concatenate(parts), [0.05, 0.95])
-
-
-def _listed(names: Sequence[Any], most: int = 3) -> str:
-    """The first few names, and how many more there are."""
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(map(str, names[:most])) + more

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -111,8 +112,9 @@ def _told(
         elif name.removeprefix(f"{variable}.") in parameters:
             told[parameters.index(name.removeprefix(f"{variable}."))] = False
         elif name.startswith(f"{variable} ("):
-            for part in name[len(variable) + 2 : -1].split(", "):
-                first, _, last = part.partition(" … ")
+            known = "|".join(map(re.escape, sorted(parameters, key=len, reverse=True)))
+            listed = rf"({known})(?: … ({known}))?(?:, |\)$)"
+            for first, last in re.findall(listed, name[len(variable) + 2 :]):
                 told[parameters.index(first) : parameters.index(last or first) + 1] = False
     return told
 

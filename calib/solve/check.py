@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
@@ -14,7 +14,11 @@ from calib.forward import Values
 from calib.problem.model import Model, Source
 from calib.residuals.scan import ScanStop
 from calib.rig import Rig, inventory, load_rig
-from calib.rig.inventory import PlacedScan, ScanSums
+from calib.rig.inventory import PlacedScan
+from calib.rig.scale import odd_mesh, odd_targets
+from calib.rig.scanned import ScanSums, odd_scans, of_scans
+from calib.rig.suspect import Suspect
+from calib.rig.tracked import odd_bodies
 from calib.solve.estimate import Estimate
 from calib.solve.fit import Progress, preview
 from calib.solve.solution import solution_of
@@ -37,6 +41,7 @@ class Check:
         contents: what is there: its name, and how much of it.
         problems: what is wrong and keeps a fit from running, a sentence each.
         odd: what is no error and yet worth a look, a sentence each.
+        suspects: those of them that are likely a mishap, with the keys of a diagnosis's blunders.
         expected: link -> unit -> rough sigma of its best and its worst known parameter, of those
             that the data tell.
         cannot: a `name` and a `why` for what the data could not tell.
@@ -45,6 +50,7 @@ class Check:
     contents: list[tuple[str, str]] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
     odd: list[str] = field(default_factory=list)
+    suspects: list[dict[str, Any]] = field(default_factory=list)
     expected: dict[str, dict[str, tuple[float, float]]] = field(default_factory=dict)
     cannot: list[dict[str, str]] = field(default_factory=list)
 
@@ -62,6 +68,7 @@ class Check:
             "contents": dict(self.contents),
             "problems": self.problems,
             "odd": self.odd,
+            "suspects": self.suspects,
             "can": self.can,
             "expected_sigma": self.expected,
             "cannot": self.cannot,
@@ -116,16 +123,26 @@ class _Checker:
             found.contents.extend(inventory.of_stops(recording))
             found.odd.extend(inventory.odd_stops(rig, recording))
             found.odd.extend(inventory.odd_joints(rig, recording))
+            self._tell(odd_bodies(rig, recording))
         scans = self._read_scans(rig)
         if rig and recording:
-            found.odd.extend(inventory.odd_scans(rig, recording, scans))
+            self._tell(odd_scans(rig, recording, scans))
         if targets:
             found.contents.extend(inventory.of_targets(targets))
         if targets and rig and rig.target:
-            found.odd.extend(inventory.odd_targets(targets, rig.target))
+            self._tell(odd_targets(targets, rig.target))
         reference = self._read_mesh(rig)
+        if reference and scans.points:
+            self._tell(odd_mesh(reference, scans.reach_m))
         if self.graph and rig and recording and (reference or not rig.reference):
             self._try_graph(Source(rig, recording, reference), scans)
+
+    def _tell(self, odd: Iterable[str | Suspect]) -> None:
+        """Note what looks odd, as sentences and, what is likely a mishap, as entries."""
+        for one in odd:
+            suspect = isinstance(one, Suspect)
+            self.found.odd.append(one.sentence if suspect else one)
+            self.found.suspects.extend(one.documents() if suspect else ())
 
     def _attempt(self, function: Callable[..., T], *args: Any) -> T | None:
         """What the function returns, or None where it found a problem, which is noted once."""
@@ -139,14 +156,14 @@ class _Checker:
     def _read_scans(self, rig: Rig | None) -> ScanSums:
         paths = sorted((self.folder / "scans").glob("*.parquet"))
         rings = rig.lidar.rings if rig and rig.lidar else None
-        scans = ScanSums(rings=np.zeros(rings or 0, int))
+        scans = ScanSums(rig.lidar if rig else None)
         for i, path in enumerate(paths):
             self.progress("reading scans", i, len(paths))
             scan = self._attempt(read_scan, path, rings)
             if scan is not None:
                 scans.add(path.stem, scan)
         if scans.points:
-            self.found.contents.extend(inventory.of_scans(scans))
+            self.found.contents.extend(of_scans(scans))
         return scans
 
     def _read_mesh(self, rig: Rig | None) -> Reference | None:

@@ -40,18 +40,20 @@ def not_estimated(
     untold = vectors[:, values > UNTOLD]
     if not untold.shape[1]:
         return []
-    owner = np.repeat([v.name for v in variables], [v.dim for v in variables])
+    dims = [v.dim for v in variables]
+    owner = np.repeat([v.name for v in variables], dims)
+    first = np.repeat(np.cumsum([0, *dims[:-1]]), dims)
     directions, leading = echelon(untold, np.where(np.isin(owner, list(effects)), 1.0, 0.3))
-    found: dict[tuple[str, str], list[str]] = {}
+    found: dict[tuple[str, str], list[int]] = {}
     for column, lead in sorted(zip(directions.T, leading, strict=True), key=lambda pair: pair[1]):
         share = np.abs(column)
         partners = np.flatnonzero((share > PARTNER) & (np.arange(len(share)) != lead))
         why = _why(touched[lead], _grouped(owner[partners], [names[i] for i in partners]))
-        found.setdefault((owner[lead], why), []).append(names[lead].split(".", 1)[1])
+        found.setdefault((str(owner[lead]), why), []).append(int(lead - first[lead]))
     whole = {v.name: v.dofs for v in variables}
     return [
-        {"name": _name(variable, dofs, whole[variable]), "why": why}
-        for (variable, why), dofs in found.items()
+        {"name": _name(variable, at, whole[variable]), "why": why}
+        for (variable, why), at in found.items()
     ]
 
 
@@ -69,20 +71,18 @@ def echelon(space: np.ndarray, preference: np.ndarray) -> tuple[np.ndarray, np.n
     return space @ np.linalg.inv(space[leading]), leading
 
 
-def _name(variable: str, dofs: list[str], all_dofs: tuple[str, ...]) -> str:
-    if len(dofs) == len(all_dofs):
+def _name(variable: str, at: list[int], dofs: tuple[str, ...]) -> str:
+    """A variable, or those of its dofs that stand at some places."""
+    if len(at) == len(dofs):
         return variable
-    return f"{variable}.{dofs[0]}" if len(dofs) == 1 else f"{variable} ({_runs(dofs, all_dofs)})"
+    return f"{variable}.{dofs[at[0]]}" if len(at) == 1 else f"{variable} ({_runs(at, dofs)})"
 
 
-def _runs(dofs: list[str], all_dofs: tuple[str, ...]) -> str:
+def _runs(at: list[int], dofs: tuple[str, ...]) -> str:
     """The names with commas; three or more that follow each other as first … last."""
-    index = np.array([all_dofs.index(dof) for dof in dofs])
-    runs = np.split(index, np.flatnonzero(np.diff(index) != 1) + 1)
+    runs = np.split(at, np.flatnonzero(np.diff(at) != 1) + 1)
     parts = [
-        f"{all_dofs[run[0]]} … {all_dofs[run[-1]]}"
-        if len(run) > 2
-        else ", ".join(all_dofs[i] for i in run)
+        f"{dofs[run[0]]} … {dofs[run[-1]]}" if len(run) > 2 else ", ".join(dofs[i] for i in run)
         for run in runs
     ]
     return ", ".join(parts)

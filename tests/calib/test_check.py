@@ -6,7 +6,9 @@ import shutil
 import numpy as np
 import pytest
 
+from calib import effects
 from calib import problem as problems
+from calib.diagnosis.candidates import lacking
 from calib.problem.model import Model, Source
 from calib.rig.inventory import PlacedScan, odd_beams
 from calib.solve.check import check
@@ -63,11 +65,24 @@ def test_every_part_is_described(found):
         "per-stop covariates": "temperature_c",
         "scans": "4 of 400 points, up to 4 sweeps averaged",
         "rings": "16 of 16 seen",
+        "intensity": "up to 255 of 255",
         "targets": "4 within 3.0 x 2.0 x 0.9 m",
         "mesh": "300 triangles in 6 surfaces, 4.0 x 3.0 x 2.5 m",
         "labels": "label_0",
     }
     assert incidence.startswith("100% meet a surface")
+
+
+def test_times_that_are_missing_are_said_to_be(rec):
+    """Row numbers were taken for seconds: neither minutes nor a drift follow from them."""
+    broken.without("stops.csv", "time_s")(rec)
+    found = check(rec)
+    assert found.problems == [] and dict(found.contents)["stops"] == "4 at 2 locations, no times"
+    source = Source.open(rec)
+    assert not {"time_s", "elapsed_s", "moved.turn"} & set(source.columns)
+    assert "time_s" not in source.recording.to_pandas()
+    for name in ("warmup_drift", "mount_creep", "mount_slip", "arm_backlash"):
+        assert lacking(effects.find(name), [source], frozenset(source.columns)), name
 
 
 def test_what_the_beams_meet_is_what_was_simulated(box, found):

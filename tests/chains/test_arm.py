@@ -219,7 +219,12 @@ def test_gravity_pulls_down_the_potential(tmp_path):
 
 @pytest.mark.parametrize(
     ("kg", "xyz", "words"),
-    [(-1, "0 0 0", "weighs -1 kg"), ("heavy", "0 0 0", "'heavy'"), (1, "0 0", "inertial/origin")],
+    [
+        (-1, "0 0 0", "weighs -1 kg"),
+        ("heavy", "0 0 0", "'heavy'"),
+        (1, "0 0", "inertial/origin"),
+        (1, "500 0 0", "centre of mass .* lies 500 m"),
+    ],
 )
 def test_a_bad_mass_is_refused_by_its_link(tmp_path, kg, xyz, words):
     path = tmp_path / "arm.urdf"

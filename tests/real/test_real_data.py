@@ -121,11 +121,14 @@ def test_ur10_nominal_error(series, expected_mm, shared, tmp_path):
 
 
 def test_ur10_times_and_blocks(shared, tmp_path):
-    for series, days in (("A", 4.2), ("D", 631 / 86400)):
+    """Series D has lost its times: each stamp is the same, and none is made up."""
+    for series, days in (("A", 4.2), ("D", None)):
         recording = foreign.ur10(series, shared / "arms/ur10_tmac", tmp_path / series)
         table = stops(recording)
-        assert np.all(np.diff(table["time_s"]) >= 0)
-        assert np.ptp(table["time_s"]) / 86400 == pytest.approx(days, abs=0.1)
+        assert ("time_s" in table) == (days is not None)
+        if days is not None:
+            assert np.all(np.diff(table["time_s"]) >= 0)
+            assert np.ptp(table["time_s"]) / 86400 == pytest.approx(days, abs=0.1)
         blocks, sizes = np.unique(table["location"], return_counts=True)
         assert len(blocks) == 12 and np.ptp(sizes) <= 1
         assert len(np.unique(table["stop"])) == len(table["stop"])

@@ -5,6 +5,7 @@ What they mean is told in `chains.readers`; here they are files and options of a
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from xml.etree import ElementTree
@@ -14,6 +15,8 @@ from chains.readers import xacro
 from chains.readers.urdf import apply_note, arm_ends, group_ends, joint_names, parse_robot
 from sensors.documents import read_text, read_yaml
 from sensors.readers.base import Arm, Contents, Options, Progress
+
+_MACROS = re.compile(r"<\s*xacro:|[$][{(]")  # an expanded file may still name the namespace
 
 
 def read_urdf(files: Sequence[Path], options: Options, progress: Progress) -> Contents:
@@ -68,6 +71,6 @@ def _text(path: Path, options: Options) -> tuple[str, tuple[str, ...]]:
     text = read_text(path)
     if not text.strip():
         raise InputError(f"{path} is empty; a URDF or xacro file is wanted")
-    if path.suffix == ".xacro" or "xmlns:xacro" in text:
+    if path.suffix == ".xacro" or _MACROS.search(text):
         return xacro.write_out(path, options.packages)
     return text, ()

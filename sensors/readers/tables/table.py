@@ -80,7 +80,7 @@ def _read(path: Path, options: Options) -> Contents:
     cells = sheet.cells(first)
     dated = "time_s" in columns and not _is_number(cells, columns["time_s"].index, sheet)
     numeric = [n for n in numeric if not (dated and n == "time_s")]
-    mapped = any(name in columns for name in options.columns)
+    mapped = any(name in columns for name in _spelled_out(options.columns, names))
     if not mapped:  # whatever else is a number may explain something
         numeric = [n for n in numeric if _is_number(cells, columns[n].index, sheet)]
     values, odd = sheet.numbers([columns[name].index for name in numeric], skip)
@@ -95,7 +95,8 @@ def _read(path: Path, options: Options) -> Contents:
     joints = [name for name in options.joints if name in table]
     table, words = _in_si(path, table, columns, joints, options)
     said += words
-    left = [n for n in names if n not in {c.theirs for c in columns.values()}]
+    taken = {c.theirs for name, c in columns.items() if name in (*numeric, *TEXT, "time_s")}
+    left = [n for n in names if n not in taken]
     said += [f"{path.name}: not taken: {', '.join(left)}"] if left else []
     if _are_stops(path, table, time, options.rows):
         return _stops(path, table, time, tuple(said), odd)
@@ -135,8 +136,9 @@ def _ours(path: Path, names: Sequence[str], options: Options) -> dict[str, _Colu
             unit = own[theirs][1] if theirs in own else split_unit(theirs)[1]
             chosen[ours] = _Column(names.index(column), column, unit)
     mapped = bool(chosen)
-    for ours in ("time_s", *TEXT, *options.joints):
-        column = _called(ours, own)
+    for ours in (*options.joints, "time_s", *TEXT):  # a joint called T is no time
+        taken = {column.theirs for column in chosen.values()}
+        column = _called(ours, {name: said for name, said in own.items() if name not in taken})
         if ours not in chosen and column is not None:
             chosen[ours] = _Column(names.index(column), column, own[column][1])
     taken = {column.theirs for column in chosen.values()}
@@ -164,13 +166,20 @@ def _spelled_out(columns: Mapping[str, str], names: Sequence[str]) -> dict[str, 
 
 
 def _called(ours: str, own: Mapping[str, tuple[str, str | None]]) -> str | None:
-    """The one header that means our column."""
+    """The one header that means our column: by our name, or, of the time, by another's."""
     for name, (short, _) in own.items():
-        if ours in (name, short) or (ours == "time_s" and short.lower() in _TIMES):
+        if ours in (name, short):
             return name
+    if ours == "time_s":
+        return next((name for name, (short, _) in own.items() if _is_time(short)), None)
     words = {name: re.split(r"[./:\s]+", name) for name in own}
     close = [n for n, w in words.items() if ours in w and set(w) - {ours} <= _POSITIONS]
     return close[0] if len(close) == 1 else None
+
+
+def _is_time(short: str) -> bool:
+    """Whether a header means the time; a capital T alone is more often a temperature."""
+    return short != "T" and short.lower() in _TIMES
 
 
 def _all_joints(
@@ -341,12 +350,13 @@ def _stops(
     """The rows as stops, in the order of time where there is one."""
     time_s, words = time
     rows = len(next(iter(table.values())))
+    stops: Columns = {"stop": np.array([f"row{k:05d}" for k in range(rows)])} | table
+    order = np.arange(rows)
     if time_s is None:
-        odd = (*odd, f"{path.name}: {words}; stops are numbered in the order of rows instead")
-        time_s = np.arange(rows, dtype=float)
-    order = np.argsort(time_s, kind="stable")
-    names = np.array([f"row{k:05d}" for k in range(rows)])
-    stops = {"stop": names, "time_s": time_s} | table
+        odd = (*odd, f"{path.name}: {words}; what changes with time cannot be told from it")
+    else:
+        order = np.argsort(time_s, kind="stable")
+        stops["time_s"] = time_s
     said = (*said, f"{path.name}: a row is a stop: {rows:,} stops")
     return Contents(stops={k: v[order] for k, v in stops.items()}, understood=said, odd=odd)
 

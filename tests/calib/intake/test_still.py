@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from calib.intake.gather import joint_track
+from calib.intake.rigfile import _without
 from calib.intake.still import SETTLE_S, find_holds
 from calib.intake.stops import locations, table
 from chains.errors import InputError
@@ -113,3 +115,30 @@ def test_locations_are_where_the_base_stood():
     assert found["location"].tolist() == ["L00", "L00", "L01", "L00", "L00", "L01"]
     assert "2 places" in words
     assert locations(columns, "base", 3)[0]["location"].tolist()[::2] == ["L00", "L01", "L02"]
+
+
+def heat(name, celsius, **changes):
+    values = np.full((len(TIME_S), 1), celsius)
+    parts = {"kind": "covariate", "names": ("temperature_c",)} | changes
+    return Track(name=name, clock="c", time_s=TIME_S, values=values, **parts)
+
+
+def test_what_is_logged_beside_the_arm_is_a_covariate_and_none_is_lost():
+    """A gripper in the arm's own log, one in a log of its own, and two thermometers."""
+    own = Track(
+        name="log", kind="joints", clock="c", time_s=TIME_S, names=("grip", *JOINTS),
+        values=np.column_stack([np.full(len(TIME_S), 0.4), VALUES]),
+    )  # fmt: skip
+    other = heat("/tool/joints", 0.7, kind="joints", names=("finger",))
+    tracks = joint_track([own, other, heat("/room", 20.0), heat("/arm/motor", 40.0)], JOINTS)
+    columns, odd = table(tracks, SPANS)
+    for name, value in {"grip": 0.4, "finger": 0.7, "temperature_c": 20.0}.items():
+        np.testing.assert_allclose(columns[name], value)
+    np.testing.assert_allclose(columns["arm_motor.temperature_c"], 40.0)
+    assert any("temperature_c is logged twice" in line for line in odd)
+    assert np.array(JOINTS)[[name in columns for name in JOINTS]].tolist() == list(JOINTS)
+
+
+def test_a_body_that_is_left_out_takes_only_its_pose_along():
+    columns = {"cup.x": 1, "cup.qw": 1, "cup.temperature_c": 1, "mug.x": 1}
+    assert _without(columns, ["cup"]).keys() == {"cup.temperature_c", "mug.x"}

@@ -125,3 +125,18 @@ def test_a_package_that_is_named_is_used(tmp_path):
 def test_what_is_wrong_is_one_sentence(tmp_path, files, options, said):
     with pytest.raises(InputError, match=said):
         read(tmp_path, files, **options)
+
+
+def test_an_expanded_file_may_name_the_namespace_of_macros(tmp_path, monkeypatch):
+    """As xacro itself writes it: nothing is left to expand, so nothing is needed to do so."""
+    expanded = ARM.replace("<robot", '<robot xmlns:xacro="http://www.ros.org/wiki/xacro"')
+
+    def write_out(path, packages):
+        raise AssertionError("taken for macros")
+
+    monkeypatch.setattr("chains.readers.xacro.write_out", write_out)
+    found = read(tmp_path, {"arm.urdf": expanded})
+    (tmp_path / "arm.urdf").write_text(found.arm.urdf)
+    assert [e.name for e in read_arm(tmp_path / "arm.urdf", "a", "hand")] == ["q1", "q2"]
+    with pytest.raises(AssertionError, match="taken for macros"):
+        read(tmp_path, {"macro.urdf": MACRO})

@@ -66,11 +66,37 @@ def test_a_log_has_bodies_joints_and_covariates_each_apart(tmp_path):
     assert {track.clock for track in found.tracks} == {"t"}
 
 
-def test_stops_without_times_are_counted_and_that_is_said(tmp_path):
+def test_times_that_are_missing_are_not_made_up(tmp_path):
     columns = {"Timestamp": np.full(20, 2.02103e13), "j1": XYZ[:, 0], "j2": XYZ[:, 1]}
     found = read_table([write(tmp_path / "t.csv", columns)], Options(joints=JOINTS), quiet)
-    assert found.stops["time_s"].tolist() == list(range(20))
-    assert "Timestamp" in found.odd[0]
+    assert "time_s" not in found.stops and "Timestamp" in found.odd[0]
+    np.testing.assert_array_equal(found.stops["j1"], XYZ[:, 0])
+    del columns["Timestamp"]
+    found = read_table([write(tmp_path / "t.csv", columns)], Options(joints=JOINTS), quiet)
+    assert "time_s" not in found.stops and "no column of times" in found.odd[0]
+
+
+@pytest.mark.parametrize("time", ["stamp", "time_s", None])
+def test_a_joint_called_like_the_time_is_no_time(tmp_path, time):
+    """A URDF's joint T, an angle: stops were sorted by it."""
+    columns = {"T": XYZ[:, 0], "t": XYZ[:, 1], **({time: 10.0 * np.arange(20)} if time else {})}
+    path = write(tmp_path / "t.csv", columns)
+    found = read_table([path], Options(joints=dict.fromkeys("Tt", "revolute")), quiet)
+    np.testing.assert_array_equal(found.stops["T"], XYZ[:, 0])
+    np.testing.assert_array_equal(found.stops["t"], XYZ[:, 1])
+    if time:
+        assert found.stops["time_s"].tolist() == columns[time].tolist()
+    else:
+        assert "time_s" not in found.stops
+
+
+def test_a_temperature_T_is_no_time(tmp_path):
+    columns = {"T": 20 + XYZ[:, 0], "j1": XYZ[:, 1], "j2": XYZ[:, 2]}
+    found = read_table([write(tmp_path / "t.csv", columns)], Options(joints=JOINTS), quiet)
+    np.testing.assert_array_equal(found.stops["T"], columns["T"])
+    columns["t"] = 10.0 * np.arange(20)
+    found = read_table([write(tmp_path / "t.csv", columns)], Options(joints=JOINTS), quiet)
+    assert found.stops["time_s"].tolist() == columns["t"].tolist()
 
 
 def test_rows_out_of_order_are_put_in_order_and_keep_their_number(tmp_path):
@@ -117,3 +143,17 @@ def test_columns_that_look_like_a_pose_are_pointed_out(tmp_path):
     assert "goal" not in line and "la" not in line.split("columns")[1].split("may")[0]
     mapped = Options(columns={"cup.*": "cup_*"}, euler="XYZ", angle_unit="rad")
     assert not any("BODY" in line for line in read_table([path], mapped, quiet).odd)
+
+
+def test_what_is_not_taken_is_said_and_nothing_else(tmp_path):
+    """A column of words, and a triple beside one that is mapped: both were told to be taken."""
+    columns = {"stop": range(20), "note": ["fine"] * 20, "heat": XYZ[:, 0]}
+    found = read_table([write(tmp_path / "t.csv", columns)], Options(), quiet)
+    assert "heat" in found.stops and "note" not in found.stops
+    assert "t.csv: not taken: note" in found.understood
+    names = [f"{body}_{axis}" for body in ("cup", "goal") for axis in "xyz"]
+    columns = {"stop": range(20), **dict.fromkeys(names, XYZ[:, 0])}
+    options = Options(columns={"cup.*": "cup_*"})
+    found = read_table([write(tmp_path / "t.csv", columns)], options, quiet)
+    assert "t.csv: not taken: goal_x, goal_y, goal_z" in found.understood
+    assert not any("taken for covariates" in line for line in found.odd)

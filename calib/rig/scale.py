@@ -1,0 +1,102 @@
+"""Targets and lengths: rods that hang askew, spheres that are mixed up, and instruments whose
+lengths differ."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from calib.rig import TargetSpec
+from calib.rig.suspect import Suspect, listed
+from chains import se3
+from chains.align import align_points
+from chains.errors import InputError
+from sensors.reference import Reference
+from sensors.stops import Targets
+
+ASKEW_RAD = np.radians(3.0)
+APART_M = 0.01
+SIGNIFICANT = 5.0  # sigmas of a ratio of lengths
+UNITS = {1000.0: "millimetres", 100.0: "centimetres", 39.37: "inches", 3.281: "feet"}  # in a metre
+NEAR_A_UNIT = 0.03  # of a factor, by which a ratio may miss it
+FARTHER = 30.0  # rooms are at most so many times as large as what is seen of them
+ROOM = 2.5  # times the distance of their walls, rooms are across from corner to corner
+
+
+def odd_targets(targets: Targets, spec: TargetSpec) -> Iterator[str | Suspect]:
+    """Rods that hang askew, lengths that differ between tracker and scanner, and spheres that both
+    see at different places."""
+    names, rods = np.array(targets.names), targets.lower_m - targets.upper_m
+    rods = rods / np.linalg.norm(rods, axis=1, keepdims=True)
+    down = np.median(rods, axis=0)
+    down /= np.linalg.norm(down)
+    askew = rods @ down < np.cos(ASKEW_RAD)
+    if askew.any():
+        said = (
+            f"the rod of {listed(names[askew])} does not hang as the others do; are its markers "
+            "swapped?"
+        )
+        yield Suspect("target", names[askew][0], said)
+    sphere_m = targets.lower_m + spec.sphere_below_lower_marker_m * down
+    try:
+        T_world_reference, _ = align_points(sphere_m, targets.faro_m)
+    except InputError:
+        return
+    there_m = se3.apply(T_world_reference, targets.faro_m)
+    off_m = np.linalg.norm(sphere_m - there_m, axis=1)
+    differing = _ratio(sphere_m, there_m, spec)
+    if differing is not None and not askew.any():
+        yield differing
+    elif off_m.max() > APART_M:
+        said = (
+            f"tracker and scanner place {names[off_m.argmax()]} {1e3 * off_m.max():.0f} mm apart, "
+            f"the others up to {1e3 * np.sort(off_m)[-2]:.0f} mm; is it the same target in both?"
+        )
+        size_m = float(off_m.max())
+        yield Suspect("target", str(names[off_m.argmax()]), said, size=size_m, unit="m")
+
+
+def _ratio(tracked_m: np.ndarray, scanned_m: np.ndarray, spec: TargetSpec) -> Suspect | None:
+    """Lengths between spheres (M, 3) m by the tracker over those by the scanner, where the ratio
+    is not 1 and explains most of how they differ."""
+    a, b = tracked_m - tracked_m.mean(axis=0), scanned_m - scanned_m.mean(axis=0)
+    square = np.sum(b**2)
+    ratio = float(np.sum(a * b) / square)
+    left_m = a - ratio * b
+    free = 3 * len(a) - 7
+    noise_m = max(np.hypot(spec.sigma_sphere_m, spec.sigma_marker_m),
+                  np.sqrt(np.sum(left_m**2) / max(free, 1)))  # fmt: skip
+    sigma = float(noise_m / np.sqrt(square))
+    if abs(ratio - 1.0) < SIGNIFICANT * sigma:
+        return None
+    said = (
+        f"distances between targets are {ratio:.6g} times as long by the tracker as by the scanner,"
+        f" +- {sigma:.1g}"
+    )
+    for factor, unit in UNITS.items():
+        for part, value in (("faro", 1 / ratio), ("upper and lower", ratio)):
+            if abs(value / factor - 1) < NEAR_A_UNIT:
+                return Suspect("target", "scale", f"{said}; is {part} in {unit}?", size=ratio - 1)
+    said += "; one of the two is out of scale"
+    return Suspect("target", "scale", said, size=ratio - 1.0, unit="1")
+
+
+def odd_mesh(reference: Reference, reach_m: float) -> Iterator[Suspect]:
+    """A mesh whose size is out of all proportion to how far the LiDAR sees.
+
+    Args:
+        reference: the mesh.
+        reach_m: distance below which nineteen in twenty returns lie.
+    """
+    size_m = float(np.linalg.norm(np.ptp(reference.vertices_m, axis=0)))
+    ratio = size_m / reach_m
+    if 1 / FARTHER < ratio < FARTHER:
+        return
+    factor = min(UNITS, key=lambda f: abs(np.log(max(ratio / ROOM, ROOM / ratio) / f)))
+    unit = UNITS[factor] if ratio > 1 else f"metres divided by {factor:g}"
+    said = (
+        f"the mesh is {size_m:.3g} m across, and nineteen in twenty returns come from within "
+        f"{reach_m:.3g} m; is it in {unit}?"
+    )
+    yield Suspect("surface", "scale", said, size=ratio)

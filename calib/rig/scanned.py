@@ -1,0 +1,160 @@
+"""What the scans hold, summed up one by one, and what of it looks wrong before any fit."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from calib.rig import Rig
+from calib.rig.suspect import Suspect, listed
+from sensors.lidar import LARGEST_REFLECTANCE, LidarModel, beams
+from sensors.recording import Recording, Scan
+from sensors.rings import odd_rings, ring_elevations
+
+FULL_SCALES = {LARGEST_REFLECTANCE: ", a reflectance", 255.0: " of 255", 65535.0: " of 65535"}
+LEAST_VALUES = 20  # different ones in a column, for its repetition to be no chance
+
+
+@dataclass
+class ScanSums:
+    """What the readable scans hold, summed up while only one of them is in memory.
+
+    Args:
+        lidar: the rig's, if it has one.
+        points: scan -> number of points.
+        sweeps: the most returns that were averaged into a point.
+        rings: (R,) points by ring.
+        elevation_rad: (R,) sum of the beams' elevations by ring.
+        columns: names of the per-point covariates.
+        intensity: scan -> its largest intensity, where it has any.
+        darkest: the least intensity.
+        reach_m: the largest distance below which nineteen in twenty returns of a scan lie.
+        contents: (column, digest of its values) -> the scans that hold it, of columns that vary;
+            "points" stands for x, y and z.
+    """
+
+    lidar: LidarModel | None = None
+    points: dict[str, int] = field(default_factory=dict)
+    sweeps: int = 0
+    rings: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
+    elevation_rad: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    columns: dict[str, None] = field(default_factory=dict)
+    intensity: dict[str, float] = field(default_factory=dict)
+    darkest: float = np.inf
+    reach_m: float = 0.0
+    contents: dict[tuple[str, str], list[str]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.lidar:
+            self.rings = np.zeros(self.lidar.rings, int)
+            self.elevation_rad = np.zeros(self.lidar.rings)
+
+    def add(self, name: str, scan: Scan) -> None:
+        """Take in one scan."""
+        self.points[name] = len(scan.ring)
+        self.sweeps = max(self.sweeps, int(scan.count.max()))
+        rings = np.bincount(scan.ring, minlength=len(self.rings))
+        rings[: len(self.rings)] += self.rings
+        self.rings = rings
+        if self.lidar:
+            up_rad = beams(scan.xyz_m, self.lidar.beam_origin_m).elevation_rad
+            self.elevation_rad += np.bincount(scan.ring, up_rad, len(self.elevation_rad))
+        away_m = np.linalg.norm(scan.xyz_m, axis=1)
+        self.reach_m = max(self.reach_m, float(np.quantile(away_m, 0.95)))
+        self.columns |= dict.fromkeys(scan.extra)
+        if np.isfinite(scan.intensity).any():
+            self.intensity[name] = float(np.nanmax(scan.intensity))
+            self.darkest = min(self.darkest, float(np.nanmin(scan.intensity)))
+        for column, values in {
+            "points": scan.xyz_m,
+            "intensity": scan.intensity,
+            "range_std_m": scan.range_std_m,
+            **scan.extra,
+        }.items():
+            if len(np.unique(values[:1000])) >= LEAST_VALUES:
+                key = column, hashlib.sha256(np.ascontiguousarray(values)).hexdigest()
+                self.contents.setdefault(key, []).append(name)
+
+
+def of_scans(scans: ScanSums) -> Iterator[tuple[str, str]]:
+    """Scans, their points, rings, intensity and covariates."""
+    low, high = min(scans.points.values()), max(scans.points.values())
+    points = f"{low:,}" if low == high else f"{low:,} to {high:,}"
+    sweeps = f", up to {scans.sweeps} sweeps averaged" if scans.sweeps > 1 else ""
+    yield "scans", f"{len(scans.points)} of {points} points{sweeps}"
+    yield "rings", f"{np.count_nonzero(scans.rings)} of {len(scans.rings)} seen"
+    if scans.intensity:
+        largest = max(scans.intensity.values())
+        unit = next((words for full, words in FULL_SCALES.items() if largest <= full), "")
+        yield "intensity", f"up to {largest:.3g}{unit}"
+    if scans.columns:
+        yield "per-point covariates", ", ".join(scans.columns)
+
+
+def odd_scans(rig: Rig, recording: Recording, scans: ScanSums) -> Iterator[str | Suspect]:
+    """Scans without stop, stops without scan, rings without points or with wrong numbers, scans
+    or columns that are there twice, and intensities of no known unit."""
+    if stray := sorted(scans.points.keys() - set(recording.stops)):
+        yield f"scans/ holds {listed(stray)}, but stops.csv has no such stop; they are not used"
+    if not scans.points:
+        return
+    if rig.lidar is None:
+        yield "there are scans, but no 'lidar' in rig.yaml, so they are not used"
+        return
+    if not recording.has_scan.all():
+        missing = np.array(recording.stops)[~recording.has_scan]
+        yield f"there is no scan of {listed(missing)}, though of other stops"
+    if (silent := np.flatnonzero(scans.rings == 0)).size:
+        yield f"no point comes from ring {listed(silent)}; rings are counted from 0"
+    numbered = odd_rings(rig.lidar, ring_elevations(scans.elevation_rad, scans.rings))
+    if numbered is not None:
+        yield Suspect("rings", rig.lidar.name, numbered.sentence, size=numbered.off_rad, unit="rad")
+    yield from _at_once(recording)
+    yield from _twice(scans)
+    yield from _intensities(scans)
+
+
+def _at_once(recording: Recording) -> Iterator[Suspect]:
+    """Stops with scans at one and the same time."""
+    at = np.flatnonzero(recording.has_scan & recording.timed)
+    _, same, count = np.unique(recording.time_s[at], return_inverse=True, return_counts=True)
+    for each in np.flatnonzero(count > 1):
+        stops = tuple(recording.stops[k] for k in at[same == each])
+        said = f"the scans of {' and '.join(stops)} were made at one time, time_s; is one a copy?"
+        yield Suspect("scan", stops[0], said, stops=stops)
+
+
+def _twice(scans: ScanSums) -> Iterator[Suspect]:
+    """Scans that are copies of each other, and columns that are copied from another scan."""
+    copies = {tuple(names) for (c, _), names in scans.contents.items() if c == "points"}
+    for names in sorted(copies):
+        if len(names) > 1:
+            said = f"the scans of {' and '.join(names)} are one and the same; which stop is it of?"
+            yield Suspect("scan", names[0], said, stops=names)
+    for (column, _), names in scans.contents.items():
+        if len(names) > 1 and column != "points" and tuple(names) not in copies:
+            said = f"column {column} of the scans of {' and '.join(names)} is one and the same"
+            yield Suspect("scan", names[0], said, stops=tuple(names))
+
+
+def _intensities(scans: ScanSums) -> Iterator[Suspect]:
+    """Units of intensity that differ from scan to scan, or are none that makers use."""
+    if not scans.intensity:
+        return
+    largest = max(scans.intensity.values())
+    small = [name for name, most in scans.intensity.items() if most <= LARGEST_REFLECTANCE]
+    if small and largest > LARGEST_REFLECTANCE:
+        said = (
+            f"intensity is a reflectance of 0 to 1 at {listed(small)}, and goes to {largest:g} at "
+            "other stops; give all in one unit"
+        )
+        yield Suspect("intensity", "intensity", said, stops=tuple(small))
+    elif largest > max(FULL_SCALES) or scans.darkest < 0:
+        said = (
+            f"intensity lies between {scans.darkest:g} and {largest:g}, which is neither a "
+            "reflectance of 0 to 1 nor a count of 8 or 16 bits; effects of it take it for counts"
+        )
+        yield Suspect("intensity", "intensity", said)

@@ -1,0 +1,285 @@
+"""What is wrong with tracked bodies, as far as it shows before any fit: placeholders, orders of
+quaternions, bodies exchanged, and poses that no other pose and no joint bears out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.rig import Rig
+from calib.rig.suspect import Suspect, listed
+from chains import se3
+from chains.align import hand_eye
+from chains.errors import InputError
+from chains.se3 import Array
+from sensors.recording import Recording
+
+MOVED = 1e-3  # rad or m by which a joint has moved, if it has
+UNKNOWN = 0.005  # rad and m that arms' joints and links are off by; those measured, by 0.003
+JITTER = 1e-4  # rad by which joints scatter at least, as of industrial arms
+OUTLIER = 8.0  # sigmas; of 21 sound recordings 3.7 at most, 7.4 where a load changes how joints sag
+LOST = 0.05  # m and rad left by all that CAD and the arm may be off by: not this arm, or not so
+TURNED_RAD, FITS_RAD = 0.1, 0.03  # turns that are not the arm's, and turns that are
+MOST_TAKEN = 0.5  # of the rows by what is unknown: more, and what is left of the others says little
+SWAPPED = 0.2  # of the misfit, left where two bodies are exchanged
+MOST_COMPARED = 100  # stops, each with each
+MOST_FITTED = 1000  # stops, to which what is unknown is fitted; all are held against it
+ORDERS = {"qx, qy, qz, qw": (3, 0, 1, 2), "qz, qw, qx, qy": (1, 2, 3, 0)}
+
+
+@dataclass(frozen=True)
+class _Pair:
+    """A body as seen from another, or from the tracker, at K stops.
+
+    Args:
+        names: the bodies: that which is seen from, if any, and that which is seen.
+        stops: (K,) indices.
+        place: (K,) which unknown place the rig's root has; -1 where the other body carries it.
+        nominal: (K, 4, 4) as joints and CAD say.
+        poses: (K, 7) as measured, of each of the names.
+        d_twist: (K, 6, P) of the nominal pose, by every edge of the rig.
+    """
+
+    names: tuple[str, ...]
+    stops: np.ndarray
+    place: np.ndarray
+    nominal: Array
+    poses: tuple[Array, ...]
+    d_twist: Array
+
+    def seen(self, order: Sequence[int] = range(4)) -> Array:
+        """(K, 4, 4) as measured, the quaternions' columns taken in some order."""
+        T = [se3.from_xyz_quat(pose[:, :3], pose[:, 3:][:, list(order)]) for pose in self.poses]
+        return T[0] if len(T) == 1 else se3.inverse(T[0]) @ T[1]
+
+
+def odd_bodies(rig: Rig, recording: Recording) -> Iterator[Suspect]:
+    """What looks wrong with tracked bodies."""
+    if rig.tracker is None:
+        return
+    usable = {}
+    for body in rig.tracker.bodies:
+        bad = yield from _placeholders(rig, recording, body)
+        usable[body] = np.isfinite(recording.bodies[body]).all(axis=1) & ~bad
+    pairs = list(_pairs(rig, recording, usable))
+    wrong = next((s for pair in pairs if (s := _at_all_stops(pair)) is not None), None)
+    if wrong is not None:
+        yield wrong
+        return
+    met: dict[int, list[tuple[_Pair, Array, bool]]] = {}
+    for pair in pairs:
+        for k, gap, exchanged in _outliers(rig, pair):
+            met.setdefault(int(pair.stops[k]), []).append((pair, gap, exchanged))
+    for stop, found in sorted(met.items()):
+        yield _at_one_stop(rig, recording.stops[stop], found)
+
+
+# --------------------------------------------------------------------------------- placeholders
+
+
+def _placeholders(rig: Rig, recording: Recording, body: str) -> Iterator[Suspect]:
+    """Poses that trackers write where they have not seen; returns (K,) which these are."""
+    pose, names = recording.bodies[body], np.array(recording.stops)
+    zero = (pose[:, :3] == 0).all(axis=1)
+    level = (pose[:, 3:] == [1, 0, 0, 0]).all(axis=1) & ~zero
+    level &= np.isfinite(pose).all(axis=1).sum() > level.sum()
+    old = _repeated(rig, recording, body) & ~zero
+    for wrong, words in (
+        (zero, "stands at exactly (0, 0, 0) at {}, as trackers write what they have not seen"),
+        (level, "is turned by exactly (1, 0, 0, 0) at {}, as trackers write a turn not seen"),
+        (old, "has at {} the pose of another stop to the last digit, though the arm had moved"),
+    ):
+        if wrong.any():
+            at = tuple(names[wrong].tolist())
+            said = f"{body} {words.format(listed(at))}; leave its cells empty there"
+            yield Suspect("body", body, said, stops=at)
+    return zero | level | old
+
+
+def _repeated(rig: Rig, recording: Recording, body: str) -> np.ndarray:
+    """(K,) stops at which a body beyond the arm repeats an old pose, its joints having moved."""
+    same = np.zeros(len(recording.stops), bool)
+    joints = [rig.joint_names.index(name) for name in rig.joints_to(body)]
+    seen = np.flatnonzero(np.isfinite(recording.bodies[body][:, 0]))
+    if not joints or len(seen) < 2:
+        return same
+    pose, at = np.nan_to_num(recording.bodies[body][seen]), recording.joints[seen][:, joints]
+    _, first, inverse = np.unique(pose, axis=0, return_index=True, return_inverse=True)
+    same[seen] = np.abs(at - at[first[inverse.ravel()]]).max(axis=1) > MOVED
+    return same
+
+
+# ------------------------------------------------------------------------------- at all stops
+
+
+def _pairs(rig: Rig, recording: Recording, usable: Mapping[str, np.ndarray]) -> Iterator[_Pair]:
+    """Each body as the tracker sees it, where the rig's root stands still; else as the body
+    nearest to the root does."""
+    bodies = sorted((b for b in usable if usable[b].any()), key=lambda b: len(rig.joints_to(b)))
+    still = np.zeros((1, len(rig.tree.edges), 6))
+    placed = {b: rig.tree.place(b, recording.joints, still) for b in bodies}
+    place = np.zeros(len(recording.stops), int)
+    if rig.moves == "location":
+        place = np.unique(recording.location, return_inverse=True)[1]
+    for body in bodies if rig.moves != "stop" else bodies[1:]:
+        names = (body,) if rig.moves != "stop" else (bodies[0], body)
+        at = np.flatnonzero(np.all([usable[name] for name in names], axis=0))
+        T, d = placed[body].Ts_root_frame[at], placed[body].d_twist[at].reshape(len(at), 6, -1)
+        if len(names) == 2:
+            first = placed[names[0]]
+            T = se3.inverse(first.Ts_root_frame[at]) @ T
+            d = d - se3.adjoint(se3.inverse(T)) @ first.d_twist[at].reshape(len(at), 6, -1)
+        yield _Pair(
+            names=names,
+            stops=at,
+            place=place[at] if len(names) == 1 else np.full(len(at), -1),
+            nominal=T,
+            poses=tuple(recording.bodies[name][at] for name in names),
+            d_twist=d,
+        )
+
+
+def _at_all_stops(pair: _Pair) -> Suspect | None:
+    """Bodies exchanged, or quaternions in another order."""
+    if len(pair.stops) < 4:
+        return None
+    seen, names = pair.seen(), " and ".join(pair.names)
+    if len(pair.names) == 2:
+        apart, swapped = (
+            np.median(_size(_gap(pair.nominal, T))) for T in (seen, se3.inverse(seen))
+        )
+        if apart > TURNED_RAD and swapped < SWAPPED * apart:
+            said = f"{names} lie as CAD says if they are exchanged; is each named as it should be?"
+            return Suspect("body", names, said)
+    if _turns(pair, seen)[0] < TURNED_RAD:
+        return None
+    orders = {order: _turns(pair, pair.seen(index)) for order, index in ORDERS.items()}
+    fitting = [order for order, (left, _) in orders.items() if left < FITS_RAD]
+    if not fitting:
+        return None
+    order = min(fitting, key=lambda order: orders[order][1])
+    said = (
+        f"{names} turn as the joints say if the columns qw, qx, qy, qz hold {order}; put them in "
+        "their order"
+    )
+    return Suspect("body", names, said)
+
+
+def _turns(pair: _Pair, seen: Array) -> tuple[float, float]:
+    """Rad by which a body turns otherwise than the joints say, median, whatever it hangs on and
+    wherever the rig stands, and by which it hangs otherwise than CAD says; 0 where not to be told.
+    """
+    places, index = np.unique(pair.place, return_inverse=True)
+    at = index == np.bincount(index, minlength=len(places)).argmax()
+    try:
+        X, Z = hand_eye(seen[at], pair.nominal[at])
+    except InputError:
+        return 0.0, 0.0
+    left = _gap(Z @ pair.nominal[at] @ X, seen[at])
+    return float(np.median(np.linalg.norm(left[:, :3], axis=1))), float(_size(se3.log(X)[:3]))
+
+
+# -------------------------------------------------------------------------------- at one stop
+
+
+def _outliers(rig: Rig, pair: _Pair) -> Iterator[tuple[int, Array, bool]]:
+    """Stops of a pair that stand out from the others: which, by how much (6,) [rad m], and whether
+    they would not if the bodies were exchanged.
+
+    The gaps between measured and nominal poses are laid on what all edges of the rig, and the
+    root's places, may be off by: weighted least squares with CAD's sigmas as priors, and Cauchy's
+    weights by stop, so that no wild one bends the rest.
+    """
+    if len(pair.stops) < 4:
+        return
+    nominal, seen = _from_places(pair), pair.seen()
+    gap = _gap(nominal, seen)
+    noise = np.repeat([rig.tracker.sigma_rad, rig.tracker.sigma_m], 3) * np.sqrt(len(pair.names))
+    noise = np.hypot(noise, max(rig.sigma_joint_rad, JITTER))
+    d_place = se3.adjoint(se3.inverse(pair.nominal))
+    columns = [pair.d_twist, *(d_place * (pair.place == p)[:, None, None]
+               for p in np.unique(pair.place[pair.place >= 0]))]  # fmt: skip
+    A = np.concatenate(columns, axis=2) / noise[:, None]
+    prior = np.full(A.shape[2], LOST)
+    prior[: pair.d_twist.shape[2]] = _edge_sigmas(rig)
+    left, taken = _robust(A * prior, gap / noise)
+    size = np.array([np.linalg.norm(left[:, s], axis=1) for s in _HALVES]).T
+    spread = np.median(size, axis=0) / 1.538 / np.sqrt(1.0 - min(taken, 0.99))
+    if taken > MOST_TAKEN or (spread * noise[[0, 3]] > LOST).any():
+        return
+    for k in np.flatnonzero((size > OUTLIER * np.maximum(spread, 1.0)).any(axis=1)):
+        exchanged = len(pair.names) == 2 and (
+            _size(_gap(nominal[k], se3.inverse(seen[k]))) < SWAPPED * _size(gap[k])
+        )
+        yield int(k), left[k] * noise, bool(exchanged)
+
+
+_HALVES = (slice(0, 3), slice(3, 6))  # of a twist: turn and shift; 1.538 is the median of chi(3)
+
+
+def _edge_sigmas(rig: Rig) -> Array:
+    """(6 E,) how far each edge may be off: CAD's sigma of a frame, or what an arm's may be."""
+    sigma = [
+        np.maximum(rig.frame_sigma[name], 1e-6) if name in rig.frame_sigma else np.full(6, UNKNOWN)
+        for name in rig.tree.edge_names
+    ]
+    return 3.0 * np.concatenate(sigma)  # one in a hundred lies beyond
+
+
+def _from_places(pair: _Pair) -> Array:
+    """(K, 4, 4) nominal poses in the world, from places that most of their stops agree on."""
+    nominal = pair.nominal.copy()
+    for p in np.unique(pair.place[pair.place >= 0]):
+        at = np.flatnonzero(pair.place == p)
+        roots = (pair.seen() @ se3.inverse(pair.nominal))[at]
+        some = roots[:: -(-len(roots) // MOST_COMPARED)]
+        apart = _size(_gap(some[:, None], some[None]))
+        nominal[at] = some[np.median(apart, axis=1).argmin()] @ nominal[at]
+    return nominal
+
+
+def _robust(A: Array, b: Array) -> tuple[Array, float]:
+    """What is left of b (K, 6) after A (K, 6, P), of unknowns with a sigma of 1, and which share
+    of the rows they took on: the mean diagonal of what makes fitted rows of seen ones."""
+    some = slice(None, None, -(-len(b) // MOST_FITTED))
+    rows, seen, P = A[some].reshape(-1, A.shape[2]), b[some], A.shape[2]
+    weight = np.ones(len(seen))
+    for _ in range(30):
+        weighted = rows * np.repeat(weight, 6)[:, None]
+        inner = rows.T @ weighted
+        x = np.linalg.solve(inner + np.eye(P), weighted.T @ seen.ravel())
+        size = np.linalg.norm(seen - (rows @ x).reshape(-1, 6), axis=1)
+        before, weight = weight, 1.0 / (1.0 + np.square(size / max(3.0 * np.median(size), 3.0)))
+        if np.abs(weight - before).max() < 1e-3:
+            break
+    taken = float(np.trace(np.linalg.solve(inner + np.eye(P), inner))) / len(rows)
+    return b - A @ x, taken
+
+
+def _at_one_stop(rig: Rig, stop: str, found: list[tuple[_Pair, Array, bool]]) -> Suspect:
+    """One stop's bodies that stand out: the one that all pairs have in common, if there is one."""
+    pair, gap, exchanged = found[0]
+    common = [name for name in pair.names if all(name in other.names for other, *_ in found)]
+    names = " or ".join(common or dict.fromkeys(n for p, *_ in found for n in p.names))
+    turn_deg, shift_mm = np.degrees(np.linalg.norm(gap[:3])), 1e3 * np.linalg.norm(gap[3:])
+    if exchanged:
+        said = f"at {stop} {' and '.join(pair.names)} lie as at other stops if they are exchanged"
+    else:
+        joints = any(rig.joints_to(name) for p, *_ in found for name in p.names)
+        said = (
+            f"at {stop} {names} is {shift_mm:.3g} mm and {turn_deg:.2g} deg from where other stops"
+            f"{' and the joints' if joints else ''} put it; look at its row"
+        )
+    return Suspect("body", names, said, stops=(stop,), size=float(shift_mm / 1e3), unit="m")
+
+
+def _gap(a: Array, b: Array) -> Array:
+    """(..., 6) by which poses b differ from a, in their own axes."""
+    return se3.log(se3.inverse(a) @ b)
+
+
+def _size(twist: Array) -> Array:
+    """Rad and m alike: (...,) how large a twist is."""
+    return np.linalg.norm(twist, axis=-1)

@@ -1,0 +1,50 @@
+"""What data could not tell, by names that hold points, slashes, commas and shapes."""
+
+import numpy as np
+import pytest
+
+from calib.problem.unknowns import Unknown
+from calib.runs.estimates import _told
+from calib.solve.observability import not_estimated
+
+AWKWARD = {
+    "range_cyclic@1.2": ("sin", "cos"),
+    "left.rig/arm_joint_offset": ("hip.yaw", "hip.roll", "knee", "foot.pitch"),
+    "label_range_offset": ("0_floor, left", "1_wall.a", "2_wall … b", "3_wall"),
+}
+
+
+def unknowns(variables):
+    return [
+        Unknown(
+            name=name,
+            kind="vector",
+            mean=np.zeros(len(dofs)),
+            sigma=np.full(len(dofs), 0.01),
+            dofs=dofs,
+            units=("m",) * len(dofs),
+        )
+        for name, dofs in variables.items()
+    ]
+
+
+@pytest.mark.parametrize(
+    ("untold", "names"),
+    [
+        ([0], ["range_cyclic@1.2.sin"]),
+        ([0, 1], ["range_cyclic@1.2"]),
+        ([3], ["left.rig/arm_joint_offset.hip.roll"]),
+        ([2, 3, 4], ["left.rig/arm_joint_offset (hip.yaw … knee)"]),
+        ([0, 2, 5], ["range_cyclic@1.2.sin", "left.rig/arm_joint_offset (hip.yaw, foot.pitch)"]),
+        ([6, 7, 9], ["label_range_offset (0_floor, left, 1_wall.a, 3_wall)"]),
+        ([7, 8, 9], ["label_range_offset (1_wall.a … 3_wall)"]),
+    ],
+)
+def test_names_are_not_cut_at_their_points_and_are_read_back(untold, names):
+    variables = unknowns(AWKWARD)
+    sigma = np.full(10, 1e-4)
+    sigma[untold] = 0.01
+    found = not_estimated(variables, np.diag(sigma**2), frozenset(AWKWARD), np.ones(10, bool))
+    assert [entry["name"] for entry in found] == names
+    told = np.concatenate([_told(name, dofs, found) for name, dofs in AWKWARD.items()])
+    assert np.flatnonzero(~told).tolist() == untold
