@@ -74,13 +74,14 @@ class Assembly:
         self.touched = np.zeros(layout.size, bool)
         for rows in (r for each in own.values() for r in each if r.measured):
             self.touched[rows.columns] |= np.any(rows.A != 0, axis=0)
-        self.weight_m2 = 0.0
+        self.weight_m2 = self.beams_chi2 = 0.0
         self.eliminated: list[Eliminated] = []
         self.twists: list[tuple[int, np.ndarray, np.ndarray]] = []
 
     def add(self, sums: StopSums) -> None:
         """Add the beams of a stop."""
         self.weight_m2 += sums.weight_m2
+        self.beams_chi2 += float(sums.dense[TWIST, TWIST])
         self.chi2 += float(sums.dense[TWIST, TWIST])
         seen = np.append(np.diag(sums.dense)[TWIST + 1 :], sums.own) > 0
         self.touched[sums.columns] |= seen
@@ -108,6 +109,7 @@ class Assembly:
 
     def _done(self, values: Values, kept: np.ndarray) -> Linearisation:
         return Linearisation(
+            beams_chi2=self.beams_chi2,
             layout=self.layout,
             values=values,
             kept=kept,
