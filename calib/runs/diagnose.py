@@ -66,4 +66,6 @@ def stand_of(run: Run, progress: Progress) -> Stand:
     """
     sources, model = reopened(run), model_of(run)
     problem, converged = build(sources, model), run.summary["converged"]
-    return Stand(sources, model, problem, resume(problem, start_of(run, sources), progress, converged))
+    return Stand(
+        sources, model, problem, resume(problem, start_of(run, sources), progress, converged)
+    )

@@ -47,23 +47,16 @@ def solve(
         loop.go_on(tolerance)
         return loop.estimate()
     loop.solve_without_scans()
-    if loop.bodies_astray() and prior is None:
-        _turn(loop)
+    if prior is None and loop.bodies_astray():
+        # A start that is right costs less before it is solved than a wrong one after.
+        for cost, values in least_turned(problem):
+            if cost < loop.cost():
+                loop.solve_without_scans(values)
+        loop.lost = loop.bodies_astray()
     if problem.scans:
-        loop.lost = loop.bodies_astray() or not loop.look_around()
+        loop.lost = loop.lost or not loop.look_around()
         loop.settle(tolerance)
     return loop.estimate()
-
-
-def _turn(loop: Loop) -> None:
-    """Try the trackers and targets from other starts, and stay where the cost is least."""
-    best = loop.cost(), loop.values
-    for values in least_turned(loop.problem):
-        loop.values = values
-        loop.solve_without_scans()
-        if loop.cost() < best[0]:
-            best = loop.cost(), loop.values
-    loop.values = best[1]
 
 
 def preview(problem: Problem, progress: Progress = lambda what, done, total: None) -> Estimate:

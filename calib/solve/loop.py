@@ -20,7 +20,7 @@ from calib.problem.problem import Block, Problem
 from calib.problem.surfaces import with_surfaces
 from calib.residuals.beams import Association
 from calib.residuals.tracker import TrackedBody
-from calib.solve.estimate import SEEN, Estimate, Start, cost_of, started, values_of
+from calib.solve.estimate import DOFS, SEEN, Estimate, Start, cost_of, started, values_of
 from calib.solve.graph import Graph, KeptRows
 from chains import se3
 
@@ -36,16 +36,17 @@ AT_OPTIMUM = 1e-3
 # far from normal each step lowers the cost by up to two thirds of what the one before it did.
 LAST = AT_OPTIMUM / 4
 STEADY = 1e-9  # the same, of trackers and targets alone, whose steps cost little
-DIGITS = 1e-12  # of a cost: what is less is rounding
+DIGITS = 1e-14  # of a cost: what is less is rounding
 UPHILL = 1e-9  # of a cost: a step that raises it by more is shortened
-SHORTEST = 1e-3  # of a step: then no part of it leads downhill
+SHORTEST, LONGEST = 1e-3, 2.0  # of a step: how much of it may be taken
 # Bodies half of whose stops are so far (m, rad) from where the chain puts them after a fit are not
 # described by it: CAD and encoders are good to millimetres. Measured on the independent recordings:
 # 0.002 at most; with two bodies exchanged, or the quaternions' order wrong, 0.2 or more.
 ASTRAY = 0.05
-# Beams are looked at so often before it is asked whether that leads anywhere: good recordings, and
+# So often is looked what beams meet before it is asked whether that leads anywhere, and so often
+# at most: good recordings, and
 # one with the LiDAR 0.13 m from where CAD has it, settle in 2 to 6 passes ...
-HOPEFUL = 8
+HOPEFUL, LOOKED = 8, 15
 # ... with scales of 1 to 4 sigmas (median over the stops); with scans at wrong stops it is 85.
 HOPELESS = 30.0
 
@@ -81,18 +82,25 @@ class Loop:
         self.linear: Linearisation | None = None
         self.graph: Graph | None = None
 
-    def solve_without_scans(self) -> None:
+    def solve_without_scans(self, start: Mapping[str, np.ndarray] | None = None) -> None:
         """Trackers and targets alone: a good start for the beams, or all there is.
 
-        Where plain steps end short of the optimum, GTSAM's damped ones go on from the start.
+        Where plain steps end short of the optimum, GTSAM's damped ones go on from the start, unless
+        bodies are far off, and another start is what is wanted.
+
+        Args:
+            start: another state to start from; its optimum is kept if it costs less.
         """
-        first = self.values
-        if not self._descend(STEADY, beams=False):
-            stuck = self.cost(), self.values
+        ended = (np.inf, self.values) if start is None else (self.cost(), self.values)
+        self.values = first = self.values if start is None else dict(start)
+        settled = self._descend(STEADY, beams=False)
+        if not settled and not self.bodies_astray():
+            ended = min(ended, (self.cost(), self.values), key=lambda each: each[0])
             self.values = self._damped(first)
             self._descend(STEADY, beams=False)
-            if self.cost() > stuck[0]:
-                self.values = stuck[1]
+        if ended[0] < self.cost():
+            self.values = ended[1]
+            self._linearise(beams=False)
         if self.problem.scans:
             self.passes = 1  # what is counted are passes over the scans
 
@@ -117,7 +125,7 @@ class Loop:
     def look_around(self) -> bool:
         """Passes that look each time anew what beams meet, until they settle; False where the fit
         is hopeless."""
-        for count in range(1, MAX_PASSES + 1):
+        for count in range(1, LOOKED + 1):
             self._linearise(associate=True)
             self.passes += 1
             scale = np.median([each.scale for each in self.linear.weighed])
@@ -145,7 +153,8 @@ class Loop:
             self.fix_association(seen, met)
             if self.lost:
                 return
-            self._descend(tolerance)
+            if not self._descend(tolerance):
+                return
             pairs = ((scan.pose(self.seen), scan.pose(self.values)) for scan in self.problem.scans)
             if all(np.abs(se3.log(se3.inverse(a) @ b)).max() < STRAYED for a, b in pairs):
                 return
@@ -187,6 +196,7 @@ class Loop:
             met: what beams are known to meet; the others look anew, and those beside a depth edge
                 are dropped. Where None and `seen` is given, what the start knows.
         """
+        known = {**self.start.state, **self._cells()}
         self.problem, self.seen = self.given, dict(seen or self.values)
         met = self.start.met if met is None and seen is not None else met or {}
         scans, found = self.problem.scans, []
@@ -203,8 +213,14 @@ class Loop:
         self.problem, self.associations = with_surfaces(self.given, found)
         for name in self.problem.cells:
             unknown = self.problem.variables[name]
-            self.values[name] = started(unknown, self.start.state, unknown.mean)
+            self.values[name] = started(unknown, known, unknown.mean)
         self.layout = self._layout()
+
+    def _cells(self) -> dict[str, np.ndarray]:
+        """The present state of the surfaces' unknowns, of those that there are."""
+        found = [self.problem.variables[name] for name in self.problem.cells]
+        dofs = {f"{v.name}{DOFS}": np.array(v.dofs, np.str_) for v in found}
+        return dofs | {v.name: self.values[v.name] for v in found}
 
     def estimate(self) -> Estimate:
         """The result, with the covariance of the calibration."""
@@ -249,21 +265,26 @@ class Loop:
             hasten: whether the curvature of the beams' cost may take the place of their weights.
         """
         newton, last, misled, wait, part = False, np.inf, 0, 0, 1.0
-        before, tangent, cost = None, None, np.inf
+        before, tangent, cost, fall = None, None, np.inf, 0.0
         weighed: Sequence[Weighing] = ()
         for _ in range(MAX_PASSES):
             self._linearise(newton=newton, beams=beams, weighed=weighed)
             self.passes += 1
-            if before is not None and not self._downhill(cost):
-                part /= 2
-                self.values = self._moved(before, tangent, part) if part > SHORTEST else before
-                if part <= SHORTEST:
-                    self._linearise(beams=beams)
-                    return False
-                continue
-            before, cost, weighed, part = self.values, self.cost(), self.linear.weighed, 1.0
+            if before is not None:
+                fell = cost - self._cost_before()
+                lowest = _lowest(part, fall, fell)
+                if fell < -UPHILL * cost - STEADY:
+                    part = min(lowest, part / 2)
+                    self.values = self._moved(before, tangent, part) if part > SHORTEST else before
+                    if part <= SHORTEST:
+                        self._linearise(beams=beams)
+                        return False
+                    continue
+                part = max(1.0, lowest)
+            before, cost, weighed = self.values, self.cost(), self.linear.weighed
             tangent, fall = self._step()
-            self.values, size = self._moved(before, tangent), self._size(tangent)
+            size = self._size(tangent)
+            self.values = self._moved(before, tangent, part)
             if size < tolerance and fall < LAST if beams else fall < max(tolerance, DIGITS * cost):
                 return True
             # Where a row's curvature misleads, steps grow; its weight never does. It is tried again
@@ -274,11 +295,10 @@ class Loop:
             newton, last = hasten and beams and not wait and size < last, size
         return False
 
-    def _downhill(self, before: float) -> bool:
-        """Whether the cost is not above that before the step, beams weighed as they were there."""
+    def _cost_before(self) -> float:
+        """The cost here, beams weighed as they were before the step."""
         told = self.linear.cost_before
-        now = self._cost(self.linear.beams_cost if told is None else told)
-        return now <= before * (1 + UPHILL) + STEADY
+        return self._cost(self.linear.beams_cost if told is None else told)
 
     def _layout(self) -> Layout:
         return Layout.of(self.problem, kept=self.held)
@@ -343,3 +363,18 @@ class Loop:
     def _size(self, tangent: Mapping[str, np.ndarray]) -> float:
         """The largest change of the calibration in a step, m or rad."""
         return max(float(np.abs(tangent[name]).max()) for name in self.problem.calibration)
+
+
+def _lowest(part: float, fall: float, fell: float) -> float:
+    """Where along a step the cost is lowest, as the parabola through what is known has it.
+
+    Of a step a whole one lowers a quadratic cost most. Where residuals are far from normal, the
+    curvature is less than the weights say, and several steps would go the same way.
+
+    Args:
+        part: how much of the step was taken.
+        fall: by how much all of it was to lower the cost; at its start the slope is twice that.
+        fell: by how much that part did.
+    """
+    bend = 2 * fall * part - fell
+    return float(np.clip(fall * part**2 / bend, part / 10, LONGEST)) if bend > 0 else LONGEST

@@ -19,8 +19,8 @@ TOGETHER = 3  # zeros and frames that may be turned at once
 Values = dict[str, np.ndarray]
 
 
-def least_turned(problem: Problem) -> list[Values]:
-    """Starts with zeros and frames turned, of which bodies are least far off; least cost first.
+def least_turned(problem: Problem) -> list[tuple[float, Values]]:
+    """Starts with zeros and frames turned, and the cost of each, least first.
 
     Every angle that is the same at all stops (a joint's zero, a frame's rotation) is turned, one at
     a time; the rig then stands where the bodies with the fewest joints before them say. From the
@@ -40,7 +40,7 @@ def least_turned(problem: Problem) -> list[Values]:
         if ranked[0][0] >= best[0]:
             break
         best = ranked[0][0], ranked[0][2]
-    return [values for _, values in sorted(found, key=lambda x: x[0])[:KEPT]]
+    return sorted(found, key=lambda x: x[0])[:KEPT]
 
 
 def _angles(problem: Problem, bodies: Sequence[TrackedBody]) -> list[tuple[str, int]]:
@@ -56,7 +56,9 @@ def _angles(problem: Problem, bodies: Sequence[TrackedBody]) -> list[tuple[str, 
     return [(v.name, i) for v in calibration for i, unit in enumerate(v.units) if unit == "rad"]
 
 
-def _turned(values: Mapping[str, np.ndarray], angles: Sequence[tuple[str, int]]) -> Iterator[Values]:
+def _turned(
+    values: Mapping[str, np.ndarray], angles: Sequence[tuple[str, int]]
+) -> Iterator[Values]:
     for name, i in angles:
         for turn in TURNS:
             theta = values[name].copy()
