@@ -74,7 +74,7 @@ class Assembly:
         self.touched = np.zeros(layout.size, bool)
         for rows in (r for each in own.values() for r in each if r.measured):
             self.touched[rows.columns] |= np.any(rows.A != 0, axis=0)
-        self.weight_m2 = 0.0
+        self.weight_m2 = self.beams_chi2 = 0.0
         self.eliminated: list[Eliminated] = []
         self.twists: list[tuple[int, np.ndarray, np.ndarray]] = []
         self.scans: dict[int, TwistSums] = {}
@@ -82,6 +82,7 @@ class Assembly:
     def add(self, sums: StopSums) -> None:
         """Add the beams of a stop."""
         self.weight_m2 += sums.weight_m2
+        self.beams_chi2 += float(sums.dense[TWIST, TWIST])
         self.chi2 += float(sums.dense[TWIST, TWIST])
         seen = np.append(np.diag(sums.dense)[TWIST + 1 :], sums.own) > 0
         self.touched[sums.columns] |= seen
@@ -111,6 +112,7 @@ class Assembly:
 
     def _done(self, values: Values, kept: np.ndarray) -> Linearisation:
         return Linearisation(
+            beams_chi2=self.beams_chi2,
             layout=self.layout,
             values=values,
             kept=kept,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from calib.linear.assembly import CellsFirst, OwnRows, StopsFirst
 from calib.linear.clusters import ClusteredRows, Gradients
 from calib.linear.layout import Layout
 from calib.linear.parallel import in_order
-from calib.linear.rows import StopRows, StopSums
+from calib.linear.rows import StopRows, StopSums, Weighing
 from calib.linear.system import Linearisation, Values
 from calib.problem import Problem
 from calib.residuals.beams import Association
@@ -31,6 +32,7 @@ def linearise(
     gradients: Gradients | None = None,
     beams: bool = True,
     progress: Progress = lambda done, total: None,
+    weighed: Sequence[Weighing] = (),
 ) -> Linearisation:
     """Linearise all rows of beams and tracked bodies at a state.
 
@@ -43,6 +45,7 @@ def linearise(
         gradients: takes those of the clusters of beams, where they are wanted.
         beams: False for tracked bodies alone.
         progress: called with how many stops are done, and of how many.
+        weighed: how the beams were weighed at another state, where costs are to be compared.
     """
     layout = layout or Layout.of(problem)
     count = len(problem.scans) if beams else 0
@@ -52,16 +55,21 @@ def linearise(
 
     placed = lidars(problem.scans, values) if count else []
 
-    def work(i: int) -> tuple[StopSums, SpreadRows | None, tuple[np.ndarray, ...] | None]:
+    found: list[tuple[Weighing, float, float]] = []  # each stop's weighing, its cost, and before
+
+    def work(i: int) -> tuple[StopSums, SpreadRows | None, tuple | None, tuple]:
         rows = StopRows.of(problem.scans[i], layout, values, placed[i], associations[i], newton)
+        here = Weighing.of(rows.rows)
+        costs = here.cost(rows.rows), weighed[i].cost(rows.rows) if weighed else 0.0
         by_cluster = None
         if gradients is not None:
             parts, cluster = rows.places()
             by_cluster = parts, cluster, *rows.gradient(cluster, len(parts))
-        return rows.sums(), rows.rows.spread, by_cluster
+        return rows.sums(), rows.rows.spread, by_cluster, (here, *costs)
 
-    for i, (sums, spread, by_cluster) in enumerate(in_order(work, count)):
+    for i, (sums, spread, by_cluster, told) in enumerate(in_order(work, count)):
         progress(i, count)
+        found.append(told)
         assembly.add(sums)
         places = None
         if by_cluster is not None:
@@ -75,7 +83,36 @@ def linearise(
                 stop = np.full(len(rows.b), sums.stop)
                 clustered = ClusteredRows(rows.A, rows.b, rows.columns, stop, places[cluster])
                 gradients.add_rows(clustered)
-    return assembly.done(values)
+    return replace(
+        assembly.done(values),
+        weighed=[each for each, _, _ in found],
+        beams_cost=sum(cost for _, cost, _ in found),
+        cost_before=sum(cost for _, _, cost in found) if weighed else None,
+    )
+
+
+def beams_cost(
+    problem: Problem,
+    values: Values,
+    associations: Sequence[Association],
+    weighed: Sequence[Weighing],
+) -> float:
+    """Half the robust chi-square of all beams at a state, and of their scatter within holds.
+
+    Args:
+        problem: what is estimated.
+        values: the state.
+        associations: per scan, what its beams meet.
+        weighed: per scan, how its beams are to be weighed.
+    """
+    placed = lidars(problem.scans, values)
+
+    def work(i: int) -> float:
+        rows = problem.scans[i].rows(values, associations[i], placed[i].T[0])
+        scatter = 0.0 if rows.spread is None else float(np.square(rows.spread.residual).sum()) / 2
+        return weighed[i].cost(rows) + scatter
+
+    return sum(in_order(work, len(problem.scans)))
 
 
 def lidars(scans: Sequence[ScanStop], values: Values) -> list[Placed]:

@@ -17,10 +17,35 @@ from calib.linear.elimination import square
 from calib.linear.layout import Layout, key_of
 from calib.residuals.beams import Association, Rows
 from calib.residuals.compiled import cluster_sums, cross_sums, renumber
+from calib.residuals.robust import tukey_cost
 from calib.residuals.scan import ScanStop
 
 PLACES = ("surface", "plane")  # beams that meet the same one share its error
 TWIST = 6  # columns of a stop's rows that come first; minus the residual is the next
+
+
+@dataclass(frozen=True)
+class Weighing:
+    """How the beams of one stop were weighed at a state, so that another can be held against it.
+
+    Sigmas and robust scale follow the state; a cost can be compared only at the same ones.
+
+    Args:
+        sigma_m: (N,) single precision: it is kept for every stop while a fit runs.
+        scale: how many sigmas wide the bulk was.
+    """
+
+    sigma_m: np.ndarray
+    scale: float
+
+    @classmethod
+    def of(cls, rows: Rows) -> Weighing:
+        """As these rows are weighed."""
+        return cls(rows.sigma_m.astype(np.float32), rows.scale)
+
+    def cost(self, rows: Rows) -> float:
+        """Half the robust chi-square of rows of that stop, at any state."""
+        return tukey_cost(np.where(rows.usable, rows.residual_m / self.sigma_m, 0.0), self.scale)
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ import numpy as np
 
 from calib.linear.elimination import Eliminated
 from calib.linear.layout import Layout
-from calib.linear.rows import TwistSums
+from calib.linear.rows import TwistSums, Weighing
 
 Values = Mapping[str, np.ndarray]
 
@@ -37,6 +37,10 @@ class Linearisation:
         scans: stop -> what its beams say of its LiDAR's twist alone; empty unless gradients were
             asked for.
         weight_m2: sum of the beams' weights over their variances, 1/m2.
+        beams_chi2: what of chi2 is of beams, at their weights.
+        weighed: per stop with beams, how they were weighed here.
+        beams_cost: half their robust chi-square, so weighed.
+        cost_before: the same as they were weighed elsewhere; None where that was not asked for.
     """
 
     layout: Layout
@@ -49,6 +53,10 @@ class Linearisation:
     twists: Sequence[tuple[int, np.ndarray, np.ndarray]]
     scans: Mapping[int, TwistSums]
     weight_m2: float
+    beams_chi2: float
+    weighed: Sequence[Weighing] = ()
+    beams_cost: float = 0.0
+    cost_before: float | None = None
 
     def directions(self, kept: np.ndarray) -> np.ndarray:
         """All unknowns (U, q) that follow from those kept (S + 1, q), in units of their sigmas.

@@ -87,5 +87,7 @@ def stand_of(run: Run, progress: Progress) -> Stand:
         InputError: its recordings are not what they were.
     """
     sources, model = reopened(run), model_of(run)
-    problem = build(sources, model)
-    return Stand(sources, model, problem, resume(problem, start_of(run, sources), progress))
+    problem, converged = build(sources, model), run.summary["converged"]
+    return Stand(
+        sources, model, problem, resume(problem, start_of(run, sources), progress, converged)
+    )

@@ -140,6 +140,13 @@ class Graph:
         fall = self._graph.error(at) - linear.error(found)
         return self._from_gtsam(at.retract(found)), moved, fall
 
+    def moved(self, values: Values, step: Values) -> dict[str, np.ndarray]:
+        """The values after a tangent step of each unknown."""
+        tangent = gtsam.VectorValues()
+        for name, key in self._key.items():
+            tangent.insert(key, step[name])
+        return self._from_gtsam(self._to_gtsam(values).retract(tangent))
+
     def covariance(self, values: Values, names: Sequence[str]) -> np.ndarray:
         """Joint marginal covariance of the named variables' tangents, in the order given.
 
