@@ -17,7 +17,7 @@ from calib.problem import Problem
 from calib.problem.model import Model, Source
 from calib.residuals.tracker import TrackedBody
 from calib.runs.reopen import model_of, reopened, start_of, stored_met
-from calib.runs.residual_table import residual_table, table_path
+from calib.runs.residual_table import recording_of, residual_table, table_path, write_rows
 from calib.runs.run import (
     COVARIANCE,
     DIAGNOSIS,
@@ -33,6 +33,7 @@ from calib.solve.errors import Errors, body_errors, misfit, row_errors, scan_err
 from calib.solve.estimate import Estimate, Start
 from calib.solve.fit import Progress, solve
 from calib.solve.holdout import held_out
+from calib.solve.misfit import misfit_by, prior_rows, target_rows, tracker_rows
 from calib.solve.recalibrate import Link, earlier, solve_from
 from calib.solve.solution import solution_of
 from chains.errors import InputError
@@ -182,7 +183,10 @@ def _fit(
         by, count = choices.hold_out, choices.folds
         unseen = held_out(sources, model, by, count, progress, estimate.start)
     nominal = _nominal(problem, progress)
-    seen = _write_residuals(problem, estimate, folder / RESIDUALS, progress)
+    by_stop = _write_residuals(problem, estimate, folder / RESIDUALS, progress)
+    seen = sum(by_stop.values(), Errors())
+    if not estimate.scans:
+        seen = body_errors(_bodies(problem), estimate.values, None)
     if not seen.count and not problem.blocks:
         raise InputError(
             f"{sources[0].recording.folder}: no beam meets a surface and no tracked body was seen, "
@@ -196,7 +200,10 @@ def _fit(
     write_state(folder, estimate.state, stored_met(estimate.start, sources))
     write_yaml(folder / MODEL, _model_document(sources, model, choices))
     summary = _summary(problem, estimate, nominal, seen, unseen)
-    summary |= {"misfit": worse, "sigmas_widened_by": widened}
+    rows = tracker_rows(estimate), target_rows(estimate), prior_rows(estimate)
+    write_rows(folder / RESIDUALS, *rows)
+    summary |= {"misfit": worse, "misfit_by": misfit_by(estimate, *rows, by_stop)}
+    summary["sigmas_widened_by"] = widened
     summary["seconds"] = time.monotonic() - began
     if links is not None:
         summary["links"] = [_link_document(link) for link in links]
@@ -226,20 +233,18 @@ def _bodies(problem: Problem) -> list[TrackedBody]:
 
 def _write_residuals(
     problem: Problem, estimate: Estimate, folder: Path, progress: Progress
-) -> Errors:
-    """Write every row's residual, stop by stop; their sums, or those of bodies without scans."""
+) -> dict[tuple[str, str], Errors]:
+    """Write every beam's residual, stop by stop; their sums, by recording and stop."""
     folder.mkdir()
-    total = Errors()
+    found = {}
     for i, (scan, association) in enumerate(
         zip(estimate.scans, estimate.associations, strict=True)
     ):
         progress("writing residuals", i, len(estimate.scans))
         rows = scan.rows(estimate.values, association)
         write_table(table_path(folder, scan, problem.sources), residual_table(rows))
-        total += row_errors(rows)
-    if not estimate.scans:
-        total = body_errors(_bodies(problem), estimate.values, None)
-    return total
+        found[recording_of(scan, problem.sources), scan.name] = row_errors(rows)
+    return found
 
 
 def _summary(
@@ -260,6 +265,10 @@ def _summary(
             "noise_floor": floor.floor_mm,
         },
         "mean_mm": {"nominal": nominal.mean_mm, "fit": seen.mean_mm, "held_out": unseen.mean_mm},
+        "rms_all_mm": seen.rms_all_mm,
+        "rejected_share": seen.rejected_share,
+        "held_out_rms_all_mm": unseen.rms_all_mm,
+        "held_out_rejected_share": unseen.rejected_share,
         "std_mm": {"nominal": nominal.std_mm, "fit": seen.std_mm, "held_out": unseen.std_mm},
         "cost": estimate.cost,
         "dof": rows - free + sum(v.dim for v in estimate.variables),
