@@ -265,16 +265,20 @@ def _summary(
             "noise_floor": floor.floor_mm,
         },
         "mean_mm": {"nominal": nominal.mean_mm, "fit": seen.mean_mm, "held_out": unseen.mean_mm},
-        "rms_all_mm": seen.rms_all_mm,
-        "rejected_share": seen.rejected_share,
-        "held_out_rms_all_mm": unseen.rms_all_mm,
-        "held_out_rejected_share": unseen.rejected_share,
+        **_of_all_beams(estimate, seen, unseen),
         "std_mm": {"nominal": nominal.std_mm, "fit": seen.std_mm, "held_out": unseen.std_mm},
         "cost": estimate.cost,
         "dof": rows - free + sum(v.dim for v in estimate.variables),
         "iterations": estimate.iterations,
         "converged": estimate.converged,
     }
+
+
+def _of_all_beams(estimate: Estimate, seen: Errors, unseen: Errors) -> dict[str, float | None]:
+    """The errors of all beams that meet a surface, those of weight 0 included; none of bodies."""
+    kinds = {"": seen, "held_out_": unseen} if estimate.scans else {"": Errors()}
+    out = {f"{kind}rms_all_mm": errors.rms_all_mm for kind, errors in kinds.items()}
+    return out | {f"{kind}rejected_share": errors.rejected_share for kind, errors in kinds.items()}
 
 
 def recordings_document(sources: Sequence[Source]) -> list[dict[str, str]]:

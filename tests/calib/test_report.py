@@ -27,7 +27,17 @@ from .rigs import retract
 SMALL = Spec(
     lidar="hesai_pandarxt32", room="box", locations=3, stops_per_location=2, column_step=200
 )
-ALWAYS = ("ladder", "chain", "moves", "effects", "budget", "tracker", "correlation")
+ALWAYS = (
+    "ladder",
+    "misfit",
+    "moved",
+    "chain",
+    "moves",
+    "effects",
+    "budget",
+    "tracker",
+    "correlation",
+)
 OF_BEAMS = (
     *("variance", "scatter", "rings", "map", "targets", "findings"),
     *(f"residual-{c}" for c in ("incidence", "range", "ring", "azimuth", "elevation", "intensity")),
