@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.diagnosis.candidates import lacking
+from calib.diagnosis.candidates import concerned, lacking
 from calib.diagnosis.curves import Curve, curves
 from calib.diagnosis.score import log_tail
 from calib.diagnosis.screen import Candidate, Screen
@@ -263,7 +263,7 @@ def _untestable(look: Look) -> dict[str, str]:
         c.effect.family for c in look.named.candidates
     }
     for effect in CATALOGUE:
-        if effect.family in there:
+        if effect.family in there or not concerned(effect, look.stand.sources):
             continue
         if missing := lacking(effect, look.stand.sources, look.columns):
             found[effect.family] = f"the recordings lack {', '.join(missing)}"

@@ -95,6 +95,9 @@ def _numbers(evidence: Evidence) -> list[tuple[str, str]]:
         (f"{rms['nominal']:.1f} mm", "before, with everything as in CAD"),
         (f"{summary['stops']}", "stops"),
     ]
+    if reached := summary.get("predicted_mm"):
+        where = f"'{reached['body']}' anywhere in the joints' range, as predicted (95 %)"
+        out.append((f"{reached['anywhere']:.2g} mm", where))
     if summary["points"]:
         out.append((f"{summary['points']:,}".replace(",", " "), "points fitted"))
     return out

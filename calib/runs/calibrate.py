@@ -32,8 +32,9 @@ from calib.runs.run import (
 from calib.solve.errors import Errors, body_errors, misfit, row_errors, scan_errors
 from calib.solve.estimate import Estimate, Start
 from calib.solve.fit import Progress, solve
-from calib.solve.holdout import held_out
+from calib.solve.holdout import held_out, unit_of
 from calib.solve.misfit import misfit_by, prior_rows, target_rows, tracker_rows
+from calib.solve.reach import reach
 from calib.solve.recalibrate import Link, earlier, solve_from
 from calib.solve.solution import solution_of
 from chains.errors import InputError
@@ -178,10 +179,10 @@ def _fit(
         estimate = solve(problem, progress=progress, start=start)
     else:
         estimate, links = solve_from(problem, earlier(problem, before), progress)
-    unseen = Errors()
+    unseen, by = Errors(), None
     if choices.hold_out != "none":
-        by, count = choices.hold_out, choices.folds
-        unseen = held_out(sources, model, by, count, progress, estimate.start)
+        unseen = held_out(sources, model, choices.hold_out, choices.folds, progress, estimate.start)
+        by = unit_of(sources, choices.hold_out) if unseen.count else None
     nominal = _nominal(problem, progress)
     by_stop = _write_residuals(problem, estimate, folder / RESIDUALS, progress)
     seen = sum(by_stop.values(), Errors())
@@ -203,7 +204,9 @@ def _fit(
     rows = tracker_rows(estimate), target_rows(estimate), prior_rows(estimate)
     write_rows(folder / RESIDUALS, *rows)
     summary |= {"misfit": worse, "misfit_by": misfit_by(estimate, *rows, by_stop)}
-    summary["sigmas_widened_by"] = widened
+    reached = reach(problem, estimate, widened)
+    summary |= {"sigmas_widened_by": widened, "held_out_by": by}
+    summary["predicted_mm"] = reached.document() if reached else None
     summary["seconds"] = time.monotonic() - began
     if links is not None:
         summary["links"] = [_link_document(link) for link in links]

@@ -58,6 +58,8 @@ def print_run(run: Run) -> None:
     console.print(error_table(summary))
     if told := beams_told(summary):
         print_pairs(console, "of how many beams", [("", line) for line in told])
+    if predicted := summary.get("predicted_mm"):
+        print_pairs(console, "how well the arm is known", [("", t) for t in predicted["told"]])
     if told := standing_out(summary):
         print_pairs(console, "what does not fit", [("", line) for line in told])
     if summary.get("sigmas_widened_by", 1.0) > 1.0:
