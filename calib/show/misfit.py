@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from statistics import median_low
 from typing import TYPE_CHECKING, Any
 
 from calib.show.scale import shown
@@ -70,6 +71,19 @@ def groups(summary: Mapping[str, Any]) -> dict[str, float]:
     return dict(sorted(out.items(), key=lambda pair: -pair[1]))
 
 
+def outstanding(summary: Mapping[str, Any]) -> dict[str, float]:
+    """Those groups that stand out from their like, the worst first.
+
+    Where most of a body's residuals are too large, its sigma is too small or an effect is missing,
+    and nothing happened to one stop: a group is held against the median of its like, and 1.
+    """
+    found = groups(summary)
+    like = {key: key.rpartition(", ")[2] if ", " in key else "target" for key in found}
+    ratios = {name: [x for key, x in found.items() if like[key] == name] for name in like.values()}
+    usual = {name: max(1.0, median_low([1.0, *each])) for name, each in ratios.items()}
+    return {key: x for key, x in found.items() if x > STANDS_OUT * usual[like[key]]}
+
+
 def moves(summary: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
     """Moves of the parts of the geometry from what was known of them, the furthest first."""
     found = summary.get("misfit_by", {"prior": {}})["prior"]
@@ -99,9 +113,8 @@ def worst_of(run: Run) -> tuple[str, str]:
 
 
 def _groups_told(summary: Mapping[str, Any]) -> Iterator[str]:
-    for name, ratio in groups(summary).items():
-        if ratio > STANDS_OUT:
-            yield f"{name}: residuals {times(ratio)} times larger than their sigmas allow"
+    for name, ratio in outstanding(summary).items():
+        yield f"{name}: residuals {times(ratio)} times larger than their sigmas allow"
 
 
 def _moves_told(summary: Mapping[str, Any]) -> Iterator[str]:

@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING, Any
 from calib.report import plots
 from calib.report.chart import Absent, Chart
 from calib.report.evidence import Evidence
-from calib.show.misfit import FAR_FROM_CAD, STANDS_OUT, groups, move_told, moves, of_stop, times
+from calib.show.misfit import (
+    FAR_FROM_CAD,
+    STANDS_OUT,
+    groups,
+    move_told,
+    moves,
+    of_stop,
+    outstanding,
+    times,
+)
 
 if TYPE_CHECKING:
     from calib.report.plots import Figure
@@ -27,12 +36,12 @@ def by_stop(evidence: Evidence) -> Iterator[Chart | Absent]:
     if not found:
         yield Absent("misfit", "no stop has residuals that anything checks")
         return
-    worst, most = next(iter(found.items()))
-    loud = sum(x > STANDS_OUT for x in found.values())
+    loud = {key: x for key, x in outstanding(summary).items() if key in found}
+    worst, most = next(iter((loud or found).items()))
     yield Chart(
         "misfit",
         f"{worst} is {times(most)} times further off than its sigmas allow"
-        + (f"; so are {loud - 1} others by more than {STANDS_OUT:g}" if loud > 1 else "")
+        + (f"; {len(loud) - 1} more stand out" if len(loud) > 1 else "")
         if loud
         else f"No stop stands out; the largest residuals, of {worst}, are {times(most)} times "
         f"their sigmas",
@@ -40,12 +49,12 @@ def by_stop(evidence: Evidence) -> Iterator[Chart | Absent]:
         f"well: of each tracked body, of what the joints must misreport, and of the beams, stop "
         f"by stop. One dot above the dashed line ({STANDS_OUT:g}) is something that happened at "
         f"that stop; a whole row of dots there is a sigma too small, or an effect that is missing.",
-        lambda: _by_stop(stops),
+        lambda: _by_stop(stops, loud),
         wide=True,
     )
 
 
-def _by_stop(stops: Mapping[str, Mapping[str, float]]) -> Figure:
+def _by_stop(stops: Mapping[str, Mapping[str, float]], loud: Mapping[str, float]) -> Figure:
     figure, grid = plots.axes(plots.WIDE, 3.2)
     ax, names = grid[0, 0], list(stops)
     series = dict.fromkeys(name for found in stops.values() for name in found)
@@ -55,9 +64,9 @@ def _by_stop(stops: Mapping[str, Mapping[str, float]]) -> Figure:
         ax.plot(at, ratio, "osD^v"[i % 5], ms=5, color=plots.LINES[i % len(plots.LINES)],
                 label=name, alpha=0.85)  # fmt: skip
     every = [(x, k, name) for k, s in enumerate(names) for name, x in stops[s].items()]
-    for x, k, name in sorted(every, reverse=True)[:MOST_NAMES]:
-        if x > STANDS_OUT:
-            ax.annotate(f"{names[k]}: {name} {times(x)}", (k, x), (6, 3),
+    for x, k, name in sorted(every, reverse=True):
+        if f"{names[k]}, {name}" in list(loud)[:MOST_NAMES]:
+            ax.annotate(f"{names[k]}, {name} {times(x)}", (k, x), (6, 3),
                         textcoords="offset points", fontsize=8)  # fmt: skip
     ax.axhline(STANDS_OUT, color=plots.INK, linestyle="--", linewidth=0.8)
     low, high = SHOWN_AT_LEAST, max(2 * STANDS_OUT, *(1.5 * x for x, _, _ in every))
