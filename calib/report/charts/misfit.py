@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from calib.report.plots import Figure
 
 MOST_BARS = 24  # moves that are drawn, the furthest
-MOST_NAMES = 12  # dots that bear their stop's name
+MOST_NAMES = 5  # dots that bear their stop's name: more would hide each other
 SHOWN_AT_LEAST = 0.2  # misfit: smaller ones are no news
 MOST_TICKS = 40  # stops whose names are written below
 
