@@ -137,6 +137,17 @@ def known_effects(model: Model, sources: Sequence[Source], columns: frozenset[st
     return found
 
 
+def concerned(effect: Effect, sources: Sequence[Source]) -> bool:
+    """Whether a rig has the instrument that an effect is about: an arm under a tracker alone lacks
+    nothing of a LiDAR, a scanner or targets."""
+    rigs = [s.rig for s in sources]
+    if effect.site in (Site.BEAM, Site.NOISE):
+        return any(rig.lidar for rig in rigs)
+    if effect.site is Site.REFERENCE:
+        return any(rig.reference or rig.lidar for rig in rigs)
+    return effect.site is not Site.TARGET or any(rig.target for rig in rigs)
+
+
 def lacking(effect: Effect, sources: Sequence[Source], columns: frozenset[str]) -> list[str]:
     """What the recordings lack to test an effect: columns, or anything to act on."""
     needed = (*effect.covariates, "range_std_m") if effect.site is Site.NOISE else effect.covariates

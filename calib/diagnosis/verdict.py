@@ -11,7 +11,7 @@ import numpy as np
 from calib.blunders import told
 from calib.blunders.chance import log_tail
 from calib.blunders.judged import LeftOut
-from calib.diagnosis.candidates import lacking
+from calib.diagnosis.candidates import concerned, lacking
 from calib.diagnosis.curves import Curve, curves
 from calib.diagnosis.screen import Candidate, Screen
 from calib.diagnosis.search import (
@@ -295,7 +295,7 @@ def _untestable(look: Look) -> dict[str, str]:
         c.effect.family for c in look.named.candidates
     }
     for effect in CATALOGUE:
-        if effect.family in there:
+        if effect.family in there or not concerned(effect, look.stand.sources):
             continue
         if missing := lacking(effect, look.stand.sources, look.columns):
             found[effect.family] = f"the recordings lack {', '.join(missing)}"

@@ -10,7 +10,8 @@ from pathlib import Path
 from calib.exporters.fitted import Fitted
 from calib.exporters.written import Written, head, write_text
 from calib.runs.estimates import VariableEstimate, variable_estimates
-from calib.show.tables import LISTED_PARAMETERS, effect_cells, estimate_cell, shown
+from calib.show.scale import shown
+from calib.show.tables import LISTED_PARAMETERS, effect_cells, estimate_cell
 
 CONVENTIONS = (
     "Links: how far T_parent_child lies from CAD, T_cad exp(twist), in the child's own axes; where",

@@ -225,6 +225,15 @@ class Source:
         return {**columns, **recording.covariates}
 
 
+def recording_names(sources: Sequence[Source]) -> list[str]:
+    """What each recording is called where stops of several stand together: its rig's name, with the
+    recording's number after it where several are of one rig."""
+    rigs = [s.rig.name for s in sources]
+    return [
+        f"{rig}.{rigs[:i].count(rig)}" if rigs.count(rig) > 1 else rig for i, rig in enumerate(rigs)
+    ]
+
+
 def same_mesh(a: Reference | None, b: Reference | None) -> bool:
     """Whether two references are one: their errors are then the same too."""
     if a is None or b is None or a is b:

@@ -39,7 +39,7 @@ SAMPLED = 8  # tables from which the bins of covariates are taken
 # Columns of a table that are no covariate: they name a place, or are what is explained.
 NOT_COVARIATES = {*PLACES, "region", "patch", "column", "residual_m", "sigma_m", "weight"}
 NEEDED = {"ring", "column", "azimuth_rad", "range_m", "incidence_rad"}
-SUMMARY_KEYS = {"rms_mm", "misfit", "converged", "residual", "stops", "points"}  # of a summary
+SUMMARY_KEYS = {"rms_mm", "misfit", "misfit_by", "converged", "residual", "stops", "points"}
 NEEDED |= {"residual_m", "sigma_m", "weight"}
 FIRST = ("incidence_rad", "range_m", "ring", "azimuth_rad", "elevation_rad", "intensity", "label")
 

@@ -14,7 +14,9 @@ from calib.report.chart import Absent, Chart
 from calib.report.charts.fit import error_mm
 from calib.report.evidence import Evidence, folder_name
 from calib.report.verdict import Verdict
-from calib.show.tables import chance, effect_page, estimate_cell, mm, shown
+from calib.show.misfit import over_beams
+from calib.show.scale import shown
+from calib.show.tables import chance, effect_page, estimate_cell, mm
 
 TOLD_CANDIDATES = 8  # candidates whose evidence is told
 LISTED_DIRECTIONS = 12  # weak directions that are told
@@ -85,12 +87,17 @@ def _numbers(evidence: Evidence) -> list[tuple[str, str]]:
         "held-out": "rms error of stops that the fit never saw",
         "fit": "rms error of the fit; none held out",
     }
+    before = "held_out_" if kind == "held-out" else ""
+    value, _, share = over_beams(error, summary, before).partition(" over ")
     out = [
-        (f"{error:.2f} mm", told[kind]),
+        (value, f"{told[kind]}, over {share}" if share else told[kind]),
         (f"{rms['noise_floor']:.2f} mm", "noise floor, if the model were right"),
         (f"{rms['nominal']:.1f} mm", "before, with everything as in CAD"),
         (f"{summary['stops']}", "stops"),
     ]
+    if reached := summary.get("predicted_mm"):
+        where = f"'{reached['body']}' anywhere in the joints' range, as predicted (95 %)"
+        out.append((f"{reached['anywhere']:.2g} mm", where))
     if summary["points"]:
         out.append((f"{summary['points']:,}".replace(",", " "), "points fitted"))
     return out

@@ -88,14 +88,15 @@ def band(ax: Axes, x: np.ndarray, mean: np.ndarray, half: np.ndarray, colour: st
     ax.fill_between(x, mean - half, mean + half, color=colour, alpha=0.25, linewidth=0)
 
 
-def log_axis(ax: Axes, least: float, most: float) -> None:
-    """Make the x axis logarithmic, with a number at every 1, 2 and 5."""
-    ax.set_xscale("log")
+def log_axis(ax: Axes, least: float, most: float, name: str = "x") -> None:
+    """Make an axis, x or y, logarithmic, with a number at every 1, 2 and 5."""
+    ax.set(**{f"{name}scale": "log"})
     powers = np.arange(np.floor(np.log10(least)), np.ceil(np.log10(most)) + 1)
     ticks = np.outer(10.0**powers, [1, 2, 5]).ravel()
     ticks = ticks[(ticks > 0.7 * least) & (ticks < 1.4 * most)]
-    ax.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
-    ax.set_xticks([], minor=True)
+    axis = ax.xaxis if name == "x" else ax.yaxis
+    axis.set_ticks(ticks, [f"{tick:g}" for tick in ticks])
+    axis.set_ticks([], minor=True)
 
 
 def signed_map(

@@ -8,6 +8,7 @@ from typing import Any
 
 from calib.runs.calibrate import TOLERATED
 from calib.runs.run import Run
+from calib.show.misfit import standing_out
 
 AT_THE_FLOOR = 1.25  # times the noise floor: a held-out error as good as it
 FAR_OFF = 3.0  # times its sigmas, or the floor: residuals that something large is behind
@@ -86,6 +87,7 @@ def _doubtful(run: Run, diagnosis: Mapping[str, Any] | None) -> Iterator[str]:
     for kind, times in run.summary["misfit"].items():
         if TOLERATED < times <= FAR_OFF:
             yield _misfit(kind, times)
+    yield from standing_out(run.summary)
     for weak in (diagnosis or {}).get("weak_directions", ()):
         if (weak["sigma_mm"] or 0.0) > FAR_OFF * rms["noise_floor"]:
             names = " and ".join(weak["parameters"])

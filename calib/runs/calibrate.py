@@ -18,7 +18,7 @@ from calib.problem.model import Model, Source
 from calib.problem.without import leave_out
 from calib.residuals.tracker import TrackedBody
 from calib.runs.reopen import model_of, reopened, start_of, stored_met
-from calib.runs.residual_table import residual_table, table_path
+from calib.runs.residual_table import recording_of, residual_table, table_path, write_rows
 from calib.runs.run import (
     COVARIANCE,
     DIAGNOSIS,
@@ -33,7 +33,9 @@ from calib.runs.run import (
 from calib.solve.errors import Errors, body_errors, misfit, row_errors, scan_errors
 from calib.solve.estimate import Estimate, Start
 from calib.solve.fit import Progress, solve
-from calib.solve.holdout import held_out
+from calib.solve.holdout import held_out, unit_of
+from calib.solve.misfit import misfit_by, prior_rows, target_rows, tracker_rows
+from calib.solve.reach import reach
 from calib.solve.recalibrate import Link, earlier, solve_from
 from calib.solve.solution import solution_of
 from chains.errors import InputError
@@ -179,12 +181,15 @@ def _fit(
         estimate = solve(problem, progress=progress, start=start)
     else:
         estimate, links = solve_from(problem, earlier(problem, before), progress)
-    unseen = Errors()
+    unseen, by = Errors(), None
     if choices.hold_out != "none":
-        by, count = choices.hold_out, choices.folds
-        unseen = held_out(sources, model, by, count, progress, estimate.start)
+        unseen = held_out(sources, model, choices.hold_out, choices.folds, progress, estimate.start)
+        by = unit_of(sources, choices.hold_out) if unseen.count else None
     nominal = _nominal(problem, progress)
-    seen = _write_residuals(problem, estimate, folder / RESIDUALS, progress)
+    by_stop = _write_residuals(problem, estimate, folder / RESIDUALS, progress)
+    seen = sum(by_stop.values(), Errors())
+    if not estimate.scans:
+        seen = body_errors(_bodies(problem), estimate.values, None)
     if not seen.count and not problem.blocks:
         raise InputError(
             f"{sources[0].recording.folder}: no beam meets a surface and no tracked body was seen, "
@@ -198,7 +203,12 @@ def _fit(
     write_state(folder, estimate.state, stored_met(estimate.start, sources))
     write_yaml(folder / MODEL, _model_document(sources, model, choices))
     summary = _summary(problem, estimate, nominal, seen, unseen)
-    summary |= {"misfit": worse, "sigmas_widened_by": widened}
+    rows = tracker_rows(estimate), target_rows(estimate), prior_rows(estimate)
+    write_rows(folder / RESIDUALS, *rows)
+    summary |= {"misfit": worse, "misfit_by": misfit_by(estimate, *rows, by_stop)}
+    reached = reach(problem, estimate, widened)
+    summary |= {"sigmas_widened_by": widened, "held_out_by": by}
+    summary["predicted_mm"] = reached.document() if reached else None
     summary["seconds"] = time.monotonic() - began
     if links is not None:
         summary["links"] = [_link_document(link) for link in links]
@@ -228,20 +238,18 @@ def _bodies(problem: Problem) -> list[TrackedBody]:
 
 def _write_residuals(
     problem: Problem, estimate: Estimate, folder: Path, progress: Progress
-) -> Errors:
-    """Write every row's residual, stop by stop; their sums, or those of bodies without scans."""
+) -> dict[tuple[str, str], Errors]:
+    """Write every beam's residual, stop by stop; their sums, by recording and stop."""
     folder.mkdir()
-    total = Errors()
+    found = {}
     for i, (scan, association) in enumerate(
         zip(estimate.scans, estimate.associations, strict=True)
     ):
         progress("writing residuals", i, len(estimate.scans))
         rows = scan.rows(estimate.values, association)
         write_table(table_path(folder, scan, problem.sources), residual_table(rows))
-        total += row_errors(rows)
-    if not estimate.scans:
-        total = body_errors(_bodies(problem), estimate.values, None)
-    return total
+        found[recording_of(scan, problem.sources), scan.name] = row_errors(rows)
+    return found
 
 
 def _summary(
@@ -262,12 +270,20 @@ def _summary(
             "noise_floor": floor.floor_mm,
         },
         "mean_mm": {"nominal": nominal.mean_mm, "fit": seen.mean_mm, "held_out": unseen.mean_mm},
+        **_of_all_beams(estimate, seen, unseen),
         "std_mm": {"nominal": nominal.std_mm, "fit": seen.std_mm, "held_out": unseen.std_mm},
         "cost": estimate.cost,
         "dof": rows - free + sum(v.dim for v in estimate.variables),
         "iterations": estimate.iterations,
         "converged": estimate.converged,
     }
+
+
+def _of_all_beams(estimate: Estimate, seen: Errors, unseen: Errors) -> dict[str, float | None]:
+    """The errors of all beams that meet a surface, those of weight 0 included; none of bodies."""
+    kinds = {"": seen, "held_out_": unseen} if estimate.scans else {"": Errors()}
+    out = {f"{kind}rms_all_mm": errors.rms_all_mm for kind, errors in kinds.items()}
+    return out | {f"{kind}rejected_share": errors.rejected_share for kind, errors in kinds.items()}
 
 
 def recordings_document(sources: Sequence[Source]) -> list[dict[str, str]]:

@@ -66,7 +66,8 @@ def variable_estimates(run: Run) -> list[VariableEstimate]:
 def comparison(runs: Sequence[Run]) -> dict[str, Any]:
     """Errors and parameters of runs side by side: every list has an entry per run, null for none.
 
-    A frame's parameters say how far it lies from CAD, in its own axes; all are in m and rad.
+    A frame's parameters say how far it lies from CAD, in its own axes; all are in m and rad. Where
+    each does not fit is as its summary has it.
     """
     return {
         "runs": [str(run.folder) for run in runs],
@@ -77,6 +78,12 @@ def comparison(runs: Sequence[Run]) -> dict[str, Any]:
             }
             for error in ("rms_mm", "mean_mm", "std_mm")
         },
+        **{key: [run.summary.get(key) for run in runs] for key in ("rms_all_mm", "rejected_share")},
+        "misfit": {
+            kind: [run.summary.get("misfit", {}).get(kind) for run in runs]
+            for kind in _kinds(runs, "misfit")
+        },
+        "misfit_by": [run.summary.get("misfit_by") for run in runs],
         "parameters": _side_by_side([variable_estimates(run) for run in runs]),
     }
 
@@ -155,7 +162,7 @@ def _effect(
 
 
 def _kinds(runs: Sequence[Run], error: str) -> list[str]:
-    return list(dict.fromkeys(kind for run in runs for kind in run.summary[error]))
+    return list(dict.fromkeys(kind for run in runs for kind in run.summary.get(error, {})))
 
 
 def _side_by_side(runs: Sequence[Sequence[VariableEstimate]]) -> dict[str, dict[str, Any]]:

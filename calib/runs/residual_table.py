@@ -7,9 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.problem.model import Source
+from calib.problem.model import Source, recording_names
 from calib.residuals.beams import Rows
 from calib.residuals.scan import ScanStop
+from calib.solve.misfit import InstrumentRows
+from sensors.recording import write_table
 
 _FIRST = ("ring", "column", "range_m", "incidence_rad", "azimuth_rad", "elevation_rad", "intensity")
 _PLACES = ("label", "surface", "region", "patch", "plane")
@@ -20,11 +22,28 @@ def table_path(folder: Path, scan: ScanStop, sources: Sequence[Source]) -> Path:
     recording's number in between where they are of one rig."""
     if len(sources) == 1:
         return folder / f"{scan.name}.parquet"
-    rig = scan.stops.rig.name
-    alike = [s.recording for s in sources if s.rig.name == rig]
-    number = next(i for i, recording in enumerate(alike) if recording is scan.recording)
-    owner = f"{rig}.{number}" if len(alike) > 1 else rig
-    return folder / f"{owner}.{scan.name}.parquet"
+    return folder / f"{recording_of(scan, sources)}.{scan.name}.parquet"
+
+
+def recording_of(scan: ScanStop, sources: Sequence[Source]) -> str:
+    """The name of the recording that a scan is of; see `recording_names`."""
+    pairs = zip(sources, recording_names(sources), strict=True)
+    return next(name for source, name in pairs if source.recording is scan.recording)
+
+
+def write_rows(
+    folder: Path,
+    tracker: InstrumentRows | None,
+    target: InstrumentRows | None,
+    prior: InstrumentRows | None,
+) -> None:
+    """Write the rows of trackers, targets and priors beside those of beams, those that there are.
+
+    Their files begin with an underscore, which readers of a folder of tables take as not of it.
+    """
+    for kind, rows in (("tracker", tracker), ("target", target), ("prior", prior)):
+        if rows is not None:
+            write_table(folder / f"_{kind}.parquet", rows.table())
 
 
 def residual_table(rows: Rows) -> dict[str, np.ndarray]:

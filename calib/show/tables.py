@@ -13,6 +13,8 @@ from rich.table import Table
 
 from calib.runs.estimates import VariableEstimate, comparison, variable_estimates
 from calib.runs.ladder import Rung, ladder
+from calib.show.misfit import beams_told, standing_out, worst_of
+from calib.show.scale import shown
 
 if TYPE_CHECKING:
     from calib.effects import Effect
@@ -29,7 +31,6 @@ ERROR_LABELS = {
     "held_out": "after, of stops held out",
     "noise_floor": "noise floor, if the model were right",
 }
-DISPLAY_UNITS = {"m": (1e3, "mm"), "rad": (1e3, "mrad"), "1": (1.0, "")}
 
 
 def print_check(check: Check) -> None:
@@ -55,6 +56,12 @@ def print_run(run: Run) -> None:
     if effects:
         console.print(effects_table(effects))
     console.print(error_table(summary))
+    if told := beams_told(summary):
+        print_pairs(console, "of how many beams", [("", line) for line in told])
+    if predicted := summary.get("predicted_mm"):
+        print_pairs(console, "how well the arm is known", [("", t) for t in predicted["told"]])
+    if told := standing_out(summary):
+        print_pairs(console, "what does not fit", [("", line) for line in told])
     if summary.get("sigmas_widened_by", 1.0) > 1.0:
         console.print(_warning(summary), style="bold", soft_wrap=True)
         console.print()
@@ -127,15 +134,6 @@ def print_catalogue(effects: Sequence[Effect], whole: bool) -> None:
 
 
 # ---------------------------------------------------------------------------------------- numbers
-
-
-def shown(unit: str) -> tuple[float, str]:
-    """Factor and unit in which a unit is shown, m/K as m is."""
-    length, per, rest = unit.partition("/")
-    if per and length in DISPLAY_UNITS and length != "1":
-        scale, name = DISPLAY_UNITS[length]
-        return scale, f"{name}/{rest}"
-    return DISPLAY_UNITS.get(unit, (1.0, unit))
 
 
 def estimate_cell(estimate: float, sigma: float, unit: str) -> str:
@@ -313,6 +311,7 @@ def _comparison_table(runs: Sequence[Run]) -> Table:
             if any(value is not None for value in values):
                 cells = (mm(value, "+" if error == "mean_mm" else "") for value in values)
                 table.add_row(f"{error[:-3]} {label}", "mm", *cells)
+    _add_misfit(table, runs, compared)
     for variable, parameters in compared["parameters"].items():
         if len(parameters) > LISTED_PARAMETERS:
             _add_spread(table, variable, list(parameters.values()))
@@ -322,6 +321,22 @@ def _comparison_table(runs: Sequence[Run]) -> Table:
             cells = ("" if s is None else estimate_cell(e, s, entry["unit"]) for e, s in numbers)
             table.add_row(f"{variable}.{name}", shown(entry["unit"])[1], *cells)
     return table
+
+
+def _add_misfit(table: Table, runs: Sequence[Run], compared: Mapping[str, Any]) -> None:
+    """What was thrown out, and how large residuals are against their sigmas."""
+    every, share = compared["rms_all_mm"], compared["rejected_share"]
+    if any(x for x in share):
+        table.add_row("rms after the fit, of all beams", "mm", *map(mm, every))
+        cells = ("" if x is None else f"{100 * x:.1f}" for x in share)
+        table.add_row("beams thrown out", "%", *cells)
+    for kind, ratios in compared["misfit"].items():
+        cells = ("" if x is None else f"{x:.2f}" for x in ratios)
+        table.add_row(f"residuals over sigma, {kind}", "", *cells)
+    labels = ("the largest of these, where", "furthest from CAD, in its sigmas")
+    for label, cells in zip(labels, zip(*map(worst_of, runs), strict=True), strict=True):
+        if any(cells):
+            table.add_row(label, "", *cells)
 
 
 def ladder_table(rungs: Sequence[Rung]) -> Table:

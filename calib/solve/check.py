@@ -21,6 +21,7 @@ from calib.rig.suspect import Suspect
 from calib.rig.tracked import odd_bodies
 from calib.solve.estimate import Estimate
 from calib.solve.fit import Progress, preview
+from calib.solve.reach import Reach, reach
 from calib.solve.solution import solution_of
 from chains.errors import InputError
 from sensors.recording import Recording, read_scan
@@ -45,6 +46,7 @@ class Check:
         expected: link -> unit -> rough sigma of its best and its worst known parameter, of those
             that the data tell.
         cannot: a `name` and a `why` for what the data could not tell.
+        predicted: of an arm under a tracker alone, how well it will be known; else empty.
     """
 
     contents: list[tuple[str, str]] = field(default_factory=list)
@@ -53,14 +55,16 @@ class Check:
     suspects: list[dict[str, Any]] = field(default_factory=list)
     expected: dict[str, dict[str, tuple[float, float]]] = field(default_factory=dict)
     cannot: list[dict[str, str]] = field(default_factory=list)
+    predicted: list[Reach] = field(default_factory=list)
 
     @property
     def can(self) -> list[str]:
         """What can be estimated and about how well, a line each."""
-        return [
+        lines = [
             f"{link}: {', '.join(_about(*sigma, unit) for unit, sigma in by_unit.items())}"
             for link, by_unit in self.expected.items()
         ]
+        return lines + [reached.sentence for reached in self.predicted]
 
     def document(self) -> dict[str, Any]:
         """As ``--json`` prints it."""
@@ -72,6 +76,7 @@ class Check:
             "can": self.can,
             "expected_sigma": self.expected,
             "cannot": self.cannot,
+            "predicted_mm": self.predicted[0].document() if self.predicted else None,
         }
 
 
@@ -197,6 +202,11 @@ class _Checker:
         if estimate is not None:
             self.found.expected.update(_expected(estimate))
             self.found.cannot.extend(solution_of(problem, estimate).not_estimated)
+            reached = reach(problem, estimate)
+            if reached is not None:
+                self.found.predicted.append(reached)
+                if reached.is_small:
+                    self.found.odd.append(reached.warning)
 
 
 def _open(folder: Path, rig: Rig | None) -> Recording:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import numpy as np
 
@@ -18,20 +18,26 @@ from chains import se3
 
 @dataclass(frozen=True)
 class Errors:
-    """Sums over residuals: count, sum [m], sum of squares [m2], and of expected variances [m2]."""
+    """Sums over residuals.
+
+    Args:
+        count: how many there are, those of weight 0 left out, as from the next three sums.
+        total_m, squares_m2: sum [m] and sum of squares [m2].
+        expected_m2: sum of the variances [m2] that their sigmas lead one to expect.
+        rejected: how many have weight 0: their beams meet a surface, and nobody believes them.
+        rejected_m2: sum of the squares of those [m2].
+    """
 
     count: int = 0
     total_m: float = 0.0
     squares_m2: float = 0.0
     expected_m2: float = 0.0
+    rejected: int = 0
+    rejected_m2: float = 0.0
 
     def __add__(self, other: Errors) -> Errors:
-        return Errors(
-            self.count + other.count,
-            self.total_m + other.total_m,
-            self.squares_m2 + other.squares_m2,
-            self.expected_m2 + other.expected_m2,
-        )
+        pairs = zip(astuple(self), astuple(other), strict=True)
+        return Errors(*(mine + its for mine, its in pairs))
 
     @property
     def rms_mm(self) -> float | None:
@@ -48,6 +54,23 @@ class Errors:
         return float(np.sqrt(max(0.0, self.rms_mm**2 - self.mean_mm**2)))
 
     @property
+    def rejected_share(self) -> float | None:
+        """Of all residuals, those of weight 0."""
+        every = self.count + self.rejected
+        return self.rejected / every if every else None
+
+    @property
+    def rms_all_mm(self) -> float | None:
+        """Of all residuals, those of weight 0 included."""
+        every = self.count + self.rejected
+        return 1e3 * float(np.sqrt((self.squares_m2 + self.rejected_m2) / every)) if every else None
+
+    @property
+    def misfit(self) -> float | None:
+        """The rms over what is expected of it."""
+        return float(np.sqrt(self.squares_m2 / self.expected_m2)) if self.count else None
+
+    @property
     def floor_mm(self) -> float | None:
         return 1e3 * float(np.sqrt(self.expected_m2 / self.count)) if self.count else None
 
@@ -58,7 +81,7 @@ def scan_errors(
     association: Association | None,
     predicted: Estimate | None,
 ) -> Errors:
-    """Range residuals of a stop's inliers.
+    """Range residuals of a stop's beams that meet a surface.
 
     Args:
         scan: the stop.
@@ -74,16 +97,17 @@ def scan_errors(
 
 
 def row_errors(rows: Rows, predicted_m2: np.ndarray | float = 0.0) -> Errors:
-    """Range residuals of the inliers among a stop's rows.
+    """Range residuals of a stop's beams that meet a surface.
 
     Args:
         rows: the rows.
         predicted_m2: variance (N,) that the stop's predicted pose adds to what is expected.
     """
-    inlier = rows.weight > 0
+    inlier, lost = rows.weight > 0, rows.usable & (rows.weight == 0)
     expected = np.square(rows.sigma_m) + np.square(rows.reference_sigma_m) + predicted_m2
-    r = rows.residual_m[inlier]
-    return Errors(len(r), float(r.sum()), float(r @ r), float(expected[inlier].sum()))
+    r, out = rows.residual_m[inlier], rows.residual_m[lost]
+    sums = (float(r.sum()), float(r @ r), float(expected[inlier].sum()))
+    return Errors(len(r), *sums, len(out), float(out @ out))
 
 
 def _predicted_variance(
@@ -145,7 +169,7 @@ def misfit(estimate: Estimate, beams: Errors) -> dict[str, float]:
             dof = max(1, sum(b.rows for b in blocks) - free)
             out[kind] = float(np.sqrt(chi2 / dof))
     if beams.count and estimate.scans:
-        out["beams"] = float(np.sqrt(beams.squares_m2 / beams.expected_m2))
+        out["beams"] = beams.misfit
     surfaces = [u for u in unknowns.values() if u.role is Role.SURFACE]
     if surfaces:
         worst = max(_prior_cost(u, values[u.name]) / u.dim for u in surfaces)

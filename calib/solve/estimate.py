@@ -19,6 +19,7 @@ from calib.solve.graph import Graph
 # Of a state, beside an unknown's NAME: the parameters of a vector, and the value at which the beams
 # looked what they meet.
 DOFS, SEEN = ".dofs", ".seen"
+AT_ONCE = 256  # rows whose joint covariance is computed for their variances: it grows as the square
 
 
 @dataclass(frozen=True)
@@ -108,6 +109,20 @@ class Estimate:
         rows = np.zeros((len(columns), layout.size))
         rows[np.arange(len(columns)), columns] = 1.0
         return self.linear.covariance(rows, self._kept)
+
+    def variance_of(self, names: Sequence[str], rows: np.ndarray) -> np.ndarray:
+        """Variances (m,) of ``rows @ tangents``.
+
+        Args:
+            names: unknowns, none of them a surface's.
+            rows: (m, n) over their tangents, in that order.
+        """
+        columns, found = self.linear.layout.columns(names), [np.zeros(0)]
+        for some in np.array_split(rows, -(-len(rows) // AT_ONCE)):
+            whole = np.zeros((len(some), self.linear.layout.size))
+            whole[:, columns] = some
+            found.append(np.diag(self.linear.covariance(whole, self._kept)))
+        return np.concatenate(found)
 
     @cached_property
     def _kept(self) -> np.ndarray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.cluster.vq import kmeans2
 
 from calib import problem as problems
 from calib.problem import Problem
@@ -19,6 +20,7 @@ from calib.solve.estimate import Estimate, Start
 from calib.solve.fit import Progress, solve
 
 FOLDS = 5  # a fit leaves out about a fifth of the locations
+BLOCKS = 3 * FOLDS  # of poses: a fold leaves out three, far from each other
 
 
 def folds(sources: Sequence[Source], by: str) -> list[list[np.ndarray]]:
@@ -26,16 +28,68 @@ def folds(sources: Sequence[Source], by: str) -> list[list[np.ndarray]]:
 
     Args:
         sources: the recordings.
-        by: "location", or "stop"; by stop too where there is one location only.
+        by: as `unit_of` has it.
     """
-    labels = [s.recording.location if by == "location" else s.recording.stops for s in sources]
+    of = {
+        "location": lambda s: s.recording.location,
+        "stop": lambda s: np.array(s.recording.stops),
+        "poses": pose_blocks,
+    }[unit_of(sources, by)]
+    labels = [of(source) for source in sources]
     names = list(dict.fromkeys(str(x) for found in labels for x in found))
-    if len(names) < 2 and by == "location":
-        return folds(sources, "stop")
     if len(names) < 3:
         return []
     count = min(FOLDS, len(names))
     return [[np.isin(found, names[i::count]) for found in labels] for i in range(count)]
+
+
+def unit_of(sources: Sequence[Source], by: str) -> str:
+    """What a fold leaves out whole: "location", "stop", or "poses".
+
+    Where there is one location only, stops are left out one by one. Of an arm under a tracker
+    alone, whose base stands still, blocks of neighbouring poses are: a pose with others close
+    around it is predicted by them, whatever the model lacks, so single poses say how well the fit
+    interpolates; blocks all over the workspace say what it does where no pose was.
+
+    Args:
+        sources: the recordings.
+        by: "location" or "stop", as a user says.
+    """
+    if by == "stop":
+        return by
+    one = len({str(x) for s in sources for x in s.recording.location}) < 2
+    still = one or all(s.rig.moves == "never" for s in sources)
+    alone = not any(s.rig.lidar and s.recording.has_scan.any() for s in sources)
+    if still and alone and any(_beyond(s) for s in sources):
+        return "poses"
+    return "stop" if one else by
+
+
+def pose_blocks(source: Source) -> np.ndarray:
+    """The block of neighbours (K,) that each pose of an arm is of, as text.
+
+    By k-means over the positions, as tracked, of the bodies beyond the joints, from poses that lie
+    as far apart as can be: the same poses give the same blocks.
+    """
+    seen = [source.recording.bodies[body][:, :3] for body in _beyond(source)]
+    at = np.hstack([np.zeros((len(source.recording.stops), 0)), *seen])
+    at = at[:, np.isfinite(at).any(axis=0)]
+    at = np.where(np.isfinite(at), at, np.nanmean(at, axis=0))
+    middles: list[int] = []
+    away = np.linalg.norm(at - at.mean(axis=0), axis=1)
+    while len(middles) < BLOCKS and away.max(initial=0.0) > 0:
+        middles.append(int(np.argmax(away)))
+        away = np.linalg.norm(at[:, None] - at[middles], axis=2).min(axis=1)
+    if not middles:
+        return np.array(source.recording.stops)
+    _, block = kmeans2(at, at[middles], iter=20, minit="matrix")
+    return np.char.mod("block %02d", block)
+
+
+def _beyond(source: Source) -> list[str]:
+    """Tracked bodies that the arm moves."""
+    tracker = source.rig.tracker
+    return [b for b in (tracker.bodies if tracker else ()) if source.rig.joints_to(b)]
 
 
 def held_out(
@@ -51,7 +105,7 @@ def held_out(
     Args:
         sources: the recordings.
         model: what is estimated.
-        by: "location" or "stop".
+        by: "location" or "stop"; see `unit_of`.
         count: how many folds to evaluate.
         progress: as of `fit.solve`.
         start: a fit of all stops: each fold's fit is near it, and starts from there.

@@ -163,10 +163,13 @@ def _effect(
 
 
 def _absent(problem: Problem) -> list[dict[str, str]]:
-    """Links of the whole chain that these recordings have no instrument for."""
+    """Links of the whole chain that these recordings say nothing of; a LiDAR or a scanner that
+    rig.yaml does not have is no link."""
     rigs, sources = [s.rig for s in problem.sources], problem.sources
     out = []
-    if not any(s.reference or s.recording.targets for s in sources):
+    scans = any(s.rig.lidar or s.recording.has_scan.any() for s in sources)
+    scanner = scans or any(rig.reference or rig.target for rig in rigs)
+    if scanner and not any(s.reference or s.recording.targets for s in sources):
         why = "neither mesh nor targets: the scanner saw nothing; add a mesh, or targets.csv"
         out.append({"name": rigs[0].reference_frame, "why": why})
     if not any(r.tracker for r in rigs):
@@ -176,7 +179,7 @@ def _absent(problem: Problem) -> list[dict[str, str]]:
         out.append(
             {"name": "arm", "why": "the rig has no arm; add 'arm' to rig.yaml with its URDF"}
         )
-    if not problem.scans:
+    if scans and not problem.scans:
         why = (
             "no scans, so the LiDAR's place and its offsets are not seen; add scans/<stop>.parquet"
         )

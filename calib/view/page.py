@@ -10,10 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from calib.problem.model import recording_names
+from calib.show.misfit import of_stop
 from calib.view import colours, panels
 from calib.view.desk import Desk, DiagnosisCurve, Findings
 from calib.view.job import Job
-from calib.view.scene import Scene
+from calib.view.scene import Points, Scene
 from calib.view.stage import AXES, PANEL_PX, RIG, ROOM, Stage
 from chains.errors import InputError
 
@@ -131,7 +133,7 @@ class Page:
         """Everything anew, for the chosen run."""
         desk = self.desk
         self._fill(self._run, list(desk.runs), desk.chosen)
-        self._ladder.content = panels.ladder(desk.rungs())
+        self._ladder.content = panels.ladder(desk.rungs()) + panels.standing_out(desk.run)
         self._undo.disabled = desk.rungs()[-1].below is None
         self._show_findings()
         self._tell(f"Reading the recordings of {desk.chosen} …")
@@ -173,7 +175,7 @@ class Page:
         self._point.content = panels.note("Click a point to read it.") if points else ""
         if points is None:
             self._legend.content = ""
-            self._scan.content = panels.scan(None, 0, self._stop.value)
+            self._tell_scan(None, 0)
             return
         self._columns = {colours.column(n).heading: n for n in colours.choices(points)}
         self._fill(self._colour, list(self._columns), self._colour.value)
@@ -189,7 +191,13 @@ class Page:
         colour, scale = colours.coloured(points, self._columns[self._colour.value], self._labels)
         drawn = self.stage.paint(colour, self._below.value + 0.01)
         self._legend.content = panels.legend(scale)
-        self._scan.content = panels.scan(points, drawn, self._stop.value)
+        self._tell_scan(points, drawn)
+
+    def _tell_scan(self, points: Points | None, drawn: int) -> None:
+        stop, names = self._stop.value, recording_names(self.stage.scene.sources)
+        label = f"{names[self._at]}.{stop}" if len(names) > 1 else stop
+        found = self.desk.run.summary.get("misfit_by", {"stop": {}})["stop"].get(label, {})
+        self._scan.content = panels.scan(points, drawn, stop, of_stop(found))
 
     def _on_what(self) -> None:
         self.stage.toggle({"room": ROOM, "rig": RIG, "frames": AXES}[self._what.value])

@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 
 from calib.runs.ladder import Rung
+from calib.runs.run import Run
+from calib.show import misfit
 from calib.show.tables import LEAST_P
 from calib.view.colours import Scale, column
 from calib.view.desk import Findings
@@ -47,17 +49,40 @@ def legend(scale: Scale) -> str:
     )
 
 
-def scan(points: Points | None, drawn: int, stop: str) -> str:
-    """What the stop's beams say, all of them, however few are drawn."""
+def scan(points: Points | None, drawn: int, stop: str, ratios: Mapping[str, float]) -> str:
+    """What the stop's beams say, all of them, however few are drawn; and how large residuals of all
+    that was measured there are, over their sigmas."""
+    return _framed(_beams(points, drawn, stop) + _misfit(ratios))
+
+
+def standing_out(run: Run) -> str:
+    """What of the run does not fit; nothing where nothing stands out."""
+    lines = "".join(f"<li>{escape(line)}</li>" for line in misfit.standing_out(run.summary))
+    title = '<b style="color:#b3261e">What does not fit</b>'
+    return _framed(f'{title}<ul data-is="misfits">{lines}</ul>') if lines else ""
+
+
+def _beams(points: Points | None, drawn: int, stop: str) -> str:
     if points is None:
-        return _framed(f"Stop {escape(stop)} was not scanned.")
+        return f"Stop {escape(stop)} was not scanned."
     if not points.inlier.any():
-        return _framed(f"{len(points.inlier):,} beams, none of which the fit took for an inlier.")
+        return f"{len(points.inlier):,} beams, none of which the fit took for an inlier."
     residual = 1e3 * points.columns["residual_m"][points.inlier].astype(float)
-    return _framed(
+    return (
         f"{len(points.inlier):,} beams, {drawn:,} drawn; residual of the inliers "
         f"{math.sqrt(np.mean(residual**2)):.2f} mm rms, {residual.mean():+.2f} mm mean"
     )
+
+
+def _misfit(ratios: Mapping[str, float]) -> str:
+    """What stands out is bold and red."""
+    loud = "color:#b3261e;font-weight:600"
+    cells = ", ".join(
+        f'<span style="{loud if ratio > misfit.STANDS_OUT else ""}">{escape(name)} '
+        f"{misfit.times(ratio)}</span>"
+        for name, ratio in ratios.items()
+    )
+    return f'<div data-is="misfit">Residuals over their sigmas: {cells}</div>' if cells else ""
 
 
 def point(points: Points, index: int, label_names: Mapping[int, str]) -> str:

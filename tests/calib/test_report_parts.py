@@ -74,6 +74,14 @@ def rms(held_out):
     return {"rms_mm": {"fit": 0.9, "held_out": held_out, "noise_floor": 1.0}}
 
 
+MOVED = {"move_sigmas": 100.2, "worst": "tz", "change": -0.133, "sigma": 0.001, "unit": "m"}
+
+
+def apart(part, what):
+    """A misfit of one part."""
+    return {"misfit_by": {"stop": {}, "body": {}, "target": {}, "prior": {}} | {part: what}}
+
+
 @pytest.mark.parametrize(
     ("changes", "diagnosis", "light", "reason"),
     [
@@ -84,6 +92,18 @@ def rms(held_out):
         (rms(1.5), found(), "amber", "1.5 times the noise floor"),
         (rms(None), found(), "amber", "no stops were held out"),
         ({"misfit": {"reference": 2.0}}, found(), "amber", "errors of the reference"),
+        (
+            apart("stop", {"a": {"bodies": {"b": 4.0}}}),
+            found(),
+            "amber",
+            "a, b: residuals 4.0 times",
+        ),
+        (
+            apart("prior", {"a": MOVED}),
+            found(),
+            "amber",
+            "a.tz: -133 mm from CAD, 100 of its sigmas",
+        ),
         ({"misfit": {"tracker": 4.0}}, found(), "red", "residuals of tracker"),
         (rms(4.0), found(), "red", "4.0 times the noise floor"),
         ({"converged": False}, found(), "red", "not converged"),

@@ -11,6 +11,7 @@ from scipy.spatial.transform import RigidTransform
 from calib.effects import CATALOGUE
 from calib.runs.run import Run
 from calib.show import tables
+from calib.show.misfit import outstanding
 from calib.solve.solution import EffectEstimate, FrameEstimate, Part, Solution
 from sensors.documents import json_text
 
@@ -301,6 +302,44 @@ def test_a_check_is_printed(printed):
     assert "joint_1 hardly moves" in text
     assert "lidar: 0.6 mm" in text
     assert "mount.tz tied to lidar.tz" in text
+
+
+def test_what_does_not_fit_is_told_the_worst_first(run, printed):
+    move = {"move_sigmas": 100.2, "worst": "tz", "change": -0.133, "sigma": 0.001, "unit": "m"}
+    stops = {f"s{k}": {"bodies": {"base": 3.1 + k}, "joints": None, "beams": 1.0} for k in range(8)}
+    stops |= {f"t{k}": {"bodies": {"base": 1.0}} for k in range(9)}
+    found = {"stop": stops, "body": {"base": 1.1}, "target": {"t": 2.9}, "prior": {"lidar": move}}
+    spoilt = replace(run, summary=run.summary | {"misfit_by": found})
+    text = " ".join(printed(tables.print_run, spoilt))
+    assert text.index("s7, base: residuals 10.1 times larger") < text.index("s6, base")
+    assert "s2, base" in text and "s1, base" not in text and "and 2 more" in text
+    assert "t0, base" not in text
+    assert "target" not in text.partition("what does not fit")[2].partition("not told")[0]
+    assert "lidar.tz: -133 mm from CAD, 100 of its sigmas" in text
+    compared = " ".join(printed(tables.print_comparison, [run, spoilt]))
+    assert "s7, base 10.1" in compared and "lidar 100" in compared
+    assert "what does not fit" not in " ".join(printed(tables.print_run, run))
+
+
+def test_what_all_stops_have_stands_out_at_none():
+    def summary(*ratios):
+        stops = {f"s{k}": {"bodies": {"tool": x}} for k, x in enumerate(ratios)}
+        return {"misfit_by": {"stop": stops, "body": {}, "target": {"a": 1.0}, "prior": {}}}
+
+    assert list(outstanding(summary(8.0, 9.0, 24.0, 10.0))) == []
+    assert list(outstanding(summary(24.0, 25.0, 4000.0, 27.0))) == ["s2, tool"]
+    assert list(outstanding(summary(1.0, 0.2, 3.1, 0.9))) == ["s2, tool"]
+
+
+def test_an_error_says_of_how_many_beams_it_speaks(run, printed):
+    rms = {"nominal": 20.0, "fit": 2.7, "held_out": 2.9, "noise_floor": 2.8}
+    told = {"rms_all_mm": 8.6, "rejected_share": 0.116, "residual": "range", "rms_mm": rms}
+    told |= {"held_out_rms_all_mm": 8.8, "held_out_rejected_share": 0.12}
+    text = " ".join(printed(tables.print_run, replace(run, summary=run.summary | told)))
+    assert "after the fit: 2.70 mm over 88.4 % of the beams; 8.60 mm over all" in text
+    assert "of stops held out: 2.90 mm over 88.0 % of the beams; 8.80 mm over all" in text
+    alone = replace(run, summary=run.summary | told | {"residual": "tracked position"})
+    assert "of the beams" not in " ".join(printed(tables.print_run, alone))
 
 
 def test_a_misfit_is_said_and_named(run, capsys):

@@ -132,6 +132,16 @@ class Text(HTMLParser):
         self.text += data
 
 
+def test_a_stop_says_what_of_it_does_not_fit():
+    html = panels.scan(None, 0, "a<b", {"base<1>": 4.5, "beams": 1.0})
+    said = Text(html)
+    assert "Stop a<b was not scanned." in said.text
+    assert "base<1> 4.5, beams 1.0" in said.text and "b" not in said.tags
+    loud = html.partition("beams")[0]
+    assert "font-weight" in loud and "font-weight" not in html.replace(loud, "")
+    assert "sigmas" not in Text(panels.scan(None, 0, "a", {})).text
+
+
 @pytest.mark.parametrize(
     "p, words",
     [

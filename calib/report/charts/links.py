@@ -14,7 +14,8 @@ from calib.report.evidence import Evidence
 from calib.rig import Rig
 from calib.runs.estimates import VariableEstimate
 from calib.runs.run import RING
-from calib.show.tables import LISTED_PARAMETERS, shown
+from calib.show.scale import shown
+from calib.show.tables import LISTED_PARAMETERS
 
 if TYPE_CHECKING:
     from calib.report.plots import Axes, Figure

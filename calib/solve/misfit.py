@@ -1,0 +1,267 @@
+"""Every row of trackers, targets and priors, and where among them the model does not fit.
+
+A residual is smaller than its error where unknowns follow it. The redundancy of a row says how much
+of an error of its own is left in its residual: ``1 - a C a^T``, with the row's whitened derivative
+a and the covariance C of the unknowns (Baarda 1968). Over a group of rows the whitened residuals'
+squares are then expected to add up to the sum of their redundancies.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from calib.effects import FrameOffset, Site
+from calib.effects.rig import DOF
+from calib.linear.layout import StopKey, key_of
+from calib.problem.model import Source, recording_names
+from calib.problem.unknowns import POSE_UNITS, Role, Unknown
+from calib.residuals.targets import HangingTarget
+from calib.residuals.tracker import TrackedBody
+from calib.solve.errors import Errors
+from calib.solve.estimate import Estimate
+
+# Mean redundancy of a group below which an error of its own cannot be seen in it (Foerstner 1987:
+# below 0.01 observations are "not checkable").
+UNCHECKED = 0.01
+XYZ = ("x", "y", "z")
+PARTS = ("lower", "upper", "sphere")  # of a target, in the order of its rows
+GEOMETRY = (Site.EDGE, Site.JOINTS, Site.TARGET, Site.REFERENCE)  # what says how the rig is built
+
+
+@dataclass(frozen=True)
+class InstrumentRows:
+    """Rows of one kind as a table.
+
+    Args:
+        names: column -> (N,) text: what each row is of.
+        unit: (N,) "m", "rad" or another.
+        sigma: (N,) of each row, in its unit.
+        whitened: (N,) residual over sigma.
+        redundancy: (N,) 0 to 1; NaN where it was not computed.
+    """
+
+    names: Mapping[str, np.ndarray]
+    unit: np.ndarray
+    sigma: np.ndarray
+    whitened: np.ndarray
+    redundancy: np.ndarray
+
+    def table(self) -> dict[str, np.ndarray]:
+        """Columns (N,) as a run keeps them; ``residual`` is in the row's unit."""
+        numbers = {"sigma": self.sigma, "whitened": self.whitened, "redundancy": self.redundancy}
+        residual = {"residual": self.sigma * self.whitened, "unit": self.unit}
+        return {**self.names, **residual, **numbers}
+
+    def misfit(self, *by: str) -> dict[tuple[str, ...], float | None]:
+        """Per group of equal names, how many times larger than expected its residuals are: the
+        root of their squares' sum over that of their redundancies; None for what nothing checks."""
+        keys = list(zip(*(self.names[name].tolist() for name in by), strict=True))
+        groups = list(dict.fromkeys(keys))
+        number = {key: i for i, key in enumerate(groups)}
+        of = np.array([number[key] for key in keys], int)
+        count = np.bincount(of)
+        squares = np.bincount(of, np.square(self.whitened))
+        expected = np.bincount(of, self.redundancy)
+        told = expected >= UNCHECKED * count
+        ratio = np.sqrt(squares / np.where(told, expected, 1.0))
+        return {k: float(r) if t else None for k, r, t in zip(groups, ratio, told, strict=True)}
+
+
+def tracker_rows(estimate: Estimate) -> InstrumentRows | None:
+    """Rows of tracked bodies: recording, stop, body, and the axis of the body as predicted, turn
+    (rx, ry, rz) or shift (tx, ty, tz); None where no body is tracked."""
+    names, out = _stop_names(estimate), _Gathered()
+    for block in (b for b in estimate.problem.blocks if isinstance(b, TrackedBody)):
+        axes = slice(3, 6) if block.is_point else slice(0, 6)
+        stops = [names[key] for key in block.stop_names]
+        each = [(*stop, block.body, axis) for stop in stops for axis in DOF[axes]]
+        sigma = np.repeat([block.sigma_rad, block.sigma_m], 3)[axes]
+        residual, d = block.evaluate(estimate.values, True)
+        left = 1.0 - estimate.variance_of(list(d), np.hstack(list(d.values())))
+        out.add(each, POSE_UNITS[axes] * len(stops), np.tile(sigma, len(stops)), residual, left)
+    return out.rows(("recording", "stop", "body", "axis"))
+
+
+def target_rows(estimate: Estimate) -> InstrumentRows | None:
+    """Rows of targets: recording, target, part (its lower or upper marker, in the tracker's axes,
+    or its sphere, in the reference's), axis; None where there are none."""
+    blocks = [b for b in estimate.problem.blocks if isinstance(b, HangingTarget)]
+    if not blocks:
+        return None
+    names = _target_names(estimate)
+    whose = {id(block): names[block.marker] for block in blocks}
+    out = _Gathered()
+    for block, by, right in estimate.graph.linear_rows(estimate.values):
+        if id(block) in whose:
+            left = 1.0 - estimate.variance_of(list(by), np.hstack(list(by.values())))
+            each = [(*whose[id(block)], part, axis) for part in PARTS for axis in XYZ]
+            marker, sphere = block.sigma_marker_m, block.sigma_sphere_m
+            out.add(each, ["m"] * 9, np.repeat([marker, marker, sphere], 3), -right, left)
+    return out.rows(("recording", "target", "part", "axis"))
+
+
+def prior_rows(estimate: Estimate) -> InstrumentRows | None:
+    """Rows of what was known before: of every parameter of frames and effects, of what the encoders
+    misreport at a stop, and of surfaces. Columns: recording and stop, empty where a parameter is
+    not of one; unknown, parameter. The residual is the estimate less what was known."""
+    owner, out = _owners(estimate), _Gathered()
+    start = np.cumsum([0, *(v.dim for v in estimate.variables)])
+    variance = np.diag(estimate.covariance)
+    at = {v.name: variance[a : a + v.dim] for v, a in zip(estimate.variables, start, strict=False)}
+    for unknown in estimate.problem.variables.values():
+        if unknown.kind != "vector" or unknown.role is Role.TARGET:
+            continue
+        if unknown.role is Role.JOINTS:
+            seen = estimate.variance_of([unknown.name], np.eye(unknown.dim))
+        else:
+            seen = at.get(unknown.name, np.full(unknown.dim, np.nan))
+        left = 1.0 - seen / np.square(unknown.sigma)
+        each = [(*owner.get(unknown.name, ("", "")), unknown.name, dof) for dof in unknown.dofs]
+        out.add(each, unknown.units, unknown.sigma, _moved(unknown, estimate), left)
+    return out.rows(("recording", "stop", "unknown", "parameter"))
+
+
+def misfit_by(
+    estimate: Estimate,
+    tracker: InstrumentRows | None,
+    target: InstrumentRows | None,
+    prior: InstrumentRows | None,
+    beams: Mapping[tuple[str, str], Errors],
+) -> dict[str, Any]:
+    """Where the model does not fit: by stop, tracked body, target, and part of the geometry.
+
+    Args:
+        estimate: the solution.
+        tracker, target, prior: its rows.
+        beams: recording and stop -> errors of its beams.
+
+    Returns:
+        As summary.json holds it. ``stop``: stop -> ``tracker``, ``bodies`` (body -> number),
+        ``joints``, ``beams``, those that it has; ``body`` and ``target``: name -> number. All of
+        these say how many times larger than their sigmas allow the residuals are, about 1 when all
+        is well; null where nothing checks them. ``prior``: frame of CAD, or ``effect.parameter`` of
+        geometry -> ``move_sigmas``, how many sigmas of CAD it moved; ``worst``, the parameter that
+        moved furthest; its ``change`` and ``sigma``, in ``unit``. Of several recordings, a stop and
+        a target bear the recording's name before theirs.
+    """
+    several = len(estimate.problem.sources) > 1
+
+    def label(recording: str, name: str) -> str:
+        return f"{recording}.{name}" if several else name
+
+    stops: dict[str, dict[str, Any]] = {}
+    if tracker:
+        for key, times in tracker.misfit("recording", "stop").items():
+            stops[label(*key)] = {"tracker": times, "bodies": {}}
+        for (*key, body), times in tracker.misfit("recording", "stop", "body").items():
+            stops[label(*key)]["bodies"][body] = times
+    for key, times in (prior.misfit("recording", "stop") if prior else {}).items():
+        if key[1]:
+            stops.setdefault(label(*key), {})["joints"] = times
+    for key, errors in beams.items():
+        stops.setdefault(label(*key), {})["beams"] = errors.misfit
+    bodies = tracker.misfit("body") if tracker else {}
+    targets = target.misfit("recording", "target") if target else {}
+    return {
+        "stop": stops,
+        "body": {body: times for (body,), times in bodies.items()},
+        "target": {label(*key): times for key, times in targets.items()},
+        "prior": dict(_moves(estimate)),
+    }
+
+
+@dataclass
+class _Gathered:
+    """Rows, block by block."""
+
+    keys: list[tuple[str, ...]] = field(default_factory=list)
+    units: list[str] = field(default_factory=list)
+    numbers: list[np.ndarray] = field(default_factory=list)
+
+    def add(
+        self,
+        keys: Sequence[tuple[str, ...]],
+        units: Sequence[str],
+        sigma: np.ndarray,
+        whitened: np.ndarray,
+        redundancy: np.ndarray,
+    ) -> None:
+        self.keys += keys
+        self.units += units
+        self.numbers.append(np.stack([sigma, whitened, redundancy]))
+
+    def rows(self, names: Sequence[str]) -> InstrumentRows | None:
+        if not self.keys:
+            return None
+        columns = zip(names, zip(*self.keys, strict=True), strict=True)
+        named = {name: np.array(column, np.str_) for name, column in columns}
+        return InstrumentRows(named, np.array(self.units), *np.hstack(self.numbers))
+
+
+def _stop_names(estimate: Estimate) -> dict[StopKey, tuple[str, str]]:
+    """Recording and stop by name."""
+    sources = estimate.problem.sources
+    return {
+        (source.recording.folder, k): (name, stop)
+        for source, name in zip(sources, recording_names(sources), strict=True)
+        for k, stop in enumerate(source.recording.stops)
+    }
+
+
+def _target_names(estimate: Estimate) -> dict[str, tuple[str, str]]:
+    """Unknown of a target's marker -> recording and target by name."""
+    sources = estimate.problem.sources
+    several = len(sources) > 1
+    return {
+        f"{i}/target:{target}" if several else f"target:{target}": (name, target)
+        for i, name in enumerate(recording_names(sources))
+        for target in _names(sources[i])
+    }
+
+
+def _names(source: Source) -> Sequence[str]:
+    targets = source.recording.targets
+    return targets.names if targets else ()
+
+
+def _owners(estimate: Estimate) -> dict[str, tuple[str, str]]:
+    """Unknown of what encoders misreport -> the recording and stop that it is of."""
+    names, problem = _stop_names(estimate), estimate.problem
+    scans = [(scan.stops.noise, key_of(scan)) for scan in problem.scans]
+    bodies = [
+        (block.stops.noise, block.stop_names[0])
+        for block in problem.blocks
+        if isinstance(block, TrackedBody)
+    ]
+    return {noise: names[key] for noise, key in scans + bodies if noise is not None}
+
+
+def _moved(unknown: Unknown, estimate: Estimate) -> np.ndarray:
+    """How many of its sigmas each parameter moved from what was known before (dim,)."""
+    return (estimate.values[unknown.name] - unknown.mean) / unknown.sigma
+
+
+def _moves(estimate: Estimate) -> Iterator[tuple[str, dict[str, Any]]]:
+    """How far frames as a whole, and parameters of geometry one by one, moved from paper."""
+    terms = {t.variable: t.effect for terms in estimate.problem.terms for t in terms}
+    for unknown in estimate.variables:
+        effect = terms.get(unknown.name)
+        if effect is None or effect.site not in GEOMETRY:
+            continue
+        moved = _moved(unknown, estimate)
+        whole = isinstance(effect, FrameOffset)
+        for i in [int(np.argmax(np.abs(moved)))] if whole else range(unknown.dim):
+            yield (
+                unknown.name if whole else f"{unknown.name}.{unknown.dofs[i]}",
+                {
+                    "move_sigmas": float(abs(moved[i])),
+                    "worst": unknown.dofs[i],
+                    "change": float(moved[i] * unknown.sigma[i]),
+                    "sigma": float(unknown.sigma[i]),
+                    "unit": unknown.units[i],
+                },
+            )

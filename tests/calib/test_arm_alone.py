@@ -1,0 +1,210 @@
+"""Arms under a tracker alone: what is held out, what is predicted elsewhere, what is said."""
+
+import json
+import shutil
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from calib.diagnosis.candidates import concerned
+from calib.effects import CATALOGUE
+from calib.problem import build
+from calib.problem.model import Model, Source
+from calib.runs.calibrate import calibrate
+from calib.show import tables
+from calib.solve.check import check
+from calib.solve.fit import solve
+from calib.solve.holdout import BLOCKS, FOLDS, folds, pose_blocks, unit_of
+from calib.solve.reach import Reach, joint_range, reach
+from calib.solve.solution import solution_of
+
+from . import rigs
+
+SMALL = Model(("arm_link_length", "arm_joint_offset"))
+
+
+def arm_alone(folder, **changes):
+    """A recording of an arm and a tracker, and of nothing else."""
+    frames = {name: f for name, f in rigs.drawing()["frames"].items() if name != "lidar"}
+    changes |= {"lidar": None, "target": None, "reference": None, "frames": frames}
+    rigs.write(folder, seed=8, **changes)
+    (folder / "targets.csv").unlink()
+    shutil.rmtree(folder / "scans")
+    return folder
+
+
+def bent(source, at_m, **changes):
+    """A source whose tool was seen at these places (K, 3)."""
+    seen = np.hstack([at_m, np.tile([1.0, 0, 0, 0], (len(at_m), 1))])
+    said = {
+        "stops": [f"p{k}" for k in range(len(at_m))],
+        "location": np.array(["a"] * len(at_m)),
+        "has_scan": np.zeros(len(at_m), bool),
+        "bodies": {"mount_markers": seen, "base_markers": np.zeros((len(at_m), 7))},
+    }
+    return SimpleNamespace(rig=source.rig, recording=SimpleNamespace(**(said | changes)))
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory):
+    return Source.open(arm_alone(tmp_path_factory.mktemp("arm") / "rec"))
+
+
+@pytest.fixture(scope="module")
+def solved(source):
+    problem = build([source], SMALL)
+    return problem, solve(problem)
+
+
+# ---------------------------------------------------------------------------------------- held out
+
+
+def test_folds_are_blocks_of_neighbours_all_over_the_workspace(source):
+    at = np.random.default_rng(1).uniform(-1, 1, (300, 3))
+    many = bent(source, at)
+    assert unit_of([many], "location") == "poses" and unit_of([many], "stop") == "stop"
+    block = pose_blocks(many)
+    assert len(set(block)) == BLOCKS and np.array_equal(block, pose_blocks(many))
+    left = [fold[0] for fold in folds([many], "location")]
+    assert len(left) == FOLDS and np.array_equal(np.sum(left, axis=0), np.ones(300))
+    for fold in left:
+        assert 30 <= fold.sum() <= 90
+        # Further from what is kept than a single pose is from its neighbours.
+        far = np.linalg.norm(at[fold][:, None] - at[~fold], axis=2).min(axis=1)
+        near = np.linalg.norm(at[:, None] - at + 9 * np.eye(300)[..., None], axis=2).min(axis=1)
+        assert np.median(far) > 1.5 * np.median(near)
+        assert np.linalg.norm(np.ptp(at[fold], axis=0)) > 1.5  # of 3.5 m: not one corner
+
+
+def test_poses_that_were_not_seen_and_few_of_them_are_in_some_fold(source):
+    at = np.random.default_rng(1).uniform(-1, 1, (8, 3))
+    at[2] = np.nan
+    left = [fold[0] for fold in folds([bent(source, at)], "location")]
+    assert np.array_equal(np.sum(left, axis=0), np.ones(8))
+    one = bent(source, np.zeros((5, 3)))
+    assert len(folds([one], "location")) == 5  # where all are at one place, one by one
+
+
+def test_scans_and_a_base_that_moves_keep_their_locations(source):
+    at = np.random.default_rng(1).uniform(-1, 1, (20, 3))
+    two = np.array(["a", "b"] * 10)
+    assert unit_of([bent(source, at, location=two)], "location") == "location"
+    still = bent(source, at, location=two)
+    still.rig = replace(source.rig, moves="never")
+    assert unit_of([still], "location") == "poses"
+    scanned = bent(source, at, has_scan=np.ones(20, bool))
+    scanned.rig = replace(source.rig, lidar=object())
+    assert unit_of([scanned], "location") == "stop"
+
+
+# --------------------------------------------------------------------------------------- predicted
+
+
+def test_what_is_predicted_is_what_the_covariance_does_to_the_chain(solved, source):
+    """Against hardware drawn from the covariance and placed link by link by scipy."""
+    problem, estimate = solved
+    found = reach(problem, estimate)
+    assert found.body == "mount_markers"
+    rng, count = np.random.default_rng(5), 4000
+    theta = rng.multivariate_normal(np.zeros(len(estimate.covariance)), estimate.covariance, count)
+
+    def hardware(errors):
+        parts, start = {}, 0
+        for v in estimate.variables:
+            parts[v.name] = {d: errors[:, start + i] for i, d in enumerate(v.dofs)}
+            start += v.dim
+        zero = np.zeros(len(errors))
+
+        def of(name, dofs):
+            value = dict(zip(problem.variables[name].dofs, estimate.values[name], strict=True))
+            moved = parts[name]
+            return np.stack([value.get(d, 0.0) + moved.get(d, zero) for d in dofs], axis=-1)
+
+        twist = ("rx", "ry", "rz", "tx", "ty", "tz")
+        frames = {n: of(n, twist) for n in rigs.FRAMES if n in parts}
+        return rigs.Hardware(
+            frames, of("arm_link_length", rigs.ARM), of("arm_joint_offset", rigs.JOINTS)
+        )
+
+    def apart(joints):
+        def at(errors):
+            made = hardware(errors)
+            base, tool = (rigs.placed(b, joints, made) for b in ("base_markers", "mount_markers"))
+            return (base.inv() * tool).translation
+
+        return np.quantile(np.linalg.norm(at(theta) - at(0 * theta), axis=1), 0.95)
+
+    anywhere = rng.uniform(-3, 3, (count, 3))
+    seen = source.recording.joints[rng.integers(4, size=count)]
+    assert found.anywhere_m == pytest.approx(apart(anywhere), rel=0.06)
+    assert found.at_poses_m == pytest.approx(apart(seen), rel=0.06)
+    assert found.is_small and found.box_share < 0.1 and "add poses" in found.warning
+    assert reach(problem, estimate, 2.0).anywhere_m == pytest.approx(2 * found.anywhere_m)
+
+
+def test_joints_without_limits_turn_once(source):
+    low, high = joint_range(source.rig, source.recording.joints)
+    assert low.tolist() == [-3, -3, -3] and high.tolist() == [3, 3, 3]
+    edges = [
+        replace(e, joint=replace(e.joint, lower=-np.inf, upper=np.inf)) if e.joint else e
+        for e in source.rig.tree.edges
+    ]
+    tree = type(source.rig.tree)(edges)
+    free = replace(source.rig, tree=tree)
+    low, high = joint_range(free, source.recording.joints)
+    np.testing.assert_allclose(low, [-np.pi, -np.pi, 0.0])
+    np.testing.assert_allclose(high, [np.pi, np.pi, 0.15])
+
+
+def test_a_rig_with_scans_or_without_an_arm_has_none(tmp_path):
+    problem = build([Source.open(rigs.write(tmp_path / "rec"))], SMALL)
+    assert reach(problem, solve(problem)) is None
+
+
+def test_it_stands_in_the_summary_and_is_said(tmp_path, capsys):
+    recording = arm_alone(tmp_path / "rec")
+    run = calibrate([recording], tmp_path / "run", SMALL)
+    summary = json.loads((run.folder / "summary.json").read_text())
+    told = summary["predicted_mm"]
+    assert 0 < told["at_poses"] < told["anywhere"] and told["body"] == "mount_markers"
+    assert summary["rejected_share"] is None and summary["rms_all_mm"] is None
+    tables.print_run(run)
+    said = " ".join(capsys.readouterr().out.split())
+    assert (
+        f"within the poses to {told['at_poses']:.2g} mm" in said and "add poses out there" in said
+    )
+    found = check(recording)
+    assert found.document()["predicted_mm"]["anywhere"] > 0
+    assert any("fill a box of" in sentence for sentence in found.odd)
+
+
+def test_a_box_is_small_where_the_prediction_outside_is_much_worse():
+    def of(anywhere_m):
+        return Reach("tool", 1e-4, anywhere_m, box_m=np.array([1.0, 0.5, 0.25]), box_share=0.4)
+
+    assert not of(1.9e-4).is_small and of(2.1e-4).is_small
+    assert "1.00 x 0.50 x 0.25 m, which holds 40 %" in of(2.1e-4).warning
+    assert "0.1 mm, anywhere in the joints' range to 0.21 mm (95 %)" in of(2.1e-4).sentence
+
+
+# -------------------------------------------------------------------------------- what is not there
+
+
+def test_nothing_is_said_of_a_lidar_or_a_scanner_that_the_rig_does_not_have(solved, source):
+    untold = {each["name"] for each in solution_of(*solved).not_estimated}
+    assert not untold & {"lidar", "faro", "opti", "arm"}
+    there = {e.family for e in CATALOGUE if concerned(e, [source])}
+    assert {"arm_gravity_sag", "mount_creep", "optitrack_scale"} <= there
+    gone = {"range_offset", "faro_scale", "moved_surface", "target_sphere_offset"}
+    assert not there & gone and gone <= {e.family for e in CATALOGUE}
+
+
+def test_a_lidar_without_scans_is_still_named(tmp_path):
+    recording = rigs.write(tmp_path / "rec")
+    for scan in (recording / "scans").iterdir():
+        scan.unlink()
+    problem = build([Source.open(recording)], SMALL)
+    untold = {each["name"] for each in solution_of(problem, solve(problem)).not_estimated}
+    assert "lidar" in untold
