@@ -10,6 +10,7 @@ import numpy as np
 
 from calib.diagnosis.candidates import lacking
 from calib.diagnosis.curves import Curve, curves
+from calib.diagnosis.rejects import Rejects
 from calib.diagnosis.score import log_tail
 from calib.diagnosis.screen import Candidate, Screen
 from calib.diagnosis.search import ALPHA, FEWEST, ODDS, NamedEffect, Search, angle_deg
@@ -42,6 +43,7 @@ class Diagnosis:
         misfit: instrument -> how many times larger than their sigmas its residuals are.
         curves: mean residual against covariates.
         too_few: whether the stops are too few to say anything, whatever the verdict.
+        rejected: what the fit threw away; None without scans, or where nobody looked.
     """
 
     verdict: str
@@ -53,6 +55,7 @@ class Diagnosis:
     misfit: Mapping[str, float]
     curves: Sequence[Curve] = field(repr=False)
     too_few: bool = False
+    rejected: Rejects | None = None
 
     @property
     def heading(self) -> str:
@@ -77,6 +80,7 @@ class Diagnosis:
             "weak_directions": list(self.weak_directions),
             "untestable": dict(self.untestable),
             "misfit": dict(self.misfit),
+            "rejected": self.rejected.document() if self.rejected else None,
             "curves": [curve.document() for curve in self.curves],
         }
 
@@ -92,6 +96,7 @@ def conclude(
     held_out: Mapping[str, tuple[float, float, float]],
     misfit: Mapping[str, float],
     weak: Sequence[Mapping[str, Any]],
+    rejected: Rejects | None = None,
 ) -> Diagnosis:
     """Sum up a search.
 
@@ -100,15 +105,21 @@ def conclude(
         held_out: effect -> held-out rms before and after it was truly fitted, and noise floor, mm.
         misfit: by instrument.
         weak: weak directions.
+        rejected: what the fit threw away.
     """
     first = found.looks[0]
-    verdict = _verdict(found)
+    verdict = _verdict(found, rejected)
     candidates = [_candidate(c, verdict, found, held_out) for c in _ranked(found)]
-    unexplained = [_unexplained(c, screen) for screen, c in _without_a_name(found, verdict)]
     untestable = _untestable(first)
+    thrown = rejected.unexplained() if rejected and verdict == UNNAMED else []
+    unexplained = [_unexplained(c, screen) for screen, c in _without_a_name(found, verdict)]
+    unexplained = [*thrown, *unexplained]
+    sentences = _sentences(verdict, found, candidates, unexplained, untestable)
+    if rejected:
+        sentences.insert(0 if verdict == UNNAMED else len(sentences), rejected.sentence)
     return Diagnosis(
         verdict=verdict,
-        sentences=_sentences(verdict, found, candidates, unexplained, untestable),
+        sentences=sentences,
         candidates=candidates,
         unexplained=unexplained,
         weak_directions=weak,
@@ -116,6 +127,7 @@ def conclude(
         misfit=misfit,
         curves=curves(first.unnamed),
         too_few=_stops(first) < FEWEST,
+        rejected=rejected,
     )
 
 
@@ -123,9 +135,10 @@ def _stops(look: Look) -> int:
     return int(look.linear.stop.max()) + 1
 
 
-def _verdict(found: Search) -> str:
+def _verdict(found: Search, rejected: Rejects | None) -> str:
     if not found.found:
-        return UNNAMED if found.unnamed else "adequate"
+        thrown = rejected is not None and not rejected.explained
+        return UNNAMED if found.unnamed or thrown else "adequate"
     named = _names_hold(found) and (not found.unnamed or _absorbed(found) > ABSORBED)
     return "missing_effect" if named else UNNAMED
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from calib.diagnosis.rejects import rejects
 from calib.diagnosis.search import search
 from calib.diagnosis.stand import Stand
 from calib.diagnosis.verdict import Diagnosis, conclude
@@ -34,6 +35,7 @@ def diagnose(
     with threadpool_limits(limits=1):
         stand = stand_of(run, progress)
         found = search(stand, progress)
+        rejected = rejects(stand, progress)
         falls = {}
         before = run.summary["rms_mm"]["held_out"]
         for step in found.found if refits and run.model["hold_out"] != "none" else ():
@@ -53,6 +55,7 @@ def diagnose(
         falls,
         run.summary["misfit"],
         weak_directions(run.solution, float(run.summary["sigmas_widened_by"]), found.looks[0]),
+        rejected,
     )
     write_json(run.folder / DIAGNOSIS, result.document())
     return result
