@@ -100,18 +100,22 @@ def _views(counts: Counts) -> Iterator[_View]:
     rejected, own = counts.rejected, np.arange(len(counts.beams))
     for a, axis in enumerate(counts.axes):
         cell = rejected.cells[:, a]
-        bins, ways = np.append(axis.bins, axis.count)[cell], (counts.stop, counts.place)
-        yield _View(axis, counts.tables[a], counts.cells[a], bins, cell, ways)
-    stops = Axis.of_things("stop", counts.stop_names)
-    places = Axis.of_things("surface", counts.place_names)
+        yield _View(
+            axis=axis,
+            beams=counts.tables[a],
+            rows=counts.cells[a],
+            bin=np.append(axis.bins, axis.count)[cell],
+            cell=cell,
+            ways=(counts.stop, counts.place),
+        )
     for axis, at, other in (
-        (stops, counts.stop, counts.place),
-        (places, counts.place, counts.stop),
+        (Axis.of_things("stop", counts.stop_names), counts.stop, counts.place),
+        (Axis.of_things("surface", counts.place_names), counts.place, counts.stop),
     ):
-        beams = np.zeros((len(own), axis.count), int)
+        beams, thing = np.zeros((len(own), axis.count), int), at[rejected.pair]
         beams[own, at] = counts.beams
-        thing = at[rejected.pair]
-        yield _View(axis, beams, beams.sum(axis=0), thing, thing, (other,))
+        rows = beams.sum(axis=0)
+        yield _View(axis=axis, beams=beams, rows=rows, bin=thing, cell=thing, ways=(other,))
 
 
 def _most(counts: Counts, left: np.ndarray) -> tuple[tuple[np.ndarray, Place] | None, float]:

@@ -68,7 +68,8 @@ class Axis:
         at = np.arange(len(names)) if numbers is None else np.asarray(numbers)
         edges = (at[1:] + at[:-1]) / 2
         ends = np.hstack([at[:1], edges, at[-1:]])
-        return cls(name, edges, ends, bins=np.arange(len(at)), names=tuple(names))
+        own = np.arange(len(at))
+        return cls(name=name, edges=edges, ends=ends, bins=own, names=tuple(names))
 
     @property
     def ordered(self) -> bool:
@@ -224,7 +225,8 @@ def _count_stop(stand: Stand, i: int, axes: Sequence[Axis]) -> _Counted:
     some = used[thrown]
     reach = TUKEY * rows.scale * rows.sigma_m[some]
     rejected = Rejected(pair[thrown], at, rows.residual_m[some], reach)
-    return _Counted(parts, np.bincount(pair, minlength=len(parts)), tables, cells, rejected)
+    beams = np.bincount(pair, minlength=len(parts))
+    return _Counted(parts=parts, beams=beams, tables=tables, cells=cells, rejected=rejected)
 
 
 def _numbered(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
