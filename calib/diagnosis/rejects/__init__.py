@@ -29,7 +29,6 @@ from calib.diagnosis.stand import Stand
 from calib.solve.fit import Progress
 
 ALPHA = 0.01  # chance that structure is claimed where there is none
-AGREES = 0.5  # share of rejected beams that agree on a shift, from which they are coherent
 MOST_PLACES = 4  # places that are told apart
 FEWEST = 4  # stops, below which nothing is claimed
 KINDS = {"all": (-1, 1), "long": (1,), "short": (-1,)}  # signs of the residuals that are counted
@@ -59,21 +58,23 @@ def rejects(stand: Stand, progress: Progress = lambda what, done, total: None) -
         inside, place = found
         places.append(place)
         left &= ~inside
-    crowded = _crowded(counts, left)
-    total = max(int(counts.beams.sum()), 1)
-    apart = [p for p in places if p.structured]
-    outside = 1.0 - sum(p.beams for p in apart)
-    expected = (len(left) / total - sum(p.rejected for p in apart)) / max(outside, 1.0 / total)
-    hit = np.bincount(counts.rejected.pair[left], minlength=len(counts.beams))[crowded].sum()
-    stops = dict.fromkeys(counts.stop[crowded].tolist())
+    total = int(counts.met.sum())
+    rest = counts.rejected[left]
+    crowded = _crowded(counts, rest)
+    hit = float(crowded[rest.stop, rest.surface].sum()) / total
+    apart = [place for place in places if place.structured]
+    outside = 1.0 - sum(place.beams for place in apart)
+    usual = len(left) / total - sum(place.rejected for place in apart)
+    beyond = len(rest) / total - hit > CLUTTER
     return Rejects(
         share=len(left) / total,
-        expected=min(max(expected, 0.0), CLUTTER + hit / total),
+        expected=min(usual / max(outside, 1.0 / total), CLUTTER + hit),
         p_adjusted=least,
         places=places,
-        clutter=hit / total,
-        clutter_stops=tuple(counts.stop_names[i] for i in stops),
-        beyond=expected - hit / total > CLUTTER,
+        clutter=hit,
+        clutter_stops=tuple(counts.stop_names[i] for i in np.flatnonzero(crowded.any(axis=1))),
+        beyond=beyond,
+        beyond_m=float(np.median(rest.residual_m)) if beyond and rest.coherent else None,
     )
 
 
@@ -83,56 +84,59 @@ class _View:
 
     Args:
         axis: its cells and bins.
-        beams: (M, B) of each pair; rows: (C,) by cells, of all.
+        rows: (C,) beams by cells.
         bin: (R,) of the rejected; B where it is not known. cell: (R,) likewise.
-        ways: the clusters by number, (M,) each.
+        ways: the clusters: per way their number (R,) of the rejected, and beams (G, B) by bins and
+            (G,) in all of each.
     """
 
     axis: Axis
-    beams: np.ndarray
     rows: np.ndarray
     bin: np.ndarray
     cell: np.ndarray
-    ways: tuple[np.ndarray, ...]
+    ways: tuple[tuple[np.ndarray, np.ndarray, np.ndarray], ...]
 
 
 def _views(counts: Counts) -> Iterator[_View]:
-    rejected, own = counts.rejected, np.arange(len(counts.beams))
+    rejected, met = counts.rejected, counts.met
+    of_stop = met.sum(axis=1)
     for a, axis in enumerate(counts.axes):
         cell = rejected.cells[:, a]
         yield _View(
             axis=axis,
-            beams=counts.tables[a],
             rows=counts.cells[a],
-            bin=np.append(axis.bins, axis.count)[cell],
+            bin=axis.bin_of[cell],
             cell=cell,
-            ways=(counts.stop, counts.place),
+            ways=(
+                (rejected.stop, counts.stops[a], of_stop),
+                (rejected.place, counts.places[a], counts.of_place),
+            ),
         )
-    for axis, at, other in (
-        (Axis.of_things("stop", counts.stop_names), counts.stop, counts.place),
-        (Axis.of_things("surface", counts.place_names), counts.place, counts.stop),
+    stops = Axis.of_things("stop", counts.stop_names)
+    surfaces = Axis.of_things("surface", counts.surface_names)
+    for axis, mine, other, beams in (
+        (stops, rejected.stop, rejected.surface, met.T),
+        (surfaces, rejected.surface, rejected.stop, met),
     ):
-        beams, thing = np.zeros((len(own), axis.count), int), at[rejected.pair]
-        beams[own, at] = counts.beams
-        rows = beams.sum(axis=0)
-        yield _View(axis=axis, beams=beams, rows=rows, bin=thing, cell=thing, ways=(other,))
+        rows, ways = beams.sum(axis=0), ((other, beams, beams.sum(axis=1)),)
+        yield _View(axis=axis, rows=rows, bin=mine, cell=mine, ways=ways)
 
 
 def _most(counts: Counts, left: np.ndarray) -> tuple[tuple[np.ndarray, Place] | None, float]:
     """The place that explains most of the rejected that are left, with which of these it holds;
     and the smallest p-value, after all looks."""
     views = list(_views(counts))
-    looks = len(KINDS) * sum(view.beams.shape[1] for view in views)
+    looks = len(KINDS) * sum(view.axis.count for view in views)
     sign = np.sign(counts.rejected.residual_m)
     best, most, least = None, 0.0, 1.0
     for view in views:
         for signs in KINDS.values():
-            mine = left & np.isin(sign, signs) & (view.bin < view.beams.shape[1])
-            p = -np.expm1(looks * np.log1p(-np.minimum(_p_values(view, counts, mine), 1 - 1e-15)))
+            mine = left & np.isin(sign, signs) & (view.bin < view.axis.count)
+            p = -np.expm1(looks * np.log1p(-np.minimum(_p_values(view, mine), 1 - 1e-15)))
             least = min(least, float(p.min()))
             if p.min() >= ALPHA:
                 continue
-            cells, gain = _extent(view, counts, mine, p < ALPHA)
+            cells, gain = _extent(view, mine, p < ALPHA)
             if gain > most:
                 most, best = gain, (view, cells, float(p.min()))
     if best is None:
@@ -142,39 +146,27 @@ def _most(counts: Counts, left: np.ndarray) -> tuple[tuple[np.ndarray, Place] | 
     return (inside, _place(view, counts, cells, inside, p)), least
 
 
-def _p_values(view: _View, counts: Counts, mine: np.ndarray) -> np.ndarray:
+def _p_values(view: _View, mine: np.ndarray) -> np.ndarray:
     """p-value (B,) of each bin: that its share of beams that are `mine` (R,) is the others'."""
-    n, bins = view.beams, view.beams.shape[1]
-    at = counts.rejected.pair[mine] * bins + view.bin[mine]
-    k = np.bincount(at, minlength=n.size).reshape(n.shape)
-    rows, whole = n.sum(axis=0), counts.beams.sum()
-    inside = k.sum(axis=0)
+    bins, of = view.axis.count, view.bin[mine]
+    _, beams, whole = view.ways[0]
+    rows, total = beams.sum(axis=0), whole.sum()
+    inside = np.bincount(of, minlength=bins)
     share = inside / np.maximum(rows, 1)
-    others = (inside.sum() - inside) / np.maximum(whole - rows, 1)
-    # Were beams independent; of so many that a bin with none has a variance.
-    mean = (inside.sum() + 1.0) / (whole + 2.0)
-    least = mean * (1 - mean) / np.maximum(rows, 1)
+    others = (len(of) - inside) / np.maximum(total - rows, 1)
+    # Were beams independent; of one more, as a bin with none has a variance too.
+    mean = (len(of) + 1.0) / (total + 2.0)
     variance, dof = np.zeros(bins), np.full(bins, np.inf)
-    for way in view.ways:
-        size = int(way.max()) + 1
-        mine_n, mine_k, all_n, all_k = (
-            _sums(way, size, x) for x in (n, k, counts.beams[:, None], k.sum(axis=1)[:, None])
-        )
-        parts, clusters = zip(
-            _apart(mine_n, mine_k), _apart(all_n - mine_n, all_k - mine_k), strict=True
-        )
-        variance += np.square(parts[0] - parts[1]).sum(axis=0)
-        dof = np.minimum(dof, np.minimum(*clusters) - 1.0)
+    for cluster, n, every in view.ways:
+        k = np.bincount(cluster[mine] * bins + of, minlength=n.size).reshape(n.shape)
+        rest = every[:, None] - n, k.sum(axis=1)[:, None] - k
+        (here, some), (there, many) = _apart(n, k), _apart(*rest)
+        variance += np.square(here - there).sum(axis=0)
+        dof = np.minimum(dof, np.minimum(some, many) - 1.0)
+    least = mean * (1.0 - mean) / np.maximum(rows, 1)
     t = (share - others) / np.sqrt(np.maximum(variance, least))
     known = (rows > 0) & (dof > 0) & np.isfinite(variance)
     return np.where(known, special.stdtr(np.where(known, dof, 1.0), -t), 1.0)
-
-
-def _sums(way: np.ndarray, size: int, table: np.ndarray) -> np.ndarray:
-    """Rows of a table (M, B) summed by cluster."""
-    out = np.zeros((size, table.shape[1]))
-    np.add.at(out, way, table)
-    return out
 
 
 def _apart(n: np.ndarray, k: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -187,9 +179,7 @@ def _apart(n: np.ndarray, k: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.where(part < 1.0, beyond, np.inf), 1.0 / np.maximum(np.square(part).sum(axis=0), 1e-9)
 
 
-def _extent(
-    view: _View, counts: Counts, mine: np.ndarray, out: np.ndarray
-) -> tuple[np.ndarray, float]:
+def _extent(view: _View, mine: np.ndarray, out: np.ndarray) -> tuple[np.ndarray, float]:
     """Cells (C,) of a place, and how much likelier (log) what is `mine` (R,) is with a share of its
     own there: the interval where that is most; or of things, those bins (B,) that stand `out`."""
     axis, n = view.axis, view.rows
@@ -226,10 +216,7 @@ def _log_likelihood(n: np.ndarray, k: np.ndarray, share: np.ndarray) -> np.ndarr
 
 def _place(view: _View, counts: Counts, cells: np.ndarray, inside: np.ndarray, p: float) -> Place:
     """What the rejected beams (R,) inside some cells (C,) of a covariate do."""
-    rejected, total, beams = counts.rejected[inside], counts.beams.sum(), view.rows[cells].sum()
-    residual, reach = rejected.residual_m, rejected.reach_m
-    median = float(np.median(residual))
-    agrees, mirrored = (np.abs(residual - m) < reach for m in (median, -median))
+    rejected, total, beams = counts.rejected[inside], view.rows.sum(), view.rows[cells].sum()
     lower, upper = view.axis.interval(cells)
     return Place(
         covariate=view.axis.name,
@@ -240,31 +227,32 @@ def _place(view: _View, counts: Counts, cells: np.ndarray, inside: np.ndarray, p
         share=len(rejected) / max(beams, 1),
         rejected=len(rejected) / total,
         beams=beams / total,
-        residual_m=median,
-        sigma_m=_sigma(counts, rejected[agrees]),
-        coherent=bool(agrees.mean() - mirrored.mean() > AGREES),
-        short=float(np.mean(residual < 0)),
+        residual_m=float(np.median(rejected.residual_m)),
+        sigma_m=_sigma(rejected.agreeing),
+        coherent=rejected.coherent,
+        short=float(np.mean(rejected.residual_m < 0)),
     )
 
 
-def _sigma(counts: Counts, rejected: Rejected) -> float:
+def _sigma(rejected: Rejected) -> float:
     """Sigma of the mean of some residuals, m, stops and surfaces counted; NaN of a single one."""
     away, variance = rejected.residual_m - rejected.residual_m.mean(), 0.0
-    for way in (counts.stop, counts.place):
-        _, cluster = np.unique(way[rejected.pair], return_inverse=True)
+    for way in (rejected.stop, rejected.surface):
+        _, cluster = np.unique(way, return_inverse=True)
         sums = np.bincount(cluster, away)
         if (several := len(sums)) > 1:
             variance += several / (several - 1) * np.sum(np.square(sums / len(away)))
     return float(np.sqrt(variance)) or np.nan
 
 
-def _crowded(counts: Counts, left: np.ndarray) -> np.ndarray:
-    """Pairs (M,) of a stop and a surface at which far more beams than elsewhere, independent or
-    not, end before the surface: something stands there."""
-    rejected = counts.rejected
-    short = left & (rejected.residual_m < 0)
-    k = np.bincount(rejected.pair[short], minlength=len(counts.beams))
-    usual = np.median(k / np.maximum(counts.beams, 1))
-    usual = max(float(usual), (k.sum() + 1.0) / counts.beams.sum())
-    chance = special.bdtrc(k - 1.0, counts.beams, min(usual, 0.5))
-    return (k > CLUTTER * counts.beams) & (chance * len(k) < LEAST_P)
+def _crowded(counts: Counts, rejected: Rejected) -> np.ndarray:
+    """Where something stands before a surface at a stop (K, S): far more beams than mixed pixels
+    explain end before it, at all distances."""
+    short = rejected[rejected.residual_m < 0]
+    k = np.zeros(counts.met.shape, int)
+    np.add.at(k, (short.stop, short.surface), 1)
+    chance = special.bdtrc(k - 1.0, counts.met, CLUTTER) * k.size
+    out = (k > CLUTTER * counts.met) & (chance < LEAST_P)
+    for stop, surface in np.argwhere(out):
+        out[stop, surface] = not short[(short.stop == stop) & (short.surface == surface)].coherent
+    return out

@@ -15,6 +15,7 @@ from calib.residuals.robust import TUKEY
 from calib.solve.fit import Progress
 
 CELLS, BINS = 240, 12  # of a covariate: where an interval may end, and what is tested
+AGREES = 0.5  # share of rejected beams that agree on a size, from which they are coherent
 STOPS_A_BIN = 5  # of a covariate of stops: fewer clusters than this tell nothing
 
 
@@ -96,9 +97,9 @@ class Axis:
         return int(self.bins[-1]) + 1
 
     @cached_property
-    def first(self) -> np.ndarray:
-        """(B,) the first cell of each bin."""
-        return np.searchsorted(self.bins, np.arange(self.count))
+    def bin_of(self) -> np.ndarray:
+        """(C + 1,) the bin of each cell; the last, of what is not known, is B."""
+        return np.append(self.bins, self.count)
 
     def cells(self, values: np.ndarray) -> np.ndarray:
         """The cell (N,) of each value; C where it is not known."""
@@ -112,12 +113,14 @@ class Rejected:
     """R beams whose robust weight is 0.
 
     Args:
-        pair: (R,) which pair of a stop and a surface they belong to.
+        stop, place, surface: (R,) numbers of the stop, the place and the surface they belong to.
         cells: (R, A) cell on each axis.
         residual_m: (R,); reach_m: (R,) by how much a beam may be off and not be rejected.
     """
 
-    pair: np.ndarray
+    stop: np.ndarray
+    place: np.ndarray
+    surface: np.ndarray
     cells: np.ndarray
     residual_m: np.ndarray
     reach_m: np.ndarray
@@ -132,71 +135,112 @@ class Rejected:
         return Rejected(*(column[rows] for column in vars(self).values()))
 
     def __len__(self) -> int:
-        return len(self.pair)
+        return len(self.stop)
+
+    @property
+    def coherent(self) -> bool:
+        """Whether most would not be rejected were their median taken off, and not as well with the
+        other sign: an error of one size, where mixed pixels and clutter scatter over all values."""
+        agrees, mirrored = (np.abs(self.residual_m - m) < self.reach_m for m in self._medians)
+        return len(self) > 0 and bool(agrees.mean() - mirrored.mean() > AGREES)
+
+    @property
+    def agreeing(self) -> Rejected:
+        """Those that would not be rejected were the median taken off."""
+        return self[np.abs(self.residual_m - self._medians[0]) < self.reach_m]
+
+    @property
+    def _medians(self) -> tuple[float, float]:
+        median = float(np.median(self.residual_m)) if len(self) else np.nan
+        return median, -median
 
 
 @dataclass(frozen=True)
 class Counts:
-    """All beams that meet a surface, counted by pairs of a stop and a surface that it sees, and the
-    rejected ones.
+    """All beams that meet a surface, counted, and the rejected ones.
 
     Args:
         axes: covariates, A of them.
-        stop, place: (M,) numbers of the stop and the surface of each pair.
-        beams: (M,) how many beams each has.
-        tables: per axis (M, B) the same by bins; cells: per axis (C,) by cells, of all pairs.
-        stop_names, place_names: by number.
+        stops, places: per axis (K, B) and (P, B) beams of each stop, and of each place, by bins.
+        cells: per axis (C,) beams by cells.
+        met: (K, S) beams of each stop on each surface.
+        of_place: (P,) beams of each place: a patch of a surface of a mesh, or a plane.
+        stop_names, surface_names: by number.
         rejected: the rejected ones.
     """
 
     axes: Sequence[Axis]
-    stop: np.ndarray
-    place: np.ndarray
-    beams: np.ndarray
-    tables: Sequence[np.ndarray]
+    stops: Sequence[np.ndarray]
+    places: Sequence[np.ndarray]
     cells: Sequence[np.ndarray]
+    met: np.ndarray
+    of_place: np.ndarray
     stop_names: Sequence[str]
-    place_names: Sequence[str]
+    surface_names: Sequence[str]
     rejected: Rejected
 
 
 def count(stand: Stand, progress: Progress) -> Counts:
     """Count the beams of a fit at its solution."""
     scans, axes = stand.estimate.scans, _axes(stand)
-    numbers: dict[tuple[object, int], int] = {}
-    pairs = 0
-    stop, place, beams, rejected = [], [], [], []
-    tables, cells = [[] for _ in axes], [np.zeros(len(a.bins), int) for a in axes]
+    places, surfaces = _Numbers(), _Numbers()
+    stops, rejected = [[] for _ in axes], []
+    by_place = [np.zeros((0, axis.count), int) for axis in axes]
+    cells = [np.zeros(len(axis.bins), int) for axis in axes]
+    met, of_place = np.zeros((len(scans), 0), int), np.zeros((0, 1), int)
     for i, found in enumerate(in_order(lambda i: _count_stop(stand, i, axes), len(scans))):
         progress("looking at what was thrown away", i, len(scans))
-        room = scans[i].room
-        place += [numbers.setdefault((room, part), len(numbers)) for part in found.parts.tolist()]
-        stop.append(np.full(len(found.parts), i))
-        beams.append(found.beams)
-        rejected.append(replace(found.rejected, pair=found.rejected.pair + pairs))
-        pairs += len(found.parts)
+        place, surface = (
+            numbers.of(scans[i].room, parts)
+            for numbers, parts in ((places, found.places), (surfaces, found.surfaces))
+        )
+        own, beams = found.rejected, found.beams
+        rejected.append(replace(own, place=place[own.place], surface=surface[own.surface]))
+        met = _grown(met.T, len(surfaces.known)).T
+        met[i, surface] = found.met
+        of_place = _grown(of_place, len(places.known))
+        of_place[place, 0] += beams
         for a, (table, fine) in enumerate(zip(found.tables, found.cells, strict=True)):
-            tables[a].append(table)
+            stops[a].append(table.sum(axis=0))
+            by_place[a] = _grown(by_place[a], len(places.known))
+            by_place[a][place] += table
             cells[a] += fine
     return Counts(
         axes=axes,
-        stop=np.concatenate(stop),
-        place=np.array(place),
-        beams=np.concatenate(beams),
-        tables=[np.vstack(each) for each in tables],
+        stops=[np.stack(each) for each in stops],
+        places=by_place,
         cells=cells,
+        met=met,
+        of_place=of_place[:, 0],
         stop_names=[scan.name for scan in scans],
-        place_names=[str(part) for _, part in numbers],
+        surface_names=[str(part) for _, part in surfaces.known],
         rejected=Rejected.of(rejected),
     )
 
 
+class _Numbers:
+    """Numbers for parts of rooms, in the order in which they are first seen."""
+
+    def __init__(self) -> None:
+        self.known: dict[tuple[object, int], int] = {}
+
+    def of(self, room: object, parts: np.ndarray) -> np.ndarray:
+        known = self.known
+        return np.array([known.setdefault((room, p), len(known)) for p in parts.tolist()], int)
+
+
+def _grown(table: np.ndarray, rows: int) -> np.ndarray:
+    return np.pad(table, ((0, rows - len(table)), (0, 0)))
+
+
 @dataclass(frozen=True)
 class _Counted:
-    """One stop's beams; its pairs are the surfaces `parts` that it sees."""
+    """One stop's beams: by places and their bins, by cells, and by surfaces."""
 
-    parts: np.ndarray
+    places: np.ndarray
     beams: np.ndarray
+    surfaces: np.ndarray
+    met: np.ndarray
     tables: Sequence[np.ndarray]
     cells: Sequence[np.ndarray]
     rejected: Rejected
@@ -206,8 +250,9 @@ def _count_stop(stand: Stand, i: int, axes: Sequence[Axis]) -> _Counted:
     scan, estimate = stand.estimate.scans[i], stand.estimate
     rows = scan.rows(estimate.values, estimate.associations[i])
     used, view = np.flatnonzero(rows.usable), rows.view
-    kind = next(name for name in PLACES if name in view.columns)
-    parts, pair = _numbered(np.asarray(view[kind])[used])
+    kinds = [name for name in ("region", *PLACES) if name in view.columns]
+    places, place = _numbered(np.asarray(view[kinds[0]])[used])
+    surfaces, surface = _numbered(np.asarray(view[kinds[min(1, len(kinds) - 1)]])[used])
     thrown = np.flatnonzero(rows.weight[used] == 0.0)
     tables, cells, at = [], [], np.zeros((len(thrown), len(axes)), np.int32)
     for a, axis in enumerate(axes):
@@ -217,16 +262,28 @@ def _count_stop(stand: Stand, i: int, axes: Sequence[Axis]) -> _Counted:
         else:
             cell = axis.cells(values[used])
         at[:, a] = cell[thrown]
-        size = len(axis.bins)
-        known = np.bincount(pair * (size + 1) + cell, minlength=len(parts) * (size + 1))
-        known = known.reshape(len(parts), size + 1)[:, :size]
-        cells.append(known.sum(axis=0))
-        tables.append(np.add.reduceat(known, axis.first, axis=1))
+        size = axis.count + 1
+        known = np.bincount(place * size + axis.bin_of[cell], minlength=len(places) * size)
+        tables.append(known.reshape(len(places), size)[:, :-1])
+        cells.append(np.bincount(cell, minlength=len(axis.bins))[: len(axis.bins)])
     some = used[thrown]
-    reach = TUKEY * rows.scale * rows.sigma_m[some]
-    rejected = Rejected(pair[thrown], at, rows.residual_m[some], reach)
-    beams = np.bincount(pair, minlength=len(parts))
-    return _Counted(parts=parts, beams=beams, tables=tables, cells=cells, rejected=rejected)
+    rejected = Rejected(
+        stop=np.full(len(some), i),
+        place=place[thrown],
+        surface=surface[thrown],
+        cells=at,
+        residual_m=rows.residual_m[some],
+        reach_m=TUKEY * rows.scale * rows.sigma_m[some],
+    )
+    return _Counted(
+        places=places,
+        beams=np.bincount(place),
+        surfaces=surfaces,
+        met=np.bincount(surface),
+        tables=tables,
+        cells=cells,
+        rejected=rejected,
+    )
 
 
 def _numbered(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

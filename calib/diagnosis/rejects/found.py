@@ -130,7 +130,8 @@ class Rejects:
         places: where more is rejected than elsewhere, most first.
         clutter: share of all beams that hit something that is not in the mesh; clutter_stops: the
             stops of these.
-        beyond: whether more is thrown away outside all places than mixed pixels may explain.
+        beyond: whether more is thrown away elsewhere than mixed pixels may explain; beyond_m: the
+            median residual of that, where it agrees on one.
     """
 
     share: float
@@ -140,6 +141,7 @@ class Rejects:
     clutter: float
     clutter_stops: tuple[str, ...]
     beyond: bool
+    beyond_m: float | None
 
     @property
     def structured(self) -> Sequence[Place]:
@@ -154,14 +156,15 @@ class Rejects:
     @property
     def sentence(self) -> str:
         """What was thrown away, in words."""
-        told = f"{100 * self.share:.2g} % of the beams that meet a surface were thrown away"
+        told = f"{percent(self.share)} % of the beams that meet a surface were thrown away"
         if self.beyond:
             told += f", more than the {100 * CLUTTER:.0f} % that mixed pixels may explain"
+            told += f", by {1e3 * self.beyond_m:+.1f} mm" if self.beyond_m else ""
         for place in (self.structured or self.places)[:2]:
-            there = f"of the beams at {place.where} it is {100 * place.share:.2g} %"
+            there = f"of the beams at {place.where} it is {percent(place.share)} %"
             told += f"; {there}, and {place.what}"
         if self.clutter_stops:
-            told += f"; {100 * self.clutter:.2g} % hit something that is not in the mesh, at stop "
+            told += f"; {percent(self.clutter)} % hit something that is not in the mesh, at stop "
             told += listed(self.clutter_stops)
         return told + "."
 
@@ -201,3 +204,8 @@ def listed(names: Sequence[str]) -> str:
     """Names with commas, no more than a sentence bears."""
     more = len(names) - NAMED
     return ", ".join(names[:NAMED]) + (f" and {more} more" if more > 0 else "")
+
+
+def percent(share: float) -> str:
+    """A share in percent, with two digits."""
+    return f"{100 * share:.0f}" if share >= 0.1 else f"{100 * share:.2g}"
