@@ -13,6 +13,7 @@ from calib.linear.system import Linearisation
 from calib.problem.problem import Block, Problem
 from calib.problem.surfaces import with_surfaces
 from calib.residuals.beams import Association
+from calib.solve.added import begun
 from calib.solve.estimate import SEEN, Estimate, Start, cost_of, started, values_of
 from calib.solve.graph import Graph, KeptRows
 from chains import se3
@@ -227,6 +228,7 @@ class _Loop:
         for name in self.problem.cells:
             unknown = self.problem.variables[name]
             self.values[name] = started(unknown, self.start.state, unknown.mean)
+        self.values |= begun(self.problem, self.values, self.associations, self.start.state)
         self.layout = self._layout()
 
     def estimate(self, converged: bool) -> Estimate:
