@@ -1,6 +1,5 @@
 """Where an effect begins that is added to a fit which rejects all that it explains."""
 
-import numpy as np
 import pytest
 
 from calib.effects.own.formula import FormulaEffect
@@ -9,8 +8,9 @@ from calib.problem.model import Model, Source
 from calib.simulation import Spec
 from calib.solve.fit import solve
 from sensors.documents import Marks
-from sensors.recording import read_table, write_table
 
+from . import rescans
+from .rescans import change_ranges
 from .simulated import made
 
 SMALL = Spec(lidar="hesai_pandarxt32", locations=3, stops_per_location=2, column_step=50)
@@ -25,15 +25,8 @@ def sector(sigma: float = 0.3) -> FormulaEffect:
 
 def shifted(source: Source, by_m: float) -> Source:
     """The recording with the ranges of a sector made longer."""
-    folder = source.recording.folder
-    for path in sorted((folder / "scans").glob("*.parquet")):
-        table = read_table(path)
-        points = np.stack([table[c] for c in "xyz"], axis=1).astype(float)
-        azimuth, size = np.arctan2(points[:, 1], points[:, 0]), np.linalg.norm(points, axis=1)
-        off = (azimuth > FIRST_RAD) & (azimuth < LAST_RAD)
-        points *= (1.0 + np.where(off, by_m, 0.0) / size)[:, None]
-        write_table(path, table | dict(zip("xyz", points.astype(np.float32).T, strict=True)))
-    return Source.open(folder)
+    change_ranges(source.recording.folder, rescans.sector(FIRST_RAD, LAST_RAD, by_m))
+    return Source.open(source.recording.folder)
 
 
 @pytest.mark.parametrize("by_m", [0.025, -0.1])

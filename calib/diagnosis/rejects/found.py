@@ -13,8 +13,8 @@ from calib.diagnosis.suggest import words
 LEAST_P = 1e-6  # tails are not known further out
 NAMED = 6  # stops or surfaces that a sentence names
 MOST = 0.5  # share of beams that makes a place structured, whatever their residuals do
-# Share that mixed pixels may explain where nothing stands out. They are 0.3 to 0.4 % in recordings
-# of two simulators, and 4 % where the simulator does as the rooms of a paper.
+# Share that mixed pixels may explain, in all or at one place. They are 0.3 to 0.4 % in recordings
+# of two simulators, 1 % at grazing incidence, and 4 % where the simulator does as a paper's rooms.
 CLUTTER = 0.05
 UNITS = {"_rad": ("rad", "deg", 180.0 / np.pi), "_m": ("m", "m", 1.0), "_s": ("s", "s", 1.0)}
 UNITS |= {"_c": ("degC", "°C", 1.0)}  # of a column: its own, the one that people are shown, factor
@@ -55,7 +55,8 @@ class Place:
     @property
     def structured(self) -> bool:
         """Whether neither mixed pixels nor things that stand in the way explain it."""
-        return self.coherent or (self.share > MOST and not self.in_the_way)
+        odd = self.coherent or (self.share > MOST and not self.in_the_way)
+        return odd and self.share > CLUTTER
 
     @property
     def in_the_way(self) -> bool:
@@ -160,7 +161,8 @@ class Rejects:
         if self.beyond:
             told += f", more than the {100 * CLUTTER:.0f} % that mixed pixels may explain"
             told += f", by {1e3 * self.beyond_m:+.1f} mm" if self.beyond_m else ""
-        for place in (self.structured or self.places)[:2]:
+        crowded = [place for place in self.places if place.share > CLUTTER]
+        for place in (self.structured or crowded)[:2]:
             there = f"of the beams at {place.where} it is {percent(place.share)} %"
             told += f"; {there}, and {place.what}"
         if self.clutter_stops:
