@@ -1,10 +1,10 @@
-"""Robust weights: Tukey's biweight, its cost and curvature; Huber's; and how wide the bulk is."""
+"""Robust weights: Tukey's biweight, its cost and curvature, and how wide the bulk of rows is."""
 
 from __future__ import annotations
 
 import numpy as np
 
-TUKEY, HUBER = 4.685, 1.345  # 95 % efficiency on normal rows (Holland and Welsch 1977)
+TUKEY = 4.685  # 95 % efficiency on normal rows (Holland and Welsch 1977)
 
 
 def tukey_weight(z: np.ndarray, scale: float = 1.0) -> np.ndarray:
@@ -16,17 +16,6 @@ def tukey_weight(z: np.ndarray, scale: float = 1.0) -> np.ndarray:
     """
     u = np.square(z / (TUKEY * scale))
     return np.square(np.maximum(1.0 - u, 0.0))
-
-
-def huber_weight(z: np.ndarray, scale: float = 1.0) -> np.ndarray:
-    """Weight of each whitened row under Huber's cost, ``min(1, k / |z|)``: never 0, and the cost
-    is convex.
-
-    Args:
-        z: (N,) whitened residuals.
-        scale: multiplies the tuning constant k = 1.345.
-    """
-    return np.minimum(1.0, HUBER * scale / np.maximum(np.abs(z), 1e-300))
 
 
 def tukey_curvature(z: np.ndarray, scale: float = 1.0) -> np.ndarray:
