@@ -7,12 +7,13 @@ weight is 0 there, where Huber's clipped residual would be a full one. So reject
 in bins of every covariate, those that read long and short together and each alone: the difference
 of these is the sum of their clipped residuals.
 
-A bin's share is held against the share elsewhere. Stops and surfaces are the clusters, not beams:
-the variance of the difference is the cluster jackknife's (Bell and McCaffrey 2002), that by stops
-and that by surfaces added, and Student's t with the effective number of the fewer clusters (Carter,
-Schnepel and Steigerwald 2017) judges it. Sidak pays for all looks. Where a covariate stands out,
-its interval is the one of the largest binomial likelihood (the scan statistic of Kulldorff 1997);
-its beams are set aside, and the rest is looked at again.
+A bin's share is held against the share elsewhere. Stops, and the patches of a metre or so that the
+beams meet, are the clusters, not beams: the variance of the difference is the cluster jackknife's
+(Bell and McCaffrey 2002), that by stops and that by patches added, and Student's t with the
+effective number of the fewer clusters (Carter, Schnepel and Steigerwald 2017) judges it. Sidak pays
+for all looks. Surfaces and stops are looked at as covariates too, with the other as clusters. Where
+a covariate stands out, its interval is the one of the largest binomial likelihood (the scan
+statistic of Kulldorff 1997); its beams are set aside, and the rest is looked at again.
 """
 
 from __future__ import annotations
