@@ -71,7 +71,7 @@ class Stand:
 
     def look(self, progress: Progress) -> Look:
         """Test everything that the model lacks."""
-        columns, sample = self._columns()
+        columns, sample = self.columns()
         known = known_effects(self.model, self.sources, columns)
         there = set(self.model.names)
         unnamed = [e for e in structure(self.sources, sample) if e.name not in there]
@@ -177,7 +177,7 @@ class Stand:
             start += variable.dim
         raise ValueError(f"'{effect.name}' is not in the model")
 
-    def _columns(self) -> tuple[frozenset[str], dict[str, np.ndarray]]:
+    def columns(self) -> tuple[frozenset[str], dict[str, np.ndarray]]:
         """Which columns there are, and the values of covariates at some of the points."""
         columns = {c for s in self.sources for c in s.columns}
         scans = self.estimate.scans

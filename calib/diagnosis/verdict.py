@@ -13,6 +13,7 @@ from calib.blunders.chance import log_tail
 from calib.blunders.judged import LeftOut
 from calib.diagnosis.candidates import concerned, lacking
 from calib.diagnosis.curves import Curve, curves
+from calib.diagnosis.rejects import Rejects
 from calib.diagnosis.screen import Candidate, Screen
 from calib.diagnosis.search import (
     ALPHA,
@@ -56,6 +57,7 @@ class Diagnosis:
         curves: mean residual against covariates.
         too_few: whether the stops are too few to say anything, whatever the verdict.
         command: what fits the same without the blunders, ready to be typed; empty without any.
+        rejected: what the fit threw away; None without scans, or where nobody looked.
     """
 
     verdict: str
@@ -70,6 +72,7 @@ class Diagnosis:
     curves: Sequence[Curve] = field(repr=False)
     too_few: bool = False
     command: str = ""
+    rejected: Rejects | None = None
 
     @property
     def heading(self) -> str:
@@ -97,6 +100,7 @@ class Diagnosis:
             "command": self.command or None,
             "detectable": dict(self.detectable),
             "misfit": dict(self.misfit),
+            "rejected": self.rejected.document() if self.rejected else None,
             "curves": [curve.document() for curve in self.curves],
         }
 
@@ -112,6 +116,7 @@ def conclude(
     held_out: Mapping[str, tuple[float, float, float]],
     misfit: Mapping[str, float],
     weak: Sequence[Mapping[str, Any]],
+    rejected: Rejects | None = None,
 ) -> Diagnosis:
     """Sum up a search.
 
@@ -120,16 +125,22 @@ def conclude(
         held_out: effect -> held-out rms before and after it was truly fitted, and noise floor, mm.
         misfit: by instrument.
         weak: weak directions.
+        rejected: what the fit threw away.
     """
     first = found.looks[0]
-    verdict = _verdict(found)
+    verdict = _verdict(found, rejected)
     candidates = [_candidate(c, verdict, found, held_out) for c in _ranked(found)]
-    unexplained = [_unexplained(c, screen) for screen, c in _without_a_name(found, verdict)]
     untestable = _untestable(first)
+    thrown = rejected.unexplained() if rejected and verdict == UNNAMED else []
+    unexplained = [_unexplained(c, screen) for screen, c in _without_a_name(found, verdict)]
+    unexplained = [*thrown, *unexplained]
     blunders = [told.document(left, _rig(left, first)) for left in found.blunders]
+    sentences = _sentences(verdict, found, candidates, unexplained, untestable, blunders)
+    if rejected:
+        sentences.insert(0 if verdict == UNNAMED else len(sentences), rejected.sentence)
     return Diagnosis(
         verdict=verdict,
-        sentences=_sentences(verdict, found, candidates, unexplained, untestable, blunders),
+        sentences=sentences,
         candidates=candidates,
         unexplained=unexplained,
         weak_directions=weak,
@@ -139,6 +150,7 @@ def conclude(
         misfit=misfit,
         curves=curves(first.unnamed),
         too_few=_stops(first) < FEWEST,
+        rejected=rejected,
     )
 
 
@@ -153,11 +165,12 @@ def _stops(look: Look) -> int:
     return int(look.linear.stop.max()) + 1
 
 
-def _verdict(found: Search) -> str:
+def _verdict(found: Search, rejected: Rejects | None) -> str:
     if found.blunders:
         return BAD
     if not found.found:
-        return UNNAMED if found.unnamed else "adequate"
+        thrown = rejected is not None and not rejected.explained
+        return UNNAMED if found.unnamed or thrown else "adequate"
     named = _names_hold(found) and (not found.unnamed or _absorbed(found) > ABSORBED)
     return "missing_effect" if named else UNNAMED
 

@@ -117,6 +117,14 @@ def signed_map(
     return ax.imshow(values, scale, vmin=-limit, vmax=limit, extent=extent, **options)
 
 
+def share_map(ax: Axes, values: np.ndarray, extent: Sequence[float], most: float) -> Any:
+    """A map (rows, columns) from 0 to `most`, drawn as one picture; grey where it is NaN."""
+    ax.set_facecolor("#d8d8d8")
+    ax.grid(False)
+    options = {"aspect": "auto", "origin": "lower", "interpolation": "nearest"}
+    return ax.imshow(values, UNSIGNED, vmin=0.0, vmax=most, extent=extent, **options)
+
+
 def svg(figure: Figure, name: str) -> str:
     """The figure as an ``<svg>`` to stand in a page among others: every id begins with `name`."""
     file = io.StringIO()

@@ -179,6 +179,8 @@ class Statistics:
         z: (100,) how many rows have so many sigmas, in the bins of `Z_EDGES`.
         rows, kept: how many rows there are, and how many the fit did not throw out.
         variance_m2: what a row's sigma is made of: range noise, angle noise, reference.
+        thrown: (rings, azimuths) share of the rows that the fit threw out; NaN where no beam went.
+        thrown_m: their residuals.
     """
 
     curves: Mapping[str, ResidualCurve]
@@ -187,6 +189,8 @@ class Statistics:
     rows: int
     kept: int
     variance_m2: Mapping[str, float]
+    thrown: np.ndarray
+    thrown_m: np.ndarray
 
 
 def residual_statistics(
@@ -201,11 +205,14 @@ def residual_statistics(
         azimuths: how many parts of a turn the map has.
     """
     sums, places = [_Sums(axis) for axis in axes], {}
-    cells = np.zeros((2, rings * azimuths))
+    cells, beams, thrown_m = np.zeros((2, rings * azimuths)), np.zeros((2, rings * azimuths)), []
     z, counts, variance = np.zeros(len(Z_EDGES) - 1), np.zeros(2, int), np.zeros(3)
     for table in tables:
         kept = table.columns["weight"] > 0
         counts += len(kept), int(kept.sum())
+        cell = _cell(table.columns, rings, azimuths)
+        beams += [np.bincount(c, minlength=rings * azimuths) for c in (cell, cell[~kept])]
+        thrown_m.append(table.columns["residual_m"][~kept])
         columns = {name: column[kept] for name, column in table.columns.items()}
         residual, weight = (columns[n].astype(float) for n in ("residual_m", "weight"))
         place = _numbered(columns, table.room, places)
@@ -214,13 +221,11 @@ def residual_statistics(
             if x is not None:
                 x = np.broadcast_to(np.asarray(x, float), residual.shape)
                 each.add(x, residual, weight, place)
-        turn = ((columns["azimuth_rad"] / (2 * np.pi) + 0.5) * azimuths).astype(int)
-        cell = columns["ring"] * azimuths + np.clip(turn, 0, azimuths - 1)
-        cells += [np.bincount(cell, v, rings * azimuths) for v in (weight, weight * residual)]
+        cells += [np.bincount(cell[kept], v, rings * azimuths) for v in (weight, weight * residual)]
         z += np.histogram(residual / columns["sigma_m"], Z_EDGES)[0]
         variance += _variance(columns, table)
     with np.errstate(invalid="ignore", divide="ignore"):
-        shown = (cells[1] / cells[0]).reshape(rings, azimuths)
+        shown, thrown = ((c[1] / c[0]).reshape(rings, azimuths) for c in (cells, beams))
     parts = dict(zip(("range noise", "angle noise", "reference"), variance, strict=True))
     return Statistics(
         curves={s.axis.name: s.curve() for s in sums if s.rows[0].any()},
@@ -229,7 +234,15 @@ def residual_statistics(
         rows=int(counts[0]),
         kept=int(counts[1]),
         variance_m2={name: value / max(counts[1], 1) for name, value in parts.items()},
+        thrown=thrown,
+        thrown_m=np.concatenate([np.zeros(0), *thrown_m]),
     )
+
+
+def _cell(columns: Mapping[str, np.ndarray], rings: int, azimuths: int) -> np.ndarray:
+    """(N,) which cell of the map of ring and azimuth each row is in."""
+    turn = ((columns["azimuth_rad"] / (2 * np.pi) + 0.5) * azimuths).astype(int)
+    return columns["ring"] * azimuths + np.clip(turn, 0, azimuths - 1)
 
 
 def _numbered(columns: Mapping[str, np.ndarray], room: int, among: dict[Any, int]) -> np.ndarray:

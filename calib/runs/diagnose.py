@@ -6,6 +6,7 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import replace
 
+from calib.diagnosis.rejects import rejects
 from calib.diagnosis.search import search
 from calib.diagnosis.stand import Stand
 from calib.diagnosis.verdict import Diagnosis, conclude
@@ -40,6 +41,7 @@ def diagnose(
     with threadpool_limits(limits=1):
         stand = stand_of(run, progress)
         found = search(stand, progress)
+        rejected = rejects(found.looks[0].stand, progress)
         falls = {}
         before = run.summary["rms_mm"]["held_out"]
         if refits and run.model["hold_out"] != "none":
@@ -55,6 +57,7 @@ def diagnose(
         falls,
         run.summary["misfit"],
         weak_directions(run.solution, float(run.summary["sigmas_widened_by"]), found.looks[0]),
+        rejected,
     )
     result = replace(result, command=command_without(run, tokens) if tokens else "")
     write_json(run.folder / DIAGNOSIS, result.document())

@@ -21,6 +21,7 @@ from calib.problem.problem import Block, Problem
 from calib.problem.surfaces import with_surfaces
 from calib.residuals.beams import Association
 from calib.residuals.tracker import TrackedBody
+from calib.solve.added import begun
 from calib.solve.estimate import DOFS, SEEN, Estimate, Start, cost_of, started, values_of
 from calib.solve.graph import Graph, KeptRows
 from calib.solve.reweight import reweighted
@@ -247,6 +248,8 @@ class Loop:
         for name in self.problem.cells:
             unknown = self.problem.variables[name]
             self.values[name] = started(unknown, known, unknown.mean)
+        if not self.passes:  # later, the fit itself knows better
+            self.values |= begun(self.problem, self.values, self.associations, self.start.state)
         self.layout = self._layout()
 
     def _cells(self) -> dict[str, np.ndarray]:

@@ -15,6 +15,9 @@ SECTIONS: Mapping[str, tuple[Charts, ...]] = {
     "What does not fit": (misfit.by_stop, misfit.moves_from_cad),
     "What was found": (knowledge.findings,),
     "The chain": (links.chain, links.moves, links.effects, knowledge.budget),
-    "What is left": (residuals.ring_map, residuals.curves, bodies.tracked, bodies.targets),
+    "What is left": (
+        *(residuals.ring_map, residuals.thrown_away, residuals.curves),
+        *(bodies.tracked, bodies.targets),
+    ),
     "What could not be determined": (knowledge.correlation,),
 }

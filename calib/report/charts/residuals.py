@@ -27,6 +27,8 @@ AXIS_UNITS = {
 }
 BY_CHANCE = 0.02  # how seldom so many bins may lie outside their bands by chance
 SELDOM = 0.01  # of the rows: things seen less decide no scale
+FEWEST_THROWN = 0.05  # share at the end of the map's scale, at least
+WITHIN = 0.9  # of the beams thrown away: what the histogram shows
 MOST_NAMES = 40  # names of things along an axis
 
 
@@ -198,4 +200,42 @@ def _ring_map(was: np.ndarray, now: np.ndarray, before: str) -> Figure:
         ax.set_xlabel("azimuth, deg")
         ax.set_xticks(range(-180, 181, 90))
     grid[0, 0].set_ylabel("ring")
+    return figure
+
+
+def thrown_away(evidence: Evidence) -> Iterator[Chart | Absent]:
+    """Where the beams are that the fit gave no weight, and by how much they are off."""
+    if not evidence.has_beams:
+        yield Absent("rejected", NO_BEAMS)
+        return
+    now = evidence.after
+    found = (evidence.diagnosis or {}).get("rejected") or {}
+    share = 100 * (1 - now.kept / max(now.rows, 1))
+    told = f"{share:.2g} % of the beams that meet a surface were thrown away"
+    yield Chart(
+        "rejected",
+        found.get("sentence", "").rstrip(".") or told,
+        "Left: share of the beams of each ring and azimuth that lie so far off that the fit gave "
+        "them no weight. Mixed pixels and clutter fall everywhere, and scatter over all values; a "
+        "patch or stripe, or a peak on the right, is an error. Right: how far off they are; what "
+        "lies beyond the picture stands at its ends.",
+        lambda: _thrown_away(now),
+        wide=True,
+    )
+
+
+def _thrown_away(now: Statistics) -> Figure:
+    figure, grid = plots.axes(plots.WIDE, 3.2, 1, 2, width_ratios=(1.6, 1.0))
+    left, right = grid[0]
+    extent = (-180, 180, -0.5, len(now.thrown) - 0.5)
+    most = max(FEWEST_THROWN, float(np.nanmax(now.thrown)))
+    picture = plots.share_map(left, 100 * now.thrown, extent, 100 * most)
+    figure.colorbar(picture, ax=left, orientation="horizontal", aspect=35).set_label("thrown, %")
+    left.set(xlabel="azimuth, deg", ylabel="ring", xticks=range(-180, 181, 90))
+    sizes_mm = 1e3 * now.thrown_m
+    if len(sizes_mm):
+        reach = round_up(float(np.quantile(np.abs(sizes_mm), WITHIN)))
+        right.hist(np.clip(sizes_mm, -reach, reach), np.linspace(-reach, reach, 81),
+                   color=plots.BEFORE)  # fmt: skip
+    right.set(xlabel="measured less predicted, mm", ylabel="beams")
     return figure

@@ -1,0 +1,259 @@
+"""What a fit threw away, looked at: how much, where, and whether it agrees with itself.
+
+A beam that meets a surface and whose robust weight is 0 is rejected. Mixed pixels and clutter are:
+they stand in a few places of the room, and scatter over all values. An error of the LiDAR that is
+larger than Tukey's 4.685 sigma is rejected as well, and no other test sees it, as the redescending
+weight is 0 there, where Huber's clipped residual would be a full one. So rejected beams are counted
+in bins of every covariate, those that read long and short together and each alone: the difference
+of these is the sum of their clipped residuals.
+
+A bin's share is held against the share elsewhere. Stops, and the patches of a metre or so that the
+beams meet, are the clusters, not beams: the variance of the difference is the cluster jackknife's
+(Bell and McCaffrey 2002), that by stops and that by patches added, and Student's t with the
+effective number of the fewer clusters (Carter, Schnepel and Steigerwald 2017) judges it. Sidak pays
+for all looks. Surfaces and stops are looked at as covariates too, with the other as clusters. Where
+a covariate stands out, its interval is the one of the largest binomial likelihood (the scan
+statistic of Kulldorff 1997); its beams are set aside, and the rest is looked at again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import special
+
+from calib.diagnosis.rejects.counts import Axis, Counts, Rejected, count
+from calib.diagnosis.rejects.found import CLUTTER, LEAST_P, Place, Rejects
+from calib.diagnosis.stand import Stand
+from calib.solve.fit import Progress
+
+ALPHA = 0.01  # chance that structure is claimed where there is none
+MOST_PLACES = 4  # places that are told apart
+FEWEST = 4  # stops, below which nothing is claimed
+KINDS = {"all": (-1, 1), "long": (1,), "short": (-1,)}  # signs of the residuals that are counted
+
+
+def rejects(stand: Stand, progress: Progress = lambda what, done, total: None) -> Rejects | None:
+    """Look at what a fit threw away.
+
+    Args:
+        stand: a fitted model.
+        progress: called with what is being done, how many stops are done, and of how many.
+
+    Returns:
+        What was found; None where there are no scans.
+    """
+    if not stand.estimate.scans:
+        return None
+    counts = count(stand, progress)
+    left = np.ones(len(counts.rejected), bool)
+    places: list[Place] = []
+    least = 1.0
+    while len(places) < MOST_PLACES and len(counts.stop_names) >= FEWEST:
+        found, p = _most(counts, left)
+        least = min(least, p)
+        if found is None:
+            break
+        inside, place = found
+        places.append(place)
+        left &= ~inside
+    total = int(counts.met.sum())
+    rest = counts.rejected[left]
+    crowded = _crowded(counts, rest)
+    hit = float(crowded[rest.stop, rest.surface].sum()) / total
+    apart = [place for place in places if place.structured]
+    outside = 1.0 - sum(place.beams for place in apart)
+    usual = len(left) / total - sum(place.rejected for place in apart)
+    beyond = len(rest) / total - hit > CLUTTER
+    return Rejects(
+        share=len(left) / total,
+        expected=min(usual / max(outside, 1.0 / total), CLUTTER + hit),
+        p_adjusted=least,
+        places=places,
+        clutter=hit,
+        clutter_stops=tuple(counts.stop_names[i] for i in np.flatnonzero(crowded.any(axis=1))),
+        beyond=beyond,
+        beyond_m=float(np.median(rest.residual_m)) if beyond and rest.coherent else None,
+    )
+
+
+@dataclass(frozen=True)
+class _View:
+    """One covariate's beams, by bins of it.
+
+    Args:
+        axis: its cells and bins.
+        rows: (C,) beams by cells.
+        bin: (R,) of the rejected; B where it is not known. cell: (R,) likewise.
+        ways: the clusters: per way their number (R,) of the rejected, and beams (G, B) by bins and
+            (G,) in all of each.
+    """
+
+    axis: Axis
+    rows: np.ndarray
+    bin: np.ndarray
+    cell: np.ndarray
+    ways: tuple[tuple[np.ndarray, np.ndarray, np.ndarray], ...]
+
+
+def _views(counts: Counts) -> Iterator[_View]:
+    rejected, met = counts.rejected, counts.met
+    of_stop = met.sum(axis=1)
+    for a, axis in enumerate(counts.axes):
+        cell = rejected.cells[:, a]
+        yield _View(
+            axis=axis,
+            rows=counts.cells[a],
+            bin=axis.bin_of[cell],
+            cell=cell,
+            ways=(
+                (rejected.stop, counts.stops[a], of_stop),
+                (rejected.place, counts.places[a], counts.of_place),
+            ),
+        )
+    stops = Axis.of_things("stop", counts.stop_names)
+    surfaces = Axis.of_things("surface", counts.surface_names)
+    for axis, mine, other, beams in (
+        (stops, rejected.stop, rejected.surface, met.T),
+        (surfaces, rejected.surface, rejected.stop, met),
+    ):
+        rows, ways = beams.sum(axis=0), ((other, beams, beams.sum(axis=1)),)
+        yield _View(axis=axis, rows=rows, bin=mine, cell=mine, ways=ways)
+
+
+def _most(counts: Counts, left: np.ndarray) -> tuple[tuple[np.ndarray, Place] | None, float]:
+    """The place that explains most of the rejected that are left, with which of these it holds;
+    and the smallest p-value, after all looks."""
+    views = list(_views(counts))
+    looks = len(KINDS) * sum(view.axis.count for view in views)
+    sign = np.sign(counts.rejected.residual_m)
+    best, most, least = None, 0.0, 1.0
+    for view in views:
+        for signs in KINDS.values():
+            mine = left & np.isin(sign, signs) & (view.bin < view.axis.count)
+            p = -np.expm1(looks * np.log1p(-np.minimum(_p_values(view, mine), 1 - 1e-15)))
+            least = min(least, float(p.min()))
+            if p.min() >= ALPHA:
+                continue
+            cells, gain = _extent(view, mine, p < ALPHA)
+            if gain > most:
+                most, best = gain, (view, cells, float(p.min()))
+    if best is None:
+        return None, least
+    view, cells, p = best
+    inside = left & np.append(cells, False)[view.cell]
+    return (inside, _place(view, counts, cells, inside, p)), least
+
+
+def _p_values(view: _View, mine: np.ndarray) -> np.ndarray:
+    """p-value (B,) of each bin: that its share of beams that are `mine` (R,) is the others'."""
+    bins, of = view.axis.count, view.bin[mine]
+    _, beams, whole = view.ways[0]
+    rows, total = beams.sum(axis=0), whole.sum()
+    inside = np.bincount(of, minlength=bins)
+    share = inside / np.maximum(rows, 1)
+    others = (len(of) - inside) / np.maximum(total - rows, 1)
+    # Were beams independent; of one more, as a bin with none has a variance too.
+    mean = (len(of) + 1.0) / (total + 2.0)
+    variance, dof = np.zeros(bins), np.full(bins, np.inf)
+    for cluster, n, every in view.ways:
+        k = np.bincount(cluster[mine] * bins + of, minlength=n.size).reshape(n.shape)
+        rest = every[:, None] - n, k.sum(axis=1)[:, None] - k
+        (here, some), (there, many) = _apart(n, k), _apart(*rest)
+        variance += np.square(here - there).sum(axis=0)
+        dof = np.minimum(dof, np.minimum(some, many) - 1.0)
+    least = mean * (1.0 - mean) / np.maximum(rows, 1)
+    t = (share - others) / np.sqrt(np.maximum(variance, least))
+    known = (rows > 0) & (dof > 0) & np.isfinite(variance)
+    return np.where(known, special.stdtr(np.where(known, dof, 1.0), -t), 1.0)
+
+
+def _apart(n: np.ndarray, k: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What each cluster (G, B) adds to a share's error were the others to predict it, and how many
+    clusters there are in effect (B,)."""
+    rows = np.maximum(n.sum(axis=0), 1)
+    part = n / rows
+    with np.errstate(divide="ignore", invalid="ignore"):
+        beyond = (k / rows - k.sum(axis=0) / rows * part) / (1.0 - part)
+    return np.where(part < 1.0, beyond, np.inf), 1.0 / np.maximum(np.square(part).sum(axis=0), 1e-9)
+
+
+def _extent(view: _View, mine: np.ndarray, out: np.ndarray) -> tuple[np.ndarray, float]:
+    """Cells (C,) of a place, and how much likelier (log) what is `mine` (R,) is with a share of its
+    own there: the interval where that is most; or of things, those bins (B,) that stand `out`."""
+    axis, n = view.axis, view.rows
+    k = np.bincount(view.cell[mine], minlength=len(n))[: len(n)]
+    if not axis.ordered:
+        return out, float(_gain(n[out].sum(), k[out].sum(), n.sum(), k.sum()))
+    size = len(n)
+    turns = 2 if axis.wraps else 1
+    n_to, k_to = (np.append(0, np.cumsum(np.tile(x, turns))) for x in (n, k))
+    start, stop = np.arange(size)[:, None], np.arange(len(n_to))[None]
+    allowed = (stop > start) & (stop - start < size)
+    gain = _gain(n_to[stop] - n_to[start], k_to[stop] - k_to[start], n.sum(), k.sum())
+    first, last = np.unravel_index(np.argmax(np.where(allowed, gain, -1.0)), gain.shape)
+    cells = np.zeros(size, bool)
+    inside = np.arange(first, last) % size
+    seen = np.flatnonzero(n[inside])
+    cells[inside[seen[0] : seen[-1] + 1]] = True
+    return cells, float(gain[first, last])
+
+
+def _gain(n: np.ndarray, k: np.ndarray, rows: int, total: int) -> np.ndarray:
+    """By how much the log likelihood of `total` in `rows` beams rises when those n with k have a
+    larger share of their own; 0 where theirs is smaller."""
+    other_n, other_k = rows - n, total - k
+    inside, outside = k / np.maximum(n, 1), other_k / np.maximum(other_n, 1)
+    out = _log_likelihood(n, k, inside) + _log_likelihood(other_n, other_k, outside)
+    out = out - _log_likelihood(rows, total, total / max(rows, 1))
+    return np.where(inside > outside, out, 0.0)
+
+
+def _log_likelihood(n: np.ndarray, k: np.ndarray, share: np.ndarray) -> np.ndarray:
+    return special.xlogy(k, share) + special.xlog1py(n - k, -share)
+
+
+def _place(view: _View, counts: Counts, cells: np.ndarray, inside: np.ndarray, p: float) -> Place:
+    """What the rejected beams (R,) inside some cells (C,) of a covariate do."""
+    rejected, total, beams = counts.rejected[inside], view.rows.sum(), view.rows[cells].sum()
+    lower, upper = view.axis.interval(cells)
+    return Place(
+        covariate=view.axis.name,
+        lower=lower,
+        upper=upper,
+        names=view.axis.names_of(cells),
+        p_adjusted=p,
+        share=len(rejected) / max(beams, 1),
+        rejected=len(rejected) / total,
+        beams=beams / total,
+        residual_m=float(np.median(rejected.residual_m)),
+        sigma_m=_sigma(rejected.agreeing),
+        coherent=rejected.coherent,
+        short=float(np.mean(rejected.residual_m < 0)),
+    )
+
+
+def _sigma(rejected: Rejected) -> float:
+    """Sigma of the mean of some residuals, m, stops and surfaces counted; NaN of a single one."""
+    away, variance = rejected.residual_m - rejected.residual_m.mean(), 0.0
+    for way in (rejected.stop, rejected.surface):
+        _, cluster = np.unique(way, return_inverse=True)
+        sums = np.bincount(cluster, away)
+        if (several := len(sums)) > 1:
+            variance += several / (several - 1) * np.sum(np.square(sums / len(away)))
+    return float(np.sqrt(variance)) or np.nan
+
+
+def _crowded(counts: Counts, rejected: Rejected) -> np.ndarray:
+    """Where something stands before a surface at a stop (K, S): far more beams than mixed pixels
+    explain end before it, at all distances."""
+    short = rejected[rejected.residual_m < 0]
+    k = np.zeros(counts.met.shape, int)
+    np.add.at(k, (short.stop, short.surface), 1)
+    chance = special.bdtrc(k - 1.0, counts.met, CLUTTER) * k.size
+    out = (k > CLUTTER * counts.met) & (chance < LEAST_P)
+    for stop, surface in np.argwhere(out):
+        out[stop, surface] = not short[(short.stop == stop) & (short.surface == surface)].coherent
+    return out

@@ -1,0 +1,318 @@
+"""How many beams there are, and which of them are rejected, in bins of every covariate."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from calib.diagnosis.stand import Stand
+from calib.linear.parallel import in_order
+from calib.linear.rows import PLACES
+from calib.residuals.robust import TUKEY
+from calib.solve.fit import Progress
+
+CELLS, BINS = 240, 12  # of a covariate: where an interval may end, and what is tested
+AGREES = 0.5  # share of rejected beams that agree on a size, from which they are coherent
+STOPS_A_BIN = 5  # of a covariate of stops: fewer clusters than this tell nothing
+
+
+@dataclass(frozen=True)
+class Axis:
+    """A covariate cut into cells, where an interval may end, and bins of these, which are tested.
+
+    Args:
+        name: column.
+        edges: (C - 1,) ascending values between the cells.
+        ends: (C + 1,) where cells begin and end; the first and last value seen at the ends.
+        bins: (C,) the bin of each cell.
+        names: of the cells, where each is a thing and neighbours have nothing in common.
+        wraps: whether the last cell is beside the first.
+    """
+
+    name: str
+    edges: np.ndarray
+    ends: np.ndarray
+    bins: np.ndarray
+    names: tuple[str, ...] = ()
+    wraps: bool = False
+
+    @classmethod
+    def of(cls, name: str, values: np.ndarray, bins: int = BINS) -> Axis:
+        """Cells of about equal count, of equal width for azimuth, one for each of few values."""
+        values = values[np.isfinite(values)].astype(float)
+        distinct = np.unique(values)
+        turn = name == "azimuth_rad"
+        if turn:
+            edges = np.linspace(-np.pi, np.pi, CELLS + 1)[1:-1]
+        elif len(distinct) <= CELLS:
+            edges = (distinct[1:] + distinct[:-1]) / 2
+        else:
+            edges = np.unique(np.quantile(values, np.arange(1, CELLS) / CELLS))
+        outer = (-np.pi, np.pi) if turn else (distinct[:1], distinct[-1:])
+        count = len(edges) + 1
+        return cls(
+            name=name,
+            edges=edges,
+            ends=np.hstack([outer[0], edges, outer[1]]),
+            bins=np.arange(count) * min(bins, count) // count,
+            wraps=turn,
+        )
+
+    @classmethod
+    def of_things(
+        cls, name: str, names: Sequence[str], numbers: Sequence[int] | None = None
+    ) -> Axis:
+        """A cell, and a bin, for each of some things; of ascending numbers, from 0 if not given."""
+        at = np.arange(len(names)) if numbers is None else np.asarray(numbers)
+        edges = (at[1:] + at[:-1]) / 2
+        ends = np.hstack([at[:1], edges, at[-1:]])
+        own = np.arange(len(at))
+        return cls(name=name, edges=edges, ends=ends, bins=own, names=tuple(names))
+
+    @property
+    def ordered(self) -> bool:
+        """Whether neighbouring cells belong together."""
+        return not self.names
+
+    def interval(self, cells: np.ndarray) -> tuple[float, float]:
+        """Where some neighbouring cells (C,) begin and end; the first ends after the second where
+        the interval goes round."""
+        at = np.flatnonzero(cells)
+        first, last = at[0], at[-1] + 1
+        if self.wraps and cells[0] and cells[-1] and not cells.all():
+            gap = np.flatnonzero(~cells)
+            first, last = gap[-1] + 1, gap[0]
+        return float(self.ends[first]), float(self.ends[last])
+
+    def names_of(self, cells: np.ndarray) -> tuple[str, ...]:
+        """The things of some cells (C,)."""
+        return tuple(self.names[i] for i in np.flatnonzero(cells)) if self.names else ()
+
+    @property
+    def count(self) -> int:
+        """How many bins."""
+        return int(self.bins[-1]) + 1
+
+    @cached_property
+    def bin_of(self) -> np.ndarray:
+        """(C + 1,) the bin of each cell; the last, of what is not known, is B."""
+        return np.append(self.bins, self.count)
+
+    def cells(self, values: np.ndarray) -> np.ndarray:
+        """The cell (N,) of each value; C where it is not known."""
+        found = np.searchsorted(self.edges, values)
+        known = np.isfinite(values)
+        return found if known.all() else np.where(known, found, len(self.bins))
+
+
+@dataclass(frozen=True)
+class Rejected:
+    """R beams whose robust weight is 0.
+
+    Args:
+        stop, place, surface: (R,) numbers of the stop, the place and the surface they belong to.
+        cells: (R, A) cell on each axis.
+        residual_m: (R,); reach_m: (R,) by how much a beam may be off and not be rejected.
+    """
+
+    stop: np.ndarray
+    place: np.ndarray
+    surface: np.ndarray
+    cells: np.ndarray
+    residual_m: np.ndarray
+    reach_m: np.ndarray
+
+    @classmethod
+    def of(cls, parts: Sequence[Rejected]) -> Rejected:
+        """Several together."""
+        columns = zip(*(vars(part).values() for part in parts), strict=True)
+        return cls(*(np.concatenate(column) for column in columns))
+
+    def __getitem__(self, rows: np.ndarray) -> Rejected:
+        return Rejected(*(column[rows] for column in vars(self).values()))
+
+    def __len__(self) -> int:
+        return len(self.stop)
+
+    @property
+    def coherent(self) -> bool:
+        """Whether most would not be rejected were their median taken off, and not as well with the
+        other sign: an error of one size, where mixed pixels and clutter scatter over all values."""
+        agrees, mirrored = (np.abs(self.residual_m - m) < self.reach_m for m in self._medians)
+        return len(self) > 0 and bool(agrees.mean() - mirrored.mean() > AGREES)
+
+    @property
+    def agreeing(self) -> Rejected:
+        """Those that would not be rejected were the median taken off."""
+        return self[np.abs(self.residual_m - self._medians[0]) < self.reach_m]
+
+    @property
+    def _medians(self) -> tuple[float, float]:
+        median = float(np.median(self.residual_m)) if len(self) else np.nan
+        return median, -median
+
+
+@dataclass(frozen=True)
+class Counts:
+    """All beams that meet a surface, counted, and the rejected ones.
+
+    Args:
+        axes: covariates, A of them.
+        stops, places: per axis (K, B) and (P, B) beams of each stop, and of each place, by bins.
+        cells: per axis (C,) beams by cells.
+        met: (K, S) beams of each stop on each surface.
+        of_place: (P,) beams of each place: a patch of a surface of a mesh, or a plane.
+        stop_names, surface_names: by number.
+        rejected: the rejected ones.
+    """
+
+    axes: Sequence[Axis]
+    stops: Sequence[np.ndarray]
+    places: Sequence[np.ndarray]
+    cells: Sequence[np.ndarray]
+    met: np.ndarray
+    of_place: np.ndarray
+    stop_names: Sequence[str]
+    surface_names: Sequence[str]
+    rejected: Rejected
+
+
+def count(stand: Stand, progress: Progress) -> Counts:
+    """Count the beams of a fit at its solution."""
+    scans, axes = stand.estimate.scans, _axes(stand)
+    places, surfaces = _Numbers(), _Numbers()
+    stops, rejected = [[] for _ in axes], []
+    by_place = [np.zeros((0, axis.count), int) for axis in axes]
+    cells = [np.zeros(len(axis.bins), int) for axis in axes]
+    met, of_place = np.zeros((len(scans), 0), int), np.zeros((0, 1), int)
+    for i, found in enumerate(in_order(lambda i: _count_stop(stand, i, axes), len(scans))):
+        progress("looking at what was thrown away", i, len(scans))
+        place, surface = (
+            numbers.of(scans[i].room, parts)
+            for numbers, parts in ((places, found.places), (surfaces, found.surfaces))
+        )
+        own, beams = found.rejected, found.beams
+        rejected.append(replace(own, place=place[own.place], surface=surface[own.surface]))
+        met = _grown(met.T, len(surfaces.known)).T
+        met[i, surface] = found.met
+        of_place = _grown(of_place, len(places.known))
+        of_place[place, 0] += beams
+        for a, (table, fine) in enumerate(zip(found.tables, found.cells, strict=True)):
+            stops[a].append(table.sum(axis=0))
+            by_place[a] = _grown(by_place[a], len(places.known))
+            by_place[a][place] += table
+            cells[a] += fine
+    return Counts(
+        axes=axes,
+        stops=[np.stack(each) for each in stops],
+        places=by_place,
+        cells=cells,
+        met=met,
+        of_place=of_place[:, 0],
+        stop_names=[scan.name for scan in scans],
+        surface_names=[str(part) for _, part in surfaces.known],
+        rejected=Rejected.of(rejected),
+    )
+
+
+class _Numbers:
+    """Numbers for parts of rooms, in the order in which they are first seen."""
+
+    def __init__(self) -> None:
+        self.known: dict[tuple[object, int], int] = {}
+
+    def of(self, room: object, parts: np.ndarray) -> np.ndarray:
+        known = self.known
+        return np.array([known.setdefault((room, p), len(known)) for p in parts.tolist()], int)
+
+
+def _grown(table: np.ndarray, rows: int) -> np.ndarray:
+    return np.pad(table, ((0, rows - len(table)), (0, 0)))
+
+
+@dataclass(frozen=True)
+class _Counted:
+    """One stop's beams: by places and their bins, by cells, and by surfaces."""
+
+    places: np.ndarray
+    beams: np.ndarray
+    surfaces: np.ndarray
+    met: np.ndarray
+    tables: Sequence[np.ndarray]
+    cells: Sequence[np.ndarray]
+    rejected: Rejected
+
+
+def _count_stop(stand: Stand, i: int, axes: Sequence[Axis]) -> _Counted:
+    scan, estimate = stand.estimate.scans[i], stand.estimate
+    rows = scan.rows(estimate.values, estimate.associations[i])
+    used, view = np.flatnonzero(rows.usable), rows.view
+    kinds = [name for name in ("region", *PLACES) if name in view.columns]
+    places, place = _numbered(np.asarray(view[kinds[0]])[used])
+    surfaces, surface = _numbered(np.asarray(view[kinds[min(1, len(kinds) - 1)]])[used])
+    thrown = np.flatnonzero(rows.weight[used] == 0.0)
+    tables, cells, at = [], [], np.zeros((len(thrown), len(axes)), np.int32)
+    for a, axis in enumerate(axes):
+        values = np.asarray(view[axis.name])
+        if len(values) == 1:  # the stop's own
+            cell = np.full(len(used), axis.cells(values)[0])
+        else:
+            cell = axis.cells(values[used])
+        at[:, a] = cell[thrown]
+        size = axis.count + 1
+        known = np.bincount(place * size + axis.bin_of[cell], minlength=len(places) * size)
+        tables.append(known.reshape(len(places), size)[:, :-1])
+        cells.append(np.bincount(cell, minlength=len(axis.bins))[: len(axis.bins)])
+    some = used[thrown]
+    rejected = Rejected(
+        stop=np.full(len(some), i),
+        place=place[thrown],
+        surface=surface[thrown],
+        cells=at,
+        residual_m=rows.residual_m[some],
+        reach_m=TUKEY * rows.scale * rows.sigma_m[some],
+    )
+    return _Counted(
+        places=places,
+        beams=np.bincount(place),
+        surfaces=surfaces,
+        met=np.bincount(surface),
+        tables=tables,
+        cells=cells,
+        rejected=rejected,
+    )
+
+
+def _numbered(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distinct whole numbers from -1 up, and which of these each value is; they are few."""
+    found = np.flatnonzero(np.bincount(values + 1))
+    number = np.zeros(found[-1] + 1, int)
+    number[found] = np.arange(len(found))
+    return found - 1, number[values + 1]
+
+
+def _axes(stand: Stand) -> list[Axis]:
+    """The covariates of points and stops that change, cut into cells and bins."""
+    scans = stand.estimate.scans
+    _, sample = stand.columns()
+    rings = max(scan.lidar.rings for scan in scans)
+    out = [Axis.of("ring", np.arange(rings))]
+    for name, values in sorted(sample.items()):
+        told = [scan.columns[name] for scan in scans if name in scan.columns]
+        if name == "label":
+            out.append(_labels(stand, values))
+        elif len(told) == len(scans):  # of stops
+            bins = max(2, min(BINS, len(scans) // STOPS_A_BIN))
+            out.append(Axis.of(name, np.concatenate(told), bins))
+        else:
+            out.append(Axis.of(name, values, 2 * BINS if name == "azimuth_rad" else BINS))
+    return [axis for axis in out if axis.count > 1]
+
+
+def _labels(stand: Stand, values: np.ndarray) -> Axis:
+    names = {n: text for source in stand.sources for n, text in source.rig.labels.items()}
+    numbers = sorted({*names, *np.unique(values).astype(int).tolist()})
+    return Axis.of_things("label", [names.get(n, str(n)) for n in numbers], numbers)

@@ -1,0 +1,213 @@
+"""What was found of the beams that a fit rejected: numbers for scripts, sentences for people."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from calib.diagnosis.suggest import words
+
+LEAST_P = 1e-6  # tails are not known further out
+NAMED = 6  # stops or surfaces that a sentence names
+MOST = 0.5  # share of beams that makes a place structured, whatever their residuals do
+# Share that mixed pixels may explain, in all or at one place. They are 0.3 to 0.4 % in recordings
+# of two simulators, 1 % at grazing incidence, and 4 % where the simulator does as a paper's rooms.
+CLUTTER = 0.05
+UNITS = {"_rad": ("rad", "deg", 180.0 / np.pi), "_m": ("m", "m", 1.0), "_s": ("s", "s", 1.0)}
+UNITS |= {"_c": ("degC", "°C", 1.0)}  # of a column: its own, the one that people are shown, factor
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where beams are rejected more than elsewhere.
+
+    Args:
+        covariate: a column; "stop" or "surface".
+        lower, upper: of its interval, in the column's own unit; an azimuth interval with
+            ``lower > upper`` runs through pi. Of things, the first and the last.
+        names: of things: stops, surfaces, labels; else empty.
+        p_adjusted: after all looks.
+        share: rejected share of its beams; rejected: share of all beams that is rejected there.
+        beams: share of all beams that is there.
+        residual_m: median residual of the rejected beams.
+        sigma_m: of their mean, by stops and surfaces; NaN where there is one of them only.
+        coherent: whether most would not be rejected were their median taken off, and not as well
+            with the other sign.
+        short: share of the rejected that reads short.
+    """
+
+    covariate: str
+    lower: float
+    upper: float
+    names: tuple[str, ...]
+    p_adjusted: float
+    share: float
+    rejected: float
+    beams: float
+    residual_m: float
+    sigma_m: float
+    coherent: bool
+    short: float
+
+    @property
+    def structured(self) -> bool:
+        """Whether neither mixed pixels nor things that stand in the way explain it."""
+        odd = self.coherent or (self.share > MOST and not self.in_the_way)
+        return odd and self.share > CLUTTER
+
+    @property
+    def in_the_way(self) -> bool:
+        """Whether its beams hit something nearer than the mesh, at all distances."""
+        return not self.coherent and self.short > 0.9
+
+    @property
+    def where(self) -> str:
+        """In words: azimuth -40 to 0 deg."""
+        if self.names:
+            return f"{words(self.covariate)} {listed(self.names)}"
+        _, unit, scale = unit_of(self.covariate)
+        lower, upper = scale * self.lower, scale * self.upper
+        if self.covariate == "ring":
+            lower, upper = np.ceil(lower), np.floor(upper)
+        return f"{words(self.covariate)} {lower:.4g} to {upper:.4g} {unit}".rstrip()
+
+    @property
+    def what(self) -> str:
+        """In words, what becomes of its beams."""
+        if self.coherent:
+            side = "short" if self.residual_m < 0 else "long"
+            sigma = f" ± {1e3 * self.sigma_m:.2g}" if np.isfinite(self.sigma_m) else ""
+            return f"they read {1e3 * abs(self.residual_m):.1f}{sigma} mm {side}"
+        if self.in_the_way:
+            return "they hit something that is nearer than the mesh"
+        return "they scatter over all values"
+
+    def document(self) -> dict[str, Any]:
+        """As in diagnosis.json: ends in the unit that is named."""
+        ends = (self.names[0], self.names[-1]) if self.names else (self.lower, self.upper)
+        return {
+            "covariate": self.covariate,
+            "from": ends[0],
+            "to": ends[1],
+            "names": list(self.names),
+            "unit": "" if self.names else unit_of(self.covariate)[0],
+            "residual_mm": 1e3 * self.residual_m,
+            "sigma_mm": 1e3 * self.sigma_m,
+            "share": self.share,
+            "coherent": self.coherent,
+            "p_adjusted": max(self.p_adjusted, LEAST_P),
+        }
+
+    def formula(self) -> dict[str, Any] | None:
+        """An effect for it as a formula, where it is an interval of a column."""
+        if self.names or not self.coherent:
+            return None
+        name, ends = self.covariate, (self.lower, self.upper)
+        above, below = f"({name} > {ends[0]:.6g})", f"({name} < {ends[1]:.6g})"
+        both = f"{above} * {below}" if ends[0] < ends[1] else f"maximum({above}, {below})"
+        bare = name.removesuffix("_rad").removesuffix("_m").replace(".", "_")
+        return {
+            "name": f"rejected_{bare}",
+            "site": "range",
+            "unit": "m",
+            "sigma": max(0.01, 2.0 * abs(self.residual_m)),
+            "basis": [both],
+            "what": "Empirical: an interval whose beams were rejected; fitted, not explained.",
+        }
+
+
+@dataclass(frozen=True)
+class Rejects:
+    """What a fit threw away.
+
+    Args:
+        share: of all beams that meet a surface.
+        expected: the same, of the beams outside what is structured: what mixed pixels and clutter
+            explain, which is never more than `CLUTTER`.
+        p_adjusted: of the least likely place.
+        places: where more is rejected than elsewhere, most first.
+        clutter: share of all beams that hit something that is not in the mesh; clutter_stops: the
+            stops of these.
+        beyond: whether more is thrown away elsewhere than mixed pixels may explain; beyond_m: the
+            median residual of that, where it agrees on one.
+    """
+
+    share: float
+    expected: float
+    p_adjusted: float
+    places: Sequence[Place]
+    clutter: float
+    clutter_stops: tuple[str, ...]
+    beyond: bool
+    beyond_m: float | None
+
+    @property
+    def structured(self) -> Sequence[Place]:
+        """The places that chance does not explain, nor mixed pixels, nor clutter."""
+        return [place for place in self.places if place.structured]
+
+    @property
+    def explained(self) -> bool:
+        """Whether all that was thrown away is what mixed pixels and clutter explain."""
+        return not self.structured and not self.beyond
+
+    @property
+    def sentence(self) -> str:
+        """What was thrown away, in words."""
+        told = f"{percent(self.share)} % of the beams that meet a surface were thrown away"
+        if self.beyond:
+            told += f", more than the {100 * CLUTTER:.0f} % that mixed pixels may explain"
+            told += f", by {1e3 * self.beyond_m:+.1f} mm" if self.beyond_m else ""
+        crowded = [place for place in self.places if place.share > CLUTTER]
+        for place in (self.structured or crowded)[:2]:
+            there = f"of the beams at {place.where} it is {percent(place.share)} %"
+            told += f"; {there}, and {place.what}"
+        if self.clutter_stops:
+            told += f"; {percent(self.clutter)} % hit something that is not in the mesh, at stop "
+            told += listed(self.clutter_stops)
+        return told + "."
+
+    def unexplained(self) -> list[dict[str, Any]]:
+        """Its structure as diagnosis.json lists structure without a name."""
+        return [
+            {
+                "covariates": [place.covariate],
+                "rms_mm": 1e3 * abs(place.residual_m) * float(np.sqrt(place.rejected)),
+                "p_value": max(place.p_adjusted, LEAST_P),
+                "p_adjusted": max(place.p_adjusted, LEAST_P),
+                "formula": place.formula(),
+            }
+            for place in self.structured
+        ]
+
+    def document(self) -> dict[str, Any]:
+        """As in diagnosis.json."""
+        return {
+            "share": self.share,
+            "expected": self.expected,
+            "covariates": list(dict.fromkeys(p.covariate for p in self.structured)),
+            "p_adjusted": max(self.p_adjusted, LEAST_P),
+            "where": [place.document() for place in self.places],
+            "clutter": {"share": self.clutter, "stops": list(self.clutter_stops)},
+            "explained": self.explained,
+            "sentence": self.sentence,
+        }
+
+
+def unit_of(covariate: str) -> tuple[str, str, float]:
+    """Unit of a column, the unit in which people are shown it, and the factor between the two."""
+    return next((u for end, u in UNITS.items() if covariate.endswith(end)), ("", "", 1.0))
+
+
+def listed(names: Sequence[str]) -> str:
+    """Names with commas, no more than a sentence bears."""
+    more = len(names) - NAMED
+    return ", ".join(names[:NAMED]) + (f" and {more} more" if more > 0 else "")
+
+
+def percent(share: float) -> str:
+    """A share in percent, with two digits."""
+    return f"{100 * share:.0f}" if share >= 0.1 else f"{100 * share:.2g}"
