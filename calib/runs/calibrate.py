@@ -178,7 +178,7 @@ def _fit(
     else:
         estimate, links = solve_from(problem, earlier(problem, before), progress)
     unseen = Errors()
-    if choices.hold_out != "none":
+    if choices.hold_out != "none" and estimate.converged:
         by, count = choices.hold_out, choices.folds
         unseen = held_out(sources, model, by, count, progress, estimate.start)
     nominal = _nominal(problem, progress)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from calib.diagnosis.search import search
 from calib.diagnosis.stand import Stand
 from calib.diagnosis.verdict import Diagnosis, conclude
@@ -36,7 +38,8 @@ def diagnose(
         found = search(stand, progress)
         falls = {}
         before = run.summary["rms_mm"]["held_out"]
-        for step in found.found if refits and run.model["hold_out"] != "none" else ():
+        refits = refits and run.model["hold_out"] != "none" and before is not None
+        for step in found.found if refits else ():
             fitted = step.after.stand
             unseen = held_out(
                 fitted.sources,
@@ -54,6 +57,7 @@ def diagnose(
         run.summary["misfit"],
         weak_directions(run.solution, float(run.summary["sigmas_widened_by"]), found.looks[0]),
     )
+    result = replace(result, sentences=[*run.warning, *result.sentences])
     write_json(run.folder / DIAGNOSIS, result.document())
     return result
 
