@@ -14,7 +14,8 @@ from chains.align import mean_pose
 
 TURNS = (np.pi, np.pi / 2, -np.pi / 2)
 KEPT = 3  # starts that are given, of all that are looked at
-TOGETHER = 3  # zeros and frames that may be turned at once
+TOGETHER = 2  # zeros and frames that may be turned at once
+WIDTH = 5  # of those with one turned, how many have a second one turned
 
 Values = dict[str, np.ndarray]
 
@@ -24,7 +25,7 @@ def least_turned(problem: Problem) -> list[tuple[float, Values]]:
 
     Every angle that is the same at all stops (a joint's zero, a frame's rotation) is turned, one at
     a time; the rig then stands where the bodies with the fewest joints before them say. From the
-    best of these a second one is turned, and so on, as long as that lowers the cost.
+    best few of these a second one is turned.
 
     Args:
         problem: its initial values are what is turned; the cost is that of its tracked bodies, and
@@ -35,17 +36,22 @@ def least_turned(problem: Problem) -> list[tuple[float, Values]]:
     if not angles:
         return []
     groups = sorted(map(_Group.of, BodiesTogether.of(bodies)), key=lambda group: group.joints)
-    best, found = (np.inf, dict(problem.initial)), []
+    found: list[tuple[float, Values]] = []
     for _ in range(TOGETHER):
-        tried = [_stood(values, groups) for values in _turned(best[1], angles)]
-        priors = (_prior(problem, values, angles) for _, values in tried)
-        costs = [cost + prior for (cost, _), prior in zip(tried, priors, strict=True)]
-        ranked = [(costs[k], tried[k][1]) for k in np.argsort(costs)[:KEPT]]
-        found += ranked
-        if ranked[0][0] >= best[0]:
-            break
-        best = ranked[0]
-    return sorted(found, key=lambda each: each[0])[:KEPT]
+        before = found[:WIDTH] or [(np.inf, dict(problem.initial))]
+        tried = [_stood(each, groups) for _, v in before for each in _turned(v, angles)]
+        found += [(cost + _prior(problem, v, angles), v) for cost, v in tried]
+        found.sort(key=lambda each: each[0])
+    return found[:KEPT]
+
+
+def turned_far(problem: Problem, values: Mapping[str, np.ndarray]) -> bool:
+    """Whether any of those angles is more than an eighth of a turn from where it was thought."""
+    bodies = [b for b in problem.blocks if isinstance(b, TrackedBody)]
+    pairs = (
+        (problem.variables[name].mean[i], values[name][i]) for name, i in _angles(problem, bodies)
+    )
+    return any(abs(now - mean) > np.pi / 4 for mean, now in pairs)
 
 
 @dataclass(frozen=True)
