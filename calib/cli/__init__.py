@@ -19,7 +19,8 @@ INTERRUPTED = 130  # as shells have it: 128 and the signal's number
 
 
 def main() -> None:
-    """Run the command line: exit code 0 done, 2 bad input or usage, 1 a fault of the program."""
+    """Run the command line: exit code 0 done, 2 bad input or usage, 3 done but not
+    converged, 1 a fault of the program."""
     try:
         code = app(sys.argv[1:] or ["--help"], prog_name="rigcal", standalone_mode=False)
     except InputError as error:

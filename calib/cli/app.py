@@ -9,11 +9,15 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
-from typing import Annotated, Any, TextIO
+from typing import TYPE_CHECKING, Annotated, Any, TextIO
 
 import typer
 import typer.core
 
+if TYPE_CHECKING:
+    from calib.runs.run import Run
+
+NOT_TO_BE_USED = 3  # exit code: done, but not to be used as it stands
 Progress = Callable[[str, int, int], None]
 
 # As people meet them; `rigcal --help` lists them so.
@@ -72,6 +76,7 @@ def effect_names(incomplete: str) -> list[str]:
 
 Json = Annotated[bool, typer.Option("--json", help="Print the machine-readable result alone.")]
 Out = Annotated[Path, typer.Option("-o", "--out", help="Where to write.")]
+Force = Annotated[bool, typer.Option("--force", help="Even of a run that has not converged.")]
 Runs = Annotated[list[Path], typer.Argument(metavar="RUN...", help="Run folders.")]
 Workers = Annotated[
     int | None,
@@ -90,6 +95,13 @@ def say(document: dict[str, Any], text: str, as_json: bool) -> None:
         print_json(document)
     else:
         print(text)
+
+
+def end_unless_converged(run: Run) -> None:
+    """End with exit code 3, and the sentence on stderr, where a run has not converged."""
+    for sentence in run.warning:
+        print(f"rigcal: {run.folder}: {sentence}", file=sys.stderr)
+        raise SystemExit(NOT_TO_BE_USED)
 
 
 def print_json(document: Any) -> None:

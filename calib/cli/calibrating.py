@@ -7,7 +7,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calib.cli.app import Json, Out, Runs, Workers, app, effect_names, print_json, progress_bar, say
+from calib.cli.app import (
+    Json,
+    Out,
+    Runs,
+    Workers,
+    app,
+    effect_names,
+    end_unless_converged,
+    print_json,
+    progress_bar,
+    say,
+)
 from calib.linear.parallel import workers as threads
 from chains.errors import InputError
 
@@ -143,6 +154,7 @@ def diagnose(
         from calib.show.diagnosis import print_diagnosis
 
         print_diagnosis(diagnosis, fitted.summary["residual"])
+    end_unless_converged(fitted)
 
 
 @app.command()
@@ -168,6 +180,7 @@ def explain(
         from calib.show.diagnosis import print_explanation
 
         print_explanation(explanation)
+    end_unless_converged(explanation.runs[-1])
 
 
 @app.command()
@@ -252,3 +265,4 @@ def _tell(run: Run, as_json: bool) -> None:
         from calib.show.tables import print_run
 
         print_run(run)
+    end_unless_converged(run)

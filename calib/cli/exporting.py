@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from calib.cli.app import Json, Out, app, progress_bar, say
+from calib.cli.app import Force, Json, Out, app, progress_bar, say
 
 
 @app.command()
@@ -22,13 +22,14 @@ def export(
             "all that have anything to hold if not given.",
         ),
     ] = None,
+    force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Write the result for others: YAML, URDF, ROS 2, ring tables, pictures, tables."""
     from calib.exporters import export as write
     from calib.runs.run import Run
 
-    done = write(Run.open(run), out, formats or [])
+    done = write(Run.open(run), out, formats or [], force)
     document = {
         "files": [str(file) for file in done.files],
         "not_held": done.not_held,
@@ -54,6 +55,7 @@ def apply(
     rig: Annotated[
         str | None, typer.Option(metavar="NAME", help="Whose LiDAR, where the run has several.")
     ] = None,
+    force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Write corrected clouds: what the run has learnt of its LiDAR is taken off."""
@@ -61,7 +63,7 @@ def apply(
     from calib.runs.run import Run
 
     with progress_bar() as progress:
-        done = correct(Run.open(run), clouds, out, rig, progress)
+        done = correct(Run.open(run), clouds, out, rig, progress, force)
     document = {
         "clouds": [
             {"file": str(a.path), "points": a.points, "moved_rms_mm": 1e3 * a.rms_m}

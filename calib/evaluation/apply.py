@@ -110,6 +110,7 @@ def apply(
     out: Path | str,
     rig: str | None = None,
     progress: Progress = lambda what, done, total: None,
+    force: bool = False,
 ) -> list[Applied]:
     """Write corrected copies of clouds, every field and every point kept.
 
@@ -121,10 +122,12 @@ def apply(
         out: the folder to write to; files keep their names.
         rig: whose LiDAR it was, where the run has several.
         progress: called with what is being done, and how far it is.
+        force: whether a run that has not converged is used.
 
     Raises:
-        InputError: a cloud cannot be read, or would be written over.
+        InputError: a cloud cannot be read, or would be written over, or the run has not converged.
     """
+    run.refuse_unconverged(force)
     out = Path(out)
     correction = Correction.of(run, rig)
     done = []

@@ -49,17 +49,20 @@ class Exported:
     left_out: dict[str, str] = field(default_factory=dict)
 
 
-def export(run: Run, out: Path | str, formats: Sequence[str] = ()) -> Exported:
+def export(run: Run, out: Path | str, formats: Sequence[str] = (), force: bool = False) -> Exported:
     """Write a run in the formats named, or in all that have anything to hold if none is.
 
     Args:
         run: what to write.
         out: the folder to write to; made if need be, files of the same name are replaced.
         formats: names in `FORMATS`.
+        force: whether a run that has not converged is written; each file then says so.
 
     Raises:
-        InputError: an unknown format, one named that has nothing to hold, or `out` is a file.
+        InputError: the run has not converged, an unknown format, one named that has nothing to
+            hold, or `out` is a file.
     """
+    run.refuse_unconverged(force)
     out, done, fitted = Path(out), Exported(), Fitted(run)
     for name in formats:
         if name not in FORMATS:

@@ -19,7 +19,7 @@ from chains import se3
 ROW, STEP, LEFT, TOP = 30, 26, 24, 84
 FONT = "font-family:system-ui,sans-serif;font-size:13px"
 BOLD, NUMBERS = "font-weight:600", "font-family:ui-monospace,monospace;font-size:12px"
-INK, PALE, AMBER = "#1f2933", "#9aa5b1", "#b7791f"
+INK, PALE, AMBER, RED = "#1f2933", "#9aa5b1", "#b7791f", "#b00020"
 MOVES = {
     "stop": "stands anew at every stop",
     "location": "stands anew at every location",
@@ -53,6 +53,8 @@ def write_tree(fit: FittedRig, folder: Path) -> Written:
     SubElement(svg, "title").text = f"Frames of {fit.rig.name}"
     SubElement(svg, "rect", width="100%", height="100%", fill="white")
     _text(svg, LEFT, 28, f"Frames of {fit.rig.name}", style=BOLD)
+    for sentence in fit.run.warning:
+        _text(svg, LEFT, 10, sentence, RED, style=BOLD)
     said = "each in the axes of the frame above it, angles as in URDF; sigma of the worst axis"
     _text(svg, LEFT, 48, f"{said}, amber where the data alone do not tell it", PALE)
     for x, title in ((where, "x, y, z, roll, pitch, yaw"), (spread, "one sigma")):

@@ -37,6 +37,7 @@ def head(run: Run, rig: str, conventions: Iterable[str], not_held: Iterable[str]
     version = run.model["versions"]["rigcal"]
     untold = "; ".join(entry["name"] for entry in run.solution.not_estimated)
     return [
+        *run.warning,
         f"Written by rigcal {version}, from the run {run.folder.resolve()} of {rig}.",
         *conventions,
         *_listed("Not held here:", not_held),

@@ -9,7 +9,7 @@ import numpy as np
 
 from calib.effects import CATALOGUE
 from calib.exporters.fitted import Fitted
-from calib.exporters.written import Written
+from calib.exporters.written import Written, commented, write_text
 from calib.runs.run import RING, Run
 from calib.solve.solution import (
     EffectEstimate,
@@ -20,7 +20,7 @@ from calib.solve.solution import (
 )
 from chains import se3
 from chains.errors import InputError
-from sensors.documents import Document, Marks, Number, read_yaml, validate, write_yaml
+from sensors.documents import Document, Marks, Number, read_yaml, validate, yaml_text
 
 FILE = "extrinsics.yaml"
 FORMAT = "rigcal extrinsics 1"
@@ -52,7 +52,7 @@ def write_extrinsics(fitted: Fitted, folder: Path) -> Written:
         "not_estimated": solution.not_estimated,
         "recordings": {rig: _part_document(part) for rig, part in solution.recordings.items()},
     }
-    write_yaml(folder / FILE, data)
+    write_text(folder / FILE, commented(run.warning) + yaml_text(data))
     return Written([folder / FILE])
 
 
@@ -80,6 +80,7 @@ def _provenance(run: Run) -> dict[str, Any]:
         "run": str(run.folder.resolve()),
         "recordings": model["recordings"],
         "model": {key: model[key] for key in ("effects", "fixed", "prior")},
+        "converged": run.converged,
         "residual": run.summary["residual"],
         "rms_mm": run.summary["rms_mm"],
         "versions": model["versions"],

@@ -49,12 +49,10 @@ def linearise(
     """
     layout = layout or Layout.of(problem)
     count = len(problem.scans) if beams else 0
-    order = StopsFirst if layout.stops_first else CellsFirst
     own = {stop: list(rows.values()) for stop, rows in own_rows(layout, values).items()}
+    order = StopsFirst if layout.stops_first else CellsFirst
     assembly = order(layout, own, count, gradients is not None)
-
     placed = lidars(problem.scans, values) if count else []
-
     found: list[tuple[Weighing, float, float]] = []  # each stop's weighing, its cost, and before
 
     def work(i: int) -> tuple[StopSums, SpreadRows | None, tuple | None, tuple]:
@@ -80,15 +78,11 @@ def linearise(
             rows = spread_rows(spread, layout)
             assembly.add_kept(rows)
             if places is not None:
-                stop = np.full(len(rows.b), sums.stop)
-                clustered = ClusteredRows(rows.A, rows.b, rows.columns, stop, places[cluster])
-                gradients.add_rows(clustered)
-    return replace(
-        assembly.done(values),
-        weighed=[each for each, _, _ in found],
-        beams_cost=sum(cost for _, cost, _ in found),
-        cost_before=sum(cost for _, _, cost in found) if weighed else None,
-    )
+                at = np.full(len(rows.b), sums.stop), places[cluster]
+                gradients.add_rows(ClusteredRows(rows.A, rows.b, rows.columns, *at))
+    cost, before = (sum(each[k] for each in found) for k in (1, 2))
+    here, before = [each for each, _, _ in found], before if weighed else None
+    return replace(assembly.done(values), weighed=here, beams_cost=cost, cost_before=before)
 
 
 def beams_cost(

@@ -47,6 +47,7 @@ def judge(run: Run, diagnosis: Mapping[str, Any] | None) -> Verdict:
     red, amber = list(_wrong(run, diagnosis)), list(_doubtful(run, diagnosis))
     light = "red" if red else "amber" if amber else "green"
     sentence = diagnosis["sentences"][0] if diagnosis else _undiagnosed(run)
+    sentence = next(iter(run.warning), sentence)
     fine = "no effect is missing, and stops that it never saw are predicted as well as noise allows"
     return Verdict(light, sentence, tuple(red + amber) or (fine,))
 
@@ -63,7 +64,7 @@ def _undiagnosed(run: Run) -> str:
 def _wrong(run: Run, diagnosis: Mapping[str, Any] | None) -> Iterator[str]:
     if diagnosis and diagnosis["verdict"] == "missing_effect":
         yield "an effect is missing that is worth adding"
-    if not run.summary["converged"]:
+    if not run.converged:
         yield "the fit has not converged"
     for kind, times in run.summary["misfit"].items():
         if times > FAR_OFF:

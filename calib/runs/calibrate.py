@@ -182,7 +182,7 @@ def _fit(
     else:
         estimate, links = solve_from(problem, earlier(problem, before), progress)
     unseen, by = Errors(), None
-    if choices.hold_out != "none":
+    if choices.hold_out != "none" and estimate.converged:
         unseen = held_out(sources, model, choices.hold_out, choices.folds, progress, estimate.start)
         by = unit_of(sources, choices.hold_out) if unseen.count else None
     nominal = _nominal(problem, progress)

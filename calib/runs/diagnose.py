@@ -44,7 +44,7 @@ def diagnose(
         rejected = rejects(found.looks[0].stand, progress)
         falls = {}
         before = run.summary["rms_mm"]["held_out"]
-        if refits and run.model["hold_out"] != "none":
+        if refits and run.model["hold_out"] != "none" and before is not None:
             if found.blunders and found.found:
                 before = _unseen(found.looks[0].stand, run, progress).rms_mm
             for step in found.found:
@@ -59,7 +59,11 @@ def diagnose(
         weak_directions(run.solution, float(run.summary["sigmas_widened_by"]), found.looks[0]),
         rejected,
     )
-    result = replace(result, command=command_without(run, tokens) if tokens else "")
+    result = replace(
+        result,
+        sentences=[*run.warning, *result.sentences],
+        command=command_without(run, tokens) if tokens else "",
+    )
     write_json(run.folder / DIAGNOSIS, result.document())
     return result
 

@@ -34,6 +34,7 @@ _OF_CANDIDATE |= {"unabsorbed_rms_mm"}
 _OF_CURVE = {"covariates", "centres", "mean_mm", "band_mm"}
 RING = re.compile(r"ring_(\d+)")  # a parameter of a ring
 _OF_STATE, _OF_MET = "state/", "met/"  # before every name in that file: numpy reserves a few
+NOT_CONVERGED = "NOT CONVERGED: the fit did not end at an optimum; its numbers are not to be used"
 
 
 @dataclass(frozen=True)
@@ -80,6 +81,24 @@ class Run:
     def effects(self) -> tuple[str, ...]:
         """Names of its model's effects; of one in a Python file, its class."""
         return tuple(_effect_name(effect) for effect in self.model["effects"])
+
+    @property
+    def converged(self) -> bool:
+        """Whether the fit ended at an optimum."""
+        return bool(self.summary["converged"])
+
+    @property
+    def warning(self) -> list[str]:
+        """What is to stand above everything that is shown of the run: a sentence, or nothing."""
+        return [] if self.converged else [NOT_CONVERGED]
+
+    def refuse_unconverged(self, force: bool) -> None:
+        """Raise InputError for a fit that did not converge, unless its numbers are wanted still."""
+        if not (self.converged or force):
+            raise InputError(
+                f"{self.folder} has NOT CONVERGED, so its numbers are not to be used; "
+                f"'rigcal diagnose {self.folder}' looks for what is wrong, --force takes them still"
+            )
 
     def diagnosis(self) -> dict[str, Any] | None:
         """What `rigcal diagnose` found, as diagnosis.json has it; None before that.

@@ -58,6 +58,8 @@ def print_explanation(explanation: Explanation) -> None:
     console, runs = terminal(), explanation.runs
     for run in runs:
         console.print(str(run.folder), style="bold", soft_wrap=True)
+        for sentence in run.warning:
+            console.print(sentence, style="bold red")
     console.print()
     console.print(ladder_table(ladder(runs) or [Rung(runs[0], None)]))
     console.print()

@@ -50,7 +50,7 @@ def run_html(run: Run) -> str:
     tables = [links_table([row for row in rows if row.parent is not None])]
     tables += [effects_table(effects)] if effects else []
     untold = [f"not told: {each['name']}: {each['why']}" for each in run.solution.not_estimated]
-    return _html(str(run.folder), untold, [*tables, error_table(run.summary)])
+    return _html(str(run.folder), [*run.warning, *untold], [*tables, error_table(run.summary)])
 
 
 def diagnosis_html(diagnosis: Diagnosis) -> str:
@@ -67,7 +67,7 @@ def diagnosis_html(diagnosis: Diagnosis) -> str:
 
 def rung_html(rung: Rung) -> str:
     """A rung: what it changed of the model, and what that did to the errors."""
-    return _html(str(rung.run.folder), (), [ladder_table([rung])])
+    return _html(str(rung.run.folder), rung.run.warning, [ladder_table([rung])])
 
 
 def _html(title: str, sentences: Sequence[str], tables: Sequence[Table]) -> str:

@@ -50,6 +50,8 @@ def print_run(run: Run) -> None:
     console, rows = terminal(), variable_estimates(run)
     summary = run.summary
     console.print(str(run.folder), style="bold", soft_wrap=True)
+    for sentence in run.warning:
+        console.print(sentence, style="bold red")
     console.print(f"{_outcome(summary)}\n")
     console.print(links_table([row for row in rows if row.parent is not None]))
     effects = [row for row in rows if row.parent is None]
@@ -86,6 +88,8 @@ def print_comparison(runs: Sequence[Run]) -> None:
     console = terminal()
     for run in runs:
         console.print(str(run.folder), style="bold", soft_wrap=True)
+        for sentence in run.warning:
+            console.print(sentence, style="bold red")
         console.print(f"{_model(run)}; {_outcome(run.summary)}")
     for start in range(0, len(runs), ABREAST):
         console.print()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from calib.problem.problem import Block, Problem
 from calib.solve.estimate import Estimate, Start
 from calib.solve.loop import CONVERGED, Loop, Progress
-from calib.solve.turned import least_turned
+from calib.solve.turned import least_turned, turned_far
 from chains.errors import InputError
 
 __all__ = ["CONVERGED", "Progress", "preview", "resume", "solve"]
@@ -49,7 +49,7 @@ def solve(
         return loop.estimate()
     loop.solve_without_scans()
     loop.reweigh()
-    if prior is None and loop.bodies_astray():
+    if prior is None and (loop.bodies_astray() or turned_far(problem, loop.values)):
         # A start that is right costs less before it is solved than a wrong one after.
         for cost, values in least_turned(problem):
             if cost < loop.cost():

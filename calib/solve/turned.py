@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from calib.problem.problem import Problem
-from calib.residuals.tracker import TrackedBody
-from calib.solve.graph import Graph
+from calib.residuals.tracker import BodiesTogether, TrackedBody
 from chains import se3
 from chains.align import mean_pose
 
 TURNS = (np.pi, np.pi / 2, -np.pi / 2)
-KEPT = 3  # starts that are tried, of all that are looked at
-TOGETHER = 3  # zeros and frames that may be turned at once
+KEPT = 3  # starts that are given, of all that are looked at
+TOGETHER = 2  # zeros and frames that may be turned at once
+WIDTH = 5  # of those with one turned, how many have a second one turned
 
 Values = dict[str, np.ndarray]
 
@@ -24,23 +25,60 @@ def least_turned(problem: Problem) -> list[tuple[float, Values]]:
 
     Every angle that is the same at all stops (a joint's zero, a frame's rotation) is turned, one at
     a time; the rig then stands where the bodies with the fewest joints before them say. From the
-    best of these a second one is turned, and so on, as long as that lowers the cost.
+    best few of these a second one is turned.
 
     Args:
-        problem: its tracked bodies and targets; its initial values are what is turned.
+        problem: its initial values are what is turned; the cost is that of its tracked bodies, and
+            of the priors of what may be turned.
     """
     bodies = [b for b in problem.blocks if isinstance(b, TrackedBody) and not b.is_point]
-    graph = Graph(list(problem.variables.values()), problem.blocks)
     angles = _angles(problem, bodies)
-    best, found = (graph.error(problem.initial), dict(problem.initial)), []
-    for _ in range(TOGETHER if bodies and angles else 0):
-        tried = [_stood(v, bodies) for v in _turned(best[1], angles)]
-        ranked = sorted(((graph.error(v), k, v) for k, v in enumerate(tried)), key=lambda x: x[:2])
-        found += [(cost, values) for cost, _, values in ranked[:KEPT]]
-        if ranked[0][0] >= best[0]:
-            break
-        best = ranked[0][0], ranked[0][2]
-    return sorted(found, key=lambda x: x[0])[:KEPT]
+    if not angles:
+        return []
+    groups = sorted(map(_Group.of, BodiesTogether.of(bodies)), key=lambda group: group.joints)
+    found: list[tuple[float, Values]] = []
+    for _ in range(TOGETHER):
+        before = found[:WIDTH] or [(np.inf, dict(problem.initial))]
+        tried = [_stood(each, groups) for _, v in before for each in _turned(v, angles)]
+        found += [(cost + _prior(problem, v, angles), v) for cost, v in tried]
+        found.sort(key=lambda each: each[0])
+    return found[:KEPT]
+
+
+def turned_far(problem: Problem, values: Mapping[str, np.ndarray]) -> bool:
+    """Whether any of those angles is more than an eighth of a turn from where it was thought."""
+    bodies = [b for b in problem.blocks if isinstance(b, TrackedBody)]
+    pairs = (
+        (problem.variables[name].mean[i], values[name][i]) for name, i in _angles(problem, bodies)
+    )
+    return any(abs(now - mean) > np.pi / 4 for mean, now in pairs)
+
+
+@dataclass(frozen=True)
+class _Group:
+    """One body at K stops.
+
+    Args:
+        whole: the body's rows at all of them.
+        roots: (K,) unknown of where the rig stands.
+        joints: how many there are before the body.
+    """
+
+    whole: TrackedBody
+    roots: Sequence[str]
+    joints: int
+
+    @classmethod
+    def of(cls, together: BodiesTogether) -> _Group:
+        roots = [b.stops.root for b in together.blocks for _ in b.measured]
+        whole = together.whole
+        return cls(whole=whole, roots=roots, joints=len(whole.stops.rig.joints_to(whole.body)))
+
+    def place(self, values: Values) -> np.ndarray:
+        """T_root_body (K, 4, 4), what encoders misreport at single stops left out."""
+        stops = self.whole.stops
+        own = {stops.noise: np.zeros(stops.joints.shape)} if stops.noise else {}
+        return stops.in_root(self.whole.body, {**values, **own}).T
 
 
 def _angles(problem: Problem, bodies: Sequence[TrackedBody]) -> list[tuple[str, int]]:
@@ -66,13 +104,27 @@ def _turned(
             yield {**values, name: theta}
 
 
-def _stood(values: Values, bodies: Sequence[TrackedBody]) -> Values:
-    """The same, the rig standing where its bodies say: those with the fewest joints before them."""
-    nearest: dict[str, TrackedBody] = {}
-    for block in sorted(bodies, key=lambda b: len(b.stops.rig.joints_to(b.body))):
-        nearest.setdefault(block.stops.root, block)
-    out = dict(values)
-    for root, block in nearest.items():
-        T_root_body = block.stops.in_root(block.body, values).T
-        out[root] = mean_pose(block.measured @ se3.inverse(T_root_body))
-    return out
+def _stood(values: Values, groups: Sequence[_Group]) -> tuple[float, Values]:
+    """The cost of all bodies, and the values with the rig standing where the bodies with the fewest
+    joints before them say."""
+    placed, stood = [group.place(values) for group in groups], {}
+    for group, T_root_body in zip(groups, placed, strict=True):
+        said: dict[str, list[np.ndarray]] = {}
+        for root, T in zip(
+            group.roots, group.whole.measured @ se3.inverse(T_root_body), strict=True
+        ):
+            said.setdefault(root, []).append(T)
+        stood = {root: mean_pose(np.stack(Ts)) for root, Ts in said.items()} | stood
+    cost = 0.0
+    for group, T_root_body in zip(groups, placed, strict=True):
+        T = np.stack([stood[root] for root in group.roots]) @ T_root_body
+        block = group.whole
+        turn = se3.so3_log(T[:, :3, :3].mT @ block.measured[:, :3, :3]) / block.sigma_rad
+        away = (T[:, :3, 3] - block.measured[:, :3, 3]) / block.sigma_m
+        cost += float(np.square(turn).sum() + np.square(away).sum()) / 2
+    return cost, {**values, **stood}
+
+
+def _prior(problem: Problem, values: Values, angles: Sequence[tuple[str, int]]) -> float:
+    unknowns = (problem.variables[name] for name in dict.fromkeys(name for name, _ in angles))
+    return sum(float(np.square((values[v.name] - v.mean) / v.sigma).sum()) / 2 for v in unknowns)

@@ -173,7 +173,9 @@ def ladder(rungs: Sequence[Rung]) -> str:
         for rung, (mm, _) in zip(rungs, errors, strict=True)
     )
     said = f"Error of {errors[-1][1]}; dashed: noise floor, {floor:.2f} mm"
-    return _framed(f'<div data-is="ladder">{rows}</div><div style="{_QUIET}">{said}</div>')
+    warning = "".join(f'<b style="color:#b00020">{w}</b>' for w in rungs[-1].run.warning)
+    picture = f'<div data-is="ladder">{rows}</div><div style="{_QUIET}">{said}</div>'
+    return _framed(warning + picture)
 
 
 def _error(rung: Rung) -> tuple[float, str]:

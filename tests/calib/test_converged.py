@@ -1,0 +1,213 @@
+"""Converged means at the optimum: found from afar, never left upwards, and said where it is not."""
+
+import csv
+import shutil
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from calib.effects import find
+from calib.exporters import export
+from calib.problem import build
+from calib.problem.model import Model, Source
+from calib.residuals.robust import tukey_cost
+from calib.runs.calibrate import calibrate
+from calib.solve.fit import solve
+from chains.errors import InputError
+
+from . import simulated
+
+ARMS = ("arm_axes_miss_each_other", "arm_base_creeps", "arm_payload")
+ARM = ("arm_link_length", "arm_joint_offset", "arm_axis_tilt", "arm_gravity_sag")
+ADDED_TO_ARMS = (
+    *("arm_axis_tilt", "arm_gravity_sag", "arm_joint_scale", "arm_joint_eccentricity"),
+    *("arm_backlash", "arm_gear_error@2", "base_flex", "mount_slip@3000", "mount_creep"),
+)
+ADDED_TO_SCANS = (
+    *("range_scale", "incidence_angle_bias", "warmup_drift", "arm_gravity_sag", "arm_axis_tilt"),
+    *("ring_elevation_offset", "beam_origin_offset", "arm_joint_eccentricity"),
+)
+
+
+def whitened(problem, values):
+    """Every row of trackers, targets and priors, plainly one after the other."""
+    rows = [block.evaluate(values, False)[0] for block in problem.blocks]
+    for v in problem.variables.values():
+        if v.kind != "direction":
+            rows.append(v.difference(v.mean, values[v.name]) / v.sigma)
+    return np.concatenate(rows)
+
+
+@pytest.mark.parametrize("name", ARMS)
+@pytest.mark.parametrize("effects", [ARM[:2], ARM[:3], ARM], ids=len)
+def test_an_arm_under_a_tracker_reaches_the_attainable_cost(name, effects, shared):
+    """scipy's trust region from the same start, derivatives by differences, finds none lower."""
+    problem = build([Source.open(shared / "recordings" / name)], Model(effects))
+    found = solve(problem)
+    unknowns = list(problem.variables.values())
+    ends = np.cumsum([v.dim for v in unknowns])
+
+    def rows(x):
+        steps = np.split(x, ends[:-1])
+        moved = {
+            v.name: v.moved(problem.initial[v.name], v.sigma * step)
+            for v, step in zip(unknowns, steps, strict=True)
+        }
+        return whitened(problem, moved)
+
+    best = least_squares(rows, np.zeros(ends[-1]), x_scale="jac", xtol=1e-12, max_nfev=60)
+    assert found.converged
+    assert found.cost == pytest.approx(np.square(whitened(problem, found.values)).sum() / 2)
+    assert found.cost < best.cost + 1e-3
+
+
+def robust_cost(problem, estimate, values):
+    """Half the robust chi-square at a state: what beams meet, their sigmas and scales as of the
+    estimate; priors included."""
+    cost = np.square(whitened(problem, values)).sum() / 2
+    for scan, met in zip(estimate.scans, estimate.associations, strict=True):
+        here, there = scan.rows(estimate.values, met), scan.rows(values, met)
+        z = np.where(there.usable, there.residual_m / here.sigma_m, 0.0)
+        cost += tukey_cost(z, here.scale)
+    return cost
+
+
+def grown(source, small, effect):
+    """The problem with one effect more, solved from a smaller one's optimum, and where it began."""
+    problem = build([source], Model().plus((find(effect),)), meetings=small.problem.meetings)
+    estimate = solve(problem, start=small.start)
+    wide = estimate.problem
+    began = {n: small.values.get(n, v.mean) for n, v in wide.variables.items()}
+    same = {n: v for n, v in began.items() if np.shape(v) == np.shape(wide.variables[n].mean)}
+    assert same.keys() == began.keys()
+    return wide, estimate, began
+
+
+@pytest.fixture(scope="module", params=["arm_payload", "arm_base_creeps", "tiny"])
+def fitted(request, tmp_path_factory):
+    """A recording, its fit, and effects to add to it."""
+    if request.param == "tiny":
+        source, _ = simulated.made(tmp_path_factory.mktemp("tiny") / "rec", "tiny")
+        return source, solve(build([source], Model())), ADDED_TO_SCANS
+    source = Source.open(request.getfixturevalue("shared") / "recordings" / request.param)
+    return source, solve(build([source], Model())), ADDED_TO_ARMS
+
+
+def test_adding_an_effect_never_raises_the_cost(fitted):
+    source, small, added = fitted
+    assert small.converged
+    for name in added:
+        problem, estimate, began = grown(source, small, name)
+        before = robust_cost(problem, estimate, began)
+        after = robust_cost(problem, estimate, estimate.values)
+        assert after <= before * (1 + 1e-9), name
+        assert estimate.converged, name
+
+
+def edited(folder, to, change):
+    """A copy of a recording with its stops.csv changed: `change` of its rows, by column."""
+    shutil.copytree(folder, to, copy_function=shutil.copyfile)
+    with (to / "stops.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    change(rows)
+    with (to / "stops.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+    return to
+
+
+@pytest.mark.parametrize(
+    "turns", [{"joint_3": 90}, {"joint_2": 180}, {"joint_2": -90, "joint_5": 90}]
+)
+def test_an_arm_whose_zeros_are_off_by_quarter_turns_is_fitted_as_any_other(
+    turns, shared, tmp_path
+):
+    """From CAD's zeros no way leads downhill to the arm."""
+
+    def turn(rows):
+        for row in rows:
+            for joint, angle in turns.items():
+                row[joint] = float(row[joint]) + np.radians(angle)
+
+    folder = shared / "recordings" / "arm_base_creeps"
+    plain = solve(build([Source.open(folder)], Model()))
+    problem = build([Source.open(edited(folder, tmp_path / "rec", turn))], Model())
+    found = solve(problem)
+    assert found.converged
+    names, offsets = (x["arm_joint_offset"] for x in (problem.variables, found.values))
+    offset = dict(zip(names.dofs, offsets, strict=True))
+    for joint, angle in turns.items():
+        assert np.cos(offset[joint] + np.radians(angle)) > np.cos(0.05)
+    # What is left is what the prior asks for so large a zero.
+    prior = sum((np.radians(angle) / 0.005) ** 2 / 2 for angle in turns.values())
+    assert found.cost < 1.05 * prior + 2 * plain.cost
+
+
+def swapped(rows):
+    """Two bodies exchanged."""
+    for row in rows:
+        for part in ("x", "y", "z", "qw", "qx", "qy", "qz"):
+            a, b = f"base_markers.{part}", f"mount_markers.{part}"
+            row[a], row[b] = row[b], row[a]
+
+
+def misread(rows):
+    """Quaternions written as x, y, z, w."""
+    for row in rows:
+        for body in ("base_markers", "mount_markers"):
+            names = [f"{body}.{q}" for q in ("qw", "qx", "qy", "qz")]
+            for name, value in zip(names, [row[n] for n in (*names[1:], names[0])], strict=True):
+                row[name] = value
+
+
+def shifted(rows):
+    """Every row at the stop before."""
+    names = [row["stop"] for row in rows]
+    for row, name in zip(rows, names[1:] + names[:1], strict=True):
+        row["stop"] = name
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory):
+    source, _ = simulated.made(tmp_path_factory.mktemp("good") / "rec", "tiny")
+    return source.recording.folder
+
+
+@pytest.mark.parametrize("damage", [swapped, misread, shifted])
+def test_a_hopeless_start_is_given_up_and_nothing_of_it_looks_usable(
+    damage, tiny, tmp_path, rigcal
+):
+    rec = edited(tiny, tmp_path / "rec", damage)
+    code, out, err = rigcal("fit", rec, "-o", tmp_path / "run")
+    assert code == 3 and "NOT CONVERGED" in out and "NOT CONVERGED" in err
+    code, _, err = rigcal("export", tmp_path / "run", "-o", tmp_path / "out")
+    assert code == 2 and "NOT CONVERGED" in err and not (tmp_path / "out").exists()
+    code, _, err = rigcal("export", tmp_path / "run", "-o", tmp_path / "out", "--force")
+    assert code == 0
+    for file in (tmp_path / "out").iterdir():
+        assert "NOT CONVERGED" in file.read_text(), file
+    code, _, err = rigcal("apply", tmp_path / "run", rec, "-o", tmp_path / "clouds")
+    assert code == 2 and "NOT CONVERGED" in err
+
+
+def test_a_hopeless_fit_takes_no_more_passes_than_a_good_one_might(tiny, tmp_path):
+    source = Source.open(edited(tiny, tmp_path / "rec", shifted))
+    found = solve(build([source], Model()))
+    assert not found.converged and found.iterations <= 11
+
+
+def test_a_fit_that_is_not_at_its_optimum_is_not_called_converged(tiny, monkeypatch):
+    """Too few passes, and a step left that would lower the cost."""
+    problem = build([Source.open(tiny)], Model())
+    assert solve(problem).converged
+    monkeypatch.setattr("calib.solve.loop.MAX_PASSES", 1)
+    assert not solve(problem).converged
+
+
+def test_python_refuses_too(tiny, tmp_path, monkeypatch):
+    monkeypatch.setattr("calib.solve.loop.MAX_PASSES", 1)
+    run = calibrate([tiny], tmp_path / "run", hold_out="none")
+    with pytest.raises(InputError, match="--force"):
+        export(run, tmp_path / "out")
