@@ -35,7 +35,7 @@ import calib
 from calib import problem as problems
 from calib.problem.model import Source
 from calib.problem.prior import JointPrior
-from calib.solve.errors import body_errors
+from calib.results.errors import body_errors
 from calib.solve.fit import solve
 
 GEOMETRY = calib.Model(("arm_link_length", "arm_joint_offset", "arm_axis_tilt"))

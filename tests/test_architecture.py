@@ -48,8 +48,8 @@ ROOMS = {
     "sensors": ("readers",),
     "sensors.readers": ("tables", "clouds", "poses", "meshes", "arms", "packets", "bags"),
     "calib": (
-        *("rig", "effects", "forward", "residuals", "problem", "linear", "solve", "blunders"),
-        "diagnosis",
+        *("rig", "effects", "forward", "residuals", "problem", "linear", "solve"),
+        *("results", "blunders", "diagnosis"),
         *("runs", "show", "simulation", "evaluation", "intake", "exporters", "report", "view"),
         "cli",
     ),

@@ -83,10 +83,12 @@ class LeftOut:
     Args:
         blunder: as it stood out when it was left out.
         rivals: groups that explain as much, and nothing once it is left out.
+        belongs: of a scan, the stop in whose place it fits.
     """
 
     blunder: Blunder
-    rivals: Sequence[Blunder]
+    rivals: Sequence[Group]
+    belongs: Group | None = None
 
 
 def judge(whole: Linearisation, problem: Problem) -> list[Blunder]:

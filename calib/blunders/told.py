@@ -43,7 +43,8 @@ def document(left: LeftOut, rig: Rig) -> dict[str, Any]:
         "p_value": blunder.p_value,
         "p_adjusted": blunder.p_adjusted,
         "detectable": dict(blunder.detectable),
-        "indistinguishable_from": [other.group.token for other in left.rivals],
+        "indistinguishable_from": [other.token for other in left.rivals],
+        "belongs_to": left.belongs.where if left.belongs else None,
         "without": group.token,
         "sentence": _sentence(left, _wrong_sign(left, rig)),
     }
@@ -52,11 +53,14 @@ def document(left: LeftOut, rig: Rig) -> dict[str, Any]:
 def _sentence(left: LeftOut, wrong_sign: str | None) -> str:
     size, sigma, unit, axis = left.blunder.leading()
     along = f" {axis}" if axis.startswith("about") else f" in {axis}" if axis else ""
+    along = " along the beams" if axis == "along the beams" else along
     along = "" if axis == left.blunder.group.what.rpartition(".")[2] else along
     sign = f", as if the sign of its {wrong_sign} were wrong" if wrong_sign else ""
     out = f"{left.blunder.group} is {_off(size, sigma, unit)} off{along}, against everything else"
+    if left.belongs:
+        return f"{out}: it was taken at {left.belongs.where}."
     if left.rivals:
-        others = ", or ".join(str(other.group) for other in left.rivals)
+        others = ", or ".join(map(str, left.rivals))
         return f"{out}{sign}; or it is {others}: nothing measured here tells them apart."
     return f"{out}{sign}."
 

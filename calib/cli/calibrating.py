@@ -67,7 +67,7 @@ def simulate(
 @app.command()
 def check(recording: Path, as_json: Json = False) -> None:
     """What is in a recording, what is wrong, and what can and cannot be estimated from it."""
-    from calib.solve.check import check as run
+    from calib.results.check import check as run
 
     with progress_bar() as progress:
         checked = run(recording, progress)

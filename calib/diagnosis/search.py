@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from calib.blunders.aside import stray_scans
 from calib.blunders.chance import after_looks, log_tail
 from calib.blunders.judged import Blunder, LeftOut
 from calib.diagnosis.score import Test
@@ -130,15 +131,20 @@ def _adapted(look: Look, left: list[LeftOut], progress: Progress) -> Look:
     """A look without the blunders that explain more than any effect or structure would; these are
     added to those left out."""
     for _ in range(ADAPTED):
-        wild = _wild(look)
-        if not wild:
+        estimate = look.stand.estimate
+        stray = list(stray_scans(estimate.problem, estimate.values, look.checked))
+        left += stray
+        wild = [] if stray else _wild(look)
+        groups = [each.blunder.group for each in stray] + [b.group for b in wild]
+        if not groups:
             break
-        after = look.stand.without([b.group for b in wild], progress).look(progress)
+        after = look.stand.without(groups, progress).look(progress)
         loud = {b.group for b in after.blunders if b.found}
         for each in wild:
             near = (b for b in look.blunders if each.evidence - b.evidence < ODDS)
             others = [b for b in near if b.found and b.group not in loud and b not in wild]
-            left.append(LeftOut(each, [b for b in others if len(wild) == 1 or _meet(each, b)]))
+            met = [b.group for b in others if len(wild) == 1 or _meet(each, b)]
+            left.append(LeftOut(each, met))
         look = after
     return look
 

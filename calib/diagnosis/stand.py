@@ -225,6 +225,11 @@ class Look:
         """All groups of rows, those that chance explains least first."""
         return judge(self.linear.whole, self.stand.estimate.problem)
 
+    @property
+    def checked(self) -> set[Group]:
+        """Groups of rows that others contradict, or could."""
+        return {blunder.group for blunder in self.blunders}
+
     def judged(self, candidate: Candidate, progress: Progress) -> Test:
         """A candidate's test with its clusters jackknifed: see `jackknife`."""
         stand, found = self.stand, candidate.test

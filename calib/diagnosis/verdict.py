@@ -26,8 +26,8 @@ from calib.diagnosis.search import (
 from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import formula, hangs_on, what_separates, words
 from calib.effects import CATALOGUE, Site
+from calib.results.solution import one_unit
 from calib.rig import Rig
-from calib.solve.solution import one_unit
 
 UNNAMED, BAD = "unexplained_structure", "bad_data"
 VERDICTS = {

@@ -10,8 +10,8 @@ from calib.diagnosis.score import projection
 from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import what_separates
 from calib.effects import Effect
-from calib.solve.observability import UNTOLD, echelon
-from calib.solve.solution import Solution
+from calib.results.observability import UNTOLD, echelon
+from calib.results.solution import Solution
 
 LEANS = 0.5  # of the prior's variance left in a direction that the data hardly determine
 SHARE = 0.2  # of a direction of unit length, in priors' sigmas, for a parameter to be named

@@ -17,10 +17,10 @@ import numpy as np
 from calib.effects import Effect, OneHot, Site, View
 from calib.exporters.written import Unheld, Written, head
 from calib.problem.model import owned
+from calib.results.solution import FrameEstimate, Part
 from calib.rig import Rig
 from calib.runs.reopen import model_of, reopened
 from calib.runs.run import Run
-from calib.solve.solution import FrameEstimate, Part
 from chains import se3
 from chains.errors import InputError
 

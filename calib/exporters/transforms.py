@@ -11,7 +11,7 @@ import numpy as np
 
 from calib.exporters.fitted import FittedRig, for_every_rig
 from calib.exporters.written import SIGMAS, Unheld, Written, commented, write_text
-from calib.solve.solution import FrameEstimate
+from calib.results.solution import FrameEstimate
 from chains import se3
 from sensors.documents import yaml_text
 

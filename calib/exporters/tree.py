@@ -12,8 +12,8 @@ import numpy as np
 
 from calib.exporters.fitted import FittedRig, for_every_rig
 from calib.exporters.written import Written, write_text
+from calib.results.solution import FrameEstimate
 from calib.runs.estimates import variable_estimates
-from calib.solve.solution import FrameEstimate
 from chains import se3
 
 ROW, STEP, LEFT, TOP = 30, 26, 24, 84

@@ -10,14 +10,14 @@ import numpy as np
 from calib.effects import CATALOGUE
 from calib.exporters.fitted import Fitted
 from calib.exporters.written import Written, commented, write_text
-from calib.runs.run import RING, Run
-from calib.solve.solution import (
+from calib.results.solution import (
     EffectEstimate,
     FrameEstimate,
     Part,
     effect_document,
     frame_document,
 )
+from calib.runs.run import RING, Run
 from chains import se3
 from chains.errors import InputError
 from sensors.documents import Document, Marks, Number, read_yaml, validate, yaml_text

@@ -27,8 +27,8 @@ from calib.intake.gather import (
 )  # fmt: skip
 from calib.intake.still import MIN_HOLD_S, find_holds
 from calib.intake.surface import write_surface
+from calib.results.check import Check, check
 from calib.rig import load_rig
-from calib.solve.check import Check, check
 from chains.errors import InputError
 from sensors.documents import replace_folder, write_atomically
 from sensors.readers.base import Columns, Options, Progress

@@ -71,18 +71,26 @@ def linearise(
         assembly.add(sums)
         places = None
         if by_cluster is not None:
-            parts, cluster, gradient, columns = by_cluster
-            places = gradients.numbers(problem.scans[i].room, parts)
-            gradients.add(gradient, columns, np.full(len(parts), sums.stop), places)
+            places = _add_clusters(gradients, problem.scans[i], sums.stop, by_cluster)
         if spread is not None:
             rows = spread_rows(spread, layout)
             assembly.add_kept(rows)
             if places is not None:
-                at = np.full(len(rows.b), sums.stop), places[cluster]
+                at = np.full(len(rows.b), sums.stop), places
                 gradients.add_rows(ClusteredRows(rows.A, rows.b, rows.columns, *at))
     cost, before = (sum(each[k] for each in found) for k in (1, 2))
     here, before = [each for each, _, _ in found], before if weighed else None
     return replace(assembly.done(values), weighed=here, beams_cost=cost, cost_before=before)
+
+
+def _add_clusters(
+    gradients: Gradients, scan: ScanStop, stop: int, by_cluster: tuple[np.ndarray, ...]
+) -> np.ndarray:
+    """Add the gradients of a stop's beams; the place (N,) that each of them errs with."""
+    parts, cluster, gradient, columns = by_cluster
+    places = gradients.numbers(scan.room, parts)
+    gradients.add(gradient, columns, np.full(len(parts), stop), places)
+    return places[cluster]
 
 
 def beams_cost(

@@ -9,6 +9,7 @@ from calib.problem.model import Source, same_mesh
 from calib.problem.places import Places
 from calib.problem.problem import Problem, SourceStops
 from calib.problem.unknowns import Role, Unknown
+from calib.residuals.groups import SCAN, Group
 from calib.residuals.scan import ScanStop
 from calib.residuals.surfaces import Meeting, MeshSurface, PlaneSurface
 from chains import se3
@@ -37,6 +38,7 @@ def add_beams(problem: Problem, part: SourceStops, places: Places) -> None:
                 reference_sigma_m=sigma_m,
                 store=source.store,
                 room=_room(problem, part),
+                group=Group("scan", source.recording.stops[k], SCAN, part.label),
             )
         )
 

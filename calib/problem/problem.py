@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -93,6 +94,7 @@ class Problem:
         scans: one per stop with a scan.
         meetings: per source, what its beams meet.
         cells: unknowns of surfaces, once what beams meet is settled.
+        aside: scans that a fit has set aside, as they contradict all others.
     """
 
     sources: Sequence[Source]
@@ -104,6 +106,14 @@ class Problem:
     scans: list[ScanStop] = field(default_factory=list)
     meetings: dict[int, Meeting] = field(default_factory=dict)
     cells: Mapping[str, SurfaceCells] = field(default_factory=dict)
+    aside: Sequence[ScanStop] = ()
+
+    def setting_aside(self, keys: Collection[tuple[Path, int]]) -> Problem:
+        """The problem with these scans, and no others, set aside."""
+        every = [*self.scans, *self.aside]
+        kept = [s for s in every if (s.recording.folder, s.index) not in keys]
+        gone = [s for s in every if (s.recording.folder, s.index) in keys]
+        return replace(self, scans=kept, aside=gone) if keys or self.aside else self
 
     def add(self, unknown: Unknown, value: np.ndarray | None = None) -> str:
         """Add an unknown once; it starts at `value`, or at its mean."""

@@ -21,8 +21,8 @@ from calib.problem import Problem
 from calib.residuals.beams import Columns
 from calib.residuals.scan import ScanStop
 from calib.residuals.tracker import TrackedBody
+from calib.results.solution import Solution
 from calib.solve.fit import Progress
-from calib.solve.solution import Solution
 
 STOPS, ROWS = 24, 2000  # of each stop that is looked at, no more rows than that
 

@@ -25,6 +25,7 @@ from calib.residuals.beams import (
     turns_beams,
 )
 from calib.residuals.compiled import twist_derivative
+from calib.residuals.groups import Group
 from calib.residuals.robust import robust_scale, tukey_weight
 from calib.residuals.spread import spread_rows
 from calib.residuals.store import BeamStore
@@ -102,6 +103,7 @@ class ScanStop:
         reference_sigma_m: how far the reference may be off its surface.
         store: its recording's scans as beams.
         room: the mesh, or the recording whose planes these are.
+        group: the name of its rows.
     """
 
     name: str
@@ -114,6 +116,7 @@ class ScanStop:
     reference_sigma_m: float
     store: BeamStore
     room: int | str
+    group: Group
 
     @property
     def lidar(self) -> LidarModel:

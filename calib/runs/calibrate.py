@@ -17,6 +17,12 @@ from calib.problem import Problem
 from calib.problem.model import Model, Source
 from calib.problem.without import leave_out
 from calib.residuals.tracker import TrackedBody
+from calib.results.errors import Errors, body_errors, misfit, row_errors, scan_errors
+from calib.results.holdout import held_out, unit_of
+from calib.results.misfit import misfit_by, prior_rows, target_rows, tracker_rows
+from calib.results.reach import reach
+from calib.results.recalibrate import Link, earlier, solve_from
+from calib.results.solution import solution_of
 from calib.runs.reopen import model_of, reopened, start_of, stored_met
 from calib.runs.residual_table import recording_of, residual_table, table_path, write_rows
 from calib.runs.run import (
@@ -30,14 +36,8 @@ from calib.runs.run import (
     versions,
     write_state,
 )
-from calib.solve.errors import Errors, body_errors, misfit, row_errors, scan_errors
 from calib.solve.estimate import Estimate, Start
 from calib.solve.fit import Progress, solve
-from calib.solve.holdout import held_out, unit_of
-from calib.solve.misfit import misfit_by, prior_rows, target_rows, tracker_rows
-from calib.solve.reach import reach
-from calib.solve.recalibrate import Link, earlier, solve_from
-from calib.solve.solution import solution_of
 from chains.errors import InputError
 from sensors.documents import replace_folder, write_json, write_yaml
 from sensors.recording import write_table
@@ -196,7 +196,8 @@ def _fit(
             "so there is nothing to fit to; 'rigcal check' says what is missing"
         )
     worse = misfit(estimate, seen)
-    widened = max([1.0, *(x for x in worse.values() if x > TOLERATED)])
+    bulk = misfit(estimate, seen, weighted=True)  # one wild row widens no sigma
+    widened = max([1.0, *(x for x in bulk.values() if x > TOLERATED)])
     solution = solution_of(problem, estimate, widened)
     write_yaml(folder / SOLUTION, solution.document())
     np.savez(folder / COVARIANCE, names=np.array(solution.names), covariance=solution.covariance)
@@ -207,12 +208,20 @@ def _fit(
     write_rows(folder / RESIDUALS, *rows)
     summary |= {"misfit": worse, "misfit_by": misfit_by(estimate, *rows, by_stop)}
     reached = reach(problem, estimate, widened)
-    summary |= {"sigmas_widened_by": widened, "held_out_by": by}
+    summary |= {"sigmas_widened_by": widened, "held_out_by": by, "without": list(model.without)}
+    summary["set_aside"] = _set_aside(estimate, sources)
     summary["predicted_mm"] = reached.document() if reached else None
     summary["seconds"] = time.monotonic() - began
     if links is not None:
         summary["links"] = [_link_document(link) for link in links]
     write_json(folder / SUMMARY, summary)
+
+
+def _set_aside(estimate: Estimate, sources: Sequence[Source]) -> dict[str, str]:
+    """Scans that contradict all others, by name: number of the recording, and of the stop."""
+    numbers = {s.recording.folder: i for i, s in enumerate(sources)}
+    scans = estimate.problem.aside
+    return {scan.group.token: f"{numbers[scan.recording.folder]}/{scan.index}" for scan in scans}
 
 
 def _refuse_twice(recordings: Sequence[Path]) -> None:

@@ -13,11 +13,11 @@ from calib.diagnosis.verdict import Diagnosis, conclude
 from calib.diagnosis.weak import weak_directions
 from calib.effects import DEFAULT
 from calib.problem import build
+from calib.results.errors import Errors
+from calib.results.holdout import held_out
 from calib.runs.reopen import model_of, reopened, start_of
 from calib.runs.run import DIAGNOSIS, Run
-from calib.solve.errors import Errors
 from calib.solve.fit import Progress, resume
-from calib.solve.holdout import held_out
 from sensors.documents import write_json
 
 

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from calib.effects.rig import DOF
+from calib.results.solution import EffectEstimate, FrameEstimate
 from calib.rig import Rig, load_rig
 from calib.runs.run import Run
-from calib.solve.solution import EffectEstimate, FrameEstimate
 from chains import se3
 from chains.errors import InputError
 

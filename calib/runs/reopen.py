@@ -44,7 +44,8 @@ def start_of(run: Run, sources: Sequence[Source]) -> Start:
     for name, part in run.met().items():
         number, stop = map(int, name.split("/"))
         met[folders[number], stop] = part
-    return Start(run.state(), met)
+    aside = (map(int, name.split("/")) for name in run.summary.get("set_aside", {}).values())
+    return Start(run.state(), met, frozenset((folders[n], stop) for n, stop in aside))
 
 
 def stored_met(start: Start, sources: Sequence[Source]) -> dict[str, np.ndarray]:

@@ -10,7 +10,7 @@ import numpy as np
 from calib.problem.model import Source, recording_names
 from calib.residuals.beams import Rows
 from calib.residuals.scan import ScanStop
-from calib.solve.misfit import InstrumentRows
+from calib.results.misfit import InstrumentRows
 from sensors.recording import write_table
 
 _FIRST = ("ring", "column", "range_m", "incidence_rad", "azimuth_rad", "elevation_rad", "intensity")

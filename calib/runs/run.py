@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.solve.solution import EffectEstimate, FrameEstimate, Part, Solution
+from calib.results.solution import EffectEstimate, FrameEstimate, Part, Solution
 from chains import se3
 from chains.errors import InputError
 from sensors.documents import read_yaml

@@ -18,8 +18,8 @@ from calib.show.scale import shown
 
 if TYPE_CHECKING:
     from calib.effects import Effect
+    from calib.results.check import Check
     from calib.runs.run import Run
-    from calib.solve.check import Check
 
 WIDTH = 100
 LISTED_PARAMETERS = 12  # an effect of more parameters than these is summarised

@@ -1,1 +1,1 @@
-"""The GTSAM graph, the loop of the fit, covariance, and stops that were held out."""
+"""The GTSAM graph, and the loop of the fit."""

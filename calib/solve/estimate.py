@@ -29,10 +29,12 @@ class Start:
     Args:
         state: `Estimate.state` of that; what it does not know starts at its mean.
         met: stop -> which part of the surface each of its beams met (N,), where that is known.
+        aside: stops whose scans it had set aside.
     """
 
     state: Mapping[str, np.ndarray] = field(default_factory=dict)
     met: Mapping[StopKey, np.ndarray] = field(default_factory=dict)
+    aside: frozenset[StopKey] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -79,7 +81,8 @@ class Estimate:
     def start(self) -> Start:
         """Where another fit of much the same problem may start from."""
         pairs = zip(self.scans, self.associations, strict=True)
-        return Start(self.state, {key_of(scan): met.part for scan, met in pairs})
+        aside = frozenset(key_of(scan) for scan in self.problem.aside)
+        return Start(self.state, {key_of(scan): met.part for scan, met in pairs}, aside)
 
     @property
     def state(self) -> dict[str, np.ndarray]:

@@ -18,10 +18,10 @@ from calib.evaluation import evaluate_stop
 from calib.evaluation.tally import Evaluated
 from calib.problem import Problem
 from calib.problem.model import Model, Source
+from calib.results import holdout
+from calib.results.errors import Errors, scan_errors
 from calib.runs.reopen import model_of
 from calib.runs.run import Run
-from calib.solve import holdout
-from calib.solve.errors import Errors, scan_errors
 from calib.solve.estimate import Start, values_of
 from calib.solve.fit import Progress, solve
 from sensors.documents import replace_folder

@@ -8,9 +8,9 @@ import numpy as np
 from calib.effects import FrameOffset
 from calib.forward import Placed, Term, place
 from calib.problem.model import Model, Source
+from calib.results.solution import EffectEstimate, FrameEstimate, Part, Solution, one_unit
 from calib.rig import Rig
 from calib.runs.run import Run
-from calib.solve.solution import EffectEstimate, FrameEstimate, Part, Solution, one_unit
 from chains import se3
 
 

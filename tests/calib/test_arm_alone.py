@@ -12,13 +12,13 @@ from calib.diagnosis.candidates import concerned
 from calib.effects import CATALOGUE
 from calib.problem import build
 from calib.problem.model import Model, Source
+from calib.results.check import check
+from calib.results.holdout import BLOCKS, FOLDS, folds, pose_blocks, unit_of
+from calib.results.reach import Reach, joint_range, reach
+from calib.results.solution import solution_of
 from calib.runs.calibrate import calibrate
 from calib.show import tables
-from calib.solve.check import check
 from calib.solve.fit import solve
-from calib.solve.holdout import BLOCKS, FOLDS, folds, pose_blocks, unit_of
-from calib.solve.reach import Reach, joint_range, reach
-from calib.solve.solution import solution_of
 
 from . import rigs
 

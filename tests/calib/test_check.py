@@ -10,10 +10,10 @@ from calib import effects
 from calib import problem as problems
 from calib.diagnosis.candidates import lacking
 from calib.problem.model import Model, Source
+from calib.results.check import check
+from calib.results.solution import solution_of
 from calib.rig.inventory import PlacedScan, odd_beams
-from calib.solve.check import check
 from calib.solve.fit import solve
-from calib.solve.solution import solution_of
 from chains.errors import InputError
 from sensors.recording import read_table
 

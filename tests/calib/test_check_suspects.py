@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from calib.results.check import check
 from calib.rig import load_rig
 from calib.rig.recording import Recording
 from calib.rig.scale import odd_mesh, odd_targets
 from calib.rig.scanned import ScanSums, odd_scans
 from calib.rig.tracked import odd_bodies
-from calib.solve.check import check
 from sensors.recording import read_scan
 
 from . import broken

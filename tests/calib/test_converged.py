@@ -202,12 +202,12 @@ def test_a_fit_that_is_not_at_its_optimum_is_not_called_converged(tiny, monkeypa
     """Too few passes, and a step left that would lower the cost."""
     problem = build([Source.open(tiny)], Model())
     assert solve(problem).converged
-    monkeypatch.setattr("calib.solve.loop.MAX_PASSES", 1)
+    monkeypatch.setattr("calib.solve.descent.MAX_PASSES", 1)
     assert not solve(problem).converged
 
 
 def test_python_refuses_too(tiny, tmp_path, monkeypatch):
-    monkeypatch.setattr("calib.solve.loop.MAX_PASSES", 1)
+    monkeypatch.setattr("calib.solve.descent.MAX_PASSES", 1)
     run = calibrate([tiny], tmp_path / "run", hold_out="none")
     with pytest.raises(InputError, match="--force"):
         export(run, tmp_path / "out")

@@ -8,8 +8,8 @@ import yaml
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from calib.exporters import FORMATS, export, read_extrinsics
+from calib.results.solution import EffectEstimate, FrameEstimate, Part, Solution
 from calib.runs.run import Run
-from calib.solve.solution import EffectEstimate, FrameEstimate, Part, Solution
 from chains.errors import InputError
 
 

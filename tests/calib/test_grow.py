@@ -11,11 +11,11 @@ import pytest
 import calib
 from calib.effects import Effect, find
 from calib.problem.model import Model
+from calib.results.solution import EffectEstimate
 from calib.runs.calibrate import calibrate, grow, grown_model
 from calib.runs.ladder import ladder
 from calib.runs.reopen import reopened
 from calib.runs.run import Run
-from calib.solve.solution import EffectEstimate
 from chains.errors import InputError
 from sensors.documents import read_yaml, write_json
 

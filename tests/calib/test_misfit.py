@@ -10,10 +10,10 @@ import pytest
 
 from calib.problem import build
 from calib.problem.model import Model, Source
+from calib.results.errors import Errors
+from calib.results.misfit import InstrumentRows, misfit_by, prior_rows, target_rows, tracker_rows
 from calib.runs.calibrate import calibrate
-from calib.solve.errors import Errors
 from calib.solve.fit import solve
-from calib.solve.misfit import InstrumentRows, misfit_by, prior_rows, target_rows, tracker_rows
 
 from . import broken, rigs
 

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from calib.diagnosis.verdict import Diagnosis
+from calib.results.solution import EffectEstimate, FrameEstimate, Part, Solution
 from calib.runs.ladder import Rung
 from calib.runs.run import Run
 from calib.show.notebook import diagnosis_html, run_html, rung_html
 from calib.show.tables import print_run
-from calib.solve.solution import EffectEstimate, FrameEstimate, Part, Solution
 
 NAMES = ("lidar.rx", "lidar.ry", "lidar.rz", "lidar.tx", "lidar.ty", "lidar.tz")
 

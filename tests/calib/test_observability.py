@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from calib.problem.unknowns import Unknown
+from calib.results.observability import not_estimated
 from calib.runs.estimates import _told
-from calib.solve.observability import not_estimated
 
 AWKWARD = {
     "range_cyclic@1.2": ("sin", "cos"),

@@ -8,7 +8,7 @@ from scipy.stats import kstest
 
 from calib.problem.prior import JointPrior
 from calib.problem.unknowns import Unknown
-from calib.solve import recalibrate
+from calib.results import recalibrate
 
 NAMES = ("mount", "lidar", "arm", "unseen")
 DIM, CAD_SIGMA = 3, 1.0

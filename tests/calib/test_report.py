@@ -12,11 +12,11 @@ import pytest
 from calib.report import Evidence, charts_of, plot, report
 from calib.report.budget import beam_jacobian, budget
 from calib.report.statistics import Z_EDGES
+from calib.results.solution import Solution
 from calib.runs.calibrate import calibrate, grow, grown_model
 from calib.runs.diagnose import diagnose
 from calib.runs.run import RESIDUALS, SUMMARY, Run
 from calib.simulation import Spec, simulate
-from calib.solve.solution import Solution
 from chains.errors import InputError
 from sensors.documents import write_json
 from sensors.recording import read_table, write_table

@@ -9,8 +9,8 @@ import pytest
 from calib.report.charts.bodies import Arrows, magnification
 from calib.report.charts.knowledge import tied
 from calib.report.verdict import judge
+from calib.results.solution import Solution
 from calib.runs.run import Run
-from calib.solve.solution import Solution
 
 
 def test_correlations_are_those_of_the_covariance_and_large_effects_are_summed_up():

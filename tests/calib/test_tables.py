@@ -9,10 +9,10 @@ import pytest
 from scipy.spatial.transform import RigidTransform
 
 from calib.effects import CATALOGUE
+from calib.results.solution import EffectEstimate, FrameEstimate, Part, Solution
 from calib.runs.run import Run
 from calib.show import tables
 from calib.show.misfit import outstanding
-from calib.solve.solution import EffectEstimate, FrameEstimate, Part, Solution
 from sensors.documents import json_text
 
 from . import rigs

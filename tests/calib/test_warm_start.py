@@ -7,10 +7,10 @@ from scipy.spatial.transform import RigidTransform
 from calib.problem import build
 from calib.problem.model import Model, Source
 from calib.residuals.surfaces import PlaneSurface
+from calib.results.holdout import held_out
 from calib.simulation import Spec
 from calib.solve.estimate import Start
 from calib.solve.fit import solve
-from calib.solve.holdout import held_out
 
 from . import rigs, simulated
 

@@ -11,8 +11,8 @@ from calib.report import plots
 from calib.report.budget import Budget
 from calib.report.chart import Absent, Chart
 from calib.report.evidence import Evidence
+from calib.results.solution import Solution
 from calib.show.tables import LISTED_PARAMETERS, small
-from calib.solve.solution import Solution
 
 if TYPE_CHECKING:
     from calib.report.plots import Figure

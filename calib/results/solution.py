@@ -12,8 +12,8 @@ from calib.effects import FrameOffset
 from calib.forward import Term
 from calib.problem import Problem
 from calib.problem.model import Source
+from calib.results.observability import not_estimated
 from calib.solve.estimate import Estimate
-from calib.solve.observability import not_estimated
 from chains import se3
 
 

@@ -15,7 +15,7 @@ from calib.problem.problem import Block
 from calib.residuals.scan import ScanStop
 from calib.residuals.surfaces import PlaneSurface
 from calib.residuals.tracker import TrackedBody
-from calib.solve.errors import Errors, body_errors, scan_errors
+from calib.results.errors import Errors, body_errors, scan_errors
 from calib.solve.estimate import Estimate, Start
 from calib.solve.fit import Progress, solve
 

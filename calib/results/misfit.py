@@ -21,8 +21,9 @@ from calib.problem.model import Source, recording_names
 from calib.problem.unknowns import POSE_UNITS, Role, Unknown
 from calib.residuals.targets import HangingTarget
 from calib.residuals.tracker import TrackedBody
-from calib.solve.errors import Errors
+from calib.results.errors import Errors
 from calib.solve.estimate import Estimate
+from calib.solve.reweight import unweighted
 
 # Mean redundancy of a group below which an error of its own cannot be seen in it (Foerstner 1987:
 # below 0.01 observations are "not checkable").
@@ -80,7 +81,7 @@ def tracker_rows(estimate: Estimate) -> InstrumentRows | None:
         stops = [names[key] for key in block.stop_names]
         each = [(*stop, block.body, axis) for stop in stops for axis in DOF[axes]]
         sigma = np.repeat([block.sigma_rad, block.sigma_m], 3)[axes]
-        residual, d = block.evaluate(estimate.values, True)
+        residual, d = unweighted(block).evaluate(estimate.values, True)
         left = 1.0 - estimate.variance_of(list(d), np.hstack(list(d.values())))
         out.add(each, POSE_UNITS[axes] * len(stops), np.tile(sigma, len(stops)), residual, left)
     return out.rows(("recording", "stop", "body", "axis"))
@@ -97,7 +98,10 @@ def target_rows(estimate: Estimate) -> InstrumentRows | None:
     out = _Gathered()
     for block, by, right in estimate.graph.linear_rows(estimate.values):
         if id(block) in whose:
-            left = 1.0 - estimate.variance_of(list(by), np.hstack(list(by.values())))
+            weight = np.ones(len(PARTS)) if block.weight is None else block.weight
+            root = np.repeat(np.sqrt(np.where(weight > 0, weight, np.inf)), 3)  # a part left out: 0
+            A, right = np.hstack(list(by.values())) / root[:, None], right / root
+            left = np.where(np.isfinite(root), 1.0 - estimate.variance_of(list(by), A), 0.0)
             each = [(*whose[id(block)], part, axis) for part in PARTS for axis in XYZ]
             marker, sphere = block.sigma_marker_m, block.sigma_sphere_m
             out.add(each, ["m"] * 9, np.repeat([marker, marker, sphere], 3), -right, left)

@@ -13,9 +13,9 @@ from calib.effects import FrameOffset
 from calib.problem import Problem
 from calib.problem.prior import JointPrior
 from calib.problem.unknowns import Unknown
+from calib.results.solution import Solution
 from calib.solve.estimate import Estimate
 from calib.solve.fit import Progress, solve
-from calib.solve.solution import Solution
 from chains import se3
 from chains.errors import InputError
 

@@ -13,6 +13,8 @@ from calib import problem as problems
 from calib.forward import Values
 from calib.problem.model import Model, Source
 from calib.residuals.scan import ScanStop
+from calib.results.reach import Reach, reach
+from calib.results.solution import solution_of
 from calib.rig import Rig, inventory, load_rig
 from calib.rig.inventory import PlacedScan
 from calib.rig.scale import odd_mesh, odd_targets
@@ -21,8 +23,6 @@ from calib.rig.suspect import Suspect
 from calib.rig.tracked import odd_bodies
 from calib.solve.estimate import Estimate
 from calib.solve.fit import Progress, preview
-from calib.solve.reach import Reach, reach
-from calib.solve.solution import solution_of
 from chains.errors import InputError
 from sensors.recording import Recording, read_scan
 from sensors.reference import Reference

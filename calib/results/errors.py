@@ -141,7 +141,7 @@ def body_errors(
     return out
 
 
-def misfit(estimate: Estimate, beams: Errors) -> dict[str, float]:
+def misfit(estimate: Estimate, beams: Errors, weighted: bool = False) -> dict[str, float]:
     """How many times larger than their sigmas allow the residuals are, by kind of instrument.
 
     For trackers and targets the root of chi-square over its degrees of freedom, their own unknowns
@@ -152,13 +152,15 @@ def misfit(estimate: Estimate, beams: Errors) -> dict[str, float]:
     Args:
         estimate: the solution.
         beams: of all scans, as fitted.
+        weighted: whether rows count with their robust weights, as they did in the fit.
     """
     values, unknowns = estimate.values, estimate.problem.variables
     out = {}
     for kind in ("tracker", "target"):
         blocks = [b for b in estimate.problem.blocks if b.kind == kind]
         if blocks:
-            rows = (unweighted(b).evaluate(values, False)[0] for b in blocks)
+            counted = blocks if weighted else map(unweighted, blocks)
+            rows = (b.evaluate(values, False)[0] for b in counted)
             chi2 = sum(float(r @ r) for r in rows)
             seen = [unknowns[n] for n in {n: None for b in blocks for n in b.variables}]
             # Beams, where there are any, hold where the rig stands.

@@ -1,0 +1,78 @@
+"""Scans that a fit set aside: which of them were taken somewhere else."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping
+
+import numpy as np
+
+from calib.blunders.chance import after_looks, log_tail
+from calib.blunders.judged import Blunder, LeftOut
+from calib.blunders.shifts import Shift
+from calib.problem.problem import Problem
+from calib.residuals.groups import Group
+from calib.residuals.scan import ScanStop
+from calib.residuals.tracker import TrackedBody
+from calib.solve.loop import CONTRADICTS
+from chains.errors import InputError
+
+MAD = 1.4826  # of normal residuals, from the median of their size to their sigma
+ALIKE = 0.1  # of a scan's misfit where it is said to be: at another stop's place it belongs there
+
+
+def stray_scans(
+    problem: Problem, values: Mapping[str, np.ndarray], checked: Collection[Group]
+) -> Iterator[LeftOut]:
+    """The scans that a fit set aside, and where they fit. Its size is how far its points lie from
+    the surfaces that they should be on (robust rms), and its sigma how far they should.
+
+    Args:
+        problem: of the fit.
+        values: its solution.
+        checked: groups that anything contradicts or could. A body at the stop that is none of them
+            alone says where the LiDAR was, and may be wrong as well.
+    """
+    looks = len(problem.scans) + len(problem.aside)
+    bodies = [g for b in problem.blocks if isinstance(b, TrackedBody) for g in b.groups]
+    for scan in problem.aside:
+        off_m, sigma_m = _off(scan, values, scan.pose(values))
+        others = [other for other in problem.aside if other is not scan]
+        there = [_off(scan, values, other.pose(values))[0] for other in others]
+        best = int(np.argmin(there)) if there else -1
+        fits = bool(there) and there[best] < ALIKE * off_m
+        chance = log_tail((off_m / sigma_m) ** 2, 1.0)
+        blunder = Blunder(
+            shift=_distance(scan.group, off_m, sigma_m),
+            p_value=float(np.exp(chance)),
+            p_adjusted=after_looks(float(np.exp(chance)), looks),
+            evidence=-chance,
+            detectable={"m": CONTRADICTS * sigma_m},
+            looks=looks,
+        )
+        place = (scan.group.recording, scan.group.where)
+        here = [g for g in bodies if (g.recording, g.where) == place and g not in checked]
+        yield LeftOut(blunder, [] if fits else here, others[best].group if fits else None)
+
+
+def _distance(group: Group, off_m: float, sigma_m: float) -> Shift:
+    """How far a scan's points lie off, as the shift of its group."""
+    return Shift(
+        group=group,
+        statistic=(off_m / sigma_m) ** 2,
+        dof=1,
+        offset=np.array([off_m]),
+        covariance=np.array([[sigma_m**2]]),
+        information=np.array([[sigma_m**-2]]),
+        axes=("along the beams",),
+        units=("m",),
+    )
+
+
+def _off(scan: ScanStop, values: Mapping[str, np.ndarray], T: np.ndarray) -> tuple[float, float]:
+    """How far the points lie off, the LiDAR being there, and how far they should."""
+    try:
+        rows = scan.rows(values, None, T)
+    except InputError:  # no beam meets anything from there
+        return np.inf, 0.0
+    residual_m, sigma_m = rows.residual_m[rows.usable], rows.sigma_m[rows.usable]
+    return MAD * float(np.median(np.abs(residual_m))), float(np.median(sigma_m))

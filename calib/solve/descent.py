@@ -1,0 +1,188 @@
+"""Downhill: Gauss-Newton passes while beams meet what they met, none so long that the cost rises."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from calib.linear.layout import Layout
+from calib.linear.linearise import linearise
+from calib.linear.rows import Weighing
+from calib.linear.system import Linearisation
+from calib.problem.problem import Block, Problem
+from calib.residuals.beams import Association
+from calib.solve.estimate import cost_of
+from calib.solve.graph import Graph, KeptRows
+
+Progress = Callable[[str, int, int], None]
+MAX_PASSES = 40
+# By how much a further step would lower half the chi-square: 1e-3 is a step of 0.04 sigma.
+AT_OPTIMUM = 1e-3
+# The last step of a fit is to be so much smaller: weights follow the state, and where residuals are
+# far from normal each step lowers the cost by up to two thirds of what the one before it did.
+LAST = AT_OPTIMUM / 4
+STEADY = 1e-9  # the same, of trackers and targets alone, whose steps cost little
+DIGITS = 1e-14  # of a cost: what is less is rounding
+UPHILL = 1e-9  # of a cost: a step that raises it by more is shortened
+SHORTEST, LONGEST = 1e-3, 2.0  # of a step: how much of it may be taken
+
+
+class Descent:
+    """A problem at a state, and the way down from there.
+
+    Args:
+        problem: what is estimated.
+        prior: a joint prior, or None.
+        progress: called with what is being done, how many stops are done, and of how many.
+        values: the state.
+    """
+
+    def __init__(
+        self, problem: Problem, prior: Block | None, progress: Progress, values: dict
+    ) -> None:
+        self.problem, self.progress, self.values = problem, progress, values
+        self.prior = [prior] if prior else []
+        self.held = frozenset(name for block in self.prior for name in block.variables)
+        self.associations: list[Association] = []
+        self.passes = 0
+        self.plain = False  # whether all was last linearised as for a result
+        self.linear: Linearisation | None = None
+        self.graph: Graph | None = None
+        self.lay_out()
+
+    def cost(self) -> float:
+        """Half the robust chi-square where all was linearised last, priors included."""
+        return self._cost(self.linear.beams_cost)
+
+    def _cost(self, of_beams: float) -> float:
+        """The same, with the beams' part given."""
+        linear = self.linear
+        return cost_of(linear, self.graph, linear.values) - linear.beams_chi2 / 2 + of_beams
+
+    def descend(self, tolerance: float, beams: bool = True, hasten: bool = True) -> bool:
+        """Gauss-Newton passes while beams meet what they met; whether they came to their end.
+
+        Of each step so much is taken as lowers the cost, beams weighed as where it began.
+
+        Args:
+            tolerance: of beams, the largest step of the last pass, m and rad; of trackers and
+                targets alone, by how much it may lower half the chi-square.
+            beams: False for trackers and targets alone.
+            hasten: whether the curvature of the beams' cost may take the place of their weights.
+        """
+        newton, last, misled, wait, part = False, np.inf, 0, 0, 1.0
+        before, tangent, cost, fall = None, None, np.inf, 0.0
+        weighed: Sequence[Weighing] = ()
+        for _ in range(MAX_PASSES):
+            self.linearise(newton=newton, beams=beams, weighed=weighed)
+            self.passes += 1
+            if before is not None:
+                fell = cost - self._cost_before()
+                lowest = _lowest(part, fall, fell)
+                if fell < -UPHILL * cost - STEADY:
+                    part = min(lowest, part / 2)
+                    self.values = self.moved(before, tangent, part) if part > SHORTEST else before
+                    if part <= SHORTEST:
+                        self.linearise(beams=beams)
+                        return False
+                    continue
+                part = max(1.0, lowest)
+            before, cost, weighed = self.values, self.cost(), self.linear.weighed
+            tangent, fall = self.step()
+            size = self.size(tangent)
+            self.values = self.moved(before, tangent, part)
+            if size < tolerance and fall < LAST if beams else fall < max(tolerance, DIGITS * cost):
+                return True
+            # Where a row's curvature misleads, steps grow; its weight never does. It is tried again
+            # after twice as many passes each time, lest the steps go round in circles.
+            if newton and size >= last:
+                misled, wait = misled + 1, 2 ** (misled + 1)
+            wait = max(wait - 1, 0)
+            newton, last = hasten and beams and not wait and size < last, size
+        return False
+
+    def _cost_before(self) -> float:
+        """The cost here, beams weighed as they were before the step."""
+        told = self.linear.cost_before
+        return self._cost(self.linear.beams_cost if told is None else told)
+
+    def lay_out(self) -> None:
+        """Take the problem as it is now."""
+        self.layout, self.plain = Layout.of(self.problem, kept=self.held), False
+
+    def linearise_here(self) -> None:
+        """Linearise everything at the present state, unless that was done last."""
+        if not self.plain or self.linear.values is not self.values:
+            self.linearise()
+
+    def linearise(
+        self,
+        associate: bool = False,
+        newton: bool = False,
+        beams: bool = True,
+        weighed: Sequence[Weighing] = (),
+    ) -> None:
+        """Linearise everything at the present state, and graph what is left of it."""
+        self.plain = beams and not associate and not newton
+        found = [None] * len(self.problem.scans) if associate else self.associations
+        self.linear, self.graph = self.linearised(
+            self.values, beams, associations=found, newton=newton, weighed=weighed
+        )
+
+    def linearised(
+        self,
+        values: Mapping[str, np.ndarray],
+        beams: bool,
+        associations: Sequence[Association | None] = (),
+        newton: bool = False,
+        weighed: Sequence[Weighing] = (),
+    ) -> tuple[Linearisation, Graph]:
+        what = f"pass {self.passes + 1}"
+        linear = linearise(
+            self.problem,
+            values,
+            associations,
+            newton,
+            self.layout,
+            beams=beams,
+            weighed=weighed,
+            progress=lambda done, total: self.progress(what, done, total),
+        )
+        blocks = [*self.layout.others, *self.prior, *KeptRows.of(linear)]
+        return linear, Graph(list(self.layout.outer().values()), blocks, self.held)
+
+    def step(self) -> tuple[dict[str, np.ndarray], float]:
+        """One step of the graph: the tangent step of every unknown, and by how much half the
+        chi-square was to fall."""
+        _, moved, fall = self.graph.step(self.values)
+        kept = np.concatenate([np.zeros(0), *(moved[n] for n in self.layout.outer())])
+        fall += (self.linear.chi2 - self.linear.kept[-1, -1]) / 2
+        return moved | self.linear.step(kept), fall
+
+    def moved(
+        self, before: Mapping[str, np.ndarray], tangent: Mapping[str, np.ndarray], part: float = 1.0
+    ) -> dict[str, np.ndarray]:
+        """The state after a part of a step."""
+        step = {name: part * each for name, each in tangent.items()}
+        inner = {n: self.layout.unknowns[n].moved(before[n], step[n]) for n in self.layout.inner()}
+        return {**before, **self.graph.moved(before, step), **inner}
+
+    def size(self, tangent: Mapping[str, np.ndarray]) -> float:
+        """The largest change of the calibration in a step, m or rad."""
+        return max(float(np.abs(tangent[name]).max()) for name in self.problem.calibration)
+
+
+def _lowest(part: float, fall: float, fell: float) -> float:
+    """Where along a step the cost is lowest, as the parabola through what is known has it.
+
+    Of a step a whole one lowers a quadratic cost most. Where residuals are far from normal, the
+    curvature is less than the weights say, and several steps would go the same way.
+
+    Args:
+        part: how much of the step was taken.
+        fall: by how much all of it was to lower the cost; at its start the slope is twice that.
+        fell: by how much that part did.
+    """
+    bend = 2 * fall * part - fell
+    return float(np.clip(fall * part**2 / bend, part / 10, LONGEST)) if bend > 0 else LONGEST
