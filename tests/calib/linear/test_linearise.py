@@ -212,6 +212,54 @@ def test_covariances_are_those_of_dense_rows(case, order):
             np.testing.assert_allclose(found, correlation[np.ix_(at, at)], atol=1e-6)
 
 
+def test_covariances_of_rows_over_any_unknowns_are_those_of_dense_rows(case, order):
+    """Rows about one kind of unknown each, about all of them at once, and about nothing."""
+    linear, dense = case.linear(), case.dense
+    estimate, layout, rng = case.estimate(linear), linear.layout, np.random.default_rng(5)
+    covariance = dense.covariance
+    own = [*layout.own.values()]
+    parts = [layout.finest, layout.cells, layout.kept, *own[:1], *own[-1:], np.arange(layout.size)]
+    rows = np.zeros((2 * len(parts) + 1, layout.size))
+    for i, columns in enumerate(parts):
+        some = rng.permutation(columns)[: 1 + len(columns) // 3]
+        rows[2 * i, some], rows[2 * i + 1, columns] = 1.0, rng.normal(size=len(columns))
+    rows = rows / np.sqrt(np.diag(covariance))
+    kept = estimate.covariance_of(list(layout.outer()))
+    before = rows.copy(), kept.copy()
+    found, expected = linear.covariance(rows, kept), rows @ covariance @ rows.T
+    size = sizes(expected)
+    unit = np.outer(size, size)
+    np.testing.assert_allclose(found / unit, expected / unit, atol=1e-6)
+    np.testing.assert_array_equal(rows, before[0])
+    np.testing.assert_array_equal(kept, before[1])
+
+
+def test_what_beams_say_of_their_lidars_twist_is_what_their_rows_say(case, order):
+    """Of a twist that one stop alone has: its information, its score, its products with all."""
+    linear, dense = case.linear(gradients=Gradients(len(case.dense.sigma))), case.dense
+    assert case.linear().scans == {}, "nobody asked"
+    numbers = {linear.layout.stops[s.recording.folder, s.index] for s in case.start.problem.scans}
+    assert linear.scans.keys() == numbers
+    pairs = zip(case.start.problem.scans, case.start.associations, strict=True)
+    for k, (scan, association) in enumerate(pairs):
+        rows = scan.rows(dense.values, association)
+        weight, residual = rows.whitened(False)
+        twist = np.sqrt(weight)[:, None] * rows.by_twist
+        mine = np.array([c is not None and c[0] == k for c in dense.cluster])
+        A = dense.A[mine][: len(weight)]  # the rows of its scatter come after those of its beams
+        sums = linear.scans[linear.layout.stops[scan.recording.folder, scan.index]]
+        cross = np.zeros((6, linear.layout.size))
+        np.add.at(cross.T, sums.columns, sums.cross.T)
+        size, wide = sizes(twist.T @ twist), sizes(A.T @ A)
+        unit = np.outer(size, size)
+        np.testing.assert_allclose(sums.information / unit, twist.T @ twist / unit, atol=1e-9)
+        expected = -twist.T @ (np.sqrt(weight) * residual)
+        limit = 1e-9 * np.linalg.norm(np.sqrt(weight) * residual)
+        np.testing.assert_allclose(sums.score / size, expected / size, atol=limit)
+        unit = np.outer(size, wide)
+        np.testing.assert_allclose(cross / unit, twist.T @ A / unit, atol=1e-9)
+
+
 def test_the_cost_is_half_the_sum_of_all_squares(case, order):
     estimate = case.estimate(case.linear())
     assert estimate.cost == pytest.approx(case.dense.b @ case.dense.b / 2, rel=1e-9)
