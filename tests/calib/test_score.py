@@ -8,6 +8,7 @@ import pytest
 from scipy import stats
 from scipy.sparse import csr_array
 
+from calib.blunders.chance import log_tail
 from calib.diagnosis import score
 from calib.diagnosis.jackknife import Shares
 from calib.diagnosis.linear import Linear
