@@ -1,19 +1,22 @@
 """Every group of rows against all others: by dense algebra, by leaving it out, and by chance."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from scipy import stats
 
-from calib.blunders.shifts import shifts
+from calib.blunders import judged
+from calib.blunders.shifts import Shift, shifts
 from calib.linear.clusters import Gradients
 from calib.linear.layout import Layout
 from calib.problem import build
 from calib.problem.model import Model, Source
 from calib.residuals.groups import CAD, MESH, Group
+from calib.simulation import Spec
 from calib.solve.fit import preview
 
-from . import rigs
+from . import rigs, simulated
 from .linear import cases
 from .linear.dense import Dense
 from .linear.groups import Groups
@@ -145,3 +148,105 @@ def test_groups_that_nothing_tells_apart_are_as_far_off(tmp_path):
         assert base.statistic == pytest.approx(mount.statistic, rel=1e-6)
         joints = here[Group("joints", stop, "joints")]
         assert joints.statistic < base.statistic - 1e-3, "three turns explain less than a pose"
+
+
+# ------------------------------------------------------------------------------------------- chance
+
+
+@dataclass
+class Drawn:
+    """Many recordings that differ from one model by noise alone, as dense right sides.
+
+    Args:
+        case: that model, at a state where its fit would start.
+        groups: its rows.
+        shifts: group -> how far it is off in the recording itself.
+    """
+
+    case: cases.Case
+    groups: Groups
+    shifts: dict[Group, Shift]
+
+    def statistics(self, count, sigma=1.0, seed=0):
+        """Group -> (count,) of recordings whose rows scatter by so many of their sigmas."""
+        noise = np.random.default_rng(seed).standard_normal((len(self.groups.b), count))
+        left = self.groups.beyond(sigma * noise)
+        return {group: self.groups.statistics(group, left)[0] for group in self.shifts}
+
+    def judged(self, statistics, monkeypatch):
+        """The verdict on groups that are so far off, the others being as they are."""
+        off = [replace(s, statistic=statistics.get(g, s.statistic)) for g, s in self.shifts.items()]
+        monkeypatch.setattr(judged, "shifts", lambda whole, problem: iter(off))
+        return {b.group: b for b in judged.judge(None, None)}
+
+
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory):
+    """Twelve stops, so that there are some groups of every kind."""
+    spec = Spec(lidar="hesai_pandarxt32", locations=4, stops_per_location=3, column_step=400)
+    source, _ = simulated.made(tmp_path_factory.mktemp("chance") / "rec", spec)
+    case = case_of(build([source], Model()))
+    checked = {group: shift for group, shift in found(case).items() if shift.dof}
+    return Drawn(case, Groups(case.dense), checked)
+
+
+def test_how_far_out_chance_puts_a_group_is_chi_square(drawn):
+    """Of its degrees of freedom, for rows that scatter as they say."""
+    for group, statistics in drawn.statistics(1000).items():
+        dof = drawn.shifts[group].dof
+        assert stats.kstest(statistics, stats.chi2(dof).cdf).pvalue > 1e-6, str(group)
+
+
+def test_the_p_value_of_a_few_groups_of_a_kind_is_uniform(drawn, monkeypatch):
+    """Three of a kind or fewer: their sigmas are taken at their word."""
+    few = {}
+    for group, shift in drawn.shifts.items():
+        few.setdefault((group.kind, group.what in ("joints", "base_markers")), (group, shift))
+    some = replace(drawn, shifts=dict(few.values()))
+    many = some.statistics(600)
+    p = {group: [] for group in some.shifts}
+    for k in range(600):
+        for group, b in some.judged({g: t[k] for g, t in many.items()}, monkeypatch).items():
+            p[group].append(b.p_value)
+    for group, values in p.items():
+        assert stats.kstest(values, "uniform").pvalue > 1e-4, str(group)
+
+
+@pytest.mark.parametrize("sigma", [1.0, 5.0], ids=["as they say", "five times that"])
+def test_by_chance_nothing_is_found_more_often_than_is_said(drawn, sigma, monkeypatch):
+    """Nor where all rows scatter more than they say: each kind is measured by its own bulk. With
+    many of a kind p-values are larger than uniform, as their scale is never taken to be below 1."""
+    count = 150
+    many = drawn.statistics(count, sigma)
+    alike = {group: (group.kind, group.kind == "body" and group.what) for group in many}
+    p, smallest = {}, []
+    for k in range(count):
+        found = drawn.judged({g: t[k] for g, t in many.items()}, monkeypatch)
+        smallest.append(min(b.p_adjusted for b in found.values()))
+        for group, b in found.items():
+            p.setdefault(alike[group], []).append(b.p_value)
+    for kind, values in p.items():
+        for level in (0.5, 0.1, 0.01):
+            # Groups of a draw share its scale, so draws count, not groups.
+            slack = 4 * np.sqrt(level / count)
+            assert np.mean(np.array(values) < level) < level + slack, (kind, level)
+    # One in a hundred: seven of 150 have a chance of 5e-4.
+    assert np.sum(np.array(smallest) < 0.01) < 7
+
+
+def test_a_shift_of_the_detectable_size_is_found_four_times_in_five(drawn, monkeypatch):
+    """Of one group, the others being as they are in the recording, along any of its axes."""
+    rng, hits = np.random.default_rng(1), []
+    noise = drawn.groups.beyond(rng.standard_normal((len(drawn.groups.b), 40)))
+    plain = drawn.judged({}, monkeypatch)
+    for group in list(drawn.shifts)[::8]:
+        units = np.array(drawn.shifts[group].units)
+        for unit, size in plain[group].detectable.items():
+            for k in rng.choice(40, 10, replace=False):
+                offset = size * (np.arange(len(units)) == rng.choice(np.flatnonzero(units == unit)))
+                right = noise[:, k] + drawn.groups.beyond(drawn.groups.shifted(group, offset))
+                (statistic,), _ = drawn.groups.statistics(group, right[:, None])
+                now = drawn.judged({group: float(statistic)}, monkeypatch)[group]
+                hits.append(now.found)
+    assert len(hits) > 200
+    assert 0.7 < np.mean(hits) < 0.9

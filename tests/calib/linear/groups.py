@@ -132,6 +132,13 @@ class Groups:
         along = axes.T @ (Z.T @ left[self._where(group)])
         return np.sum(np.square(along), axis=0), told @ axes @ along
 
+    def shifted(self, group: Group, offset: np.ndarray) -> np.ndarray:
+        """The right side (m,) of a group that is off by this and nothing else."""
+        Z, told, _, _ = self._checked(group)
+        out = np.zeros(len(self.b))
+        out[self._where(group)] = Z @ np.linalg.lstsq(told, offset)[0]
+        return out
+
     def off(self, group: Group) -> Off:
         """By how much a group is off what all others say."""
         (statistic,), offset = self.statistics(group, self.left[:, None])
