@@ -9,9 +9,9 @@ import numpy as np
 
 from calib.effects import Effect, FrameOffset
 from calib.linear.layout import Layout
-from calib.linear.system import Linearisation
+from calib.linear.system import Linearisation, Values
 from calib.problem.problem import Block, Problem
-from calib.problem.unknowns import Role, Unknown
+from calib.problem.unknowns import Role
 from calib.problem.without import ROD, of_the_arm
 from calib.residuals.groups import CAD, JOINTS, MESH, SCAN, Group
 from calib.residuals.targets import HangingTarget
@@ -33,7 +33,7 @@ class GroupRows:
         weight: (m,) robust.
         sigma: (m,) of each row.
         axes, units: (m,) of each row.
-        groups: group -> which rows.
+        groups: group -> (m, r) the directions in these rows in which it may be off.
         turn: (m, m) from the rows' axes to those in which an offset is told.
         information: (m, m) of that twist; None of what is no scan.
     """
@@ -99,7 +99,7 @@ def _bodies(whole: Linearisation) -> Iterator[GroupRows]:
                     sigma=np.repeat([block.sigma_rad, block.sigma_m], 3)[-per:],
                     axes=POSE[-per:],
                     units=("rad",) * (per - 3) + ("m",) * 3,
-                    groups={group: np.arange(per)},
+                    groups={group: np.eye(per)},
                     turn=turn[-per:, -per:],
                 )
 
@@ -111,8 +111,13 @@ def _targets(whole: Linearisation, graph_rows: GraphRows) -> Iterator[GroupRows]
             continue
         weight = np.repeat(np.ones(3) if block.weight is None else block.weight, 3)
         root = np.sqrt(np.where(weight > 0, weight, 1.0))
-        parts = {g: 3 * i + np.arange(3) for i, g in enumerate(block.groups) if weight[3 * i] > 0}
-        rod = {replace(block.groups[0], what=ROD): np.concatenate(list(parts.values()))}
+        every = np.split(_off_rod(block, whole.values), np.cumsum([3, 2]), axis=1)
+        parts = {
+            g: d
+            for i, (g, d) in enumerate(zip(block.groups, every, strict=True))
+            if weight[3 * i] > 0
+        }
+        rod = {replace(block.groups[0], what=ROD): np.hstack(list(parts.values()))}
         yield GroupRows(
             A=np.hstack(list(by.values())) / root[:, None],
             columns=whole.layout.columns(list(by)),
@@ -125,6 +130,15 @@ def _targets(whole: Linearisation, graph_rows: GraphRows) -> Iterator[GroupRows]
         )
 
 
+def _off_rod(block: HangingTarget, values: Values) -> np.ndarray:
+    """Directions (9, 8) in which a target's rows may be off: its upper marker only across the rod,
+    since how far apart markers are is not used."""
+    out = np.zeros((9, 8))
+    out[:3, :3] = out[6:, 5:] = np.eye(3)
+    out[3:6, 3:5] = np.linalg.svd(values[block.gravity][None])[2][1:].T
+    return out
+
+
 def _paper(whole: Linearisation, problem: Problem) -> Iterator[GroupRows]:
     """What is known beforehand: joint readings at a stop, frames, the URDF, the mesh's surfaces."""
     layout, geometry = whole.layout, _geometry(problem)
@@ -133,14 +147,16 @@ def _paper(whole: Linearisation, problem: Problem) -> Iterator[GroupRows]:
         if name in layout.unbounded or unknown.kind != "vector":
             continue
         groups: dict[Group, np.ndarray] = {}
+        each = np.split(np.eye(unknown.dim), unknown.dim, axis=1)
         if unknown.role is Role.JOINTS:
             (stop,) = layout.touched[name]
-            groups = _joints(unknown, *stops[stop])
+            groups = _joints(unknown.dofs, each, *stops[stop])
         elif unknown.role is Role.SURFACE and problem.cells[name].column == "surface":
             parts = problem.cells[name].parts.tolist()
-            groups = {Group("surface", MESH, f"surface_{p}"): _at(i) for i, p in enumerate(parts)}
+            names = (Group("surface", MESH, f"surface_{part}") for part in parts)
+            groups = dict(zip(names, each, strict=True))
         elif name in geometry:
-            groups = _geometric(unknown, geometry[name])
+            groups = _geometric(unknown.dofs, each, geometry[name])
         if groups:
             yield GroupRows(
                 A=np.diag(1.0 / unknown.sigma),
@@ -154,23 +170,24 @@ def _paper(whole: Linearisation, problem: Problem) -> Iterator[GroupRows]:
             )
 
 
-def _joints(unknown: Unknown, where: str, recording: str) -> dict[Group, np.ndarray]:
+def _joints(
+    dofs: Sequence[str], each: Sequence[np.ndarray], where: str, recording: str
+) -> dict[Group, np.ndarray]:
     """All joints of a stop, and each."""
-    single = [Group("joints", where, dof, recording) for dof in unknown.dofs]
-    groups = {Group("joints", where, JOINTS, recording): np.arange(unknown.dim)}
-    return groups | {g: _at(i) for i, g in enumerate(single) if unknown.dim > 1}
+    groups = {Group("joints", where, JOINTS, recording): np.hstack(each)}
+    if len(dofs) > 1:
+        groups |= {Group("joints", where, d, recording): e for d, e in zip(dofs, each, strict=True)}
+    return groups
 
 
-def _geometric(unknown: Unknown, effect: Effect) -> dict[Group, np.ndarray]:
+def _geometric(
+    dofs: Sequence[str], each: Sequence[np.ndarray], effect: Effect
+) -> dict[Group, np.ndarray]:
     """A frame as a whole; a length or a joint's zero, each."""
     if isinstance(effect, FrameOffset):
-        return {Group("frame", CAD, effect.name): np.arange(unknown.dim)}
-    dofs = enumerate(unknown.dofs)
-    return {Group("frame", CAD, f"{effect.name}.{dof}"): _at(i) for i, dof in dofs}
-
-
-def _at(i: int) -> np.ndarray:
-    return np.array([i])
+        return {Group("frame", CAD, effect.name): np.hstack(each)}
+    names = (Group("frame", CAD, f"{effect.name}.{dof}") for dof in dofs)
+    return dict(zip(names, each, strict=True))
 
 
 def _geometry(problem: Problem) -> dict[str, Effect]:
@@ -197,7 +214,7 @@ def _scans(whole: Linearisation, problem: Problem) -> Iterator[GroupRows]:
             sigma=np.ones(6),
             axes=POSE,
             units=("rad",) * 3 + ("m",) * 3,
-            groups={Group("scan", where, SCAN, recording): np.arange(6)},
+            groups={Group("scan", where, SCAN, recording): np.eye(6)},
             information=sums.information,
         )
 

@@ -128,11 +128,9 @@ def _of_set(some: Sequence[GroupRows], H: np.ndarray, b: np.ndarray) -> Iterator
     for rows in some:
         here = slice(first, first + len(rows.A))
         first = here.stop
-        for group, at in rows.groups.items():
-            if rows.information is not None:
-                yield _of_scan(group, rows, b[here], H[here, here])
-            else:
-                yield _of_rows(group, rows, at, b[here][at], H[here, here][np.ix_(at, at)])
+        of = _of_rows if rows.information is None else _of_scan
+        for group in rows.groups:
+            yield of(group, rows, b[here], H[here, here])
 
 
 def _of_scan(group: Group, rows: GroupRows, score: np.ndarray, explained: np.ndarray) -> Shift:
@@ -155,22 +153,23 @@ def _of_scan(group: Group, rows: GroupRows, score: np.ndarray, explained: np.nda
     )
 
 
-def _of_rows(group: Group, rows: GroupRows, at: np.ndarray, b: np.ndarray, H: np.ndarray) -> Shift:
+def _of_rows(group: Group, rows: GroupRows, b: np.ndarray, H: np.ndarray) -> Shift:
     """The residual of a group under the fit without it; see the module."""
-    values, axes = np.linalg.eigh(np.eye(len(at)) - H)
+    own = rows.groups[group]
+    values, axes = np.linalg.eigh(own.T @ (np.eye(len(H)) - H) @ own)
     seen = values > UNCHECKED
-    basis = axes[:, seen]
-    along = (basis.T @ b) / values[seen]
-    turn = basis if rows.turn is None else rows.turn[np.ix_(at, at)] @ basis
-    out = rows.sigma[at][:, None] * turn
-    told = turn / rows.sigma[at][:, None]
+    values, basis = values[seen], own @ axes[:, seen]
+    along = (basis.T @ b) / values
+    at = np.flatnonzero(np.any(own != 0, axis=1))
+    turned = (basis if rows.turn is None else rows.turn @ basis)[at]
+    out, told = rows.sigma[at][:, None] * turned, turned / rows.sigma[at][:, None]
     return Shift(
         group=group,
-        statistic=float(along @ (values[seen] * along)),
-        dof=int(seen.sum()),
+        statistic=float(along @ (values * along)),
+        dof=len(values),
         offset=-out @ along,
-        covariance=(out / values[seen]) @ out.T,
-        information=(told * values[seen]) @ told.T,
+        covariance=(out / values) @ out.T,
+        information=(told * values) @ told.T,
         axes=[rows.axes[i] for i in at],
         units=[rows.units[i] for i in at],
     )

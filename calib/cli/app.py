@@ -99,8 +99,8 @@ def say(document: dict[str, Any], text: str, as_json: bool) -> None:
 
 def end_unless_converged(run: Run) -> None:
     """End with exit code 3, and the sentence on stderr, where a run has not converged."""
-    for sentence in run.warning:
-        print(f"rigcal: {run.folder}: {sentence}", file=sys.stderr)
+    if not run.converged:
+        print(f"rigcal: {run.folder}: {run.warning[0]}", file=sys.stderr)
         raise SystemExit(NOT_TO_BE_USED)
 
 

@@ -115,13 +115,8 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NAMES) -> Search:
             found = [f.with_effect(swapped.get(f.effect.name)) for f in found]
     last = looks[-1]
     unnamed = structures(last, progress)
-    done = Search(
-        looks=looks,
-        found=found,
-        blunders=left,
-        unnamed=unnamed,
-        scatter=_scatter(last, progress),
-    )
+    scatter = _scatter(last, progress)
+    done = Search(looks=looks, found=found, blunders=left, unnamed=unnamed, scatter=scatter)
     if found and done.dressed_up(0):
         return replace(done, at_first=structures(looks[0], progress))
     return done

@@ -134,7 +134,8 @@ class Stand:
                 swapped[effect.name] = effect.at(float(f"{effect.shape * by:.6g}"))
         if not swapped:
             return self, {}
-        model = Model(tuple(swapped.get(e.name, e) for e in self.model.effects), self.model.fixed)
+        effects = tuple(swapped.get(e.name, e) for e in self.model.effects)
+        model = replace(self.model, effects=effects)
         start = replace(self.estimate.start, state=self._state_with(swapped))
         return self._refitted(model, start, progress), swapped
 

@@ -117,6 +117,7 @@ def conclude(
     misfit: Mapping[str, float],
     weak: Sequence[Mapping[str, Any]],
     rejected: Rejects | None = None,
+    forbids: Sequence[str] = (),
 ) -> Diagnosis:
     """Sum up a search.
 
@@ -126,9 +127,12 @@ def conclude(
         misfit: by instrument.
         weak: weak directions.
         rejected: what the fit threw away.
+        forbids: why the run is not to be believed, whatever its model explains; a clause each.
     """
     first = found.looks[0]
     verdict = _verdict(found, rejected)
+    if verdict == "adequate" and forbids:
+        verdict = BAD
     candidates = [_candidate(c, verdict, found, held_out) for c in _ranked(found)]
     untestable = _untestable(first)
     thrown = rejected.unexplained() if rejected and verdict == UNNAMED else []
@@ -136,6 +140,8 @@ def conclude(
     unexplained = [*thrown, *unexplained]
     blunders = [told.document(left, _rig(left, first)) for left in found.blunders]
     sentences = _sentences(verdict, found, candidates, unexplained, untestable, blunders)
+    if forbids and not found.blunders:
+        sentences.insert(0, f"This run is not to be believed as it stands: {'; '.join(forbids)}.")
     if rejected:
         sentences.insert(0 if verdict == UNNAMED else len(sentences), rejected.sentence)
     return Diagnosis(
@@ -339,8 +345,6 @@ def _sentences(
             f"The model is adequate: of {len(look.named.candidates)} known effects and "
             f"{len(look.unnamed.candidates)} kinds of structure none stands out from chance."
         )
-    if without := look.stand.model.without[: len(look.stand.model.without) - len(blunders)]:
-        out.append(f"Left out before: {', '.join(without)}.")
     out += [each["sentence"] for each in blunders[:LISTED]]
     if len(blunders) > LISTED:
         out.append(f"And {len(blunders) - LISTED} more, in diagnosis.json.")

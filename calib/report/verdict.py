@@ -6,12 +6,12 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from calib.runs.belief import FAR_OFF, forbids, misfit_sentence, over_floor
 from calib.runs.calibrate import TOLERATED
 from calib.runs.run import Run
 from calib.show.misfit import standing_out
 
 AT_THE_FLOOR = 1.25  # times the noise floor: a held-out error as good as it
-FAR_OFF = 3.0  # times its sigmas, or the floor: residuals that something large is behind
 MEANING = {"green": "use it", "amber": "use it with care", "red": "do not use it yet"}
 
 
@@ -47,7 +47,7 @@ def judge(run: Run, diagnosis: Mapping[str, Any] | None) -> Verdict:
     red, amber = list(_wrong(run, diagnosis)), list(_doubtful(run, diagnosis))
     light = "red" if red else "amber" if amber else "green"
     sentence = diagnosis["sentences"][0] if diagnosis else _undiagnosed(run)
-    sentence = next(iter(run.warning), sentence)
+    sentence = sentence if run.converged else run.warning[0]
     fine = "no effect is missing, and stops that it never saw are predicted as well as noise allows"
     return Verdict(light, sentence, tuple(red + amber) or (fine,))
 
@@ -64,13 +64,9 @@ def _undiagnosed(run: Run) -> str:
 def _wrong(run: Run, diagnosis: Mapping[str, Any] | None) -> Iterator[str]:
     if diagnosis and diagnosis["verdict"] == "missing_effect":
         yield "an effect is missing that is worth adding"
-    if not run.converged:
-        yield "the fit has not converged"
-    for kind, times in run.summary["misfit"].items():
-        if times > FAR_OFF:
-            yield _misfit(kind, times)
-    if (times := _over_floor(run)) > FAR_OFF:
-        yield f"the held-out error is {times:.1f} times the noise floor"
+    elif diagnosis and diagnosis["verdict"] == "bad_data":
+        yield "something in the recording is wrong, which is to be mended or left out"
+    yield from forbids(run)
 
 
 def _doubtful(run: Run, diagnosis: Mapping[str, Any] | None) -> Iterator[str]:
@@ -83,24 +79,13 @@ def _doubtful(run: Run, diagnosis: Mapping[str, Any] | None) -> Iterator[str]:
         yield "there is structure that no known effect explains"
     if rms.get("held_out") is None:
         yield "no stops were held out, so nothing says how well it predicts"
-    if AT_THE_FLOOR < (times := _over_floor(run)) <= FAR_OFF:
+    if AT_THE_FLOOR < (times := over_floor(run)) <= FAR_OFF:
         yield f"the held-out error is {times:.1f} times the noise floor"
     for kind, times in run.summary["misfit"].items():
         if TOLERATED < times <= FAR_OFF:
-            yield _misfit(kind, times)
+            yield misfit_sentence(kind, times)
     yield from standing_out(run.summary)
     for weak in (diagnosis or {}).get("weak_directions", ()):
         if (weak["sigma_mm"] or 0.0) > FAR_OFF * rms["noise_floor"]:
             names = " and ".join(weak["parameters"])
             yield f"{names} may still be off by {weak['sigma_mm']:.1f} mm (one sigma)"
-
-
-def _misfit(kind: str, times: float) -> str:
-    what = "errors of the reference" if kind == "reference" else f"residuals of {kind}"
-    return f"the {what} are {times:.1f} times larger than their sigmas allow"
-
-
-def _over_floor(run: Run) -> float:
-    """The held-out error in noise floors; 0 where nothing was held out."""
-    rms = run.summary["rms_mm"]
-    return (rms.get("held_out") or 0.0) / rms["noise_floor"]

@@ -15,6 +15,7 @@ from calib.effects import DEFAULT
 from calib.problem import build
 from calib.results.errors import Errors
 from calib.results.holdout import held_out
+from calib.runs.belief import forbids
 from calib.runs.reopen import model_of, reopened, start_of
 from calib.runs.run import DIAGNOSIS, Run
 from calib.solve.fit import Progress, resume
@@ -58,6 +59,7 @@ def diagnose(
         run.summary["misfit"],
         weak_directions(run.solution, float(run.summary["sigmas_widened_by"]), found.looks[0]),
         rejected,
+        forbids(run),
     )
     result = replace(
         result,

@@ -89,8 +89,25 @@ class Run:
 
     @property
     def warning(self) -> list[str]:
-        """What is to stand above everything that is shown of the run: a sentence, or nothing."""
-        return [] if self.converged else [NOT_CONVERGED]
+        """What is to stand above everything that is shown of the run, a sentence each."""
+        out = [] if self.converged else [NOT_CONVERGED]
+        if self.set_aside:
+            out.append(
+                f"Set aside, as they contradict all other scans: {', '.join(self.set_aside)}"
+            )
+        if self.left_out:
+            out.append(f"Left out: {', '.join(self.left_out)}")
+        return out
+
+    @property
+    def set_aside(self) -> list[str]:
+        """Scans that the fit could not use."""
+        return list(self.summary.get("set_aside", ()))
+
+    @property
+    def left_out(self) -> list[str]:
+        """What was left out of its recordings."""
+        return list(self.model.get("without", ()))
 
     def refuse_unconverged(self, force: bool) -> None:
         """Raise InputError for a fit that did not converge, unless its numbers are wanted still."""

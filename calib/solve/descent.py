@@ -1,4 +1,4 @@
-"""Downhill: Gauss-Newton passes while beams meet what they met, none so long that the cost rises."""
+"""Downhill: Gauss-Newton passes while beams meet what they met, none so far that the cost rises."""
 
 from __future__ import annotations
 
@@ -138,6 +138,7 @@ class Descent:
         newton: bool = False,
         weighed: Sequence[Weighing] = (),
     ) -> tuple[Linearisation, Graph]:
+        """The linearisation at a state, and the graph that it is in."""
         what = f"pass {self.passes + 1}"
         linear = linearise(
             self.problem,

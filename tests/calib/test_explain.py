@@ -25,16 +25,17 @@ class World:
     Args:
         errors: effects beside those of the first fit -> held-out rms.
         named: the same -> what the diagnosis of that model calls worth adding.
+        spoiled: what a diagnosis says to leave out, as long as it is not.
     """
 
-    def __init__(self, errors, named):
-        self.errors, self.named, self.fits = errors, named, []
+    def __init__(self, errors, named, spoiled=()):
+        self.errors, self.named, self.spoiled, self.fits = errors, named, spoiled, []
 
     def run(self, out, model, below=None):
         names = frozenset(model.names) - frozenset(Model().names)
         self.fits.append(names)
         out.mkdir(parents=True)
-        error = self.errors[names]
+        error = self.errors[names] + 5.0 * len(model.without)
         rms = {"fit": error, "held_out": error, "noise_floor": 1.0}
         grown_from = str(below.folder.resolve()) if below else None
         return Run(out, model.document() | {"grown_from": grown_from}, {"rms_mm": rms}, None)
@@ -43,7 +44,13 @@ class World:
         names = frozenset(run.effects) - frozenset(Model().names)
         adding = self.named.get(names, [])
         verdict = "missing_effect" if adding else "adequate"
-        return SimpleNamespace(worth_adding=adding, verdict=verdict, sentences=[str(sorted(names))])
+        spoiled = [token for token in self.spoiled if token not in run.model["without"]]
+        return SimpleNamespace(
+            worth_adding=adding,
+            blunders=[{"without": token} for token in spoiled],
+            verdict="bad_data" if spoiled else verdict,
+            sentences=[str(sorted(names))],
+        )
 
 
 def of(*names):
@@ -88,6 +95,16 @@ def test_what_lowers_the_held_out_error_is_added_until_nothing_is_named(climbed,
         "02",
         EXPLANATION,
     ]
+
+
+def test_what_a_mishap_spoiled_is_left_out_first_whatever_the_error_then_is(climbed):
+    """Its rows are gone from the error too, so that says nothing."""
+    spoiled = ("L00P01:scan", "cad:lidar")
+    found = climbed(World({of(): 9.0, of(A): 5.0}, {of(): [A]}, spoiled))
+    assert [s["left_out"] for s in found.steps] == [[], [*spoiled], []]
+    assert ladder(found) == [([], [], 9.0), ([], [], 19.0), ([A], [], 15.0)]
+    assert [run.model["without"] for run in found.runs] == [[], [*spoiled], [*spoiled]]
+    assert found.diagnosis.verdict == "adequate"
 
 
 @pytest.mark.parametrize("error", [9.0, 9.1, 8.98], ids=["the same", "worse", "hardly less"])

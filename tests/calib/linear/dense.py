@@ -31,7 +31,8 @@ def away(unknown: Unknown, value: np.ndarray) -> np.ndarray:
 
 @dataclass
 class Dense:
-    """Whitened rows A (m, U) and minus their residuals b (m,), and of what kind each is.
+    """Whitened rows A (m, U) and minus their residuals b (m,), of what kind each is, and which are
+    those of ``scan NUMBER``, ``block NUMBER`` and ``prior:UNKNOWN``.
 
     Args:
         problem: what is estimated, surfaces' unknowns included.
@@ -50,6 +51,7 @@ class Dense:
     b: np.ndarray = field(init=False)
     kind: np.ndarray = field(init=False)
     cluster: list[tuple[int, object, int] | None] = field(init=False)
+    rows_of: dict[str, slice] = field(init=False)
 
     def __post_init__(self) -> None:
         unknowns = self.problem.variables
@@ -57,13 +59,15 @@ class Dense:
         self.at = {n: np.arange(i, k) for n, i, k in zip(unknowns, ends, ends[1:], strict=False)}
         self.sigma = np.concatenate([u.sigma for u in unknowns.values()])
         self._parts: list[tuple[np.ndarray, np.ndarray, str, list]] = []
+        self.rows_of = {}
         for number in range(len(self.problem.scans)):
             self._beams(number)
-        for block in [*self.problem.blocks, *self.held]:
+        for i, block in enumerate([*self.problem.blocks, *self.held]):
             residual, d = block.evaluate(self.values, True)
             kind = "body" if isinstance(block, TrackedBody) else "other"
             name = f"{kind}:{','.join(block.variables)}"
-            self._add(-residual, {n: self._tangent(n, x) for n, x in d.items()}, name)
+            by = {n: self._tangent(n, x) for n, x in d.items()}
+            self._add(-residual, by, name, of=f"block {i}")
         without = {name for block in self.held for name in block.variables}
         for name, unknown in unknowns.items():
             if name not in without:
@@ -73,7 +77,11 @@ class Dense:
         self.kind = np.concatenate([np.full(len(b), kind) for _, b, kind, _ in self._parts])
         self.cluster = [c for _, _, _, cluster in self._parts for c in cluster]
 
-    def _add(self, b: np.ndarray, by: Mapping, kind: str, cluster: list | None = None) -> None:
+    def _add(
+        self, b: np.ndarray, by: Mapping, kind: str, cluster: list | None = None, of: str = ""
+    ) -> None:
+        first = sum(len(each) for _, each, _, _ in self._parts)
+        self.rows_of[of or kind] = slice(first, first + len(b))
         A = np.zeros((len(b), len(self.sigma)))
         for name, d in by.items():
             A[:, self.at[name]] += d
@@ -110,9 +118,11 @@ class Dense:
         met = rows.view["surface" if "surface" in rows.view.columns else "plane"]
         cluster = [(number, scan.room, int(part)) for part in met]
         weighted = {name: root[:, None] * d for name, d in by.items()}
-        self._add(-root * residual, weighted, "beams", cluster)
+        self._add(-root * residual, weighted, "beams", cluster, of=f"scan {number}")
         if rows.spread is not None:
-            self._add(-rows.spread.residual, rows.spread.columns, "beams", cluster)
+            self._add(
+                -rows.spread.residual, rows.spread.columns, "beams", cluster, f"spread {number}"
+            )
 
     # ------------------------------------------------------------------------- what follows from it
 

@@ -1,108 +1,25 @@
 """The linearisation against dense rows: what is kept, the step, the covariance, and gradients."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from calib.effects import DEFAULT
 from calib.linear import assembly
 from calib.linear.clusters import Gradients
 from calib.linear.layout import Layout
-from calib.linear.linearise import linearise
 from calib.linear.parallel import workers
-from calib.linear.system import Linearisation
-from calib.problem import build
-from calib.problem.model import Model, Source
-from calib.problem.prior import JointPrior
-from calib.simulation import Spec
-from calib.solve.estimate import Estimate
-from calib.solve.fit import preview
-from calib.solve.graph import Graph, KeptRows
 
-from .. import rigs, simulated
-from .dense import Dense
+from .. import rigs
+from .cases import CASES, made
 
-MODEL = Model((*DEFAULT, "noise_range", "optitrack_scale", "faro_scale"))
-PERFECT = {"frame": "faro", "mesh": "reference/mesh.ply", "sigma_m": 0}
-PLAIN_ARM = {"urdf": "arm.urdf", "base": "arm_base", "tip": "arm_end", "sigma_joint_rad": 0}
-BOXES = {  # changes of rig.yaml
-    "stop by stop": {"base": {"moves": "stop"}},
-    "by location": {},
-    "never moved, no joint noise": {"base": {"moves": "never"}, "arm": PLAIN_ARM},
-    "no joint noise": {"base": {"moves": "stop"}, "arm": PLAIN_ARM},
-    "no tracker": {"tracker": None, "target": None, "base": {"moves": "stop"}},
-    "perfect mesh": {"reference": PERFECT},
-    "no lidar": {"lidar": None},
-}
-SIMULATED = {
-    "simulated": Spec(locations=2, stops_per_location=2, column_step=128),
-    "planes": Spec(mesh=False, targets=0, locations=3, stops_per_location=2, column_step=100),
-}
-CASES = (*BOXES, *SIMULATED, "a stop without scan", "two recordings", "an earlier estimate")
 # Order of elimination, and whether the chain behind twists is taken stop by stop or as a whole.
 ORDERS = {"cells first": (False, 10**9), "by blocks": (False, 0), "stops first": (True, 0)}
 
 
-@dataclass
-class Case:
-    """A problem at a state near no optimum, linearised densely."""
-
-    start: Estimate
-    dense: Dense
-    prior: JointPrior | None
-
-    @property
-    def held(self) -> tuple[str, ...]:
-        return self.prior.variables if self.prior else ()
-
-    def linear(self, newton: bool = False, gradients: Gradients | None = None) -> Linearisation:
-        problem, given = self.start.problem, self.start.associations
-        layout = Layout.of(problem, kept=self.held)
-        return linearise(problem, self.dense.values, given, newton, layout, gradients)
-
-    def estimate(self, linear: Linearisation) -> Estimate:
-        """As a fit would leave it."""
-        blocks = [*linear.layout.others, *KeptRows.of(linear)]
-        blocks += [self.prior] if self.prior else []
-        unknowns = list(linear.layout.outer().values())
-        graph = Graph(unknowns, blocks, frozenset(self.held))
-        return replace(self.start, values=self.dense.values, graph=graph, linear=linear)
-
-
-def sources(name, folder):
-    if name in SIMULATED:
-        return [simulated.made(folder / "rec", SIMULATED[name])[0]]
-    if name == "two recordings":
-        return [Source.open(rigs.write(folder / str(k), seed=k)) for k in (1, 2)]
-    box = rigs.write(folder / "box", seed=6, **BOXES.get(name, {}))
-    if name == "a stop without scan":
-        (box / "scans/s1.parquet").unlink()
-    return [Source.open(box)]
-
-
-def tied(problem):
-    """Two frames and where one stop stood, known together from before."""
-    held = [problem.variables[name] for name in ("mount", "root@a", "joints@s3")]
-    spread = np.diag(np.concatenate([u.sigma for u in held]))
-    mixed = spread @ np.random.default_rng(0).normal(size=(len(spread), 40))
-    return JointPrior(held, {u.name: u.mean for u in held}, mixed @ mixed.T / 40)
-
-
 @pytest.fixture(scope="module", params=CASES)
 def case(request, tmp_path_factory):
-    problem = build(sources(request.param, tmp_path_factory.mktemp("linear")), MODEL)
-    start = preview(problem)
-    prior = tied(problem) if request.param == "an earlier estimate" else None
-    whole = start.problem
-    sigma = {name: u.sigma for name, u in whole.variables.items()}
-    rng = np.random.default_rng(1)
-    steps = {n: np.minimum(s, 1e-3) * rng.uniform(-1, 1, len(s)) for n, s in sigma.items()}
-    values = {
-        n: rigs.retract(u.kind, start.values[n], steps[n]) for n, u in whole.variables.items()
-    }
-    blocks = (prior,) if prior else ()
-    return Case(start, Dense(whole, values, start.associations, held=blocks), prior)
+    return made(request.param, tmp_path_factory.mktemp("linear"))
 
 
 @pytest.fixture(params=ORDERS)
@@ -210,6 +127,54 @@ def test_covariances_are_those_of_dense_rows(case, order):
             at = dense.columns(names)
             found = estimate.covariance_of(names) / np.outer(sigma[at], sigma[at])
             np.testing.assert_allclose(found, correlation[np.ix_(at, at)], atol=1e-6)
+
+
+def test_covariances_of_rows_over_any_unknowns_are_those_of_dense_rows(case, order):
+    """Rows about one kind of unknown each, about all of them at once, and about nothing."""
+    linear, dense = case.linear(), case.dense
+    estimate, layout, rng = case.estimate(linear), linear.layout, np.random.default_rng(5)
+    covariance = dense.covariance
+    own = [*layout.own.values()]
+    parts = [layout.finest, layout.cells, layout.kept, *own[:1], *own[-1:], np.arange(layout.size)]
+    rows = np.zeros((2 * len(parts) + 1, layout.size))
+    for i, columns in enumerate(parts):
+        some = rng.permutation(columns)[: 1 + len(columns) // 3]
+        rows[2 * i, some], rows[2 * i + 1, columns] = 1.0, rng.normal(size=len(columns))
+    rows = rows / np.sqrt(np.diag(covariance))
+    kept = estimate.covariance_of(list(layout.outer()))
+    before = rows.copy(), kept.copy()
+    found, expected = linear.covariance(rows, kept), rows @ covariance @ rows.T
+    size = sizes(expected)
+    unit = np.outer(size, size)
+    np.testing.assert_allclose(found / unit, expected / unit, atol=1e-6)
+    np.testing.assert_array_equal(rows, before[0])
+    np.testing.assert_array_equal(kept, before[1])
+
+
+def test_what_beams_say_of_their_lidars_twist_is_what_their_rows_say(case, order):
+    """Of a twist that one stop alone has: its information, its score, its products with all."""
+    linear, dense = case.linear(gradients=Gradients(len(case.dense.sigma))), case.dense
+    assert case.linear().scans == {}, "nobody asked"
+    numbers = {linear.layout.stops[s.recording.folder, s.index] for s in case.start.problem.scans}
+    assert linear.scans.keys() == numbers
+    pairs = zip(case.start.problem.scans, case.start.associations, strict=True)
+    for k, (scan, association) in enumerate(pairs):
+        rows = scan.rows(dense.values, association)
+        weight, residual = rows.whitened(False)
+        twist = np.sqrt(weight)[:, None] * rows.by_twist
+        mine = np.array([c is not None and c[0] == k for c in dense.cluster])
+        A = dense.A[mine][: len(weight)]  # the rows of its scatter come after those of its beams
+        sums = linear.scans[linear.layout.stops[scan.recording.folder, scan.index]]
+        cross = np.zeros((6, linear.layout.size))
+        np.add.at(cross.T, sums.columns, sums.cross.T)
+        size, wide = sizes(twist.T @ twist), sizes(A.T @ A)
+        unit = np.outer(size, size)
+        np.testing.assert_allclose(sums.information / unit, twist.T @ twist / unit, atol=1e-9)
+        expected = -twist.T @ (np.sqrt(weight) * residual)
+        limit = 1e-9 * np.linalg.norm(np.sqrt(weight) * residual)
+        np.testing.assert_allclose(sums.score / size, expected / size, atol=limit)
+        unit = np.outer(size, wide)
+        np.testing.assert_allclose(cross / unit, twist.T @ A / unit, atol=1e-9)
 
 
 def test_the_cost_is_half_the_sum_of_all_squares(case, order):

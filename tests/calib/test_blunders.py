@@ -1,0 +1,252 @@
+"""Every group of rows against all others: by dense algebra, by leaving it out, and by chance."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from calib.blunders import judged
+from calib.blunders.shifts import Shift, shifts
+from calib.linear.clusters import Gradients
+from calib.linear.layout import Layout
+from calib.problem import build
+from calib.problem.model import Model, Source
+from calib.residuals.groups import CAD, MESH, Group
+from calib.simulation import Spec
+from calib.solve.fit import preview
+
+from . import rigs, simulated
+from .linear import cases
+from .linear.dense import Dense
+from .linear.groups import Groups
+
+CASES = [name for name in cases.CASES if name != "an earlier estimate"]
+WELL = 1e-3  # of what a group says, checked by others: rows can be left out without loss of digits
+BY_STOP = {"base": {"moves": "stop"}}
+
+
+@pytest.fixture(scope="module", params=CASES)
+def both(request, tmp_path_factory):
+    """A case, and the dense rows of each place with the full weight there."""
+    case = cases.made(request.param, tmp_path_factory.mktemp("blunders"))
+    where = {g.where for b in case.start.problem.blocks for g in b.groups}
+    places = {*where, *(s.name for s in case.start.problem.scans), CAD, MESH}
+    if not case.weighted:
+        return case, dict.fromkeys(places, Groups(case.dense))
+    return case, {place: Groups(case.dense, {place}) for place in places}
+
+
+def found(case):
+    """Group -> its shift, as the program has it."""
+    linear = case.linear(gradients=Gradients(len(case.dense.sigma)))
+    return {shift.group: shift for shift in shifts(linear, case.start.problem)}
+
+
+def case_of(problem):
+    """A problem where its fit would start, with the weights that it has."""
+    start = preview(problem)
+    return cases.Case(start, Dense(start.problem, start.values, start.associations), None)
+
+
+def assert_same(shift, off, tolerance=1e-6):
+    name = str(shift.group)
+    assert shift.dof == off.dof, name
+    assert shift.statistic == pytest.approx(off.statistic, rel=tolerance, abs=tolerance), name
+    size = np.sqrt(np.maximum(np.diag(off.covariance), 1e-300))
+    limit = tolerance * (1 + np.abs(off.offset / size).max(initial=0.0))
+    np.testing.assert_allclose(shift.offset / size, off.offset / size, atol=limit, err_msg=name)
+    unit = np.outer(size, size)
+    np.testing.assert_allclose(
+        shift.covariance / unit, off.covariance / unit, atol=tolerance, err_msg=name
+    )
+
+
+# ------------------------------------------------------------------------------------------ algebra
+
+
+@pytest.mark.parametrize("stops_first", [False, True], ids=["cells first", "stops first"])
+def test_every_group_is_off_as_dense_rows_say(both, stops_first, monkeypatch):
+    monkeypatch.setattr(Layout, "stops_first", stops_first)
+    case, there = both
+    here = found(case)
+    assert here.keys() == {*there[CAD].parts, *there[CAD].scans}
+    for group, shift in here.items():
+        assert_same(shift, there[group.where].off(group))
+        axes, units = shift.axes, shift.units
+        assert len(axes) == len(units) == len(shift.offset) == len(shift.information)
+
+
+@pytest.mark.parametrize("name", ["stop by stop", "no lidar", "a stop without scan"])
+def test_a_group_is_off_by_what_a_solution_without_its_rows_says(name, tmp_path):
+    """Of each kind that which is furthest off."""
+    case = cases.made(name, tmp_path)
+    here, there, seen = found(case), Groups(case.dense), set()
+    for group in sorted(here, key=lambda g: -here[g].statistic):
+        kind = group.kind, group.what in ("rod", "upper"), len(here[group].axes)
+        if kind not in seen and there.well(group) > WELL:
+            seen.add(kind)
+            assert_same(here[group], there.left_out(group))
+    assert {kind for kind, _, _ in seen} >= {"body", "target", "frame", "joints"}
+
+
+def test_rows_that_lost_weight_are_judged_as_if_they_had_not(tmp_path):
+    """With all weights of a place at 1; those elsewhere stay, so that one wild row hides none."""
+    source = Source.open(rigs.write(tmp_path / "box", seed=6, **BY_STOP))
+    case = case_of(build([source], cases.MODEL))
+    problem, plain = case.start.problem, found(case)
+    weights = {("body", "s1"): [0.02], ("body", "s3"): [0.5], ("target", "t2"): [0.1, 1.0, 0.4]}
+    at = [(b.groups[0].kind, b.groups[0].where) for b in problem.blocks]
+    given = (weights.get(key) for key in at)
+    blocks = [
+        replace(b, weight=w and np.array(w)) for b, w in zip(problem.blocks, given, strict=True)
+    ]
+    lighter = {"joints@s1": 0.3, "joints@s2": 0.05, "lidar": 0.2, "arm_link_length": 0.6}
+    unknowns = {n: replace(u, weight=lighter.get(n, 1.0)) for n, u in problem.variables.items()}
+    problem = replace(problem, blocks=blocks, variables=unknowns)
+    dense = Dense(problem, case.dense.values, case.dense.associations)
+    case = cases.Case(replace(case.start, problem=problem), dense, None)
+    here = found(case)
+    assert here.keys() == plain.keys()
+    for place in ("s0", "s1", "s2", "t2", CAD):
+        there = Groups(case.dense, {place})
+        for group in (g for g in here if g.where == place):
+            assert_same(here[group], there.off(group))
+    wild = Group("body", "s1", "mount_markers")
+    assert here[wild].statistic != pytest.approx(plain[wild].statistic, rel=1e-3), (
+        "others lost some"
+    )
+
+
+def test_what_nothing_contradicts_has_no_degree_of_freedom(tmp_path):
+    """A body that alone says where the rig stands; a scan that alone does, planes known or not."""
+    rig = {**BY_STOP, "arm": cases.PLAIN_ARM, "lidar": None, "target": None, "reference": None}
+    tracker = rigs.drawing()["tracker"] | {"bodies": ["base_markers"]}
+    folder = rigs.write(tmp_path / "one body", seed=2, **rig, tracker=tracker)
+    (folder / "targets.csv").unlink()
+    one = found(case_of(build([Source.open(folder)], Model(("arm_link_length",)))))
+    bodies = [shift for group, shift in one.items() if group.kind == "body"]
+    assert len(bodies) == 4
+    blind = {"tracker": None, "target": None, **BY_STOP}
+    folder = rigs.write(tmp_path / "no tracker", seed=2, **blind)
+    alone = found(case_of(build([Source.open(folder)], Model())))
+    scans = [shift for group, shift in alone.items() if group.kind == "scan"]
+    assert len(scans) == 4
+    for shift in (*bodies, *scans):
+        assert (shift.dof, shift.statistic) == (0, 0.0), str(shift.group)
+        assert not shift.offset.any() and not shift.information.any()
+
+
+def test_groups_that_nothing_tells_apart_are_as_far_off(tmp_path):
+    """Without scans, at a stop where only two bodies and the encoders meet, either body takes all
+    of what contradicts the other."""
+    folder = rigs.write(tmp_path / "box", seed=5, lidar=None, **BY_STOP)
+    here = found(case_of(build([Source.open(folder)], Model(("arm_joint_offset",)))))
+    for stop in rigs.STOPS:
+        base, mount = (here[Group("body", stop, b)] for b in ("base_markers", "mount_markers"))
+        assert base.dof == mount.dof == 6
+        assert base.statistic == pytest.approx(mount.statistic, rel=1e-6)
+        joints = here[Group("joints", stop, "joints")]
+        assert joints.statistic < base.statistic - 1e-3, "three turns explain less than a pose"
+
+
+# ------------------------------------------------------------------------------------------- chance
+
+
+@dataclass
+class Drawn:
+    """Many recordings that differ from one model by noise alone, as dense right sides.
+
+    Args:
+        case: that model, at a state where its fit would start.
+        groups: its rows.
+        shifts: group -> how far it is off in the recording itself.
+    """
+
+    case: cases.Case
+    groups: Groups
+    shifts: dict[Group, Shift]
+
+    def statistics(self, count, sigma=1.0, seed=0):
+        """Group -> (count,) of recordings whose rows scatter by so many of their sigmas."""
+        noise = np.random.default_rng(seed).standard_normal((len(self.groups.b), count))
+        left = self.groups.beyond(sigma * noise)
+        return {group: self.groups.statistics(group, left)[0] for group in self.shifts}
+
+    def judged(self, statistics, monkeypatch):
+        """The verdict on groups that are so far off, the others being as they are."""
+        off = [replace(s, statistic=statistics.get(g, s.statistic)) for g, s in self.shifts.items()]
+        monkeypatch.setattr(judged, "shifts", lambda whole, problem: iter(off))
+        return {b.group: b for b in judged.judge(None, None)}
+
+
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory):
+    """Twelve stops, so that there are some groups of every kind."""
+    spec = Spec(lidar="hesai_pandarxt32", locations=4, stops_per_location=3, column_step=400)
+    source, _ = simulated.made(tmp_path_factory.mktemp("chance") / "rec", spec)
+    case = case_of(build([source], Model()))
+    checked = {group: shift for group, shift in found(case).items() if shift.dof}
+    return Drawn(case, Groups(case.dense), checked)
+
+
+def test_how_far_out_chance_puts_a_group_is_chi_square(drawn):
+    """Of its degrees of freedom, for rows that scatter as they say."""
+    for group, statistics in drawn.statistics(1000).items():
+        dof = drawn.shifts[group].dof
+        assert stats.kstest(statistics, stats.chi2(dof).cdf).pvalue > 1e-6, str(group)
+
+
+def test_the_p_value_of_a_few_groups_of_a_kind_is_uniform(drawn, monkeypatch):
+    """Three of a kind or fewer: their sigmas are taken at their word."""
+    few = {}
+    for group, shift in drawn.shifts.items():
+        few.setdefault((group.kind, group.what in ("joints", "base_markers")), (group, shift))
+    some = replace(drawn, shifts=dict(few.values()))
+    many = some.statistics(600)
+    p = {group: [] for group in some.shifts}
+    for k in range(600):
+        for group, b in some.judged({g: t[k] for g, t in many.items()}, monkeypatch).items():
+            p[group].append(b.p_value)
+    for group, values in p.items():
+        assert stats.kstest(values, "uniform").pvalue > 1e-4, str(group)
+
+
+@pytest.mark.parametrize("sigma", [1.0, 5.0], ids=["as they say", "five times that"])
+def test_by_chance_nothing_is_found_more_often_than_is_said(drawn, sigma, monkeypatch):
+    """Nor where all rows scatter more than they say: each kind is measured by its own bulk. With
+    many of a kind p-values are larger than uniform, as their scale is never taken to be below 1."""
+    count = 150
+    many = drawn.statistics(count, sigma)
+    alike = {group: (group.kind, group.kind == "body" and group.what) for group in many}
+    p, smallest = {}, []
+    for k in range(count):
+        found = drawn.judged({g: t[k] for g, t in many.items()}, monkeypatch)
+        smallest.append(min(b.p_adjusted for b in found.values()))
+        for group, b in found.items():
+            p.setdefault(alike[group], []).append(b.p_value)
+    for kind, values in p.items():
+        for level in (0.5, 0.1, 0.01):
+            # Groups of a draw share its scale, so draws count, not groups.
+            slack = 4 * np.sqrt(level / count)
+            assert np.mean(np.array(values) < level) < level + slack, (kind, level)
+    # One in a hundred: seven of 150 have a chance of 5e-4.
+    assert np.sum(np.array(smallest) < 0.01) < 7
+
+
+def test_a_shift_of_the_detectable_size_is_found_four_times_in_five(drawn, monkeypatch):
+    """Of one group, the others being as they are in the recording, along any of its axes."""
+    rng, hits = np.random.default_rng(1), []
+    noise = drawn.groups.beyond(rng.standard_normal((len(drawn.groups.b), 40)))
+    plain = drawn.judged({}, monkeypatch)
+    for group in list(drawn.shifts)[::8]:
+        units = np.array(drawn.shifts[group].units)
+        for unit, size in plain[group].detectable.items():
+            for k in rng.choice(40, 10, replace=False):
+                offset = size * (np.arange(len(units)) == rng.choice(np.flatnonzero(units == unit)))
+                right = noise[:, k] + drawn.groups.beyond(drawn.groups.shifted(group, offset))
+                (statistic,), _ = drawn.groups.statistics(group, right[:, None])
+                now = drawn.judged({group: float(statistic)}, monkeypatch)[group]
+                hits.append(now.found)
+    assert len(hits) > 200
+    assert 0.7 < np.mean(hits) < 0.9
