@@ -140,7 +140,7 @@ def conclude(
     unexplained = [*thrown, *unexplained]
     blunders = [told.document(left, _rig(left, first)) for left in found.blunders]
     sentences = _sentences(verdict, found, candidates, unexplained, untestable, blunders)
-    if forbids and not found.blunders:
+    if forbids and verdict == BAD and not found.blunders:
         sentences.insert(0, f"This run is not to be believed as it stands: {'; '.join(forbids)}.")
     if rejected:
         sentences.insert(0 if verdict == UNNAMED else len(sentences), rejected.sentence)

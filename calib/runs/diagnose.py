@@ -41,7 +41,8 @@ def diagnose(
 
     with threadpool_limits(limits=1):
         stand = stand_of(run, progress)
-        found = search(stand, progress)
+        # Away from an optimum every effect that moves the state towards one looks missing.
+        found = search(stand, progress) if run.converged else search(stand, progress, most=0)
         rejected = rejects(found.looks[0].stand, progress)
         falls = {}
         before = run.summary["rms_mm"]["held_out"]

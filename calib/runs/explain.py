@@ -139,6 +139,8 @@ class _Climb:
         if diagnosis.blunders:
             self._leave_out([each["without"] for each in diagnosis.blunders])
             return True
+        if not self.run.converged:  # of such a run nothing else is learnt
+            return False
         names = diagnosis.worth_adding
         earlier = [name for step in self.steps for name in step["added"]]
         before = len(self.runs)
@@ -178,7 +180,7 @@ class _Climb:
         run = self._finished(folder, model, self.run)
         if run is None:
             run = grow(self.run, model, folder, self.tell)
-        if _falls(self.run, run, LEAST_FALL if added else 0.0):
+        if run.converged and _falls(self.run, run, LEAST_FALL if added else 0.0):
             self._keep(run, added, dropped)
         else:
             shutil.rmtree(folder)

@@ -33,7 +33,8 @@ LOOKS = 3  # how often, before a fit is given up
 REWEIGHTED = 10  # how often weights are taken anew; their distance halves each time or better
 # Bodies half of whose stops are so far (m, rad) from where the chain puts them after a fit are not
 # described by it: CAD and encoders are good to millimetres. Measured on the independent recordings:
-# 0.002 at most; with two bodies exchanged, or the quaternions' order wrong, 0.2 or more.
+# 0.004 at most, though effects were missing; 0.09 with rows of zeros, 0.6 with the quaternions'
+# order wrong, 0.8 with two bodies exchanged.
 ASTRAY = 0.05
 # So often is looked what beams meet before it is asked whether that leads anywhere, and so often at
 # most; good recordings, and one with the LiDAR 0.13 m from where CAD has it, take 2 to 6 passes.

@@ -46,7 +46,11 @@ def found_by_chance(
         "recordings": documents, **model.document(), "prior": None, "versions": {"rigcal": "0.1.0"},
     }  # fmt: skip
     untold = [{"name": "mount.tz", "why": "tied to arm_link_length.tip: both change alike"}]
-    summary = {"residual": "range", "rms_mm": {"fit": 3.25, "held_out": None}}
+    summary = {
+        "residual": "range",
+        "converged": True,
+        "rms_mm": {"fit": 3.25, "held_out": None},
+    }
     solution = Solution(
         shared=shared,
         recordings=own,

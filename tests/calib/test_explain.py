@@ -38,7 +38,8 @@ class World:
         error = self.errors[names] + 5.0 * len(model.without)
         rms = {"fit": error, "held_out": error, "noise_floor": 1.0}
         grown_from = str(below.folder.resolve()) if below else None
-        return Run(out, model.document() | {"grown_from": grown_from}, {"rms_mm": rms}, None)
+        summary = {"rms_mm": rms, "converged": True}
+        return Run(out, model.document() | {"grown_from": grown_from}, summary, None)
 
     def diagnose(self, run, progress, refits):
         names = frozenset(run.effects) - frozenset(Model().names)

@@ -43,7 +43,11 @@ def run(tmp_path):
         "prior": None,
         "versions": {"rigcal": "0.1.0"},
     }
-    summary = {"residual": "range", "rms_mm": {"fit": 3.25, "held_out": None}}
+    summary = {
+        "residual": "range",
+        "converged": True,
+        "rms_mm": {"fit": 3.25, "held_out": None},
+    }
     return Run(
         tmp_path / "run",
         model,

@@ -1,7 +1,6 @@
 """Parts of a report that need no run: the light, correlations, arrows."""
 
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -57,7 +56,7 @@ def run_like(**changes) -> Run:
         "misfit": {"beams": 0.9},
         "converged": True,
     }
-    return SimpleNamespace(summary=summary | changes, folder=Path("run"))
+    return Run(Path("run"), model={}, summary=summary | changes, solution=None)
 
 
 def found(verdict="adequate", sigma_mm=0.5):
