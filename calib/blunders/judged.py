@@ -27,6 +27,8 @@ KNOWN = 1e6  # degrees of freedom of a scale that is taken as known
 # Of groups that nothing tells apart, that which goes wrong most often is named first: bodies are
 # touched, knocked and occluded, scans mixed up; all joints of an arm are seldom wrong at once.
 LIKELY = ("body", "scan", "target", "frame", "surface", "joints", "rings")
+# Beyond this what a joint does is far from its derivative: no joint is said to be so far off.
+LINEAR_RAD = 0.5
 ALONG = 0.95  # of an offset's length, along one axis, to be said to lie along it
 
 
@@ -53,6 +55,17 @@ class Blunder:
     @property
     def group(self) -> Group:
         return self.shift.group
+
+    @property
+    def likely(self) -> int:
+        """How seldom its kind goes wrong, from 0."""
+        return LIKELY.index(self.group.kind)
+
+    @property
+    def possible(self) -> bool:
+        """Whether it may be off by so much at all."""
+        angles = [x for x, u in zip(self.shift.offset, self.shift.units, strict=True) if u == "rad"]
+        return self.group.kind != "joints" or bool(np.all(np.abs(angles) < LINEAR_RAD))
 
     @property
     def found(self) -> bool:
@@ -99,7 +112,7 @@ def judge(whole: Linearisation, problem: Problem) -> list[Blunder]:
             kinds.setdefault(_alike(shift.group), []).append(shift)
     looks = sum(len(some) for some in kinds.values())
     found = [b for some in kinds.values() for b in _judged(some, looks)]
-    return sorted(found, key=lambda b: (-round(b.evidence, 3), LIKELY.index(b.group.kind)))
+    return sorted(found, key=lambda b: -b.evidence)
 
 
 def _alike(group: Group) -> tuple[str, str]:

@@ -8,14 +8,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.effects import Effect, FrameOffset
-from calib.linear.layout import Layout
+from calib.forward import NOISE, Stops
+from calib.linear.layout import Layout, key_of
 from calib.linear.system import Linearisation, Values
 from calib.problem.problem import Block, Problem
 from calib.problem.unknowns import Role
 from calib.problem.without import ROD, of_the_arm
 from calib.residuals.groups import CAD, JOINTS, MESH, SCAN, Group
+from calib.residuals.scan import ScanStop
 from calib.residuals.targets import HangingTarget
 from calib.residuals.tracker import BodiesTogether, TrackedBody
+from calib.rig import Rig
 
 POSE = ("about x", "about y", "about z", "x", "y", "z")
 # Block (none for a prior), whitened derivative by each unknown, and right side: see `Graph`.
@@ -70,6 +73,7 @@ def group_rows(
     yield from _targets(whole, graph_rows)
     yield from _paper(whole, problem)
     yield from _scans(whole, problem)
+    yield from _exact_joints(whole, problem)
 
 
 def _bodies(whole: Linearisation) -> Iterator[GroupRows]:
@@ -217,6 +221,82 @@ def _scans(whole: Linearisation, problem: Problem) -> Iterator[GroupRows]:
             groups={Group("scan", where, SCAN, recording): np.eye(6)},
             information=sums.information,
         )
+
+
+def _exact_joints(whole: Linearisation, problem: Problem) -> Iterator[GroupRows]:
+    """Joint readings of arms whose encoders count as exact, through all that hangs from them."""
+    layout, names = whole.layout, _stop_names(whole.layout, problem)
+    found: dict[int, list[_JointSums]] = {}
+    rigs: dict[int, Rig] = {}
+    for block in layout.others:
+        if isinstance(block, TrackedBody) and _is_exact(block.stops):
+            for k, key in enumerate(block.stop_names):
+                rigs[layout.stops[key]] = block.stops.rig
+                sums = _JointSums.of_body(block, k, whole)
+                found.setdefault(layout.stops[key], []).append(sums)
+    for scan in (s for s in problem.scans if _is_exact(s.stops)):
+        stop = layout.stops[key_of(scan)]
+        if stop in whole.scans:
+            rigs[stop] = scan.stops.rig
+            found.setdefault(stop, []).append(_JointSums.of_scan(scan, whole, stop))
+    for stop, parts in found.items():
+        where, recording = names[stop]
+        dofs, count = rigs[stop].joint_names, len(rigs[stop].joint_names)
+        yield GroupRows(
+            A=np.hstack([part.cross for part in parts]),
+            columns=np.concatenate([part.columns for part in parts]),
+            b=sum(part.score for part in parts),
+            weight=np.ones(count),
+            sigma=np.ones(count),
+            axes=dofs,
+            units=tuple("rad" if k == "revolute" else "m" for k in rigs[stop].joint_kinds),
+            groups=_joints(dofs, np.split(np.eye(count), count, axis=1), where, recording),
+            information=sum(part.information for part in parts),
+        )
+
+
+def _is_exact(stops: Stops) -> bool:
+    return stops.noise is None and bool(stops.rig.joint_names)
+
+
+@dataclass(frozen=True)
+class _JointSums:
+    """What some rows of a stop say of its joint readings (J,).
+
+    Args:
+        information: (J, J), score: (J,) of them.
+        cross: (J, n) products with unknowns, columns: (n,) which.
+    """
+
+    information: np.ndarray
+    score: np.ndarray
+    cross: np.ndarray
+    columns: np.ndarray
+
+    @classmethod
+    def of_body(cls, block: TrackedBody, k: int, whole: Linearisation) -> _JointSums:
+        """The rows of a body at one of its stops."""
+        one = replace(
+            block,
+            weight=None,
+            stops=block.stops.some(np.array([k]), block.stops.root).with_joint_noise(NOISE),
+            measured=block.measured[[k]],
+            bases={n: b if len(b) == 1 else b[[k]] for n, b in block.bases.items()},
+        )
+        count = len(block.stops.rig.joint_names)
+        residual, d = one.evaluate({**whole.values, NOISE: np.zeros(count)}, True)
+        Z = d.pop(NOISE)
+        A = np.hstack(list(d.values()))
+        return cls(Z.T @ Z, -Z.T @ residual, Z.T @ A, whole.layout.columns(list(d)))
+
+    @classmethod
+    def of_scan(cls, scan: ScanStop, whole: Linearisation, stop: int) -> _JointSums:
+        """The beams of a stop, through the twist of their LiDAR."""
+        rig, sums = scan.stops.rig, whole.scans[stop]
+        values = {**whole.values, NOISE: np.zeros(len(rig.joint_names))}
+        stops = scan.stops.with_joint_noise(NOISE)
+        P = stops.in_reference(rig.lidar_frame, values).d[NOISE][0]
+        return cls(P.T @ sums.information @ P, P.T @ sums.score, P.T @ sums.cross, sums.columns)
 
 
 def _stop_names(layout: Layout, problem: Problem) -> dict[int, tuple[str, str]]:

@@ -128,15 +128,17 @@ def _of_set(some: Sequence[GroupRows], H: np.ndarray, b: np.ndarray) -> Iterator
     for rows in some:
         here = slice(first, first + len(rows.A))
         first = here.stop
-        of = _of_rows if rows.information is None else _of_scan
+        of = _of_rows if rows.information is None else _of_sums
         for group in rows.groups:
             yield of(group, rows, b[here], H[here, here])
 
 
-def _of_scan(group: Group, rows: GroupRows, score: np.ndarray, explained: np.ndarray) -> Shift:
-    """The score test of a twist that the stop's beams alone have."""
-    left = rows.information - explained
-    size = np.sqrt(np.maximum(np.diag(rows.information), 1e-300))
+def _of_sums(group: Group, rows: GroupRows, score: np.ndarray, explained: np.ndarray) -> Shift:
+    """The score test of a shift that some rows of the stop alone have."""
+    own = rows.groups[group]
+    left, score = own.T @ (rows.information - explained) @ own, own.T @ score
+    size = np.sqrt(np.maximum(np.diag(own.T @ rows.information @ own), 1e-300))
+    at = np.argmax(own, axis=0)
     values, axes = np.linalg.eigh(left / np.outer(size, size))
     seen = values > UNCHECKED
     whiten = axes[:, seen] / np.sqrt(values[seen]) / size[:, None]
@@ -148,8 +150,8 @@ def _of_scan(group: Group, rows: GroupRows, score: np.ndarray, explained: np.nda
         offset=whiten @ score,
         covariance=whiten @ whiten.T,
         information=left if seen.all() else np.zeros_like(left),
-        axes=rows.axes,
-        units=rows.units,
+        axes=[rows.axes[i] for i in at],
+        units=[rows.units[i] for i in at],
     )
 
 

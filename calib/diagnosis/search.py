@@ -138,6 +138,7 @@ def _adapted(look: Look, left: list[LeftOut], progress: Progress) -> Look:
         for each in wild:
             near = (b for b in look.blunders if each.evidence - b.evidence < ODDS)
             others = [b for b in near if b.found and b.group not in loud and b not in wild]
+            others = [b for b in others if b.possible]
             met = [b.group for b in others if len(wild) == 1 or _meet(each, b)]
             left.append(LeftOut(each, met))
         look = after
@@ -159,11 +160,17 @@ def _wild(look: Look) -> list[Blunder]:
     best = max((c.evidence - np.log(c.looks) for c in every), default=0.0)
     if found[0].evidence - np.log(found[0].looks) < best:
         return []
-    worst: dict[tuple[str, str], Blunder] = {}
+    places: dict[tuple[str, str], list[Blunder]] = {}
     for each in found:
         if each.evidence > AS_FAR * found[0].evidence:
-            worst.setdefault((each.group.recording, each.group.where), each)
-    return list(worst.values())
+            places.setdefault((each.group.recording, each.group.where), []).append(each)
+    return [_likeliest(some) for some in places.values()]
+
+
+def _likeliest(some: Sequence[Blunder]) -> Blunder:
+    """Of those that explain as much as the first, the one whose kind goes wrong most often."""
+    near = [b for b in some if some[0].evidence - b.evidence < ODDS and b.possible]
+    return min(near, key=lambda b: b.likely) if near else some[0]
 
 
 def _named(look: Look, progress: Progress) -> NamedEffect | None:
