@@ -109,12 +109,18 @@ def odd_scans(rig: Rig, recording: Recording, scans: ScanSums) -> Iterator[str |
         yield f"there is no scan of {listed(missing)}, though of other stops"
     if (silent := np.flatnonzero(scans.rings == 0)).size:
         yield f"no point comes from ring {listed(silent)}; rings are counted from 0"
-    numbered = odd_rings(rig.lidar, ring_elevations(scans.elevation_rad, scans.rings))
-    if numbered is not None:
-        yield Suspect("rings", rig.lidar.name, numbered.sentence, size=numbered.off_rad, unit="rad")
+    yield from odd_numbers(scans)
     yield from _at_once(recording)
     yield from _twice(scans)
     yield from _intensities(scans)
+
+
+def odd_numbers(scans: ScanSums) -> Iterator[Suspect]:
+    """Rings that are not numbered as their LiDAR's model has it."""
+    lidar = scans.lidar
+    numbered = odd_rings(lidar, ring_elevations(scans.elevation_rad, scans.rings))
+    if numbered is not None:
+        yield Suspect("rings", lidar.name, numbered.sentence, size=numbered.off_rad, unit="rad")
 
 
 def _at_once(recording: Recording) -> Iterator[Suspect]:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+
+import numpy as np
 
 from calib.diagnosis.rejects import rejects
 from calib.diagnosis.search import search
@@ -15,11 +17,14 @@ from calib.effects import DEFAULT
 from calib.problem import build
 from calib.results.errors import Errors
 from calib.results.holdout import held_out
+from calib.rig.scanned import ScanSums, odd_numbers
 from calib.runs.belief import forbids
 from calib.runs.reopen import model_of, reopened, start_of
 from calib.runs.run import DIAGNOSIS, Run
 from calib.solve.fit import Progress, resume
 from sensors.documents import write_json
+
+LOOKED = 3  # scans from which the numbers of rings are checked: each holds all rings
 
 
 def diagnose(
@@ -64,7 +69,7 @@ def diagnose(
     )
     result = replace(
         result,
-        sentences=[*run.warning, *result.sentences],
+        sentences=[*run.warning, *result.sentences, *_odd_rings(stand)],
         command=command_without(run, tokens) if tokens else "",
     )
     write_json(run.folder / DIAGNOSIS, result.document())
@@ -82,6 +87,19 @@ def command_without(run: Run, tokens: Sequence[str]) -> str:
     chosen = [] if tuple(effects) == DEFAULT else ["--effects", ",".join(effects)]
     fixed = [part for name in run.model["fixed"] for part in ("--fix", name)]
     return shlex.join(["rigcal", "fit", *map(str, run.recordings), *out, *chosen, *fixed, *without])
+
+
+def _odd_rings(stand: Stand) -> Iterator[str]:
+    """Whether rings are numbered otherwise than their model has it: no fit suffers, but whoever
+    takes its ring offsets by number does."""
+    for source in stand.sources:
+        scanned = np.flatnonzero(source.recording.has_scan)[:LOOKED]
+        if source.rig.lidar is not None and len(scanned):
+            sums = ScanSums(source.rig.lidar)
+            for k in scanned.tolist():
+                sums.add(source.recording.stops[k], source.store.read(k)[0])
+            told = (suspect.sentence for suspect in odd_numbers(sums))
+            yield from (f"{sentence[0].upper()}{sentence[1:]}." for sentence in told)
 
 
 def _unseen(stand: Stand, run: Run, progress: Progress) -> Errors:
