@@ -55,7 +55,7 @@ class Said:
         code: its exit code; None where it ran out of time.
         document: what it printed with --json; empty where that is none.
         complaint: what it printed on stderr.
-        seconds: it took.
+        seconds: of this process that it took.
     """
 
     code: int | None
@@ -73,7 +73,7 @@ class Said:
 def rigcal(*words: object, limit_s: float = 600) -> Said:
     """Run a command in this process."""
     out, err = io.StringIO(), io.StringIO()
-    begin, code = time.perf_counter(), None
+    begin, code = time.process_time(), None
     argv = ["rigcal", *map(str, words), "--json"]
     with patch.object(sys, "argv", argv), redirect_stdout(out), redirect_stderr(err):
         try:
@@ -83,7 +83,7 @@ def rigcal(*words: object, limit_s: float = 600) -> Said:
             code = int(exit_.code or 0)
         except TooLong:
             pass
-    seconds = time.perf_counter() - begin
+    seconds = time.process_time() - begin
     try:
         document = json.loads(out.getvalue())
     except ValueError:
@@ -91,8 +91,16 @@ def rigcal(*words: object, limit_s: float = 600) -> Said:
     return Said(code=code, document=document, complaint=err.getvalue(), seconds=seconds)
 
 
-def asked(recording: Path, run: Path, limit_s: float = 600) -> dict[str, Any]:
+def asked(
+    recording: Path, run: Path, limit_s: float = 600, at_any_rate: bool = True
+) -> dict[str, Any]:
     """What check, fit and diagnose say of a recording, as far as they come.
+
+    Args:
+        recording: a folder.
+        run: the folder that the fit makes.
+        limit_s: of each command.
+        at_any_rate: a fit that has not converged is diagnosed as well.
 
     Returns:
         `outcome`: "refused", "fault", "endless", "not converged" or the verdict; `sentence`, `odd`
@@ -110,22 +118,21 @@ def asked(recording: Path, run: Path, limit_s: float = 600) -> dict[str, Any]:
         "names": [],
         "detectable": {},
     }
-    outcome = None
-    if fit.code in (0, 3) and fit.document:
+    fitted = fit.code in (0, 3) and bool(fit.document)
+    loose = fit.code == 3 or (fitted and not fit.document["converged"])
+    outcome = "not converged" if loose else None
+    if fitted and (at_any_rate or not loose):
         said.append(rigcal("diagnose", run, "--no-refits", limit_s=limit_s))
         diagnosis = said[-1].document
         found |= {"blunders": blunders(diagnosis), "names": names(diagnosis)}
         found["detectable"] = detectable(diagnosis)
-        # A diagnosis of what has not converged may end by itself with 3, or be refused.
-        outcome = diagnosis.get("verdict")
-        if fit.code == 3 or not fit.document["converged"]:
-            outcome = "not converged"
+        outcome = outcome or diagnosis.get("verdict")
     last = said[-1]
     if fit.refused:
         outcome = "refused"
-    elif fit.code is None or last.code is None:
+    elif None in (fit.code, last.code):
         outcome = "endless"
-    elif outcome is None:
+    elif outcome is None or last.code not in (0, 2, 3):
         outcome = "fault"
     return found | {
         "outcome": outcome,
@@ -147,7 +154,7 @@ def token(blunder: Mapping[str, Any]) -> str:
         return f"{'cad' if kind == 'frame' else 'mesh'}:{name}"
     if kind == "rings":
         return "rings"
-    return f"{stop}:{name}" if stop else name
+    return f"{stop}:{name or kind}" if stop else name
 
 
 def blunders(diagnosis: Mapping[str, Any]) -> list[list[str]]:
@@ -231,7 +238,7 @@ def off(run: Path, truth: Mapping[str, Any], done: Done | None = None) -> dict[s
     Args:
         run: a fit.
         truth: ``frames`` -> name -> T_parent_child (4, 4), ``effects`` -> name -> parameter ->
-            value.
+            value, or the values of all parameters in their order.
         done: what has changed the truth.
     """
     found, done = solution(run), done or Done()
@@ -254,6 +261,8 @@ def off(run: Path, truth: Mapping[str, Any], done: Done | None = None) -> dict[s
         if effect is None or name in done.unsure:
             continue
         each = zip(effect["names"], effect["estimate"], effect["sigma"], strict=True)
+        if not isinstance(parameters, Mapping):
+            parameters = dict(zip(effect["names"], parameters, strict=True))
         for parameter, estimate, sigma in each:
             if sigma and parameter in parameters:
                 true = parameters[parameter] + done.shifts.get((name, parameter), 0.0)
