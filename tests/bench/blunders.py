@@ -1,7 +1,8 @@
 """One thing wrong in a recording: is it named, and is anything ever wrong and calm?
 
     python -m tests.bench.blunders [--quick] [--rigs all,"no arm"] [--kinds "*scan*"]
-                                   [--worlds 3] [--nulls 6] [--jobs 2] [-o FILE --resume]
+                                   [--times 3,10] [--worlds 3] [--nulls 6] [--jobs 2]
+                                   [-o FILE --resume]
 
 Every mishap of `tests.mishaps` is done to a good recording of every rig that has what it needs, at
 1, 3 and 10 times the size that the diagnosis of the good recording says it can detect (or a usual
@@ -31,7 +32,7 @@ from threadpoolctl import threadpool_limits
 
 from sensors.documents import plain
 
-from ..mishaps import MISHAPS, Done, Scene
+from ..mishaps import MISHAPS, TIMES, Done, Scene
 from ..mishaps.judge import as_truth, asked, largest, off, read_truth
 from .blunders_table import NOTHING, show
 from .blunders_worlds import RIGS, made
@@ -170,8 +171,9 @@ def main() -> None:
             )
             features.setdefault(null.rig, scene.features())
         chosen = list(cases(wanted.rigs, wanted.kinds, min(wanted.worlds, wanted.nulls), features))
+        chosen = [c for c in chosen if c.times in wanted.times]
         if wanted.quick:
-            chosen = [c for c in chosen if c.kind in QUICK and c.times in (3, 10)]
+            chosen = [c for c in chosen if c.kind in QUICK]
         _finish("nothing wrong", nulls, known, worlds, wanted)
         _finish("mishaps", chosen, known, worlds, wanted)
         show([known[c.name] for c in (*nulls, *chosen) if c.name in known])
@@ -182,6 +184,8 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--quick", action="store_true", help="a dozen cases of one rig")
     parser.add_argument("--rigs", default=",".join(RIGS), help="with commas; all if not given")
     parser.add_argument("--kinds", default="*", help="a pattern")
+    sizes = ",".join(map(str, TIMES))
+    parser.add_argument("--times", default=sizes, help="the detectable sizes, with commas")
     parser.add_argument("--worlds", type=int, default=3, help="good recordings that are spoilt")
     parser.add_argument("--nulls", type=int, default=6, help="good recordings of each rig")
     parser.add_argument("--jobs", type=int, choices=(1, 2), default=1)
@@ -189,6 +193,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--resume", action="store_true", help="keep what the file has")
     wanted = parser.parse_args()
     wanted.rigs = [QUICK_RIG] if wanted.quick else wanted.rigs.split(",")
+    wanted.times = [3, 10] if wanted.quick else [int(x) for x in wanted.times.split(",")]
     if wanted.quick:
         wanted.nulls = wanted.worlds = 2
     if unknown := set(wanted.rigs) - set(RIGS):
