@@ -22,6 +22,7 @@ from ..mishaps.scene import QUAT, XYZ
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data" / "recordings"
 BEAMS = 800  # of a stop, about: columns are left out until so few are left
+BEAMS_OF_PLANES = 2000  # enough neighbours for a flat patch to be seen; 1000 are not
 GUESSED_M, GUESSED_RAD = 0.01, 0.01  # how well somebody guesses where the base stands
 
 Fill = Callable[[Path, int], None]
@@ -62,7 +63,7 @@ def _copy(name: str, folder: Path) -> None:
     shutil.copy(SHARED / f"{name}.truth.json", f"{folder}.truth.json")
 
 
-def _lab(folder: Path, number: int) -> Scene:
+def _lab(folder: Path, number: int, beams: int = BEAMS) -> Scene:
     name, mend = LABS[number % len(LABS)]
     _copy(name, folder)
     scene = Scene(folder, np.random.default_rng(number))
@@ -71,7 +72,7 @@ def _lab(folder: Path, number: int) -> Scene:
 
     def thin(columns: dict[str, np.ndarray]) -> None:
         at = np.unique(columns["column"], return_inverse=True)[1]
-        step = max(1, round(len(at) / BEAMS))
+        step = max(1, round(len(at) / beams))
         keep = at % step == phase % step
         columns.update({name: column[keep] for name, column in columns.items()})
 
@@ -103,7 +104,7 @@ def no_arm(folder: Path, number: int) -> None:
 
 def no_mesh(folder: Path, number: int) -> None:
     """Planes that the stops have in common, and no laser scanner."""
-    scene = _lab(folder, number)
+    scene = _lab(folder, number, BEAMS_OF_PLANES)
     shutil.rmtree(folder / "reference")
     (folder / "targets.csv").unlink()
     with scene.description() as rig:

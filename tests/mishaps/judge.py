@@ -32,19 +32,24 @@ class TooLong(BaseException):
 
 
 @contextmanager
-def at_most(seconds: float) -> Iterator[None]:
-    """Ends what takes longer, in the main thread of a process."""
+def at_most(seconds: float) -> Iterator[list[bool]]:
+    """Ends what takes more CPU seconds, in the main thread; gives a list that then has an entry.
+
+    What is ended inside compiled code may report that as an error of its own.
+    """
+    over: list[bool] = []
 
     def end(signum: int, frame: object) -> None:
+        over.append(True)
         raise TooLong
 
-    before = signal.signal(signal.SIGALRM, end)
-    signal.setitimer(signal.ITIMER_REAL, seconds)
+    before = signal.signal(signal.SIGPROF, end)
+    signal.setitimer(signal.ITIMER_PROF, seconds)
     try:
-        yield
+        yield over
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
+        signal.setitimer(signal.ITIMER_PROF, 0)
+        signal.signal(signal.SIGPROF, before)
 
 
 @dataclass(frozen=True)
@@ -77,10 +82,10 @@ def rigcal(*words: object, limit_s: float = 600) -> Said:
     argv = ["rigcal", *map(str, words), "--json"]
     with patch.object(sys, "argv", argv), redirect_stdout(out), redirect_stderr(err):
         try:
-            with at_most(limit_s):
+            with at_most(limit_s) as over:
                 main()
         except SystemExit as exit_:
-            code = int(exit_.code or 0)
+            code = None if over else int(exit_.code or 0)
         except TooLong:
             pass
     seconds = time.process_time() - begin
@@ -99,7 +104,7 @@ def asked(
     Args:
         recording: a folder.
         run: the folder that the fit makes.
-        limit_s: of each command.
+        limit_s: of each command, CPU seconds.
         at_any_rate: a fit that has not converged is diagnosed as well.
 
     Returns:

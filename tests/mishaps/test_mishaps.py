@@ -14,7 +14,17 @@ from calib.simulation import Spec, simulate
 from sensors.documents import write_yaml
 
 from . import MISHAPS, Scene
-from .judge import Said, blunders, detectable, largest, matches, off, read_truth
+from .judge import (
+    Said,
+    TooLong,
+    at_most,
+    blunders,
+    detectable,
+    largest,
+    matches,
+    off,
+    read_truth,
+)
 
 SPEC = Spec(lidar="hesai_pandarxt32", locations=3, stops_per_location=3, column_step=120)
 
@@ -168,3 +178,13 @@ def test_truths_of_both_simulators_are_read(tmp_path):
     found = read_truth(tmp_path / "theirs.json")
     assert found["effects"]["arm_link_length"] == {"joint_1": 0.1, "joint_tip": 0.2}
     np.testing.assert_allclose(found["frames"]["faro"][:3, 3], [-1, -2, -3])
+
+
+def test_what_takes_too_long_is_ended():
+    with pytest.raises(TooLong), at_most(0.05) as over:
+        while True:
+            pass
+    assert over
+    with at_most(10) as over:
+        pass
+    assert not over
