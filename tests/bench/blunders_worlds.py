@@ -22,7 +22,7 @@ from ..mishaps.scene import QUAT, XYZ
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data" / "recordings"
 BEAMS = 800  # of a stop, about: columns are left out until so few are left
-BEAMS_OF_PLANES = 2000  # enough neighbours for a flat patch to be seen; 1000 are not
+BEAMS_OF_PLANES = 4000  # enough neighbours for a flat patch to be seen; 2000 of an OS0-128 are not
 GUESSED_M, GUESSED_RAD = 0.01, 0.01  # how well somebody guesses where the base stands
 
 Fill = Callable[[Path, int], None]
