@@ -1,0 +1,202 @@
+"""Ninety kinds of damage: each is refused, named or harmless; none calm and wrong, or endless.
+
+A small recording is damaged in one way each, ten times as much as can be detected, and `rigcal
+check`, `fit` and `diagnose` are asked. Of files that no reader can take, see test_bad_input.py.
+"""
+
+from __future__ import annotations
+
+import shutil
+import zlib
+from dataclasses import dataclass
+from fnmatch import fnmatch
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from calib.simulation import Spec, simulate
+
+from ..mishaps import MISHAPS, Scene
+from ..mishaps.judge import as_truth, asked, largest, off
+
+SPEC = Spec(lidar="hesai_pandarxt32", locations=4, stops_per_location=3, column_step=150)
+TIMES = 10  # the detectable size
+UNCHANGED = 1.0  # sigma of the good recording's fit
+LIMIT = 2.0  # times as long as the good recording's fit
+SLACK_S = 0.5  # beside it, CPU seconds: about one fit, for what machines and passes vary
+LONGEST_S = 60
+ENOUGH = 30  # cases that were run, for their times to be looked at
+
+# What the program does not see yet, by how it fares instead.
+CALM = "adequate, estimates are off, and check says nothing"
+LOOSE = "not converged, and exit code 0"
+UNSEEN = {
+    CALM: (
+        "mount body shifted at one stop",
+        "rings numbered from the other end",
+        "rings numbered one off",
+        "rings in the order of firing",
+        "CAD of the sensor shifted",
+        "CAD of the sensor turned",
+        "CAD of a body shifted",
+        "CAD of a body turned",
+        "CAD of the arms base shifted",
+        "CAD of the sensor of wrong sign",
+        "CAD of a body of wrong sign",
+        "CAD axes exchanged",
+        "a link of the URDF too long",
+    ),
+    LOOSE: (
+        "one wild coordinate",
+        "rows of zeros where nothing was seen",
+        "the last seen pose held on",
+        "bodies swapped at one stop",
+        "bodies swapped",
+        "quaternions with the scalar last",
+        "joints read one stop late",
+        "one encoder stuck for some stops",
+        "one encoder stuck all the time",
+        "one joint counts the other way",
+        "columns of two joints exchanged",
+        "two scans exchanged",
+        "scans one stop late",
+        "one scan is a copy of another",
+        "half of a scan from after a knock",
+        "points mirrored",
+        "points with axes exchanged",
+        "a base that moves said to stand",
+        "CAD turned the wrong way",
+        "an axis of the URDF of wrong sign",
+        "an origin of the URDF turned",
+        "two targets exchanged",
+        "mesh in inches",
+        "mesh mirrored",
+    ),
+}
+HOPELESS_TAKE_LONG = "fits of hopeless recordings take ten times as long as good ones"
+# Others of their sort are run always.
+LONG = (
+    "* turned at one stop",
+    "mount body taped*",
+    "the last seen pose held on",
+    "bodies swapped at one stop",
+    "poses the other way round",
+    "joints read one stop late",
+    "one encoder stuck all*",
+    "one joint scaled",
+    "columns of two joints*",
+    "base moved between*",
+    "one scan is a copy*",
+    "sweeps of two stops*",
+    "half of a scan*",
+    "rings numbered one off",
+    "rings in the order*",
+    "one ring reads long",
+    "ranges long at one stop",
+    "points mirrored",
+    "points in millimetres",
+    "one scan lost*",
+    "returns in any order",
+    "spheres worse*",
+    "stops in any order",
+    "times in milliseconds",
+    "a column of one value",
+    "CAD of the sensor turned",
+    "CAD of a body*",
+    "CAD of the arms base*",
+    "CAD turned*",
+    "CAD in inches",
+    "a link of the URDF of*",
+    "an origin of the URDF*",
+    "a lower marker*",
+    "an upper marker*",
+    "one target in millimetres",
+    "mesh shifted*",
+    "mesh in inches",
+    "furniture moved",
+)
+
+TOOK_S: dict[str, float] = {}  # kind -> CPU seconds of its fit, in this session
+
+
+@dataclass(frozen=True)
+class Good:
+    """The recording with nothing wrong.
+
+    Args:
+        folder: of it.
+        found: what is said of it.
+        truth: its estimates, as `off` takes them.
+        sigmas: of each.
+    """
+
+    folder: Path
+    found: dict[str, Any]
+    truth: dict[str, Any]
+    sigmas: dict[str, float]
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory) -> Good:
+    """A recording with nothing wrong, and what is said of it once everything is compiled."""
+    home = tmp_path_factory.mktemp("good")
+    recording, run = home / "recording", home / "run"
+    simulate(SPEC, recording, seed=1)
+    asked(recording, run)
+    found, truth = asked(recording, run), as_truth(run)
+    sigmas = {name: error.sigma for name, error in off(run, truth).items()}
+    return Good(folder=recording, found=found, truth=truth, sigmas=sigmas)
+
+
+def test_nothing_is_said_of_a_good_recording(good):
+    """Else every case below might be named for another reason."""
+    assert good.found["outcome"] == "adequate", good.found
+    assert not good.found["odd"] and not good.found["blunders"]
+
+
+def kinds() -> list[Any]:
+    why = {kind: reason for reason, unseen in UNSEEN.items() for kind in unseen}
+    assert why.keys() <= MISHAPS.keys()
+    assert all(any(map(lambda kind: fnmatch(kind, p), MISHAPS)) for p in LONG)
+    out = []
+    for kind in MISHAPS:
+        marks = [pytest.mark.xfail(reason=why[kind], strict=True)] if kind in why else []
+        if any(fnmatch(kind, pattern) for pattern in LONG):
+            marks.append(pytest.mark.long)
+        out.append(pytest.param(kind, marks=marks, id=kind))
+    return out
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", kinds())
+def test_damage_is_refused_or_named_or_harmless(good, tmp_path, kind):
+    recording, run = shutil.copytree(good.folder, tmp_path / "recording"), tmp_path / "run"
+    rng = np.random.default_rng(zlib.crc32(kind.encode()))
+    done = MISHAPS[kind].apply(Scene(recording, rng), TIMES)
+    found = asked(recording, run, LONGEST_S, at_any_rate=False)
+    TOOK_S[kind] = found["seconds"][1]
+    outcome = found["outcome"]
+    assert outcome not in ("endless", "fault"), found
+    if outcome == "refused":
+        return
+    if outcome == "not converged":
+        assert found["codes"][1] == 3, f"not converged, and exit code {found['codes'][1]}"
+        return
+    moved = largest(off(run, good.truth, done), good.sigmas)
+    if MISHAPS[kind].harmless:
+        assert moved < UNCHANGED and outcome == "adequate", (moved, found)
+    elif outcome == "adequate" and set(found["odd"]) <= set(good.found["odd"]):
+        assert moved < UNCHANGED, f"calm, and an estimate is off by {moved:.1f} sigma"
+
+
+@pytest.mark.slow
+@pytest.mark.xfail(reason=HOPELESS_TAKE_LONG, strict=True)
+def test_no_damage_takes_long(good):
+    """What was run above; refusals too."""
+    if len(TOOK_S) < ENOUGH:
+        pytest.skip(f"only {len(TOOK_S)} kinds of damage were tried")
+    allowed_s = LIMIT * good.found["seconds"][1] + SLACK_S
+    long = {kind: took_s for kind, took_s in TOOK_S.items() if took_s > allowed_s}
+    assert not long, f"more than {allowed_s:.1f} s: {long}"
