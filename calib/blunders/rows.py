@@ -153,8 +153,8 @@ def _paper(whole: Linearisation, problem: Problem) -> Iterator[GroupRows]:
         groups: dict[Group, np.ndarray] = {}
         each = np.split(np.eye(unknown.dim), unknown.dim, axis=1)
         if unknown.role is Role.JOINTS:
-            (stop,) = layout.touched[name]
-            groups = _joints(unknown.dofs, each, *stops[stop])
+            for stop in layout.touched.get(name, ()):  # of a stop without any row there is none
+                groups = _joints(unknown.dofs, each, *stops[stop])
         elif unknown.role is Role.SURFACE and problem.cells[name].column == "surface":
             parts = problem.cells[name].parts.tolist()
             names = (Group("surface", MESH, f"surface_{part}") for part in parts)

@@ -178,16 +178,12 @@ def names(diagnosis: Mapping[str, Any]) -> list[str]:
 
 def detectable(diagnosis: Mapping[str, Any]) -> dict[str, float]:
     """Of a diagnosis: ``NAME UNIT`` -> the smallest size of a blunder that it would find."""
-    found = {}
-    for key in ("smallest_detectable_blunders", "blunders"):
-        each = diagnosis.get(key, [])
-        if isinstance(each, Mapping):
-            each = [{"without": name} | dict(value) for name, value in each.items()]
-        for blunder in each:
-            size = blunder.get("detectable")
-            if isinstance(size, int | float) and np.isfinite(size) and size > 0:
-                found[f"{token(blunder)} {blunder['unit']}"] = float(size)
-    return found
+    return {
+        f"{name} {unit}": float(size)
+        for name, by_unit in diagnosis.get("detectable", {}).items()
+        for unit, size in by_unit.items()
+        if np.isfinite(size) and size > 0
+    }
 
 
 def matches(name: str, patterns: Sequence[str] | frozenset[str]) -> bool:
