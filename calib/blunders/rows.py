@@ -10,6 +10,7 @@ import numpy as np
 from calib.effects import Effect, FrameOffset
 from calib.linear.layout import Layout
 from calib.linear.system import Linearisation, Values
+from calib.problem.model import labels
 from calib.problem.problem import Block, Problem
 from calib.problem.unknowns import Role
 from calib.problem.without import ROD, of_the_arm
@@ -221,10 +222,9 @@ def _scans(whole: Linearisation, problem: Problem) -> Iterator[GroupRows]:
 
 def _stop_names(layout: Layout, problem: Problem) -> dict[int, tuple[str, str]]:
     """Name of each stop, and of its recording where there are several."""
-    several = len(problem.sources) > 1
     return {
-        layout.stops[s.recording.folder, k]: (stop, s.recording.folder.name if several else "")
-        for s in problem.sources
+        layout.stops[s.recording.folder, k]: (stop, label)
+        for s, label in zip(problem.sources, labels(problem.sources), strict=True)
         for k, stop in enumerate(s.recording.stops)
         if (s.recording.folder, k) in layout.stops
     }

@@ -25,6 +25,7 @@ from calib.diagnosis.search import (
 from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import formula, hangs_on, what_separates, words
 from calib.effects import CATALOGUE, Site
+from calib.problem.model import labels
 from calib.rig import Rig
 from calib.solve.solution import one_unit
 
@@ -144,9 +145,9 @@ def conclude(
 
 def _rig(left: LeftOut, look: Look) -> Rig:
     """On paper, of the recording that a blunder is in."""
-    named = left.blunder.group.recording
-    rigs = {s.recording.folder.name: s.rig for s in look.stand.sources}
-    return rigs.get(named) or look.stand.sources[0].rig
+    sources = look.stand.sources
+    rigs = dict(zip(labels(sources), (source.rig for source in sources), strict=True))
+    return rigs.get(left.blunder.group.recording) or sources[0].rig
 
 
 def _stops(look: Look) -> int:
@@ -326,8 +327,9 @@ def _sentences(
             f"The model is adequate: of {len(look.named.candidates)} known effects and "
             f"{len(look.unnamed.candidates)} kinds of structure none stands out from chance."
         )
-    if without := look.stand.model.without[: len(look.stand.model.without) - len(blunders)]:
-        out.append(f"Left out before: {', '.join(without)}.")
+    now = [each["without"] for each in blunders]
+    if before := [token for token in look.stand.model.without if token not in now]:
+        out.append(f"Left out before: {', '.join(before)}.")
     out += [each["sentence"] for each in blunders[:LISTED]]
     if len(blunders) > LISTED:
         out.append(f"And {len(blunders) - LISTED} more, in diagnosis.json.")
