@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.blunders.chance import after_looks, log_tail
-from calib.blunders.judged import Blunder, LeftOut
+from calib.blunders.judged import LIKELY, Blunder, LeftOut
 from calib.diagnosis.score import Test
 from calib.diagnosis.score import test as joint_test
 from calib.diagnosis.screen import Candidate, Screen
@@ -153,11 +153,18 @@ def _wild(look: Look) -> list[Blunder]:
     best = max((c.evidence - np.log(c.looks) for c in every), default=0.0)
     if found[0].evidence - np.log(found[0].looks) < best:
         return []
-    worst: dict[tuple[str, str], Blunder] = {}
+    places: dict[tuple[str, str], list[Blunder]] = {}
     for each in found:
         if each.evidence > AS_FAR * found[0].evidence:
-            worst.setdefault((each.group.recording, each.group.where), each)
-    return list(worst.values())
+            places.setdefault((each.group.recording, each.group.where), []).append(each)
+    return [likeliest(here) for here in places.values()]
+
+
+def likeliest(here: Sequence[Blunder]) -> Blunder:
+    """Of groups of one place, furthest out first, that which goes wrong most often among those that
+    can stand in for the first."""
+    near = [b for b in here if here[0].evidence - b.evidence < ODDS]
+    return min(near, key=lambda b: LIKELY.index(b.group.kind))
 
 
 def _named(look: Look, progress: Progress) -> NamedEffect | None:
