@@ -107,8 +107,9 @@ class LeftOut:
 def judge(whole: Linearisation, problem: Problem) -> list[Blunder]:
     """All groups of rows, those that chance explains least first; arguments as of `shifts`."""
     kinds: dict[object, list[Shift]] = {}
+    gone = {group for source in problem.sources for group in source.without}
     for shift in shifts(whole, problem):
-        if shift.dof:
+        if shift.dof and shift.group not in gone:
             kinds.setdefault(_alike(shift.group), []).append(shift)
     looks = sum(len(some) for some in kinds.values())
     found = [b for some in kinds.values() for b in _judged(some, looks)]

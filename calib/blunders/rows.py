@@ -11,6 +11,7 @@ from calib.effects import Effect, FrameOffset
 from calib.forward import NOISE, Stops
 from calib.linear.layout import Layout, key_of
 from calib.linear.system import Linearisation, Values
+from calib.problem.model import labels
 from calib.problem.problem import Block, Problem
 from calib.problem.unknowns import Role
 from calib.problem.without import ROD, of_the_arm
@@ -301,10 +302,9 @@ class _JointSums:
 
 def _stop_names(layout: Layout, problem: Problem) -> dict[int, tuple[str, str]]:
     """Name of each stop, and of its recording where there are several."""
-    several = len(problem.sources) > 1
     return {
-        layout.stops[s.recording.folder, k]: (stop, s.recording.folder.name if several else "")
-        for s in problem.sources
+        layout.stops[s.recording.folder, k]: (stop, label)
+        for s, label in zip(problem.sources, labels(problem.sources), strict=True)
         for k, stop in enumerate(s.recording.stops)
         if (s.recording.folder, k) in layout.stops
     }

@@ -164,13 +164,14 @@ def _wild(look: Look) -> list[Blunder]:
     for each in found:
         if each.evidence > AS_FAR * found[0].evidence:
             places.setdefault((each.group.recording, each.group.where), []).append(each)
-    return [_likeliest(some) for some in places.values()]
+    return [likeliest(here) for here in places.values()]
 
 
-def _likeliest(some: Sequence[Blunder]) -> Blunder:
-    """Of those that explain as much as the first, the one whose kind goes wrong most often."""
-    near = [b for b in some if some[0].evidence - b.evidence < ODDS and b.possible]
-    return min(near, key=lambda b: b.likely) if near else some[0]
+def likeliest(here: Sequence[Blunder]) -> Blunder:
+    """Of groups of one place, furthest out first, that which goes wrong most often among those that
+    can stand in for the first."""
+    near = [b for b in here if here[0].evidence - b.evidence < ODDS and b.possible]
+    return min(near, key=lambda b: b.likely) if near else here[0]
 
 
 def _named(look: Look, progress: Progress) -> NamedEffect | None:

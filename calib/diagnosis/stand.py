@@ -54,10 +54,11 @@ class Stand:
         """The model fitted from here, with some groups of rows left out."""
         tokens = [group.token for group in groups]
         sources, model = leave_out(self.sources, tokens), self.model.leaving_out(tokens)
-        anew = any(group.kind == "surface" for group in groups)  # beams then meet other things
-        start = self.estimate.start
-        problem = problems.build(sources, model, meetings=None if anew else self.problem.meetings)
-        estimate = solve(problem, progress=progress, start=Start(start.state) if anew else start)
+        meetings = dict(self.problem.meetings)
+        if any(group.kind == "surface" for group in groups):  # a mesh then has fewer
+            meetings = {i: m for i, m in meetings.items() if sources[i].reference is None}
+        problem = problems.build(sources, model, meetings=meetings)
+        estimate = solve(problem, progress=progress, start=self.estimate.start)
         return Stand(sources, model, problem, estimate)
 
     def _refitted(self, model: Model, start: Start, progress: Progress) -> Stand:

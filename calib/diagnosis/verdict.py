@@ -26,6 +26,7 @@ from calib.diagnosis.search import (
 from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import formula, hangs_on, what_separates, words
 from calib.effects import CATALOGUE, Site
+from calib.problem.model import labels
 from calib.results.solution import one_unit
 from calib.rig import Rig
 
@@ -66,10 +67,10 @@ class Diagnosis:
     unexplained: Sequence[Mapping[str, Any]]
     weak_directions: Sequence[Mapping[str, Any]]
     untestable: Mapping[str, str]
-    blunders: Sequence[Mapping[str, Any]]
-    detectable: Mapping[str, Mapping[str, float]] = field(repr=False)
     misfit: Mapping[str, float]
     curves: Sequence[Curve] = field(repr=False)
+    blunders: Sequence[Mapping[str, Any]] = ()
+    detectable: Mapping[str, Mapping[str, float]] = field(default_factory=dict, repr=False)
     too_few: bool = False
     command: str = ""
     rejected: Rejects | None = None
@@ -162,9 +163,9 @@ def conclude(
 
 def _rig(left: LeftOut, look: Look) -> Rig:
     """On paper, of the recording that a blunder is in."""
-    named = left.blunder.group.recording
-    rigs = {s.recording.folder.name: s.rig for s in look.stand.sources}
-    return rigs.get(named) or look.stand.sources[0].rig
+    sources = look.stand.sources
+    rigs = dict(zip(labels(sources), (source.rig for source in sources), strict=True))
+    return rigs.get(left.blunder.group.recording) or sources[0].rig
 
 
 def _stops(look: Look) -> int:

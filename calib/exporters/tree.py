@@ -53,7 +53,8 @@ def write_tree(fit: FittedRig, folder: Path) -> Written:
     SubElement(svg, "title").text = f"Frames of {fit.rig.name}"
     SubElement(svg, "rect", width="100%", height="100%", fill="white")
     _text(svg, LEFT, 28, f"Frames of {fit.rig.name}", style=BOLD)
-    _text(svg, LEFT, 10, ". ".join(fit.run.warning), RED, style=BOLD)
+    if fit.run.warning:
+        _text(svg, LEFT, 10, ". ".join(fit.run.warning), RED, style=BOLD)
     said = "each in the axes of the frame above it, angles as in URDF; sigma of the worst axis"
     _text(svg, LEFT, 48, f"{said}, amber where the data alone do not tell it", PALE)
     for x, title in ((where, "x, y, z, roll, pitch, yaw"), (spread, "one sigma")):

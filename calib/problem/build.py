@@ -9,7 +9,7 @@ import numpy as np
 from calib.forward import Term
 from calib.problem.beams import add_beams
 from calib.problem.bodies import add_bodies, add_targets
-from calib.problem.model import Model, Source
+from calib.problem.model import Model, Source, labels
 from calib.problem.places import Places
 from calib.problem.problem import Problem, SourceStops
 from calib.problem.unknowns import Unknown
@@ -45,11 +45,16 @@ def build(
         for term in terms:
             problem.calibration.append(problem.add(effect_unknown(term, source)))
     problem.calibration = list(dict.fromkeys(problem.calibration))
-    for i, source in enumerate(sources):
+    for i, (source, label) in enumerate(zip(sources, labels(sources), strict=True)):
         chosen = np.ones(len(source.recording.stops), bool) if use is None else use[i]
         prefix = "" if len(sources) == 1 else f"{i}/"
         part = SourceStops(
-            number=i, source=source, terms=problem.terms[i], chosen=chosen, prefix=prefix
+            number=i,
+            source=source,
+            terms=problem.terms[i],
+            chosen=chosen,
+            prefix=prefix,
+            label=label,
         )
         places = Places(problem, part, model)
         add_bodies(problem, part, places)

@@ -86,7 +86,7 @@ class Model:
 
     def leaving_out(self, tokens: Sequence[str]) -> Model:
         """The model with more left out of its recordings."""
-        return replace(self, without=(*self.without, *(t for t in tokens if t not in self.without)))
+        return replace(self, without=(*self.without, *tokens))
 
     def minus(self, names: Sequence[str]) -> Model:
         """The model without some effects, and without what it held of them.
@@ -176,12 +176,21 @@ def owned(effect: Effect, rig: Rig) -> bool:
 
 @dataclass(frozen=True)
 class Source:
-    """A recording opened for a fit: its rig, its stops, its reference, and what is left out."""
+    """A recording opened for a fit.
+
+    Args:
+        rig: what is bolted to what.
+        recording: its stops, without what is left out.
+        reference: its mesh, if it has one.
+        without: what is left out.
+        given: the recording as it is on disk, where something is left out.
+    """
 
     rig: Rig
     recording: Recording
     reference: Reference | None
     without: tuple[Group, ...] = ()
+    given: Recording | None = None
 
     @classmethod
     def open(cls, folder: Path | str) -> Source:
@@ -201,10 +210,16 @@ class Source:
     def changed(self, recording: Recording, without: Group) -> Source:
         """The same with a changed recording, something being left out; what scans were read stay
         read."""
-        out = replace(self, recording=recording, without=(*self.without, without))
+        given = self.given or self.recording
+        out = replace(self, recording=recording, without=(*self.without, without), given=given)
         if self.rig.lidar is not None:
             out.__dict__["store"] = self.store
         return out
+
+    @property
+    def whole(self) -> Source:
+        """The same with nothing left out."""
+        return replace(self, recording=self.given or self.recording, without=(), given=None)
 
     def lacks(self, kind: Kind) -> set[tuple[str, str]]:
         """Where and what of one kind is left out."""
@@ -232,6 +247,19 @@ def recording_names(sources: Sequence[Source]) -> list[str]:
     return [
         f"{rig}.{rigs[:i].count(rig)}" if rigs.count(rig) > 1 else rig for i, rig in enumerate(rigs)
     ]
+
+
+def labels(sources: Sequence[Source]) -> list[str]:
+    """What each recording is called beside the others: its folder, with as much of the path to it
+    as tells it from them; empty where it is the only one."""
+    if len(sources) == 1:
+        return [""]
+    paths = [source.recording.folder.resolve().parts for source in sources]
+    for count in range(1, 1 + max(map(len, paths))):
+        found = ["/".join(path[-count:]) for path in paths]
+        if len(set(found)) == len(found):
+            break
+    return found
 
 
 def same_mesh(a: Reference | None, b: Reference | None) -> bool:

@@ -109,6 +109,9 @@ class Places:
             guess, seen = start.guessed_pose(source, [k]), start.root_pose(source, [k])
             if guess is not None and seen is not None:
                 return seen @ se3.inverse(guess)
+        T = start.reference_from_targets(source.whole)  # good enough to start from
+        if T is not None:
+            return T
         raise InputError(
             f"{source.recording.folder}: nothing ties '{source.rig.reference_frame}' to "
             f"'{source.rig.world}'; add targets.csv, or base_guess columns to stops.csv."

@@ -43,6 +43,7 @@ class SourceStops:
         terms: the model's effects on its rig.
         chosen: (K,) bool, which stops take part.
         prefix: before the names of its own unknowns; empty where it is the only recording.
+        label: what it is called beside others, see `labels`.
     """
 
     number: int
@@ -50,11 +51,7 @@ class SourceStops:
     terms: Sequence[Term]
     chosen: np.ndarray
     prefix: str
-
-    @property
-    def label(self) -> str:
-        """Before the names of its groups of rows: empty where it is the only recording."""
-        return self.source.recording.folder.name if self.prefix else ""
+    label: str
 
     @property
     def has_lidar(self) -> bool:

@@ -12,6 +12,8 @@ from chains.align import align_points, mean_pose
 from chains.errors import InputError
 from sensors.stops import Targets
 
+FEWEST = 3  # spheres that fix a pose
+
 
 def root_pose(source: Source, stops: Sequence[int]) -> np.ndarray | None:
     """T_world_root (4, 4) of stops that share it, with every CAD and URDF value taken at its word.
@@ -46,12 +48,21 @@ def root_pose(source: Source, stops: Sequence[int]) -> np.ndarray | None:
 
 
 def reference_from_targets(source: Source) -> np.ndarray | None:
-    """T_world_reference (4, 4) from the spheres, the rods hanging along their mean direction."""
+    """T_world_reference (4, 4) from the spheres, the rods hanging along their mean direction.
+
+    Returns:
+        None where no targets are there, or what is left out leaves too few.
+
+    Raises:
+        InputError: there are too few.
+    """
     targets, spec = source.recording.targets, source.rig.target
     if targets is None or spec is None:
         return None
     sphere = lower_markers(targets) + spec.sphere_below_lower_marker_m * gravity(source)
     known = np.isfinite(targets.faro_m).all(axis=1)
+    if known.sum() < FEWEST and source.given is not None:
+        return None
     try:
         return align_points(sphere[known], targets.faro_m[known])[0]
     except InputError as error:
@@ -74,9 +85,19 @@ def lower_markers(targets: Targets) -> np.ndarray:
 
 
 def _rods(targets: Targets) -> np.ndarray:
-    """From upper to lower marker, of the rods that have both."""
+    """From upper to lower marker, of the rods that have both.
+
+    Raises:
+        InputError: none has.
+    """
     rods = targets.lower_m - targets.upper_m
-    return rods[np.isfinite(rods).all(axis=1)]
+    rods = rods[np.isfinite(rods).all(axis=1)]
+    if not len(rods):
+        raise InputError(
+            "no target has both of its markers, so nothing says which way rods hang; leave out "
+            "fewer markers, or the rods as a whole"
+        )
+    return rods
 
 
 def guessed_pose(source: Source, stops: Sequence[int]) -> np.ndarray | None:

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from calib.effects import DEFAULT, Effect, Site, find
-from calib.problem.model import Source
+from calib.problem.model import Source, labels
 from calib.residuals.groups import CAD, JOINTS, MESH, SCAN, Group
 from calib.residuals.targets import PARTS
 from chains.errors import InputError
@@ -29,35 +29,39 @@ def leave_out(sources: Sequence[Source], tokens: Sequence[str]) -> list[Source]:
     Raises:
         InputError: a token names nothing that any recording has, or something in several.
     """
-    out = list(sources)
+    out, called = list(sources), labels(sources)
     for token in tokens:
-        found = [(i, group) for i, s in enumerate(out) for group in _matching(s, token)]
+        every = enumerate(zip(out, called, strict=True))
+        found = [(i, g) for i, (s, label) in every for g in _matching(s, label, token)]
+        if any(group in out[i].without for i, group in found):
+            raise InputError(f"--without {token}: that is left out already; name it once")
         shared = found and found[0][1].where in (CAD, MESH)
         if not found or (len(found) > 1 and not shared):
-            raise InputError(_refusal(sources, token, len(found)))
+            raise InputError(_refusal(out, token, [called[i] for i, _ in found]))
         for i, group in found:
             out[i] = _left_out(out[i], group)
     return out
 
 
-def _matching(source: Source, token: str) -> list[Group]:
-    """What a token names in a recording: one group, or none."""
-    folder = source.recording.folder.name
-    token = token.removeprefix(f"{folder}/")
-    return [group for group in _groups(source) if group.token == token]
+def _matching(source: Source, label: str, token: str) -> list[Group]:
+    """What a token names in a recording: one group, or none. What belongs to a recording may bear
+    its name, or what it is called beside others."""
+    bare = {token, *(token.removeprefix(f"{n}/") for n in (label, source.recording.folder.name))}
+    here = dict.fromkeys([*source.without, *_groups(source, label)])
+    return [group for group in here if replace(group, recording="").token in bare]
 
 
-def _groups(source: Source) -> list[Group]:
-    """All that can be left out of a recording."""
+def _groups(source: Source, label: str = "") -> list[Group]:
+    """All that can be left out of a recording that is called so."""
     rig, recording = source.rig, source.recording
     out = []
     for k, stop in enumerate(recording.stops):
-        out += [Group("body", stop, b) for b in recording.bodies if _seen(recording, b)[k]]
-        out += [Group("scan", stop, SCAN)] if recording.has_scan[k] else []
+        out += [Group("body", stop, b, label) for b in recording.bodies if _seen(recording, b)[k]]
+        out += [Group("scan", stop, SCAN, label)] if recording.has_scan[k] else []
         if rig.joint_names:
-            out += [Group("joints", stop, what) for what in (JOINTS, *rig.joint_names)]
+            out += [Group("joints", stop, what, label) for what in (JOINTS, *rig.joint_names)]
     for target in recording.targets.names if recording.targets else ():
-        out += [Group("target", target, what) for what in (*PARTS, ROD)]
+        out += [Group("target", target, what, label) for what in (*PARTS, ROD)]
     out += [Group("frame", CAD, frame) for frame in rig.frame_sigma]
     out += [Group("frame", CAD, f"{e}.{p}") for e, p in on_paper(source)]
     if source.reference is not None:
@@ -97,9 +101,11 @@ def _left_out(source: Source, group: Group) -> Source:
 
 
 def _targets(targets: Targets, group: Group) -> Targets | None:
-    """The targets without a part of one, which is NaN, or without one."""
+    """The targets without a part of one, which is NaN, or without one: a rod that has lost both of
+    its markers hangs nowhere."""
     at = targets.names.index(group.where)
-    if group.what == ROD:
+    other = {"lower": targets.upper_m, "upper": targets.lower_m}.get(group.what)
+    if group.what == ROD or (other is not None and not np.isfinite(other[at]).all()):
         kept = np.delete(np.arange(len(targets.names)), at)
         if not len(kept):
             return None
@@ -111,13 +117,15 @@ def _targets(targets: Targets, group: Group) -> Targets | None:
     return replace(targets, **{name: part})
 
 
-def _refusal(sources: Sequence[Source], token: str, count: int) -> str:
-    if count > 1:
-        folders = " or ".join(f"{s.recording.folder.name}/{token}" for s in sources)
-        return f"--without {token}: several recordings have that; say which: {folders}"
+def _refusal(sources: Sequence[Source], token: str, called: Sequence[str]) -> str:
+    """Of a token that names something in none of the recordings, or in all of those called so."""
+    if called:
+        what = token.rpartition("/")[2]
+        choice = " or ".join(f"{label}/{what}" for label in called)
+        return f"--without {token}: several recordings have that; say which: {choice}"
     known = [group.token for s in sources for group in _groups(s)]
     return (
-        f"--without {token}: no recording has that{nearest(token, known)}; write STOP:BODY, "
-        "STOP:scan, STOP:joints, STOP:JOINT, TARGET:sphere, lower, upper or rod, cad:FRAME, "
-        "cad:EFFECT.PARAMETER or mesh:surface_N"
+        f"--without {token}: no recording has that; write STOP:BODY, STOP:scan, STOP:joints, "
+        "STOP:JOINT, TARGET:sphere, lower, upper or rod, cad:FRAME, cad:EFFECT.PARAMETER or "
+        f"mesh:surface_N{nearest(token, known)}"
     )

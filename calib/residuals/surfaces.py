@@ -93,10 +93,7 @@ class MeshSurface:
             near_edges: True drops beams near a depth edge, and grazing ones.
         """
         origins, directions = _in_reference(T, beams)
-        triangle = self.reference.first_triangle(origins, directions)
-        if self.without:
-            gone = np.isin(self.reference.facts(triangle)[2], [*self.without])
-            triangle = np.where(gone, -1, triangle).astype(np.int32)
+        triangle = self._kept(self.reference.first_triangle(origins, directions))
         if not near_edges:
             return Association(triangle)
         hits = self.reference.hits(triangle, origins, directions)
@@ -105,7 +102,9 @@ class MeshSurface:
         return self.divided(T, beams, np.where(spoilt, -1, hits.triangle).astype(np.int32))
 
     def divided(self, T: np.ndarray, beams: Beams, part: np.ndarray) -> Association:
-        """The triangles (N,) that beams meet from there, and the patches of them."""
+        """The triangles (N,) that beams meet from there, and the patches of them; -1 for one of a
+        surface that is left out."""
+        part = self._kept(part)
         met = _Met(T, beams, self.reference.planes, part)
         patches = {
             kind: self._patch(met, size_m).astype(np.int32)
@@ -127,6 +126,12 @@ class MeshSurface:
         for kind, size_m in self.patches_m.items():
             columns[kind] = partial(self._patch, met, size_m)
         return met.surface(columns | association.patches)
+
+    def _kept(self, triangle: np.ndarray) -> np.ndarray:
+        if not self.without:
+            return triangle
+        gone = np.isin(self.reference.facts(triangle)[2], [*self.without])
+        return np.where(gone, -1, triangle).astype(np.int32)
 
     def _patch(self, met: _Met, size_m: float) -> np.ndarray:
         return self.reference.patch(met.part, met.point_m, size_m)

@@ -96,8 +96,7 @@ def grow(
     if Path(out).resolve() == run.folder.resolve():
         raise InputError(f"{out}: a run cannot replace the one that it grows from; give another -o")
     with _folder(out) as folder:
-        more = [token for token in model.without if token not in run.model.get("without", ())]
-        sources = leave_out(reopened(run), more)
+        sources = reopened(run, model.without)
         start = start_of(run, sources)
         _refuse_idle(model, run, sources)
         told = {key: run.model.get(key) for key in ("hold_out", "folds", "prior")}

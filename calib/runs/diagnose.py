@@ -85,8 +85,11 @@ def command_without(run: Run, tokens: Sequence[str]) -> str:
     if any(not isinstance(effect, str) for effect in effects):  # of files, or with a shape
         return shlex.join(["rigcal", "add", str(run.folder), *out, *without[-2 * len(tokens) :]])
     chosen = [] if tuple(effects) == DEFAULT else ["--effects", ",".join(effects)]
-    fixed = [part for name in run.model["fixed"] for part in ("--fix", name)]
-    return shlex.join(["rigcal", "fit", *map(str, run.recordings), *out, *chosen, *fixed, *without])
+    chosen += [part for name in run.model["fixed"] for part in ("--fix", name)]
+    for key, usual in (("hold_out", "location"), ("folds", 1), ("prior", None)):
+        if run.model[key] != usual:
+            chosen += [f"--{key.replace('_', '-')}", str(run.model[key])]
+    return shlex.join(["rigcal", "fit", *map(str, run.recordings), *out, *chosen, *without])
 
 
 def _odd_rings(stand: Stand) -> Iterator[str]:

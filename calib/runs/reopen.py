@@ -23,14 +23,18 @@ def model_of(run: Run) -> Model:
     return Model.read(run.model, run.folder / MODEL)
 
 
-def reopened(run: Run) -> list[Source]:
-    """A run's recordings, as they were when the run was fitted to them, without what it left out.
+def reopened(run: Run, without: Sequence[str] | None = None) -> list[Source]:
+    """A run's recordings, as they were when the run was fitted to them.
+
+    Args:
+        run: the run.
+        without: what is left out of them; what the run left out where None.
 
     Raises:
-        InputError: one is gone, or has changed.
+        InputError: one is gone, or has changed; or one does not have what is to be left out.
     """
     found = [_reopened(recording, run) for recording in run.model["recordings"]]
-    return leave_out(found, run.model.get("without", ()))
+    return leave_out(found, run.model.get("without", ()) if without is None else without)
 
 
 def start_of(run: Run, sources: Sequence[Source]) -> Start:

@@ -20,7 +20,7 @@ from calib.residuals.robust import huber_weight
 from calib.residuals.targets import PARTS, HangingTarget
 from calib.residuals.tracker import BodiesTogether, TrackedBody
 
-SETTLED = 0.01  # change of a weight that moves no estimate: a hundredth of one group's pull
+SETTLED = 0.01  # relative change of a weight, and so of how hard a group pulls
 
 
 class _Norms(NamedTuple):
@@ -32,7 +32,12 @@ class _Norms(NamedTuple):
     dof: np.ndarray
 
 
-def reweighted(problem: Problem, values: Mapping[str, np.ndarray], held: frozenset[str]) -> Problem:
+def reweighted(
+    problem: Problem,
+    values: Mapping[str, np.ndarray],
+    held: frozenset[str],
+    settled: float = SETTLED,
+) -> Problem:
     """The problem with the weights that its residuals at a state ask for; itself, where these are
     what it has.
 
@@ -40,6 +45,7 @@ def reweighted(problem: Problem, values: Mapping[str, np.ndarray], held: frozens
         problem: as fitted.
         values: the state.
         held: unknowns without a prior of their own.
+        settled: relative change of a weight that is none.
     """
     kinds: dict[str, list[_Norms]] = {}
     for found in (*_of_blocks(problem.blocks, values), *_of_priors(problem, values, held)):
@@ -50,8 +56,9 @@ def reweighted(problem: Problem, values: Mapping[str, np.ndarray], held: frozens
         split = np.cumsum([len(s.norm) for s in some])[:-1]
         for each, weight in zip(some, np.split(huber_weight(norm, dof), split), strict=True):
             weights[id(each.owner)] = weight
-    blocks = [_weighted(b, weights.get(id(b))) for b in problem.blocks]
-    variables = {n: _weighted(v, weights.get(id(v))) for n, v in problem.variables.items()}
+    blocks = [_weighted(b, weights.get(id(b)), settled) for b in problem.blocks]
+    unknowns = problem.variables.items()
+    variables = {n: _weighted(v, weights.get(id(v)), settled) for n, v in unknowns}
     same = all(a is b for a, b in zip(blocks, problem.blocks, strict=True))
     if same and all(variables[n] is v for n, v in problem.variables.items()):
         return problem
@@ -106,14 +113,12 @@ def _of_priors(
             yield _Norms(kind, unknown, np.array([norm]), np.array([unknown.dim]))
 
 
-def _weighted(owner: Block | Unknown, weight: np.ndarray | None) -> Block | Unknown:
+def _weighted(owner: Block | Unknown, weight: np.ndarray | None, settled: float) -> Block | Unknown:
     """With another weight, if it differs."""
     if weight is None:
         return owner
-    if isinstance(owner, Unknown):
-        return (
-            owner if abs(weight[0] - owner.weight) < SETTLED else replace(owner, weight=weight[0])
-        )
-    now = np.ones(len(weight)) if owner.weight is None else owner.weight
-    weight = np.where(now > 0, weight, 0.0)
-    return owner if np.abs(weight - now).max() < SETTLED else replace(owner, weight=weight)
+    now = np.ones(len(weight)) if owner.weight is None else np.atleast_1d(owner.weight)
+    weight = np.where(now > 0, weight, 0.0)  # what was left out stays so
+    if (np.abs(weight - now) <= settled * now).all():
+        return owner
+    return replace(owner, weight=float(weight[0]) if isinstance(owner, Unknown) else weight)

@@ -15,7 +15,8 @@ from calib.linear.linearise import lidars
 from calib.problem.unknowns import Unknown
 from calib.residuals.beams import Rows
 from calib.residuals.scan import ScanStop
-from calib.solve.fit import CONVERGED, MAX_PASSES
+from calib.solve.descent import MAX_PASSES
+from calib.solve.loop import CONVERGED
 from chains import se3
 
 Part = tuple[np.ndarray, csr_array]

@@ -177,7 +177,7 @@ class Drawn:
         """The verdict on groups that are so far off, the others being as they are."""
         off = [replace(s, statistic=statistics.get(g, s.statistic)) for g, s in self.shifts.items()]
         monkeypatch.setattr(judged, "shifts", lambda whole, problem: iter(off))
-        return {b.group: b for b in judged.judge(None, None)}
+        return {b.group: b for b in judged.judge(None, self.case.start.problem)}
 
 
 @pytest.fixture(scope="module")

@@ -119,11 +119,8 @@ def test_a_users_effect_is_written_so_that_it_can_be_read_again(first, tmp_path)
     assert third.effects == ("ring_range_offset", "lean", "arm_joint_offset")
     assert third.solution.shared.effects["lean"].names == ("p1", "p2")
     again = Model.read(third.model)
-    assert again.document() == {
-        "effects": third.model["effects"],
-        "fixed": ["mount.tx"],
-        "without": [],
-    }
+    expected = {"effects": third.model["effects"], "fixed": ["mount.tx"], "without": []}
+    assert again.document() == expected
     with pytest.raises(InputError, match="lean"):
         again.plus([e for e in again.effects if e.name == "lean"])
 

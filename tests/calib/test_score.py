@@ -72,6 +72,7 @@ class World:
             stop=stop,
             place=place,
             weight_m2=float(len(J)),
+            whole=None,
             directions=lambda kept: kept,
         )
 

@@ -23,7 +23,9 @@ def test_ur10(shared, tmp_path):
     assert 0.25 < mean["held_out"] < 0.45
     # Ten times its repeatability is left: the sigmas are not to be believed as they stand.
     assert run.summary["misfit"]["tracker"] > 2
-    assert run.summary["sigmas_widened_by"] == run.summary["misfit"]["tracker"]
+    # With the weights that rows had in the fit: a few wild ones widen no sigma.
+    widened = run.summary["sigmas_widened_by"]
+    assert 0.9 * run.summary["misfit"]["tracker"] < widened <= run.summary["misfit"]["tracker"]
     tied = {entry["name"]: entry["why"] for entry in run.solution.not_estimated}
     assert any("shoulder_pan_joint" in name for name in tied)
 
