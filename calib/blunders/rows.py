@@ -80,8 +80,7 @@ def group_rows(
 def _bodies(whole: Linearisation) -> Iterator[GroupRows]:
     """Every body at every stop where it was seen; offsets in the tracker's axes."""
     layout = whole.layout
-    blocks = [b for together in layout.bodies for b in together.blocks]
-    blocks += [b for b in layout.others if isinstance(b, TrackedBody)]
+    blocks = _tracked(layout)
     plain = [replace(b, weight=None) for b in blocks]
     weight = {id(p): b.weight for p, b in zip(plain, blocks, strict=True)}
     for together in BodiesTogether.of(plain):
@@ -107,6 +106,11 @@ def _bodies(whole: Linearisation) -> Iterator[GroupRows]:
                     groups={group: np.eye(per)},
                     turn=turn[-per:, -per:],
                 )
+
+
+def _tracked(layout: Layout) -> list[TrackedBody]:
+    own = [b for together in layout.bodies for b in together.blocks]
+    return own + [b for b in layout.others if isinstance(b, TrackedBody)]
 
 
 def _targets(whole: Linearisation, graph_rows: GraphRows) -> Iterator[GroupRows]:
@@ -229,8 +233,8 @@ def _exact_joints(whole: Linearisation, problem: Problem) -> Iterator[GroupRows]
     layout, names = whole.layout, _stop_names(whole.layout, problem)
     found: dict[int, list[_JointSums]] = {}
     rigs: dict[int, Rig] = {}
-    for block in layout.others:
-        if isinstance(block, TrackedBody) and _is_exact(block.stops):
+    for block in _tracked(layout):
+        if _is_exact(block.stops):
             for k, key in enumerate(block.stop_names):
                 rigs[layout.stops[key]] = block.stops.rig
                 sums = _JointSums.of_body(block, k, whole)

@@ -12,7 +12,7 @@ from calib.rig import Rig
 from calib.rig.suspect import Suspect, listed
 from sensors.lidar import LARGEST_REFLECTANCE, LidarModel, beams
 from sensors.recording import Recording, Scan
-from sensors.rings import odd_rings, ring_elevations
+from sensors.rings import RingFinding, odd_rings, ring_elevations
 
 FULL_SCALES = {LARGEST_REFLECTANCE: ", a reflectance", 255.0: " of 255", 65535.0: " of 65535"}
 LEAST_VALUES = 20  # different ones in a column, for its repetition to be no chance
@@ -109,18 +109,17 @@ def odd_scans(rig: Rig, recording: Recording, scans: ScanSums) -> Iterator[str |
         yield f"there is no scan of {listed(missing)}, though of other stops"
     if (silent := np.flatnonzero(scans.rings == 0)).size:
         yield f"no point comes from ring {listed(silent)}; rings are counted from 0"
-    yield from odd_numbers(scans)
+    numbered = numbering(scans)
+    if numbered is not None:
+        yield Suspect("rings", rig.lidar.name, numbered.sentence, size=numbered.off_rad, unit="rad")
     yield from _at_once(recording)
     yield from _twice(scans)
     yield from _intensities(scans)
 
 
-def odd_numbers(scans: ScanSums) -> Iterator[Suspect]:
-    """Rings that are not numbered as their LiDAR's model has it."""
-    lidar = scans.lidar
-    numbered = odd_rings(lidar, ring_elevations(scans.elevation_rad, scans.rings))
-    if numbered is not None:
-        yield Suspect("rings", lidar.name, numbered.sentence, size=numbered.off_rad, unit="rad")
+def numbering(scans: ScanSums) -> RingFinding | None:
+    """How rings are numbered otherwise than their LiDAR's model has it, if they are."""
+    return odd_rings(scans.lidar, ring_elevations(scans.elevation_rad, scans.rings))
 
 
 def _at_once(recording: Recording) -> Iterator[Suspect]:

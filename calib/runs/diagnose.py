@@ -17,7 +17,7 @@ from calib.effects import DEFAULT
 from calib.problem import build
 from calib.results.errors import Errors
 from calib.results.holdout import held_out
-from calib.rig.scanned import ScanSums, odd_numbers
+from calib.rig.scanned import ScanSums, numbering
 from calib.runs.belief import forbids
 from calib.runs.reopen import model_of, reopened, start_of
 from calib.runs.run import DIAGNOSIS, Run
@@ -47,6 +47,7 @@ def diagnose(
     with threadpool_limits(limits=1):
         stand = stand_of(run, progress)
         # Away from an optimum every effect that moves the state towards one looks missing.
+        rings = list(_odd_rings(stand))
         found = search(stand, progress) if run.converged else search(stand, progress, most=0)
         rejected = rejects(found.looks[0].stand, progress)
         falls = {}
@@ -65,11 +66,15 @@ def diagnose(
         run.summary["misfit"],
         weak_directions(run.solution, float(run.summary["sigmas_widened_by"]), found.looks[0]),
         rejected,
-        forbids(run),
+        [*forbids(run), *(clause for clause, harms in rings if harms)],
     )
     result = replace(
         result,
-        sentences=[*run.warning, *result.sentences, *_odd_rings(stand)],
+        sentences=[
+            *run.warning,
+            *result.sentences,
+            *(f"{clause[0].upper()}{clause[1:]}." for clause, harms in rings if not harms),
+        ],
         command=command_without(run, tokens) if tokens else "",
     )
     write_json(run.folder / DIAGNOSIS, result.document())
@@ -92,17 +97,18 @@ def command_without(run: Run, tokens: Sequence[str]) -> str:
     return shlex.join(["rigcal", "fit", *map(str, run.recordings), *out, *chosen, *without])
 
 
-def _odd_rings(stand: Stand) -> Iterator[str]:
-    """Whether rings are numbered otherwise than their model has it: no fit suffers, but whoever
-    takes its ring offsets by number does."""
+def _odd_rings(stand: Stand) -> Iterator[tuple[str, bool]]:
+    """How rings are numbered otherwise than their model has it, a clause each, and whether offsets
+    by ring are then of no use: those counted from the other end are many makers' own."""
     for source in stand.sources:
         scanned = np.flatnonzero(source.recording.has_scan)[:LOOKED]
         if source.rig.lidar is not None and len(scanned):
             sums = ScanSums(source.rig.lidar)
             for k in scanned.tolist():
                 sums.add(source.recording.stops[k], source.store.read(k)[0])
-            told = (suspect.sentence for suspect in odd_numbers(sums))
-            yield from (f"{sentence[0].upper()}{sentence[1:]}." for sentence in told)
+            found = numbering(sums)
+            if found is not None:
+                yield found.sentence, found.what != "reversed"
 
 
 def _unseen(stand: Stand, run: Run, progress: Progress) -> Errors:

@@ -35,6 +35,7 @@ LOOKS = 3  # how often, before a fit is given up
 # trackers and targets alone, whose passes cost little and where few rows check each other. A change
 # can be nine tenths of the one before there (four rods, one off: 0.7 sigma from the optimum after
 # ten times, 0.03 once changes are below a thousandth).
+AS_GOOD = 1e-6  # of a cost, by which weights may still lower it: where nothing fits, they never end
 REWEIGHTED, ALONE = (10, SETTLED_WEIGHT), (200, 1e-3)
 # Bodies half of whose stops are so far (m, rad) from where the chain puts them after a fit are not
 # described by it: CAD and encoders are good to millimetres. Measured on the independent recordings:
@@ -113,7 +114,14 @@ class Loop(Descent):
         """
         times, settled = ALONE if tolerance is None else REWEIGHTED
         for _ in range(times):
+            before = self.given, self.problem
             if self.lost or not self.take_weights(settled):
+                break
+            self.linearise(beams=tolerance is not None)
+            _, fall = self.step()
+            if fall < max(AT_OPTIMUM, AS_GOOD * self.cost()):
+                self.given, self.problem = before
+                self.lay_out()
                 break
             if tolerance is None:
                 self.solve_without_scans()
@@ -168,14 +176,20 @@ class Loop(Descent):
     def _set_aside(self, scale: np.ndarray) -> bool:
         """Leave scans out of the fit that contradict all others; whether there are any.
 
+        Not where bodies contradict each other: there the scan is to say which of them is right.
+
         Args:
             scale: (K,) how many sigmas wide the bulk of each scan's residuals is, bodies alone
                 telling where the LiDAR is.
         """
-        told = {b.stops.root for b in self.problem.blocks if isinstance(b, TrackedBody)}
+        bodies = [b for b in self.problem.blocks if isinstance(b, TrackedBody)]
+        told = {b.stops.root for b in bodies}
+        weights = ((b.stop_names, b.weight) for b in bodies if b.weight is not None)
+        torn = {k for names, w in weights for k, x in zip(names, w, strict=True) if x < 1}
         far = scale > CONTRADICTS * np.median(scale)
         pairs = zip(self.problem.scans, far, strict=True)
         keys = {key_of(scan) for scan, is_far in pairs if is_far and scan.stops.root in told}
+        keys -= torn
         if not keys:
             return False
         self.given = self.problem = self.given.setting_aside(keys)

@@ -70,11 +70,31 @@ def test_every_group_is_off_as_dense_rows_say(both, stops_first, monkeypatch):
     monkeypatch.setattr(Layout, "stops_first", stops_first)
     case, there = both
     here = found(case)
-    assert here.keys() == {*there[CAD].parts, *there[CAD].scans}
-    for group, shift in here.items():
+    known = {*there[CAD].parts, *there[CAD].scans}
+    assert here.keys() >= known
+    assert {g.kind for g in here.keys() - known} <= {"joints"}, "those of exact encoders: see below"
+    for group in known:
+        shift = here[group]
         assert_same(shift, there[group.where].off(group))
         axes, units = shift.axes, shift.units
         assert len(axes) == len(units) == len(shift.offset) == len(shift.information)
+
+
+@pytest.mark.parametrize("lidar", [True, False], ids=["lidar", "tracker alone"])
+def test_readings_of_exact_encoders_are_judged_as_those_of_nearly_exact_ones(lidar, tmp_path):
+    """Whose errors are unknowns, and whose readings are rows: to what 10 urad of play changes."""
+    statistics = []
+    for sigma_rad in (0, 1e-5):
+        rig = BY_STOP | {"arm": cases.PLAIN_ARM | {"sigma_joint_rad": sigma_rad}}
+        rig |= {} if lidar else {"lidar": None, "reference": None}
+        folder = rigs.write(tmp_path / f"{sigma_rad}", seed=6, **rig)
+        case = case_of(build([Source.open(folder)], cases.MODEL))
+        here = {g: s for g, s in found(case).items() if g.kind == "joints"}
+        assert len(here) == 4 * (1 + len(rigs.JOINTS))
+        statistics.append({g: (s.dof, s.statistic) for g, s in here.items()})
+    for group, (dof, statistic) in statistics[0].items():
+        assert statistics[1][group][0] == dof
+        assert statistics[1][group][1] == pytest.approx(statistic, rel=0.03, abs=0.03), str(group)
 
 
 @pytest.mark.parametrize("name", ["stop by stop", "no lidar", "a stop without scan"])

@@ -11,7 +11,7 @@ from calib.problem.model import Model, Source
 from calib.problem.unknowns import Role
 from calib.problem.without import leave_out
 from calib.residuals.robust import huber_weight
-from calib.solve import fit
+from calib.solve import loop
 from calib.solve.fit import solve
 
 from . import broken, rigs
@@ -55,7 +55,7 @@ def test_where_all_of_a_kind_are_off_none_is_wild():
 def test_where_nothing_is_off_no_bit_changes(tmp_path, monkeypatch, changes):
     source = Source.open(rigs.write(tmp_path / "box", seed=5, **changes))
     robust = solve(build([source], Model()))
-    monkeypatch.setattr(fit, "reweighted", lambda problem, *others: problem)
+    monkeypatch.setattr(loop, "reweighted", lambda problem, *others: problem)
     plain = solve(build([source], Model()))
     assert all(getattr(block, "weight", None) is None for block in robust.problem.blocks)
     assert all(unknown.weight == 1.0 for unknown in robust.problem.variables.values())

@@ -271,4 +271,4 @@ def test_of_several_recordings_it_is_said_which(box, places, tmp_path):
 def test_adding_nothing_and_leaving_nothing_out_is_refused(run, rigcal, tmp_path):
     code, out, err = rigcal("add", run.folder, "-o", tmp_path / "out")
     assert (code, out) == (2, "") and not (tmp_path / "out").exists()
-    assert "give an effect to add, or what to leave out with --without" in " ".join(err.split())
+    assert "give an EFFECT to add, or what to leave out with --without" in " ".join(err.split())
