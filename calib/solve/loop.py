@@ -112,7 +112,7 @@ class Loop(Descent):
         Args:
             tolerance: as of `settle`; of trackers and targets alone where None.
         """
-        times, settled = ALONE if tolerance is None else REWEIGHTED
+        times, settled = REWEIGHTED if self.problem.scans else ALONE
         for _ in range(times):
             before = self.given, self.problem
             if self.lost or not self.take_weights(settled):
