@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 WIDTH = 100
 LISTED_PARAMETERS = 12  # an effect of more parameters than these is summarised
 ABREAST = 3  # runs in one table
+STACKED = 4  # names in a cell
 LEAST_P = 1e-12  # smaller ones are not told from each other
 ERROR_LABELS = {
     "nominal": "before, all as in CAD",
@@ -315,6 +316,9 @@ def _comparison_table(runs: Sequence[Run]) -> Table:
             if any(value is not None for value in values):
                 cells = (mm(value, "+" if error == "mean_mm" else "") for value in values)
                 table.add_row(f"{error[:-3]} {label}", "mm", *cells)
+    for key in ("left_out", "set_aside"):
+        if any(compared[key]):
+            table.add_row(key.replace("_", " "), "", *map(_stacked, compared[key]))
     _add_misfit(table, runs, compared)
     for variable, parameters in compared["parameters"].items():
         if len(parameters) > LISTED_PARAMETERS:
@@ -325,6 +329,12 @@ def _comparison_table(runs: Sequence[Run]) -> Table:
             cells = ("" if s is None else estimate_cell(e, s, entry["unit"]) for e, s in numbers)
             table.add_row(f"{variable}.{name}", shown(entry["unit"])[1], *cells)
     return table
+
+
+def _stacked(tokens: Sequence[str]) -> str:
+    """Names below each other, and how many more there are."""
+    more = [f"and {len(tokens) - STACKED} more"] if len(tokens) > STACKED else []
+    return "\n".join([*tokens[:STACKED], *more])
 
 
 def _add_misfit(table: Table, runs: Sequence[Run], compared: Mapping[str, Any]) -> None:
@@ -353,18 +363,8 @@ def ladder_table(rungs: Sequence[Rung]) -> Table:
         below = rung.below.summary["rms_mm"] if rung.below else {}
         held_out = " -> ".join(filter(None, (mm(r.get("held_out")) for r in (below, rms))))
         name = rung.run.folder.name or str(rung.run.folder)
-        table.add_row(name, _step(rung), held_out, mm(rms["fit"]), mm(rms["noise_floor"]))
+        table.add_row(name, rung.step, held_out, mm(rms["fit"]), mm(rms["noise_floor"]))
     return table
-
-
-def _step(rung: Rung) -> str:
-    """What a rung added and dropped."""
-    if rung.grown_from is None:
-        return "start"
-    if rung.below is None:
-        return f"grew from {rung.grown_from.name}, which is gone"
-    added = [f"+ {name}" for name in rung.added]
-    return ", ".join([*added, *(f"- {name}" for name in rung.dropped)]) or "the same model"
 
 
 def _add_spread(table: Table, variable: str, entries: Sequence[Mapping[str, Any]]) -> None:

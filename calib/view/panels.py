@@ -188,22 +188,14 @@ def _error(rung: Rung) -> tuple[float, str]:
 def _rung(rung: Rung, mm: float, width: float, floor: float) -> str:
     """One bar, `width` and `floor` in percent of the panel."""
     name = escape(rung.run.folder.name or str(rung.run.folder))
+    step = rung.step if rung.below else f"{rung.step}: {rung.run.folder.name}"
     line = f"position:absolute;top:0;bottom:0;left:{floor:.2f}%;border-left:2px dashed #00664a"
     return (
         f'<div style="display:flex;gap:.6em" title="{name}">'
-        f'<span style="{_CUT};flex:1">{escape(_step(rung))}</span><b>{mm:.2f} mm</b></div>'
+        f'<span style="{_CUT};flex:1">{escape(step)}</span><b>{mm:.2f} mm</b></div>'
         f'<div style="position:relative"><div style="background:#7fb2d9;height:.9em;'
         f'width:{width:.2f}%" data-mm="{mm:.4f}"></div><div style="{line}"></div></div>'
     )
-
-
-def _step(rung: Rung) -> str:
-    if rung.grown_from is None:
-        return f"start: {rung.run.folder.name}"
-    if rung.below is None:
-        return f"{rung.run.folder.name}, grown from {rung.grown_from.name}, which is gone"
-    changes = [f"+ {n}" for n in rung.added] + [f"- {n}" for n in rung.dropped]
-    return ", ".join(changes) or "the same model"
 
 
 def note(text: str, bad: bool = False) -> str:

@@ -264,6 +264,25 @@ def test_the_ladder_is_printed_below_the_comparison(run, printed):
     assert lines[1].startswith("01 grew from 00, which is gone 2.31")
 
 
+def test_what_was_left_out_stands_in_the_comparison_and_on_the_ladder(run, printed):
+    tokens = [f"s{k}:base" for k in range(6)]
+    first = replace(run, model=run.model | {"without": tokens[:1]})
+    summary = SUMMARY | {"set_aside": {"s9:scan": "0/9"}}
+    model = run.model | {"without": tokens, "grown_from": str(run.folder)}
+    second = replace(run, folder=run.folder.with_name("01"), model=model, summary=summary)
+    compared = tables.comparison([first, second])
+    assert compared["left_out"] == [tokens[:1], tokens]
+    assert compared["set_aside"] == [[], ["s9:scan"]]
+    lines = printed(tables.print_comparison, [first, second])
+    at = lines.index("left out s0:base s0:base")
+    assert lines[at + 1 : at + 5] == [*tokens[1:4], "and 2 more"]
+    assert lines[at + 5] == "set aside s9:scan"
+    assert any(line.startswith("first start, without s0:base") for line in lines)
+    assert "without s1:base, s2:base, s3:base and 2 more" in " ".join(lines)
+    lines = printed(tables.print_comparison, [replace(run, model=run.model)])
+    assert not any("left out" in line or "set aside" in line for line in lines)
+
+
 def test_many_runs_are_broken_into_tables(run, printed):
     runs = [replace(run, folder=run.folder.with_name(f"run{i}")) for i in range(7)]
     lines = printed(tables.print_comparison, runs)
