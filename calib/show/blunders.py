@@ -11,7 +11,7 @@ from calib.show.tables import columns_table
 if TYPE_CHECKING:
     from rich.table import Table
 
-HEADINGS = ("left out by", "off by", "or else")
+HEADINGS = ("what", "off by", "or else")
 
 
 def blunder_cells(blunder: Mapping[str, Any]) -> tuple[str, str, str]:

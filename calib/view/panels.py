@@ -64,7 +64,7 @@ def standing_out(run: Run) -> str:
 
 def _beams(points: Points | None, drawn: int, stop: str) -> str:
     if points is None:
-        return f"Stop {escape(stop)} was not scanned."
+        return f"Stop {escape(stop)} has no scan in this fit."
     if not points.inlier.any():
         return f"{len(points.inlier):,} beams, none of which the fit took for an inlier."
     residual = 1e3 * points.columns["residual_m"][points.inlier].astype(float)
@@ -118,11 +118,20 @@ def findings(diagnosed: Findings | None) -> str:
     """The verdict in sentences, and the candidates in their order."""
     if diagnosed is None:
         return _framed("This run has not been diagnosed.")
+    above = {each["sentence"] for each in diagnosed.blunders}  # listed with their buttons
     sentences = "".join(
-        f'<p style="margin:.3em 0">{escape(text)}</p>' for text in diagnosed.sentences
+        f'<p style="margin:.3em 0">{escape(text)}</p>'
+        for text in diagnosed.sentences
+        if text not in above
     )
     verdict = escape(f"Verdict: {diagnosed.heading}")
     return _framed(f'<b data-is="verdict">{verdict}</b>{sentences}{_candidates(diagnosed)}')
+
+
+def blunders(found: Sequence[Mapping[str, Any]]) -> str:
+    """What is wrong in the recording, in the sentences of the diagnosis."""
+    lines = "".join(f'<li style="margin:.3em 0">{escape(b["sentence"])}</li>' for b in found)
+    return _framed(f'<ul data-is="blunders" style="margin:0;padding-left:1.2em">{lines}</ul>')
 
 
 def _candidates(diagnosed: Findings) -> str:
@@ -173,7 +182,10 @@ def ladder(rungs: Sequence[Rung]) -> str:
         for rung, (mm, _) in zip(rungs, errors, strict=True)
     )
     said = f"Error of {errors[-1][1]}; dashed: noise floor, {floor:.2f} mm"
-    warning = "".join(f'<b style="color:#b00020">{w}</b>' for w in rungs[-1].run.warning)
+    warning = "".join(
+        f'<div data-is="warning" style="color:#b3261e;font-weight:600">{escape(sentence)}</div>'
+        for sentence in rungs[-1].run.warning
+    )
     picture = f'<div data-is="ladder">{rows}</div><div style="{_QUIET}">{said}</div>'
     return _framed(warning + picture)
 
