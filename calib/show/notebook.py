@@ -14,13 +14,14 @@ from calib.runs.estimates import variable_estimates
 from calib.runs.ladder import Rung
 from calib.runs.run import Run
 from calib.show.blunders import blunders_table
+from calib.show.comparison import ladder_table
 from calib.show.diagnosis import (
     LEADING,
     candidates_table,
     detectable_table,
     unexplained_table,
 )
-from calib.show.tables import effects_table, error_table, ladder_table, links_table
+from calib.show.tables import effects_table, error_table, links_table
 
 if TYPE_CHECKING:
     from rich.table import Table
