@@ -66,7 +66,7 @@ def test_make_targets_exist():
 def test_the_loop_runs_and_leaves_what_it_names(loop):
     folder, said = loop
     names = {path.name for path in folder.iterdir()}
-    made = {"run", "grown", "report.html", "corrected", "extrinsics"}
+    made = {"run", "grown", "less", "report.html", "corrected", "extrinsics"}
     assert names == {"rec", "rec.truth.json", *made}
     files = {path.name for path in (folder / "extrinsics").iterdir()}
     assert {"extrinsics.yaml", "arm.urdf", "rig.urdf", "rings.csv"} <= files

@@ -46,6 +46,7 @@ def stray_scans(
             p_value=float(np.exp(chance)),
             p_adjusted=after_looks(float(np.exp(chance)), looks),
             evidence=-chance,
+            limit=CONTRADICTS**2,
             detectable={"m": CONTRADICTS * sigma_m},
             looks=looks,
         )

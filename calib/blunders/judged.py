@@ -41,6 +41,7 @@ class Blunder:
         p_value: how often chance alone does, given how far out others of its kind are.
         p_adjusted: the same, all groups looked at being paid for.
         evidence: minus the log of the p-value of independent rows, at the scale of its kind.
+        limit: of the statistic, beyond which it is named.
         detectable: unit -> size that is found with 80 % power.
         looks: how many groups were looked at.
     """
@@ -49,6 +50,7 @@ class Blunder:
     p_value: float
     p_adjusted: float
     evidence: float
+    limit: float
     detectable: Mapping[str, float]
     looks: int
 
@@ -141,6 +143,7 @@ def _judged(some: Sequence[Shift], looks: int) -> Iterator[Blunder]:
             p_value=p,
             p_adjusted=after_looks(p, looks),
             evidence=-log_tail(scaled, shift.dof),
+            limit=float(limit * shift.dof * bulk),
             detectable={u: float(np.sqrt(enough * bulk / t)) for u, t in told.items() if t > 0},
             looks=looks,
         )

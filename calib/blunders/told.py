@@ -2,16 +2,39 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 
-from calib.blunders.judged import LeftOut
+from calib.blunders.judged import Blunder, LeftOut
 from calib.rig import Rig
 
 SHOWN = {"m": ("mm", 1e3), "rad": ("mrad", 1e3)}
 LARGE = 1000.0  # mm or mrad, from which on metres and radians are read more easily
 SIGN = 0.05  # of twice a value on paper, within which it is off as a wrong sign would have it
+
+
+def groups(looked_at: Iterable[Blunder]) -> dict[str, Any]:
+    """How far out every group that was looked at is, and the size from which a mishap to it would
+    be found, as diagnosis.json has them; of a group that is there twice, as it is at first."""
+    first: dict[str, Blunder] = {}
+    for blunder in looked_at:
+        first.setdefault(blunder.group.token, blunder)
+    return {
+        "groups": [
+            {
+                "token": token,
+                "kind": b.group.kind,
+                "statistic": b.shift.statistic,
+                "dof": b.shift.dof,
+                "limit": b.limit,
+                "p_value": b.p_value,
+            }
+            for token, b in first.items()
+        ],
+        "detectable": {token: dict(b.detectable) for token, b in first.items()},
+    }
 
 
 def document(left: LeftOut, rig: Rig) -> dict[str, Any]:
@@ -51,12 +74,12 @@ def document(left: LeftOut, rig: Rig) -> dict[str, Any]:
 
 
 def _sentence(left: LeftOut, wrong_sign: str | None) -> str:
-    size, sigma, unit, axis = left.blunder.leading()
+    *size, axis = left.blunder.leading()
     along = f" {axis}" if axis.startswith("about") else f" in {axis}" if axis else ""
     along = " along the beams" if axis == "along the beams" else along
     along = "" if axis == left.blunder.group.what.rpartition(".")[2] else along
     sign = f", as if the sign of its {wrong_sign} were wrong" if wrong_sign else ""
-    out = f"{left.blunder.group} is {_off(size, sigma, unit)} off{along}, against everything else"
+    out = f"{left.blunder.group} is {size_told(*size)} off{along}, against everything else"
     if left.belongs:
         return f"{out}: it was taken at {left.belongs.where}."
     if left.rivals:
@@ -65,7 +88,8 @@ def _sentence(left: LeftOut, wrong_sign: str | None) -> str:
     return f"{out}{sign}."
 
 
-def _off(size: float, sigma: float, unit: str) -> str:
+def size_told(size: float, sigma: float, unit: str) -> str:
+    """A size in m or rad and its sigma, as people read it."""
     name, scale = SHOWN.get(unit, (unit, 1.0))
     if scale * size >= LARGE:
         return f"{size:.3g} {unit}"

@@ -188,7 +188,7 @@ def compare(runs: Runs, as_json: Json = False) -> None:
     """Errors and parameters of runs side by side, and the ladder by which they grew."""
     from calib.runs.ladder import ladder
     from calib.runs.run import Run
-    from calib.show.tables import comparison, print_comparison
+    from calib.show.comparison import comparison, print_comparison
 
     opened = [Run.open(run) for run in runs]
     if as_json:

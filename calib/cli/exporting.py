@@ -29,13 +29,14 @@ def export(
     from calib.exporters import export as write
     from calib.runs.run import Run
 
-    done = write(Run.open(run), out, formats or [], force)
+    opened = Run.open(run)
+    done = write(opened, out, formats or [], force)
     document = {
         "files": [str(file) for file in done.files],
         "not_held": done.not_held,
         "left_out": done.left_out,
     }
-    lines = [f"wrote {file}" for file in done.files]
+    lines = [*opened.warning, *(f"wrote {file}" for file in done.files)]
     for name, why in done.left_out.items():
         lines.append(f"left out {name}: {why}")
     for name, sentences in done.not_held.items():

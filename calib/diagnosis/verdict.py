@@ -10,7 +10,7 @@ import numpy as np
 
 from calib.blunders import told
 from calib.blunders.chance import log_tail
-from calib.blunders.judged import LeftOut
+from calib.blunders.judged import Blunder, LeftOut
 from calib.diagnosis.candidates import concerned, lacking
 from calib.diagnosis.curves import Curve, curves
 from calib.diagnosis.rejects import Rejects
@@ -53,7 +53,7 @@ class Diagnosis:
         weak_directions: what the data hardly determine, and what would.
         untestable: effect -> what the recordings lack to test it.
         blunders: groups of rows that were left out, as nothing but a mishap explains them.
-        detectable: group -> unit -> the smallest mishap that would be found.
+        groups: all groups of rows that were looked at, and how far out each is.
         misfit: instrument -> how many times larger than their sigmas its residuals are.
         curves: mean residual against covariates.
         too_few: whether the stops are too few to say anything, whatever the verdict.
@@ -70,7 +70,7 @@ class Diagnosis:
     misfit: Mapping[str, float]
     curves: Sequence[Curve] = field(repr=False)
     blunders: Sequence[Mapping[str, Any]] = ()
-    detectable: Mapping[str, Mapping[str, float]] = field(default_factory=dict, repr=False)
+    groups: Sequence[Blunder] = field(default=(), repr=False)
     too_few: bool = False
     command: str = ""
     rejected: Rejects | None = None
@@ -99,7 +99,7 @@ class Diagnosis:
             "untestable": dict(self.untestable),
             "blunders": list(self.blunders),
             "command": self.command or None,
-            "detectable": dict(self.detectable),
+            **told.groups(self.groups),
             "misfit": dict(self.misfit),
             "rejected": self.rejected.document() if self.rejected else None,
             "curves": [curve.document() for curve in self.curves],
@@ -153,7 +153,7 @@ def conclude(
         weak_directions=weak,
         untestable=untestable,
         blunders=blunders,
-        detectable={str(b.group.token): dict(b.detectable) for b in first.blunders},
+        groups=[*(left.blunder for left in found.blunders), *first.blunders],
         misfit=misfit,
         curves=curves(first.unnamed),
         too_few=_stops(first) < FEWEST,

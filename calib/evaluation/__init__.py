@@ -22,12 +22,11 @@ from typing import Any
 
 import numpy as np
 
-from calib import problem as problems
 from calib.evaluation.tally import FLAT_M, Columns, Evaluated, Tally
 from calib.forward import Values
 from calib.residuals.scan import Ranges, ScanStop
 from calib.residuals.surfaces import Meeting, MeshSurface
-from calib.runs.reopen import model_of, reopened
+from calib.runs.reopen import problem_of, reopened
 from calib.runs.run import Run
 from calib.solve.estimate import values_of
 from calib.solve.fit import Progress
@@ -147,7 +146,7 @@ def evaluate(
         InputError: the run's recordings are not what they were, or hold no scans.
     """
     sources = reopened(run)
-    problem = problems.build(sources, model_of(run))
+    problem = problem_of(run, sources)
     if not problem.scans:
         raise InputError(
             f"{run.folder}: its recordings hold no scans, so there is no LiDAR to evaluate"

@@ -15,13 +15,12 @@ from pathlib import Path
 
 import numpy as np
 
-from calib import problem as problems
 from calib.effects import Effect, LazyColumn, Site, View
 from calib.problem.model import Source
 from calib.residuals.beams import site_error
 from calib.residuals.scan import turned
 from calib.rig import Rig, load_rig
-from calib.runs.reopen import model_of, reopened
+from calib.runs.reopen import model_of, problem_of, reopened
 from calib.runs.run import Run
 from calib.solve.estimate import values_of
 from calib.solve.fit import Progress
@@ -155,7 +154,8 @@ def _apply_recording(
     run: Run, correction: Correction, folder: Path, target: Path, progress: Progress
 ) -> Applied:
     """A recording's copy with its scans corrected."""
-    stops = _met(run, folder) or _unmet(Source.open(folder))
+    met = dict(_met(run, folder))  # but for scans that were left out, or set aside
+    stops = (dict(_unmet(Source.open(folder))) | met).items()
     points, squares, left_out = 0, 0.0, {}
     with replace_folder(target, "rig.yaml", "recording") as copy:
         shutil.copytree(folder, copy, dirs_exist_ok=True)
@@ -187,7 +187,7 @@ def _met(run: Run, folder: Path) -> list[tuple[str, Known]]:
     wanted = next(s for s in sources if s.recording.folder.resolve() == folder.resolve())
     if wanted.reference is None:
         return []
-    problem = problems.build(sources, model_of(run))
+    problem = problem_of(run, sources)
     values = values_of(problem, run.state())
     scans = [scan for scan in problem.scans if scan.recording is wanted.recording]
     return [(scan.name, lambda ray, scan=scan: scan.what_meets(ray, values)) for scan in scans]

@@ -73,7 +73,9 @@ def write_hesai(fit: FittedRig, folder: Path) -> Written:
     rows = [f"{ring},{up!r},{aside!r}" for ring, (up, aside) in enumerate(angles, 1)]
     path = fit.file(folder, "hesai_angle_correction.csv")
     write_text(path, "\n".join(["Channel,Elevation,Azimuth", *rows, ""]))
-    return Written([path], [_table(fit), *_not_in_a_table(fit, _turning(fit))])
+    warning = f"warnings: {'. '.join(fit.run.warning)}"
+    not_held = [_table(fit), *_not_in_a_table(fit, _turning(fit))]
+    return Written([path], [warning, *not_held] if fit.run.warning else not_held)
 
 
 @for_every_rig

@@ -11,12 +11,12 @@ from xml.etree.ElementTree import Element, SubElement
 import numpy as np
 
 from calib.exporters.fitted import FittedRig, for_every_rig
-from calib.exporters.written import Written, write_text
+from calib.exporters.written import Written, warnings, write_text
 from calib.results.solution import FrameEstimate
 from calib.runs.estimates import variable_estimates
 from chains import se3
 
-ROW, STEP, LEFT, TOP = 30, 26, 24, 84
+ROW, STEP, LEFT, TOP, LINE = 30, 26, 24, 84, 20
 FONT = "font-family:system-ui,sans-serif;font-size:13px"
 BOLD, NUMBERS = "font-weight:600", "font-family:ui-monospace,monospace;font-size:12px"
 INK, PALE, AMBER, RED = "#1f2933", "#9aa5b1", "#b7791f", "#b00020"
@@ -48,21 +48,23 @@ def write_tree(fit: FittedRig, folder: Path) -> Written:
     rows = list(_rows(fit))
     names = max(LEFT + STEP * row.depth + _CHARACTER * len(row.frame) for row in rows)
     where, spread = names + 40, names + 490
-    size = {"width": f"{spread + 240:.0f}", "height": f"{TOP + ROW * len(rows) + 16}"}
+    warning = warnings(fit.run)
+    top = TOP + LINE * len(warning)
+    size = {"width": f"{spread + 240:.0f}", "height": f"{top + ROW * len(rows) + 16}"}
     svg = Element("svg", size, xmlns="http://www.w3.org/2000/svg", style=FONT)
     SubElement(svg, "title").text = f"Frames of {fit.rig.name}"
     SubElement(svg, "rect", width="100%", height="100%", fill="white")
-    _text(svg, LEFT, 28, f"Frames of {fit.rig.name}", style=BOLD)
-    if fit.run.warning:
-        _text(svg, LEFT, 10, ". ".join(fit.run.warning), RED, style=BOLD)
+    for i, line in enumerate(warning):
+        _text(svg, LEFT, 28 + LINE * i, line, RED, style=BOLD)
+    _text(svg, LEFT, top - 56, f"Frames of {fit.rig.name}", style=BOLD)
     said = "each in the axes of the frame above it, angles as in URDF; sigma of the worst axis"
-    _text(svg, LEFT, 48, f"{said}, amber where the data alone do not tell it", PALE)
+    _text(svg, LEFT, top - 36, f"{said}, amber where the data alone do not tell it", PALE)
     for x, title in ((where, "x, y, z, roll, pitch, yaw"), (spread, "one sigma")):
-        _text(svg, x, TOP - 12, title, PALE)
+        _text(svg, x, top - 12, title, PALE)
     for i, row in enumerate(rows):
-        x, y = LEFT + STEP * row.depth, TOP + ROW * i + 12
+        x, y = LEFT + STEP * row.depth, top + ROW * i + 12
         if row.above is not None:
-            up, left = TOP + ROW * row.above + 20, x - STEP + 6
+            up, left = top + ROW * row.above + 20, x - STEP + 6
             dashed = {"stroke-dasharray": "4 3"} if row.loose else {}
             line = {"d": f"M{left},{up}V{y}H{x - 4}", "fill": "none", "stroke": PALE} | dashed
             SubElement(svg, "path", line)

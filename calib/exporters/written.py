@@ -11,6 +11,7 @@ from calib.runs.run import Run
 from chains.errors import InputError
 from sensors.documents import write_atomically
 
+WIDTH = 90
 SIGMAS = "sigmas: this format has no place for them; extrinsics.yaml has"
 
 
@@ -32,16 +33,21 @@ def write_text(path: Path, text: str | bytes) -> None:
         temporary.write_bytes(text if isinstance(text, bytes) else text.encode())
 
 
+def warnings(run: Run) -> list[str]:
+    """What stands above everything that is written of a run, in short lines."""
+    return [line for sentence in run.warning for line in textwrap.wrap(sentence, WIDTH)]
+
+
 def head(run: Run, rig: str, conventions: Iterable[str], not_held: Iterable[str]) -> list[str]:
     """The lines that explain a rig's file to its reader, to be written as its comments."""
     version = run.model["versions"]["rigcal"]
     untold = "; ".join(entry["name"] for entry in run.solution.not_estimated)
     return [
-        *run.warning,
+        *warnings(run),
         f"Written by rigcal {version}, from the run {run.folder.resolve()} of {rig}.",
         *conventions,
         *_listed("Not held here:", not_held),
-        *_listed("Not told by the data alone (why: solution.yaml):", textwrap.wrap(untold, 90)),
+        *_listed("Not told by the data alone (why: solution.yaml):", textwrap.wrap(untold, WIDTH)),
     ]
 
 

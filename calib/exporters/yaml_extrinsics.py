@@ -9,7 +9,7 @@ import numpy as np
 
 from calib.effects import CATALOGUE
 from calib.exporters.fitted import Fitted
-from calib.exporters.written import Written, commented, write_text
+from calib.exporters.written import Written, commented, warnings, write_text
 from calib.results.solution import (
     EffectEstimate,
     FrameEstimate,
@@ -52,7 +52,7 @@ def write_extrinsics(fitted: Fitted, folder: Path) -> Written:
         "not_estimated": solution.not_estimated,
         "recordings": {rig: _part_document(part) for rig, part in solution.recordings.items()},
     }
-    write_text(folder / FILE, commented(run.warning) + yaml_text(data))
+    write_text(folder / FILE, commented(warnings(run)) + yaml_text(data))
     return Written([folder / FILE])
 
 
@@ -80,6 +80,8 @@ def _provenance(run: Run) -> dict[str, Any]:
         "run": str(run.folder.resolve()),
         "recordings": model["recordings"],
         "model": {key: model[key] for key in ("effects", "fixed", "prior")},
+        "left_out": run.left_out,
+        "set_aside": run.set_aside,
         "converged": run.converged,
         "residual": run.summary["residual"],
         "rms_mm": run.summary["rms_mm"],

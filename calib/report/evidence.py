@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from calib import problem as problems
 from calib.problem import Problem
 from calib.problem.model import Source, same_mesh
 from calib.report.budget import Budget, budget
@@ -26,7 +25,7 @@ from calib.report.statistics import (
 from calib.residuals.scan import ScanStop
 from calib.runs.estimates import VariableEstimate, variable_estimates
 from calib.runs.ladder import Rung, ladder
-from calib.runs.reopen import model_of, reopened
+from calib.runs.reopen import problem_of, reopened
 from calib.runs.residual_table import residual_table, table_path
 from calib.runs.run import RESIDUALS, SUMMARY, Run
 from calib.solve.estimate import values_of
@@ -103,7 +102,7 @@ class Evidence:
     @cached_property
     def problem(self) -> Problem:
         """The run's variables, blocks and scans."""
-        return problems.build(self.sources, model_of(self.run))
+        return problem_of(self.run, self.sources)
 
     @cached_property
     def values(self) -> dict[str, np.ndarray]:

@@ -14,6 +14,7 @@ from calib.report.chart import Absent, Chart
 from calib.report.charts.fit import error_mm
 from calib.report.evidence import Evidence, folder_name
 from calib.report.verdict import Verdict
+from calib.show.blunders import HEADINGS, blunder_cells
 from calib.show.misfit import over_beams
 from calib.show.scale import shown
 from calib.show.tables import chance, effect_page, estimate_cell, mm
@@ -70,6 +71,8 @@ def render(
         sections=sections,
         absent=absent,
         diagnosis=evidence.diagnosis,
+        headings=HEADINGS,
+        blunders=[blunder_cells(b) for b in (evidence.diagnosis or {}).get("blunders", ())],
         candidates=_candidates(evidence),
         detectable=_detectable(evidence),
         weak=_weak(evidence),
@@ -185,6 +188,8 @@ def _provenance(evidence: Evidence) -> list[tuple[str, str]]:
     ]
     out += [
         ("model", ", ".join(evidence.run.effects) or "no effects"),
+        ("left out", ", ".join(evidence.run.left_out) or "nothing"),
+        ("set aside", ", ".join(evidence.run.set_aside) or "nothing"),
         ("held fixed", ", ".join(model["fixed"]) or "nothing but what CAD has exact"),
         ("held out", f"{model['hold_out']}, {model['folds']} fold(s)"),
         ("made with", ", ".join(f"{n} {v}" for n, v in model["versions"].items())),

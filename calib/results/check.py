@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import shlex
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
@@ -12,6 +13,8 @@ import numpy as np
 from calib import problem as problems
 from calib.forward import Values
 from calib.problem.model import Model, Source
+from calib.problem.without import ROD, leave_out
+from calib.residuals.groups import SCAN
 from calib.residuals.scan import ScanStop
 from calib.results.reach import Reach, reach
 from calib.results.solution import solution_of
@@ -39,16 +42,19 @@ class Check:
     """What was found in a recording.
 
     Args:
+        folder: of the recording.
         contents: what is there: its name, and how much of it.
         problems: what is wrong and keeps a fit from running, a sentence each.
         odd: what is no error and yet worth a look, a sentence each.
-        suspects: those of them that are likely a mishap, with the keys of a diagnosis's blunders.
+        suspects: those of them that are likely a mishap, with the keys of a diagnosis's blunders;
+            `without` is None where what is wrong cannot be left out, or is one of several things.
         expected: link -> unit -> rough sigma of its best and its worst known parameter, of those
             that the data tell.
         cannot: a `name` and a `why` for what the data could not tell.
         predicted: of an arm under a tracker alone, how well it will be known; else empty.
     """
 
+    folder: Path
     contents: list[tuple[str, str]] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
     odd: list[str] = field(default_factory=list)
@@ -56,6 +62,14 @@ class Check:
     expected: dict[str, dict[str, tuple[float, float]]] = field(default_factory=dict)
     cannot: list[dict[str, str]] = field(default_factory=list)
     predicted: list[Reach] = field(default_factory=list)
+
+    @property
+    def command(self) -> str:
+        """What fits the recording without the suspects, ready to be typed; empty where none of them
+        can be left out."""
+        tokens = dict.fromkeys(each["without"] for each in self.suspects if each["without"])
+        without = [part for token in tokens for part in ("--without", token)]
+        return shlex.join(["rigcal", "fit", str(self.folder), "-o", "RUN", *without]) * bool(tokens)
 
     @property
     def can(self) -> list[str]:
@@ -73,6 +87,7 @@ class Check:
             "problems": self.problems,
             "odd": self.odd,
             "suspects": self.suspects,
+            "command": self.command or None,
             "can": self.can,
             "expected_sigma": self.expected,
             "cannot": self.cannot,
@@ -99,7 +114,7 @@ def check(
     if not folder.is_dir():
         raise InputError(f"{folder}: there is no such folder; a recording is one, with a rig.yaml")
     with threadpool_limits(limits=1):
-        found = Check()
+        found = Check(folder)
         _Checker(folder, found, progress, graph).run()
     return found
 
@@ -136,6 +151,8 @@ class _Checker:
             found.contents.extend(inventory.of_targets(targets))
         if targets and rig and rig.target:
             self._tell(odd_targets(targets, rig.target))
+        for suspect in found.suspects:
+            suspect["without"] = _token(suspect, rig, recording)
         reference = self._read_mesh(rig)
         if reference and scans.points:
             self._tell(odd_mesh(reference, scans.reach_m))
@@ -207,6 +224,20 @@ class _Checker:
                 self.found.predicted.append(reached)
                 if reached.is_small:
                     self.found.odd.append(reached.warning)
+
+
+def _token(suspect: Mapping[str, Any], rig: Rig | None, recording: Recording | None) -> str | None:
+    """How ``--without`` names what a suspect is about, if it has a name for it."""
+    kind, stop, name = (suspect[key] for key in ("kind", "stop", "name"))
+    known = {"scan": f"{stop}:{SCAN}", "target": f"{name}:{ROD}"}
+    token = known.get(kind, f"{stop}:{name}")
+    if rig is None or recording is None:
+        return None
+    try:
+        leave_out([Source(rig, recording, None)], [token])
+    except InputError:
+        return None
+    return token
 
 
 def _open(folder: Path, rig: Rig | None) -> Recording:

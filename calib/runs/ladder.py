@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from calib.rig.suspect import listed
 from calib.runs.run import Run
 from chains.errors import InputError
 
@@ -43,6 +44,23 @@ class Rung:
             return None if self.grown_from else []
         return [name for name in self.below.effects if name not in self.run.effects]
 
+    @property
+    def left_out(self) -> list[str] | None:
+        """What the run leaves out of the recordings and the run below does not; None where that is
+        gone."""
+        if self.below is None:
+            return None if self.grown_from else self.run.left_out
+        return [token for token in self.run.left_out if token not in self.below.left_out]
+
+    @property
+    def step(self) -> str:
+        """What the run changed of the one below, in words."""
+        if self.grown_from and self.below is None:
+            return f"grew from {self.grown_from.name}, which is gone"
+        changes = [f"+ {name}" for name in self.added] + [f"- {name}" for name in self.dropped]
+        changes += [f"without {listed(self.left_out)}"] if self.left_out else []
+        return ", ".join(changes if self.below else ["start", *changes]) or "the same model"
+
     def document(self) -> dict[str, Any]:
         """As ``rigcal compare --json`` gives it."""
         rms = self.run.summary["rms_mm"]
@@ -51,6 +69,7 @@ class Rung:
             "grown_from": str(self.grown_from) if self.grown_from else None,
             "added": self.added,
             "dropped": self.dropped,
+            "left_out": self.left_out,
             "held_out_rms_mm": rms["held_out"],
             "fit_rms_mm": rms["fit"],
             "noise_floor_mm": rms["noise_floor"],

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from calib.problem import Problem, build
 from calib.problem.model import Model, Source
 from calib.problem.without import leave_out
 from calib.runs.run import MODEL, Run
@@ -48,8 +49,26 @@ def start_of(run: Run, sources: Sequence[Source]) -> Start:
     for name, part in run.met().items():
         number, stop = map(int, name.split("/"))
         met[folders[number], stop] = part
+    return Start(run.state(), met, _aside(run, sources))
+
+
+def problem_of(
+    run: Run, sources: Sequence[Source], meetings: Mapping[int, object] | None = None
+) -> Problem:
+    """A run's model on its recordings, without the scans that its fit set aside.
+
+    Args:
+        run: the run.
+        sources: its recordings.
+        meetings: as of `calib.problem.build`.
+    """
+    return build(sources, model_of(run), meetings=meetings).setting_aside(_aside(run, sources))
+
+
+def _aside(run: Run, sources: Sequence[Source]) -> frozenset[tuple[Path, int]]:
+    """Recording and number of the stops whose scans the fit set aside."""
     aside = (map(int, name.split("/")) for name in run.summary.get("set_aside", {}).values())
-    return Start(run.state(), met, frozenset((folders[n], stop) for n, stop in aside))
+    return frozenset((sources[number].recording.folder, stop) for number, stop in aside)
 
 
 def stored_met(start: Start, sources: Sequence[Source]) -> dict[str, np.ndarray]:

@@ -28,7 +28,7 @@ SOLUTION, MODEL, SUMMARY, COVARIANCE, RESIDUALS, STATE, DIAGNOSIS = (
     "diagnosis.json",
 )
 _OF_DIAGNOSIS = {"verdict", "heading", "too_few_stops", "sentences", "candidates"}
-_OF_DIAGNOSIS |= {"unexplained", "weak_directions", "curves"}
+_OF_DIAGNOSIS |= {"unexplained", "weak_directions", "curves", "blunders", "groups", "command"}
 _OF_CANDIDATE = {"effect", "add", "p_adjusted", "step", "dressed_up", "held_out_rms_mm"}
 _OF_CANDIDATE |= {"unabsorbed_rms_mm"}
 _OF_CURVE = {"covariates", "centres", "mean_mm", "band_mm"}

@@ -11,11 +11,12 @@ from rich.console import Console
 from rich.table import Table
 
 from calib.runs.ladder import Rung, ladder
+from calib.show.comparison import ladder_table
 from calib.show.tables import (
     columns_table,
     estimate_cell,
-    ladder_table,
     mm,
+    print_command,
     print_pairs,
     shown,
     small,
@@ -75,9 +76,7 @@ def _say_verdict(console: Console, diagnosis: Diagnosis) -> None:
         console.print(sentence)
     console.print()
     if diagnosis.command:
-        console.print("Mend it in the recording; or leave it out:")
-        console.print(diagnosis.command, style="bold", soft_wrap=True)
-        console.print()
+        print_command(console, diagnosis.command)
 
 
 def candidates_table(candidates: Sequence[Mapping[str, Any]], residual: str) -> Table:

@@ -13,13 +13,15 @@ from calib.diagnosis import Diagnosis
 from calib.runs.estimates import variable_estimates
 from calib.runs.ladder import Rung
 from calib.runs.run import Run
+from calib.show.blunders import blunders_table
+from calib.show.comparison import ladder_table
 from calib.show.diagnosis import (
     LEADING,
     candidates_table,
     detectable_table,
     unexplained_table,
 )
-from calib.show.tables import effects_table, error_table, ladder_table, links_table
+from calib.show.tables import effects_table, error_table, links_table
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -29,6 +31,10 @@ _PAGE = """\
 {%- for sentence in sentences %}
 <p>{{ sentence }}</p>
 {%- endfor %}
+{%- if command %}
+<p>Mend it in the recording; or leave it out:</p>
+<pre>{{ command }}</pre>
+{%- endif %}
 {%- for table in tables %}
 <table>
 {%- if table.title %}<caption>{{ table.title }}</caption>{% endif %}
@@ -54,15 +60,17 @@ def run_html(run: Run) -> str:
 
 
 def diagnosis_html(diagnosis: Diagnosis) -> str:
-    """A diagnosis: the verdict, the sentences, and what may be missing."""
-    tables = []
+    """A diagnosis: the verdict, the sentences, what is wrong in the recording and the command that
+    leaves it out, and what may be missing."""
+    tables = [blunders_table(diagnosis.blunders)] if diagnosis.blunders else []
     if diagnosis.candidates:
         tables.append(candidates_table(diagnosis.candidates[:LEADING], "residual"))
     if diagnosis.unexplained:
         tables.append(unexplained_table(diagnosis.unexplained[:LEADING], "residual"))
     if diagnosis.verdict == "adequate" and not diagnosis.too_few:
         tables.append(detectable_table(diagnosis.candidates))
-    return _html(f"verdict: {diagnosis.heading}", diagnosis.sentences, tables)
+    title = f"verdict: {diagnosis.heading}"
+    return _html(title, diagnosis.sentences, tables, diagnosis.command)
 
 
 def rung_html(rung: Rung) -> str:
@@ -70,11 +78,11 @@ def rung_html(rung: Rung) -> str:
     return _html(str(rung.run.folder), rung.run.warning, [ladder_table([rung])])
 
 
-def _html(title: str, sentences: Sequence[str], tables: Sequence[Table]) -> str:
+def _html(title: str, sentences: Sequence[str], tables: Sequence[Table], command: str = "") -> str:
     from jinja2 import Environment
 
-    page = Environment(autoescape=True).from_string(_PAGE)
-    return page.render(title=title, sentences=sentences, tables=[_rows(t) for t in tables])
+    page, rows = Environment(autoescape=True).from_string(_PAGE), [_rows(t) for t in tables]
+    return page.render(title=title, sentences=sentences, command=command, tables=rows)
 
 
 def _rows(table: Table) -> dict[str, Any]:

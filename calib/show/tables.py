@@ -11,9 +11,8 @@ from rich.console import Console
 from rich.padding import Padding
 from rich.table import Table
 
-from calib.runs.estimates import VariableEstimate, comparison, variable_estimates
-from calib.runs.ladder import Rung, ladder
-from calib.show.misfit import beams_told, standing_out, worst_of
+from calib.runs.estimates import VariableEstimate, variable_estimates
+from calib.show.misfit import beams_told, standing_out
 from calib.show.scale import shown
 
 if TYPE_CHECKING:
@@ -23,7 +22,6 @@ if TYPE_CHECKING:
 
 WIDTH = 100
 LISTED_PARAMETERS = 12  # an effect of more parameters than these is summarised
-ABREAST = 3  # runs in one table
 LEAST_P = 1e-12  # smaller ones are not told from each other
 ERROR_LABELS = {
     "nominal": "before, all as in CAD",
@@ -41,8 +39,17 @@ def print_check(check: Check) -> None:
         print_pairs(console, "what is wrong", [("", problem) for problem in check.problems])
     if check.odd:
         print_pairs(console, "what is worth a look", [("", sentence) for sentence in check.odd])
+    if check.command:
+        print_command(console, check.command)
     print_pairs(console, "what can be estimated", [("", line) for line in check.can or ["nothing"]])
     _print_reasons(console, "what cannot", check.cannot)
+
+
+def print_command(console: Console, command: str) -> None:
+    """Print the command that leaves out what is wrong, in one line, ready to be pasted."""
+    console.print("Mend it in the recording; or leave it out:")
+    console.print(command, style="bold", soft_wrap=True)
+    console.print()
 
 
 def print_run(run: Run) -> None:
@@ -52,7 +59,7 @@ def print_run(run: Run) -> None:
     console.print(str(run.folder), style="bold", soft_wrap=True)
     for sentence in run.warning:
         console.print(sentence, style="bold red")
-    console.print(f"{_outcome(summary)}\n")
+    console.print(f"{outcome(summary)}\n")
     console.print(links_table([row for row in rows if row.parent is not None]))
     effects = [row for row in rows if row.parent is None]
     if effects:
@@ -81,23 +88,6 @@ def _warning(summary: dict[str, Any]) -> str:
         f"the {what} are {factor:.1f} times larger than their sigmas allow: something is missing "
         f"from the model, or a sigma in rig.yaml too small; every sigma above is widened by that"
     )
-
-
-def print_comparison(runs: Sequence[Run]) -> None:
-    """Print errors, noise floor and parameters of runs side by side, and the ladder of a study."""
-    console = terminal()
-    for run in runs:
-        console.print(str(run.folder), style="bold", soft_wrap=True)
-        for sentence in run.warning:
-            console.print(sentence, style="bold red")
-        console.print(f"{_model(run)}; {_outcome(run.summary)}")
-    for start in range(0, len(runs), ABREAST):
-        console.print()
-        console.print(_comparison_table(runs[start : start + ABREAST]))
-    rungs = ladder(runs)
-    if rungs:
-        console.print()
-        console.print(ladder_table(rungs))
 
 
 def effect_page(effect: Effect) -> dict[str, Any]:
@@ -306,87 +296,8 @@ def _print_reasons(console: Console, title: str, entries: Sequence[Mapping[str, 
         print_pairs(console, f"{title}: {why}", rows)
 
 
-def _comparison_table(runs: Sequence[Run]) -> Table:
-    compared = comparison(runs)
-    table = columns_table("", "", *(run.folder.name or str(run.folder) for run in runs))
-    for error in ("rms_mm", "mean_mm", "std_mm"):
-        for kind, label in ERROR_LABELS.items():
-            values = compared[error].get(kind, ())
-            if any(value is not None for value in values):
-                cells = (mm(value, "+" if error == "mean_mm" else "") for value in values)
-                table.add_row(f"{error[:-3]} {label}", "mm", *cells)
-    _add_misfit(table, runs, compared)
-    for variable, parameters in compared["parameters"].items():
-        if len(parameters) > LISTED_PARAMETERS:
-            _add_spread(table, variable, list(parameters.values()))
-            continue
-        for name, entry in parameters.items():
-            numbers = zip(entry["estimate"], entry["sigma"], strict=True)
-            cells = ("" if s is None else estimate_cell(e, s, entry["unit"]) for e, s in numbers)
-            table.add_row(f"{variable}.{name}", shown(entry["unit"])[1], *cells)
-    return table
-
-
-def _add_misfit(table: Table, runs: Sequence[Run], compared: Mapping[str, Any]) -> None:
-    """What was thrown out, and how large residuals are against their sigmas."""
-    every, share = compared["rms_all_mm"], compared["rejected_share"]
-    if any(x for x in share):
-        table.add_row("rms after the fit, of all beams", "mm", *map(mm, every))
-        cells = ("" if x is None else f"{100 * x:.1f}" for x in share)
-        table.add_row("beams thrown out", "%", *cells)
-    for kind, ratios in compared["misfit"].items():
-        cells = ("" if x is None else f"{x:.2f}" for x in ratios)
-        table.add_row(f"residuals over sigma, {kind}", "", *cells)
-    labels = ("the largest of these, where", "furthest from CAD, in its sigmas")
-    for label, cells in zip(labels, zip(*map(worst_of, runs), strict=True), strict=True):
-        if any(cells):
-            table.add_row(label, "", *cells)
-
-
-def ladder_table(rungs: Sequence[Rung]) -> Table:
-    """What each rung changed of the model, and what that did to the error of stops held out."""
-    table = columns_table("ladder", "model", "held out, mm", "fit, mm", "noise floor, mm")
-    for column in table.columns[2:]:
-        column.justify = "right"
-    for rung in rungs:
-        rms = rung.run.summary["rms_mm"]
-        below = rung.below.summary["rms_mm"] if rung.below else {}
-        held_out = " -> ".join(filter(None, (mm(r.get("held_out")) for r in (below, rms))))
-        name = rung.run.folder.name or str(rung.run.folder)
-        table.add_row(name, _step(rung), held_out, mm(rms["fit"]), mm(rms["noise_floor"]))
-    return table
-
-
-def _step(rung: Rung) -> str:
-    """What a rung added and dropped."""
-    if rung.grown_from is None:
-        return "start"
-    if rung.below is None:
-        return f"grew from {rung.grown_from.name}, which is gone"
-    added = [f"+ {name}" for name in rung.added]
-    return ", ".join([*added, *(f"- {name}" for name in rung.dropped)]) or "the same model"
-
-
-def _add_spread(table: Table, variable: str, entries: Sequence[Mapping[str, Any]]) -> None:
-    """Mean and standard deviation, per run, over an effect's many parameters of each unit."""
-    for kind in dict.fromkeys(entry["unit"] for entry in entries):
-        scale, unit = shown(kind)
-        alike = [entry["estimate"] for entry in entries if entry["unit"] == kind]
-        estimates = np.array(alike, float).T
-        for what, function in (("mean", np.mean), ("sd", np.std)):
-            present = (each[~np.isnan(each)] for each in estimates)
-            cells = (f"{scale * function(each):+.3g}" if len(each) else "" for each in present)
-            table.add_row(f"{variable}, {what}", unit, *cells)
-
-
-def _model(run: Run) -> str:
-    model = run.model
-    text = ", ".join(run.effects) or "no effects"
-    text += f"; fixed {', '.join(model['fixed'])}" if model["fixed"] else ""
-    return text + (f"; from {model['prior']}" if model["prior"] else "")
-
-
-def _outcome(summary: Mapping[str, Any]) -> str:
+def outcome(summary: Mapping[str, Any]) -> str:
+    """How a fit went, in a line."""
     settled = "converged" if summary["converged"] else "NOT CONVERGED"
     points = f"{summary['points']} points at " if summary["points"] else ""
     passes = f"{settled} in {summary['iterations']} passes, {summary['seconds']:.0f} s"

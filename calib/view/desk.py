@@ -25,6 +25,7 @@ class Findings:
         sentences: the finding in words.
         candidates: effects that the model lacks, best first.
         unexplained: structure without a name.
+        blunders: what is wrong in the recording.
         curves: mean residual against one covariate each, by its name.
     """
 
@@ -32,6 +33,7 @@ class Findings:
     sentences: Sequence[str]
     candidates: Sequence[Mapping[str, Any]]
     unexplained: Sequence[Mapping[str, Any]]
+    blunders: Sequence[Mapping[str, Any]]
     curves: Mapping[str, DiagnosisCurve]
 
     @classmethod
@@ -46,8 +48,9 @@ class Findings:
             return None
         single = (c for c in document["curves"] if len(c["covariates"]) == 1)
         curves = {c["covariates"][0]: DiagnosisCurve.read(c) for c in single}
-        lists = (document[key] for key in ("sentences", "candidates", "unexplained"))
-        return cls(document["heading"], *lists, curves)
+        names = ("sentences", "candidates", "unexplained", "blunders")
+        lists = {name: document[name] for name in names}
+        return cls(heading=document["heading"], curves=curves, **lists)
 
     @property
     def worth_adding(self) -> list[str]:
@@ -169,8 +172,15 @@ class Desk:
 
     def folder_for(self, effect: str) -> Path:
         """Where a run with one more effect goes: beside this one, under a name not yet taken."""
+        return self._beside(f"+{effect}")
+
+    def folder_without(self) -> Path:
+        """Where a run goes that leaves something out; as `folder_for`."""
+        return self._beside("-without")
+
+    def _beside(self, change: str) -> Path:
         here = self.run.folder.resolve()
-        wanted = here.with_name(f"{here.name}+{effect}")
+        wanted = here.with_name(f"{here.name}{change}")
         taken, number = wanted, 2
         while taken.exists():
             taken, number = wanted.with_name(f"{wanted.name}-{number}"), number + 1

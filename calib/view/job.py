@@ -8,7 +8,7 @@ from __future__ import annotations
 import multiprocessing
 import signal
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -35,23 +35,29 @@ class Told:
 
 
 class Job:
-    """One effect added to a run and the result diagnosed; or a run diagnosed, where no effect is.
+    """An effect added to a run, or something left out, and the result diagnosed; or a run
+    diagnosed, where nothing is to be changed.
 
     Args:
         run: folder of the run to start from.
         effect: as `Desk.addable` has it: a name, or the document of a formula.
         out: folder of the run to make.
+        without: what to leave out, as ``--without`` takes it.
     """
 
     def __init__(
-        self, run: Path, effect: str | Mapping[str, Any] | None = None, out: Path | None = None
+        self,
+        run: Path,
+        effect: str | Mapping[str, Any] | None = None,
+        out: Path | None = None,
+        without: Sequence[str] = (),
     ) -> None:
         # Spawned: a process with threads and libraries such as these cannot be forked safely.
         context = multiprocessing.get_context("spawn")
         self._ear, mouth = context.Pipe(duplex=False)
         self._stopped = False
         self._process = context.Process(
-            target=_work, args=(mouth, run, effect, out), daemon=True, name="rigcal job"
+            target=_work, args=(mouth, run, effect, out, without), daemon=True, name="rigcal job"
         )
         self._process.start()
         mouth.close()  # so that the pipe ends when the process does
@@ -83,13 +89,17 @@ class Job:
 
 
 def _work(
-    mouth: Connection, run: Path, effect: str | Mapping[str, Any] | None, out: Path | None
+    mouth: Connection,
+    run: Path,
+    effect: str | Mapping[str, Any] | None,
+    out: Path | None,
+    without: Sequence[str],
 ) -> None:
     """What the process does."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the page, which ends its jobs
     signal.signal(signal.SIGTERM, _leave)
     try:
-        _study(mouth, run, effect, out)
+        _study(mouth, run, effect, out, without)
         mouth.send(Told("done"))
     except InputError as error:
         mouth.send(Told("failed", str(error)))
@@ -100,7 +110,11 @@ def _work(
 
 
 def _study(
-    mouth: Connection, folder: Path, effect: str | Mapping[str, Any] | None, out: Path | None
+    mouth: Connection,
+    folder: Path,
+    effect: str | Mapping[str, Any] | None,
+    out: Path | None,
+    without: Sequence[str],
 ) -> None:
     from calib.runs.calibrate import grow, grown_model
     from calib.runs.diagnose import diagnose
@@ -111,14 +125,14 @@ def _study(
         mouth.send(Told("progress", what, (done + 1) / max(total, 1)))
 
     run = Run.open(folder)
-    if effect is not None:
+    if out is not None:
         with tempfile.TemporaryDirectory() as scratch:
-            if not isinstance(effect, str):
+            if isinstance(effect, Mapping):
                 path = Path(scratch) / "formula.yaml"
                 write_yaml(path, dict(effect))
                 effect = str(path)
-            model = grown_model(run, [effect])
-        run = grow(run, model, out, progress)
+            model = grown_model(run, [effect] if effect else [])
+        run = grow(run, model.leaving_out(without), out, progress)
         mouth.send(Told("run", str(run.folder)))
     diagnose(run, progress)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from calib.show.misfit import of_stop
 from calib.view import colours, panels
 from calib.view.desk import Desk, DiagnosisCurve, Findings
 from calib.view.job import Job
+from calib.view.leave_out import LeaveOut
 from calib.view.scene import Points, Scene
 from calib.view.stage import AXES, PANEL_PX, RIG, ROOM, Stage
 from chains.errors import InputError
@@ -45,6 +46,7 @@ class Page:
         self._note = server.gui.add_html("", visible=False)
         self._add_scan_widgets()
         self._add_ladder_widgets()
+        self._blunders = LeaveOut(server.gui, self._on_leave_out)
         self._add_findings_widgets()
         server.scene.on_click()(self._guarded(self._on_point, with_event=True))
 
@@ -225,6 +227,7 @@ class Page:
             self.findings = Findings.read(self.desk.run)
         finally:
             self._findings.content = panels.findings(self.findings)
+            self._blunders.show(self.findings.blunders if self.findings else [])
             self._diagnose.visible = self.findings is None
             self._fill(self._effect, list(self.desk.addable(self.findings)) or [NOTHING])
             worth = self.findings is not None and bool(self.findings.worth_adding)
@@ -255,6 +258,13 @@ class Page:
             raise InputError(f"'{name}' is not an effect that can be added to this run")
         self._start(Job(self.desk.run.folder, what, self.desk.folder_for(name)))
 
+    def _on_leave_out(self, tokens: Sequence[str]) -> None:
+        def leave_out() -> None:
+            run, out = self.desk.run.folder, self.desk.folder_without()
+            self._start(Job(run, out=out, without=tokens))
+
+        self._guarded(leave_out)()
+
     def _on_undo(self) -> None:
         told = self.desk.undo()
         self._show_run()
@@ -275,6 +285,7 @@ class Page:
         for widget in (self._bar, self._doing, self._cancel):
             widget.visible = busy
         self._add.disabled = self._diagnose.disabled = busy
+        self._blunders.busy(busy)
         self._bar.value, self._doing.content = 0.0, panels.note("Starting …")
 
     def _follow(self, job: Job) -> None:

@@ -64,7 +64,7 @@ def standing_out(run: Run) -> str:
 
 def _beams(points: Points | None, drawn: int, stop: str) -> str:
     if points is None:
-        return f"Stop {escape(stop)} was not scanned."
+        return f"Stop {escape(stop)} has no scan in this fit."
     if not points.inlier.any():
         return f"{len(points.inlier):,} beams, none of which the fit took for an inlier."
     residual = 1e3 * points.columns["residual_m"][points.inlier].astype(float)
@@ -118,11 +118,20 @@ def findings(diagnosed: Findings | None) -> str:
     """The verdict in sentences, and the candidates in their order."""
     if diagnosed is None:
         return _framed("This run has not been diagnosed.")
+    above = {each["sentence"] for each in diagnosed.blunders}  # listed with their buttons
     sentences = "".join(
-        f'<p style="margin:.3em 0">{escape(text)}</p>' for text in diagnosed.sentences
+        f'<p style="margin:.3em 0">{escape(text)}</p>'
+        for text in diagnosed.sentences
+        if text not in above
     )
     verdict = escape(f"Verdict: {diagnosed.heading}")
     return _framed(f'<b data-is="verdict">{verdict}</b>{sentences}{_candidates(diagnosed)}')
+
+
+def blunders(found: Sequence[Mapping[str, Any]]) -> str:
+    """What is wrong in the recording, in the sentences of the diagnosis."""
+    lines = "".join(f'<li style="margin:.3em 0">{escape(b["sentence"])}</li>' for b in found)
+    return _framed(f'<ul data-is="blunders" style="margin:0;padding-left:1.2em">{lines}</ul>')
 
 
 def _candidates(diagnosed: Findings) -> str:
@@ -173,7 +182,10 @@ def ladder(rungs: Sequence[Rung]) -> str:
         for rung, (mm, _) in zip(rungs, errors, strict=True)
     )
     said = f"Error of {errors[-1][1]}; dashed: noise floor, {floor:.2f} mm"
-    warning = "".join(f'<b style="color:#b00020">{w}</b>' for w in rungs[-1].run.warning)
+    warning = "".join(
+        f'<div data-is="warning" style="color:#b3261e;font-weight:600">{escape(sentence)}</div>'
+        for sentence in rungs[-1].run.warning
+    )
     picture = f'<div data-is="ladder">{rows}</div><div style="{_QUIET}">{said}</div>'
     return _framed(warning + picture)
 
@@ -188,22 +200,14 @@ def _error(rung: Rung) -> tuple[float, str]:
 def _rung(rung: Rung, mm: float, width: float, floor: float) -> str:
     """One bar, `width` and `floor` in percent of the panel."""
     name = escape(rung.run.folder.name or str(rung.run.folder))
+    step = rung.step if rung.below else f"{rung.step}: {rung.run.folder.name}"
     line = f"position:absolute;top:0;bottom:0;left:{floor:.2f}%;border-left:2px dashed #00664a"
     return (
         f'<div style="display:flex;gap:.6em" title="{name}">'
-        f'<span style="{_CUT};flex:1">{escape(_step(rung))}</span><b>{mm:.2f} mm</b></div>'
+        f'<span style="{_CUT};flex:1">{escape(step)}</span><b>{mm:.2f} mm</b></div>'
         f'<div style="position:relative"><div style="background:#7fb2d9;height:.9em;'
         f'width:{width:.2f}%" data-mm="{mm:.4f}"></div><div style="{line}"></div></div>'
     )
-
-
-def _step(rung: Rung) -> str:
-    if rung.grown_from is None:
-        return f"start: {rung.run.folder.name}"
-    if rung.below is None:
-        return f"{rung.run.folder.name}, grown from {rung.grown_from.name}, which is gone"
-    changes = [f"+ {n}" for n in rung.added] + [f"- {n}" for n in rung.dropped]
-    return ", ".join(changes) or "the same model"
 
 
 def note(text: str, bad: bool = False) -> str:

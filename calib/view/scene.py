@@ -12,12 +12,12 @@ from functools import cached_property
 
 import numpy as np
 
-from calib import problem as problems
 from calib.forward import Stops
+from calib.problem import Problem
 from calib.problem.model import Source
 from calib.residuals.scan import ScanStop
 from calib.residuals.tracker import TrackedBody
-from calib.runs.reopen import model_of, reopened
+from calib.runs.reopen import problem_of, reopened
 from calib.runs.residual_table import table_path
 from calib.runs.run import RESIDUALS, Run
 from chains import se3
@@ -91,7 +91,7 @@ class Scene:
 
     run: Run
     sources: Sequence[Source]
-    problem: problems.Problem
+    problem: Problem
     state: Mapping[str, np.ndarray]
 
     @classmethod
@@ -101,10 +101,10 @@ class Scene:
         Raises:
             InputError: the recordings are gone or changed, or the run is of an earlier version.
         """
-        sources, model = reopened(run), model_of(run)
+        sources = reopened(run)
         # Poses need no surface, and planes would have to be looked for in every scan.
         nothing = dict.fromkeys(range(len(sources)), object())
-        problem = problems.build(sources, model, meetings=nothing)
+        problem = problem_of(run, sources, nothing)
         scene = cls(run, sources, problem, run.state())
         for stops, _ in scene._stops.values():
             unknown = [name for name in stops.variables if name not in scene.state]

@@ -1,6 +1,7 @@
 """What check sees before any fit: each mishap named, and nothing in recordings that are sound."""
 
 import json
+import shlex
 import shutil
 from dataclasses import replace
 from types import SimpleNamespace
@@ -9,12 +10,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from calib.problem.model import Source
+from calib.problem.without import leave_out
 from calib.results.check import check
 from calib.rig import load_rig
 from calib.rig.recording import Recording
 from calib.rig.scale import odd_mesh, odd_targets
 from calib.rig.scanned import ScanSums, odd_scans
 from calib.rig.tracked import odd_bodies
+from calib.show.tables import print_check
 from sensors.recording import read_scan
 
 from . import broken
@@ -274,5 +278,29 @@ def test_the_document_holds_an_entry_for_each_stop(shared, tmp_path):
     broken.cells("stops.csv", r"tool\.(x|y|z)", "0", row=7)(rec)
     document = json.loads(json.dumps(check(rec, graph=False).document()))
     assert len(document["suspects"]) == 14 and len(document["odd"]) == 1
-    assert document["suspects"][0].keys() == {"kind", "name", "stop", "size", "unit"}
+    assert document["suspects"][0].keys() == {"kind", "name", "stop", "size", "unit", "without"}
     assert {each["kind"] for each in document["suspects"]} == {"body"}
+    tokens = [each["without"] for each in document["suspects"]]
+    assert tokens == [f"{each['stop']}:tool" for each in document["suspects"]]
+    words = shlex.split(document["command"])
+    assert words[:3] == ["rigcal", "fit", str(rec)] and words[6::2] == tokens
+
+
+def test_a_suspect_that_may_be_one_of_two_has_no_name_to_leave_out(shared, capsys):
+    found = check(shared / "recordings/known_base_moved_at_one_stop", graph=False)
+    assert [each["without"] for each in found.suspects] == [None]
+    assert found.command == "" and found.document()["command"] is None
+    print_check(found)
+    assert "--without" not in capsys.readouterr().out
+
+
+def test_scans_and_targets_are_left_out_by_their_names(shared, tmp_path, capsys):
+    rec = shutil.copytree(shared / "recordings/known_nothing_hidden", tmp_path / "rec")
+    shutil.copy(rec / "scans/L00P00.parquet", rec / "scans/L01P00.parquet")
+    broken.cells("targets.csv", "faro_x", lambda x: x + 0.1, row=1)(rec)
+    found = check(rec, graph=False)
+    tokens = {each["without"] for each in found.suspects}
+    assert tokens == {"L00P00:scan", "L01P00:scan", "T2:rod"}
+    assert leave_out([Source.open(rec)], list(tokens))  # as a fit takes them
+    print_check(found)
+    assert found.command in capsys.readouterr().out.splitlines()

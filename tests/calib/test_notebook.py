@@ -10,6 +10,7 @@ from calib.diagnosis.verdict import Diagnosis
 from calib.results.solution import EffectEstimate, FrameEstimate, Part, Solution
 from calib.runs.ladder import Rung
 from calib.runs.run import Run
+from calib.show.blunders import blunder_cells
 from calib.show.notebook import diagnosis_html, run_html, rung_html
 from calib.show.tables import print_run
 
@@ -40,6 +41,13 @@ def run():
     }
     model = {"effects": [], "fixed": [], "prior": None, "recordings": []}
     return Run(Path("runs/a&b"), model, summary, solution)
+
+
+def blunder(token, axis="x", rivals=(), **more):
+    """A blunder of a diagnosis."""
+    found = {"without": token, "size": 0.00292, "sigma": 0.000254, "unit": "m", "axis": axis}
+    found |= {"indistinguishable_from": list(rivals), "belongs_to": None, "wrong_sign": None}
+    return found | more
 
 
 def parsed(html):
@@ -77,22 +85,39 @@ def candidate(name):
     }  # fmt: skip
 
 
+def test_what_else_may_be_said_of_a_blunder():
+    about = blunder("cad:lidar", "about x", wrong_sign="z")
+    assert blunder_cells(about)[1:] == (
+        "2.92 ± 0.25 mm about x",
+        "its z may have the wrong sign",
+    )
+    scan = blunder("s1:scan", "along the beams", belongs_to="s2")
+    assert blunder_cells(scan)[1:] == ("2.92 ± 0.25 mm along the beams", "it was taken at s2")
+    assert blunder_cells(blunder("s1:scan", None))[1:] == ("2.92 ± 0.25 mm", "")
+
+
 def test_a_diagnosis_shows_its_verdict_sentences_and_candidates():
     sentences = ["incidence_angle_bias is missing: 2.97 mm < rms & so on."]
     found = Diagnosis(
-        verdict="missing_effect",
+        verdict="bad_data",
         sentences=sentences,
         candidates=[candidate("incidence_angle_bias")],
         unexplained=[],
         weak_directions=[],
         untestable={},
+        blunders=[blunder("a<b:base_markers", rivals=["a<b:joints"])],
+        groups=[],
         misfit={},
         curves=[],
+        command="rigcal fit rec -o run-without --without 'a<b:base_markers'",
     )
     html = diagnosis_html(found)
     said = "".join(parsed(html).itertext())
-    assert "verdict: an effect is missing" in said
+    assert "verdict: something in the recording is wrong" in said
     assert sentences[0] in said
+    assert found.command == "".join(parsed(html).find("pre").itertext())
+    row = next(row for row in cells(html) if "a<b:base_markers" in row)
+    assert row[1:] == ["2.92 ± 0.25 mm in x", "or a<b:joints: nothing tells them apart"]
     row = next(row for row in cells(html) if "incidence_angle_bias" in row)
     assert "7.71 -> 1.42" in row
     assert any("+6.19 ± 0.12" in cell for cell in row)

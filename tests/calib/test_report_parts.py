@@ -103,7 +103,7 @@ def apart(part, what):
             "amber",
             "a.tz: -133 mm from CAD, 100 of its sigmas",
         ),
-        ({"misfit": {"tracker": 4.0}}, found(), "red", "residuals of tracker"),
+        ({"misfit": {"tracker": 4.0}}, found(), "red", "residuals of the tracker"),
         (rms(4.0), found(), "red", "4.0 times the noise floor"),
         ({"converged": False}, found(), "red", "not converged"),
         ({}, found("missing_effect"), "red", "worth adding"),

@@ -12,6 +12,7 @@ from calib.effects import CATALOGUE
 from calib.results.solution import EffectEstimate, FrameEstimate, Part, Solution
 from calib.runs.run import Run
 from calib.show import tables
+from calib.show.comparison import comparison, print_comparison
 from calib.show.misfit import outstanding
 from sensors.documents import json_text
 
@@ -198,7 +199,7 @@ def test_nothing_moved_is_said(run, printed):
 
 def test_comparison_has_an_entry_per_run(run, tmp_path):
     bare = replace(run.solution, shared=Part(run.solution.shared.frames, {}))
-    compared = tables.comparison([run, replace(run, folder=tmp_path / "second", solution=bare)])
+    compared = comparison([run, replace(run, folder=tmp_path / "second", solution=bare)])
     assert compared["runs"] == [str(tmp_path / "first"), str(tmp_path / "second")]
     assert compared["rms_mm"]["fit"] == [3.34, 3.34]
     lidar = [compared["parameters"]["lidar"][dof] for dof in DOF]
@@ -215,7 +216,7 @@ def test_comparison_is_printed_side_by_side(run, tmp_path, printed):
     bare = replace(run.solution, shared=Part(run.solution.shared.frames, {}))
     summary = SUMMARY | {"rms_mm": {"fit": 9.9}}
     other = replace(run, folder=tmp_path / "second", solution=bare, summary=summary)
-    lines = printed(tables.print_comparison, [run, other])
+    lines = printed(print_comparison, [run, other])
     assert "first second" in lines
     assert "rms after the fit mm 3.34 9.90" in lines
     assert "rms before, all as in CAD mm 24.31" in lines
@@ -236,7 +237,7 @@ def test_parameters_of_several_units_are_shown_each_in_its_own(run, printed):
     assert "slip r +1.00 ± 0.50 mrad" in lines and "t +2.00 ± 0.50 mm" in lines
     assert "many 10 values mean +3.00, sd 0.00, +3.00 to +3.00, sigma 0.4 mrad" in lines
     assert "4 values mean +5.00, sd 0.00, +5.00 to +5.00, sigma 0.4 mm" in lines
-    lines = printed(tables.print_comparison, [run])
+    lines = printed(print_comparison, [run])
     assert "slip.r mrad +1.00 ± 0.50" in lines and "slip.t mm +2.00 ± 0.50" in lines
     assert "many, mean mrad +3" in lines and "many, mean mm +5" in lines
 
@@ -252,21 +253,40 @@ def test_the_ladder_is_printed_below_the_comparison(run, printed):
         model=grown | {"grown_from": str(below.folder)},
         summary=SUMMARY | {"rms_mm": rms},
     )
-    lines = after(printed(tables.print_comparison, [above, below]), "ladder")
+    lines = after(printed(print_comparison, [above, below]), "ladder")
     assert lines[1] == "00 start 3.47 3.34 3.62"
     assert lines[2] == "01 + mount_slip@150, + arm_backlash, - lean 3.47 -> 2.31 2.22 2.20"
     unheld = replace(below, summary=SUMMARY | {"rms_mm": rms | {"held_out": None}})
-    lines = after(printed(tables.print_comparison, [unheld, above]), "ladder")
+    lines = after(printed(print_comparison, [unheld, above]), "ladder")
     assert lines[1] == "00 start 2.22 2.20"
-    alone = printed(tables.print_comparison, [below])
+    alone = printed(print_comparison, [below])
     assert not any(line.startswith("ladder") for line in alone)
-    lines = after(printed(tables.print_comparison, [above]), "ladder")
+    lines = after(printed(print_comparison, [above]), "ladder")
     assert lines[1].startswith("01 grew from 00, which is gone 2.31")
+
+
+def test_what_was_left_out_stands_in_the_comparison_and_on_the_ladder(run, printed):
+    tokens = [f"s{k}:base" for k in range(6)]
+    first = replace(run, model=run.model | {"without": tokens[:1]})
+    summary = SUMMARY | {"set_aside": {"s9:scan": "0/9"}}
+    model = run.model | {"without": tokens, "grown_from": str(run.folder)}
+    second = replace(run, folder=run.folder.with_name("01"), model=model, summary=summary)
+    compared = comparison([first, second])
+    assert compared["left_out"] == [tokens[:1], tokens]
+    assert compared["set_aside"] == [[], ["s9:scan"]]
+    lines = printed(print_comparison, [first, second])
+    at = lines.index("left out s0:base s0:base")
+    assert lines[at + 1 : at + 5] == [*tokens[1:4], "and 2 more"]
+    assert lines[at + 5] == "set aside s9:scan"
+    assert any(line.startswith("first start, without s0:base") for line in lines)
+    assert "without s1:base, s2:base, s3:base and 2 more" in " ".join(lines)
+    lines = printed(print_comparison, [replace(run, model=run.model)])
+    assert not any("left out" in line or "set aside" in line for line in lines)
 
 
 def test_many_runs_are_broken_into_tables(run, printed):
     runs = [replace(run, folder=run.folder.with_name(f"run{i}")) for i in range(7)]
-    lines = printed(tables.print_comparison, runs)
+    lines = printed(print_comparison, runs)
     heads = [line for line in lines if re.fullmatch(r"(run\d ?)+", line)]
     assert " ".join(heads).split() == [f"run{i}" for i in range(7)]
 
@@ -293,6 +313,7 @@ def test_a_check_is_printed(printed):
         contents=[("stops", "12 at 4 locations")],
         problems=["stops.csv:3: no such thing [red]"],
         odd=["joint_1 hardly moves"],
+        command="",
         can=["lidar: 0.6 mm"],
         cannot=[{"name": "mount.tz", "why": f"tied to lidar.tz: {WHY}"}],
     )
@@ -316,7 +337,7 @@ def test_what_does_not_fit_is_told_the_worst_first(run, printed):
     assert "t0, base" not in text
     assert "target" not in text.partition("what does not fit")[2].partition("not told")[0]
     assert "lidar.tz: -133 mm from CAD, 100 of its sigmas" in text
-    compared = " ".join(printed(tables.print_comparison, [run, spoilt]))
+    compared = " ".join(printed(print_comparison, [run, spoilt]))
     assert "s7, base 10.1" in compared and "lidar 100" in compared
     assert "what does not fit" not in " ".join(printed(tables.print_run, run))
 

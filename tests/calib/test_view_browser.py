@@ -19,7 +19,7 @@ from calib.view.page import Page
 from calib.view.server import address, serve, stop
 from calib.view.stage import PANEL_PX
 from tests.browser import SOFTWARE_GL, Watched, browser_page
-from tests.calib.viewed import diagnosed, small_run
+from tests.calib.viewed import blunder, diagnosed, small_run
 
 pytestmark = pytest.mark.slow
 SOON_MS, FIT_MS = 60_000, 300_000
@@ -60,6 +60,11 @@ def small(once) -> Run:
     return run
 
 
+@pytest.fixture
+def copied(small, tmp_path) -> Run:
+    return Run.open(shutil.copytree(small.folder, tmp_path / "run"))
+
+
 @pytest.fixture(scope="module")
 def hidden(tmp_path_factory) -> Run:
     """A run whose model lacks what was hidden in its recording."""
@@ -94,6 +99,28 @@ def test_the_first_finding_is_added_and_the_ladder_falls(hidden):
         button(watched, "Undo").click()
         watched.page.get_by_text("stays on disk").wait_for()
         assert bars(watched) == before and made.folder.is_dir()
+
+
+def test_a_blunder_is_left_out_by_a_click_and_undone(copied):
+    """The button of one leaves out that one; what is left out is shown, and Undo goes back."""
+    tokens = ["L00P01:base_markers", "L01P01:base_markers"]
+    diagnosed(copied.folder, blunders=[blunder(token) for token in tokens])
+    with shown(copied.folder) as (watched, page):
+        for name in (*(f"Leave out {token}" for token in tokens), "Leave all out"):
+            button(watched, name).wait_for()
+        assert watched.page.locator("[data-is=blunders] li").count() == 2
+        button(watched, f"Leave out {tokens[1]}").click()
+        watched.page.get_by_text(f"Left out: {tokens[1]}").first.wait_for(timeout=FIT_MS)
+        made = page.desk.run
+        assert made.left_out == tokens[1:]
+        assert made.model["grown_from"] == str(copied.folder.resolve())
+        watched.page.locator("[data-is=verdict]").wait_for(timeout=FIT_MS)
+        assert not button(watched, "Leave all out").is_visible()
+        button(watched, "Undo").click()
+        watched.page.get_by_text("stays on disk").wait_for()
+        button(watched, "Leave all out").wait_for()
+        assert page.desk.run.folder == copied.folder
+        assert not watched.page.get_by_text("Left out:").first.is_visible()
 
 
 def test_a_click_reads_the_point_that_it_meets(small):

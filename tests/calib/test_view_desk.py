@@ -8,10 +8,12 @@ import socket
 import sys
 import time
 import urllib.request
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import pytest
 
+from calib.runs.add import add
 from calib.runs.ladder import Rung
 from calib.runs.run import Run
 from calib.view import panels
@@ -19,7 +21,7 @@ from calib.view.desk import Desk, Findings
 from calib.view.job import Job
 from calib.view.server import serve, stop
 from chains.errors import InputError
-from tests.calib.viewed import candidate, diagnosed, grown, small_run
+from tests.calib.viewed import blunder, candidate, diagnosed, grown, small_run
 from tests.programs import RIGCAL, execute, started
 
 
@@ -64,6 +66,13 @@ def test_new_runs_go_beside_under_a_name_not_taken(first, tmp_path):
     (tmp_path / "run+x").mkdir()
     (tmp_path / "run+x-2").mkdir()
     assert desk.folder_for("x") == tmp_path / "run+x-3"
+
+
+def test_a_run_that_leaves_something_out_goes_beside_too(first, tmp_path):
+    desk = Desk.of([first.folder])
+    assert desk.folder_without() == tmp_path / "run-without"
+    (tmp_path / "run-without").mkdir()
+    assert desk.folder_without() == tmp_path / "run-without-2"
 
 
 def test_of_several_folders_those_that_are_runs_are_opened(first, tmp_path):
@@ -132,10 +141,22 @@ class Text(HTMLParser):
         self.text += data
 
 
+def test_what_is_wrong_is_listed_once(first):
+    """In a list of its own, with its buttons, and not among the sentences."""
+    wrong = [blunder("s1:base"), blunder("s2:scan")]
+    sentences = [wrong[0]["sentence"], "The rest is fine.", wrong[1]["sentence"]]
+    diagnosed(first.folder, sentences=sentences, blunders=wrong)
+    found = Findings.read(first)
+    assert found.blunders == wrong
+    said = Text(panels.findings(found)).text
+    assert "The rest is fine." in said and "s1:base" not in said and "s2:scan" not in said
+    assert all(each["sentence"] in Text(panels.blunders(wrong)).text for each in wrong)
+
+
 def test_a_stop_says_what_of_it_does_not_fit():
     html = panels.scan(None, 0, "a<b", {"base<1>": 4.5, "beams": 1.0})
     said = Text(html)
-    assert "Stop a<b was not scanned." in said.text
+    assert "Stop a<b has no scan in this fit." in said.text
     assert "base<1> 4.5, beams 1.0" in said.text and "b" not in said.tags
     loud = html.partition("beams")[0]
     assert "font-weight" in loud and "font-weight" not in html.replace(loud, "")
@@ -176,7 +197,9 @@ def test_the_ladder_draws_every_rung_and_the_floor_to_scale(first, tmp_path):
 def test_names_cannot_become_markup(first):
     evil = '<script>alert("x")</script>'
     diagnosed(first.folder, sentences=[evil], candidates=[candidate(evil)])
-    for html in (panels.findings(Findings.read(first)), panels.note(evil)):
+    rung = Rung(replace(first, model=first.model | {"without": [evil]}), None)
+    shown = (panels.note(evil), panels.ladder([rung]), panels.blunders([blunder(evil)]))
+    for html in (panels.findings(Findings.read(first)), *shown):
         assert "script" not in Text(html).tags and evil in Text(html).text
 
 
@@ -187,6 +210,24 @@ def test_a_job_that_cannot_be_done_ends_in_its_sentence(first, tmp_path):
     *_, last = Job(first.folder, "no_such_effect", tmp_path / "out").listen()
     assert last.kind == "failed" and "not in the catalogue" in last.text
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_a_job_leaves_out_what_rigcal_add_leaves_out(first, tmp_path):
+    token = "L01P01:base_markers"
+    job = Job(first.folder, out=tmp_path / "out", without=[token])
+    for each in job.listen():
+        if each.kind == "run":
+            job.stop()
+    wanted = add(first, [], tmp_path / "wanted", without=[token])
+    found = Run.open(tmp_path / "out")
+    assert found.model == wanted.model and found.left_out == [token]
+    rms = [r.summary["rms_mm"]["fit"] for r in (found, wanted)]
+    assert rms[0] == pytest.approx(rms[1], rel=1e-9)
+    desk = Desk.of([found.folder])
+    said = Text(panels.ladder(desk.rungs())).text
+    assert f"Left out: {token}" in said and f"without {token}" in said
+    assert "Left out" not in Text(panels.ladder(desk.rungs()[:1])).text
 
 
 def test_a_job_that_is_stopped_leaves_nothing(first, tmp_path):

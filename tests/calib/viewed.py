@@ -49,6 +49,21 @@ def candidate(name: str, step: int | None = None, dressed_up: bool = False) -> d
     }
 
 
+def blunder(token: str) -> dict:
+    """A blunder of a diagnosis, as diagnosis.json has it."""
+    return {
+        "without": token,
+        "size": 0.00292,
+        "sigma": 0.00025,
+        "unit": "m",
+        "axis": "x",
+        "wrong_sign": None,
+        "belongs_to": None,
+        "indistinguishable_from": [],
+        "sentence": f"{token} is 2.92 ± 0.25 mm off in x, against everything else.",
+    }
+
+
 def diagnosed(folder: Path, **changes: object) -> dict:
     """Write a diagnosis into a run folder: one effect found, another not, a formula, two curves."""
     curve = {"centres": [[0.2, 0.6, 1.0]], "band_mm": [0.1, 0.1, 0.1]}
@@ -57,6 +72,9 @@ def diagnosed(folder: Path, **changes: object) -> dict:
         "heading": "an effect is missing",
         "too_few_stops": False,
         "weak_directions": [],
+        "blunders": [],
+        "groups": [],
+        "command": None,
         "sentences": ["incidence_angle_bias is missing."],
         "candidates": [candidate("range_scale"), candidate("incidence_angle_bias", step=1)],
         "unexplained": [{"formula": {"name": "empirical_range", "basis": ["range"]}}],

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 
 from calib.report.chart import Absent, Chart
-from calib.report.charts import bodies, fit, knowledge, links, misfit, residuals
+from calib.report.charts import bodies, fit, groups, knowledge, links, misfit, residuals
 from calib.report.evidence import Evidence
 
 Charts = Callable[[Evidence], Iterator[Chart | Absent]]
 
 SECTIONS: Mapping[str, tuple[Charts, ...]] = {
     "How good it is": (fit.ladder, fit.variance, fit.scatter),
-    "What does not fit": (misfit.by_stop, misfit.moves_from_cad),
+    "What does not fit": (groups.groups, misfit.by_stop, misfit.moves_from_cad),
     "What was found": (knowledge.findings,),
     "The chain": (links.chain, links.moves, links.effects, knowledge.budget),
     "What is left": (

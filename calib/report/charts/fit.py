@@ -20,16 +20,6 @@ if TYPE_CHECKING:
 STEEP = 8.0  # largest over smallest error from which a scale is logarithmic
 
 
-def step_name(rung: Rung) -> str:
-    """What a rung added and dropped."""
-    if rung.grown_from is None:
-        return "start"
-    if rung.below is None:
-        return f"grew from {rung.grown_from.name}, which is gone"
-    parts = [f"+ {n}" for n in rung.added] + [f"- {n}" for n in rung.dropped]
-    return ", ".join(parts) or "the same model"
-
-
 def error_mm(rung: Rung) -> tuple[str, float]:
     """The error that counts: of stops held out, or of the fit where none were."""
     rms = rung.run.summary["rms_mm"]
@@ -59,7 +49,7 @@ def ladder(evidence: Evidence) -> Iterator[Chart | Absent]:
 
 def _ladder(evidence: Evidence) -> Figure:
     rungs = evidence.rungs
-    names = [f"{folder_name(r.run.folder)}\n{step_name(r)}" for r in rungs]
+    names = [f"{folder_name(r.run.folder)}\n{r.step}" for r in rungs]
     rms = [r.run.summary["rms_mm"] for r in rungs]
     figure, grid = plots.axes(plots.WIDE, 1.3 + 0.55 * (len(rungs) + 1))
     ax, y = grid[0, 0], np.arange(1, len(rungs) + 1)

@@ -1,0 +1,118 @@
+"""Every group of rows that one mishap would spoil together, against what chance allows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from calib.report import plots
+from calib.report.chart import Absent, Chart
+from calib.report.evidence import Evidence
+from calib.residuals.groups import JOINTS, SCAN
+from calib.show.misfit import times
+
+if TYPE_CHECKING:
+    from calib.report.plots import Figure
+
+AT_STOPS = ("body", "joints", "scan")  # kinds that a stop has; others have columns of their own
+LEAST = 0.1  # of what chance allows: what is less is drawn there
+MOST_NAMES = 5  # groups that are named in the picture: more would hide each other
+MOST_TICKS = 40  # stops whose names are written below
+ONE_JOINT = "a single joint"
+OTHERS = "targets, paper, surfaces"
+COLOURS = (plots.AFTER, plots.FLOOR, *plots.LINES[3:])
+
+
+def groups(evidence: Evidence) -> Iterator[Chart | Absent]:
+    """How far each group of rows is off, over the most that chance allows."""
+    if evidence.diagnosis is None:
+        yield Absent("groups", f"not diagnosed; 'rigcal diagnose {evidence.run.folder}' does it")
+        return
+    found = {g["token"]: (g["kind"], ratio(g)) for g in evidence.diagnosis["groups"]}
+    if not found:
+        yield Absent("groups", "there is no group of rows that others could contradict")
+        return
+    loud = sorted((t for t in found if found[t][1] > 1.0), key=lambda t: -found[t][1])
+    worst = max(found, key=lambda t: found[t][1])
+    most = times(found[worst][1])
+    stops = {stop: k for s in evidence.sources for k, stop in enumerate(s.recording.stops)}
+    yield Chart(
+        "groups",
+        f"{worst} is {most} times further off than chance allows"
+        + (f"; {len(loud) - 1} more stand out" if len(loud) > 1 else "")
+        if loud
+        else f"Of {len(found)} groups of rows none is further off than chance allows; the furthest "
+        f"is {worst}, at {most} of it",
+        "How far each group of rows that one mishap would spoil together is off from what all "
+        "others say of it, over the most that chance allows when so many are looked at. What lies "
+        "above the dashed line is something that happened there; what the diagnosis left out is "
+        "drawn as it was before. What nothing contradicts cannot be told, and is not here.",
+        lambda: _groups(found, loud, stops),
+        wide=True,
+    )
+
+
+def ratio(group: Mapping[str, Any]) -> float:
+    """How far a group is off, over the most that chance allows: lengths, so roots of squares."""
+    return float(np.sqrt(group["statistic"] / group["limit"]))
+
+
+def _groups(
+    found: Mapping[str, tuple[str, float]], loud: Sequence[str], stops: Mapping[str, int]
+) -> Figure:
+    column, series = _columns(found, stops), _series(found)
+    figure, grid = plots.axes(plots.WIDE, 3.4)
+    ax = grid[0, 0]
+    for i, (name, tokens) in enumerate(series.items()):
+        minor = name in (ONE_JOINT, OTHERS)
+        ax.plot([column[_place(t)] for t in tokens], [max(found[t][1], LEAST) for t in tokens],
+                "." if minor else "osD^v"[i % 5], ms=4 if minor else 5.5, alpha=0.85, label=name,
+                color=plots.PALE if minor else COLOURS[i % len(COLOURS)],
+                zorder=1 if minor else 2)  # fmt: skip
+    for token in loud[:MOST_NAMES]:
+        at, right = column[_place(token)], column[_place(token)] > 0.6 * len(column)
+        ax.plot(at, found[token][1], "o", ms=12, mfc="none", mew=1.5, color=plots.BEFORE)
+        ax.annotate(token, (at, found[token][1]), (-10 if right else 10, -3), fontsize=9,
+                    textcoords="offset points", ha="right" if right else "left",
+                    color=plots.BEFORE, fontweight="bold")  # fmt: skip
+    high = max(2.0, 1.6 * max(x for _, x in found.values()))
+    plots.log_axis(ax, LEAST, high, "y")
+    ax.set_ylim(0.8 * LEAST, high)
+    ax.axhline(1.0, color=plots.INK, linestyle="--", linewidth=0.8)
+    names, step = list(column), -(-len(column) // MOST_TICKS)
+    ax.set_xticks(range(0, len(names), step), names[::step], rotation=90, fontsize=8)
+    ax.set_xlim(-0.7, len(names) - 0.3)
+    ax.set_ylabel("off, over what chance allows")
+    figure.legend(loc="outside upper left", ncols=6)
+    return figure
+
+
+def _place(token: str) -> str:
+    """Where a group is: its stop or target, `CAD` or `MESH`."""
+    return token.rpartition(":")[0]
+
+
+def _columns(found: Mapping[str, tuple[str, float]], stops: Mapping[str, int]) -> dict[str, int]:
+    """Place -> its column: stops in their order, recording by recording, then all others."""
+    at_stop = {_place(t): kind in AT_STOPS for t, (kind, _) in found.items()}
+
+    def order(place: str) -> tuple[bool, str, int, str]:
+        # Of several recordings, the name of each stands before a slash.
+        recording, _, stop = place.rpartition("/")
+        return not at_stop[place], recording, stops.get(stop, -1) if at_stop[place] else 0, place
+
+    return {place: k for k, place in enumerate(sorted(at_stop, key=order))}
+
+
+def _series(found: Mapping[str, tuple[str, float]]) -> dict[str, list[str]]:
+    """What is drawn alike: each body, scans, joints; then what is drawn small."""
+    out: dict[str, list[str]] = {}
+    for token, (kind, _) in found.items():
+        what = token.rpartition(":")[2]
+        name = what if kind in AT_STOPS else OTHERS
+        name = ONE_JOINT if kind == "joints" and what != JOINTS else name
+        out.setdefault(name, []).append(token)
+    last = (SCAN, JOINTS, ONE_JOINT, OTHERS)
+    return dict(sorted(out.items(), key=lambda pair: pair[0] in last and last.index(pair[0]) + 1))

@@ -1,0 +1,126 @@
+"""Runs side by side in a terminal, and the ladder by which they grew: ``rigcal compare``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from calib.runs.estimates import comparison
+from calib.runs.ladder import Rung, ladder
+from calib.show.misfit import worst_of
+from calib.show.scale import shown
+from calib.show.tables import (
+    ERROR_LABELS,
+    LISTED_PARAMETERS,
+    columns_table,
+    estimate_cell,
+    mm,
+    outcome,
+    terminal,
+)
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from calib.runs.run import Run
+
+ABREAST = 3  # runs in one table
+STACKED = 4  # names in a cell
+
+
+def print_comparison(runs: Sequence[Run]) -> None:
+    """Print errors, noise floor and parameters of runs side by side, and the ladder of a study."""
+    console = terminal()
+    for run in runs:
+        console.print(str(run.folder), style="bold", soft_wrap=True)
+        for sentence in run.warning:
+            console.print(sentence, style="bold red")
+        console.print(f"{_model(run)}; {outcome(run.summary)}")
+    for start in range(0, len(runs), ABREAST):
+        console.print()
+        console.print(_comparison_table(runs[start : start + ABREAST]))
+    rungs = ladder(runs)
+    if rungs:
+        console.print()
+        console.print(ladder_table(rungs))
+
+
+def ladder_table(rungs: Sequence[Rung]) -> Table:
+    """What each rung changed of the model, and what that did to the error of stops held out."""
+    table = columns_table("ladder", "model", "held out, mm", "fit, mm", "noise floor, mm")
+    for column in table.columns[2:]:
+        column.justify = "right"
+    for rung in rungs:
+        rms = rung.run.summary["rms_mm"]
+        below = rung.below.summary["rms_mm"] if rung.below else {}
+        held_out = " -> ".join(filter(None, (mm(r.get("held_out")) for r in (below, rms))))
+        name = rung.run.folder.name or str(rung.run.folder)
+        table.add_row(name, rung.step, held_out, mm(rms["fit"]), mm(rms["noise_floor"]))
+    return table
+
+
+def _comparison_table(runs: Sequence[Run]) -> Table:
+    compared = comparison(runs)
+    table = columns_table("", "", *(run.folder.name or str(run.folder) for run in runs))
+    for error in ("rms_mm", "mean_mm", "std_mm"):
+        for kind, label in ERROR_LABELS.items():
+            values = compared[error].get(kind, ())
+            if any(value is not None for value in values):
+                cells = (mm(value, "+" if error == "mean_mm" else "") for value in values)
+                table.add_row(f"{error[:-3]} {label}", "mm", *cells)
+    for key in ("left_out", "set_aside"):
+        if any(compared[key]):
+            table.add_row(key.replace("_", " "), "", *map(_stacked, compared[key]))
+    _add_misfit(table, runs, compared)
+    for variable, parameters in compared["parameters"].items():
+        if len(parameters) > LISTED_PARAMETERS:
+            _add_spread(table, variable, list(parameters.values()))
+            continue
+        for name, entry in parameters.items():
+            numbers = zip(entry["estimate"], entry["sigma"], strict=True)
+            cells = ("" if s is None else estimate_cell(e, s, entry["unit"]) for e, s in numbers)
+            table.add_row(f"{variable}.{name}", shown(entry["unit"])[1], *cells)
+    return table
+
+
+def _stacked(tokens: Sequence[str]) -> str:
+    """Names below each other, and how many more there are."""
+    more = [f"and {len(tokens) - STACKED} more"] if len(tokens) > STACKED else []
+    return "\n".join([*tokens[:STACKED], *more])
+
+
+def _add_misfit(table: Table, runs: Sequence[Run], compared: Mapping[str, Any]) -> None:
+    """What was thrown out, and how large residuals are against their sigmas."""
+    every, share = compared["rms_all_mm"], compared["rejected_share"]
+    if any(x for x in share):
+        table.add_row("rms after the fit, of all beams", "mm", *map(mm, every))
+        cells = ("" if x is None else f"{100 * x:.1f}" for x in share)
+        table.add_row("beams thrown out", "%", *cells)
+    for kind, ratios in compared["misfit"].items():
+        cells = ("" if x is None else f"{x:.2f}" for x in ratios)
+        table.add_row(f"residuals over sigma, {kind}", "", *cells)
+    labels = ("the largest of these, where", "furthest from CAD, in its sigmas")
+    for label, cells in zip(labels, zip(*map(worst_of, runs), strict=True), strict=True):
+        if any(cells):
+            table.add_row(label, "", *cells)
+
+
+def _add_spread(table: Table, variable: str, entries: Sequence[Mapping[str, Any]]) -> None:
+    """Mean and standard deviation, per run, over an effect's many parameters of each unit."""
+    for kind in dict.fromkeys(entry["unit"] for entry in entries):
+        scale, unit = shown(kind)
+        alike = [entry["estimate"] for entry in entries if entry["unit"] == kind]
+        estimates = np.array(alike, float).T
+        for what, function in (("mean", np.mean), ("sd", np.std)):
+            present = (each[~np.isnan(each)] for each in estimates)
+            cells = (f"{scale * function(each):+.3g}" if len(each) else "" for each in present)
+            table.add_row(f"{variable}, {what}", unit, *cells)
+
+
+def _model(run: Run) -> str:
+    model = run.model
+    text = ", ".join(run.effects) or "no effects"
+    text += f"; fixed {', '.join(model['fixed'])}" if model["fixed"] else ""
+    return text + (f"; from {model['prior']}" if model["prior"] else "")

@@ -1,0 +1,156 @@
+"""The pages of docs/: every command and program on them is run, and says what they show."""
+
+import re
+import shlex
+import xml.etree.ElementTree as ElementTree
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import yaml
+
+from calib.problem.model import Source
+from calib.problem.without import leave_out
+from calib.runs.run import Run
+
+from .programs import ROOT, rigcal, script
+from .test_readme import shape
+
+PAGES = sorted((ROOT / "docs").glob("*.md"))
+TOKEN = "L02P01:base_markers"
+
+
+@dataclass
+class Session:
+    """A page, the folder in which all on it was run, and what that printed."""
+
+    text: str
+    folder: Path
+    said: str
+
+
+def run_through(page: Path, folder: Path) -> Session:
+    """Run the blocks of a page, one after another."""
+    text, said = page.read_text(encoding="utf-8"), []
+    for language, block in re.findall(r"^```(\w+)\n(.*?)^```", text, flags=re.M | re.S):
+        if language == "python":
+            (folder / "block.py").write_text(block)
+            said.append(script(folder / "block.py", [], folder))
+        for line in block.splitlines() if language == "sh" else ():
+            program, *words = shlex.split(line, comments=True)
+            assert program == "rigcal"
+            said.append(rigcal(words, folder))
+    return Session(text, folder, "\n".join(said))
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory):
+    """The page about blunders, run."""
+    return run_through(ROOT / "docs/one_thing_wrong.md", tmp_path_factory.mktemp("docs"))
+
+
+def test_every_page_is_linked_from_readme():
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert PAGES and all(f"(docs/{page.name})" in readme for page in PAGES)
+
+
+@pytest.mark.slow
+def test_what_the_page_shows_is_what_is_printed(session):
+    """But for the numbers; the size agrees to a tenth."""
+    shown = re.findall(r"^```text\n(.*?)^```", session.text, flags=re.M | re.S)
+    assert len(shown) == 2
+    for part in shown:
+        assert shape(part) in shape(session.said), part
+    size = r"base_markers is (\S+) ± \S+ mm off in x"
+    assert float(re.search(size, session.said)[1]) == pytest.approx(
+        float(re.search(size, session.text)[1]), rel=0.1
+    )
+
+
+@pytest.mark.slow
+def test_the_command_that_diagnose_prints_is_the_one_of_the_page(session):
+    run = Run.open(session.folder / "run")
+    found = run.diagnosis()
+    assert [b["without"] for b in found["blunders"]] == [TOKEN]
+    assert found["command"] in session.said.splitlines()
+    words = shlex.split(found["command"])
+    assert words[:3] == ["rigcal", "fit", str((session.folder / "rec").resolve())]
+    assert words[3:] == ["-o", "run-without", "--without", TOKEN]
+    assert found["blunders"][0]["indistinguishable_from"] == ["L02P01:joints"]
+
+
+@pytest.mark.slow
+def test_every_group_stands_in_the_diagnosis_and_one_is_wild(session):
+    found = Run.open(session.folder / "run").diagnosis()
+    wild = [g["token"] for g in found["groups"] if g["statistic"] > g["limit"]]
+    assert wild == [TOKEN] and found["groups"][0]["token"] == TOKEN
+    assert {g["token"] for g in found["groups"]} == found["detectable"].keys()
+    assert {g["kind"] for g in found["groups"]} >= {"body", "scan", "joints", "target", "frame"}
+    assert all(0 <= g["p_value"] <= 1 and g["dof"] > 0 for g in found["groups"])
+    mended = Run.open(session.folder / "without").diagnosis()
+    assert mended["verdict"] == "adequate" and mended["command"] is None
+    assert not [g for g in mended["groups"] if g["statistic"] > g["limit"]]
+    assert TOKEN not in {g["token"] for g in mended["groups"]}
+
+
+@pytest.mark.slow
+def test_the_report_says_it_near_the_verdict_and_draws_it(session):
+    html = (session.folder / "report.html").read_text(encoding="utf-8")
+    top = html[: html.index("<nav")]
+    assert 'class="verdict red"' in top
+    for said in (TOKEN, "or L02P01:joints: nothing tells them apart", f"--without {TOKEN}</pre>"):
+        assert said in top, said
+    figure = html[html.index('<figure id="groups"') :]
+    figure = figure[: figure.index("</figure>")]
+    assert f"{TOKEN} is " in figure and "times further off than chance allows" in figure
+    svg = ElementTree.fromstring(figure[figure.index("<svg") : figure.index("</svg>") + 6])
+    texts = {"".join(e.itertext()).strip() for e in svg.iter() if e.tag.endswith("text")}
+    assert {TOKEN, "base_markers", "scan", "L02P01", "cad"} <= texts
+
+
+@pytest.mark.slow
+def test_what_was_left_out_stands_wherever_the_result_is_shown(session):
+    run = Run.open(session.folder / "without")
+    assert run.left_out == run.summary["without"] == [TOKEN]
+    assert re.search(rf"left out +{TOKEN}", session.said)
+    for file in (session.folder / "extrinsics").iterdir():
+        assert f"Left out: {TOKEN}" in file.read_text(), file.name
+    provenance = yaml.safe_load((session.folder / "extrinsics/extrinsics.yaml").read_text())
+    assert provenance["provenance"]["left_out"] == [TOKEN]
+
+
+@pytest.mark.slow
+def test_every_name_in_the_table_is_one(session):
+    """With a name of this recording in the place of each word in capitals."""
+    source = Source.open(session.folder / "rec")
+    table = re.search(r"\|---\|---\|---\|\n(.*?)\n\n", session.text, flags=re.S)[1]
+    cells = [re.findall(r"`([^`]+)`", row.split("|")[2]) for row in table.splitlines()]
+    tokens = [t if ":" in t else f"TARGET:{t}" for row in cells for t in row]
+    words = {
+        "TARGET": first_target(session.folder),
+        "STOP": "L00P00",
+        "JOINT": "joint_2",
+        "BODY": "base_markers",
+    }
+    words |= {"EFFECT.PARAMETER": "arm_link_length.joint_3", "FRAME": "lidar"}
+    words |= {"surface_N": f"surface_{int(source.reference.surface.max())}"}
+    assert len(tokens) == 11
+    for token in tokens:
+        for word, name in words.items():
+            token = token.replace(word, name)
+        assert leave_out([source], [token])[0] is not source, token
+
+
+def first_target(folder: Path) -> str:
+    """The name of a recording's first target."""
+    return (folder / "rec/targets.csv").read_text().splitlines()[1].partition(",")[0]
+
+
+@pytest.mark.slow
+def test_the_table_of_what_a_diagnosis_holds_is_right(session):
+    found = Run.open(session.folder / "run").diagnosis()
+    part = session.text[session.text.index("## In `diagnosis.json`") :]
+    named = set(re.findall(r"`(\w+)`", part.partition("## Sources")[0])) - {"bad_data"}
+    known = {*found, *found["blunders"][0], *found["groups"][0]}
+    assert named <= known, named - known
+    assert {*found["groups"][0]} <= named
