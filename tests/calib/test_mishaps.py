@@ -39,6 +39,7 @@ MISHAPS = {  # what is done, what is to be named, and by how much it is off, m o
         broken.cells("stops.csv", r"mount_markers\.z", lambda z: z - 0.005, 4),
         0.005,
     ),
+    "a joint": (broken.cells("stops.csv", "joint_2", lambda q: q + 0.005, 4), 0.005),
     "a scan": (turned(0.01), 0.01),
     "a sphere": (broken.cells("targets.csv", "faro_x", lambda x: x + 0.01, 1), 0.01),
     "a sign in the CAD": (broken.rig("frames", "lidar", "xyz_m", value=[0.0, 0.0, -0.085]), 0.17),
@@ -47,12 +48,13 @@ MISHAPS = {  # what is done, what is to be named, and by how much it is off, m o
 NAMES = {
     "a body": f"{STOP}:base_markers",
     "the other body": f"{STOP}:mount_markers",
+    "a joint": f"{STOP}:joint_2",
     "a scan": f"{STOP}:scan",
     "a sphere": "T2:sphere",
     "a sign in the CAD": "cad:lidar",
     "a length": "cad:arm_link_length.joint_3",
 }
-QUICK = ("a scan", "a sign in the CAD")
+QUICK = ("a joint", "a sign in the CAD")
 
 
 @pytest.fixture(scope="module")
