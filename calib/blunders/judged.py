@@ -120,18 +120,23 @@ def judge(whole: Linearisation, problem: Problem) -> list[Blunder]:
 
 def _alike(group: Group) -> tuple[str, str]:
     """Groups that are as likely as each other to be somewhat off."""
-    if group.kind == "body":
-        return group.kind, group.what
-    return group.kind, JOINTS if group.what == JOINTS else ""
+    return group.kind, group.what if group.kind == "body" else ""
+
+
+def _whole(group: Group) -> bool:
+    """Whether it tells how far out its kind is. Each joint of a stop can stand in for much of what
+    contradicts that stop, so the median of single joints says little."""
+    return group.kind != "joints" or group.what == JOINTS
 
 
 def _judged(some: Sequence[Shift], looks: int) -> Iterator[Blunder]:
     """Groups of one kind: in units of how far out their bulk is."""
-    dof = np.array([shift.dof for shift in some])
-    ratio = np.array([shift.statistic for shift in some]) / special.chdtri(dof, 0.5)
-    bulk = max(1.0, float(np.median(ratio))) if len(some) >= BULK else 1.0
+    wholes = [shift for shift in some if _whole(shift.group)]
+    dof = np.array([shift.dof for shift in wholes])
+    ratio = np.array([shift.statistic for shift in wholes]) / special.chdtri(dof, 0.5)
+    bulk = max(1.0, float(np.median(ratio))) if len(wholes) >= BULK else 1.0
     for shift in some:
-        known = MEDIAN * (dof.sum() - shift.dof) if len(some) >= BULK else KNOWN
+        known = MEDIAN * max(dof.sum() - shift.dof, 1) if len(wholes) >= BULK else KNOWN
         scaled = shift.statistic / bulk
         p = float(special.fdtrc(shift.dof, known, scaled / shift.dof))
         limit = special.fdtri(shift.dof, known, (1.0 - ALPHA) ** (1.0 / looks))

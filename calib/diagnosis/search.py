@@ -123,8 +123,8 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NAMES) -> Search:
 
 
 def _adapted(look: Look, left: list[LeftOut], progress: Progress) -> Look:
-    """A look without the blunders that explain more than any effect or structure would; these are
-    added to those left out."""
+    """A look without the blunders that explain more than any effect or structure would, or leave
+    these nothing to explain; they are added to those left out."""
     for _ in range(ADAPTED):
         estimate = look.stand.estimate
         stray = list(stray_scans(estimate.problem, estimate.values, look.checked))
@@ -134,6 +134,8 @@ def _adapted(look: Look, left: list[LeftOut], progress: Progress) -> Look:
         if not groups:
             break
         after = look.stand.without(groups, progress).look(progress)
+        if wild and _outdone(look, wild[0]) and not _quiet(after):
+            break
         loud = {b.group for b in after.blunders if b.found}
         for each in wild:
             near = (b for b in look.blunders if each.evidence - b.evidence < ODDS)
@@ -154,17 +156,25 @@ def _meet(a: Blunder, b: Blunder) -> bool:
 def _wild(look: Look) -> list[Blunder]:
     """Blunders to leave out now: the worst of each place, as far out as the worst of all."""
     found = [b for b in look.blunders if b.found]
-    if not found:
-        return []
-    every = (*look.named.candidates, *look.unnamed.candidates)
-    best = max((c.evidence - np.log(c.looks) for c in every), default=0.0)
-    if found[0].evidence - np.log(found[0].looks) < best:
-        return []
     places: dict[tuple[str, str], list[Blunder]] = {}
     for each in found:
         if each.evidence > AS_FAR * found[0].evidence:
             places.setdefault((each.group.recording, each.group.where), []).append(each)
     return [likeliest(here) for here in places.values()]
+
+
+def _outdone(look: Look, by: Blunder) -> bool:
+    """Whether an effect or a structure explains more than a blunder, at its price."""
+    every = (*look.named.candidates, *look.unnamed.candidates)
+    best = max((c.evidence - np.log(c.looks) for c in every), default=0.0)
+    return by.evidence - np.log(by.looks) < best
+
+
+def _quiet(look: Look) -> bool:
+    """Whether no effect and no structure stands out: bins, or a name that acts like bins, take on
+    what one stop has alone, but one stop left out does not take an effect away."""
+    named = any(_stands_out(c, ALPHA) for c in look.named.candidates)
+    return not named and not any(_stands_out(c, ALPHA_UNNAMED) for c in look.unnamed.candidates)
 
 
 def likeliest(here: Sequence[Blunder]) -> Blunder:

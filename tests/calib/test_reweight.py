@@ -87,7 +87,7 @@ def test_one_wild_row_of_300_moves_no_estimate_by_a_sigma(shared):
 def test_the_fit_is_at_the_optimum_of_hubers_loss(tmp_path, monkeypatch):
     """With a body, a joint, a sphere and a frame that are off: against scipy's least squares of
     rows whose square is twice Huber's loss of each group's norm."""
-    turns = np.random.default_rng(3).uniform(-1, 1, (5, 3)) * [2.0, 0.6, 0.1]
+    turns = np.random.default_rng(3).uniform(-1, 1, (7, 3)) * [2.0, 0.6, 0.1]
     monkeypatch.setattr(rigs, "STOPS", {f"s{k}": ("a", tuple(q)) for k, q in enumerate(turns)})
     box = rigs.write(tmp_path / "box", seed=5, lidar=None)
     broken.cells("stops.csv", r"base_markers\.x", lambda x: x + 0.05, row=1)(box)

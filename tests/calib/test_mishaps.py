@@ -1,0 +1,109 @@
+"""One thing wrong in a recording, from the file to its name: twelve stops of a simulated rig."""
+
+import shutil
+
+import numpy as np
+import pytest
+
+from calib.diagnosis.search import search
+from calib.diagnosis.stand import Stand
+from calib.problem import build
+from calib.problem.model import Model, Source
+from calib.runs.explain import explain
+from calib.simulation import Spec, simulate
+from calib.solve.fit import solve
+from sensors.recording import read_table, write_table
+
+from . import broken
+
+SPEC = Spec(lidar="hesai_pandarxt32", locations=4, stops_per_location=3, column_step=400)
+STOP = "L01P01"  # row 4 of stops.csv
+
+
+def turned(angle_rad):
+    """The scan of that stop, turned about the LiDAR's axis."""
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+
+    def apply(rec):
+        table = read_table(rec / f"scans/{STOP}.parquet")
+        x, y = table["x"], table["y"]
+        table |= {"x": (c * x - s * y).astype("f4"), "y": (s * x + c * y).astype("f4")}
+        write_table(rec / f"scans/{STOP}.parquet", table)
+
+    return apply
+
+
+MISHAPS = {  # what is done, what is to be named, and by how much it is off, m or rad
+    "a body": (broken.cells("stops.csv", r"base_markers\.y", lambda y: y + 0.005, 4), 0.005),
+    "the other body": (
+        broken.cells("stops.csv", r"mount_markers\.z", lambda z: z - 0.005, 4),
+        0.005,
+    ),
+    "a joint": (broken.cells("stops.csv", "joint_2", lambda q: q + 0.005, 4), 0.005),
+    "a scan": (turned(0.01), 0.01),
+    "a sphere": (broken.cells("targets.csv", "faro_x", lambda x: x + 0.01, 1), 0.01),
+    "a sign in the CAD": (broken.rig("frames", "lidar", "xyz_m", value=[0.0, 0.0, -0.085]), 0.17),
+    "a length": (broken.text("arm.urdf", 'xyz="0.0 0.35 0.0"', 'xyz="0.0 0.38 0.0"'), 0.03),
+}
+NAMES = {
+    "a body": f"{STOP}:base_markers",
+    "the other body": f"{STOP}:mount_markers",
+    "a joint": f"{STOP}:joint_2",
+    "a scan": f"{STOP}:scan",
+    "a sphere": "T2:sphere",
+    "a sign in the CAD": "cad:lidar",
+    "a length": "cad:arm_link_length.joint_3",
+}
+QUICK = ("a joint", "a sign in the CAD")
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("mishaps") / "rec"
+    simulate(SPEC, folder, 3, {})
+    return folder
+
+
+def searched(folder):
+    """What a search finds from a fit of the default model."""
+    source = Source.open(folder)
+    problem = build([source], Model())
+    stand = Stand([source], Model(), problem, solve(problem))
+    return search(stand, lambda what, done, total: None)
+
+
+def marked(mishap):
+    return mishap if mishap in QUICK else pytest.param(mishap, marks=pytest.mark.long)
+
+
+@pytest.mark.parametrize("mishap", [marked(mishap) for mishap in MISHAPS])
+def test_it_is_named_and_sized_and_nothing_else_is(recording, tmp_path, mishap):
+    rec = shutil.copytree(recording, tmp_path / "rec")
+    done, size = MISHAPS[mishap]
+    done(rec)
+    found = searched(rec)
+    assert [left.blunder.group.token for left in found.blunders] == [NAMES[mishap]]
+    assert not found.found and not found.unnamed, "no effect takes its place"
+    estimate, sigma, _, _ = found.blunders[0].blunder.leading()
+    assert abs(estimate - size) < 4 * sigma < size
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", range(8))
+def test_where_nothing_was_done_nothing_is_named(tmp_path, seed):
+    simulate("tiny", tmp_path / "rec", seed, {})
+    assert searched(tmp_path / "rec").blunders == []
+
+
+def test_explain_leaves_it_out_and_goes_on(recording, tmp_path):
+    """A body that is 5 mm off at one stop: a rung of its own, and an adequate model after that."""
+    rec = shutil.copytree(recording, tmp_path / "rec")
+    MISHAPS["a body"][0](rec)
+    found = explain([rec], tmp_path / "ladder")
+    assert [step["left_out"] for step in found.steps] == [[], [NAMES["a body"]]]
+    assert [step["added"] for step in found.steps] == [[], []]
+    assert found.diagnosis.verdict == "adequate" and not found.diagnosis.blunders
+    assert f"Left out before: {NAMES['a body']}." in found.diagnosis.sentences
+    first = found.runs[0].diagnosis()
+    assert first["verdict"] == "bad_data" and first["blunders"][0]["stop"] == STOP
+    assert first["command"].endswith(f"--without {NAMES['a body']}")
