@@ -71,8 +71,9 @@ def diagnose(
     result = replace(
         result,
         sentences=[
-            *run.warning,
+            *run.doubts,
             *result.sentences,
+            *run.warning[len(run.doubts) :],
             *(f"{clause[0].upper()}{clause[1:]}." for clause, harms in rings if not harms),
         ],
         command=command_without(run, tokens) if tokens else "",

@@ -88,16 +88,20 @@ class Run:
         return bool(self.summary["converged"])
 
     @property
-    def warning(self) -> list[str]:
-        """What is to stand above everything that is shown of the run, a sentence each."""
+    def doubts(self) -> list[str]:
+        """Why the fit may not be what it should be, a sentence each."""
         out = [] if self.converged else [NOT_CONVERGED]
         if self.set_aside:
             out.append(
-                f"Set aside, as they contradict all other scans: {', '.join(self.set_aside)}"
+                f"Set aside, as they contradict all other scans: {', '.join(self.set_aside)}."
             )
-        if self.left_out:
-            out.append(f"Left out: {', '.join(self.left_out)}")
         return out
+
+    @property
+    def warning(self) -> list[str]:
+        """What is to stand above everything that is shown of the run, a sentence each."""
+        left_out = [f"Left out: {', '.join(self.left_out)}."] if self.left_out else []
+        return [*self.doubts, *left_out]
 
     @property
     def set_aside(self) -> list[str]:

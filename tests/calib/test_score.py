@@ -71,7 +71,6 @@ class World:
             gradient=csr_array(pick @ J),
             stop=stop,
             place=place,
-            whole=None,
             weight_m2=float(len(J)),
             whole=None,
             directions=lambda kept: kept,
