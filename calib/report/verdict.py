@@ -54,8 +54,8 @@ def judge(run: Run, diagnosis: Mapping[str, Any] | None) -> Verdict:
 
 def _first_found(run: Run, diagnosis: Mapping[str, Any]) -> str:
     """The first sentence of a diagnosis, but for those that stand above all that is shown."""
-    said = (each for each in diagnosis["sentences"] if each not in run.warning)
-    return next(said, diagnosis["heading"])
+    sentences = diagnosis["sentences"]
+    return next((each for each in sentences if each not in run.warning), sentences[0])
 
 
 def _undiagnosed(run: Run) -> str:

@@ -267,6 +267,7 @@ def test_a_shift_of_the_detectable_size_is_found_four_times_in_five(drawn, monke
                 right = noise[:, k] + drawn.groups.beyond(drawn.groups.shifted(group, offset))
                 (statistic,), _ = drawn.groups.statistics(group, right[:, None])
                 now = drawn.judged({group: float(statistic)}, monkeypatch)[group]
+                assert now.found == (statistic > now.limit)
                 hits.append(now.found)
     assert len(hits) > 200
     assert 0.7 < np.mean(hits) < 0.9

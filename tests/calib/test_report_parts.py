@@ -1,11 +1,14 @@
 """Parts of a report that need no run: the light, correlations, arrows."""
 
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from calib.report.charts.bodies import Arrows, magnification
+from calib.report.charts.groups import groups
 from calib.report.charts.knowledge import tied
 from calib.report.verdict import judge
 from calib.results.solution import Solution
@@ -107,9 +110,82 @@ def apart(part, what):
         (rms(4.0), found(), "red", "4.0 times the noise floor"),
         ({"converged": False}, found(), "red", "not converged"),
         ({}, found("missing_effect"), "red", "worth adding"),
+        ({}, found("bad_data"), "red", "to be mended or left out"),
     ],
 )
 def test_the_light_follows_its_rule(changes, diagnosis, light, reason):
     verdict = judge(run_like(**changes), diagnosis)
     assert verdict.light == light
     assert any(reason in told for told in verdict.reasons)
+
+
+def test_what_was_left_out_is_not_the_verdict():
+    """It stands above the sentences of a diagnosis, and has a place of its own on the page."""
+    run = replace(run_like(), model={"without": ["s1:base"]})
+    diagnosis = found() | {"sentences": [*run.warning, "It is so."]}
+    assert run.warning == ["Left out: s1:base"]
+    assert judge(run, diagnosis).sentence == "It is so."
+    assert judge(run, diagnosis).light == "green"
+
+
+# ---------------------------------------------------------------------------------------- groups
+
+
+def group(token, kind, times_as_far):
+    return {"token": token, "kind": kind, "statistic": times_as_far**2 * 40.0, "limit": 40.0}
+
+
+SOUND = [
+    group("b/s10:base", "body", 0.5),
+    group("b/s2:base", "body", 0.0),
+    group("b/s2:scan", "scan", 0.2),
+    group("a/s2:joints", "joints", 0.3),
+    group("a/s2:joint_1", "joints", 0.3),
+    group("T1:rod", "target", 0.1),
+    group("cad:lidar", "frame", 0.6),
+    group("mesh:surface_3", "surface", 0.4),
+]
+
+
+def drawn(groups_found):
+    """The chart of groups of a run of two recordings, a and b, with stops s2 and s10."""
+    recording = SimpleNamespace(stops=["s2", "s10"])
+    sources = [SimpleNamespace(recording=recording)] * 2
+    diagnosis = {"groups": groups_found} if groups_found is not None else None
+    evidence = SimpleNamespace(diagnosis=diagnosis, sources=sources, run=run_like())
+    (chart,) = groups(evidence)
+    return chart
+
+
+def test_the_wild_group_stands_alone_above_the_line():
+    chart = drawn([group("b/s2:base", "body", 7.0), *SOUND[:1], *SOUND[2:]])
+    assert chart.title == "b/s2:base is 7.0 times further off than chance allows"
+    (ax,) = chart.figure().axes
+    names = [tick.get_text() for tick in ax.get_xticklabels()]
+    assert names == ["a/s2", "b/s2", "b/s10", "T1", "cad", "mesh"]
+    rings = [line for line in ax.lines if line.get_markerfacecolor() == "none"]
+    assert [(line.get_xdata()[0], line.get_ydata()[0]) for line in rings] == [(1, 7.0)]
+    assert [text.get_text() for text in ax.texts] == ["b/s2:base"]
+    by_name = {line.get_label(): line for line in ax.lines}
+    assert sorted(by_name["base"].get_ydata()) == pytest.approx([0.5, 7.0])
+    assert {"joints", "scan", "a single joint", "targets, paper, surfaces"} <= by_name.keys()
+    assert ax.get_ylim()[1] > 7.0
+
+
+def test_where_nothing_is_wild_the_furthest_is_named():
+    chart = drawn(SOUND)
+    assert chart.title.startswith("Of 8 groups of rows none is further off than chance allows")
+    assert "cad:lidar, at 0.6 of it" in chart.title
+    assert not chart.figure().axes[0].texts
+
+
+def test_of_many_wild_groups_the_worst_are_named():
+    wild = [group(f"a/s{k}:base", "body", 2.0 + k) for k in range(9)]
+    chart = drawn([*SOUND, *wild])
+    assert chart.title.startswith("a/s8:base is 10.0 times") and "8 more stand out" in chart.title
+    assert len(chart.figure().axes[0].texts) == 5
+
+
+def test_without_a_diagnosis_or_groups_there_is_no_such_figure():
+    assert "not diagnosed" in drawn(None).why
+    assert "could contradict" in drawn([]).why
