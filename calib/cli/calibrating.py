@@ -124,7 +124,7 @@ def add(
 ) -> None:
     """The model of a run and more effects, refitted from that run to the same recordings."""
     if not effects and not without:
-        raise InputError("give an effect to add, or what to leave out with --without")
+        raise InputError("give an EFFECT to add, or what to leave out with --without")
     from calib.runs.add import add as grow
     from calib.runs.run import Run
 
