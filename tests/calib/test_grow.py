@@ -26,9 +26,9 @@ NOTHING = {
     "verdict": "adequate",
     "heading": "the model is adequate",
     "too_few_stops": False,
-    **{
-        name: [] for name in ("sentences", "candidates", "unexplained", "weak_directions", "curves")
-    },
+    "command": None,
+    **{name: [] for name in ("sentences", "candidates", "unexplained", "weak_directions")},
+    **{name: [] for name in ("curves", "blunders", "groups")},
 }
 FORMULA = """\
 name: lean

@@ -168,7 +168,7 @@ def test_the_wild_group_stands_alone_above_the_line():
     assert [text.get_text() for text in ax.texts] == ["b/s2:base"]
     by_name = {line.get_label(): line for line in ax.lines}
     assert sorted(by_name["base"].get_ydata()) == pytest.approx([0.5, 7.0])
-    assert {"joints", "scan", "a single joint", "targets, paper, surfaces"} <= by_name.keys()
+    assert {"joints", "scan", "a single joint", "others"} <= by_name.keys()
     assert ax.get_ylim()[1] > 7.0
 
 

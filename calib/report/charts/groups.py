@@ -21,7 +21,7 @@ LEAST = 0.1  # of what chance allows: what is less is drawn there
 MOST_NAMES = 5  # groups that are named in the picture: more would hide each other
 MOST_TICKS = 40  # stops whose names are written below
 ONE_JOINT = "a single joint"
-OTHERS = "targets, paper, surfaces"
+OTHERS = "others"
 COLOURS = (plots.AFTER, plots.FLOOR, *plots.LINES[3:])
 
 
@@ -41,14 +41,16 @@ def groups(evidence: Evidence) -> Iterator[Chart | Absent]:
     yield Chart(
         "groups",
         f"{worst} is {most} times further off than chance allows"
-        + (f"; {len(loud) - 1} more stand out" if len(loud) > 1 else "")
+        + (f"; {len(loud) - 1} more stand{'s' * (len(loud) == 2)} out" if len(loud) > 1 else "")
         if loud
         else f"Of {len(found)} groups of rows none is further off than chance allows; the furthest "
         f"is {worst}, at {most} of it",
         "How far each group of rows that one mishap would spoil together is off from what all "
         "others say of it, over the most that chance allows when so many are looked at. What lies "
         "above the dashed line is something that happened there; what the diagnosis left out is "
-        "drawn as it was before. What nothing contradicts cannot be told, and is not here.",
+        "drawn as it was before. Small dots: single joints and, after the stops, targets, values "
+        "on paper (cad) and surfaces (mesh). What nothing contradicts cannot be told, and is not "
+        "here.",
         lambda: _groups(found, loud, stops),
         wide=True,
     )
