@@ -9,7 +9,7 @@ FAR_OFF = 3.0  # times its sigmas, or the floor: residuals that something large 
 
 def misfit_sentence(kind: str, times: float) -> str:
     """How far the residuals of an instrument exceed their sigmas."""
-    what = "errors of the reference" if kind == "reference" else f"residuals of {kind}"
+    what = "errors of the reference" if kind == "reference" else f"residuals of the {kind}"
     return f"the {what} are {times:.1f} times larger than their sigmas allow"
 
 

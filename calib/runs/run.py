@@ -100,7 +100,7 @@ class Run:
     @property
     def warning(self) -> list[str]:
         """What is to stand above everything that is shown of the run, a sentence each."""
-        left_out = [f"Left out: {', '.join(self.left_out)}."] if self.left_out else []
+        left_out = [f"Left out: {', '.join(self.left_out)}"] if self.left_out else []
         return [*self.doubts, *left_out]
 
     @property

@@ -103,7 +103,7 @@ def test_explain_leaves_it_out_and_goes_on(recording, tmp_path):
     assert [step["left_out"] for step in found.steps] == [[], [NAMES["a body"]]]
     assert [step["added"] for step in found.steps] == [[], []]
     assert found.diagnosis.verdict == "adequate" and not found.diagnosis.blunders
-    assert f"Left out: {NAMES['a body']}." in found.diagnosis.sentences
+    assert f"Left out: {NAMES['a body']}" in found.diagnosis.sentences
     first = found.runs[0].diagnosis()
     assert first["verdict"] == "bad_data" and first["blunders"][0]["stop"] == STOP
     assert first["command"].endswith(f"--without {NAMES['a body']}")

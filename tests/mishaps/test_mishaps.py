@@ -156,7 +156,8 @@ def test_blunders_have_the_names_that_without_takes():
     ]
     found = blunders({"blunders": listed})
     assert found == [["L03P02:base_markers"], ["L03P02:scan"], ["cad:lidar"], ["T1:rod", "x"]]
-    assert detectable({"blunders": listed}) == {"cad:lidar m": 2e-3}
+    told = {"cad:lidar": {"m": 2e-3, "rad": float("inf")}}
+    assert detectable({"detectable": told}) == {"cad:lidar m": 2e-3}
     assert matches("L0:x", ["*:x"]) and not matches("L0:y", ["*:x"])
 
 
