@@ -186,6 +186,8 @@ class _Loop:
             if not self.take_weights(settled):
                 break
             converged = self.run(tolerance, False) if scans else self.solve_without_scans()
+            if not (scans or converged):  # weights of a state that is no optimum lead nowhere
+                break
         return converged
 
     def take_weights(self, settled: float = SETTLED_WEIGHT) -> bool:
