@@ -35,7 +35,9 @@ LOOKS = 3  # how often, before a fit is given up
 # trackers and targets alone, whose passes cost little and where few rows check each other. A change
 # can be nine tenths of the one before there (four rods, one off: 0.7 sigma from the optimum after
 # ten times, 0.03 once changes are below a thousandth).
-AS_GOOD = 1e-7  # of a cost, by which weights may still lower it: where nothing fits, they never end
+# By how much new weights may still lower half the chi-square, and of it: a hundredth of what an
+# optimum allows, as each round may go but a tenth of the way; where nothing fits, it never ends.
+STILL, AS_GOOD = AT_OPTIMUM / 100, 1e-8
 REWEIGHTED, ALONE = (10, SETTLED_WEIGHT), (200, 1e-3)
 # Bodies half of whose stops are so far (m, rad) from where the chain puts them after a fit are not
 # described by it: CAD and encoders are good to millimetres. Measured on the independent recordings:
@@ -119,7 +121,7 @@ class Loop(Descent):
                 break
             self.linearise(beams=tolerance is not None)
             _, fall = self.step()
-            if fall < max(AT_OPTIMUM, AS_GOOD * self.cost()):
+            if fall < max(STILL, AS_GOOD * self.cost()):
                 self.given, self.problem = before
                 self.lay_out()
                 break

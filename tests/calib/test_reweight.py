@@ -121,7 +121,8 @@ class Huber:
             some = [(r, dof) for k, r, dof in found if k == kind and dof]
             norm, dof = np.array([np.linalg.norm(r) for r, _ in some]), [dof for _, dof in some]
             wide = np.median(norm / np.sqrt(stats.chi2(dof).median())) if len(some) > 3 else 1.0
-            self.reach[kind] = max(1.0, wide)
+            begin = {d: np.sqrt(stats.chi2(d).isf(1e-4)) for d in dof}
+            self.reach |= {(kind, d): max(1.0, wide) * k for d, k in begin.items()}
 
     def rows(self, x):
         values, start = {}, 0
@@ -130,8 +131,7 @@ class Huber:
             start += u.dim
         out = []
         for kind, r, dof in self._groups(values):
-            k = self.reach.get(kind, np.inf) * np.sqrt(stats.chi2(dof).isf(1e-4)) if dof else np.inf
-            norm = np.linalg.norm(r)
+            k, norm = self.reach.get((kind, dof), np.inf), np.linalg.norm(r)
             out.append(r if norm <= k else r * np.sqrt(2 * k * norm - k * k) / norm)
         return np.concatenate(out)
 
