@@ -192,7 +192,8 @@ class Test:
     def sigma(self, common: float) -> np.ndarray:
         """Of the estimate (q,), by clusters."""
         W = self.whiten
-        return np.sqrt(np.einsum("qr,rs,qs->q", W, self.moderated(common), W))
+        # The covariance is a difference (by stops, by places, less both): it may dip below 0.
+        return np.sqrt(np.maximum(np.einsum("qr,rs,qs->q", W, self.moderated(common), W), 0.0))
 
     def smallest_detectable(self, common: float, alpha: float) -> float:
         """Root mean square of its parameters' size at which it is found with 80 % power.
