@@ -15,14 +15,7 @@ from calib.diagnosis.candidates import concerned, lacking
 from calib.diagnosis.curves import Curve, curves
 from calib.diagnosis.rejects import Rejects
 from calib.diagnosis.screen import Candidate, Screen
-from calib.diagnosis.search import (
-    ALPHA,
-    FEWEST,
-    ODDS,
-    NamedEffect,
-    Search,
-    angle_deg,
-)
+from calib.diagnosis.search import ALPHA, FEWEST, ODDS, NamedEffect, Search, angle_deg
 from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import formula, hangs_on, what_separates, words
 from calib.effects import CATALOGUE, Site
@@ -144,7 +137,8 @@ def conclude(
     if forbids and verdict == BAD and not found.blunders:
         sentences.insert(0, f"This run is not to be believed as it stands: {'; '.join(forbids)}.")
     if rejected:
-        sentences.insert(0 if verdict == UNNAMED else len(sentences), rejected.sentence)
+        first_of_all = verdict == UNNAMED and not rejected.explained
+        sentences.insert(0 if first_of_all else len(sentences), rejected.sentence)
     return Diagnosis(
         verdict=verdict,
         sentences=sentences,
