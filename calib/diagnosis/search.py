@@ -103,7 +103,7 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NAMES) -> Search:
     """
     looks, found, left = [stand.look(progress)], [], []
     while True:
-        looks[-1] = _adapted(looks[-1], left, progress)
+        looks[-1] = _adapted(looks[-1], left, progress, named=bool(found))
         step = _named(looks[-1], progress) if len(found) < most else None
         if step is None:
             break
@@ -122,14 +122,16 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NAMES) -> Search:
     return done
 
 
-def _adapted(look: Look, left: list[LeftOut], progress: Progress) -> Look:
+def _adapted(look: Look, left: list[LeftOut], progress: Progress, named: bool) -> Look:
     """A look without the blunders that explain more than any effect or structure would, or leave
-    these nothing to explain; they are added to those left out."""
+    these nothing to explain; they are added to those left out. Once an effect was `named`, paper is
+    none: a name that is wrong trades with lengths, and would put the blame on them."""
     for _ in range(ADAPTED):
         estimate = look.stand.estimate
         stray = list(stray_scans(estimate.problem, estimate.values, look.checked))
         left += stray
         wild = [] if stray else _wild(look)
+        wild = [b for b in wild if not (named and b.group.kind == "frame")]
         groups = [each.blunder.group for each in stray] + [b.group for b in wild]
         if not groups:
             break
