@@ -11,12 +11,11 @@ from calib.blunders.judged import Blunder, LeftOut
 from calib.blunders.shifts import Shift
 from calib.problem.problem import Problem
 from calib.residuals.groups import Group
+from calib.residuals.robust import MAD
 from calib.residuals.scan import ScanStop
-from calib.residuals.tracker import TrackedBody
 from calib.solve.loop import CONTRADICTS
 from chains.errors import InputError
 
-MAD = 1.4826  # of normal residuals, from the median of their size to their sigma
 ALIKE = 0.1  # of a scan's misfit where it is said to be: at another stop's place it belongs there
 
 
@@ -33,18 +32,18 @@ def stray_scans(
             alone says where the LiDAR was, and may be wrong as well.
     """
     looks = len(problem.scans) + len(problem.aside)
-    bodies = [g for b in problem.blocks if isinstance(b, TrackedBody) for g in b.groups]
+    bodies = [group for body in problem.bodies for group in body.groups]
     for scan in problem.aside:
         off_m, sigma_m = _off(scan, values, scan.pose(values))
         others = [other for other in problem.aside if other is not scan]
-        there = [_off(scan, values, other.pose(values))[0] for other in others]
+        there = [_off_there(scan, values, other) for other in others]
         best = int(np.argmin(there)) if there else -1
         fits = bool(there) and there[best] < ALIKE * off_m
         chance = log_tail((off_m / sigma_m) ** 2, 1.0)
         blunder = Blunder(
             shift=_distance(scan.group, off_m, sigma_m),
             p_value=float(np.exp(chance)),
-            p_adjusted=after_looks(float(np.exp(chance)), looks),
+            p_adjusted=float(after_looks(np.exp(chance), looks)),
             evidence=-chance,
             limit=CONTRADICTS**2,
             detectable={"m": CONTRADICTS * sigma_m},
@@ -69,11 +68,16 @@ def _distance(group: Group, off_m: float, sigma_m: float) -> Shift:
     )
 
 
+def _off_there(scan: ScanStop, values: Mapping[str, np.ndarray], other: ScanStop) -> float:
+    """How far the points lie off from another stop; infinite where no beam meets anything."""
+    try:
+        return _off(scan, values, other.pose(values))[0]
+    except InputError:
+        return np.inf
+
+
 def _off(scan: ScanStop, values: Mapping[str, np.ndarray], T: np.ndarray) -> tuple[float, float]:
     """How far the points lie off, the LiDAR being there, and how far they should."""
-    try:
-        rows = scan.rows(values, None, T)
-    except InputError:  # no beam meets anything from there
-        return np.inf, 0.0
+    rows = scan.rows(values, None, T)
     residual_m, sigma_m = rows.residual_m[rows.usable], rows.sigma_m[rows.usable]
     return MAD * float(np.median(np.abs(residual_m))), float(np.median(sigma_m))

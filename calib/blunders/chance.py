@@ -15,6 +15,6 @@ def log_tail(x: float, q: float) -> float:
     return float((q / 2 - 1) * np.log(half) - half - special.gammaln(q / 2))
 
 
-def after_looks(p: float, looks: float) -> float:
+def after_looks(p: np.ndarray | float, looks: float) -> np.ndarray | float:
     """Chance that the smallest of so many independent p-values is as small (Sidak 1967)."""
-    return float(-np.expm1(looks * np.log1p(-min(p, 1 - 1e-15))))
+    return -np.expm1(looks * np.log1p(-np.minimum(p, 1 - 1e-15)))

@@ -146,7 +146,7 @@ def _judged(some: Sequence[Shift], looks: int) -> Iterator[Blunder]:
         yield Blunder(
             shift=shift,
             p_value=p,
-            p_adjusted=after_looks(p, looks),
+            p_adjusted=float(after_looks(p, looks)),
             evidence=-log_tail(scaled, shift.dof),
             limit=float(limit * shift.dof * bulk),
             detectable={u: float(np.sqrt(enough * bulk / t)) for u, t in told.items() if t > 0},

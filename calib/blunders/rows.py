@@ -15,11 +15,12 @@ from calib.problem.model import labels
 from calib.problem.problem import Block, Problem
 from calib.problem.unknowns import Role
 from calib.problem.without import ROD, of_the_arm
-from calib.residuals.groups import CAD, JOINTS, MESH, SCAN, Group
+from calib.residuals.groups import CAD, JOINTS, MESH, Group
 from calib.residuals.scan import ScanStop
 from calib.residuals.targets import HangingTarget
 from calib.residuals.tracker import BodiesTogether, TrackedBody
 from calib.rig import Rig
+from calib.solve.reweight import unweighted
 
 POSE = ("about x", "about y", "about z", "x", "y", "z")
 # Block (none for a prior), whitened derivative by each unknown, and right side: see `Graph`.
@@ -31,15 +32,16 @@ class GroupRows:
     """Rows, and the groups that some of them make.
 
     Args:
-        A: (m, n) whitened derivatives, columns: (n,) by which unknowns; of a scan its products
-            with them.
-        b: (m,) minus the residuals; of a scan the score of a twist that it alone has.
+        A: (m, n) whitened derivatives, columns: (n,) by which unknowns; of sums the products of a
+            shift with them.
+        b: (m,) minus the residuals; of sums the score of that shift.
         weight: (m,) robust.
         sigma: (m,) of each row.
         axes, units: (m,) of each row.
         groups: group -> (m, r) the directions in these rows in which it may be off.
         turn: (m, m) from the rows' axes to those in which an offset is told.
-        information: (m, m) of that twist; None of what is no scan.
+        information: (m, m) of the shift, where rows come as sums: a twist of the LiDAR that a scan
+            alone has, or readings of exact encoders; None of rows.
     """
 
     A: np.ndarray
@@ -81,7 +83,7 @@ def _bodies(whole: Linearisation) -> Iterator[GroupRows]:
     """Every body at every stop where it was seen; offsets in the tracker's axes."""
     layout = whole.layout
     blocks = _tracked(layout)
-    plain = [replace(b, weight=None) for b in blocks]
+    plain = [unweighted(b) for b in blocks]
     weight = {id(p): b.weight for p, b in zip(plain, blocks, strict=True)}
     for together in BodiesTogether.of(plain):
         for block, (residual, d) in zip(
@@ -212,9 +214,8 @@ def _geometry(problem: Problem) -> dict[str, Effect]:
 
 def _scans(whole: Linearisation, problem: Problem) -> Iterator[GroupRows]:
     """Every scan, through the place of its LiDAR."""
-    names = _stop_names(whole.layout, problem)
-    for stop, sums in whole.scans.items():
-        where, recording = names[stop]
+    for scan in problem.scans:
+        sums = whole.scans[whole.layout.stops[key_of(scan)]]
         yield GroupRows(
             A=sums.cross,
             columns=sums.columns,
@@ -223,7 +224,7 @@ def _scans(whole: Linearisation, problem: Problem) -> Iterator[GroupRows]:
             sigma=np.ones(6),
             axes=POSE,
             units=("rad",) * 3 + ("m",) * 3,
-            groups={Group("scan", where, SCAN, recording): np.eye(6)},
+            groups={scan.group: np.eye(6)},
             information=sums.information,
         )
 

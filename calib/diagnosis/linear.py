@@ -161,7 +161,6 @@ def linearise_with(
         scaled = np.vstack([kept / unit[:, None], np.zeros((1, kept.shape[1]))])
         return linear.directions(scaled) * layout.sigma[:, None]
 
-    bodies = [b for b in wide.blocks if isinstance(b, TrackedBody)]
     table, stop, place = gradients.table()
     return Linear(
         candidates=tuple(candidates),
@@ -172,7 +171,7 @@ def linearise_with(
         gradient=table,
         stop=stop,
         place=place,
-        weight_m2=linear.weight_m2 or sum(len(b.measured) / b.sigma_m**2 for b in bodies),
+        weight_m2=linear.weight_m2 or sum(len(b.measured) / b.sigma_m**2 for b in wide.bodies),
         whole=linear,
         directions=directions,
     )

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from calib.blunders.chance import after_looks
 from calib.diagnosis.score import Scores, Test, test
 from calib.effects import Effect
 
@@ -89,17 +90,17 @@ def screen(
     for family in families.values():
         drawn = np.min([by_chance[e.name] for e in family], axis=0)
         looks = looked(drawn)
-        least.append(_adjust(drawn, looks))
+        least.append(after_looks(drawn, looks))
         best = max(family, key=lambda e: tests[e.name].evidence(common))
         p = min(tests[e.name].p_value(common) for e in family)
-        found.append((best, _adjust(p, looks), looks))
+        found.append((best, after_looks(p, looks), looks))
     together = looked(np.min(least, axis=0)) if least else 1.0
     candidates = [
         Candidate(
             effect=effect,
             test=tests[effect.name],
             p_value=float(p),
-            p_adjusted=float(_adjust(p, together)),
+            p_adjusted=float(after_looks(p, together)),
             evidence=tests[effect.name].evidence(common),
             looks=looks * together,
         )
@@ -124,8 +125,3 @@ def looked(smallest: np.ndarray) -> float:
     """How many independent tests have so small a smallest p-value, by chance (R,), at 5 %."""
     limit = float(np.quantile(smallest, QUANTILE))
     return max(1.0, float(np.log1p(-QUANTILE) / np.log1p(-min(max(limit, 1e-12), QUANTILE))))
-
-
-def _adjust(p: np.ndarray | float, looks: float) -> np.ndarray | float:
-    """Chance that the smallest of so many p-values is as small (Sidak)."""
-    return -np.expm1(looks * np.log1p(-np.minimum(p, 1 - 1e-15)))

@@ -248,7 +248,7 @@ def judged(look: Look, candidate: Candidate, progress: Progress) -> tuple[Test, 
     # What candidates have in common may be another effect's signal; it need not be this one's.
     common = (look.noise if candidate.effect.site is Site.NOISE else look.named).common
     p = found.p_value(min(common, max(found.inflation, 1.0)))
-    return found, after_looks(p, candidate.looks)
+    return found, float(after_looks(p, candidate.looks))
 
 
 def suspects(screen: Screen, alpha: float) -> Iterator[Candidate]:

@@ -14,6 +14,7 @@ from calib.problem.model import Source
 from calib.problem.unknowns import Unknown
 from calib.residuals.scan import ScanStop
 from calib.residuals.surfaces import Meeting
+from calib.residuals.tracker import TrackedBody
 
 
 class Block(Protocol):
@@ -104,6 +105,11 @@ class Problem:
     meetings: dict[int, Meeting] = field(default_factory=dict)
     cells: Mapping[str, SurfaceCells] = field(default_factory=dict)
     aside: Sequence[ScanStop] = ()
+
+    @property
+    def bodies(self) -> list[TrackedBody]:
+        """The blocks of tracked bodies."""
+        return [block for block in self.blocks if isinstance(block, TrackedBody)]
 
     def setting_aside(self, keys: Collection[tuple[Path, int]]) -> Problem:
         """The problem with these scans, and no others, set aside."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import chdtri
 
+MAD = 1.4826  # of normal residuals, from the median of their size to their sigma
 TUKEY = 4.685  # 95 % efficiency on normal rows (Holland and Welsch 1977)
 # Chance that a group of good rows lies further out than where Huber's weights begin: of a recording
 # with a hundred groups, one in a hundred has any weight below 1.
@@ -40,7 +41,7 @@ def tukey_cost(z: np.ndarray, scale: float = 1.0) -> float:
 
 def robust_scale(z: np.ndarray) -> float:
     """How many times wider than its sigma the bulk of the rows is; at least 1 (from the MAD)."""
-    return max(1.0, 1.4826 * float(np.median(np.abs(z)))) if len(z) else 1.0
+    return max(1.0, MAD * float(np.median(np.abs(z)))) if len(z) else 1.0
 
 
 def huber_weight(norm: np.ndarray, dof: np.ndarray) -> np.ndarray:

@@ -14,7 +14,6 @@ from calib.problem.prior import JointPrior
 from calib.problem.problem import Block
 from calib.residuals.scan import ScanStop
 from calib.residuals.surfaces import PlaneSurface
-from calib.residuals.tracker import TrackedBody
 from calib.results.errors import Errors, body_errors, scan_errors
 from calib.solve.estimate import Estimate, Start
 from calib.solve.fit import Progress, solve
@@ -134,7 +133,7 @@ def _without_planes(trained: Problem, start: Start | None) -> Start | None:
 
 def predict(unseen: Problem, trained: Problem, estimate: Estimate) -> Errors:
     """Residuals of a problem whose calibration comes from an estimate of another; see `placed`."""
-    scans, bodies = unseen.scans, [b for b in unseen.blocks if isinstance(b, TrackedBody)]
+    scans, bodies = unseen.scans, unseen.bodies
     predicted, told = placed(unseen, trained, estimate)
     if not scans:
         judged = [b for b in bodies if not _among(b, unseen.blocks) and b.stops.root in told]
@@ -165,7 +164,7 @@ def placed(unseen: Problem, trained: Problem, estimate: Estimate) -> tuple[Estim
     names = [v.name for v in held]
     covariance = estimate.covariance_of(names)
     prior = JointPrior(held, {n: estimate.values[n] for n in names}, covariance)
-    scans, bodies = unseen.scans, [b for b in unseen.blocks if isinstance(b, TrackedBody)]
+    scans, bodies = unseen.scans, unseen.bodies
     # Without a LiDAR, bodies before the joints tell where the rig is; those beyond are judged.
     unseen.blocks = bodies if scans else [b for b in bodies if not b.stops.rig.joints_to(b.body)]
     told = {block.stops.root for block in unseen.blocks} | set(shared)

@@ -76,7 +76,7 @@ def tracker_rows(estimate: Estimate) -> InstrumentRows | None:
     """Rows of tracked bodies: recording, stop, body, and the axis of the body as predicted, turn
     (rx, ry, rz) or shift (tx, ty, tz); None where no body is tracked."""
     names, out = _stop_names(estimate), _Gathered()
-    for block in (b for b in estimate.problem.blocks if isinstance(b, TrackedBody)):
+    for block in estimate.problem.bodies:
         axes = slice(3, 6) if block.is_point else slice(0, 6)
         stops = [names[key] for key in block.stop_names]
         each = [(*stop, block.body, axis) for stop in stops for axis in DOF[axes]]

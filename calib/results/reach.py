@@ -94,7 +94,7 @@ def reach(problem: Problem, estimate: Estimate, widened: float = 1.0) -> Reach |
         None where there are scans, no arm, or no tracked body beyond it.
     """
     source, rig = problem.sources[0], problem.sources[0].rig
-    blocks = [b for b in problem.blocks if isinstance(b, TrackedBody) and _is_of(b, source)]
+    blocks = [b for b in problem.bodies if _is_of(b, source)]
     beyond = [b for b in blocks if rig.joints_to(b.body)]
     if problem.scans or not beyond:
         return None

@@ -16,7 +16,6 @@ from calib.effects import Effect, load_effects
 from calib.problem import Problem
 from calib.problem.model import Model, Source
 from calib.problem.without import leave_out
-from calib.residuals.tracker import TrackedBody
 from calib.results.errors import Errors, body_errors, misfit, row_errors, scan_errors
 from calib.results.holdout import held_out, unit_of
 from calib.results.misfit import misfit_by, prior_rows, target_rows, tracker_rows
@@ -188,7 +187,7 @@ def _fit(
     by_stop = _write_residuals(problem, estimate, folder / RESIDUALS, progress)
     seen = sum(by_stop.values(), Errors())
     if not estimate.scans:
-        seen = body_errors(_bodies(problem), estimate.values, None)
+        seen = body_errors(problem.bodies, estimate.values, None)
     if not seen.count and not problem.blocks:
         raise InputError(
             f"{sources[0].recording.folder}: no beam meets a surface and no tracked body was seen, "
@@ -232,16 +231,12 @@ def _refuse_twice(recordings: Sequence[Path]) -> None:
 def _nominal(problem: Problem, progress: Progress) -> Errors:
     """Residuals with every frame and effect as on paper, the rig where it then seems to be."""
     if not problem.scans:
-        return body_errors(_bodies(problem), problem.initial, None)
+        return body_errors(problem.bodies, problem.initial, None)
     total = Errors()
     for i, scan in enumerate(problem.scans):
         progress("nominal residuals", i, len(problem.scans))
         total += scan_errors(scan, problem.initial, None, None)
     return total
-
-
-def _bodies(problem: Problem) -> list[TrackedBody]:
-    return [b for b in problem.blocks if isinstance(b, TrackedBody)]
 
 
 def _write_residuals(

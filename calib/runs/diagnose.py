@@ -46,8 +46,8 @@ def diagnose(
 
     with threadpool_limits(limits=1):
         stand = stand_of(run, progress)
-        # Away from an optimum every effect that moves the state towards one looks missing.
         rings = list(_odd_rings(stand))
+        # Away from an optimum every effect that moves the state towards one looks missing.
         found = search(stand, progress) if run.converged else search(stand, progress, most=0)
         rejected = rejects(found.looks[0].stand, progress)
         falls = {}
@@ -73,7 +73,7 @@ def diagnose(
         sentences=[
             *run.doubts,
             *result.sentences,
-            *run.warning[len(run.doubts) :],
+            *run.omissions,
             *(f"{clause[0].upper()}{clause[1:]}." for clause, harms in rings if not harms),
         ],
         command=command_without(run, tokens) if tokens else "",

@@ -100,8 +100,12 @@ class Run:
     @property
     def warning(self) -> list[str]:
         """What is to stand above everything that is shown of the run, a sentence each."""
-        left_out = [f"Left out: {', '.join(self.left_out)}"] if self.left_out else []
-        return [*self.doubts, *left_out]
+        return [*self.doubts, *self.omissions]
+
+    @property
+    def omissions(self) -> list[str]:
+        """What was left out of its recordings, as a sentence; none where nothing was."""
+        return [f"Left out: {', '.join(self.left_out)}"] if self.left_out else []
 
     @property
     def set_aside(self) -> list[str]:

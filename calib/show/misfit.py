@@ -53,6 +53,12 @@ def times(ratio: float) -> str:
     return f"{ratio:.1f}" if ratio < 100 else f"{ratio:.0f}"
 
 
+def furthest(worst: str, ratio: float, limit: str, loud: int) -> str:
+    """What is furthest off, over which limit, and how many others stand out with it."""
+    more = f"; {loud - 1} more stand{'s' * (loud == 2)} out" if loud > 1 else ""
+    return f"{worst} is {times(ratio)} times further off than {limit}{more}"
+
+
 def of_stop(found: Mapping[str, Any]) -> dict[str, float]:
     """Misfit of what a stop has, by name: its bodies, joints and beams; without what is unknown."""
     parts = {**found.get("bodies", {}), **{k: found.get(k) for k in ("joints", "beams")}}

@@ -18,7 +18,6 @@ from calib.linear.parallel import in_order
 from calib.problem.problem import Block, Problem
 from calib.problem.surfaces import with_surfaces
 from calib.residuals.beams import Association
-from calib.residuals.tracker import TrackedBody
 from calib.solve.added import begun
 from calib.solve.descent import AT_OPTIMUM, STEADY, UPHILL, Descent, Progress
 from calib.solve.estimate import DOFS, SEEN, Estimate, Start, cost_of, started, values_of
@@ -149,7 +148,7 @@ class Loop(Descent):
     def bodies_astray(self) -> bool:
         """Whether half of the stops have a body far from where the chain puts it."""
         off: dict[str, list[np.ndarray]] = {}
-        for block in (b for b in self.problem.blocks if isinstance(b, TrackedBody)):
+        for block in self.problem.bodies:
             T = block.stops.in_world(block.body, self.values).T
             away = np.linalg.norm(block.measured[:, :3, 3] - T[:, :3, 3], axis=1)
             if not block.is_point:
@@ -184,7 +183,7 @@ class Loop(Descent):
             scale: (K,) how many sigmas wide the bulk of each scan's residuals is, bodies alone
                 telling where the LiDAR is.
         """
-        bodies = [b for b in self.problem.blocks if isinstance(b, TrackedBody)]
+        bodies = self.problem.bodies
         told = {b.stops.root for b in bodies}
         weights = ((b.stop_names, b.weight) for b in bodies if b.weight is not None)
         torn = {k for names, w in weights for k, x in zip(names, w, strict=True) if x < 1}

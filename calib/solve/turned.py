@@ -31,7 +31,7 @@ def least_turned(problem: Problem) -> list[tuple[float, Values]]:
         problem: its initial values are what is turned; the cost is that of its tracked bodies, and
             of the priors of what may be turned.
     """
-    bodies = [b for b in problem.blocks if isinstance(b, TrackedBody) and not b.is_point]
+    bodies = [b for b in problem.bodies if not b.is_point]
     angles = _angles(problem, bodies)
     if not angles:
         return []
@@ -47,9 +47,9 @@ def least_turned(problem: Problem) -> list[tuple[float, Values]]:
 
 def turned_far(problem: Problem, values: Mapping[str, np.ndarray]) -> bool:
     """Whether any of those angles is more than an eighth of a turn from where it was thought."""
-    bodies = [b for b in problem.blocks if isinstance(b, TrackedBody)]
     pairs = (
-        (problem.variables[name].mean[i], values[name][i]) for name, i in _angles(problem, bodies)
+        (problem.variables[name].mean[i], values[name][i])
+        for name, i in _angles(problem, problem.bodies)
     )
     return any(abs(now - mean) > np.pi / 4 for mean, now in pairs)
 

@@ -24,6 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import special
 
+from calib.blunders.chance import after_looks
 from calib.diagnosis.rejects.counts import Axis, Counts, Rejected, count
 from calib.diagnosis.rejects.found import CLUTTER, LEAST_P, Place, Rejects
 from calib.diagnosis.stand import Stand
@@ -133,7 +134,7 @@ def _most(counts: Counts, left: np.ndarray) -> tuple[tuple[np.ndarray, Place] | 
     for view in views:
         for signs in KINDS.values():
             mine = left & np.isin(sign, signs) & (view.bin < view.axis.count)
-            p = -np.expm1(looks * np.log1p(-np.minimum(_p_values(view, mine), 1 - 1e-15)))
+            p = after_looks(_p_values(view, mine), looks)
             least = min(least, float(p.min()))
             if p.min() >= ALPHA:
                 continue

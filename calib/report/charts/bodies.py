@@ -38,7 +38,7 @@ class Arrows:
 
 def tracked(evidence: Evidence) -> Iterator[Chart | Absent]:
     """Where the tracker saw each body, and how far from where the chain puts it."""
-    blocks = [b for b in evidence.problem.blocks if isinstance(b, TrackedBody)]
+    blocks = evidence.problem.bodies
     if not blocks:
         yield Absent("tracker", "nothing tracks this rig")
         return

@@ -11,7 +11,7 @@ from calib.report import plots
 from calib.report.chart import Absent, Chart
 from calib.report.evidence import Evidence
 from calib.residuals.groups import JOINTS, SCAN
-from calib.show.misfit import times
+from calib.show.misfit import furthest, times
 
 if TYPE_CHECKING:
     from calib.report.plots import Figure
@@ -36,15 +36,13 @@ def groups(evidence: Evidence) -> Iterator[Chart | Absent]:
         return
     loud = sorted((t for t in found if found[t][1] > 1.0), key=lambda t: -found[t][1])
     worst = max(found, key=lambda t: found[t][1])
-    most = times(found[worst][1])
     stops = {stop: k for s in evidence.sources for k, stop in enumerate(s.recording.stops)}
     yield Chart(
         "groups",
-        f"{worst} is {most} times further off than chance allows"
-        + (f"; {len(loud) - 1} more stand{'s' * (len(loud) == 2)} out" if len(loud) > 1 else "")
+        furthest(worst, found[worst][1], "chance allows", len(loud))
         if loud
         else f"Of {len(found)} groups of rows none is further off than chance allows; the furthest "
-        f"is {worst}, at {most} of it",
+        f"is {worst}, at {times(found[worst][1])} of it",
         "How far each group of rows that one mishap would spoil together is off from what all "
         "others say of it, over the most that chance allows when so many are looked at. What lies "
         "above the dashed line is something that happened there; what the diagnosis left out is "

@@ -11,6 +11,7 @@ from calib.report.evidence import Evidence
 from calib.show.misfit import (
     FAR_FROM_CAD,
     STANDS_OUT,
+    furthest,
     groups,
     move_told,
     moves,
@@ -40,8 +41,7 @@ def by_stop(evidence: Evidence) -> Iterator[Chart | Absent]:
     worst, most = next(iter((loud or found).items()))
     yield Chart(
         "misfit",
-        f"{worst} is {times(most)} times further off than its sigmas allow"
-        + (f"; {len(loud) - 1} more stand out" if len(loud) > 1 else "")
+        furthest(worst, most, "its sigmas allow", len(loud))
         if loud
         else f"No stop stands out; the largest residuals, of {worst}, are {times(most)} times "
         f"their sigmas",
