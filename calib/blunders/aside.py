@@ -10,7 +10,7 @@ from calib.blunders.chance import after_looks, log_tail
 from calib.blunders.judged import Blunder, LeftOut
 from calib.blunders.shifts import Shift
 from calib.problem.problem import Problem
-from calib.residuals.groups import Group
+from calib.residuals.groups import BEAMS, Group
 from calib.residuals.robust import MAD
 from calib.residuals.scan import ScanStop
 from calib.solve.loop import CONTRADICTS
@@ -51,7 +51,8 @@ def stray_scans(
         )
         place = (scan.group.recording, scan.group.where)
         here = [g for g in bodies if (g.recording, g.where) == place and g not in checked]
-        yield LeftOut(blunder, [] if fits else here, others[best].group if fits else None)
+        there = others[best].group if fits else None
+        yield LeftOut(blunder, [] if fits else here, there, aside=True)
 
 
 def _distance(group: Group, off_m: float, sigma_m: float) -> Shift:
@@ -63,7 +64,7 @@ def _distance(group: Group, off_m: float, sigma_m: float) -> Shift:
         offset=np.array([off_m]),
         covariance=np.array([[sigma_m**2]]),
         information=np.array([[sigma_m**-2]]),
-        axes=("along the beams",),
+        axes=(BEAMS,),
         units=("m",),
     )
 

@@ -78,8 +78,7 @@ class Blunder:
         """Size, its sigma, the unit, and along which axis; empty where it is along no single one.
         Of shifts in several units, that which is more sigmas."""
         shift, best = self.shift, (0.0, 0.0, np.inf, "m", "")
-        for unit in dict.fromkeys(shift.units):
-            at = np.flatnonzero(np.array(shift.units) == unit)
+        for (unit, _), at in shift.parts.items():
             offset, covariance = shift.offset[at], shift.covariance[np.ix_(at, at)]
             size = float(np.linalg.norm(offset))
             if not size:
@@ -99,11 +98,13 @@ class LeftOut:
         blunder: as it stood out when it was left out.
         rivals: groups that explain as much, and nothing once it is left out.
         belongs: of a scan, the stop in whose place it fits.
+        aside: whether the fit itself had set it aside.
     """
 
     blunder: Blunder
     rivals: Sequence[Group]
     belongs: Group | None = None
+    aside: bool = False
 
 
 def judge(whole: Linearisation, problem: Problem) -> list[Blunder]:
@@ -141,8 +142,11 @@ def _judged(some: Sequence[Shift], looks: int) -> Iterator[Blunder]:
         p = float(special.fdtrc(shift.dof, known, scaled / shift.dof))
         limit = special.fdtri(shift.dof, known, (1.0 - ALPHA) ** (1.0 / looks))
         enough = special.ncfdtrinc(shift.dof, known, 1.0 - POWER, limit)
-        units, told = np.array(shift.units), np.diag(shift.information)
-        told = {unit: told[units == unit].mean() for unit in dict.fromkeys(shift.units)}
+        told = {
+            unit: np.diag(shift.information)[at].mean()
+            for (unit, beams), at in shift.parts.items()
+            if not beams or len(shift.parts) == 1
+        }
         yield Blunder(
             shift=shift,
             p_value=p,

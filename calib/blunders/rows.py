@@ -15,7 +15,7 @@ from calib.problem.model import labels
 from calib.problem.problem import Block, Problem
 from calib.problem.unknowns import Role
 from calib.problem.without import ROD, of_the_arm
-from calib.residuals.groups import CAD, JOINTS, MESH, Group
+from calib.residuals.groups import BEAMS, CAD, JOINTS, MESH, Group
 from calib.residuals.scan import ScanStop
 from calib.residuals.targets import HangingTarget
 from calib.residuals.tracker import BodiesTogether, TrackedBody
@@ -23,6 +23,7 @@ from calib.rig import Rig
 from calib.solve.reweight import unweighted
 
 POSE = ("about x", "about y", "about z", "x", "y", "z")
+SHIFT = (*POSE, BEAMS)  # of a scan
 # Block (none for a prior), whitened derivative by each unknown, and right side: see `Graph`.
 GraphRows = Sequence[tuple[Block | None, Mapping[str, np.ndarray], np.ndarray]]
 
@@ -40,8 +41,8 @@ class GroupRows:
         axes, units: (m,) of each row.
         groups: group -> (m, r) the directions in these rows in which it may be off.
         turn: (m, m) from the rows' axes to those in which an offset is told.
-        information: (m, m) of the shift, where rows come as sums: a twist of the LiDAR that a scan
-            alone has, or readings of exact encoders; None of rows.
+        information: (m, m) of the shift, where rows come as sums: a twist of the LiDAR and a range
+            zero that a scan alone has, or readings of exact encoders; None of rows.
     """
 
     A: np.ndarray
@@ -213,18 +214,19 @@ def _geometry(problem: Problem) -> dict[str, Effect]:
 
 
 def _scans(whole: Linearisation, problem: Problem) -> Iterator[GroupRows]:
-    """Every scan, through the place of its LiDAR."""
+    """Every scan, through the place of its LiDAR and a range zero of its own."""
     for scan in problem.scans:
         sums = whole.scans[whole.layout.stops[key_of(scan)]]
+        count = len(sums.score)
         yield GroupRows(
             A=sums.cross,
             columns=sums.columns,
             b=sums.score,
-            weight=np.ones(6),
-            sigma=np.ones(6),
-            axes=POSE,
-            units=("rad",) * 3 + ("m",) * 3,
-            groups={scan.group: np.eye(6)},
+            weight=np.ones(count),
+            sigma=np.ones(count),
+            axes=SHIFT[:count],
+            units=("rad",) * 3 + ("m",) * (count - 3),
+            groups={scan.group: np.eye(count)},
             information=sums.information,
         )
 
@@ -302,7 +304,9 @@ class _JointSums:
         values = {**whole.values, NOISE: np.zeros(len(rig.joint_names))}
         stops = scan.stops.with_joint_noise(NOISE)
         P = stops.in_reference(rig.lidar_frame, values).d[NOISE][0]
-        return cls(P.T @ sums.information @ P, P.T @ sums.score, P.T @ sums.cross, sums.columns)
+        twist = slice(len(P))
+        cross, score = sums.cross[twist], sums.score[twist]
+        return cls(P.T @ sums.information[twist, twist] @ P, P.T @ score, P.T @ cross, sums.columns)
 
 
 def _stop_names(layout: Layout, problem: Problem) -> dict[int, tuple[str, str]]:

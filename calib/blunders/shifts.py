@@ -26,7 +26,7 @@ from calib.blunders.rows import GraphRows, GroupRows, group_rows
 from calib.linear.layout import positions
 from calib.linear.system import Linearisation
 from calib.problem.problem import Problem
-from calib.residuals.groups import Group
+from calib.residuals.groups import BEAMS, Group
 from calib.solve.graph import Graph
 
 # Of I - w H: below this a direction is held by the group alone (rounding of C is some 1e-9 of it).
@@ -57,6 +57,12 @@ class Shift:
     information: np.ndarray
     axes: Sequence[str]
     units: Sequence[str]
+
+    @property
+    def parts(self) -> dict[tuple[str, bool], np.ndarray]:
+        """Directions (r,) that have one length together: by unit, a range zero apart."""
+        keys = [(unit, axis == BEAMS) for unit, axis in zip(self.units, self.axes, strict=True)]
+        return {key: np.flatnonzero([k == key for k in keys]) for key in dict.fromkeys(keys)}
 
 
 def shifts(whole: Linearisation, problem: Problem) -> Iterator[Shift]:

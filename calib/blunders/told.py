@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 
 from calib.blunders.judged import Blunder, LeftOut
+from calib.residuals.groups import BEAMS
 from calib.rig import Rig
+from sensors.rings import RingFinding
 
 SHOWN = {"m": ("mm", 1e3), "rad": ("mrad", 1e3)}
 LARGE = 1000.0  # mm or mrad, from which on metres and radians are read more easily
@@ -73,10 +75,46 @@ def document(left: LeftOut, rig: Rig) -> dict[str, Any]:
     }
 
 
+def of_rings(lidar: str, found: RingFinding) -> dict[str, Any]:
+    """Rings with wrong numbers, in the same form; there is nothing to leave out. As sigma, how far
+    off elevations are with the numbers that fit best."""
+    return {
+        "kind": "rings",
+        "name": lidar,
+        "where": "rings",
+        "stop": None,
+        "recording": None,
+        "size": found.off_rad,
+        "unit": "rad",
+        "sigma": found.left_rad,
+        "axis": None,
+        "wrong_sign": None,
+        "offset": None,
+        "p_value": 0.0,  # chance puts no ring in another's place
+        "p_adjusted": 0.0,
+        "detectable": {},
+        "indistinguishable_from": [],
+        "belongs_to": None,
+        "without": None,
+        "sentence": whole(found.sentence),
+    }
+
+
+def whole(clause: str) -> str:
+    """A clause as a sentence of its own."""
+    return f"{clause[0].upper()}{clause[1:]}."
+
+
+def tokens(blunders: Iterable[Mapping[str, Any]]) -> list[str]:
+    """What ``--without`` takes, of blunders as diagnosis.json has them: of all that can be left
+    out."""
+    return [each["without"] for each in blunders if each["without"]]
+
+
 def _sentence(left: LeftOut, wrong_sign: str | None) -> str:
     *size, axis = left.blunder.leading()
     along = f" {axis}" if axis.startswith("about") else f" in {axis}" if axis else ""
-    along = " along the beams" if axis == "along the beams" else along
+    along = f" {axis}" if axis == BEAMS else along
     along = "" if axis == left.blunder.group.what.rpartition(".")[2] else along
     sign = f", as if the sign of its {wrong_sign} were wrong" if wrong_sign else ""
     out = f"{left.blunder.group} is {size_told(*size)} off{along}, against everything else"

@@ -101,7 +101,7 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NAMES) -> Search:
         progress: as of `fit.solve`.
         most: how many effects are named at most.
     """
-    looks, found, left = [stand.look(progress)], [], []
+    first, looks, found, left = stand, [stand.look(progress)], [], []
     while True:
         looks[-1] = _adapted(looks[-1], left, progress, named=bool(found))
         step = _named(looks[-1], progress) if len(found) < most else None
@@ -113,6 +113,7 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NAMES) -> Search:
         if swapped:
             looks[-1] = stand.look(progress)
             found = [f.with_effect(swapped.get(f.effect.name)) for f in found]
+    looks[-1], left = _restored(first, looks[-1], left, progress) if found else (looks[-1], left)
     last = looks[-1]
     unnamed = structures(last, progress)
     scatter = _scatter(last, progress)
@@ -147,6 +148,25 @@ def _adapted(look: Look, left: list[LeftOut], progress: Progress, named: bool) -
             left.append(LeftOut(each, met))
         look = after
     return look
+
+
+def _restored(
+    first: Stand, last: Look, left: list[LeftOut], progress: Progress
+) -> tuple[Look, list[LeftOut]]:
+    """What was left out of the first fit is tested once more, beside the effects that have been
+    named since: those that explain it leave no blunder there (backward elimination)."""
+    aside = [each.blunder.group for each in left if each.aside]
+    if len(aside) == len(left):
+        return last, left
+    look = last.stand.without(aside, progress, of=first).look(progress)
+    found = {blunder.group for blunder in look.blunders if blunder.found}
+    kept = [each for each in left if each.aside or each.blunder.group in found]
+    if len(kept) == len(left):
+        return last, left
+    if len(kept) > len(aside):
+        groups = [each.blunder.group for each in kept]
+        look = last.stand.without(groups, progress, of=first).look(progress)
+    return look, kept
 
 
 def _meet(a: Blunder, b: Blunder) -> bool:

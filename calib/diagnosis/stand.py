@@ -50,12 +50,17 @@ class Stand:
         """The model with more effects, fitted from here."""
         return self._refitted(self.model.plus(tuple(added)), self.estimate.start, progress)
 
-    def without(self, groups: Sequence[Group], progress: Progress) -> Stand:
-        """The model fitted from here, with some groups of rows left out."""
+    def without(
+        self, groups: Sequence[Group], progress: Progress, of: Stand | None = None
+    ) -> Stand:
+        """The model fitted from here, with some groups of rows left out: of what this fit was made
+        of, or `of` what another one was."""
+        of = of or self
         tokens = [group.token for group in groups]
-        sources, model = leave_out(self.sources, tokens), self.model.leaving_out(tokens)
+        sources = leave_out(of.sources, tokens)
+        model = replace(self.model, without=(*of.model.without, *tokens))
         meetings = dict(self.problem.meetings)
-        if any(group.kind == "surface" for group in groups):  # a mesh then has fewer
+        if of is not self or any(group.kind == "surface" for group in groups):  # other surfaces
             meetings = {i: m for i, m in meetings.items() if sources[i].reference is None}
         problem = problems.build(sources, model, meetings=meetings)
         estimate = solve(problem, progress=progress, start=self.estimate.start)

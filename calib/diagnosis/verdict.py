@@ -112,6 +112,7 @@ def conclude(
     weak: Sequence[Mapping[str, Any]],
     rejected: Rejects | None = None,
     forbids: Sequence[str] = (),
+    rings: Sequence[Mapping[str, Any]] = (),
 ) -> Diagnosis:
     """Sum up a search.
 
@@ -122,9 +123,10 @@ def conclude(
         weak: weak directions.
         rejected: what the fit threw away.
         forbids: why the run is not to be believed, whatever its model explains; a clause each.
+        rings: whose numbers are wrong, as blunders.
     """
     first = found.looks[0]
-    verdict = _verdict(found, rejected)
+    verdict = BAD if rings else _verdict(found, rejected)
     if verdict == "adequate" and forbids:
         verdict = BAD
     candidates = [_candidate(c, verdict, found, held_out) for c in _ranked(found)]
@@ -132,9 +134,9 @@ def conclude(
     thrown = rejected.unexplained() if rejected and verdict == UNNAMED else []
     unexplained = [_unexplained(c, screen) for screen, c in _without_a_name(found, verdict)]
     unexplained = [*thrown, *unexplained]
-    blunders = [told.document(left, _rig(left, first)) for left in found.blunders]
+    blunders = [*rings, *(told.document(left, _rig(left, first)) for left in found.blunders)]
     sentences = _sentences(verdict, found, candidates, unexplained, untestable, blunders)
-    if forbids and verdict == BAD and not found.blunders:
+    if forbids and verdict == BAD and not blunders:
         sentences.insert(0, f"This run is not to be believed as it stands: {'; '.join(forbids)}.")
     if rejected:
         first_of_all = verdict == UNNAMED and not rejected.explained

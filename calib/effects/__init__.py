@@ -49,7 +49,7 @@ from calib.effects.range import (
 from calib.effects.reference import FaroScale, MovedSurface
 from calib.effects.rig import BaseFlex, FrameOffset, MountBending, MountCreep, MountSlip
 from calib.effects.targets import TargetRodTilt, TargetSphereOffset
-from calib.effects.tracker import OptitrackDistortion, OptitrackScale
+from calib.effects.tracker import BodySlip, OptitrackDistortion, OptitrackScale
 from chains.errors import InputError
 
 CATALOGUE: tuple[Effect, ...] = (
@@ -89,6 +89,7 @@ CATALOGUE: tuple[Effect, ...] = (
     MountBending(),
     OptitrackScale(),
     OptitrackDistortion(),
+    BodySlip(),
     TargetRodTilt(),
     TargetSphereOffset(),
     FaroScale(),

@@ -31,7 +31,8 @@ class Site(Enum):
     EDGE = "edge"  # (E, 6) twist of every edge of the frame tree; a row per stop
     TRACKER = "tracker"  # (B, 6) twist of every tracked body as seen; a row per stop
     TARGET = "target"  # (3,) m, sphere centre on its rod, tracker frame; a row per target
-    REFERENCE = "reference"  # (3,) m, where the surface is, reference frame; a row per point
+    REFERENCE = "reference"  # (3,) m, where the surface is, reference frame; a row per point, and
+    # per sphere of what hangs on the place alone: the scanner's error, which scanned both
     NOISE = "noise"  # (1,) log sigma of the range; a row per point
 
 
@@ -125,6 +126,11 @@ class Effect(ABC):
     shape: float = 0.0
     whole: ClassVar[bool] = False
     origin: Mapping[str, Any] | None = None
+
+    @property
+    def of_scanner(self) -> bool:
+        """Whether it is the scanner's error at a place, which its spheres' centres have as well."""
+        return self.site is Site.REFERENCE and self.covariates == ("point_m",)
 
     @property
     def family(self) -> str:

@@ -10,12 +10,13 @@ from calib.rig import Rig
 
 
 class FaroScale(Effect):
-    """The scanner's metre is too long or too short: ``true = mesh * (1 + s)``."""
+    """The scanner's metre is too long or too short, in the mesh and in the spheres' places:
+    ``true = scanned * (1 + s)``."""
 
     name = "faro_scale"
     site = Site.REFERENCE
     unit = "1"
-    formula = "true surface = mesh + s * mesh, about the origin of the reference's frame"
+    formula = "surface or sphere = scanned * (1 + s), about the origin of the reference's frame"
     typical = "1 to 100 ppm of a laser's clock; 1000 ppm of a mesh merged badly, size assumed"
     covariates = ("point_m",)
     confounded_with = ("range_scale", "optitrack_scale", "incidence_angle_bias")

@@ -100,13 +100,7 @@ class MountSlip(Effect):
     sigma = np.repeat([0.001, 0.001], 3)
 
     def shapes(self, stops: View) -> tuple[float, ...]:
-        """Midway between stops, three or more of them on either side; 20 such times at most."""
-        time_s = np.sort(stops["elapsed_s"])
-        between = (0.5 * (time_s[1:] + time_s[:-1]))[2:-2]
-        if not mount_edges(stops.rig) or not len(between):
-            return ()
-        chosen = np.linspace(0, len(between) - 1, min(len(between), 20)).round().astype(int)
-        return tuple(float(f"{t:.6g}") for t in np.unique(between[chosen]))
+        return step_times(stops) if mount_edges(stops.rig) else ()
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
         units = ("rad",) * 3 + ("m",) * 3
@@ -177,6 +171,16 @@ class MountBending(Effect):
         basis = np.zeros((len(lever), len(tree.edges), 6, 1))
         basis[:, edge, :3, 0] = np.cross(lever, -T_root_mount[:, 2, :3])
         return basis
+
+
+def step_times(stops: View) -> tuple[float, ...]:
+    """Times midway between stops, three or more of them on either side; 20 at most."""
+    time_s = np.sort(stops["elapsed_s"])
+    between = (0.5 * (time_s[1:] + time_s[:-1]))[2:-2]
+    if not len(between):
+        return ()
+    chosen = np.linspace(0, len(between) - 1, min(len(between), 20)).round().astype(int)
+    return tuple(float(f"{t:.6g}") for t in np.unique(between[chosen]))
 
 
 def mount_edges(rig: Rig) -> tuple[int, ...]:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from calib.effects.base import Effect, Param, Site, View
+from calib.effects.rig import DOF, MountSlip, mount_edges, step_times
 from calib.rig import Rig
 
 VOLUME_M = 3.0  # half the width of a usual volume
@@ -55,6 +56,50 @@ class OptitrackDistortion(Effect):
             return np.kron(np.eye(3), (p[:, j] * p[:, k])[:, None, :])
 
         return _in_body(view, field)
+
+
+class BodySlip(MountSlip):
+    """A tracked body slips once on what carries it, is knocked or taped anew, and stays there.
+
+    A step for each body; not for one that is itself what `mount_slip` moves.
+    """
+
+    name = "body_slip"
+    site = Site.TRACKER
+    unit = "rad, m"
+    formula = "T_parent_body = T_cad exp(theta) where t > t*, t since the first stop"
+    typical = "0.2 to 5 mm, 0.2 to 5 mrad, size assumed"
+    covariates = ("elapsed_s", "tracked")
+    confounded_with = ("mount_slip", "mount_creep", "optitrack_distortion")
+    source = "size assumed"
+
+    def shapes(self, stops: View) -> tuple[float, ...]:
+        return step_times(stops) if _bodies(stops.rig) else ()
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        units = ("rad",) * 3 + ("m",) * 3
+        each = list(zip(DOF, units, self.sigma, strict=True))
+        return tuple(
+            Param(f"{body}.{dof}", unit, float(sigma))
+            for body in _bodies(rig)
+            for dof, unit, sigma in each
+        )
+
+    def basis(self, view: View) -> np.ndarray:
+        bodies = view.rig.tracker.bodies
+        own = [bodies.index(body) for body in _bodies(view.rig)]
+        when = self.when(view["elapsed_s"])
+        basis = np.zeros((len(when), len(bodies), 6, 6 * len(own)))
+        for i, b in enumerate(own):
+            basis[:, b, :, 6 * i : 6 * (i + 1)] = when[:, None, None] * np.eye(6)
+        return basis
+
+
+def _bodies(rig: Rig) -> tuple[str, ...]:
+    """Tracked bodies that slip by themselves."""
+    tree, mount = rig.tree, mount_edges(rig)
+    bodies = rig.tracker.bodies if rig.tracker else ()
+    return tuple(b for b in bodies if not mount or tree.edges[mount[0]].child != b)
 
 
 def _in_body(view: View, field: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:

@@ -16,7 +16,7 @@ import numpy as np
 
 from calib.linear.elimination import BY_TWIST, Eliminated, eliminate, square
 from calib.linear.layout import Layout, positions
-from calib.linear.rows import TWIST, StopSums, TwistSums
+from calib.linear.rows import TWIST, OwnSums, StopSums
 from calib.linear.system import Linearisation, Values
 from calib.problem.unknowns import Role
 from calib.residuals.compiled import add_at, add_both, add_gram, add_sparse
@@ -77,7 +77,7 @@ class Assembly:
         self.weight_m2 = self.beams_chi2 = 0.0
         self.eliminated: list[Eliminated] = []
         self.twists: list[tuple[int, np.ndarray, np.ndarray]] = []
-        self.scans: dict[int, TwistSums] = {}
+        self.scans: dict[int, OwnSums] = {}
 
     def add(self, sums: StopSums) -> None:
         """Add the beams of a stop."""
@@ -88,7 +88,7 @@ class Assembly:
         self.touched[sums.columns] |= seen
         self.touched[sums.chain_columns] |= np.any(sums.chain != 0, axis=0)
         if self.raw is not None:
-            self.scans[sums.stop] = sums.of_twist()
+            self.scans[sums.stop] = sums.alone()
 
     def _add_raw(self, found: Iterable[OwnRows]) -> None:
         """Add what rows say of kept columns."""

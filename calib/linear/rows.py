@@ -7,7 +7,7 @@ summed without zeros. Sums here are in the unknowns' own units; `assembly` scale
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +22,7 @@ from calib.residuals.scan import ScanStop
 
 PLACES = ("surface", "plane")  # beams that meet the same one share its error
 TWIST = 6  # columns of a stop's rows that come first; minus the residual is the next
+ZERO = "range_offset"  # the effect that lengthens all ranges alike
 
 
 @dataclass(frozen=True)
@@ -61,6 +62,7 @@ class StopRows:
         columns: (d + s,) columns of the layout that the dense and the sparse ones are.
         last: where among the sparse columns the last group begins; see `compiled.cross_sums`.
         chain: (6, n) derivative of the twist by what places the LiDAR, chain_columns: (n,) those.
+        zero: the dense column that lengthens all ranges alike, in a list; or none.
         rows: what this is made of.
     """
 
@@ -73,6 +75,7 @@ class StopRows:
     last: int
     chain: np.ndarray
     chain_columns: np.ndarray
+    zero: Sequence[int]
     rows: Rows
 
     @classmethod
@@ -108,6 +111,7 @@ class StopRows:
             last=last,
             chain=np.hstack([d[0] for d in placed.d.values()]),
             chain_columns=layout.columns(list(placed.d)),
+            zero=list(_zero(scan, rows)),
             rows=rows,
         )
 
@@ -136,6 +140,7 @@ class StopRows:
             columns=self.columns,
             chain=self.chain,
             chain_columns=self.chain_columns,
+            zero=self.zero,
             weight_m2=float(self.weight.sum()),
         )
 
@@ -179,7 +184,7 @@ class StopSums:
         with_dense: (s, 7 + d) sparse by dense columns.
         with_sparse: (l, s) sparse by sparse of different groups, see `compiled.cross_sums`.
         own: (s,) each sparse column by itself.
-        columns, chain, chain_columns: as of `StopRows`.
+        columns, chain, chain_columns, zero: as of `StopRows`.
         weight_m2: sum of the weights over their variances, 1/m2.
     """
 
@@ -191,6 +196,7 @@ class StopSums:
     columns: np.ndarray
     chain: np.ndarray
     chain_columns: np.ndarray
+    zero: Sequence[int]
     weight_m2: float
 
     @property
@@ -203,14 +209,14 @@ class StopSums:
         """(s,) columns of the layout."""
         return self.columns[self.dense.shape[1] - TWIST - 1 :]
 
-    def of_twist(self) -> TwistSums:
-        """What they say of the LiDAR's twist alone."""
-        direct = np.hstack([self.dense[:TWIST, TWIST + 1 :], self.with_dense[:, :TWIST].T])
-        information = self.dense[:TWIST, :TWIST]
-        return TwistSums(
-            information=information,
-            score=self.dense[:TWIST, TWIST],
-            cross=np.hstack([information @ self.chain, direct]),
+    def alone(self) -> OwnSums:
+        """What they say of a twist of the LiDAR, and of a range zero, that this stop alone has."""
+        own = [*range(TWIST), *self.zero]
+        by_chain = self.dense[own, :TWIST] @ self.chain
+        return OwnSums(
+            information=self.dense[np.ix_(own, own)],
+            score=self.dense[own, TWIST],
+            cross=np.hstack([by_chain, self.dense[own, TWIST + 1 :], self.with_dense[:, own].T]),
             columns=np.concatenate([self.chain_columns, self.columns]),
         )
 
@@ -224,15 +230,27 @@ class StopSums:
 
 
 @dataclass(frozen=True)
-class TwistSums:
-    """What a stop's beams say of a twist of its LiDAR that nothing else shares.
+class OwnSums:
+    """What a stop's beams say of a shift that nothing else shares: a twist of its LiDAR and, where
+    the linearisation has such a column, a range zero.
 
     Args:
-        information: (6, 6), score: (6,) of that twist.
-        cross: (6, n) its products with unknowns, columns: (n,) which; one may stand twice.
+        information: (7, 7) or (6, 6), score: (7,) or (6,) of that shift.
+        cross: (7, n) or (6, n) its products with unknowns, columns: (n,) which; one may stand
+            twice.
     """
 
     information: np.ndarray
     score: np.ndarray
     cross: np.ndarray
     columns: np.ndarray
+
+
+def _zero(scan: ScanStop, rows: Rows) -> Iterator[int]:
+    """Where among the dense columns all ranges are lengthened alike."""
+    at = TWIST + 1
+    mine = {term.variable for term in scan.terms if term.effect.family == ZERO}
+    for name, columns in rows.dense.items():
+        if name in mine:
+            yield at
+        at += columns.shape[1]

@@ -12,7 +12,7 @@ import numpy as np
 
 from calib.linear.elimination import Eliminated
 from calib.linear.layout import Layout
-from calib.linear.rows import TwistSums, Weighing
+from calib.linear.rows import OwnSums, Weighing
 
 Values = Mapping[str, np.ndarray]
 
@@ -34,7 +34,7 @@ class Linearisation:
         eliminated: what was eliminated, in that order.
         twists: per stop with beams its number, the derivative (6, n) of its LiDAR's twist, and the
             columns (n,) of that; empty unless cells were eliminated while stops were twists.
-        scans: stop -> what its beams say of its LiDAR's twist alone; empty unless gradients were
+        scans: stop -> what its beams say of a shift that it alone has; empty unless gradients were
             asked for.
         weight_m2: sum of the beams' weights over their variances, 1/m2.
         beams_chi2: what of chi2 is of beams, at their weights.
@@ -51,7 +51,7 @@ class Linearisation:
     touched: np.ndarray
     eliminated: Sequence[Eliminated]
     twists: Sequence[tuple[int, np.ndarray, np.ndarray]]
-    scans: Mapping[int, TwistSums]
+    scans: Mapping[int, OwnSums]
     weight_m2: float
     beams_chi2: float
     weighed: Sequence[Weighing] = ()

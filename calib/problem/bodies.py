@@ -74,9 +74,15 @@ def add_targets(problem: Problem, part: SourceStops, places: Places) -> None:
             role=Role.TARGET,
         )
     )
-    view = View(part.source.rig, len(targets.names), {}, np.zeros((1, 0)))
-    terms = [t for t in part.terms if t.effect.site is Site.TARGET]
-    shifts = {t.variable: t.basis(view) for t in terms}
+    shape = len(targets.names), 3
+    view = View(part.source.rig, shape[0], {"point_m": targets.faro_m}, np.zeros((1, 0)))
+    shifts, scanned = (
+        {t.variable: np.broadcast_to(b := t.basis(view), (*shape, b.shape[2])) for t in terms}
+        for terms in (
+            [t for t in part.terms if t.effect.site is Site.TARGET],
+            [t for t in part.terms if t.effect.of_scanner],
+        )
+    )
     for m, name in enumerate(targets.names):
         marker = Unknown(
             f"{part.prefix}target:{name}",
@@ -100,10 +106,8 @@ def add_targets(problem: Problem, part: SourceStops, places: Places) -> None:
                 below_m=spec.sphere_below_lower_marker_m,
                 sigma_sphere_m=spec.sigma_sphere_m,
                 sigma_marker_m=spec.sigma_marker_m,
-                shift={
-                    v: np.broadcast_to(b, (len(targets.names), *b.shape[1:]))[m]
-                    for v, b in shifts.items()
-                },
+                shift={v: b[m] for v, b in shifts.items()},
+                scanned={v: b[m] for v, b in scanned.items()},
                 groups=tuple(Group("target", name, what, part.label) for what in PARTS),
                 weight=None if whole[m].all() else whole[m].astype(float),
             )

@@ -8,6 +8,7 @@ from typing import Literal
 Kind = Literal["body", "joints", "scan", "target", "frame", "rings", "surface"]
 SCAN, JOINTS = "scan", "joints"  # what of a stop, beside its bodies and single joints
 CAD, MESH = "cad", "mesh"  # where, of what belongs to no stop and no target
+BEAMS = "along the beams"  # the direction of a range zero
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ class Group:
         if self.kind == "target":
             return f"target {of}: its {what}"
         if self.kind == "frame":
-            return f"what paper says of {what}"
+            return f"{what} of the URDF" if "." in what else f"{what} of the CAD"
         if self.kind == "surface":
             return f"{what} of the mesh"
         return f"{of}: {what}"

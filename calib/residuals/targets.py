@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -16,8 +17,9 @@ PARTS = ("lower", "upper", "sphere")  # of a target, three rows each
 class HangingTarget:
     """One rod. Its lower marker's true place p is unknown; gravity g is common to all rods.
 
-    ``lower - p``, ``upper - p`` across the rod, and ``faro - T_faro_world (p + L g)``, each over
-    its sigma; the spacing of the markers is not used, so it need not be known.
+    ``lower - p``, ``upper - p`` across the rod, and ``faro + s - T_faro_world (p + L g)``, s the
+    scanner's error there, each over its sigma; the spacing of the markers is not used, so it need
+    not be known.
 
     Args:
         name: for messages.
@@ -28,6 +30,7 @@ class HangingTarget:
         below_m: L, sphere centre below the lower marker.
         sigma_sphere_m, sigma_marker_m: per axis.
         shift: (3, P) per variable: where the sphere truly sits beyond that, world frame.
+        scanned: (3, P) per variable: where it truly sits beyond where it was scanned, faro frame.
         groups: (3,) the names of the rows of each of `PARTS`.
         weight: (3,) of the rows of each, robust, and 0 for a part that was left out; 1 where None.
     """
@@ -42,7 +45,8 @@ class HangingTarget:
     below_m: float
     sigma_sphere_m: float
     sigma_marker_m: float
-    shift: dict[str, np.ndarray]
+    shift: Mapping[str, np.ndarray]
+    scanned: Mapping[str, np.ndarray] = field(default_factory=dict)
     groups: tuple[Group, ...] = ()
     weight: np.ndarray | None = None
 
@@ -51,7 +55,7 @@ class HangingTarget:
 
     @property
     def variables(self) -> tuple[str, ...]:
-        return (self.marker, self.gravity, self.reference, *self.shift)
+        return (self.marker, self.gravity, self.reference, *self.shift, *self.scanned)
 
     def evaluate(self, values: Values, derivatives: bool) -> tuple[np.ndarray, Derivatives | None]:
         """Nine whitened rows [lower marker, upper marker across the rod, sphere]."""
@@ -61,11 +65,12 @@ class HangingTarget:
         sphere = p + self.below_m * g + sum(b @ values[n] for n, b in self.shift.items())
         R_t = T[:3, :3].T
         in_faro = R_t @ (sphere - T[:3, 3])
+        scanned = self.faro_m + sum(b @ values[n] for n, b in self.scanned.items())
         residual = np.concatenate(
             [
                 (self.lower_m - p) / self.sigma_marker_m,
                 across / self.sigma_marker_m,
-                (self.faro_m - in_faro) / self.sigma_sphere_m,
+                (scanned - in_faro) / self.sigma_sphere_m,
             ]
         )
         root = 1.0 if self.weight is None else np.sqrt(np.repeat(self.weight, 3))
@@ -90,4 +95,6 @@ class HangingTarget:
         d = {self.marker: by_p, self.gravity: by_g, self.reference: by_T}
         for name, basis in self.shift.items():
             d[name] = np.vstack([np.zeros((6, basis.shape[1])), -R_t @ basis * sphere])
+        for name, basis in self.scanned.items():
+            d[name] = np.vstack([np.zeros((6, basis.shape[1])), basis * sphere])
         return d

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from calib.blunders import told
 from calib.diagnosis.rejects import rejects
 from calib.diagnosis.search import search
 from calib.diagnosis.stand import Stand
@@ -23,6 +24,7 @@ from calib.runs.reopen import model_of, reopened, start_of
 from calib.runs.run import DIAGNOSIS, Run
 from calib.solve.fit import Progress, resume
 from sensors.documents import write_json
+from sensors.rings import RingFinding
 
 LOOKED = 3  # scans from which the numbers of rings are checked: each holds all rings
 
@@ -46,35 +48,37 @@ def diagnose(
 
     with threadpool_limits(limits=1):
         stand = stand_of(run, progress)
-        rings = list(_odd_rings(stand))
+        rings = dict(_odd_rings(stand))
+        harmful = {name: each for name, each in rings.items() if each.what != "reversed"}
         # Away from an optimum every effect that moves the state towards one looks missing.
         found = search(stand, progress) if run.converged else search(stand, progress, most=0)
         rejected = rejects(found.looks[0].stand, progress)
         falls = {}
         before = run.summary["rms_mm"]["held_out"]
         if refits and run.model["hold_out"] != "none" and before is not None:
-            if found.blunders and found.found:
+            if found.looks[0].stand is not stand and found.found:
                 before = _unseen(found.looks[0].stand, run, progress).rms_mm
             for step in found.found:
                 unseen = _unseen(step.after.stand, run, progress)
                 falls[step.effect.name] = (before, unseen.rms_mm, unseen.floor_mm)
                 before = unseen.rms_mm
-    tokens = [left.blunder.group.token for left in found.blunders]
     result = conclude(
         found,
         falls,
         run.summary["misfit"],
         weak_directions(run.solution, float(run.summary["sigmas_widened_by"]), found.looks[0]),
         rejected,
-        [*forbids(run), *(clause for clause, harms in rings if harms)],
+        forbids(run),
+        [told.of_rings(lidar, each) for lidar, each in harmful.items()],
     )
+    tokens = told.tokens(result.blunders)
     result = replace(
         result,
         sentences=[
             *run.doubts,
             *result.sentences,
             *run.omissions,
-            *(f"{clause[0].upper()}{clause[1:]}." for clause, harms in rings if not harms),
+            *(told.whole(each.sentence) for each in rings.values() if each not in harmful.values()),
         ],
         command=command_without(run, tokens) if tokens else "",
     )
@@ -98,9 +102,9 @@ def command_without(run: Run, tokens: Sequence[str]) -> str:
     return shlex.join(["rigcal", "fit", *map(str, run.recordings), *out, *chosen, *without])
 
 
-def _odd_rings(stand: Stand) -> Iterator[tuple[str, bool]]:
-    """How rings are numbered otherwise than their model has it, a clause each, and whether offsets
-    by ring are then of no use: those counted from the other end are many makers' own."""
+def _odd_rings(stand: Stand) -> Iterator[tuple[str, RingFinding]]:
+    """LiDARs whose rings are numbered otherwise than their model has it. Those counted from the
+    other end are many makers' own; else offsets by ring are of no use."""
     for source in stand.sources:
         scanned = np.flatnonzero(source.recording.has_scan)[:LOOKED]
         if source.rig.lidar is not None and len(scanned):
@@ -109,7 +113,7 @@ def _odd_rings(stand: Stand) -> Iterator[tuple[str, bool]]:
                 sums.add(source.recording.stops[k], source.store.read(k)[0])
             found = numbering(sums)
             if found is not None:
-                yield found.sentence, found.what != "reversed"
+                yield source.rig.lidar.name, found
 
 
 def _unseen(stand: Stand, run: Run, progress: Progress) -> Errors:

@@ -9,6 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from calib.blunders import told
 from calib.diagnosis import Diagnosis
 from calib.effects import load_effects
 from calib.problem.model import Model, Source
@@ -136,8 +137,8 @@ class _Climb:
     def improve(self, diagnosis: Diagnosis) -> bool:
         """Leave out blunders; or else add what lowers the held-out error, and drop what that made
         idle. Whether anything was changed."""
-        if diagnosis.blunders:
-            self._leave_out([each["without"] for each in diagnosis.blunders])
+        if tokens := told.tokens(diagnosis.blunders):
+            self._leave_out(tokens)
             return True
         if not self.run.converged:  # of such a run nothing else is learnt
             return False

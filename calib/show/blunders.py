@@ -28,7 +28,8 @@ def blunder_cells(blunder: Mapping[str, Any]) -> tuple[str, str, str]:
     if blunder["wrong_sign"]:
         said.append(f"its {blunder['wrong_sign']} may have the wrong sign")
     size = size_told(blunder["size"], blunder["sigma"], blunder["unit"])
-    return blunder["without"], f"{size} {along}".rstrip(), "; ".join(said)
+    what = blunder["without"] or f"{blunder['kind']} of {blunder['name']}"
+    return what, f"{size} {along}".rstrip(), "; ".join(said)
 
 
 def blunders_table(blunders: Sequence[Mapping[str, Any]]) -> Table:

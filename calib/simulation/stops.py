@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -245,12 +245,14 @@ def hang_targets(
     sets = FLOOR_CENTRE_M + rng.uniform((-2.8, -1.9, 0.5), (2.8, 1.9, 1.9), (200, count, 3))
     spread = np.linalg.svd(sets - sets.mean(axis=1, keepdims=True), compute_uv=False)[:, -1]
     sphere = sets[spread.argmax()]
-    view = View(truth.rig, count, {}, np.zeros((1, 0)))
+    view = View(truth.rig, count, {"point_m": sphere}, np.zeros((1, 0)))
     up = truth.T_opti_faro[:3, 2]
     nominal = se3.apply(truth.T_opti_faro, sphere) - truth.error(Site.TARGET, view, (3,))
     lower = nominal + spec.sphere_below_lower_marker_m * up
+    scanner = replace(truth, effects=tuple(e for e in truth.effects if e[0].of_scanner))
+    scanned = sphere - scanner.error(Site.REFERENCE, view, (3,))
     measured = (
-        ("faro", sphere, spec.sigma_sphere_m),
+        ("faro", scanned, spec.sigma_sphere_m),
         ("upper", lower + 0.12 * up, spec.sigma_marker_m),
         ("lower", lower, spec.sigma_marker_m),
     )

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
+from calib.blunders import told
 from calib.view import panels
 
 MOST_BUTTONS = 6  # blunders that have one of their own; all are listed, and "Leave all out" has all
@@ -33,7 +34,7 @@ class LeaveOut:
             self._buttons.pop().remove()
         self._folder.visible = bool(blunders)
         self._listed.content = panels.blunders(blunders)
-        tokens = [each["without"] for each in blunders]
+        tokens = told.tokens(blunders)
         with self._folder:
             for token in tokens[:MOST_BUTTONS]:
                 self._offer(f"Leave out {token}", [token])

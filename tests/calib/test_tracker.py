@@ -92,7 +92,7 @@ def test_tracked_body_rows_are_measured_less_predicted_in_sigmas(values, tracked
     np.testing.assert_allclose(residual, step / np.repeat([3e-4, 2e-4], 3), rtol=1e-9)
 
 
-def hanging(shift=None):
+def hanging(shift=None, scanned=None):
     rng = np.random.default_rng(6)
     faro_m, upper_m, lower_m = rng.normal(size=(3, 3))
     return HangingTarget(
@@ -107,19 +107,21 @@ def hanging(shift=None):
         sigma_sphere_m=6e-4,
         sigma_marker_m=2e-4,
         shift=shift or {},
+        scanned=scanned or {},
     )
 
 
 def test_hanging_target_derivatives():
     rng = np.random.default_rng(7)
-    block = hanging({"off": rng.normal(size=(3, 2)), "low": rng.normal(size=(3, 1))})
+    shift = {"off": rng.normal(size=(3, 2)), "low": rng.normal(size=(3, 1))}
+    block = hanging(shift, {"scale": rng.normal(size=(3, 1))})
     down = np.array([0.3, -0.4, -1.0])
     values = {
         "p": rng.normal(size=3),
         "g": down / np.linalg.norm(down),
         "faro": rigs.T_OPTI_FARO.as_matrix(),
     }
-    values |= {"off": np.array([0.01, -0.02]), "low": np.array([0.03])}
+    values |= {"off": np.array([0.01, -0.02]), "low": np.array([0.03]), "scale": np.array([0.02])}
     kinds = {"g": SimpleNamespace(kind="direction"), "faro": SimpleNamespace(kind="pose")}
     rigs.assert_block_derivatives(block, kinds, values)
 

@@ -57,7 +57,10 @@ def _taped(scene: Scene, times: float, which: int) -> Done:
     way = times * scene.size(f"{scene.names[first]}:{body}", "body m") * scene.way()
     quat = scene.stops.numbers(*(f"{body}.{q}" for q in QUAT))[rows]
     scene.move(body, rows, Rotation.from_quat(quat, scalar_first=True).apply(way), NO)
-    return done({f"*:{body}", f"cad:{body}"}, {"*:joints", "*:scan"}, unsure={body})
+    # With no arm, or no LiDAR, whatever moves a body moves it against all that is seen.
+    alike = set() if scene.joints and "lidar" in scene.rig else {"mount_slip"}
+    right = {f"*:{body}", f"cad:{body}", "body_slip"}
+    return done(right, {"*:joints", "*:scan"} | alike, unsure={body})
 
 
 @mishap("tracker", "base", "poses", sized=True)
@@ -251,7 +254,7 @@ def one_joint_scaled(scene: Scene, times: float) -> Done:
 def _scaled(scene: Scene, joint: str, factor: float) -> Done:
     with scene.sheet("stops.csv") as sheet:
         sheet.put(factor * sheet.numbers(joint), joint)
-    return done({f"*:{joint}", "*:joints"}, {"*:*"})
+    return done({f"*:{joint}", "*:joints", "arm_joint_scale"}, {"*:*"})
 
 
 @mishap("arm")
