@@ -10,10 +10,10 @@ from calib.blunders.chance import after_looks, log_tail
 from calib.blunders.judged import Blunder, LeftOut
 from calib.blunders.shifts import Shift
 from calib.problem.problem import Problem
-from calib.residuals.groups import BEAMS, Group
+from calib.residuals.groups import BEAMS, JOINTS, Group
 from calib.residuals.robust import MAD
 from calib.residuals.scan import ScanStop
-from calib.solve.loop import CONTRADICTS
+from calib.solve.torn import CONTRADICTS
 from chains.errors import InputError
 
 ALIKE = 0.1  # of a scan's misfit where it is said to be: at another stop's place it belongs there
@@ -28,8 +28,8 @@ def stray_scans(
     Args:
         problem: of the fit.
         values: its solution.
-        checked: groups that anything contradicts or could. A body at the stop that is none of them
-            alone says where the LiDAR was, and may be wrong as well.
+        checked: groups that anything contradicts or could. A body, or the joints, of the stop that
+            are none of them alone say where the LiDAR was, and may be wrong as well.
     """
     looks = len(problem.scans) + len(problem.aside)
     bodies = [group for body in problem.bodies for group in body.groups]
@@ -50,9 +50,16 @@ def stray_scans(
             looks=looks,
         )
         place = (scan.group.recording, scan.group.where)
-        here = [g for g in bodies if (g.recording, g.where) == place and g not in checked]
+        here = [g for g in (*bodies, *_joints(scan)) if (g.recording, g.where) == place]
+        here = [g for g in here if g not in checked]
         there = others[best].group if fits else None
         yield LeftOut(blunder, [] if fits else here, there, aside=True)
+
+
+def _joints(scan: ScanStop) -> list[Group]:
+    """The joints of a scan's stop."""
+    where, recording = scan.group.where, scan.group.recording
+    return [Group("joints", where, JOINTS, recording)] if scan.stops.rig.joint_names else []
 
 
 def _distance(group: Group, off_m: float, sigma_m: float) -> Shift:

@@ -21,7 +21,7 @@ from calib.diagnosis.score import test as joint_test
 from calib.diagnosis.screen import Candidate, Screen
 from calib.diagnosis.stand import Look, Stand
 from calib.effects import Effect, Site
-from calib.residuals.groups import CAD, MESH
+from calib.residuals.groups import CAD, JOINTS, MESH
 from calib.solve.fit import Progress
 
 ALPHA = 0.04  # chance that a named effect is found where nothing is missing
@@ -143,7 +143,7 @@ def _adapted(look: Look, left: list[LeftOut], progress: Progress, named: bool) -
         for each in wild:
             near = (b for b in look.blunders if each.evidence - b.evidence < ODDS)
             others = [b for b in near if b.found and b.group not in loud and b not in wild]
-            others = [b for b in others if b.possible]
+            others = [b for b in others if b.possible or b.group.what == JOINTS]
             met = [b.group for b in others if len(wild) == 1 or _meet(each, b)]
             left.append(LeftOut(each, met))
         look = after

@@ -43,6 +43,10 @@ def solve(
     if not problem.calibration:
         raise InputError("nothing is left to estimate: fix fewer names, or choose an effect")
     loop = Loop(problem, prior, progress, start)
+    if loop.start.state:
+        loop.take_weights()
+    else:
+        loop.doubt_bodies()
     if loop.start.state and problem.scans:
         loop.go_on(tolerance)
         loop.reweigh(tolerance)
@@ -66,6 +70,7 @@ def solve(
 def preview(problem: Problem, progress: Progress = lambda what, done, total: None) -> Estimate:
     """What a fit would know, from one linearisation at the start: its covariance, near enough."""
     loop = Loop(problem, None, progress)
+    loop.doubt_bodies()
     loop.solve_without_scans()
     loop.reweigh()
     if problem.scans:

@@ -7,6 +7,7 @@ them is called converged.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -24,6 +25,7 @@ from calib.solve.estimate import DOFS, SEEN, Estimate, Start, cost_of, started, 
 from calib.solve.graph import Graph
 from calib.solve.reweight import SETTLED as SETTLED_WEIGHT
 from calib.solve.reweight import reweighted
+from calib.solve.torn import CONTRADICTS, astray, borne_out, doubted
 from chains import se3
 
 SETTLED = 1e-4  # m and rad: after that, which triangle a beam meets is kept
@@ -37,22 +39,20 @@ LOOKS = 3  # how often, before a fit is given up
 # By how much new weights may still lower half the chi-square, and of it: a hundredth of what an
 # optimum allows, as each round may go but a tenth of the way; where nothing fits, it never ends.
 STILL, AS_GOOD = AT_OPTIMUM / 100, 1e-8
+# While weights still change, passes end when one lowers the cost by less than so much of what new
+# weights were to lower it by.
+ROUGHLY = 0.01
+BEFORE_SCANS = 2  # times: bodies are then a start for the scans, and no result
 REWEIGHTED, ALONE = (10, SETTLED_WEIGHT), (200, 1e-3)
-# Bodies half of whose stops are so far (m, rad) from where the chain puts them after a fit are not
-# described by it: CAD and encoders are good to millimetres. Measured on the independent recordings:
-# 0.004 at most, though effects were missing; 0.09 with rows of zeros, 0.6 with the quaternions'
-# order wrong, 0.8 with two bodies exchanged.
-ASTRAY = 0.05
 # So often is looked what beams meet before it is asked whether that leads anywhere, and so often at
 # most; good recordings, and one with the LiDAR 0.13 m from where CAD has it, take 2 to 6 passes.
 HOPEFUL, LOOKED = 8, 15
 # How many sigmas wide the residuals of most stops may be by then: in those recordings it is 1 to 4,
 # with scans at wrong stops 85.
 HOPELESS = 30.0
-# A scan whose residuals are so many times wider than those of most, where trackers and targets put
-# the LiDAR, was not taken there. On the recordings of the independent simulator it is 1.8 at most,
-# and 206 and 208 of two scans that were exchanged.
-CONTRADICTS = 10.0
+
+
+SEVERAL = 3  # scans of a place, for most of them to tell where the rig stood
 
 
 class Loop(Descent):
@@ -78,6 +78,16 @@ class Loop(Descent):
         self.given, self.start = self.problem, start
         self.seen: dict[str, np.ndarray] = {}
         self.lost = False  # whether the fit is given up
+
+    def doubt_bodies(self) -> None:
+        """Begin with next to no weight on the bodies of stops where one is grossly off."""
+        self._give(doubted(self.given, self.values))
+
+    def _give(self, given: Problem) -> None:
+        """Take a problem with other weights, or fewer scans, in place of that which was given."""
+        if given is not self.given:
+            self.given = self.problem = given
+            self.lay_out()
 
     def solve_without_scans(self, start: Mapping[str, np.ndarray] | None = None) -> None:
         """Trackers and targets alone: a good start for the beams, or all there is.
@@ -114,6 +124,8 @@ class Loop(Descent):
             tolerance: as of `settle`; of trackers and targets alone where None.
         """
         times, settled = REWEIGHTED if self.problem.scans else ALONE
+        times = BEFORE_SCANS if tolerance is None and self.problem.scans else times
+        changed = False
         for _ in range(times):
             before = self.given, self.problem
             if self.lost or not self.take_weights(settled):
@@ -124,10 +136,13 @@ class Loop(Descent):
                 self.given, self.problem = before
                 self.lay_out()
                 break
+            changed = True
             if tolerance is None:
-                self.solve_without_scans()
+                self.descend(max(STEADY, ROUGHLY * fall), beams=False)
             else:
                 self.settle(tolerance, self.seen, self._met())
+        if changed and tolerance is None:
+            self.solve_without_scans()
 
     def take_weights(self, settled: float = SETTLED_WEIGHT) -> bool:
         """Give every group of rows the weight that its residuals ask for; whether any changed."""
@@ -147,19 +162,14 @@ class Loop(Descent):
 
     def bodies_astray(self) -> bool:
         """Whether half of the stops have a body far from where the chain puts it."""
-        off: dict[str, list[np.ndarray]] = {}
-        for block in self.problem.bodies:
-            T = block.stops.in_world(block.body, self.values).T
-            away = np.linalg.norm(block.measured[:, :3, 3] - T[:, :3, 3], axis=1)
-            if not block.is_point:
-                turn = se3.so3_log(T[:, :3, :3].mT @ block.measured[:, :3, :3])
-                away = np.maximum(away, np.linalg.norm(turn, axis=1))
-            off.setdefault(block.body, []).append(away)
-        return any(np.median(np.concatenate(away)) > ASTRAY for away in off.values())
+        return astray(self.problem, self.values)
 
     def look_around(self) -> bool:
         """Passes that look each time anew what beams meet, until they settle; False where the fit
-        is hopeless."""
+        is hopeless. Where bodies contradict each other, scans first say which of them is right."""
+        given, stood = borne_out(self.given, self.values)
+        self.values |= stood
+        self._give(given)
         for count in range(1, LOOKED + 1):
             self.linearise(associate=True)
             self.passes += 1
@@ -177,25 +187,19 @@ class Loop(Descent):
     def _set_aside(self, scale: np.ndarray) -> bool:
         """Leave scans out of the fit that contradict all others; whether there are any.
 
-        Not where bodies contradict each other: there the scan is to say which of them is right.
-
         Args:
-            scale: (K,) how many sigmas wide the bulk of each scan's residuals is, bodies alone
-                telling where the LiDAR is.
+            scale: (K,) how many sigmas wide the bulk of each scan's residuals is, where bodies, or
+                most scans of a place where the rig stood, say that the LiDAR is.
         """
-        bodies = self.problem.bodies
-        told = {b.stops.root for b in bodies}
-        weights = ((b.stop_names, b.weight) for b in bodies if b.weight is not None)
-        torn = {k for names, w in weights for k, x in zip(names, w, strict=True) if x < 1}
+        stood = Counter(scan.stops.root for scan in self.problem.scans)
+        told = {b.stops.root for b in self.problem.bodies}
+        told |= {root for root, count in stood.items() if count >= SEVERAL}
         far = scale > CONTRADICTS * np.median(scale)
         pairs = zip(self.problem.scans, far, strict=True)
         keys = {key_of(scan) for scan, is_far in pairs if is_far and scan.stops.root in told}
-        keys -= torn
-        if not keys:
-            return False
-        self.given = self.problem = self.given.setting_aside(keys)
-        self.lay_out()
-        return True
+        if keys:
+            self._give(self.given.setting_aside(keys))
+        return bool(keys)
 
     def settle(
         self,
