@@ -14,7 +14,7 @@ import numpy as np
 from scipy.sparse import csr_array, diags_array
 
 from calib.linear.clusters import ClusteredRows, Gradients
-from calib.linear.layout import Layout, key_of, keys_of, positions
+from calib.linear.layout import Layout, keys_of, positions
 from calib.linear.linearise import lidars, linearise, own_rows, spread_rows
 from calib.linear.parallel import in_order
 from calib.linear.rows import StopRows
@@ -117,7 +117,7 @@ def beside(wide: Problem, estimate: Estimate) -> tuple[Problem, dict[str, np.nda
     """A problem with candidates at a model's solution: with the surfaces' unknowns and the robust
     weights of that, and the candidates at zero."""
     cells, wide = estimate.problem.cells, weighted_as(wide, estimate.problem)
-    wide = wide.setting_aside({key_of(scan) for scan in estimate.problem.aside})
+    wide = wide.setting_aside(estimate.problem.set_aside)
     wide = wide.with_cells([estimate.problem.variables[name] for name in cells], cells)
     absent = {n: u.mean for n, u in wide.variables.items() if n not in estimate.values}
     return wide, absent | estimate.values

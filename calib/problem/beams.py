@@ -8,6 +8,7 @@ from calib.effects import Site
 from calib.problem.model import Source, same_mesh
 from calib.problem.places import Places
 from calib.problem.problem import Problem, SourceStops
+from calib.problem.surfaces import LEAST_BEAMS
 from calib.problem.unknowns import Role, Unknown
 from calib.residuals.groups import SCAN, Group
 from calib.residuals.scan import ScanStop
@@ -95,7 +96,7 @@ def _find_planes(problem: Problem, part: SourceStops, places: Places) -> Planes:
         T = stops.in_reference(rig.lidar_frame, problem.initial).T[0]
         points_m = ray.origin_m + ray.range_m[:, None] * ray.direction
         finder.add(k, se3.apply(T, points_m), T[:3, 3])
-    planes = finder.planes(min_points=100)
+    planes = finder.planes(min_points=LEAST_BEAMS)
     if not len(planes.normal):
         raise InputError(
             f"{recording.folder}: there is no mesh, and no flat patch in the scans to fit to; "

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -92,7 +91,8 @@ class Problem:
         scans: one per stop with a scan.
         meetings: per source, what its beams meet.
         cells: unknowns of surfaces, once what beams meet is settled.
-        aside: scans that a fit has set aside, as they contradict all others.
+        aside: scans that a fit has set aside, as they contradict all others; bodies that it has
+            weigh nothing.
     """
 
     sources: Sequence[Source]
@@ -111,12 +111,25 @@ class Problem:
         """The blocks of tracked bodies."""
         return [block for block in self.blocks if isinstance(block, TrackedBody)]
 
-    def setting_aside(self, keys: Collection[tuple[Path, int]]) -> Problem:
-        """The problem with these scans, and no others, set aside."""
+    @property
+    def set_aside(self) -> frozenset[str]:
+        """Tokens of the scans, and of the bodies at stops, that a fit has set aside."""
+        weights = ((b.groups, b.weight) for b in self.bodies if b.weight is not None)
+        bodies = (g for groups, w in weights for g, x in zip(groups, w, strict=True) if x == 0)
+        return frozenset(g.token for g in (*(scan.group for scan in self.aside), *bodies))
+
+    def setting_aside(self, tokens: Collection[str]) -> Problem:
+        """The problem with these scans and bodies, and no others, set aside; see `Group.token`."""
+        if self.set_aside == set(tokens):
+            return self
         every = [*self.scans, *self.aside]
-        kept = [s for s in every if (s.recording.folder, s.index) not in keys]
-        gone = [s for s in every if (s.recording.folder, s.index) in keys]
-        return replace(self, scans=kept, aside=gone) if keys or self.aside else self
+        kept = [scan for scan in every if scan.group.token not in tokens]
+        gone = [scan for scan in every if scan.group.token in tokens]
+        blocks = [
+            block.setting_aside(tokens) if isinstance(block, TrackedBody) else block
+            for block in self.blocks
+        ]
+        return replace(self, scans=kept, aside=gone, blocks=blocks)
 
     def add(self, unknown: Unknown, value: np.ndarray | None = None) -> str:
         """Add an unknown once; it starts at `value`, or at its mean."""

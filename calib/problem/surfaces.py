@@ -15,7 +15,9 @@ import numpy as np
 from calib.problem.problem import Problem, SurfaceCells
 from calib.problem.unknowns import Role, Unknown
 from calib.residuals.beams import Association
+from calib.residuals.surfaces import PlaneSurface
 
+LEAST_BEAMS = 100  # on a plane: three numbers of it, known ten times better than by a single beam
 # Variance of the displacements, as shares of the reference's. They add up to more than 1: an error
 # that is smooth over metres has slopes, for which steps between cells must stand. Chosen by how
 # often intervals of ring zeros hold in simulated worlds: with cells of 0.7 m alone, their sigmas
@@ -56,6 +58,28 @@ def with_surfaces(
                 numbered[i][name] = number[parts_of[i]]
     found = [replace(a, cells=n) for a, n in zip(associations, numbered, strict=True)]
     return problem.with_cells(unknowns, cells), found
+
+
+def well_seen(problem: Problem, associations: Sequence[Association]) -> list[Association]:
+    """What beams meet, without planes that too few of them meet: stops that seemed elsewhere when
+    the planes were found leave such, and a fit does not settle on them.
+
+    Args:
+        problem: whose recordings may have no mesh.
+        associations: per scan, what its beams meet.
+    """
+    found = list(associations)
+    rooms: dict[object, list[int]] = {}
+    for i, scan in enumerate(problem.scans):
+        if isinstance(scan.meeting, PlaneSurface):
+            rooms.setdefault(scan.room, []).append(i)
+    for scans in rooms.values():
+        count = len(problem.scans[scans[0]].meeting.planes.normal)
+        beams = sum(np.bincount(found[i].part + 1, minlength=count + 1)[1:] for i in scans)
+        few = np.append(beams < LEAST_BEAMS, False)  # the last stands for -1
+        for i in scans:
+            found[i] = replace(found[i], part=np.where(few[found[i].part], -1, found[i].part))
+    return found
 
 
 def _unknown(name: str, room: int, column: str, parts: np.ndarray, sigma_m: float) -> Unknown:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -31,7 +31,7 @@ class TrackedBody:
         bases: variable -> (K or 1, 6, P), what the tracker adds to the body's pose, per unit.
         stop_names: (K,) recording and number of each stop: rows of one err together.
         groups: (K,) the names of those rows.
-        weight: (K,) robust weight of each stop's rows; 1 where None.
+        weight: (K,) robust weight of each stop's rows, 0 where set aside; 1 where None.
     """
 
     name: str
@@ -55,6 +55,13 @@ class TrackedBody:
     @property
     def rows(self) -> int:
         return len(self.measured) * (3 if self.is_point else 6)
+
+    def setting_aside(self, tokens: Collection[str]) -> TrackedBody:
+        """The block with these stops' rows, and no others, set aside; see `Group.token`."""
+        now = np.ones(len(self.groups)) if self.weight is None else self.weight
+        gone = np.array([group.token in tokens for group in self.groups])
+        weight = np.where(gone, 0.0, np.where(now > 0, now, 1.0))
+        return replace(self, weight=None if (weight == 1.0).all() else weight)
 
     def evaluate(self, values: Values, derivatives: bool) -> tuple[np.ndarray, Derivatives | None]:
         """Whitened rows, stop by stop [rotation, position], and their derivatives."""

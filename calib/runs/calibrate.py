@@ -207,19 +207,12 @@ def _fit(
     summary |= {"misfit": worse, "misfit_by": misfit_by(estimate, *rows, by_stop)}
     reached = reach(problem, estimate, widened)
     summary |= {"sigmas_widened_by": widened, "held_out_by": by, "without": list(model.without)}
-    summary["set_aside"] = _set_aside(estimate, sources)
+    summary["set_aside"] = sorted(estimate.problem.set_aside)
     summary["predicted_mm"] = reached.document() if reached else None
     summary["seconds"] = time.monotonic() - began
     if links is not None:
         summary["links"] = [_link_document(link) for link in links]
     write_json(folder / SUMMARY, summary)
-
-
-def _set_aside(estimate: Estimate, sources: Sequence[Source]) -> dict[str, str]:
-    """Scans that contradict all others, by name: number of the recording, and of the stop."""
-    numbers = {s.recording.folder: i for i, s in enumerate(sources)}
-    scans = estimate.problem.aside
-    return {scan.group.token: f"{numbers[scan.recording.folder]}/{scan.index}" for scan in scans}
 
 
 def _refuse_twice(recordings: Sequence[Path]) -> None:

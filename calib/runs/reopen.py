@@ -49,26 +49,20 @@ def start_of(run: Run, sources: Sequence[Source]) -> Start:
     for name, part in run.met().items():
         number, stop = map(int, name.split("/"))
         met[folders[number], stop] = part
-    return Start(run.state(), met, _aside(run, sources))
+    return Start(run.state(), met, frozenset(run.set_aside))
 
 
 def problem_of(
     run: Run, sources: Sequence[Source], meetings: Mapping[int, object] | None = None
 ) -> Problem:
-    """A run's model on its recordings, without the scans that its fit set aside.
+    """A run's model on its recordings, without what its fit set aside.
 
     Args:
         run: the run.
         sources: its recordings.
         meetings: as of `calib.problem.build`.
     """
-    return build(sources, model_of(run), meetings=meetings).setting_aside(_aside(run, sources))
-
-
-def _aside(run: Run, sources: Sequence[Source]) -> frozenset[tuple[Path, int]]:
-    """Recording and number of the stops whose scans the fit set aside."""
-    aside = (map(int, name.split("/")) for name in run.summary.get("set_aside", {}).values())
-    return frozenset((sources[number].recording.folder, stop) for number, stop in aside)
+    return build(sources, model_of(run), meetings=meetings).setting_aside(run.set_aside)
 
 
 def stored_met(start: Start, sources: Sequence[Source]) -> dict[str, np.ndarray]:

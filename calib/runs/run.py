@@ -93,7 +93,7 @@ class Run:
         out = [] if self.converged else [NOT_CONVERGED]
         if self.set_aside:
             out.append(
-                f"Set aside, as they contradict all other scans: {', '.join(self.set_aside)}."
+                f"Set aside, as they contradict everything else: {', '.join(self.set_aside)}."
             )
         return out
 
@@ -109,7 +109,7 @@ class Run:
 
     @property
     def set_aside(self) -> list[str]:
-        """Scans that the fit could not use."""
+        """Scans, and bodies at stops, that the fit could not use."""
         return list(self.summary.get("set_aside", ()))
 
     @property

@@ -29,12 +29,12 @@ class Start:
     Args:
         state: `Estimate.state` of that; what it does not know starts at its mean.
         met: stop -> which part of the surface each of its beams met (N,), where that is known.
-        aside: stops whose scans it had set aside.
+        aside: tokens of the scans and bodies that it had set aside.
     """
 
     state: Mapping[str, np.ndarray] = field(default_factory=dict)
     met: Mapping[StopKey, np.ndarray] = field(default_factory=dict)
-    aside: frozenset[StopKey] = frozenset()
+    aside: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -81,8 +81,8 @@ class Estimate:
     def start(self) -> Start:
         """Where another fit of much the same problem may start from."""
         pairs = zip(self.scans, self.associations, strict=True)
-        aside = frozenset(key_of(scan) for scan in self.problem.aside)
-        return Start(self.state, {key_of(scan): met.part for scan, met in pairs}, aside)
+        met = {key_of(scan): met.part for scan, met in pairs}
+        return Start(self.state, met, self.problem.set_aside)
 
     @property
     def state(self) -> dict[str, np.ndarray]:

@@ -17,7 +17,7 @@ from calib.linear.layout import StopKey, key_of
 from calib.linear.linearise import beams_cost
 from calib.linear.parallel import in_order
 from calib.problem.problem import Block, Problem
-from calib.problem.surfaces import with_surfaces
+from calib.problem.surfaces import well_seen, with_surfaces
 from calib.residuals.beams import Association
 from calib.solve.added import begun
 from calib.solve.descent import AT_OPTIMUM, STEADY, UPHILL, Descent, Progress
@@ -52,6 +52,7 @@ HOPEFUL, LOOKED = 8, 15
 HOPELESS = 30.0
 
 
+ASKED = 2  # times: the first pass brings the LiDAR to where it is, near enough
 SEVERAL = 3  # scans of a place, for most of them to tell where the rig stood
 
 
@@ -166,11 +167,11 @@ class Loop(Descent):
 
     def look_around(self) -> bool:
         """Passes that look each time anew what beams meet, until they settle; False where the fit
-        is hopeless. Where bodies contradict each other, scans first say which of them is right."""
-        given, stood = borne_out(self.given, self.values)
-        self.values |= stood
-        self._give(given)
+        is hopeless. Where bodies contradict each other, scans say which of them is right: as CAD
+        has the LiDAR, and once more where a pass has put it."""
         for count in range(1, LOOKED + 1):
+            if count <= ASKED:
+                self._ask_scans()
             self.linearise(associate=True)
             self.passes += 1
             scale = np.array([each.scale for each in self.linear.weighed])
@@ -184,6 +185,14 @@ class Loop(Descent):
                 break
         return True
 
+    def _ask_scans(self) -> None:
+        """Set aside the bodies that the scan at their stop shows to be wrong."""
+        wrong, stood = borne_out(self.given, self.values)
+        if wrong:
+            self.values |= stood
+            self._give(self.given.setting_aside(self.given.set_aside | wrong))
+            self.take_weights()
+
     def _set_aside(self, scale: np.ndarray) -> bool:
         """Leave scans out of the fit that contradict all others; whether there are any.
 
@@ -196,10 +205,9 @@ class Loop(Descent):
         told |= {root for root, count in stood.items() if count >= SEVERAL}
         far = scale > CONTRADICTS * np.median(scale)
         pairs = zip(self.problem.scans, far, strict=True)
-        keys = {key_of(scan) for scan, is_far in pairs if is_far and scan.stops.root in told}
-        if keys:
-            self._give(self.given.setting_aside(keys))
-        return bool(keys)
+        gone = {s.group.token for s, is_far in pairs if is_far and s.stops.root in told}
+        self._give(self.given.setting_aside(self.given.set_aside | gone))
+        return bool(gone)
 
     def settle(
         self,
@@ -274,7 +282,7 @@ class Loop(Descent):
         for i, association in enumerate(in_order(work, len(scans))):
             self.progress("looking for depth edges", i, len(scans))
             found.append(association)
-        self.problem, self.associations = with_surfaces(self.given, found)
+        self.problem, self.associations = with_surfaces(self.given, well_seen(self.given, found))
         for name in self.problem.cells:
             unknown = self.problem.variables[name]
             self.values[name] = started(unknown, known, unknown.mean)

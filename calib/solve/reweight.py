@@ -78,9 +78,12 @@ def weighted_as(problem: Problem, other: Problem) -> Problem:
 
 
 def unweighted(block: Block) -> Block:
-    """A block as its sigmas have it; parts that were left out stay so."""
+    """A block as its sigmas have it, bodies that were set aside as well; parts of targets that were
+    left out stay so."""
     if getattr(block, "weight", None) is None:
         return block
+    if isinstance(block, TrackedBody):
+        return replace(block, weight=None)
     whole = np.where(block.weight > 0, 1.0, 0.0)
     return replace(block, weight=None if whole.all() else whole)
 
@@ -118,7 +121,7 @@ def _weighted(owner: Block | Unknown, weight: np.ndarray | None, settled: float)
     if weight is None:
         return owner
     now = np.ones(len(weight)) if owner.weight is None else np.atleast_1d(owner.weight)
-    weight = np.where(now > 0, weight, 0.0)  # what was left out stays so
+    weight = np.where(now > 0, weight, 0.0)  # what was left out, or set aside, stays so
     if (np.abs(weight - now) <= settled * now).all():
         return owner
     return replace(owner, weight=float(weight[0]) if isinstance(owner, Unknown) else weight)

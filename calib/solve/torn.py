@@ -16,6 +16,7 @@ import numpy as np
 from calib.linear.layout import StopKey, key_of
 from calib.linear.parallel import in_order
 from calib.problem.problem import Problem
+from calib.residuals.groups import Group
 from calib.residuals.scan import ScanStop
 from calib.residuals.tracker import TrackedBody
 from chains import se3
@@ -69,31 +70,37 @@ def doubted(problem: Problem, values: Values) -> Problem:
         for block, far in found:
             wild = np.flatnonzero(far > max(CONTRADICTS * median, ASTRAY))
             torn |= {block.stop_names[k] for k in wild}
-    return _weighing(problem, {key: "" for key in torn}) if torn else problem
+    blocks = []
+    for block in problem.blocks:
+        if isinstance(block, TrackedBody) and not torn.isdisjoint(block.stop_names):
+            wild = np.array([key in torn for key in block.stop_names])
+            block = replace(block, weight=np.where(wild, DOUBTED, 1.0))
+        blocks.append(block)
+    return replace(problem, blocks=blocks) if torn else problem
 
 
-def borne_out(problem: Problem, values: Values) -> tuple[Problem, dict[str, np.ndarray]]:
-    """At stops where bodies contradict each other grossly, the one that the scan there bears out
-    gets all the weight, and says where the rig stands.
+def borne_out(problem: Problem, values: Values) -> tuple[set[str], dict[str, np.ndarray]]:
+    """What scans say of stops at which bodies contradict each other grossly.
 
     Args:
         problem: with the weights that residuals of bodies ask for.
         values: the state.
 
     Returns:
-        The problem, itself where no scan decides; and where the rig stands at those stops.
+        Tokens of the bodies that are wrong there, and where the rig stands as the right ones say.
     """
     roots = Counter(scan.stops.root for scan in problem.scans)
     torn = [scan for scan in _torn(problem) if roots[scan.stops.root] == 1]  # none shares its place
     usual = _usual(problem, values, torn) if torn else 0.0
-    right: dict[StopKey, str] = {}
+    wrong: set[str] = set()
     stood: dict[str, np.ndarray] = {}
     for scan in torn:
-        tried = [(_width(scan, values, T), body, T) for body, T in _stands(problem, scan, values)]
+        tried = [(_width(scan, values, T), g, T) for g, T in _stands(problem, scan, values)]
         first, *others = sorted(tried, key=lambda each: each[0])
         if others and first[0] < ALIKE * usual and ALIKE * first[0] < others[0][0]:
-            right[key_of(scan)], stood[scan.stops.root] = first[1:]
-    return (_weighing(problem, right) if right else problem), stood
+            wrong |= {group.token for _, group, _ in others}
+            stood[scan.stops.root] = first[2]
+    return wrong, stood
 
 
 def _torn(problem: Problem) -> list[ScanStop]:
@@ -103,7 +110,7 @@ def _torn(problem: Problem) -> list[ScanStop]:
         for block in problem.bodies
         if block.weight is not None
         for key, weight in zip(block.stop_names, block.weight, strict=True)
-        if weight < 1.0 / CONTRADICTS
+        if 0 < weight < 1.0 / CONTRADICTS
     }
     return [scan for scan in problem.scans if key_of(scan) in torn]
 
@@ -119,14 +126,14 @@ def _usual(problem: Problem, values: Values, torn: Sequence[ScanStop]) -> float:
     return float(np.median(list(in_order(width, len(others))))) if others else np.inf
 
 
-def _stands(problem: Problem, scan: ScanStop, values: Values) -> Iterator[tuple[str, np.ndarray]]:
-    """Where each body (4, 4) that gives a pose says that the rig stands at a scan's stop."""
+def _stands(problem: Problem, scan: ScanStop, values: Values) -> Iterator[tuple[Group, np.ndarray]]:
+    """Where each body that gives a pose says that the rig stands at a scan's stop (4, 4)."""
     for block in problem.bodies:
         if key_of(scan) in block.stop_names and not block.is_point:
             k = block.stop_names.index(key_of(scan))
             T_root_body = block.stops.in_root(block.body, values).T
             T = T_root_body[k if len(T_root_body) > 1 else 0]
-            yield block.body, block.measured[k] @ se3.inverse(T)
+            yield block.groups[k], block.measured[k] @ se3.inverse(T)
 
 
 def _width(scan: ScanStop, values: Values, T_world_root: np.ndarray) -> float:
@@ -135,17 +142,3 @@ def _width(scan: ScanStop, values: Values, T_world_root: np.ndarray) -> float:
         return scan.rows({**values, scan.stops.root: T_world_root}).scale
     except InputError:  # no beam meets anything there
         return np.inf
-
-
-def _weighing(problem: Problem, right: Mapping[StopKey, str]) -> Problem:
-    """The problem with next to no weight on the bodies of some stops, but for the right one."""
-    blocks = []
-    for block in problem.blocks:
-        if isinstance(block, TrackedBody) and not right.keys().isdisjoint(block.stop_names):
-            wanted = [right.get(key, None) for key in block.stop_names]
-            weight = np.ones(len(wanted)) if block.weight is None else block.weight
-            wrong = [body is not None and body != block.body for body in wanted]
-            mine = [body == block.body for body in wanted]
-            block = replace(block, weight=np.where(wrong, DOUBTED, np.where(mine, 1.0, weight)))
-        blocks.append(block)
-    return replace(problem, blocks=blocks)
