@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from calib.blunders.judged import Blunder, LeftOut
-from calib.residuals.groups import BEAMS
+from calib.residuals.groups import BEAMS, MESH, Group
 from calib.rig import Rig
 from sensors.rings import RingFinding
 
@@ -79,14 +79,46 @@ def of_rings(lidar: str, found: RingFinding) -> dict[str, Any]:
     """Rings with wrong numbers, in the same form; there is nothing to leave out. As sigma, how far
     off elevations are with the numbers that fit best."""
     return {
-        "kind": "rings",
-        "name": lidar,
-        "where": "rings",
-        "stop": None,
-        "recording": None,
+        **_otherwise("rings", lidar, "rings", whole(found.sentence)),
         "size": found.off_rad,
         "unit": "rad",
         "sigma": found.left_rad,
+    }
+
+
+def of_surface(name: str, off_m: float, sigma_m: float, p: float) -> dict[str, Any]:
+    """A surface of the mesh whose beams were rejected as they agree on another place, in the same
+    form.
+
+    Args:
+        name: as of `Group.what`.
+        off_m, sigma_m: residual of its beams, and of their mean; infinite where it is not known.
+        p: by chance, all looks paid for.
+    """
+    group = Group("surface", MESH, name)
+    beams = (
+        f"its beams read {size_told(abs(off_m), sigma_m, 'm')} {'long' if off_m > 0 else 'short'}"
+    )
+    return {
+        **_otherwise("surface", name, MESH, whole(f"{group} is not where it was scanned: {beams}")),
+        "size": abs(off_m),
+        "unit": "m",
+        "sigma": sigma_m,
+        "axis": BEAMS,
+        "p_value": p,
+        "p_adjusted": p,
+        "without": group.token,
+    }
+
+
+def _otherwise(kind: str, name: str, where: str, sentence: str) -> dict[str, Any]:
+    """What was not found as a group of rows, with the keys of `document`."""
+    return {
+        "kind": kind,
+        "name": name,
+        "where": where,
+        "stop": None,
+        "recording": None,
         "axis": None,
         "wrong_sign": None,
         "offset": None,
@@ -96,7 +128,7 @@ def of_rings(lidar: str, found: RingFinding) -> dict[str, Any]:
         "indistinguishable_from": [],
         "belongs_to": None,
         "without": None,
-        "sentence": whole(found.sentence),
+        "sentence": sentence,
     }
 
 

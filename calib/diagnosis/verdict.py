@@ -126,7 +126,8 @@ def conclude(
         rings: whose numbers are wrong, as blunders.
     """
     first = found.looks[0]
-    verdict = BAD if rings else _verdict(found, rejected)
+    spoilt = [*rings, *(rejected.blunders() if rejected and not found.found else [])]
+    verdict = BAD if spoilt else _verdict(found, rejected)
     if verdict == "adequate" and forbids:
         verdict = BAD
     candidates = [_candidate(c, verdict, found, held_out) for c in _ranked(found)]
@@ -134,7 +135,7 @@ def conclude(
     thrown = rejected.unexplained() if rejected and verdict == UNNAMED else []
     unexplained = [_unexplained(c, screen) for screen, c in _without_a_name(found, verdict)]
     unexplained = [*thrown, *unexplained]
-    blunders = [*rings, *(told.document(left, _rig(left, first)) for left in found.blunders)]
+    blunders = [*spoilt, *(told.document(left, _rig(left, first)) for left in found.blunders)]
     sentences = _sentences(verdict, found, candidates, unexplained, untestable, blunders)
     if forbids and verdict == BAD and not blunders:
         sentences.insert(0, f"This run is not to be believed as it stands: {'; '.join(forbids)}.")

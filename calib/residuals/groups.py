@@ -44,7 +44,7 @@ class Group:
         if self.kind == "target":
             return f"target {of}: its {what}"
         if self.kind == "frame":
-            return f"{what} of the URDF" if "." in what else f"{what} of the CAD"
+            return f"the URDF's {what}" if "." in what else f"the CAD of {what}"
         if self.kind == "surface":
-            return f"{what} of the mesh"
+            return f"the mesh's {what}"
         return f"{of}: {what}"

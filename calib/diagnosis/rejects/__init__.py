@@ -73,6 +73,7 @@ def rejects(stand: Stand, progress: Progress = lambda what, done, total: None) -
         expected=min(usual / max(outside, 1.0 / total), CLUTTER + hit),
         p_adjusted=least,
         places=places,
+        meshed=all(source.reference for source in stand.sources),
         clutter=hit,
         clutter_stops=tuple(counts.stop_names[i] for i in np.flatnonzero(crowded.any(axis=1))),
         beyond=beyond,

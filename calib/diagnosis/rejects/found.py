@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from calib.blunders import told
 from calib.diagnosis.suggest import words
 
 LEAST_P = 1e-6  # tails are not known further out
@@ -129,6 +130,7 @@ class Rejects:
             explain, which is never more than `CLUTTER`.
         p_adjusted: of the least likely place.
         places: where more is rejected than elsewhere, most first.
+        meshed: whether surfaces are those of a mesh, and not planes found in the scans.
         clutter: share of all beams that hit something that is not in the mesh; clutter_stops: the
             stops of these.
         beyond: whether more is thrown away elsewhere than mixed pixels may explain; beyond_m: the
@@ -139,6 +141,7 @@ class Rejects:
     expected: float
     p_adjusted: float
     places: Sequence[Place]
+    meshed: bool
     clutter: float
     clutter_stops: tuple[str, ...]
     beyond: bool
@@ -150,6 +153,22 @@ class Rejects:
         return [place for place in self.places if place.structured]
 
     @property
+    def moved(self) -> Sequence[Place]:
+        """Those of them that are surfaces which stand elsewhere than the mesh has them."""
+        mine = (place for place in self.structured if place.covariate == "surface")
+        return [place for place in mine if place.coherent and self.meshed]
+
+    def blunders(self) -> list[dict[str, Any]]:
+        """These as blunders in diagnosis.json, to be left out."""
+        return [
+            told.of_surface(
+                f"surface_{name}", place.residual_m, place.sigma_m, max(place.p_adjusted, LEAST_P)
+            )
+            for place in self.moved
+            for name in place.names
+        ]
+
+    @property
     def explained(self) -> bool:
         """Whether all that was thrown away is what mixed pixels and clutter explain."""
         return not self.structured and not self.beyond
@@ -157,18 +176,18 @@ class Rejects:
     @property
     def sentence(self) -> str:
         """What was thrown away, in words."""
-        told = f"{percent(self.share)} % of the beams that meet a surface were thrown away"
+        said = f"{percent(self.share)} % of the beams that meet a surface were thrown away"
         if self.beyond:
-            told += f", more than the {100 * CLUTTER:.0f} % that mixed pixels may explain"
-            told += f", by {1e3 * self.beyond_m:+.1f} mm" if self.beyond_m else ""
+            said += f", more than the {100 * CLUTTER:.0f} % that mixed pixels may explain"
+            said += f", by {1e3 * self.beyond_m:+.1f} mm" if self.beyond_m else ""
         crowded = [place for place in self.places if place.share > CLUTTER]
         for place in (self.structured or crowded)[:2]:
             there = f"of the beams at {place.where} it is {percent(place.share)} %"
-            told += f"; {there}, and {place.what}"
+            said += f"; {there}, and {place.what}"
         if self.clutter_stops:
-            told += f"; {percent(self.clutter)} % hit something that is not in the mesh, at stop "
-            told += listed(self.clutter_stops)
-        return told + "."
+            said += f"; {percent(self.clutter)} % hit something that is not in the mesh, at stop "
+            said += listed(self.clutter_stops)
+        return said + "."
 
     def unexplained(self) -> list[dict[str, Any]]:
         """Its structure as diagnosis.json lists structure without a name."""
@@ -181,6 +200,7 @@ class Rejects:
                 "formula": place.formula(),
             }
             for place in self.structured
+            if place not in self.moved
         ]
 
     def document(self) -> dict[str, Any]:
