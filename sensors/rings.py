@@ -87,7 +87,7 @@ def odd_rings(lidar: LidarModel, elevation_rad: ArrayLike) -> RingFinding | None
         model=found.get("model"),
         sentence=(
             f"rings of {lidar.name} {found['said']}: their elevations are "
-            f"{np.degrees(off_rad):.2g} deg rms off its table, and {np.degrees(left_rad):.2g} deg "
+            f"{np.degrees(off_rad):.2g} deg rms off its table, and {np.degrees(left_rad):.2f} deg "
             "off the nearest other one"
         ),
     )

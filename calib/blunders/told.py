@@ -96,9 +96,8 @@ def of_surface(name: str, off_m: float, sigma_m: float, p: float) -> dict[str, A
         p: by chance, all looks paid for.
     """
     group = Group("surface", MESH, name)
-    beams = (
-        f"its beams read {size_told(abs(off_m), sigma_m, 'm')} {'long' if off_m > 0 else 'short'}"
-    )
+    side = "long" if off_m > 0 else "short"
+    beams = f"its beams read {size_told(abs(off_m), sigma_m, 'm')} {side}"
     return {
         **_otherwise("surface", name, MESH, whole(f"{group} is not where it was scanned: {beams}")),
         "size": abs(off_m),
@@ -149,7 +148,9 @@ def _sentence(left: LeftOut, wrong_sign: str | None) -> str:
     along = f" {axis}" if axis == BEAMS else along
     along = "" if axis == left.blunder.group.what.rpartition(".")[2] else along
     sign = f", as if the sign of its {wrong_sign} were wrong" if wrong_sign else ""
-    out = f"{left.blunder.group} is {size_told(*size)} off{along}, against everything else"
+    group = str(left.blunder.group)
+    group = f"T{group[1:]}" if group.startswith("the ") else group
+    out = f"{group} is {size_told(*size)} off{along}, against everything else"
     if left.belongs:
         return f"{out}: it was taken at {left.belongs.where}."
     if left.rivals:
