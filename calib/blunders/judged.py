@@ -78,7 +78,7 @@ class Blunder:
         """Size, its sigma, the unit, and along which axis; empty where it is along no single one.
         Of shifts in several units, that which is more sigmas."""
         shift, best = self.shift, (0.0, 0.0, np.inf, "m", "")
-        for (unit, _), at in shift.parts.items():
+        for unit, at in shift.parts.items():
             offset, covariance = shift.offset[at], shift.covariance[np.ix_(at, at)]
             size = float(np.linalg.norm(offset))
             if not size:
@@ -113,7 +113,7 @@ def judge(whole: Linearisation, problem: Problem) -> list[Blunder]:
     gone = {group for source in problem.sources for group in source.without}
     for shift in shifts(whole, problem):
         if shift.dof and shift.group not in gone:
-            kinds.setdefault(_alike(shift.group), []).append(shift)
+            kinds.setdefault((*_alike(shift.group), shift.of_ranges), []).append(shift)
     looks = sum(len(some) for some in kinds.values())
     found = [b for some in kinds.values() for b in _judged(some, looks)]
     return sorted(found, key=lambda b: -b.evidence)
@@ -142,11 +142,7 @@ def _judged(some: Sequence[Shift], looks: int) -> Iterator[Blunder]:
         p = float(special.fdtrc(shift.dof, known, scaled / shift.dof))
         limit = special.fdtri(shift.dof, known, (1.0 - ALPHA) ** (1.0 / looks))
         enough = special.ncfdtrinc(shift.dof, known, 1.0 - POWER, limit)
-        told = {
-            unit: np.diag(shift.information)[at].mean()
-            for (unit, beams), at in shift.parts.items()
-            if not beams or len(shift.parts) == 1
-        }
+        told = {u: np.diag(shift.information)[at].mean() for u, at in shift.parts.items()}
         yield Blunder(
             shift=shift,
             p_value=p,

@@ -214,21 +214,23 @@ def _geometry(problem: Problem) -> dict[str, Effect]:
 
 
 def _scans(whole: Linearisation, problem: Problem) -> Iterator[GroupRows]:
-    """Every scan, through the place of its LiDAR and a range zero of its own."""
+    """Every scan: through the place of its LiDAR, and through a range zero of its own."""
     for scan in problem.scans:
         sums = whole.scans[whole.layout.stops[key_of(scan)]]
         count = len(sums.score)
-        yield GroupRows(
-            A=sums.cross,
-            columns=sums.columns,
-            b=sums.score,
-            weight=np.ones(count),
-            sigma=np.ones(count),
-            axes=SHIFT[:count],
-            units=("rad",) * 3 + ("m",) * (count - 3),
-            groups={scan.group: np.eye(count)},
-            information=sums.information,
-        )
+        for at in (np.arange(6), np.arange(6, count)):
+            if len(at):
+                yield GroupRows(
+                    A=sums.cross[at],
+                    columns=sums.columns,
+                    b=sums.score[at],
+                    weight=np.ones(len(at)),
+                    sigma=np.ones(len(at)),
+                    axes=[SHIFT[i] for i in at],
+                    units=["rad" if i < 3 else "m" for i in at],
+                    groups={scan.group: np.eye(len(at))},
+                    information=sums.information[np.ix_(at, at)],
+                )
 
 
 def _exact_joints(whole: Linearisation, problem: Problem) -> Iterator[GroupRows]:

@@ -20,7 +20,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import block_diag, cho_factor, cho_solve
 
 from calib.blunders.rows import GraphRows, GroupRows, group_rows
 from calib.linear.layout import positions
@@ -59,10 +59,15 @@ class Shift:
     units: Sequence[str]
 
     @property
-    def parts(self) -> dict[tuple[str, bool], np.ndarray]:
-        """Directions (r,) that have one length together: by unit, a range zero apart."""
-        keys = [(unit, axis == BEAMS) for unit, axis in zip(self.units, self.axes, strict=True)]
-        return {key: np.flatnonzero([k == key for k in keys]) for key in dict.fromkeys(keys)}
+    def of_ranges(self) -> bool:
+        """Whether it is a range zero, and not a place."""
+        return list(self.axes) == [BEAMS]
+
+    @property
+    def parts(self) -> dict[str, np.ndarray]:
+        """Unit -> directions (r,) in it, which have one length together."""
+        units = np.array(self.units)
+        return {unit: np.flatnonzero(units == unit) for unit in dict.fromkeys(self.units)}
 
 
 def shifts(whole: Linearisation, problem: Problem) -> Iterator[Shift]:
@@ -72,16 +77,93 @@ def shifts(whole: Linearisation, problem: Problem) -> Iterator[Shift]:
         whole: all rows at the solution of a fit, with its scans.
         problem: of that fit; candidates beside it change nothing.
     """
-    layout = whole.layout
-    graph = Graph(list(layout.outer().values()), layout.others, layout.unbounded)
-    graph_rows = list(graph.linear_rows(whole.values))
-    kept = _kept_covariance(whole, graph_rows)
-    step = _step(whole, graph_rows, kept)
+    others = _Others.of(whole)
     sets: dict[tuple[str, str], list[GroupRows]] = {}
-    for rows in group_rows(whole, problem, graph_rows):
+    for rows in group_rows(whole, problem, others.graph_rows):
         sets.setdefault(rows.at, []).append(rows)
     for some in _batches(list(sets.values())):
-        yield from _against(whole, kept, step, some)
+        yield from _against(others, some)
+
+
+def standing_alone(
+    whole: Linearisation, problem: Problem, some: Sequence[tuple[Shift, float]]
+) -> list[Group]:
+    """Of groups at different places that stand out, those that still do once those before them are
+    left out: what one of them does to the estimate makes others stand out.
+
+    With score u and information M of the shifts of all of them (``u = b``, ``M = I - H`` for rows),
+    that of one beside others is their Schur complement.
+
+    Args:
+        whole, problem: as of `shifts`.
+        some: shifts of these, and the limit of the statistic beyond which each stands out; the
+            worst first.
+    """
+    others = _Others.of(whole)
+    wanted = {(shift.group, shift.of_ranges) for shift, _ in some}
+    mine = {
+        key: rows
+        for rows in group_rows(whole, problem, others.graph_rows)
+        for group in rows.groups
+        if (key := (group, list(rows.axes) == [BEAMS])) in wanted
+    }
+    order = [shift.group for shift, _ in some]
+    every = [mine[shift.group, shift.of_ranges] for shift, _ in some]
+    H, b = _at_their_sigmas(every, *others.against(every))
+    own = block_diag(*(rows.groups[group] for group, rows in zip(order, every, strict=True)))
+    raw = block_diag(*(np.eye(len(r.A)) if r.information is None else r.information for r in every))
+    M, u = own.T @ (raw - H) @ own, own.T @ b
+    ends = np.cumsum([0, *(rows.groups[g].shape[1] for g, rows in zip(order, every, strict=True))])
+    gone, alone = np.zeros(0, int), []
+    for (shift, limit), start, end in zip(some, ends, ends[1:], strict=False):
+        at = np.arange(start, end)
+        if _statistic(M, u, np.append(gone, at)) - _statistic(M, u, gone) > limit:
+            gone, alone = np.append(gone, at), [*alone, shift.group]
+    return alone
+
+
+def _statistic(M: np.ndarray, u: np.ndarray, at: np.ndarray) -> float:
+    """``u^T M^-1 u`` of some shifts, in the directions that anything contradicts."""
+    if not len(at):
+        return 0.0
+    size = np.sqrt(np.maximum(np.diag(M)[at], 1e-300))
+    values, axes = np.linalg.eigh(M[np.ix_(at, at)] / np.outer(size, size))
+    seen = values > UNCHECKED
+    return float(np.sum(np.square(axes[:, seen].T @ (u[at] / size)) / values[seen]))
+
+
+@dataclass(frozen=True)
+class _Others:
+    """What all rows of a fit say, against which some of them are held.
+
+    Args:
+        whole: they, linearised.
+        graph_rows: those of the kept unknowns that are not in it.
+        kept: (S, S) covariance of the kept unknowns.
+        step: (U,) one more step of all unknowns.
+    """
+
+    whole: Linearisation
+    graph_rows: GraphRows
+    kept: np.ndarray
+    step: np.ndarray
+
+    @classmethod
+    def of(cls, whole: Linearisation) -> _Others:
+        layout = whole.layout
+        graph = Graph(list(layout.outer().values()), layout.others, layout.unbounded)
+        graph_rows = list(graph.linear_rows(whole.values))
+        kept = _kept_covariance(whole, graph_rows)
+        return cls(whole, graph_rows, kept, step=_step(whole, graph_rows, kept))
+
+    def against(self, every: Sequence[GroupRows]) -> tuple[np.ndarray, np.ndarray]:
+        """H and b of these rows."""
+        ends = np.cumsum([0, *(len(rows.A) for rows in every)])
+        A = np.zeros((ends[-1], self.whole.layout.size))
+        for rows, start in zip(every, ends, strict=False):
+            np.add.at(A[start : start + len(rows.A)].T, rows.columns, rows.A.T)
+        b = np.concatenate([rows.b for rows in every]) - A @ self.step
+        return self.whole.covariance(A, self.kept), b
 
 
 def _batches(sets: Sequence[Sequence[GroupRows]]) -> Iterator[list[Sequence[GroupRows]]]:
@@ -97,16 +179,9 @@ def _batches(sets: Sequence[Sequence[GroupRows]]) -> Iterator[list[Sequence[Grou
         yield batch
 
 
-def _against(
-    whole: Linearisation, kept: np.ndarray, step: np.ndarray, sets: Sequence[Sequence[GroupRows]]
-) -> Iterator[Shift]:
-    """Groups against all other rows, after one more step (U,) of all unknowns."""
-    ends = np.cumsum([0, *(len(rows.A) for some in sets for rows in some)])
-    every = [rows for some in sets for rows in some]
-    A = np.zeros((ends[-1], whole.layout.size))
-    for rows, start in zip(every, ends, strict=False):
-        np.add.at(A[start : start + len(rows.A)].T, rows.columns, rows.A.T)
-    H, b = whole.covariance(A, kept), np.concatenate([rows.b for rows in every]) - A @ step
+def _against(others: _Others, sets: Sequence[Sequence[GroupRows]]) -> Iterator[Shift]:
+    """Groups against all other rows."""
+    H, b = others.against([rows for some in sets for rows in some])
     first = 0
     for some in sets:
         mine = slice(first, first + sum(len(rows.A) for rows in some))

@@ -21,8 +21,11 @@ def groups(looked_at: Iterable[Blunder]) -> dict[str, Any]:
     """How far out every group that was looked at is, and the size from which a mishap to it would
     be found, as diagnosis.json has them; of a group that is there twice, as it is at first."""
     first: dict[str, Blunder] = {}
+    sizes: dict[str, dict[str, float]] = {}
     for blunder in looked_at:
         first.setdefault(blunder.group.token, blunder)
+        if not blunder.shift.of_ranges:  # the size of a scan's shift is that of its place
+            sizes.setdefault(blunder.group.token, dict(blunder.detectable))
     return {
         "groups": [
             {
@@ -35,7 +38,7 @@ def groups(looked_at: Iterable[Blunder]) -> dict[str, Any]:
             }
             for token, b in first.items()
         ],
-        "detectable": {token: dict(b.detectable) for token, b in first.items()},
+        "detectable": sizes,
     }
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from calib.blunders.aside import stray_scans
 from calib.blunders.chance import after_looks, log_tail
 from calib.blunders.judged import Blunder, LeftOut
+from calib.blunders.shifts import standing_alone
 from calib.diagnosis.score import Test
 from calib.diagnosis.score import test as joint_test
 from calib.diagnosis.screen import Candidate, Screen
@@ -143,6 +144,7 @@ def _adapted(look: Look, left: list[LeftOut], progress: Progress, named: bool) -
         for each in wild:
             near = (b for b in look.blunders if each.evidence - b.evidence < ODDS)
             others = [b for b in near if b.found and b.group not in loud and b not in wild]
+            others = [b for b in others if b.group != each.group]
             others = [b for b in others if b.possible or b.group.what == JOINTS]
             met = [b.group for b in others if len(wild) == 1 or _meet(each, b)]
             left.append(LeftOut(each, met))
@@ -176,13 +178,19 @@ def _meet(a: Blunder, b: Blunder) -> bool:
 
 
 def _wild(look: Look) -> list[Blunder]:
-    """Blunders to leave out now: the worst of each place, as far out as the worst of all."""
+    """Blunders to leave out now: the worst of each place, as far out as the worst of all, of those
+    that stand out beside each other."""
     found = [b for b in look.blunders if b.found]
     places: dict[tuple[str, str], list[Blunder]] = {}
     for each in found:
         if each.evidence > AS_FAR * found[0].evidence:
             places.setdefault((each.group.recording, each.group.where), []).append(each)
-    return [likeliest(here) for here in places.values()]
+    worst = [likeliest(here) for here in places.values()]
+    if len(worst) < 2:
+        return worst
+    some = [(b.shift, b.limit) for b in sorted(worst, key=lambda b: -b.evidence)]
+    alone = standing_alone(look.linear.whole, look.stand.estimate.problem, some)
+    return [b for b in worst if b.group in alone]
 
 
 def _outdone(look: Look, by: Blunder) -> bool:

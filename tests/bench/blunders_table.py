@@ -41,7 +41,8 @@ def named(result: Result) -> list[list[str]]:
 def verdict(result: Result) -> str:
     """The class of a case.
 
-    What is said of the good recording as well is no word on the mishap.
+    What is said of the good recording as well is no word on the mishap. What does no harm may be
+    named beside a model that is adequate.
     """
     outcome, right = result["outcome"], result["right"]
     before = result["without_it"]
@@ -55,6 +56,8 @@ def verdict(result: Result) -> str:
             return "right"
         if matches(found[0][0], result["group"]) or any(matches(n, right) for n in found[0]):
             return "group"
+    if outcome == "adequate" and any(matches(note, right) for note in result.get("notes", ())):
+        return "right"
     if outcome == "not converged":
         return outcome
     if outcome != "adequate":

@@ -110,13 +110,14 @@ def asked(
     Returns:
         `outcome`: "refused", "fault", "endless", "not converged" or the verdict; `sentence`, `odd`
         (of check), `blunders` (names, most certain first, each with what it may be taken for),
-        `names` (of effects and covariates), `misfit`, `detectable`, `seconds` (check, fit,
-        diagnose), `codes` of their exits.
+        `names` (of effects and covariates), `notes` (names of what does no harm), `misfit`,
+        `detectable`, `seconds` (check, fit, diagnose), `codes` of their exits.
     """
     checked = rigcal("check", recording, limit_s=limit_s)
     fit = rigcal("fit", recording, "-o", run, "--hold-out", "none", limit_s=limit_s)
     said = [checked, fit]
     found = {
+        "notes": [],
         "odd": checked.document.get("odd", []) + checked.document.get("problems", []),
         "misfit": fit.document.get("misfit", {}),
         "blunders": [],
@@ -130,6 +131,7 @@ def asked(
         said.append(rigcal("diagnose", run, "--no-refits", limit_s=limit_s))
         diagnosis = said[-1].document
         found |= {"blunders": blunders(diagnosis), "names": names(diagnosis)}
+        found["notes"] = notes(diagnosis)
         found["detectable"] = detectable(diagnosis)
         outcome = outcome or diagnosis.get("verdict")
     last = said[-1]
@@ -174,6 +176,12 @@ def names(diagnosis: Mapping[str, Any]) -> list[str]:
     loose = [name for each in diagnosis.get("unexplained", []) for name in each["covariates"]]
     thrown = list((diagnosis.get("rejected") or {}).get("covariates", []))
     return [*effects, *loose, *thrown]
+
+
+def notes(diagnosis: Mapping[str, Any]) -> list[str]:
+    """Of a diagnosis: what is told and does no harm, as beams that hit what is not in the mesh."""
+    clutter = (diagnosis.get("rejected") or {}).get("clutter", {})
+    return [f"{stop}:scan" for stop in clutter.get("stops", [])]
 
 
 def detectable(diagnosis: Mapping[str, Any]) -> dict[str, float]:

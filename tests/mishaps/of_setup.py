@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from itertools import islice
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -306,13 +307,33 @@ def _planes(at: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return normal, np.argsort(order)[plane.ravel()]
 
 
+def _seen(at: np.ndarray, triangles: np.ndarray, which: np.ndarray) -> bool:
+    """Whether the largest of some triangles (F,) is the first that a ray to it from the middle of
+    the room meets (Moeller and Trumbore 1997)."""
+    corners = at[triangles]
+    edge_1, edge_2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    area = np.linalg.norm(np.cross(edge_1, edge_2), axis=1)
+    middle = np.percentile(at, [2, 98], axis=0).mean(axis=0)
+    ray = corners[np.argmax(np.where(which, area, -1))].mean(axis=0) - middle
+    p, from_corner = np.cross(ray, edge_2), middle - corners[:, 0]
+    det = np.einsum("fi,fi->f", edge_1, p)
+    q = np.cross(from_corner, edge_1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u, v = np.einsum("fi,fi->f", from_corner, p) / det, q @ ray / det
+        part = np.einsum("fi,fi->f", edge_2, q) / det  # of the way to that triangle
+        before = (u >= 0) & (v >= 0) & (u + v <= 1) & (part > 0) & (part < 1 - 1e-6)
+    return not np.any(before & ~which)
+
+
 @mishap("mesh", sized=True)
 def one_surface_moved(scene: Scene, times: float) -> Done:
-    """A wall's panel stands off since the room was scanned: the second largest plane of all."""
+    """A wall's panel stands off since the room was scanned: the second largest of the planes that
+    are seen from the middle of the room."""
 
     def moved(at: np.ndarray, triangles: np.ndarray) -> np.ndarray:
         normal, plane = _planes(at, triangles)
-        which = plane == 1
+        seen = (n for n in range(plane.max() + 1) if _seen(at, triangles, plane == n))
+        which = plane == list(islice(seen, 2))[1]
         size = times * scene.size("mesh:surface", "surface m")
         at[np.unique(triangles[which])] += size * normal[which].mean(axis=0)
         return at
