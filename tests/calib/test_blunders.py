@@ -7,7 +7,8 @@ import pytest
 from scipy import stats
 
 from calib.blunders import judged
-from calib.blunders.shifts import Shift, shifts
+from calib.blunders.shifts import Shift, shifts, standing_alone
+from calib.effects import find
 from calib.linear.clusters import Gradients
 from calib.linear.layout import Layout
 from calib.problem import build
@@ -40,7 +41,8 @@ def both(request, tmp_path_factory):
 def found(case):
     """Group -> its shift, as the program has it."""
     linear = case.linear(gradients=Gradients(len(case.dense.sigma)))
-    return {shift.group: shift for shift in shifts(linear, case.start.problem)}
+    every = shifts(linear, case.start.problem)
+    return {shift.group: shift for shift in every if not shift.of_ranges}
 
 
 def case_of(problem):
@@ -78,6 +80,56 @@ def test_every_group_is_off_as_dense_rows_say(both, stops_first, monkeypatch):
         assert_same(shift, there[group.where].off(group))
         axes, units = shift.axes, shift.units
         assert len(axes) == len(units) == len(shift.offset) == len(shift.information)
+
+
+def with_range_zero(tmp_path):
+    """A case with a range zero that all scans have, and its linearisation."""
+    source = Source.open(rigs.write(tmp_path / "box", seed=6, **BY_STOP))
+    case = case_of(build([source], cases.MODEL.plus((find("range_offset"),))))
+    return case, case.linear(gradients=Gradients(len(case.dense.sigma)))
+
+
+def test_a_range_zero_of_one_scan_is_off_as_dense_rows_say(tmp_path):
+    case, linear = with_range_zero(tmp_path)
+    here = {s.group: s for s in shifts(linear, case.start.problem) if s.of_ranges}
+    there = Groups(case.dense)
+    assert here.keys() == there.scans.keys()
+    for group, shift in here.items():
+        u, M = there.score([there.lengthened(group)])
+        assert (shift.dof, list(shift.units)) == (1, ["m"])
+        assert shift.statistic == pytest.approx(u[0] ** 2 / M[0, 0], rel=1e-6)
+        np.testing.assert_allclose(shift.offset, u / M[0], rtol=1e-6)
+        np.testing.assert_allclose(shift.covariance, 1 / M, rtol=1e-6)
+
+
+def test_groups_are_told_apart_by_what_each_adds_to_those_before_it(tmp_path):
+    """Just accepted where the limit is a little below what dense rows say that it adds, and just
+    not where it is a little above; what is not accepted is not left out for the next."""
+    case, linear = with_range_zero(tmp_path)
+    problem, there = case.start.problem, Groups(case.dense)
+    every = {(s.group, s.of_ranges): s for s in shifts(linear, problem)}
+    bodies = [
+        Group("body", stop, body)
+        for stop, body in (("s0", "base_markers"), ("s2", "mount_markers"))
+    ]
+    scans = [Group("scan", "s1", "scan"), Group("scan", "s3", "scan")]
+    order = [(bodies[0], False), (scans[0], False), (Group("target", "t2", "sphere"), False)]
+    order += [(scans[1], True), (bodies[1], False), (Group("frame", CAD, "lidar"), False)]
+    columns = [there.lengthened(g) if zero else there.directions(g) for g, zero in order]
+    before = []
+    for (group, zero), mine in zip(order, columns, strict=True):
+        adds = there.together([*before, mine]) - there.together(before)
+        known = [(every[key], -1.0) for key in order[: len(before)]]
+        for limit, accepted in ((adds - 1e-5, True), (adds + 1e-5, False)):
+            found = standing_alone(linear, problem, [*known, (every[group, zero], limit)])
+            assert (len(found) == len(known) + 1) is accepted, str(group)
+        before.append(mine)
+    worst, second, third = (
+        (every[key], limit) for key, limit in zip(order[:3], (-1, 1e9, -1), strict=True)
+    )
+    adds = there.together([columns[0], columns[2]]) - there.together([columns[0]])
+    for limit, count in ((adds - 1e-5, 2), (adds + 1e-5, 1)):
+        assert len(standing_alone(linear, problem, [worst, second, (third, limit)])) == count
 
 
 @pytest.mark.parametrize("lidar", [True, False], ids=["lidar", "tracker alone"])

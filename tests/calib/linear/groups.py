@@ -7,7 +7,7 @@ D, ``D^T P D`` is how much of it others check.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -169,6 +169,38 @@ class Groups:
         if group in self.scans:
             return self._rows(f"scan {self.scans[group]}")
         return self.parts[group].rows
+
+    def directions(self, group: Group) -> np.ndarray:
+        """Whitened rows (m, q) of a shift of a group."""
+        Z = self._checked(group)[0]
+        out = np.zeros((len(self.b), Z.shape[1]))
+        out[self._where(group)] = Z
+        return out
+
+    def lengthened(self, group: Group) -> np.ndarray:
+        """Derivative (m, 1) of all rows by a range zero that a scan alone has."""
+        names = list(self.problem.variables)
+        ends = np.cumsum([0, *(self.problem.variables[n].dim for n in names)])
+        out, mine = np.zeros((len(self.b), 1)), self._where(group)
+        out[mine, 0] = self.A[mine, ends[names.index("range_offset")]]
+        return out
+
+    def score(self, columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """Score (q,) and information (q, q) of shifts along columns (m, ...), all else being
+        estimated."""
+        Z = np.hstack(columns)
+        taken = self.Q.T @ Z
+        return Z.T @ self.left, Z.T @ Z - taken.T @ taken
+
+    def together(self, columns: Sequence[np.ndarray]) -> float:
+        """The statistic of some shifts together, in the directions that others check."""
+        if not columns:
+            return 0.0
+        u, M = self.score(columns)
+        size = np.sqrt(np.diag(M))
+        values, axes = np.linalg.eigh(M / np.outer(size, size))
+        seen = values > CHECKED
+        return float(np.sum(np.square(axes[:, seen].T @ (u / size)) / values[seen]))
 
     def left_out(self, group: Group) -> Off:
         """The same of a group that others check well, from a solution without its rows; of a scan,
