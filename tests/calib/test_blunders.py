@@ -124,12 +124,11 @@ def test_groups_are_told_apart_by_what_each_adds_to_those_before_it(tmp_path):
             found = standing_alone(linear, problem, [*known, (every[group, zero], limit)])
             assert (len(found) == len(known) + 1) is accepted, str(group)
         before.append(mine)
-    worst, second, third = (
-        (every[key], limit) for key, limit in zip(order[:3], (-1, 1e9, -1), strict=True)
-    )
+    worst, second, third = (every[key] for key in order[:3])
+    known = [(worst, -1.0), (second, np.inf)]
     adds = there.together([columns[0], columns[2]]) - there.together([columns[0]])
     for limit, count in ((adds - 1e-5, 2), (adds + 1e-5, 1)):
-        assert len(standing_alone(linear, problem, [worst, second, (third, limit)])) == count
+        assert len(standing_alone(linear, problem, [*known, (third, limit)])) == count
 
 
 @pytest.mark.parametrize("lidar", [True, False], ids=["lidar", "tracker alone"])
