@@ -14,6 +14,9 @@ from calib.simulation import Spec, simulate
 from calib.solve.fit import solve
 from sensors.recording import read_table, write_table
 
+from ..mishaps import MISHAPS as MISHAPS_OF_ALL
+from ..mishaps import Scene
+from ..mishaps.judge import asked
 from . import broken
 
 SPEC = Spec(lidar="hesai_pandarxt32", locations=4, stops_per_location=3, column_step=400)
@@ -93,6 +96,30 @@ def test_it_is_named_and_sized_and_nothing_else_is(recording, tmp_path, mishap):
 def test_where_nothing_was_done_nothing_is_named(tmp_path, seed):
     simulate("tiny", tmp_path / "rec", seed, {})
     assert searched(tmp_path / "rec").blunders == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("kind", "blunder", "effect"),
+    [
+        ("base body taped anew from a stop on", None, "body_slip"),
+        ("mesh scaled", None, "faro_scale"),
+        ("rings numbered one off", "rings", None),
+        ("ranges long at one stop", ":scan", None),
+        ("one surface moved", "mesh:surface_", None),
+    ],
+)
+def test_what_lasts_is_an_effect_and_what_does_not_a_blunder(
+    recording, tmp_path, kind, blunder, effect
+):
+    """Each by its one name, and none beside it."""
+    folder = shutil.copytree(recording, tmp_path / "rec")
+    MISHAPS_OF_ALL[kind].apply(Scene(folder, np.random.default_rng(5)), 10)
+    said = asked(folder, tmp_path / "run", at_any_rate=False)
+    assert [name for name in said["names"] if name != "surface"] == ([effect] if effect else [])
+    assert len(said["blunders"]) == (blunder is not None)
+    assert all(blunder in first for first, *_ in said["blunders"])
+    assert said["outcome"] == ("bad_data" if blunder else "missing_effect")
 
 
 def test_explain_leaves_it_out_and_goes_on(recording, tmp_path):
