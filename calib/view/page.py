@@ -308,6 +308,8 @@ class Page:
     def _hear(self, told: Told, by: Any) -> None:
         """Show what a job tells; `by` is the page that started it."""
         if told.kind == "progress":
+            if not self._bar.visible:  # another page started it
+                self._show_busy()
             self._bar.value = float(np.clip(100 * told.share, 0, 100))
             self._doing.content = panels.note(told.text)
         elif told.kind == "run":
