@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import io
 import re
 import sys
@@ -48,6 +49,13 @@ _stdout: TextIO | None = None
 _verbose = False
 
 
+def _print_version(asked: bool) -> None:
+    """Print the version that is installed, as pyproject.toml has it, and end."""
+    if asked:
+        print(f"rigcal {importlib.metadata.version('rigcal')}")
+        raise typer.Exit
+
+
 @app.callback()
 def manners(
     context: typer.Context,
@@ -56,6 +64,9 @@ def manners(
     ] = False,
     quiet: Annotated[
         bool, typer.Option("-q", "--quiet", help="Print nothing but errors, and what --json asks.")
+    ] = False,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Which one.")
     ] = False,
 ) -> None:
     """Take down what is said of how much is to be said."""
