@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
-import time
+import threading
 import webbrowser
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -41,17 +43,32 @@ def view(
     bench = Bench(Desk.of(runs))
     served = serve(port)
     try:
-        tell(served.address, served.look_address)
-        if show and _has_display():
-            webbrowser.open(served.address)  # False where there is none; it is told anyway
-        attend(served, bench)
-        while True:
-            time.sleep(3600)
-    except KeyboardInterrupt:
-        pass
+        with _interruption() as interrupted:
+            tell(served.address, served.look_address)
+            if show and _has_display():
+                webbrowser.open(served.address)  # False where there is none; it is told anyway
+            attend(served, bench)
+            interrupted.wait()
     finally:
         bench.stop()
         served.stop()
+
+
+@contextmanager
+def _interruption() -> Iterator[threading.Event]:
+    """Ctrl-C as an event: an exception in the midst of an import can be lost in what is imported.
+
+    Outside the main thread, which alone hears of Ctrl-C, nothing sets it.
+    """
+    event = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield event
+        return
+    before = signal.signal(signal.SIGINT, lambda *_: event.set())
+    try:
+        yield event
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def attend(served: Served, bench: Bench) -> dict[int, Page]:
