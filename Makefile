@@ -2,6 +2,13 @@
 # make test       checks style and runs every test but the long ones
 # make test-long  runs the long ones: how often intervals hold, what else is found by its name
 # make clean      removes what these made
+#
+# With LOCKED=1 they install the versions in requirements.lock, each held to its hash, and no others.
+# make lock       makes that file anew; with UPGRADE=1, of the newest versions there are
+# make audit      looks up known vulnerabilities of these versions; fails where it cannot
+# make licences   writes docs/licences.md from what is installed
+# make dist       builds the sdist and, from it, the wheel, in dist/
+# make dist-check installs both outside the checkout, and runs the quick tests there
 
 PYTHON = $(firstword $(foreach p,python3.11 python3,$(shell $(p) -c \
 	'import sys; (3, 11) <= sys.version_info < (3, 15) and print("$(p)")' 2>/dev/null)))
@@ -12,9 +19,23 @@ PIP = $(BIN)/python -m pip install --quiet --disable-pip-version-check
 # What tests of a file share is made once; files stay in the order that tests/conftest.py gives them.
 PYTEST = $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
+define PYTHON_NEEDED
+@$(if $(PYTHON),,echo "rigcal needs Python 3.11 to 3.14, and neither python3.11 nor python3 is one." >&2; exit 1)
+endef
+
 BROWSER = $(firstword $(foreach b,chromium chromium-browser google-chrome,$(shell command -v $(b))))
 
-.PHONY: demo test test-long system browser clean
+# What builds and looks up, apart from what rigcal needs.
+TOOLS = build/tools
+ifdef LOCKED
+INSTALLED = .venv/.locked
+TESTED = .venv/.locked
+else
+INSTALLED = .venv/.installed
+TESTED = .venv/.tested
+endif
+
+.PHONY: demo test test-long system browser clean lock audit licences dist dist-check
 
 demo: system
 	@echo "== demo: a simulated recording of the default rig"
@@ -30,26 +51,55 @@ demo: system
 	@echo "== demo: the result for people; open demo/report.html, or type $(BIN)/rigcal view demo/run"
 	$(BIN)/rigcal report demo/run -o demo/report.html
 
-test: system browser .venv/.tested
+test: system browser $(TESTED)
 	@echo "== test: style"
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	@echo "== test: pytest"
 	$(PYTEST)
 
-test-long: system browser .venv/.tested
+test-long: system browser $(TESTED)
 	@echo "== test-long: pytest"
 	$(PYTEST) -m long
 
 clean:
 	@echo "== clean: removing the environment, the demo and what the tools left"
-	rm -rf .venv demo build *.egg-info .pytest_cache .ruff_cache
+	rm -rf .venv demo build dist *.egg-info .pytest_cache .ruff_cache
 	find . -name __pycache__ -prune -exec rm -rf {} +
 
 system: .venv/.system
 
+lock: $(TOOLS)/.installed
+	@echo "== lock: versions and hashes, for every Python and system, in requirements.lock"
+	$(TOOLS)/bin/uv pip compile pyproject.toml --extra test --universal --python-version 3.11 \
+		--generate-hashes --quiet $(if $(UPGRADE),--upgrade) \
+		--custom-compile-command "make lock" --output-file requirements.lock
+
+audit: $(TOOLS)/.installed
+	@echo "== audit: known vulnerabilities of what requirements.lock has"
+	$(TOOLS)/bin/pip-audit --strict --require-hashes --disable-pip -r requirements.lock
+
+licences: $(TESTED)
+	@echo "== licences: of all that requirements.lock has, in docs/licences.md"
+	$(BIN)/python .ci/licences.py requirements.lock docs/licences.md
+
+dist: $(TOOLS)/.installed
+	@echo "== dist: the sdist, and from it the wheel"
+	rm -rf dist
+	$(TOOLS)/bin/python -m build --quiet --outdir dist .
+
+dist-check: dist $(TESTED)
+	@echo "== dist-check: both installed outside the checkout, and tested there"
+	$(BIN)/python .ci/dist_check.py dist
+
+$(TOOLS)/.installed:
+	$(PYTHON_NEEDED)
+	$(PYTHON) -m venv $(TOOLS)
+	$(TOOLS)/bin/python -m pip install --quiet --disable-pip-version-check build pip-audit uv
+	@touch $@
+
 .venv/.installed: pyproject.toml
-	@$(if $(PYTHON),,echo "rigcal needs Python 3.11 to 3.14, and neither python3.11 nor python3 is one." >&2; exit 1)
+	$(PYTHON_NEEDED)
 	@echo "== install: rigcal and what it needs, into .venv (about 1.2 GB, minutes the first time)"
 	$(PYTHON) -m venv .venv
 	$(PIP) --editable '.[view]'
@@ -60,7 +110,15 @@ system: .venv/.system
 	$(PIP) --editable '.[test]'
 	@touch $@
 
-.venv/.system: .venv/.installed
+.venv/.locked: pyproject.toml requirements.lock
+	$(PYTHON_NEEDED)
+	@echo "== install: rigcal, and the very versions of requirements.lock, into .venv"
+	$(PYTHON) -m venv .venv
+	$(PIP) --require-hashes -r requirements.lock
+	$(PIP) --no-deps --no-build-isolation --editable .
+	@touch .venv/.installed .venv/.tested $@
+
+.venv/.system: $(INSTALLED)
 	@echo "== system: does Open3D find its system libraries?"
 	@if $(OPEN3D_LOADS); then \
 		echo "yes"; \

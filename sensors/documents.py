@@ -21,6 +21,7 @@ import numpy as np
 import pydantic
 import yaml
 
+from chains import escape
 from chains.errors import InputError, nearest
 
 Marks = dict[tuple[str | int, ...], int]
@@ -145,7 +146,7 @@ def read_csv(path: str | Path, text: Collection[str] = ()) -> dict[str, np.ndarr
     column that stands in the header twice.
     """
     lines = csv.reader(read_text(path).splitlines())
-    header = [name.strip() for name in next(lines, [])]
+    header = [escape.from_csv_cell(name.strip()) for name in next(lines, [])]
     if len(header) <= 1 and ";" in "".join(header):
         raise InputError(f"{path}:1: columns are separated by ';' here; separate them by commas")
     for name in header:
@@ -159,7 +160,7 @@ def read_csv(path: str | Path, text: Collection[str] = ()) -> dict[str, np.ndarr
                     f"{path}:{lines.line_num}: {len(row)} cells where the header names"
                     f" {len(header)} columns; write an empty cell for what is unknown"
                 )
-            rows.append([cell.strip() for cell in row])
+            rows.append([escape.from_csv_cell(cell.strip()) for cell in row])
     columns = zip(*rows, strict=True) if rows else ((),) * len(header)
     return {
         name: np.array(cells, dtype=np.str_) if name in text else _numbers_or_text(cells)
@@ -303,7 +304,7 @@ def write_json(path: str | Path, data: Any) -> None:
 
 def json_text(data: Any) -> str:
     """The data as a JSON document; a number that is not finite becomes null."""
-    return json.dumps(_finite(plain(data)), indent=1, ensure_ascii=False)
+    return escape.json(json.dumps(_finite(plain(data)), indent=1, ensure_ascii=False))
 
 
 def plain(data: Any) -> Any:

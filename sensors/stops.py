@@ -5,10 +5,12 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from chains import escape
 from chains.errors import InputError
 from sensors.documents import plain, read_csv, write_atomically
 
@@ -172,12 +174,19 @@ def read_targets(path: Path) -> Targets | None:
 
 
 def write_columns(path: str | Path, columns: Mapping[str, Iterable]) -> None:
-    """Write columns of equal length as CSV; what is not a number is an empty cell."""
+    """Write columns of equal length as CSV; a number that is none is an empty cell, and text that
+    a spreadsheet would run as a formula is marked as text."""
     with write_atomically(path) as work, open(work, "w", newline="", encoding="utf-8") as file:
         table = csv.writer(file, lineterminator="\n")
-        table.writerow(columns)
+        table.writerow(map(escape.csv_cell, columns))
         for row in zip(*(plain(values) for values in columns.values()), strict=True):
-            table.writerow("" if cell != cell else cell for cell in row)
+            table.writerow(map(_cell, row))
+
+
+def _cell(value: Any) -> Any:
+    if isinstance(value, str):
+        return escape.csv_cell(value)
+    return "" if value != value else value
 
 
 def _is_number(cell: str) -> bool:

@@ -14,6 +14,7 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 from calib.cli import calibrating, exporting, importing, reporting  # noqa: E402, F401
 from calib.cli.app import app  # noqa: E402
 from chains.errors import InputError  # noqa: E402
+from chains.escape import terminal  # noqa: E402
 
 INTERRUPTED = 130  # as shells have it: 128 and the signal's number
 
@@ -49,5 +50,5 @@ def _interrupted(error: BaseException | None) -> bool:
 
 
 def _fail(message: str, code: int) -> NoReturn:
-    print(f"rigcal: {message}", file=sys.stderr)
+    print(f"rigcal: {terminal(message)}", file=sys.stderr)
     raise SystemExit(code)

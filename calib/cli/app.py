@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import io
 import re
 import sys
@@ -13,6 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Any, TextIO
 
 import typer
 import typer.core
+
+from chains.escape import terminal
 
 if TYPE_CHECKING:
     from calib.runs.run import Run
@@ -46,6 +49,13 @@ _stdout: TextIO | None = None
 _verbose = False
 
 
+def _print_version(asked: bool) -> None:
+    """Print the version that is installed, as pyproject.toml has it, and end."""
+    if asked:
+        print(f"rigcal {importlib.metadata.version('rigcal')}")
+        raise typer.Exit
+
+
 @app.callback()
 def manners(
     context: typer.Context,
@@ -54,6 +64,9 @@ def manners(
     ] = False,
     quiet: Annotated[
         bool, typer.Option("-q", "--quiet", help="Print nothing but errors, and what --json asks.")
+    ] = False,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Which one.")
     ] = False,
 ) -> None:
     """Take down what is said of how much is to be said."""
@@ -94,13 +107,13 @@ def say(document: dict[str, Any], text: str, as_json: bool) -> None:
     if as_json:
         print_json(document)
     else:
-        print(text)
+        print(terminal(text))
 
 
 def end_unless_converged(run: Run) -> None:
     """End with exit code 3, and the sentence on stderr, where a run has not converged."""
     if not run.converged:
-        print(f"rigcal: {run.folder}: {run.warning[0]}", file=sys.stderr)
+        print(terminal(f"rigcal: {run.folder}: {run.warning[0]}"), file=sys.stderr)
         raise SystemExit(NOT_TO_BE_USED)
 
 
@@ -121,7 +134,7 @@ def progress_bar() -> Iterator[Progress]:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     columns = (
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
@@ -129,7 +142,7 @@ def progress_bar() -> Iterator[Progress]:
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("reading", total=None)
         yield lambda what, done, total: bar.update(
-            task, description=what, completed=done + 1, total=total
+            task, description=terminal(what), completed=done + 1, total=total
         )
 
 
@@ -139,6 +152,7 @@ def _line_by_line() -> Progress:
 
     def tell(what: str, done: int, total: int) -> None:
         seconds = time.monotonic() - start
-        print(f"{seconds:8.1f} s  {what} {done + 1}/{total}", file=sys.stderr, flush=True)
+        said = terminal(f"{seconds:8.1f} s  {what} {done + 1}/{total}")
+        print(said, file=sys.stderr, flush=True)
 
     return tell

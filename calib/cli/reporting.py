@@ -68,8 +68,9 @@ def view(
     """The browser workbench, on this machine alone, until Ctrl-C."""
     from calib.view import view as serve
 
-    def tell(url: str) -> None:
-        say({"url": url}, f"{url} (Ctrl-C ends it)", as_json)
+    def tell(url: str, look_url: str) -> None:
+        text = f"{url} (Ctrl-C ends it)\n{look_url} is for others: it cannot change anything"
+        say({"url": url, "look_url": look_url}, text, as_json)
         sys.stdout.flush()
 
     serve(runs, port, show, tell)

@@ -12,22 +12,13 @@ from calib.exporters.written import Written, head, write_text
 from calib.runs.estimates import VariableEstimate, variable_estimates
 from calib.show.scale import shown
 from calib.show.tables import LISTED_PARAMETERS, effect_cells, estimate_cell
+from chains import escape
 
 CONVENTIONS = (
     "Links: how far T_parent_child lies from CAD, T_cad exp(twist), in the child's own axes; where",
     "no CAD says, sigma alone. Effects: geometry, true = nominal + effect; instruments,",
     "measured = true + effect. The number after the sign is one standard deviation.",
 )
-_LATEX = {
-    **{sign: f"\\{sign}" for sign in "&%$#_{}"},
-    "\\": r"\textbackslash{}",
-    "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}",
-    "±": r"$\pm$",
-    "→": r"$\to$",
-    "<": r"$<$",
-    ">": r"$>$",
-}
 
 
 @dataclass(frozen=True)
@@ -61,7 +52,9 @@ def _write(
         *(f"each value of {name}: extrinsics.yaml has them" for name in long),
     ]
     rigs = ", ".join(recording["rig"] for recording in fitted.run.model["recordings"])
-    text = "".join(line.format(each) for each in head(fitted.run, rigs, CONVENTIONS, not_held))
+    text = "".join(
+        line.format(escape.line(each)) for each in head(fitted.run, rigs, CONVENTIONS, not_held)
+    )
     for table in _tables(rows):
         text += "\n" + "\n".join(render(table)) + "\n"
     write_text(path, text)
@@ -105,8 +98,8 @@ def _latex(table: _TextTable) -> Iterable[str]:
 
 
 def _latex_row(cells: Iterable[str]) -> str:
-    escaped = ("".join(_LATEX.get(c, c) for c in cell) for cell in cells)
-    return " & ".join(re.sub(r"^-(?=\d)", "$-$", cell) for cell in escaped) + r" \\"
+    minus = (re.sub(r"^-(?=\d)", "$-$", escape.latex(cell)) for cell in cells)
+    return " & ".join(minus) + r" \\"
 
 
 def _markdown(table: _TextTable) -> Iterable[str]:
@@ -117,4 +110,4 @@ def _markdown(table: _TextTable) -> Iterable[str]:
 
 
 def _markdown_row(cells: Iterable[str]) -> str:
-    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+    return "| " + " | ".join(map(escape.markdown, cells)) + " |"

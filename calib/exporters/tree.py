@@ -14,7 +14,7 @@ from calib.exporters.fitted import FittedRig, for_every_rig
 from calib.exporters.written import Written, warnings, write_text
 from calib.results.solution import FrameEstimate
 from calib.runs.estimates import variable_estimates
-from chains import se3
+from chains import escape, se3
 
 ROW, STEP, LEFT, TOP, LINE = 30, 26, 24, 84, 20
 FONT = "font-family:system-ui,sans-serif;font-size:13px"
@@ -52,7 +52,7 @@ def write_tree(fit: FittedRig, folder: Path) -> Written:
     top = TOP + LINE * len(warning)
     size = {"width": f"{spread + 240:.0f}", "height": f"{top + ROW * len(rows) + 16}"}
     svg = Element("svg", size, xmlns="http://www.w3.org/2000/svg", style=FONT)
-    SubElement(svg, "title").text = f"Frames of {fit.rig.name}"
+    SubElement(svg, "title").text = escape.line(f"Frames of {fit.rig.name}")
     SubElement(svg, "rect", width="100%", height="100%", fill="white")
     for i, line in enumerate(warning):
         _text(svg, LEFT, 28 + LINE * i, line, RED, style=BOLD)
@@ -131,4 +131,4 @@ def _sigma(estimate: FrameEstimate | None) -> str:
 
 def _text(svg: Element, x: float, y: float, text: str, fill: str = INK, **more: str) -> None:
     place = {"x": f"{x:.0f}", "y": f"{y:.0f}", "fill": fill, "xml:space": "preserve"}
-    SubElement(svg, "text", place, **more).text = text
+    SubElement(svg, "text", place, **more).text = escape.line(text)

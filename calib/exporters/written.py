@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from calib.runs.run import Run
+from chains import escape
 from chains.errors import InputError
 from sensors.documents import write_atomically
 
@@ -53,7 +54,7 @@ def head(run: Run, rig: str, conventions: Iterable[str], not_held: Iterable[str]
 
 def commented(lines: Iterable[str]) -> str:
     """Lines as comments of YAML, Python or CSV."""
-    return "".join(f"# {line}\n" for line in lines)
+    return "".join(f"# {escape.line(line)}\n" for line in lines)
 
 
 def _listed(title: str, sentences: Iterable[str]) -> list[str]:

@@ -12,13 +12,14 @@ import numpy as np
 
 from calib.intake.gather import Gathered, section
 from calib.intake.roles import Mounted, Roles, find_roles
-from chains import se3
+from chains import escape, se3
 from chains.errors import InputError
 from sensors.documents import nearest, write_atomically
 from sensors.lidar import catalog
 from sensors.readers.base import POSE, Columns
 
 GUESS_M, GUESS_RAD = 0.1, 0.3
+_PLAIN = re.compile(r"[A-Za-z_][\w./-]*( [\w./-]+)*|\d+")
 _TRACKER = "sigma_m: 0.0002, sigma_rad: 0.0003"
 
 
@@ -155,7 +156,10 @@ def _frame(mounted: Mounted) -> list[str]:
     T = mounted.T_parent_body
     at = {"parent": mounted.parent, "xyz_m": _round(T[:3, 3]), "rpy_rad": _round(se3.to_rpy(T))}
     sigma = {"sigma_m": GUESS_M, "sigma_rad": 0.0 if mounted.point else GUESS_RAD}
-    return [f"  # guess: {mounted.why}", f"  {_word(mounted.body)}: {_flow(at | sigma)}"]
+    return [
+        f"  # guess: {escape.line(mounted.why)}",
+        f"  {_word(mounted.body)}: {_flow(at | sigma)}",
+    ]
 
 
 def _round(values: Sequence[float]) -> list[float]:
@@ -175,4 +179,6 @@ def _scalar(value: Any) -> str:
 
 def _word(name: str) -> str:
     """A name as YAML takes it: in quotes where it is more than a plain word."""
-    return name if re.fullmatch(r"[A-Za-z_][\w ./-]*|\d+", name) else json.dumps(name)
+    if _PLAIN.fullmatch(name) and name.lower() not in ("true", "false", "null"):
+        return name
+    return escape.json(json.dumps(name, ensure_ascii=False))

@@ -35,7 +35,7 @@ class Chart:
     def figure(self) -> Figure:
         """The figure, drawn in the house style."""
         with plots.styled():
-            return self.draw()
+            return plots.with_plain_text(self.draw())
 
     def document(self) -> dict[str, Any]:
         """As ``--json`` gives it."""

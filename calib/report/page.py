@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import base64
 import datetime
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +20,7 @@ from calib.show.blunders import HEADINGS, blunder_cells
 from calib.show.misfit import over_beams
 from calib.show.scale import shown
 from calib.show.tables import chance, effect_page, estimate_cell, mm
+from chains import escape
 
 TOLD_CANDIDATES = 8  # candidates whose evidence is told
 LISTED_DIRECTIONS = 12  # weak directions that are told
@@ -55,6 +58,7 @@ def render(
         absent: figures that the run does not have.
     """
     import jinja2
+    import markupsafe
 
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent),
@@ -63,7 +67,10 @@ def render(
         lstrip_blocks=True,
         undefined=jinja2.StrictUndefined,
     )
-    return environment.get_template("page.html.j2").render(
+    css = (Path(__file__).parent / "page.css").read_text(encoding="utf-8")
+    page = environment.get_template("page.html.j2").render(
+        css=markupsafe.Markup(css),
+        policy=policy(css),
         run=evidence.run,
         name=folder_name(evidence.run.folder),
         verdict=verdict,
@@ -80,6 +87,27 @@ def render(
         links=evidence.run.summary.get("links"),
         provenance=_provenance(evidence),
     )
+    return escape.terminal(page)
+
+
+def policy(css: str) -> str:
+    """What a browser may do with the page: show it. It runs no script and loads nothing.
+
+    Args:
+        css: the text of its only style element, which is let in by its hash; matplotlib's figures
+            have style attributes besides.
+    """
+    digest = base64.b64encode(hashlib.sha256(css.encode()).digest()).decode()
+    rules = {
+        "default-src": "'none'",
+        "img-src": "data:",  # maps within figures
+        "style-src": "'unsafe-inline'",  # for browsers that do not know the next two
+        "style-src-elem": f"'sha256-{digest}'",
+        "style-src-attr": "'unsafe-inline'",
+        "base-uri": "'none'",
+        "form-action": "'none'",
+    }
+    return "; ".join(f"{name} {value}" for name, value in rules.items())
 
 
 def _numbers(evidence: Evidence) -> list[tuple[str, str]]:

@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from chains import escape
 from chains.errors import InputError
 
 if TYPE_CHECKING:
@@ -27,6 +29,7 @@ SIGNED, UNSIGNED = "PuOr_r", "cividis"
 HALF, WIDE = 5.6, 8.0  # inches: of a column of the page, and of both
 FORMATS = ("png", "svg", "pdf")
 PAPER_DPI, MAP_DPI = 300, 110
+LONGEST_NAME = {"x": 24, "y": 44}  # letters along an axis: longer ones leave no room for the rest
 _STYLE = {
     "font.size": 9.5,
     "text.parse_math": False,  # a dollar in a run's name is a dollar
@@ -125,8 +128,34 @@ def share_map(ax: Axes, values: np.ndarray, extent: Sequence[float], most: float
     return ax.imshow(values, UNSIGNED, vmin=0.0, vmax=most, extent=extent, **options)
 
 
+def with_plain_text(figure: Figure) -> Figure:
+    """The figure, its texts without control characters, which neither XML nor a font has; names
+    along its axes that would leave no room for what is drawn are shortened."""
+    from matplotlib.text import Text
+
+    for text in figure.findobj(Text):
+        text.set_text(escape.terminal(text.get_text()))
+    for ax in figure.axes:
+        for axis in (ax.xaxis, ax.yaxis):
+            names, most = axis.get_major_formatter(), LONGEST_NAME[axis.axis_name]
+            names.format_ticks = partial(_plain_ticks, names.format_ticks, most)
+    return figure
+
+
+def _plain_ticks(format_ticks: Callable[[Any], list[str]], most: int, values: Any) -> list[str]:
+    return [_shortened(escape.terminal(name), most) for name in format_ticks(values)]
+
+
+def _shortened(name: str, most: int) -> str:
+    lines = name.split("\n")
+    return "\n".join(line if len(line) <= most else f"{line[: most - 1]}…" for line in lines)
+
+
 def svg(figure: Figure, name: str) -> str:
-    """The figure as an ``<svg>`` to stand in a page among others: every id begins with `name`."""
+    """The figure as an ``<svg>`` to stand in a page among others.
+
+    Every id begins with `name`, of letters, digits, hyphens and underscores only.
+    """
     file = io.StringIO()
     with styled():
         # Laid out here and not by savefig, which would draw all of it once more to that end.
@@ -135,7 +164,9 @@ def svg(figure: Figure, name: str) -> str:
         figure.savefig(file, format="svg", dpi=MAP_DPI, metadata={"Date": None})
     text = file.getvalue()
     text = text[text.index("<svg") :]
-    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+    # The page has the one rule of matplotlib's style, and runs no style but its own.
+    for part in ("metadata", "style"):
+        text = re.sub(rf"<{part}\b.*?</{part}>", "", text, flags=re.DOTALL)
     # As large as its column, and in the page's own letters.
     text = re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", text, count=1)
     text = re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", text, count=1)

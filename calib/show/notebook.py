@@ -22,6 +22,7 @@ from calib.show.diagnosis import (
     unexplained_table,
 )
 from calib.show.tables import effects_table, error_table, links_table
+from chains import escape
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -82,7 +83,8 @@ def _html(title: str, sentences: Sequence[str], tables: Sequence[Table], command
     from jinja2 import Environment
 
     page, rows = Environment(autoescape=True).from_string(_PAGE), [_rows(t) for t in tables]
-    return page.render(title=title, sentences=sentences, command=command, tables=rows)
+    shown = page.render(title=title, sentences=sentences, command=command, tables=rows)
+    return escape.terminal(shown)
 
 
 def _rows(table: Table) -> dict[str, Any]:

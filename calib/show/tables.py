@@ -10,10 +10,12 @@ import numpy as np
 from rich.console import Console
 from rich.padding import Padding
 from rich.table import Table
+from rich.text import Text
 
 from calib.runs.estimates import VariableEstimate, variable_estimates
 from calib.show.misfit import beams_told, standing_out
 from calib.show.scale import shown
+from chains import escape
 
 if TYPE_CHECKING:
     from calib.effects import Effect
@@ -152,9 +154,16 @@ def mm(value: float | None, sign: str = "") -> str:
 # ----------------------------------------------------------------------------------------- tables
 
 
+class _Terminal(Console):
+    """All text passes here on its way to a terminal, cells of tables too."""
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        return super().render_str(escape.terminal(text), **options)
+
+
 def terminal() -> Console:
     """Where people read: at most `WIDTH` columns wide, and as wide where nobody looks."""
-    console = Console(markup=False, highlight=False, emoji=False)
+    console = _Terminal(markup=False, highlight=False, emoji=False)
     console.width = min(console.width, WIDTH) if console.is_terminal else WIDTH
     return console
 

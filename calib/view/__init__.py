@@ -3,18 +3,26 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
-import time
+import threading
 import webbrowser
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from calib.view.bench import Bench
+    from calib.view.page import Page
+    from calib.view.server import Served
 
 
 def view(
     runs: Sequence[Path | str],
     port: int = 0,
     show: bool = True,
-    tell: Callable[[str], None] = lambda url: None,
+    tell: Callable[[str, str], None] = lambda url, look_url: None,
 ) -> None:
     """Serve the workbench on this machine alone, until Ctrl-C.
 
@@ -22,35 +30,66 @@ def view(
         runs: run folders; those that they grew from come along.
         port: where; 0 is any that is free.
         show: whether to open it in a browser, where there is one.
-        tell: called with the address as soon as it is served.
+        tell: called with two addresses as soon as they are served: one that may do everything,
+            and one that may only look. Each holds a key; without one, nothing is served.
 
     Raises:
         InputError: no run can be opened, viser is not installed, or the port is taken.
     """
+    from calib.view.bench import Bench
     from calib.view.desk import Desk
-    from calib.view.server import address, serve, stop
+    from calib.view.server import serve
 
-    desk = Desk.of(runs)
-    server = serve(port)
-    page = None
+    bench = Bench(Desk.of(runs))
+    served = serve(port)
     try:
-        tell(address(server))
-        if show and _has_display():
-            webbrowser.open(
-                address(server)
-            )  # False where there is none; the address is told anyway
-        from calib.view.page import Page  # much to load, while the browser starts
-
-        page = Page(server, desk)
-        page.open()
-        while True:
-            time.sleep(3600)
-    except KeyboardInterrupt:
-        pass
+        with _interruption() as interrupted:
+            tell(served.address, served.look_address)
+            if show and _has_display():
+                webbrowser.open(served.address)  # False where there is none; it is told anyway
+            attend(served, bench)
+            interrupted.wait()
     finally:
+        bench.stop()
+        served.stop()
+
+
+@contextmanager
+def _interruption() -> Iterator[threading.Event]:
+    """Ctrl-C as an event: an exception in the midst of an import can be lost in what is imported.
+
+    Outside the main thread, which alone hears of Ctrl-C, nothing sets it.
+    """
+    event = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield event
+        return
+    before = signal.signal(signal.SIGINT, lambda *_: event.set())
+    try:
+        yield event
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def attend(served: Served, bench: Bench) -> dict[int, Page]:
+    """Give every browser that comes a page of its own; the pages that are open, by client."""
+    from calib.view.page import Page  # much to load, while the browser starts
+
+    pages: dict[int, Page] = {}
+
+    def arrive(client: Any, may_change: bool) -> None:
+        page = pages[client.client_id] = Page(client, bench, may_change)
+        page.open()
+        if client.client_id not in pages:  # it left meanwhile
+            page.close()
+
+    def leave(client: Any) -> None:
+        page = pages.pop(client.client_id, None)
         if page is not None:
             page.close()
-        stop(server)
+
+    served.welcome(arrive, leave)
+    return pages
 
 
 def _has_display() -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -123,6 +123,10 @@ class Desk:
         """The one that is looked at."""
         return self.runs[self.chosen]
 
+    def another(self) -> Desk:
+        """One with the same runs, those to come included, and a choice of its own."""
+        return replace(self)
+
     def add(self, folder: Path) -> None:
         """Lay a run on the bench, with those below it, and choose it.
 
@@ -131,7 +135,7 @@ class Desk:
         """
         run = Run.open(folder)
         for rung in ladder([run]) or [Rung(run, None)]:
-            self.chosen = self._name(rung.run)
+            self.chosen = self.name_of(rung.run.folder)
             self.runs[self.chosen] = rung.run
 
     def choose(self, name: str) -> None:
@@ -151,7 +155,7 @@ class Desk:
         left, below = self.run, self.rungs()[-1].below
         if below is None:
             raise InputError(f"{left.folder} grew from no other run that is still there")
-        self.chosen = self._name(below)
+        self.chosen = self.name_of(below.folder)
         self.runs[self.chosen] = below
         return f"Back at {self.chosen}; {left.folder} stays on disk."
 
@@ -186,9 +190,9 @@ class Desk:
             taken, number = wanted.with_name(f"{wanted.name}-{number}"), number + 1
         return taken
 
-    def _name(self, run: Run) -> str:
-        """A run's folder, as short as tells it from the others."""
-        here = run.folder.resolve()
+    def name_of(self, folder: Path) -> str:
+        """What a run is shown under: its folder, as short as tells it from the others."""
+        here = folder.resolve()
         known = next((n for n, r in self.runs.items() if r.folder.resolve() == here), None)
         if known is not None:
             return known

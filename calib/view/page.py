@@ -1,4 +1,4 @@
-"""The page itself: widgets, and what happens when they are used."""
+"""The page of one browser: its widgets, and what happens when they are used."""
 
 from __future__ import annotations
 
@@ -13,58 +13,67 @@ import numpy as np
 from calib.problem.model import recording_names
 from calib.show.misfit import of_stop
 from calib.view import colours, panels
-from calib.view.desk import Desk, DiagnosisCurve, Findings
-from calib.view.job import Job
+from calib.view.bench import Bench
+from calib.view.desk import DiagnosisCurve, Findings
+from calib.view.job import Told
 from calib.view.leave_out import LeaveOut
-from calib.view.scene import Points, Scene
+from calib.view.scene import Points
 from calib.view.stage import AXES, PANEL_PX, RIG, ROOM, Stage
 from chains.errors import InputError
 
 CURVE_PX = 180
 NOTHING = "—"
+LOOKS = "Opened to look at: this address cannot change anything."
 
 
 class Page:
-    """The workbench in a browser; every widget's callback ends in a redrawing of what it changed.
+    """The workbench in one browser. What is chosen here is chosen here alone; runs that are made,
+    and the fit that makes them, are everybody's.
+
+    Every widget's callback ends in a redrawing of what it changed.
 
     Args:
-        server: viser's, of `server.serve`.
-        desk: what lies on the bench.
+        client: viser's, of the browser.
+        bench: what all browsers share.
+        may_change: whether a fit may be started from here.
     """
 
-    def __init__(self, server: Any, desk: Desk) -> None:
-        self.server, self.desk = server, desk
-        self.stage = Stage(server)
+    def __init__(self, client: Any, bench: Bench, may_change: bool) -> None:
+        self.client, self.bench, self.may_change = client, bench, may_change
+        self.desk = bench.desk()
+        self.stage = Stage(client)
         self.findings: Findings | None = None
-        self.job: Job | None = None
         self._columns: dict[str, str] = {}  # heading -> column that points can be coloured by
         self._covariates: dict[str, str] = {}  # heading -> covariate that has a curve
         self._lock = threading.RLock()
-        server.gui.configure_theme(show_logo=False, show_share_button=False)
-        server.gui.main_panel.dock_right()
-        server.gui.main_panel.set_width(PANEL_PX)
-        self._note = server.gui.add_html("", visible=False)
+        gui = client.gui
+        gui.configure_theme(show_logo=False, show_share_button=False)
+        gui.main_panel.dock_right()
+        gui.main_panel.set_width(PANEL_PX)
+        gui.add_html(panels.note(LOOKS), visible=not may_change)
+        self._note = gui.add_html("", visible=False)
         self._add_scan_widgets()
         self._add_ladder_widgets()
-        self._blunders = LeaveOut(server.gui, self._on_leave_out)
+        self._blunders = LeaveOut(gui, self._on_leave_out)
         self._add_findings_widgets()
-        server.scene.on_click()(self._guarded(self._on_point, with_event=True))
+        client.scene.on_click()(self._guarded(self._on_point, with_event=True))
 
     def open(self) -> None:
-        """Show the chosen run; slow the first time, so call it once the page is being served."""
+        """Show the chosen run, and from now on what is being made."""
         self._guarded(self._show_run)()
         if self.desk.refused:
             self._tell("; ".join(self.desk.refused), bad=True)
+        self.bench.listen(self._hear)
+        self._show_busy()
 
     def close(self) -> None:
-        """End what runs in the background."""
-        if self.job is not None:
-            self.job.stop()
+        """Its browser has gone."""
+        self.bench.forget(self._hear)
 
     # ------------------------------------------------------------------------------------ widgets
 
     def _add_scan_widgets(self) -> None:
-        gui = self.server.gui
+        gui = self.client.gui
         self._run = self._menu("Run", list(self.desk.runs), self._on_run)
         self._recording = self._menu("Recording", [NOTHING], self._on_recording)
         self._stop = self._menu("Stop", [NOTHING], self._on_stop)
@@ -78,7 +87,7 @@ class Page:
         self._point = gui.add_html(panels.note("Click a point to read it."))
 
     def _add_findings_widgets(self) -> None:
-        gui = self.server.gui
+        gui = self.client.gui
         with gui.add_folder("Findings"):
             self._findings = gui.add_html("")
             self._effect = self._menu("Effect", [NOTHING], self._choose_curve)
@@ -95,17 +104,17 @@ class Page:
                 height=CURVE_PX,
             )
         self._add.on_click(self._guarded(self._on_add))
-        self._diagnose.on_click(self._guarded(lambda: self._start(Job(self.desk.run.folder))))
+        self._diagnose.on_click(self._guarded(lambda: self._start(self.desk.run.folder)))
         self._cancel.on_click(self._guarded(self._on_cancel))
 
     def _add_ladder_widgets(self) -> None:
-        with self.server.gui.add_folder("Ladder"):
-            self._ladder = self.server.gui.add_html("")
-            self._undo = self.server.gui.add_button("Undo", hint="Back to the run below")
+        with self.client.gui.add_folder("Ladder"):
+            self._ladder = self.client.gui.add_html("")
+            self._undo = self.client.gui.add_button("Undo", hint="Back to the run below")
         self._undo.on_click(self._guarded(self._on_undo))
 
     def _menu(self, label: str, options: list[str], use: Callable[[], None]) -> Any:
-        menu = self.server.gui.add_dropdown(label, options)
+        menu = self.client.gui.add_dropdown(label, options)
         menu.on_update(self._guarded(use))
         return menu
 
@@ -140,7 +149,7 @@ class Page:
         self._show_findings()
         self._tell(f"Reading the recordings of {desk.chosen} …")
         try:
-            scene = Scene.of(desk.run)
+            scene = self.bench.scene(desk.run)
         except InputError:
             self._show_nothing()
             raise
@@ -256,12 +265,12 @@ class Page:
         what = self.desk.addable(self.findings).get(name)
         if what is None:
             raise InputError(f"'{name}' is not an effect that can be added to this run")
-        self._start(Job(self.desk.run.folder, what, self.desk.folder_for(name)))
+        self._start(self.desk.run.folder, what, self.desk.folder_for(name))
 
     def _on_leave_out(self, tokens: Sequence[str]) -> None:
         def leave_out() -> None:
             run, out = self.desk.run.folder, self.desk.folder_without()
-            self._start(Job(run, out=out, without=tokens))
+            self._start(run, out=out, without=tokens)
 
         self._guarded(leave_out)()
 
@@ -272,51 +281,59 @@ class Page:
 
     # ------------------------------------------------------------------------- in the background
 
-    def _start(self, job: Job) -> None:
-        if self.job is not None:
-            job.stop()
-            raise InputError("one fit is running already; wait for it, or cancel it")
-        self.job = job
+    def _start(self, run: Path, *what: Any, **more: Any) -> None:
+        self._ask()
+        self.bench.start(self, run, *what, **more)
         self._tell("")
-        self._busy(True)
-        threading.Thread(target=self._follow, args=(job,), daemon=True).start()
-
-    def _busy(self, busy: bool) -> None:
-        for widget in (self._bar, self._doing, self._cancel):
-            widget.visible = busy
-        self._add.disabled = self._diagnose.disabled = busy
-        self._blunders.busy(busy)
-        self._bar.value, self._doing.content = 0.0, panels.note("Starting …")
-
-    def _follow(self, job: Job) -> None:
-        """Show what a job tells, until it is over."""
-        for told in job.listen():
-            if told.kind == "progress":
-                self._bar.value = float(np.clip(100 * told.share, 0, 100))
-                self._doing.content = panels.note(told.text)
-            elif told.kind == "run":
-                self._guarded(partial(self._made, Path(told.text)))()
-            else:
-                self._guarded(partial(self._ended, told.kind, told.text))()
-
-    def _made(self, folder: Path) -> None:
-        self.desk.add(folder)
-        self._show_run()
-        self._tell(panels.new_run(folder))
-
-    def _ended(self, kind: str, text: str) -> None:
-        self.job = None
-        self._busy(False)
-        if kind == "done":
-            self._show_findings()
-        elif kind == "stopped":
-            self._tell("Cancelled; what was not finished left nothing behind.")
-        else:
-            raise InputError(text)
+        self._show_busy()
 
     def _on_cancel(self) -> None:
-        if self.job is not None:
-            self.job.stop()
+        self._ask()
+        self.bench.stop()
+
+    def _ask(self) -> None:
+        """Whoever may only look has no buttons; this is for one who sends messages without."""
+        if not self.may_change:
+            raise InputError(LOOKS)
+
+    def _show_busy(self) -> None:
+        """Whether a job runs."""
+        busy = self.bench.busy
+        self._bar.visible = self._doing.visible = busy
+        self._cancel.visible = busy and self.may_change
+        self._add.disabled = self._diagnose.disabled = busy or not self.may_change
+        self._blunders.busy(busy or not self.may_change)
+        self._bar.value, self._doing.content = 0.0, panels.note("Starting …")
+
+    def _hear(self, told: Told, by: Any) -> None:
+        """Show what a job tells; `by` is the page that started it."""
+        if told.kind == "progress":
+            if not self._bar.visible:  # another page started it
+                self._show_busy()
+            self._bar.value = float(np.clip(100 * told.share, 0, 100))
+            self._doing.content = panels.note(told.text)
+        elif told.kind == "run":
+            self._guarded(partial(self._made, Path(told.text), by is self))()
+        else:
+            self._guarded(partial(self._ended, told, by is self))()
+
+    def _made(self, folder: Path, here: bool) -> None:
+        """A run stands: it is shown where it was asked for, and offered elsewhere."""
+        if here:
+            self.desk.choose(self.desk.name_of(folder))
+            self._show_run()
+        else:
+            self._fill(self._run, list(self.desk.runs), self.desk.chosen)
+        self._tell(panels.new_run(folder))
+
+    def _ended(self, told: Told, here: bool) -> None:
+        self._show_busy()
+        if told.kind == "done" and self.findings is None:
+            self._show_findings()
+        if told.kind == "stopped" and here:
+            self._tell("Cancelled; what was not finished left nothing behind.")
+        if told.kind == "failed" and here:
+            raise InputError(told.text)
 
     def _fill(self, menu: Any, options: list[str], chosen: str | None = None) -> None:
         """Give a menu other options, and choose one of them: the first where `chosen` is none."""

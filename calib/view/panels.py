@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ from calib.show.tables import LEAST_P
 from calib.view.colours import Scale, column
 from calib.view.desk import Findings
 from calib.view.scene import Points
+from chains.escape import html as escape
 
 SHOWN_CANDIDATES = 6  # candidates in the table; the menu has all
 LARGE = ((1e9, " billion"), (1e6, " million"), (1.0, ""))

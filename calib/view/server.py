@@ -1,45 +1,173 @@
-"""The server that the page lives on. This is the viser door."""
+"""The server that the page lives on. This is the viser door.
+
+viser has no place for a guard, so the websockets server that it starts is given one: every request
+passes it before viser sees anything. Should viser come to start its server in another way, the
+guard would be missing; so one request without a key is sent first, and has to be refused.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
+import http
+import http.client
 import io
+import logging
+from collections.abc import Callable, Iterator
+from contextvars import ContextVar
 from typing import Any
 
+from calib.view.keys import Keys, Visit
 from chains.errors import InputError
 
 HOST = "127.0.0.1"  # this machine alone
+PATIENCE_S = 10.0
+REFUSED = "Open the workbench by the whole address that `rigcal view` printed: it holds a key.\n"
+# viser's page is one file, whose scripts and styles lie in it and are unpacked there. It may talk
+# to this server and to nobody else.
+POLICY = (
+    "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval' blob:; worker-src blob:; "
+    "style-src 'unsafe-inline'; img-src data: blob:; font-src data:; "
+    "connect-src {here} data: blob:; frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
+)
+# Of the connection that a message came by; viser's callbacks run in its context.
+_may_change: ContextVar[bool] = ContextVar("may_change", default=False)
 
 
-def serve(port: int) -> Any:
+class Served:
+    """A viser server behind keys.
+
+    Args:
+        server: viser's.
+        keys: those of its addresses.
+    """
+
+    def __init__(self, server: Any, keys: Keys) -> None:
+        self.server, self.keys = server, keys
+        self._changing: set[int] = set()  # clients that came with the key for that
+        server.request_share_url = _refuse
+
+        @server.on_client_connect
+        async def remember(client: Any) -> None:
+            if _may_change.get():
+                self._changing.add(client.client_id)
+
+    @property
+    def address(self) -> str:
+        """Where a browser finds it, with the key to everything."""
+        return self._under(self.keys.change)
+
+    @property
+    def look_address(self) -> str:
+        """Where a browser can look but not change anything."""
+        return self._under(self.keys.look)
+
+    def welcome(self, arrive: Callable[[Any, bool], None], leave: Callable[[Any], None]) -> None:
+        """Have every browser that comes, or is there, told of: viser's client, and whether it may
+        change anything; and every one that goes."""
+
+        def came(client: Any) -> None:
+            arrive(client, client.client_id in self._changing)
+
+        def went(client: Any) -> None:
+            self._changing.discard(client.client_id)
+            leave(client)
+
+        self.server.on_client_disconnect(went)
+        self.server.on_client_connect(came)
+
+    def stop(self) -> None:
+        """End it."""
+        with contextlib.redirect_stdout(io.StringIO()):
+            self.server.stop()
+
+    def _under(self, key: str) -> str:
+        return f"http://{HOST}:{self.server.get_port()}/{key}/"
+
+
+def serve(port: int) -> Served:
     """A viser server on this machine alone; port 0 is any free one.
 
     Raises:
-        InputError: viser is not installed, or the port is taken.
+        InputError: viser is not installed or cannot be guarded, or the port is taken.
     """
     try:
         import viser
     except ImportError:
         raise InputError("'rigcal view' needs viser; pip install 'rigcal[view]'") from None
-    with contextlib.redirect_stdout(io.StringIO()):  # it greets on stdout, which is the caller's
-        server = viser.ViserServer(HOST, port, label="rigcal", verbose=False)
-    server.request_share_url = _refuse
-    if port and server.get_port() != port:  # it takes the next one
-        stop(server)
+    keys = Keys()
+    # viser greets on stdout, which is the caller's.
+    with contextlib.redirect_stdout(io.StringIO()), _guarded(keys):
+        served = Served(viser.ViserServer(HOST, port, label="rigcal", verbose=False), keys)
+    found = served.server.get_port()
+    if port and found != port:  # it takes the next one
+        served.stop()
         raise InputError(f"--port {port} is taken; give another one, or none for any that is free")
-    return server
+    if not _refuses(found):
+        served.stop()
+        raise InputError(
+            f"'rigcal view' cannot guard viser {viser.__version__}: it lets in who has no key; "
+            "install an earlier version of viser"
+        )
+    return served
+
+
+@contextlib.contextmanager
+def _guarded(keys: Keys) -> Iterator[None]:
+    """While this lasts, a websockets server that is started asks for keys."""
+    import websockets.asyncio.server as websockets
+
+    start, quiet = websockets.serve, logging.getLogger("rigcal.view.websockets")
+    quiet.addHandler(logging.NullHandler())
+    quiet.propagate = False  # what strangers send is no fault of ours, and no traceback
+
+    def serve_guarded(handle: Any, *args: Any, process_request: Any = None, **options: Any) -> Any:
+        def admit(connection: Any, request: Any) -> Any:
+            visit = _visit(keys, request)
+            if visit is None:
+                return connection.respond(http.HTTPStatus.FORBIDDEN, REFUSED)
+            answer = process_request(connection, dataclasses.replace(request, path=visit.path))
+            if answer is not None:
+                _restrict(answer.headers, request.headers["Host"])
+            return answer
+
+        async def enter(connection: Any) -> None:
+            visit = _visit(keys, connection.request)
+            _may_change.set(visit is not None and visit.may_change)
+            await handle(connection)
+
+        return start(enter, *args, process_request=admit, **options | {"logger": quiet})
+
+    websockets.serve = serve_guarded
+    try:
+        yield
+    finally:
+        websockets.serve = start
+
+
+def _visit(keys: Keys, request: Any) -> Visit | None:
+    hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
+    return keys.visit(request.path, hosts, origins, "Upgrade" in request.headers)
+
+
+def _restrict(headers: Any, host: str) -> None:
+    """Tell the browser what the page may load, and to keep its address to itself."""
+    headers["Content-Security-Policy"] = POLICY.format(here=f"http://{host} ws://{host}")
+    headers["Referrer-Policy"] = "no-referrer"
+    headers["X-Content-Type-Options"] = "nosniff"
+    headers["X-Frame-Options"] = "DENY"
+    headers["Cache-Control"] = "no-store"
+
+
+def _refuses(port: int) -> bool:
+    """Whether a request without a key is refused."""
+    connection = http.client.HTTPConnection(HOST, port, timeout=PATIENCE_S)
+    try:
+        connection.request("GET", "/")
+        return connection.getresponse().status == http.HTTPStatus.FORBIDDEN
+    finally:
+        connection.close()
 
 
 def _refuse(*_: Any, **__: Any) -> None:
     """In the place of viser's tunnel to the outside, which any page could ask it to open."""
-
-
-def address(server: Any) -> str:
-    """Where a browser finds it."""
-    return f"http://{HOST}:{server.get_port()}"
-
-
-def stop(server: Any) -> None:
-    """End a server."""
-    with contextlib.redirect_stdout(io.StringIO()):
-        server.stop()

@@ -22,14 +22,14 @@ FOV_RAD = np.radians(50.0)
 
 
 class Stage:
-    """What is drawn. All is drawn about the room's middle, as browsers have single precision.
+    """What one browser draws, about the room's middle, as browsers have single precision.
 
     Args:
-        server: viser's.
+        client: viser's, of that browser.
     """
 
-    def __init__(self, server: Any) -> None:
-        self.server = server
+    def __init__(self, client: Any) -> None:
+        self.client = client
         self.scene: Scene | None = None
         self.points: Points | None = None
         self.shown = np.zeros(0, int)
@@ -37,14 +37,13 @@ class Stage:
         self._room: tuple[str, str] | None = None
         self._around: np.ndarray | None = None
         self.hidden: set[str] = set()
-        server.scene.configure_default_lights(cast_shadow=False)
-        server.on_client_connect(self._aim)
+        client.scene.configure_default_lights(cast_shadow=False)
 
     def clear(self) -> None:
         """Draw nothing."""
         self.scene, self.points, self._room = None, None, None
         for name in (ROOM, RIG, AXES, POINTS, PICKED):
-            self.server.scene.remove_by_name(name)
+            self.client.scene.remove_by_name(name)
 
     def open(self, scene: Scene, recording: int) -> None:
         """Draw another run's room; the same one is not sent again."""
@@ -61,7 +60,7 @@ class Stage:
         if room:
             # Half of every point would be inside the wall that it lies on.
             vertices = scenes.sunk(*room, BEHIND_M) - self._middle_m
-            self.server.scene.add_mesh_simple(
+            self.client.scene.add_mesh_simple(
                 ROOM,
                 vertices,
                 room[1],
@@ -77,16 +76,15 @@ class Stage:
         Raises:
             InputError: the points cannot be read.
         """
-        self.server.scene.remove_by_name(PICKED)
+        self.client.scene.remove_by_name(PICKED)
         self._draw_rig(recording, stop)
         self.points = None
         self.points = self.scene.points(recording, stop)
         if self.points is None:
-            self.server.scene.remove_by_name(POINTS)
+            self.client.scene.remove_by_name(POINTS)
         if self._around is None:
             self._around = self._extent(recording, stop) - self._middle_m
-            for client in self.server.get_clients().values():
-                self._aim(client)
+            self._aim()
         return self.points
 
     def ceiling_m(self) -> tuple[float, float, float]:
@@ -102,7 +100,7 @@ class Stage:
         span = float(np.linalg.norm(np.subtract(*scenes.box(points.xyz_m))))
         size = float(np.clip(span / 2 / np.sqrt(len(self.shown) + 1), FINEST_M, span * COARSEST))
         xyz = points.xyz_m[self.shown] - self._middle_m
-        self.server.scene.add_point_cloud(
+        self.client.scene.add_point_cloud(
             POINTS,
             xyz.astype(np.float32),
             colours[self.shown],
@@ -119,11 +117,11 @@ class Stage:
             return None
         index = self.points.picked(self.shown, origin_m + self._middle_m, direction)
         if index is None:
-            self.server.scene.remove_by_name(PICKED)
+            self.client.scene.remove_by_name(PICKED)
         else:
             at = self.points.xyz_m[index] - self._middle_m
             distance = np.linalg.norm(at - origin_m)
-            self.server.scene.add_icosphere(
+            self.client.scene.add_icosphere(
                 PICKED, radius=0.006 * distance, color=(0, 0, 0), position=at
             )
         return index
@@ -137,7 +135,7 @@ class Stage:
         return np.array([T[:3, 3] for T in frames])
 
     def _draw_rig(self, recording: int, stop: str) -> None:
-        scene = self.server.scene
+        scene = self.client.scene
         scene.remove_by_name(RIG)
         scene.remove_by_name(AXES)
         scene.add_frame(RIG, show_axes=False, visible=RIG not in self.hidden)
@@ -168,14 +166,13 @@ class Stage:
     def toggle(self, name: str) -> None:
         """Hide the room, the rig or its axes; or show it again."""
         self.hidden ^= {name}
-        node = self.server.scene.get_handle_by_name(name)
+        node = self.client.scene.get_handle_by_name(name)
         if node is not None:
             node.visible = name not in self.hidden
 
-    def _aim(self, client: Any) -> None:
-        """Let a person who comes to the page look at all of it, from above one corner."""
-        if self._around is None:
-            return
+    def _aim(self) -> None:
+        """Let the person at the page look at all of it, from above one corner."""
+        client = self.client
         # What is told is the window: the panel stands beside the picture, or below it on a phone.
         width, height = client.camera.image_width, client.camera.image_height
         width -= PANEL_PX if width > 1.5 * PANEL_PX else 0

@@ -9,12 +9,12 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from xml.parsers import expat
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
 from chains import se3
 from chains.errors import InputError
+from chains.escape import xml_attribute, xml_comment
 from chains.frames import Edge
 from chains.se3 import Array
 
@@ -74,8 +74,8 @@ class _Robot:
 
 def empty_robot(name: str, link: str) -> bytes:
     """Return a URDF of one link, to add frames to."""
-    lines = ('<?xml version="1.0"?>', f"<robot name={quoteattr(name)}>", "</robot>", "")
-    text = "\n".join([*lines[:2], f"  <link name={quoteattr(link)}/>", *lines[2:]])
+    lines = ('<?xml version="1.0"?>', f"<robot name={xml_attribute(name)}>", "</robot>", "")
+    text = "\n".join([*lines[:2], f"  <link name={xml_attribute(link)}/>", *lines[2:]])
     return text.encode("ascii", "xmlcharrefreplace")
 
 
@@ -112,10 +112,8 @@ def with_comment(text: bytes, lines: Iterable[str], where: str | Path) -> bytes:
     """Return a URDF with a comment before its robot; raises InputError as `with_origins`."""
     _refuse_wide(text, where)
     start = _Robot(text, where).start
-    # Two hyphens would end a comment.
-    inside = re.sub("-(?=-)", "- ", "\n  ".join(lines))
-    ascii_only = inside.encode("ascii", "backslashreplace")
-    return text[:start] + b"<!--\n  " + ascii_only + b"\n-->\n" + text[start:]
+    inside = "\n  ".join(map(xml_comment, lines)).encode("ascii")
+    return text[:start] + b"<!--\n  " + inside + b"\n-->\n" + text[start:]
 
 
 def with_frames(
@@ -144,7 +142,7 @@ def with_frames(
         edge = fit[0]
         waiting.remove(edge)
         lines += [
-            f"<link name={quoteattr(n)}/>" for n in (edge.parent, edge.child) if n not in links
+            f"<link name={xml_attribute(n)}/>" for n in (edge.parent, edge.child) if n not in links
         ]
         lines.append(_fixed(edge, {*robot.joints}))
         links |= {edge.parent, edge.child}
@@ -157,9 +155,9 @@ def _fixed(edge: Edge, taken: set[str]) -> str:
     name = f"{edge.parent}_to_{edge.child}"
     while name in taken:
         name += "_"
+    name, parent, child = map(xml_attribute, (name, edge.parent, edge.child))
     return (
-        f'<joint name={quoteattr(name)} type="fixed"><parent link={quoteattr(edge.parent)}/>'
-        f"<child link={quoteattr(edge.child)}/>"
+        f'<joint name={name} type="fixed"><parent link={parent}/><child link={child}/>'
         f"<origin{_attributes(edge.T_parent_child).decode()}/></joint>"
     )
 

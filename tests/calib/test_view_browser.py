@@ -14,9 +14,11 @@ from calib.runs.calibrate import calibrate
 from calib.runs.diagnose import diagnose
 from calib.runs.run import Run
 from calib.simulation import simulate
+from calib.view import attend
+from calib.view.bench import Bench
 from calib.view.desk import Desk
 from calib.view.page import Page
-from calib.view.server import address, serve, stop
+from calib.view.server import serve
 from calib.view.stage import PANEL_PX
 from tests.browser import SOFTWARE_GL, Watched, browser_page
 from tests.calib.viewed import blunder, diagnosed, small_run
@@ -28,19 +30,22 @@ SOON_MS, FIT_MS = 60_000, 300_000
 @contextmanager
 def shown(*runs: Path, width: int = 1400) -> Iterator[tuple[Watched, Page]]:
     """The workbench of runs in a browser, its first picture drawn."""
-    server = serve(0)
+    served, bench = serve(0), Bench(Desk.of(runs))
     try:
         with browser_page(width, 900, *SOFTWARE_GL) as watched:
-            page = Page(server, Desk.of(runs))
+            pages = attend(served, bench)
             watched.page.set_default_timeout(SOON_MS)
-            watched.page.goto(address(server))
-            page.open()
+            watched.page.goto(served.address)
             button(watched, "Add").wait_for()
+            watched.page.get_by_text("drawn; residual").or_(
+                watched.page.get_by_text("is no")
+            ).first.wait_for()
+            (page,) = pages.values()
             yield watched, page
             watched.assert_clean()
-            page.close()
     finally:
-        stop(server)
+        bench.stop()
+        served.stop()
 
 
 def bars(watched: Watched) -> list[float]:
@@ -127,7 +132,7 @@ def test_a_click_reads_the_point_that_it_meets(small):
     with shown(small.folder) as (watched, page):
         points, shown_points = page.stage.points, page.stage.shown
         watched.page.wait_for_timeout(3000)
-        (client,) = page.server.get_clients().values()
+        client = page.client
         box = watched.page.locator("canvas").first.bounding_box()
         eye = client.camera.position
         ahead = client.camera.look_at - eye

@@ -10,6 +10,7 @@ import time
 import urllib.request
 from dataclasses import replace
 from html.parser import HTMLParser
+from urllib.parse import urlsplit
 
 import pytest
 
@@ -19,7 +20,7 @@ from calib.runs.run import Run
 from calib.view import panels
 from calib.view.desk import Desk, Findings
 from calib.view.job import Job
-from calib.view.server import serve, stop
+from calib.view.server import serve
 from chains.errors import InputError
 from tests.calib.viewed import blunder, candidate, diagnosed, grown, small_run
 from tests.programs import RIGCAL, execute, started
@@ -275,7 +276,7 @@ def test_view_serves_this_machine_alone_and_ends_with_ctrl_c(first):
         while "}" not in text:
             text += process.stdout.readline()
         url = json.loads(text)["url"]
-        host, port = url.removeprefix("http://").split(":")
+        host, port = urlsplit(url).netloc.split(":")
         assert host == "127.0.0.1"
         page = urllib.request.urlopen(url, timeout=30).read()
         assert b"<html" in page[:500].lower()
@@ -293,11 +294,12 @@ def test_view_serves_this_machine_alone_and_ends_with_ctrl_c(first):
 def test_no_page_can_open_a_tunnel_to_the_outside(monkeypatch):
     viser = pytest.importorskip("viser")
     monkeypatch.setattr(viser._viser, "ViserTunnel", None)  # calling it would fail
-    server = serve(0)
+    served = serve(0)
     try:
-        assert server.request_share_url() is None and server._share_tunnel is None
+        assert served.server.request_share_url() is None
+        assert served.server._share_tunnel is None
     finally:
-        stop(server)
+        served.stop()
 
 
 def test_a_missing_library_is_said(monkeypatch):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
@@ -13,6 +14,7 @@ from calib.report.chart import Absent, Chart
 from calib.report.evidence import FIRST, Evidence
 from calib.report.statistics import ResidualCurve, Statistics
 from calib.show.scale import round_up
+from chains import escape
 
 if TYPE_CHECKING:
     from calib.report.plots import Axes, Figure
@@ -55,7 +57,7 @@ def curves(evidence: Evidence) -> Iterator[Chart | Absent]:
 
 def curve_id(covariate: str) -> str:
     """The name of a covariate's chart."""
-    return f"residual-{_bare(covariate).replace('.', '-').replace('_', '-')}"
+    return f"residual-{escape.identifier(re.sub('[._]', '-', _bare(covariate)))}"
 
 
 def _bare(covariate: str) -> str:

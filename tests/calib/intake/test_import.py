@@ -267,3 +267,28 @@ def test_help_lists_the_kinds(monkeypatch, capsys):
         main()
     out = capsys.readouterr().out
     assert all(f"  {kind} " in out for kind in READERS) and "rigcal[xacro]" in out
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *(
+            "base_markers",
+            "Rigid Body 1",
+            "null",
+            "true",
+            "a: b",
+            "x #y",
+            "tail ",
+            "-",
+            "é 日本 😀",
+        ),
+        *("{x: 1}", 'quo"te', "back\\slash", "a\nb: 1", "\x1b[31m", "\u2028b: 1", "[bold]"),
+    ],
+)
+def test_a_name_in_rig_yaml_is_read_back_as_it_was(name, tmp_path):
+    from calib.intake.rigfile import _word
+    from sensors.documents import read_yaml
+
+    (tmp_path / "x.yaml").write_text(f"{_word(name)}: {{a: {_word(name)}}}\n", encoding="utf-8")
+    assert read_yaml(tmp_path / "x.yaml")[0] == {name: {"a": name}}
