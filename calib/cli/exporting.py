@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from calib.cli.app import Force, Json, Out, app, progress_bar, say
+from calib.cli.app import Force, Json, Out, Trust, app, progress_bar, say
 
 
 @app.command()
@@ -22,6 +22,7 @@ def export(
             "all that have anything to hold if not given.",
         ),
     ] = None,
+    trust: Trust = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -29,7 +30,7 @@ def export(
     from calib.exporters import export as write
     from calib.runs.run import Run
 
-    opened = Run.open(run)
+    opened = Run.open(run, trust or ())
     done = write(opened, out, formats or [], force)
     document = {
         "files": [str(file) for file in done.files],
@@ -56,6 +57,7 @@ def apply(
     rig: Annotated[
         str | None, typer.Option(metavar="NAME", help="Whose LiDAR, where the run has several.")
     ] = None,
+    trust: Trust = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -63,8 +65,9 @@ def apply(
     from calib.evaluation.apply import apply as correct
     from calib.runs.run import Run
 
+    opened = Run.open(run, trust or ())
     with progress_bar() as progress:
-        done = correct(Run.open(run), clouds, out, rig, progress, force)
+        done = correct(opened, clouds, out, rig, progress, force)
     document = {
         "clouds": [
             {"file": str(a.path), "points": a.points, "moved_rms_mm": 1e3 * a.rms_m}

@@ -6,13 +6,14 @@ import importlib.metadata
 import platform
 import re
 import zipfile
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from calib.effects import Trust, trusted
 from calib.results.solution import EffectEstimate, FrameEstimate, Part, Solution
 from chains import se3
 from chains.errors import InputError
@@ -39,20 +40,33 @@ NOT_CONVERGED = "NOT CONVERGED: the fit did not end at an optimum; its numbers a
 
 @dataclass(frozen=True)
 class Run:
-    """A run folder, read."""
+    """A run folder, read.
+
+    Args:
+        folder: where it is.
+        model, summary, solution: its files.
+        trust: the Python files of effects that may run, where its model names them.
+    """
 
     folder: Path
     model: dict[str, Any]
     summary: dict[str, Any]
     solution: Solution
+    trust: Trust = field(default_factory=dict)
 
     @classmethod
-    def open(cls, folder: Path | str) -> Run:
-        """Read a run.
+    def open(cls, folder: Path | str, trust: Trust | Iterable[str | Path] = ()) -> Run:
+        """Read a run. No code of it is run, now or later, but what `trust` names.
+
+        Args:
+            folder: where it is.
+            trust: Python files of effects, or their sha256; as ``--trust`` takes them.
 
         Raises:
-            InputError: the folder is no run, or a part of it is missing or of another version.
+            InputError: the folder is no run, or a part of it is missing or of another version; or
+                something to trust is neither file nor hash.
         """
+        may_run = trust if isinstance(trust, Mapping) else trusted(trust)
         folder = Path(folder)
         if not (folder / MODEL).is_file():
             raise InputError(
@@ -62,9 +76,8 @@ class Run:
             if not (folder / name).is_file():
                 raise InputError(f"{folder / name} is missing; the run is incomplete, fit it again")
         try:
-            return cls(
-                folder, _yaml(folder / MODEL), _json(folder / SUMMARY), read_solution(folder)
-            )
+            model, summary = _yaml(folder / MODEL), _json(folder / SUMMARY)
+            return cls(folder, model, summary, read_solution(folder), trust=may_run)
         except (KeyError, TypeError, ValueError) as error:
             if isinstance(error, InputError):
                 raise

@@ -6,7 +6,7 @@ import os
 import sys
 import time
 import webbrowser
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 
@@ -15,6 +15,7 @@ def view(
     port: int = 0,
     show: bool = True,
     tell: Callable[[str], None] = lambda url: None,
+    trust: Iterable[str | Path] = (),
 ) -> None:
     """Serve the workbench on this machine alone, until Ctrl-C.
 
@@ -23,14 +24,16 @@ def view(
         port: where; 0 is any that is free.
         show: whether to open it in a browser, where there is one.
         tell: called with the address as soon as it is served.
+        trust: Python files of effects that the runs' models may name, or their sha256.
 
     Raises:
         InputError: no run can be opened, viser is not installed, or the port is taken.
     """
+    from calib.effects import trusted
     from calib.view.desk import Desk
     from calib.view.server import address, serve, stop
 
-    desk = Desk.of(runs)
+    desk = Desk.of(runs, trusted(trust))
     server = serve(port)
     page = None
     try:

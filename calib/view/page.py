@@ -95,7 +95,7 @@ class Page:
                 height=CURVE_PX,
             )
         self._add.on_click(self._guarded(self._on_add))
-        self._diagnose.on_click(self._guarded(lambda: self._start(Job(self.desk.run.folder))))
+        self._diagnose.on_click(self._guarded(lambda: self._start(self._job())))
         self._cancel.on_click(self._guarded(self._on_cancel))
 
     def _add_ladder_widgets(self) -> None:
@@ -256,12 +256,11 @@ class Page:
         what = self.desk.addable(self.findings).get(name)
         if what is None:
             raise InputError(f"'{name}' is not an effect that can be added to this run")
-        self._start(Job(self.desk.run.folder, what, self.desk.folder_for(name)))
+        self._start(self._job(effect=what, out=self.desk.folder_for(name)))
 
     def _on_leave_out(self, tokens: Sequence[str]) -> None:
         def leave_out() -> None:
-            run, out = self.desk.run.folder, self.desk.folder_without()
-            self._start(Job(run, out=out, without=tokens))
+            self._start(self._job(out=self.desk.folder_without(), without=tokens))
 
         self._guarded(leave_out)()
 
@@ -271,6 +270,9 @@ class Page:
         self._tell(told)
 
     # ------------------------------------------------------------------------- in the background
+
+    def _job(self, **what: Any) -> Job:
+        return Job(self.desk.run.folder, trust=self.desk.trust, **what)
 
     def _start(self, job: Job) -> None:
         if self.job is not None:
