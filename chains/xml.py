@@ -26,7 +26,8 @@ def parse_xml(text: str | bytes, where: object, wanted: str) -> Element:
         wanted: what it should be, "a URDF file" say.
 
     Raises:
-        InputError: it is no XML, defines an entity that is not plain words, or is nested deeper than any such file is.
+        InputError: it is no XML, defines an entity that is not plain words, or is nested deeper
+            than any such file is.
     """
     try:
         _look_through(text, where)

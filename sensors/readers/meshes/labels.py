@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from chains.errors import InputError
-from sensors.documents import read_csv, read_yaml
+from sensors.documents import read_yaml
+from sensors.numbers import read_csv
 
 # Colours this near each other are one: what a JPEG makes of one colour scatters by a few steps.
 _SAME_COLOUR = 24.0

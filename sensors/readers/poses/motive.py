@@ -136,6 +136,11 @@ def _track(
     path: Path, part: _Asset, column: Mapping[int, Array], turn: str, scale: float, options: Options
 ) -> Track:
     where = f"{path}: {part.name}"
+    lacking = [axis for axis in "XYZ" if axis not in part.position]
+    if part.kind == "Rigid Body":
+        lacking += [f"rotation {axis}" for axis in "XYZ" if axis not in part.rotation]
+    if lacking:
+        raise InputError(f"{where} has no column {lacking[0]}; export the take anew")
     xyz = np.stack([column[part.position[axis]] for axis in "XYZ"], axis=1) * scale
     values, kind = xyz, "point"
     if part.kind == "Rigid Body":
