@@ -157,3 +157,31 @@ def _recording(folder: Path) -> list[Sample]:
     files = ("model.yaml", "solution.yaml", "summary.json", "covariance.npz", "state.npz")
     found = [Sample("recording", part) for part in parts]
     return [*found, *(Sample("run", run / name) for name in files)]
+
+
+def real(shared: Path, folder: Path) -> list[Sample]:
+    """Copies of small real files, to be damaged."""
+    ouster, hesai = shared / "lidar/ouster_sdk_tests", shared / "lidar/hesai_nebula"
+    sensor = {"metadata": str(ouster / "OS-0-32-U1_v2.2.0_1024x10.json")}
+    angles = {"metadata": str(hesai / "calibration/PandarQT64.csv")}
+    arms = shared / "arms"
+    given = [
+        ("bag", ouster / "512x10_raw.bag", sensor),
+        ("ouster", ouster / "OS-0-32-U1_v2.2.0_1024x10.pcap", sensor),
+        ("ouster", ouster / "single_scan_016.osf", {}),
+        ("ouster", ouster / "OS-0-128_v3.0.1_1024x10_20241017_141645.osf", {}),
+        ("bag", hesai / "qt64/1673401195788312575_0.db3", angles),
+        ("pcd", hesai / "xt32m/1660893203292679064.pcd", {"rings_from_elevation": True}),
+        ("e57", shared / "reference/e57_pump/pumpAVisualReferenceImage.e57", {}),
+        ("motive", shared / "tracking/motive_csv_sample/sample_optitrack_take.csv", {}),
+        ("table", arms / "ur10_tmac/Series_D/calibration_handeye.csv", {}),
+        ("industrial_calibration", arms / "rosi_positioner_2axis/measurements.yaml", {}),
+        ("urdf", shared / "urdf/lwa4p_ipa320/lwa4p.urdf.xacro", {}),
+        ("urdf", shared / "urdf/husky/husky.urdf.xacro", {}),
+    ]
+    found = []
+    for kind, path, options in given:
+        copy = folder / f"real_{path.name}"
+        copy.write_bytes(path.read_bytes())
+        found.append(Sample(kind, copy, options))
+    return found

@@ -245,7 +245,8 @@ def test_a_chunk_that_unpacks_without_end(pack, unpack, monkeypatch):
 
 VIEWS = {
     "view": "CREATE VIEW messages AS WITH RECURSIVE c(x) AS"
-    " (SELECT 1 UNION ALL SELECT x + 1 FROM c) SELECT x AS id, 1 AS topic_id, x AS timestamp, zeroblob(1000000) AS data FROM c",
+    " (SELECT 1 UNION ALL SELECT x + 1 FROM c)"
+    " SELECT x AS id, 1 AS topic_id, x AS timestamp, zeroblob(1000000) AS data FROM c",
     "column": "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id, timestamp,"
     " data AS (zeroblob(1000000000)))",
     "trigger": "CREATE TABLE messages(id, topic_id, timestamp, data);"
