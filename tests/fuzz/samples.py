@@ -177,7 +177,6 @@ def real(shared: Path, folder: Path) -> list[Sample]:
         ("table", arms / "ur10_tmac/Series_D/calibration_handeye.csv", {}),
         ("industrial_calibration", arms / "rosi_positioner_2axis/measurements.yaml", {}),
         ("urdf", shared / "urdf/lwa4p_ipa320/lwa4p.urdf.xacro", {}),
-        ("urdf", shared / "urdf/husky/husky.urdf.xacro", {}),
     ]
     found = []
     for kind, path, options in given:

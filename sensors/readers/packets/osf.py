@@ -107,7 +107,8 @@ def read_osf(path: Path, options: Options) -> Contents:
     sensors = {key: text for key, text in sensors.items() if messages.get(key)}
     if not sensors:
         raise InputError(f"{path} holds no turns of a LiDAR")
-    key, metadata = _choose(path, sensors, options)
+    with _damage(path):
+        key, metadata = _choose(path, sensors, options)
     facts = parse_json(sensors[key], f"{path.name}'s own metadata")
     _decode(path, metadata, facts, messages[key][0].scan)  # what cannot be decoded says so here
     sweeps = _sweeps(path, metadata, facts, messages[key])
@@ -240,9 +241,7 @@ def _png(data: bytes) -> NDArray:
     """Bytes (rings, columns, bytes of a pixel) of a PNG, the lowest first."""
     from PIL import Image
 
-    width, height = struct.unpack_from(
-        ">2I", data, 16
-    )  # PIL's own limit is an error of another kind
+    width, height = struct.unpack_from(">2I", data, 16)  # before PIL refuses it in its own way
     if 4 * width * height > most(len(data)):
         raise ValueError(f"{len(data)} bytes claim to be an image of {width} x {height} pixels")
     with Image.open(io.BytesIO(data), formats=["PNG"]) as image:
