@@ -28,6 +28,7 @@ def export(
 ) -> None:
     """Write the result for others: YAML, URDF, ROS 2, ring tables, pictures, tables."""
     from calib.exporters import export as write
+    from calib.runs.reopen import effects_that_may_run
     from calib.runs.run import Run
 
     opened = Run.open(run, trust or ())
@@ -38,6 +39,8 @@ def export(
         "left_out": done.left_out,
     }
     lines = [*opened.warning, *(f"wrote {file}" for file in done.files)]
+    if missing := effects_that_may_run(opened)[1]:
+        lines.append(missing)
     for name, why in done.left_out.items():
         lines.append(f"left out {name}: {why}")
     for name, sentences in done.not_held.items():

@@ -15,7 +15,7 @@ import yaml
 from calib.effects import load_effects, trust_in
 from calib.problem.model import Model
 from calib.runs.calibrate import calibrate
-from calib.runs.diagnose import diagnose
+from calib.runs.diagnose import command_without, diagnose
 from calib.runs.run import MODEL, Run
 from calib.view.desk import Desk, Findings
 from calib.view.job import Job
@@ -152,6 +152,8 @@ def test_a_file_that_has_moved_is_trusted_where_it_is_now(folder, rigcal, tmp_pa
     document = yaml.safe_load((run / MODEL).read_text())
     document["effects"][1]["python"] = "/home/colleague/mine.py"
     write_yaml(run / MODEL, document)
+    found = command_without(Run.open(run), ["s1:scan"])
+    assert found.endswith("--without s1:scan --trust /home/colleague/mine.py")
     code, _, err = rigcal("evaluate", run)
     assert code == 2 and "/home/colleague/mine.py, which is not there" in err
     assert digest(folder / "mine.py") in err
