@@ -9,6 +9,7 @@ import numpy as np
 
 from calib.problem.model import Model
 from calib.runs.calibrate import calibrate
+from sensors.lidar import CATALOG
 from sensors.recording import write_table
 
 from ..calib import rigs
@@ -97,6 +98,8 @@ def _packets(folder: Path) -> list[Sample]:
     angles = {"metadata": str(folder / "angles.csv")}
     (folder / "ouster.json").write_text(json.dumps(test_ouster.facts()))
     return [
+        Sample("angles", folder / "angles.csv"),
+        Sample("sensor", folder / "ouster.json"),
         Sample("hesai", write_pcap(folder / "hesai.pcap", sent), angles),
         Sample("hesai", write_pcap(folder / "parts.pcap", sent, mtu=500), angles),
         Sample("hesai", write_pcapng(folder / "hesai.pcapng", sent), angles),
@@ -123,6 +126,9 @@ def _texts(folder: Path) -> list[Sample]:
         "plate.yaml": ("industrial_calibration", json.dumps(test_industrial_calibration.ROWS)),
         "effect.yaml": ("effects", FORMULA),
         "spec.yaml": ("spec", SPEC),
+        "palette.yaml": ("palette", "0: floor\n1: [255, 0, 0]\n"),
+        "palette.csv": ("palette", "label,name\n0,floor\n1,wall\n"),
+        "scanner.yaml": ("lidar", (CATALOG / "velodyne_vlp16.yaml").read_text()),
     }
     found = [Sample("motive", folder / "motive.csv")]
     for name, (kind, text) in files.items():

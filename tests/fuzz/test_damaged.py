@@ -103,6 +103,9 @@ FOUND = {
     "pose of words": ("industrial_calibration", "a.yaml", plate("x", "target_joints: [1]")),
     "joints of nothing": ("industrial_calibration", "a.yaml", plate(1, "target_joints: 3")),
     "number of 400 digits": ("effects", "a.yaml", b"sigma: " + b"1" * 400),
+    "label without a number": ("palette", "a.csv", b"label,name\n0,floor\n,wall\n"),
+    "cell without end": ("table", "a.csv", b'time_s,a\n0,"' + b"x" * 200_000 + b"\n1,2\n"),
+    "angle without end": ("angles", "a.csv", b'id,e,a\n1,"' + b"x" * 200_000),
     "number of zeros": ("lidar", "a.yaml", b"name: \0"),
 }  # fmt: skip
 

@@ -64,8 +64,12 @@ def _one(kind: str, files: list[str], options: dict[str, Any]) -> None:
     """A file that is read by a function of its own."""
     from calib.effects import load_effects
     from calib.simulation import load_spec
+    from sensors.documents import read_text
     from sensors.lidar import load_lidar
     from sensors.meshes import read_cloud, read_mesh
+    from sensors.readers.meshes.labels import read_palette
+    from sensors.readers.packets.hesai import read_angles
+    from sensors.readers.packets.ouster import read_metadata
     from sensors.recording import read_table
 
     {
@@ -75,11 +79,15 @@ def _one(kind: str, files: list[str], options: dict[str, Any]) -> None:
         "lidar": load_lidar,
         "spec": load_spec,
         "table of points": read_table,
+        "angles": lambda path: read_angles(Path(path)),
+        "palette": lambda path: read_palette(Path(path)),
+        "sensor": lambda path: read_metadata(Path(path).name, read_text(path)),
     }[kind](files[0])
 
 
 TASKS: dict[str, Callable[..., None]] = {"recording": _recording, "run": _run}
 ONES = ("cloud", "surface", "effects", "lidar", "spec", "table of points")
+ONES += ("angles", "palette", "sensor")
 TASKS |= dict.fromkeys(ONES, _one)
 
 

@@ -67,6 +67,8 @@ def read_palette(path: Path) -> Palette:
     numbers, colours = {}, {}
     for key, value in rows:
         if isinstance(key, int | float):
+            if not np.isfinite(key):
+                raise InputError(f"{path}: {key} is no number of a label")
             numbers[int(key)] = str(value)
         else:
             colours[key] = _colour(path, key, value)
