@@ -18,9 +18,11 @@ from chains.errors import LONGEST_NAME, is_file_name
 from sensors.numbers import read_csv
 
 from ..calib import rigs
+from ..sensors.readers.clouds.test_files import TABLE
 
 NAMES = (
-    "../../x", "/etc/x", "/tmp/rigcal-test-must-not-be-there", "a/b", "a\\b", "..", ".", "", " ",
+    "../../x", "/etc/x", "../" * 12 + "rigcal-escaped", "/tmp/rigcal-escaped", "a/b", "a\\b",
+    "..", ".", "", " ",
     "con", "nul.txt", "two\nlines", "nul\0byte", "\x1b[31mred", "'", '"', "`x`", "$(touch x)",
     "a;b", "a,b", "a: b", "ünï 😀", "x" * 5000, "<script>alert(1)</script>", "=cmd()", "-rf",
     "--out", "_tracker", "{x}", "%s", "%2e%2e", "~", "*", "a=b", "null", "1", "NaN", "&amp;",
@@ -87,8 +89,8 @@ def outside(folder: Path) -> set[str]:
     """What is there beside the folders that commands were told to write: round the recording, in
     the working folder, and where hostile names point."""
     around = [p for base in (folder, folder.parent, Path.cwd()) for p in base.iterdir()]
-    aimed = [Path(n) for n in ("/etc/x", "/tmp/x", "/tmp/x.parquet", *NAMES) if n.startswith("/")]
-    aimed += [folder.parent / "x", folder.parent.parent / "x"]
+    names = ("/rigcal-escaped", "/tmp/x", *(name for name in NAMES if name.startswith("/")))
+    aimed = [Path(name + ending) for name in names for ending in ("", ".parquet", ".urdf")]
     return {str(p) for p in (*around, *filter(Path.exists, aimed)) if p.name not in ("out", "rec")}
 
 
@@ -126,12 +128,11 @@ def looked_at(rec, tmp_path, monkeypatch, capfd, chosen) -> list[str]:
 @pytest.mark.parametrize("place", PLACES)
 def test_names_lead_nowhere(place, tmp_path, monkeypatch, capfd):
     """A name for each place, another one for each: all of them with -m long."""
-    at = PLACES.index(place)
-    for k, name in enumerate(NAMES[at : at + 1]):
-        folder = tmp_path / f"n{k}"
-        folder.mkdir()
-        rec = renamed(folder, place, name)
-        assert not looked_at(rec, folder, monkeypatch, capfd, ("check", "fit", "export")), name
+    name = NAMES[PLACES.index(place)]
+    (tmp_path / "n").mkdir()
+    rec = renamed(tmp_path / "n", place, name)
+    chosen = ("check", "fit", "evaluate" if place == "location" else "export")
+    assert not looked_at(rec, tmp_path / "n", monkeypatch, capfd, chosen), name
 
 
 @pytest.mark.long
@@ -171,11 +172,16 @@ def test_an_import_writes_the_arm_into_the_recording(tmp_path, monkeypatch, capf
         assert not (tmp_path / "stolen.urdf").exists() and not (tmp_path / "new").exists()
 
 
-@pytest.mark.parametrize("name", ["../../x", "/tmp/x", ".x", "_x", "a\nb", "x" * 300])
+@pytest.mark.parametrize("name", ["../../x", "/tmp/rigcal-escaped", ".x", "_x", "x" * 300])
 def test_an_import_names_no_scan_after_such_a_stop(name, tmp_path, monkeypatch, capfd):
-    (tmp_path / "t.csv").write_text(f'stop,q1,x\n"{name}",0,1\nb,0.5,2\n')
+    """Clouds without a clock are given to the stops of a table, and written under their names."""
+    (tmp_path / "deep").mkdir()
+    (tmp_path / "t.csv").write_text(f'stop,q1,x\n"{name}",0,1\nk,0.5,2\n')
+    for cloud in ("a.bin", "b.bin"):
+        TABLE[:, :4].tofile(tmp_path / cloud)
     before = outside(tmp_path)
-    given = ["import", "table", tmp_path / "t.csv", "--rows", "stops", "-o", tmp_path / "out"]
-    code, _, err = run(given, monkeypatch, capfd)
-    assert code in (0, 2) and "internal fault" not in err
-    assert outside(tmp_path) == before
+    given = ["table", tmp_path / "t.csv", "kitti", tmp_path / "a.bin", tmp_path / "b.bin"]
+    given += ["--rows", "stops", "--lidar", "velodyne_vlp16", "--rings-from-elevation"]
+    code, _, err = run(["import", *given, "-o", tmp_path / "deep" / "out"], monkeypatch, capfd)
+    assert code == 2 and "is no name for a file" in err, err
+    assert outside(tmp_path) == before and not list((tmp_path / "deep").iterdir())
