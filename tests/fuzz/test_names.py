@@ -42,7 +42,7 @@ def renamed(folder: Path, place: str, name: str) -> Path:
     elif place == "stop":
         old, table["stop"][1] = table["stop"][1], name
         (rec / "scans" / f"{old}.parquet").rename(rec / "scans" / "odd.parquet")
-        if is_file_name(name):
+        if is_file_name(name) and name == os.path.basename(name):
             (rec / "scans" / "odd.parquet").rename(rec / "scans" / f"{name}.parquet")
     elif place == "location":
         table["location"][0] = name
