@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
-from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -17,6 +16,7 @@ from chains import se3
 from chains.errors import InputError
 from chains.frames import Edge, FrameTree, Joint, unknown_name
 from chains.se3 import Array
+from chains.xml import parse_xml
 
 G = 9.80665  # m/s^2
 _LONGEST_LINK_M = 10.0  # more is taken for millimetres, of a centre of mass as well
@@ -110,11 +110,10 @@ def gravity_torque(tree: FrameTree, masses: Sequence[Mass], joints: Array) -> Ar
 
 def _parse(path: Path) -> Element:
     try:
-        robot = ElementTree.parse(path).getroot()
+        text = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); name a URDF file") from None
-    except ElementTree.ParseError as error:
-        raise InputError(f"{path}: is not XML ({error}); a URDF file is wanted") from None
+    robot = parse_xml(text, path, "a URDF file")
     if any("xacro" in element.tag for element in robot.iter()):
         raise InputError(f"{path}: still holds xacro; write it out with 'xacro FILE > arm.urdf'")
     if robot.tag != "robot":

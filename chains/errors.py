@@ -13,7 +13,25 @@ class InputError(ValueError):
     """
 
 
+LONGEST_NAME = 80  # bytes: tables are called RIG.STOP.parquet, and file systems take 255
+
+
+def is_file_name(name: str) -> bool:
+    """Whether a name of a file's own may stand in the name of one that is written.
+
+    It leads nowhere else, is not hidden, is not among those that runs give their own tables (they
+    begin with an underscore), holds nothing that cannot be seen, and is short.
+    """
+    plain = name.isprintable() and not name.startswith((".", "_")) and not set(name) & set("/\\")
+    return bool(name.strip()) and plain and len(name.encode("utf-8", "replace")) <= LONGEST_NAME
+
+
+def shortened(name: str) -> str:
+    """A name as it stands in a sentence: in quotes, what cannot be seen spelled out, and short."""
+    return repr(name if len(name) <= LONGEST_NAME else name[:LONGEST_NAME] + " ...")
+
+
 def nearest(name: str, known: Collection[str]) -> str:
     """Return the rest of a sentence about an unknown name: the one probably meant, or all."""
-    close = difflib.get_close_matches(name, list(known), n=1)
+    close = difflib.get_close_matches(name[:LONGEST_NAME], list(known), n=1)
     return f"; did you mean {close[0]}?" if close else f"; known are {', '.join(known)}"

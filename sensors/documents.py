@@ -1,18 +1,19 @@
-"""The documents people write and read: YAML, JSON, CSV.
+"""The documents people write and read: YAML, JSON, text.
 
 Reading is strict, and every complaint names the file, the line and what would be right. Writing is
 all or nothing: a file appears whole, under its own name, or not at all. This is the yaml door.
 """
 
-import csv
 import json
 import math
 import os
 import re
 import shutil
+import stat
+import sys
 import typing
 import uuid
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -23,6 +24,12 @@ import yaml
 
 from chains import escape
 from chains.errors import InputError, nearest
+
+LARGEST_TEXT = 500_000_000  # bytes: a log of a million rows has 200 MB
+LARGEST_YAML = 10_000_000  # bytes: read at about 150 kB a second; no calibration has 1 MB
+DEEPEST = 50  # lists and mappings within each other; a run's files have 6
+LONGEST_WHOLE = 300  # digits; a float holds 308
+FEW_NODES = 10_000  # values that aliases may always stand for
 
 Marks = dict[tuple[str | int, ...], int]
 """Line (from 1) of every key and item of a YAML document, by its path in the data."""
@@ -50,9 +57,29 @@ Model = TypeVar("Model", bound=Document)
 
 
 class _StrictLoader(yaml.SafeLoader):
-    """YAML 1.2 scalars: 1e-3 is a number, 012 is twelve, `on` and `1:30` are text."""
+    """YAML 1.2 scalars: 1e-3 is a number, 012 is twelve, `on` and `1:30` are text.
+
+    Nothing is nested deeper than people write, and no other tags are read.
+    """
 
     yaml_implicit_resolvers: typing.ClassVar[dict] = {}
+    yaml_constructors: typing.ClassVar[dict] = {
+        tag: construct
+        for tag, construct in yaml.SafeLoader.yaml_constructors.items()
+        if tag is None or tag.rpartition(":")[2] in ("str", "seq", "map")
+    }
+    _depth = 0
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node:
+        self._depth += 1
+        if self._depth > DEEPEST:
+            mark = self.peek_event().start_mark
+            raise yaml.MarkedYAMLError(
+                problem=f"nested more than {DEEPEST} deep", problem_mark=mark
+            )
+        node = super().compose_node(parent, index)
+        self._depth -= 1
+        return node
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
         seen = set()
@@ -66,6 +93,13 @@ class _StrictLoader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
+def _whole(text: str) -> int:
+    """A whole number that a float can hold; ValueError of one that is longer."""
+    if len(text) > LONGEST_WHOLE:
+        raise ValueError(f"a whole number of {len(text)} digits")
+    return int(text)
+
+
 _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?$|[-+]?\.inf$|\.nan$")
 for _tag, _pattern, _first, _construct in (
     ("null", re.compile(r"~$|null$|Null$|NULL$|$"), ["~", "n", "N", ""], lambda text: None),
@@ -75,7 +109,7 @@ for _tag, _pattern, _first, _construct in (
         list("tTfF"),
         lambda text: text.lower() == "true",
     ),
-    ("int", re.compile(r"[-+]?[0-9]+$"), list("-+0123456789"), int),
+    ("int", re.compile(r"[-+]?[0-9]+$"), list("-+0123456789"), lambda text: _whole(text)),
     (
         "float",
         _FLOAT,
@@ -95,24 +129,48 @@ for _tag, _pattern, _first, _construct in (
 def read_yaml(path: str | Path) -> tuple[Any, Marks]:
     """Read one YAML document, with the line of every key for later complaints.
 
-    Raises InputError where the file is missing, is no YAML, or has a key twice in one mapping.
+    Raises InputError where the file is missing, is no YAML, has a key twice in one mapping, or
+    would take far more memory than its size: by its aliases, its depth, or its length.
     """
-    text = read_text(path)
+    text = read_text(path, LARGEST_YAML)
     try:
         loader = _StrictLoader(text)
     except yaml.YAMLError as error:
         raise InputError(f"{path} is not YAML text: {str(error).splitlines()[0]}") from None
     try:
         node = loader.get_single_node()
+        _refuse_aliases(path, node, len(text))
         data = loader.construct_document(node) if node else None
         return data, dict(_lines(node, ()))
     except yaml.MarkedYAMLError as error:
         line = f":{error.problem_mark.line + 1}" if error.problem_mark else ""
         raise InputError(f"{path}{line}: {error.problem}") from None
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
+    except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
+        if isinstance(error, InputError):
+            raise
         raise InputError(f"{path} is not YAML text: {str(error).splitlines()[0]}") from None
     finally:
         loader.dispose()
+
+
+def _refuse_aliases(path: str | Path, node: yaml.Node | None, length: int) -> None:
+    """Raise InputError where aliases make more of a document than its text could hold without."""
+    sizes: dict[int, int] = {}
+
+    def size(node: yaml.Node) -> int:
+        if id(node) not in sizes:
+            sizes[id(node)] = sys.maxsize  # of one that holds itself
+            parts = getattr(node, "value", ()) if not isinstance(node, yaml.ScalarNode) else ()
+            pairs = isinstance(node, yaml.MappingNode)
+            inner = (each for part in parts for each in (part if pairs else (part,)))
+            sizes[id(node)] = 1 + sum(map(size, inner))
+        return sizes[id(node)]
+
+    if node is not None and size(node) > max(length, FEW_NODES):
+        raise InputError(
+            f"{path}: its aliases (*name) stand for more than {max(length, FEW_NODES)} values; "
+            f"write out what is meant"
+        )
 
 
 def _lines(node: yaml.Node | None, path: tuple) -> Iterator[tuple[tuple, int]]:
@@ -126,53 +184,40 @@ def _lines(node: yaml.Node | None, path: tuple) -> Iterator[tuple[tuple, int]]:
             yield from _lines(value, (*path, i))
 
 
-def read_text(path: str | Path) -> str:
-    """Read a UTF-8 text file; InputError names the file that is missing or is no text."""
+def read_json(path: str | Path) -> Any:
+    """Read a JSON document; InputError where the file is missing or is none."""
+    return parse_json(read_text(path), path)
+
+
+def parse_json(text: str | bytes, where: object) -> Any:
+    """The data of a JSON text; InputError, which names `where` it stands, where it is none."""
     try:
-        return Path(path).read_text(encoding="utf-8-sig")
+        return json.loads(text, parse_int=_whole)
+    except (ValueError, RecursionError) as error:
+        why = "nested too deep" if isinstance(error, RecursionError) else error
+        raise InputError(f"{where} is no JSON: {why}") from None
+
+
+def read_text(path: str | Path, largest: int = LARGEST_TEXT) -> str:
+    """Read a UTF-8 text file; InputError names the file that is missing, is no text, or has more
+    bytes than `largest`."""
+    try:
+        facts = os.stat(path)
+        if not stat.S_ISREG(facts.st_mode):
+            raise InputError(f"{path} cannot be read: it is no file")
+        if (size := facts.st_size) > largest:
+            most = f"at most {largest / 1e6:.0f} MB of such a file are read"
+            raise InputError(f"{path} has {size / 1e6:.0f} MB; {most}")
+        text = Path(path).read_text(encoding="utf-8-sig")
+        if "\0" in text:
+            raise InputError(f"{path} is not UTF-8 text: it holds bytes of 0")
+        return text
     except FileNotFoundError:
         raise InputError(f"{path} does not exist") from None
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}") from None
     except UnicodeDecodeError:
         raise InputError(f"{path} is not UTF-8 text") from None
-
-
-def read_csv(path: str | Path, text: Collection[str] = ()) -> dict[str, np.ndarray]:
-    """Read a comma-separated table with one header row into columns.
-
-    A column is float64 where every cell is a number or empty (NaN), otherwise text; the columns
-    named in `text` are text always. Raises InputError naming the row of a ragged line, or the
-    column that stands in the header twice.
-    """
-    lines = csv.reader(read_text(path).splitlines())
-    header = [escape.from_csv_cell(name.strip()) for name in next(lines, [])]
-    if len(header) <= 1 and ";" in "".join(header):
-        raise InputError(f"{path}:1: columns are separated by ';' here; separate them by commas")
-    for name in header:
-        if not name or header.count(name) > 1:
-            raise InputError(f"{path}:1: every column needs its own name, and {name!r} is not one")
-    rows = []
-    for row in lines:
-        if any(cell.strip() for cell in row):
-            if len(row) != len(header):
-                raise InputError(
-                    f"{path}:{lines.line_num}: {len(row)} cells where the header names"
-                    f" {len(header)} columns; write an empty cell for what is unknown"
-                )
-            rows.append([escape.from_csv_cell(cell.strip()) for cell in row])
-    columns = zip(*rows, strict=True) if rows else ((),) * len(header)
-    return {
-        name: np.array(cells, dtype=np.str_) if name in text else _numbers_or_text(cells)
-        for name, cells in zip(header, columns, strict=True)
-    }
-
-
-def _numbers_or_text(cells: Collection[str]) -> np.ndarray:
-    try:
-        return np.array([float(cell or "nan") for cell in cells], dtype=np.float64)
-    except ValueError:
-        return np.array(cells, dtype=np.str_)
 
 
 # ------------------------------------------------------------------------------------- validating

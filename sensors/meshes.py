@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 
 from chains.errors import InputError
+from chains.sizes import check_claim, check_stored
 from sensors.documents import write_atomically
-from sensors.ply import Columns, read_ply, write_ply
+from sensors.ply import Columns, fans, read_ply, write_ply
 
 _GROUPS = {
     "positions": ("x", "y", "z"),
@@ -119,9 +120,39 @@ def _count_of_pcd(path: Path) -> int:
     if not head:
         raise InputError(f"{path} is empty (0 bytes); a PCD file was wanted")
     count = re.search(rb"^POINTS\s+(\d+)", head, re.MULTILINE)
-    if count is None or not re.search(rb"^DATA\s+\w+", head, re.MULTILINE):
+    data = re.search(rb"^DATA\s+(\w+)[^\n]*\n?", head, re.MULTILINE)
+    if count is None or data is None:
         raise InputError(f"{path} is no PCD file: it has no header with POINTS and DATA")
+    _check_pcd(path, head[: data.start()], data[1], data.end())
     return int(count[1])
+
+
+def _check_pcd(path: Path, head: bytes, kind: bytes, start: int) -> None:
+    """Refuse a header whose points the file cannot hold: Open3D believes it."""
+    told = {line.split()[0]: line.split()[1:] for line in head.splitlines() if line.split()}
+    try:
+        points = int(told[b"POINTS"][0])
+        wide = [int(size) for size in told.get(b"SIZE", ())]
+        each = [int(count) for count in told.get(b"COUNT", ())] or [1] * len(wide)
+        sound = {*wide} <= {1, 2, 4, 8} and min(each, default=0) >= 0
+        if not sound or len(told.get(b"FIELDS", ())) != len(wide):
+            raise ValueError
+        record = sum(size * count for size, count in zip(wide, each, strict=True))
+    except (KeyError, IndexError, ValueError):
+        raise InputError(f"{path} is no PCD file: its header's lines do not agree") from None
+    what = f"{points} points"
+    if kind == b"binary":
+        check_stored(path, start + points * record, what)
+    elif kind == b"binary_compressed":
+        with open(path, "rb") as file:
+            file.seek(start)
+            sizes = np.frombuffer(file.read(8), "<u4").astype(int)
+        if len(sizes) < 2 or sizes[1] != points * record:
+            raise InputError(f"{path} claims to hold {what}, which is not what is packed in it")
+        check_stored(path, start + 8 + int(sizes[0]), what)
+        check_claim(path, points * record, what)
+    else:  # as text each number takes a digit and a space
+        check_stored(path, start + 2 * points * sum(each) - 1, what)
 
 
 def _write_pcd(path: Path, columns: Mapping[str, np.ndarray]) -> None:
@@ -187,8 +218,10 @@ def read_mesh(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: no such mesh; give a PLY, OBJ or STL file.")
-    if path.suffix.lower() == ".ply" and (triangles := _ply_triangles(path)):
-        return triangles
+    if path.suffix.lower() == ".ply":
+        return _ply_triangles(path)
+    if path.suffix.lower() not in (".obj", ".stl"):
+        raise InputError(f"{path}: no triangles in it, or broken; give a PLY, OBJ or STL mesh.")
     o3d = _open3d()
 
     # The tensor reader would round doubles to float32; this one keeps them.
@@ -199,20 +232,25 @@ def read_mesh(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(mesh.vertices), np.asarray(mesh.triangles)
 
 
-def _ply_triangles(path: Path) -> tuple[np.ndarray, np.ndarray] | None:
-    """Vertices and triangles of a PLY file, without Open3D's start; None where not all of its
-    faces are triangles, or something is wrong with it."""
+def _ply_triangles(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and triangles of a PLY file; polygons are cut into fans."""
     try:
         elements = read_ply(path)
-    except InputError:
-        return None
+    except InputError as error:
+        why = str(error).removeprefix(str(path)).strip()
+        raise InputError(
+            f"{path}: no triangles in it, or broken ({why}); give a PLY, OBJ or STL mesh."
+        ) from None
     vertex, face = elements.get("vertex", {}), elements.get("face", {})
     corners = face.get("vertex_indices", face.get("vertex_index", np.zeros((0, 3), int)))
-    whole = {"x", "y", "z"} <= vertex.keys() and len(corners) and corners.shape[1] == 3
-    if not whole or corners.min() < 0 or corners.max() >= len(vertex["x"]):
-        return None
+    triangles, _ = fans(corners)
+    if not {"x", "y", "z"} <= vertex.keys() or not len(triangles):
+        raise InputError(f"{path}: no triangles in it, or broken; give a PLY, OBJ or STL mesh.")
+    if triangles.min() < 0 or triangles.max() >= len(vertex["x"]):
+        last = len(vertex["x"]) - 1
+        raise InputError(f"{path}: a triangle has a vertex that is none of 0 to {last}")
     xyz = np.stack([vertex[axis] for axis in "xyz"], axis=1).astype(float)
-    return xyz, corners.astype(np.int32)
+    return xyz, triangles.astype(np.int32)
 
 
 def ray_caster(vertices_m: np.ndarray, triangles: np.ndarray) -> Any:

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from chains.errors import InputError
+from chains.sizes import check_claim
 from sensors.documents import write_atomically
 from sensors.numbers import parse_numbers
 
@@ -52,6 +53,16 @@ def read_ply(path: str | Path) -> dict[str, Columns]:
     for element in elements:
         tables[element.name], offset = _read_element(path, data, offset, element, order)
     return tables
+
+
+def fans(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Triangles (F, 3) of polygons (P, k), -1 behind the last corner, and each one's polygon."""
+    if corners.ndim != 2 or corners.dtype.kind not in "iu" or corners.shape[1] < 3:
+        return np.zeros((0, 3), np.int64), np.zeros(0, np.int64)
+    corners = corners.astype(np.int64)
+    first, second = np.nonzero(corners[:, 2:] != -1)
+    fans = [corners[first, 0], corners[first, second + 1], corners[first, second + 2]]
+    return np.stack(fans, axis=1), first
 
 
 def write_ply(path: str | Path, elements: Mapping[str, Mapping[str, np.ndarray]]) -> None:
@@ -166,7 +177,13 @@ def _read_element(
     """
     runs, done, block = [], 0, _BLOCK_ROWS
     while done < element.count:
-        record = _record(data, offset, element, order)
+        try:
+            record = _record(data, offset, element, order)
+        except _NoLengthError:
+            raise InputError(
+                f"{path}: row {done + 1} of its element {element.name} has a list of no length that"
+                f" can be; get the whole file"
+            ) from None
         there = 0 if record is None else (len(data) - offset) // record.itemsize
         if there == 0:
             raise InputError(
@@ -179,6 +196,9 @@ def _read_element(
         offset += record.itemsize * len(rows)
         done += len(rows)
         block = min(2 * len(rows), _BLOCK_ROWS)
+    for name, _, length in element.properties:  # a list takes as much room as the longest
+        longest = max((run[name].shape[1] for run in runs if length is not None), default=0)
+        check_claim(path, 8 * longest * done, f"{done} lists as long as one of {name}")
     return {name: _join(runs, name, kind) for name, kind, _ in element.properties}, offset
 
 
@@ -192,11 +212,22 @@ def _record(data: np.ndarray, offset: int, element: _Element, order: str) -> np.
             size = _stored(length, order)
             if at + size.itemsize > len(data):
                 return None
-            count = (int(np.frombuffer(data, size, 1, at)[0]),)
+            count = (_length(np.frombuffer(data, size, 1, at)[0], len(data)),)
             fields.append((_length_of(name), size))
         fields.append((name, _stored(kind, order), count))
     record = np.dtype(fields)
     return record if 0 < record.itemsize <= len(data) - offset else None
+
+
+def _length(stored: np.generic, most: int) -> int:
+    """The length of a list, no longer than the file; -1 and the like are no length."""
+    if not 0 <= stored <= most:
+        raise _NoLengthError
+    return int(stored)
+
+
+class _NoLengthError(Exception):
+    """A list claims to be longer than its file, or shorter than nothing."""
 
 
 def _stored(kind: str, order: str) -> np.dtype:

@@ -5,6 +5,7 @@ This is the pyarrow door: `read_table` and `write_table` serve whoever needs a P
 
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chains.errors import InputError
+from chains.sizes import check_claim, most
 from sensors.documents import write_atomically
 from sensors.holds import Columns, average_hold
 from sensors.stops import POSE, Array, CsvTable, Targets, read_targets
@@ -133,7 +135,7 @@ class Recording:
         return cls(
             folder=folder,
             stops=stops,
-            location=table.text("location"),
+            location=table.locations(),
             time_s=table.times("time_s"),
             joints=table.joints(joint_names),
             bodies={body: table.pose(body) for body in bodies},
@@ -230,6 +232,8 @@ def unpack_zstd(data: bytes, size: int) -> bytes:
     """Decompress zstd data whose plain size is known; ValueError where it is no such data."""
     import pyarrow
 
+    if size > most(len(data)):
+        raise ValueError(f"{len(data)} bytes claim to be {size}")
     try:
         return pyarrow.decompress(data, decompressed_size=size, codec="zstd", asbytes=True)
     except OSError as error:
@@ -244,15 +248,20 @@ def _data_frame(columns: Mapping[str, np.ndarray]) -> "pandas.DataFrame":
     return pandas.DataFrame(dict(columns))
 
 
-def _open_parquet(path: Path) -> "ParquetFile":
+@contextmanager
+def _open_parquet(path: Path) -> Iterator["ParquetFile"]:
+    """The file, while it is read: whatever is wrong in it is one sentence."""
     import pyarrow
     import pyarrow.parquet
 
     try:
-        return pyarrow.parquet.ParquetFile(path)
+        with pyarrow.parquet.ParquetFile(path) as file:
+            rows, columns = file.metadata.num_rows, file.metadata.num_columns
+            check_claim(path, 8 * rows * columns, f"{rows} rows of {columns} columns")
+            yield file
     except FileNotFoundError:
         raise InputError(f"{path} does not exist") from None
-    except (pyarrow.ArrowException, OSError) as error:
+    except (pyarrow.ArrowException, OSError, MemoryError, UnicodeDecodeError) as error:
         raise InputError(f"{path} is not a Parquet file: {str(error).splitlines()[0]}") from None
 
 
@@ -262,7 +271,14 @@ def _columns(path: Path, table: "pyarrow.Table | pyarrow.RecordBatch") -> Column
         if table[name].null_count:
             raise InputError(f"{path}: column {name} has empty cells; every return needs one")
     arrays = {name: _numpy(table[name]) for name in table.schema.names}
-    return {name: a.astype(np.str_) if a.dtype == object else a for name, a in arrays.items()}
+    return {n: _text(path, n, a) if a.dtype == object else a for n, a in arrays.items()}
+
+
+def _text(path: Path, name: str, values: NDArray[Any]) -> NDArray[np.str_]:
+    """Values as text, each of which takes as much room as the longest."""
+    longest = max((len(str(value)) for value in values), default=0)
+    check_claim(path, 4 * longest * len(values), f"{len(values)} texts as long as one of {name}")
+    return values.astype(np.str_)
 
 
 def _numpy(column: "pyarrow.ChunkedArray | pyarrow.Array") -> NDArray[Any]:

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chains import escape
-from chains.errors import InputError
-from sensors.documents import plain, read_csv, write_atomically
+from chains.errors import LONGEST_NAME, InputError, is_file_name, shortened
+from sensors.documents import plain, write_atomically
+from sensors.numbers import read_csv
 
 Array = NDArray[np.float64]
 
@@ -49,11 +50,15 @@ class CsvTable:
         """Take the names of the rows: at least one row, no empty name, none twice."""
         if not self._names:
             raise InputError(f"{self.path} has no rows; it needs one per stop")
+        seen: set[str] = set()
         for row, name in enumerate(self._names):
-            if not name or "/" in name or "\\" in name:
-                raise InputError(f"{self.path}: row {row + 1}: {name!r} is no name for a file")
-            if name in self._names[:row]:
+            if not is_file_name(name):
+                raise InputError(
+                    f"{self.path}: row {row + 1}: {shortened(name)} is no name for a file"
+                )
+            if name in seen:
                 raise InputError(f"{self.path}: row {row + 1}: {name} is there twice; rename one")
+            seen.add(name)
         return self._names
 
     def text(self, name: str) -> NDArray[np.str_]:
@@ -69,6 +74,19 @@ class CsvTable:
         wrong = np.abs(values) > largest
         self.refuse(wrong, lambda row: f"{name} is {values[row]:g}; {units}")
         return values
+
+    def locations(self) -> NDArray[np.str_]:
+        """Take the names of places, one for every row: short, and nothing in them unseen."""
+        places = self.text("location")
+        wrong = [
+            len(place.encode("utf-8", "replace")) > LONGEST_NAME or not place.isprintable()
+            for place in places.tolist()
+        ]
+        self.refuse(
+            np.array(wrong, bool),
+            lambda row: f"location {shortened(str(places[row]))} is no short name of a place",
+        )
+        return places
 
     def times(self, name: str) -> Array:
         """Take a column of times in s; NaN throughout where there is none, or nothing in it."""

@@ -55,6 +55,16 @@ def test_every_page_is_linked_from_readme():
 
 
 @pytest.mark.slow
+def test_the_page_about_trust_runs(tmp_path):
+    """Its file of code leaves no effect in what was exported, and is evaluated when trusted."""
+    session = run_through(ROOT / "docs/trust.md", tmp_path)
+    words = " ".join((tmp_path / "extrinsics" / "extrinsics.yaml").read_text().split())
+    assert "model.yaml names effects of a Python file" in session.said
+    assert "--trust" in session.said and "lean: " in words
+    assert (tmp_path / "run" / "evaluation.json").is_file()
+
+
+@pytest.mark.slow
 def test_what_the_page_shows_is_what_is_printed(session):
     """But for the numbers; the size agrees to a tenth."""
     shown = re.findall(r"^```text\n(.*?)^```", session.text, flags=re.M | re.S)

@@ -26,6 +26,8 @@ def main() -> None:
         code = app(sys.argv[1:] or ["--help"], prog_name="rigcal", standalone_mode=False)
     except InputError as error:
         _fail(str(error), 2)
+    except MemoryError:
+        _fail("there is not enough memory for this; look with 'rigcal check' at how much it is", 2)
     except KeyboardInterrupt:
         code = INTERRUPTED
     except Exception as error:

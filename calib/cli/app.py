@@ -91,6 +91,14 @@ Json = Annotated[bool, typer.Option("--json", help="Print the machine-readable r
 Out = Annotated[Path, typer.Option("-o", "--out", help="Where to write.")]
 Force = Annotated[bool, typer.Option("--force", help="Even of a run that has not converged.")]
 Runs = Annotated[list[Path], typer.Argument(metavar="RUN...", help="Run folders.")]
+Trust = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--trust",
+        metavar="FILE_OR_HASH",
+        help="A Python file of effects, named by the input, that may run; or its sha256.",
+    ),
+]
 Workers = Annotated[
     int | None,
     typer.Option(

@@ -11,6 +11,7 @@ from calib.cli.app import (
     Json,
     Out,
     Runs,
+    Trust,
     Workers,
     app,
     effect_names,
@@ -50,13 +51,14 @@ def simulate(
     hide: Annotated[
         list[str] | None, typer.Option(metavar="EFFECT=SIZE", help="An effect to hide in it.")
     ] = None,
+    trust: Trust = None,
     as_json: Json = False,
 ) -> None:
     """Write a recording, and the truth beside it."""
     from calib.simulation import simulate as run
 
     with progress_bar() as progress:
-        run(spec, out, seed, _sizes(hide or []), progress)
+        run(spec, out, seed, _sizes(hide or []), progress, trust or [])
     say(
         {"recording": str(out), "truth": f"{out}.truth.json"},
         f"wrote {out} and {out}.truth.json",
@@ -119,6 +121,7 @@ def add(
         ),
     ] = None,
     without: Without = None,
+    trust: Trust = None,
     workers: Workers = None,
     as_json: Json = False,
 ) -> None:
@@ -128,8 +131,9 @@ def add(
     from calib.runs.add import add as grow
     from calib.runs.run import Run
 
+    grown_from = Run.open(run, trust or ())
     with threads(workers), progress_bar() as progress:
-        _tell(grow(Run.open(run), effects or [], out, progress, without or []), as_json)
+        _tell(grow(grown_from, effects or [], out, progress, without or []), as_json)
 
 
 @app.command()
@@ -138,6 +142,7 @@ def diagnose(
     refits: Annotated[
         bool, typer.Option("--refits/--no-refits", help="Whether to take the held-out falls.")
     ] = True,
+    trust: Trust = None,
     workers: Workers = None,
     as_json: Json = False,
 ) -> None:
@@ -145,7 +150,7 @@ def diagnose(
     from calib.runs.diagnose import diagnose as find
     from calib.runs.run import Run
 
-    fitted = Run.open(run)
+    fitted = Run.open(run, trust or ())
     with threads(workers), progress_bar() as progress:
         diagnosis = find(fitted, progress, refits)
     if as_json:
@@ -208,13 +213,14 @@ def evaluate(
         ),
     ] = None,
     raw: Annotated[bool, typer.Option("--raw", help="Of the returns before correction.")] = False,
+    trust: Trust = None,
     as_json: Json = False,
 ) -> None:
     """Accuracy and precision of every return, by ring, distance, incidence and label."""
     from calib.evaluation import evaluate_all
     from calib.runs.run import Run
 
-    opened = [Run.open(run) for run in runs]
+    opened = [Run.open(run, trust or ()) for run in runs]
     with progress_bar() as progress:
         evaluations = evaluate_all(opened, out, raw, progress)
     if as_json:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from calib.cli.app import Force, Json, Out, app, progress_bar, say
+from calib.cli.app import Force, Json, Out, Trust, app, progress_bar, say
 
 
 @app.command()
@@ -22,14 +22,16 @@ def export(
             "all that have anything to hold if not given.",
         ),
     ] = None,
+    trust: Trust = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Write the result for others: YAML, URDF, ROS 2, ring tables, pictures, tables."""
     from calib.exporters import export as write
+    from calib.runs.reopen import effects_that_may_run
     from calib.runs.run import Run
 
-    opened = Run.open(run)
+    opened = Run.open(run, trust or ())
     done = write(opened, out, formats or [], force)
     document = {
         "files": [str(file) for file in done.files],
@@ -37,6 +39,8 @@ def export(
         "left_out": done.left_out,
     }
     lines = [*opened.warning, *(f"wrote {file}" for file in done.files)]
+    if missing := effects_that_may_run(opened)[1]:
+        lines.append(missing)
     for name, why in done.left_out.items():
         lines.append(f"left out {name}: {why}")
     for name, sentences in done.not_held.items():
@@ -56,6 +60,7 @@ def apply(
     rig: Annotated[
         str | None, typer.Option(metavar="NAME", help="Whose LiDAR, where the run has several.")
     ] = None,
+    trust: Trust = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -63,8 +68,9 @@ def apply(
     from calib.evaluation.apply import apply as correct
     from calib.runs.run import Run
 
+    opened = Run.open(run, trust or ())
     with progress_bar() as progress:
-        done = correct(Run.open(run), clouds, out, rig, progress, force)
+        done = correct(opened, clouds, out, rig, progress, force)
     document = {
         "clouds": [
             {"file": str(a.path), "points": a.points, "moved_rms_mm": 1e3 * a.rms_m}

@@ -8,17 +8,17 @@ from typing import Annotated
 
 import typer
 
-from calib.cli.app import Json, Out, Runs, app, progress_bar, say
+from calib.cli.app import Json, Out, Runs, Trust, app, progress_bar, say
 from chains.errors import InputError
 
 
 @app.command()
-def report(runs: Runs, out: Out, as_json: Json = False) -> None:
+def report(runs: Runs, out: Out, trust: Trust = None, as_json: Json = False) -> None:
     """One page for a colleague: the verdict, what was found, and how good it is; no network."""
     from calib.report import report as write
     from calib.runs.run import Run
 
-    opened = [Run.open(run) for run in runs]
+    opened = [Run.open(run, trust or ()) for run in runs]
     with progress_bar() as progress:
         written = write(opened, out, progress)
     say(written.document(), f"wrote {out}: {written.summary}", as_json)
@@ -32,6 +32,7 @@ def plot(
         Path | None, typer.Option("-o", "--out", help="A .png, .svg or .pdf file.")
     ] = None,
     listed: Annotated[bool, typer.Option("--list", help="Which figures this run has.")] = False,
+    trust: Trust = None,
     as_json: Json = False,
 ) -> None:
     """One figure of a run's report, for a paper."""
@@ -40,7 +41,7 @@ def plot(
     from calib.runs.run import Run
 
     with progress_bar() as progress:
-        evidence = Evidence.of([Run.open(run)], progress)
+        evidence = Evidence.of([Run.open(run, trust or ())], progress)
         if listed:
             charts = [chart.document() for chart in charts_of(evidence).charts]
     if listed:
@@ -63,6 +64,7 @@ def view(
     show: Annotated[
         bool, typer.Option("--open/--no-open", help="Whether to open it in a browser.")
     ] = True,
+    trust: Trust = None,
     as_json: Json = False,
 ) -> None:
     """The browser workbench, on this machine alone, until Ctrl-C."""
@@ -73,4 +75,4 @@ def view(
         say({"url": url, "look_url": look_url}, text, as_json)
         sys.stdout.flush()
 
-    serve(runs, port, show, tell)
+    serve(runs, port, show, tell, trust or ())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from calib.effects.arm import (
@@ -31,6 +32,7 @@ from calib.effects.beams import (
 )
 from calib.effects.noise import NoiseIncidence, NoiseIntensity, NoiseRange
 from calib.effects.own.files import from_document, from_file, is_file
+from calib.effects.own.trust import NotTrustedError, Trust, trusted
 from calib.effects.range import (
     AzimuthRangeHarmonic,
     IncidenceAngleBias,
@@ -107,13 +109,17 @@ __all__ = [
     "Effect",
     "FrameOffset",
     "LazyColumn",
+    "NotTrustedError",
     "OneHot",
     "Param",
     "Site",
+    "Trust",
     "View",
     "find",
     "load_effects",
     "read",
+    "trust_in",
+    "trusted",
 ]
 
 
@@ -142,13 +148,15 @@ def find(name: str) -> Effect:
     return effect.at(chosen)
 
 
-def load_effects(texts: str | Iterable[str]) -> tuple[Effect, ...]:
+def load_effects(texts: str | Iterable[str], trust: Trust | None = None) -> tuple[Effect, ...]:
     """The effects that a command line names, each once.
 
     Args:
         texts: names of the catalogue, ``family@shape``, and files of effects of the user's own:
             ``file.yaml`` of formulas, ``file.py`` or ``file.py:Class``. One text may hold several
             of these, with commas between.
+        trust: the Python files that may run, where a file names these effects; None where the user
+            did so himself.
 
     Raises:
         InputError: there is no such effect or file, or two effects have one name.
@@ -156,24 +164,38 @@ def load_effects(texts: str | Iterable[str]) -> tuple[Effect, ...]:
     texts = texts.split(",") if isinstance(texts, str) else texts
     found: dict[str, Effect] = {}
     for text in (text.strip() for text in texts if text.strip()):
-        for effect in map(_own, from_file(text)) if is_file(text) else [find(text)]:
+        for effect in map(_own, from_file(text, trust)) if is_file(text) else [find(text)]:
             same = found.setdefault(effect.name, effect)
             if same.document() != effect.document():
                 raise InputError(f"{text}: another effect is called '{effect.name}' too")
     return tuple(found.values())
 
 
-def read(document: str | Mapping[str, Any], path: str | Path = "model.yaml") -> Effect:
+def read(
+    document: str | Mapping[str, Any],
+    path: str | Path = "model.yaml",
+    trust: Trust = MappingProxyType({}),
+) -> Effect:
     """The effect that `Effect.document` spelled.
 
     Args:
         document: a name in the catalogue, the mapping of a formula, or a class in a Python file.
         path: where it stands, for messages.
+        trust: the Python files that may run.
 
     Raises:
+        NotTrustedError: it is of a Python file that may not run.
         InputError: there is no such effect.
     """
-    return find(document) if isinstance(document, str) else _own(from_document(document, path))
+    if isinstance(document, str):
+        return find(document)
+    return _own(from_document(document, path, trust))
+
+
+def trust_in(effects: Iterable[Effect]) -> Trust:
+    """The Python files that effects came from, which ran: the user trusts them already."""
+    origins = (effect.origin for effect in effects if effect.origin)
+    return {origin["sha256"]: Path(origin["python"]) for origin in origins}
 
 
 def _own(effect: Effect) -> Effect:

@@ -16,6 +16,7 @@ scatter by s about e, so a hold says the same raw or averaged.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -47,7 +48,13 @@ COLUMNS = {
     "precision_m": "standard deviation of a return",
     "raw_signed_error_m raw_accuracy_m": "the same, before correction",
 }
+_APART = re.compile(r"[%/\\=]")  # what would end a part of a path, or its key
 NEAREST = 1024  # points of a stop whose nearest point of the mesh is sought: each costs many rays
+
+
+def _part(name: str) -> str:
+    """A name as a part of a path, where readers of such folders find it again."""
+    return _APART.sub(lambda found: f"%{ord(found[0]):02X}", name)
 
 
 def evaluate_stop(scan: ScanStop, values: Values) -> Evaluated:
@@ -199,7 +206,8 @@ def write_evaluation(
         write_yaml(points / MEANING, COLUMNS)
         for done in stops:
             tally.add(done)
-            place = points / f"sensor={done.sensor}/location={done.location}/stop={done.stop}"
+            names = {"sensor": done.sensor, "location": done.location, "stop": done.stop}
+            place = points / "/".join(f"{key}={_part(name)}" for key, name in names.items())
             place.mkdir(parents=True, exist_ok=True)
             write_table(place / f"{done.rig}.parquet", done.points)
         document = tally.document(labels)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +20,7 @@ from calib.problem.model import Source
 from calib.residuals.beams import site_error
 from calib.residuals.scan import turned
 from calib.rig import Rig, load_rig
-from calib.runs.reopen import model_of, problem_of, reopened
+from calib.runs.reopen import effects_that_may_run, problem_of, reopened
 from calib.runs.run import Run
 from calib.solve.estimate import values_of
 from calib.solve.fit import Progress
@@ -49,10 +49,12 @@ class Correction:
     Args:
         rig: as on paper.
         effects: the model's effects on beams, and the estimate (P,) of each.
+        closed: effects that are not known here, as their Python file may not run -> that sentence.
     """
 
     rig: Rig
     effects: Sequence[tuple[Effect, np.ndarray]]
+    closed: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
     def of(cls, run: Run, rig_name: str | None = None) -> Correction:
@@ -63,9 +65,13 @@ class Correction:
         """
         rig = _rig(run, rig_name)
         part = run.solution.part(rig.name)
-        known = [e for e in model_of(run).effects if e.name in part.effects]
-        of_beams = [e for e in known if e.site is Site.BEAM]
-        return cls(rig, [(e, part.effects[e.name].estimate) for e in of_beams])
+        effects, why = effects_that_may_run(run)
+        known = {e.name: e for e in effects if e.name in part.effects}
+        of_beams = [e for e in known.values() if e.site is Site.BEAM]
+        closed = {
+            name: f"is not known: {why}" for name in part.effects if why and name not in known
+        }
+        return cls(rig, [(e, part.effects[e.name].estimate) for e in of_beams], closed=closed)
 
     def usable(self, columns: Collection[str]) -> tuple[Correction, dict[str, str]]:
         """What can be corrected where these columns are known, and what of it not, and why."""
@@ -73,7 +79,7 @@ class Correction:
         lacking = {e.name: sorted({*e.covariates} - known) for e, _ in self.effects}
         kept = [(e, theta) for e, theta in self.effects if not lacking[e.name]]
         why = {name: f"needs {', '.join(missing)}" for name, missing in lacking.items() if missing}
-        return replace(self, effects=kept), why
+        return replace(self, effects=kept), {**why, **self.closed}
 
     def apply(self, xyz_m: np.ndarray, columns: Mapping[str, LazyColumn]) -> np.ndarray:
         """Corrected points (N, 3) of points as the driver gives them, in the LiDAR's frame.

@@ -8,7 +8,7 @@ alone shifts that ring for good. All others change from stop to stop, or from po
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from calib.exporters.written import Unheld, Written, head
 from calib.problem.model import owned
 from calib.results.solution import FrameEstimate, Part
 from calib.rig import Rig
-from calib.runs.reopen import model_of, reopened
+from calib.runs.reopen import effects_that_may_run, reopened
 from calib.runs.run import Run
 from chains import se3
 from chains.errors import InputError
@@ -38,13 +38,23 @@ _PROBES = 16  # poses at which a basis must be the same to count as fixed
 
 @dataclass(frozen=True)
 class FittedRig:
-    """One rig of a run, with what the fit found of it."""
+    """One rig of a run, with what the fit found of it.
+
+    Args:
+        run: the run.
+        rig: as on paper.
+        part: what was estimated of it.
+        effects: of the model, by name.
+        several: whether the run has more rigs.
+        closed: effects that are not known here, as their Python file may not run -> that sentence.
+    """
 
     run: Run
     rig: Rig
     part: Part
     effects: Mapping[str, Effect]
     several: bool
+    closed: Mapping[str, str] = field(default_factory=dict)
 
     def file(self, folder: Path, name: str) -> Path:
         """Where a file of this rig goes: ``arm.urdf``, or ``arm.<rig>.urdf`` of several rigs."""
@@ -138,7 +148,7 @@ class FittedRig:
 
     def not_held(self, held: Iterable[str] = ()) -> list[str]:
         """A sentence for each effect of the rig that a format has no place for."""
-        held, out = set(held), []
+        held, out = set(held), [f"{name}: {why}" for name, why in self.closed.items()]
         for name, effect in self.effects.items():
             if name not in held:
                 what = f"{name}: an error of {WHERE[effect.site]}"
@@ -178,9 +188,12 @@ class Fitted:
     def _rig(self, rig: Rig) -> FittedRig:
         several = len(self.run.model["recordings"]) > 1
         part = self.run.solution.part(rig.name if several else None)
-        known = model_of(self.run).effects
+        known, why = effects_that_may_run(self.run)
         effects = {effect.name: effect for effect in known if effect.name in part.effects}
-        return FittedRig(run=self.run, rig=rig, part=part, effects=effects, several=several)
+        closed = {name: why for name in part.effects if why and name not in effects}
+        return FittedRig(
+            run=self.run, rig=rig, part=part, effects=effects, several=several, closed=closed
+        )
 
 
 Format = Callable[[Fitted, Path], Written]

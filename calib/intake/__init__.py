@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -29,7 +28,7 @@ from calib.intake.still import MIN_HOLD_S, find_holds
 from calib.intake.surface import write_surface
 from calib.results.check import Check, check
 from calib.rig import load_rig
-from chains.errors import InputError
+from chains.errors import InputError, is_file_name, shortened
 from sensors.documents import replace_folder, write_atomically
 from sensors.readers.base import Columns, Options, Progress
 from sensors.stops import write_columns
@@ -123,7 +122,7 @@ def import_files(
         if choices.rig is not None:
             columns, said, more = rigfile.matched(choices.rig, columns)
         else:
-            name = re.sub(r"[/\\]", "-", out.name) or "rig"
+            name = out.name if is_file_name(out.name) else "rig"
             columns, said, more = rigfile.first_rig(folder, name, gathered, columns, options.lidar)
         rig = load_rig(folder)
         base = next((b for b in (rig.tracker.bodies if rig.tracker else ())
@@ -133,6 +132,7 @@ def import_files(
         odd += more
         write_columns(folder / "stops.csv", _ordered(columns))
         if share:
+            _check_names(columns["stop"].tolist())
             scans.write(folder / "scans", columns["stop"].tolist(), share, progress)
         rods, more = targets.join(gathered.spheres, gathered.tracks)
         odd += more
@@ -212,6 +212,16 @@ def _still(gathered: Gathered, timed: bool) -> _Cut:
     return _Cut(columns, share, [], [f"nothing says when the rig stood still: {what}"])
 
 
+def _check_names(stops: Sequence[str]) -> None:
+    """Refuse stops that no file can be named after."""
+    for name in stops:
+        if not is_file_name(str(name)):
+            raise InputError(
+                f"stop {shortened(str(name))} is no name for a file; rename the file or row that "
+                f"it is called after"
+            )
+
+
 def _thinned(cut: _Cut, most: int | None) -> tuple[Columns, scans.Share]:
     """The stops, or so many of them, evenly spread, and which turns belong to each."""
     count = len(cut.columns["stop"])
@@ -232,6 +242,11 @@ def _write_parts(folder: Path, gathered: Gathered, rig: Path | None) -> list[str
     name, odd = "arm.urdf", []
     if rig is not None:
         name = str(section(rig, "arm").get("urdf", name))
+        if Path(name).is_absolute() or ".." in Path(name).parts or "\0" in name:
+            raise InputError(
+                f"{rig}: arm.urdf is {shortened(name)}, and the arm is written into the recording; "
+                f"name a file there, arm.urdf say"
+            )
         shutil.copyfile(rig, folder / "rig.yaml")
         for file in _files_of(rig):
             if (rig.parent / file).is_file():

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -54,13 +55,24 @@ class Model:
         return cls(named, tuple(fixed), tuple(without))
 
     @classmethod
-    def read(cls, document: Mapping[str, Any], path: Path | str = "model.yaml") -> Model:
-        """The model that a run's model.yaml describes, `path` being where that stands.
+    def read(
+        cls,
+        document: Mapping[str, Any],
+        path: Path | str = "model.yaml",
+        trust: effects.Trust = MappingProxyType({}),
+    ) -> Model:
+        """The model that a run's model.yaml describes.
+
+        Args:
+            document: what model.yaml holds.
+            path: where it stands, for messages.
+            trust: the Python files of effects that may run, as `calib.effects.trusted` gives them.
 
         Raises:
+            NotTrustedError: an effect of a Python file that may not run.
             InputError: an effect that there is not, or no longer.
         """
-        found = tuple(effects.read(effect, path) for effect in document["effects"])
+        found = tuple(effects.read(effect, path, trust) for effect in document["effects"])
         return cls(found, tuple(document["fixed"]), tuple(document.get("without", ())))
 
     def document(self) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from chains import se3
 from chains.arm import Mass, read_arm, read_masses
-from chains.errors import InputError
+from chains.errors import InputError, is_file_name, shortened
 from chains.frames import Edge, FrameTree, unknown_name
 from sensors.documents import Document, Marks, Number, Triple, read_yaml, validate
 from sensors.lidar import LidarFile, LidarModel, Size, load_lidar
@@ -116,6 +116,12 @@ class Rig:
         return tuple(edge.joint.name for edge in edges if edge.joint is not None)
 
 
+def _file_name(name: str) -> str:
+    if not is_file_name(name):
+        raise ValueError(f"{shortened(name)} is no name for a file, and a rig's names some")
+    return name
+
+
 def _metres(length: float) -> float:
     if abs(length) > LARGEST_FRAME_M:
         raise ValueError(f"{length:g} m looks like millimetres; give metres")
@@ -203,7 +209,7 @@ class _Reference(Document):
 
 
 class _RigFile(Document):
-    name: Annotated[str, pydantic.Field(pattern=r"^[^/\\]+$")]
+    name: Annotated[str, pydantic.AfterValidator(_file_name)]
     lidar: _Lidar | None = None
     arm: _Arm | None = None
     frames: dict[str, _Frame] = pydantic.Field(default_factory=dict)

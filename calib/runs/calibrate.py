@@ -5,14 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from calib import problem as problems
-from calib.effects import Effect, load_effects
+from calib.effects import Effect, load_effects, trust_in
 from calib.problem import Problem
 from calib.problem.model import Model, Source
 from calib.problem.without import leave_out
@@ -72,7 +72,7 @@ def calibrate(
         _refuse_twice([Path(r).resolve() for r in recordings])
         sources = leave_out([Source.open(r) for r in recordings], model.without)
         _fit(sources, model, folder, _Choices(hold_out, folds, prior), progress)
-    return Run.open(out)
+    return Run.open(out, trust_in(model.effects))
 
 
 def grow(
@@ -100,20 +100,21 @@ def grow(
         _refuse_idle(model, run, sources)
         told = {key: run.model.get(key) for key in ("hold_out", "folds", "prior")}
         _fit(sources, model, folder, _Choices(**told, grown_from=run), progress, start)
-    return Run.open(out)
+    return Run.open(out, {**run.trust, **trust_in(model.effects)})
 
 
 def grown_model(run: Run, added: Sequence[str]) -> Model:
     """A run's model and more effects, as ``rigcal add`` names them.
 
     An effect that needs a shape and is given none takes the one that the run's diagnosis found
-    for it, or else its usual one.
+    for it, or else its usual one. Who names a Python file here trusts it, where the run has it too.
 
     Raises:
         InputError: an effect is unknown, or in the model already.
     """
-    found = (_shaped(effect, run) for effect in load_effects(added))
-    return model_of(run).plus(tuple(found))
+    found = tuple(_shaped(effect, run) for effect in load_effects(added))
+    knowing = replace(run, trust={**run.trust, **trust_in(found)})
+    return model_of(knowing).plus(found)
 
 
 def _shaped(effect: Effect, run: Run) -> Effect:

@@ -93,7 +93,10 @@ def command_without(run: Run, tokens: Sequence[str]) -> str:
     effects = run.model["effects"]
     out = ["-o", f"{run.folder}-without"]
     if any(not isinstance(effect, str) for effect in effects):  # of files, or with a shape
-        return shlex.join(["rigcal", "add", str(run.folder), *out, *without[-2 * len(tokens) :]])
+        named = (e["python"] for e in effects if not isinstance(e, str) and "python" in e)
+        trust = [part for file in dict.fromkeys(named) for part in ("--trust", str(file))]
+        new = without[-2 * len(tokens) :]
+        return shlex.join(["rigcal", "add", str(run.folder), *out, *new, *trust])
     chosen = [] if tuple(effects) == DEFAULT else ["--effects", ",".join(effects)]
     chosen += [part for name in run.model["fixed"] for part in ("--fix", name)]
     for key, usual in (("hold_out", "location"), ("folds", 1), ("prior", None)):

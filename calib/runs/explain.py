@@ -11,10 +11,11 @@ from typing import Any
 
 from calib.blunders import told
 from calib.diagnosis import Diagnosis
-from calib.effects import load_effects
+from calib.effects import load_effects, trust_in
 from calib.problem.model import Model, Source
 from calib.runs.calibrate import calibrate, grow, recordings_document
 from calib.runs.diagnose import diagnose
+from calib.runs.reopen import model_of
 from calib.runs.run import Run
 from calib.solve.fit import Progress
 from chains.errors import InputError
@@ -174,7 +175,7 @@ class _Climb:
 
     @property
     def _model(self) -> Model:
-        return Model.read(self.run.model)
+        return model_of(self.run)
 
     def _try(self, model: Model, added: list[str], dropped: list[str]) -> None:
         folder = self._next()
@@ -210,7 +211,7 @@ class _Climb:
     def _finished(self, folder: Path, model: Model, below: Run | None) -> Run | None:
         """The rung that an earlier call made here, if it is the same one."""
         try:
-            run = Run.open(folder)
+            run = Run.open(folder, trust_in(model.effects))
             run.state()
         except InputError:
             return None

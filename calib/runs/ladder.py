@@ -111,6 +111,6 @@ def _below(run: Run, known: dict[Path, Run]) -> Run | None:
     if Path(folder).resolve() in known:
         return known[Path(folder).resolve()]
     try:
-        return Run.open(folder)
+        return Run.open(folder, run.trust)
     except InputError:
         return None

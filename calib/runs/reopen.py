@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from calib.effects import Effect, NotTrustedError, read
 from calib.problem import Problem, build
 from calib.problem.model import Model, Source
 from calib.problem.without import leave_out
@@ -20,8 +21,24 @@ _opened: dict[tuple[Path, str], Source] = {}
 
 
 def model_of(run: Run) -> Model:
-    """The model that a run was fitted with."""
-    return Model.read(run.model, run.folder / MODEL)
+    """The model that a run was fitted with.
+
+    Raises:
+        NotTrustedError: it has an effect of a Python file that the user did not say may run.
+    """
+    return Model.read(run.model, run.folder / MODEL, run.trust)
+
+
+def effects_that_may_run(run: Run) -> tuple[list[Effect], str]:
+    """Effects of a run's model but those of Python files that the user did not say may run, and
+    the sentence that says which these are; empty where there is none."""
+    found, why = [], ""
+    for document in run.model["effects"]:
+        try:
+            found.append(read(document, run.folder / MODEL, run.trust))
+        except NotTrustedError as error:
+            why = str(error)
+    return found, why
 
 
 def reopened(run: Run, without: Sequence[str] | None = None) -> list[Source]:

@@ -5,18 +5,20 @@ from __future__ import annotations
 import importlib.metadata
 import platform
 import re
-import zipfile
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+import pydantic
 
+from calib.effects import Trust, trusted
 from calib.results.solution import EffectEstimate, FrameEstimate, Part, Solution
 from chains import se3
 from chains.errors import InputError
-from sensors.documents import read_yaml
+from sensors.documents import Document, read_json, read_yaml, validate
+from sensors.numbers import read_arrays
 
 SOLUTION, MODEL, SUMMARY, COVARIANCE, RESIDUALS, STATE, DIAGNOSIS = (
     "solution.yaml",
@@ -39,20 +41,33 @@ NOT_CONVERGED = "NOT CONVERGED: the fit did not end at an optimum; its numbers a
 
 @dataclass(frozen=True)
 class Run:
-    """A run folder, read."""
+    """A run folder, read.
+
+    Args:
+        folder: where it is.
+        model, summary, solution: its files.
+        trust: the Python files of effects that may run, where its model names them.
+    """
 
     folder: Path
     model: dict[str, Any]
     summary: dict[str, Any]
     solution: Solution
+    trust: Trust = field(default_factory=dict)
 
     @classmethod
-    def open(cls, folder: Path | str) -> Run:
-        """Read a run.
+    def open(cls, folder: Path | str, trust: Trust | Iterable[str | Path] = ()) -> Run:
+        """Read a run. No code of it is run, now or later, but what `trust` names.
+
+        Args:
+            folder: where it is.
+            trust: Python files of effects, or their sha256; as ``--trust`` takes them.
 
         Raises:
-            InputError: the folder is no run, or a part of it is missing or of another version.
+            InputError: the folder is no run, or a part of it is missing or of another version; or
+                something to trust is neither file nor hash.
         """
+        may_run = trust if isinstance(trust, Mapping) else trusted(trust)
         folder = Path(folder)
         if not (folder / MODEL).is_file():
             raise InputError(
@@ -62,10 +77,9 @@ class Run:
             if not (folder / name).is_file():
                 raise InputError(f"{folder / name} is missing; the run is incomplete, fit it again")
         try:
-            return cls(
-                folder, _yaml(folder / MODEL), _json(folder / SUMMARY), read_solution(folder)
-            )
-        except (KeyError, TypeError, ValueError) as error:
+            model, summary = _model(folder / MODEL), _json(folder / SUMMARY)
+            return cls(folder, model, summary, read_solution(folder), trust=may_run)
+        except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
             if isinstance(error, InputError):
                 raise
             raise InputError(
@@ -170,18 +184,17 @@ class Run:
                 f"{path} is missing: the run was made by an earlier version; fit it again"
             )
         try:
-            with np.load(path) as stored:
-                names = [name for name in stored.files if name.startswith(prefix)]
-                return {name.removeprefix(prefix): stored[name] for name in names}
-        except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+            stored = _arrays(path)
+        except InputError as error:
             raise InputError(f"{path} cannot be read ({error}); fit the run again") from None
+        return {n.removeprefix(prefix): a for n, a in stored.items() if n.startswith(prefix)}
 
 
 def read_solution(folder: Path) -> Solution:
     """The solution of a run folder."""
     data = _yaml(folder / SOLUTION)
-    with np.load(folder / COVARIANCE) as stored:
-        names, covariance = tuple(stored["names"].tolist()), stored["covariance"]
+    stored = _arrays(folder / COVARIANCE)
+    names, covariance = tuple(stored["names"].tolist()), stored["covariance"]
     recordings = {n: _read_part(p) for n, p in data.get("recordings", {}).items()}
     return Solution(
         shared=_read_part(data),
@@ -205,6 +218,36 @@ def versions() -> dict[str, str]:
     names = ("rigcal", "gtsam", "numpy", "scipy")
     numbers = {n: importlib.metadata.version(n) for n in names}
     return numbers | {"python": platform.python_version()}
+
+
+class _Fitted(Document):
+    """A recording that a run was fitted to."""
+
+    model_config = pydantic.ConfigDict(extra="ignore")
+    path: str
+    rig: str
+    sha256: str
+
+
+class _ModelFile(Document):
+    """What of a run's model.yaml is looked at."""
+
+    model_config = pydantic.ConfigDict(extra="ignore")
+    recordings: Annotated[tuple[_Fitted, ...], pydantic.Field(min_length=1)]
+    effects: tuple[str | dict[str, Any], ...]
+    fixed: tuple[str, ...] = ()
+    without: tuple[str, ...] = ()
+    hold_out: str = "location"
+    folds: int = 1
+    prior: str | None = None
+    grown_from: str | None = None
+
+
+def _model(path: Path) -> dict[str, Any]:
+    """A run's model.yaml, as it stands, once it is known to be one."""
+    data, marks = read_yaml(path)
+    validate(_ModelFile, data, path, marks)
+    return data
 
 
 def _effect_name(document: str | Mapping[str, Any]) -> str:
@@ -236,11 +279,16 @@ def _read_part(data: Mapping[str, Any]) -> Part:
     return Part(frames, effects)
 
 
+def _arrays(path: Path) -> dict[str, np.ndarray]:
+    stored = read_arrays(path)
+    if not isinstance(stored, dict):
+        raise InputError(f"{path} is one array, where arrays with names are wanted")
+    return stored
+
+
 def _yaml(path: Path) -> Any:
     return read_yaml(path)[0]
 
 
 def _json(path: Path) -> Any:
-    import json
-
-    return json.loads(path.read_text(encoding="utf-8"))
+    return read_json(path)

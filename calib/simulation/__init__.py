@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
-from calib.rig import load_rig
+from calib.effects import trusted
+from calib.rig import Rig, load_rig
 from calib.simulation import rig as rig_on_paper
-from calib.simulation.room import build
+from calib.simulation.room import Room, build
 from calib.simulation.scan import Scanner
 from calib.simulation.spec import PRESETS, Spec, load_spec
 from calib.simulation.stops import World, plan
-from calib.simulation.truth import draw, stream
+from calib.simulation.truth import Truth, draw, stream
 from calib.simulation.write import write_reference, write_stops, write_targets, write_truth
 from chains.errors import InputError
 from sensors.documents import replace_folder, write_yaml
@@ -28,6 +29,7 @@ def simulate(
     seed: int = 0,
     hide: Mapping[str, float] | None = None,
     progress: Progress | None = None,
+    trust: Iterable[str | Path] = (),
 ) -> None:
     """Write a simulated recording, and the truth beside it as ``<out>.truth.json``.
 
@@ -40,36 +42,47 @@ def simulate(
         seed: 0 or more.
         hide: effect, or file of effects -> size, in sigmas of its parameters (see `truth.draw`).
         progress: called with what is done, how much of it, and how much there is.
+        trust: Python files of effects that a spec's file may name, or their sha256.
 
     Raises:
         InputError: the spec, the seed or an effect's name is wrong, or `out` is something else.
     """
+    may_run = trusted(trust) if isinstance(spec, str) else None
     spec = load_spec(spec) if isinstance(spec, str) else spec
     if seed < 0:
         raise InputError(f"seed {seed} is negative; give 0 or more")
     out = Path(out)
     with replace_folder(out, "rig.yaml", "recording") as folder:
-        _record(spec, folder, seed, dict(hide or {}), progress or (lambda what, done, total: None))
+        rig, room = _on_paper(spec, folder, seed)
+        truth = draw(rig, spec, dict(hide or {}), seed, may_run)
+        _record(truth, spec, room, folder, seed, progress or (lambda what, done, total: None))
         (folder / "truth.json").replace(out.with_name(f"{out.name}.truth.json"))
 
 
-def _record(
-    spec: Spec, folder: Path, seed: int, hide: dict[str, float], progress: Progress
-) -> None:
-    world_seed = seed if spec.world_seed is None else spec.world_seed
-    room = build(spec.room, spec.mesh_error_m, stream(world_seed, "room"))
+def _on_paper(spec: Spec, folder: Path, seed: int) -> tuple[Rig, Room]:
+    """Write what is known before anything is measured."""
+    room = build(spec.room, spec.mesh_error_m, stream(_world(spec, seed), "room"))
     if spec.mesh:
         write_reference(folder / "reference", room.measured)
     if spec.arm:
         (folder / "arm.urdf").write_text(rig_on_paper.urdf(), encoding="utf-8")
     write_yaml(folder / "rig.yaml", rig_on_paper.document(spec))
-    rig = load_rig(folder)
-    truth = draw(rig, spec, hide, seed)
+    return load_rig(folder), room
+
+
+def _world(spec: Spec, seed: int) -> int:
+    return seed if spec.world_seed is None else spec.world_seed
+
+
+def _record(
+    truth: Truth, spec: Spec, room: Room, folder: Path, seed: int, progress: Progress
+) -> None:
+    rig = truth.rig
     stops = plan(rig, spec, room.true, stream(seed, "plan"))
     world = World.of(truth, stops, spec.noise, stream(seed, "encoders"))
     write_stops(folder / "stops.csv", world, spec, stream(seed, "tracker"))
     if spec.targets:
-        write_targets(folder / "targets.csv", truth, spec, stream(world_seed, "targets"))
+        write_targets(folder / "targets.csv", truth, spec, stream(_world(spec, seed), "targets"))
     if spec.lidar:
         scanner, Ts_faro_lidar = Scanner(truth, room, spec), world.in_faro(rig.lidar_frame)
         for k, name in enumerate(stops.names):

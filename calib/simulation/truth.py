@@ -8,7 +8,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.effects import DEFAULT, Effect, FrameOffset, OneHot, Site, View, find, load_effects
+from calib.effects import (
+    DEFAULT,
+    Effect,
+    FrameOffset,
+    OneHot,
+    Site,
+    Trust,
+    View,
+    find,
+    load_effects,
+)
 from calib.problem.model import owned
 from calib.rig import Rig
 from calib.simulation.spec import Spec
@@ -62,7 +72,9 @@ class Truth:
         return frames
 
 
-def draw(rig: Rig, spec: Spec, hide: Mapping[str, float], seed: int) -> Truth:
+def draw(
+    rig: Rig, spec: Spec, hide: Mapping[str, float], seed: int, trust: Trust | None = None
+) -> Truth:
     """Hardware as it might have been built, with effects hidden in it.
 
     Frames are off by their sigma. The default effects are off by 0.6 of their parameters' sigma;
@@ -76,14 +88,15 @@ def draw(rig: Rig, spec: Spec, hide: Mapping[str, float], seed: int) -> Truth:
         spec: how far from paper hardware is built.
         hide: what `calib.effects.load_effects` takes -> size.
         seed: of the recording.
+        trust: the Python files that the spec may name; None where the caller made it himself.
 
     Raises:
-        InputError: there is no such effect, or it finds nothing to act on.
+        InputError: there is no such effect, or it may not run, or it finds nothing to act on.
     """
     shared_seed = seed if spec.world_seed is None else spec.world_seed
     asked = [(effect, size) for text, size in hide.items() for effect in load_effects([text])]
     hidden = {effect.name: size for effect, size in asked}
-    given = [(e, value) for text, value in spec.acting.items() for e in load_effects([text])]
+    given = [(e, value) for text, value in spec.acting.items() for e in load_effects([text], trust)]
     hidden_or_given = {*hidden, *(effect.name for effect, _ in given)}
     usual = [FrameOffset(name) for name in rig.frame_sigma]
     usual += [find(name) for name in DEFAULT if name not in hidden_or_given]

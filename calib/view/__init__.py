@@ -7,7 +7,7 @@ import signal
 import sys
 import threading
 import webbrowser
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,6 +23,7 @@ def view(
     port: int = 0,
     show: bool = True,
     tell: Callable[[str, str], None] = lambda url, look_url: None,
+    trust: Iterable[str | Path] = (),
 ) -> None:
     """Serve the workbench on this machine alone, until Ctrl-C.
 
@@ -32,15 +33,17 @@ def view(
         show: whether to open it in a browser, where there is one.
         tell: called with two addresses as soon as they are served: one that may do everything,
             and one that may only look. Each holds a key; without one, nothing is served.
+        trust: Python files of effects that the runs' models may name, or their sha256.
 
     Raises:
         InputError: no run can be opened, viser is not installed, or the port is taken.
     """
+    from calib.effects import trusted
     from calib.view.bench import Bench
     from calib.view.desk import Desk
     from calib.view.server import serve
 
-    bench = Bench(Desk.of(runs))
+    bench = Bench(Desk.of(runs, trusted(trust)))
     served = serve(port)
     try:
         with _interruption() as interrupted:

@@ -77,7 +77,7 @@ class Bench:
         with self._lock:
             if self.busy:
                 raise InputError("one fit is running already; wait for it, or cancel it")
-            job = self._job = Job(run, effect, out, without)
+            job = self._job = Job(run, effect, out, without, self._desk.trust)
         threading.Thread(target=self._follow, args=(job, by), daemon=True).start()
 
     def stop(self) -> None:

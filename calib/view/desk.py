@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from calib.diagnosis.verdict import worth_adding
-from calib.effects import CATALOGUE, find
+from calib.effects import CATALOGUE, Trust, find
 from calib.runs.ladder import Rung, ladder
 from calib.runs.run import Run
 from chains.errors import InputError
@@ -95,20 +96,22 @@ class Desk:
         runs: by the name that each is shown under, the lowest rung of a ladder first.
         chosen: which of them is looked at.
         refused: a sentence for each folder that could not be opened.
+        trust: the Python files of effects that may run.
     """
 
     runs: dict[str, Run] = field(default_factory=dict)
     chosen: str = ""
     refused: list[str] = field(default_factory=list)
+    trust: Trust = field(default_factory=dict)
 
     @classmethod
-    def of(cls, folders: Sequence[Path | str]) -> Desk:
+    def of(cls, folders: Sequence[Path | str], trust: Trust = MappingProxyType({})) -> Desk:
         """Runs, and those that they grew from; the last one is chosen.
 
         Raises:
             InputError: none of them can be opened; of several, those that can are.
         """
-        desk = cls()
+        desk = cls(trust=trust)
         for folder in folders:
             try:
                 desk.add(Path(folder))
@@ -133,7 +136,7 @@ class Desk:
         Raises:
             InputError: it cannot be opened.
         """
-        run = Run.open(folder)
+        run = Run.open(folder, self.trust)
         for rung in ladder([run]) or [Rung(run, None)]:
             self.chosen = self.name_of(rung.run.folder)
             self.runs[self.chosen] = rung.run
@@ -172,7 +175,11 @@ class Desk:
             offered |= {c["add"]: c["add"] for c in findings.candidates}
         families = {name.partition("@")[0] for name in (*offered, *self.run.effects)}
         offered |= {e.name: e.name for e in CATALOGUE if e.family not in families}
-        return {name: what for name, what in offered.items() if name not in self.run.effects}
+        return {
+            name: what
+            for name, what in offered.items()
+            if name not in self.run.effects and _addable(name, what)
+        }
 
     def folder_for(self, effect: str) -> Path:
         """Where a run with one more effect goes: beside this one, under a name not yet taken."""
@@ -197,3 +204,14 @@ class Desk:
         if known is not None:
             return known
         return str(here) if here.name in self.runs else here.name
+
+
+def _addable(name: Any, what: str | Mapping[str, Any]) -> bool:
+    """Whether a diagnosis, which anybody may have written, names an effect of the catalogue or
+    gives a formula: never a file."""
+    if isinstance(what, Mapping):
+        return str(name).isidentifier() and "python" not in what
+    try:
+        return find(str(name)) is not None
+    except InputError:
+        return False

@@ -12,8 +12,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal
 
+from calib.effects import Trust
 from chains.errors import InputError
 
 PATIENCE_S = 10.0  # for a process that was stopped to clean up
@@ -43,6 +45,7 @@ class Job:
         effect: as `Desk.addable` has it: a name, or the document of a formula.
         out: folder of the run to make.
         without: what to leave out, as ``--without`` takes it.
+        trust: the Python files of effects that may run.
     """
 
     def __init__(
@@ -51,13 +54,15 @@ class Job:
         effect: str | Mapping[str, Any] | None = None,
         out: Path | None = None,
         without: Sequence[str] = (),
+        trust: Trust = MappingProxyType({}),
     ) -> None:
         # Spawned: a process with threads and libraries such as these cannot be forked safely.
         context = multiprocessing.get_context("spawn")
         self._ear, mouth = context.Pipe(duplex=False)
         self._stopped = False
+        task = (run, effect, out, without, dict(trust))
         self._process = context.Process(
-            target=_work, args=(mouth, run, effect, out, without), daemon=True, name="rigcal job"
+            target=_work, args=(mouth, *task), daemon=True, name="rigcal job"
         )
         self._process.start()
         mouth.close()  # so that the pipe ends when the process does
@@ -94,12 +99,13 @@ def _work(
     effect: str | Mapping[str, Any] | None,
     out: Path | None,
     without: Sequence[str],
+    trust: Trust,
 ) -> None:
     """What the process does."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the page, which ends its jobs
     signal.signal(signal.SIGTERM, _leave)
     try:
-        _study(mouth, run, effect, out, without)
+        _study(mouth, run, effect, out, without, trust)
         mouth.send(Told("done"))
     except InputError as error:
         mouth.send(Told("failed", str(error)))
@@ -115,6 +121,7 @@ def _study(
     effect: str | Mapping[str, Any] | None,
     out: Path | None,
     without: Sequence[str],
+    trust: Trust,
 ) -> None:
     from calib.runs.calibrate import grow, grown_model
     from calib.runs.diagnose import diagnose
@@ -124,7 +131,7 @@ def _study(
     def progress(what: str, done: int, total: int) -> None:
         mouth.send(Told("progress", what, (done + 1) / max(total, 1)))
 
-    run = Run.open(folder)
+    run = Run.open(folder, trust)
     if out is not None:
         with tempfile.TemporaryDirectory() as scratch:
             if isinstance(effect, Mapping):

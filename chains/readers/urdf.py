@@ -16,16 +16,14 @@ import numpy as np
 
 from chains import se3
 from chains.errors import InputError, nearest
+from chains.xml import parse_xml
 
 _MOVING = ("revolute", "continuous", "prismatic")
 
 
 def parse_robot(path: Path, text: str) -> Element:
     """The tree of a URDF's text; InputError, which names `path`, where it is none."""
-    try:
-        robot = ElementTree.fromstring(text)
-    except ElementTree.ParseError as error:
-        raise InputError(f"{path} is not XML ({error}); a URDF file is wanted") from None
+    robot = parse_xml(text, path, "a URDF file")
     if robot.tag != "robot" or not robot.findall("link"):
         raise InputError(f"{path} is no URDF: it holds no <robot> with links")
     return robot
@@ -125,10 +123,7 @@ def group_ends(path: Path, text: str, tip: str | None = None) -> tuple[str, str]
 
 
 def _srdf(path: Path, text: str) -> Element:
-    try:
-        return ElementTree.fromstring(text)
-    except ElementTree.ParseError as error:
-        raise InputError(f"{path} is not XML ({error}); an SRDF file is wanted") from None
+    return parse_xml(text, path, "an SRDF file")
 
 
 def apply_note(path: Path, data: Any, robot: Element) -> str:

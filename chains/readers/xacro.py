@@ -12,11 +12,11 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 from xml.dom import minidom
-from xml.parsers.expat import ExpatError
 
 import numpy as np
 
 from chains.errors import InputError
+from chains.readers.confined import confined, read_document
 
 _MOST_MISSING = 200  # things that may be missing
 _NOWHERE = "nowhere-to-be-found"
@@ -42,7 +42,7 @@ def write_out(path: Path, packages: Mapping[str, Path]) -> tuple[str, tuple[str,
     xacrodoc.packages.reset()
     xacrodoc.packages.walk_up_from(path)
     xacrodoc.packages.update_package_cache(dict(packages))
-    document = _parse(path)
+    document = read_document(path)
     for include in document.getElementsByTagName("xacro:include"):
         include.setAttribute("optional", "true")
     urdf, odd = _compiled(path, document)
@@ -53,15 +53,6 @@ def write_out(path: Path, packages: Mapping[str, Path]) -> tuple[str, tuple[str,
     return urdf, tuple(f"{path.name}: {line}" for line in odd)
 
 
-def _parse(path: Path) -> minidom.Document:
-    try:
-        return minidom.parse(str(path))
-    except OSError as error:
-        raise InputError(f"{path} cannot be read ({error.strerror}); name a file") from None
-    except ExpatError as error:
-        raise InputError(f"{path} is not XML ({error}); a xacro file is wanted") from None
-
-
 def _compiled(path: Path, document: minidom.Document) -> tuple[str, list[str]]:
     """Write out what can be, dropping what is missing one by one."""
     from xacrodoc import XacroDoc, packages
@@ -69,7 +60,7 @@ def _compiled(path: Path, document: minidom.Document) -> tuple[str, list[str]]:
     missing, macros = [], []
     for _ in range(_MOST_MISSING):
         try:
-            with contextlib.redirect_stderr(io.StringIO()):
+            with contextlib.redirect_stderr(io.StringIO()), confined(path, _folders):
                 doc = XacroDoc.from_string(
                     document.toxml(), resolve_packages=False, rootdir=path.parent
                 )
@@ -77,7 +68,7 @@ def _compiled(path: Path, document: minidom.Document) -> tuple[str, list[str]]:
         except packages.PackageNotFoundError as error:
             missing += error.args
         except Exception as error:  # xacro raises its own, and whatever an expression of it raises
-            said = str(error)
+            said = (str(error).splitlines() or [type(error).__name__])[0].strip()
             if gone := re.search(r"Package not found: (\S+)", said):
                 missing.append(gone[1])
             elif (gone := re.search(r"unknown macro name: (\S+)", said)) and _drop(
@@ -89,9 +80,16 @@ def _compiled(path: Path, document: minidom.Document) -> tuple[str, list[str]]:
                 _define(document, "M_PI", repr(np.pi))
                 continue
             else:
-                raise InputError(f"{path} cannot be written out: {said.splitlines()[0]}") from None
+                raise InputError(f"{path} cannot be written out: {said}") from None
         packages.update_package_cache({missing[-1]: path.parent / _NOWHERE / missing[-1]})
     raise InputError(f"{path} cannot be written out: more than {_MOST_MISSING} things are missing")
+
+
+def _folders() -> list[str]:
+    """Of the packages that were found so far."""
+    from xacrodoc import packages
+
+    return list(packages._finder.package_cache.values())
 
 
 def _left_out(document: minidom.Document, missing: list[str], macros: list[str]) -> list[str]:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.effects import FrameOffset
+from calib.effects import FrameOffset, trust_in
 from calib.forward import Placed, Term, place
 from calib.problem.model import Model, Source
 from calib.results.solution import EffectEstimate, FrameEstimate, Part, Solution, one_unit
@@ -58,7 +58,8 @@ def found_by_chance(
         names=tuple(names),
         covariance=root @ root.T,
     )
-    return Run(folders[0].parent / "run", document, summary, solution)
+    trust = trust_in(model.effects)
+    return Run(folders[0].parent / "run", document, summary, solution, trust=trust)
 
 
 def _put(part: Part, rig: Rig, effect: object, theta: np.ndarray, sigma: np.ndarray) -> None:
@@ -81,7 +82,7 @@ def as_fitted(
     """
     part = run.solution.part(source.rig.name if run.solution.recordings else None)
     values, terms = {}, []
-    for effect in Model.read(run.model).effects:
+    for effect in Model.read(run.model, trust=run.trust).effects:
         if effect.name in effects:
             values[effect.name] = part.effects[effect.name].estimate
             terms.append(Term(effect, effect.name, np.arange(len(values[effect.name]))))

@@ -9,7 +9,8 @@ from xml.etree import ElementTree
 import pytest
 
 from chains import escape
-from sensors.documents import json_text, read_csv, read_yaml
+from sensors.documents import json_text, read_yaml
+from sensors.numbers import read_csv
 from sensors.stops import write_columns
 
 EVIL = [

@@ -10,13 +10,13 @@ from sensors.documents import (
     Document,
     Number,
     Triple,
-    read_csv,
     read_yaml,
     validate,
     write_atomically,
     write_json,
     write_yaml,
 )
+from sensors.numbers import read_csv
 
 
 class Leaf(Document):

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import importlib.util
 import inspect
 import sys
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from types import ModuleType
@@ -13,6 +11,7 @@ from typing import Any
 
 from calib.effects.base import Effect, Site
 from calib.effects.own.formula import FormulaEffect
+from calib.effects.own.trust import Code, Trust, code_named
 from chains.errors import InputError
 from sensors.documents import nearest, read_yaml
 
@@ -24,19 +23,29 @@ def is_file(text: str) -> bool:
     return text.endswith((*YAML, PYTHON)) or f"{PYTHON}:" in text
 
 
-def from_file(text: str) -> list[Effect]:
+def from_file(text: str, trust: Trust | None = None) -> list[Effect]:
     """The effects that a file holds: ``file.yaml``, ``file.py`` or ``file.py:Class``.
 
     A YAML file is one formula effect (see `FormulaFile`) or a list of them. A Python file is run.
 
+    Args:
+        text: the file, and the class.
+        trust: the Python files that may run; None where the user named this one himself.
+
     Raises:
-        InputError: the file is missing, or holds no such effect.
+        InputError: the file is missing, may not run, or holds no such effect.
     """
     if text.endswith(YAML):
         return _formulas(text)
     path, _, name = text.rpartition(f"{PYTHON}:") if f"{PYTHON}:" in text else (text, "", "")
     path = f"{path}{PYTHON}" if name else text.removesuffix(":")
-    module = _run(Path(path))
+    code = Code.read(path) if trust is None else code_named(path, None, "the spec", trust)
+    return _effects(code, name)
+
+
+def _effects(code: Code, name: str) -> list[Effect]:
+    """The effects of a Python file, which is run: those of all its classes, or of one."""
+    module, path = _run(code), code.path
     classes = {
         key: value
         for key, value in vars(module).items()
@@ -52,19 +61,25 @@ def from_file(text: str) -> list[Effect]:
     if name and name not in classes:
         raise InputError(f"{path} has no effect '{name}'{nearest(name, classes)}")
     chosen = {name: classes[name]} if name else classes
-    return [_made(Path(path), key, kind) for key, kind in chosen.items()]
+    return [_made(code, key, kind) for key, kind in chosen.items()]
 
 
-def from_document(document: Mapping[str, Any], path: str | Path) -> Effect:
-    """The effect of a mapping that `Effect.document` gave; `path` is where it stands."""
+def from_document(document: Mapping[str, Any], path: str | Path, trust: Trust) -> Effect:
+    """The effect of a mapping that `Effect.document` gave; `path` is where it stands.
+
+    Raises:
+        NotTrustedError: it is of a Python file that is not in `trust`.
+        InputError: there is no such effect, or the file has changed.
+    """
     if "python" not in document:
         return FormulaEffect.read(document, path, {})
     try:
         source, name = str(document["python"]), str(document["name"])
         shape = None if document.get("shape") is None else float(document["shape"])
+        recorded = None if document.get("sha256") is None else str(document["sha256"])
     except (KeyError, TypeError, ValueError):
         raise InputError(f"{path}: {dict(document)} names no effect of a Python file") from None
-    (effect,) = from_file(f"{source}:{name}")
+    (effect,) = _effects(code_named(source, recorded, path, trust), name)
     return effect if shape is None else effect.at(shape)
 
 
@@ -80,25 +95,26 @@ def _formulas(path: str) -> list[Effect]:
     ]
 
 
-def _run(path: Path) -> ModuleType:
-    """The module of a Python file."""
-    if not path.is_file():
-        raise InputError(f"{path} does not exist")
-    path = path.resolve()
-    name = f"rigcal_effects_{zlib.crc32(str(path).encode()):08x}"
-    spec = importlib.util.spec_from_file_location(name, path)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
+def _run(code: Code) -> ModuleType:
+    """The module of a Python file.
+
+    It is compiled from the bytes that were hashed: an importer would take a cached .pyc for it,
+    which need not be made from the same text.
+    """
+    module = ModuleType(f"rigcal_effects_{code.sha256[:16]}")
+    module.__file__ = str(code.path)
+    sys.modules[module.__name__] = module
     try:
-        spec.loader.exec_module(module)
-    except Exception as error:
-        del sys.modules[name]
-        raise InputError(f"{path} cannot be run: {type(error).__name__}: {error}") from error
+        exec(compile(code.source, str(code.path), "exec", dont_inherit=True), module.__dict__)
+    except (Exception, SystemExit) as error:
+        del sys.modules[module.__name__]
+        raise InputError(f"{code.path} cannot be run: {type(error).__name__}: {error}") from error
     return module
 
 
-def _made(path: Path, name: str, kind: type[Effect]) -> Effect:
+def _made(code: Code, name: str, kind: type[Effect]) -> Effect:
     """The effect of a class, which remembers where it came from."""
+    path = code.path
     try:
         effect = kind()
     except Exception as error:
@@ -107,5 +123,5 @@ def _made(path: Path, name: str, kind: type[Effect]) -> Effect:
         raise InputError(f"{path}: {name} needs a name: letters, digits and _")
     if not isinstance(getattr(effect, "site", None), Site):
         raise InputError(f"{path}: {name} needs a site, one of calib.effects.Site")
-    effect.origin = {"python": str(path.resolve()), "name": name}
+    effect.origin = {"python": str(path), "name": name, "sha256": code.sha256}
     return effect

@@ -116,7 +116,8 @@ def _made(where: str, k: int, values: Mapping[str, Any]) -> DhRow:
     if kind not in ("revolute", "prismatic"):
         raise InputError(f"{where}: type is {kind}; a joint is revolute or prismatic")
     centre = values.get("centre_m", (0.0, 0.0, 0.0))
-    if np.shape(centre) != (3,):
+    numbers = isinstance(centre, list | tuple) and all(isinstance(c, int | float) for c in centre)
+    if not numbers or len(centre) != 3:
         raise InputError(f"{where}: centre_m is {centre}; three numbers are wanted")
     return DhRow(
         name=str(values.get("name", f"joint_{k + 1}")),

@@ -11,6 +11,7 @@ import struct
 from array import array
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from pathlib import Path
@@ -76,7 +77,8 @@ def read_bag(files: Sequence[Path], options: Options, progress: Progress) -> Con
     name = files[0].stem or files[0].name
     topics = topics_of(paths)
     lidar, logs = _choose(name, topics, options)
-    log = _pass(paths, lidar, logs, topics, progress)
+    with _of_bag(paths):
+        log = _pass(paths, lidar, logs, topics, progress)
     parts = []
     if lidar is not None:
         parts.append(_lidar(name, paths, lidar, log, options, progress))
@@ -86,6 +88,17 @@ def read_bag(files: Sequence[Path], options: Options, progress: Progress) -> Con
         Contents(understood=(f"{name}: not used: {', '.join(unused)}",)) if unused else Contents()
     )
     return together([*parts, rest])
+
+
+@contextmanager
+def _of_bag(paths: Sequence[Path]) -> Iterator[None]:
+    """Name the bag where a sentence names only its topic."""
+    try:
+        yield
+    except InputError as error:
+        if paths[0].name in str(error):
+            raise
+        raise InputError(f"{paths[0]}: {error}") from None
 
 
 # ------------------------------------------------------------------------- topics
@@ -268,8 +281,9 @@ def _packets(paths: list[Path], topic: Topic, seen: list[int]) -> Packets:
     """The packets of one topic; `seen` has the message that iterating has come to."""
 
     def packets() -> Iterator[tuple[float, bytes]]:
-        for seen[0], message in enumerate(messages(paths, [topic.name])):
-            yield from payloads_of(message.decode(), message.arrival_ns / 1e9)
+        with _of_bag(paths):
+            for seen[0], message in enumerate(messages(paths, [topic.name])):
+                yield from payloads_of(message.decode(), message.arrival_ns / 1e9)
 
     return packets
 
@@ -309,9 +323,10 @@ def _cloud_stream(
             return
         first, last = arrivals_ns[wanted][[0, -1]].tolist()
         k = int(np.searchsorted(arrivals_ns, first))
-        for s, message in enumerate(messages(paths, [topic.name], first, last + 1), k):
-            if wanted[s]:
-                yield s, cloud_of(topic.name, message.decode())
+        with _of_bag(paths):
+            for s, message in enumerate(messages(paths, [topic.name], first, last + 1), k):
+                if wanted[s]:
+                    yield s, cloud_of(topic.name, message.decode())
 
     return stream
 

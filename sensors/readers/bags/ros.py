@@ -7,10 +7,19 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from chains.errors import InputError
-from sensors.documents import read_text
+from sensors.documents import read_text, read_yaml
+from sensors.readers.bags.bounded import (
+    check_database,
+    databases,
+    open_zstd,
+    unpack_bz2,
+    unpack_lz4,
+    unpack_zstd,
+)
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -151,15 +160,44 @@ def _opened(paths: Sequence[Path]) -> Iterator[AnyReader]:
         from rosbags.highlevel import AnyReader
     except ImportError:
         raise InputError("reading bags needs rosbags: pip install 'rigcal[ros]'") from None
+    for path in databases(paths):
+        if path.suffix == ".db3":
+            check_database(path)
+    for path in paths:
+        if (path / "metadata.yaml").is_file():
+            read_yaml(path / "metadata.yaml")
+    with _bounded():
+        try:
+            reader = AnyReader(list(paths), default_typestore=_known_types())
+            reader.open()
+        except Exception as error:  # rosbags, its SQLite and its decompressors each have their own
+            raise _unreadable(paths, error) from None
+        try:
+            yield reader
+        finally:
+            reader.close()
+
+
+@contextmanager
+def _bounded() -> Iterator[None]:
+    """Where rosbags unpacks no more than a file may hold."""
+    from rosbags.rosbag1 import reader as one
+    from rosbags.rosbag2 import reader as two
+    from rosbags.rosbag2 import storage_mcap as mcap
+
+    by_name = {"bz2": unpack_bz2, "lz4": unpack_lz4}
+    by_size = {"lz4": lambda data, _: unpack_lz4(data), "zstd": lambda data, _: unpack_zstd(data)}
+    zstd = SimpleNamespace(decompress=unpack_zstd, open=open_zstd)
+    kept = dict(one.decompressors), dict(mcap.DECOMPRESSORS), two.zstd
+    one.decompressors.update(by_name)
+    mcap.DECOMPRESSORS.update(by_size)
+    two.zstd = zstd
     try:
-        reader = AnyReader(list(paths), default_typestore=_known_types())
-        reader.open()
-    except Exception as error:  # rosbags, its SQLite and its decompressors each have their own
-        raise _unreadable(paths, error) from None
-    try:
-        yield reader
+        yield
     finally:
-        reader.close()
+        one.decompressors.update(kept[0])
+        mcap.DECOMPRESSORS.update(kept[1])
+        two.zstd = kept[2]
 
 
 @cache

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,11 +11,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from chains.errors import InputError
+from chains.sizes import check_claim
+from chains.xml import parse_xml
 from sensors.readers.base import Array, Columns
 
 if TYPE_CHECKING:
     from pye57 import E57
 
+_HEAD = struct.Struct("<8s2I4Q")  # ASTM E2807: name, version, length, where the XML is, page
 _NAMES = {
     "cartesianX": "x",
     "cartesianY": "y",
@@ -77,6 +81,7 @@ def _open(path: Path) -> E57:
         raise InputError(f"{path} cannot be read: {error.strerror}") from None
     if not size:
         raise InputError(f"{path} is empty (0 bytes); an E57 file was wanted")
+    _check_xml(path)
     try:
         return pye57.E57(str(path))
     except pye57.libe57.E57Exception as error:
@@ -84,11 +89,32 @@ def _open(path: Path) -> E57:
         raise InputError(f"{path} is no whole E57 file: {why}") from None
 
 
+def _check_xml(path: Path) -> None:
+    """Refuse XML that defines entities, before the library's own parser sees it.
+
+    The header says where it is; every page of the file ends in a checksum of 4 bytes.
+    """
+    with open(path, "rb") as file:
+        head = file.read(_HEAD.size)
+        if len(head) < _HEAD.size or head[:8] != b"ASTM-E57":
+            raise InputError(f"{path} is no whole E57 file: it does not begin as one")
+        *_, at, length, page = _HEAD.unpack(head)
+        if not 4 < page <= 1 << 20 or at + length > path.stat().st_size:
+            raise InputError(f"{path} is no whole E57 file: its XML is not where it says")
+        file.seek(at - at % page)
+        pages = length // (page - 4) + 2
+        data = file.read(pages * page)
+    whole = b"".join(data[k : k + page - 4] for k in range(0, len(data), page))
+    parse_xml(whole[at % page : at % page + length], path, "an E57 file")
+
+
 def _scan(path: Path, file: E57, number: int) -> E57Scan:
     import pye57
 
     try:
         header = file.get_header(number)
+        count, fields = header.point_count, header.point_fields
+        check_claim(path, 8 * count * len(fields), f"{count} points in scan {number}")
         raw = file.read_scan_raw(number, ignore_unsupported_fields=True)
     except pye57.libe57.E57Exception as error:
         why = str(error).splitlines()[0]

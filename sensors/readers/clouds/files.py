@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chains.errors import InputError
+from sensors.numbers import read_arrays
 from sensors.readers.base import Columns, Contents, Options, Progress, Sweep, Sweeps
 from sensors.readers.clouds.fields import Cloud
 from sensors.readers.clouds.rings import find_format
@@ -142,16 +143,11 @@ def _e57(path: Path) -> Iterator[Named]:
 
 
 def _numpy(path: Path) -> Iterator[Named]:
-    try:
-        data = np.load(path, allow_pickle=False)
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror or error}") from None
-    except (ValueError, EOFError) as error:
-        raise InputError(f"{path} is no whole NumPy file: {error}") from None
+    data = read_arrays(path)
     if isinstance(data, np.ndarray):
         fields, shape = _array_fields(path, data)
     else:
-        fields, shape = _archive_fields(path, {key: data[key] for key in data.files})
+        fields, shape = _archive_fields(path, data)
     yield path.stem, Cloud(fields, shape)
 
 

@@ -3,11 +3,23 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from chains.errors import InputError
+from chains.sizes import check_claim, check_stored
 from sensors.readers.base import Columns
+
+
+def _check_header(path: Path, header: Any) -> None:
+    """Refuse a header that claims more points than the file can hold."""
+    claimed = header.point_count * header.point_format.size
+    what = f"{header.point_count} points of {header.point_format.size} bytes"
+    if header.are_points_compressed:
+        check_claim(path, claimed, what)
+    else:
+        check_stored(path, header.offset_to_point_data + claimed, what)
 
 
 def read_las_points(path: str | Path) -> Columns:
@@ -24,7 +36,9 @@ def read_las_points(path: str | Path) -> Columns:
     try:
         if not path.stat().st_size:
             raise InputError(f"{path} is empty (0 bytes); a LAS file was wanted")
-        las = laspy.read(path)
+        with laspy.open(path) as file:
+            _check_header(path, file.header)
+            las = file.read()
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}") from None
     except InputError:

@@ -136,6 +136,8 @@ def _rings(
     rows = cloud.shape is not None and min(cloud.shape) > 1 and _rows_are_rings(cloud, xyz_m, seen)
     if "ring" in fields:
         values = cloud.fields[fields["ring"]][seen]
+        if not np.isfinite(values).all():
+            raise InputError(f"{name}: field {fields['ring']} is not finite, and numbers rings")
         first = _first_ring(name, values, options, odd)
         return f"field {fields['ring']}, from {first}", first, None, rows
     if rows:

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from chains.errors import InputError
-from sensors.documents import read_csv, read_yaml
+from sensors.documents import read_yaml
+from sensors.numbers import read_csv
 
 # Colours this near each other are one: what a JPEG makes of one colour scatters by a few steps.
 _SAME_COLOUR = 24.0
@@ -66,6 +67,8 @@ def read_palette(path: Path) -> Palette:
     numbers, colours = {}, {}
     for key, value in rows:
         if isinstance(key, int | float):
+            if not np.isfinite(key):
+                raise InputError(f"{path}: {key} is no number of a label")
             numbers[int(key)] = str(value)
         else:
             colours[key] = _colour(path, key, value)

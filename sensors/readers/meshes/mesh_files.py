@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from chains.errors import InputError
-from sensors.ply import Columns, read_ply
+from sensors.ply import Columns, fans, read_ply
 
 SUFFIXES = (".ply", ".obj", ".stl", ".glb", ".gltf", ".off")
 # Where a triangle's texture is looked at: its middle, and half-way from there to each corner.
@@ -68,6 +68,8 @@ def read_mesh_file(path: Path) -> Mesh:
     if mesh.triangles.min() < 0 or mesh.triangles.max() >= len(mesh.vertices):
         last = len(mesh.vertices) - 1
         raise InputError(f"{path}: a triangle has a vertex that is none of 0 to {last}")
+    if mesh.vertices.shape[1:] != (3,):
+        raise InputError(f"{path} has vertices of {mesh.vertices.shape[1:]} numbers, not of 3")
     if not np.isfinite(mesh.vertices[mesh.triangles]).all():
         raise InputError(f"{path}: a triangle has a corner that is not finite; repair the mesh")
     return mesh
@@ -82,7 +84,7 @@ def _read_ply(path: Path) -> Mesh:
     corners = next((face.pop(n) for n in ("vertex_indices", "vertex_index") if n in face), None)
     if corners is None:
         return Mesh(vertices, np.zeros((0, 3), np.int64))
-    triangles, polygon = _fans(corners)
+    triangles, polygon = fans(corners)
     face = {name: values[polygon] for name, values in face.items() if values.ndim == 1}
     colours = _rgb(face)
     if colours is not None:
@@ -90,16 +92,6 @@ def _read_ply(path: Path) -> Mesh:
     elif (of_vertices := _rgb(vertex)) is not None:
         colours = of_vertices[triangles]
     return Mesh(vertices=vertices, triangles=triangles, vertex=vertex, face=face, colours=colours)
-
-
-def _fans(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles (F, 3) of polygons (P, k), -1 behind the last corner, and each one's polygon."""
-    if corners.ndim != 2 or corners.shape[1] < 3:
-        return np.zeros((0, 3), np.int64), np.zeros(0, np.int64)
-    corners = corners.astype(np.int64)
-    first, second = np.nonzero(corners[:, 2:] != -1)
-    fans = [corners[first, 0], corners[first, second + 1], corners[first, second + 2]]
-    return np.stack(fans, axis=1), first
 
 
 def _rgb(columns: Columns) -> np.ndarray | None:

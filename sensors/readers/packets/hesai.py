@@ -253,7 +253,7 @@ def read_angles(path: str | Path) -> tuple[Array, Array]:
         }
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}") from None
-    except (ValueError, IndexError):
+    except (ValueError, IndexError, csv.Error):
         table = {}
     if not table or sorted(table) != list(range(1, len(table) + 1)):
         raise InputError(

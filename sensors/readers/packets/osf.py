@@ -10,9 +10,9 @@ begins with the distance to its vtable, which has the place of every field (flat
 from __future__ import annotations
 
 import io
-import json
 import mmap
 import struct
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -22,6 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chains.errors import InputError
+from chains.sizes import most
+from sensors.documents import parse_json
 from sensors.readers.base import Columns, Contents, Options, Sweep, Sweeps
 from sensors.readers.packets.ouster_sensor import (
     Metadata,
@@ -32,6 +34,9 @@ from sensors.readers.packets.ouster_sensor import (
 from sensors.recording import unpack_zstd
 
 _CONVERT = "convert it: ouster-cli source {name} save {stem}.pcap"
+# What struct, numpy, zstd and PIL raise where bytes are not what they should be.
+_BROKEN = (struct.error, ValueError, IndexError, KeyError, TypeError, OSError, SyntaxError)
+_BROKEN += (EOFError, OverflowError, MemoryError, zlib.error)
 _CHANNELS = {1: "range", 3: "signal", 5: "intensity", 7: "near_infrared"}
 
 
@@ -77,6 +82,8 @@ class _Flatbuffer:
 
     def tables(self, number: int) -> Iterator[_Flatbuffer]:
         at, count = self.vector(number)
+        if at + 4 * count > len(self.data):
+            raise ValueError(f"it says that it has {count} parts, and ends before")
         for k in range(count):
             place = at + 4 * k
             yield _Flatbuffer(self.data, place + struct.unpack_from("<I", self.data, place)[0])
@@ -100,9 +107,9 @@ def read_osf(path: Path, options: Options) -> Contents:
     sensors = {key: text for key, text in sensors.items() if messages.get(key)}
     if not sensors:
         raise InputError(f"{path} holds no turns of a LiDAR")
-    key, metadata = _choose(path, sensors, options)
     with _damage(path):
-        facts = json.loads(sensors[key])
+        key, metadata = _choose(path, sensors, options)
+    facts = parse_json(sensors[key], f"{path.name}'s own metadata")
     _decode(path, metadata, facts, messages[key][0].scan)  # what cannot be decoded says so here
     sweeps = _sweeps(path, metadata, facts, messages[key])
     return describe_ouster(path.stem, sweeps, metadata, options)
@@ -129,7 +136,7 @@ def _damage(path: Path) -> Iterator[None]:
         yield
     except InputError:
         raise
-    except (struct.error, ValueError, IndexError, OSError) as error:
+    except _BROKEN as error:
         raise InputError(f"{path} is damaged or cut short: {error}") from None
 
 
@@ -234,7 +241,11 @@ def _png(data: bytes) -> NDArray:
     """Bytes (rings, columns, bytes of a pixel) of a PNG, the lowest first."""
     from PIL import Image
 
-    pixels = np.asarray(Image.open(io.BytesIO(data)))
+    width, height = struct.unpack_from(">2I", data, 16)  # before PIL refuses it in its own way
+    if 4 * width * height > most(len(data)):
+        raise ValueError(f"{len(data)} bytes claim to be an image of {width} x {height} pixels")
+    with Image.open(io.BytesIO(data), formats=["PNG"]) as image:
+        pixels = np.asarray(image)
     if pixels.ndim == 3:
         return pixels
     return np.stack([pixels & 0xFF, pixels.astype(np.uint32) >> 8], axis=2)

@@ -15,7 +15,6 @@ count from the highest beam down, from 0; columns are the sensor's measurement i
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chains.errors import InputError
+from sensors.documents import parse_json
 from sensors.lidar import LidarModel, catalog, load_lidar
 from sensors.readers.base import Array, Columns, Contents, Options, Sweeps
 
@@ -100,6 +100,9 @@ PROFILES = {
 _BEAM_ORIGIN_MM = {"OS-0-": 27.67, "OS-1-": 15.806, "OS-2-": 13.762, "": 12.163}
 
 
+_MOST_RINGS, _MOST_COLUMNS = 512, 8192  # four times, and twice, what the largest sensors have
+
+
 @dataclass(frozen=True)
 class Metadata:
     """What the sensor says of itself; angles (rings,) rad."""
@@ -167,6 +170,11 @@ def read_metadata(name: str, text: str) -> Metadata:
             f"{name} has {len(altitude)} altitude and {len(azimuth)} azimuth angles for {rings}"
             " rings; every ring has one of each"
         )
+    if not (0 < rings <= _MOST_RINGS and 0 < columns <= _MOST_COLUMNS and columns_per_packet > 0):
+        raise InputError(
+            f"{name} states {rings} rings and {columns} columns, {columns_per_packet} to a packet; "
+            f"sensors have up to {_MOST_RINGS} and {_MOST_COLUMNS}"
+        )
     profile = shape.get("udp_profile_lidar", "LEGACY")
     if profile not in PROFILES:
         raise InputError(
@@ -227,10 +235,7 @@ def describe_ouster(name: str, sweeps: Sweeps, metadata: Metadata, options: Opti
 
 def _flat(name: str, text: str) -> dict[str, Any]:
     """The JSON's facts in one mapping, as firmware before 2.4 wrote them."""
-    try:
-        facts = json.loads(text)
-    except ValueError as error:
-        raise InputError(f"{name} is no JSON: {error}") from None
+    facts = parse_json(text, name)
     if not isinstance(facts, dict):
         raise InputError(f"{name} is no metadata of an Ouster sensor: it holds no mapping")
     groups = ("sensor_info", "beam_intrinsics", "lidar_intrinsics", "config_params")

@@ -35,6 +35,7 @@ _PCAPNG = b"\x0a\x0d\x0d\x0a"
 _LINKS = {1: (14, 12), 113: (16, 14), 276: (20, 0)}
 _RAW_IP = {0: 4, 101: 0, 228: 0, 229: 0}
 _LARGEST = 1 << 20
+_LARGEST_DATAGRAM = 1 << 17  # twice what IPv4 can carry
 
 
 class Capture:
@@ -201,7 +202,10 @@ def _join(fragments: dict, key: bytes, offset: int, more: bool, data: bytes) -> 
     parts[offset] = data
     if not more:
         parts[-1] = (offset + len(data)).to_bytes(4, "big")
-    whole = b"".join(parts[at] for at in sorted(parts) if at >= 0)
+    if -1 in parts and sum(map(len, parts.values())) > _LARGEST_DATAGRAM:
+        del fragments[key]
+        return None
+    whole = b"".join(parts[at] for at in sorted(parts) if at >= 0) if -1 in parts else b""
     if -1 in parts and len(whole) == int.from_bytes(parts[-1], "big"):
         del fragments[key]
         return whole

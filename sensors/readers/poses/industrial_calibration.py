@@ -59,12 +59,19 @@ def _rows(path: Path) -> dict[float, Mapping[str, Any]]:
             raise InputError(
                 f"{path}: {stamp}: needs target_joints, and a pose of {', '.join(POSE)}"
             )
+        joints = row["target_joints"]
+        numbers = [*(pose[part] for part in POSE), *(joints if isinstance(joints, list) else "?")]
+        if wrong := [n for n in numbers if isinstance(n, bool) or not isinstance(n, int | float)]:
+            raise InputError(
+                f"{path}: {stamp}: {wrong[0]!r} is no number; target_joints is a list of numbers, "
+                f"and pose has one for each of {', '.join(POSE)}"
+            )
         if row.get("camera_joints"):
             raise InputError(
                 f"{path}: {stamp}: the camera moves on joints, and it must stand still"
             )
         try:
             rows[float(stamp)] = row
-        except ValueError:
+        except (ValueError, TypeError, OverflowError):
             raise InputError(f"{path}: '{stamp}' is no time in seconds") from None
     return rows

@@ -7,7 +7,6 @@ does not say where it was told otherwise; `--up z` does.
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +16,7 @@ import numpy as np
 from chains.errors import InputError
 from sensors.readers import conventions
 from sensors.readers.base import POSE, Array, Contents, Options, Progress, Track, together
-from sensors.readers.tables.sheets import Sheet, open_sheet
+from sensors.readers.tables.sheets import Sheet, open_sheet, quoted
 
 _LENGTHS = {"meters": 1.0, "centimeters": 1e-2, "millimeters": 1e-3, "inches": 0.0254}
 _BODY = 11  # cells of a body in format 1.1: its number, x y z, qx qy qz qw, yaw pitch roll
@@ -136,6 +135,11 @@ def _track(
     path: Path, part: _Asset, column: Mapping[int, Array], turn: str, scale: float, options: Options
 ) -> Track:
     where = f"{path}: {part.name}"
+    lacking = [axis for axis in "XYZ" if axis not in part.position]
+    if part.kind == "Rigid Body":
+        lacking += [f"rotation {axis}" for axis in "XYZ" if axis not in part.rotation]
+    if lacking:
+        raise InputError(f"{where} has no column {lacking[0]}; export the take anew")
     xyz = np.stack([column[part.position[axis]] for axis in "XYZ"], axis=1) * scale
     values, kind = xyz, "point"
     if part.kind == "Rigid Body":
@@ -213,7 +217,7 @@ def _tracking_tools(sheet: Sheet, options: Options) -> Contents:
 
 def _rows(sheet: Sheet) -> Iterator[tuple[int, list[str]]]:
     for number, line in sheet.lines():
-        yield number, next(csv.reader([line]))
+        yield number, quoted(sheet.path, line)
 
 
 def _bodies(frame: int, row: Sequence[str]) -> Iterator[list[float]]:

@@ -97,6 +97,9 @@ def _read(path: Path, block: _Block, options: Options) -> Contents:
     if block.rows and len(block.rows[-1]) < len(block.axes) - 1:
         block.rows.pop()
         odd = (f"{path.name} breaks off within its last line, which is left out",)
+    width += 6  # a body that the file breaks off lacks up to 6 columns of its 7
+    for cells in (block.axes, block.units):
+        cells += [""] * (width - len(cells))
     try:
         table = np.array(
             [[float(c) if c else np.nan for c in row + [""] * (width - len(row))][:width]

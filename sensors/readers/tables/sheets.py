@@ -67,7 +67,7 @@ class Sheet:
         if self.separator is None:
             return line.split()
         if '"' in line:
-            return [cell.strip() for cell in next(csv.reader([line], delimiter=self.separator))]
+            return [cell.strip() for cell in quoted(self.path, line, self.separator)]
         return [cell.strip() for cell in line.split(self.separator)]
 
     def numbers(self, columns: Sequence[int], skip: int = 0) -> tuple[Array, tuple[str, ...]]:
@@ -183,3 +183,11 @@ def _separator(rows: Sequence[str]) -> str | None:
     """The first of ; tab and comma that stands in half of the rows; else white space."""
     half = len(rows) / 2  # not in all: the last may be cut off
     return next((mark for mark in ";\t," if sum(mark in row for row in rows) >= half), None)
+
+
+def quoted(path: Path, line: str, separator: str = ",") -> list[str]:
+    """The cells of a line, some of which may stand in quotes; InputError where one has no end."""
+    try:
+        return next(csv.reader([line], delimiter=separator))
+    except csv.Error as error:
+        raise InputError(f"{path} is no table: {error}") from None
