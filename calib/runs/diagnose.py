@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from calib import outputs
 from calib.diagnosis.rejects import rejects
 from calib.diagnosis.search import search
 from calib.diagnosis.stand import Stand
@@ -44,21 +45,28 @@ def diagnose(
     """
     from threadpoolctl import threadpool_limits
 
-    with threadpool_limits(limits=1):
-        stand = stand_of(run, progress)
-        rings = list(_odd_rings(stand))
-        # Away from an optimum every effect that moves the state towards one looks missing.
-        found = search(stand, progress) if run.converged else search(stand, progress, most=0)
-        rejected = rejects(found.looks[0].stand, progress)
-        falls = {}
-        before = run.summary["rms_mm"]["held_out"]
-        if refits and run.model["hold_out"] != "none" and before is not None:
-            if found.blunders and found.found:
-                before = _unseen(found.looks[0].stand, run, progress).rms_mm
-            for step in found.found:
-                unseen = _unseen(step.after.stand, run, progress)
-                falls[step.effect.name] = (before, unseen.rms_mm, unseen.floor_mm)
-                before = unseen.rms_mm
+    with threadpool_limits(limits=1), outputs.entries(run.folder, outputs.RUN) as entries:
+        result = _found(run, progress, refits)
+        write_json(entries / DIAGNOSIS, result.document())
+    return result
+
+
+def _found(run: Run, progress: Progress, refits: bool) -> Diagnosis:
+    """As `diagnose`, and nothing is written."""
+    stand = stand_of(run, progress)
+    rings = list(_odd_rings(stand))
+    # Away from an optimum every effect that moves the state towards one looks missing.
+    found = search(stand, progress) if run.converged else search(stand, progress, most=0)
+    rejected = rejects(found.looks[0].stand, progress)
+    falls = {}
+    before = run.summary["rms_mm"]["held_out"]
+    if refits and run.model["hold_out"] != "none" and before is not None:
+        if found.blunders and found.found:
+            before = _unseen(found.looks[0].stand, run, progress).rms_mm
+        for step in found.found:
+            unseen = _unseen(step.after.stand, run, progress)
+            falls[step.effect.name] = (before, unseen.rms_mm, unseen.floor_mm)
+            before = unseen.rms_mm
     tokens = [left.blunder.group.token for left in found.blunders]
     result = conclude(
         found,
@@ -68,7 +76,7 @@ def diagnose(
         rejected,
         [*forbids(run), *(clause for clause, harms in rings if harms)],
     )
-    result = replace(
+    return replace(
         result,
         sentences=[
             *run.doubts,
@@ -78,8 +86,6 @@ def diagnose(
         ],
         command=command_without(run, tokens) if tokens else "",
     )
-    write_json(run.folder / DIAGNOSIS, result.document())
-    return result
 
 
 def command_without(run: Run, tokens: Sequence[str]) -> str:

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from calib import outputs
 from calib.results.solution import EffectEstimate, FrameEstimate, Part, Solution
 from chains import se3
 from chains.errors import InputError
@@ -54,6 +55,7 @@ class Run:
             InputError: the folder is no run, or a part of it is missing or of another version.
         """
         folder = Path(folder)
+        outputs.settle(folder)
         if not (folder / MODEL).is_file():
             raise InputError(
                 f"{folder}: no run there ({MODEL} is missing); make one with 'rigcal fit'"
@@ -76,6 +78,12 @@ class Run:
     def recordings(self) -> list[Path]:
         """Where the recordings were that this run was fitted to."""
         return [Path(r["path"]) for r in self.model["recordings"]]
+
+    @property
+    def inputs(self) -> list[Path]:
+        """Folders that are read with it: its recordings, and the run that was its prior."""
+        prior = self.model.get("prior")
+        return [*self.recordings, *([Path(prior)] if prior else [])]
 
     @property
     def effects(self) -> tuple[str, ...]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+from calib import outputs
 from calib.rig import load_rig
 from calib.simulation import rig as rig_on_paper
 from calib.simulation.room import build
@@ -14,7 +15,7 @@ from calib.simulation.stops import World, plan
 from calib.simulation.truth import draw, stream
 from calib.simulation.write import write_reference, write_stops, write_targets, write_truth
 from chains.errors import InputError
-from sensors.documents import replace_folder, write_yaml
+from sensors.documents import write_yaml
 from sensors.recording import write_table
 
 __all__ = ["PRESETS", "Spec", "load_spec", "simulate"]
@@ -44,13 +45,12 @@ def simulate(
     Raises:
         InputError: the spec, the seed or an effect's name is wrong, or `out` is something else.
     """
+    inputs = [spec] if isinstance(spec, str) else []
     spec = load_spec(spec) if isinstance(spec, str) else spec
     if seed < 0:
         raise InputError(f"seed {seed} is negative; give 0 or more")
-    out = Path(out)
-    with replace_folder(out, "rig.yaml", "recording") as folder:
+    with outputs.folder(out, outputs.RECORDING, inputs, beside=("truth.json",)) as folder:
         _record(spec, folder, seed, dict(hide or {}), progress or (lambda what, done, total: None))
-        (folder / "truth.json").replace(out.with_name(f"{out.name}.truth.json"))
 
 
 def _record(
