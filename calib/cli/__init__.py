@@ -16,6 +16,7 @@ from calib.cli import calibrating, exporting, importing, reporting  # noqa: E402
 from calib.cli.app import app  # noqa: E402
 from chains.errors import InputError  # noqa: E402
 
+
 class _OnStderr(logging.Handler):
     """What happened beside what was asked for, a sentence each; not an error."""
 

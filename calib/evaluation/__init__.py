@@ -27,7 +27,7 @@ from calib.evaluation.tally import FLAT_M, Columns, Evaluated, Tally
 from calib.forward import Values
 from calib.residuals.scan import Ranges, ScanStop
 from calib.residuals.surfaces import Meeting, MeshSurface
-from calib.runs.reopen import problem_of, reopened
+from calib.runs.reopen import problem_of, reopened, state_of
 from calib.runs.run import Run
 from calib.solve.estimate import values_of
 from calib.solve.fit import Progress
@@ -157,7 +157,7 @@ def evaluate(
             raise InputError(
                 f"{run.folder}: its recordings hold no scans, so there is no LiDAR to evaluate"
             )
-        stops = _each(problem.scans, values_of(problem, run.state()), progress)
+        stops = _each(problem.scans, values_of(problem, state_of(run, problem)), progress)
         return write_evaluation(stops, folder, raw, sources[0].rig.labels)
 
 

@@ -21,7 +21,7 @@ from calib.problem.model import Source
 from calib.residuals.beams import site_error
 from calib.residuals.scan import turned
 from calib.rig import Rig, load_rig
-from calib.runs.reopen import model_of, problem_of, reopened
+from calib.runs.reopen import model_of, problem_of, reopened, state_of
 from calib.runs.run import Run
 from calib.solve.estimate import values_of
 from calib.solve.fit import Progress
@@ -191,7 +191,7 @@ def _met(run: Run, folder: Path) -> list[tuple[str, Known]]:
     if wanted.reference is None:
         return []
     problem = problem_of(run, sources)
-    values = values_of(problem, run.state())
+    values = values_of(problem, state_of(run, problem))
     scans = [scan for scan in problem.scans if scan.recording is wanted.recording]
     return [(scan.name, lambda ray, scan=scan: scan.what_meets(ray, values)) for scan in scans]
 

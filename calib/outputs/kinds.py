@@ -9,7 +9,9 @@ from pathlib import Path
 from chains.errors import InputError
 
 CLOUDS_MARK = ".rigcal-clouds"
-_HEAD = 1 << 16  # bytes of a file among which an export says that rigcal wrote it
+_HEAD = 1 << 16  # bytes of a file among which an export says that it is one
+# What they say; a picture of the frames by its title, and Hesai's table of angles by its columns.
+_EXPORTED = (b"rigcal", b"<title>Frames of ", b"Channel,Elevation,Azimuth\n")
 
 
 @dataclass(frozen=True)
@@ -84,14 +86,13 @@ def visible(folder: Path) -> list[Path]:
 
 
 def is_exported(path: Path) -> bool:
-    """Whether a file says at its head that rigcal wrote it, or holds Hesai's table of angles, which
-    takes no comments."""
+    """Whether a file says at its head that an export wrote it."""
     try:
         with open(path, "rb") as file:
             head = file.read(_HEAD)
     except OSError:
         return False
-    return b"rigcal" in head or head.startswith(b"Channel,Elevation,Azimuth\n")
+    return any(words in head for words in _EXPORTED)
 
 
 RECORDING = Kind(
@@ -152,7 +153,8 @@ def _refuse_input(path: Path | str, target: Path, given: Path) -> None:
     if not given.exists():
         return
     if target.exists() and target.samefile(given):
-        raise InputError(f"{path} is read here, and so would be written over; give another -o")
+        what = "folder" if given.is_dir() else "file"
+        raise InputError(f"{path} exists and is read here; give another {what} with -o")
     if _inside(target, given):
         raise InputError(f"{path} lies inside {given}, which is read here; give an -o outside")
     if _inside(given.resolve(), target):

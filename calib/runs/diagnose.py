@@ -20,7 +20,7 @@ from calib.results.errors import Errors
 from calib.results.holdout import held_out
 from calib.rig.scanned import ScanSums, numbering
 from calib.runs.belief import forbids
-from calib.runs.reopen import model_of, reopened, start_of
+from calib.runs.reopen import model_of, reopened, start_of, state_of
 from calib.runs.run import DIAGNOSIS, Run
 from calib.solve.fit import Progress, resume
 from sensors.documents import write_json
@@ -132,6 +132,7 @@ def stand_of(run: Run, progress: Progress) -> Stand:
     """
     sources, model = reopened(run), model_of(run)
     problem, converged = build(sources, model), run.summary["converged"]
+    state_of(run, problem)  # or it would look from elsewhere, unseen
     return Stand(
         sources, model, problem, resume(problem, start_of(run, sources), progress, converged)
     )

@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.metadata
 import platform
 import re
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ import numpy as np
 
 from calib import outputs
 from calib.results.solution import EffectEstimate, FrameEstimate, Part, Solution
+from calib.runs.stored import AGAIN, read_arrays, read_json, read_model, read_summary
 from chains import se3
 from chains.errors import InputError
 from sensors.documents import read_yaml
@@ -63,16 +63,8 @@ class Run:
         for name in (SOLUTION, SUMMARY, COVARIANCE):
             if not (folder / name).is_file():
                 raise InputError(f"{folder / name} is missing; the run is incomplete, fit it again")
-        try:
-            return cls(
-                folder, _yaml(folder / MODEL), _json(folder / SUMMARY), read_solution(folder)
-            )
-        except (KeyError, TypeError, ValueError) as error:
-            if isinstance(error, InputError):
-                raise
-            raise InputError(
-                f"{folder}: written by another version of rigcal, or edited ({error}); fit it again"
-            ) from None
+        model, summary = read_model(folder / MODEL), read_summary(folder / SUMMARY)
+        return cls(folder, model, summary, read_solution(folder))
 
     @property
     def recordings(self) -> list[Path]:
@@ -143,7 +135,7 @@ class Run:
         if not path.is_file():
             return None
         try:
-            document = _json(path)
+            document = read_json(path)
             whole = [(_OF_CANDIDATE, c) for c in document["candidates"]]
             whole += [(_OF_CURVE, c) for c in document["curves"]]
             if all(each.keys() >= keys for keys, each in [(_OF_DIAGNOSIS, document), *whole]):
@@ -177,27 +169,33 @@ class Run:
             raise InputError(
                 f"{path} is missing: the run was made by an earlier version; fit it again"
             )
-        try:
-            with np.load(path) as stored:
-                names = [name for name in stored.files if name.startswith(prefix)]
-                return {name.removeprefix(prefix): stored[name] for name in names}
-        except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-            raise InputError(f"{path} cannot be read ({error}); fit the run again") from None
+        stored = read_arrays(path).items()
+        return {name.removeprefix(prefix): x for name, x in stored if name.startswith(prefix)}
 
 
 def read_solution(folder: Path) -> Solution:
-    """The solution of a run folder."""
-    data = _yaml(folder / SOLUTION)
-    with np.load(folder / COVARIANCE) as stored:
-        names, covariance = tuple(stored["names"].tolist()), stored["covariance"]
-    recordings = {n: _read_part(p) for n, p in data.get("recordings", {}).items()}
-    return Solution(
-        shared=_read_part(data),
-        recordings=recordings,
-        not_estimated=data["not_estimated"],
-        names=names,
-        covariance=covariance,
-    )
+    """The solution of a run folder.
+
+    Raises:
+        InputError: its file, or that of its covariance, is broken or of another version.
+    """
+    path, beside = folder / SOLUTION, folder / COVARIANCE
+    data, stored = read_yaml(path)[0], read_arrays(beside)
+    names, covariance = stored.get("names", np.zeros(1)), stored.get("covariance", np.zeros(0))
+    if names.ndim != 1 or covariance.shape != 2 * names.shape or covariance.dtype.kind != "f":
+        raise InputError(f"{beside} is no covariance of a run; {AGAIN}")
+    try:
+        return Solution(
+            shared=_read_part(data),
+            recordings={n: _read_part(p) for n, p in data.get("recordings", {}).items()},
+            not_estimated=[{"name": e["name"], "why": e["why"]} for e in data["not_estimated"]],
+            names=tuple(names.tolist()),
+            covariance=covariance,
+        )
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(
+            f"{path} is no solution of this version of rigcal, or was edited ({error}); {AGAIN}"
+        ) from None
 
 
 def write_state(
@@ -242,13 +240,3 @@ def _read_part(data: Mapping[str, Any]) -> Part:
         for name, e in data["effects"].items()
     }
     return Part(frames, effects)
-
-
-def _yaml(path: Path) -> Any:
-    return read_yaml(path)[0]
-
-
-def _json(path: Path) -> Any:
-    import json
-
-    return json.loads(path.read_text(encoding="utf-8"))
