@@ -241,6 +241,9 @@ def in_sentences(path: Path | str, work: Path) -> Iterator[None]:
 
 
 def _sentence(error: OSError, path: Path, work: Path) -> str:
+    if isinstance(error, shutil.Error):  # of a whole folder: of its first file
+        name, _, why = error.args[0][0]
+        return f"{name}: {why}; {path} was not written"
     why = error.strerror or str(error).splitlines()[0]
     name = os.fsdecode(error.filename) if isinstance(error.filename, str | bytes) else ""
     inside = str(Path(os.path.abspath(name))).startswith(str(work)) if name else True
