@@ -22,6 +22,7 @@ from calib.outputs.kinds import (
     LADDER,
     RECORDING,
     RUN,
+    SIMULATED,
     Kind,
     is_exported,
     refuse,
@@ -37,6 +38,7 @@ __all__ = [
     "LADDER",
     "RECORDING",
     "RUN",
+    "SIMULATED",
     "Kind",
     "entries",
     "file",
@@ -119,8 +121,7 @@ def entries(path: Path | str, kind: Kind, inputs: Inputs = ()) -> Iterator[Path]
         yield shop.draft
         refuse(path, kind, anywhere=True)
         if any(shop.draft.iterdir()):
-            shop.path.mkdir(exist_ok=True)
-            os.replace(shop.draft, shop.work / ENTRIES)
+            os.replace(shop.draft, shop.work / (ENTRIES if shop.path.is_dir() else WHOLE))
             shop.commit()
 
 

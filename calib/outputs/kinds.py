@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from calib.outputs.workshop import settle
 from chains.errors import InputError
 
 CLOUDS_MARK = ".rigcal-clouds"
@@ -41,6 +42,12 @@ def _without(*names: str) -> Callable[[Path], str]:
         return next((f"it has no {name}" for name in names if not (folder / name).is_file()), "")
 
     return lacks
+
+
+def _lacks_simulated(folder: Path) -> str:
+    truth = folder.with_name(f"{folder.name}.truth.json")
+    why = RECORDING.lacks(folder)
+    return why or ("" if truth.is_file() else f"there is no {truth.name} beside it")
 
 
 def _lacks_run(folder: Path) -> str:
@@ -100,6 +107,8 @@ RECORDING = Kind(
     _without("rig.yaml", "stops.csv"),
     ("rig.yaml", "stops.csv", "targets.csv", "scans", "reference", "*.urdf"),
 )
+# A measured recording cost a week: no simulation takes its place.
+SIMULATED = Kind("simulated recording", _lacks_simulated, RECORDING.parts)
 RUN = Kind(
     "run",
     _lacks_run,
@@ -142,6 +151,7 @@ def refuse(
                 raise InputError(
                     f"{path} lies inside the {name} {above}; give an -o that is outside"
                 )
+        settle(target)  # or what a killed command left half-way would look like something else
         _refuse_other(path, target, kind)
     except (OSError, RuntimeError) as error:  # the latter where links go round in a circle
         reason = getattr(error, "strerror", None) or error

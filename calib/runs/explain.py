@@ -76,6 +76,8 @@ def explain(
     """
     out = Path(out)
     with outputs.entries(out, outputs.LADDER, recordings) as entries:
+        for number in range(MOST_RUNGS):  # one that is not climbed any more, too
+            outputs.settle(out / f"{number:02d}")
         climb = _Climb([Path(r) for r in recordings], out, progress)
         climb.first(model)
         diagnosis = diagnose(climb.run, climb.tell, refits=False)

@@ -37,7 +37,7 @@ def simulate(
 
     Args:
         spec: a preset, the path of a YAML file, or a spec.
-        out: the recording's folder; another recording there is replaced.
+        out: the recording's folder; another simulated one there is replaced.
         seed: 0 or more.
         hide: effect, or file of effects -> size, in sigmas of its parameters (see `truth.draw`).
         progress: called with what is done, how much of it, and how much there is.
@@ -49,7 +49,7 @@ def simulate(
     spec = load_spec(spec) if isinstance(spec, str) else spec
     if seed < 0:
         raise InputError(f"seed {seed} is negative; give 0 or more")
-    with outputs.folder(out, outputs.RECORDING, inputs, beside=("truth.json",)) as folder:
+    with outputs.folder(out, outputs.SIMULATED, inputs, beside=("truth.json",)) as folder:
         _record(spec, folder, seed, dict(hide or {}), progress or (lambda what, done, total: None))
 
 
