@@ -7,6 +7,7 @@ themselves do is tested in tests/calib/test_outputs.py, without commands.
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -77,11 +78,11 @@ class World:
         )  # fmt: skip
         assert self.zygote.stdout.readline() == "ready\n"
 
-    def start(self, words: str, at: int | None = None, exchange: bool = True) -> int:
+    def start(self, words: str, at: int | None = None, exchange: bool = True, most=None) -> int:
         self.steps.unlink(missing_ok=True)
         request = {
             "argv": words.split(), "cwd": str(self.folder), "at": at, "exchange": exchange,
-            "steps": str(self.steps), "told": str(self.told),
+            "steps": str(self.steps), "told": str(self.told), "most": most,
         }  # fmt: skip
         print(json.dumps(request), file=self.zygote.stdin, flush=True)
         return int(self.zygote.stdout.readline())
@@ -89,8 +90,8 @@ class World:
     def ended(self) -> int:
         return int(self.zygote.stdout.readline())
 
-    def run(self, words: str, at: int | None = None, exchange: bool = True) -> int:
-        self.start(words, at, exchange)
+    def run(self, words: str, at: int | None = None, exchange: bool = True, most=None) -> int:
+        self.start(words, at, exchange, most)
         return self.ended()
 
     def did(self, words: str) -> None:
@@ -133,6 +134,8 @@ def said(path: Path) -> object:
     if path.suffix == ".npz":
         with np.load(path) as arrays:
             return {name: arrays[name].tobytes() for name in arrays.files}
+    if path.suffix == ".html":
+        return re.sub(r"<th>written</th><td>[^<]*", "", path.read_text())
     return path.read_bytes()
 
 
@@ -211,6 +214,18 @@ def found_whole(world: World, case: Case, old: dict, new: dict, caplog) -> None:
         return
     assert world.contents(case) in (old, new)
     assert leftovers(world) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in CASES if name != "report"])
+def test_a_full_disk_is_one_sentence_and_changes_nothing(world, name):
+    """No file may grow beyond a few lines, which the system answers as it does a full disk."""
+    case = CASES[name]
+    world.restore(case)
+    old = world.contents(case)
+    assert world.run(case.words, most=1000) == 2
+    assert re.fullmatch(r"rigcal: .* cannot be written: .*; nothing was .*again\n", world.said())
+    assert world.contents(case) == old and leftovers(world) == []
 
 
 def killed_at_every_step(world: World, case: Case, caplog, exchange=True, all_steps=True) -> None:

@@ -5,6 +5,7 @@ the number of the process as soon as it runs, and by how it ended. A request say
 
     argv, cwd   the command, and where
     at          kill it before its n-th step that changes a folder; None: let it end
+    most        how many bytes a file may have; None: any number
     exchange    whether the system can exchange two folders in one step
     steps       a file that takes every such step, a line each
     told        a file for what it prints
@@ -13,6 +14,7 @@ the number of the process as soon as it runs, and by how it ended. A request say
 import importlib
 import json
 import os
+import resource
 import signal
 import sys
 
@@ -59,6 +61,8 @@ def run(request: dict) -> int:
     if not request.get("exchange", True):
         moves.exchange = lambda one, other: False
     watch(request)
+    if request.get("most") is not None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (request["most"], resource.RLIM_INFINITY))
     try:
         main()
     except SystemExit as exit_:

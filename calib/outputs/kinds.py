@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -135,11 +136,13 @@ def refuse(
         path: as the user gave it.
         kind: of the folder that is to be made; None of a file.
         inputs: files and folders that are read meanwhile.
-        anywhere: whether it may lie inside a recording or a run, where an earlier version put it.
+        anywhere: whether it may lie inside a recording or a run, where an earlier version put it,
+            as only what lies in it is written.
 
     Raises:
         InputError: it is an input, or inside one, or an input is inside it; or it lies inside a
-            recording or run; or it is there, and neither empty nor of that kind.
+            recording or run; or it is there, and neither empty nor of that kind; or it is
+            write-protected.
     """
     try:
         target = Path(path).resolve()
@@ -153,6 +156,10 @@ def refuse(
                 )
         settle(target)  # or what a killed command left half-way would look like something else
         _refuse_other(path, target, kind)
+        for each in (target,) if anywhere else (target, *target.rglob("*")):
+            # Also of an immutable file, which even root could neither replace nor remove.
+            if os.path.exists(each) and not each.is_symlink() and not os.access(each, os.W_OK):
+                raise InputError(f"{each} is write-protected; lift that, or give another -o")
     except (OSError, RuntimeError) as error:  # the latter where links go round in a circle
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"{path} cannot be written ({reason}); give another -o") from None

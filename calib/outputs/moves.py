@@ -86,7 +86,10 @@ def _move(source: Path, target: Path, aside: Path) -> Callable[[], None]:
     if exchange(source, target):
         return lambda: exchange(source, target)
     kept = aside / f"{target.name}.old"
-    os.replace(target, kept)
+    try:
+        os.link(target, kept)  # so that a file, which can be written over, is never gone
+    except OSError:
+        os.replace(target, kept)
     os.replace(source, target)
 
     def back() -> None:

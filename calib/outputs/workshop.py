@@ -11,6 +11,7 @@ import errno
 import json
 import logging
 import os
+import re
 import shutil
 import stat
 from collections.abc import Iterator
@@ -178,6 +179,7 @@ def _leave(work: Path, lock: int) -> None:
             _remove(work / name)
         if any(os.path.lexists(work / name) for name in left):
             _LOG.warning("%s could not be removed; it is of no use any more", work)
+            return
         with suppress(OSError):
             os.unlink(work / LOCK)
             os.rmdir(work)
@@ -241,10 +243,11 @@ def in_sentences(path: Path | str, work: Path) -> Iterator[None]:
 
 
 def _sentence(error: OSError, path: Path, work: Path) -> str:
-    if isinstance(error, shutil.Error):  # of a whole folder: of its first file
-        name, _, why = error.args[0][0]
-        return f"{name}: {why}; {path} was not written"
-    why = error.strerror or str(error).splitlines()[0]
+    if isinstance(error, shutil.Error):  # of a whole folder: all that went wrong, as text
+        name, _, text = error.args[0][0]
+        found = re.search(r"\[Errno (\d+)\]", text)
+        error = OSError(int(found[1]) if found else None, text, name)
+    why = os.strerror(error.errno) if error.errno else str(error).splitlines()[0]
     name = os.fsdecode(error.filename) if isinstance(error.filename, str | bytes) else ""
     inside = str(Path(os.path.abspath(name))).startswith(str(work)) if name else True
     if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):

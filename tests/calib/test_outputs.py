@@ -132,6 +132,18 @@ def test_a_ladder_holds_runs_and_nothing_else(tmp_path):
         outputs.refuse(tmp_path / "days", outputs.LADDER)
 
 
+def test_what_is_write_protected_is_not_replaced(tmp_path, monkeypatch):
+    """As root sees an immutable file, and others what they have protected by its mode."""
+    done = run(tmp_path / "run")
+    protected = str(done / "residuals.parquet/a.parquet")
+    monkeypatch.setattr(os, "access", lambda path, mode: str(path) != protected)
+    said = "a.parquet is write-protected"
+    with pytest.raises(InputError, match=said), outputs.folder(done, outputs.RUN):
+        pytest.fail("it was let through")
+    with outputs.entries(done, outputs.RUN) as new:  # which leaves that file alone
+        (new / "diagnosis.json").write_text("{}")
+
+
 # ------------------------------------------------------------------------------- what is replaced
 
 
