@@ -14,10 +14,10 @@ FOLDERS = {
     "simulate": ["simulate rec/spec.yaml"],
     "import": [IMPORT],
     "fit": ["fit rec", "fit other --prior run --hold-out none"],
-    "add": ["add run arm_axis_tilt", "add run --without L00P00:scan"],
+    "add": ["add run arm_axis_tilt"],
     "explain": ["explain rec"],
-    "evaluate": ["evaluate run", "evaluate run --raw"],
-    "export": ["export run", "export run --format yaml --force"],
+    "evaluate": ["evaluate run"],
+    "export": ["export run --format yaml --force"],
     "apply": ["apply run rec", "apply run rec/scans/L00P00.parquet"],
 }
 FILES = {"report": ["report run", "report run again"], "plot": ["plot run chain"]}
