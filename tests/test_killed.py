@@ -2,7 +2,7 @@
 
 Each command that writes is killed before every step that changes a folder outside its draft, with
 and without a system that can exchange two folders; and at moments drawn by chance. What the steps
-themselves do is tested in tests/calib/test_outputs.py, without commands.
+themselves do is tested in tests/calib/test_outputs_killed.py, without commands.
 """
 
 import json

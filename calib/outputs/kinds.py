@@ -109,7 +109,7 @@ RECORDING = Kind(
     ("rig.yaml", "stops.csv", "targets.csv", "scans", "reference", "*.urdf"),
 )
 # A measured recording cost a week: no simulation takes its place.
-SIMULATED = Kind("simulated recording", _lacks_simulated, RECORDING.parts)
+SIMULATED = Kind("recording of a simulation", _lacks_simulated, RECORDING.parts)
 RUN = Kind(
     "run",
     _lacks_run,
