@@ -16,9 +16,10 @@ STEPS = {"os.rename", "os.remove", "os.rmdir", "os.mkdir", "os.link", "os.trunca
 
 
 def simulated(out: Path) -> None:
-    with outputs.folder(out, outputs.RUN, beside=["truth.json"]) as new:
+    with outputs.folder(out, outputs.SIMULATED, beside=["truth.json"]) as new:
         fill(new)
-        (new / "truth.json").write_text("new")
+        for name in ("rig.yaml", "stops.csv", "truth.json"):
+            (new / name).write_text("new")
 
 
 def fitted(out: Path) -> None:
@@ -45,7 +46,9 @@ def reported(out: Path) -> None:
 
 def before_all(folder: Path) -> Path:
     run(folder / "run")
-    for name in ("page.html", "run/evaluation.json", "run.truth.json", "run/notes.txt"):
+    for name in ("page.html", "run.truth.json"):
+        (folder / name).write_text("old")
+    for name in ("run/evaluation.json", "run/notes.txt", "run/rig.yaml", "run/stops.csv"):
         (folder / name).write_text("old")
     (folder / "run/points.parquet").mkdir()
     (folder / "run/points.parquet/a").write_text("old")
@@ -96,11 +99,14 @@ def test_killed_before_any_step_it_is_old_or_new(tmp_path, caplog, write, there,
     steps = die_before(-1, write, world / "run", exchange)
     old, new = contents(begin), contents(world)
     assert steps > 5 and old != new and not [*world.glob(".*")]
-    for step in range(steps):
+    each = [(k, bool(k % 2)) for k in range(steps)] + [
+        (k, False) for k in range(steps) if not there
+    ]
+    for step, reads in each:
         shutil.rmtree(world)
         shutil.copytree(begin, world)
         assert die_before(step, write, world / "run", exchange) == -1
-        if step % 2:  # somebody reads it, or it is written again at once
+        if reads:  # somebody reads it, or it is written again at once
             outputs.settle(world / "run")
             outputs.settle(world / "page.html")
             assert contents(world) in (old, new), step
