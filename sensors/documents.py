@@ -8,7 +8,6 @@ import json
 import math
 import os
 import re
-import shutil
 import stat
 import sys
 import typing
@@ -281,33 +280,6 @@ def write_atomically(path: str | Path) -> Iterator[Path]:
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
-
-
-@contextmanager
-def replace_folder(path: str | Path, marker: str, kind: str) -> Iterator[Path]:
-    """Give a temporary folder beside `path` to fill, moved into place when all went well.
-
-    A folder already there is replaced if it is empty or holds a file named `marker`, which says
-    that it is of the same kind; it is put aside until the new one stands. Raises InputError, which
-    calls what is wanted a `kind`, for any other.
-    """
-    path = Path(path)
-    if path.exists() and not (
-        path.is_dir() and ((path / marker).exists() or not any(path.iterdir()))
-    ):
-        raise InputError(
-            f"{path} exists and is no {kind} (it has no {marker}); give another folder, or remove "
-            f"that one"
-        )
-    work = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
-    _make_folder(work / "new", path)
-    try:
-        yield work / "new"
-        if path.exists():
-            os.replace(path, work / "old")
-        os.replace(work / "new", path)
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
 
 
 def _make_folder(folder: Path, wanted: Path) -> None:

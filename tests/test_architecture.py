@@ -48,7 +48,7 @@ ROOMS = {
     "sensors": ("readers",),
     "sensors.readers": ("tables", "clouds", "poses", "meshes", "arms", "packets", "bags"),
     "calib": (
-        *("rig", "effects", "forward", "residuals", "problem", "linear", "solve"),
+        *("outputs", "rig", "effects", "forward", "residuals", "problem", "linear", "solve"),
         *("results", "blunders", "diagnosis"),
         *("runs", "show", "simulation", "evaluation", "intake", "exporters", "report", "view"),
         "cli",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
 from typing import NoReturn
@@ -15,6 +16,16 @@ from calib.cli import calibrating, exporting, importing, reporting  # noqa: E402
 from calib.cli.app import app  # noqa: E402
 from chains.errors import InputError  # noqa: E402
 from chains.escape import terminal  # noqa: E402
+
+
+class _OnStderr(logging.Handler):
+    """What happened beside what was asked for, a sentence each; not an error."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        print(f"rigcal: {record.getMessage()}", file=sys.stderr)
+
+
+logging.getLogger("rigcal").addHandler(_OnStderr())
 
 INTERRUPTED = 130  # as shells have it: 128 and the signal's number
 
@@ -33,6 +44,8 @@ def main() -> None:
     except Exception as error:
         if hasattr(error, "format_message"):  # wrong usage: typer's click, wherever that lives
             _fail(error.format_message(), 2)
+        if isinstance(error, OSError) and error.filename and error.strerror:
+            _fail(f"{os.fsdecode(error.filename)}: {error.strerror}", 2)  # the machine's
         if not _interrupted(error):
             if os.environ.get("RIGCAL_TRACEBACK"):
                 raise

@@ -36,12 +36,15 @@ def plot(
     as_json: Json = False,
 ) -> None:
     """One figure of a run's report, for a paper."""
-    from calib.report import Evidence, charts_of
+    from calib.report import Evidence, charts_of, refuse_figure
     from calib.report import plot as draw
     from calib.runs.run import Run
 
+    opened = Run.open(run, trust or ())
+    if out is not None and not listed:
+        refuse_figure([opened], out)
     with progress_bar() as progress:
-        evidence = Evidence.of([Run.open(run, trust or ())], progress)
+        evidence = Evidence.of([opened], progress)
         if listed:
             charts = [chart.document() for chart in charts_of(evidence).charts]
     if listed:

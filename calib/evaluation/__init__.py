@@ -23,16 +23,17 @@ from typing import Any
 
 import numpy as np
 
+from calib import outputs
 from calib.evaluation.tally import FLAT_M, Columns, Evaluated, Tally
 from calib.forward import Values
 from calib.residuals.scan import Ranges, ScanStop
 from calib.residuals.surfaces import Meeting, MeshSurface
-from calib.runs.reopen import problem_of, reopened
+from calib.runs.reopen import problem_of, reopened, state_of
 from calib.runs.run import Run
 from calib.solve.estimate import values_of
 from calib.solve.fit import Progress
 from chains.errors import InputError
-from sensors.documents import replace_folder, write_json, write_yaml
+from sensors.documents import write_json, write_yaml
 from sensors.recording import write_table
 
 EVALUATION, POINTS, MEANING = "evaluation.json", "points.parquet", "_columns.yaml"
@@ -152,15 +153,19 @@ def evaluate(
     Raises:
         InputError: the run's recordings are not what they were, or hold no scans.
     """
-    sources = reopened(run)
-    problem = problem_of(run, sources)
-    if not problem.scans:
-        raise InputError(
-            f"{run.folder}: its recordings hold no scans, so there is no LiDAR to evaluate"
-        )
-    values = values_of(problem, run.state())
-    stops = _each(problem.scans, values, progress)
-    return write_evaluation(stops, Path(out or run.folder), raw, sources[0].rig.labels)
+    if out is None:
+        place = outputs.entries(run.folder, outputs.RUN)
+    else:
+        place = outputs.folder(out, outputs.EVALUATION, [run.folder, *run.inputs])
+    with place as folder:
+        sources = reopened(run)
+        problem = problem_of(run, sources)
+        if not problem.scans:
+            raise InputError(
+                f"{run.folder}: its recordings hold no scans, so there is no LiDAR to evaluate"
+            )
+        stops = _each(problem.scans, values_of(problem, state_of(run, problem)), progress)
+        return write_evaluation(stops, folder, raw, sources[0].rig.labels)
 
 
 def evaluate_all(
@@ -182,7 +187,9 @@ def evaluate_all(
         if names.count(name) > 1:
             raise InputError(f"{out}: two runs are called {name}; evaluate them one by one")
     places = [out if len(runs) == 1 or out is None else Path(out) / name for name in names]
-    pairs = zip(runs, places, strict=True)
+    pairs = list(zip(runs, places, strict=True))
+    for run, place in pairs if out else ():  # before the first is written
+        outputs.refuse(place, outputs.EVALUATION, [run.folder, *run.inputs])
     return {str(run.folder): evaluate(run, place, raw, progress) for run, place in pairs}
 
 
@@ -193,23 +200,23 @@ def write_evaluation(
 
     Args:
         stops: any number of them, evaluated.
-        folder: where evaluation.json and points.parquet/ go; earlier ones are replaced.
+        folder: where evaluation.json and points.parquet/ go; neither is there yet.
         raw: as of `evaluate`.
         labels: their names, where they have any.
 
     Returns:
         What evaluation.json holds.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    points = folder / POINTS
+    points.mkdir(parents=True)
     tally = Tally(raw)
-    with replace_folder(folder / POINTS, MEANING, "table of points") as points:
-        write_yaml(points / MEANING, COLUMNS)
-        for done in stops:
-            tally.add(done)
-            names = {"sensor": done.sensor, "location": done.location, "stop": done.stop}
-            place = points / "/".join(f"{key}={_part(name)}" for key, name in names.items())
-            place.mkdir(parents=True, exist_ok=True)
-            write_table(place / f"{done.rig}.parquet", done.points)
-        document = tally.document(labels)
-        write_json(folder / EVALUATION, document)
+    write_yaml(points / MEANING, COLUMNS)
+    for done in stops:
+        tally.add(done)
+        names = {"sensor": done.sensor, "location": done.location, "stop": done.stop}
+        place = points / "/".join(f"{key}={_part(name)}" for key, name in names.items())
+        place.mkdir(parents=True, exist_ok=True)
+        write_table(place / f"{done.rig}.parquet", done.points)
+    document = tally.document(labels)
+    write_json(folder / EVALUATION, document)
     return document

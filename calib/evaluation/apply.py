@@ -15,17 +15,18 @@ from pathlib import Path
 
 import numpy as np
 
+from calib import outputs
 from calib.effects import Effect, LazyColumn, Site, View
 from calib.problem.model import Source
 from calib.residuals.beams import site_error
 from calib.residuals.scan import turned
 from calib.rig import Rig, load_rig
-from calib.runs.reopen import effects_that_may_run, problem_of, reopened
+from calib.runs.reopen import effects_that_may_run, problem_of, reopened, state_of
 from calib.runs.run import Run
 from calib.solve.estimate import values_of
 from calib.solve.fit import Progress
 from chains.errors import InputError
-from sensors.documents import nearest, replace_folder
+from sensors.documents import nearest
 from sensors.lidar import Beams, beams
 from sensors.meshes import read_cloud, write_cloud
 from sensors.recording import read_table, write_table
@@ -124,27 +125,30 @@ def apply(
         clouds: PCD, PLY or Parquet files with x y z in m in the LiDAR's frame, as its driver gives
             them; or recording folders. Of the run's own recordings the mesh tells range, incidence
             and label of what was met.
-        out: the folder to write to; files keep their names.
+        out: the folder to write to; files keep their names, and earlier clouds there stay.
         rig: whose LiDAR it was, where the run has several.
         progress: called with what is being done, and how far it is.
         force: whether a run that has not converged is used.
 
     Raises:
-        InputError: a cloud cannot be read, or would be written over, or the run has not converged.
+        InputError: a cloud cannot be read, or would be written over, or the run has not converged;
+            or two clouds have one name.
     """
     run.refuse_unconverged(force)
-    out = Path(out)
-    correction = Correction.of(run, rig)
-    done = []
-    for i, cloud in enumerate(map(Path, clouds)):
-        target = out / cloud.name
-        if target.resolve() == cloud.resolve():
-            raise InputError(f"{cloud}: would be written over; give another folder with -o")
-        if cloud.is_dir():
-            done.append(_apply_recording(run, correction, cloud, target, progress))
-        else:
-            progress("correcting", i, len(clouds))
-            done.append(_apply_file(correction, cloud, target))
+    out, done, names = Path(out), [], [Path(cloud).resolve().name for cloud in clouds]
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"{out}: two clouds are called {name}; correct them one by one")
+    with outputs.folder(out, outputs.CLOUDS, [*clouds, run.folder, *run.inputs]) as folder:
+        (folder / outputs.CLOUDS_MARK).write_text("corrected by rigcal\n", encoding="utf-8")
+        correction = Correction.of(run, rig)
+        for i, (cloud, name) in enumerate(zip(map(Path, clouds), names, strict=True)):
+            if cloud.is_dir():
+                one = _apply_recording(run, correction, cloud, folder / name, progress)
+            else:
+                progress("correcting", i, len(clouds))
+                one = _apply_file(correction, cloud, folder / name)
+            done.append(replace(one, path=out / name))
     return done
 
 
@@ -163,16 +167,15 @@ def _apply_recording(
     met = dict(_met(run, folder))  # but for scans that were left out, or set aside
     stops = (dict(_unmet(Source.open(folder))) | met).items()
     points, squares, left_out = 0, 0.0, {}
-    with replace_folder(target, "rig.yaml", "recording") as copy:
-        shutil.copytree(folder, copy, dirs_exist_ok=True)
-        for i, (stop, known) in enumerate(stops):
-            progress("correcting", i, len(stops))
-            path = copy / "scans" / f"{stop}.parquet"
-            columns = read_table(path)
-            rms_m, without = _correct(correction, path, columns, known)
-            write_table(path, columns)
-            points, left_out = points + len(columns["x"]), left_out | without
-            squares += len(columns["x"]) * rms_m**2
+    shutil.copytree(folder, target)
+    for i, (stop, known) in enumerate(stops):
+        progress("correcting", i, len(stops))
+        path = target / "scans" / f"{stop}.parquet"
+        columns = read_table(path)
+        rms_m, without = _correct(correction, path, columns, known)
+        write_table(path, columns)
+        points, left_out = points + len(columns["x"]), left_out | without
+        squares += len(columns["x"]) * rms_m**2
     return Applied(target, points, float(np.sqrt(squares / max(points, 1))), left_out)
 
 
@@ -194,7 +197,7 @@ def _met(run: Run, folder: Path) -> list[tuple[str, Known]]:
     if wanted.reference is None:
         return []
     problem = problem_of(run, sources)
-    values = values_of(problem, run.state())
+    values = values_of(problem, state_of(run, problem))
     scans = [scan for scan in problem.scans if scan.recording is wanted.recording]
     return [(scan.name, lambda ray, scan=scan: scan.what_meets(ray, values)) for scan in scans]
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from calib import outputs
 from calib.exporters.fitted import Fitted, Format
 from calib.exporters.rings import write_hesai, write_ouster, write_rings
 from calib.exporters.tables import write_latex, write_markdown
@@ -54,7 +55,8 @@ def export(run: Run, out: Path | str, formats: Sequence[str] = (), force: bool =
 
     Args:
         run: what to write.
-        out: the folder to write to; made if need be, files of the same name are replaced.
+        out: the folder to write to; of an earlier export there, files of the same name are
+            replaced and the others kept.
         formats: names in `FORMATS`.
         force: whether a run that has not converged is written; each file then says so.
 
@@ -63,20 +65,23 @@ def export(run: Run, out: Path | str, formats: Sequence[str] = (), force: bool =
             hold, or `out` is a file.
     """
     run.refuse_unconverged(force)
-    out, done, fitted = Path(out), Exported(), Fitted(run)
+    out, done = Path(out), Exported()
     for name in formats:
         if name not in FORMATS:
             raise InputError(f"--format {name}: that is none; there are {', '.join(FORMATS)}")
-    if out.exists() and not out.is_dir():
-        raise InputError(f"{out} is a file; give a folder to export to")
-    for name in dict.fromkeys(formats or FORMATS):
-        try:
-            written = FORMATS[name](fitted, out)
-        except Unheld as error:
-            if formats:
-                raise InputError(f"--format {name}: {error}") from None
-            done.left_out[name] = str(error)
-            continue
-        done.files.extend(written.files)
-        done.not_held[name] = written.not_held
+    with outputs.folder(out, outputs.EXPORT, [run.folder, *run.inputs]) as folder:
+        fitted = Fitted(run)
+        for name in dict.fromkeys(formats or FORMATS):
+            try:
+                written = FORMATS[name](fitted, folder)
+            except Unheld as error:
+                if formats:
+                    raise InputError(f"--format {name}: {error}") from None
+                done.left_out[name] = str(error)
+                continue
+            done.files.extend(out / file.name for file in written.files)
+            done.not_held[name] = written.not_held
+        for file in done.files:
+            if file.exists() and not outputs.is_exported(file):
+                raise InputError(f"{file} was not written by rigcal; move it, or give another -o")
     return done

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from calib import outputs
 from calib.intake import rigfile, scans, stops, targets
 from calib.intake.clocks import align
 from calib.intake.gather import (
@@ -29,7 +30,7 @@ from calib.intake.surface import write_surface
 from calib.results.check import Check, check
 from calib.rig import load_rig
 from chains.errors import InputError, is_file_name, shortened
-from sensors.documents import replace_folder, write_atomically
+from sensors.documents import write_atomically
 from sensors.readers.base import Columns, Options, Progress
 from sensors.stops import write_columns
 
@@ -112,12 +113,13 @@ def import_files(
     options, choices, out = options or Options(), choices or Choices(), Path(out)
     if choices.rig is not None and not choices.rig.is_file():
         raise InputError(f"--rig {choices.rig}: there is no such file")
-    gathered = gather(given, options, choices.rig, progress)
-    refuse_parts(gathered, choices.rig)
-    cut = _from_rows(gathered) if gathered.stops is not None else _from_logs(gathered, choices)
-    understood, odd = [*gathered.understood, *cut.understood], [*gathered.odd, *cut.odd]
-    columns, share = _thinned(cut, choices.most_stops)
-    with replace_folder(out, "rig.yaml", "recording") as folder, _called(folder, out):
+    inputs = _inputs(given, options, choices)
+    with outputs.folder(out, outputs.RECORDING, inputs) as folder, _called(folder, out):
+        gathered = gather(given, options, choices.rig, progress)
+        refuse_parts(gathered, choices.rig)
+        cut = _from_rows(gathered) if gathered.stops is not None else _from_logs(gathered, choices)
+        understood, odd = [*gathered.understood, *cut.understood], [*gathered.odd, *cut.odd]
+        columns, share = _thinned(cut, choices.most_stops)
         odd += _write_parts(folder, gathered, choices.rig)
         if choices.rig is not None:
             columns, said, more = rigfile.matched(choices.rig, columns)
@@ -142,6 +144,13 @@ def import_files(
         if checked.problems:
             raise InputError(checked.problems[0])
     return Imported(out, understood, odd, checked)
+
+
+def _inputs(given: Sequence[Given], options: Options, choices: Choices) -> list[Path]:
+    """All files and folders that an import reads."""
+    files = [path for _, paths in given for path in paths]
+    named = (choices.rig, options.metadata, options.lidar)
+    return [*files, *options.packages.values(), *(Path(each) for each in named if each)]
 
 
 @contextmanager

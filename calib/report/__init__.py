@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import Any
 
+from calib import outputs
 from calib.report import plots
 from calib.report.chart import Absent, Chart
 from calib.report.charts import SECTIONS
@@ -18,9 +18,12 @@ from calib.report.verdict import Verdict, judge
 from calib.runs.run import Run
 from calib.solve.fit import Progress
 from chains.errors import InputError
-from sensors.documents import nearest, write_atomically
+from sensors.documents import nearest
 
 __all__ = ["Evidence", "Written", "charts_of", "plot", "report"]
+
+
+PAGES = (".html", ".htm")
 
 
 @dataclass(frozen=True)
@@ -91,20 +94,22 @@ def report(
         InputError: a recording has moved or changed, a run is incomplete or of another version, or
             the file cannot be written.
     """
-    evidence = Evidence.of(runs, progress)
-    contents = charts_of(evidence)
-    verdict = judge(evidence.run, evidence.diagnosis)
-    done, total, sections = 0, len(contents.charts), []
-    for title, charts in contents.sections.items():
-        drawn = []
-        for chart in charts:
-            progress("drawing", done, total)
-            drawn.append((chart, plots.svg(chart.figure(), chart.id)))
-            done += 1
-        sections.append(Section(title, drawn))
-    page = render(evidence, verdict, sections, contents.absent)
-    with _file(out) as temporary:
-        temporary.write_text(page, encoding="utf-8")
+    if Path(out).suffix.lower() not in PAGES:
+        raise InputError(f"{out}: a report is a page of HTML; name the file so, {PAGES[0]}")
+    with outputs.file(out, _inputs(runs)) as file:
+        evidence = Evidence.of(runs, progress)
+        contents = charts_of(evidence)
+        verdict = judge(evidence.run, evidence.diagnosis)
+        done, total, sections = 0, len(contents.charts), []
+        for title, charts in contents.sections.items():
+            drawn = []
+            for chart in charts:
+                progress("drawing", done, total)
+                drawn.append((chart, plots.svg(chart.figure(), chart.id)))
+                done += 1
+            sections.append(Section(title, drawn))
+        page = render(evidence, verdict, sections, contents.absent)
+        file.write_text(page, encoding="utf-8")
     return WrittenReport(Path(out), verdict, contents)
 
 
@@ -119,11 +124,21 @@ def plot(evidence: Evidence, name: str, out: Path | str) -> Chart:
     Raises:
         InputError: there is no such figure, or not for this run, or not in that format.
     """
-    plots.check_format(out)
-    chart = _find(evidence, name)
-    with _file(out) as temporary:
-        plots.save(chart.figure(), temporary)
+    refuse_figure([evidence.run], out)
+    with outputs.file(out) as file:
+        chart = _find(evidence, name)
+        plots.save(chart.figure(), file)
     return chart
+
+
+def refuse_figure(runs: Sequence[Run], out: Path | str) -> None:
+    """Raise InputError for a file that a figure of these runs is not to be written to."""
+    plots.check_format(out)
+    outputs.refuse(out, None, _inputs(runs))
+
+
+def _inputs(runs: Sequence[Run]) -> list[Path]:
+    return [path for run in runs for path in (run.folder, *run.inputs)]
 
 
 def _find(evidence: Evidence, name: str) -> Chart:
@@ -137,12 +152,3 @@ def _find(evidence: Evidence, name: str) -> Chart:
                 raise InputError(f"{evidence.run.folder} has no figure '{name}': {each.why}")
             known += [each.id] if isinstance(each, Chart) else []
     raise InputError(f"there is no figure '{name}'{nearest(name, known)}")
-
-
-@contextmanager
-def _file(out: Path | str) -> Iterator[Path]:
-    try:
-        with write_atomically(out) as temporary:
-            yield temporary
-    except OSError as error:
-        raise InputError(f"{out} cannot be written ({error.strerror}); give another -o") from None

@@ -25,7 +25,7 @@ from calib.report.statistics import (
 from calib.residuals.scan import ScanStop
 from calib.runs.estimates import VariableEstimate, variable_estimates
 from calib.runs.ladder import Rung, ladder
-from calib.runs.reopen import problem_of, reopened
+from calib.runs.reopen import problem_of, reopened, state_of
 from calib.runs.residual_table import residual_table, table_path
 from calib.runs.run import RESIDUALS, SUMMARY, Run
 from calib.solve.estimate import values_of
@@ -107,7 +107,7 @@ class Evidence:
     @cached_property
     def values(self) -> dict[str, np.ndarray]:
         """The state in which the fit was left."""
-        return values_of(self.problem, self.run.state())
+        return values_of(self.problem, state_of(self.run, self.problem))
 
     @cached_property
     def prior_sigma(self) -> dict[str, float]:

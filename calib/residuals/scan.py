@@ -132,8 +132,17 @@ class ScanStop:
         return self._associate(self.pose(values), ray, values, near_edges)
 
     def met(self, values: Values, part: np.ndarray) -> Association:
-        """What is to be kept of what the beams met, the parts (N,), at a state."""
+        """What is to be kept of what the beams met, the parts (N,), at a state.
+
+        Raises:
+            InputError: there are not so many beams.
+        """
         _, ray = self._read()
+        if part.shape != ray.range_m.shape:
+            raise InputError(
+                f"{self.recording.folder}: stop '{self.name}' has {len(ray.range_m)} beams, and "
+                f"state.npz of the run says what {len(part)} of them met; fit the run again"
+            )
         return self.meeting.divided(self.pose(values), ray, part)
 
     def rows(

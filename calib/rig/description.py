@@ -8,6 +8,7 @@ import numpy as np
 import pydantic
 from numpy.typing import NDArray
 
+from calib.outputs import settle
 from chains import se3
 from chains.arm import Mass, read_arm, read_masses
 from chains.errors import InputError, is_file_name, shortened
@@ -228,6 +229,7 @@ def load_rig(folder: str | Path) -> Rig:
     files, frames that form no tree, and numbers that look like millimetres or degrees.
     """
     folder = Path(folder)
+    settle(folder)
     path = folder / "rig.yaml"
     if not path.is_file():
         raise InputError(f"{path} does not exist; a recording is a folder that holds one")

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from calib import outputs
 from calib import problem as problems
 from calib.effects import Effect, load_effects, trust_in
 from calib.problem import Problem
@@ -38,7 +39,7 @@ from calib.runs.run import (
 from calib.solve.estimate import Estimate, Start
 from calib.solve.fit import Progress, solve
 from chains.errors import InputError
-from sensors.documents import replace_folder, write_json, write_yaml
+from sensors.documents import write_json, write_yaml
 from sensors.recording import write_table
 
 # Residuals so much larger than their sigmas are no accident: the result's sigmas are widened.
@@ -68,7 +69,7 @@ def calibrate(
     Raises:
         InputError: what is wrong with the input, in one sentence.
     """
-    with _folder(out) as folder:
+    with _folder(out, [*recordings, *([prior] if prior else [])]) as folder:
         _refuse_twice([Path(r).resolve() for r in recordings])
         sources = leave_out([Source.open(r) for r in recordings], model.without)
         _fit(sources, model, folder, _Choices(hold_out, folds, prior), progress)
@@ -92,9 +93,7 @@ def grow(
     Raises:
         InputError: the run's recordings are not what they were, or it is of an earlier version.
     """
-    if Path(out).resolve() == run.folder.resolve():
-        raise InputError(f"{out}: a run cannot replace the one that it grows from; give another -o")
-    with _folder(out) as folder:
+    with _folder(out, [run.folder, *run.inputs]) as folder:
         sources = reopened(run, model.without)
         start = start_of(run, sources)
         _refuse_idle(model, run, sources)
@@ -155,11 +154,11 @@ class _Choices:
 
 
 @contextmanager
-def _folder(out: Path | str) -> Iterator[Path]:
+def _folder(out: Path | str, inputs: Sequence[Path | str]) -> Iterator[Path]:
     """The run folder while it is made."""
     from threadpoolctl import threadpool_limits
 
-    with threadpool_limits(limits=1), replace_folder(out, MODEL, "run") as folder:
+    with threadpool_limits(limits=1), outputs.folder(out, outputs.RUN, inputs) as folder:
         yield folder
 
 

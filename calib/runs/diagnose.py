@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from calib import outputs
 from calib.blunders import told
 from calib.diagnosis.rejects import rejects
 from calib.diagnosis.search import search
@@ -20,7 +21,7 @@ from calib.results.errors import Errors
 from calib.results.holdout import held_out
 from calib.rig.scanned import ScanSums, numbering
 from calib.runs.belief import forbids
-from calib.runs.reopen import model_of, reopened, start_of
+from calib.runs.reopen import model_of, reopened, start_of, state_of
 from calib.runs.run import DIAGNOSIS, Run
 from calib.solve.fit import Progress, resume
 from sensors.documents import write_json
@@ -46,22 +47,29 @@ def diagnose(
     """
     from threadpoolctl import threadpool_limits
 
-    with threadpool_limits(limits=1):
-        stand = stand_of(run, progress)
-        rings = dict(_odd_rings(stand))
-        harmful = {name: each for name, each in rings.items() if each.what != "reversed"}
-        # Away from an optimum every effect that moves the state towards one looks missing.
-        found = search(stand, progress) if run.converged else search(stand, progress, most=0)
-        rejected = rejects(found.looks[0].stand, progress)
-        falls = {}
-        before = run.summary["rms_mm"]["held_out"]
-        if refits and run.model["hold_out"] != "none" and before is not None:
-            if found.looks[0].stand is not stand and found.found:
-                before = _unseen(found.looks[0].stand, run, progress).rms_mm
-            for step in found.found:
-                unseen = _unseen(step.after.stand, run, progress)
-                falls[step.effect.name] = (before, unseen.rms_mm, unseen.floor_mm)
-                before = unseen.rms_mm
+    with threadpool_limits(limits=1), outputs.entries(run.folder, outputs.RUN) as entries:
+        result = _found(run, progress, refits)
+        write_json(entries / DIAGNOSIS, result.document())
+    return result
+
+
+def _found(run: Run, progress: Progress, refits: bool) -> Diagnosis:
+    """As `diagnose`, and nothing is written."""
+    stand = stand_of(run, progress)
+    rings = dict(_odd_rings(stand))
+    harmful = {name: each for name, each in rings.items() if each.what != "reversed"}
+    # Away from an optimum every effect that moves the state towards one looks missing.
+    found = search(stand, progress) if run.converged else search(stand, progress, most=0)
+    rejected = rejects(found.looks[0].stand, progress)
+    falls = {}
+    before = run.summary["rms_mm"]["held_out"]
+    if refits and run.model["hold_out"] != "none" and before is not None:
+        if found.looks[0].stand is not stand and found.found:
+            before = _unseen(found.looks[0].stand, run, progress).rms_mm
+        for step in found.found:
+            unseen = _unseen(step.after.stand, run, progress)
+            falls[step.effect.name] = (before, unseen.rms_mm, unseen.floor_mm)
+            before = unseen.rms_mm
     result = conclude(
         found,
         falls,
@@ -72,7 +80,7 @@ def diagnose(
         [told.of_rings(lidar, each) for lidar, each in harmful.items()],
     )
     tokens = told.tokens(result.blunders)
-    result = replace(
+    return replace(
         result,
         sentences=[
             *run.doubts,
@@ -82,8 +90,6 @@ def diagnose(
         ],
         command=command_without(run, tokens) if tokens else "",
     )
-    write_json(run.folder / DIAGNOSIS, result.document())
-    return result
 
 
 def command_without(run: Run, tokens: Sequence[str]) -> str:
@@ -133,6 +139,7 @@ def stand_of(run: Run, progress: Progress) -> Stand:
     """
     sources, model = reopened(run), model_of(run)
     problem, converged = build(sources, model), run.summary["converged"]
+    state_of(run, problem)  # or it would look from elsewhere, unseen
     return Stand(
         sources, model, problem, resume(problem, start_of(run, sources), progress, converged)
     )

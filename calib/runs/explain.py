@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from calib import outputs
 from calib.blunders import told
 from calib.diagnosis import Diagnosis
 from calib.effects import load_effects, trust_in
@@ -77,37 +77,18 @@ def explain(
         InputError: what is wrong with the input, or `out` is something else.
     """
     out = Path(out)
-    _refuse_other(out)
-    climb = _Climb([Path(r) for r in recordings], out, progress)
-    try:
+    with outputs.entries(out, outputs.LADDER, recordings) as entries:
+        for number in range(MOST_RUNGS):  # one that is not climbed any more, too
+            outputs.settle(out / f"{number:02d}")
+        climb = _Climb([Path(r) for r in recordings], out, progress)
         climb.first(model)
-    except BaseException:
-        _remove_if_empty(out)
-        raise
-    diagnosis = diagnose(climb.run, climb.tell, refits=False)
-    while len(climb.runs) < MOST_RUNGS and climb.improve(diagnosis):
         diagnosis = diagnose(climb.run, climb.tell, refits=False)
-    climb.clear_above()
-    result = Explanation(climb.runs, climb.steps, climb.refused, diagnosis)
-    write_json(out / EXPLANATION, result.document())
+        while len(climb.runs) < MOST_RUNGS and climb.improve(diagnosis):
+            diagnosis = diagnose(climb.run, climb.tell, refits=False)
+        climb.clear_above()
+        result = Explanation(climb.runs, climb.steps, climb.refused, diagnosis)
+        write_json(entries / EXPLANATION, result.document())
     return result
-
-
-def _refuse_other(out: Path) -> None:
-    """A folder that holds anything but a ladder is not ours to write into."""
-    if not out.exists():
-        return
-    if not out.is_dir():
-        raise InputError(f"{out} is a file; give a folder for the runs")
-    others = [p.name for p in out.iterdir() if not (p.name.isdigit() or p.name == EXPLANATION)]
-    others = [name for name in others if not name.startswith(".")]
-    if others:
-        raise InputError(f"{out} holds {others[0]}, so it is no ladder of runs; give another -o")
-
-
-def _remove_if_empty(folder: Path) -> None:
-    if folder.is_dir() and not any(folder.iterdir()):
-        folder.rmdir()
 
 
 class _Climb:
@@ -159,7 +140,7 @@ class _Climb:
         """Remove rungs that an earlier call left above the last one."""
         for folder in self.out.iterdir():
             if folder.name.isdigit() and int(folder.name) >= len(self.runs):
-                shutil.rmtree(folder)
+                outputs.remove(folder)
 
     def _add(self, name: str) -> None:
         effects = load_effects((name,))
@@ -185,7 +166,7 @@ class _Climb:
         if run.converged and _falls(self.run, run, LEAST_FALL if added else 0.0):
             self._keep(run, added, dropped)
         else:
-            shutil.rmtree(folder)
+            outputs.remove(folder)
             self.refused += added
 
     def _keep(

@@ -11,10 +11,12 @@ from calib.effects import Effect, NotTrustedError, read
 from calib.problem import Problem, build
 from calib.problem.model import Model, Source
 from calib.problem.without import leave_out
-from calib.runs.run import MODEL, Run
-from calib.solve.estimate import Start
+from calib.runs.run import MODEL, STATE, Run
+from calib.runs.stored import AGAIN
+from calib.solve.estimate import DOFS, Start
 from chains.errors import InputError
 from sensors.recording import digest
+from sensors.reference import Reference
 
 OPENED = 4  # recordings that stay open in a process: to grow and diagnose runs of them again
 _opened: dict[tuple[Path, str], Source] = {}
@@ -64,9 +66,32 @@ def start_of(run: Run, sources: Sequence[Source]) -> Start:
     folders = [source.recording.folder for source in sources]
     met = {}
     for name, part in run.met().items():
-        number, stop = map(int, name.split("/"))
-        met[folders[number], stop] = part
+        number, _, stop = name.partition("/")
+        known = number.isdecimal() and stop.isdecimal() and int(number) < len(sources)
+        mesh = sources[int(number)].reference if known else None
+        if mesh is None or not _are_of(mesh, part):
+            raise InputError(f"{run.folder / STATE}: {name} is no list of triangles; {AGAIN}")
+        met[folders[int(number)], int(stop)] = part
     return Start(run.state(), met, frozenset(run.set_aside))
+
+
+def state_of(run: Run, problem: Problem) -> dict[str, np.ndarray]:
+    """Where a run's fit stood, all of the problem's unknowns.
+
+    Raises:
+        InputError: the state has not all of them, or one of another shape.
+    """
+    state = run.state()
+    for name, unknown in problem.variables.items():
+        found, dofs = state.get(name), state.get(f"{name}{DOFS}")
+        whole = found is not None and found.dtype.kind == "f" and np.isfinite(found).all()
+        if whole and dofs is None:
+            whole = found.shape == problem.initial[name].shape
+        elif whole:
+            whole = found.shape == dofs.shape and set(unknown.dofs) <= set(dofs.tolist())
+        if not whole:
+            raise InputError(f"{run.folder / STATE}: its state lacks '{name}'; {AGAIN}")
+    return state
 
 
 def problem_of(
@@ -80,6 +105,12 @@ def problem_of(
         meetings: as of `calib.problem.build`.
     """
     return build(sources, model_of(run), meetings=meetings).setting_aside(run.set_aside)
+
+
+def _are_of(mesh: Reference, part: np.ndarray) -> bool:
+    """Whether these can be the triangles (N,) of a mesh that beams met, -1 for none."""
+    whole = part.ndim == 1 and part.dtype.kind == "i"
+    return whole and bool(((part >= -1) & (part < len(mesh.triangles))).all())
 
 
 def stored_met(start: Start, sources: Sequence[Source]) -> dict[str, np.ndarray]:

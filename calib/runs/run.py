@@ -8,17 +8,17 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import pydantic
 
+from calib import outputs
 from calib.effects import Trust, trusted
 from calib.results.solution import EffectEstimate, FrameEstimate, Part, Solution
+from calib.runs.stored import AGAIN, read_arrays, read_json, read_model, read_summary
 from chains import se3
 from chains.errors import InputError
-from sensors.documents import Document, read_json, read_yaml, validate
-from sensors.numbers import read_arrays
+from sensors.documents import read_yaml
 
 SOLUTION, MODEL, SUMMARY, COVARIANCE, RESIDUALS, STATE, DIAGNOSIS = (
     "solution.yaml",
@@ -69,6 +69,7 @@ class Run:
         """
         may_run = trust if isinstance(trust, Mapping) else trusted(trust)
         folder = Path(folder)
+        outputs.settle(folder)
         if not (folder / MODEL).is_file():
             raise InputError(
                 f"{folder}: no run there ({MODEL} is missing); make one with 'rigcal fit'"
@@ -76,20 +77,19 @@ class Run:
         for name in (SOLUTION, SUMMARY, COVARIANCE):
             if not (folder / name).is_file():
                 raise InputError(f"{folder / name} is missing; the run is incomplete, fit it again")
-        try:
-            model, summary = _model(folder / MODEL), _json(folder / SUMMARY)
-            return cls(folder, model, summary, read_solution(folder), trust=may_run)
-        except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
-            if isinstance(error, InputError):
-                raise
-            raise InputError(
-                f"{folder}: written by another version of rigcal, or edited ({error}); fit it again"
-            ) from None
+        model, summary = read_model(folder / MODEL), read_summary(folder / SUMMARY)
+        return cls(folder, model, summary, read_solution(folder), trust=may_run)
 
     @property
     def recordings(self) -> list[Path]:
         """Where the recordings were that this run was fitted to."""
         return [Path(r["path"]) for r in self.model["recordings"]]
+
+    @property
+    def inputs(self) -> list[Path]:
+        """Folders that are read with it: its recordings, and the run that was its prior."""
+        prior = self.model.get("prior")
+        return [*self.recordings, *([Path(prior)] if prior else [])]
 
     @property
     def effects(self) -> tuple[str, ...]:
@@ -149,7 +149,7 @@ class Run:
         if not path.is_file():
             return None
         try:
-            document = _json(path)
+            document = read_json(path)
             whole = [(_OF_CANDIDATE, c) for c in document["candidates"]]
             whole += [(_OF_CURVE, c) for c in document["curves"]]
             if all(each.keys() >= keys for keys, each in [(_OF_DIAGNOSIS, document), *whole]):
@@ -183,26 +183,33 @@ class Run:
             raise InputError(
                 f"{path} is missing: the run was made by an earlier version; fit it again"
             )
-        try:
-            stored = _arrays(path)
-        except InputError as error:
-            raise InputError(f"{path} cannot be read ({error}); fit the run again") from None
-        return {n.removeprefix(prefix): a for n, a in stored.items() if n.startswith(prefix)}
+        stored = read_arrays(path).items()
+        return {name.removeprefix(prefix): x for name, x in stored if name.startswith(prefix)}
 
 
 def read_solution(folder: Path) -> Solution:
-    """The solution of a run folder."""
-    data = _yaml(folder / SOLUTION)
-    stored = _arrays(folder / COVARIANCE)
-    names, covariance = tuple(stored["names"].tolist()), stored["covariance"]
-    recordings = {n: _read_part(p) for n, p in data.get("recordings", {}).items()}
-    return Solution(
-        shared=_read_part(data),
-        recordings=recordings,
-        not_estimated=data["not_estimated"],
-        names=names,
-        covariance=covariance,
-    )
+    """The solution of a run folder.
+
+    Raises:
+        InputError: its file, or that of its covariance, is broken or of another version.
+    """
+    path, beside = folder / SOLUTION, folder / COVARIANCE
+    data, stored = read_yaml(path)[0], read_arrays(beside)
+    names, covariance = stored.get("names", np.zeros(1)), stored.get("covariance", np.zeros(0))
+    if names.ndim != 1 or covariance.shape != 2 * names.shape or covariance.dtype.kind != "f":
+        raise InputError(f"{beside} is no covariance of a run; {AGAIN}")
+    try:
+        return Solution(
+            shared=_read_part(data),
+            recordings={n: _read_part(p) for n, p in data.get("recordings", {}).items()},
+            not_estimated=[{"name": e["name"], "why": e["why"]} for e in data["not_estimated"]],
+            names=tuple(names.tolist()),
+            covariance=covariance,
+        )
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(
+            f"{path} is no solution of this version of rigcal, or was edited ({error}); {AGAIN}"
+        ) from None
 
 
 def write_state(
@@ -218,36 +225,6 @@ def versions() -> dict[str, str]:
     names = ("rigcal", "gtsam", "numpy", "scipy")
     numbers = {n: importlib.metadata.version(n) for n in names}
     return numbers | {"python": platform.python_version()}
-
-
-class _Fitted(Document):
-    """A recording that a run was fitted to."""
-
-    model_config = pydantic.ConfigDict(extra="ignore")
-    path: str
-    rig: str
-    sha256: str
-
-
-class _ModelFile(Document):
-    """What of a run's model.yaml is looked at."""
-
-    model_config = pydantic.ConfigDict(extra="ignore")
-    recordings: Annotated[tuple[_Fitted, ...], pydantic.Field(min_length=1)]
-    effects: tuple[str | dict[str, Any], ...]
-    fixed: tuple[str, ...] = ()
-    without: tuple[str, ...] = ()
-    hold_out: str = "location"
-    folds: int = 1
-    prior: str | None = None
-    grown_from: str | None = None
-
-
-def _model(path: Path) -> dict[str, Any]:
-    """A run's model.yaml, as it stands, once it is known to be one."""
-    data, marks = read_yaml(path)
-    validate(_ModelFile, data, path, marks)
-    return data
 
 
 def _effect_name(document: str | Mapping[str, Any]) -> str:
@@ -277,18 +254,3 @@ def _read_part(data: Mapping[str, Any]) -> Part:
         for name, e in data["effects"].items()
     }
     return Part(frames, effects)
-
-
-def _arrays(path: Path) -> dict[str, np.ndarray]:
-    stored = read_arrays(path)
-    if not isinstance(stored, dict):
-        raise InputError(f"{path} is one array, where arrays with names are wanted")
-    return stored
-
-
-def _yaml(path: Path) -> Any:
-    return read_yaml(path)[0]
-
-
-def _json(path: Path) -> Any:
-    return read_json(path)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
+from calib import outputs
 from calib.effects import trusted
 from calib.rig import Rig, load_rig
 from calib.simulation import rig as rig_on_paper
@@ -15,7 +16,7 @@ from calib.simulation.stops import World, plan
 from calib.simulation.truth import Truth, draw, stream
 from calib.simulation.write import write_reference, write_stops, write_targets, write_truth
 from chains.errors import InputError
-from sensors.documents import replace_folder, write_yaml
+from sensors.documents import write_yaml
 from sensors.recording import write_table
 
 __all__ = ["PRESETS", "Spec", "load_spec", "simulate"]
@@ -38,7 +39,7 @@ def simulate(
 
     Args:
         spec: a preset, the path of a YAML file, or a spec.
-        out: the recording's folder; another recording there is replaced.
+        out: the recording's folder; another simulated one there is replaced.
         seed: 0 or more.
         hide: effect, or file of effects -> size, in sigmas of its parameters (see `truth.draw`).
         progress: called with what is done, how much of it, and how much there is.
@@ -48,15 +49,14 @@ def simulate(
         InputError: the spec, the seed or an effect's name is wrong, or `out` is something else.
     """
     may_run = trusted(trust) if isinstance(spec, str) else None
+    inputs = [spec] if isinstance(spec, str) else []
     spec = load_spec(spec) if isinstance(spec, str) else spec
     if seed < 0:
         raise InputError(f"seed {seed} is negative; give 0 or more")
-    out = Path(out)
-    with replace_folder(out, "rig.yaml", "recording") as folder:
+    with outputs.folder(out, outputs.SIMULATED, inputs, beside=("truth.json",)) as folder:
         rig, room = _on_paper(spec, folder, seed)
         truth = draw(rig, spec, dict(hide or {}), seed, may_run)
         _record(truth, spec, room, folder, seed, progress or (lambda what, done, total: None))
-        (folder / "truth.json").replace(out.with_name(f"{out.name}.truth.json"))
 
 
 def _on_paper(spec: Spec, folder: Path, seed: int) -> tuple[Rig, Room]:

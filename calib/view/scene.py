@@ -17,7 +17,7 @@ from calib.problem import Problem
 from calib.problem.model import Source
 from calib.residuals.scan import ScanStop
 from calib.residuals.tracker import TrackedBody
-from calib.runs.reopen import problem_of, reopened
+from calib.runs.reopen import problem_of, reopened, state_of
 from calib.runs.residual_table import table_path
 from calib.runs.run import RESIDUALS, Run
 from chains import se3
@@ -105,7 +105,7 @@ class Scene:
         # Poses need no surface, and planes would have to be looked for in every scan.
         nothing = dict.fromkeys(range(len(sources)), object())
         problem = problem_of(run, sources, nothing)
-        scene = cls(run, sources, problem, run.state())
+        scene = cls(run, sources, problem, state_of(run, problem))
         for stops, _ in scene._stops.values():
             unknown = [name for name in stops.variables if name not in scene.state]
             if unknown:

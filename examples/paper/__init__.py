@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from calib import outputs
 from calib.evaluation import write_evaluation
 from calib.problem.model import Source
 from calib.runs.calibrate import calibrate, grow, grown_model
@@ -136,7 +137,8 @@ def _judged(case: Case, explained: bool, tell: Progress) -> _One:
     known = (points[c][learnt] for c in ("ring", "raw_signed_error_m", "count"))
     sequence = State(before.problem, offsets_by_ring(before.values, *known))
     labels = case.source.rig.labels
-    write_evaluation(sequence.evaluated(case.stops(), tell), case.work / "sequence", False, labels)
+    with outputs.folder(case.work / "sequence", outputs.EVALUATION) as folder:
+        write_evaluation(sequence.evaluated(case.stops(), tell), folder, False, labels)
 
     fitted = {name: case.fitted(run, tell) for name, run in _runs(case, explained, tell).items()}
     states = {ON_PAPER: case.on_paper(), SEQUENCE: sequence, **fitted}

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from calib import outputs
 from calib import problem as problems
 from calib.evaluation import evaluate_stop
 from calib.evaluation.tally import Evaluated
@@ -24,7 +25,6 @@ from calib.runs.reopen import model_of
 from calib.runs.run import Run
 from calib.solve.estimate import Start, values_of
 from calib.solve.fit import Progress, solve
-from sensors.documents import replace_folder
 
 from . import sequence
 
@@ -158,7 +158,7 @@ def well_seen(points: Mapping[str, np.ndarray]) -> np.ndarray:
 
 def _with_stops(recording: Path, out: Path, names: set[str]) -> Path:
     """A copy of a recording that has only the stops of these names."""
-    with replace_folder(out, "rig.yaml", "recording") as copy:
+    with outputs.folder(out, outputs.RECORDING, [recording]) as copy:
         shutil.copytree(
             recording, copy, dirs_exist_ok=True, ignore=shutil.ignore_patterns("scans", "stops.csv")
         )

@@ -18,6 +18,7 @@ from pathlib import Path
 
 from workload import recorded, threads, timed
 
+from calib import outputs
 from calib import problem as problems
 from calib.evaluation import evaluate_stop, write_evaluation
 from calib.evaluation.tally import Evaluated
@@ -37,7 +38,8 @@ def each(problem: Problem, copies: int = 1) -> Iterator[Evaluated]:
 
 def ours(problem: Problem, folder: Path, copies: int = 1) -> None:
     """A whole evaluation, written."""
-    write_evaluation(each(problem, copies), folder, False, {})
+    with outputs.folder(folder, outputs.EVALUATION) as draft:
+        write_evaluation(each(problem, copies), draft, False, {})
 
 
 def theirs(problem: Problem, tables: Sequence[dict], folder: Path) -> None:

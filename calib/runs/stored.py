@@ -1,0 +1,118 @@
+"""What a run's files must hold to be read: checked where they are opened, not where they are used.
+
+A file may have been cut short, edited, or made by somebody else.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pydantic
+
+from chains.errors import InputError
+from sensors import documents, numbers
+from sensors.documents import Document, Number, read_yaml, validate
+
+AGAIN = "fit the run again"
+
+
+class _Part(Document):
+    """Some keys of a document, which may have others."""
+
+    model_config = pydantic.ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
+
+
+class _Kinds(_Part):
+    nominal: Number | None
+    fit: Number | None
+    held_out: Number | None
+
+
+class _Rms(_Kinds):
+    noise_floor: Number | None
+
+
+class _Summary(_Part):
+    points: int
+    stops: int
+    residual: str
+    rms_mm: _Rms
+    mean_mm: _Kinds
+    std_mm: _Kinds
+    misfit: dict[str, Number | None]
+    sigmas_widened_by: Number
+    iterations: int
+    converged: bool
+
+
+class _Recording(_Part):
+    path: str
+    rig: str
+    sha256: str
+
+
+class _Model(_Part):
+    recordings: list[_Recording] = pydantic.Field(min_length=1)
+    effects: list[str | dict]
+    fixed: list[str]
+    hold_out: str
+    folds: int
+    prior: str | None
+    grown_from: str | None
+    versions: dict[str, str]
+    without: list[str] = []  # noqa: RUF012 - pydantic copies it
+
+
+def read_model(path: Path) -> dict[str, Any]:
+    """A run's model.yaml.
+
+    Raises:
+        InputError: it is no YAML, or lacks a key, or has something else there.
+    """
+    data, marks = read_yaml(path)
+    return _checked(_Model, data, path, marks)
+
+
+def read_summary(path: Path) -> dict[str, Any]:
+    """A run's summary.json; raises as `read_model`."""
+    return _checked(_Summary, read_json(path), path, {})
+
+
+def read_json(path: Path) -> Any:
+    """A JSON document.
+
+    Raises:
+        InputError: it is missing, or none.
+    """
+    try:
+        return documents.read_json(path)
+    except InputError as error:
+        raise InputError(f"{error}; {AGAIN}") from None
+
+
+def _checked(model: type[_Part], data: Any, path: Path, marks: dict) -> dict[str, Any]:
+    try:
+        validate(model, data, path, marks)
+    except InputError as error:
+        raise InputError(
+            f"{error}; it was written by another version of rigcal, or edited: {AGAIN}"
+        ) from None
+    return data
+
+
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of an .npz file, by name.
+
+    Raises:
+        InputError: it is missing, broken, or claims more than it holds.
+    """
+    try:
+        stored = numbers.read_arrays(path)
+        if isinstance(stored, dict):
+            return stored
+        why = f"{path} is one array, where arrays with names are wanted"
+    except InputError as error:
+        why = str(error)
+    raise InputError(f"{why}; {AGAIN}")

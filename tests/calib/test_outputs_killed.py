@@ -1,0 +1,128 @@
+"""Writers that die before any step that changes a folder: what they write is old or new."""
+
+import os
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+
+from calib import outputs
+from calib.outputs import moves
+
+from .folders import contents, fill, run
+
+STEPS = {"os.rename", "os.remove", "os.rmdir", "os.mkdir", "os.link", "os.truncate"}
+
+
+def simulated(out: Path) -> None:
+    with outputs.folder(out, outputs.SIMULATED, beside=["truth.json"]) as new:
+        fill(new)
+        for name in ("rig.yaml", "stops.csv", "truth.json"):
+            (new / name).write_text("new")
+
+
+def fitted(out: Path) -> None:
+    with outputs.folder(out, outputs.RUN) as new:
+        fill(new)
+
+
+def in_its_own(out: Path) -> None:
+    os.chdir(out if out.exists() else out.parent)
+    fitted(out)
+
+
+def evaluated(out: Path) -> None:
+    with outputs.entries(out, outputs.RUN) as new:
+        (new / "points.parquet").mkdir()
+        (new / "points.parquet/a").write_text("new")
+        (new / "evaluation.json").write_text("new")
+
+
+def reported(out: Path) -> None:
+    with outputs.file(out.with_name("page.html")) as file:
+        file.write_text("new")
+
+
+def before_all(folder: Path) -> Path:
+    run(folder / "run")
+    for name in ("page.html", "run.truth.json"):
+        (folder / name).write_text("old")
+    for name in ("run/evaluation.json", "run/notes.txt", "run/rig.yaml", "run/stops.csv"):
+        (folder / name).write_text("old")
+    (folder / "run/points.parquet").mkdir()
+    (folder / "run/points.parquet/a").write_text("old")
+    return folder
+
+
+def die_before(step: int, write, out: Path, exchange: bool) -> int:
+    """Write in a forked process that ends, as if killed, before a step; how many steps it took."""
+    reader, pipe = os.pipe()
+    child = os.fork()
+    if child == 0:
+        count = 0
+
+        def watch(event, arguments):
+            nonlocal count
+            if event in STEPS:
+                if count == step:
+                    os._exit(9)
+                count += 1
+
+        try:
+            if not exchange:
+                moves.exchange = lambda one, other: False
+            sys.addaudithook(watch)
+            write(out)
+            os.write(pipe, str(count).encode())
+        finally:
+            os._exit(0)
+    os.waitpid(child, 0)
+    os.close(pipe)
+    with os.fdopen(reader) as told:
+        return int(told.read() or -1)
+
+
+@pytest.mark.parametrize("exchange", [True, False], ids=["exchange", "aside"])
+@pytest.mark.parametrize(
+    ("write", "there"),
+    [
+        *[(simulated, True), (fitted, True), (in_its_own, True), (evaluated, True)],
+        *[(reported, True), (simulated, False), (in_its_own, False), (reported, False)],
+    ],
+)
+def test_killed_before_any_step_it_is_old_or_new(tmp_path, caplog, write, there, exchange):
+    begin = before_all(tmp_path / "begin") if there else tmp_path / "begin"
+    begin.mkdir(exist_ok=True)
+    world = tmp_path / "world"
+    shutil.copytree(begin, world)
+    steps = die_before(-1, write, world / "run", exchange)
+    old, new = contents(begin), contents(world)
+    assert steps > 5 and old != new and not [*world.glob(".*")]
+    each = [(k, bool(k % 2)) for k in range(steps)] + [
+        (k, False) for k in range(steps) if not there
+    ]
+    for step, reads in each:
+        shutil.rmtree(world)
+        shutil.copytree(begin, world)
+        assert die_before(step, write, world / "run", exchange) == -1
+        if reads:  # somebody reads it, or it is written again at once
+            outputs.settle(world / "run")
+            outputs.settle(world / "page.html")
+            assert contents(world) in (old, new), step
+            assert not [*world.rglob(".*.rigcal")]
+        (fitted if write is in_its_own else write)(world / "run")
+        assert contents(world) == new, step
+        assert not [*world.rglob(".*.rigcal")]
+    assert "the new one stands" in caplog.text
+    assert ("the earlier one stands" if there else "nothing of it was kept") in caplog.text
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="renameat2 is Linux's")
+def test_two_folders_are_exchanged_in_one_step(tmp_path):
+    run(tmp_path / "a", "a")
+    run(tmp_path / "b", "b")
+    assert moves.exchange(tmp_path / "a", tmp_path / "b")
+    assert contents(tmp_path / "a")["model.yaml"] == "b"
+    with pytest.raises(FileNotFoundError):
+        moves.exchange(tmp_path / "a", tmp_path / "nowhere")
