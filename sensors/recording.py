@@ -258,8 +258,8 @@ def _open_parquet(path: Path) -> "ParquetFile":
 
 def _columns(path: Path, table: "pyarrow.Table | pyarrow.RecordBatch") -> Columns:
     """Turn a table or batch into numpy columns; an index must have a value in every row."""
-    for name in {"ring", "column", "scan"}.intersection(table.schema.names):
-        if table[name].null_count:
+    for name in ("ring", "column", "scan"):
+        if name in table.schema.names and table[name].null_count:
             raise InputError(f"{path}: column {name} has empty cells; every return needs one")
     arrays = {name: _numpy(table[name]) for name in table.schema.names}
     return {name: a.astype(np.str_) if a.dtype == object else a for name, a in arrays.items()}

@@ -191,7 +191,8 @@ class Stand:
             if np.isfinite(scans[i].recording.scan(scans[i].index).range_std_m).any():
                 columns.add("range_std_m")
             own = self._own_columns(scans[i].recording)
-            for name in {*covariates(), *own} & set(rows.view.columns):
+            looked_at = {*covariates(), *own}
+            for name in (n for n in rows.view.columns if n in looked_at):
                 whole = np.broadcast_to(rows.view[name], rows.view.rows)
                 found.setdefault(name, []).append(whole[rows.usable])
         return frozenset(columns), {n: np.concatenate(parts) for n, parts in found.items()}

@@ -68,7 +68,7 @@ def budget(
     uncertain, moved = dict.fromkeys(at, 0.0), dict.fromkeys(drawn, 0.0)
     rows, stops = 0, 0
     for J, count in _jacobians(problem, values, progress):
-        for name in at.keys() & J.keys():
+        for name in (n for n in at if n in J):
             uncertain[name] += _variance(J[name], solution.covariance[np.ix_(at[name], at[name])])
             if name in moved:
                 moved[name] += float(np.square(J[name] @ values[name]).sum())

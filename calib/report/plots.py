@@ -27,6 +27,7 @@ SIGNED, UNSIGNED = "PuOr_r", "cividis"
 HALF, WIDE = 5.6, 8.0  # inches: of a column of the page, and of both
 FORMATS = ("png", "svg", "pdf")
 PAPER_DPI, MAP_DPI = 300, 110
+POSITION_DIGITS = 9  # of a position of axes, as a share of the figure: far below what is seen
 _STYLE = {
     "font.size": 9.5,
     "text.parse_math": False,  # a dollar in a run's name is a dollar
@@ -129,9 +130,7 @@ def svg(figure: Figure, name: str) -> str:
     """The figure as an ``<svg>`` to stand in a page among others: every id begins with `name`."""
     file = io.StringIO()
     with styled():
-        # Laid out here and not by savefig, which would draw all of it once more to that end.
-        figure.get_layout_engine().execute(figure)
-        figure.set_layout_engine("none")
+        _lay_out(figure)
         figure.savefig(file, format="svg", dpi=MAP_DPI, metadata={"Date": None})
     text = file.getvalue()
     text = text[text.index("<svg") :]
@@ -142,6 +141,19 @@ def svg(figure: Figure, name: str) -> str:
     text = re.sub(r"font: ([0-9.]+px) [^;\"]*", r"font-size: \1; font-family: inherit", text)
     text = re.sub(r'\bid="', f'id="{name}-', text)
     return re.sub(r'(url\(#|href="#)', rf"\1{name}-", text)
+
+
+def _lay_out(figure: Figure) -> None:
+    """Put the axes where they stay.
+
+    Not by savefig, which would draw all of it once more to that end. The solver of constraints adds
+    up in the order of addresses in memory, so the last digits, of which ids of the SVG are made,
+    are chance; they are rounded away.
+    """
+    figure.get_layout_engine().execute(figure)
+    figure.set_layout_engine("none")
+    for each in figure.axes:
+        each.set_position(np.round(each.get_position(original=True).bounds, POSITION_DIGITS))
 
 
 def check_format(path: Path | str) -> str:
@@ -161,6 +173,9 @@ def save(figure: Figure, path: Path | str) -> None:
     """Write a figure as the end of the path says; `check_format` says what it may be."""
     from matplotlib import rc_context
 
+    kind = check_format(path)
+    undated = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(kind)
     # A paper is read where our letters may not be there: they are drawn.
     with styled(), rc_context({"svg.fonttype": "path"}):
-        figure.savefig(path, format=check_format(path), dpi=PAPER_DPI, facecolor="white")
+        _lay_out(figure)
+        figure.savefig(path, format=kind, dpi=PAPER_DPI, facecolor="white", metadata=undated)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -27,11 +28,13 @@ from calib.runs.residual_table import recording_of, residual_table, table_path, 
 from calib.runs.run import (
     COVARIANCE,
     DIAGNOSIS,
+    FORMAT,
     MODEL,
     RESIDUALS,
     SOLUTION,
     SUMMARY,
     Run,
+    solution_digest,
     versions,
     write_state,
 )
@@ -71,7 +74,7 @@ def calibrate(
     with _folder(out) as folder:
         _refuse_twice([Path(r).resolve() for r in recordings])
         sources = leave_out([Source.open(r) for r in recordings], model.without)
-        _fit(sources, model, folder, _Choices(hold_out, folds, prior), progress)
+        _fit(sources, model, folder, _Choices(Path(out), hold_out, folds, prior), progress)
     return Run.open(out)
 
 
@@ -98,8 +101,9 @@ def grow(
         sources = reopened(run, model.without)
         start = start_of(run, sources)
         _refuse_idle(model, run, sources)
-        told = {key: run.model.get(key) for key in ("hold_out", "folds", "prior")}
-        _fit(sources, model, folder, _Choices(**told, grown_from=run), progress, start)
+        hold_out, folds = run.model["hold_out"], run.model["folds"]
+        choices = _Choices(Path(out), hold_out, folds, run.prior, grown_from=run)
+        _fit(sources, model, folder, choices, progress, start)
     return Run.open(out)
 
 
@@ -145,8 +149,9 @@ def _refuse_idle(model: Model, run: Run, sources: Sequence[Source]) -> None:
 
 @dataclass(frozen=True)
 class _Choices:
-    """What a fit was asked beside its model; see `calibrate`."""
+    """What a fit was asked beside its model, and where its run will stand; see `calibrate`."""
 
+    out: Path
     hold_out: str
     folds: int
     prior: Path | str | None
@@ -302,16 +307,31 @@ def recordings_document(sources: Sequence[Source]) -> list[dict[str, str]]:
 
 
 def _model_document(sources: Sequence[Source], model: Model, choices: _Choices) -> dict[str, Any]:
-    prior, grown_from = choices.prior, choices.grown_from
+    below = choices.grown_from
     return {
+        "format": FORMAT.newest,
         "recordings": recordings_document(sources),
         **model.document(),
         "hold_out": choices.hold_out,
         "folds": choices.folds,
-        "prior": str(Path(prior).resolve()) if prior else None,
-        "grown_from": str(grown_from.folder.resolve()) if grown_from else None,
+        "prior": _way(choices.out, Path(choices.prior)) if choices.prior else None,
+        "prior_sha256": solution_digest(Path(choices.prior)) if choices.prior else None,
+        "grown_from": _way(choices.out, below.folder) if below else None,
+        "steps": _steps(below) if below else [],
         "versions": versions(),
     }
+
+
+def _way(run: Path, other: Path) -> str:
+    """The way from a run's folder to another: it holds where both are moved together."""
+    return Path(os.path.relpath(other.resolve(), run.resolve())).as_posix()
+
+
+def _steps(below: Run) -> list[dict[str, Any]] | None:
+    """The models of the run that one grows from, and of all below it, the lowest first; None where
+    one of these did not write them down."""
+    lower = below.model.get("steps", None if below.grown_from else [])
+    return None if lower is None else [*lower, model_of(below).document()]
 
 
 def _link_document(link: Link) -> dict[str, Any]:

@@ -92,9 +92,10 @@ def command_without(run: Run, tokens: Sequence[str]) -> str:
         return shlex.join(["rigcal", "add", str(run.folder), *out, *without[-2 * len(tokens) :]])
     chosen = [] if tuple(effects) == DEFAULT else ["--effects", ",".join(effects)]
     chosen += [part for name in run.model["fixed"] for part in ("--fix", name)]
-    for key, usual in (("hold_out", "location"), ("folds", 1), ("prior", None)):
+    for key, usual in (("hold_out", "location"), ("folds", 1)):
         if run.model[key] != usual:
             chosen += [f"--{key.replace('_', '-')}", str(run.model[key])]
+    chosen += ["--prior", str(run.prior)] if run.prior else []
     return shlex.join(["rigcal", "fit", *map(str, run.recordings), *out, *chosen, *without])
 
 

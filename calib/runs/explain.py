@@ -97,8 +97,8 @@ def _refuse_other(out: Path) -> None:
         return
     if not out.is_dir():
         raise InputError(f"{out} is a file; give a folder for the runs")
-    others = [p.name for p in out.iterdir() if not (p.name.isdigit() or p.name == EXPLANATION)]
-    others = [name for name in others if not name.startswith(".")]
+    names = sorted(p.name for p in out.iterdir() if not p.name.startswith("."))
+    others = [name for name in names if not (name.isdigit() or name == EXPLANATION)]
     if others:
         raise InputError(f"{out} holds {others[0]}, so it is no ladder of runs; give another -o")
 
@@ -216,10 +216,11 @@ class _Climb:
         wanted = {
             **model.document(),
             "recordings": self._told,
-            "grown_from": str(below.folder.resolve()) if below else None,
             "hold_out": "location",
             "prior": None,
         }
+        if run.grown_from != (below.folder.resolve() if below else None):
+            return None
         return run if all(run.model[key] == plain(wanted[key]) for key in wanted) else None
 
     @cached_property

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib.metadata
+import os
 import platform
 import re
 import zipfile
@@ -16,7 +18,7 @@ import numpy as np
 from calib.results.solution import EffectEstimate, FrameEstimate, Part, Solution
 from chains import se3
 from chains.errors import InputError
-from sensors.documents import read_yaml
+from sensors.documents import Format, read_yaml
 
 SOLUTION, MODEL, SUMMARY, COVARIANCE, RESIDUALS, STATE, DIAGNOSIS = (
     "solution.yaml",
@@ -32,6 +34,10 @@ _OF_DIAGNOSIS |= {"unexplained", "weak_directions", "curves", "blunders", "group
 _OF_CANDIDATE = {"effect", "add", "p_adjusted", "step", "dressed_up", "held_out_rms_mm"}
 _OF_CANDIDATE |= {"unabsorbed_rms_mm"}
 _OF_CURVE = {"covariates", "centres", "mean_mm", "band_mm"}
+FORMAT = Format(
+    kind="run",
+    newest=2,  # 1: without a number, steps, and the hash of a prior; ways are absolute
+)
 RING = re.compile(r"ring_(\d+)")  # a parameter of a ring
 _OF_STATE, _OF_MET = "state/", "met/"  # before every name in that file: numpy reserves a few
 NOT_CONVERGED = "NOT CONVERGED: the fit did not end at an optimum; its numbers are not to be used"
@@ -62,10 +68,10 @@ class Run:
             if not (folder / name).is_file():
                 raise InputError(f"{folder / name} is missing; the run is incomplete, fit it again")
         try:
-            return cls(
-                folder, _yaml(folder / MODEL), _json(folder / SUMMARY), read_solution(folder)
-            )
-        except (KeyError, TypeError, ValueError) as error:
+            model = _yaml(folder / MODEL)
+            FORMAT.check(model, folder / MODEL, model.get("versions", {}).get("rigcal", ""))
+            return cls(folder, model, _json(folder / SUMMARY), read_solution(folder))
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
             if isinstance(error, InputError):
                 raise
             raise InputError(
@@ -76,6 +82,21 @@ class Run:
     def recordings(self) -> list[Path]:
         """Where the recordings were that this run was fitted to."""
         return [Path(r["path"]) for r in self.model["recordings"]]
+
+    @property
+    def grown_from(self) -> Path | None:
+        """Where the run is that this one grew from; None of a first one."""
+        return self._other("grown_from")
+
+    @property
+    def prior(self) -> Path | None:
+        """Where the run is whose solution stood for CAD; None where CAD did."""
+        return self._other("prior")
+
+    def _other(self, key: str) -> Path | None:
+        """Another run, which is named by its way from this one's folder."""
+        way = self.model.get(key)
+        return Path(os.path.normpath(self.folder.resolve() / way)) if way else None
 
     @property
     def effects(self) -> tuple[str, ...]:
@@ -201,10 +222,29 @@ def write_state(
 
 
 def versions() -> dict[str, str]:
-    """Of what made a run: for provenance."""
-    names = ("rigcal", "gtsam", "numpy", "scipy")
-    numbers = {n: importlib.metadata.version(n) for n in names}
-    return numbers | {"python": platform.python_version()}
+    """Of what made a run, and on what kind of machine: for provenance."""
+    names = ("rigcal", "gtsam", "numba", "numpy", "pyarrow", "scipy")
+    numbers = {n: importlib.metadata.version(n) for n in names} | {"open3d": _open3d()}
+    machine = f"{platform.system()} {platform.machine()}"
+    return numbers | {"python": platform.python_version(), "platform": machine}
+
+
+def _open3d() -> str:
+    """Its version; it comes under two names."""
+    for name in ("open3d-cpu", "open3d"):
+        try:
+            return importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return ""
+
+
+def solution_digest(folder: Path) -> str:
+    """The SHA-256 (hex) of what a run gives to one that takes it as its prior."""
+    sha = hashlib.sha256()
+    for name in (SOLUTION, COVARIANCE):
+        sha.update((folder / name).read_bytes())
+    return sha.hexdigest()
 
 
 def _effect_name(document: str | Mapping[str, Any]) -> str:
