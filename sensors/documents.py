@@ -209,7 +209,7 @@ class Format:
                 f"{self.former[found]} and earlier; open it with that version"
             )
         if found > self.newest:
-            wanted = f"rigcal {written_by}, which wrote it," if written_by else "a newer rigcal"
+            wanted = f"rigcal {written_by}, which wrote it" if written_by else "a newer rigcal"
             raise InputError(
                 f"{path}: this {self.kind} is of format {found}, and this version of rigcal reads "
                 f"formats up to {self.newest}; open it with {wanted}"

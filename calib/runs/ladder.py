@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from calib.rig.suspect import listed
+from calib.runs.reopen import model_of
 from calib.runs.run import Run
 from chains.errors import InputError
 
@@ -110,6 +111,8 @@ def _below(run: Run, known: dict[Path, Run]) -> Run | None:
     if folder.resolve() in known:
         return known[folder.resolve()]
     try:
-        return Run.open(folder)
+        found = Run.open(folder)
     except InputError:
         return None
+    steps = run.model.get("steps")  # another run may stand there by now
+    return found if not steps or model_of(found).document() == steps[-1] else None

@@ -220,8 +220,8 @@ def _apart(was: Any, now: Any) -> tuple[float, Any, Any]:
     same = (a == b) | (np.isnan(a) & np.isnan(b))
     if same.all():
         return 0.0, None, None
-    largest = np.fmax(np.abs(a), np.abs(b))
-    apart = np.where(same, 0.0, np.nan_to_num(np.abs(a - b) / largest, nan=np.inf))
+    a, b = np.where(same, 1.0, a), np.where(same, 1.0, b)
+    apart = np.nan_to_num(np.abs(a - b) / np.fmax(np.abs(a), np.abs(b)), nan=np.inf)
     at = int(apart.argmax())
     return float(apart[at]), float(a[at]), float(b[at])
 
