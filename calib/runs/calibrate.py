@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ import numpy as np
 
 from calib import problem as problems
 from calib.effects import Effect, load_effects
+from calib.linear.parallel import one_blas_thread
 from calib.problem import Problem
 from calib.problem.model import Model, Source
 from calib.problem.without import leave_out
@@ -48,6 +48,7 @@ from sensors.recording import write_table
 TOLERATED = 1.2
 
 
+@one_blas_thread
 def calibrate(
     recordings: Sequence[Path | str],
     out: Path | str,
@@ -71,13 +72,14 @@ def calibrate(
     Raises:
         InputError: what is wrong with the input, in one sentence.
     """
-    with _folder(out) as folder:
+    with replace_folder(out, MODEL, "run") as folder:
         _refuse_twice([Path(r).resolve() for r in recordings])
         sources = leave_out([Source.open(r) for r in recordings], model.without)
         _fit(sources, model, folder, _Choices(Path(out), hold_out, folds, prior), progress)
     return Run.open(out)
 
 
+@one_blas_thread
 def grow(
     run: Run,
     model: Model,
@@ -97,7 +99,7 @@ def grow(
     """
     if Path(out).resolve() == run.folder.resolve():
         raise InputError(f"{out}: a run cannot replace the one that it grows from; give another -o")
-    with _folder(out) as folder:
+    with replace_folder(out, MODEL, "run") as folder:
         sources = reopened(run, model.without)
         start = start_of(run, sources)
         _refuse_idle(model, run, sources)
@@ -156,15 +158,6 @@ class _Choices:
     folds: int
     prior: Path | str | None
     grown_from: Run | None = None
-
-
-@contextmanager
-def _folder(out: Path | str) -> Iterator[Path]:
-    """The run folder while it is made."""
-    from threadpoolctl import threadpool_limits
-
-    with threadpool_limits(limits=1), replace_folder(out, MODEL, "run") as folder:
-        yield folder
 
 
 def _fit(

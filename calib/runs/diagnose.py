@@ -14,6 +14,7 @@ from calib.diagnosis.stand import Stand
 from calib.diagnosis.verdict import Diagnosis, conclude
 from calib.diagnosis.weak import weak_directions
 from calib.effects import DEFAULT
+from calib.linear.parallel import one_blas_thread
 from calib.problem import build
 from calib.results.errors import Errors
 from calib.results.holdout import held_out
@@ -27,6 +28,7 @@ from sensors.documents import write_json
 LOOKED = 3  # scans from which the numbers of rings are checked: each holds all rings
 
 
+@one_blas_thread
 def diagnose(
     run: Run,
     progress: Progress = lambda what, done, total: None,
@@ -42,23 +44,20 @@ def diagnose(
     Raises:
         InputError: the recordings are not what they were.
     """
-    from threadpoolctl import threadpool_limits
-
-    with threadpool_limits(limits=1):
-        stand = stand_of(run, progress)
-        rings = list(_odd_rings(stand))
-        # Away from an optimum every effect that moves the state towards one looks missing.
-        found = search(stand, progress) if run.converged else search(stand, progress, most=0)
-        rejected = rejects(found.looks[0].stand, progress)
-        falls = {}
-        before = run.summary["rms_mm"]["held_out"]
-        if refits and run.model["hold_out"] != "none" and before is not None:
-            if found.blunders and found.found:
-                before = _unseen(found.looks[0].stand, run, progress).rms_mm
-            for step in found.found:
-                unseen = _unseen(step.after.stand, run, progress)
-                falls[step.effect.name] = (before, unseen.rms_mm, unseen.floor_mm)
-                before = unseen.rms_mm
+    stand = stand_of(run, progress)
+    rings = list(_odd_rings(stand))
+    # Away from an optimum every effect that moves the state towards one looks missing.
+    found = search(stand, progress) if run.converged else search(stand, progress, most=0)
+    rejected = rejects(found.looks[0].stand, progress)
+    falls = {}
+    before = run.summary["rms_mm"]["held_out"]
+    if refits and run.model["hold_out"] != "none" and before is not None:
+        if found.blunders and found.found:
+            before = _unseen(found.looks[0].stand, run, progress).rms_mm
+        for step in found.found:
+            unseen = _unseen(step.after.stand, run, progress)
+            falls[step.effect.name] = (before, unseen.rms_mm, unseen.floor_mm)
+            before = unseen.rms_mm
     tokens = [left.blunder.group.token for left in found.blunders]
     result = conclude(
         found,
