@@ -275,10 +275,15 @@ def _numpy(column: "pyarrow.ChunkedArray | pyarrow.Array") -> NDArray[Any]:
 
 
 def _arrow(values: NDArray[Any]) -> "pyarrow.Array":
-    """An array as a column, the same way back."""
+    """An array as a column, the same way back; of text, too."""
     import pyarrow
 
     values = np.ascontiguousarray(values)
+    if values.dtype.kind == "U":
+        texts = [text.encode() for text in values.tolist()]
+        ends = np.cumsum([0, *map(len, texts)], dtype=np.int32)
+        buffers = pyarrow.py_buffer(ends), pyarrow.py_buffer(b"".join(texts))
+        return pyarrow.StringArray.from_buffers(len(texts), *buffers)
     if values.dtype.kind not in "fiu":
         return pyarrow.array(values)
     kind = pyarrow.from_numpy_dtype(values.dtype)

@@ -78,11 +78,11 @@ def spoken(covariate: str) -> str:
 
 def outside(curve: ResidualCurve) -> tuple[int, int, bool]:
     """How many bins lie outside their band about zero, of how many; whether chance does not."""
-    from scipy.stats import binom
+    from scipy.special import bdtrc
 
     known = np.isfinite(curve.band_m)
     out = int((np.abs(curve.mean_m[known]) > curve.band_m[known]).sum())
-    return out, int(known.sum()), bool(binom.sf(out - 1, known.sum(), 0.05) < BY_CHANCE)
+    return out, int(known.sum()), bool(bdtrc(out - 1, known.sum(), 0.05) < BY_CHANCE)
 
 
 def _title(name: str, now: ResidualCurve, was: ResidualCurve | None, before: str) -> str:
