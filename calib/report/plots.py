@@ -27,6 +27,7 @@ SIGNED, UNSIGNED = "PuOr_r", "cividis"
 HALF, WIDE = 5.6, 8.0  # inches: of a column of the page, and of both
 FORMATS = ("png", "svg", "pdf")
 PAPER_DPI, MAP_DPI = 300, 110
+LABEL_IN = 0.22  # of axes' labels from the left and from below, where margins are given
 POSITION_DIGITS = 9  # of a position of axes, as a share of the figure: far below what is seen
 _STYLE = {
     "font.size": 9.5,
@@ -57,6 +58,7 @@ def axes(
     height: float = 3.0,
     rows: int = 1,
     columns: int = 1,
+    margins: Sequence[float] | None = None,
     **options: Any,
 ) -> tuple[Figure, np.ndarray]:
     """A figure of so many inches, and its axes (rows, columns) with faint grids.
@@ -64,14 +66,27 @@ def axes(
     Args:
         width, height: inches.
         rows, columns: of axes.
+        margins: inches on the left, on the right, below, above, where it is known how wide labels
+            are; else all of it is measured, which takes as long as drawing it.
         options: more for ``Figure.subplots``.
     """
     from matplotlib.figure import Figure
+    from matplotlib.transforms import blended_transform_factory
 
-    figure = Figure(figsize=(width, height), layout="constrained")
+    figure = Figure(figsize=(width, height), layout=None if margins else "constrained")
+    if margins:
+        left, right, bottom, top = margins
+        figure.subplots_adjust(
+            left / width, bottom / height, 1 - right / width, 1 - top / height, hspace=0.12
+        )
     grid = figure.subplots(rows, columns, squeeze=False, **options)
     for each in grid.flat:
         each.grid(True)
+        if margins:
+            beside = blended_transform_factory(figure.transFigure, each.transAxes)
+            each.yaxis.set_label_coords(LABEL_IN / width, 0.5, beside)
+            below = blended_transform_factory(each.transAxes, figure.transFigure)
+            each.xaxis.set_label_coords(0.5, LABEL_IN / height, below)
     return figure, grid
 
 
@@ -128,10 +143,14 @@ def share_map(ax: Axes, values: np.ndarray, extent: Sequence[float], most: float
 
 def svg(figure: Figure, name: str) -> str:
     """The figure as an ``<svg>`` to stand in a page among others: every id begins with `name`."""
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+
     file = io.StringIO()
     with styled():
         _lay_out(figure)
-        figure.savefig(file, format="svg", dpi=MAP_DPI, metadata={"Date": None})
+        figure.set_dpi(MAP_DPI)
+        # Not by savefig, which would draw all of it once more before, in case of a layout to make.
+        FigureCanvasSVG(figure).print_svg(file, metadata={"Date": None})
     text = file.getvalue()
     text = text[text.index("<svg") :]
     text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
@@ -144,12 +163,13 @@ def svg(figure: Figure, name: str) -> str:
 
 
 def _lay_out(figure: Figure) -> None:
-    """Put the axes where they stay.
+    """Put the axes where they stay, unless they are there.
 
-    Not by savefig, which would draw all of it once more to that end. The solver of constraints adds
-    up in the order of addresses in memory, so the last digits, of which ids of the SVG are made,
-    are chance; they are rounded away.
+    The solver of constraints adds up in the order of addresses in memory, so the last digits, of
+    which ids of the SVG are made, are chance; they are rounded away.
     """
+    if figure.get_layout_engine() is None:
+        return
     figure.get_layout_engine().execute(figure)
     figure.set_layout_engine("none")
     for each in figure.axes:
