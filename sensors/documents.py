@@ -14,6 +14,7 @@ import typing
 import uuid
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -220,6 +221,44 @@ def read_text(path: str | Path, largest: int = LARGEST_TEXT) -> str:
 
 
 # ------------------------------------------------------------------------------------- validating
+
+
+@dataclass(frozen=True)
+class Format:
+    """The format numbers of a kind of folder: which of them this version reads.
+
+    Args:
+        kind: what the folder is called.
+        newest: the number that this version writes, and the newest that it reads.
+        former: numbers that it reads no longer -> the last version of rigcal that does.
+    """
+
+    kind: str
+    newest: int
+    former: Mapping[int, str] = field(default_factory=dict)
+
+    def check(self, document: Any, path: str | Path, written_by: str = "") -> None:
+        """Raise InputError for a document of a format that is not read.
+
+        Args:
+            document: its data, with the number under ``format``; without one it is of format 1.
+            path: where it stands.
+            written_by: the version of rigcal that wrote it, where that is known.
+        """
+        found = document.get("format", 1) if isinstance(document, Mapping) else 1
+        if type(found) is not int or found < 1:
+            raise InputError(f"{path}: format: a whole number from 1 is wanted, not {found!r}")
+        if found in self.former:
+            raise InputError(
+                f"{path}: this {self.kind} is of format {found}, which is read by rigcal "
+                f"{self.former[found]} and earlier; open it with that version"
+            )
+        if found > self.newest:
+            wanted = f"rigcal {written_by}, which wrote it" if written_by else "a newer rigcal"
+            raise InputError(
+                f"{path}: this {self.kind} is of format {found}, and this version of rigcal reads "
+                f"formats up to {self.newest}; open it with {wanted}"
+            )
 
 
 def validate(model: type[Model], data: Any, path: str | Path, marks: Marks) -> Model:

@@ -155,3 +155,25 @@ def _array(path: Path, file: BinaryIO, size: int) -> np.ndarray:
         )
     values = np.frombuffer(file.read(count * dtype.itemsize), dtype, count)
     return values.reshape(shape[::-1]).T if fortran else values.reshape(shape)
+
+
+def connected(count: int, a: NDArray[np.int64], b: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Which part of a graph each of its nodes (count,) is in, counted by their first nodes.
+
+    Each node takes the lowest number among its neighbours' and its own, and then that which the
+    node of this number has (Shiloach and Vishkin 1982), until none is lowered.
+
+    Args:
+        count: how many nodes there are.
+        a, b: (n,) nodes that an edge joins.
+    """
+    lowest = np.arange(count)
+    while True:
+        new = lowest.copy()
+        joined = np.minimum(lowest[a], lowest[b])
+        for ends in (a, b):
+            np.minimum.at(new, lowest[ends], joined)
+        new = new[new]
+        if np.array_equal(new, lowest):
+            return np.unique(lowest, return_inverse=True)[1].astype(np.int64)
+        lowest = new

@@ -12,8 +12,8 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+
+from sensors.numbers import connected
 
 if TYPE_CHECKING:
     from scipy.spatial import KDTree
@@ -174,8 +174,7 @@ class PlaneFinder:
         cells = self._cells
         pairs = _tree(cells.mean_m).query_pairs(1.5 * self.cell_m, output_type="ndarray")
         a, b = pairs[self._apart_m(cells.take(pairs[:, 0]), cells.take(pairs[:, 1])) < np.inf].T
-        graph = coo_array((np.ones(len(a), dtype=bool), (a, b)), shape=(len(cells.count),) * 2)
-        plane = connected_components(graph, directed=False)[1].astype(np.int64)
+        plane = connected(len(cells.count), a, b)
         pooled = cells.pool(plane)
         kept = np.flatnonzero(
             (pooled.count >= min_points)

@@ -267,8 +267,8 @@ def _open_parquet(path: Path) -> Iterator["ParquetFile"]:
 
 def _columns(path: Path, table: "pyarrow.Table | pyarrow.RecordBatch") -> Columns:
     """Turn a table or batch into numpy columns; an index must have a value in every row."""
-    for name in {"ring", "column", "scan"}.intersection(table.schema.names):
-        if table[name].null_count:
+    for name in ("ring", "column", "scan"):
+        if name in table.schema.names and table[name].null_count:
             raise InputError(f"{path}: column {name} has empty cells; every return needs one")
     arrays = {name: _numpy(table[name]) for name in table.schema.names}
     return {n: _text(path, n, a) if a.dtype == object else a for n, a in arrays.items()}
@@ -291,10 +291,15 @@ def _numpy(column: "pyarrow.ChunkedArray | pyarrow.Array") -> NDArray[Any]:
 
 
 def _arrow(values: NDArray[Any]) -> "pyarrow.Array":
-    """An array as a column, the same way back."""
+    """An array as a column, the same way back; of text, too."""
     import pyarrow
 
     values = np.ascontiguousarray(values)
+    if values.dtype.kind == "U":
+        texts = [text.encode() for text in values.tolist()]
+        ends = np.cumsum([0, *map(len, texts)], dtype=np.int32)
+        buffers = pyarrow.py_buffer(ends), pyarrow.py_buffer(b"".join(texts))
+        return pyarrow.StringArray.from_buffers(len(texts), *buffers)
     if values.dtype.kind not in "fiu":
         return pyarrow.array(values)
     kind = pyarrow.from_numpy_dtype(values.dtype)

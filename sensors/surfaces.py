@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+
+from sensors.numbers import connected
 
 # A triangle thinner than this has no normal: it is treated as a hole.
 THINNEST_TRIANGLE_M = 1e-9
@@ -46,9 +46,7 @@ def connected_surfaces(
     first, second, alike = _shared_edges(_merge_vertices(vertices_m)[triangles])
     cos_turn = np.where(alike, 1.0, -1.0) * np.einsum("ni,ni->n", normal[first], normal[second])
     joined = (cos_turn > np.cos(SMOOTH_TURN_RAD)) & (label[first] == label[second])
-    count = len(triangles)
-    graph = coo_array((joined[joined], (first[joined], second[joined])), shape=(count, count))
-    return connected_components(graph, directed=False)[1].astype(np.int64)
+    return connected(len(triangles), first[joined], second[joined])
 
 
 @dataclass(frozen=True)

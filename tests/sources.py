@@ -113,3 +113,38 @@ def every_argument(function: ast.FunctionDef) -> list[ast.arg]:
     given = function.args
     rest = filter(None, (given.vararg, given.kwarg))
     return [*given.posonlyargs, *given.args, *given.kwonlyargs, *rest]
+
+
+ORDERING = {"list", "tuple", "fromkeys", "array", "join", "enumerate", "zip", "iter", "next", "map"}
+
+
+def walks_over_sets(tree: ast.AST) -> Iterator[str]:
+    """Line and text of each loop, list or text that is made in the order of a set.
+
+    That order is another each time Python starts, where the set holds texts. Known as sets are
+    displays, calls of ``set``, and what is made of these, and of keys, by operators.
+    """
+    walked = (each for node in ast.walk(tree) for each in _walked(node))
+    yield from (f"{each.lineno} {ast.unparse(each)}" for each in walked if _is_set(each))
+
+
+def _walked(node: ast.AST) -> Sequence[ast.expr]:
+    if isinstance(node, ast.For):
+        return [node.iter]
+    if isinstance(node, ast.ListComp | ast.DictComp | ast.GeneratorExp):
+        return [generator.iter for generator in node.generators]
+    return node.args if isinstance(node, ast.Call) and _called(node) in ORDERING else []
+
+
+def _is_set(node: ast.AST) -> bool:
+    if isinstance(node, ast.Call):
+        return _called(node) in {"set", "frozenset", "union", "intersection", "difference"}
+    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.BitAnd | ast.BitOr | ast.Sub):
+        sides = (node.left, node.right)
+        keys = isinstance(node.op, ast.BitAnd) and any(".keys()" in ast.unparse(s) for s in sides)
+        return keys or any(map(_is_set, sides))
+    return isinstance(node, ast.Set | ast.SetComp)
+
+
+def _called(node: ast.Call) -> str:
+    return getattr(node.func, "id", getattr(node.func, "attr", ""))

@@ -16,6 +16,7 @@ from .sources import (
     module_name,
     public,
     upward,
+    walks_over_sets,
     wide_calls,
 )
 
@@ -235,6 +236,21 @@ def test_a_wide_call_would_be_found():
     trees = {path: ast.parse(text) for path, text in sources.items()}
     calls = [list(wide_calls(path, tree, dataclasses(trees), 4)) for path, tree in trees.items()]
     assert calls == [["4 A"], ["2 B"], ["2 A"], []]
+
+
+def test_nothing_follows_the_order_of_a_set():
+    """Texts hash otherwise each time Python starts: what is made in a set's order is chance."""
+    none([f"{path}:{w}" for path, tree in PACKAGE_SOURCES.items() for w in walks_over_sets(tree)])
+
+
+def test_a_walk_over_a_set_would_be_found():
+    bad = (
+        *("for x in {'a', 'b'}: pass", "y = [x for x in a.keys() & b]"),
+        *("', '.join(set(a) - {'b'})", "list(c | {*b})", "dict.fromkeys(a.intersection(b))"),
+    )
+    good = ("for x in sorted({1}): pass", "y = {x for x in {1}}", "z = len({1} & {2})", "1 in {1}")
+    assert [len(list(walks_over_sets(ast.parse(text)))) > 0 for text in bad] == [True] * 5
+    assert [list(walks_over_sets(ast.parse(text))) for text in good] == [[]] * 4
 
 
 def test_everything_public_has_a_docstring():

@@ -64,6 +64,14 @@ def test_the_page_about_trust_runs(tmp_path):
     assert (tmp_path / "run" / "evaluation.json").is_file()
 
 
+def test_the_page_about_same_bytes_shows_what_is_printed(tmp_path):
+    page = run_through(ROOT / "docs/same_bytes.md", tmp_path)
+    (shown,) = re.findall(r"^```text\n(.*?)^```", page.text, flags=re.M | re.S)
+    assert page.said.endswith(shown)
+    keys = re.findall(r"`(\w+)`", re.search(r"\|---\|---\|\n(.*?)\n\n", page.text, flags=re.S)[1])
+    assert set(keys) == set(Run.open(tmp_path / "grown").model)
+
+
 @pytest.mark.slow
 def test_what_the_page_shows_is_what_is_printed(session):
     """But for the numbers; the size agrees to a tenth."""

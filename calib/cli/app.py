@@ -26,7 +26,7 @@ Progress = Callable[[str, int, int], None]
 # As people meet them; `rigcal --help` lists them so.
 ORDER = (
     *("import", "simulate", "check", "fit", "diagnose", "add", "explain", "compare"),
-    *("evaluate", "report", "view", "plot", "export", "apply", "effects"),
+    *("reproduce", "evaluate", "report", "view", "plot", "export", "apply", "effects"),
 )
 
 

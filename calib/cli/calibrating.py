@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from calib.cli.app import (
+    NOT_TO_BE_USED,
     Json,
     Out,
     Runs,
@@ -201,6 +202,35 @@ def compare(runs: Runs, as_json: Json = False) -> None:
         print_json(comparison(opened) | {"ladder": rungs})
     else:
         print_comparison(opened)
+
+
+@app.command()
+def reproduce(
+    run: Path,
+    recordings: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--recording", metavar="PATH", help="Where it is now; several in the run's order."
+        ),
+    ] = None,
+    workers: Workers = None,
+    trust: Trust = None,
+    as_json: Json = False,
+) -> None:
+    """Fit a run again, with all that it grew from, and say whether every file holds the same."""
+    from calib.runs.reproduce import reproduce as make_again
+    from calib.runs.run import Run
+
+    with threads(workers), progress_bar() as progress:
+        found = make_again(Run.open(run, trust or ()), recordings or (), progress)
+    if as_json:
+        print_json(found.document())
+    else:
+        from calib.show.reproduction import print_reproduction
+
+        print_reproduction(found)
+    if not found.identical:
+        raise SystemExit(NOT_TO_BE_USED)
 
 
 @app.command()

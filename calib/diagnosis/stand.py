@@ -27,9 +27,9 @@ from calib.problem import Problem
 from calib.problem.model import Model, Source
 from calib.problem.without import leave_out
 from calib.residuals.groups import Group
+from calib.residuals.scan import ScanStop
 from calib.solve.estimate import DOFS, SEEN, Estimate, Start
 from calib.solve.fit import Progress, solve
-from sensors.recording import Recording
 
 FINER = 9  # shapes tried between the two beside the best one
 BETTER_SHAPE = 9.0  # squared sigmas by which another shape must fit better
@@ -77,7 +77,7 @@ class Stand:
 
     def look(self, progress: Progress) -> Look:
         """Test everything that the model lacks."""
-        columns, sample = self.columns()
+        columns, sample = self.columns
         known = known_effects(self.model, self.sources, columns)
         there = set(self.model.names)
         unnamed = [e for e in structure(self.sources, sample) if e.name not in there]
@@ -184,6 +184,7 @@ class Stand:
             start += variable.dim
         raise ValueError(f"'{effect.name}' is not in the model")
 
+    @cached_property
     def columns(self) -> tuple[frozenset[str], dict[str, np.ndarray]]:
         """Which columns there are, and the values of covariates at some of the points."""
         columns = {c for s in self.sources for c in s.columns}
@@ -193,18 +194,20 @@ class Stand:
         for i in chosen.tolist() if scans else ():
             rows = scans[i].rows(self.estimate.values, self.estimate.associations[i])
             columns |= set(rows.view.columns)
-            if np.isfinite(scans[i].recording.scan(scans[i].index).range_std_m).any():
+            if np.isfinite(scans[i].store.read(scans[i].index)[0].range_std_m).any():
                 columns.add("range_std_m")
-            own = self._own_columns(scans[i].recording)
-            for name in {*covariates(), *own} & set(rows.view.columns):
+            own = _own_columns(scans[i])
+            looked_at = {*covariates(), *own}
+            for name in (n for n in rows.view.columns if n in looked_at):
                 whole = np.broadcast_to(rows.view[name], rows.view.rows)
                 found.setdefault(name, []).append(whole[rows.usable])
         return frozenset(columns), {n: np.concatenate(parts) for n, parts in found.items()}
 
-    def _own_columns(self, recording: Recording) -> tuple[str, ...]:
-        """Columns that the recording's maker added."""
-        scanned = np.flatnonzero(recording.has_scan)
-        return (*recording.covariates, *recording.scan(int(scanned[0])).extra)
+
+def _own_columns(scan: ScanStop) -> tuple[str, ...]:
+    """Columns that the maker of a scan's recording added, as the first of its scans has them."""
+    first = int(np.flatnonzero(scan.recording.has_scan)[0])
+    return (*scan.recording.covariates, *scan.store.read(first)[0].extra)
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,7 @@ import numpy as np
 from calib import outputs
 from calib.evaluation.tally import FLAT_M, Columns, Evaluated, Tally
 from calib.forward import Values
+from calib.linear.parallel import one_blas_thread
 from calib.residuals.scan import Ranges, ScanStop
 from calib.residuals.surfaces import Meeting, MeshSurface
 from calib.runs.reopen import problem_of, reopened, state_of
@@ -133,6 +134,7 @@ def _each(scans: Sequence[ScanStop], values: Values, progress: Progress) -> Iter
         yield evaluate_stop(scan, values)
 
 
+@one_blas_thread
 def evaluate(
     run: Run,
     out: Path | str | None = None,

@@ -17,6 +17,7 @@ import numpy as np
 
 from calib import outputs
 from calib.effects import Effect, LazyColumn, Site, View
+from calib.linear.parallel import one_blas_thread
 from calib.problem.model import Source
 from calib.residuals.beams import site_error
 from calib.residuals.scan import turned
@@ -110,6 +111,7 @@ class Applied:
     left_out: dict[str, str]
 
 
+@one_blas_thread
 def apply(
     run: Run,
     clouds: Sequence[Path | str],

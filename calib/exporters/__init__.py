@@ -15,6 +15,7 @@ from calib.exporters.tree import write_tree
 from calib.exporters.urdf import write_urdf
 from calib.exporters.written import Unheld
 from calib.exporters.yaml_extrinsics import read_extrinsics, write_extrinsics
+from calib.linear.parallel import one_blas_thread
 from calib.runs.run import Run
 from chains.errors import InputError
 
@@ -50,6 +51,7 @@ class Exported:
     left_out: dict[str, str] = field(default_factory=dict)
 
 
+@one_blas_thread
 def export(run: Run, out: Path | str, formats: Sequence[str] = (), force: bool = False) -> Exported:
     """Write a run in the formats named, or in all that have anything to hold if none is.
 

@@ -45,7 +45,7 @@ def head(run: Run, rig: str, conventions: Iterable[str], not_held: Iterable[str]
     untold = "; ".join(entry["name"] for entry in run.solution.not_estimated)
     return [
         *warnings(run),
-        f"Written by rigcal {version}, from the run {run.folder.resolve()} of {rig}.",
+        f"Written by rigcal {version}, from the run {run.folder.resolve().name} of {rig}.",
         *conventions,
         *_listed("Not held here:", not_held),
         *_listed("Not told by the data alone (why: solution.yaml):", textwrap.wrap(untold, WIDTH)),

@@ -77,7 +77,7 @@ def read_extrinsics(path: Path | str) -> tuple[Part, dict[str, Part]]:
 def _provenance(run: Run) -> dict[str, Any]:
     model = run.model
     return {
-        "run": str(run.folder.resolve()),
+        "run": run.folder.resolve().name,
         "recordings": model["recordings"],
         "model": {key: model[key] for key in ("effects", "fixed", "prior")},
         "left_out": run.left_out,

@@ -12,6 +12,7 @@ import numpy as np
 
 from calib.intake.gather import Gathered, section
 from calib.intake.roles import Mounted, Roles, find_roles
+from calib.rig.description import FORMAT
 from chains import escape, se3
 from chains.errors import InputError
 from sensors.documents import nearest, write_atomically
@@ -85,6 +86,7 @@ def first_rig(
     roles = _roles(gathered, columns)
     lines = [
         "# Written by rigcal import. A guess was found in the data: write there what CAD says.",
+        f"format: {FORMAT.newest}",
         f"name: {name}",
     ]
     lidar = _lidar(gathered, model) if gathered.sweeps else None

@@ -8,10 +8,28 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import TypeVar
+from functools import wraps
+from typing import ParamSpec, TypeVar
 
-T = TypeVar("T")
+P, T = ParamSpec("P"), TypeVar("T")
 _WORKERS: ContextVar[int | None] = ContextVar("workers", default=None)
+
+
+def one_blas_thread(function: Callable[P, T]) -> Callable[P, T]:
+    """The function, with every call of BLAS on one thread while it runs.
+
+    The last digits of a product depend on the number of threads that share it; and on cores that
+    stops keep busy already they cost many times what they save.
+    """
+
+    @wraps(function)
+    def limited(*args: P.args, **kwargs: P.kwargs) -> T:
+        from threadpoolctl import threadpool_limits
+
+        with threadpool_limits(limits=1):
+            return function(*args, **kwargs)
+
+    return limited
 
 
 @contextmanager

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from calib import outputs
+from calib.linear.parallel import one_blas_thread
 from calib.report import plots
 from calib.report.chart import Absent, Chart
 from calib.report.charts import SECTIONS
@@ -63,6 +64,7 @@ class WrittenReport:
         }
 
 
+@one_blas_thread
 def charts_of(evidence: Evidence) -> ReportContents:
     """Every figure that a run has; none is drawn yet.
 
@@ -78,6 +80,7 @@ def charts_of(evidence: Evidence) -> ReportContents:
     return ReportContents(sections, absent)
 
 
+@one_blas_thread
 def report(
     runs: Sequence[Run],
     out: Path | str,
@@ -113,6 +116,7 @@ def report(
     return WrittenReport(Path(out), verdict, contents)
 
 
+@one_blas_thread
 def plot(evidence: Evidence, name: str, out: Path | str) -> Chart:
     """Write one figure as the end of the path says: .png, .svg or .pdf.
 

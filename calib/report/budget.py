@@ -14,11 +14,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 
+from calib.linear.layout import StopKey, key_of
 from calib.problem import Problem
-from calib.residuals.beams import Columns
+from calib.residuals.beams import Association, Columns
 from calib.residuals.scan import ScanStop
 from calib.residuals.tracker import TrackedBody
 from calib.results.solution import Solution
@@ -51,6 +53,7 @@ def budget(
     values: Mapping[str, np.ndarray],
     solution: Solution,
     progress: Progress = lambda what, done, total: None,
+    met: Mapping[StopKey, np.ndarray] = MappingProxyType({}),
 ) -> Budget:
     """The budget at a solution, over rows drawn evenly from stops drawn evenly.
 
@@ -59,6 +62,7 @@ def budget(
         values: the solution's state.
         solution: its covariance.
         progress: called with what is being done, and how far it is.
+        met: what beams are known to have met, as of `Start.met`; of others it is found anew.
     """
     owner = {f"{v.name}.{dof}": v.name for v in problem.variables.values() for dof in v.dofs}
     at: dict[str, list[int]] = {}
@@ -67,8 +71,8 @@ def budget(
     drawn = [n for n in at if problem.variables[n].kind == "vector"]  # a pose has no paper
     uncertain, moved = dict.fromkeys(at, 0.0), dict.fromkeys(drawn, 0.0)
     rows, stops = 0, 0
-    for J, count in _jacobians(problem, values, progress):
-        for name in at.keys() & J.keys():
+    for J, count in _jacobians(problem, values, met, progress):
+        for name in (n for n in at if n in J):
             uncertain[name] += _variance(J[name], solution.covariance[np.ix_(at[name], at[name])])
             if name in moved:
                 moved[name] += float(np.square(J[name] @ values[name]).sum())
@@ -83,7 +87,10 @@ def _variance(J: np.ndarray, covariance: np.ndarray) -> float:
 
 
 def _jacobians(
-    problem: Problem, values: Mapping[str, np.ndarray], progress: Progress
+    problem: Problem,
+    values: Mapping[str, np.ndarray],
+    met: Mapping[StopKey, np.ndarray],
+    progress: Progress,
 ) -> Iterator[tuple[Jacobian, int]]:
     """Per stop, variable -> (n, dim) derivative of what is measured there, m per unit; and how many
     measurements that is."""
@@ -91,7 +98,10 @@ def _jacobians(
         chosen = np.linspace(0, len(problem.scans) - 1, STOPS).round().astype(int)
         for k, i in enumerate(np.unique(chosen).tolist()):
             progress("derivatives", k, len(chosen))
-            jacobian = beam_jacobian(problem.scans[i], values)
+            scan = problem.scans[i]
+            part = met.get(key_of(scan))
+            known = None if part is None else scan.met(values, part)
+            jacobian = beam_jacobian(scan, values, known)
             yield jacobian, len(next(iter(jacobian.values())))
         return
     for block in problem.blocks:
@@ -103,14 +113,17 @@ def _jacobians(
             yield jacobian, len(block.measured)
 
 
-def beam_jacobian(scan: ScanStop, values: Mapping[str, np.ndarray]) -> Jacobian:
+def beam_jacobian(
+    scan: ScanStop, values: Mapping[str, np.ndarray], association: Association | None = None
+) -> Jacobian:
     """Variable -> (n, dim) derivative of the range residuals of a stop's beams, m per unit.
 
     Args:
         scan: the stop; of its beams that the fit keeps, at most `ROWS` are taken, evenly.
         values: the state.
+        association: what its beams meet; found anew where None.
     """
-    rows = scan.rows(values)
+    rows = scan.rows(values, association)
     kept = np.flatnonzero(rows.weight > 0)
     some = kept[np.unique(np.linspace(0, len(kept) - 1, ROWS).round().astype(int))]
     placed = scan.stops.in_reference(scan.stops.rig.lidar_frame, values)

@@ -25,10 +25,10 @@ from calib.report.statistics import (
 from calib.residuals.scan import ScanStop
 from calib.runs.estimates import VariableEstimate, variable_estimates
 from calib.runs.ladder import Rung, ladder
-from calib.runs.reopen import problem_of, reopened, state_of
+from calib.runs.reopen import problem_of, reopened, start_of, state_of
 from calib.runs.residual_table import residual_table, table_path
 from calib.runs.run import RESIDUALS, SUMMARY, Run
-from calib.solve.estimate import values_of
+from calib.solve.estimate import Start, values_of
 from calib.solve.fit import Progress
 from chains.errors import InputError
 from sensors.recording import read_table
@@ -110,6 +110,11 @@ class Evidence:
         return values_of(self.problem, state_of(self.run, self.problem))
 
     @cached_property
+    def start(self) -> Start:
+        """That state, and what the beams met there."""
+        return start_of(self.run, self.sources)
+
+    @cached_property
     def prior_sigma(self) -> dict[str, float]:
         """``variable.parameter`` of the calibration -> how sure CAD was of it, rad or m."""
         variables = (self.problem.variables[name] for name in self.problem.calibration)
@@ -122,7 +127,8 @@ class Evidence:
     @cached_property
     def budget(self) -> Budget:
         """What each link and effect contributes."""
-        return budget(self.problem, self.values, self.run.solution, self.progress)
+        found = self.problem, self.values, self.run.solution
+        return budget(*found, self.progress, self.start.met)
 
     # ----------------------------------------------------------------------------------- residuals
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import datetime
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -221,6 +220,5 @@ def _provenance(evidence: Evidence) -> list[tuple[str, str]]:
         ("held fixed", ", ".join(model["fixed"]) or "nothing but what CAD has exact"),
         ("held out", f"{model['hold_out']}, {model['folds']} fold(s)"),
         ("made with", ", ".join(f"{n} {v}" for n, v in model["versions"].items())),
-        ("written", datetime.datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z")),
     ]
     return out

@@ -30,6 +30,8 @@ HALF, WIDE = 5.6, 8.0  # inches: of a column of the page, and of both
 FORMATS = ("png", "svg", "pdf")
 PAPER_DPI, MAP_DPI = 300, 110
 LONGEST_NAME = {"x": 24, "y": 44}  # letters along an axis: longer ones leave no room for the rest
+LABEL_IN = 0.22  # of axes' labels from the left and from below, where margins are given
+POSITION_DIGITS = 9  # of a position of axes, as a share of the figure: far below what is seen
 _STYLE = {
     "font.size": 9.5,
     "text.parse_math": False,  # a dollar in a run's name is a dollar
@@ -59,6 +61,7 @@ def axes(
     height: float = 3.0,
     rows: int = 1,
     columns: int = 1,
+    margins: Sequence[float] | None = None,
     **options: Any,
 ) -> tuple[Figure, np.ndarray]:
     """A figure of so many inches, and its axes (rows, columns) with faint grids.
@@ -66,14 +69,27 @@ def axes(
     Args:
         width, height: inches.
         rows, columns: of axes.
+        margins: inches on the left, on the right, below, above, where it is known how wide labels
+            are; else all of it is measured, which takes as long as drawing it.
         options: more for ``Figure.subplots``.
     """
     from matplotlib.figure import Figure
+    from matplotlib.transforms import blended_transform_factory
 
-    figure = Figure(figsize=(width, height), layout="constrained")
+    figure = Figure(figsize=(width, height), layout=None if margins else "constrained")
+    if margins:
+        left, right, bottom, top = margins
+        figure.subplots_adjust(
+            left / width, bottom / height, 1 - right / width, 1 - top / height, hspace=0.12
+        )
     grid = figure.subplots(rows, columns, squeeze=False, **options)
     for each in grid.flat:
         each.grid(True)
+        if margins:
+            beside = blended_transform_factory(figure.transFigure, each.transAxes)
+            each.yaxis.set_label_coords(LABEL_IN / width, 0.5, beside)
+            below = blended_transform_factory(each.transAxes, figure.transFigure)
+            each.xaxis.set_label_coords(0.5, LABEL_IN / height, below)
     return figure, grid
 
 
@@ -156,12 +172,14 @@ def svg(figure: Figure, name: str) -> str:
 
     Every id begins with `name`, of letters, digits, hyphens and underscores only.
     """
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+
     file = io.StringIO()
     with styled():
-        # Laid out here and not by savefig, which would draw all of it once more to that end.
-        figure.get_layout_engine().execute(figure)
-        figure.set_layout_engine("none")
-        figure.savefig(file, format="svg", dpi=MAP_DPI, metadata={"Date": None})
+        _lay_out(figure)
+        figure.set_dpi(MAP_DPI)
+        # Not by savefig, which would draw all of it once more before, in case of a layout to make.
+        FigureCanvasSVG(figure).print_svg(file, metadata={"Date": None})
     text = file.getvalue()
     text = text[text.index("<svg") :]
     # The page has the one rule of matplotlib's style, and runs no style but its own.
@@ -173,6 +191,20 @@ def svg(figure: Figure, name: str) -> str:
     text = re.sub(r"font: ([0-9.]+px) [^;\"]*", r"font-size: \1; font-family: inherit", text)
     text = re.sub(r'\bid="', f'id="{name}-', text)
     return re.sub(r'(url\(#|href="#)', rf"\1{name}-", text)
+
+
+def _lay_out(figure: Figure) -> None:
+    """Put the axes where they stay, unless they are there.
+
+    The solver of constraints adds up in the order of addresses in memory, so the last digits, of
+    which ids of the SVG are made, are chance; they are rounded away.
+    """
+    if figure.get_layout_engine() is None:
+        return
+    figure.get_layout_engine().execute(figure)
+    figure.set_layout_engine("none")
+    for each in figure.axes:
+        each.set_position(np.round(each.get_position(original=True).bounds, POSITION_DIGITS))
 
 
 def check_format(path: Path | str) -> str:
@@ -192,6 +224,9 @@ def save(figure: Figure, path: Path | str) -> None:
     """Write a figure as the end of the path says; `check_format` says what it may be."""
     from matplotlib import rc_context
 
+    kind = check_format(path)
+    undated = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(kind)
     # A paper is read where our letters may not be there: they are drawn.
     with styled(), rc_context({"svg.fonttype": "path"}):
-        figure.savefig(path, format=check_format(path), dpi=PAPER_DPI, facecolor="white")
+        _lay_out(figure)
+        figure.savefig(path, format=kind, dpi=PAPER_DPI, facecolor="white", metadata=undated)

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy import special
 
 CONFIDENCE = 0.95
 BINS, AZIMUTHS = 30, 180  # at most
@@ -148,8 +149,6 @@ class _Sums:
         )
 
     def _band(self, mean: np.ndarray, weight: np.ndarray) -> np.ndarray:
-        from scipy.stats import t
-
         clusters = [self.by_stop, _squares(self.places), self.by_both]
         stop, place, both = (
             np.maximum(ww * mean**2 - 2 * wr * mean + rr, 0.0) * np.where(g > 1, g / (g - 1), 0.0)
@@ -158,7 +157,11 @@ class _Sums:
         variance = np.maximum.reduce([stop + place - both, stop, place, both])
         few = np.minimum(*(np.where(g > 1, g, np.inf) for g in (clusters[0][0], clusters[1][0])))
         many = np.where(np.isfinite(few), few, clusters[2][0])
-        half = t.ppf(0.5 + CONFIDENCE / 2, np.maximum(many - 1, 1)) * np.sqrt(variance) / weight
+        half = (
+            special.stdtrit(np.maximum(many - 1, 1), 0.5 + CONFIDENCE / 2)
+            * np.sqrt(variance)
+            / weight
+        )
         return np.where(many > 1, half, np.nan)
 
 

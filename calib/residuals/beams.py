@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -85,11 +86,9 @@ class Rows:
         reference_sigma_m: (N,) error of the reference along the beam, beyond `sigma_m`: carried by
             the surface's own unknowns where the model has them.
         scale: how many sigmas wide the bulk of the rows is, at least 1.
-        by_twist: (N, 6) derivative by the lidar's right increment.
-        dense: unknown -> (N, P) derivatives.
-        sparse: derivatives with one non-zero per row.
         view: what effects looked at.
         usable: (N,) False where the beam met nothing fit to compare with; its weight is 0.
+        derive: gives `by_twist`, `dense` and `sparse`; many look at the residuals alone.
         spread: rows of the scatter within the hold, where an effect speaks of it.
     """
 
@@ -98,12 +97,29 @@ class Rows:
     weight: np.ndarray
     reference_sigma_m: np.ndarray
     scale: float
-    by_twist: np.ndarray
-    dense: Mapping[str, np.ndarray]
-    sparse: Sequence[Columns]
     view: View
     usable: np.ndarray
+    derive: Callable[[], tuple[np.ndarray, Mapping[str, np.ndarray], Sequence[Columns]]]
     spread: SpreadRows | None = None
+
+    @cached_property
+    def _derivatives(self) -> tuple[np.ndarray, Mapping[str, np.ndarray], Sequence[Columns]]:
+        return self.derive()
+
+    @property
+    def by_twist(self) -> np.ndarray:
+        """(N, 6) derivative by the lidar's right increment."""
+        return self._derivatives[0]
+
+    @property
+    def dense(self) -> Mapping[str, np.ndarray]:
+        """Unknown -> (N, P) derivatives."""
+        return self._derivatives[1]
+
+    @property
+    def sparse(self) -> Sequence[Columns]:
+        """Derivatives with one non-zero per row."""
+        return self._derivatives[2]
 
     @property
     def cost(self) -> float:

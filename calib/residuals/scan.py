@@ -279,11 +279,6 @@ class ScanStop:
         sigma = np.sqrt(variance + LOCAL_SHARE * reference**2)
         z = residual / sigma
         scale = robust_scale(z[usable])
-        dense, sparse = self._derivatives(seen, T, t, slope)
-        sparse += [
-            Columns(name, np.where(usable, index, -1), 1.0 / cosine, np.arange(size))
-            for name, index, size in seen.cells
-        ]
         growth = {
             name: growth_columns(basis, len(t))
             for name, (site, basis) in seen.bases.items()
@@ -295,18 +290,17 @@ class ScanStop:
             weight=np.where(usable, tukey_weight(z, scale), 0.0),
             reference_sigma_m=reference * np.sqrt(1.0 - LOCAL_SHARE),
             scale=scale,
-            by_twist=twist_derivative(ray.origin_m, ray.direction, t, slope),
-            dense=dense,
-            sparse=sparse,
             view=seen.view,
             usable=usable,
+            derive=lambda: self._derivatives(seen, T, t, slope, cosine),
             spread=spread_rows(scan, single, usable, growth),
         )
 
     def _derivatives(
-        self, seen: _Seen, T: np.ndarray, t: np.ndarray, slope: np.ndarray
-    ) -> tuple[dict[str, np.ndarray], list[Columns]]:
-        """By unknowns of effects and of found planes: dense ones, and one non-zero per row."""
+        self, seen: _Seen, T: np.ndarray, t: np.ndarray, slope: np.ndarray, cosine: np.ndarray
+    ) -> tuple[np.ndarray, dict[str, np.ndarray], list[Columns]]:
+        """By the LiDAR's twist; by unknowns of effects and of found planes, dense ones, and those
+        with one non-zero per row, parts of surfaces the last."""
         by_site: dict[Site, np.ndarray] = {}
         found = {}
         for name, (site, basis) in seen.bases.items():
@@ -322,11 +316,16 @@ class ScanStop:
         sparse = [c for c in found.values() if isinstance(c, Columns)] + list(
             seen.surface.unknown()
         )
-        lost = np.flatnonzero(~seen.surface.usable)
+        usable = seen.surface.usable
+        lost = np.flatnonzero(~usable)
         if len(lost):  # 0 * inf would be NaN
             sparse = [replace(c, value=_without(c.value, lost)) for c in sparse]
             dense = {name: _without(c, lost) for name, c in dense.items()}
-        return dense, sparse
+        sparse += [
+            Columns(name, np.where(usable, index, -1), 1.0 / cosine, np.arange(size))
+            for name, index, size in seen.cells
+        ]
+        return twist_derivative(seen.ray.origin_m, seen.ray.direction, t, slope), dense, sparse
 
     def _beam_variance(
         self,

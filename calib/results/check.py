@@ -12,6 +12,7 @@ import numpy as np
 
 from calib import problem as problems
 from calib.forward import Values
+from calib.linear.parallel import one_blas_thread
 from calib.problem.model import Model, Source
 from calib.problem.without import ROD, leave_out
 from calib.residuals.groups import SCAN
@@ -95,6 +96,7 @@ class Check:
         }
 
 
+@one_blas_thread
 def check(
     folder: Path | str,
     progress: Progress = lambda what, done, total: None,
@@ -108,14 +110,11 @@ def check(
     Raises:
         InputError: there is no such folder.
     """
-    from threadpoolctl import threadpool_limits
-
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(f"{folder}: there is no such folder; a recording is one, with a rig.yaml")
-    with threadpool_limits(limits=1):
-        found = Check(folder)
-        _Checker(folder, found, progress, graph).run()
+    found = Check(folder)
+    _Checker(folder, found, progress, graph).run()
     return found
 
 

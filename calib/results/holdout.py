@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.cluster.vq import kmeans2
 
 from calib import problem as problems
 from calib.problem import Problem
@@ -81,6 +80,8 @@ def pose_blocks(source: Source) -> np.ndarray:
         away = np.linalg.norm(at[:, None] - at[middles], axis=2).min(axis=1)
     if not middles:
         return np.array(source.recording.stops)
+    from scipy.cluster.vq import kmeans2  # late: it loads much, and few recordings need it
+
     _, block = kmeans2(at, at[middles], iter=20, minit="matrix")
     return np.char.mod("block %02d", block)
 

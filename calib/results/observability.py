@@ -43,7 +43,7 @@ def not_estimated(
     dims = [v.dim for v in variables]
     owner = np.repeat([v.name for v in variables], dims)
     first = np.repeat(np.cumsum([0, *dims[:-1]]), dims)
-    directions, leading = echelon(untold, np.where(np.isin(owner, list(effects)), 1.0, 0.3))
+    directions, leading = echelon(untold, np.where(np.isin(owner, sorted(effects)), 1.0, 0.3))
     found: dict[tuple[str, str], list[int]] = {}
     for column, lead in sorted(zip(directions.T, leading, strict=True), key=lambda pair: pair[1]):
         share = np.abs(column)

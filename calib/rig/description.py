@@ -13,11 +13,12 @@ from chains import se3
 from chains.arm import Mass, read_arm, read_masses
 from chains.errors import InputError, is_file_name, shortened
 from chains.frames import Edge, FrameTree, unknown_name
-from sensors.documents import Document, Marks, Number, Triple, read_yaml, validate
+from sensors.documents import Document, Format, Marks, Number, Triple, read_yaml, validate
 from sensors.lidar import LidarFile, LidarModel, Size, load_lidar
 
 Sigma = Annotated[Number, pydantic.Field(gt=0)]
 
+FORMAT = Format(kind="recording", newest=1)
 LARGEST_FRAME_M = 10.0
 
 
@@ -210,6 +211,7 @@ class _Reference(Document):
 
 
 class _RigFile(Document):
+    format: int = FORMAT.newest
     name: Annotated[str, pydantic.AfterValidator(_file_name)]
     lidar: _Lidar | None = None
     arm: _Arm | None = None
@@ -234,6 +236,7 @@ def load_rig(folder: str | Path) -> Rig:
     if not path.is_file():
         raise InputError(f"{path} does not exist; a recording is a folder that holds one")
     data, marks = read_yaml(path)
+    FORMAT.check(data, path)
     file = validate(_RigFile, data, path, marks)
     where = _Where(path, marks)
     arm, masses = _read_arm(file.arm, folder, where)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ import numpy as np
 from calib import outputs
 from calib import problem as problems
 from calib.effects import Effect, load_effects, trust_in
+from calib.linear.parallel import one_blas_thread
 from calib.problem import Problem
 from calib.problem.model import Model, Source
 from calib.problem.without import leave_out
@@ -33,9 +34,11 @@ from calib.runs.run import (
     SOLUTION,
     SUMMARY,
     Run,
+    solution_digest,
     versions,
     write_state,
 )
+from calib.runs.stored import FORMAT
 from calib.solve.estimate import Estimate, Start
 from calib.solve.fit import Progress, solve
 from chains.errors import InputError
@@ -46,6 +49,7 @@ from sensors.recording import write_table
 TOLERATED = 1.2
 
 
+@one_blas_thread
 def calibrate(
     recordings: Sequence[Path | str],
     out: Path | str,
@@ -69,13 +73,15 @@ def calibrate(
     Raises:
         InputError: what is wrong with the input, in one sentence.
     """
-    with _folder(out, [*recordings, *([prior] if prior else [])]) as folder:
+    inputs = [*recordings, *([prior] if prior else [])]
+    with outputs.folder(out, outputs.RUN, inputs) as folder:
         _refuse_twice([Path(r).resolve() for r in recordings])
         sources = leave_out([Source.open(r) for r in recordings], model.without)
-        _fit(sources, model, folder, _Choices(hold_out, folds, prior), progress)
+        _fit(sources, model, folder, _Choices(Path(out), hold_out, folds, prior), progress)
     return Run.open(out, trust_in(model.effects))
 
 
+@one_blas_thread
 def grow(
     run: Run,
     model: Model,
@@ -93,12 +99,13 @@ def grow(
     Raises:
         InputError: the run's recordings are not what they were, or it is of an earlier version.
     """
-    with _folder(out, [run.folder, *run.inputs]) as folder:
+    with outputs.folder(out, outputs.RUN, [run.folder, *run.inputs]) as folder:
         sources = reopened(run, model.without)
         start = start_of(run, sources)
         _refuse_idle(model, run, sources)
-        told = {key: run.model.get(key) for key in ("hold_out", "folds", "prior")}
-        _fit(sources, model, folder, _Choices(**told, grown_from=run), progress, start)
+        hold_out, folds = run.model["hold_out"], run.model["folds"]
+        choices = _Choices(Path(out), hold_out, folds, run.prior, grown_from=run)
+        _fit(sources, model, folder, choices, progress, start)
     return Run.open(out, {**run.trust, **trust_in(model.effects)})
 
 
@@ -145,21 +152,13 @@ def _refuse_idle(model: Model, run: Run, sources: Sequence[Source]) -> None:
 
 @dataclass(frozen=True)
 class _Choices:
-    """What a fit was asked beside its model; see `calibrate`."""
+    """What a fit was asked beside its model, and where its run will stand; see `calibrate`."""
 
+    out: Path
     hold_out: str
     folds: int
     prior: Path | str | None
     grown_from: Run | None = None
-
-
-@contextmanager
-def _folder(out: Path | str, inputs: Sequence[Path | str]) -> Iterator[Path]:
-    """The run folder while it is made."""
-    from threadpoolctl import threadpool_limits
-
-    with threadpool_limits(limits=1), outputs.folder(out, outputs.RUN, inputs) as folder:
-        yield folder
 
 
 def _fit(
@@ -295,16 +294,31 @@ def recordings_document(sources: Sequence[Source]) -> list[dict[str, str]]:
 
 
 def _model_document(sources: Sequence[Source], model: Model, choices: _Choices) -> dict[str, Any]:
-    prior, grown_from = choices.prior, choices.grown_from
+    below = choices.grown_from
     return {
+        "format": FORMAT.newest,
         "recordings": recordings_document(sources),
         **model.document(),
         "hold_out": choices.hold_out,
         "folds": choices.folds,
-        "prior": str(Path(prior).resolve()) if prior else None,
-        "grown_from": str(grown_from.folder.resolve()) if grown_from else None,
+        "prior": _way(choices.out, Path(choices.prior)) if choices.prior else None,
+        "prior_sha256": solution_digest(Path(choices.prior)) if choices.prior else None,
+        "grown_from": _way(choices.out, below.folder) if below else None,
+        "steps": _steps(below) if below else [],
         "versions": versions(),
     }
+
+
+def _way(run: Path, other: Path) -> str:
+    """The way from a run's folder to another: it holds where both are moved together."""
+    return Path(os.path.relpath(other.resolve(), run.resolve())).as_posix()
+
+
+def _steps(below: Run) -> list[dict[str, Any]] | None:
+    """The models of the run that one grows from, and of all below it, the lowest first; None where
+    one of these did not write them down."""
+    lower = below.model.get("steps", None if below.grown_from else [])
+    return None if lower is None else [*lower, model_of(below).document()]
 
 
 def _link_document(link: Link) -> dict[str, Any]:

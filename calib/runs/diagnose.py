@@ -16,6 +16,7 @@ from calib.diagnosis.stand import Stand
 from calib.diagnosis.verdict import Diagnosis, conclude
 from calib.diagnosis.weak import weak_directions
 from calib.effects import DEFAULT
+from calib.linear.parallel import one_blas_thread
 from calib.problem import build
 from calib.results.errors import Errors
 from calib.results.holdout import held_out
@@ -30,6 +31,7 @@ from sensors.rings import RingFinding
 LOOKED = 3  # scans from which the numbers of rings are checked: each holds all rings
 
 
+@one_blas_thread
 def diagnose(
     run: Run,
     progress: Progress = lambda what, done, total: None,
@@ -45,9 +47,7 @@ def diagnose(
     Raises:
         InputError: the recordings are not what they were.
     """
-    from threadpoolctl import threadpool_limits
-
-    with threadpool_limits(limits=1), outputs.entries(run.folder, outputs.RUN) as entries:
+    with outputs.entries(run.folder, outputs.RUN) as entries:
         result = _found(run, progress, refits)
         write_json(entries / DIAGNOSIS, result.document())
     return result
@@ -105,9 +105,10 @@ def command_without(run: Run, tokens: Sequence[str]) -> str:
         return shlex.join(["rigcal", "add", str(run.folder), *out, *new, *trust])
     chosen = [] if tuple(effects) == DEFAULT else ["--effects", ",".join(effects)]
     chosen += [part for name in run.model["fixed"] for part in ("--fix", name)]
-    for key, usual in (("hold_out", "location"), ("folds", 1), ("prior", None)):
+    for key, usual in (("hold_out", "location"), ("folds", 1)):
         if run.model[key] != usual:
             chosen += [f"--{key.replace('_', '-')}", str(run.model[key])]
+    chosen += ["--prior", str(run.prior)] if run.prior else []
     return shlex.join(["rigcal", "fit", *map(str, run.recordings), *out, *chosen, *without])
 
 

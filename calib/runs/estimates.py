@@ -71,7 +71,11 @@ def comparison(runs: Sequence[Run]) -> dict[str, Any]:
     """
     return {
         "runs": [str(run.folder) for run in runs],
-        "models": [{k: run.model[k] for k in ("effects", "fixed", "prior")} for run in runs],
+        "models": [
+            {k: run.model[k] for k in ("effects", "fixed")}
+            | {"prior": str(run.prior) if run.prior else None}
+            for run in runs
+        ],
         **{
             error: {
                 kind: [run.summary[error].get(kind) for run in runs] for kind in _kinds(runs, error)

@@ -199,10 +199,11 @@ class _Climb:
         wanted = {
             **model.document(),
             "recordings": self._told,
-            "grown_from": str(below.folder.resolve()) if below else None,
             "hold_out": "location",
             "prior": None,
         }
+        if run.grown_from != (below.folder.resolve() if below else None):
+            return None
         return run if all(run.model[key] == plain(wanted[key]) for key in wanted) else None
 
     @cached_property

@@ -27,8 +27,7 @@ class Rung:
     @property
     def grown_from(self) -> Path | None:
         """Where the run below was when this one grew from it."""
-        folder = self.run.model.get("grown_from")
-        return Path(folder) if folder else None
+        return self.run.grown_from
 
     @property
     def added(self) -> list[str] | None:
@@ -86,7 +85,7 @@ def ladder(runs: Sequence[Run]) -> list[Rung]:
         runs = list(_down(runs[0]))[::-1]
     known = {run.folder.resolve(): run for run in runs}
     below = {folder: _below(run, known) for folder, run in known.items()}
-    related = {folder for folder, run in known.items() if run.model.get("grown_from")}
+    related = {folder for folder, run in known.items() if run.grown_from}
     related |= {run.folder.resolve() for run in below.values() if run is not None}
     shown = [folder for folder in known if folder in related]
     depth = {folder: len(list(_down(known[folder], known))) for folder in shown}
@@ -105,12 +104,15 @@ def _down(run: Run, known: dict[Path, Run] | None = None) -> Iterator[Run]:
 
 def _below(run: Run, known: dict[Path, Run]) -> Run | None:
     """What a run grew from, where that is still there."""
-    folder = run.model.get("grown_from")
-    if not folder:
+    folder = run.grown_from
+    if folder is None:
         return None
-    if Path(folder).resolve() in known:
-        return known[Path(folder).resolve()]
+    if folder.resolve() in known:
+        return known[folder.resolve()]
     try:
-        return Run.open(folder, run.trust)
+        found = Run.open(folder, run.trust)
     except InputError:
         return None
+    steps = run.model.get("steps")  # another run may stand there by now
+    same = not steps or all(found.model.get(key) == value for key, value in steps[-1].items())
+    return found if same else None

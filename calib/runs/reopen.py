@@ -120,19 +120,24 @@ def stored_met(start: Start, sources: Sequence[Source]) -> dict[str, np.ndarray]
     return {f"{number[folder]}/{stop}": part for folder, stop, part in known if folder in number}
 
 
-def _reopened(recording: Mapping[str, str], run: Run) -> Source:
-    path = Path(recording["path"])
+def as_it_was(recording: Mapping[str, str], path: Path, run: Run) -> None:
+    """Raise InputError where a recording of a run is not at this path, or has changed since."""
     if not path.is_dir():
         raise InputError(
             f"{path}, which {run.folder} was fitted to, is no longer there; put it back, or fit it "
             f"where it is now with 'rigcal fit'"
         )
-    known = _opened.get((path, recording["sha256"]))
-    source = known or Source.open(path)
     if digest(path) != recording["sha256"]:
         raise InputError(
             f"{path} has changed since {run.folder} was fitted to it; fit it anew with 'rigcal fit'"
         )
+
+
+def _reopened(recording: Mapping[str, str], run: Run) -> Source:
+    path = Path(recording["path"])
+    as_it_was(recording, path, run)
+    known = _opened.get((path, recording["sha256"]))
+    source = known or Source.open(path)
     if known is None and len(_opened) == OPENED:
         _opened.clear()
     _opened[path, recording["sha256"]] = source

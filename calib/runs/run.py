@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib.metadata
+import os
 import platform
 import re
 from collections.abc import Iterable, Mapping
@@ -86,10 +88,24 @@ class Run:
         return [Path(r["path"]) for r in self.model["recordings"]]
 
     @property
+    def grown_from(self) -> Path | None:
+        """Where the run is that this one grew from; None of a first one."""
+        return self._other("grown_from")
+
+    @property
+    def prior(self) -> Path | None:
+        """Where the run is whose solution stood for CAD; None where CAD did."""
+        return self._other("prior")
+
+    def _other(self, key: str) -> Path | None:
+        """Another run, which is named by its way from this one's folder."""
+        way = self.model.get(key)
+        return Path(os.path.normpath(self.folder.resolve() / way)) if way else None
+
+    @property
     def inputs(self) -> list[Path]:
         """Folders that are read with it: its recordings, and the run that was its prior."""
-        prior = self.model.get("prior")
-        return [*self.recordings, *([Path(prior)] if prior else [])]
+        return [*self.recordings, *([self.prior] if self.prior else [])]
 
     @property
     def effects(self) -> tuple[str, ...]:
@@ -221,10 +237,29 @@ def write_state(
 
 
 def versions() -> dict[str, str]:
-    """Of what made a run: for provenance."""
-    names = ("rigcal", "gtsam", "numpy", "scipy")
-    numbers = {n: importlib.metadata.version(n) for n in names}
-    return numbers | {"python": platform.python_version()}
+    """Of what made a run, and on what kind of machine: for provenance."""
+    names = ("rigcal", "gtsam", "numba", "numpy", "pyarrow", "scipy")
+    numbers = {n: importlib.metadata.version(n) for n in names} | {"open3d": _open3d()}
+    machine = f"{platform.system()} {platform.machine()}"
+    return numbers | {"python": platform.python_version(), "platform": machine}
+
+
+def _open3d() -> str:
+    """Its version; it comes under two names."""
+    for name in ("open3d-cpu", "open3d"):
+        try:
+            return importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return ""
+
+
+def solution_digest(folder: Path) -> str:
+    """The SHA-256 (hex) of what a run gives to one that takes it as its prior."""
+    sha = hashlib.sha256()
+    for name in (SOLUTION, COVARIANCE):
+        sha.update((folder / name).read_bytes())
+    return sha.hexdigest()
 
 
 def _effect_name(document: str | Mapping[str, Any]) -> str:

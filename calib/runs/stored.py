@@ -13,9 +13,13 @@ import pydantic
 
 from chains.errors import InputError
 from sensors import documents, numbers
-from sensors.documents import Document, Number, read_yaml, validate
+from sensors.documents import Document, Format, Number, read_yaml, validate
 
 AGAIN = "fit the run again"
+FORMAT = Format(
+    kind="run",
+    newest=2,  # 1: without a number, steps, and the hash of a prior; ways are absolute
+)
 
 
 class _Part(Document):
@@ -69,9 +73,12 @@ def read_model(path: Path) -> dict[str, Any]:
     """A run's model.yaml.
 
     Raises:
-        InputError: it is no YAML, or lacks a key, or has something else there.
+        InputError: it is no YAML, of a format that is not read, or lacks a key, or has something
+            else there.
     """
     data, marks = read_yaml(path)
+    known = data.get("versions") if isinstance(data, dict) else None
+    FORMAT.check(data, path, str(known.get("rigcal", "")) if isinstance(known, dict) else "")
     return _checked(_Model, data, path, marks)
 
 

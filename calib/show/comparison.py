@@ -123,4 +123,4 @@ def _model(run: Run) -> str:
     model = run.model
     text = ", ".join(run.effects) or "no effects"
     text += f"; fixed {', '.join(model['fixed'])}" if model["fixed"] else ""
-    return text + (f"; from {model['prior']}" if model["prior"] else "")
+    return text + (f"; from {run.prior}" if run.prior else "")

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from calib.rig.description import FORMAT
 from calib.simulation.spec import Spec
 
 # name, origin xyz (m), origin rpy (rad), axis z, limit (degrees), mass of the link behind it (kg),
@@ -64,7 +65,8 @@ def bodies(spec: Spec) -> list[str]:
 def document(spec: Spec) -> dict[str, Any]:
     """What rig.yaml says of the rig that the spec asks for."""
     carrier = "husky-lwa4p" if spec.arm else "handheld"
-    rig: dict[str, Any] = {"name": f"{carrier}-{spec.lidar or 'no-lidar'}"}
+    name = f"{carrier}-{spec.lidar or 'no-lidar'}"
+    rig: dict[str, Any] = {"format": FORMAT.newest, "name": name}
     if spec.lidar:
         rig["lidar"] = {"model": spec.lidar, "frame": "lidar"}
     if spec.arm:

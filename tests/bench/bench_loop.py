@@ -79,8 +79,9 @@ def sides_of(against: Path, folder: Path) -> list[Side]:
 def loop(preset: str, hide: str, against: Path, folder: Path, repeats: int) -> None:
     """All verbs on a preset."""
     sides = sides_of(against, folder)
-    rigcal(HERE, folder, "simulate", preset, "-o", "plain")
-    rigcal(HERE, folder, "simulate", preset, "-o", "hiding", "--hide", hide)
+    # By the other side: a recording of a newer format is refused by an older one.
+    rigcal(against, folder, "simulate", preset, "-o", "plain")
+    rigcal(against, folder, "simulate", preset, "-o", "hiding", "--hide", hide)
 
     def line(told: str, verb: str, *words: object) -> None:
         seconds = turns(sides, repeats, verb, *words)
@@ -99,7 +100,10 @@ def loop(preset: str, hide: str, against: Path, folder: Path, repeats: int) -> N
 def large(rows: int, against: Path, folder: Path, repeats: int) -> None:
     """A fit of many rows; the other side's once, as it takes minutes."""
     ours, theirs = sides_of(against, folder)
-    words = ("fit", recorded(folder, rows, stops=8), "-o", "run")
+    recording = recorded(folder, rows, stops=8)
+    rig = recording / "rig.yaml"
+    rig.write_text(rig.read_text().removeprefix("format: 1\n"))  # older versions know no number
+    words = ("fit", recording, "-o", "run")
     each = [turns([ours], repeats, *words), turns([theirs], 1, *words)]
     row(f"{rows} rows", "fit", np.concatenate(each), "", agreement(folder, "run"))
 

@@ -130,7 +130,7 @@ def test_where_it_came_from_is_told(run, written):
         "prior": None,
     }
     assert told["versions"] == {"rigcal": "0.1.0"}
-    assert told["run"] == str(run.folder)
+    assert told["run"] == run.folder.name
     assert written["not_estimated"] == run.solution.not_estimated
 
 

@@ -80,7 +80,8 @@ def test_a_run_says_where_its_fit_stood(made):
 def test_a_grown_run_has_the_same_recordings_choices_and_more_effects(made):
     first, second = made
     was, now = first.model, second.model
-    assert now["grown_from"] == str(first.folder.resolve()) and was["grown_from"] is None
+    assert second.grown_from == first.folder.resolve() and first.grown_from is None
+    assert now["steps"] == [Model.read(was).document()] and was["steps"] == []
     assert now["effects"] == [*was["effects"], "arm_joint_offset", "mount_slip@150"]
     for key in ("recordings", "fixed", "hold_out", "folds", "prior"):
         assert now[key] == was[key], key

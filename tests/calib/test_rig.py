@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from calib.rig import load_rig
+from calib.simulation import simulate
 from chains import se3
 from chains.errors import InputError
-from sensors.documents import read_yaml, write_yaml
+from sensors.documents import Format, read_yaml, write_yaml
 
 URDF = """<robot name="arm">
 <link name="arm_base"/><link name="arm_1"/><link name="arm_2"/><link name="arm_end"/>
@@ -223,3 +224,40 @@ def test_the_rig_file_alone_is_not_enough_where_it_names_others(shared, tmp_path
     shutil.copy(shared / "recordings/mystery_a/rig.yaml", tmp_path)
     with pytest.raises(InputError, match=r"arm\.urdf does not exist"):
         load_rig(tmp_path)
+
+
+# ------------------------------------------------------------------------------------------ formats
+
+
+def rewritten(folder, first_lines):
+    """A rig of nothing but its name, with these lines above it."""
+    (folder / "rig.yaml").write_text(f"{first_lines}name: bench\n")
+    return folder
+
+
+@pytest.mark.parametrize("line", ["", "format: 1\n"])
+def test_a_recording_without_a_number_is_of_format_1(tmp_path, line):
+    assert load_rig(rewritten(tmp_path, line)).name == "bench"
+
+
+def test_a_newer_recording_is_refused_whatever_else_it_says(tmp_path):
+    sentence = r"rig\.yaml: this recording is of format 2, .* up to 1; open it with a newer rigcal$"
+    with pytest.raises(InputError, match=sentence):
+        load_rig(rewritten(tmp_path, "format: 2\nnot_known_yet: 3\n"))
+
+
+def test_an_older_recording_that_is_no_longer_read_names_the_version_that_does(
+    tmp_path, monkeypatch
+):
+    now = Format(kind="recording", newest=3, former={1: "0.4.2"})
+    monkeypatch.setattr("calib.rig.description.FORMAT", now)
+    with pytest.raises(
+        InputError, match=r"is of format 1, which is read by rigcal 0\.4\.2 and ear"
+    ):
+        load_rig(rewritten(tmp_path, ""))
+    assert load_rig(rewritten(tmp_path, "format: 2\n")).name == "bench"
+
+
+def test_what_rigcal_writes_has_the_number(tmp_path):
+    simulate("arm-tracker", tmp_path / "rec")
+    assert (tmp_path / "rec/rig.yaml").read_text().startswith("format: 1\n")

@@ -205,7 +205,7 @@ def test_arrays_are_not_believed_before_the_file_is_looked_at(tmp_path):
     for shape, descr in (((10**12,), "<f8"), ((2**62, 4), "<f8"), ((3,), "|O"), ((-1,), "<f8")):
         with zipfile.ZipFile(path, "w") as archive:
             archive.writestr("x.npy", header(shape, descr))
-        with pytest.raises(InputError, match=r"a\.npz cannot be read"):
+        with pytest.raises(InputError, match=r"a\.npz (claims|holds|is no whole)"):
             read_arrays(path)
     np.savez(path, x=np.zeros((3, 0)), y=np.array(["é"]), z=np.float64(1))
     assert {n: x.shape for n, x in read_arrays(path).items()} == {"x": (3, 0), "y": (1,), "z": ()}

@@ -50,7 +50,7 @@ NEED_IT = {
     "add": ["{run}", "range_scale", "-o", "{out}"],
     "diagnose": ["{run}", "--no-refits"],
     "evaluate": ["{run}"],
-    "report": ["{run}", "-o", "{out}"],
+    "report": ["{run}", "-o", "{out}.html"],
     "plot": ["{run}", "--list"],
 }
 DO_WITHOUT = {

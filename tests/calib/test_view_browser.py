@@ -118,7 +118,7 @@ def test_a_blunder_is_left_out_by_a_click_and_undone(copied):
         watched.page.get_by_text(f"Left out: {tokens[1]}").first.wait_for(timeout=FIT_MS)
         made = page.desk.run
         assert made.left_out == tokens[1:]
-        assert made.model["grown_from"] == str(copied.folder.resolve())
+        assert made.grown_from == copied.folder.resolve()
         watched.page.locator("[data-is=verdict]").wait_for(timeout=FIT_MS)
         assert not button(watched, "Leave all out").is_visible()
         button(watched, "Undo").click()

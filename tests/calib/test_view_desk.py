@@ -261,7 +261,7 @@ def test_a_job_makes_the_run_that_rigcal_add_makes(first, tmp_path):
     mine.write_text(json.dumps(formula))
     wanted = grow(first, grown_model(first, [str(mine)]), tmp_path / "wanted")
     found = Run.open(tmp_path / "out")
-    assert found.model == wanted.model and found.model["grown_from"] == str(first.folder.resolve())
+    assert found.model == wanted.model and found.grown_from == first.folder.resolve()
     rms = [r.summary["rms_mm"]["fit"] for r in (found, wanted, first)]
     assert rms[0] == pytest.approx(rms[1], rel=1e-9) and rms[0] != rms[2]
 

@@ -297,7 +297,7 @@ def _numbered(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _axes(stand: Stand) -> list[Axis]:
     """The covariates of points and stops that change, cut into cells and bins."""
     scans = stand.estimate.scans
-    _, sample = stand.columns()
+    _, sample = stand.columns
     rings = max(scan.lidar.rings for scan in scans)
     out = [Axis.of("ring", np.arange(rings))]
     for name, values in sorted(sample.items()):

@@ -32,6 +32,8 @@ SELDOM = 0.01  # of the rows: things seen less decide no scale
 FEWEST_THROWN = 0.05  # share at the end of the map's scale, at least
 WITHIN = 0.9  # of the beams thrown away: what the histogram shows
 MOST_NAMES = 40  # names of things along an axis
+UPRIGHT_NAMES = 6  # of these; more are turned
+MARGINS = (0.72, 0.1, 0.5, 0.32)  # inches, for labels of four digits and a sign
 
 
 def curves(evidence: Evidence) -> Iterator[Chart | Absent]:
@@ -80,11 +82,11 @@ def spoken(covariate: str) -> str:
 
 def outside(curve: ResidualCurve) -> tuple[int, int, bool]:
     """How many bins lie outside their band about zero, of how many; whether chance does not."""
-    from scipy.stats import binom
+    from scipy.special import bdtrc
 
     known = np.isfinite(curve.band_m)
     out = int((np.abs(curve.mean_m[known]) > curve.band_m[known]).sum())
-    return out, int(known.sum()), bool(binom.sf(out - 1, known.sum(), 0.05) < BY_CHANCE)
+    return out, int(known.sum()), bool(bdtrc(out - 1, known.sum(), 0.05) < BY_CHANCE)
 
 
 def _title(name: str, now: ResidualCurve, was: ResidualCurve | None, before: str) -> str:
@@ -103,7 +105,11 @@ def _title(name: str, now: ResidualCurve, was: ResidualCurve | None, before: str
 
 
 def _curve(now: ResidualCurve, was: ResidualCurve | None, before: str) -> Figure:
-    figure, grid = plots.axes(plots.HALF, 4.3, 3, sharex=True, height_ratios=(2.0, 2.0, 1.0))
+    names = now.axis.names or ()
+    margins = None if len(names) > UPRIGHT_NAMES else MARGINS
+    figure, grid = plots.axes(
+        plots.HALF, 4.3, 3, margins=margins, sharex=True, height_ratios=(2.0, 2.0, 1.0)
+    )
     top, middle, bottom = grid[:, 0]
     if was is not None:
         _draw(top, was, plots.BEFORE, before)
@@ -120,9 +126,10 @@ def _curve(now: ResidualCurve, was: ResidualCurve | None, before: str) -> Figure
         for ax, drawn in ((top, [now, was or now]), (middle, [now])):
             limit = max(map(_reach, drawn))
             ax.set_ylim(-limit, limit)
-    figure.align_ylabels()
     _name_bins(bottom, now)
-    figure.legend(loc="outside upper left", ncols=2)
+    if margins is None:
+        figure.align_ylabels()
+    figure.legend(loc="upper left" if margins else "outside upper left", ncols=2)
     return figure
 
 
@@ -162,8 +169,9 @@ def _name_bins(ax: Axes, curve: ResidualCurve) -> None:
     ax.set_xlabel(f"{spoken(curve.axis.name)}, {unit}" if unit else spoken(curve.axis.name))
     names = curve.axis.names
     if names and len(names) <= MOST_NAMES:
-        ax.set_xticks(range(len(names)), names, rotation=45 if len(names) > 6 else 0,
-                      ha="right" if len(names) > 6 else "center", rotation_mode="anchor",
+        ax.set_xticks(range(len(names)), names, rotation=45 if len(names) > UPRIGHT_NAMES else 0,
+                      ha="right" if len(names) > UPRIGHT_NAMES else "center",
+                      rotation_mode="anchor",
                       fontsize=8)  # fmt: skip
 
 

@@ -42,8 +42,9 @@ def read_dh(files: Sequence[Path], options: Options, progress: Progress) -> Cont
     said = {head.get("convention", options.dh)} | {r.pop("convention", None) for r in records}
     said -= {None}
     if len(said) != 1 or not said <= set(_CONVENTIONS):
+        told = " and ".join(sorted(map(str, said))) or "not said"
         raise InputError(
-            f"{path}: the convention is {' and '.join(map(str, said)) or 'not said'}; say --dh "
+            f"{path}: the convention is {told}; say --dh "
             "standard (Rz Tz Tx Rx) or --dh modified (Rx Tx Rz Tz), or write convention: standard"
         )
     (convention,) = said

@@ -78,9 +78,10 @@ def fields_of(name: str, cloud: Cloud, options: Options) -> dict[str, str]:
             " name the right one by --column ring=FIELD"
         )
     taken = {*fields.values()}
-    useless = _USELESS if plain.keys() >= _AVERAGED else _USELESS | _AVERAGED
+    useless = {*_TIME, *fields} | _USELESS
+    useless |= set() if plain.keys() >= _AVERAGED else _AVERAGED
     for key, field in plain.items():
-        if field not in taken and key not in (*useless, *_TIME, *fields):
+        if field not in taken and key not in useless:
             fields[key] = field
     return fields
 

@@ -4,8 +4,13 @@ import threading
 import time
 
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
-from calib.linear.parallel import in_order, workers
+import calib
+from calib.linear.parallel import in_order, one_blas_thread, workers
+from calib.report import charts_of, plot, report
+from calib.results.check import check
+from calib.runs.calibrate import grow
 
 COUNTS = (1, 2, 5)
 
@@ -125,3 +130,28 @@ def test_no_more_than_so_many_work_at_once_and_as_many_do(count):
     with workers(count):
         list(in_order(work, 4 * count))
     assert most[0] == count
+
+
+# --------------------------------------------------------------------------------------------- BLAS
+
+
+def blas_threads() -> set[int]:
+    """How many threads BLAS may use now."""
+    return {each["num_threads"] for each in threadpool_info() if each["user_api"] == "blas"}
+
+
+def test_blas_has_one_thread_within_and_what_it_had_behind():
+    with threadpool_limits(limits=3):
+        assert one_blas_thread(blas_threads)() == {1}
+        assert blas_threads() == {3}
+        with pytest.raises(ZeroDivisionError):
+            one_blas_thread(lambda: 1 / 0)()
+        assert blas_threads() == {3}
+
+
+def test_whatever_multiplies_large_matrices_has_one_thread():
+    """Those that the others call: add, explain and reproduce are made of them."""
+    functions = calib.fit, calib.diagnose, calib.evaluate, calib.apply, calib.export, grow
+    functions += check, report, plot, charts_of
+    name = one_blas_thread(blas_threads).__code__.co_name
+    assert [f.__name__ for f in functions if f.__code__.co_name != name] == []
