@@ -148,7 +148,7 @@ def _array(path: Path, file: BinaryIO, size: int) -> np.ndarray:
     count = 1
     for length in shape:  # exact, where numpy's product would run over
         count *= length
-    if count * dtype.itemsize + file.tell() > size:
+    if min(shape, default=0) < 0 or count * dtype.itemsize + file.tell() > size:
         raise InputError(
             f"{path} claims an array {shape} of {dtype}, and holds {size} bytes of it; get the "
             f"whole file"

@@ -144,7 +144,7 @@ def _with(symbols: Mapping[str, Any], **given: Any) -> dict[str, Any]:
         if isinstance(value, dict) and value.keys() & given:
             value = type(value)()
             value.update(symbols[name])
-            value.update({key: given[key] for key in value.keys() & given})
+            value.update({key: new for key, new in given.items() if key in symbols[name]})
         made[name] = given.get(name, value)
     return made
 

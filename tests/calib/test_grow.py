@@ -243,7 +243,7 @@ def test_a_recording_stays_open_only_while_it_is_what_it_was(first, tmp_path):
 
 def test_a_run_without_a_state_is_of_an_earlier_version(first, tmp_path):
     (first.folder / "state.npz").write_bytes(b"PK no longer")
-    with pytest.raises(InputError, match=r"state.npz cannot be read"):
+    with pytest.raises(InputError, match=r"state.npz is no whole NumPy file"):
         first.state()
     (first.folder / "state.npz").unlink()
     with pytest.raises(InputError, match="made by an earlier version; fit it again"):
