@@ -79,13 +79,13 @@ def screen(
     tests = {e.name: test(scores, columns[e.name]) for e in effects if e.name in columns}
     gauges = [e for e in effects if e.name not in tests or not tests[e.name].dof]
     tests = {name: t for name, t in tests.items() if t.dof}
-    if common is None:
-        common = float(np.median([t.inflation for t in tests.values()])) if tests else 1.0
-    by_chance = _by_chance(scores, tests)
     families: dict[str, list[Effect]] = {}
     for effect in effects:
         if effect.name in tests:
             families.setdefault(effect.family, []).append(effect)
+    if common is None:
+        common = _common([[tests[e.name].inflation for e in some] for some in families.values()])
+    by_chance = _by_chance(scores, tests)
     least, found = [], []
     for family in families.values():
         drawn = np.min([by_chance[e.name] for e in family], axis=0)
@@ -107,6 +107,11 @@ def screen(
         for effect, p, looks in found
     ]
     return Screen(scores, common, sorted(candidates, key=lambda c: -c.evidence), gauges)
+
+
+def _common(inflation: Sequence[Sequence[float]]) -> float:
+    """The median of the families' own medians: a family has one voice, however many its shapes."""
+    return float(np.median([np.median(some) for some in inflation])) if inflation else 1.0
 
 
 def _by_chance(scores: Scores, tests: Mapping[str, Test]) -> dict[str, np.ndarray]:
