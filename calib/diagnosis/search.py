@@ -210,8 +210,9 @@ def _quiet(look: Look) -> bool:
 def likeliest(here: Sequence[Blunder]) -> Blunder:
     """Of groups of one place, furthest out first, that which goes wrong most often among those that
     can stand in for the first."""
-    near = [b for b in here if here[0].evidence - b.evidence < ODDS and b.possible]
-    return min(near, key=lambda b: b.likely) if near else here[0]
+    here = [b for b in here if b.possible] or here
+    near = (b for b in here if here[0].evidence - b.evidence < ODDS)
+    return min(near, key=lambda b: b.likely)
 
 
 def _named(look: Look, progress: Progress) -> NamedEffect | None:
