@@ -22,7 +22,13 @@ FOLDERS = {
 }
 FILES = {"report": ["report run", "report run again"], "plot": ["plot run chain"]}
 INSIDE = {"diagnose", "evaluate"}  # what they find stands in the run itself
-READ = {"check", "compare", "effects", "view"}  # view makes runs by the same functions as add
+READ = {
+    "check",
+    "compare",
+    "effects",
+    "reproduce",
+    "view",
+}  # view makes runs by the same functions as add
 ENDS = {"report": ".html", "plot": ".png"}
 
 

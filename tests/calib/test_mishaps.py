@@ -102,11 +102,16 @@ def test_where_nothing_was_done_nothing_is_named(tmp_path, seed):
 @pytest.mark.parametrize(
     ("kind", "blunder", "effect"),
     [
-        ("base body taped anew from a stop on", None, "body_slip"),
         ("mesh scaled", None, "faro_scale"),
-        ("rings numbered one off", "rings", None),
-        ("ranges long at one stop", ":scan", None),
         ("one surface moved", "mesh:surface_", None),
+        *(
+            pytest.param(*each, marks=pytest.mark.long)
+            for each in (
+                ("base body taped anew from a stop on", None, "body_slip"),
+                ("rings numbered one off", "rings", None),
+                ("ranges long at one stop", ":scan", None),
+            )
+        ),
     ],
 )
 def test_what_lasts_is_an_effect_and_what_does_not_a_blunder(
