@@ -24,6 +24,7 @@ from calib.solve.reweight import unweighted
 
 POSE = ("about x", "about y", "about z", "x", "y", "z")
 SHIFT = (*POSE, BEAMS)  # of a scan
+SEVERAL = 3  # scans, for most of them to say that the range zero of one is not theirs
 # Block (none for a prior), whitened derivative by each unknown, and right side: see `Graph`.
 GraphRows = Sequence[tuple[Block | None, Mapping[str, np.ndarray], np.ndarray]]
 
@@ -218,7 +219,7 @@ def _scans(whole: Linearisation, problem: Problem) -> Iterator[GroupRows]:
     for scan in problem.scans:
         sums = whole.scans[whole.layout.stops[key_of(scan)]]
         count = len(sums.score)
-        for at in (np.arange(6), np.arange(6, count)):
+        for at in (np.arange(6), np.arange(6, count if len(problem.scans) >= SEVERAL else 6)):
             if len(at):
                 yield GroupRows(
                     A=sums.cross[at],

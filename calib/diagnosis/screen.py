@@ -9,7 +9,7 @@ import numpy as np
 
 from calib.blunders.chance import after_looks
 from calib.diagnosis.score import Scores, Test, test
-from calib.effects import Effect
+from calib.effects import Effect, Site
 
 QUANTILE = 0.05  # of the smallest p-value, at which dependent tests are counted
 
@@ -84,7 +84,7 @@ def screen(
         if effect.name in tests:
             families.setdefault(effect.family, []).append(effect)
     if common is None:
-        common = _common([[tests[e.name].inflation for e in some] for some in families.values()])
+        common = _common([(e, tests[e.name]) for some in families.values() for e in some])
     by_chance = _by_chance(scores, tests)
     least, found = [], []
     for family in families.values():
@@ -109,9 +109,12 @@ def screen(
     return Screen(scores, common, sorted(candidates, key=lambda c: -c.evidence), gauges)
 
 
-def _common(inflation: Sequence[Sequence[float]]) -> float:
-    """The median of the families' own medians: a family has one voice, however many its shapes."""
-    return float(np.median([np.median(some) for some in inflation])) if inflation else 1.0
+def _common(tests: Sequence[tuple[Effect, Test]]) -> float:
+    """The median inflation; of what beams tell, where they tell anything: their rows share errors
+    of surfaces, of which those of trackers and targets know nothing."""
+    of_beams = [t.inflation for e, t in tests if e.site not in (Site.TRACKER, Site.TARGET)]
+    every = of_beams or [t.inflation for _, t in tests]
+    return float(np.median(every)) if every else 1.0
 
 
 def _by_chance(scores: Scores, tests: Mapping[str, Test]) -> dict[str, np.ndarray]:

@@ -231,7 +231,7 @@ def test_what_is_no_run_is_not_replaced(rec, refused):
     assert "rec exists" in sentence and "another folder" in sentence
     notes = rec.parent / "notes.txt"
     notes.write_text("mine")
-    assert "notes.txt exists" in refused("fit", rec, "-o", notes)
+    assert "notes.txt is a file; give a folder" in refused("fit", rec, "-o", notes)
     assert "run cannot be written" in refused("fit", rec, "-o", notes / "run")
 
 

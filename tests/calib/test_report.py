@@ -307,7 +307,7 @@ def with_another_diagnosis(run):
     [
         (without_table, "the run is incomplete, fit it again"),
         (without_column, "has no column weight"),
-        (of_another_version, "has no 'misfit'"),
+        (of_another_version, "misfit is missing"),
         (with_another_diagnosis, "diagnose the run again"),
     ],
 )
