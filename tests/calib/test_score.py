@@ -199,7 +199,8 @@ def test_intervals_cover():
 def named(world):
     found = scores(world)
     chosen = ("one", "twin", "several", "rings", "gauge")
-    effects = [SimpleNamespace(name=n, family=n, covariates=(n,)) for n in chosen]
+    site = Site.BEAM
+    effects = [SimpleNamespace(name=n, family=n, covariates=(n,), site=site) for n in chosen]
     return screen(found, effects, {n: np.r_[found.at[n]] for n in chosen})
 
 
