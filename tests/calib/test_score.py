@@ -14,6 +14,7 @@ from calib.diagnosis.jackknife import Shares
 from calib.diagnosis.linear import Linear
 from calib.diagnosis.screen import looked, screen
 from calib.diagnosis.search import rivals
+from calib.effects import Site
 from calib.linear.clusters import ClusteredRows
 
 STOPS, PLACES, EACH = 30, 25, 6
