@@ -27,7 +27,7 @@ CLASSES = {
     "alarm": "a",  # not adequate, and none of the names is right
     "calm": ".",  # adequate, and rightly so
     "moved": "m",  # adequate, and an estimate moved, yet not so far from the truth
-    "silent": "S",  # adequate, and an estimate is wrong
+    "silent": "S",  # adequate, and an estimate is wrong; of a mishap: one that it moved
     "endless": "E",
     "fault": "F",
 }
@@ -62,9 +62,10 @@ def verdict(result: Result) -> str:
         return outcome
     if outcome != "adequate":
         return "alarm"
-    if result["told_off"] > WRONG:
+    moved = result["moved"] > MOVED
+    if result["told_off"] > WRONG and (moved or not before):
         return "silent"
-    return "moved" if result["moved"] > MOVED else "calm"
+    return "moved" if moved else "calm"
 
 
 def false_names(result: Result) -> list[str]:
