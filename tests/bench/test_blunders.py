@@ -42,7 +42,9 @@ def bad(*blunders, **more):
     ("result", "wanted"),
     [
         (CALM, "calm"),
-        (CALM | {"told_off": 4.1}, "silent"),
+        (CALM | {"told_off": 4.1, "moved": 3.1}, "silent"),
+        (CALM | {"told_off": 4.1}, "calm"),  # and so it is in the good recording
+        (CALM | {"told_off": 4.1, "without_it": {}}, "silent"),  # which is this one
         (CALM | {"moved": 3.1}, "moved"),
         (CALM | {"outcome": "refused"}, "refused"),
         (CALM | {"outcome": "endless"}, "endless"),
@@ -61,7 +63,7 @@ def test_a_case_has_its_class(result, wanted):
 
 def test_what_is_said_without_the_mishap_is_no_word_on_it():
     said = {"outcome": "missing_effect", "names": ["range_scale"], "odd": []}
-    result = CALM | said | {"without_it": said, "told_off": 5.0}
+    result = CALM | said | {"without_it": said, "told_off": 5.0, "moved": 4.0}
     assert verdict(result) == "silent"
     assert verdict(result | {"names": ["faro_scale"]}) == "alarm"
 
@@ -72,7 +74,7 @@ def test_names_that_are_neither_right_nor_in_the_group_are_false():
 
 def test_the_table_shows_what_is_wrong():
     null = CALM | {"case": "all/0/nothing x0", "kind": NOTHING, "right": [], "without_it": {}}
-    wrong = CALM | {"told_off": 9.0, "seconds": [0.1, 9.0, 1.0]}
+    wrong = CALM | {"told_off": 9.0, "moved": 8.0, "seconds": [0.1, 9.0, 1.0]}
     failed = {"case": "all/1/nothing x0", "error": "Traceback\nValueError: no"}
     text = io.StringIO()
     show([null, wrong, failed], Console(file=text, width=200))
