@@ -25,7 +25,7 @@ from calib.solve.estimate import DOFS, SEEN, Estimate, Start, cost_of, started, 
 from calib.solve.graph import Graph
 from calib.solve.reweight import SETTLED as SETTLED_WEIGHT
 from calib.solve.reweight import reweighted
-from calib.solve.torn import CONTRADICTS, astray, borne_out, doubted
+from calib.solve.torn import CONTRADICTS, astray, borne_out, doubted, torn
 from chains import se3
 
 SETTLED = 1e-4  # m and rad: after that, which triangle a beam meets is kept
@@ -175,7 +175,7 @@ class Loop(Descent):
             self.linearise(associate=True)
             self.passes += 1
             scale = np.array([each.scale for each in self.linear.weighed])
-            if count == 1 and self._set_aside(scale):
+            if count <= ASKED and self._set_aside(scale, count == ASKED):
                 continue
             if count > HOPEFUL and np.median(scale) > HOPELESS:
                 return False
@@ -193,10 +193,11 @@ class Loop(Descent):
             self._give(self.given.setting_aside(self.given.set_aside | wrong))
             self.take_weights()
 
-    def _set_aside(self, scale: np.ndarray) -> bool:
+    def _set_aside(self, scale: np.ndarray, torn_too: bool) -> bool:
         """Leave scans out of the fit that contradict all others; whether there are any.
 
         Args:
+            torn_too: also those of stops whose bodies contradict each other, once they were asked.
             scale: (K,) how many sigmas wide the bulk of each scan's residuals is, where bodies, or
                 most scans of a place where the rig stood, say that the LiDAR is.
         """
@@ -205,7 +206,9 @@ class Loop(Descent):
         told |= {root for root, count in stood.items() if count >= SEVERAL}
         far = scale > CONTRADICTS * np.median(scale)
         pairs = zip(self.problem.scans, far, strict=True)
+        spared = set() if torn_too else {scan.group for scan in torn(self.problem)}
         gone = {s.group.token for s, is_far in pairs if is_far and s.stops.root in told}
+        gone -= {group.token for group in spared}
         self._give(self.given.setting_aside(self.given.set_aside | gone))
         return bool(gone)
 

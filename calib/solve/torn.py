@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.special import ndtri
 
 from calib.linear.layout import StopKey, key_of
 from calib.linear.parallel import in_order
@@ -32,6 +33,7 @@ ASTRAY = 0.05
 # and 206 and 208 of two scans that were exchanged. So it is of a body, against most stops of it.
 CONTRADICTS = 10.0
 ALIKE = 2.0  # and by less than this scans differ that were taken where they are said to be
+MOST = 0.9  # of a scan's beams; a tenth and more meet the walls across any axis of a room
 DOUBTED = 1e-6  # weight: a body a metre off then pulls as hard as one a millimetre off
 
 Values = Mapping[str, np.ndarray]
@@ -64,19 +66,19 @@ def doubted(problem: Problem, values: Values) -> Problem:
     A fit begins with it: at their sigmas, placeholders would draw the first solution to them by
     metres, and weights taken there find the way back slowly.
     """
-    torn: set[StopKey] = set()
+    wild_at: set[StopKey] = set()
     for found in away(problem, values).values():
         median = float(np.median(np.concatenate([far for _, far in found])))
         for block, far in found:
             wild = np.flatnonzero(far > max(CONTRADICTS * median, ASTRAY))
-            torn |= {block.stop_names[k] for k in wild}
+            wild_at |= {block.stop_names[k] for k in wild}
     blocks = []
     for block in problem.blocks:
-        if isinstance(block, TrackedBody) and not torn.isdisjoint(block.stop_names):
-            wild = np.array([key in torn for key in block.stop_names])
+        if isinstance(block, TrackedBody) and not wild_at.isdisjoint(block.stop_names):
+            wild = np.array([key in wild_at for key in block.stop_names])
             block = replace(block, weight=np.where(wild, DOUBTED, 1.0))
         blocks.append(block)
-    return replace(problem, blocks=blocks) if torn else problem
+    return replace(problem, blocks=blocks) if wild_at else problem
 
 
 def borne_out(problem: Problem, values: Values) -> tuple[set[str], dict[str, np.ndarray]]:
@@ -90,11 +92,11 @@ def borne_out(problem: Problem, values: Values) -> tuple[set[str], dict[str, np.
         Tokens of the bodies that are wrong there, and where the rig stands as the right ones say.
     """
     roots = Counter(scan.stops.root for scan in problem.scans)
-    torn = [scan for scan in _torn(problem) if roots[scan.stops.root] == 1]  # none shares its place
-    usual = _usual(problem, values, torn) if torn else 0.0
+    asked = [scan for scan in torn(problem) if roots[scan.stops.root] == 1]  # none shares its place
+    usual = _usual(problem, values, asked) if asked else 0.0
     wrong: set[str] = set()
     stood: dict[str, np.ndarray] = {}
-    for scan in torn:
+    for scan in asked:
         tried = [(_width(scan, values, T), g, T) for g, T in _stands(problem, scan, values)]
         first, *others = sorted(tried, key=lambda each: each[0])
         if others and first[0] < ALIKE * usual and ALIKE * first[0] < others[0][0]:
@@ -103,21 +105,21 @@ def borne_out(problem: Problem, values: Values) -> tuple[set[str], dict[str, np.
     return wrong, stood
 
 
-def _torn(problem: Problem) -> list[ScanStop]:
+def torn(problem: Problem) -> list[ScanStop]:
     """Scans of stops at which a body lost nearly all its weight."""
-    torn = {
+    keys = {
         key
         for block in problem.bodies
         if block.weight is not None
         for key, weight in zip(block.stop_names, block.weight, strict=True)
         if 0 < weight < 1.0 / CONTRADICTS
     }
-    return [scan for scan in problem.scans if key_of(scan) in torn]
+    return [scan for scan in problem.scans if key_of(scan) in keys]
 
 
-def _usual(problem: Problem, values: Values, torn: Sequence[ScanStop]) -> float:
+def _usual(problem: Problem, values: Values, asked: Sequence[ScanStop]) -> float:
     """How many sigmas wide the residuals of most other scans are."""
-    keys = set(map(key_of, torn))
+    keys = set(map(key_of, asked))
     others = [scan for scan in problem.scans if key_of(scan) not in keys]
 
     def width(i: int) -> float:
@@ -137,8 +139,11 @@ def _stands(problem: Problem, scan: ScanStop, values: Values) -> Iterator[tuple[
 
 
 def _width(scan: ScanStop, values: Values, T_world_root: np.ndarray) -> float:
-    """How many sigmas wide a scan's residuals are with the rig standing there."""
+    """How many sigmas wide the residuals of most beams are with the rig standing there: half of the
+    beams of a LiDAR that is off along one axis, on floor and ceiling, tell nothing of it."""
     try:
-        return scan.rows({**values, scan.stops.root: T_world_root}).scale
+        rows = scan.rows({**values, scan.stops.root: T_world_root})
     except InputError:  # no beam meets anything there
         return np.inf
+    size = np.abs(rows.residual_m / rows.sigma_m)[rows.usable]
+    return float(np.quantile(size, MOST)) / ndtri((1 + MOST) / 2) if len(size) else np.inf
