@@ -51,7 +51,7 @@ from calib.effects.range import (
 from calib.effects.reference import FaroScale, MovedSurface
 from calib.effects.rig import BaseFlex, FrameOffset, MountBending, MountCreep, MountSlip
 from calib.effects.targets import TargetRodTilt, TargetSphereOffset
-from calib.effects.tracker import BodySlip, OptitrackDistortion, OptitrackScale
+from calib.effects.tracker import BaseSlip, BodySlip, OptitrackDistortion, OptitrackScale
 from chains.errors import InputError
 
 CATALOGUE: tuple[Effect, ...] = (
@@ -92,6 +92,7 @@ CATALOGUE: tuple[Effect, ...] = (
     OptitrackScale(),
     OptitrackDistortion(),
     BodySlip(),
+    BaseSlip(),
     TargetRodTilt(),
     TargetSphereOffset(),
     FaroScale(),

@@ -59,9 +59,10 @@ class OptitrackDistortion(Effect):
 
 
 class BodySlip(MountSlip):
-    """A tracked body slips once on what carries it, is knocked or taped anew, and stays there.
+    """A tracked body beyond the arm slips once on what carries it, is knocked or taped anew, and
+    stays there.
 
-    A step for each body; not for one that is itself what `mount_slip` moves.
+    Without an arm, any body. Not one that is itself what `mount_slip` moves.
     """
 
     name = "body_slip"
@@ -74,20 +75,27 @@ class BodySlip(MountSlip):
     source = "size assumed"
 
     def shapes(self, stops: View) -> tuple[float, ...]:
-        return step_times(stops) if _bodies(stops.rig) else ()
+        return step_times(stops) if self.bodies(stops.rig) else ()
+
+    def bodies(self, rig: Rig) -> tuple[str, ...]:
+        """The bodies that it is about."""
+        tree, mount = rig.tree, mount_edges(rig)
+        bodies = rig.tracker.bodies if rig.tracker else ()
+        alone = (b for b in bodies if not mount or tree.edges[mount[0]].child != b)
+        return tuple(b for b in alone if rig.joints_to(b) or not rig.arm_edges)
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
         units = ("rad",) * 3 + ("m",) * 3
         each = list(zip(DOF, units, self.sigma, strict=True))
         return tuple(
             Param(f"{body}.{dof}", unit, float(sigma))
-            for body in _bodies(rig)
+            for body in self.bodies(rig)
             for dof, unit, sigma in each
         )
 
     def basis(self, view: View) -> np.ndarray:
         bodies = view.rig.tracker.bodies
-        own = [bodies.index(body) for body in _bodies(view.rig)]
+        own = [bodies.index(body) for body in self.bodies(view.rig)]
         when = self.when(view["elapsed_s"])
         basis = np.zeros((len(when), len(bodies), 6, 6 * len(own)))
         for i, b in enumerate(own):
@@ -95,11 +103,16 @@ class BodySlip(MountSlip):
         return basis
 
 
-def _bodies(rig: Rig) -> tuple[str, ...]:
-    """Tracked bodies that slip by themselves."""
-    tree, mount = rig.tree, mount_edges(rig)
-    bodies = rig.tracker.bodies if rig.tracker else ()
-    return tuple(b for b in bodies if not mount or tree.edges[mount[0]].child != b)
+class BaseSlip(BodySlip):
+    """A tracked body before the arm slips once on the base, or the arm on it, and stays there."""
+
+    name = "base_slip"
+    confounded_with = ("arm_base", "mount_creep", "optitrack_distortion")
+
+    def bodies(self, rig: Rig) -> tuple[str, ...]:
+        beyond = super().bodies(rig)
+        bodies = rig.tracker.bodies if rig.tracker and rig.arm_edges else ()
+        return tuple(body for body in bodies if body not in beyond and not rig.joints_to(body))
 
 
 def _in_body(view: View, field: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:

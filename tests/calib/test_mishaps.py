@@ -107,7 +107,7 @@ def test_where_nothing_was_done_nothing_is_named(tmp_path, seed):
         *(
             pytest.param(*each, marks=pytest.mark.long)
             for each in (
-                ("base body taped anew from a stop on", None, "body_slip"),
+                ("base body taped anew from a stop on", None, "base_slip"),
                 ("rings numbered one off", "rings", None),
                 ("ranges long at one stop", ":scan", None),
             )

@@ -59,7 +59,8 @@ def _taped(scene: Scene, times: float, which: int) -> Done:
     scene.move(body, rows, Rotation.from_quat(quat, scalar_first=True).apply(way), NO)
     # With no arm, or no LiDAR, whatever moves a body moves it against all that is seen.
     alike = set() if scene.joints and "lidar" in scene.rig else {"mount_slip"}
-    right = {f"*:{body}", f"cad:{body}", "body_slip"}
+    right = {f"*:{body}", f"cad:{body}", "body_slip" if which else "base_slip"}
+    right |= {"body_slip"} if len(scene.bodies) == 1 else set()
     return done(right, {"*:joints", "*:scan"} | alike, unsure={body})
 
 
