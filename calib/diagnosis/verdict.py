@@ -30,7 +30,7 @@ VERDICTS = {
     UNNAMED: "structure that no effect explains",
     BAD: "something in the recording is wrong",
 }
-ABSORBED = 0.7  # share of the structure that named effects must explain to be the answer
+ABSORBED = 0.7  # share of structure, or held-out error, that names must explain to be the answer
 LISTED = 6  # untestable effects and rivals that a sentence names
 
 
@@ -128,6 +128,9 @@ def conclude(
     first = found.looks[0]
     spoilt = [*rings, *(rejected.blunders() if rejected and not found.found else [])]
     verdict = BAD if spoilt else _verdict(found, rejected)
+    falls = [held_out[s.effect.name] for s in found.found if s.effect.name in held_out]
+    fell = _explained(falls[0][0], *falls[-1][1:]) if falls and first.stand.estimate.scans else 1.0
+    verdict = UNNAMED if verdict == "missing_effect" and fell < ABSORBED else verdict
     if verdict == "adequate" and forbids:
         verdict = BAD
     candidates = [_candidate(c, verdict, found, held_out) for c in _ranked(found)]
