@@ -127,9 +127,15 @@ def _statistic(M: np.ndarray, u: np.ndarray, at: np.ndarray) -> float:
     if not len(at):
         return 0.0
     size = np.sqrt(np.maximum(np.diag(M)[at], 1e-300))
-    values, axes = np.linalg.eigh(M[np.ix_(at, at)] / np.outer(size, size))
+    return float(np.sum(np.square(_whitening(M[np.ix_(at, at)], size).T @ u[at])))
+
+
+def _whitening(M: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """What takes a score (r,) of information M (r, r) to independent ones (dof,) of unit variance,
+    in the directions that anything contradicts, in units of `size` (r,)."""
+    values, axes = np.linalg.eigh(M / np.outer(size, size))
     seen = values > UNCHECKED
-    return float(np.sum(np.square(axes[:, seen].T @ (u[at] / size)) / values[seen]))
+    return axes[:, seen] / np.sqrt(values[seen]) / size[:, None]
 
 
 @dataclass(frozen=True)
@@ -220,17 +226,15 @@ def _of_sums(group: Group, rows: GroupRows, score: np.ndarray, explained: np.nda
     left, score = own.T @ (rows.information - explained) @ own, own.T @ score
     size = np.sqrt(np.maximum(np.diag(own.T @ rows.information @ own), 1e-300))
     at = np.argmax(own, axis=0)
-    values, axes = np.linalg.eigh(left / np.outer(size, size))
-    seen = values > UNCHECKED
-    whiten = axes[:, seen] / np.sqrt(values[seen]) / size[:, None]
+    whiten = _whitening(left, size)
     score = whiten.T @ score
     return Shift(
         group=group,
         statistic=float(score @ score),
-        dof=int(seen.sum()),
+        dof=len(score),
         offset=whiten @ score,
         covariance=whiten @ whiten.T,
-        information=left if seen.all() else np.zeros_like(left),
+        information=left if len(score) == len(left) else np.zeros_like(left),
         axes=[rows.axes[i] for i in at],
         units=[rows.units[i] for i in at],
     )

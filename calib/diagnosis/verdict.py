@@ -127,10 +127,7 @@ def conclude(
     """
     first = found.looks[0]
     spoilt = [*rings, *(rejected.blunders() if rejected and not found.found else [])]
-    verdict = BAD if spoilt else _verdict(found, rejected)
-    falls = [held_out[s.effect.name] for s in found.found if s.effect.name in held_out]
-    fell = _explained(falls[0][0], *falls[-1][1:]) if falls and first.stand.estimate.scans else 1.0
-    verdict = UNNAMED if verdict == "missing_effect" and fell < ABSORBED else verdict
+    verdict = BAD if spoilt else _verdict(found, rejected, held_out)
     if verdict == "adequate" and forbids:
         verdict = BAD
     candidates = [_candidate(c, verdict, found, held_out) for c in _ranked(found)]
@@ -172,13 +169,16 @@ def _stops(look: Look) -> int:
     return int(look.linear.stop.max()) + 1
 
 
-def _verdict(found: Search, rejected: Rejects | None) -> str:
+def _verdict(found: Search, rejected: Rejects | None, held_out: Mapping[str, tuple]) -> str:
     if found.blunders:
         return BAD
     if not found.found:
         thrown = rejected is not None and not rejected.explained
         return UNNAMED if found.unnamed or thrown else "adequate"
     named = _names_hold(found) and (not found.unnamed or _absorbed(found) > ABSORBED)
+    falls = [held_out[s.effect.name] for s in found.found if s.effect.name in held_out]
+    if falls and found.looks[0].stand.estimate.scans:
+        named = named and _explained(falls[0][0], *falls[-1][1:]) >= ABSORBED
     return "missing_effect" if named else UNNAMED
 
 

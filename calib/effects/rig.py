@@ -103,9 +103,13 @@ class MountSlip(Effect):
         return step_times(stops) if mount_edges(stops.rig) else ()
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
+        return self.moves() if mount_edges(rig) else ()
+
+    def moves(self) -> tuple[Param, ...]:
+        """The six of one frame."""
         units = ("rad",) * 3 + ("m",) * 3
-        moves = zip(DOF, units, self.sigma, strict=True) if mount_edges(rig) else ()
-        return tuple(Param(dof, unit, float(sigma)) for dof, unit, sigma in moves)
+        each = zip(DOF, units, self.sigma, strict=True)
+        return tuple(Param(dof, unit, float(sigma)) for dof, unit, sigma in each)
 
     def basis(self, view: View) -> np.ndarray:
         when = self.when(view["elapsed_s"])

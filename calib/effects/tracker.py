@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
 from calib.effects.base import Effect, Param, Site, View
-from calib.effects.rig import DOF, MountSlip, mount_edges, step_times
+from calib.effects.rig import MountSlip, mount_edges, step_times
 from calib.rig import Rig
 
 VOLUME_M = 3.0  # half the width of a usual volume
@@ -85,12 +86,9 @@ class BodySlip(MountSlip):
         return tuple(b for b in alone if rig.joints_to(b) or not rig.arm_edges)
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
-        units = ("rad",) * 3 + ("m",) * 3
-        each = list(zip(DOF, units, self.sigma, strict=True))
+        each = self.moves()
         return tuple(
-            Param(f"{body}.{dof}", unit, float(sigma))
-            for body in self.bodies(rig)
-            for dof, unit, sigma in each
+            replace(move, name=f"{body}.{move.name}") for body in self.bodies(rig) for move in each
         )
 
     def basis(self, view: View) -> np.ndarray:
@@ -110,9 +108,8 @@ class BaseSlip(BodySlip):
     confounded_with = ("arm_base", "mount_creep", "optitrack_distortion")
 
     def bodies(self, rig: Rig) -> tuple[str, ...]:
-        beyond = super().bodies(rig)
         bodies = rig.tracker.bodies if rig.tracker and rig.arm_edges else ()
-        return tuple(body for body in bodies if body not in beyond and not rig.joints_to(body))
+        return tuple(body for body in bodies if not rig.joints_to(body))
 
 
 def _in_body(view: View, field: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:

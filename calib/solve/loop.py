@@ -206,9 +206,8 @@ class Loop(Descent):
         told |= {root for root, count in stood.items() if count >= SEVERAL}
         far = scale > CONTRADICTS * np.median(scale)
         pairs = zip(self.problem.scans, far, strict=True)
-        spared = set() if torn_too else {scan.group for scan in torn(self.problem)}
         gone = {s.group.token for s, is_far in pairs if is_far and s.stops.root in told}
-        gone -= {group.token for group in spared}
+        gone -= set() if torn_too else {scan.group.token for scan in torn(self.problem)}
         self._give(self.given.setting_aside(self.given.set_aside | gone))
         return bool(gone)
 
