@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from calib.blunders.judged import Blunder, LeftOut
-from calib.residuals.groups import BEAMS, MESH, Group
+from calib.residuals.groups import BEAMS, JOINTS, MESH, Group
 from calib.rig import Rig
 from sensors.rings import RingFinding
 
@@ -153,7 +153,8 @@ def _sentence(left: LeftOut, wrong_sign: str | None) -> str:
     sign = f", as if the sign of its {wrong_sign} were wrong" if wrong_sign else ""
     group = str(left.blunder.group)
     group = f"T{group[1:]}" if group.startswith("the ") else group
-    out = f"{group} is {size_told(*size)} off{along}, against everything else"
+    verb = "are" if left.blunder.group.what == JOINTS else "is"
+    out = f"{group} {verb} {size_told(*size)} off{along}, against everything else"
     if left.belongs:
         return f"{out}: it was taken at {left.belongs.where}."
     if left.rivals:
