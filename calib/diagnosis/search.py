@@ -194,9 +194,9 @@ def _wild(look: Look) -> list[Blunder]:
 
 
 def _outdone(look: Look, by: Blunder) -> bool:
-    """Whether an effect or a structure that no chance of stops and surfaces makes explains more
-    than a blunder, at its price."""
-    every = (c for c in (*look.named.candidates, *look.unnamed.candidates) if c.p_adjusted < ALPHA)
+    """Whether an effect or a structure explains more than a blunder, at its price: also one that
+    chance by stops may make, as where stops scatter none of them is a blunder."""
+    every = (*look.named.candidates, *look.unnamed.candidates)
     best = max((c.evidence - np.log(c.looks) for c in every), default=0.0)
     return by.evidence - np.log(by.looks) < best
 
