@@ -50,6 +50,7 @@ from calib.effects.range import (
 )
 from calib.effects.reference import FaroScale, MovedSurface
 from calib.effects.rig import BaseFlex, FrameOffset, MountBending, MountCreep, MountSlip
+from calib.effects.scatter import LocationRangeScatter, Scatter, StopRangeScatter
 from calib.effects.targets import TargetRodTilt, TargetSphereOffset
 from calib.effects.tracker import BaseSlip, BodySlip, OptitrackDistortion, OptitrackScale
 from chains.errors import InputError
@@ -100,6 +101,8 @@ CATALOGUE: tuple[Effect, ...] = (
     NoiseRange(),
     NoiseIncidence(),
     NoiseIntensity(),
+    StopRangeScatter(),
+    LocationRangeScatter(),
 )
 DEFAULT = ("arm_link_length", "arm_joint_offset", "ring_range_offset")
 
@@ -113,6 +116,7 @@ __all__ = [
     "NotTrustedError",
     "OneHot",
     "Param",
+    "Scatter",
     "Site",
     "Trust",
     "View",

@@ -112,6 +112,7 @@ class Effect(ABC):
         whole: True where a shape is a whole number.
         origin: the Python file and class of a user's effect; None for one of the catalogue.
         of_lidar: True when the effect belongs to the mounted LiDAR, so that rigs do not share it.
+        by_chance: True where its parameters are drawn by chance, and their spread is estimated.
     """
 
     name: str
@@ -125,6 +126,7 @@ class Effect(ABC):
     shape_name: ClassVar[str] = ""
     shape: float = 0.0
     whole: ClassVar[bool] = False
+    by_chance: ClassVar[bool] = False
     origin: Mapping[str, Any] | None = None
 
     @property

@@ -69,10 +69,12 @@ class Correction:
         part = run.solution.part(rig.name)
         effects, why = effects_that_may_run(run)
         known = {e.name: e for e in effects if e.name in part.effects}
-        of_beams = [e for e in known.values() if e.site is Site.BEAM]
+        of_beams = [e for e in known.values() if e.site is Site.BEAM and not e.by_chance]
         closed = {
             name: f"is not known: {why}" for name in part.effects if why and name not in known
         }
+        chance = (e.name for e in known.values() if e.by_chance)
+        closed |= {name: "is another one each time, by chance" for name in chance}
         return cls(rig, [(e, part.effects[e.name].estimate) for e in of_beams], closed=closed)
 
     def usable(self, columns: Collection[str]) -> tuple[Correction, dict[str, str]]:

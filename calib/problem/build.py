@@ -12,7 +12,7 @@ from calib.problem.bodies import add_bodies, add_targets
 from calib.problem.model import Model, Source, labels
 from calib.problem.places import Places
 from calib.problem.problem import Problem, SourceStops
-from calib.problem.unknowns import Unknown
+from calib.problem.unknowns import Role, Unknown
 from calib.residuals.groups import CAD
 from calib.residuals.surfaces import Meeting
 from chains.errors import InputError
@@ -39,11 +39,15 @@ def build(
             nothing to estimate.
     """
     several = len({s.rig.name for s in sources}) > 1
-    problem = Problem(sources, [model.terms(s.rig, several) for s in sources])
+    terms = with_members([model.terms(s.rig, several) for s in sources], sources)
+    problem = Problem(sources, terms)
     problem.meetings.update(meetings or {})
     for source, terms in zip(sources, problem.terms, strict=True):
         for term in terms:
-            problem.calibration.append(problem.add(effect_unknown(term, source)))
+            unknown = effect_unknown(term, source)
+            problem.add(unknown)
+            if unknown.role is Role.CALIBRATION:
+                problem.calibration.append(unknown.name)
     problem.calibration = list(dict.fromkeys(problem.calibration))
     for i, (source, label) in enumerate(zip(sources, labels(sources), strict=True)):
         chosen = np.ones(len(source.recording.stops), bool) if use is None else use[i]
@@ -82,4 +86,24 @@ def effect_unknown(term: Term, source: Source) -> Unknown:
         sigma=np.where(free, FREE, [p.sigma for p in params]),
         dofs=tuple(p.name for p in params),
         units=tuple(p.unit for p in params),
+        role=Role.SCATTER if term.effect.by_chance else Role.CALIBRATION,
     )
+
+
+def with_members(terms: Sequence[Sequence[Term]], sources: Sequence[Source]) -> list[list[Term]]:
+    """Terms of each source, those by chance with a parameter for every member of its group, in all
+    recordings that share their spread."""
+    labelled = [f"{label}/" if label else "" for label in labels(sources)]
+    members: dict[str, list[str]] = {}
+    for some, source, label in zip(terms, sources, labelled, strict=True):
+        for term in (t for t in some if t.effect.by_chance):
+            names = source.columns[term.effect.per].tolist()
+            members.setdefault(term.variable, []).extend(f"{label}{name}" for name in names)
+
+    def bound(term: Term, label: str) -> Term:
+        if not term.effect.by_chance:
+            return term
+        effect = term.effect.among(members[term.variable], label)
+        return Term(effect, term.variable, np.arange(len(effect.members)))
+
+    return [[bound(t, label) for t in some] for some, label in zip(terms, labelled, strict=True)]

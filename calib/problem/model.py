@@ -247,6 +247,7 @@ class Source:
         """Per-stop columns (K, ...) that effects may look at; see `stop_columns`."""
         recording = self.recording
         columns = stop_columns(self.rig, recording.joints, recording.time_s)
+        columns |= {"stop": np.array(recording.stops), "location": recording.location}
         if self.rig.tracker:
             columns["tracked"] = tracked_poses(self.rig, recording)
         return {**columns, **recording.covariates}

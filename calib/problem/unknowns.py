@@ -26,6 +26,7 @@ class Role(Enum):
     TARGET = "target"  # a rod's marker, and gravity
     PLANE = "plane"  # planes found in the scans
     SURFACE = "surface"  # how far parts of the mesh stand off the room
+    SCATTER = "scatter"  # what chance does anew to each stop or location
 
 
 @dataclass(frozen=True)

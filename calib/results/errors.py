@@ -93,7 +93,8 @@ def scan_errors(
     rows = scan.rows(values, association)
     if predicted is None:
         return row_errors(rows)
-    return row_errors(rows, _predicted_variance(scan, values, predicted, rows.by_twist))
+    variance = _predicted_variance(scan, values, predicted, rows.by_twist)
+    return row_errors(rows, variance + _by_chance(rows, predicted))
 
 
 def row_errors(rows: Rows, predicted_m2: np.ndarray | float = 0.0) -> Errors:
@@ -118,6 +119,16 @@ def _predicted_variance(
     d = np.hstack([placed.d[name][0] for name in names])
     twist = d @ predicted.covariance_of(names) @ d.T
     return np.einsum("ni,ij,nj->n", by_twist, twist, by_twist)
+
+
+def _by_chance(rows: Rows, predicted: Estimate) -> np.ndarray:
+    """Variance (N,) of what chance does anew to each stop or location, which no other tells."""
+    known, out = predicted.problem.variables, np.zeros(len(rows.residual_m))
+    for column in rows.sparse:
+        if column.variable in known and known[column.variable].role is Role.SCATTER:
+            variance = np.diag(predicted.covariance_of([column.variable]))[column.components]
+            out += np.where(column.index >= 0, np.square(column.value), 0) * variance[column.index]
+    return out
 
 
 def body_errors(

@@ -13,6 +13,7 @@ from calib.forward import Term
 from calib.problem import Problem
 from calib.problem.model import Source
 from calib.results.observability import not_estimated
+from calib.solve.components import spreads
 from calib.solve.estimate import Estimate
 from chains import se3
 
@@ -96,12 +97,15 @@ def solution_of(problem: Problem, estimate: Estimate, widened: float = 1.0) -> S
     told = widened**2 * estimate.covariance
     start = np.cumsum([0] + [v.dim for v in estimate.variables])
     at = {v.name: slice(a, a + v.dim) for v, a in zip(estimate.variables, start, strict=False)}
-    shared, recordings = Part(), {}
+    shared, recordings, scatter = Part(), {}, spreads(estimate)
     for source, terms in zip(problem.sources, problem.terms, strict=True):
         rig = source.rig
         for term in terms:
             own = term.variable != term.effect.name
             part = recordings.setdefault(rig.name, Part()) if own else shared
+            if term.effect.by_chance:
+                part.effects[term.effect.name] = _spread(term, scatter[term.variable], widened)
+                continue
             theta = estimate.values[term.variable]
             covariance = told[at[term.variable], at[term.variable]]
             if isinstance(term.effect, FrameOffset):
@@ -160,6 +164,12 @@ def _effect(
     sigma[term.free] = np.sqrt(np.diag(covariance))
     unit = one_unit([p.unit for p in params])
     return EffectEstimate(unit, tuple(p.name for p in params), estimate, sigma)
+
+
+def _spread(term: Term, told: tuple[float, float], widened: float) -> EffectEstimate:
+    """What is known of an effect by chance: how widely it scatters."""
+    sd, sigma = told
+    return EffectEstimate(term.effect.unit, ("sd",), np.array([sd]), np.array([widened * sigma]))
 
 
 def _absent(problem: Problem) -> list[dict[str, str]]:

@@ -60,6 +60,15 @@ class Spec(Document):
     build_error: float = pydantic.Field(default=1.0, ge=0)
     world_seed: int | None = pydantic.Field(default=None, ge=0)
 
+    @property
+    def names(self) -> dict[str, list[str]]:
+        """Of all stops, and of the location (K,) of each."""
+        places = [(a, b) for a in range(self.locations) for b in range(self.stops_per_location)]
+        return {
+            "stop": [f"L{a:02d}P{b:02d}" for a, b in places],
+            "location": [f"L{a:02d}" for a, _ in places],
+        }
+
     @pydantic.model_validator(mode="after")
     def _fits_together(self) -> Self:
         if self.targets and self.tracker is None:

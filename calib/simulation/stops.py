@@ -32,27 +32,22 @@ class Plan:
     """Where the K stops are and what was written down there.
 
     Args:
-        location: (K,) index of the location.
+        names, location: (K,) of the stops, and of the location of each.
         joints: (K, J) as reported, rad or m.
         Ts_faro_root: (K, 4, 4) true poses of the rig's root frame.
         columns: (K,) time and covariates, by name.
     """
 
-    location: np.ndarray
+    names: list[str]
+    location: list[str]
     joints: np.ndarray
     Ts_faro_root: np.ndarray
     columns: dict[str, np.ndarray]
 
     def seen(self, rig: Rig) -> dict[str, np.ndarray]:
         """What effects may look at (K,), by name, as in a fit."""
-        return {**stop_columns(rig, self.joints, self.columns["time_s"]), **self.columns}
-
-    @cached_property
-    def names(self) -> list[str]:
-        """Names (K,) of the stops."""
-        count = len(self.location)
-        nth = np.arange(count) - np.searchsorted(self.location, self.location)
-        return [f"L{a:02d}P{b:02d}" for a, b in zip(self.location, nth, strict=True)]
+        known = {"stop": np.array(self.names), "location": np.array(self.location)}
+        return {**stop_columns(rig, self.joints, self.columns["time_s"]), **self.columns, **known}
 
 
 def plan(rig: Rig, spec: Spec, mesh: Reference, rng: np.random.Generator) -> Plan:
@@ -79,7 +74,13 @@ def plan(rig: Rig, spec: Spec, mesh: Reference, rng: np.random.Generator) -> Pla
     if spec.poses == "moving":
         rates = RATE * rng.standard_normal((len(location), len(rig.joint_names)))
         columns |= {f"rate.{j}": r for j, r in zip(rig.joint_names, rates.T, strict=True)}
-    return Plan(location, np.concatenate(joints), Ts_faro_root, columns)
+    return Plan(
+        names=spec.names["stop"],
+        location=spec.names["location"],
+        joints=np.concatenate(joints),
+        Ts_faro_root=Ts_faro_root,
+        columns=columns,
+    )
 
 
 def _bases(
@@ -228,7 +229,8 @@ class World:
     def guessed(self, moves: str, rng: np.random.Generator) -> np.ndarray:
         """Rough T_faro_root (K, 4, 4), off by about 2 cm and 1 degree wherever the base stood."""
         stop = np.arange(len(self.joints))
-        group = {"stop": stop, "location": self.plan.location, "never": 0 * stop}[moves]
+        _, location = np.unique(self.plan.location, return_inverse=True)
+        group = {"stop": stop, "location": location, "never": 0 * stop}[moves]
         off = se3.exp(GUESS * rng.standard_normal((len(stop), 6)))
         return self.plan.Ts_faro_root @ off[group]
 

@@ -94,13 +94,14 @@ def draw(
         InputError: there is no such effect, or it may not run, or it finds nothing to act on.
     """
     shared_seed = seed if spec.world_seed is None else spec.world_seed
-    asked = [(effect, size) for text, size in hide.items() for effect in load_effects([text])]
+    asked = [(_met(e, spec), size) for text, size in hide.items() for e in load_effects([text])]
     hidden = {effect.name: size for effect, size in asked}
-    given = [(e, value) for text, value in spec.acting.items() for e in load_effects([text], trust)]
+    acting = ((e, a) for text, a in spec.acting.items() for e in load_effects([text], trust))
+    given = [(_met(effect, spec), value) for effect, value in acting]
     hidden_or_given = {*hidden, *(effect.name for effect, _ in given)}
     usual = [FrameOffset(name) for name in rig.frame_sigma]
     usual += [find(name) for name in DEFAULT if name not in hidden_or_given]
-    effects = [_acting(effect, rig, value) for effect, value in given]
+    effects = [_acting(e, rig, value, stream(seed, e.name)) for e, value in given]
     for effect in [*usual, *(effect for effect, _ in asked)]:
         rng = stream(seed if owned(effect, rig) else shared_seed, effect.name)
         sigma = np.array([p.sigma for p in effect.params(rig)])
@@ -119,12 +120,21 @@ def draw(
     return Truth(rig, tuple(effects), _opti_faro(stream(shared_seed, "opti")), hidden)
 
 
-def _acting(effect: Effect, rig: Rig, value: float) -> tuple[Effect, np.ndarray]:
-    """An effect, every parameter of it that may differ from 0 at one value."""
+def _met(effect: Effect, spec: Spec) -> Effect:
+    """An effect; one by chance with a parameter for every stop or location that there will be."""
+    return effect.among(spec.names[effect.per]) if effect.by_chance else effect
+
+
+def _acting(
+    effect: Effect, rig: Rig, value: float, rng: np.random.Generator
+) -> tuple[Effect, np.ndarray]:
+    """An effect, every parameter of it that may differ from 0 at one value; of one by chance that
+    is their spread."""
     sigma = np.array([p.sigma for p in effect.params(rig)])
     if not sigma.any():
         raise InputError(f"effect '{effect.name}' has nothing to act on in rig {rig.name}")
-    return effect, np.where(sigma > 0, value, 0.0)
+    chance = rng.standard_normal(len(sigma)) if effect.by_chance else 1.0
+    return effect, np.where(sigma > 0, value * chance, 0.0)
 
 
 def _pattern(rig: Rig, count: int, rng: np.random.Generator) -> np.ndarray:

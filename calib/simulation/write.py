@@ -33,7 +33,7 @@ def write_stops(path: Path, world: World, spec: Spec, rng: np.random.Generator) 
     stops, rig = world.plan, world.truth.rig
     columns: dict[str, Iterable] = {
         "stop": stops.names,
-        "location": [f"L{location:02d}" for location in stops.location],
+        "location": stops.location,
         **stops.columns,
         **dict(zip(rig.joint_names, stops.joints.T, strict=True)),
     }

@@ -11,7 +11,7 @@ import numpy as np
 from calib.linear.layout import StopKey, key_of
 from calib.linear.system import Linearisation
 from calib.problem.problem import Problem
-from calib.problem.unknowns import Unknown
+from calib.problem.unknowns import Role, Unknown
 from calib.residuals.beams import Association
 from calib.residuals.scan import ScanStop
 from calib.solve.graph import Graph
@@ -19,6 +19,7 @@ from calib.solve.graph import Graph
 # Of a state, beside an unknown's NAME: the parameters of a vector, and the value at which the beams
 # looked what they meet.
 DOFS, SEEN = ".dofs", ".seen"
+SD = ".sd"  # and the spread of values by chance
 AT_ONCE = 256  # rows whose joint covariance is computed for their variances: it grows as the square
 
 
@@ -35,6 +36,12 @@ class Start:
     state: Mapping[str, np.ndarray] = field(default_factory=dict)
     met: Mapping[StopKey, np.ndarray] = field(default_factory=dict)
     aside: frozenset[str] = frozenset()
+
+    @property
+    def spread(self) -> dict[str, float]:
+        """Unknown -> spread of its values by chance."""
+        ends = (name for name in self.state if name.endswith(SD))
+        return {name.removesuffix(SD): float(self.state[name]) for name in ends}
 
 
 @dataclass(frozen=True)
@@ -86,11 +93,13 @@ class Estimate:
 
     @property
     def state(self) -> dict[str, np.ndarray]:
-        """All values; per vector ``NAME.dofs``, its parameters; and ``NAME.seen``, the value at
-        which the scans were associated."""
-        vectors = (v for v in self.problem.variables.values() if v.kind == "vector")
-        dofs = {f"{v.name}{DOFS}": np.array(v.dofs, np.str_) for v in vectors}
-        return self.values | dofs | {f"{name}{SEEN}": x for name, x in self.seen.items()}
+        """All values; per vector ``NAME.dofs``, its parameters; ``NAME.seen``, the value at which
+        the scans were associated; and ``NAME.sd``, the spread of values by chance."""
+        known = self.problem.variables.values()
+        dofs = {f"{v.name}{DOFS}": np.array(v.dofs, np.str_) for v in known if v.kind == "vector"}
+        spread = {f"{v.name}{SD}": v.sigma[0] for v in known if v.role is Role.SCATTER}
+        seen = {f"{name}{SEEN}": x for name, x in self.seen.items()}
+        return self.values | dofs | spread | seen
 
     def touched(self) -> np.ndarray:
         """Whether any measurement depends on each parameter of the calibration: (P,) bool."""

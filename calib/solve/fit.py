@@ -50,6 +50,7 @@ def solve(
     if loop.start.state and problem.scans:
         loop.go_on(tolerance)
         loop.reweigh(tolerance)
+        loop.take_spread(tolerance)
         return loop.estimate()
     loop.solve_without_scans()
     loop.reweigh()
@@ -64,6 +65,7 @@ def solve(
         loop.lost = loop.lost or not loop.look_around()
         loop.settle(tolerance)
         loop.reweigh(tolerance)
+        loop.take_spread(tolerance)
     return loop.estimate()
 
 

@@ -20,6 +20,7 @@ from calib.problem.problem import Block, Problem
 from calib.problem.surfaces import well_seen, with_surfaces
 from calib.residuals.beams import Association
 from calib.solve.added import begun
+from calib.solve.components import by_chance, told, with_spread
 from calib.solve.descent import AT_OPTIMUM, STEADY, UPHILL, Descent, Progress
 from calib.solve.estimate import DOFS, SEEN, Estimate, Start, cost_of, started, values_of
 from calib.solve.graph import Graph
@@ -50,6 +51,7 @@ HOPEFUL, LOOKED = 8, 15
 # How many sigmas wide the residuals of most stops may be by then: in those recordings it is 1 to 4,
 # with scans at wrong stops 85.
 HOPELESS = 30.0
+SPREAD = 5  # times: all but the beams' weights is linear, so the second changes next to nothing
 
 
 ASKED = 2  # times: the first pass brings the LiDAR to where it is, near enough
@@ -74,7 +76,7 @@ class Loop(Descent):
         start: Start | None = None,
     ) -> None:
         start = start or Start()
-        problem = problem.setting_aside(start.aside)
+        problem = with_spread(problem.setting_aside(start.aside), start.spread)
         super().__init__(problem, prior, progress, values_of(problem, start.state))
         self.given, self.start = self.problem, start
         self.seen: dict[str, np.ndarray] = {}
@@ -155,6 +157,28 @@ class Loop(Descent):
         self.problem = replace(self.problem, blocks=given.blocks, variables=variables)
         self.lay_out()
         return True
+
+    def take_spread(self, tolerance: float) -> None:
+        """Estimate how widely values by chance scatter, and go on with that, until it settles.
+
+        Args:
+            tolerance: as of `settle`.
+        """
+        some = [u for u in by_chance(self.problem) if u.name not in self.held]
+        for _ in range(SPREAD if some and not self.lost else 0):
+            self.linearise_here()
+            names = [u.name for u in some]
+            found = told(some, self.values, self.graph.covariance(self.values, names))
+            sd = found.spread(np.array([u.sigma[0] for u in some]))
+            given = with_spread(self.given, dict(zip(names, sd.tolist(), strict=True)))
+            if given is self.given:
+                break
+            some = [given.variables[name] for name in names]
+            self.given = given
+            variables = self.problem.variables | {u.name: u for u in some}
+            self.problem = replace(self.problem, variables=variables)
+            self.lay_out()
+            self.settle(tolerance, self.seen, self._met())
 
     def _met(self) -> dict[StopKey, np.ndarray]:
         """What beams meet now."""

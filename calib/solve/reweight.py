@@ -66,7 +66,7 @@ def reweighted(
 
 
 def weighted_as(problem: Problem, other: Problem) -> Problem:
-    """A problem with the weights of another of the same recordings."""
+    """A problem with the weights, and the spreads, of another of the same recordings."""
     of = {b.groups: b.weight for b in other.blocks}
     blocks = [replace(b, weight=of.get(b.groups, b.weight)) for b in problem.blocks]
     known = other.variables
@@ -74,6 +74,7 @@ def weighted_as(problem: Problem, other: Problem) -> Problem:
         n: replace(v, weight=known[n].weight) if n in known else v
         for n, v in problem.variables.items()
     }
+    variables |= {n: known[n] for n, v in variables.items() if v.role is Role.SCATTER if n in known}
     return replace(problem, blocks=blocks, variables=variables)
 
 

@@ -222,9 +222,9 @@ def test_a_noise_lie_scales_the_scatter(lying):
 @pytest.mark.parametrize("effect", CATALOGUE, ids=lambda e: e.name)
 def test_every_effect_can_be_hidden_at_its_size(paper_rig, effect):
     rig = coarse(paper_rig)
-    sigma = np.array([p.sigma for p in effect.params(rig)])
     truth = draw(rig, Spec(build_error=0), {effect.name: 3.0}, 1)
-    (theta,) = (theta for hidden, theta in truth.effects if hidden.name == effect.name)
+    ((hidden, theta),) = (pair for pair in truth.effects if pair[0].name == effect.name)
+    sigma = np.array([p.sigma for p in hidden.params(rig)])
     free = sigma > 0
     assert np.sqrt(np.mean((theta[free] / sigma[free]) ** 2)) == pytest.approx(3.0)
     assert not theta[~free].any()

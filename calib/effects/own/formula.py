@@ -132,6 +132,8 @@ class FormulaEffect(Effect):
                 known = [n for n, c in view.columns.items() if callable(c) or np.ndim(c) == 1]
                 raise expression.wrong(f"there is no column {name} here{nearest(name, known)}")
             values = np.asarray(view[name])
+            if values.dtype.kind not in "biuf":
+                raise expression.wrong(f"column {name} holds names, not numbers")
             if values.ndim != 1:
                 raise expression.wrong(f"column {name} has more than one number a row")
             return values.astype(float)
