@@ -1,7 +1,9 @@
 """From one look to a named effect: the best explanation is judged, then fitted, then looked past.
 
 What is left once it is fitted is looked at again: an effect that nobody has named dresses up as
-several that somebody has. A blunder is an explanation like any other: where it is the best, its
+several that somebody has. What then still scatters from stop to stop may be chance, of which names
+and structure make what they can: the model gets that scatter, and all is looked at again beside it.
+A blunder is an explanation like any other: where it is the best, its
 rows are left out, the model is fitted without them, and looked at again (detection, identification
 and adaptation: Teunissen 1990).
 """
@@ -17,6 +19,7 @@ from calib.blunders.aside import stray_scans
 from calib.blunders.chance import after_looks, log_tail
 from calib.blunders.judged import Blunder, LeftOut
 from calib.blunders.shifts import standing_alone
+from calib.diagnosis.chance import Chance
 from calib.diagnosis.score import Test
 from calib.diagnosis.score import test as joint_test
 from calib.diagnosis.screen import Candidate, Screen
@@ -78,6 +81,7 @@ class Search:
         scatter: the effect on the scatter that is confirmed, if one is.
         at_first: structure that is confirmed before any of them; empty, as not asked for, unless
             the first of them is dressed up.
+        chance: what scatters by chance beside all that was found, strongest first.
     """
 
     looks: Sequence[Look]
@@ -86,6 +90,7 @@ class Search:
     unnamed: Sequence[Candidate]
     scatter: Candidate | None
     at_first: Sequence[Candidate] = ()
+    chance: Sequence[Chance] = ()
 
     def dressed_up(self, i: int) -> bool:
         """Whether structure without a name would have explained more than the i-th name did."""
@@ -102,9 +107,23 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NAMES) -> Search:
         progress: as of `fit.solve`.
         most: how many effects are named at most.
     """
+    done = _searched(stand, progress, most)
+    chance: list[Chance] = []
+    while strongest := next((c for c in done.looks[-1].chance if c.found), None):
+        chance.append(strongest)
+        beside = stand.with_effects([c.effect for c in chance], progress)
+        done = _searched(beside, progress, most)
+    still = (c.beside(done.looks[-1].stand.estimate) for c in chance)
+    return replace(done, chance=[c for c in still if c.found])
+
+
+def _searched(stand: Stand, progress: Progress, most: int) -> Search:
+    """As `search`, with no more by chance than the model has."""
     first, looks, found, left = stand, [stand.look(progress)], [], []
     while True:
         looks[-1] = _adapted(looks[-1], left, progress, named=bool(found))
+        if not found and _chance_leads(looks[-1]):
+            break
         step = _named(looks[-1], progress) if len(found) < most else None
         if step is None:
             break
@@ -199,6 +218,13 @@ def _outdone(look: Look, by: Blunder) -> bool:
     every = (*look.named.candidates, *look.unnamed.candidates)
     best = max((c.evidence - np.log(c.looks) for c in every), default=0.0)
     return by.evidence - np.log(by.looks) < best
+
+
+def _chance_leads(look: Look) -> bool:
+    """Whether scatter by chance explains more than any effect or structure does."""
+    every = (*look.named.candidates, *look.unnamed.candidates)
+    best = max((c.test.statistic for c in every), default=0.0)
+    return any(c.found and c.statistic > best for c in look.chance)
 
 
 def _quiet(look: Look) -> bool:

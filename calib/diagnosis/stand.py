@@ -18,6 +18,7 @@ from calib.diagnosis.candidates import (
     stops_view,
     structure,
 )
+from calib.diagnosis.chance import Chance, chances
 from calib.diagnosis.jackknife import Shares
 from calib.diagnosis.linear import Linear, linearise_with, rows_along
 from calib.diagnosis.score import Test, away_from_model, project, test
@@ -83,11 +84,19 @@ class Stand:
         unnamed = [e for e in structure(self.sources, sample) if e.name not in there]
         linear, at = self.linearise((*known, *unnamed), progress)
         scores = project(linear, linear.candidates)
-        named = screen(scores, [e for e in known if e.site is not Site.NOISE], at)
+        chance = [e for e in known if e.by_chance]
+        named = [e for e in known if e.site is not Site.NOISE and not e.by_chance]
+        named = screen(scores, named, at)
         rest = screen(scores, unnamed, at, named.common if named.candidates else None)
         noise = screen(scores, [e for e in known if e.site is Site.NOISE], at, 1.0)
         return Look(
-            stand=self, linear=linear, named=named, unnamed=rest, noise=noise, columns=columns
+            stand=self,
+            linear=linear,
+            named=named,
+            unnamed=rest,
+            noise=noise,
+            chance=chances(scores, chance, at),
+            columns=columns,
         )
 
     def linearise(
@@ -220,6 +229,7 @@ class Look:
         named: the catalogue's effects, tested.
         unnamed: structure, tested.
         noise: effects on the scatter, tested; they move no mean.
+        chance: effects that are drawn anew by chance, tested.
         columns: what points and stops carry.
     """
 
@@ -228,6 +238,7 @@ class Look:
     named: Screen
     unnamed: Screen
     noise: Screen
+    chance: Sequence[Chance]
     columns: frozenset[str]
 
     @cached_property

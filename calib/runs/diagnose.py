@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -82,6 +83,7 @@ def _found(run: Run, progress: Progress, refits: bool) -> Diagnosis:
     tokens = told.tokens(result.blunders)
     return replace(
         result,
+        scatter=[*_scatter(run), *result.scatter],
         sentences=[
             *run.doubts,
             *result.sentences,
@@ -90,6 +92,15 @@ def _found(run: Run, progress: Progress, refits: bool) -> Diagnosis:
         ],
         command=command_without(run, tokens) if tokens else "",
     )
+
+
+def _scatter(run: Run) -> Iterator[dict[str, Any]]:
+    """How widely things scatter by chance, as the run's model has it."""
+    parts = [run.solution.shared, *run.solution.recordings.values()]
+    for effect in (e for e in model_of(run).effects if e.by_chance):
+        for found in (part.effects[effect.name] for part in parts if effect.name in part.effects):
+            numbers = {"sd": float(found.estimate[0]), "sigma": float(found.sigma[0])}
+            yield {"effect": effect.name, **numbers, "unit": found.unit}
 
 
 def command_without(run: Run, tokens: Sequence[str]) -> str:

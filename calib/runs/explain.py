@@ -132,7 +132,8 @@ class _Climb:
         if len(self.runs) == before:
             return False
         for name in earlier:
-            if name in self._model.names:
+            here = {effect.name: effect for effect in self._model.effects}
+            if name in here and not here[name].by_chance:
                 self._try(self._model.minus([name]), [], [name])
         return True
 
@@ -163,7 +164,9 @@ class _Climb:
         run = self._finished(folder, model, self.run)
         if run is None:
             run = grow(self.run, model, folder, self.tell)
-        if run.converged and _falls(self.run, run, LEAST_FALL if added else 0.0):
+        # What is drawn anew by chance tells nothing of a stop that was left out.
+        chance = any(effect.by_chance for effect in model.effects if effect.name in added)
+        if run.converged and (chance or _falls(self.run, run, LEAST_FALL if added else 0.0)):
             self._keep(run, added, dropped)
         else:
             outputs.remove(folder)

@@ -17,13 +17,13 @@ from calib.diagnosis.rejects import Rejects
 from calib.diagnosis.screen import Candidate, Screen
 from calib.diagnosis.search import ALPHA, FEWEST, ODDS, NamedEffect, Search, angle_deg
 from calib.diagnosis.stand import Look
-from calib.diagnosis.suggest import formula, hangs_on, what_separates, words
+from calib.diagnosis.suggest import formula, hangs_on, what_separates
+from calib.diagnosis.verdict.sentences import BAD, UNNAMED, sentences_of, stops_of
 from calib.effects import CATALOGUE, Site
 from calib.problem.model import labels
 from calib.results.solution import one_unit
 from calib.rig import Rig
 
-UNNAMED, BAD = "unexplained_structure", "bad_data"
 VERDICTS = {
     "adequate": "the model is adequate",
     "missing_effect": "an effect is missing",
@@ -31,7 +31,6 @@ VERDICTS = {
     BAD: "something in the recording is wrong",
 }
 ABSORBED = 0.7  # share of structure, or held-out error, that names must explain to be the answer
-LISTED = 6  # untestable effects and rivals that a sentence names
 
 
 @dataclass(frozen=True)
@@ -52,6 +51,7 @@ class Diagnosis:
         too_few: whether the stops are too few to say anything, whatever the verdict.
         command: what fits the same without the blunders, ready to be typed; empty without any.
         rejected: what the fit threw away; None without scans, or where nobody looked.
+        scatter: how widely things scatter by chance, of the model and of what it lacks.
     """
 
     verdict: str
@@ -67,6 +67,7 @@ class Diagnosis:
     too_few: bool = False
     command: str = ""
     rejected: Rejects | None = None
+    scatter: Sequence[Mapping[str, Any]] = ()
 
     @property
     def heading(self) -> str:
@@ -93,6 +94,7 @@ class Diagnosis:
             "blunders": list(self.blunders),
             "command": self.command or None,
             **told.groups(self.groups),
+            "scatter": list(self.scatter),
             "misfit": dict(self.misfit),
             "rejected": self.rejected.document() if self.rejected else None,
             "curves": [curve.document() for curve in self.curves],
@@ -130,13 +132,17 @@ def conclude(
     verdict = BAD if spoilt else _verdict(found, rejected, held_out)
     if verdict == "adequate" and forbids:
         verdict = BAD
-    candidates = [_candidate(c, verdict, found, held_out) for c in _ranked(found)]
+    named, ranked = len(found.found), _ranked(found)
+    candidates = [_candidate(c, verdict, found, held_out) for c in ranked]
+    chance = [each.document(named + i) for i, each in enumerate(found.chance, 1)]
+    others = [each.document(None) for each in found.looks[-1].chance]
+    candidates = [*candidates[:named], *chance, *candidates[named:], *others]
     untestable = _untestable(first)
     thrown = rejected.unexplained() if rejected and verdict == UNNAMED else []
     unexplained = [_unexplained(c, screen) for screen, c in _without_a_name(found, verdict)]
     unexplained = [*thrown, *unexplained]
     blunders = [*spoilt, *(told.document(left, _rig(left, first)) for left in found.blunders)]
-    sentences = _sentences(verdict, found, candidates, unexplained, untestable, blunders)
+    sentences = sentences_of(verdict, found, candidates, unexplained, untestable, blunders)
     if forbids and verdict == BAD and not blunders:
         sentences.insert(0, f"This run is not to be believed as it stands: {'; '.join(forbids)}.")
     if rejected:
@@ -153,8 +159,9 @@ def conclude(
         groups=[*(left.blunder for left in found.blunders), *first.blunders],
         misfit=misfit,
         curves=curves(first.unnamed),
-        too_few=_stops(first) < FEWEST,
+        too_few=stops_of(first) < FEWEST,
         rejected=rejected,
+        scatter=[each.spread for each in found.chance],
     )
 
 
@@ -165,16 +172,14 @@ def _rig(left: LeftOut, look: Look) -> Rig:
     return rigs.get(left.blunder.group.recording) or sources[0].rig
 
 
-def _stops(look: Look) -> int:
-    return int(look.linear.stop.max()) + 1
-
-
 def _verdict(found: Search, rejected: Rejects | None, held_out: Mapping[str, tuple]) -> str:
     if found.blunders:
         return BAD
     if not found.found:
         thrown = rejected is not None and not rejected.explained
-        return UNNAMED if found.unnamed or thrown else "adequate"
+        if found.unnamed or thrown:
+            return UNNAMED
+        return "missing_effect" if found.chance else "adequate"
     named = _names_hold(found) and (not found.unnamed or _absorbed(found) > ABSORBED)
     falls = [held_out[s.effect.name] for s in found.found if s.effect.name in held_out]
     if falls and found.looks[0].stand.estimate.scans:
@@ -322,79 +327,3 @@ def _untestable(look: Look) -> dict[str, str]:
         elif effect.family in gauges:
             found[effect.family] = "not observable: the model can take on all that it does"
     return found
-
-
-def _sentences(
-    verdict: str,
-    found: Search,
-    candidates: Sequence[Mapping[str, Any]],
-    unexplained: Sequence[Mapping[str, Any]],
-    untestable: Mapping[str, str],
-    blunders: Sequence[Mapping[str, Any]],
-) -> list[str]:
-    look = found.looks[0]
-    residual = _residual(look)
-    out = []
-    stops = _stops(look)
-    if stops < FEWEST:
-        out.append(
-            f"Nothing can be said: {stops} stops are too few to name an effect, as all of them may "
-            f"share one error; {FEWEST} are the least, and 20 are better."
-        )
-    elif verdict == "adequate":
-        out.append(
-            f"The model is adequate: of {len(look.named.candidates)} known effects and "
-            f"{len(look.unnamed.candidates)} kinds of structure none stands out from chance."
-        )
-    out += [each["sentence"] for each in blunders[:LISTED]]
-    if len(blunders) > LISTED:
-        out.append(f"And {len(blunders) - LISTED} more, in diagnosis.json.")
-    for step in found.found:
-        out += _step_sentences(step, next(c for c in candidates if c["add"] == step.effect.name))
-    if verdict == UNNAMED:
-        out.insert(0, "Something is here that no known effect explains.")
-    for each in unexplained[:2]:
-        what = " and ".join(words(c) for c in each["covariates"])
-        out.append(f"What is left hangs on {what}: {each['rms_mm']:.2f} mm rms of {residual}.")
-        if each["formula"]:
-            out.append(
-                f"An empirical effect for it, '{each['formula']['name']}', stands in diagnosis.json"
-                f" ready to be saved and added; it describes, and explains nothing."
-            )
-    if found.scatter is not None:
-        what = " and ".join(words(c) for c in found.scatter.effect.covariates)
-        out.append(
-            f"The scatter grows with {what} otherwise than the LiDAR's model has it: "
-            f"{found.scatter.effect.name} would weigh the rows better, and move no mean."
-        )
-    gone = [name for name, why in untestable.items() if why.startswith("the recordings")]
-    if gone:
-        more = f" and {len(gone) - LISTED} more" if len(gone) > LISTED else ""
-        out.append(f"Could not be tested on these recordings: {', '.join(gone[:LISTED])}{more}.")
-    return out
-
-
-def _step_sentences(step: NamedEffect, candidate: Mapping[str, Any]) -> list[str]:
-    if candidate["dressed_up"]:
-        return [
-            f"{step.effect.name} takes on a part of it, as a name will; bins without any name "
-            f"explain more, so it is not to be believed."
-        ]
-    before, after = (candidate["held_out_rms_mm"][k] for k in ("before", "after"))
-    fall = f"; the held-out error goes from {before:.2f} to {after:.2f} mm" if after else ""
-    out = [
-        f"{step.effect.name} is missing: it bends {_residual(step.before)} by "
-        f"{candidate['rms_mm']:.2f} mm rms, {candidate['unabsorbed_rms_mm']:.2f} mm of which the "
-        f"model cannot take on (p = {max(step.p_adjusted, 1e-99):.1g} after all that was looked "
-        f"at){fall}."
-    ]
-    for rival in candidate["rivals"][:LISTED]:
-        out.append(
-            f"This data cannot tell it from {rival['effect']} (odds {rival['odds']:.1f} to 1); "
-            f"{rival['separate']} would."
-        )
-    return out
-
-
-def _residual(look: Look) -> str:
-    return "the ranges" if look.stand.estimate.scans else "the tracked poses"

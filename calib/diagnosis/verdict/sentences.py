@@ -1,0 +1,96 @@
+"""What was found, in sentences for people."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from calib.diagnosis.search import FEWEST, NamedEffect, Search
+from calib.diagnosis.stand import Look
+from calib.diagnosis.suggest import words
+
+UNNAMED, BAD = "unexplained_structure", "bad_data"
+LISTED = 6  # untestable effects and rivals that a sentence names
+
+
+def sentences_of(
+    verdict: str,
+    found: Search,
+    candidates: Sequence[Mapping[str, Any]],
+    unexplained: Sequence[Mapping[str, Any]],
+    untestable: Mapping[str, str],
+    blunders: Sequence[Mapping[str, Any]],
+) -> list[str]:
+    """The finding in words, the verdict first; arguments as `conclude` has made them."""
+    look = found.looks[0]
+    residual = _residual(look)
+    out = []
+    stops = stops_of(look)
+    if stops < FEWEST:
+        out.append(
+            f"Nothing can be said: {stops} stops are too few to name an effect, as all of them may "
+            f"share one error; {FEWEST} are the least, and 20 are better."
+        )
+    elif verdict == "adequate":
+        out.append(
+            f"The model is adequate: of {len(look.named.candidates)} known effects and "
+            f"{len(look.unnamed.candidates)} kinds of structure none stands out from chance."
+        )
+    out += [each["sentence"] for each in blunders[:LISTED]]
+    if len(blunders) > LISTED:
+        out.append(f"And {len(blunders) - LISTED} more, in diagnosis.json.")
+    for step in found.found:
+        out += _step_sentences(step, next(c for c in candidates if c["add"] == step.effect.name))
+    out += [each.sentence for each in found.chance]
+    if verdict == UNNAMED:
+        out.insert(0, "Something is here that no known effect explains.")
+    for each in unexplained[:2]:
+        what = " and ".join(words(c) for c in each["covariates"])
+        out.append(f"What is left hangs on {what}: {each['rms_mm']:.2f} mm rms of {residual}.")
+        if each["formula"]:
+            out.append(
+                f"An empirical effect for it, '{each['formula']['name']}', stands in diagnosis.json"
+                f" ready to be saved and added; it describes, and explains nothing."
+            )
+    if found.scatter is not None:
+        what = " and ".join(words(c) for c in found.scatter.effect.covariates)
+        out.append(
+            f"The scatter grows with {what} otherwise than the LiDAR's model has it: "
+            f"{found.scatter.effect.name} would weigh the rows better, and move no mean."
+        )
+    gone = [name for name, why in untestable.items() if why.startswith("the recordings")]
+    if gone:
+        more = f" and {len(gone) - LISTED} more" if len(gone) > LISTED else ""
+        out.append(f"Could not be tested on these recordings: {', '.join(gone[:LISTED])}{more}.")
+    return out
+
+
+def _step_sentences(step: NamedEffect, candidate: Mapping[str, Any]) -> list[str]:
+    if candidate["dressed_up"]:
+        return [
+            f"{step.effect.name} takes on a part of it, as a name will; bins without any name "
+            f"explain more, so it is not to be believed."
+        ]
+    before, after = (candidate["held_out_rms_mm"][k] for k in ("before", "after"))
+    fall = f"; the held-out error goes from {before:.2f} to {after:.2f} mm" if after else ""
+    out = [
+        f"{step.effect.name} is missing: it bends {_residual(step.before)} by "
+        f"{candidate['rms_mm']:.2f} mm rms, {candidate['unabsorbed_rms_mm']:.2f} mm of which the "
+        f"model cannot take on (p = {max(step.p_adjusted, 1e-99):.1g} after all that was looked "
+        f"at){fall}."
+    ]
+    for rival in candidate["rivals"][:LISTED]:
+        out.append(
+            f"This data cannot tell it from {rival['effect']} (odds {rival['odds']:.1f} to 1); "
+            f"{rival['separate']} would."
+        )
+    return out
+
+
+def _residual(look: Look) -> str:
+    return "the ranges" if look.stand.estimate.scans else "the tracked poses"
+
+
+def stops_of(look: Look) -> int:
+    """How many stops there are."""
+    return int(look.linear.stop.max()) + 1

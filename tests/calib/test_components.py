@@ -1,0 +1,182 @@
+"""How widely values scatter by chance: against a dense likelihood, closed forms, and chance."""
+
+import numpy as np
+import pytest
+from scipy import optimize, stats
+
+from calib import diagnose, fit
+from calib.diagnosis.chance import AtZero
+from calib.effects import find
+from calib.problem import build
+from calib.problem.model import Model, Source
+from calib.simulation import Spec, simulate
+from calib.solve.components import Told, spreads
+from calib.solve.fit import solve
+
+SD, PLACE_SD = 0.7, 0.4
+SPEC = Spec(
+    lidar="hesai_pandarxt32", locations=6, stops_per_location=4, column_step=100, world_seed=5
+)
+
+
+class Mixed:
+    """Rows ``y = X b + Z u + e``, unit noise, with values u of members in two crossed groups."""
+
+    def __init__(self, seed, sd=(SD, PLACE_SD), members=(20, 8), rows=300):
+        rng = np.random.default_rng(seed)
+        design = np.random.default_rng(99)
+        self.X = np.column_stack([np.ones(rows), design.standard_normal((rows, 2))])
+        index = [design.integers(0, count, rows) for count in members]
+        self.Z = np.hstack([np.eye(c)[i] for c, i in zip(members, index, strict=True)])
+        self.group = np.repeat([0, 1], members)
+        u = np.repeat(sd, members) * rng.standard_normal(sum(members))
+        self.y = self.X @ [1.0, -0.5, 2.0] + self.Z @ u + rng.standard_normal(rows)
+
+    def told(self):
+        """Score and information of the values, the others projected off."""
+        left = np.eye(len(self.y)) - self.X @ np.linalg.pinv(self.X)
+        return Told(self.Z.T @ left @ self.y, self.Z.T @ left @ self.Z, self.group)
+
+    def minus_log_likelihood(self, log_variance):
+        """Restricted, from the dense covariance of all rows (Patterson and Thompson 1971)."""
+        variance = np.exp(log_variance)[self.group]
+        V = np.eye(len(self.y)) + (self.Z * variance) @ self.Z.T
+        inverse = np.linalg.inv(V)
+        inner = self.X.T @ inverse @ self.X
+        P = inverse - inverse @ self.X @ np.linalg.solve(inner, self.X.T @ inverse)
+        logs = np.linalg.slogdet(V)[1] + np.linalg.slogdet(inner)[1]
+        return (logs + self.y @ P @ self.y) / 2
+
+
+def test_the_spread_has_the_greatest_restricted_likelihood():
+    for seed in range(3):
+        world = Mixed(seed)
+        dense = optimize.minimize(world.minus_log_likelihood, [0.0, 0.0], method="Nelder-Mead")
+        expected = np.exp(dense.x / 2)
+        for start in ([0.05, 5.0], [1.0, 1.0]):
+            found = world.told().spread(np.array(start))
+            np.testing.assert_allclose(found, expected, rtol=2e-3)
+
+
+def test_its_sigma_is_the_curvature_of_that_likelihood():
+    world = Mixed(4, rows=900, members=(60, 40))
+    sd = world.told().spread(np.ones(2))
+    x, step = 2 * np.log(sd), 1e-3
+    second = [
+        world.minus_log_likelihood(x + step * e)
+        + world.minus_log_likelihood(x - step * e)
+        - 2 * world.minus_log_likelihood(x)
+        for e in np.eye(2)
+    ]
+    observed = sd / 2 / np.sqrt(np.array(second) / step**2)  # of the sd, groups nearly independent
+    np.testing.assert_allclose(world.told().sigma(sd), observed, rtol=0.15)
+
+
+def test_a_balanced_design_has_the_closed_form():
+    members, each = 12, 5
+    rng = np.random.default_rng(3)
+    member = np.repeat(np.arange(members), each)
+    y = 0.8 * rng.standard_normal(members)[member] + rng.standard_normal(members * each)
+    Z = np.eye(members)[member]
+    left = np.eye(len(y)) - 1.0 / len(y)
+    told = Told(Z.T @ left @ y, Z.T @ left @ Z, np.zeros(members, int))
+    means = y.reshape(members, each).mean(axis=1)
+    expected = np.sqrt(means.var(ddof=1) - 1.0 / each)  # the noise is known
+    assert told.spread(np.array([0.1]))[0] == pytest.approx(expected, rel=1e-4)
+
+
+def test_values_as_fitted_say_the_same_whatever_held_them():
+    told = Mixed(5).told()
+    for sd in (0.2, 3.0):
+        variance = np.full(28, sd**2)
+        covariance = np.linalg.inv(told.information + np.diag(1 / variance))
+        again = Told.of(covariance @ told.score, covariance, variance, told.group)
+        np.testing.assert_allclose(again.score, told.score, rtol=1e-7)
+        np.testing.assert_allclose(again.information, told.information, atol=1e-8)
+
+
+def test_the_estimate_and_its_sigma_hold_over_many_worlds():
+    found = [Mixed(seed).told() for seed in range(150)]
+    sd = np.array([told.spread(np.ones(2)) for told in found])
+    sigma = np.array([t.sigma(s) for t, s in zip(found, sd, strict=True)])
+    np.testing.assert_allclose(np.sqrt((sd**2).mean(axis=0)), [SD, PLACE_SD], rtol=0.08)
+    z = (sd[:, 0] - SD) / sigma[:, 0]
+    assert 0.85 < z.std() < 1.2
+
+
+def test_where_nothing_scatters_the_spread_is_nothing():
+    sd = np.array([Mixed(seed, sd=(0, 0)).told().spread(np.ones(2))[0] for seed in range(60)])
+    assert np.mean(sd < 0.01) > 0.3 and np.median(sd) < 0.12
+
+
+# --------------------------------------------------------------------------------- tested at zero
+
+
+def one_way(seed, sd=0.0, members=30, even=True):
+    """A group whose members are seen by as many rows each, or by very different numbers."""
+    rng = np.random.default_rng(seed)
+    each = np.full(members, 20.0) if even else np.geomspace(1, 400, members)
+    M = np.diag(each) - np.outer(each, each) / each.sum()
+    u = sd * rng.standard_normal(members)
+    noise = rng.standard_normal(members) * np.sqrt(each)
+    score = each * u + noise
+    return Told(score - each * score.sum() / each.sum(), M, np.zeros(members, int))
+
+
+@pytest.mark.parametrize("even", [True, False])
+@pytest.mark.parametrize("members", [6, 30])
+def test_the_test_at_zero_has_its_size(even, members):
+    p = [AtZero(one_way(s, members=members, even=even)).p_value()[1] for s in range(400)]
+    for level in (0.01, 0.05, 0.2):
+        least, most = stats.binom.ppf([0.001, 0.999], 400, level)
+        assert least <= np.sum(np.array(p) < level) <= most
+
+
+def test_a_spread_of_the_smallest_detectable_size_is_found_four_times_out_of_five():
+    size = AtZero(one_way(0)).detectable(0.01)
+    hits = [AtZero(one_way(seed, sd=size)).p_value()[1] < 0.01 for seed in range(300)]
+    assert 0.72 < np.mean(hits) < 0.88
+
+
+# ------------------------------------------------------------------------------------ in recordings
+
+
+@pytest.fixture(scope="module")
+def scattered(tmp_path_factory):
+    """A recording whose stops scatter by 0.9 mm, and the truth's values."""
+    folder = tmp_path_factory.mktemp("scatter")
+    simulate(SPEC, folder / "rec", 7, {"stop_range_scatter": 3.0})
+    return folder
+
+
+def test_a_fit_estimates_the_spread_and_each_stop(scattered):
+    source = Source.open(scattered / "rec")
+    estimate = solve(build([source], Model().plus([find("stop_range_scatter")])))
+    ((name, (sd, sigma)),) = spreads(estimate).items()
+    assert abs(sd - 0.0009) < 3 * sigma and 0.1 < sigma / sd < 0.25
+    assert estimate.converged and name not in estimate.problem.calibration
+    assert len(estimate.values[name]) == 24
+
+
+def test_it_is_found_said_to_be_chance_and_then_nothing_is_missing(scattered):
+    run = fit([scattered / "rec"], scattered / "run")
+    found = diagnose(run)
+    assert found.verdict == "missing_effect" and found.worth_adding == ["stop_range_scatter"]
+    assert not found.unexplained and not found.blunders
+    (told,) = found.scatter
+    assert told["sd"] == pytest.approx(0.0009, abs=3 * told["sigma"])
+    assert any("Stops scatter by" in sentence for sentence in found.sentences)
+
+
+def test_two_recordings_share_the_spread_and_nothing_else(scattered, tmp_path):
+    simulate(
+        SPEC.model_copy(update={"locations": 4}), tmp_path / "other", 8, {"stop_range_scatter": 3.0}
+    )
+    sources = [Source.open(scattered / "rec"), Source.open(tmp_path / "other")]
+    problem = build(sources, Model().plus([find("stop_range_scatter")]))
+    (name,) = [u.name for u in problem.variables.values() if u.role.name == "SCATTER"]
+    dofs = problem.variables[name].dofs
+    assert len(set(dofs)) == len(dofs) == 24 + 16
+    estimate = solve(problem)
+    sd, sigma = spreads(estimate)[name]
+    assert abs(sd - 0.0009) < 3 * sigma
