@@ -74,7 +74,7 @@ def _found(run: Run, progress: Progress, refits: bool) -> Diagnosis:
     result = conclude(
         found,
         falls,
-        run.summary["misfit"],
+        run.summary,
         weak_directions(run.solution, float(run.summary["sigmas_widened_by"]), found.looks[0]),
         rejected,
         forbids(run),

@@ -18,6 +18,7 @@ from calib.diagnosis.screen import Candidate, Screen
 from calib.diagnosis.search import ALPHA, FEWEST, ODDS, NamedEffect, Search, angle_deg
 from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import formula, hangs_on, what_separates
+from calib.diagnosis.verdict.matters import weighed
 from calib.diagnosis.verdict.sentences import BAD, UNNAMED, sentences_of, stops_of
 from calib.effects import CATALOGUE, Site
 from calib.problem.model import labels
@@ -110,7 +111,7 @@ def worth_adding(candidates: Sequence[Mapping[str, Any]]) -> list[str]:
 def conclude(
     found: Search,
     held_out: Mapping[str, tuple[float, float, float]],
-    misfit: Mapping[str, float],
+    summary: Mapping[str, Any],
     weak: Sequence[Mapping[str, Any]],
     rejected: Rejects | None = None,
     forbids: Sequence[str] = (),
@@ -121,12 +122,13 @@ def conclude(
     Args:
         found: the search.
         held_out: effect -> held-out rms before and after it was truly fitted, and noise floor, mm.
-        misfit: by instrument.
+        summary: of the run: its errors, and its misfit by instrument.
         weak: weak directions.
         rejected: what the fit threw away.
         forbids: why the run is not to be believed, whatever its model explains; a clause each.
         rings: whose numbers are wrong, as blunders.
     """
+    found, matter, traces = weighed(found, held_out, summary["rms_mm"])
     first = found.looks[0]
     spoilt = [*rings, *(rejected.blunders() if rejected and not found.found else [])]
     verdict = BAD if spoilt else _verdict(found, rejected, held_out)
@@ -134,6 +136,8 @@ def conclude(
         verdict = BAD
     named, ranked = len(found.found), _ranked(found)
     candidates = [_candidate(c, verdict, found, held_out) for c in ranked]
+    for each in candidates:
+        each["matters"] = matter[each["add"]].document() if each["add"] in matter else None
     chance = [each.document(named + i) for i, each in enumerate(found.chance, 1)]
     others = [each.document(None) for each in found.looks[-1].chance]
     candidates = [*candidates[:named], *chance, *candidates[named:], *others]
@@ -142,7 +146,7 @@ def conclude(
     unexplained = [_unexplained(c, screen) for screen, c in _without_a_name(found, verdict)]
     unexplained = [*thrown, *unexplained]
     blunders = [*spoilt, *(told.document(left, _rig(left, first)) for left in found.blunders)]
-    sentences = sentences_of(verdict, found, candidates, unexplained, untestable, blunders)
+    sentences = sentences_of(verdict, found, candidates, unexplained, untestable, blunders, traces)
     if forbids and verdict == BAD and not blunders:
         sentences.insert(0, f"This run is not to be believed as it stands: {'; '.join(forbids)}.")
     if rejected:
@@ -157,7 +161,7 @@ def conclude(
         untestable=untestable,
         blunders=blunders,
         groups=[*(left.blunder for left in found.blunders), *first.blunders],
-        misfit=misfit,
+        misfit=summary["misfit"],
         curves=curves(first.unnamed),
         too_few=stops_of(first) < FEWEST,
         rejected=rejected,

@@ -20,6 +20,7 @@ def sentences_of(
     unexplained: Sequence[Mapping[str, Any]],
     untestable: Mapping[str, str],
     blunders: Sequence[Mapping[str, Any]],
+    traces: Sequence[str] = (),
 ) -> list[str]:
     """The finding in words, the verdict first; arguments as `conclude` has made them."""
     look = found.looks[0]
@@ -34,7 +35,8 @@ def sentences_of(
     elif verdict == "adequate":
         out.append(
             f"The model is adequate: of {len(look.named.candidates)} known effects and "
-            f"{len(look.unnamed.candidates)} kinds of structure none stands out from chance."
+            f"{len(look.unnamed.candidates)} kinds of structure none "
+            f"{'that matters ' if traces else ''}stands out from chance."
         )
     out += [each["sentence"] for each in blunders[:LISTED]]
     if len(blunders) > LISTED:
@@ -42,6 +44,7 @@ def sentences_of(
     for step in found.found:
         out += _step_sentences(step, next(c for c in candidates if c["add"] == step.effect.name))
     out += [each.sentence for each in found.chance]
+    out += traces
     if verdict == UNNAMED:
         out.insert(0, "Something is here that no known effect explains.")
     for each in unexplained[:2]:

@@ -1,0 +1,151 @@
+"""What a finding would change: the error on stops that were held out, and the calibration.
+
+With many rows a test sees what no user feels. A finding matters where the held-out error would fall
+by a hundredth of what noise alone makes of it, or a value of the calibration would move by half its
+sigma; one that does neither is a trace.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from calib.diagnosis.score import projection
+from calib.diagnosis.screen import Candidate, Screen
+from calib.diagnosis.search import Search
+from calib.diagnosis.stand import Look
+from calib.diagnosis.suggest import hangs_on, words
+
+# Where neither is reached a user would decide nothing otherwise: a hundredth of an error is less
+# than two folds of one recording differ by, and half a sigma widens an interval by a tenth.
+FALL, SHIFT = 0.01, 0.5
+
+
+@dataclass(frozen=True)
+class Matters:
+    """What adding an effect or a structure would change.
+
+    Args:
+        held_out_mm: of the held-out error; negative where it falls.
+        largest_shift_sigmas: of any value of the calibration, in its own sigma.
+        floor_mm: the error that noise alone makes.
+    """
+
+    held_out_mm: float
+    largest_shift_sigmas: float
+    floor_mm: float
+
+    @property
+    def enough(self) -> bool:
+        """Whether it is more than a trace."""
+        return -self.held_out_mm > FALL * self.floor_mm or self.largest_shift_sigmas > SHIFT
+
+    def document(self) -> dict[str, Any]:
+        """As the contract has it."""
+        return {
+            "held_out_mm": self.held_out_mm,
+            "largest_shift_sigmas": self.largest_shift_sigmas,
+        }
+
+
+class Consequences:
+    """What the candidates of a look would change.
+
+    Args:
+        look: at which they were tested.
+        rms_mm: keys ``held_out`` and ``noise_floor`` of a run's summary, or ``fit`` where nothing
+            was held out.
+    """
+
+    def __init__(self, look: Look, rms_mm: Mapping[str, float | None]) -> None:
+        self.look = look
+        self.floor_mm = rms_mm["noise_floor"] or 0.0
+        self.error_mm = rms_mm["held_out"] or rms_mm["fit"] or 0.0
+
+    def of(
+        self, candidate: Candidate, screen: Screen, fall: tuple[float, float, float] | None = None
+    ) -> Matters:
+        """What a candidate would change.
+
+        Args:
+            candidate: of the look.
+            screen: of the look, that it is in.
+            fall: the held-out error before and after it was truly fitted, and the floor, mm; where
+                None, what it explains of the residuals is taken off.
+        """
+        if fall is None:
+            explained = 1e3 * screen.rms_m(candidate)
+            after = np.sqrt(max(self.error_mm**2 - explained**2, 0.0))
+            fall = self.error_mm, float(after), self.floor_mm
+        moved = self._taken[:, candidate.test.columns] @ candidate.test.estimate()
+        shift = float(np.max(np.abs(moved) / self._sigma, initial=0.0))
+        return Matters(fall[1] - fall[0], shift, fall[2])
+
+    @cached_property
+    def _projected(self) -> tuple[np.ndarray, np.ndarray]:
+        """How much (C, Q) of each candidate every value of the calibration takes on, and sigmas."""
+        linear = self.look.linear
+        _, model, taken = projection(linear, linear.candidates)
+        names = [n for n in self.look.stand.problem.calibration if n in linear.at]
+        ours = np.searchsorted(model, linear.among(names))
+        block = linear.information[np.ix_(model, model)]
+        scale = np.sqrt(np.maximum(np.diag(block), 1e-300))
+        inverse = np.linalg.inv(block / np.outer(scale, scale) + 1e-13 * np.eye(len(model)))
+        return taken[ours], np.sqrt(np.diag(inverse)[ours]) / scale[ours]
+
+    @property
+    def _taken(self) -> np.ndarray:
+        return self._projected[0]
+
+    @property
+    def _sigma(self) -> np.ndarray:
+        return self._projected[1]
+
+
+def weighed(
+    found: Search,
+    held_out: Mapping[str, tuple[float, float, float]],
+    rms_mm: Mapping[str, float | None],
+) -> tuple[Search, dict[str, Matters], list[str]]:
+    """A search without its traces.
+
+    Args:
+        found: the search.
+        held_out: effect -> held-out rms before and after it was truly fitted, and noise floor, mm.
+        rms_mm: as of `Consequences`.
+
+    Returns:
+        What is left of it; effect -> what it would change; and a sentence for each trace.
+    """
+    matter, named, traces = {}, [], []
+    for step in found.found:
+        screen, name = step.before.named, step.effect.name
+        told = Consequences(step.before, rms_mm).of(step.candidate, screen, held_out.get(name))
+        matter[name] = told
+        if told.enough:
+            named.append(step)
+        else:
+            traces.append(_sentence(name, step.candidate, screen, told))
+    kept: dict[str, list[Candidate]] = {"unnamed": [], "at_first": []}
+    for key, look in (("unnamed", found.looks[-1]), ("at_first", found.looks[0])):
+        every, weigh = getattr(found, key), Consequences(look, rms_mm)
+        for candidate in every:
+            told = weigh.of(candidate, look.unnamed)
+            if told.enough:
+                kept[key].append(candidate)
+            elif key == "unnamed":
+                what = " and ".join(words(c) for c in hangs_on(candidate.effect))
+                traces.append(_sentence(f"structure over {what}", candidate, look.unnamed, told))
+    return replace(found, found=named, **kept), matter, traces
+
+
+def _sentence(what: str, candidate: Candidate, screen: Screen, told: Matters) -> str:
+    return (
+        f"A trace of {what} is there, {1e3 * screen.rms_m(candidate):.2f} mm rms, too small to "
+        f"matter: it would change the held-out error by {told.held_out_mm:+.3f} mm, and no value "
+        f"of the calibration by more than {told.largest_shift_sigmas:.1f} of its sigmas."
+    )

@@ -1,0 +1,80 @@
+"""What a finding would change, as predicted, is what it does change once it is fitted."""
+
+import numpy as np
+import pytest
+
+from calib import diagnose, fit
+from calib.diagnosis.stand import Stand
+from calib.diagnosis.verdict.matters import FALL, SHIFT, Consequences, Matters
+from calib.effects import find
+from calib.problem import build
+from calib.problem.model import Model, Source
+from calib.simulation import Spec, simulate
+from calib.solve.fit import solve
+
+SPEC = Spec(lidar="hesai_pandarxt32", locations=6, stops_per_location=4, column_step=100)
+
+
+def quiet(what, done, total):
+    pass
+
+
+@pytest.fixture(scope="module")
+def look(tmp_path_factory):
+    """A fit that lacks an incidence bias, looked at."""
+    folder = tmp_path_factory.mktemp("matters") / "rec"
+    simulate(SPEC, folder, 11, {"incidence_angle_bias": 0.3})
+    source, model = [Source.open(folder)], Model()
+    problem = build(source, model)
+    return Stand(source, model, problem, solve(problem)).look(quiet)
+
+
+def test_values_move_as_far_as_predicted(look):
+    candidate = next(c for c in look.named.candidates if c.effect.name == "incidence_angle_bias")
+    rms_mm = {"held_out": 3.0, "fit": 3.0, "noise_floor": 2.0}
+    told = Consequences(look, rms_mm).of(candidate, look.named)
+    after = look.stand.with_effects([find("incidence_angle_bias")], quiet).estimate
+    before = look.stand.estimate
+    found = []
+    at = np.cumsum([0, *(v.dim for v in after.variables)])
+    sigma = np.sqrt(np.diag(after.covariance))
+    for v, start in zip(after.variables, at, strict=False):
+        if v.name in before.values:
+            moved = v.difference(before.values[v.name], after.values[v.name])
+            found.append(np.abs(moved) / sigma[start : start + v.dim])
+    largest = np.concatenate(found).max()
+    # Its own sigma without the effect is smaller, as that holds what the effect does besides.
+    assert largest > 2 and 0.5 < told.largest_shift_sigmas / largest < 4
+
+
+def test_the_error_falls_by_what_is_explained(look):
+    candidate = next(c for c in look.named.candidates if c.effect.name == "incidence_angle_bias")
+    weigh = Consequences(look, {"held_out": 3.0, "fit": 1.0, "noise_floor": 2.0})
+    explained = 1e3 * look.named.rms_m(candidate)
+    expected = np.sqrt(9.0 - explained**2) - 3.0
+    assert weigh.of(candidate, look.named).held_out_mm == pytest.approx(expected)
+    assert weigh.of(candidate, look.named, (5.0, 2.5, 2.0)).held_out_mm == -2.5
+
+
+@pytest.mark.parametrize(
+    ("fall_mm", "shift", "enough"),
+    [
+        (-1.1 * FALL * 2.0, 0.0, True),
+        (-0.9 * FALL * 2.0, 0.0, False),
+        (0.0, 1.1 * SHIFT, True),
+        (+1.0, 0.9 * SHIFT, False),
+    ],
+)
+def test_either_of_them_is_enough(fall_mm, shift, enough):
+    assert Matters(fall_mm, shift, 2.0).enough is enough
+
+
+def test_what_matters_stands_with_each_finding_and_a_trace_is_said_to_be_one(tmp_path):
+    """0.08 mm of 1.6, of a pattern that no value of the calibration is like."""
+    simulate(SPEC, tmp_path / "rec", 4, {"azimuth_range_harmonic": 0.03})
+    found = diagnose(fit([tmp_path / "rec"], tmp_path / "run"))
+    (told,) = (c["matters"] for c in found.candidates if c["effect"] == "azimuth_range_harmonic")
+    assert -0.01 < told["held_out_mm"] < 0 < told["largest_shift_sigmas"] < SHIFT
+    traces = [s for s in found.sentences if s.startswith("A trace of")]
+    assert found.verdict == "adequate" and not found.worth_adding
+    assert len(traces) == 1 and "none that matters" in found.sentences[0]
