@@ -9,7 +9,8 @@ import numpy as np
 NEAREST_M = 0.5
 TAIL_DOF = 6  # of Student's t, which single ranges follow: tails are slightly heavy
 SPREAD = 0.15  # of log sigma between beams
-STRADDLE_RAD, JUMP_M, MIXED = 0.005, 0.05, 0.004  # mixed pixels: a beam's width, how many
+STRADDLE_RAD, JUMP_M, MIXED = 0.005, 0.05, 0.002  # at edges: a beam's width, how many are mixed
+STRAY = 0.002  # of all beams: they graze what is too thin for a mesh
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,7 @@ LABELS = {
 FURNITURE = ("wood_panel", "metal_cabinet", "cardboard", "plastic_black", "foam")
 CELL_M = 0.2  # of the mesh
 WAVES, SHORTEST_M, LONGEST_M = 12, 0.5, 4.0  # of the mesh's error on a surface
+TRIES = 200  # to place a box of clutter
 WARPED = 2  # the surface whose error a warp adds to: a wall
 
 
@@ -195,19 +196,20 @@ def cluttered(
         The boxes alone; none where the share is 0.
     """
     out = Quads(*(np.zeros((0, 3)) for _ in range(3)), np.zeros(0, int))
-    most = SIZE_M[:2] / 2 - 0.5
-    for _ in range(200):
-        both = quads.and_(out)
-        met = [
-            both.hit(*each)[1] >= len(quads.corner) for each in zip(starts, towards, strict=True)
-        ]
-        if np.mean(met) >= share:
+    free = [quads.hit(*each)[0] for each in zip(starts, towards, strict=True)]
+    met = np.zeros((len(starts), towards.shape[1]), bool)
+    most, middle = SIZE_M[:2] / 2 - 0.5, starts[:, :2].mean(axis=0)
+    for _ in range(TRIES):
+        if met.mean() >= share:
             break
         size = rng.uniform([0.15, 0.15, 0.4], [0.35, 0.35, 1.7])
         bearing, away = rng.uniform(0, 2 * np.pi), rng.uniform(0.6, 1.8)
-        xy = starts[:, :2].mean(axis=0) + away * np.array([np.cos(bearing), np.sin(bearing)])
+        xy = middle + away * np.array([np.cos(bearing), np.sin(bearing)])
         near = np.linalg.norm(starts[:, :2] - xy, axis=1).min() < 0.45
         if not near and np.all(np.abs(xy) < most):
-            at = np.array([*xy, size[2] / 2])
-            out = out.and_(box(at, size, rng.uniform(0, np.pi), "cardboard"))
+            yaw = rng.uniform(0, np.pi)
+            more = box(np.array([*xy, size[2] / 2]), size, yaw, "cardboard")
+            bundles = zip(starts, towards, strict=True)
+            met |= [more.hit(*each)[0] < far for each, far in zip(bundles, free, strict=True)]
+            out = out.and_(more)
     return out

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from . import arm, effects, room
-from .beams import JUMP_M, MIXED, NEAREST_M, STRADDLE_RAD, Lidar, averaged
+from .beams import JUMP_M, MIXED, NEAREST_M, STRADDLE_RAD, STRAY, Lidar, averaged
 from .hardware import (
     BELOW_M,
     BODIES,
@@ -185,7 +185,7 @@ def _mixed(
     beside: np.ndarray,
     met: tuple[np.ndarray, np.ndarray],
 ) -> np.ndarray:
-    """Ranges (N,) m of which a few, of beams that straddle an edge, lie between near and far.
+    """Ranges (N,) m of which a few lie between near and far, at edges and at what is thin.
 
     Args:
         rng: of which and where between.
@@ -202,4 +202,4 @@ def _mixed(
     chosen = rng.permutation(edges)[: round(MIXED * len(range_m))]
     out = range_m.copy()
     out[chosen] += rng.uniform(0.1, 0.9, len(chosen)) * step_m[chosen]
-    return out
+    return out * np.where(rng.random(len(out)) < STRAY, rng.uniform(0.3, 1.0, len(out)), 1.0)
