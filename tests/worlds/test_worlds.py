@@ -15,7 +15,7 @@ from . import World, arm, effects, room, write
 from .beams import TAIL_DOF, averaged, model
 from .hardware import SIGMA_MESH_M, SIGMA_TRACKER_M
 from .knobs import LIDARS
-from .poses import apply, inverse, moved, pose, quaternion, rpy, turn, turn_vector
+from .poses import inverse, moved, pose, quaternion, rpy, turn, turn_vector
 
 SMALL = World(seed=3, locations=2, stops=2, beams=400)
 
@@ -144,32 +144,43 @@ def test_a_seed_makes_the_same_bytes_again(small, tmp_path):
     assert json.loads(Path(f"{folder}.truth.json").read_text()) == json.loads(json.dumps(truth))
 
 
-def test_points_lie_in_the_room_where_the_truth_puts_them(small):
+HIDDEN = (("gravity_sag", 1e-3), ("warm_up", 0.05), ("incidence", 0.02))
+
+
+@pytest.mark.parametrize("hidden", [(), HIDDEN], ids=["nothing hidden", "much hidden"])
+def test_points_lie_in_the_room_where_the_truth_puts_them(tmp_path, hidden):
     """Files alone, through the true frames: points of a scan are on the walls, to the noise."""
-    folder, truth = small
-    stops = pd.read_csv(folder / "stops.csv")
-    T = {name: np.array(each) for name, each in truth["frames"].items()}
-    T_faro_opti, rings = np.array(truth["T_faro_opti"]), np.array(truth["ring_range_offset"])
-    for _, stop in stops.iterrows():
-        body = [stop[f"base_markers.{part}"] for part in ("x", "y", "z")]
-        w, *xyz = (stop[f"base_markers.{part}"] for part in ("qw", "qx", "qy", "qz"))
-        angle = 2 * np.arccos(w)
-        R = turn(np.array(xyz) / np.sin(angle / 2), angle)
-        T_faro_base = T_faro_opti @ pose(R, np.array(body)) @ inverse(T["base_markers"])
-        angles = stop[list(arm.JOINTS)].to_numpy(float) + truth["joint_offset"]
-        tip = arm.along(angles[None], arm.lengthened(np.array(truth["dlen"])))[0, -1]
-        T_faro_lidar = T_faro_base @ T["arm_base"] @ tip @ T["mount"] @ T["lidar"]
+    world, folder = replace(SMALL, hidden=hidden), tmp_path / "recording"
+    truth = write(world, folder)
+    quads, rings = room.furnished(world.rng("room")), np.array(truth["ring_range_offset"])
+    for _, stop in pd.read_csv(folder / "stops.csv").iterrows():
+        T = T_faro_lidar(stop, truth)
         scan = pd.read_parquet(folder / "scans" / f"{stop['stop']}.parquet")
         xyz = scan[["x", "y", "z"]].to_numpy(float)
         length = np.linalg.norm(xyz, axis=1)
-        xyz = xyz * (1 - rings[scan["ring"]] / length)[:, None]
-        quads = room.furnished(SMALL.rng("room"))
-        towards = xyz @ T_faro_lidar[:3, :3].T
-        length = np.linalg.norm(towards, axis=1)
-        start = np.broadcast_to(T_faro_lidar[:3, 3], towards.shape)
-        reach, _ = quads.hit(start, towards / length[:, None])
+        towards = (xyz / length[:, None]) @ T[:3, :3].T
+        reach, which = quads.hit(T[:3, 3], towards)
+        cosine = np.abs(np.sum(towards * quads.normal[which], axis=1))
+        where = (stop["time_s"], stop["temperature_c"])
+        length = length - rings[scan["ring"]]
+        length -= effects.of_range(world.hidden, cosine, np.zeros(len(length)), *where)
         assert np.median(np.abs(length - reach)) < 0.002
-        assert np.all(np.abs(apply(T_faro_lidar, xyz)[:, :2]) < room.SIZE_M[:2] / 2 + 0.05)
+        on_walls = T[:3, 3] + length[:, None] * towards
+        assert np.all(np.abs(on_walls[:, :2]) < room.SIZE_M[:2] / 2 + 0.05)
+
+
+def T_faro_lidar(stop, truth):
+    """Of a row of stops.csv: from the base that the tracker saw, the joints read, and the truth."""
+    T = {name: np.array(each) for name, each in truth["frames"].items()}
+    w, *xyz = (stop[f"base_markers.{part}"] for part in ("qw", "qx", "qy", "qz"))
+    angle = 2 * np.arccos(w)
+    R = turn(np.array(xyz) / np.sin(angle / 2), angle)
+    seen = pose(R, np.array([stop[f"base_markers.{part}"] for part in "xyz"]))
+    read = stop[list(arm.JOINTS)].to_numpy(float)[None]
+    angles = read + truth["joint_offset"] + effects.of_joints(truth["params"].items(), read)
+    tip = arm.along(angles, arm.lengthened(np.array(truth["dlen"])))[0, -1]
+    T_faro_base = np.array(truth["T_faro_opti"]) @ seen @ inverse(T["base_markers"])
+    return T_faro_base @ T["arm_base"] @ tip @ T["mount"] @ T["lidar"]
 
 
 def test_knobs_change_what_they_name_and_nothing_else(small, tmp_path):
