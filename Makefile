@@ -1,6 +1,7 @@
 # make demo       simulates a recording, calibrates it, exports and reports the result, in demo/
 # make test       checks style and runs every test but the long ones
 # make test-long  runs the long ones: how often intervals hold, what else is found by its name
+# make bench-hidden  counts false alarms, intervals that hold, effects found by name; CASES=4 of each kind
 # make clean      removes what these made
 #
 # With LOCKED=1 they install the versions in requirements.lock, each held to its hash, and no others.
@@ -35,7 +36,7 @@ INSTALLED = .venv/.installed
 TESTED = .venv/.tested
 endif
 
-.PHONY: demo test test-long system browser clean lock audit licences dist dist-check
+.PHONY: demo test test-long bench-hidden system browser clean lock audit licences dist dist-check
 
 demo: system
 	@echo "== demo: a simulated recording of the default rig"
@@ -61,6 +62,14 @@ test: system browser $(TESTED)
 test-long: system browser $(TESTED)
 	@echo "== test-long: pytest"
 	$(PYTEST) -m long
+
+CASES = 4
+bench-hidden: system $(TESTED)
+	@mkdir -p build
+	@echo "== bench-hidden: nothing is hidden, in worlds of a simulator of their own"
+	$(BIN)/python -m tests.bench.chance --count $(CASES) -o build/chance.jsonl
+	@echo "== bench-hidden: effects, pairs and what no catalogue has"
+	$(BIN)/python -m tests.bench.hidden_effects --cases $(CASES) -o build/hidden_effects.jsonl
 
 clean:
 	@echo "== clean: removing the environment, the demo and what the tools left"

@@ -1,0 +1,50 @@
+"""What can be chosen of a world."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+
+import numpy as np
+
+LIDARS = ("hesai_pandarxt32", "hesai_pandarqt64", "ouster_os0_128_rev7")
+
+
+@dataclass(frozen=True)
+class World:
+    """One recording: the defaults are a good one.
+
+    Args:
+        seed: of all that is drawn; each part has a stream of its own, so that worlds which differ
+            in one knob share the rest.
+        lidar: of `LIDARS`.
+        locations: where the base stands.
+        stops: at each location.
+        sweeps: that are averaged at a stop; with 1 no scatter within the hold is known.
+        beams: of a stop, about; columns are left out until so few are left.
+        stop_scatter_m: standard deviation of a range zero that each stop has of its own.
+        location_scatter_m: the same of each location.
+        tracker_factor: how many times the tracker is worse than rig.yaml says.
+        mesh_error_factor: how many times the mesh is worse than rig.yaml says.
+        warp_m: how far the middle of one wall is bowed out of the mesh's plane.
+        clutter: share of the beams that hit boxes which are not in the mesh, about.
+        hidden: effects with their sizes, of `effects.EFFECTS`.
+    """
+
+    seed: int = 0
+    lidar: str = LIDARS[0]
+    locations: int = 6
+    stops: int = 5
+    sweeps: int = 20
+    beams: int = 2000
+    stop_scatter_m: float = 0.0
+    location_scatter_m: float = 0.0
+    tracker_factor: float = 1.0
+    mesh_error_factor: float = 1.0
+    warp_m: float = 0.0
+    clutter: float = 0.0
+    hidden: tuple[tuple[str, float], ...] = ()
+
+    def rng(self, part: str) -> np.random.Generator:
+        """The stream of random numbers of one part of the world."""
+        return np.random.default_rng([self.seed, zlib.crc32(part.encode())])
