@@ -16,8 +16,8 @@ weights of other stops stay as they are, so that one wild row does not hide the 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.linalg import block_diag, cho_factor, cho_solve
@@ -47,6 +47,7 @@ class Shift:
         information: (q, q) of an offset, all else being estimated.
         axes: (q,) names of the directions.
         units: (q,) "m" or "rad" each.
+        squares: unit -> sum of squares of its whitened rows, and of their redundancies; of rows.
     """
 
     group: Group
@@ -57,6 +58,7 @@ class Shift:
     information: np.ndarray
     axes: Sequence[str]
     units: Sequence[str]
+    squares: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def of_ranges(self) -> bool:
@@ -120,6 +122,19 @@ def standing_alone(
         if _statistic(M, u, np.append(gone, at)) - _statistic(M, u, gone) > limit:
             gone, alone = np.append(gone, at), [*alone, shift.group]
     return alone
+
+
+def of_cells(whole: Linearisation, problem: Problem) -> tuple[float, float]:
+    """The sum of squares of what the mesh's surfaces stand off, whitened, and of redundancies."""
+    others, total, left = _Others.of(whole), 0.0, 0.0
+    for name in problem.cells:
+        sigma, columns = problem.variables[name].sigma, whole.layout.columns([name])
+        total += float(np.square(whole.values[name] / sigma).sum())
+        for some in np.array_split(np.arange(len(sigma)), -(-len(sigma) // TOGETHER)):
+            rows = np.zeros((len(some), whole.layout.size))
+            rows[np.arange(len(some)), columns[some]] = 1.0 / sigma[some]
+            left += float(np.sum(1.0 - np.diag(whole.covariance(rows, others.kept))))
+    return total, left
 
 
 def _statistic(M: np.ndarray, u: np.ndarray, at: np.ndarray) -> float:
@@ -259,7 +274,16 @@ def _of_rows(group: Group, rows: GroupRows, b: np.ndarray, H: np.ndarray) -> Shi
         information=(told * values) @ told.T,
         axes=[rows.axes[i] for i in at],
         units=[rows.units[i] for i in at],
+        squares=_squares(rows, b, H),
     )
+
+
+def _squares(rows: GroupRows, b: np.ndarray, H: np.ndarray) -> dict[str, tuple[float, float]]:
+    units, left = np.array(rows.units), 1.0 - np.diag(H)
+    return {
+        unit: (float(np.square(b[units == unit]).sum()), float(left[units == unit].sum()))
+        for unit in dict.fromkeys(rows.units)
+    }
 
 
 def _kept_covariance(whole: Linearisation, graph_rows: GraphRows) -> np.ndarray:

@@ -18,16 +18,44 @@ import numpy as np
 from scipy import special
 
 from calib.blunders.chance import after_looks
+from calib.blunders.shifts import Shift, of_cells
 from calib.diagnosis.score import Scores
-from calib.effects import Scatter
-from calib.solve.components import SEEN, Told, spreads, told
+from calib.effects import CATALOGUE, Scatter, Site
+from calib.linear.system import Linearisation
+from calib.problem import Problem
+from calib.problem.spread import REFERENCE, sigmas
+from calib.results.solution import one_unit
+from calib.solve.components import SEEN, Sums, Told, sigma_beyond, spreads, squares, told
 from calib.solve.estimate import Estimate
 
 ALPHA = 0.01  # chance that a scatter is found where there is none
 POWER = 0.8  # with which one of the smallest detectable spread is found
-FEWEST = 4  # members that anything tells of, below which nothing is said of their spread
+FEWEST = 4  # members, or checks of a body's rows, below which nothing is said of their spread
+LOOKS = sum(effect.by_chance for effect in CATALOGUE)  # effects that are looked at
 DRAWS = 2000
 GRID = np.append(0.0, np.geomspace(1e-3, 1e3, 61))  # of d, in units of the mean 1 / l
+
+
+@dataclass(frozen=True)
+class Spread:
+    """How widely values scatter, or the rows of one body beyond their sigma.
+
+    Args:
+        of: the body; empty where the effect has one spread.
+        unit: "m" or "rad".
+        sd, sigma: the spread, and its sigma.
+    """
+
+    of: str
+    unit: str
+    sd: float
+    sigma: float
+
+    @property
+    def told(self) -> str:
+        """As people read it."""
+        unit = {"m": "mm", "rad": "mrad"}[self.unit]
+        return f"{1e3 * self.sd:.2f} ± {1e3 * self.sigma:.2f} {unit}"
 
 
 @dataclass(frozen=True)
@@ -36,21 +64,22 @@ class Chance:
 
     Args:
         effect: which.
-        sd: how widely its values scatter.
-        sigma: of the sd.
+        spreads: how widely it scatters; of several bodies, in each of their units.
         statistic: the likelihood ratio against none.
         p_value: how often as much is seen where there is none.
-        p_adjusted: the same, the others of its kind being looked at too.
-        detectable: sd that is found with 80 % power.
+        detectable: spread that is found with 80 % power; of bodies that of a position.
     """
 
     effect: Scatter
-    sd: float
-    sigma: float
+    spreads: Sequence[Spread]
     statistic: float
     p_value: float
-    p_adjusted: float
     detectable: float
+
+    @property
+    def p_adjusted(self) -> float:
+        """Its p-value, all effects by chance being looked at."""
+        return float(after_looks(self.p_value, LOOKS))
 
     @property
     def found(self) -> bool:
@@ -59,21 +88,25 @@ class Chance:
 
     def beside(self, estimate: Estimate) -> Chance:
         """The same as a fit has it that it is part of, tested beside all else in that."""
-        spread, best = spreads(estimate), self
-        for name in (n for n in spread if n.rpartition("/")[2] == self.effect.name):
-            unknown = estimate.problem.variables[name]
-            test = AtZero(told([unknown], estimate.values, estimate.covariance_of([name])))
-            statistic, p = test.p_value()
-            sd, sigma = spread[name]
-            again = replace(self, sd=sd, sigma=sigma, statistic=statistic, p_value=p, p_adjusted=p)
-            best = again if best is self or statistic > best.statistic else best
-        return best
+        if self.effect.widens:
+            return _of_rows(self.effect, squares(estimate), estimate.problem) or self
+        found = []
+        for name, (sd, sigma) in spreads(estimate).items():
+            if name.rpartition("/")[2] == self.effect.name:  # before it: of several rigs, which
+                unknown = estimate.problem.variables[name]
+                test = AtZero(told([unknown], estimate.values, estimate.covariance_of([name])))
+                statistic, p = test.p_value()
+                each = [Spread("", self.effect.unit, sd, sigma)]
+                found.append(replace(self, spreads=each, statistic=statistic, p_value=p))
+        return max(found, key=lambda chance: chance.statistic)
 
-    @property
-    def spread(self) -> dict[str, Any]:
+    def told(self) -> list[dict[str, Any]]:
         """How widely it scatters, as the contract has it."""
-        effect = self.effect
-        return {"effect": effect.name, "sd": self.sd, "sigma": self.sigma, "unit": effect.unit}
+        return [
+            {"effect": self.effect.name, **({"of": s.of} if s.of else {})}
+            | {"sd": s.sd, "sigma": s.sigma, "unit": s.unit}
+            for s in self.spreads
+        ]
 
     def document(self, step: int | None) -> dict[str, Any]:
         """As one of the candidates of diagnosis.json.
@@ -81,40 +114,46 @@ class Chance:
         Args:
             step: in which it was added, counting from 1; None where it was not.
         """
+        size_mm = 1e3 * max(spread.sd for spread in self.spreads if spread.unit == "m")
         return {
             "effect": self.effect.family,
             "add": self.effect.name,
-            "site": "range",
+            "site": "range" if self.effect.site is Site.BEAM else self.effect.site.value,
             "p_value": self.p_value,
             "p_adjusted": self.p_adjusted,
             "statistic": self.statistic,
-            "dof": 1,
+            "dof": len(self.spreads),
             "step": step,
             "dressed_up": False,
             "held_out_rms_mm": {"before": None, "after": None},
             "error_explained": None,
-            "rms_mm": 1e3 * self.sd,
-            "unabsorbed_rms_mm": 1e3 * self.sd,
+            "rms_mm": size_mm,
+            "unabsorbed_rms_mm": size_mm,
             "parameters": {
-                "unit": self.effect.unit,
-                "names": ["sd"],
-                "estimate": [self.sd],
-                "sigma": [self.sigma],
+                "unit": one_unit([spread.unit for spread in self.spreads]),
+                "names": [f"{s.of}.{s.unit}" if s.of else "sd" for s in self.spreads],
+                "estimate": [spread.sd for spread in self.spreads],
+                "sigma": [spread.sigma for spread in self.spreads],
             },
             "smallest_detectable": self.detectable,
             "indistinguishable_from": [],
             "rivals": [],
+            "matters": None,
         }
 
     @property
     def sentence(self) -> str:
         """What it says, and what to do about it."""
         each, name = self.effect.per, self.effect.name
+        if self.effect.widens:
+            parts = [f"{s.of} {s.told}" for s in self.spreads if s.sd > s.sigma]
+            what = f"More scatter than rig.yaml says, beyond its sigma: {', '.join(parts)}"
+        else:
+            what = f"{each.capitalize()}s scatter by {self.spreads[0].told} in range"
         return (
-            f"{each.capitalize()}s scatter by {1e3 * self.sd:.2f} +- {1e3 * self.sigma:.2f} mm in "
-            f"range, by chance as far as this data tell (p = {self.p_adjusted:.1g}): {name} takes "
-            f"that into every sigma. It tells nothing of the next {each}, so no held-out error "
-            f"falls."
+            f"{what}; by chance as far as this data tell (p = {max(self.p_adjusted, 1e-99):.1g}). "
+            f"{name} takes that into every sigma; it tells nothing of the next {each}, so no "
+            f"held-out error falls."
         )
 
 
@@ -178,14 +217,14 @@ class AtZero:
 def chances(
     scores: Scores, some: Sequence[Scatter], columns: Mapping[str, np.ndarray]
 ) -> list[Chance]:
-    """The tests of effects by chance, those that chance explains least first.
+    """The tests of effects whose values are drawn by chance.
 
     Args:
         scores: of candidates, these among them.
         some: those to test.
         columns: effect's name -> its columns among the scores.
     """
-    out, looks = [], len(some)
+    out = []
     for effect in some:
         at = columns[effect.name]
         rows = Told(scores.score[at], scores.information[np.ix_(at, at)], np.zeros(len(at), int))
@@ -194,15 +233,62 @@ def chances(
             continue
         sd = rows.spread(np.array([effect.sigma]))
         statistic, p = test.p_value()
-        out.append(
-            Chance(
-                effect=effect,
-                sd=float(sd[0]),
-                sigma=float(rows.sigma(sd)[0]),
-                statistic=statistic,
-                p_value=p,
-                p_adjusted=float(after_looks(p, looks)),
-                detectable=test.detectable(ALPHA / looks),
-            )
-        )
-    return sorted(out, key=lambda chance: (chance.p_value, -chance.statistic))
+        spread = Spread("", effect.unit, float(sd[0]), float(rows.sigma(sd)[0]))
+        detectable = test.detectable(ALPHA / LOOKS)
+        out.append(Chance(effect, [spread], statistic, p_value=p, detectable=detectable))
+    return out
+
+
+def ranked(some: Sequence[Chance]) -> list[Chance]:
+    """Those that chance explains least first."""
+    return sorted(some, key=lambda chance: (chance.p_value, -chance.statistic))
+
+
+def rows_by_chance(
+    effects: Sequence[Scatter], good: Sequence[Shift], whole: Linearisation, problem: Problem
+) -> list[Chance]:
+    """The tests that rows of tracked bodies, and the mesh's surfaces, scatter beyond their sigmas;
+    of those that next to nothing checks there is none.
+
+    Args:
+        effects: that say so.
+        good: the groups of rows that are no blunders.
+        whole: all rows, linearised at the fit.
+        problem: of the fit.
+    """
+    sums: dict[tuple[str, str], tuple[float, float]] = {}
+    for shift in (s for s in good if s.group.kind == "body"):
+        for unit, (total, left) in shift.squares.items():
+            before = sums.get((shift.group.what, unit), (0.0, 0.0))
+            sums[shift.group.what, unit] = before[0] + total, before[1] + left
+    if problem.cells:
+        sums[REFERENCE, "m"] = of_cells(whole, problem)
+    found = (_of_rows(effect, sums, problem) for effect in effects)
+    return [chance for chance in found if chance is not None]
+
+
+def _of_rows(effect: Scatter, sums: Sums, problem: Problem) -> Chance | None:
+    """The test that rows have the variance that is stated: the sum of their squares is near
+    chi-square with their redundancy for degrees of freedom."""
+    known, spreads, p, statistic, detectable = sigmas(problem), [], [], 0.0, np.inf
+    of_bodies = effect.site is Site.TRACKER
+    mine = {key: each for key, each in sums.items() if (key[0] != REFERENCE) == of_bodies}
+    checked = {key: each for key, each in mine.items() if each[1] >= FEWEST}
+    for (what, unit), (total, left) in checked.items():
+        sigma, beyond = known[what, unit]
+        variance = sigma**2 - beyond**2
+        total *= sigma**2 / variance  # as its first sigma has it
+        factor = total / left
+        sd = float(np.sqrt(max(factor - 1.0, 0.0) * variance))
+        of = sigma_beyond(sd, max(factor, 1.0) * variance, left)
+        spreads.append(Spread(what, unit, sd, of))
+        p.append(float(special.chdtrc(left, total)))
+        statistic += left * (factor - 1.0 - np.log(factor)) if factor > 1.0 else 0.0
+        if unit == "m":
+            limit = special.chdtri(left, ALPHA / LOOKS / len(checked))
+            least = np.sqrt(variance * (limit / special.chdtri(left, POWER) - 1.0))
+            detectable = min(detectable, float(least))
+    if not any(spread.unit == "m" for spread in spreads):
+        return None
+    p_value = float(after_looks(min(p), len(p)))
+    return Chance(effect, spreads, statistic, p_value=p_value, detectable=detectable)

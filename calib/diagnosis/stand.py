@@ -18,12 +18,12 @@ from calib.diagnosis.candidates import (
     stops_view,
     structure,
 )
-from calib.diagnosis.chance import Chance, chances
+from calib.diagnosis.chance import Chance, chances, ranked, rows_by_chance
 from calib.diagnosis.jackknife import Shares
 from calib.diagnosis.linear import Linear, linearise_with, rows_along
 from calib.diagnosis.score import Test, away_from_model, project, test
 from calib.diagnosis.screen import Candidate, Screen, screen
-from calib.effects import Effect, Site
+from calib.effects import Effect, Scatter, Site
 from calib.problem import Problem
 from calib.problem.model import Model, Source
 from calib.problem.without import leave_out
@@ -80,6 +80,8 @@ class Stand:
         """Test everything that the model lacks."""
         columns, sample = self.columns
         known = known_effects(self.model, self.sources, columns)
+        wider = [e for e in known if e.widens]
+        known = [e for e in known if not e.widens]
         there = set(self.model.names)
         unnamed = [e for e in structure(self.sources, sample) if e.name not in there]
         linear, at = self.linearise((*known, *unnamed), progress)
@@ -95,7 +97,8 @@ class Stand:
             named=named,
             unnamed=rest,
             noise=noise,
-            chance=chances(scores, chance, at),
+            values=chances(scores, chance, at),
+            wider=wider,
             columns=columns,
         )
 
@@ -229,7 +232,8 @@ class Look:
         named: the catalogue's effects, tested.
         unnamed: structure, tested.
         noise: effects on the scatter, tested; they move no mean.
-        chance: effects that are drawn anew by chance, tested.
+        values: effects whose values are drawn anew by chance, tested.
+        wider: effects by chance that widen the sigmas of rows, not in the model.
         columns: what points and stops carry.
     """
 
@@ -238,13 +242,21 @@ class Look:
     named: Screen
     unnamed: Screen
     noise: Screen
-    chance: Sequence[Chance]
+    values: Sequence[Chance]
+    wider: Sequence[Scatter]
     columns: frozenset[str]
 
     @cached_property
     def blunders(self) -> list[Blunder]:
         """All groups of rows, those that chance explains least first."""
         return judge(self.linear.whole, self.stand.estimate.problem)
+
+    @cached_property
+    def chance(self) -> list[Chance]:
+        """What may scatter by chance, that which chance explains least first."""
+        good = [blunder.shift for blunder in self.blunders if not blunder.found]
+        of_rows = rows_by_chance(self.wider, good, self.linear.whole, self.stand.estimate.problem)
+        return ranked([*self.values, *of_rows])
 
     @property
     def checked(self) -> set[Group]:

@@ -84,7 +84,7 @@ def standing_in(look: Look) -> list[dict[str, Any]]:
     """
     linear, stand = look.linear, look.stand
     ours = {t.effect.name: (t.effect, t.variable) for terms in stand.problem.terms for t in terms}
-    ours = {n: v for n, v in ours.items() if n in stand.model.names}
+    ours = {n: v for n, v in ours.items() if n in stand.model.names and not v[0].by_chance}
     out = []
     for name, (effect, variable) in ours.items():
         theirs, model, taken = projection(linear, [*linear.candidates, variable])

@@ -50,7 +50,13 @@ from calib.effects.range import (
 )
 from calib.effects.reference import FaroScale, MovedSurface
 from calib.effects.rig import BaseFlex, FrameOffset, MountBending, MountCreep, MountSlip
-from calib.effects.scatter import LocationRangeScatter, Scatter, StopRangeScatter
+from calib.effects.scatter import (
+    LocationRangeScatter,
+    ReferenceScatter,
+    Scatter,
+    StopRangeScatter,
+    TrackerScatter,
+)
 from calib.effects.targets import TargetRodTilt, TargetSphereOffset
 from calib.effects.tracker import BaseSlip, BodySlip, OptitrackDistortion, OptitrackScale
 from chains.errors import InputError
@@ -103,6 +109,8 @@ CATALOGUE: tuple[Effect, ...] = (
     NoiseIntensity(),
     StopRangeScatter(),
     LocationRangeScatter(),
+    TrackerScatter(),
+    ReferenceScatter(),
 )
 DEFAULT = ("arm_link_length", "arm_joint_offset", "ring_range_offset")
 

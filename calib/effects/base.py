@@ -113,6 +113,7 @@ class Effect(ABC):
         origin: the Python file and class of a user's effect; None for one of the catalogue.
         of_lidar: True when the effect belongs to the mounted LiDAR, so that rigs do not share it.
         by_chance: True where its parameters are drawn by chance, and their spread is estimated.
+        widens: of those, True where the rows that it acts on get a wider sigma instead of values.
     """
 
     name: str
@@ -127,6 +128,7 @@ class Effect(ABC):
     shape: float = 0.0
     whole: ClassVar[bool] = False
     by_chance: ClassVar[bool] = False
+    widens: ClassVar[bool] = False
     origin: Mapping[str, Any] | None = None
 
     @property

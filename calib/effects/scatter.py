@@ -1,9 +1,10 @@
 """What chance does anew at every stop or place: random effects, whose spread is what is estimated.
 
 Each member of a group (a stop, a location) has a value of its own about zero, ``a ~ N(0, sd^2)``.
-The values are unknowns of the graph with that prior; the sd is estimated from them (see
-`calib.solve.components`). Values of one stop say nothing of the next: they correct no other
-recording, but without them errors that rows share count as so many independent ones.
+The values are unknowns of the graph with that prior; or, where each is seen by rows of its own
+only, those rows have a wider sigma. The sd is estimated (see `calib.solve.components`). Values of
+one stop say nothing of the next: they correct no other recording, but without them errors that rows
+share count as so many independent ones.
 """
 
 from __future__ import annotations
@@ -16,7 +17,10 @@ import numpy as np
 
 from calib.effects.base import Effect, OneHot, Param, Site, View
 from calib.effects.basis import RANGE
+from calib.effects.rig import DOF
 from calib.rig import Rig
+
+UNITS = ("rad",) * 3 + ("m",) * 3  # of `DOF`
 
 
 class Scatter(Effect):
@@ -83,3 +87,60 @@ class LocationRangeScatter(StopRangeScatter):
     covariates = ("location",)
     formula = "range = true + a_location, a_location by chance with a spread of sd"
     confounded_with = ("stop_range_scatter", "temperature_drift", "warmup_drift")
+
+
+class TrackerScatter(Scatter):
+    """The tracker scatters more from stop to stop than rig.yaml says, in turn or in place: glints,
+    cameras that were bumped, markers that are hidden one by one."""
+
+    name = "tracker_scatter"
+    site = Site.TRACKER
+    unit, sigma = "rad, m", 0.0003
+    per = "stop"
+    widens = True
+    covariates = ("stop",)
+    formula = "T_body = true exp(a_stop), a_stop by chance with a spread of sd, beyond its sigma"
+    typical = "as much as the sigma on paper, size assumed"
+    confounded_with = ("optitrack_distortion", "body_slip", "base_slip")
+    source = "variance components of groups of observations: Foerstner 1979; size assumed"
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        bodies = rig.tracker.bodies if rig.tracker else ()
+        return tuple(
+            Param(f"{member}.{body}.{dof}", unit, self.sigma)
+            for member in self.members or ("each",)
+            for body in bodies
+            for dof, unit in zip(DOF, UNITS, strict=True)
+        )
+
+    def basis(self, view: View) -> np.ndarray:
+        bodies, member = len(view.rig.tracker.bodies), self.member(view)
+        count = max(1, len(self.members))
+        basis = np.zeros((len(member), bodies, 6, count, bodies, 6))
+        rows, seen = np.arange(len(member)), member >= 0
+        for b in range(bodies):
+            basis[rows[seen], b, :, member[seen], b, :] = np.eye(6)
+        return basis.reshape(len(member), bodies, 6, -1)
+
+
+class ReferenceScatter(Scatter):
+    """The mesh lies further off its surfaces than rig.yaml says, each surface by its own: scans
+    that were registered badly, meshes that were made too coarse."""
+
+    name = "reference_scatter"
+    site = Site.REFERENCE
+    unit, sigma = "m", 0.0005
+    per = "surface"
+    widens = True
+    covariates = ("surface",)
+    formula = "surface = mesh + a_surface * normal, a_surface by chance with a spread of sd"
+    typical = "as much as the sigma on paper, size assumed"
+    confounded_with = ("moved_surface", "faro_scale")
+    source = "variance components of groups of observations: Foerstner 1979; size assumed"
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        return super().params(rig) if rig.reference and rig.reference.mesh else ()
+
+    def basis(self, view: View) -> OneHot:
+        index = np.broadcast_to(self.member(view), view.rows)
+        return OneHot(index, view["normal"], max(1, len(self.members)))

@@ -24,7 +24,7 @@ def add_beams(problem: Problem, part: SourceStops, places: Places) -> None:
     """Add every scan of a recording, and the planes' unknowns where there is no mesh."""
     source = part.source
     meeting = _meeting(problem, part, places)
-    terms = [t for t in part.terms if t.effect.site in OF_BEAMS]
+    terms = [t for t in part.terms if t.effect.site in OF_BEAMS and not t.effect.widens]
     sigma_m = source.rig.reference.sigma_m if source.rig.reference and source.reference else 0.0
     for k, stops in places.scanned():
         problem.scans.append(

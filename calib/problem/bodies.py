@@ -45,7 +45,7 @@ def _tracker_bases(part: SourceStops) -> dict[str, np.ndarray]:
     """What the tracker adds to every body at every stop, (K or 1, B, 6, P) by unknown."""
     source = part.source
     view = View(source.rig, len(source.recording.stops), source.columns, source.recording.joints)
-    terms = (t for t in part.terms if t.effect.site is Site.TRACKER)
+    terms = (t for t in part.terms if t.effect.site is Site.TRACKER and not t.effect.widens)
     return {t.variable: t.basis(view) for t in terms}
 
 

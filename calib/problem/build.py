@@ -43,7 +43,7 @@ def build(
     problem = Problem(sources, terms)
     problem.meetings.update(meetings or {})
     for source, terms in zip(sources, problem.terms, strict=True):
-        for term in terms:
+        for term in (t for t in terms if not t.effect.widens):
             unknown = effect_unknown(term, source)
             problem.add(unknown)
             if unknown.role is Role.CALIBRATION:
@@ -96,12 +96,12 @@ def with_members(terms: Sequence[Sequence[Term]], sources: Sequence[Source]) -> 
     labelled = [f"{label}/" if label else "" for label in labels(sources)]
     members: dict[str, list[str]] = {}
     for some, source, label in zip(terms, sources, labelled, strict=True):
-        for term in (t for t in some if t.effect.by_chance):
+        for term in (t for t in some if t.effect.by_chance and not t.effect.widens):
             names = source.columns[term.effect.per].tolist()
             members.setdefault(term.variable, []).extend(f"{label}{name}" for name in names)
 
     def bound(term: Term, label: str) -> Term:
-        if not term.effect.by_chance:
+        if term.variable not in members:
             return term
         effect = term.effect.among(members[term.variable], label)
         return Term(effect, term.variable, np.arange(len(effect.members)))

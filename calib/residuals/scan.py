@@ -104,6 +104,7 @@ class ScanStop:
         store: its recording's scans as beams.
         room: the mesh, or the recording whose planes these are.
         group: the name of its rows.
+        reference_scatter_m: how much of that is beyond what it was at first.
     """
 
     name: str
@@ -117,6 +118,13 @@ class ScanStop:
     store: BeamStore
     room: int | str
     group: Group
+    reference_scatter_m: float = 0.0
+
+    def scattering(self, sd_m: float) -> ScanStop:
+        """The scan on a reference that scatters otherwise beyond its sigma."""
+        stated2 = self.reference_sigma_m**2 - self.reference_scatter_m**2
+        sigma_m = float(np.sqrt(stated2 + sd_m**2))
+        return replace(self, reference_sigma_m=sigma_m, reference_scatter_m=sd_m)
 
     @property
     def lidar(self) -> LidarModel:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +32,7 @@ class TrackedBody:
         stop_names: (K,) recording and number of each stop: rows of one err together.
         groups: (K,) the names of those rows.
         weight: (K,) robust weight of each stop's rows, 0 where set aside; 1 where None.
+        scatter: unit, "m" or "rad" -> how widely it scatters beyond what its sigmas were at first.
     """
 
     name: str
@@ -45,6 +46,7 @@ class TrackedBody:
     stop_names: Sequence[tuple[Path, int]] = ()
     groups: tuple[Group, ...] = ()
     weight: np.ndarray | None = None
+    scatter: Mapping[str, float] = field(default_factory=lambda: {"m": 0.0, "rad": 0.0})
 
     kind = "tracker"
 
@@ -55,6 +57,13 @@ class TrackedBody:
     @property
     def rows(self) -> int:
         return len(self.measured) * (3 if self.is_point else 6)
+
+    def scattering(self, unit: str, sd: float) -> TrackedBody:
+        """The block with another spread beyond the sigma in this unit."""
+        sigma = getattr(self, f"sigma_{unit}")
+        wider = np.sqrt(sigma**2 - self.scatter[unit] ** 2 + sd**2)
+        changed = {f"sigma_{unit}": float(wider), "scatter": {**self.scatter, unit: sd}}
+        return replace(self, **changed)
 
     def setting_aside(self, tokens: Collection[str]) -> TrackedBody:
         """The block with these stops' rows, and no others, set aside; see `Group.token`."""

@@ -11,6 +11,7 @@ from calib.problem import Problem
 from calib.problem.model import Model, Source
 from calib.problem.prior import JointPrior
 from calib.problem.problem import Block
+from calib.problem.spread import with_spread
 from calib.residuals.scan import ScanStop
 from calib.residuals.surfaces import PlaneSurface
 from calib.results.errors import Errors, body_errors, scan_errors
@@ -119,6 +120,7 @@ def held_out(
         trained = problems.build(sources, model, [~left for left in fold])
         estimate = solve(trained, progress=tell, start=_without_planes(trained, start))
         unseen = problems.build(sources, model, fold, trained.meetings)
+        unseen = with_spread(unseen, estimate.start.spread)
         out += predict(unseen, trained, estimate)
     return out
 
@@ -170,7 +172,7 @@ def placed(unseen: Problem, trained: Problem, estimate: Estimate) -> tuple[Estim
     unseen.blocks = bodies if scans else [b for b in bodies if not b.stops.rig.joints_to(b.body)]
     told = {block.stops.root for block in unseen.blocks} | set(shared)
     unseen.scans = [scan for scan in scans if scan.stops.root not in told]
-    return solve(unseen, prior), told
+    return solve(unseen, prior, spread=False), told
 
 
 def _scan(scan: ScanStop, predicted: Estimate, told: bool) -> Errors:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -104,7 +104,7 @@ def solution_of(problem: Problem, estimate: Estimate, widened: float = 1.0) -> S
             own = term.variable != term.effect.name
             part = recordings.setdefault(rig.name, Part()) if own else shared
             if term.effect.by_chance:
-                part.effects[term.effect.name] = _spread(term, scatter[term.variable], widened)
+                part.effects[term.effect.name] = _spread(term, scatter, widened)
                 continue
             theta = estimate.values[term.variable]
             covariance = told[at[term.variable], at[term.variable]]
@@ -166,10 +166,14 @@ def _effect(
     return EffectEstimate(unit, tuple(p.name for p in params), estimate, sigma)
 
 
-def _spread(term: Term, told: tuple[float, float], widened: float) -> EffectEstimate:
-    """What is known of an effect by chance: how widely it scatters."""
-    sd, sigma = told
-    return EffectEstimate(term.effect.unit, ("sd",), np.array([sd]), np.array([widened * sigma]))
+def _spread(term: Term, told: Mapping[str, tuple[float, float]], widened: float) -> EffectEstimate:
+    """What is known of an effect by chance: how widely it scatters; of several bodies, each."""
+    mine = {key: each for key, each in told.items() if key.startswith(f"{term.variable}.")}
+    mine = mine or {f"{term.variable}.sd": told[term.variable]}
+    names = tuple(key.removeprefix(f"{term.variable}.") for key in mine)
+    units = [name.rpartition(".")[2] if term.effect.widens else term.effect.unit for name in names]
+    sd, sigma = np.array(list(mine.values())).T
+    return EffectEstimate(one_unit(units), names, sd, widened * sigma)
 
 
 def _absent(problem: Problem) -> list[dict[str, str]]:

@@ -99,8 +99,12 @@ def _scatter(run: Run) -> Iterator[dict[str, Any]]:
     parts = [run.solution.shared, *run.solution.recordings.values()]
     for effect in (e for e in model_of(run).effects if e.by_chance):
         for found in (part.effects[effect.name] for part in parts if effect.name in part.effects):
-            numbers = {"sd": float(found.estimate[0]), "sigma": float(found.sigma[0])}
-            yield {"effect": effect.name, **numbers, "unit": found.unit}
+            for name, unit, *each in zip(
+                found.names, found.units, found.estimate, found.sigma, strict=True
+            ):
+                of = {} if name == "sd" else {"of": name.rpartition(".")[0]}
+                numbers = dict(zip(("sd", "sigma"), map(float, each), strict=True))
+                yield {"effect": effect.name, **of, **numbers, "unit": unit}
 
 
 def command_without(run: Run, tokens: Sequence[str]) -> str:

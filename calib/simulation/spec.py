@@ -10,6 +10,8 @@ import pydantic
 from chains.errors import InputError
 from sensors.documents import Document, nearest, read_yaml, validate
 
+SURFACES = 200  # that values by chance are drawn for: more than any room here has
+
 
 class Spec(Document):
     """A recording to be simulated; the defaults are the preset `default`.
@@ -62,11 +64,12 @@ class Spec(Document):
 
     @property
     def names(self) -> dict[str, list[str]]:
-        """Of all stops, and of the location (K,) of each."""
+        """Of all stops, of the location (K,) of each, and of surfaces."""
         places = [(a, b) for a in range(self.locations) for b in range(self.stops_per_location)]
         return {
             "stop": [f"L{a:02d}P{b:02d}" for a, b in places],
             "location": [f"L{a:02d}" for a, _ in places],
+            "surface": [str(k) for k in range(SURFACES)],
         }
 
     @pydantic.model_validator(mode="after")

@@ -10,18 +10,18 @@ variances of greatest likelihood are those of restricted maximum likelihood (Pat
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from calib.problem.problem import Problem
-from calib.problem.unknowns import Role, Unknown
+from calib.problem.spread import REFERENCE, by_chance, sigmas, widening
+from calib.problem.unknowns import Unknown
 from calib.solve.estimate import Estimate
 
 ROUNDS = 500  # of the fixed point; from ten times too large or small 40 were measured
 STEADY = 1e-6  # relative change of a variance that ends them
-SETTLED = 0.01  # relative change of an sd that is none: a tenth of how well 50 members tell it
 LEAST = 1e-3  # of the sd that a group starts from: what is smaller counts as none
 SEEN = 1e-9  # of the largest information, below which a direction of values is not seen
 
@@ -92,11 +92,6 @@ class Told:
         return np.sqrt(np.maximum(np.diag(inverse), 0.0)) / (2 * sd)
 
 
-def by_chance(problem: Problem) -> list[Unknown]:
-    """The unknowns whose spread is estimated."""
-    return [u for u in problem.variables.values() if u.role is Role.SCATTER]
-
-
 def told(some: Sequence[Unknown], values: Mapping[str, np.ndarray], covariance: np.ndarray) -> Told:
     """What all rows say of some unknowns by chance; `covariance` is their joint one, as fitted."""
     return Told.of(
@@ -107,23 +102,60 @@ def told(some: Sequence[Unknown], values: Mapping[str, np.ndarray], covariance: 
     )
 
 
+Sums = Mapping[tuple[str, str], tuple[float, float]]
+
+
+def squares(estimate: Estimate) -> Sums:
+    """Whose rows and unit -> the sum of squares of these rows, whitened, and of their redundancies:
+    both are about equal where sigmas are right (Foerstner 1979)."""
+    found: dict[tuple[str, str], list[tuple[float, float]]] = {}
+    for block in estimate.problem.bodies:
+        residual, d = block.evaluate(estimate.values, True)
+        count = len(block.measured)
+        weight = np.ones(count) if block.weight is None else block.weight
+        seen = estimate.variance_of(list(d), np.hstack(list(d.values())))
+        left = np.repeat(weight, len(residual) // count) - seen
+        for k, unit in enumerate(("m",) if block.is_point else ("rad", "m")):
+            rows = [each.reshape(count, -1, 3)[:, k] for each in (residual, left)]
+            sums = float(np.square(rows[0]).sum()), float(rows[1].sum())
+            found.setdefault((block.body, unit), []).append(sums)
+    for name in estimate.problem.cells:
+        sigma = estimate.problem.variables[name].sigma
+        total = float(np.square(estimate.values[name] / sigma).sum())
+        seen = estimate.variance_of([name], np.eye(len(sigma)))
+        sums = total, float(np.sum(1.0 - seen / np.square(sigma)))
+        found.setdefault((REFERENCE, "m"), []).append(sums)
+    return {key: tuple(np.sum(sums, axis=0).tolist()) for key, sums in found.items()}
+
+
+def wider(problem: Problem, sums: Sums) -> dict[str, float]:
+    """Key of a spread -> how widely rows scatter beyond their first sigma, as they have it."""
+    out, known = {}, sigmas(problem)
+    for key, whose in widening(problem).items():
+        (total, redundancy), (sigma, beyond) = sums.get(whose, (0.0, 0.0)), known[whose]
+        factor = total / redundancy if redundancy > 0 else 0.0
+        out[key] = float(np.sqrt(max(factor * sigma**2 - (sigma**2 - beyond**2), 0.0)))
+    return out
+
+
 def spreads(estimate: Estimate) -> dict[str, tuple[float, float]]:
-    """Unknown by chance -> how widely its values scatter, and the sigma of that."""
-    some = by_chance(estimate.problem)
-    if not some:
-        return {}
-    names = [u.name for u in some]
-    found = told(some, estimate.values, estimate.covariance_of(names))
-    sd = np.array([u.sigma[0] for u in some])
-    return dict(zip(names, zip(sd.tolist(), found.sigma(sd).tolist(), strict=True), strict=True))
+    """Key of a spread, an unknown by chance or what widens rows -> that spread, and its sigma."""
+    some, out = by_chance(estimate.problem), {}
+    if some:
+        names = [u.name for u in some]
+        found = told(some, estimate.values, estimate.covariance_of(names))
+        sd = np.array([u.sigma[0] for u in some])
+        pairs = zip(sd.tolist(), found.sigma(sd).tolist(), strict=True)
+        out |= dict(zip(names, pairs, strict=True))
+    if keys := widening(estimate.problem):
+        sums, known = squares(estimate), sigmas(estimate.problem)
+        for key, whose in keys.items():
+            sigma, beyond = known[whose]
+            out[key] = beyond, sigma_beyond(beyond, sigma**2, sums[whose][1])
+    return out
 
 
-def with_spread(problem: Problem, spread: Mapping[str, float]) -> Problem:
-    """The problem with other sds of unknowns by chance; itself where they are what it has."""
-    known = problem.variables
-    changed = {
-        name: replace(known[name], sigma=np.full(known[name].dim, sd))
-        for name, sd in spread.items()
-        if name in known and abs(known[name].sigma[0] - sd) > SETTLED * sd
-    }
-    return replace(problem, variables=known | changed) if changed else problem
+def sigma_beyond(sd: float, variance: float, redundancy: float) -> float:
+    """Sigma of a spread beyond a known sigma, from a variance that rows of some redundancy tell."""
+    of_variance = variance * np.sqrt(2.0 / max(redundancy, 1.0))
+    return float(np.sqrt(sd**2 + of_variance) - sd)

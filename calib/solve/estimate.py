@@ -11,7 +11,8 @@ import numpy as np
 from calib.linear.layout import StopKey, key_of
 from calib.linear.system import Linearisation
 from calib.problem.problem import Problem
-from calib.problem.unknowns import Role, Unknown
+from calib.problem.spread import spread_of
+from calib.problem.unknowns import Unknown
 from calib.residuals.beams import Association
 from calib.residuals.scan import ScanStop
 from calib.solve.graph import Graph
@@ -19,7 +20,7 @@ from calib.solve.graph import Graph
 # Of a state, beside an unknown's NAME: the parameters of a vector, and the value at which the beams
 # looked what they meet.
 DOFS, SEEN = ".dofs", ".seen"
-SD = ".sd"  # and the spread of values by chance
+SD = ".sd"  # and, after a key of `problem.spread`, how widely something scatters by chance
 AT_ONCE = 256  # rows whose joint covariance is computed for their variances: it grows as the square
 
 
@@ -39,7 +40,7 @@ class Start:
 
     @property
     def spread(self) -> dict[str, float]:
-        """Unknown -> spread of its values by chance."""
+        """How widely things scatter by chance, by the keys of `problem.spread`."""
         ends = (name for name in self.state if name.endswith(SD))
         return {name.removesuffix(SD): float(self.state[name]) for name in ends}
 
@@ -94,10 +95,10 @@ class Estimate:
     @property
     def state(self) -> dict[str, np.ndarray]:
         """All values; per vector ``NAME.dofs``, its parameters; ``NAME.seen``, the value at which
-        the scans were associated; and ``NAME.sd``, the spread of values by chance."""
+        the scans were associated; and ``KEY.sd``, how widely things scatter by chance."""
         known = self.problem.variables.values()
         dofs = {f"{v.name}{DOFS}": np.array(v.dofs, np.str_) for v in known if v.kind == "vector"}
-        spread = {f"{v.name}{SD}": v.sigma[0] for v in known if v.role is Role.SCATTER}
+        spread = {f"{k}{SD}": np.float64(sd) for k, sd in spread_of(self.problem).items()}
         seen = {f"{name}{SEEN}": x for name, x in self.seen.items()}
         return self.values | dofs | spread | seen
 

@@ -17,6 +17,7 @@ def solve(
     tolerance: float = CONVERGED,
     progress: Progress = lambda what, done, total: None,
     start: Start | None = None,
+    spread: bool = True,
 ) -> Estimate:
     """Maximum a posteriori estimate of a problem.
 
@@ -36,6 +37,7 @@ def solve(
         tolerance: largest step of the last pass, m and rad.
         progress: called with what is being done, how many stops are done, and of how many.
         start: an earlier fit to start from.
+        spread: whether it is estimated how widely things scatter by chance, where they do.
 
     Raises:
         InputError: nothing is left to estimate.
@@ -50,8 +52,7 @@ def solve(
     if loop.start.state and problem.scans:
         loop.go_on(tolerance)
         loop.reweigh(tolerance)
-        loop.take_spread(tolerance)
-        return loop.estimate()
+        return loop.estimate(tolerance if spread else None)
     loop.solve_without_scans()
     loop.reweigh()
     if prior is None and (loop.bodies_astray() or turned_far(problem, loop.values)):
@@ -65,8 +66,7 @@ def solve(
         loop.lost = loop.lost or not loop.look_around()
         loop.settle(tolerance)
         loop.reweigh(tolerance)
-        loop.take_spread(tolerance)
-    return loop.estimate()
+    return loop.estimate(tolerance if spread else None)
 
 
 def preview(problem: Problem, progress: Progress = lambda what, done, total: None) -> Estimate:

@@ -17,10 +17,11 @@ from calib.linear.layout import StopKey, key_of
 from calib.linear.linearise import beams_cost
 from calib.linear.parallel import in_order
 from calib.problem.problem import Block, Problem
+from calib.problem.spread import by_chance, widening, with_spread
 from calib.problem.surfaces import well_seen, with_surfaces
 from calib.residuals.beams import Association
 from calib.solve.added import begun
-from calib.solve.components import by_chance, told, with_spread
+from calib.solve.components import squares, told, wider
 from calib.solve.descent import AT_OPTIMUM, STEADY, UPHILL, Descent, Progress
 from calib.solve.estimate import DOFS, SEEN, Estimate, Start, cost_of, started, values_of
 from calib.solve.graph import Graph
@@ -51,6 +52,7 @@ HOPEFUL, LOOKED = 8, 15
 # How many sigmas wide the residuals of most stops may be by then: in those recordings it is 1 to 4,
 # with scans at wrong stops 85.
 HOPELESS = 30.0
+SETTLED_SPREAD = 0.01  # relative change of a spread that is none: 50 members tell it to a tenth
 SPREAD = 5  # times: all but the beams' weights is linear, so the second changes next to nothing
 
 
@@ -164,21 +166,31 @@ class Loop(Descent):
         Args:
             tolerance: as of `settle`.
         """
-        some = [u for u in by_chance(self.problem) if u.name not in self.held]
-        for _ in range(SPREAD if some and not self.lost else 0):
+        for _ in range(0 if self.lost else SPREAD):
+            found = self._spread()
+            given = with_spread(self.given, found, SETTLED_SPREAD)
+            if given is self.given:
+                break
+            self.given, self.problem = given, with_spread(self.problem, found, SETTLED_SPREAD)
+            self.lay_out()
+            if self.problem.scans:
+                self.settle(tolerance, self.seen, self._met())
+            else:
+                self.descend(STEADY, beams=False)
+
+    def _spread(self) -> dict[str, float]:
+        """Key of a spread -> what it is, as all rows have it here."""
+        some, out = [u for u in by_chance(self.problem) if u.name not in self.held], {}
+        if some or widening(self.problem):
             self.linearise_here()
+        if some:
             names = [u.name for u in some]
             found = told(some, self.values, self.graph.covariance(self.values, names))
             sd = found.spread(np.array([u.sigma[0] for u in some]))
-            given = with_spread(self.given, dict(zip(names, sd.tolist(), strict=True)))
-            if given is self.given:
-                break
-            some = [given.variables[name] for name in names]
-            self.given = given
-            variables = self.problem.variables | {u.name: u for u in some}
-            self.problem = replace(self.problem, variables=variables)
-            self.lay_out()
-            self.settle(tolerance, self.seen, self._met())
+            out |= dict(zip(names, sd.tolist(), strict=True))
+        if widening(self.problem):
+            out |= wider(self.problem, squares(self.as_it_stands(True, whole=True)))
+        return out
 
     def _met(self) -> dict[StopKey, np.ndarray]:
         """What beams meet now."""
@@ -322,8 +334,15 @@ class Loop(Descent):
         dofs = {f"{v.name}{DOFS}": np.array(v.dofs, np.str_) for v in found}
         return dofs | {v.name: self.values[v.name] for v in found}
 
-    def estimate(self) -> Estimate:
-        """The result, with the covariance of the calibration."""
+    def estimate(self, tolerance: float | None = None) -> Estimate:
+        """The result, with the covariance of the calibration.
+
+        Args:
+            tolerance: of the passes after it is estimated how widely things scatter by chance, as
+                of `settle`; None where that is not to be estimated.
+        """
+        if tolerance is not None:
+            self.take_spread(tolerance)
         self.linearise_here()
         _, fall = self.step()
         return self.as_it_stands(fall < AT_OPTIMUM and not self.lost, whole=True)

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from calib.problem.problem import Block, Problem
+from calib.problem.spread import spread_of, with_spread
 from calib.problem.unknowns import Role, Unknown
 from calib.residuals.robust import huber_weight
 from calib.residuals.targets import PARTS, HangingTarget
@@ -74,8 +75,8 @@ def weighted_as(problem: Problem, other: Problem) -> Problem:
         n: replace(v, weight=known[n].weight) if n in known else v
         for n, v in problem.variables.items()
     }
-    variables |= {n: known[n] for n, v in variables.items() if v.role is Role.SCATTER if n in known}
-    return replace(problem, blocks=blocks, variables=variables)
+    weighted = replace(problem, blocks=blocks, variables=variables)
+    return with_spread(weighted, spread_of(other))
 
 
 def unweighted(block: Block) -> Block:

@@ -1,0 +1,97 @@
+"""How widely things scatter by chance, as a problem has it: values of unknowns, and rows.
+
+A spread has a key: the name of the unknown whose values scatter; or, where the rows of a tracked
+body or of the reference have a wider sigma, ``effect.body.unit``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from calib.effects import Site
+from calib.problem.problem import Problem
+from calib.problem.unknowns import Role, Unknown
+from calib.residuals.tracker import TrackedBody
+
+REFERENCE = "reference"  # whose rows get wider, where these are no body's
+
+
+def by_chance(problem: Problem) -> list[Unknown]:
+    """The unknowns whose spread is estimated."""
+    return [u for u in problem.variables.values() if u.role is Role.SCATTER]
+
+
+def widening(problem: Problem) -> dict[str, tuple[str, str]]:
+    """Key of every spread that widens the sigma of rows -> whose, a tracked body's or the
+    reference's, and its unit."""
+    out, bodies = {}, {block.body: block.is_point for block in problem.bodies}
+    for term in (t for some in problem.terms for t in some if t.effect.widens):
+        if term.effect.site is Site.TRACKER:
+            for body, is_point in bodies.items():
+                for unit in ("m",) if is_point else ("rad", "m"):
+                    out[f"{term.variable}.{body}.{unit}"] = body, unit
+        elif any(scan.reference_sigma_m for scan in problem.scans):
+            out[f"{term.variable}.{REFERENCE}.m"] = REFERENCE, "m"
+    return out
+
+
+def sigmas(problem: Problem) -> dict[tuple[str, str], tuple[float, float]]:
+    """Whose rows and unit -> their sigma, and how much of it is beyond what it was at first."""
+    out = {
+        (block.body, unit): (getattr(block, f"sigma_{unit}"), block.scatter[unit])
+        for block in problem.bodies
+        for unit in ("rad", "m")
+    }
+    for scan in problem.scans[:1]:
+        out[REFERENCE, "m"] = scan.reference_sigma_m, scan.reference_scatter_m
+    return out
+
+
+def spread_of(problem: Problem) -> dict[str, float]:
+    """Key of every spread, an unknown's by chance or what widens rows -> what it is."""
+    known = sigmas(problem)
+    out = {unknown.name: float(unknown.sigma[0]) for unknown in by_chance(problem)}
+    return out | {key: float(known[whose][1]) for key, whose in widening(problem).items()}
+
+
+def with_spread(problem: Problem, spread: Mapping[str, float], settled: float = 0.0) -> Problem:
+    """The problem with other spreads; itself where they are what it has.
+
+    Args:
+        problem: as it is.
+        spread: by the keys of `spread_of`; of some of them.
+        settled: relative change of a sigma that is none.
+    """
+    known = problem.variables
+    changed = {
+        name: replace(known[name], sigma=np.full(known[name].dim, sd))
+        for name, sd in spread.items()
+        if name in known and abs(known[name].sigma[0] - sd) > settled * sd
+    }
+    problem = replace(problem, variables=known | changed) if changed else problem
+    now = sigmas(problem)
+    for key, whose in widening(problem).items():
+        sigma, beyond = now[whose]
+        other = np.sqrt(sigma**2 - beyond**2 + spread.get(key, beyond) ** 2)
+        if abs(other - sigma) > settled * sigma:
+            problem = _widened(problem, whose, spread[key])
+    return problem
+
+
+def _widened(problem: Problem, whose: tuple[str, str], sd: float) -> Problem:
+    """The problem with another spread of a body's rows, or of the reference."""
+    what, unit = whose
+    if what != REFERENCE:
+        blocks = [
+            b.scattering(unit, sd) if isinstance(b, TrackedBody) and b.body == what else b
+            for b in problem.blocks
+        ]
+        return replace(problem, blocks=blocks)
+    scans, aside = ([s.scattering(sd) for s in some] for some in (problem.scans, problem.aside))
+    wider = scans[0].reference_sigma_m / problem.scans[0].reference_sigma_m
+    known = problem.variables
+    cells = {n: replace(known[n], sigma=wider * known[n].sigma) for n in problem.cells}
+    return replace(problem, scans=scans, aside=aside, variables=known | cells)
