@@ -124,17 +124,19 @@ def standing_alone(
     return alone
 
 
-def of_cells(whole: Linearisation, problem: Problem) -> tuple[float, float]:
-    """The sum of squares of what the mesh's surfaces stand off, whitened, and of redundancies."""
-    others, total, left = _Others.of(whole), 0.0, 0.0
-    for name in problem.cells:
+def of_cells(whole: Linearisation, problem: Problem) -> dict[str, tuple[float, float]]:
+    """Kind of part of the mesh -> the sum of squares of what such parts stand off, whitened, and of
+    their redundancies."""
+    kept, out = _Others.of(whole).kept, {}
+    for name, cells in problem.cells.items():
         sigma, columns = problem.variables[name].sigma, whole.layout.columns([name])
-        total += float(np.square(whole.values[name] / sigma).sum())
+        total, left = out.get(cells.column, (0.0, 0.0))
         for some in np.array_split(np.arange(len(sigma)), -(-len(sigma) // TOGETHER)):
             rows = np.zeros((len(some), whole.layout.size))
             rows[np.arange(len(some)), columns[some]] = 1.0 / sigma[some]
-            left += float(np.sum(1.0 - np.diag(whole.covariance(rows, others.kept))))
-    return total, left
+            left += float(np.sum(1.0 - np.diag(whole.covariance(rows, kept))))
+        out[cells.column] = total + float(np.square(whole.values[name] / sigma).sum()), left
+    return out
 
 
 def _statistic(M: np.ndarray, u: np.ndarray, at: np.ndarray) -> float:

@@ -23,7 +23,8 @@ from calib.diagnosis.score import Scores
 from calib.effects import CATALOGUE, Scatter, Site
 from calib.linear.system import Linearisation
 from calib.problem import Problem
-from calib.problem.spread import REFERENCE, sigmas
+from calib.problem.spread import sigmas
+from calib.problem.surfaces import SURFACE_SHARES
 from calib.results.solution import one_unit
 from calib.solve.components import SEEN, Sums, Told, sigma_beyond, spreads, squares, told
 from calib.solve.estimate import Estimate
@@ -261,8 +262,7 @@ def rows_by_chance(
         for unit, (total, left) in shift.squares.items():
             before = sums.get((shift.group.what, unit), (0.0, 0.0))
             sums[shift.group.what, unit] = before[0] + total, before[1] + left
-    if problem.cells:
-        sums[REFERENCE, "m"] = of_cells(whole, problem)
+    sums |= {(part, "m"): each for part, each in of_cells(whole, problem).items()}
     found = (_of_rows(effect, sums, problem) for effect in effects)
     return [chance for chance in found if chance is not None]
 
@@ -272,7 +272,7 @@ def _of_rows(effect: Scatter, sums: Sums, problem: Problem) -> Chance | None:
     chi-square with their redundancy for degrees of freedom."""
     known, spreads, p, statistic, detectable = sigmas(problem), [], [], 0.0, np.inf
     of_bodies = effect.site is Site.TRACKER
-    mine = {key: each for key, each in sums.items() if (key[0] != REFERENCE) == of_bodies}
+    mine = {key: each for key, each in sums.items() if (key[0] not in SURFACE_SHARES) == of_bodies}
     checked = {key: each for key, each in mine.items() if each[1] >= FEWEST}
     for (what, unit), (total, left) in checked.items():
         sigma, beyond = known[what, unit]

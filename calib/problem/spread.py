@@ -1,7 +1,7 @@
 """How widely things scatter by chance, as a problem has it: values of unknowns, and rows.
 
 A spread has a key: the name of the unknown whose values scatter; or, where the rows of a tracked
-body or of the reference have a wider sigma, ``effect.body.unit``.
+body or parts of the mesh have a wider sigma, ``effect.body.unit`` or ``effect.surface.m``.
 """
 
 from __future__ import annotations
@@ -13,10 +13,9 @@ import numpy as np
 
 from calib.effects import Site
 from calib.problem.problem import Problem
+from calib.problem.surfaces import SURFACE_SHARES, cell_sigma_m
 from calib.problem.unknowns import Role, Unknown
 from calib.residuals.tracker import TrackedBody
-
-REFERENCE = "reference"  # whose rows get wider, where these are no body's
 
 
 def by_chance(problem: Problem) -> list[Unknown]:
@@ -25,8 +24,8 @@ def by_chance(problem: Problem) -> list[Unknown]:
 
 
 def widening(problem: Problem) -> dict[str, tuple[str, str]]:
-    """Key of every spread that widens the sigma of rows -> whose, a tracked body's or the
-    reference's, and its unit."""
+    """Key of every spread that widens the sigma of rows -> whose, a tracked body's or
+    those of a kind of part of the mesh, and its unit."""
     out, bodies = {}, {block.body: block.is_point for block in problem.bodies}
     for term in (t for some in problem.terms for t in some if t.effect.widens):
         if term.effect.site is Site.TRACKER:
@@ -34,7 +33,7 @@ def widening(problem: Problem) -> dict[str, tuple[str, str]]:
                 for unit in ("m",) if is_point else ("rad", "m"):
                     out[f"{term.variable}.{body}.{unit}"] = body, unit
         elif any(scan.reference_sigma_m for scan in problem.scans):
-            out[f"{term.variable}.{REFERENCE}.m"] = REFERENCE, "m"
+            out |= {f"{term.variable}.{part}.m": (part, "m") for part in SURFACE_SHARES}
     return out
 
 
@@ -46,7 +45,8 @@ def sigmas(problem: Problem) -> dict[tuple[str, str], tuple[float, float]]:
         for unit in ("rad", "m")
     }
     for scan in problem.scans[:1]:
-        out[REFERENCE, "m"] = scan.reference_sigma_m, scan.reference_scatter_m
+        for part in SURFACE_SHARES:
+            out[part, "m"] = cell_sigma_m(scan, part), scan.reference_scatter_m.get(part, 0.0)
     return out
 
 
@@ -82,16 +82,20 @@ def with_spread(problem: Problem, spread: Mapping[str, float], settled: float = 
 
 
 def _widened(problem: Problem, whose: tuple[str, str], sd: float) -> Problem:
-    """The problem with another spread of a body's rows, or of the reference."""
+    """The problem with another spread of a body's rows, or of a kind of part of the mesh."""
     what, unit = whose
-    if what != REFERENCE:
+    if what not in SURFACE_SHARES:
         blocks = [
             b.scattering(unit, sd) if isinstance(b, TrackedBody) and b.body == what else b
             for b in problem.blocks
         ]
         return replace(problem, blocks=blocks)
-    scans, aside = ([s.scattering(sd) for s in some] for some in (problem.scans, problem.aside))
-    wider = scans[0].reference_sigma_m / problem.scans[0].reference_sigma_m
-    known = problem.variables
-    cells = {n: replace(known[n], sigma=wider * known[n].sigma) for n in problem.cells}
-    return replace(problem, scans=scans, aside=aside, variables=known | cells)
+    scans, aside = (
+        [scan.scattering(what, sd) for scan in some] for some in (problem.scans, problem.aside)
+    )
+    cells = {
+        name: replace(known, sigma=np.full(known.dim, cell_sigma_m(scans[0], what)))
+        for name, known in problem.variables.items()
+        if name in problem.cells and problem.cells[name].column == what
+    }
+    return replace(problem, scans=scans, aside=aside, variables=problem.variables | cells)

@@ -15,6 +15,7 @@ import numpy as np
 from calib.problem.problem import Problem, SurfaceCells
 from calib.problem.unknowns import Role, Unknown
 from calib.residuals.beams import Association
+from calib.residuals.scan import ScanStop
 from calib.residuals.surfaces import PlaneSurface
 
 LEAST_BEAMS = 100  # on a plane: three numbers of it, known ten times better than by a single beam
@@ -45,20 +46,26 @@ def with_surfaces(
         first = problem.scans[scans[0]]
         if not first.reference_sigma_m:
             continue
-        for column, share in SURFACE_SHARES.items():
+        for column in SURFACE_SHARES:
             parts_of = {i: _parts(problem, associations[i], i, column) for i in scans}
             last = max(int(p.max(initial=-1)) for p in parts_of.values())
             seen = sum(np.bincount(p + 1, minlength=last + 2) for p in parts_of.values())
             parts = np.flatnonzero(seen[1:])  # counted from -1: nothing is met
             number = np.full(last + 2, -1, np.int32)  # the last stands for -1
             number[parts] = np.arange(len(parts))
-            name, sigma_m = f"{room}/reference_{column}", first.reference_sigma_m * np.sqrt(share)
+            name, sigma_m = f"{room}/reference_{column}", cell_sigma_m(first, column)
             unknowns.append(_unknown(name, room, column, parts, sigma_m))
             cells[name] = SurfaceCells(column, parts, first.meeting.surface_of(column, parts), room)
             for i in scans:
                 numbered[i][name] = number[parts_of[i]]
     found = [replace(a, cells=n) for a, n in zip(associations, numbered, strict=True)]
     return problem.with_cells(unknowns, cells), found
+
+
+def cell_sigma_m(scan: ScanStop, column: str) -> float:
+    """How far parts of a kind may stand off the mesh that a scan meets."""
+    beyond = scan.reference_scatter_m.get(column, 0.0)
+    return float(np.sqrt(SURFACE_SHARES[column] * scan.stated_sigma_m**2 + beyond**2))
 
 
 def well_seen(problem: Problem, associations: Sequence[Association]) -> list[Association]:

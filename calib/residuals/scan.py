@@ -6,7 +6,7 @@ A stop is computed from the recording and a state alone, so stops can be compute
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -104,7 +104,8 @@ class ScanStop:
         store: its recording's scans as beams.
         room: the mesh, or the recording whose planes these are.
         group: the name of its rows.
-        reference_scatter_m: how much of that is beyond what it was at first.
+        reference_scatter_m: kind of part, "surface", "region" or "patch" -> how widely such parts
+            scatter beyond what rig.yaml says, which is in `reference_sigma_m`.
     """
 
     name: str
@@ -118,13 +119,19 @@ class ScanStop:
     store: BeamStore
     room: int | str
     group: Group
-    reference_scatter_m: float = 0.0
+    reference_scatter_m: Mapping[str, float] = field(default_factory=dict)
 
-    def scattering(self, sd_m: float) -> ScanStop:
-        """The scan on a reference that scatters otherwise beyond its sigma."""
-        stated2 = self.reference_sigma_m**2 - self.reference_scatter_m**2
-        sigma_m = float(np.sqrt(stated2 + sd_m**2))
-        return replace(self, reference_sigma_m=sigma_m, reference_scatter_m=sd_m)
+    @property
+    def stated_sigma_m(self) -> float:
+        """How far the reference may be off as rig.yaml has it."""
+        beyond2 = sum(sd**2 for sd in self.reference_scatter_m.values())
+        return float(np.sqrt(max(self.reference_sigma_m**2 - beyond2, 0.0)))
+
+    def scattering(self, part: str, sd_m: float) -> ScanStop:
+        """The scan on a reference whose parts of one kind scatter otherwise beyond that."""
+        scatter = {**self.reference_scatter_m, part: sd_m}
+        sigma_m = float(np.sqrt(self.stated_sigma_m**2 + sum(sd**2 for sd in scatter.values())))
+        return replace(self, reference_sigma_m=sigma_m, reference_scatter_m=scatter)
 
     @property
     def lidar(self) -> LidarModel:

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from calib.problem.problem import Problem
-from calib.problem.spread import REFERENCE, by_chance, sigmas, widening
+from calib.problem.spread import by_chance, sigmas, widening
 from calib.problem.unknowns import Unknown
 from calib.solve.estimate import Estimate
 
@@ -119,12 +119,12 @@ def squares(estimate: Estimate) -> Sums:
             rows = [each.reshape(count, -1, 3)[:, k] for each in (residual, left)]
             sums = float(np.square(rows[0]).sum()), float(rows[1].sum())
             found.setdefault((block.body, unit), []).append(sums)
-    for name in estimate.problem.cells:
+    for name, cells in estimate.problem.cells.items():
         sigma = estimate.problem.variables[name].sigma
         total = float(np.square(estimate.values[name] / sigma).sum())
         seen = estimate.variance_of([name], np.eye(len(sigma)))
         sums = total, float(np.sum(1.0 - seen / np.square(sigma)))
-        found.setdefault((REFERENCE, "m"), []).append(sums)
+        found.setdefault((cells.column, "m"), []).append(sums)
     return {key: tuple(np.sum(sums, axis=0).tolist()) for key, sums in found.items()}
 
 

@@ -4,14 +4,15 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from calib import diagnose, fit
+from calib import add, diagnose, fit
 from calib.diagnosis.chance import AtZero
 from calib.effects import find
 from calib.problem import build
 from calib.problem.model import Model, Source
+from calib.problem.spread import spread_of
 from calib.simulation import Spec, simulate
-from calib.solve.components import Told, spreads
-from calib.solve.fit import solve
+from calib.solve.components import Told, spreads, squares
+from calib.solve.fit import resume, solve
 
 SD, PLACE_SD = 0.7, 0.4
 SPEC = Spec(
@@ -180,3 +181,63 @@ def test_two_recordings_share_the_spread_and_nothing_else(scattered, tmp_path):
     estimate = solve(problem)
     sd, sigma = spreads(estimate)[name]
     assert abs(sd - 0.0009) < 3 * sigma
+
+
+@pytest.mark.parametrize(
+    ("effect", "size", "keys"),
+    [
+        ("tracker_scatter", 3.0, {"base_markers.rad", "mount_markers.rad"}),
+        ("tracker_scatter", 3.0, {"base_markers.m", "mount_markers.m"}),
+        ("reference_scatter", 3.0, {"surface.m"}),
+    ],
+)
+def test_rows_that_scatter_beyond_their_sigma_tell_by_how_much(worse, effect, size, keys):
+    """Bodies at 24 stops each; some 70 surfaces of the mesh, those furthest off of which meet no
+    beam that is believed."""
+    _, estimate = worse(effect, size)
+    sigma = find(effect).sigma * size
+    found = {key.partition(".")[2]: each for key, each in spreads(estimate).items()}
+    for key in keys:
+        sd, of = found[key]
+        least = 0.7 * sigma if effect == "reference_scatter" else sigma - 3 * of
+        assert least < sd < sigma + 3 * of and 0.05 < of / sd < 0.3
+    again = squares(estimate)
+    for what, (total, left) in again.items():
+        if f"{what[0]}.{what[1]}" in keys:
+            assert total / left == pytest.approx(1.0, abs=0.05)  # its sigmas are right now
+
+
+@pytest.fixture(scope="module")
+def worse(tmp_path_factory):
+    """Recordings in which one thing scatters more than rig.yaml says, and fits that know of it."""
+    made = {}
+
+    def make(effect, size):
+        if effect not in made:
+            folder = tmp_path_factory.mktemp(effect) / "rec"
+            simulate(SPEC, folder, 9, {effect: size})
+            source = Source.open(folder)
+            made[effect] = source, solve(build([source], Model().plus([find(effect)])))
+        return made[effect]
+
+    return make
+
+
+@pytest.mark.parametrize("effect", ["tracker_scatter", "reference_scatter"])
+def test_a_fit_goes_on_with_the_spread_that_it_had(worse, effect):
+    source, estimate = worse(effect, 3.0)
+    problem = build([source], Model().plus([find(effect)]))
+    again = resume(problem, estimate.start)
+    assert spread_of(again.problem) == pytest.approx(spread_of(estimate.problem))
+
+
+def test_a_tracker_worse_than_stated_is_named_and_then_nothing_is_missing(worse):
+    source, _ = worse("tracker_scatter", 3.0)
+    folder = source.recording.folder
+    run = fit([folder], folder.parent / "run")
+    found = diagnose(run)
+    assert found.verdict == "missing_effect" and found.worth_adding == ["tracker_scatter"]
+    assert run.summary["sigmas_widened_by"] > 1.5
+    grown = add(run, found.worth_adding, folder.parent / "grown")
+    assert grown.summary["sigmas_widened_by"] == 1.0
+    assert diagnose(grown).verdict == "adequate"
