@@ -34,6 +34,7 @@ def ladder(evidence: Evidence) -> Iterator[Chart | Absent]:
     first = error_mm(evidence.rungs[0])[1]
     way = f" from {first:.2f}" if len(evidence.rungs) > 1 else ""
     near = "down to" if last <= AT_THE_FLOOR * floor else "still above"
+    near = "below" if last > first and last <= floor else near
     yield Chart(
         "ladder",
         f"The {kind} error went{way} to {last:.2f} mm, {near} the noise floor of {floor:.2f} mm"
@@ -90,8 +91,8 @@ def variance(evidence: Evidence) -> Iterator[Chart | Absent]:
         f"{100 * parts[largest] ** 2 / floor**2:.0f} % of the variance",
         "Independent parts, which add up in squares. Range and angle noise and the reference are "
         "what the rows' own sigmas hold; the pose is what is not known of where the LiDAR is at a "
-        "stop that the fit never saw; with these the noise floor is complete. What the error has "
-        "beyond the floor nothing explains.",
+        "stop that the fit never saw, and chance what each stop draws anew; with these the noise "
+        "floor is complete. What the error has beyond the floor nothing explains.",
         lambda: _bars(parts, "contribution to the rms error, mm"),
     )
 
@@ -102,6 +103,10 @@ def variance_mm(evidence: Evidence) -> dict[str, float]:
     error, floor = error_mm(evidence.rungs[-1])[1], rms["noise_floor"]
     parts = {n: 1e3 * np.sqrt(v) for n, v in evidence.after.variance_m2.items()}
     if rms.get("held_out") is not None:
+        solution = evidence.run.solution
+        for part in (solution.shared, *solution.recordings.values()):
+            by_chance = {n: e for n, e in part.effects.items() if e.names == ("sd",)}
+            parts |= {f"chance, as {n} has it": 1e3 * e.estimate[0] for n, e in by_chance.items()}
         of_rows = sum(v * v for v in parts.values())
         parts["pose of an unseen stop"] = np.sqrt(max(floor**2 - of_rows, 0.0))
     parts["unexplained"] = np.sqrt(max(error**2 - floor**2, 0.0))
