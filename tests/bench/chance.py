@@ -103,7 +103,8 @@ def said(fit: Said, diagnose: Said | None = None) -> dict[str, Any]:
 
     Returns:
         `outcome`: the verdict, "too few stops", "not converged", "refused", "endless" or "fault";
-        `names` of effects, covariates and scatter; `blunders`; `p`, by effect; `misfit`, `rms_mm`; `seconds`.
+        `names` of effects, covariates and scatter; `blunders`; `p`, by effect; `misfit`,
+        `rms_mm`; `seconds`.
     """
     last = diagnose or fit
     document = diagnose.document if diagnose else {}
