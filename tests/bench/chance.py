@@ -103,7 +103,8 @@ def said(fit: Said, diagnose: Said | None = None) -> dict[str, Any]:
 
     Returns:
         `outcome`: the verdict, "too few stops", "not converged", "refused", "endless" or "fault";
-        `names` of effects, covariates and scatter; `blunders`; `p`, by effect; `misfit`; `seconds`.
+        `names` of effects, covariates and scatter; `blunders`; `p`, by effect; `misfit`,
+        `rms_mm`; `seconds`.
     """
     last = diagnose or fit
     document = diagnose.document if diagnose else {}
@@ -128,6 +129,7 @@ def said(fit: Said, diagnose: Said | None = None) -> dict[str, Any]:
         ],
         "sentences": document.get("sentences", [last.complaint.strip()])[:3],
         "misfit": fit.document.get("misfit", {}),
+        "rms_mm": fit.document.get("rms_mm", {}),
         "seconds": [round(each.seconds, 2) for each in (fit, diagnose) if each],
     }
 
