@@ -131,16 +131,21 @@ def conclude(
         forbids: why the run is not to be believed, whatever its model explains; a clause each.
         rings: whose numbers are wrong, as blunders.
     """
-    found, matter, traces = weighed(found, held_out, summary["rms_mm"])
-    first = found.looks[0]
+    heavy = weighed(found, held_out, summary["rms_mm"])
+    found, first = heavy.found, found.looks[0]
     spoilt = [*rings, *(rejected.blunders() if rejected and not found.found else [])]
-    verdict = BAD if spoilt else _verdict(found, rejected, held_out)
+    hold = _names_hold(found) and not _leave_most(found, held_out)
+    thrown = bool(heavy.refused) or (rejected is not None and not rejected.explained)
+    verdict = BAD if spoilt or found.blunders else _verdict(found, hold, thrown)
     if verdict == "adequate" and forbids:
         verdict = BAD
     named, ranked = len(found.found), _ranked(found)
-    candidates = [_candidate(c, verdict, found, held_out) for c in ranked]
+    candidates = [_candidate(c, found, held_out) for c in ranked]
     for each in candidates:
-        each["matters"] = matter[each["add"]].document() if each["add"] in matter else None
+        told_of = heavy.matter.get(each["add"])
+        each["matters"] = told_of.document() if told_of else None
+        worn = bool(each["step"]) and found.dressed_up(each["step"] - 1)
+        each["dressed_up"] = verdict == UNNAMED and bool(each["step"]) and (worn or not hold)
     chance = [each.document(named + i) for i, each in enumerate(found.chance, 1)]
     others = [each.document(None) for each in found.looks[-1].chance]
     candidates = [*candidates[:named], *chance, *candidates[named:], *others]
@@ -149,7 +154,7 @@ def conclude(
     unexplained = [_unexplained(c, screen) for screen, c in _without_a_name(found, verdict)]
     unexplained = [*thrown, *unexplained]
     blunders = [*spoilt, *(told.document(left, _rig(left, first)) for left in found.blunders)]
-    sentences = sentences_of(verdict, found, candidates, unexplained, untestable, blunders, traces)
+    sentences = sentences_of(verdict, heavy, candidates, unexplained, untestable, blunders)
     if forbids and verdict == BAD and not blunders:
         sentences.insert(0, f"This run is not to be believed as it stands: {'; '.join(forbids)}.")
     if rejected:
@@ -179,29 +184,41 @@ def _rig(left: LeftOut, look: Look) -> Rig:
     return rigs.get(left.blunder.group.recording) or sources[0].rig
 
 
-def _verdict(found: Search, rejected: Rejects | None, held_out: Mapping[str, tuple]) -> str:
-    if found.blunders:
-        return BAD
+def _verdict(found: Search, hold: bool, more: bool) -> str:
+    """Of a search without blunders.
+
+    Args:
+        found: the search.
+        hold: whether its names are to be believed.
+        more: whether there is something beside all that it found.
+    """
     if not found.found:
-        thrown = rejected is not None and not rejected.explained
-        if found.unnamed or thrown:
+        if found.unnamed or more:
             return UNNAMED
         return "missing_effect" if found.chance else "adequate"
-    named = _names_hold(found) and (not found.unnamed or _absorbed(found) > ABSORBED)
-    falls = [held_out[s.effect.name] for s in found.found if s.effect.name in held_out]
-    if falls and found.looks[0].stand.estimate.scans:
-        after, floor = falls[-1][1:]
-        far = after > BY_CHANCE * floor
-        named = named and not (far and _explained(falls[0][0], after, floor) < ABSORBED)
+    named = hold and (not found.unnamed or _absorbed(found) > ABSORBED)
     return "missing_effect" if named else UNNAMED
 
 
+def _leave_most(found: Search, held_out: Mapping[str, tuple[float, float, float]]) -> bool:
+    """Whether the names leave most of the held-out error, where that is further above its floor
+    than chance puts it."""
+    falls = [held_out[s.effect.name] for s in found.found if s.effect.name in held_out]
+    if not falls or not found.looks[0].stand.estimate.scans:
+        return False
+    after, floor = falls[-1][1:]
+    return after > BY_CHANCE * floor and _explained(falls[0][0], after, floor) < ABSORBED
+
+
 def _names_hold(found: Search) -> bool:
-    """Whether the names explain as much, at their price, as a single structure without a name.
+    """Whether the names explain as much, at their price, as a single structure without a name; so
+    they do where there are none.
 
     Something that nobody has named is dressed up by a search in several names, each of which takes
     a part of it; where a name is right, no bins do better.
     """
+    if not found.found:
+        return True
     common = found.looks[-1].named.common
     tests = [step.candidate.test for step in found.found]
     together = sum(t.statistic for t in tests), sum(t.dof for t in tests)
@@ -240,10 +257,7 @@ def _without_a_name(found: Search, verdict: str) -> list[tuple[Screen, Candidate
 
 
 def _candidate(
-    candidate: Candidate,
-    verdict: str,
-    found: Search,
-    held_out: Mapping[str, tuple[float, float, float]],
+    candidate: Candidate, found: Search, held_out: Mapping[str, tuple[float, float, float]]
 ) -> dict[str, Any]:
     """As the contract has it."""
     effect, test, look = candidate.effect, candidate.test, found.looks[0].named
@@ -272,7 +286,7 @@ def _candidate(
         "statistic": test.statistic,
         "dof": test.dof,
         "step": step,
-        "dressed_up": bool(step) and verdict == UNNAMED and found.dressed_up(step - 1),
+        "dressed_up": False,
         "held_out_rms_mm": {"before": before, "after": after},
         "error_explained": _explained(before, after, floor),
         "rms_mm": None if noise else 1e3 * look.size_m(candidate),

@@ -7,7 +7,7 @@ sigma; one that does neither is a trace.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -38,6 +38,11 @@ class Matters:
     held_out_mm: float
     largest_shift_sigmas: float
     floor_mm: float
+
+    @property
+    def worse(self) -> bool:
+        """Whether stops that were held out are predicted worse with it."""
+        return self.held_out_mm > FALL * self.floor_mm
 
     @property
     def enough(self) -> bool:
@@ -106,27 +111,45 @@ class Consequences:
         return self._projected[1]
 
 
+@dataclass(frozen=True)
+class Weighed:
+    """What of a search matters.
+
+    Args:
+        found: the search without the rest.
+        matter: effect -> what it would change.
+        traces, refused: a sentence for each trace, and for each name that is not to be believed.
+    """
+
+    found: Search
+    matter: Mapping[str, Matters]
+    traces: Sequence[str]
+    refused: Sequence[str]
+
+
 def weighed(
     found: Search,
     held_out: Mapping[str, tuple[float, float, float]],
     rms_mm: Mapping[str, float | None],
-) -> tuple[Search, dict[str, Matters], list[str]]:
-    """A search without its traces.
+) -> Weighed:
+    """A search without its traces, and without names that predict worse what was held out.
 
     Args:
         found: the search.
         held_out: effect -> held-out rms before and after it was truly fitted, and noise floor, mm.
         rms_mm: as of `Consequences`.
-
-    Returns:
-        What is left of it; effect -> what it would change; and a sentence for each trace.
     """
-    matter, named, traces = {}, [], []
+    matter, named, traces, refused = {}, [], [], []
     for step in found.found:
         screen, name = step.before.named, step.effect.name
         told = Consequences(step.before, rms_mm).of(step.candidate, screen, held_out.get(name))
         matter[name] = told
-        if told.enough:
+        if told.worse:
+            refused.append(
+                f"{name} takes on a part of it, and stops that were held out are predicted worse "
+                f"with it ({told.held_out_mm:+.2f} mm), so it is not to be believed."
+            )
+        elif told.enough:
             named.append(step)
         else:
             traces.append(_sentence(name, step.candidate, screen, told))
@@ -140,7 +163,7 @@ def weighed(
             elif key == "unnamed":
                 what = " and ".join(words(c) for c in hangs_on(candidate.effect))
                 traces.append(_sentence(f"structure over {what}", candidate, look.unnamed, told))
-    return replace(found, found=named, **kept), matter, traces
+    return Weighed(replace(found, found=named, **kept), matter, traces, refused=refused)
 
 
 def _sentence(what: str, candidate: Candidate, screen: Screen, told: Matters) -> str:

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from calib.diagnosis.search import FEWEST, NamedEffect, Search
+from calib.diagnosis.search import FEWEST, NamedEffect
 from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import words
+from calib.diagnosis.verdict.matters import Weighed
 
 UNNAMED, BAD = "unexplained_structure", "bad_data"
 LISTED = 6  # untestable effects and rivals that a sentence names
@@ -15,14 +16,14 @@ LISTED = 6  # untestable effects and rivals that a sentence names
 
 def sentences_of(
     verdict: str,
-    found: Search,
+    heavy: Weighed,
     candidates: Sequence[Mapping[str, Any]],
     unexplained: Sequence[Mapping[str, Any]],
     untestable: Mapping[str, str],
     blunders: Sequence[Mapping[str, Any]],
-    traces: Sequence[str] = (),
 ) -> list[str]:
     """The finding in words, the verdict first; arguments as `conclude` has made them."""
+    found, traces = heavy.found, heavy.traces
     look = found.looks[0]
     residual = _residual(look)
     out = []
@@ -41,12 +42,15 @@ def sentences_of(
     out += [each["sentence"] for each in blunders[:LISTED]]
     if len(blunders) > LISTED:
         out.append(f"And {len(blunders) - LISTED} more, in diagnosis.json.")
-    for step in found.found:
-        out += _step_sentences(step, next(c for c in candidates if c["add"] == step.effect.name))
+    for i, step in enumerate(found.found):
+        candidate = next(c for c in candidates if c["add"] == step.effect.name)
+        out += _step_sentences(step, candidate, found.dressed_up(i))
     out += [each.sentence for each in found.chance]
-    out += traces
+    out += [*heavy.refused, *traces]
     if verdict == UNNAMED:
-        out.insert(0, "Something is here that no known effect explains.")
+        beside = any(c["step"] and not c["dressed_up"] for c in candidates)
+        what = "Beside what is named here, something" if beside else "Something"
+        out.insert(0, f"{what} is here that no known effect explains.")
     for each in unexplained[:2]:
         what = " and ".join(words(c) for c in each["covariates"])
         out.append(f"What is left hangs on {what}: {each['rms_mm']:.2f} mm rms of {residual}.")
@@ -68,13 +72,17 @@ def sentences_of(
     return out
 
 
-def _step_sentences(step: NamedEffect, candidate: Mapping[str, Any]) -> list[str]:
-    if candidate["dressed_up"]:
-        return [
-            f"{step.effect.name} takes on a part of it, as a name will; bins without any name "
-            f"explain more, so it is not to be believed."
-        ]
+def _step_sentences(step: NamedEffect, candidate: Mapping[str, Any], worn: bool) -> list[str]:
+    """Of a named effect; `worn` where bins without a name explain more than it does."""
     before, after = (candidate["held_out_rms_mm"][k] for k in ("before", "after"))
+    if candidate["dressed_up"]:
+        why = "bins without any name explain more"
+        if after and not worn:
+            why = f"most of the held-out error stays ({before:.2f} to {after:.2f} mm)"
+        return [
+            f"{step.effect.name} takes on a part of it, as a name will; {why}, so it is not to be "
+            f"believed."
+        ]
     fall = f"; the held-out error goes from {before:.2f} to {after:.2f} mm" if after else ""
     out = [
         f"{step.effect.name} is missing: it bends {_residual(step.before)} by "
