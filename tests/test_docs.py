@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from calib.effects import CATALOGUE
 from calib.problem.model import Source
 from calib.problem.without import leave_out
 from calib.runs.run import Run
@@ -70,6 +71,18 @@ def test_the_page_about_same_bytes_shows_what_is_printed(tmp_path):
     assert page.said.endswith(shown)
     keys = re.findall(r"`(\w+)`", re.search(r"\|---\|---\|\n(.*?)\n\n", page.text, flags=re.S)[1])
     assert set(keys) == set(Run.open(tmp_path / "grown").model)
+
+
+@pytest.mark.slow
+def test_the_page_about_chance_shows_what_is_printed(tmp_path):
+    session = run_through(ROOT / "docs/by_chance.md", tmp_path)
+    shown = re.findall(r"^```text\n(.*?)^```", session.text, flags=re.M | re.S)
+    said = " ".join(session.said.split())
+    assert len(shown) == 2 and all(" ".join(part.split()) in said for part in shown)
+    listed = re.findall(r"^\| `(\w+)` \|", session.text, flags=re.M)
+    assert listed == [effect.name for effect in CATALOGUE if effect.by_chance]
+    sigma = Run.open(tmp_path / "grown").solution.shared.effects["ring_range_offset"].sigma
+    assert f"{1e3 * sigma.mean():.2f} mm" in session.text
 
 
 @pytest.mark.slow
