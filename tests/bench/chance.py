@@ -26,6 +26,7 @@ from typing import Any
 from rich.progress import track
 from threadpoolctl import threadpool_limits
 
+from calib.diagnosis.verdict import worth_adding
 from sensors.documents import plain
 
 from ..mishaps.judge import Said, blunders, names, off, read_truth, rigcal
@@ -94,6 +95,13 @@ def run(case: Case) -> dict[str, Any]:
         truth = read_truth(Path(f"{recording}.truth.json"))
         solved = (fitted / "solution.yaml").is_file()
         result = said(**found) | (errors(fitted, truth) if solved else {"z": {}, "z_untold": {}})
+        document = found["diagnose"].document if "diagnose" in found else {}
+        added = worth_adding(document.get("candidates", []))
+        result |= {"added": added, "z_added": result["z"]}
+        if added:
+            grown = Path(folder) / "grown"
+            last = rigcal("add", fitted, ",".join(added), "-o", grown, limit_s=LIMIT_S)
+            result["z_added"] = errors(grown, truth)["z"] if last.code == 0 else {}
     about = {"case": case.name, "family": case.family, "lidar": case.world.lidar}
     return plain(about | result)
 
