@@ -18,7 +18,7 @@ from calib.diagnosis.screen import Candidate, Screen
 from calib.diagnosis.search import ALPHA, FEWEST, ODDS, NamedEffect, Search, angle_deg
 from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import formula, hangs_on, what_separates
-from calib.diagnosis.verdict.matters import weighed
+from calib.diagnosis.verdict.matters import Weighed, weighed
 from calib.diagnosis.verdict.sentences import BAD, UNNAMED, sentences_of, stops_of
 from calib.effects import CATALOGUE, Site
 from calib.problem.model import labels
@@ -139,16 +139,7 @@ def conclude(
     verdict = BAD if spoilt or found.blunders else _verdict(found, hold, thrown)
     if verdict == "adequate" and forbids:
         verdict = BAD
-    named, ranked = len(found.found), _ranked(found)
-    candidates = [_candidate(c, found, held_out) for c in ranked]
-    for each in candidates:
-        told_of = heavy.matter.get(each["add"])
-        each["matters"] = told_of.document() if told_of else None
-        worn = bool(each["step"]) and found.dressed_up(each["step"] - 1)
-        each["dressed_up"] = verdict == UNNAMED and bool(each["step"]) and (worn or not hold)
-    chance = [each.document(named + i) for i, each in enumerate(found.chance, 1)]
-    others = [each.document(None) for each in found.looks[-1].chance]
-    candidates = [*candidates[:named], *chance, *candidates[named:], *others]
+    candidates = _candidates(heavy, held_out, verdict == UNNAMED, hold)
     untestable = _untestable(first)
     thrown = rejected.unexplained() if rejected and verdict == UNNAMED else []
     unexplained = [_unexplained(c, screen) for screen, c in _without_a_name(found, verdict)]
@@ -254,6 +245,32 @@ def _without_a_name(found: Search, verdict: str) -> list[tuple[Screen, Candidate
     worn = verdict == UNNAMED and bool(found.found) and found.dressed_up(0)
     left, look = (found.at_first, 0) if worn else (found.unnamed, -1)
     return [(found.looks[look].unnamed, c) for c in left]
+
+
+def _candidates(
+    heavy: Weighed,
+    held_out: Mapping[str, tuple[float, float, float]],
+    unnamed: bool,
+    hold: bool,
+) -> list[dict[str, Any]]:
+    """All of them, those first that were confirmed.
+
+    Args:
+        heavy: what of the search matters.
+        held_out: as of `conclude`.
+        unnamed: whether something has no name.
+        hold: whether the names are to be believed nevertheless, where bins do not do better.
+    """
+    found = heavy.found
+    named, out = len(found.found), [_candidate(c, found, held_out) for c in _ranked(found)]
+    for each in out:
+        told_of = heavy.matter.get(each["add"])
+        each["matters"] = told_of.document() if told_of else None
+        worn = bool(each["step"]) and (not hold or found.dressed_up(each["step"] - 1))
+        each["dressed_up"] = unnamed and worn
+    chance = [each.document(named + i) for i, each in enumerate(found.chance, 1)]
+    others = [each.document(None) for each in found.looks[-1].chance]
+    return [*out[:named], *chance, *out[named:], *others]
 
 
 def _candidate(
