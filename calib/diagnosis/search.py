@@ -36,6 +36,7 @@ FEWEST = 4  # stops, below which nothing is claimed
 TRIES = 3  # how many suspects are judged before a look is called quiet
 ADAPTED = 8  # how often blunders are left out and the model is looked at again
 AS_FAR = 0.1  # of the leading blunder's evidence: others at other places are left out with it
+HELD_BACK = 0.1  # of what a test says of an effect: what is fitted with less does not bear it out
 ODDS = np.log(20.0)  # of a rival: within these it can stand in for the best
 
 
@@ -221,10 +222,11 @@ def _outdone(look: Look, by: Blunder) -> bool:
 
 
 def _chance_leads(look: Look) -> bool:
-    """Whether scatter by chance explains more than any effect or structure does."""
+    """Whether values by chance explain more than any effect or structure does; wider sigmas would
+    take in whatever is missing."""
     every = (*look.named.candidates, *look.unnamed.candidates)
     best = max((c.test.statistic for c in every), default=0.0)
-    return any(c.found and c.statistic > best for c in look.chance)
+    return any(c.found and c.statistic > best for c in look.chance if not c.effect.widens)
 
 
 def _quiet(look: Look) -> bool:
@@ -248,7 +250,10 @@ def _named(look: Look, progress: Progress) -> NamedEffect | None:
         test, p = judged(look, candidate, progress)
         if p < ALPHA:
             effect = look.stand.finest(candidate.effect, progress)
-            after = look.stand.with_effects([effect], progress).look(progress)
+            stand = look.stand.with_effects([effect], progress)
+            if _taken_up(look.named, candidate, stand.theta(effect, whole=False)) < HELD_BACK:
+                continue
+            after = stand.look(progress)
             others = rivals(look.named, candidate, max(after.named.common, test.inflation))
             return NamedEffect(
                 candidate=replace(candidate, effect=effect),
@@ -259,6 +264,14 @@ def _named(look: Look, progress: Progress) -> NamedEffect | None:
                 rivals=others,
             )
     return None
+
+
+def _taken_up(screen: Screen, candidate: Candidate, theta: np.ndarray) -> float:
+    """Share of what a test says of a candidate that its parameters (q,) have once it is fitted:
+    little, where it would have to be far larger than it may be."""
+    columns, wanted = candidate.test.columns, candidate.test.estimate()
+    told = screen.scores.information[np.ix_(columns, columns)] @ wanted
+    return float(theta @ told / max(wanted @ told, 1e-300)) if len(theta) == len(wanted) else 1.0
 
 
 def structures(look: Look, progress: Progress) -> list[Candidate]:
