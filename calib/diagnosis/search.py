@@ -21,7 +21,7 @@ from calib.diagnosis.score import Test
 from calib.diagnosis.score import test as joint_test
 from calib.diagnosis.screen import Candidate, Screen
 from calib.diagnosis.stand import Look, Stand
-from calib.effects import Effect, Site
+from calib.effects import Effect
 from calib.residuals.groups import CAD, JOINTS, MESH
 from calib.solve.fit import Progress
 
@@ -275,10 +275,7 @@ def judged(look: Look, candidate: Candidate, progress: Progress) -> tuple[Test, 
     """A candidate's test with its clusters jackknifed; its p-value, all that was looked at paid
     for."""
     found = look.judged(candidate, progress)
-    # What candidates have in common may be another effect's signal; it need not be this one's.
-    common = (look.noise if candidate.effect.site is Site.NOISE else look.named).common
-    p = found.p_value(min(common, max(found.inflation, 1.0)))
-    return found, float(after_looks(p, candidate.looks))
+    return found, float(after_looks(found.p_value(), candidate.looks))
 
 
 def suspects(screen: Screen, alpha: float) -> Iterator[Candidate]:
