@@ -13,8 +13,9 @@ inverted, so there may be more parameters than clusters. There are two ways to V
   are the mean and half the variance of the statistic over all signs: the restricted wild bootstrap
   of scores (Cameron, Gelbach and Miller 2008) in closed form, as Box and Andersen (1955) have it
   for permutations. Then ``V = (sum s_c s_c' - s s'/c) c / (c - 1)``, nu matches that variance, and
-  ``d = (n - 1) nu``, n the number of stops or of surfaces, whichever is smaller. It holds however clusters err, and however uneven they are; but an effect
-  that few stops show cannot be significant, as few signs agree by chance.
+  ``d = (n - 1) nu``, n the number of stops or of surfaces, whichever is smaller. It holds however
+  clusters err, and however uneven they are; but an effect that few stops show cannot be
+  significant, as few signs agree by chance.
 - **By leaving out** cluster after cluster, which needs the information ``I_c`` of each, thus one
   more pass over the rows, for one candidate. Each cluster is compared with what the others predict:
   ``(1 - I_c)^-1 (s_c - I_c s)`` (the cluster jackknife CV3 of MacKinnon, Nielsen and Webb 2022), so
@@ -33,8 +34,9 @@ and miss a warm-up that three of thirty stops show, at any size.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from scipy import special
@@ -43,7 +45,7 @@ from calib.linear.clusters import ClusteredRows
 
 ALONE = 0.999  # of a direction's information: a cluster that has more of it is alone with it
 UNKNOWN = 1e12  # variance, of a whitened score, where nothing tells it
-SLIGHT = 0.01  # of all information: a cluster with less leaves the others' as it is, to 1 %
+SLIGHT = 0.05  # of a direction's information: the others predict a cluster with less to 5 %
 
 
 @dataclass(frozen=True)
@@ -133,11 +135,10 @@ class Shares:
         Args:
             nu: degrees of freedom of the statistic, by signs.
         """
-        by_stop, of_stops = _left_out(self._clusters(0))
-        by_place, of_places = _left_out(self._clusters(1))
-        both, _ = _left_out(list(self.cells.values()))
-        d = min(of_stops, of_places)
-        return Chance(by_stop + _beyond(by_place, both), nu, d, d + 1.0)
+        ways = [self._clusters(0), self._clusters(1), list(self.cells.values())]
+        scores = [np.stack([score for score, _ in way]) for way in ways]
+        clusters = [Clusters.of(np.stack([known for _, known in way])) for way in ways]
+        return by_leaving_out(clusters, scores, nu)
 
     def _clusters(self, way: int) -> list[list[np.ndarray]]:
         """Score and information of each cluster: by stop (0) or by place (1)."""
@@ -147,23 +148,51 @@ class Shares:
         return list(found.values())
 
 
-def _left_out(clusters: Sequence[list[np.ndarray]]) -> tuple[np.ndarray, float]:
-    """Covariance (r, r) of the score, and its degrees of freedom per parameter, were rows
-    independent."""
-    score = np.stack([score for score, _ in clusters])
-    information = np.stack([information for _, information in clusters])
-    beyond = score - information @ score.sum(axis=0)
-    odds = information.copy()  # I (1 - I)^-1, the variance of each one were rows independent
-    alone = np.zeros_like(information[0])
-    for c in np.flatnonzero(np.trace(information, axis1=1, axis2=2) > SLIGHT):
-        values, axes = np.linalg.eigh(information[c])
-        left = 1.0 - np.clip(values, 0.0, ALONE)
-        beyond[c] = axes @ ((axes.T @ beyond[c]) / left)
-        odds[c] = (axes * (np.clip(values, 0.0, ALONE) / left)) @ axes.T
-        lonely = axes[:, values > ALONE]
-        alone += UNKNOWN * lonely @ lonely.T
-    mean = float(np.trace(odds, axis1=1, axis2=2).sum())
-    twice = odds @ odds
-    apart = np.square(twice.sum(axis=0)).sum() - np.square(twice).sum()
-    variance = float(np.square(odds).sum() + apart)
-    return beyond.T @ beyond + alone, mean**2 / max(variance, 1e-300) / score.shape[1]
+@dataclass(frozen=True)
+class Clusters:
+    """What can be said of clusters before their scores are known.
+
+    Args:
+        information: (c, r, r) of the whitened score; they add up to 1.
+        apart: cluster -> ``(1 - I)^-1`` (r, r), where that is not nearly 1.
+        alone: (r, r) variance in directions that one cluster alone holds.
+    """
+
+    information: np.ndarray
+    apart: Mapping[int, np.ndarray]
+    alone: np.ndarray
+
+    @classmethod
+    def of(cls, information: np.ndarray) -> Clusters:
+        apart, alone = {}, np.zeros_like(information[0])
+        for c in np.flatnonzero(np.linalg.norm(information, axis=(1, 2)) > SLIGHT).tolist():
+            values, axes = np.linalg.eigh(information[c])
+            apart[c] = (axes / (1.0 - np.clip(values, 0.0, ALONE))) @ axes.T
+            lonely = axes[:, values > ALONE]
+            alone += UNKNOWN * lonely @ lonely.T
+        return cls(information, apart, alone)
+
+    @cached_property
+    def d(self) -> float:
+        """Degrees of freedom, per parameter, of the covariance's trace, were rows independent."""
+        variance = self.information.copy()  # I (1 - I)^-1, of what each is compared by
+        for c, inverse in self.apart.items():
+            variance[c] = variance[c] @ inverse
+        common = variance @ variance  # of two clusters: minus I (1 - I)^-1 of one by the other's
+        squares = np.square(variance).sum() + np.square(common.sum(axis=0)).sum()
+        squares = max(float(squares - np.square(common).sum()), 1e-300)
+        return float(np.trace(variance, axis1=1, axis2=2).sum()) ** 2 / squares / len(self.alone)
+
+    def covariance(self, score: np.ndarray) -> np.ndarray:
+        """Covariance (r, r) of the sum of scores (c, r), each compared with what others predict."""
+        beyond = score - self.information @ score.sum(axis=0)
+        for c, inverse in self.apart.items():
+            beyond[c] = inverse @ beyond[c]
+        return beyond.T @ beyond + self.alone
+
+
+def by_leaving_out(ways: Sequence[Clusters], scores: Sequence[np.ndarray], nu: float) -> Chance:
+    """Chance from clusters and their scores (c, r), by stop, by surface, and by both."""
+    by_stop, by_place, both = (w.covariance(s) for w, s in zip(ways, scores, strict=True))
+    d = min(ways[0].d, ways[1].d)
+    return Chance(by_stop + _beyond(by_place, both), nu, d, d + 1.0)

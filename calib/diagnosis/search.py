@@ -225,7 +225,7 @@ def _named(look: Look, progress: Progress) -> NamedEffect | None:
             after = look.stand.with_effects([effect], progress).look(progress)
             others = rivals(look.named, candidate, max(after.named.common, test.inflation))
             return NamedEffect(
-                candidate=replace(candidate, effect=effect),
+                candidate=replace(candidate, effect=effect, p_value=test.p_value()),
                 before=look,
                 after=after,
                 judged=test,
@@ -245,9 +245,9 @@ def structures(look: Look, progress: Progress) -> list[Candidate]:
         instead = out and len(candidate.effect.covariates) == 1
         instead = instead and candidate.evidence > INSTEAD * out[0].evidence
         if instead or not _covered(look.unnamed, candidate, out):
-            p = judged(look, candidate, progress)[1]
+            test, p = judged(look, candidate, progress)
             if p < ALPHA_UNNAMED:
-                out.append(replace(candidate, p_adjusted=p))
+                out.append(replace(candidate, p_value=test.p_value(), p_adjusted=p))
     return out
 
 
@@ -267,7 +267,7 @@ def _scatter(look: Look, progress: Progress) -> Candidate | None:
     for candidate in suspects(look.noise, ALPHA):
         test, p = judged(look, candidate, progress)
         if p < ALPHA:
-            return replace(candidate, test=test, p_adjusted=p)
+            return replace(candidate, test=test, p_value=test.p_value(), p_adjusted=p)
     return None
 
 
