@@ -19,9 +19,10 @@ inverted, so there may be more parameters than clusters. There are two ways to V
 - **By leaving out** cluster after cluster, which needs the information ``I_c`` of each, thus one
   more pass over the rows, for one candidate. Each cluster is compared with what the others predict:
   ``(1 - I_c)^-1 (s_c - I_c s)`` (the cluster jackknife CV3 of MacKinnon, Nielsen and Webb 2022), so
-  a true effect widens nothing. d comes from the I_c, as Bell and McCaffrey (2002) have it, per
-  parameter, of the way that leaves less of it. A cluster that alone holds a direction leaves
-  nothing to compare it with: the variance there is infinite.
+  a true effect widens nothing. The degrees of freedom of either way come from the I_c, as Bell and
+  McCaffrey (2002) have it, were the rows of a cluster to err as one; those of the sum are
+  Satterthwaite's. A cluster that alone holds a direction leaves nothing to compare it with: the
+  variance there is infinite.
 
 The smaller of both p-values counts. Where nothing is missing the second is hardly ever the smaller,
 but for a single parameter, where both are nearly the same (`tests/bench/bench_size.py`). What was
@@ -174,14 +175,14 @@ class Clusters:
 
     @cached_property
     def d(self) -> float:
-        """Degrees of freedom, per parameter, of the covariance's trace, were rows independent."""
+        """Degrees of freedom of the covariance's trace, were each cluster's rows to err as one."""
         variance = self.information.copy()  # I (1 - I)^-1, of what each is compared by
         for c, inverse in self.apart.items():
             variance[c] = variance[c] @ inverse
         common = variance @ variance  # of two clusters: minus I (1 - I)^-1 of one by the other's
-        squares = np.square(variance).sum() + np.square(common.sum(axis=0)).sum()
-        squares = max(float(squares - np.square(common).sum()), 1e-300)
-        return float(np.trace(variance, axis1=1, axis2=2).sum()) ** 2 / squares / len(self.alone)
+        among = np.square(common.sum(axis=0)).sum() - np.square(common).sum()
+        size = np.trace(variance, axis1=1, axis2=2)
+        return float(size.sum() ** 2 / max(np.square(size).sum() + among, 1e-300))
 
     def covariance(self, score: np.ndarray) -> np.ndarray:
         """Covariance (r, r) of the sum of scores (c, r), each compared with what others predict."""
@@ -194,5 +195,7 @@ class Clusters:
 def by_leaving_out(ways: Sequence[Clusters], scores: Sequence[np.ndarray], nu: float) -> Chance:
     """Chance from clusters and their scores (c, r), by stop, by surface, and by both."""
     by_stop, by_place, both = (w.covariance(s) for w, s in zip(ways, scores, strict=True))
-    d = min(ways[0].d, ways[1].d)
-    return Chance(by_stop + _beyond(by_place, both), nu, d, d + 1.0)
+    more = _beyond(by_place, both)
+    parts = np.array([np.trace(by_stop), np.trace(more)])
+    d = parts.sum() ** 2 / max(float(np.sum(parts**2 / [ways[0].d, ways[1].d])), 1e-300)
+    return Chance(by_stop + more, nu, float(d), float(d) + 1.0)

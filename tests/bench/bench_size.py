@@ -45,7 +45,8 @@ class Family:
 
     Args:
         act: how the candidate acts: sizes of its columns by row, by stop and by surface; `within`:
-            its mean of every stop is taken off; `few`: all but three stops show 0.15 of it.
+            its mean of every stop is taken off; `stops`, `places`: all but so many of
+            them show 0.15 of it.
         stop_sd, place_sd: errors that the rows of a stop, or a surface, share, in those of a row.
         by_stop: how many unknowns of the model differ by stop alone.
     """
@@ -54,7 +55,8 @@ class Family:
     by_stop: float = 1.0
     by_place: float = 0.5
     within: bool = False
-    few: bool = False
+    stops: int = 0
+    places: int = 0
     stop_sd: float = 0.0
     place_sd: float = 0.0
     model_by_stop: int = 0
@@ -65,9 +67,11 @@ FAMILIES = {
     "stops err a little": Family(stop_sd=0.5),
     "stops err": Family(stop_sd=3.0),
     "by stop, stops err": Family(by_row=0.05, by_place=0.0, stop_sd=3.0),
-    "three stops": Family(few=True),
-    "three stops, stops err": Family(few=True, stop_sd=3.0),
+    "three stops": Family(stops=3),
+    "three stops, stops err": Family(stops=3, stop_sd=3.0),
     "within stops, stops err": Family(by_stop=0.0, within=True, stop_sd=3.0),
+    "surfaces err": Family(place_sd=3.0),
+    "three surfaces, these err": Family(places=3, place_sd=3.0),
     "both err": Family(stop_sd=0.5, place_sd=0.5),
     "model by stop, stops err": Family(stop_sd=3.0, model_by_stop=3),
 }
@@ -88,8 +92,10 @@ class World:
         mine += family.by_place * rng.standard_normal((PLACES, parameters))[self.place]
         if family.within:
             mine -= mine.reshape(stops, -1, parameters).mean(axis=1)[self.stop]
-        if family.few:
-            mine *= np.where(np.arange(stops) < 3, 1.0, 0.15)[self.stop, None]
+        if family.stops:
+            mine *= np.where(self.stop < family.stops, 1.0, 0.15)[:, None]
+        if family.places:
+            mine *= np.where(self.place < family.places, 1.0, 0.15)[:, None]
         model = rng.standard_normal((stops, family.model_by_stop))[self.stop]
         model = np.column_stack([np.ones(rows), rng.standard_normal(rows), model])
         self.model = np.linalg.qr(model)[0]
@@ -192,7 +198,7 @@ def sizes(names: list[str], draws: int) -> Iterator[str]:
 def power(draws: int) -> Iterator[str]:
     """Lines of the table of power at 0.001."""
     yield f"\n{'power at 0.001, 30 stops':26}{'sigmas':>10}{'signs':>8}{'judged':>8}{'webb':>8}"
-    for name, family in (("all stops", Family()), ("three stops", Family(few=True))):
+    for name, family in (("all stops", Family()), ("three stops", Family(stops=3))):
         for effect in (4.0, 6.0, 10.0, 30.0, 100.0):
             p = drawn(family, 30, 1, draws // 4, effect)
             share = "".join(f"{np.mean(p[t] < 1e-3):8.2f}" for t in ("signs", "judged", "webb"))
