@@ -165,6 +165,7 @@ class Clusters:
 
     @classmethod
     def of(cls, information: np.ndarray) -> Clusters:
+        """Of clusters that hold so much of the information, (c, r, r)."""
         apart, alone = {}, np.zeros_like(information[0])
         for c in np.flatnonzero(np.linalg.norm(information, axis=(1, 2)) > SLIGHT).tolist():
             values, axes = np.linalg.eigh(information[c])

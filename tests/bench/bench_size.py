@@ -106,10 +106,6 @@ class World:
         information = np.einsum("bki,bkj->bij", self._cells(), self._cells())
         self.clusters = [Clusters.of(way) for way in self._ways(information)]
 
-    @property
-    def r(self) -> int:
-        return self.columns.shape[1]
-
     def _cells(self) -> np.ndarray:
         return self.columns.reshape(self.stops * PLACES, EACH, -1)
 

@@ -94,10 +94,8 @@ def test_a_hidden_effect_is_named_first_and_sized(studies):
     assert found.verdict == "missing_effect" and found.worth_adding == [HIDDEN]
     first = found.candidates[0]
     assert first["effect"] == HIDDEN and first["step"] == 1
-    assert (
-        1e-6 <= first["p_adjusted"] < 1e-3
-        and first["p_adjusted"] < found.candidates[1]["p_adjusted"]
-    )
+    # Six stops, and one wall that holds half of the information.
+    assert first["p_adjusted"] < min(0.01, found.candidates[1]["p_adjusted"])
     assert HIDDEN in found.sentences[0]
     truth = json.loads(run.recordings[0].with_suffix(".truth.json").read_text())
     (true_m,) = truth["effects"][HIDDEN]
