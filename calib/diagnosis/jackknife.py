@@ -12,8 +12,9 @@ inverted, so there may be more parameters than clusters. There are two ways to V
   have the other sign. ``E = sum |s_c|^2`` and ``sum (s_c's_d)^2`` over pairs of different clusters
   are the mean and half the variance of the statistic over all signs: the restricted wild bootstrap
   of scores (Cameron, Gelbach and Miller 2008) in closed form, as Box and Andersen (1955) have it
-  for permutations. Then ``V = (sum s_c s_c' - s s'/c) c / (c - 1)``, nu matches that variance, and
-  ``d = (n - 1) nu``, n the number of stops or of surfaces, whichever is smaller. It holds however
+  for permutations. Then ``V = (sum s_c s_c' - s s'/c) c / (c - 1)``, nu matches that variance (by
+  stops or, where surfaces add to V, by surfaces if that leaves less), and ``d = (n - 1) nu``, n the
+  number of stops or of surfaces, whichever is smaller. It holds however
   clusters err, and however uneven they are; but an effect that few stops show cannot be
   significant, as few signs agree by chance.
 - **By leaving out** cluster after cluster, which needs the information ``I_c`` of each, thus one
@@ -22,7 +23,8 @@ inverted, so there may be more parameters than clusters. There are two ways to V
   a true effect widens nothing. The degrees of freedom of either way come from the I_c, as Bell and
   McCaffrey (2002) have it, were the rows of a cluster to err as one; those of the sum are
   Satterthwaite's. A cluster that alone holds a direction leaves nothing to compare it with: the
-  variance there is infinite.
+  variance there is infinite. Clusters fewer than five for each parameter that one of them tells as
+  one (the sum of the largest eigenvalues of the I_c) tell nothing: see the benchmark.
 
 The smaller of both p-values counts. Where nothing is missing the second is hardly ever the smaller,
 but for a single parameter, where both are nearly the same (`tests/bench/bench_size.py`). What was
@@ -46,6 +48,7 @@ from calib.linear.clusters import ClusteredRows
 
 ALONE = 0.999  # of a direction's information: a cluster that has more of it is alone with it
 UNKNOWN = 1e12  # variance, of a whitened score, where nothing tells it
+PER_PARAMETER = 5  # stops, or surfaces, for each parameter that these tell as one
 SLIGHT = 0.05  # of a direction's information: the others predict a cluster with less to 5 %
 
 
@@ -81,15 +84,24 @@ def by_signs(ways: Sequence[np.ndarray], stops: int) -> Chance:
         stops: how many stops have a share in it.
     """
     by_stop, by_place, both = (_evenly(shares) for shares in ways)
-    covariance = by_stop + _beyond(by_place, both)
-    size = np.square(ways[0]).sum(axis=1)
-    pairs = np.square(ways[0].T @ ways[0]).sum() - np.square(size).sum()
-    alike = max(float(pairs / max(size.sum() ** 2, 1e-300)), 1e-9)
+    more = _beyond(by_place, both)
     count = max(min(stops, len(ways[1])), 2)
-    nu = max((1.0 - 1.0 / count) / alike - 2.0 / count, 0.5)
+    nu = _freedom(ways[0], count)
+    if np.trace(more) > 0.0:
+        nu = min(nu, _freedom(ways[1], max(len(ways[1]), 2)))
+    size = np.square(ways[0]).sum(axis=1)
     # Were scores normal, their squares would scatter by 2 / nu.
     even = size.sum() ** 2 / max(np.square(size).sum(), 1e-300) * (1.0 + 2.0 / nu)
-    return Chance(covariance, nu, (count - 1.0) * nu, min(float(count), float(even)))
+    return Chance(by_stop + more, nu, (count - 1.0) * nu, min(float(count), float(even)))
+
+
+def _freedom(shares: np.ndarray, count: int) -> float:
+    """Degrees of freedom of the square of a sum of shares (c, r), by pairs of different clusters;
+    so many of them tell it."""
+    size = np.square(shares).sum(axis=1)
+    pairs = np.square(shares.T @ shares).sum() - np.square(size).sum()
+    alike = max(float(pairs / max(size.sum() ** 2, 1e-300)), 1e-9)
+    return max((1.0 - 1.0 / count) / alike - 2.0 / count, 0.5)
 
 
 def _evenly(shares: np.ndarray) -> np.ndarray:
@@ -136,17 +148,24 @@ class Shares:
         Args:
             nu: degrees of freedom of the statistic, by signs.
         """
-        ways = [self._clusters(0), self._clusters(1), list(self.cells.values())]
-        scores = [np.stack([score for score, _ in way]) for way in ways]
-        clusters = [Clusters.of(np.stack([known for _, known in way])) for way in ways]
+        ways = [self._clusters(0), self._clusters(1), self.cells]
+        scores = [np.stack([score for score, _ in way.values()]) for way in ways]
+        clusters = [
+            Clusters.of(
+                np.stack([information for _, information in way.values()]),
+                sum(isinstance(key, int) for key in way) or len(way),
+            )
+            for way in ways
+        ]
         return by_leaving_out(clusters, scores, nu)
 
-    def _clusters(self, way: int) -> list[list[np.ndarray]]:
-        """Score and information of each cluster: by stop (0) or by place (1)."""
-        found: dict[object, list[np.ndarray]] = {}
+    def _clusters(self, way: int) -> dict[int | tuple[int, int], list[np.ndarray]]:
+        """Score and information of each cluster: by stop (0) or by place (1); by cell of rows that
+        have none."""
+        found: dict[int | tuple[int, int], list[np.ndarray]] = {}
         for cell, (score, information) in self.cells.items():
             self._sum(found, cell[way] if cell[way] >= 0 else cell, score, information)
-        return list(found.values())
+        return found
 
 
 @dataclass(frozen=True)
@@ -155,16 +174,18 @@ class Clusters:
 
     Args:
         information: (c, r, r) of the whitened score; they add up to 1.
+        count: how many are stops, in the way by stops, or surfaces.
         apart: cluster -> ``(1 - I)^-1`` (r, r), where that is not nearly 1.
         alone: (r, r) variance in directions that one cluster alone holds.
     """
 
     information: np.ndarray
+    count: int
     apart: Mapping[int, np.ndarray]
     alone: np.ndarray
 
     @classmethod
-    def of(cls, information: np.ndarray) -> Clusters:
+    def of(cls, information: np.ndarray, count: int) -> Clusters:
         """Of clusters that hold so much of the information, (c, r, r)."""
         apart, alone = {}, np.zeros_like(information[0])
         for c in np.flatnonzero(np.linalg.norm(information, axis=(1, 2)) > SLIGHT).tolist():
@@ -172,7 +193,7 @@ class Clusters:
             apart[c] = (axes / (1.0 - np.clip(values, 0.0, ALONE))) @ axes.T
             lonely = axes[:, values > ALONE]
             alone += UNKNOWN * lonely @ lonely.T
-        return cls(information, apart, alone)
+        return cls(information, count, apart, alone)
 
     @cached_property
     def d(self) -> float:
@@ -185,6 +206,12 @@ class Clusters:
         size = np.trace(variance, axis1=1, axis2=2)
         return float(size.sum() ** 2 / max(np.square(size).sum() + among, 1e-300))
 
+    @cached_property
+    def crowded(self) -> bool:
+        """Whether they are too few for the parameters that each of them tells as one: these then
+        fit what the clusters err by, and nothing is left of it."""
+        return PER_PARAMETER * np.linalg.eigvalsh(self.information)[:, -1].sum() > self.count
+
     def covariance(self, score: np.ndarray) -> np.ndarray:
         """Covariance (r, r) of the sum of scores (c, r), each compared with what others predict."""
         beyond = score - self.information @ score.sum(axis=0)
@@ -196,6 +223,8 @@ class Clusters:
 def by_leaving_out(ways: Sequence[Clusters], scores: Sequence[np.ndarray], nu: float) -> Chance:
     """Chance from clusters and their scores (c, r), by stop, by surface, and by both."""
     by_stop, by_place, both = (w.covariance(s) for w, s in zip(ways, scores, strict=True))
+    if ways[0].crowded or ways[1].crowded:
+        by_stop = UNKNOWN * np.eye(len(by_stop))
     more = _beyond(by_place, both)
     parts = np.array([np.trace(by_stop), np.trace(more)])
     d = parts.sum() ** 2 / max(float(np.sum(parts**2 / [ways[0].d, ways[1].d])), 1e-300)

@@ -171,10 +171,10 @@ class Test:
     def dof(self) -> int:
         return self.whiten.shape[1]
 
-    @property
+    @cached_property
     def chance(self) -> Chance:
-        """The last that was found: once it is judged, a true effect does not widen it."""
-        return self.chances[-1]
+        """That which counts, as it leaves least to chance; a true effect widens the first."""
+        return min(self.chances, key=lambda chance: chance.p_value(self.statistic))
 
     @cached_property
     def inflation(self) -> float:
@@ -187,7 +187,7 @@ class Test:
 
     def p_value(self) -> float:
         """How often chance alone explains as much."""
-        return at_least(min(chance.p_value(self.statistic) for chance in self.chances))
+        return at_least(self.chance.p_value(self.statistic))
 
     def evidence(self, common: float) -> float:
         """Minus the log of the p-value were rows independent but for the common inflation. It

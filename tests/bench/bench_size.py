@@ -104,7 +104,12 @@ class World:
         seen = values > 1e-6 * values.max()
         self.columns = mine @ (axes[:, seen] / np.sqrt(values[seen]))
         information = np.einsum("bki,bkj->bij", self._cells(), self._cells())
-        self.clusters = [Clusters.of(way) for way in self._ways(information)]
+        self.clusters = [
+            Clusters.of(way, count)
+            for way, count in zip(
+                self._ways(information), (stops, PLACES, stops * PLACES), strict=True
+            )
+        ]
 
     def _cells(self) -> np.ndarray:
         return self.columns.reshape(self.stops * PLACES, EACH, -1)
