@@ -8,14 +8,15 @@ otherwise. A line is a family, a number of stops and one of parameters; its colu
 draws in which a test finds something:
 
 signs   the screen's test (`calib.diagnosis.jackknife`, by signs)
-out     a judged candidate's second test (the same module, by leaving out)
+out     a judged candidate's second test (the same module, by leaving out; 0 where too few are left)
 judged  the smaller p-value of both, which decides a name
-CV3     leaving out, with the degrees of freedom times nu (see the module): left
-webb    a restricted wild bootstrap by stops, with Webb's weights, studentised by CV3: left
+CV3     the second test, with its degrees of freedom times nu: left
+webb    a restricted wild bootstrap by stops, with Webb's weights, studentised by leaving
+        out: left
 KS      largest distance of the judged p-values from a uniform distribution
 
 The last table is power: effects of some sizes that all stops show, or three of them. One thread
-and eight minutes.
+and five minutes.
 """
 
 from __future__ import annotations
@@ -208,7 +209,7 @@ def power(draws: int) -> Iterator[str]:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--draws", type=int, default=160)
+    parser.add_argument("--draws", type=int, default=240)
     parser.add_argument("--families", default=",".join(FAMILIES).replace(", ", "; "))
     asked = parser.parse_args()
     chosen = [name.replace("; ", ", ") for name in asked.families.split(",")]
