@@ -34,8 +34,8 @@ three stops show most of the effect, or it acts within stops only, 0.02 to 0.07 
 show something, stops averaged over (0.12 in the worst of 192 cases); none, where parameters that
 act by stop are as many as the stops. Limits: 0.13 with few stops where surfaces err by three times
 a row's sigma and the model does not know it; and a model that itself has unknowns that differ by
-stop alone, as residuals then scatter less than errors: with three of these 0.15 for 6 to 12 stops and
-0.09 for 30, and 0.3 for 16 parameters and 12 stops. An effect of 30 sigmas that three of thirty
+stop alone, as residuals then scatter less than errors: with three of these 0.15 for 6 to 12 stops
+and 0.09 for 30, and 0.3 for 16 parameters and 12 stops. An effect of 30 sigmas that three of thirty
 stops show is found at 0.001 in 0.9 of worlds, by signs alone in none.
 
 What was compared and left, on the same rows: leaving out with ``d nu`` in place of d and no least
