@@ -83,7 +83,9 @@ class Chance:
         return float(np.trace(self.covariance))
 
     def p_value(self, statistic: float) -> float:
-        """How often chance alone makes as large a statistic."""
+        """How often chance alone makes as large a statistic; always, where nothing tells."""
+        if self.d <= 0.0:
+            return 1.0
         return float(special.fdtrc(self.nu, self.d, statistic / self.trace))
 
 
@@ -92,14 +94,14 @@ def by_signs(ways: Sequence[np.ndarray], stops: int) -> Chance:
 
     Args:
         ways: shares (c, r) of the whitened score by stop, by surface, and by both.
-        stops: how many stops have a share in it.
+        stops: how many stops have a share in it; one tells nothing.
     """
     by_stop, by_place, both = (_evenly(shares) for shares in ways)
     more = _beyond(by_place, both)
-    count = max(min(stops, len(ways[1])), 2)
+    count = max(min(stops, len(ways[1])), 1)
     nu = _freedom(ways[0], count)
     if np.trace(more) > 0.0:
-        nu = min(nu, _freedom(ways[1], max(len(ways[1]), 2)))
+        nu = min(nu, _freedom(ways[1], len(ways[1])))
     size = np.square(ways[0]).sum(axis=1)
     # Were scores normal, their squares would scatter by 2 / nu.
     even = size.sum() ** 2 / max(np.square(size).sum(), 1e-300) * (1.0 + 2.0 / nu)

@@ -214,7 +214,7 @@ class Test:
         if not self.dof:
             return np.inf
         nu = self.chance.nu
-        d = min(self.chance.d, max(self.chance.clusters - 1.0, 0.5) * nu)
+        d = max(min(self.chance.d, (self.chance.clusters - 1.0) * nu), 0.5 * nu)
         limit = special.fdtri(nu, d, 1.0 - alpha)
         noncentral = special.ncfdtrinc(nu, d, 1.0 - POWER, limit)
         # Along a direction of unit length the information is this much, on average.

@@ -10,7 +10,7 @@ draws in which a test finds something:
 signs   the screen's test (`calib.diagnosis.jackknife`, by signs)
 out     a judged candidate's second test (the same module, by leaving out; 0 where too few are left)
 judged  the smaller p-value of both, which decides a name
-CV3     the second test, with its degrees of freedom times nu: left
+CV3     the second test, its degrees of freedom times nu, however few the clusters: left
 webb    a restricted wild bootstrap by stops, with Webb's weights, studentised by leaving
         out: left
 KS      largest distance of the judged p-values from a uniform distribution
@@ -140,7 +140,10 @@ def p_values(
     out = by_leaving_out(world.clusters, ways, signs.nu)
     found = {"signs": signs.p_value(statistic), "out": out.p_value(statistic)}
     found["judged"] = min(found.values())
-    wide = Chance(out.covariance, out.nu, out.d * out.nu, out.clusters)
+    stop, place, both = (c.covariance(w) for c, w in zip(world.clusters, ways, strict=True))
+    more = (place - both) * (np.trace(place - both) > 0.0)
+    d = min(clusters.d for clusters in world.clusters[:2]) * signs.nu
+    wide = Chance(stop + more, signs.nu, d, d)
     return found | {
         "CV3": wide.p_value(statistic),
         "webb": webb(world.clusters[0], ways[0], rng, bootstraps),
