@@ -1,6 +1,6 @@
 """How often a test of an effect finds one in rows where there is none, at a nominal 0.05.
 
-    python tests/bench/bench_size.py [--draws 400] [--families "rows,stops differ,..."]
+    python tests/bench/bench_size.py [--draws 240] [--families "rows; stops err; ..."]
 
 Own rows: a number of stops that see 25 surfaces, two rows each; a model that the rows' errors are
 fitted by; and a candidate of 1 to 64 parameters. Every family makes the candidate, or the errors,
@@ -213,9 +213,9 @@ def power(draws: int) -> Iterator[str]:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--draws", type=int, default=240)
-    parser.add_argument("--families", default=",".join(FAMILIES).replace(", ", "; "))
+    parser.add_argument("--families", default="; ".join(FAMILIES))
     asked = parser.parse_args()
-    chosen = [name.replace("; ", ", ") for name in asked.families.split(",")]
+    chosen = [name.strip() for name in asked.families.split(";")]
     with threadpool_limits(1):
         for line in chain(sizes(chosen, asked.draws), power(asked.draws)):
             print(line, flush=True)

@@ -67,6 +67,7 @@ def test_p_values_of_several_parameters_are_uniform(bench):
 def test_one_stop_that_alone_shows_an_effect_proves_nothing():
     lone = [np.array([[50.0], [0.1], [-0.2]]), np.array([[50.0], [-0.1]]), np.array([[49.9]])]
     assert by_signs(lone, 3).p_value(49.9**2) > 0.1
+    assert by_signs([lone[0], lone[1], lone[2]], 1).p_value(1e6) == 1.0
     holds = np.array([0.9995, 0.0003, 0.0002])[:, None, None]
     assert Clusters.of(holds, 3).covariance(lone[0])[0, 0] > 0.99 * UNKNOWN
 
