@@ -59,8 +59,8 @@ from calib.linear.clusters import ClusteredRows
 
 ALONE = 0.999  # of a direction's information: a cluster that has more of it is alone with it
 UNKNOWN = 1e12  # variance, of a whitened score, where nothing tells it
-# Least stops, or surfaces, for each parameter that one of these tells as one. By the benchmark: with
-# fewer, 0.1 to 1.0 of empty worlds show something where stops err together; with more, 0.0 to 0.09.
+# Least stops, or surfaces, for each parameter that one of these tells as one. Measured in the
+# benchmark: with fewer, 0.1 to 1.0 of empty worlds where stops err show something; else below 0.1.
 PER_PARAMETER = 2
 SLIGHT = 0.05  # of a direction's information: the others predict a cluster with less to 5 %
 
