@@ -88,7 +88,7 @@ class Chance:
         """How often chance alone makes as large a statistic; always, where nothing tells."""
         if self.d <= 0.0:
             return 1.0
-        return float(special.fdtrc(self.nu, self.d, statistic / self.trace))
+        return float(special.fdtrc(self.nu, self.d, statistic / max(self.trace, 1e-300)))
 
 
 def by_signs(ways: Sequence[np.ndarray], stops: int) -> Chance:
