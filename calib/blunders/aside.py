@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterator, Mapping
 
 import numpy as np
 
-from calib.blunders.chance import after_looks, log_tail
+from calib.blunders.chance import after_looks, at_least, log_tail
 from calib.blunders.judged import Blunder, LeftOut
 from calib.blunders.shifts import Shift
 from calib.problem.problem import Problem
@@ -40,10 +40,11 @@ def stray_scans(
         best = int(np.argmin(there)) if there else -1
         fits = bool(there) and there[best] < ALIKE * off_m
         chance = log_tail((off_m / sigma_m) ** 2, 1.0)
+        p = at_least(np.exp(chance))
         blunder = Blunder(
             shift=_distance(scan.group, off_m, sigma_m),
-            p_value=float(np.exp(chance)),
-            p_adjusted=float(after_looks(np.exp(chance), looks)),
+            p_value=p,
+            p_adjusted=float(after_looks(p, looks)),
             evidence=-chance,
             limit=CONTRADICTS**2,
             detectable={"m": CONTRADICTS * sigma_m},

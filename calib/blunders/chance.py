@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy import special
 
+LEAST_P = 1e-6  # nobody knows a tail further out: no p-value is said to be smaller
+
 
 def log_tail(x: float, q: float) -> float:
     """Log of the upper tail of chi-square with q degrees of freedom, however far out."""
@@ -15,6 +17,12 @@ def log_tail(x: float, q: float) -> float:
     return float((q / 2 - 1) * np.log(half) - half - special.gammaln(q / 2))
 
 
+def at_least(p: float) -> float:
+    """A p-value as it is told."""
+    return max(float(p), LEAST_P)
+
+
 def after_looks(p: np.ndarray | float, looks: float) -> np.ndarray | float:
-    """Chance that the smallest of so many independent p-values is as small (Sidak 1967)."""
-    return -np.expm1(looks * np.log1p(-np.minimum(p, 1 - 1e-15)))
+    """Chance that the smallest of so many independent p-values is as small (Sidak 1967); no less
+    than a p-value that is told."""
+    return -np.expm1(looks * np.log1p(-np.clip(p, LEAST_P, 1 - 1e-15)))

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import special
 
-from calib.blunders.chance import after_looks, log_tail
+from calib.blunders.chance import after_looks, at_least, log_tail
 from calib.blunders.shifts import Shift, shifts
 from calib.linear.system import Linearisation
 from calib.problem.problem import Problem
@@ -139,7 +139,7 @@ def _judged(some: Sequence[Shift], looks: int) -> Iterator[Blunder]:
     for shift in some:
         known = MEDIAN * max(dof.sum() - shift.dof, 1) if len(wholes) >= BULK else KNOWN
         scaled = shift.statistic / bulk
-        p = float(special.fdtrc(shift.dof, known, scaled / shift.dof))
+        p = at_least(special.fdtrc(shift.dof, known, scaled / shift.dof))
         limit = special.fdtri(shift.dof, known, (1.0 - ALPHA) ** (1.0 / looks))
         enough = special.ncfdtrinc(shift.dof, known, 1.0 - POWER, limit)
         told = {u: np.diag(shift.information)[at].mean() for u, at in shift.parts.items()}

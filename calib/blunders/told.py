@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from calib.blunders.chance import LEAST_P
 from calib.blunders.judged import Blunder, LeftOut
 from calib.residuals.groups import BEAMS, JOINTS, MESH, Group
 from calib.rig import Rig
@@ -124,8 +125,8 @@ def _otherwise(kind: str, name: str, where: str, sentence: str) -> dict[str, Any
         "axis": None,
         "wrong_sign": None,
         "offset": None,
-        "p_value": 0.0,  # chance puts no ring in another's place
-        "p_adjusted": 0.0,
+        "p_value": LEAST_P,  # chance puts no ring in another's place
+        "p_adjusted": LEAST_P,
         "detectable": {},
         "indistinguishable_from": [],
         "belongs_to": None,

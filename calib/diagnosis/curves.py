@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from calib.diagnosis.candidates import Binned
-from calib.diagnosis.score import COMMON
 from calib.diagnosis.screen import Screen
 
 CONFIDENCE = 0.95
@@ -23,7 +22,8 @@ class Curve:
         centres: covariate -> (B,) mean of its values in each bin.
         mean_m: (B,) or (B1, B2), weighted mean of what is left after the fit; NaN where nothing is.
         band_m: half the width of a band that holds all bins together with 95 % probability where
-            the model is right, stops and surfaces counted, not rows; moderated as the tests are.
+            the model is right, stops and surfaces counted, not rows; no narrower than the
+            candidates' common inflation has it.
     """
 
     centres: Mapping[str, np.ndarray]
@@ -61,10 +61,8 @@ def _curve(screen: Screen, effect: Binned, columns: np.ndarray, drawn: np.ndarra
     stop, place = np.square(scores.by_stop[:, columns]), np.square(scores.by_place[:, columns])
     one_way = np.maximum(stop.sum(axis=0), place.sum(axis=0))
     two_way = stop.sum(axis=0) + place.sum(axis=0) - np.square(scores.both[:, columns]).sum(axis=0)
-    clusters = (stop > 0).sum(axis=0)
     model = screen.common * np.diag(scores.information)[columns]
-    variance = clusters * np.maximum(one_way, two_way) + COMMON * model
-    sigma = np.sqrt(np.maximum(variance, 0.0) / (clusters + COMMON)) / weight
+    sigma = np.sqrt(np.maximum(np.maximum(one_way, two_way), model)) / weight
     by_chance = np.abs(drawn) / np.sqrt(np.maximum(stop.sum(axis=0) + place.sum(axis=0), 1e-300))
     width = np.quantile(by_chance[:, np.isfinite(weight)].max(axis=1), CONFIDENCE)
     # A range error of 1 m changes every residual of its bin by as much: mean = score / weight.

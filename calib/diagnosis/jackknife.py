@@ -1,23 +1,136 @@
-"""One candidate judged by leaving out cluster after cluster.
+"""How far a candidate's score goes by chance, told from clusters of rows that err together.
 
-The scatter of the clusters' scores judges a candidate. A true effect widens that scatter itself,
-and one odd cluster can make a candidate that acts in few clusters look certain. So each cluster is
-compared with what the others predict: with the whitened score ``s = sum s_c`` and information
-``sum I_c = 1``, its part is ``(1 - I_c)^-1 (s_c - I_c s)``. This is the cluster jackknife
-(MacKinnon, Nielsen and Webb 2022, CV3), by stops and by surfaces. It needs each cluster's own share
-of the information, so it is one more pass over the rows, for one candidate.
+The rows fall into clusters in two ways: by stop and by surface. A row of no stop (a surface's own
+error) is a cluster of that surface among the stops, and the other way round. With ``s_c`` a
+cluster's share of the whitened score ``s = sum s_c`` of r parameters, the score's covariance is
+``V = V_stop + max(V_surface - V_both, 0)`` (Cameron, Gelbach and Miller 2011): stops count in full,
+and what surfaces share between stops comes on top. The statistic ``s's`` over the trace of V is
+near ``F(nu, d)`` (the ANOVA-type statistic: Box 1954; Brunner, Dette and Munk 1997). V is never
+inverted, so there may be more parameters than clusters. There are two ways to V and d:
+
+- **By signs**, from the scores alone. Where nothing is missing every stop's score might as well
+  have the other sign. ``E = sum |s_c|^2`` and ``sum (s_c's_d)^2`` over pairs of different clusters
+  are the mean and half the variance of the statistic over all signs: the restricted wild bootstrap
+  of scores (Cameron, Gelbach and Miller 2008) in closed form, as Box and Andersen (1955) have it
+  for permutations. Then ``V = (sum s_c s_c' - s s'/c) c / (c - 1)``, nu matches that variance (by
+  stops or, where surfaces add to V, by surfaces if that leaves less), and ``d = (n - 1) nu``, n the
+  number of stops or of surfaces, whichever is smaller. It holds however clusters err, and however
+  uneven they are; but an effect that few stops show cannot be significant, as few signs often agree
+  by chance.
+- **By leaving out** cluster after cluster, which needs the information ``I_c`` of each, thus one
+  more pass over the rows, for one candidate. Each cluster is compared with what the others predict:
+  ``(1 - I_c)^-1 (s_c - I_c s)`` (the cluster jackknife CV3 of MacKinnon, Nielsen and Webb 2022), so
+  a true effect widens nothing. The degrees of freedom of either way come from the I_c, as Bell and
+  McCaffrey (2002) have it, were the rows of a cluster to err as one; those of the sum are
+  Satterthwaite's. A cluster that alone holds a direction leaves nothing to compare it with: the
+  variance there is infinite. Clusters fewer than two for each parameter that one of them tells as
+  one (the sum of the largest eigenvalues of the I_c) tell nothing: parameters fit their errors.
+
+The smaller of both p-values counts: where nothing is missing the second is hardly ever the smaller,
+but for a single parameter, where both are nearly the same. Measured by `tests/bench/bench_size.py`
+at a nominal 0.05, with 1, 4, 16 and 64 parameters and 6 to 60 stops, 240 draws each: where rows err
+alone, stops err together by up to three times a row's sigma, stops and surfaces do by half of it,
+three stops show most of the effect, or it acts within stops only, 0.02 to 0.07 of empty worlds
+show something, stops averaged over (0.12 in the worst of 192 cases); none, where parameters that
+act by stop are as many as the stops. Limits: 0.13 with few stops where surfaces err by three times
+a row's sigma and the model does not know it; and a model that itself has unknowns that differ by
+stop alone, as residuals then scatter less than errors: with three of these 0.15 for 6 to 12 stops
+and 0.09 for 30, and 0.3 for 16 parameters and 12 stops. An effect of 30 sigmas that three of thirty
+stops show is found at 0.001 in 0.9 of worlds, by signs alone in none.
+
+What was compared and left, on the same rows: leaving out with ``d nu`` in place of d and no least
+number of clusters finds something in 0.1 to 1.0 of empty worlds where stops err together and 4 or
+more parameters act by stop, as the I_c know nothing of such errors. Draws of the restricted wild
+bootstrap by stops, studentised, with Webb's weights, are as good for one parameter and too bold for
+4 to 64 with few stops (0.1 to 1.0); they see no surfaces; and their least p-value is one over their
+number.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
+from scipy import special
 
 from calib.linear.clusters import ClusteredRows
 
-WHOLE = 0.999  # of a direction's information: a cluster that has more of it is alone with it
+ALONE = 0.999  # of a direction's information: a cluster that has more of it is alone with it
+UNKNOWN = 1e12  # variance, of a whitened score, where nothing tells it
+# Least stops, or surfaces, for each parameter that one of these tells as one. Measured in the
+# benchmark: with fewer, 0.1 to 1.0 of empty worlds where stops err show something; else below 0.1.
+PER_PARAMETER = 2
+SLIGHT = 0.05  # of a direction's information: the others predict a cluster with less to 5 %
+
+
+@dataclass(frozen=True)
+class Chance:
+    """How a whitened score scatters where nothing is missing.
+
+    Args:
+        covariance: (r, r) of the score.
+        nu, d: degrees of freedom of the statistic over the covariance's trace.
+        clusters: how many even clusters would tell as much of the covariance.
+    """
+
+    covariance: np.ndarray
+    nu: float
+    d: float
+    clusters: float
+
+    @property
+    def trace(self) -> float:
+        return float(np.trace(self.covariance))
+
+    def p_value(self, statistic: float) -> float:
+        """How often chance alone makes as large a statistic; always, where nothing tells."""
+        if self.d <= 0.0:
+            return 1.0
+        return float(special.fdtrc(self.nu, self.d, statistic / max(self.trace, 1e-300)))
+
+
+def by_signs(ways: Sequence[np.ndarray], stops: int) -> Chance:
+    """Chance from the scores alone; see the module.
+
+    Args:
+        ways: shares (c, r) of the whitened score by stop, by surface, and by both.
+        stops: how many stops have a share in it; one tells nothing.
+    """
+    by_stop, by_place, both = (_evenly(shares) for shares in ways)
+    more = _beyond(by_place, both)
+    count = max(min(stops, len(ways[1])), 1)
+    nu = _freedom(ways[0], count)
+    if np.trace(more) > 0.0:
+        nu = min(nu, _freedom(ways[1], len(ways[1])))
+    size = np.square(ways[0]).sum(axis=1)
+    # Were scores normal, their squares would scatter by 2 / nu.
+    even = size.sum() ** 2 / max(np.square(size).sum(), 1e-300) * (1.0 + 2.0 / nu)
+    return Chance(by_stop + more, nu, (count - 1.0) * nu, min(float(count), float(even)))
+
+
+def _freedom(shares: np.ndarray, count: int) -> float:
+    """Degrees of freedom of the square of a sum of shares (c, r), by pairs of different clusters;
+    so many of them tell it."""
+    size = np.square(shares).sum(axis=1)
+    pairs = np.square(shares.T @ shares).sum() - np.square(size).sum()
+    alike = max(float(pairs / max(size.sum() ** 2, 1e-300)), 1e-9)
+    return max((1.0 - 1.0 / count) / alike - 2.0 / count, 0.5)
+
+
+def _evenly(shares: np.ndarray) -> np.ndarray:
+    """Covariance (r, r) of the sum of shares (c, r), an even part of it taken off each."""
+    count, total = len(shares), shares.sum(axis=0)
+    if count < 2:
+        return UNKNOWN * np.eye(len(total))
+    return (shares.T @ shares - np.outer(total, total) / count) * count / (count - 1)
+
+
+def _beyond(by_place: np.ndarray, both: np.ndarray) -> np.ndarray:
+    """What surfaces that err alike at all stops add to a covariance by stops."""
+    more = by_place - both
+    return more if np.trace(more) > 0.0 else np.zeros_like(more)
 
 
 @dataclass
@@ -44,27 +157,90 @@ class Shares:
         else:
             to[key] = [score.copy(), information.copy()]
 
-    def covariance(self) -> np.ndarray:
-        """Covariance (r, r) of the whitened score: by stops, plus by places, less by both."""
-        total = sum(score for score, _ in self.cells.values())
-        ways = {"stop": {}, "place": {}, "both": {}}
-        for (stop, place), (score, information) in self.cells.items():
-            if stop >= 0:
-                self._sum(ways["stop"], stop, score, information)
-            if place >= 0:
-                self._sum(ways["place"], place, score, information)
-            if stop >= 0 and place >= 0:
-                self._sum(ways["both"], (stop, place), score, information)
-        stop, place, both = (_spread(cells.values(), total) for cells in ways.values())
-        return max(stop + place - both, stop, place, key=np.trace)
+    def left_out(self, nu: float) -> Chance:
+        """Chance from leaving out cluster after cluster; see the module.
+
+        Args:
+            nu: degrees of freedom of the statistic, by signs.
+        """
+        ways = [self._clusters(0), self._clusters(1), self.cells]
+        scores = [np.stack([score for score, _ in way.values()]) for way in ways]
+        clusters = [
+            Clusters.of(
+                np.stack([information for _, information in way.values()]),
+                sum(isinstance(key, int) for key in way) or len(way),
+            )
+            for way in ways
+        ]
+        return by_leaving_out(clusters, scores, nu)
+
+    def _clusters(self, way: int) -> dict[int | tuple[int, int], list[np.ndarray]]:
+        """Score and information of each cluster: by stop (0) or by place (1); by cell of rows that
+        have none."""
+        found: dict[int | tuple[int, int], list[np.ndarray]] = {}
+        for cell, (score, information) in self.cells.items():
+            self._sum(found, cell[way] if cell[way] >= 0 else cell, score, information)
+        return found
 
 
-def _spread(cells: Sequence[list[np.ndarray]], total: np.ndarray) -> np.ndarray:
-    """Sum over clusters of the squares of ``(1 - I_c)^-1 (s_c - I_c s)``; see the module."""
-    out = np.zeros((len(total), len(total)))
-    for score, information in cells:
-        values, axes = np.linalg.eigh(information)
-        left = 1.0 - np.clip(values, 0.0, WHOLE)
-        beyond = axes @ ((axes.T @ (score - information @ total)) / left)
-        out += np.outer(beyond, beyond)
-    return out
+@dataclass(frozen=True)
+class Clusters:
+    """What can be said of clusters before their scores are known.
+
+    Args:
+        information: (c, r, r) of the whitened score; they add up to 1.
+        count: how many are stops, in the way by stops, or surfaces.
+        apart: cluster -> ``(1 - I)^-1`` (r, r), where that is not nearly 1.
+        alone: (r, r) variance in directions that one cluster alone holds.
+    """
+
+    information: np.ndarray
+    count: int
+    apart: Mapping[int, np.ndarray]
+    alone: np.ndarray
+
+    @classmethod
+    def of(cls, information: np.ndarray, count: int) -> Clusters:
+        """Of clusters that hold so much of the information, (c, r, r)."""
+        apart, alone = {}, np.zeros_like(information[0])
+        for c in np.flatnonzero(np.linalg.norm(information, axis=(1, 2)) > SLIGHT).tolist():
+            values, axes = np.linalg.eigh(information[c])
+            apart[c] = (axes / (1.0 - np.clip(values, 0.0, ALONE))) @ axes.T
+            lonely = axes[:, values > ALONE]
+            alone += UNKNOWN * lonely @ lonely.T
+        return cls(information, count, apart, alone)
+
+    @cached_property
+    def d(self) -> float:
+        """Degrees of freedom of the covariance's trace, were each cluster's rows to err as one."""
+        variance = self.information.copy()  # I (1 - I)^-1, of what each is compared by
+        for c, inverse in self.apart.items():
+            variance[c] = variance[c] @ inverse
+        common = variance @ variance  # of two clusters: minus I (1 - I)^-1 of one by the other's
+        among = np.square(common.sum(axis=0)).sum() - np.square(common).sum()
+        size = np.trace(variance, axis1=1, axis2=2)
+        return float(size.sum() ** 2 / max(np.square(size).sum() + among, 1e-300))
+
+    @cached_property
+    def crowded(self) -> bool:
+        """Whether they are too few for the parameters that each of them tells as one: these then
+        fit what the clusters err by, and nothing is left of it."""
+        return PER_PARAMETER * np.linalg.eigvalsh(self.information)[:, -1].sum() > self.count
+
+    def covariance(self, score: np.ndarray) -> np.ndarray:
+        """Covariance (r, r) of the sum of scores (c, r), each compared with what others predict."""
+        beyond = score - self.information @ score.sum(axis=0)
+        for c, inverse in self.apart.items():
+            beyond[c] = inverse @ beyond[c]
+        return beyond.T @ beyond + self.alone
+
+
+def by_leaving_out(ways: Sequence[Clusters], scores: Sequence[np.ndarray], nu: float) -> Chance:
+    """Chance from clusters and their scores (c, r), by stop, by surface, and by both."""
+    by_stop, by_place, both = (w.covariance(s) for w, s in zip(ways, scores, strict=True))
+    if ways[0].crowded or ways[1].crowded:
+        by_stop = UNKNOWN * np.eye(len(by_stop))
+    more = _beyond(by_place, both)
+    parts = np.array([np.trace(by_stop), np.trace(more)])
+    d = parts.sum() ** 2 / max(float(np.sum(parts**2 / [ways[0].d, ways[1].d])), 1e-300)
+    return Chance(by_stop + more, nu, float(d), float(d) + 1.0)

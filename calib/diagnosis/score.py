@@ -3,18 +3,13 @@
 One fit serves all candidates: their columns are projected off everything that the model estimates,
 stops' poses and surfaces' errors included, and what is left of the residual along them is the score
 ``s``, with information ``I`` (Rao 1948). The statistic ``s' I^-1 s`` is what the effect would
-explain. How large it gets by chance is judged from clusters of rows, not rows: the score's
-covariance ``V`` is the sum over stops plus that over surfaces less that over both (Cameron, Gelbach
-and Miller 2011). The statistic is then near ``a F(nu, d)`` whose a and nu match its mean and
-variance (Satterthwaite; Rao and Scott 1984). As V is never inverted, an effect may have more
-parameters than there are clusters. Few clusters tell V badly: it is moderated towards what all
-candidates have in common, as Smyth (2004) does for variances.
+explain. How large it gets by chance is told from clusters of rows, not rows: see `jackknife`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -22,12 +17,12 @@ from scipy import special
 from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import csr_array
 
-from calib.blunders.chance import log_tail
+from calib.blunders.chance import at_least, log_tail
+from calib.diagnosis.jackknife import Chance, Shares, by_signs
 from calib.diagnosis.linear import Linear
 
 GAUGE = 1e-6  # share of a direction's information that is left, below which there is none
 UNFELT = 1e-9  # of an effect's largest column, below which no row feels a parameter
-COMMON = 30.0  # how many clusters the candidates' common inflation counts for
 POWER = 0.8  # with which an effect of the smallest detectable size is found
 DRAWS = 1999
 
@@ -41,8 +36,8 @@ class Scores:
         score: (Q,).
         information: (Q, Q) left after projection.
         whole: (Q, Q) before it.
-        by_stop: (K, Q) and by_place (M, Q): shares of the score.
-        both: (C, Q) shares of the cells of stop and place.
+        cells: (C, Q) shares of the score, of rows of one stop and one place.
+        stop, place: (C,) the numbers of these, -1 for none.
         weight_m2: of all beams, 1/m2.
     """
 
@@ -50,15 +45,33 @@ class Scores:
     score: np.ndarray
     information: np.ndarray
     whole: np.ndarray
-    by_stop: np.ndarray
-    by_place: np.ndarray
-    both: np.ndarray
+    cells: np.ndarray
+    stop: np.ndarray
+    place: np.ndarray
     weight_m2: float
 
     @cached_property
-    def shares(self) -> tuple[np.ndarray, ...]:
-        """By stop, by place, and by both, of those that have any."""
-        every = (self.by_stop, self.by_place, self.both)
+    def by_stop(self) -> np.ndarray:
+        """(K, Q) shares of the score of rows of each stop."""
+        return _sums(self.cells, self.stop)
+
+    @cached_property
+    def by_place(self) -> np.ndarray:
+        """(M, Q) shares of the score of rows of each place."""
+        return _sums(self.cells, self.place)
+
+    @cached_property
+    def both(self) -> np.ndarray:
+        """Shares of the score of rows that have a stop and a place, by both."""
+        return self.cells[(self.stop >= 0) & (self.place >= 0)]
+
+    @cached_property
+    def ways(self) -> tuple[np.ndarray, ...]:
+        """By stop, by place, and by both, of those that have any share; each adds up to the
+        score, as rows that have no stop, or no place, are clusters of their own."""
+        by_stop = np.vstack([self.by_stop, self.cells[self.stop < 0]])
+        by_place = np.vstack([self.by_place, self.cells[self.place < 0]])
+        every = (by_stop, by_place, self.cells)
         return tuple(part[np.any(part != 0, axis=1)] for part in every)
 
     @cached_property
@@ -119,9 +132,9 @@ def project(linear: Linear, names: Sequence[str]) -> Scores:
         score=cells.sum(axis=0),
         information=information_left(linear, names),
         whole=linear.raw[np.ix_(theirs, theirs)],
-        by_stop=_sums(cells, linear.stop),
-        by_place=_sums(cells, linear.place),
-        both=cells[(linear.stop >= 0) & (linear.place >= 0)],
+        cells=cells,
+        stop=linear.stop,
+        place=linear.place,
         weight_m2=linear.weight_m2,
     )
 
@@ -141,15 +154,16 @@ class Test:
         statistic: what it would explain, in squared sigmas.
         whiten: (q, r), ``whiten @ whiten.T`` the inverse of the information; r is in how many
             directions the data could show it, 0 for a gauge.
-        covariance: (r, r) of the whitened score, by clusters.
-        clusters: c, how many stops have a share in it.
+        chances: how the whitened score scatters by chance: by signs and, once it is judged, by
+            leaving out; see `jackknife`.
+        clusters: how many stops have a share in it.
         score: (q,).
     """
 
     columns: np.ndarray
     statistic: float
     whiten: np.ndarray
-    covariance: np.ndarray
+    chances: tuple[Chance, ...]
     clusters: int
     score: np.ndarray
 
@@ -158,31 +172,26 @@ class Test:
         return self.whiten.shape[1]
 
     @cached_property
+    def chance(self) -> Chance:
+        """That which counts, as it leaves least to chance; a true effect widens the first."""
+        return min(self.chances, key=lambda chance: chance.p_value(self.statistic))
+
+    @cached_property
     def inflation(self) -> float:
         """How much wider its score scatters than independent rows of their sigmas would."""
-        return float(np.trace(self.covariance)) / self.dof
+        return self.chance.trace / self.dof
 
-    def moderated(self, common: float) -> np.ndarray:
-        """Covariance (r, r) of the whitened score, leaning on the candidates' `common` one."""
-        own = self.clusters * self.covariance + COMMON * common * np.eye(self.dof)
-        return own / (self.clusters + COMMON)
+    def judged(self, shares: Shares) -> Test:
+        """The same with its clusters left out one by one."""
+        return replace(self, chances=(*self.chances, shares.left_out(self.chances[0].nu)))
 
-    def p_value(self, common: float, statistic: float | None = None) -> float:
+    def p_value(self) -> float:
         """How often chance alone explains as much."""
-        first, nu = self._moments(common)
-        d = max(1.0, self.clusters - 1.0 + COMMON)
-        value = self.statistic if statistic is None else statistic
-        return float(special.fdtrc(nu, d, value / first))
-
-    def _moments(self, common: float) -> tuple[float, float]:
-        """Mean of the statistic under the null, and its effective degrees of freedom."""
-        spread = self.moderated(common)
-        first, second = float(np.trace(spread)), float(np.sum(np.square(spread)))
-        return first, first**2 / second
+        return at_least(self.chance.p_value(self.statistic))
 
     def evidence(self, common: float) -> float:
-        """Minus the log of the p-value were rows independent but for the common inflation: ranks
-        what candidates explain, at a price for their parameters."""
+        """Minus the log of the p-value were rows independent but for the common inflation. It
+        ranks what candidates explain, at a price for their parameters, and decides nothing."""
         return -log_tail(self.statistic / max(common, 1e-300), self.dof)
 
     def estimate(self) -> np.ndarray:
@@ -190,25 +199,28 @@ class Test:
         return self.whiten @ (self.whiten.T @ self.score)
 
     def sigma(self, common: float) -> np.ndarray:
-        """Of the estimate (q,), by clusters."""
+        """Of the estimate (q,), by clusters; no less than with the candidates' `common` inflation,
+        as few clusters of a difference of covariances may say anything."""
         W = self.whiten
-        # The covariance is a difference (by stops, by places, less both): it may dip below 0.
-        return np.sqrt(np.maximum(np.einsum("qr,rs,qs->q", W, self.moderated(common), W), 0.0))
+        own = np.einsum("qr,rs,qs->q", W, self.chance.covariance, W)
+        return np.sqrt(np.maximum(own, common * np.square(W).sum(axis=1)))
 
     def smallest_detectable(self, common: float, alpha: float) -> float:
-        """Root mean square of its parameters' size at which it is found with 80 % power.
+        """Root mean square of its parameters' size at which it is found with 80 % power, where its
+        score scatters as it does here; no less than the candidates' `common` inflation has it.
 
         For several parameters on average over directions. Infinite for a gauge.
         """
         if not self.dof:
             return np.inf
-        first, nu = self._moments(common)
-        d = max(1.0, self.clusters - 1.0 + COMMON)
+        nu = self.chance.nu
+        d = max(min(self.chance.d, (self.chance.clusters - 1.0) * nu), 0.5 * nu)
         limit = special.fdtri(nu, d, 1.0 - alpha)
         noncentral = special.ncfdtrinc(nu, d, 1.0 - POWER, limit)
         # Along a direction of unit length the information is this much, on average.
         each = np.trace(np.linalg.pinv(self.whiten @ self.whiten.T)) / len(self.score)
-        return float(np.sqrt(noncentral * first / nu / each))
+        scale = max(self.chance.trace, common * self.dof)
+        return float(np.sqrt(noncentral * scale / nu / each))
 
 
 def test(scores: Scores, columns: np.ndarray) -> Test:
@@ -220,17 +232,12 @@ def test(scores: Scores, columns: np.ndarray) -> Test:
     seen = values > GAUGE
     whiten = (axes[:, seen] / np.sqrt(values[seen])) / size[:, None]
     score = scores.score[columns]
-    statistic = float(np.sum(np.square(whiten.T @ score)))
-    stop, place, both = (part[:, columns] @ whiten for part in scores.shares)
-    one_way = stop.T @ stop, place.T @ place
-    two_way = one_way[0] + one_way[1] - both.T @ both
-    covariance = max(two_way, *one_way, key=np.trace)
-    clusters = int((np.abs(stop).max(axis=1, initial=0.0) > 0).sum())
+    clusters = int((np.abs(scores.by_stop[:, columns] @ whiten).max(axis=1, initial=0.0) > 0).sum())
     return Test(
         columns=columns,
-        statistic=statistic,
+        statistic=float(np.sum(np.square(whiten.T @ score))),
         whiten=whiten,
-        covariance=covariance,
+        chances=(by_signs([way[:, columns] @ whiten for way in scores.ways], clusters),),
         clusters=clusters,
         score=score,
     )

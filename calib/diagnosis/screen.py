@@ -21,8 +21,9 @@ class Candidate:
     Args:
         effect: with that shape.
         test: its test.
-        p_value: adjusted for the shapes tried.
-        p_adjusted: adjusted for all candidates as well.
+        p_value: how often chance alone does as much, the shapes tried paid for; of the screen's
+            test until it is judged, then of that.
+        p_adjusted: how often chance does so in any candidate that was looked at, so no less.
         evidence: see `Test.evidence`.
         looks: by how many independent looks p_adjusted pays.
     """
@@ -92,7 +93,7 @@ def screen(
         looks = looked(drawn)
         least.append(after_looks(drawn, looks))
         best = max(family, key=lambda e: tests[e.name].evidence(common))
-        p = min(tests[e.name].p_value(common) for e in family)
+        p = min(tests[e.name].p_value() for e in family)
         found.append((best, after_looks(p, looks), looks))
     together = looked(np.min(least, axis=0)) if least else 1.0
     candidates = [

@@ -24,7 +24,7 @@ from calib.diagnosis.score import Test
 from calib.diagnosis.score import test as joint_test
 from calib.diagnosis.screen import Candidate, Screen
 from calib.diagnosis.stand import Look, Stand
-from calib.effects import Effect, Site
+from calib.effects import Effect
 from calib.residuals.groups import CAD, JOINTS, MESH
 from calib.solve.fit import Progress
 
@@ -256,7 +256,7 @@ def _named(look: Look, progress: Progress) -> NamedEffect | None:
             after = stand.look(progress)
             others = rivals(look.named, candidate, max(after.named.common, test.inflation))
             return NamedEffect(
-                candidate=replace(candidate, effect=effect),
+                candidate=replace(candidate, effect=effect, p_value=test.p_value()),
                 before=look,
                 after=after,
                 judged=test,
@@ -284,9 +284,9 @@ def structures(look: Look, progress: Progress) -> list[Candidate]:
         instead = out and len(candidate.effect.covariates) == 1
         instead = instead and candidate.evidence > INSTEAD * out[0].evidence
         if instead or not _covered(look.unnamed, candidate, out):
-            p = judged(look, candidate, progress)[1]
+            test, p = judged(look, candidate, progress)
             if p < ALPHA_UNNAMED:
-                out.append(replace(candidate, p_adjusted=p))
+                out.append(replace(candidate, p_value=test.p_value(), p_adjusted=p))
     return out
 
 
@@ -306,7 +306,7 @@ def _scatter(look: Look, progress: Progress) -> Candidate | None:
     for candidate in suspects(look.noise, ALPHA):
         test, p = judged(look, candidate, progress)
         if p < ALPHA:
-            return replace(candidate, test=test, p_adjusted=p)
+            return replace(candidate, test=test, p_value=test.p_value(), p_adjusted=p)
     return None
 
 
@@ -314,10 +314,7 @@ def judged(look: Look, candidate: Candidate, progress: Progress) -> tuple[Test, 
     """A candidate's test with its clusters jackknifed; its p-value, all that was looked at paid
     for."""
     found = look.judged(candidate, progress)
-    # What candidates have in common may be another effect's signal; it need not be this one's.
-    common = (look.noise if candidate.effect.site is Site.NOISE else look.named).common
-    p = found.p_value(min(common, max(found.inflation, 1.0)))
-    return found, float(after_looks(p, candidate.looks))
+    return found, float(after_looks(found.p_value(), candidate.looks))
 
 
 def suspects(screen: Screen, alpha: float) -> Iterator[Candidate]:

@@ -277,7 +277,7 @@ class Look:
 
         for rows in rows_along(wide, stand.estimate, by_name, tell):
             shares.add(rows)
-        return replace(found, covariance=shares.covariance())
+        return found.judged(shares)
 
 
 def _variables(problem: Problem, effects: set[str]) -> dict[str, list[str]]:

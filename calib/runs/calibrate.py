@@ -13,6 +13,7 @@ import numpy as np
 
 from calib import outputs
 from calib import problem as problems
+from calib.blunders.chance import at_least
 from calib.effects import Effect, load_effects, trust_in
 from calib.linear.parallel import one_blas_thread
 from calib.problem import Problem
@@ -325,7 +326,7 @@ def _link_document(link: Link) -> dict[str, Any]:
     return {
         "name": link.name,
         "moved": link.moved,
-        "p_value": link.p_value,
+        "p_value": None if link.p_value is None else at_least(link.p_value),
         "parameters": link.parameters,
         "units": link.units,
         "change": link.change,

@@ -12,6 +12,7 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
+from calib.blunders.chance import LEAST_P
 from calib.runs.estimates import VariableEstimate, variable_estimates
 from calib.show.misfit import beams_told, standing_out
 from calib.show.scale import shown
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
 
 WIDTH = 100
 LISTED_PARAMETERS = 12  # an effect of more parameters than these is summarised
-LEAST_P = 1e-12  # smaller ones are not told from each other
 ERROR_LABELS = {
     "nominal": "before, all as in CAD",
     "fit": "after the fit",

@@ -9,17 +9,17 @@ from typing import Any
 
 import numpy as np
 
+from calib.blunders.chance import LEAST_P
 from calib.runs.ladder import Rung
 from calib.runs.run import Run
 from calib.show import misfit
-from calib.show.tables import LEAST_P
 from calib.view.colours import Scale, column
 from calib.view.desk import Findings
 from calib.view.scene import Points
 from chains.escape import html as escape
 
 SHOWN_CANDIDATES = 6  # candidates in the table; the menu has all
-LARGE = ((1e9, " billion"), (1e6, " million"), (1.0, ""))
+LARGE = ((1e6, " million"), (1.0, ""))
 _FRAME = "padding:0 1.2em .4em .75em;font-size:12px;line-height:1.4;color:#222"
 _QUIET = "color:#555"
 _CUT = "overflow:hidden;text-overflow:ellipsis;white-space:nowrap"
@@ -165,8 +165,8 @@ def by_chance(p: float | None) -> str:
         return ""
     if p > 0.1:
         return "often"
-    if p < LEAST_P:
-        return "1 in over 10¹²"
+    if p <= LEAST_P:
+        return "1 in over a million"
     odds = float(f"{1 / p:.1g}")
     size, word = next(each for each in LARGE if odds >= each[0])
     return f"1 in {odds / size:,.0f}{word}"

@@ -94,7 +94,8 @@ def test_a_hidden_effect_is_named_first_and_sized(studies):
     assert found.verdict == "missing_effect" and found.worth_adding == [HIDDEN]
     first = found.candidates[0]
     assert first["effect"] == HIDDEN and first["step"] == 1
-    assert first["p_adjusted"] < 1e-6 and first["p_adjusted"] < found.candidates[1]["p_adjusted"]
+    # Six stops, and one wall that holds half of the information.
+    assert first["p_adjusted"] < min(0.01, found.candidates[1]["p_adjusted"])
     assert HIDDEN in found.sentences[0]
     truth = json.loads(run.recordings[0].with_suffix(".truth.json").read_text())
     (true_m,) = truth["effects"][HIDDEN]
@@ -154,8 +155,8 @@ def test_every_number_is_one(study):
         assert all(map(math.isfinite, numbers(each))), each["effect"]
         assert None not in each["parameters"]["estimate"] + each["parameters"]["sigma"]
         for key in ("p_value", "p_adjusted"):
-            assert 0.0 <= each[key] <= 1.0, each["effect"]
-        assert each["p_value"] <= each["p_adjusted"] or each["step"], each["effect"]
+            assert 1e-6 <= each[key] <= 1.0, each["effect"]
+        assert each["p_value"] <= each["p_adjusted"], each["effect"]
 
 
 def test_candidates_are_ranked_and_none_is_in_the_model(study):
@@ -185,7 +186,8 @@ def test_people_read_it_in_mm_and_within_100_columns(studies, capsys):
     row = next(line for line in out.splitlines() if line.startswith("1 "))
     estimate_m, sigma_m = (found.candidates[0]["parameters"][k][0] for k in ("estimate", "sigma"))
     before, after = (found.candidates[0]["held_out_rms_mm"][k] for k in ("before", "after"))
-    assert f"{before:.2f} -> {after:.2f}" in row and "< 1e-12" in row
+    p = f"{found.candidates[0]['p_adjusted']:.2g}"
+    assert f"{before:.2f} -> {after:.2f}" in row and p in row
     assert f"{1e3 * estimate_m:+.2f} ± {1e3 * sigma_m:.2f} mm" in row
     assert "range_offset" in out.split("what could not be tested")[1]
     assert "found from" not in out

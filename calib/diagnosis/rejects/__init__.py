@@ -24,9 +24,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import special
 
-from calib.blunders.chance import after_looks
+from calib.blunders.chance import LEAST_P, after_looks
 from calib.diagnosis.rejects.counts import Axis, Counts, Rejected, count
-from calib.diagnosis.rejects.found import CLUTTER, LEAST_P, Place, Rejects
+from calib.diagnosis.rejects.found import CLUTTER, Place, Rejects
 from calib.diagnosis.stand import Stand
 from calib.solve.fit import Progress
 

@@ -11,7 +11,6 @@ import numpy as np
 from calib.blunders import told
 from calib.diagnosis.suggest import words
 
-LEAST_P = 1e-6  # tails are not known further out
 NAMED = 6  # stops or surfaces that a sentence names
 MOST = 0.5  # share of beams that makes a place structured, whatever their residuals do
 # Share that mixed pixels may explain, in all or at one place. They are 0.3 to 0.4 % in recordings
@@ -99,7 +98,7 @@ class Place:
             "sigma_mm": 1e3 * self.sigma_m,
             "share": self.share,
             "coherent": self.coherent,
-            "p_adjusted": max(self.p_adjusted, LEAST_P),
+            "p_adjusted": self.p_adjusted,
         }
 
     def formula(self) -> dict[str, Any] | None:
@@ -161,9 +160,7 @@ class Rejects:
     def blunders(self) -> list[dict[str, Any]]:
         """These as blunders in diagnosis.json, to be left out."""
         return [
-            told.of_surface(
-                f"surface_{name}", place.residual_m, place.sigma_m, max(place.p_adjusted, LEAST_P)
-            )
+            told.of_surface(f"surface_{name}", place.residual_m, place.sigma_m, place.p_adjusted)
             for place in self.moved
             for name in place.names
         ]
@@ -195,8 +192,8 @@ class Rejects:
             {
                 "covariates": [place.covariate],
                 "rms_mm": 1e3 * abs(place.residual_m) * float(np.sqrt(place.rejected)),
-                "p_value": max(place.p_adjusted, LEAST_P),
-                "p_adjusted": max(place.p_adjusted, LEAST_P),
+                "p_value": place.p_adjusted,
+                "p_adjusted": place.p_adjusted,
                 "formula": place.formula(),
             }
             for place in self.structured
@@ -209,7 +206,7 @@ class Rejects:
             "share": self.share,
             "expected": self.expected,
             "covariates": list(dict.fromkeys(p.covariate for p in self.structured)),
-            "p_adjusted": max(self.p_adjusted, LEAST_P),
+            "p_adjusted": self.p_adjusted,
             "where": [place.document() for place in self.places],
             "clutter": {"share": self.clutter, "stops": list(self.clutter_stops)},
             "explained": self.explained,

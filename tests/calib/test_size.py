@@ -1,0 +1,81 @@
+"""Tests of effects find one in about as many empty worlds as they say, and no p-value is told that
+nobody knows."""
+
+import sys
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from calib.blunders.chance import LEAST_P, after_looks, at_least
+from calib.diagnosis.jackknife import UNKNOWN, Clusters, by_signs
+
+BENCH = Path(__file__).parents[1] / "bench"
+DRAWS = 800
+LOWEST, HIGHEST = 0.012, 0.097  # 0.03 to 0.07, and three sigmas of as many draws beside
+
+
+@pytest.fixture(scope="module")
+def bench():
+    """The benchmark, which is a script."""
+    sys.path.insert(0, str(BENCH))
+    try:
+        yield import_module("bench_size")
+    finally:
+        sys.path.remove(str(BENCH))
+
+
+@pytest.mark.parametrize(
+    "family, parameters, stops",
+    [
+        ("rows", 1, 12),
+        ("rows", 16, 6),
+        ("stops err", 1, 6),
+        ("stops err", 4, 12),
+        ("stops err", 16, 30),
+        ("by stop, stops err", 1, 20),
+        ("three stops, stops err", 1, 30),
+        ("within stops, stops err", 4, 12),
+        ("both err", 1, 12),
+    ],
+)
+def test_a_judged_test_has_its_size(bench, family, parameters, stops):
+    p = bench.drawn(bench.FAMILIES[family], stops, parameters, DRAWS)["judged"]
+    assert LOWEST < np.mean(p < 0.05) < HIGHEST
+
+
+def test_with_degrees_of_freedom_that_are_not_there_it_would_not(bench):
+    """The test above has teeth."""
+    family, small = bench.FAMILIES["stops err"], []
+    for seed in range(8):
+        world, rng = bench.World(family, 6, 1, seed), np.random.default_rng(seed)
+        for _ in range(DRAWS // 8):
+            ways = world.scores(rng)
+            statistic = float(np.sum(np.square(ways[0].sum(axis=0))))
+            small.append(replace(by_signs(ways, 6), d=36.0).p_value(statistic) < 0.05)
+    assert np.mean(small) > HIGHEST
+
+
+def test_p_values_of_several_parameters_are_uniform(bench):
+    p = bench.drawn(bench.FAMILIES["stops err a little"], 30, 4, DRAWS)["signs"]
+    assert stats.kstest(p, "uniform").pvalue > 1e-3
+
+
+def test_one_stop_that_alone_shows_an_effect_proves_nothing():
+    lone = [np.array([[50.0], [0.1], [-0.2]]), np.array([[50.0], [-0.1]]), np.array([[49.9]])]
+    assert by_signs(lone, 3).p_value(49.9**2) > 0.1
+    assert by_signs([lone[0], lone[1], lone[2]], 1).p_value(1e6) == 1.0
+    holds = np.array([0.9995, 0.0003, 0.0002])[:, None, None]
+    assert Clusters.of(holds, 3).covariance(lone[0])[0, 0] > 0.99 * UNKNOWN
+
+
+def test_no_p_value_is_told_below_the_least_nor_adjusted_below_itself():
+    for p in (0.0, 1e-300, 1e-7, 1e-3, 0.5, 1.0):
+        told = at_least(p)
+        assert LEAST_P <= told <= 1.0
+        for looks in (1.0, 3.7, 300.0):
+            assert told <= after_looks(p, looks) * (1 + 1e-9)
+            assert after_looks(p, looks) == pytest.approx(after_looks(told, looks))
