@@ -112,10 +112,20 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NAMES) -> Search:
     chance: list[Chance] = []
     while strongest := next((c for c in done.looks[-1].chance if c.found), None):
         chance.append(strongest)
-        beside = stand.with_effects([c.effect for c in chance], progress)
-        done = _searched(beside, progress, most)
+        done = (
+            _widened(done, strongest, progress)
+            if strongest.effect.widens
+            else _searched(stand.with_effects([c.effect for c in chance], progress), progress, most)
+        )
     still = (c.beside(done.looks[-1].stand.estimate) for c in chance)
     return replace(done, chance=[c for c in still if c.found])
+
+
+def _widened(done: Search, by: Chance, progress: Progress) -> Search:
+    """A search, what it left looked at again with wider sigmas."""
+    look = done.looks[-1].stand.with_effects([by.effect], progress).look(progress)
+    unnamed, scatter = structures(look, progress), _scatter(look, progress)
+    return replace(done, looks=[*done.looks, look], unnamed=unnamed, scatter=scatter)
 
 
 def _searched(stand: Stand, progress: Progress, most: int) -> Search:

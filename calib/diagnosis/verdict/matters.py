@@ -147,7 +147,7 @@ def weighed(
         if told.worse:
             refused.append(
                 f"{name} takes on a part of it, and stops that were held out are predicted worse "
-                f"with it ({told.held_out_mm:+.2f} mm), so it is not to be believed."
+                f"with it ({told.held_out_mm:+.3f} mm), so it is not to be believed."
             )
         elif told.enough:
             named.append(step)
