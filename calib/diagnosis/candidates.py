@@ -112,17 +112,23 @@ class ShapeStep(Effect):
         return (larger - smaller)[..., None] / (2 * np.log1p(STEP))
 
 
-def known_effects(model: Model, sources: Sequence[Source], columns: frozenset[str]) -> list[Effect]:
-    """The catalogue's effects that the model lacks and the recordings can show, shape by shape.
+def known_effects(
+    model: Model,
+    sources: Sequence[Source],
+    columns: frozenset[str],
+    catalogue: Sequence[Effect] = CATALOGUE,
+) -> list[Effect]:
+    """The effects that the model lacks and the recordings can show, shape by shape.
 
     Args:
         model: as fitted.
         sources: the recordings.
         columns: what points and stops carry.
+        catalogue: the effects that are known.
     """
     there = {effect.family for effect in model.effects}
     found = []
-    for effect in CATALOGUE:
+    for effect in catalogue:
         if effect.family in there:
             continue
         if effect.family in model.fixed or lacking(effect, sources, columns):

@@ -20,7 +20,7 @@ from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import formula, hangs_on, what_separates
 from calib.diagnosis.verdict.matters import weighed
 from calib.diagnosis.verdict.sentences import BAD, UNNAMED, sentences_of, stops_of
-from calib.effects import CATALOGUE, Site
+from calib.effects import Site
 from calib.problem.model import labels
 from calib.results.solution import one_unit
 from calib.rig import Rig
@@ -258,9 +258,12 @@ def _candidate(
         wider = max(1.0, clean, found.found[step - 1].judged.inflation)
         sigma = np.sqrt(wider) * found.looks[-1].stand.sigma(effect)
     alpha = -np.expm1(np.log1p(-ALPHA) / candidate.looks)
+    document = effect.document()
     return {
         "effect": effect.family,
         "add": effect.name,
+        # Of a user's own: what `rigcal add` reads, wherever its file is by then.
+        **({} if isinstance(document, str) else {"document": document}),
         "site": "range" if effect.site is Site.BEAM else effect.site.value,
         "p_value": candidate.p_value,
         "p_adjusted": found.found[step - 1].p_adjusted if step else candidate.p_adjusted,
@@ -323,7 +326,7 @@ def _untestable(look: Look) -> dict[str, str]:
     gauges = {g.family for g in look.named.gauges} - {
         c.effect.family for c in look.named.candidates
     }
-    for effect in CATALOGUE:
+    for effect in look.stand.catalogue:
         if effect.family in there or not concerned(effect, look.stand.sources):
             continue
         if missing := lacking(effect, look.stand.sources, look.columns):
