@@ -143,7 +143,8 @@ def conclude(
     candidates = [*candidates[:named], *chance, *candidates[named:], *others]
     untestable = _untestable(first)
     thrown = rejected.unexplained() if rejected and verdict == UNNAMED else []
-    unexplained = [_unexplained(c, screen) for screen, c in _without_a_name(found, verdict)]
+    taken = first.stand.model.names
+    unexplained = [_unexplained(c, screen, taken) for screen, c in _without_a_name(found, verdict)]
     unexplained = [*thrown, *unexplained]
     blunders = [*spoilt, *(told.document(left, _rig(left, first)) for left in found.blunders)]
     sentences = sentences_of(verdict, found, candidates, unexplained, untestable, blunders, traces)
@@ -310,13 +311,14 @@ def _rivals(step: NamedEffect) -> list[dict[str, Any]]:
     ]
 
 
-def _unexplained(candidate: Candidate, screen: Screen) -> dict[str, Any]:
+def _unexplained(candidate: Candidate, screen: Screen, taken: Sequence[str]) -> dict[str, Any]:
     return {
         "covariates": list(hangs_on(candidate.effect)),
         "rms_mm": 1e3 * screen.rms_m(candidate),
         "p_value": candidate.p_value,
         "p_adjusted": candidate.p_adjusted,
-        "formula": formula(candidate),
+        "formula": formula(candidate, taken),
+        "seen": {name: list(ends) for name, ends in candidate.effect.seen.items()},
     }
 
 
