@@ -273,7 +273,7 @@ def effects(
     name: Annotated[
         str | None,
         typer.Argument(
-            metavar="[NAME_OR_FILE]",
+            metavar="NAME_OR_FILE",
             help="One effect, or a file of your own; all of the catalogue if not given.",
             autocompletion=effect_names,
         ),

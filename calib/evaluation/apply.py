@@ -52,11 +52,13 @@ class Correction:
         rig: as on paper.
         effects: the model's effects on beams, and the estimate (P,) of each.
         closed: effects that are not known here, as their Python file may not run -> that sentence.
+        median_intensity: of the recordings that the run was fitted to; NaN where no effect asks.
     """
 
     rig: Rig
     effects: Sequence[tuple[Effect, np.ndarray]]
     closed: Mapping[str, str] = field(default_factory=dict)
+    median_intensity: float = float("nan")
 
     @classmethod
     def of(cls, run: Run, rig_name: str | None = None) -> Correction:
@@ -75,11 +77,17 @@ class Correction:
         }
         chance = (e.name for e in known.values() if e.by_chance)
         closed |= {name: "is another one each time, by chance" for name in chance}
-        return cls(rig, [(e, part.effects[e.name].estimate) for e in of_beams], closed=closed)
+        asked = any({"intensity", "median_intensity"} & {*e.covariates} for e in of_beams)
+        return cls(
+            rig,
+            [(e, part.effects[e.name].estimate) for e in of_beams],
+            closed=closed,
+            median_intensity=_median_intensity(run, rig) if asked else float("nan"),
+        )
 
     def usable(self, columns: Collection[str]) -> tuple[Correction, dict[str, str]]:
         """What can be corrected where these columns are known, and what of it not, and why."""
-        known = {*columns, *_SEEN}
+        known = {*columns, *_SEEN, "median_intensity"}
         lacking = {e.name: sorted({*e.covariates} - known) for e, _ in self.effects}
         kept = [(e, theta) for e, theta in self.effects if not lacking[e.name]]
         why = {name: f"needs {', '.join(missing)}" for name, missing in lacking.items() if missing}
@@ -96,6 +104,7 @@ class Correction:
         error = np.zeros((len(xyz_m), 3))
         for _ in range(PASSES):
             there = {"range_m": ray.range_m - error[:, 0], **_angles(ray), **columns}
+            there["median_intensity"] = np.array([self.median_intensity])
             view = View(self.rig, len(xyz_m), there, np.zeros((1, 0)))
             each = (site_error(e.basis(view), theta) for e, theta in self.effects)
             error = sum(each, np.zeros((len(xyz_m), 3)))
@@ -284,6 +293,12 @@ def _check_rings(rig: Rig, path: Path, columns: Columns, seen: np.ndarray) -> No
             f"{path}: ring {ring.min()} to {ring.max()}, but {rig.lidar.name} has 0 to "
             f"{rig.lidar.rings - 1}; count from 0, or give a run of this LiDAR"
         )
+
+
+def _median_intensity(run: Run, rig: Rig) -> float:
+    """The intensity to which the run's effects compare others, in the unit of its recordings."""
+    mine = [Path(r["path"]) for r in run.model["recordings"] if r["rig"] == rig.name]
+    return float(np.median([Source.open(path).store.median_intensity for path in mine]))
 
 
 def _rig(run: Run, name: str | None) -> Rig:

@@ -102,6 +102,7 @@ class ScanStop:
         meeting: mesh or planes.
         reference_sigma_m: how far the reference may be off its surface.
         store: its recording's scans as beams.
+        alike: those of all recordings by the same LiDAR; its own alone where empty.
         room: the mesh, or the recording whose planes these are.
         group: the name of its rows.
         reference_scatter_m: kind of part, "surface", "region" or "patch" -> how widely such parts
@@ -120,6 +121,7 @@ class ScanStop:
     room: int | str
     group: Group
     reference_scatter_m: Mapping[str, float] = field(default_factory=dict)
+    alike: tuple[BeamStore, ...] = ()
 
     @property
     def stated_sigma_m(self) -> float:
@@ -273,11 +275,16 @@ class ScanStop:
             "ring": scan.ring,
             "column": scan.column,
             "intensity": scan.intensity,
+            "median_intensity": self._median_intensity,
             "azimuth_rad": lambda: ray.azimuth_rad,
             "elevation_rad": lambda: ray.elevation_rad,
             "range_m": surface.predicted_m,
         }
         return View(self.stops.rig, len(scan.ring), columns, self.stops.joints)
+
+    def _median_intensity(self) -> np.ndarray:
+        """(1,) that all recordings by one LiDAR share, as they share what hangs on intensity."""
+        return np.array([np.median([s.median_intensity for s in self.alike or (self.store,)])])
 
     def _rows(self, seen: _Seen, T: np.ndarray) -> Rows:
         scan, ray, surface, error = seen.scan, seen.ray, seen.surface, seen.error
