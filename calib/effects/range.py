@@ -285,7 +285,7 @@ class RangeQuantisation(RangeEffect):
 
 
 def log_intensity(view: View) -> np.ndarray:
-    """``ln(I / I0)`` of the intensity (rows,), I0 being the median of its recording, so that no
-    unit matters: taken as I0 / 100 below that, and as I0 where none was recorded."""
-    relative = view["intensity"] / view["median_intensity"]
+    """``ln(I / I0)`` of the intensity (rows,), which a view gives over the median I0 already: taken
+    as I0 / 100 below that, and as I0 where none was recorded."""
+    relative = view["intensity"]
     return np.log(np.maximum(np.where(np.isfinite(relative), relative, 1.0), FAINTEST))

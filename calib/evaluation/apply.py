@@ -21,6 +21,7 @@ from calib.linear.parallel import one_blas_thread
 from calib.problem.model import Source
 from calib.residuals.beams import site_error
 from calib.residuals.scan import turned
+from calib.residuals.store import common_median
 from calib.rig import Rig, load_rig
 from calib.runs.reopen import effects_that_may_run, problem_of, reopened, state_of
 from calib.runs.run import Run
@@ -52,7 +53,8 @@ class Correction:
         rig: as on paper.
         effects: the model's effects on beams, and the estimate (P,) of each.
         closed: effects that are not known here, as their Python file may not run -> that sentence.
-        median_intensity: of the recordings that the run was fitted to; NaN where no effect asks.
+        median_intensity: to which effects hold others, in the unit of the run's recordings; NaN
+            where no effect asks.
     """
 
     rig: Rig
@@ -77,7 +79,7 @@ class Correction:
         }
         chance = (e.name for e in known.values() if e.by_chance)
         closed |= {name: "is another one each time, by chance" for name in chance}
-        asked = any({"intensity", "median_intensity"} & {*e.covariates} for e in of_beams)
+        asked = any("intensity" in e.covariates for e in of_beams)
         return cls(
             rig,
             [(e, part.effects[e.name].estimate) for e in of_beams],
@@ -87,7 +89,7 @@ class Correction:
 
     def usable(self, columns: Collection[str]) -> tuple[Correction, dict[str, str]]:
         """What can be corrected where these columns are known, and what of it not, and why."""
-        known = {*columns, *_SEEN, "median_intensity"}
+        known = {*columns, *_SEEN}
         lacking = {e.name: sorted({*e.covariates} - known) for e, _ in self.effects}
         kept = [(e, theta) for e, theta in self.effects if not lacking[e.name]]
         why = {name: f"needs {', '.join(missing)}" for name, missing in lacking.items() if missing}
@@ -102,9 +104,10 @@ class Correction:
         """
         ray = beams(xyz_m, self.rig.lidar.beam_origin_m)
         error = np.zeros((len(xyz_m), 3))
+        if "intensity" in columns:
+            columns = {**columns, "intensity": columns["intensity"] / self.median_intensity}
         for _ in range(PASSES):
             there = {"range_m": ray.range_m - error[:, 0], **_angles(ray), **columns}
-            there["median_intensity"] = np.array([self.median_intensity])
             view = View(self.rig, len(xyz_m), there, np.zeros((1, 0)))
             each = (site_error(e.basis(view), theta) for e, theta in self.effects)
             error = sum(each, np.zeros((len(xyz_m), 3)))
@@ -296,9 +299,9 @@ def _check_rings(rig: Rig, path: Path, columns: Columns, seen: np.ndarray) -> No
 
 
 def _median_intensity(run: Run, rig: Rig) -> float:
-    """The intensity to which the run's effects compare others, in the unit of its recordings."""
+    """As of `Correction`."""
     mine = [Path(r["path"]) for r in run.model["recordings"] if r["rig"] == rig.name]
-    return float(np.median([Source.open(path).store.median_intensity for path in mine]))
+    return common_median([Source.open(path).store for path in mine])
 
 
 def _rig(run: Run, name: str | None) -> Rig:

@@ -28,7 +28,7 @@ from calib.residuals.compiled import twist_derivative
 from calib.residuals.groups import Group
 from calib.residuals.robust import robust_scale, tukey_weight
 from calib.residuals.spread import spread_rows
-from calib.residuals.store import BeamStore
+from calib.residuals.store import BeamStore, common_median
 from calib.residuals.surfaces import Meeting
 from chains import se3
 from chains.errors import InputError
@@ -84,9 +84,8 @@ class _Seen:
     def error_at(self, site: Site, rows: np.ndarray) -> np.ndarray:
         """The error (R, D) at some rows."""
         error = self.error[site]
-        return (
-            error[rows] if len(error) > 1 else np.broadcast_to(error, (len(rows), error.shape[1]))
-        )
+        shape = len(rows), error.shape[1]
+        return error[rows] if len(error) > 1 else np.broadcast_to(error, shape)
 
 
 @dataclass(frozen=True)
@@ -101,8 +100,7 @@ class ScanStop:
         columns: (1,) covariates of the stop.
         meeting: mesh or planes.
         reference_sigma_m: how far the reference may be off its surface.
-        store: its recording's scans as beams.
-        alike: those of all recordings by the same LiDAR; its own alone where empty.
+        store, alike: its recording's scans as beams, and those of all recordings by this LiDAR.
         room: the mesh, or the recording whose planes these are.
         group: the name of its rows.
         reference_scatter_m: kind of part, "surface", "region" or "patch" -> how widely such parts
@@ -274,17 +272,12 @@ class ScanStop:
             **surface.columns,
             "ring": scan.ring,
             "column": scan.column,
-            "intensity": scan.intensity,
-            "median_intensity": self._median_intensity,
+            "intensity": lambda: scan.intensity / common_median(self.alike or (self.store,)),
             "azimuth_rad": lambda: ray.azimuth_rad,
             "elevation_rad": lambda: ray.elevation_rad,
             "range_m": surface.predicted_m,
         }
         return View(self.stops.rig, len(scan.ring), columns, self.stops.joints)
-
-    def _median_intensity(self) -> np.ndarray:
-        """(1,) that all recordings by one LiDAR share, as they share what hangs on intensity."""
-        return np.array([np.median([s.median_intensity for s in self.alike or (self.store,)])])
 
     def _rows(self, seen: _Seen, T: np.ndarray) -> Rows:
         scan, ray, surface, error = seen.scan, seen.ray, seen.surface, seen.error

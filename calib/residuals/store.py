@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from threading import Lock
@@ -62,6 +63,11 @@ class BeamStore:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__init__(**state)
+
+
+def common_median(stores: Sequence[BeamStore]) -> float:
+    """The median intensity that recordings by one LiDAR share, as they share its range zero."""
+    return float(np.median([store.median_intensity for store in stores]))
 
 
 def _size(found: tuple[Scan, Beams]) -> float:

@@ -88,7 +88,7 @@ def _record(
         write_targets(folder / "targets.csv", truth, spec, stream(_world(spec, seed), "targets"))
     if spec.lidar:
         scanner, Ts_faro_lidar = Scanner(truth, room, spec), world.in_faro(rig.lidar_frame)
-        if any({"intensity", "median_intensity"} & {*e.covariates} for e, _ in truth.effects):
+        if any("intensity" in effect.covariates for effect, _ in truth.effects):
             each = zip(Ts_faro_lidar, stops.names, strict=True)
             every = [scanner.intensities(T, stream(seed, f"scan {name}")) for T, name in each]
             scanner = replace(scanner, median_intensity=float(np.median(np.concatenate(every))))
