@@ -70,7 +70,7 @@ def _described(run: Run) -> dict[str, Any]:
     document, found = run.diagnosis(), {}
     try:
         for each in reversed(document["candidates"] if document else []):  # best first: it stays
-            if "document" in each:
+            if isinstance(each.get("document"), Mapping):
                 found |= dict.fromkeys((str(each["effect"]), str(each["add"])), each["document"])
         formulas = (each.get("formula") for each in (document["unexplained"] if document else []))
         return found | {str(each["name"]): each for each in formulas if each}

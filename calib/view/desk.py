@@ -169,7 +169,8 @@ class Desk:
         """
         offered: dict[str, str | Mapping[str, Any]] = {}
         if findings is not None:
-            own = {c["add"]: c["document"] for c in findings.candidates if "document" in c}
+            documents = ((c["add"], c.get("document")) for c in findings.candidates)
+            own = {name: what for name, what in documents if isinstance(what, Mapping)}
             offered |= {name: own.get(name, name) for name in findings.worth_adding}
             formulas = (each["formula"] for each in findings.unexplained if each.get("formula"))
             offered |= {formula["name"]: formula for formula in formulas}

@@ -7,6 +7,7 @@ import pytest
 import yaml
 
 from calib.effects import load_effects, own_effects
+from calib.exporters import export
 from calib.rig import load_rig
 from calib.runs.add import add
 from calib.runs.calibrate import calibrate, grown_model
@@ -125,6 +126,19 @@ def test_python_that_a_diagnosis_names_does_not_run_unasked(diagnosed, made, tmp
     assert "humid_air" not in Desk.of([other.folder]).addable(Findings.read(other))
 
 
+def test_a_diagnosis_cannot_slip_a_file_in(diagnosed, made, tmp_path):
+    run, found = diagnosed
+    other = Run.open(shutil.copytree(run.folder, tmp_path / "run"))
+    document = json.loads(json_text(found.document()))
+    file = str(made / "mine/beside.py")
+    document["candidates"][0] |= {"effect": "range_cyclic", "add": "range_cyclic", "document": file}
+    (other.folder / "diagnosis.json").write_text(json_text(document))
+    assert file not in Desk.of([other.folder]).addable(Findings.read(other)).values()
+    assert grown_model(other, ["range_cyclic"]).names[-1] == "range_cyclic@1"
+    with pytest.raises(InputError, match="not in the catalogue"):
+        grown_model(other, ["humid_air"])
+
+
 def test_a_folder_holds_its_formulas_and_runs_nothing(made, tmp_path):
     assert [e.name for e in load_effects(str(made / "mine"))] == ["humid_air", "dusty_air"]
     with pytest.raises(InputError, match="has no file of effects"):
@@ -169,6 +183,40 @@ def test_one_name_for_two_effects_is_refused(made, tmp_path):
     other.write_text(yaml.safe_dump(HUMID | {"sigma": 0.02}))
     with pytest.raises(InputError, match="another effect is called 'humid_air' too"):
         own_effects([load_rig(rec)], str(other))
+
+
+# ---------------------------------------------------------------------------------- what follows
+
+
+def test_an_export_has_its_formula(made, diagnosed, tmp_path):
+    run, found = diagnosed
+    (run.folder / "diagnosis.json").write_text(json_text(found.document()))
+    grown = add(run, "humid_air", tmp_path / "grown")
+    export(grown, tmp_path / "out", ["yaml"])
+    told = yaml.safe_load((tmp_path / "out/extrinsics.yaml").read_text())["effects"]
+    assert "(humidity - 0.45) * range" in told["humid_air"]["formula"]
+    assert told["arm_link_length"]["formula"]
+
+
+@pytest.mark.slow
+def test_what_no_catalogue_has_is_sized_as_an_independent_simulator_made_it(shared, tmp_path):
+    """Ranges that depend on ring x temperature, by 15 mm; see the recordings' README."""
+    rec = shared / "recordings/known_ring_by_temperature"
+    basis = ["(temperature - 27) / 4 * (2 * ring / 63 - 1)"]
+    effect = HUMID | {"name": "ring_by_temperature", "unit": "m", "basis": basis}
+    (tmp_path / "mine.yaml").write_text(yaml.safe_dump(effect))
+    run = calibrate([rec], tmp_path / "run")
+    found = diagnose(run, refits=False, candidates=str(tmp_path / "mine.yaml"))
+    assert found.worth_adding == ["ring_by_temperature"]
+    grown = add(run, found.worth_adding, tmp_path / "grown")
+    size, sigma = (
+        getattr(grown.solution.shared.effects["ring_by_temperature"], which)[0]
+        for which in ("estimate", "sigma")
+    )
+    true, _ = json.loads(rec.with_suffix(".truth.json").read_text())["params"]["x_temp_ring"]
+    assert abs(size - true) < 4 * sigma < 1e-3
+    before, after = (each.summary["rms_mm"]["held_out"] for each in (run, grown))
+    assert after < 0.5 * before
 
 
 # ------------------------------------------------------------------------------------ command line
