@@ -10,8 +10,10 @@ import pytest
 import yaml
 
 from calib.effects import CATALOGUE
+from calib.effects.own.formula import FormulaEffect
 from calib.problem.model import Source
 from calib.problem.without import leave_out
+from calib.rig import load_rig
 from calib.runs.run import Run
 
 from .programs import ROOT, rigcal, script
@@ -63,6 +65,29 @@ def test_the_page_about_trust_runs(tmp_path):
     assert "model.yaml names effects of a Python file" in session.said
     assert "--trust" in session.said and "lean: " in words
     assert (tmp_path / "run" / "evaluation.json").is_file()
+
+
+@pytest.mark.slow
+def test_the_page_about_ones_own_effects_shows_what_is_printed(tmp_path):
+    session = run_through(ROOT / "docs/your_own_effects.md", tmp_path)
+    shown = re.findall(r"^```text\n(.*?)^```", session.text, flags=re.M | re.S)
+    said = shape(" ".join(session.said.split()))
+    assert len(shown) == 2
+    for part in shown:
+        assert shape(" ".join(part.split())) in said, part
+    for run, before, name in (("grown", "run", "humid_air"), ("described", "plain", "empirical_")):
+        runs = [Run.open(tmp_path / each) for each in (run, before)]
+        now, then = (each.summary["rms_mm"]["held_out"] for each in runs)
+        assert runs[0].effects[-1].startswith(name) and now < 0.8 * then
+    table = re.search(r"\|---\|---\|\n(.*?)\n\n", session.text, flags=re.S)[1]
+    cells = (re.findall(r"`(\w[^`]*)`", row.split("|")[1]) for row in table.splitlines())
+    places = [place for cell in cells for place in cell]
+    rig, effect = load_rig(tmp_path / "rec"), yaml.safe_load((tmp_path / "mine.yaml").read_text())
+    for place in places:
+        for word, name in (("NAME", "joint_1"), ("FRAME", "mount"), ("BODY", "mount_markers")):
+            place = place.replace(word, name)
+        assert FormulaEffect.read(effect | {"site": place}, "mine.yaml", {}).params(rig), place
+    assert len(places) == 9
 
 
 def test_the_page_about_same_bytes_shows_what_is_printed(tmp_path):

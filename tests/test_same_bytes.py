@@ -23,7 +23,7 @@ explain {rec} -o ladder --fix lidar.tz --workers {n}
 fit {rec} -o run --effects ring_range_offset --hold-out none --workers {n}
 add run arm_gravity_sag ../mine.yaml -o deeper/run --workers {n}
 fit {rec} -o later --prior run --hold-out stop --without L01P01:joint_2 --workers {n}
-diagnose later --workers {n}
+diagnose later --candidates ../mine.yaml --workers {n}
 evaluate deeper/run
 report later -o report.html
 plot run rings -o rings.svg

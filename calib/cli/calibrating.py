@@ -34,6 +34,7 @@ Effects = Annotated[
 Fix = Annotated[
     list[str] | None, typer.Option(metavar="NAME", help="Hold a frame, effect or parameter.")
 ]
+CANDIDATES = "Effects of your own that may be missing: files of them, or folders, with commas."
 Without = Annotated[
     list[str] | None,
     typer.Option(
@@ -105,7 +106,7 @@ def fit(
     from calib.problem.model import Model
     from calib.runs.calibrate import calibrate
 
-    chosen = Model.of(effects, fix or [], without or [])
+    chosen = Model.of(effects, fix or [], without or [], recordings)
     with threads(workers), progress_bar() as progress:
         run = calibrate(recordings, out, chosen, hold_out, folds, prior, progress)
     _tell(run, as_json)
@@ -143,6 +144,9 @@ def diagnose(
     refits: Annotated[
         bool, typer.Option("--refits/--no-refits", help="Whether to take the held-out falls.")
     ] = True,
+    candidates: Annotated[
+        str | None, typer.Option("--candidates", "--effects", metavar="FILE", help=CANDIDATES)
+    ] = None,
     trust: Trust = None,
     workers: Workers = None,
     as_json: Json = False,
@@ -153,7 +157,7 @@ def diagnose(
 
     fitted = Run.open(run, trust or ())
     with threads(workers), progress_bar() as progress:
-        diagnosis = find(fitted, progress, refits)
+        diagnosis = find(fitted, progress, refits, candidates or ())
     if as_json:
         print_json(diagnosis.document())
     else:
@@ -170,6 +174,9 @@ def explain(
     effects: Effects = None,
     fix: Fix = None,
     without: Without = None,
+    candidates: Annotated[
+        str | None, typer.Option("--candidates", metavar="FILE", help=CANDIDATES)
+    ] = None,
     workers: Workers = None,
     as_json: Json = False,
 ) -> None:
@@ -177,9 +184,9 @@ def explain(
     from calib.problem.model import Model
     from calib.runs.explain import explain as climb
 
-    chosen = Model.of(effects, fix or [], without or [])
+    chosen = Model.of(effects, fix or [], without or [], recordings)
     with threads(workers), progress_bar() as progress:
-        explanation = climb(recordings, out, chosen, progress)
+        explanation = climb(recordings, out, chosen, progress, candidates or ())
     if as_json:
         print_json(explanation.document())
     else:
@@ -265,15 +272,19 @@ def evaluate(
 def effects(
     name: Annotated[
         str | None,
-        typer.Argument(help="One effect; all if not given.", autocompletion=effect_names),
+        typer.Argument(
+            metavar="NAME_OR_FILE",
+            help="One effect, or a file of your own; all of the catalogue if not given.",
+            autocompletion=effect_names,
+        ),
     ] = None,
     as_json: Json = False,
 ) -> None:
     """The catalogue: formula, unit, size, what an effect is confounded with, source."""
-    from calib.effects import CATALOGUE, find
+    from calib.effects import CATALOGUE, load_effects
     from calib.show.tables import effect_page, print_catalogue
 
-    chosen = [find(name)] if name else list(CATALOGUE)
+    chosen = load_effects((name,)) if name else CATALOGUE
     if as_json:
         print_json([effect_page(e) for e in chosen])
     else:

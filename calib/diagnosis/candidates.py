@@ -30,14 +30,20 @@ class Binned(Effect):
     Args:
         edges: covariate -> (B - 1,) ascending values between its bins.
         centres: covariate -> (B,) mean of its values in each bin.
+        seen: covariate -> its least and largest value.
     """
 
     site = Site.BEAM
     formula = "range = true + a_bin"
     typical = "empirical"
 
-    def __init__(self, edges: Mapping[str, np.ndarray], centres: Mapping[str, np.ndarray]) -> None:
-        self.edges, self.centres = edges, centres
+    def __init__(
+        self,
+        edges: Mapping[str, np.ndarray],
+        centres: Mapping[str, np.ndarray],
+        seen: Mapping[str, tuple[float, float]],
+    ) -> None:
+        self.edges, self.centres, self.seen = edges, centres, seen
         self.covariates = tuple(edges)
         self.name = "structure:" + ",".join(edges)
 
@@ -63,14 +69,20 @@ class Binned(Effect):
 
 
 class JointShape(Effect):
-    """A joint turns by a smooth function of itself, or of another joint beside; empirical."""
+    """A joint turns by a smooth function of itself, or of another joint beside; empirical.
+
+    Args:
+        joint: which turns.
+        other: of which it is a function.
+        seen: the least and largest value of that.
+    """
 
     site = Site.JOINTS
     typical = "empirical"
     formula = "q_i = reported_i + sum over m = 1..3 of a_m sin(m q_k) + b_m cos(m q_k)"
 
-    def __init__(self, joint: str, other: str) -> None:
-        self.joint, self.other = joint, other
+    def __init__(self, joint: str, other: str, seen: tuple[float, float]) -> None:
+        self.joint, self.other, self.seen = joint, other, {other: seen}
         self.covariates = ("joints",)
         self.name = f"structure:{joint}" + (f",{other}" if other != joint else "")
 
@@ -112,17 +124,23 @@ class ShapeStep(Effect):
         return (larger - smaller)[..., None] / (2 * np.log1p(STEP))
 
 
-def known_effects(model: Model, sources: Sequence[Source], columns: frozenset[str]) -> list[Effect]:
-    """The catalogue's effects that the model lacks and the recordings can show, shape by shape.
+def known_effects(
+    model: Model,
+    sources: Sequence[Source],
+    columns: frozenset[str],
+    catalogue: Sequence[Effect] = CATALOGUE,
+) -> list[Effect]:
+    """The effects that the model lacks and the recordings can show, shape by shape.
 
     Args:
         model: as fitted.
         sources: the recordings.
         columns: what points and stops carry.
+        catalogue: the effects that are known.
     """
     there = {effect.family for effect in model.effects}
     found = []
-    for effect in CATALOGUE:
+    for effect in catalogue:
         if effect.family in there:
             continue
         if effect.family in model.fixed or lacking(effect, sources, columns):
@@ -185,20 +203,28 @@ def structure(sources: Sequence[Source], sample: Mapping[str, np.ndarray]) -> li
     for names in wanted:
         edges = {c: _edges(sample[c], _bins(c, len(names))) for c in names}
         if all(len(e) for e in edges.values()):
-            out.append(Binned(edges, {c: _centres(sample[c], e) for c, e in edges.items()}))
-    joints = dict.fromkeys(j for s in sources for j in _moving(s))
-    out += [JointShape(j, j) for j in joints]
-    out += [JointShape(i, k) for i, k in permutations(joints, 2)]
+            centres = {c: _centres(sample[c], e) for c, e in edges.items()}
+            out.append(Binned(edges, centres, {c: _ends(sample[c]) for c in names}))
+    joints: dict[str, list[np.ndarray]] = {}
+    for name, values in (each for s in sources for each in _moving(s)):
+        joints.setdefault(name, []).append(values)
+    seen = {name: _ends(np.concatenate(values)) for name, values in joints.items()}
+    out += [JointShape(j, j, seen[j]) for j in joints]
+    out += [JointShape(i, k, seen[k]) for i, k in permutations(joints, 2)]
     return out
 
 
-def _moving(source: Source) -> Iterator[str]:
-    turned = np.ptp(source.recording.joints, axis=0) if len(source.recording.joints) else ()
-    for name, kind, way in zip(
-        source.rig.joint_names, source.rig.joint_kinds, turned, strict=False
+def _moving(source: Source) -> Iterator[tuple[str, np.ndarray]]:
+    """Revolute joints that turned, and their values (K,)."""
+    for name, kind, values in zip(
+        source.rig.joint_names, source.rig.joint_kinds, source.recording.joints.T, strict=False
     ):
-        if kind == "revolute" and way > 1e-3:
-            yield name
+        if kind == "revolute" and len(values) and np.ptp(values) > 1e-3:
+            yield name, values
+
+
+def _ends(values: np.ndarray) -> tuple[float, float]:
+    return float(np.nanmin(values)), float(np.nanmax(values))
 
 
 def _bins(covariate: str, together: int) -> int:

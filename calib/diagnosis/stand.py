@@ -23,7 +23,7 @@ from calib.diagnosis.jackknife import Shares
 from calib.diagnosis.linear import Linear, linearise_with, rows_along
 from calib.diagnosis.score import Test, away_from_model, project, test
 from calib.diagnosis.screen import Candidate, Screen, screen
-from calib.effects import Effect, Scatter, Site
+from calib.effects import CATALOGUE, Effect, Scatter, Site
 from calib.problem import Problem
 from calib.problem.model import Model, Source
 from calib.problem.without import leave_out
@@ -40,12 +40,23 @@ SAMPLED = 8  # scans from which the bins of covariates are taken
 
 @dataclass(frozen=True)
 class Stand:
-    """A model fitted to its recordings."""
+    """A model fitted to its recordings.
+
+    Args:
+        sources, model, problem, estimate: these.
+        own: effects of the user's own, candidates as those of the catalogue are.
+    """
 
     sources: Sequence[Source]
     model: Model
     problem: Problem
     estimate: Estimate
+    own: Sequence[Effect] = ()
+
+    @property
+    def catalogue(self) -> tuple[Effect, ...]:
+        """Every effect that could be missing."""
+        return (*CATALOGUE, *self.own)
 
     def with_effects(self, added: Sequence[Effect], progress: Progress) -> Stand:
         """The model with more effects, fitted from here."""
@@ -65,12 +76,12 @@ class Stand:
             meetings = {i: m for i, m in meetings.items() if sources[i].reference is None}
         problem = problems.build(sources, model, meetings=meetings)
         estimate = solve(problem, progress=progress, start=self.estimate.start)
-        return Stand(sources, model, problem, estimate)
+        return Stand(sources, model, problem, estimate, own=self.own)
 
     def _refitted(self, model: Model, start: Start, progress: Progress) -> Stand:
         problem = self.problem_of(model)
         estimate = solve(problem, progress=progress, start=start)
-        return Stand(self.sources, model, problem, estimate)
+        return Stand(self.sources, model, problem, estimate, own=self.own)
 
     def problem_of(self, model: Model) -> Problem:
         """The problem of another model on these recordings; beams meet what they met here."""
@@ -79,7 +90,7 @@ class Stand:
     def look(self, progress: Progress) -> Look:
         """Test everything that the model lacks."""
         columns, sample = self.columns
-        known = known_effects(self.model, self.sources, columns)
+        known = known_effects(self.model, self.sources, columns, self.catalogue)
         wider = [e for e in known if e.widens]
         known = [e for e in known if not e.widens]
         there = set(self.model.names)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from itertools import pairwise
+import re
+from collections.abc import Collection, Iterator
+from itertools import count, pairwise
 from typing import Any
 
 import numpy as np
@@ -11,11 +12,22 @@ import numpy as np
 from calib.diagnosis.candidates import Binned, JointShape
 from calib.diagnosis.screen import Candidate
 from calib.effects import Effect, Site
+from calib.effects.own.formula import FormulaEffect
+from chains.errors import InputError
 
 KNOTS = 7  # of the piecewise linear function that is suggested for one covariate
 PAIR_KNOTS = 3
 WAVES = 2  # of the harmonics of azimuth
 
+DESCRIBES = "Empirical: it describes and explains nothing, and was seen at"
+# Endings of columns -> the unit that people read, and how many of it the column's unit is.
+UNITS = {
+    "_m": ("m", 1.0),
+    "_rad": ("degrees", float(np.degrees(1.0))),
+    "_s": ("s", 1.0),
+    "_c": ("degrees C", 1.0),
+    "_kg": ("kg", 1.0),
+}
 WORDS = {
     "range_m": "range",
     "incidence_rad": "incidence",
@@ -37,32 +49,50 @@ def words(covariate: str) -> str:
     return WORDS.get(covariate, covariate)
 
 
-def formula(candidate: Candidate) -> dict[str, Any] | None:
+def formula(candidate: Candidate, taken: Collection[str] = ()) -> dict[str, Any] | None:
     """An effect as a formula that the user can add as it stands, empirical as it is.
 
     Piecewise linear over the covariate's bins, products of such for a pair, the strongest harmonics
-    of azimuth; for a joint, harmonics of the joint that it hangs on.
+    of azimuth; for a joint, harmonics of the joint that it hangs on. None where there is no formula
+    for it: of labels, or of a column that goes by no name of a formula.
+
+    Args:
+        candidate: structure that stands out.
+        taken: names that the model has already.
     """
     effect = candidate.effect
-    name = "empirical_" + "_".join(
-        c.removesuffix("_rad").removesuffix("_m") for c in hangs_on(effect)
-    )
-    page = {"name": name, "unit": "m", "sigma": 0.01, "what": "Empirical: fitted, not explained."}
     if isinstance(effect, JointShape):
         basis = [f"{f}({m} * {effect.other})" for m in (1, 2, 3) for f in ("sin", "cos")]
-        return page | {
-            "site": f"joint:{effect.joint}",
-            "unit": "rad",
-            "sigma": 0.003,
-            "basis": basis,
-        }
-    if not isinstance(effect, Binned) or "label" in effect.covariates:
+        rest = {"site": f"joint:{effect.joint}", "unit": "rad", "sigma": 0.003, "basis": basis}
+    elif isinstance(effect, Binned) and "label" not in effect.covariates:
+        sides = [list(_shapes(c, effect, candidate)) for c in effect.covariates]
+        basis = sides[0]
+        for side in sides[1:]:
+            basis = [f"({a}) * ({b})" for a in basis for b in side]
+        rest = {"site": "range", "unit": "m", "sigma": 0.01, "basis": basis}
+    else:
         return None
-    sides = [list(_shapes(c, effect, candidate)) for c in effect.covariates]
-    basis = sides[0]
-    for side in sides[1:]:
-        basis = [f"({a}) * ({b})" for a in basis for b in side]
-    return page | {"site": "range", "basis": basis}
+    bare = (c.removesuffix("_rad").removesuffix("_m") for c in hangs_on(effect))
+    name = "_".join(["empirical", *(re.sub(r"\W", "_", c, flags=re.ASCII) for c in bare)])
+    numbered = (f"{name}_{i}" for i in count(2))
+    name = name if name not in taken else next(n for n in numbered if n not in taken)
+    found = {"name": name, **rest, "what": f"{DESCRIBES} {seen(effect)}."}
+    try:
+        FormulaEffect.read(found, "diagnosis.json", {})
+    except InputError:
+        return None
+    return found
+
+
+def seen(effect: Binned | JointShape) -> str:
+    """From where to where each covariate of structure went, in words."""
+    parts = []
+    for name, ends in effect.seen.items():
+        suffix = "_rad" if isinstance(effect, JointShape) else f"_{name.rpartition('_')[2]}"
+        unit, scale = UNITS.get(suffix, ("", 1.0))
+        low, high = (f"{scale * x:.0f}" if abs(x) > 1e4 else f"{scale * x:.3g}" for x in ends)
+        parts.append(f"{words(name)} from {low} to {high} {unit}".rstrip())
+    return " and ".join(parts)
 
 
 def hangs_on(effect: Effect) -> tuple[str, ...]:
@@ -77,14 +107,14 @@ def _shapes(covariate: str, effect: Binned, candidate: Candidate) -> Iterator[st
         waves = _strongest_waves(candidate) if len(effect.covariates) == 1 else (1, 2)
         yield from (f"{f}({m} * azimuth_rad)" for m in waves for f in ("sin", "cos"))
         return
-    count = KNOTS if len(effect.covariates) == 1 else PAIR_KNOTS
-    at = np.unique(np.quantile(effect.centres[covariate], np.linspace(0, 1, count)))
+    most = KNOTS if len(effect.covariates) == 1 else PAIR_KNOTS
+    at = np.unique(np.quantile(effect.centres[covariate], np.linspace(0, 1, most)))
     gaps = [b - a for a, b in pairwise(at)]
     for i, knot in enumerate(at):
         left = gaps[max(i - 1, 0)]
         right = gaps[min(i, len(gaps) - 1)]
-        rise = f"1 - ({knot:.4g} - {covariate}) / {left:.4g}"
-        fall = f"1 - ({covariate} - {knot:.4g}) / {right:.4g}"
+        rise = f"1 - ({knot:.9g} - {covariate}) / {left:.4g}"
+        fall = f"1 - ({covariate} - {knot:.9g}) / {right:.4g}"
         yield f"maximum(0, minimum({rise}, {fall}))"
 
 

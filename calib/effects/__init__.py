@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -31,7 +31,7 @@ from calib.effects.beams import (
     SpinAxisWobble,
 )
 from calib.effects.noise import NoiseIncidence, NoiseIntensity, NoiseRange
-from calib.effects.own.files import from_document, from_file, is_file
+from calib.effects.own.files import files_in, from_document, from_file, is_file
 from calib.effects.own.trust import NotTrustedError, Trust, trusted
 from calib.effects.range import (
     AzimuthRangeHarmonic,
@@ -59,6 +59,7 @@ from calib.effects.scatter import (
 )
 from calib.effects.targets import TargetRodTilt, TargetSphereOffset
 from calib.effects.tracker import BaseSlip, BodySlip, OptitrackDistortion, OptitrackScale
+from calib.rig import Rig
 from chains.errors import InputError
 
 CATALOGUE: tuple[Effect, ...] = (
@@ -129,28 +130,35 @@ __all__ = [
     "Trust",
     "View",
     "find",
+    "is_known",
     "load_effects",
+    "own_effects",
     "read",
+    "split",
     "trust_in",
     "trusted",
 ]
 
 
-def find(name: str) -> Effect:
+def find(name: str, own: Iterable[Effect] = ()) -> Effect:
     """The effect of this name, ``family`` or ``family@shape``.
 
+    Args:
+        name: as commands have it.
+        own: effects that are known beside the catalogue.
+
     Raises:
-        InputError: when the catalogue has none, naming the nearest.
+        InputError: there is none, naming the nearest.
     """
+    known = {effect.name: effect for effect in (*CATALOGUE, *own)}
+    if name in known:
+        return known[name]
     family, _, shape = name.partition("@")
-    known = {effect.name: effect for effect in CATALOGUE}
     if family not in known:
         near = difflib.get_close_matches(family, known, 1)
         hint = f"; did you mean '{near[0]}'?" if near else f": it has {', '.join(known)}."
         raise InputError(f"effect '{name}' is not in the catalogue{hint}")
     effect = known[family]
-    if not shape:
-        return effect
     try:
         chosen = float(shape)
     except ValueError:
@@ -161,27 +169,66 @@ def find(name: str) -> Effect:
     return effect.at(chosen)
 
 
-def load_effects(texts: str | Iterable[str], trust: Trust | None = None) -> tuple[Effect, ...]:
+def load_effects(
+    texts: str | Iterable[str], trust: Trust | None = None, own: Sequence[Effect] = ()
+) -> tuple[Effect, ...]:
     """The effects that a command line names, each once.
 
     Args:
         texts: names of the catalogue, ``family@shape``, and files of effects of the user's own:
-            ``file.yaml`` of formulas, ``file.py`` or ``file.py:Class``. One text may hold several
-            of these, with commas between.
+            ``file.yaml`` of formulas, a folder of such files, ``file.py`` or ``file.py:Class``. One
+            text may hold several of these, with commas between.
         trust: the Python files that may run, where a file names these effects; None where the user
             did so himself.
+        own: effects that go by their names beside the catalogue.
 
     Raises:
         InputError: there is no such effect or file, or two effects have one name.
     """
-    texts = texts.split(",") if isinstance(texts, str) else texts
     found: dict[str, Effect] = {}
-    for text in (text.strip() for text in texts if text.strip()):
-        for effect in map(_own, from_file(text, trust)) if is_file(text) else [find(text)]:
+    for text in split(texts):
+        for effect in _named(text, trust, own):
             same = found.setdefault(effect.name, effect)
             if same.document() != effect.document():
                 raise InputError(f"{text}: another effect is called '{effect.name}' too")
     return tuple(found.values())
+
+
+def own_effects(rigs: Iterable[Rig], named: str | Iterable[str] = ()) -> tuple[Effect, ...]:
+    """Effects of the user's own that stand beside the catalogue: of rigs' files, and `named` ones.
+
+    Args:
+        rigs: whose ``effects`` name files.
+        named: as of `load_effects`; what is of the catalogue is there already.
+
+    Raises:
+        InputError: as of `load_effects`.
+    """
+    files = [str(path) for rig in rigs for path in rig.effects]
+    every = load_effects(files + split(named))
+    return tuple(e for e in every if all(e.family != known.family for known in CATALOGUE))
+
+
+def split(texts: str | Iterable[str]) -> list[str]:
+    """Items of a command line, which may be one text with commas."""
+    texts = texts.split(",") if isinstance(texts, str) else texts
+    return [text.strip() for text in texts if text.strip()]
+
+
+def is_known(text: str) -> bool:
+    """Whether an item of a command line is a name of the catalogue, a file, or a folder."""
+    named = any(text.partition("@")[0] == effect.family for effect in CATALOGUE)
+    return named or is_file(text) or Path(text).is_dir()
+
+
+def _named(text: str, trust: Trust | None, own: Sequence[Effect]) -> list[Effect]:
+    """What one item of a command line names."""
+    if any(text == effect.name for effect in (*CATALOGUE, *own)):
+        return [find(text, own)]
+    files = files_in(text) if Path(text).is_dir() else [text] if is_file(text) else []
+    if files:
+        return [_own(effect) for file in files for effect in from_file(file, trust)]
+    return [find(text, own)]
 
 
 def read(

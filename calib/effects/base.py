@@ -54,6 +54,7 @@ class View:
 
     Columns of a point are those of its stop too. Range and incidence are those *predicted* by the
     model, never the measured ones: noise common to a column and its residual looks like an effect.
+    Intensity is that over the median of all recordings by one LiDAR, so that no unit matters.
 
     Args:
         rig: the rig as built on paper.

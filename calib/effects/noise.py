@@ -52,7 +52,7 @@ class NoiseIntensity(NoiseRange):
     """Weak returns scatter more: sigma grows as a power of 1 / intensity."""
 
     name = "noise_intensity"
-    formula = "sigma = nominal * (100 / I)^b, I = intensity not below 1; 255 of a reflectance 1"
+    formula = "sigma = nominal * (I0 / I)^b, I0 the recording's median intensity, I >= I0 / 100"
     typical = "b of 0.5 to 0.8"
     covariates = ("intensity",)
     confounded_with = ("noise_range", "noise_incidence")

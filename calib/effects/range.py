@@ -7,11 +7,9 @@ import numpy as np
 from calib.effects.base import Effect, OneHot, Param, Site, View
 from calib.effects.basis import RANGE, beam, finite, incidence_rad, place_of, range_m
 from calib.rig import Rig
-from sensors.lidar import LARGEST_REFLECTANCE
 
 STUDY = "Pushing the Limits of LiDAR: Accurate Performance Analysis of Indoor 3D LiDARs"
-INTENSITY_0 = 100.0  # in counts
-REFLECTANCE_1 = 255.0  # counts of a reflectance of 1, as makers that give 8 bits scale it
+FAINTEST = 0.01  # of the median intensity: about 1 count of 8 bits, where a room's median is 100
 AMBIENT_C = 20.0
 
 
@@ -171,7 +169,7 @@ class IntensityRangeWalk(RangeEffect):
 
     name = "intensity_range_walk"
     sigma = 0.002
-    formula = "range = true + w * ln(I / 100), I = intensity not below 1; 255 of a reflectance 1"
+    formula = "range = true + w * ln(I / I0), I0 the recording's median intensity, I >= I0 / 100"
     typical = "1 to 15 mm per decade, w < 0, size assumed"
     covariates = ("intensity",)
     confounded_with = ("label_range_offset", "range_scale", "incidence_angle_bias")
@@ -287,12 +285,7 @@ class RangeQuantisation(RangeEffect):
 
 
 def log_intensity(view: View) -> np.ndarray:
-    """``ln(I / 100)`` of the intensity (rows,) in counts: taken as 1 below that, as 100 if not
-    recorded. Where no row is above 2, intensity is a reflectance, of which 1 is 255 counts; makers
-    that count do so to 255 or 65535. A unit's factor shifts the logarithm by a constant, which the
-    range zero takes on; without it the floor of 1 would take all."""
-    intensity = view["intensity"]
-    recorded = np.isfinite(intensity)
-    reflectance = intensity.max(initial=0.0, where=recorded) <= LARGEST_REFLECTANCE
-    counts = intensity * (REFLECTANCE_1 if reflectance else 1.0)
-    return np.log(np.maximum(np.where(recorded, counts, INTENSITY_0), 1.0) / INTENSITY_0)
+    """``ln(I / I0)`` of the intensity (rows,), which a view gives over the median I0 already: taken
+    as I0 / 100 below that, and as I0 where none was recorded."""
+    relative = view["intensity"]
+    return np.log(np.maximum(np.where(np.isfinite(relative), relative, 1.0), FAINTEST))

@@ -21,6 +21,7 @@ from calib.linear.parallel import one_blas_thread
 from calib.problem.model import Source
 from calib.residuals.beams import site_error
 from calib.residuals.scan import turned
+from calib.residuals.store import common_median
 from calib.rig import Rig, load_rig
 from calib.runs.reopen import effects_that_may_run, problem_of, reopened, state_of
 from calib.runs.run import Run
@@ -52,11 +53,14 @@ class Correction:
         rig: as on paper.
         effects: the model's effects on beams, and the estimate (P,) of each.
         closed: effects that are not known here, as their Python file may not run -> that sentence.
+        median_intensity: to which effects hold others, in the unit of the run's recordings; NaN
+            where no effect asks.
     """
 
     rig: Rig
     effects: Sequence[tuple[Effect, np.ndarray]]
     closed: Mapping[str, str] = field(default_factory=dict)
+    median_intensity: float = float("nan")
 
     @classmethod
     def of(cls, run: Run, rig_name: str | None = None) -> Correction:
@@ -75,7 +79,13 @@ class Correction:
         }
         chance = (e.name for e in known.values() if e.by_chance)
         closed |= {name: "is another one each time, by chance" for name in chance}
-        return cls(rig, [(e, part.effects[e.name].estimate) for e in of_beams], closed=closed)
+        asked = any("intensity" in e.covariates for e in of_beams)
+        return cls(
+            rig,
+            [(e, part.effects[e.name].estimate) for e in of_beams],
+            closed=closed,
+            median_intensity=_median_intensity(run, rig) if asked else float("nan"),
+        )
 
     def usable(self, columns: Collection[str]) -> tuple[Correction, dict[str, str]]:
         """What can be corrected where these columns are known, and what of it not, and why."""
@@ -94,6 +104,8 @@ class Correction:
         """
         ray = beams(xyz_m, self.rig.lidar.beam_origin_m)
         error = np.zeros((len(xyz_m), 3))
+        if "intensity" in columns:
+            columns = {**columns, "intensity": columns["intensity"] / self.median_intensity}
         for _ in range(PASSES):
             there = {"range_m": ray.range_m - error[:, 0], **_angles(ray), **columns}
             view = View(self.rig, len(xyz_m), there, np.zeros((1, 0)))
@@ -284,6 +296,12 @@ def _check_rings(rig: Rig, path: Path, columns: Columns, seen: np.ndarray) -> No
             f"{path}: ring {ring.min()} to {ring.max()}, but {rig.lidar.name} has 0 to "
             f"{rig.lidar.rings - 1}; count from 0, or give a run of this LiDAR"
         )
+
+
+def _median_intensity(run: Run, rig: Rig) -> float:
+    """As of `Correction`."""
+    mine = [Path(r["path"]) for r in run.model["recordings"] if r["rig"] == rig.name]
+    return common_median([Source.open(path).store for path in mine])
 
 
 def _rig(run: Run, name: str | None) -> Rig:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from calib.effects import CATALOGUE
 from calib.exporters.fitted import Fitted
 from calib.exporters.written import Written, commented, warnings, write_text
 from calib.results.solution import (
@@ -17,6 +17,7 @@ from calib.results.solution import (
     effect_document,
     frame_document,
 )
+from calib.runs.reopen import effects_that_may_run
 from calib.runs.run import RING, Run
 from chains import se3
 from chains.errors import InputError
@@ -43,14 +44,17 @@ def write_extrinsics(fitted: Fitted, folder: Path) -> Written:
     """Write extrinsics.yaml of a run into a folder, whole or not at all; it holds everything."""
     run = fitted.run
     solution = run.solution
+    formulas = {effect.name: effect.formula for effect in effects_that_may_run(run)[0]}
     data = {
         "format": FORMAT,
         "units": UNITS,
         "conventions": CONVENTIONS,
         "provenance": _provenance(run),
-        **_part_document(solution.shared),
+        **_part_document(solution.shared, formulas),
         "not_estimated": solution.not_estimated,
-        "recordings": {rig: _part_document(part) for rig, part in solution.recordings.items()},
+        "recordings": {
+            rig: _part_document(part, formulas) for rig, part in solution.recordings.items()
+        },
     }
     write_text(folder / FILE, commented(warnings(run)) + yaml_text(data))
     return Written([folder / FILE])
@@ -89,12 +93,12 @@ def _provenance(run: Run) -> dict[str, Any]:
     }
 
 
-def _part_document(part: Part) -> dict[str, Any]:
+def _part_document(part: Part, formulas: Mapping[str, str]) -> dict[str, Any]:
     by_ring = {name for name, e in part.effects.items() if all(map(RING.fullmatch, e.names))}
     return {
         "frames": {name: _frame_document(frame) for name, frame in part.frames.items()},
         "effects": {
-            name: {"formula": _formula(name), **effect_document(effect)}
+            name: {"formula": formulas.get(name, ""), **effect_document(effect)}
             for name, effect in part.effects.items()
             if name not in by_ring
         },
@@ -109,11 +113,6 @@ def _frame_document(frame: FrameEstimate) -> dict[str, Any]:
     sigmas = {key: document.pop(key) for key in ("sigma_m", "sigma_rad")}
     T = frame.T_parent_child
     return {**document, "rpy_rad": se3.to_rpy(T), "T_parent_child": T, **sigmas}
-
-
-def _formula(name: str) -> str:
-    family = name.partition("@")[0]
-    return next((effect.formula for effect in CATALOGUE if effect.name == family), "")
 
 
 def _ring_document(effect: EffectEstimate) -> dict[str, Any]:

@@ -38,6 +38,7 @@ def add_beams(problem: Problem, part: SourceStops, places: Places) -> None:
                 meeting=meeting,
                 reference_sigma_m=sigma_m,
                 store=source.store,
+                alike=tuple(s.store for s in problem.sources if s.rig.name == source.rig.name),
                 room=_room(problem, part),
                 group=Group("scan", source.recording.stops[k], SCAN, part.label),
             )

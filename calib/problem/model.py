@@ -45,13 +45,27 @@ class Model:
         object.__setattr__(self, "effects", tuple(chosen))
 
     @classmethod
-    def of(cls, chosen: str | None, fixed: Sequence[str], without: Sequence[str] = ()) -> Model:
+    def of(
+        cls,
+        chosen: str | None,
+        fixed: Sequence[str],
+        without: Sequence[str] = (),
+        recordings: Sequence[Path | str] = (),
+    ) -> Model:
         """The model that a command line names: effects with commas, or the default ones.
+
+        Args:
+            chosen, fixed, without: as the command line has them.
+            recordings: those whose ``rig.yaml`` names effects that go by their names here.
 
         Raises:
             InputError: an effect that there is not, in the catalogue or in a file.
         """
-        named = effects.DEFAULT if chosen is None else effects.load_effects(chosen)
+        named = effects.DEFAULT
+        if chosen is not None:
+            whole = all(map(effects.is_known, effects.split(chosen)))
+            own = () if whole else effects.own_effects(map(load_rig, recordings))
+            named = effects.load_effects(chosen, own=own)
         return cls(named, tuple(fixed), tuple(without))
 
     @classmethod

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -137,6 +137,8 @@ def _candidates(evidence: Evidence) -> list[dict[str, str]]:
     """Candidates that are confirmed, or beyond chance, each with its evidence in words."""
     about = {effect.family: effect_page(effect)["what"] for effect in CATALOGUE}
     candidates = evidence.diagnosis["candidates"] if evidence.diagnosis else []
+    own = {c["effect"]: c["document"] for c in candidates if isinstance(c.get("document"), Mapping)}
+    about |= {name: str(document.get("what", "")) for name, document in own.items()}
     return [
         {
             "name": c["add"],

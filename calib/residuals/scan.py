@@ -28,7 +28,7 @@ from calib.residuals.compiled import twist_derivative
 from calib.residuals.groups import Group
 from calib.residuals.robust import robust_scale, tukey_weight
 from calib.residuals.spread import spread_rows
-from calib.residuals.store import BeamStore
+from calib.residuals.store import BeamStore, common_median
 from calib.residuals.surfaces import Meeting
 from chains import se3
 from chains.errors import InputError
@@ -84,9 +84,8 @@ class _Seen:
     def error_at(self, site: Site, rows: np.ndarray) -> np.ndarray:
         """The error (R, D) at some rows."""
         error = self.error[site]
-        return (
-            error[rows] if len(error) > 1 else np.broadcast_to(error, (len(rows), error.shape[1]))
-        )
+        shape = len(rows), error.shape[1]
+        return error[rows] if len(error) > 1 else np.broadcast_to(error, shape)
 
 
 @dataclass(frozen=True)
@@ -101,7 +100,7 @@ class ScanStop:
         columns: (1,) covariates of the stop.
         meeting: mesh or planes.
         reference_sigma_m: how far the reference may be off its surface.
-        store: its recording's scans as beams.
+        store, alike: its recording's scans as beams, and those of all recordings by this LiDAR.
         room: the mesh, or the recording whose planes these are.
         group: the name of its rows.
         reference_scatter_m: kind of part, "surface", "region" or "patch" -> how widely such parts
@@ -120,6 +119,7 @@ class ScanStop:
     room: int | str
     group: Group
     reference_scatter_m: Mapping[str, float] = field(default_factory=dict)
+    alike: tuple[BeamStore, ...] = ()
 
     @property
     def stated_sigma_m(self) -> float:
@@ -272,7 +272,7 @@ class ScanStop:
             **surface.columns,
             "ring": scan.ring,
             "column": scan.column,
-            "intensity": scan.intensity,
+            "intensity": lambda: scan.intensity / common_median(self.alike or (self.store,)),
             "azimuth_rad": lambda: ray.azimuth_rad,
             "elevation_rad": lambda: ray.elevation_rad,
             "range_m": surface.predicted_m,

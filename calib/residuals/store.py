@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from threading import Lock
 from typing import Any
+
+import numpy as np
 
 from sensors.lidar import Beams, beams
 from sensors.recording import Recording, Scan
@@ -44,12 +48,26 @@ class BeamStore:
                 self._bytes += size
         return found
 
+    @cached_property
+    def median_intensity(self) -> float:
+        """Of all returns of the recording; NaN where none has an intensity, or most are dark."""
+        scanned = np.flatnonzero(self.recording.has_scan).tolist()
+        found = np.concatenate([np.zeros(0), *(self.read(k)[0].intensity for k in scanned)])
+        found = found[np.isfinite(found)]
+        median = float(np.median(found)) if len(found) else 0.0
+        return median if median > 0 else float("nan")
+
     def __getstate__(self) -> dict[str, object]:
         """Without what was read: another process reads for itself."""
         return {"recording": self.recording, "beam_origin_m": self.beam_origin_m}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__init__(**state)
+
+
+def common_median(stores: Sequence[BeamStore]) -> float:
+    """The median intensity that recordings by one LiDAR share, as they share its range zero."""
+    return float(np.median([store.median_intensity for store in stores]))
 
 
 def _size(found: tuple[Scan, Beams]) -> float:

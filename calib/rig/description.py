@@ -82,6 +82,8 @@ class Rig:
     """What weighs on the arm's joints, as the URDF says."""
     arm_urdf: Path | None = None
     """The URDF that the arm was read from."""
+    effects: tuple[Path, ...] = ()
+    """Files of formulas: effects of the user's own, candidates of every diagnosis."""
     labels: dict[int, str] = field(default_factory=dict)
     """Names of the labels of the reference's triangles; empty where nothing names them."""
 
@@ -222,6 +224,7 @@ class _RigFile(Document):
     reference: _Reference | None = None
     shared: tuple[str, ...] = ()
     own: tuple[str, ...] = ()
+    effects: tuple[str, ...] = ()
 
 
 def load_rig(folder: str | Path) -> Rig:
@@ -263,6 +266,7 @@ def load_rig(folder: str | Path) -> Rig:
         own=file.own,
         masses=masses,
         arm_urdf=folder / file.arm.urdf if file.arm else None,
+        effects=_read_effects(file.effects, folder, where),
         labels=_read_labels(reference.labels) if reference else {},
     )
 
@@ -280,7 +284,7 @@ class _Where:
         )
         return InputError(f"{self.path}:{line}: {'.'.join(map(str, key))}: {what}")
 
-    def file(self, folder: Path, name: str | None, *key: str) -> Path | None:
+    def file(self, folder: Path, name: str | None, *key: str | int) -> Path | None:
         if name is None:
             return None
         if not (folder / name).is_file():
@@ -343,6 +347,15 @@ def _read_reference(reference: _Reference, folder: Path, where: _Where) -> Refer
         for key in ("mesh", "faces", "labels")
     }
     return ReferenceSpec(frame=reference.frame, sigma_m=reference.sigma_m, **paths)
+
+
+def _read_effects(names: tuple[str, ...], folder: Path, where: _Where) -> tuple[Path, ...]:
+    for i, name in enumerate(names):
+        if not name.endswith((".yaml", ".yml")):
+            what = f"{shortened(name)} is no YAML file of formulas; give Python to --candidates"
+            raise where.wrong(what, "effects", i)
+        where.file(folder, name, "effects", i)
+    return tuple(folder / name for name in names)
 
 
 def _read_labels(path: Path | None) -> dict[int, str]:

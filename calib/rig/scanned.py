@@ -160,6 +160,6 @@ def _intensities(scans: ScanSums) -> Iterator[Suspect]:
     elif largest > max(FULL_SCALES) or scans.darkest < 0:
         said = (
             f"intensity lies between {scans.darkest:g} and {largest:g}, which is neither a "
-            "reflectance of 0 to 1 nor a count of 8 or 16 bits; effects of it take it for counts"
+            "reflectance of 0 to 1 nor a count of 8 or 16 bits; effects of it want a linear unit"
         )
         yield Suspect("intensity", "intensity", said)

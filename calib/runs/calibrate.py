@@ -14,7 +14,7 @@ import numpy as np
 from calib import outputs
 from calib import problem as problems
 from calib.blunders.chance import at_least
-from calib.effects import Effect, load_effects, trust_in
+from calib.effects import Effect, is_known, load_effects, split, trust_in
 from calib.linear.parallel import one_blas_thread
 from calib.problem import Problem
 from calib.problem.model import Model, Source
@@ -25,7 +25,7 @@ from calib.results.misfit import misfit_by, prior_rows, target_rows, tracker_row
 from calib.results.reach import reach
 from calib.results.recalibrate import Link, earlier, solve_from
 from calib.results.solution import solution_of
-from calib.runs.reopen import model_of, reopened, start_of, stored_met
+from calib.runs.reopen import model_of, proposed, reopened, start_of, stored_met
 from calib.runs.residual_table import recording_of, residual_table, table_path, write_rows
 from calib.runs.run import (
     COVARIANCE,
@@ -110,16 +110,20 @@ def grow(
     return Run.open(out, {**run.trust, **trust_in(model.effects)})
 
 
-def grown_model(run: Run, added: Sequence[str]) -> Model:
+def grown_model(run: Run, added: str | Sequence[str]) -> Model:
     """A run's model and more effects, as ``rigcal add`` names them.
 
     An effect that needs a shape and is given none takes the one that the run's diagnosis found
     for it, or else its usual one. Who names a Python file here trusts it, where the run has it too.
+    A name that the catalogue lacks is one that the run's diagnosis printed, or that ``rig.yaml`` of
+    its recordings has.
 
     Raises:
         InputError: an effect is unknown, or in the model already.
     """
-    found = tuple(_shaped(effect, run) for effect in load_effects(added))
+    unknown = [text for text in split(added) if not is_known(text)]
+    own = proposed(run, unknown) if unknown else ()
+    found = tuple(_shaped(effect, run) for effect in load_effects(added, own=own))
     knowing = replace(run, trust={**run.trust, **trust_in(found)})
     return model_of(knowing).plus(found)
 

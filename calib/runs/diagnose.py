@@ -16,7 +16,7 @@ from calib.diagnosis.search import search
 from calib.diagnosis.stand import Stand
 from calib.diagnosis.verdict import Diagnosis, conclude
 from calib.diagnosis.weak import weak_directions
-from calib.effects import DEFAULT
+from calib.effects import DEFAULT, own_effects
 from calib.linear.parallel import one_blas_thread
 from calib.problem import build
 from calib.results.errors import Errors
@@ -37,6 +37,7 @@ def diagnose(
     run: Run,
     progress: Progress = lambda what, done, total: None,
     refits: bool = True,
+    candidates: str | Sequence[str] = (),
 ) -> Diagnosis:
     """Find where a run's model fails and which effect it lacks; written to its diagnosis.json.
 
@@ -44,19 +45,23 @@ def diagnose(
         run: a fitted run, with its recordings where they were.
         progress: called with what is being done, and how far it is.
         refits: whether effects found are fitted without the held-out stops too.
+        candidates: files of effects of the user's own, which are tested beside the catalogue as are
+            those that ``rig.yaml`` names; see `calib.effects.load_effects`.
 
     Raises:
-        InputError: the recordings are not what they were.
+        InputError: the recordings are not what they were, or a file of effects is wrong.
     """
     with outputs.entries(run.folder, outputs.RUN) as entries:
-        result = _found(run, progress, refits)
+        result = _found(run, progress, refits, candidates)
         write_json(entries / DIAGNOSIS, result.document())
     return result
 
 
-def _found(run: Run, progress: Progress, refits: bool) -> Diagnosis:
+def _found(
+    run: Run, progress: Progress, refits: bool, candidates: str | Sequence[str]
+) -> Diagnosis:
     """As `diagnose`, and nothing is written."""
-    stand = stand_of(run, progress)
+    stand = stand_of(run, progress, candidates)
     rings = dict(_odd_rings(stand))
     harmful = {name: each for name, each in rings.items() if each.what != "reversed"}
     # Away from an optimum every effect that moves the state towards one looks missing.
@@ -147,15 +152,20 @@ def _unseen(stand: Stand, run: Run, progress: Progress) -> Errors:
     return held_out(stand.sources, stand.model, by, count, progress, stand.estimate.start)
 
 
-def stand_of(run: Run, progress: Progress) -> Stand:
+def stand_of(run: Run, progress: Progress, candidates: str | Sequence[str] = ()) -> Stand:
     """Where a run stands: its model, its recordings, and the state in which its fit was left.
 
+    Args:
+        run: the run.
+        progress: as of `fit.solve`.
+        candidates: as of `diagnose`.
+
     Raises:
-        InputError: its recordings are not what they were.
+        InputError: its recordings are not what they were, or a file of effects is wrong.
     """
     sources, model = reopened(run), model_of(run)
+    own = own_effects([source.rig for source in sources], candidates)
     problem, converged = build(sources, model), run.summary["converged"]
     state_of(run, problem)  # or it would look from elsewhere, unseen
-    return Stand(
-        sources, model, problem, resume(problem, start_of(run, sources), progress, converged)
-    )
+    estimate = resume(problem, start_of(run, sources), progress, converged)
+    return Stand(sources, model, problem, estimate, own=own)

@@ -11,8 +11,9 @@ from typing import Any
 from calib import outputs
 from calib.blunders import told
 from calib.diagnosis import Diagnosis
-from calib.effects import load_effects, trust_in
+from calib.effects import Effect, is_known, load_effects, own_effects, trust_in
 from calib.problem.model import Model, Source
+from calib.rig import load_rig
 from calib.runs.calibrate import calibrate, grow, recordings_document
 from calib.runs.diagnose import diagnose
 from calib.runs.reopen import model_of
@@ -59,6 +60,7 @@ def explain(
     out: Path | str,
     model: Model = Model(),  # noqa: B008 - frozen
     progress: Progress = lambda what, done, total: None,
+    candidates: str | Sequence[str] = (),
 ) -> Explanation:
     """Grow a model until it is adequate, or what is left has no name; every rung is kept.
 
@@ -72,6 +74,7 @@ def explain(
         out: folder of the runs ``00``, ``01``, …, made if it is not there.
         model: what is estimated at first.
         progress: as of `fit.solve`.
+        candidates: files of effects of the user's own, as of `diagnose`.
 
     Raises:
         InputError: what is wrong with the input, or `out` is something else.
@@ -80,11 +83,12 @@ def explain(
     with outputs.entries(out, outputs.LADDER, recordings) as entries:
         for number in range(MOST_RUNGS):  # one that is not climbed any more, too
             outputs.settle(out / f"{number:02d}")
-        climb = _Climb([Path(r) for r in recordings], out, progress)
+        own_effects((), candidates)  # what is wrong with a file is said before the first fit
+        climb = _Climb([Path(r) for r in recordings], out, progress, candidates)
         climb.first(model)
-        diagnosis = diagnose(climb.run, climb.tell, refits=False)
+        diagnosis = diagnose(climb.run, climb.tell, False, candidates)
         while len(climb.runs) < MOST_RUNGS and climb.improve(diagnosis):
-            diagnosis = diagnose(climb.run, climb.tell, refits=False)
+            diagnosis = diagnose(climb.run, climb.tell, False, candidates)
         climb.clear_above()
         result = Explanation(climb.runs, climb.steps, climb.refused, diagnosis)
         write_json(entries / EXPLANATION, result.document())
@@ -94,8 +98,15 @@ def explain(
 class _Climb:
     """The ladder while it is climbed."""
 
-    def __init__(self, recordings: list[Path], out: Path, progress: Progress) -> None:
+    def __init__(
+        self,
+        recordings: list[Path],
+        out: Path,
+        progress: Progress,
+        candidates: str | Sequence[str] = (),
+    ) -> None:
         self.recordings, self.out, self.progress = recordings, out, progress
+        self.candidates = candidates
         self.runs: list[Run] = []
         self.steps: list[dict[str, Any]] = []
         self.refused: list[str] = []
@@ -144,7 +155,7 @@ class _Climb:
                 outputs.remove(folder)
 
     def _add(self, name: str) -> None:
-        effects = load_effects((name,))
+        effects = load_effects((name,), own=() if is_known(name) else self._own)
         families = {effect.family for effect in self._model.effects}
         if name not in self.refused and effects[0].family not in families:
             self._try(self._model.plus(effects), [name], [])
@@ -208,6 +219,11 @@ class _Climb:
         if run.grown_from != (below.folder.resolve() if below else None):
             return None
         return run if all(run.model[key] == plain(wanted[key]) for key in wanted) else None
+
+    @cached_property
+    def _own(self) -> tuple[Effect, ...]:
+        """Effects that stand beside the catalogue."""
+        return own_effects(map(load_rig, self.recordings), self.candidates)
 
     @cached_property
     def _told(self) -> list[dict[str, str]]:

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from calib.effects import Effect, NotTrustedError, read
+from calib.effects import Effect, NotTrustedError, own_effects, read
 from calib.problem import Problem, build
 from calib.problem.model import Model, Source
 from calib.problem.without import leave_out
-from calib.runs.run import MODEL, STATE, Run
+from calib.rig import load_rig
+from calib.runs.run import DIAGNOSIS, MODEL, STATE, Run
 from calib.runs.stored import AGAIN
 from calib.solve.estimate import DOFS, Start
 from chains.errors import InputError
@@ -41,6 +43,41 @@ def effects_that_may_run(run: Run) -> tuple[list[Effect], str]:
         except NotTrustedError as error:
             why = str(error)
     return found, why
+
+
+def proposed(run: Run, names: Sequence[str]) -> list[Effect]:
+    """Effects of these names that no catalogue has: as the run's diagnosis describes them, or else
+    as the files do that its recordings' ``rig.yaml`` names.
+
+    Args:
+        run: the run.
+        names: effects, with or without a shape; those that are known nowhere are left out.
+
+    Raises:
+        NotTrustedError: one is of a Python file that the user did not say may run.
+        InputError: the diagnosis, or a file, holds no such effect as it should.
+    """
+    described = _described(run)
+    found = [read(described[n], run.folder / DIAGNOSIS, run.trust) for n in names if n in described]
+    if set(names) <= described.keys():
+        return found
+    rest = own_effects(load_rig(folder) for folder in run.recordings if folder.is_dir())
+    return [*found, *(e for e in rest if e.name in names and e.name not in described)]
+
+
+def _described(run: Run) -> dict[str, Any]:
+    """Name -> how the run's diagnosis describes an effect that no catalogue has."""
+    document, found = run.diagnosis(), {}
+    try:
+        for each in reversed(document["candidates"] if document else []):  # best first: it stays
+            if isinstance(each.get("document"), Mapping):
+                found |= dict.fromkeys((str(each["effect"]), str(each["add"])), each["document"])
+        formulas = (each.get("formula") for each in (document["unexplained"] if document else []))
+        return found | {str(each["name"]): each for each in formulas if each}
+    except (KeyError, TypeError, AttributeError):
+        raise InputError(
+            f"{run.folder / DIAGNOSIS} is no diagnosis of this version; diagnose the run again"
+        ) from None
 
 
 def reopened(run: Run, without: Sequence[str] | None = None) -> list[Source]:

@@ -104,7 +104,7 @@ def candidates_table(candidates: Sequence[Mapping[str, Any]], residual: str) -> 
 
 def unexplained_table(unexplained: Sequence[Mapping[str, Any]], residual: str) -> Table:
     """Structure that no effect accounts for, strongest first."""
-    table = columns_table("left without a name, over", "p", "mm", "formula in diagnosis.json")
+    table = columns_table("left without a name, over", "p", "mm", "to add it")
     for column in table.columns[1:3]:
         column.justify = "right"
     table.title = f"structure; p after all looks, mm rms of {residual}"

@@ -66,6 +66,9 @@ def print_run(run: Run) -> None:
     effects = [row for row in rows if row.parent is None]
     if effects:
         console.print(effects_table(effects))
+    formulas = (e for e in run.model["effects"] if isinstance(e, Mapping))
+    if own := [(str(e["name"]), str(e["what"])) for e in formulas if "what" in e]:
+        print_pairs(console, "effects of your own", own)
     console.print(error_table(summary))
     if told := beams_told(summary):
         print_pairs(console, "of how many beams", [("", line) for line in told])

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from calib import outputs
 from calib.effects import trusted
@@ -85,6 +88,10 @@ def _record(
         write_targets(folder / "targets.csv", truth, spec, stream(_world(spec, seed), "targets"))
     if spec.lidar:
         scanner, Ts_faro_lidar = Scanner(truth, room, spec), world.in_faro(rig.lidar_frame)
+        if any("intensity" in effect.covariates for effect, _ in truth.effects):
+            each = zip(Ts_faro_lidar, stops.names, strict=True)
+            every = [scanner.intensities(T, stream(seed, f"scan {name}")) for T, name in each]
+            scanner = replace(scanner, median_intensity=float(np.median(np.concatenate(every))))
         for k, name in enumerate(stops.names):
             columns = {c: v[k : k + 1] for c, v in world.columns.items()}
             rng = stream(seed, f"scan {name}")

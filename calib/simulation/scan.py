@@ -37,11 +37,17 @@ class EmittedBeams:
 
 @dataclass(frozen=True)
 class Scanner:
-    """A simulated LiDAR in its room."""
+    """A simulated LiDAR in its room.
+
+    Args:
+        truth, room, spec: of the world.
+        median_intensity: of all that it will return; NaN where no effect asks for it.
+    """
 
     truth: Truth
     room: Room
     spec: Spec
+    median_intensity: float = float("nan")
 
     @property
     def lidar(self) -> LidarModel:
@@ -94,6 +100,10 @@ class Scanner:
             **extra,
         }
 
+    def intensities(self, T_faro_lidar: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Those (N,) of one stop's beams, as `scan` draws them first of all."""
+        return self._intensity(self._meet(T_faro_lidar)[1], rng)
+
     def _meet(self, T_faro_lidar: np.ndarray) -> tuple[EmittedBeams, Hits]:
         """The beams that return, and what they hit."""
         lidar = self.lidar
@@ -134,7 +144,7 @@ class Scanner:
             "column": beams.column,
             "azimuth_rad": beams.azimuth_rad,
             "elevation_rad": beams.elevation_rad,
-            "intensity": intensity,
+            "intensity": intensity / self.median_intensity,
             "range_m": hits.range_m,
             "incidence_rad": hits.incidence_rad,
             "label": hits.label,

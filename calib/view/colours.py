@@ -43,7 +43,7 @@ COLUMNS = {
     "column": Column("column"),
     "azimuth_rad": Column("azimuth", "deg", 180 / np.pi),
     "elevation_rad": Column("elevation", "deg", 180 / np.pi),
-    "intensity": Column("intensity"),
+    "intensity": Column("intensity", "of the median"),
     "label": Column("label"),
     "sigma_m": Column("sigma", "mm", 1e3),
     "weight": Column("weight in the fit"),

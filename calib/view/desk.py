@@ -169,10 +169,12 @@ class Desk:
         """
         offered: dict[str, str | Mapping[str, Any]] = {}
         if findings is not None:
-            offered |= {name: name for name in findings.worth_adding}
+            documents = ((c["add"], c.get("document")) for c in findings.candidates)
+            own = {name: what for name, what in documents if isinstance(what, Mapping)}
+            offered |= {name: own.get(name, name) for name in findings.worth_adding}
             formulas = (each["formula"] for each in findings.unexplained if each.get("formula"))
             offered |= {formula["name"]: formula for formula in formulas}
-            offered |= {c["add"]: c["add"] for c in findings.candidates}
+            offered |= {c["add"]: own.get(c["add"], c["add"]) for c in findings.candidates}
         families = {name.partition("@")[0] for name in (*offered, *self.run.effects)}
         offered |= {e.name: e.name for e in CATALOGUE if e.family not in families}
         return {

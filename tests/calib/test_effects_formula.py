@@ -1,15 +1,20 @@
 """Users' own effects: formulas that are parsed, never run, and classes in files."""
 
+import json
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import yaml
 
 from calib import effects
-from calib.effects import Site, View, load_effects, read, trust_in
+from calib.effects import OneHot, Site, View, load_effects, read, trust_in
 from calib.effects.own.expression import Expression
 from calib.effects.own.formula import FormulaEffect
 from calib.problem import build
 from calib.problem.model import Model, Source
+from calib.runs.calibrate import calibrate
+from calib.simulation import Spec, simulate
 from chains.errors import InputError
 
 from . import rigs
@@ -308,3 +313,81 @@ def test_a_formula_is_fitted_like_any_effect(source):
     longer = 0.002 * view["range_m"] + 0.003 * (view["azimuth_rad"] > 0)
     moved = (before.residual_m - after.residual_m)[before.usable]
     np.testing.assert_allclose(moved, longer[before.usable], atol=1e-9)
+
+
+# ------------------------------------------------------------------------------------------- sites
+
+
+@pytest.mark.parametrize(
+    ("catalogue", "place", "formula", "column"),
+    [
+        ("body_slip@100", "tracker:mount_markers.ty", "where(elapsed > 100, 1, 0)", 4),
+        ("target_rod_tilt", "target.y", "0.18", 1),
+        ("target_sphere_offset", "target.z", "-1", 0),
+        ("moved_surface", "reference", "where(label == 7, 1, 0)", 1),
+    ],
+)
+def test_a_formula_at_a_site_is_the_catalogues_effect_there(
+    source, catalogue, place, formula, column
+):
+    """One parameter of each, as the catalogue's own class has it."""
+    rig = replace(source.rig, labels={3: "floor", 7: "wall"})
+    rng = np.random.default_rng(0)
+    columns = {"elapsed_s": np.array([0.0, 99.0, 101.0, 300.0]), "label": np.array([3, 7, 9, 7])}
+    columns["normal"] = rng.standard_normal((4, 3))
+    view = View(rig, 4, columns, np.zeros((4, 3)))
+    mine, theirs = made(site=place, basis=[formula]), effects.find(catalogue)
+    assert mine.site is theirs.site and len(mine.params(rig)) == 1
+    wanted = theirs.basis(view)
+    if isinstance(wanted, OneHot):
+        wanted = np.where(wanted.index == column, wanted.values.T, 0.0).T[..., None]
+    else:
+        wanted = wanted[..., [column]]
+    found = np.broadcast_to(mine.basis(view), (4, *wanted.shape[1:]))
+    np.testing.assert_allclose(found, np.broadcast_to(wanted, found.shape), atol=1e-15)
+    assert found.any()
+
+
+def test_a_site_that_the_rig_has_no_hardware_for_has_nothing_to_act_on(source):
+    bare = replace(source.rig, tracker=None, target=None, lidar=None)
+    for place in ("tracker:mount_markers.ty", "target.z", "reference", "noise", "range"):
+        assert made(site=place).params(bare) == ()
+        assert made(site=place).params(source.rig)
+
+
+@pytest.mark.parametrize(
+    ("place", "words"),
+    [
+        ("tracker:mount_marker.ty", "did you mean tracker:mount_markers.ty?"),
+        ("tracker:mount_markers.y", "did you mean tracker:mount_markers."),
+        ("target.zz", "did you mean target.z?"),
+        ("referenc", "did you mean reference?"),
+    ],
+)
+def test_a_site_that_is_none_is_refused_with_the_nearest(source, place, words):
+    with pytest.raises(InputError, match="there is no site") as refused:
+        made(site=place).params(source.rig)
+    assert words in str(refused.value)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("place", "unit", "formula", "size"),
+    [
+        ("tracker:mount_markers.tx", "m", "where(elapsed > 900, 1, 0)", 0.002),
+        ("target.x", "m", "1", 0.004),
+        ("reference", "m", "where(label == 4, 1, 0)", 0.008),
+        ("mount.tz", "m", "(temperature - 22) / 5", 0.002),
+    ],
+)
+def test_a_formula_anywhere_is_simulated_and_found_again(tmp_path, place, unit, formula, size):
+    effect = DAMP | {"site": place, "unit": unit, "sigma": size, "basis": [formula]}
+    (tmp_path / "mine.yaml").write_text(yaml.safe_dump(effect))
+    spec = Spec(lidar="hesai_pandarxt32", locations=4, stops_per_location=3, column_step=200)
+    simulate(spec, tmp_path / "rec", 3, {str(tmp_path / "mine.yaml"): 1.0})
+    truth = json.loads((tmp_path / "rec.truth.json").read_text())["effects"]["damp"]
+    assert abs(truth[0]) == pytest.approx(size)
+    chosen = load_effects([*effects.DEFAULT, str(tmp_path / "mine.yaml")])
+    run = calibrate([tmp_path / "rec"], tmp_path / "run", Model(chosen), hold_out="none")
+    found = run.solution.shared.effects["damp"]
+    assert abs(found.estimate[0] - truth[0]) < 4 * found.sigma[0] < 2 * size

@@ -101,13 +101,8 @@ def test_ring_offsets_turn_their_ring_only(source):
         ("incidence_angle_bias", {"incidence_rad": [0, np.pi / 3]}, [[0], [1]]),
         (
             "intensity_range_walk",
-            {"intensity": [100 * np.e, np.nan, 0]},
-            [[1], [0], [-np.log(100)]],
-        ),
-        (
-            "intensity_range_walk",  # a reflectance
-            {"intensity": [100 / 255 * np.e, np.nan, 0, 10 / 255, 1.05]},
-            [[1], [0], [-np.log(100)], [-np.log(10)], [np.log(2.55 * 1.05)]],
+            {"intensity": [np.e, np.nan, 0, 0.1, 2.6]},  # of the median
+            [[1], [0], [-np.log(100)], [-np.log(10)], [np.log(2.6)]],
         ),
         ("warmup_drift@100", {"elapsed_s": [0, 100]}, [[0], [1 - np.exp(-1)]]),
         ("temperature_drift", {"temperature_c": [21.5, np.nan]}, [[1.5], [0]]),

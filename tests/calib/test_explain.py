@@ -41,7 +41,7 @@ class World:
         summary = {"rms_mm": rms, "converged": True}
         return Run(out, model.document() | {"grown_from": grown_from}, summary, None)
 
-    def diagnose(self, run, progress, refits):
+    def diagnose(self, run, progress, refits, candidates=()):
         names = frozenset(run.effects) - frozenset(Model().names)
         adding = self.named.get(names, [])
         verdict = "missing_effect" if adding else "adequate"

@@ -115,7 +115,8 @@ class Place:
             "unit": "m",
             "sigma": max(0.01, 2.0 * abs(self.residual_m)),
             "basis": [both],
-            "what": "Empirical: an interval whose beams were rejected; fitted, not explained.",
+            "what": f"Empirical: it describes and explains nothing, in an interval of {name} whose "
+            "beams were rejected.",
         }
 
 

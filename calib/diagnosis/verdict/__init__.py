@@ -20,7 +20,7 @@ from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import formula, hangs_on, what_separates
 from calib.diagnosis.verdict.matters import Weighed, weighed
 from calib.diagnosis.verdict.sentences import BAD, UNNAMED, sentences_of, stops_of
-from calib.effects import CATALOGUE, Site
+from calib.effects import Site
 from calib.problem.model import labels
 from calib.results.solution import one_unit
 from calib.rig import Rig
@@ -142,7 +142,8 @@ def conclude(
     candidates = _candidates(heavy, held_out, verdict == UNNAMED, hold)
     untestable = _untestable(first)
     thrown = rejected.unexplained() if rejected and verdict == UNNAMED else []
-    unexplained = [_unexplained(c, screen) for screen, c in _without_a_name(found, verdict)]
+    taken = first.stand.model.names
+    unexplained = [_unexplained(c, screen, taken) for screen, c in _without_a_name(found, verdict)]
     unexplained = [*thrown, *unexplained]
     blunders = [*spoilt, *(told.document(left, _rig(left, first)) for left in found.blunders)]
     sentences = sentences_of(verdict, heavy, candidates, unexplained, untestable, blunders)
@@ -294,9 +295,12 @@ def _candidate(
         wider = max(1.0, clean, found.found[step - 1].judged.inflation)
         sigma = np.sqrt(wider) * found.looks[-1].stand.sigma(effect)
     alpha = -np.expm1(np.log1p(-ALPHA) / candidate.looks)
+    document = effect.document()
     return {
         "effect": effect.family,
         "add": effect.name,
+        # Of a user's own: what `rigcal add` reads, wherever its file is by then.
+        **({} if isinstance(document, str) else {"document": document}),
         "site": "range" if effect.site is Site.BEAM else effect.site.value,
         "p_value": candidate.p_value,
         "p_adjusted": found.found[step - 1].p_adjusted if step else candidate.p_adjusted,
@@ -343,13 +347,14 @@ def _rivals(step: NamedEffect) -> list[dict[str, Any]]:
     ]
 
 
-def _unexplained(candidate: Candidate, screen: Screen) -> dict[str, Any]:
+def _unexplained(candidate: Candidate, screen: Screen, taken: Sequence[str]) -> dict[str, Any]:
     return {
         "covariates": list(hangs_on(candidate.effect)),
         "rms_mm": 1e3 * screen.rms_m(candidate),
         "p_value": candidate.p_value,
         "p_adjusted": candidate.p_adjusted,
-        "formula": formula(candidate),
+        "formula": formula(candidate, taken),
+        "seen": {name: list(ends) for name, ends in candidate.effect.seen.items()},
     }
 
 
@@ -359,7 +364,7 @@ def _untestable(look: Look) -> dict[str, str]:
     gauges = {g.family for g in look.named.gauges} - {
         c.effect.family for c in look.named.candidates
     }
-    for effect in CATALOGUE:
+    for effect in look.stand.catalogue:
         if effect.family in there or not concerned(effect, look.stand.sources):
             continue
         if missing := lacking(effect, look.stand.sources, look.columns):

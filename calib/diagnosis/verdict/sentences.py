@@ -56,8 +56,8 @@ def sentences_of(
         out.append(f"What is left hangs on {what}: {each['rms_mm']:.2f} mm rms of {residual}.")
         if each["formula"]:
             out.append(
-                f"An empirical effect for it, '{each['formula']['name']}', stands in diagnosis.json"
-                f" ready to be saved and added; it describes, and explains nothing."
+                f"An empirical effect for it can be added by its name, '{each['formula']['name']}'."
+                f" {each['formula']['what']}"
             )
     if found.scatter is not None:
         what = " and ".join(words(c) for c in found.scatter.effect.covariates)

@@ -23,6 +23,18 @@ def is_file(text: str) -> bool:
     return text.endswith((*YAML, PYTHON)) or f"{PYTHON}:" in text
 
 
+def files_in(folder: str) -> list[str]:
+    """The files of formulas in a folder, by name; what is Python there is not named, so not run.
+
+    Raises:
+        InputError: there is none.
+    """
+    found = sorted(str(path) for path in Path(folder).iterdir() if path.suffix in YAML)
+    if not found:
+        raise InputError(f"{folder} has no file of effects; write formulas into {folder}/mine.yaml")
+    return found
+
+
 def from_file(text: str, trust: Trust | None = None) -> list[Effect]:
     """The effects that a file holds: ``file.yaml``, ``file.py`` or ``file.py:Class``.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Self
 
@@ -18,6 +18,9 @@ from chains.errors import InputError
 from sensors.documents import Document, Marks, Number, nearest, validate
 
 AXES = {"range": 0, "azimuth": 1, "elevation": 2}
+OF_TARGET = {"target.x": 0, "target.y": 1, "target.z": 2}
+WORDS = {"noise": Site.NOISE, "reference": Site.REFERENCE, **dict.fromkeys(OF_TARGET, Site.TARGET)}
+TRACKER = "tracker:"  # before a body's name, as frames go by the same
 Text = Annotated[str, pydantic.Field(min_length=1)]
 Sigma = Annotated[Number, pydantic.Field(gt=0)]
 
@@ -28,7 +31,10 @@ class FormulaFile(Document):
     Attributes:
         name: letters, digits and _.
         site: `range`, `azimuth`, `elevation` or `noise` of a beam; a joint's name, or
-            ``joint:<name>``; or ``<frame>.<dof>``, ``mount.tz`` say, in the frame's own axes.
+            ``joint:<name>``; ``<frame>.<dof>``, ``mount.tz`` say, in the frame's own axes;
+            ``tracker:<body>.<dof>``, what the tracker adds to a body's pose, in its own axes;
+            ``target.x`` to ``.z``, where spheres sit, in the tracker's; or `reference`, where the
+            surface is, along its normal, which faces the LiDAR.
         unit: of the parameters: the site's per unit of the formulas.
         sigma: how large a parameter may plausibly be.
         basis: a formula per parameter: the error at the site per unit of it.
@@ -100,12 +106,15 @@ class FormulaEffect(Effect):
         return self.file.parameters or numbered
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
+        needed = {Site.TRACKER: rig.tracker, Site.TARGET: rig.target}
         if self.site is Site.JOINTS:
             self._joint(rig)
         elif self.site is Site.EDGE:
             self._edge(rig)
-        elif rig.lidar is None:
+        elif not needed.get(self.site, rig.lidar):
             return ()
+        elif self.site is Site.TRACKER:
+            self._body(rig)
         return tuple(Param(name, self.file.unit, self.file.sigma) for name in self.parameters)
 
     def basis(self, view: View) -> np.ndarray:
@@ -120,6 +129,14 @@ class FormulaEffect(Effect):
         elif self.site is Site.EDGE:
             basis = np.zeros((rows, len(view.rig.tree.edges), 6, count))
             basis[:, *self._edge(view.rig)] = columns
+        elif self.site is Site.TRACKER:
+            basis = np.zeros((rows, len(view.rig.tracker.bodies), 6, count))
+            basis[:, *self._body(view.rig)] = columns
+        elif self.site is Site.REFERENCE:
+            basis = view["normal"][:, :, None] * columns[:, None]
+        elif self.site is Site.TARGET:
+            basis = np.zeros((rows, 3, count))
+            basis[:, OF_TARGET[self.file.site]] = columns
         else:
             basis = np.zeros((rows, 3, count))
             basis[:, AXES[self.file.site]] = columns
@@ -143,8 +160,10 @@ class FormulaEffect(Effect):
     def _site(self) -> Site:
         if self.file.site in AXES:
             return Site.BEAM
-        if self.file.site == "noise":
-            return Site.NOISE
+        if self.file.site in WORDS:
+            return WORDS[self.file.site]
+        if self.file.site.startswith(TRACKER):
+            return Site.TRACKER
         return Site.EDGE if self.file.site.rpartition(".")[2] in DOF else Site.JOINTS
 
     def _joint(self, rig: Rig) -> int:
@@ -152,15 +171,24 @@ class FormulaEffect(Effect):
         name = self.file.site.removeprefix("joint:")
         if name not in rig.joint_names:
             frames = [f"{edge}.tz" for edge in rig.tree.edge_names]
-            raise self._no_site([*AXES, "noise", *rig.joint_names, *frames])
+            bodies = [f"{TRACKER}{body}.tz" for body in (rig.tracker.bodies if rig.tracker else ())]
+            raise self._no_site([*AXES, *WORDS, *rig.joint_names, *frames, *bodies])
         return rig.joint_names.index(name)
 
     def _edge(self, rig: Rig) -> tuple[int, int]:
         """Index of the edge that it acts on, and of the degree of freedom."""
-        name, _, dof = self.file.site.rpartition(".")
-        if name not in rig.tree.edge_names:
-            raise self._no_site([f"{edge}.{dof}" for edge in rig.tree.edge_names])
-        return rig.tree.edge_names.index(name), DOF.index(dof)
+        return self._among(rig.tree.edge_names)
+
+    def _body(self, rig: Rig) -> tuple[int, int]:
+        """Index of the tracked body that it acts on, and of the degree of freedom."""
+        return self._among(rig.tracker.bodies, TRACKER)
+
+    def _among(self, names: Sequence[str], before: str = "") -> tuple[int, int]:
+        name, _, dof = self.file.site.removeprefix(before).rpartition(".")
+        if name not in names or dof not in DOF:
+            dof = dof if dof in DOF else DOF[-1]
+            raise self._no_site([f"{before}{each}.{dof}" for each in names])
+        return list(names).index(name), DOF.index(dof)
 
     def _no_site(self, known: list[str]) -> InputError:
         what = f"effect '{self.name}': there is no site {self.file.site} on this rig"

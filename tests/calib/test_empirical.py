@@ -1,0 +1,90 @@
+"""Structure without a name: what is proposed for it is added by the name that was printed."""
+
+import json
+import re
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import yaml
+
+from calib.diagnosis.candidates import Binned, JointShape
+from calib.diagnosis.suggest import formula
+from calib.runs.calibrate import calibrate
+from calib.runs.run import Run
+from calib.simulation import Spec, simulate
+from calib.view.desk import Desk, Findings
+
+# No catalogue has a hump at 34 degrees of incidence.
+HUMP = {
+    "name": "hump",
+    "site": "range",
+    "unit": "m",
+    "sigma": 0.004,
+    "basis": ["exp(-((incidence - 0.6) / 0.15)**2)"],
+}
+SPEC = Spec(
+    lidar="hesai_pandarxt32", room="box", locations=4, stops_per_location=2, column_step=200
+)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("empirical")
+    (folder / "hump.yaml").write_text(yaml.safe_dump(HUMP))
+    simulate(SPEC, folder / "rec", 2, {str(folder / "hump.yaml"): 1.0})
+    return calibrate([folder / "rec"], folder / "run")
+
+
+def test_it_is_added_by_the_printed_name_and_the_held_out_error_falls(run, rigcal, tmp_path):
+    code, said, err = rigcal("diagnose", run.folder)
+    assert code == 0, err
+    (name,) = set(re.findall(r"can be added by its name, '(\w+)'", " ".join(said.split())))
+    assert name == "empirical_incidence"
+    code, said, err = rigcal("add", run.folder, name, "-o", tmp_path / "grown")
+    assert code == 0, err
+    said = " ".join(said.split())
+    assert "describes and explains nothing" in said
+    (ends,) = re.findall(r"seen at incidence from ([\d.]+) to ([\d.]+) degrees", said)
+    assert float(ends[0]) < 5 and 60 < float(ends[1]) < 90
+    before, after = run.summary["rms_mm"], Run.open(tmp_path / "grown").summary["rms_mm"]
+    assert after["held_out"] < 1.05 * after["noise_floor"] < before["held_out"] / 1.2
+    document = json.loads((run.folder / "diagnosis.json").read_text())
+    seen = document["unexplained"][0]["seen"]["incidence_rad"]
+    assert np.degrees(seen) == pytest.approx([float(x) for x in ends], rel=0.01)
+    assert name in Desk.of([run.folder]).addable(Findings.read(run))
+
+
+def test_a_second_one_has_another_name():
+    effect = JointShape("turn", "lift", (-1.0, 0.5))
+    assert proposal(effect)["name"] == "empirical_turn_lift"
+    assert proposal(effect, ["empirical_turn_lift"])["name"] == "empirical_turn_lift_2"
+    assert proposal(effect)["what"].endswith("lift from -57.3 to 28.6 degrees.")
+
+
+@pytest.mark.parametrize(
+    ("column", "name"),
+    [
+        ("humidity", "empirical_humidity"),
+        ("moved.joint_1", "empirical_moved_joint_1"),
+        ("two words", None),
+        ("a; b", None),
+        ("label", None),
+    ],
+)
+def test_a_column_that_no_formula_can_name_has_none(column, name):
+    at = np.array([0.1, 0.4, 0.9])
+    found = proposal(Binned({column: (at[1:] + at[:-1]) / 2}, {column: at}, {column: (0.0, 1.0)}))
+    assert (found and found["name"]) == name
+
+
+def test_knots_are_told_apart_where_values_are_large():
+    """Seconds since 1970, say."""
+    at = 1.7e9 + 60.0 * np.arange(12)
+    effect = Binned({"time_s": (at[1:] + at[:-1]) / 2}, {"time_s": at}, {"time_s": (at[0], at[-1])})
+    knots = re.findall(r"1 - \((\d[\d.e+]*) - time_s", " ".join(proposal(effect)["basis"]))
+    assert len({float(knot) for knot in knots}) == len(knots) == 7
+
+
+def proposal(effect, taken=()):
+    return formula(SimpleNamespace(effect=effect), taken)
