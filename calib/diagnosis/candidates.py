@@ -24,6 +24,11 @@ POINT = ("range_m", "incidence_rad", "azimuth_rad", "elevation_rad", "intensity"
 PAIRS = (*combinations(POINT[:4], 2), ("intensity", "range_m"), ("label", "incidence_rad"))
 
 
+# What a column of the stops may act on: an offset by stop alone may be chance, but one that differs
+# from ring to ring, or with range, is none.
+WITH_OWN = ("range_m", "elevation_rad")
+
+
 class Binned(Effect):
     """Range has an error of its own in every bin of some covariates; empirical.
 
@@ -199,7 +204,7 @@ def structure(sources: Sequence[Source], sample: Mapping[str, np.ndarray]) -> li
     own = [c for c in sample if c not in covariates() - {"time_s"}]
     wanted = [(c,) for c in (*POINT, *own) if c in sample]
     wanted += [p for p in PAIRS if all(c in sample for c in p)]
-    wanted += [(c, "range_m") for c in own]
+    wanted += [(c, point) for c in own for point in WITH_OWN if point in sample]
     for names in wanted:
         edges = {c: _edges(sample[c], _bins(c, len(names))) for c in names}
         if all(len(e) for e in edges.values()):

@@ -118,7 +118,7 @@ class ScanStop:
     store: BeamStore
     room: int | str
     group: Group
-    reference_scatter_m: Mapping[str, float] = field(default_factory=dict)
+    reference_scatter_m: Mapping[str, float] = field(default_factory=dict, kw_only=True)
     alike: tuple[BeamStore, ...] = ()
 
     @property

@@ -103,7 +103,8 @@ def _described(case: Case, hidden: Hidden, truth: dict[str, Any]) -> dict[str, A
 
 def _said(found: Search) -> dict[str, Any]:
     """What the diagnosis says, and the numbers behind it."""
-    said = conclude(found, {}, {}, ())
+    summary = {"misfit": {}, "rms_mm": dict.fromkeys(("held_out", "fit", "noise_floor"), 0.0)}
+    said = conclude(found, {}, summary, ())
     first = found.looks[0]
     named = first.named
     return {

@@ -269,7 +269,10 @@ def _candidates(
         each["matters"] = told_of.document() if told_of else None
         worn = bool(each["step"]) and (not hold or found.dressed_up(each["step"] - 1))
         each["dressed_up"] = unnamed and worn
-    chance = [each.document(named + i) for i, each in enumerate(found.chance, 1)]
+    # What has no name may scatter as chance does: that is judged once it is in the model.
+    chance = [
+        each.document(None if unnamed else named + i) for i, each in enumerate(found.chance, 1)
+    ]
     others = [each.document(None) for each in found.looks[-1].chance]
     return [*out[:named], *chance, *out[named:], *others]
 

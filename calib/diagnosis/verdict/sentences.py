@@ -45,7 +45,11 @@ def sentences_of(
     for i, step in enumerate(found.found):
         candidate = next(c for c in candidates if c["add"] == step.effect.name)
         out += _step_sentences(step, candidate, found.dressed_up(i))
-    out += [each.sentence for each in found.chance]
+    if verdict == UNNAMED and found.chance:
+        beside = ", ".join(each.effect.name for each in found.chance)
+        out.append(f"What scatters beside it ({beside}) is judged once that is in the model.")
+    else:
+        out += [each.sentence for each in found.chance]
     out += [*heavy.refused, *traces]
     if verdict == UNNAMED:
         beside = any(c["step"] and not c["dressed_up"] for c in candidates)
