@@ -105,7 +105,7 @@ class ScanStop:
         room: the mesh, or the recording whose planes these are.
         group: the name of its rows.
         reference_scatter_m: kind of part, "surface", "region" or "patch" -> how widely such parts
-            scatter beyond what rig.yaml says, which is in `reference_sigma_m`.
+            scatter beyond what is stated of them, which is in `reference_sigma_m`.
     """
 
     name: str
@@ -123,7 +123,7 @@ class ScanStop:
 
     @property
     def stated_sigma_m(self) -> float:
-        """How far the reference may be off as rig.yaml has it."""
+        """How far the reference may be off as rig.yaml has it, or the least that planes are."""
         beyond2 = sum(sd**2 for sd in self.reference_scatter_m.values())
         return float(np.sqrt(max(self.reference_sigma_m**2 - beyond2, 0.0)))
 

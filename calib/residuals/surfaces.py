@@ -18,7 +18,7 @@ from chains import se3
 from sensors.lidar import Beams
 from sensors.planes import Cells, Planes
 from sensors.reference import Reference
-from sensors.surfaces import transverse
+from sensors.surfaces import SurfaceGrid, transverse
 
 GRAZING_RAD = np.deg2rad(80.0)  # a fit keeps no beam that meets its surface flatter than this
 PARALLEL_RAD = np.deg2rad(89.0)
@@ -59,10 +59,7 @@ class MeshSurface:
     @cached_property
     def patches_m(self) -> dict[str, float]:
         """Kind of patch -> its width, in this room."""
-        length, width, height = np.ptp(self.reference.vertices_m, axis=0)
-        walls_m2 = 2.0 * (length * width + width * height + height * length)
-        scale = max(1.0, float(np.sqrt(walls_m2 / ROOM_M2)))
-        return {kind: scale * size_m for kind, size_m in PATCHES_M.items()}
+        return _patches_m(self.reference.vertices_m)
 
     @cached_property
     def roughness_m(self) -> np.ndarray:
@@ -158,16 +155,36 @@ class PlaneSurface:
         side = transverse(self.planes.normal)
         return np.stack([side, np.cross(self.planes.normal, side)], axis=1)
 
+    @cached_property
+    def patches_m(self) -> dict[str, float]:
+        """Kind of patch -> its width, in this room."""
+        return _patches_m(self.planes.cell_mean_m)
+
+    @cached_property
+    def _grid(self) -> SurfaceGrid:
+        """Over the cells in which each plane was seen."""
+        return self.planes.grid(self.axes)
+
+    def surface_of(self, kind: str, parts: np.ndarray) -> np.ndarray:
+        """The plane that each of those parts is of."""
+        return self._grid.patch_surface(self.patches_m[kind])[parts]
+
     def divided(self, T: np.ndarray, beams: Beams, part: np.ndarray) -> Association:
-        """The planes (N,) that beams meet, which have no patches."""
-        return Association(part)
+        """The planes (N,) that beams meet from there, and the patches of them."""
+        met = _Met(T, beams, _and_none(self.planes.normal, self.planes.distance_m), part)
+        patches = {
+            kind: self._patch(met, size_m).astype(np.int32)
+            for kind, size_m in self.patches_m.items()
+        }
+        return Association(part, patches)
 
     def associate(
         self, T: np.ndarray, beams: Beams, values: Values, near_edges: bool
     ) -> Association:
-        """Plane of each beam, by where its point lies; -1 for none."""
+        """Plane of each beam, by where its point lies, -1 for none; near edges its patches too."""
         point = beams.origin_m + beams.range_m[:, None] * beams.direction
-        return Association(self.planes.assign(se3.apply(T, point)).astype(np.int32))
+        part = self.planes.assign(se3.apply(T, point)).astype(np.int32)
+        return self.divided(T, beams, part) if near_edges else Association(part)
 
     def meet(
         self, T: np.ndarray, beams: Beams, values: Values, association: Association
@@ -177,11 +194,18 @@ class PlaneSurface:
         tilted = self.planes.normal + np.einsum("mk,mki->mi", theta[:, :2], self.axes)
         length = np.linalg.norm(tilted, axis=1)
         distance = self.planes.distance_m + theta[:, 2]
-        none = [[0.0, 0.0, 0.0, np.inf]]
-        plane = np.vstack([np.column_stack([tilted / length[:, None], distance]), none])
+        plane = _and_none(tilted / length[:, None], distance)
         met = _Met(T, beams, plane, association.part)
         columns = met.columns | {"plane": association.part}
-        return met.surface(columns, lambda: self._by_numbers(met, length))
+        for kind, size_m in self.patches_m.items():
+            columns[kind] = partial(self._patch, met, size_m)
+        return met.surface(columns | association.patches, lambda: self._by_numbers(met, length))
+
+    def _patch(self, met: _Met, size_m: float) -> np.ndarray:
+        patch = np.full(len(met.part), -1)
+        hit = np.flatnonzero(met.part >= 0)
+        patch[hit] = self._grid.patch(met.part[hit], met.point_m[hit], size_m)
+        return patch
 
     def _by_numbers(self, met: _Met, length: np.ndarray) -> list[Columns]:
         """Derivatives by the three numbers of each plane: ``d r / d n = hit / n.u``, and n moves
@@ -261,6 +285,19 @@ class _Met:
             columns=columns,
             unknown=unknown,
         )
+
+
+def _patches_m(points_m: np.ndarray) -> dict[str, float]:
+    """Kind of patch -> its width, in a room whose box holds the points (N, 3)."""
+    length, width, height = np.ptp(points_m, axis=0)
+    walls_m2 = 2.0 * (length * width + width * height + height * length)
+    scale = max(1.0, float(np.sqrt(walls_m2 / ROOM_M2)))
+    return {kind: scale * size_m for kind, size_m in PATCHES_M.items()}
+
+
+def _and_none(normal: np.ndarray, distance_m: np.ndarray) -> np.ndarray:
+    """Planes (M + 1, 4), the last met by no beam."""
+    return np.vstack([np.column_stack([normal, distance_m]), [[0.0, 0.0, 0.0, np.inf]]])
 
 
 def _once(compute: Callable[[], Any]) -> Callable[[], Any]:
