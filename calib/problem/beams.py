@@ -12,7 +12,7 @@ from calib.problem.surfaces import LEAST_BEAMS
 from calib.problem.unknowns import Role, Unknown
 from calib.residuals.groups import SCAN, Group
 from calib.residuals.scan import ScanStop
-from calib.residuals.surfaces import PATCHES_M, Meeting, MeshSurface, PlaneSurface
+from calib.residuals.surfaces import PLANE_PATCHES_M, Meeting, MeshSurface, PlaneSurface
 from chains import se3
 from chains.errors import InputError
 from sensors.planes import PlaneFinder, Planes
@@ -29,7 +29,7 @@ def add_beams(problem: Problem, part: SourceStops, places: Places) -> None:
     source = part.source
     meeting = _meeting(problem, part, places)
     terms = [t for t in part.terms if t.effect.site in OF_BEAMS and not t.effect.widens]
-    uneven_m = dict.fromkeys(PATCHES_M, UNEVEN_M) if isinstance(meeting, PlaneSurface) else {}
+    uneven_m = dict.fromkeys(PLANE_PATCHES_M, UNEVEN_M) if isinstance(meeting, PlaneSurface) else {}
     stated_m = FLATTEST_M if uneven_m else source.rig.reference.sigma_m
     for k, stops in places.scanned():
         problem.scans.append(

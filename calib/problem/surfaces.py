@@ -17,7 +17,7 @@ from calib.problem.problem import Problem, SurfaceCells
 from calib.problem.unknowns import Role, Unknown
 from calib.residuals.beams import Association
 from calib.residuals.scan import ScanStop
-from calib.residuals.surfaces import PATCHES_M, PlaneSurface
+from calib.residuals.surfaces import PLANE_PATCHES_M, PlaneSurface
 
 LEAST_BEAMS = 100  # on a plane: three numbers of it, known ten times better than by a single beam
 LOST = 0.5  # of these, below which a plane that was found has lost its beams
@@ -57,8 +57,13 @@ def with_surfaces(
             name = kind if column != kind else f"{room}/reference_{column}"
             sigma_m = cell_sigma_m(first, column)
             unknowns.append(_unknown(name, room, column, parts, sigma_m))
-            surface = first.meeting.surface_of(column, parts)
-            cells[name] = SurfaceCells(column, kind, parts, surface, room)
+            cells[name] = SurfaceCells(
+                column=column,
+                kind=kind,
+                parts=parts,
+                surface=first.meeting.surface_of(column, parts),
+                room=room,
+            )
             for i in scans:
                 numbered[i][name] = number[parts_of[i]]
     found = [replace(a, cells=n) for a, n in zip(associations, numbered, strict=True)]
@@ -69,7 +74,7 @@ def kinds_of(scan: ScanStop) -> dict[str, str]:
     """Column of the parts of what a scan meets -> what those with one spread are called: all meshes
     have one for each column; the planes of a recording have their own."""
     if isinstance(scan.meeting, PlaneSurface):
-        return {column: f"{scan.meeting.variable}/{column}" for column in PATCHES_M}
+        return {column: f"{scan.meeting.variable}/{column}" for column in PLANE_PATCHES_M}
     return {column: column for column in SURFACE_SHARES}
 
 

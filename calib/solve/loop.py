@@ -166,23 +166,30 @@ class Loop(Descent):
         Args:
             tolerance: as of `settle`.
         """
-        for _ in range(0 if self.lost else SPREAD):
+        first = self.given
+        for _ in range(0 if self.lost or not self._by_chance() else SPREAD):
+            self.linearise_here()
+            if self.given is not first and self.problem.scans:
+                self.values = self.moved(self.values, self.step()[0])
             found = self._spread()
             given = with_spread(self.given, found, SETTLED_SPREAD)
             if given is self.given:
                 break
             self.given, self.problem = given, with_spread(self.problem, found, SETTLED_SPREAD)
             self.lay_out()
-            if self.problem.scans:
-                self.settle(tolerance, self.seen, self._met())
-            else:
+            if not self.problem.scans:
                 self.descend(STEADY, beams=False)
+        if self.given is not first and self.problem.scans:
+            self.settle(tolerance, self.seen, self._met())
+
+    def _by_chance(self) -> list[str]:
+        """Names of the unknowns, and keys of what widens rows, whose spread is estimated."""
+        some = [u.name for u in by_chance(self.problem) if u.name not in self.held]
+        return [*some, *widening(self.problem)]
 
     def _spread(self) -> dict[str, float]:
-        """Key of a spread -> what it is, as all rows have it here."""
+        """Key of a spread -> what it is, as all rows have it where they were linearised last."""
         some, out = [u for u in by_chance(self.problem) if u.name not in self.held], {}
-        if some or widening(self.problem):
-            self.linearise_here()
         if some:
             names = [u.name for u in some]
             found = told(some, self.values, self.graph.covariance(self.values, names))
