@@ -328,9 +328,8 @@ class ScanStop:
                     by_site[site] = beam_derivative(seen.ray, t, slope) if beam else slope @ turn
                 found[name] = effect_columns(name, basis, by_site[site])
         dense = {name: c for name, c in found.items() if not isinstance(c, Columns)}
-        sparse = [c for c in found.values() if isinstance(c, Columns)] + list(
-            seen.surface.unknown()
-        )
+        sparse = [c for c in found.values() if isinstance(c, Columns)]
+        sparse += seen.surface.unknown(t)
         usable = seen.surface.usable
         lost = np.flatnonzero(~usable)
         if len(lost):  # 0 * inf would be NaN

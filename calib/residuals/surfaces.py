@@ -202,7 +202,7 @@ class PlaneSurface:
         columns = met.columns | {"plane": association.part}
         for kind, size_m in self.patches_m.items():
             columns[kind] = partial(self._patch, met, size_m)
-        return met.surface(columns | association.patches, lambda: self._by_numbers(met, length))
+        return met.surface(columns | association.patches, partial(self._by_numbers, met, length))
 
     def _patch(self, met: _Met, size_m: float) -> np.ndarray:
         patch = np.full(len(met.part), -1)
@@ -210,18 +210,20 @@ class PlaneSurface:
         patch[hit] = self._grid.patch(met.part[hit], met.point_m[hit], size_m)
         return patch
 
-    def _by_numbers(self, met: _Met, length: np.ndarray) -> list[Columns]:
+    def _by_numbers(self, met: _Met, length: np.ndarray, range_m: np.ndarray) -> list[Columns]:
         """Derivatives by the three numbers of each plane: ``d r / d n = hit / n.u``, and n moves
-        along an axis, less what renormalising takes back."""
+        along an axis, less what renormalising takes back; the beams reach so far (N,) m."""
         part = met.association_part
         n = met.plane[part, :3]
-        along = np.einsum("ni,ni->n", n, met.beams.direction @ met.T[:3, :3].T)
+        origins, directions = _in_reference(met.T, met.beams)
+        hit = origins + range_m[:, None] * directions
+        along = np.einsum("ni,ni->n", n, directions)
         along[along == 0.0] = np.inf  # nothing is met
         out = []
         for k in (0, 1):
             axis = self.axes[:, k][part]
             across = axis - np.einsum("ni,ni->n", axis, n)[:, None] * n
-            value = np.einsum("ni,ni->n", met.point_m, across) / (along * length[part])
+            value = np.einsum("ni,ni->n", hit, across) / (along * length[part])
             out.append(self._columns(k, part, value))
         return [*out, self._columns(2, part, -1.0 / along)]
 
@@ -276,7 +278,7 @@ class _Met:
     def surface(
         self,
         columns: Mapping[str, LazyColumn],
-        unknown: Callable[[], Sequence[Columns]] = tuple,
+        unknown: Callable[[np.ndarray], Sequence[Columns]] = lambda range_m: (),
     ) -> Surface:
         """As rows want it."""
         usable = self.cosine > np.cos(PARALLEL_RAD)
