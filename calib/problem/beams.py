@@ -19,8 +19,8 @@ from sensors.planes import PlaneFinder, Planes
 
 OF_BEAMS = (Site.BEAM, Site.REFERENCE, Site.NOISE)
 # How uneven planes are, region by region and patch by patch: a third of the 3 mm over 1 m that DIN
-# 18202 (table 3, row 7) allows a good wall. A fit starts from it and estimates it; what it does not
-# go below is next to nothing beside the noise of any LiDAR, averaged over a patch.
+# 18202 (table 3, row 7) allows a good wall. A fit starts from it and estimates it, but for what is
+# always there: a coat of paint, 0.05 mm thick or more, assumed to be no more even than that.
 UNEVEN_M, FLATTEST_M = 1e-3, 5e-5
 
 

@@ -52,9 +52,9 @@ HOPEFUL, LOOKED = 8, 15
 # How many sigmas wide the residuals of most stops may be by then: in those recordings it is 1 to 4,
 # with scans at wrong stops 85.
 HOPELESS = 30.0
-# Relative change of a spread that is none: 50 members tell it to a tenth; and one for which all
-# passes to the optimum are not worth doing again.
-SETTLED_SPREAD, NEAR_SPREAD = 0.01, 0.03
+# Relative change of a spread that is none; and one for which the passes to the optimum are not
+# worth doing again, as 50 members tell it no better.
+SETTLED_SPREAD, NEAR_SPREAD = 0.01, 0.1
 SPREAD = 8  # times: where rows do not scatter, each halves what they were thought to
 
 
@@ -190,6 +190,7 @@ class Loop(Descent):
         for _ in range(0 if self.lost or not self._by_chance() else SPREAD):
             self.linearise_here()
             if self.problem.scans and not (settled and self.given is first):
+                self.passes += 1
                 self.values = self.moved(self.values, self.step()[0])
             found = self._spread()
             given = with_spread(self.given, found, least)
