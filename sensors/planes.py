@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sensors.numbers import connected
+from sensors.surfaces import SurfaceGrid
 
 if TYPE_CHECKING:
     from scipy.spatial import KDTree
@@ -108,6 +109,14 @@ class Planes:
     cell_plane: np.ndarray  # (C,) plane of each cell
     cell_m: float
     tolerance_m: float
+
+    def grid(self, axes: np.ndarray) -> SurfaceGrid:
+        """A grid over the cells that each plane was seen in, along its axes (M, 2, 3)."""
+        place_m = np.einsum("cki,ci->ck", axes[self.cell_plane], self.cell_mean_m)
+        low, high = np.full((2, len(axes), 2), [[[np.inf]], [[-np.inf]]])
+        np.minimum.at(low, self.cell_plane, place_m)
+        np.maximum.at(high, self.cell_plane, place_m)
+        return SurfaceGrid(axes, low - self.cell_m / 2, high - low + self.cell_m)
 
     def assign(self, points_world_m: np.ndarray) -> np.ndarray:
         """Plane (N,) int64 of each point (N, 3), or -1.

@@ -130,6 +130,8 @@ def of_cells(whole: Linearisation, problem: Problem) -> dict[str, tuple[float, f
     kept, out = _Others.of(whole).kept, {}
     for name, cells in problem.cells.items():
         sigma, columns = problem.variables[name].sigma, whole.layout.columns([name])
+        if cells.kind != cells.column:
+            continue  # of planes, whose spread is estimated
         total, left = out.get(cells.column, (0.0, 0.0))
         for some in np.array_split(np.arange(len(sigma)), -(-len(sigma) // TOGETHER)):
             rows = np.zeros((len(some), whole.layout.size))

@@ -62,19 +62,22 @@ class SourceStops:
 
 @dataclass(frozen=True)
 class SurfaceCells:
-    """Parts of a mesh that stand off the room, each by an unknown way along its normal.
+    """Parts of a mesh, or of planes, that stand off the room, each by an unknown way along its
+    normal.
 
     Args:
         column: what kind of part: surface, region or patch.
+        kind: of all those with one spread; see `calib.problem.surfaces.kinds_of`.
         parts: (P,) those that any beam meets, ascending.
         surface: (P,) the surface that each is of.
-        room: the mesh.
+        room: the mesh, or the recording whose planes these are.
     """
 
     column: str
+    kind: str
     parts: np.ndarray
     surface: np.ndarray
-    room: int
+    room: int | str
 
 
 @dataclass

@@ -1,7 +1,8 @@
 """How widely things scatter by chance, as a problem has it: values of unknowns, and rows.
 
 A spread has a key: the name of the unknown whose values scatter; or, where the rows of a tracked
-body or parts of the mesh have a wider sigma, ``effect.body.unit`` or ``effect.surface.m``.
+body or parts of the mesh have a wider sigma, ``effect.body.unit`` or ``effect.surface.m``; or, of
+how uneven the planes of a recording are, which no effect needs to say, ``planes/region.m``.
 """
 
 from __future__ import annotations
@@ -13,8 +14,10 @@ import numpy as np
 
 from calib.effects import Site
 from calib.problem.problem import Problem
-from calib.problem.surfaces import SURFACE_SHARES, cell_sigma_m
+from calib.problem.surfaces import SURFACE_SHARES, cell_sigma_m, kinds_of
 from calib.problem.unknowns import Role, Unknown
+from calib.residuals.scan import ScanStop
+from calib.residuals.surfaces import PlaneSurface
 from calib.residuals.tracker import TrackedBody
 
 
@@ -24,17 +27,20 @@ def by_chance(problem: Problem) -> list[Unknown]:
 
 
 def widening(problem: Problem) -> dict[str, tuple[str, str]]:
-    """Key of every spread that widens the sigma of rows -> whose, a tracked body's or
-    those of a kind of part of the mesh, and its unit."""
+    """Key of every spread that widens the sigma of rows -> whose, a tracked body's or those of a
+    kind of part of the mesh or of planes, and its unit."""
     out, bodies = {}, {block.body: block.is_point for block in problem.bodies}
     for term in (t for some in problem.terms for t in some if t.effect.widens):
         if term.effect.site is Site.TRACKER:
             for body, is_point in bodies.items():
                 for unit in ("m",) if is_point else ("rad", "m"):
                     out[f"{term.variable}.{body}.{unit}"] = body, unit
-        elif any(scan.reference_sigma_m for scan in problem.scans):
+        elif any(scan.reference_sigma_m for scan in problem.scans if not _on_planes(scan)):
             out |= {f"{term.variable}.{part}.m": (part, "m") for part in SURFACE_SHARES}
-    return out
+    planes = (
+        kind for scan in problem.scans if _on_planes(scan) for kind in kinds_of(scan).values()
+    )
+    return out | {f"{kind}.m": (kind, "m") for kind in planes}
 
 
 def sigmas(problem: Problem) -> dict[tuple[str, str], tuple[float, float]]:
@@ -44,9 +50,10 @@ def sigmas(problem: Problem) -> dict[tuple[str, str], tuple[float, float]]:
         for block in problem.bodies
         for unit in ("rad", "m")
     }
-    for scan in problem.scans[:1]:
-        for part in SURFACE_SHARES:
-            out[part, "m"] = cell_sigma_m(scan, part), scan.reference_scatter_m.get(part, 0.0)
+    for scan in problem.scans:
+        for part, kind in kinds_of(scan).items():
+            beyond = scan.reference_scatter_m.get(part, 0.0)
+            out.setdefault((kind, "m"), (cell_sigma_m(scan, part), beyond))
     return out
 
 
@@ -82,20 +89,32 @@ def with_spread(problem: Problem, spread: Mapping[str, float], settled: float = 
 
 
 def _widened(problem: Problem, whose: tuple[str, str], sd: float) -> Problem:
-    """The problem with another spread of a body's rows, or of a kind of part of the mesh."""
+    """The problem with another spread of a body's rows, or of a kind of part of surfaces."""
     what, unit = whose
-    if what not in SURFACE_SHARES:
+    if any(block.body == what for block in problem.bodies):
         blocks = [
             b.scattering(unit, sd) if isinstance(b, TrackedBody) and b.body == what else b
             for b in problem.blocks
         ]
         return replace(problem, blocks=blocks)
     scans, aside = (
-        [scan.scattering(what, sd) for scan in some] for some in (problem.scans, problem.aside)
+        [_scattering(scan, what, sd) for scan in some] for some in (problem.scans, problem.aside)
     )
+    wider = replace(problem, scans=scans, aside=aside)
+    sigma_m = sigmas(wider)[whose][0]
     cells = {
-        name: replace(known, sigma=np.full(known.dim, cell_sigma_m(scans[0], what)))
+        name: replace(known, sigma=np.full(known.dim, sigma_m))
         for name, known in problem.variables.items()
-        if name in problem.cells and problem.cells[name].column == what
+        if name in problem.cells and problem.cells[name].kind == what
     }
-    return replace(problem, scans=scans, aside=aside, variables=problem.variables | cells)
+    return replace(wider, variables=problem.variables | cells)
+
+
+def _scattering(scan: ScanStop, what: str, sd: float) -> ScanStop:
+    """The scan with another spread of a kind of part, if it is of what the scan meets."""
+    mine = [part for part, kind in kinds_of(scan).items() if kind == what]
+    return scan.scattering(mine[0], sd) if mine else scan
+
+
+def _on_planes(scan: ScanStop) -> bool:
+    return isinstance(scan.meeting, PlaneSurface)

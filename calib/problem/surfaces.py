@@ -1,8 +1,9 @@
-"""Errors of the mesh, common to the points of a surface or cell, as unknowns.
+"""Errors of the mesh or of planes, common to the points of a surface or cell, as unknowns.
 
 Mesh error is smooth over whole surfaces, so a fit carries one displacement along the normal per
 surface, per region and per patch: without them neighbouring points would count as independent
-facts.
+facts. Walls are no flatter: planes found in the scans have regions and patches too. Where a plane
+is as a whole is itself estimated.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from calib.problem.problem import Problem, SurfaceCells
 from calib.problem.unknowns import Role, Unknown
 from calib.residuals.beams import Association
 from calib.residuals.scan import ScanStop
-from calib.residuals.surfaces import PlaneSurface
+from calib.residuals.surfaces import PLANE_PATCHES_M, PlaneSurface
 
 LEAST_BEAMS = 100  # on a plane: three numbers of it, known ten times better than by a single beam
 LOST = 0.5  # of these, below which a plane that was found has lost its beams
@@ -46,24 +47,39 @@ def with_surfaces(
         first = problem.scans[scans[0]]
         if not first.reference_sigma_m:
             continue
-        for column in SURFACE_SHARES:
+        for column, kind in kinds_of(first).items():
             parts_of = {i: _parts(problem, associations[i], i, column) for i in scans}
             last = max(int(p.max(initial=-1)) for p in parts_of.values())
             seen = sum(np.bincount(p + 1, minlength=last + 2) for p in parts_of.values())
             parts = np.flatnonzero(seen[1:])  # counted from -1: nothing is met
             number = np.full(last + 2, -1, np.int32)  # the last stands for -1
             number[parts] = np.arange(len(parts))
-            name, sigma_m = f"{room}/reference_{column}", cell_sigma_m(first, column)
+            name = kind if column != kind else f"{room}/reference_{column}"
+            sigma_m = cell_sigma_m(first, column)
             unknowns.append(_unknown(name, room, column, parts, sigma_m))
-            cells[name] = SurfaceCells(column, parts, first.meeting.surface_of(column, parts), room)
+            cells[name] = SurfaceCells(
+                column=column,
+                kind=kind,
+                parts=parts,
+                surface=first.meeting.surface_of(column, parts),
+                room=room,
+            )
             for i in scans:
                 numbered[i][name] = number[parts_of[i]]
     found = [replace(a, cells=n) for a, n in zip(associations, numbered, strict=True)]
     return problem.with_cells(unknowns, cells), found
 
 
+def kinds_of(scan: ScanStop) -> dict[str, str]:
+    """Column of the parts of what a scan meets -> what those with one spread are called: all meshes
+    have one for each column; the planes of a recording have their own."""
+    if isinstance(scan.meeting, PlaneSurface):
+        return {column: f"{scan.meeting.variable}/{column}" for column in PLANE_PATCHES_M}
+    return {column: column for column in SURFACE_SHARES}
+
+
 def cell_sigma_m(scan: ScanStop, column: str) -> float:
-    """How far parts of a kind may stand off the mesh that a scan meets."""
+    """How far parts of a kind may stand off the mesh, or the planes, that a scan meets."""
     beyond = scan.reference_scatter_m.get(column, 0.0)
     return float(np.sqrt(SURFACE_SHARES[column] * scan.stated_sigma_m**2 + beyond**2))
 
@@ -90,7 +106,7 @@ def well_seen(problem: Problem, associations: Sequence[Association]) -> list[Ass
     return found
 
 
-def _unknown(name: str, room: int, column: str, parts: np.ndarray, sigma_m: float) -> Unknown:
+def _unknown(name: str, room: int | str, column: str, parts: np.ndarray, sigma_m: float) -> Unknown:
     return Unknown(
         name,
         "vector",
@@ -109,9 +125,9 @@ def _parts(problem: Problem, association: Association, scan: int, column: str) -
     return problem.scans[scan].meeting.surfaces(association)
 
 
-def _by_room(problem: Problem) -> dict[int, list[int]]:
-    """The scans on each mesh, of whatever recording."""
-    found: dict[int, list[int]] = {}
+def _by_room(problem: Problem) -> dict[int | str, list[int]]:
+    """The scans on each mesh, of whatever recording, and on the planes of each recording."""
+    found: dict[int | str, list[int]] = {}
     for i, scan in enumerate(problem.scans):
         if scan.reference_sigma_m:
             found.setdefault(scan.room, []).append(i)

@@ -25,7 +25,7 @@ class Role(Enum):
     JOINTS = "joints"  # what the encoders misreport at one stop
     TARGET = "target"  # a rod's marker, and gravity
     PLANE = "plane"  # planes found in the scans
-    SURFACE = "surface"  # how far parts of the mesh stand off the room
+    SURFACE = "surface"  # how far parts of the mesh, or of planes, stand off the room
     SCATTER = "scatter"  # what chance does anew to each stop or location
 
 
@@ -41,7 +41,8 @@ class Unknown:
         dofs: (dim,) a name per tangent direction.
         units: (dim,) "m" or "rad" or another unit, per tangent direction.
         role: what it stands for.
-        owner: of SURFACE, the mesh: unknowns of one mesh bear the same number.
+        owner: of SURFACE, the mesh or the recording whose planes they are: those of one have the
+            same.
         weight: robust weight of what was known before, 0 to 1.
     """
 
@@ -52,7 +53,7 @@ class Unknown:
     dofs: tuple[str, ...]
     units: tuple[str, ...]
     role: Role = Role.CALIBRATION
-    owner: int = 0
+    owner: int | str = 0
     weight: float = 1.0
 
     @property

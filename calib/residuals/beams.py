@@ -66,7 +66,8 @@ class Surface:
         slope: (N, 3) the normal over its product with the beam's direction, lidar axes; 0 there.
         usable: (N,) False where nothing was hit, or a depth edge or grazing hit spoils the beam.
         columns: name -> (N, ...), or a function that gives it: label, surface, patch, plane, ...
-        unknown: gives the derivatives of the residual by what of the surface is itself unknown.
+        unknown: gives the derivatives of the residual by what of the surface is itself unknown, for
+            beams that reach so far (N,) m.
     """
 
     predicted_m: np.ndarray
@@ -74,7 +75,7 @@ class Surface:
     slope: np.ndarray
     usable: np.ndarray
     columns: Mapping[str, LazyColumn]
-    unknown: Callable[[], Sequence[Columns]]
+    unknown: Callable[[np.ndarray], Sequence[Columns]]
 
 
 @dataclass(frozen=True)

@@ -104,7 +104,7 @@ class ScanStop:
         room: the mesh, or the recording whose planes these are.
         group: the name of its rows.
         reference_scatter_m: kind of part, "surface", "region" or "patch" -> how widely such parts
-            scatter beyond what rig.yaml says, which is in `reference_sigma_m`.
+            scatter beyond what is stated of them, which is in `reference_sigma_m`.
     """
 
     name: str
@@ -123,7 +123,7 @@ class ScanStop:
 
     @property
     def stated_sigma_m(self) -> float:
-        """How far the reference may be off as rig.yaml has it."""
+        """How far the reference may be off as rig.yaml has it, or the least that planes are."""
         beyond2 = sum(sd**2 for sd in self.reference_scatter_m.values())
         return float(np.sqrt(max(self.reference_sigma_m**2 - beyond2, 0.0)))
 
@@ -328,9 +328,8 @@ class ScanStop:
                     by_site[site] = beam_derivative(seen.ray, t, slope) if beam else slope @ turn
                 found[name] = effect_columns(name, basis, by_site[site])
         dense = {name: c for name, c in found.items() if not isinstance(c, Columns)}
-        sparse = [c for c in found.values() if isinstance(c, Columns)] + list(
-            seen.surface.unknown()
-        )
+        sparse = [c for c in found.values() if isinstance(c, Columns)]
+        sparse += seen.surface.unknown(t)
         usable = seen.surface.usable
         lost = np.flatnonzero(~usable)
         if len(lost):  # 0 * inf would be NaN

@@ -18,13 +18,16 @@ from chains import se3
 from sensors.lidar import Beams
 from sensors.planes import Cells, Planes
 from sensors.reference import Reference
-from sensors.surfaces import transverse
+from sensors.surfaces import SurfaceGrid, transverse
 
 GRAZING_RAD = np.deg2rad(80.0)  # a fit keeps no beam that meets its surface flatter than this
 PARALLEL_RAD = np.deg2rad(89.0)
 # Widths of the cells that surfaces are divided into, in a room whose box has 200 m2 of walls; in
-# larger ones the cells grow alike, so that there are never many more of them.
+# larger ones the cells grow alike, so that there are never many more of them. Patches of planes are
+# as wide as the cells that planes are found in: within patches of 0.5 m the walls of the simulated
+# labs are uneven enough for ring zeros of an XT32 to be 1.2 to 1.5 times their sigmas off.
 PATCHES_M = {"region": 1.2, "patch": 0.5}
+PLANE_PATCHES_M = {"region": 1.2, "patch": 0.3}
 ROOM_M2 = 200.0
 
 
@@ -59,10 +62,7 @@ class MeshSurface:
     @cached_property
     def patches_m(self) -> dict[str, float]:
         """Kind of patch -> its width, in this room."""
-        length, width, height = np.ptp(self.reference.vertices_m, axis=0)
-        walls_m2 = 2.0 * (length * width + width * height + height * length)
-        scale = max(1.0, float(np.sqrt(walls_m2 / ROOM_M2)))
-        return {kind: scale * size_m for kind, size_m in PATCHES_M.items()}
+        return _widths_m(PATCHES_M, self.reference.vertices_m)
 
     @cached_property
     def roughness_m(self) -> np.ndarray:
@@ -158,16 +158,36 @@ class PlaneSurface:
         side = transverse(self.planes.normal)
         return np.stack([side, np.cross(self.planes.normal, side)], axis=1)
 
+    @cached_property
+    def patches_m(self) -> dict[str, float]:
+        """Kind of patch -> its width, in this room."""
+        return _widths_m(PLANE_PATCHES_M, self.planes.cell_mean_m)
+
+    @cached_property
+    def _grid(self) -> SurfaceGrid:
+        """Over the cells in which each plane was seen."""
+        return self.planes.grid(self.axes)
+
+    def surface_of(self, kind: str, parts: np.ndarray) -> np.ndarray:
+        """The plane that each of those parts is of."""
+        return self._grid.patch_surface(self.patches_m[kind])[parts]
+
     def divided(self, T: np.ndarray, beams: Beams, part: np.ndarray) -> Association:
-        """The planes (N,) that beams meet, which have no patches."""
-        return Association(part)
+        """The planes (N,) that beams meet from there, and the patches of them."""
+        met = _Met(T, beams, _and_none(self.planes.normal, self.planes.distance_m), part)
+        patches = {
+            kind: self._patch(met, size_m).astype(np.int32)
+            for kind, size_m in self.patches_m.items()
+        }
+        return Association(part, patches)
 
     def associate(
         self, T: np.ndarray, beams: Beams, values: Values, near_edges: bool
     ) -> Association:
-        """Plane of each beam, by where its point lies; -1 for none."""
+        """Plane of each beam, by where its point lies, -1 for none; near edges its patches too."""
         point = beams.origin_m + beams.range_m[:, None] * beams.direction
-        return Association(self.planes.assign(se3.apply(T, point)).astype(np.int32))
+        part = self.planes.assign(se3.apply(T, point)).astype(np.int32)
+        return self.divided(T, beams, part) if near_edges else Association(part)
 
     def meet(
         self, T: np.ndarray, beams: Beams, values: Values, association: Association
@@ -177,24 +197,33 @@ class PlaneSurface:
         tilted = self.planes.normal + np.einsum("mk,mki->mi", theta[:, :2], self.axes)
         length = np.linalg.norm(tilted, axis=1)
         distance = self.planes.distance_m + theta[:, 2]
-        none = [[0.0, 0.0, 0.0, np.inf]]
-        plane = np.vstack([np.column_stack([tilted / length[:, None], distance]), none])
+        plane = _and_none(tilted / length[:, None], distance)
         met = _Met(T, beams, plane, association.part)
         columns = met.columns | {"plane": association.part}
-        return met.surface(columns, lambda: self._by_numbers(met, length))
+        for kind, size_m in self.patches_m.items():
+            columns[kind] = partial(self._patch, met, size_m)
+        return met.surface(columns | association.patches, partial(self._by_numbers, met, length))
 
-    def _by_numbers(self, met: _Met, length: np.ndarray) -> list[Columns]:
+    def _patch(self, met: _Met, size_m: float) -> np.ndarray:
+        patch = np.full(len(met.part), -1)
+        hit = np.flatnonzero(met.part >= 0)
+        patch[hit] = self._grid.patch(met.part[hit], met.point_m[hit], size_m)
+        return patch
+
+    def _by_numbers(self, met: _Met, length: np.ndarray, range_m: np.ndarray) -> list[Columns]:
         """Derivatives by the three numbers of each plane: ``d r / d n = hit / n.u``, and n moves
-        along an axis, less what renormalising takes back."""
+        along an axis, less what renormalising takes back; the beams reach so far (N,) m."""
         part = met.association_part
         n = met.plane[part, :3]
-        along = np.einsum("ni,ni->n", n, met.beams.direction @ met.T[:3, :3].T)
+        origins, directions = _in_reference(met.T, met.beams)
+        hit = origins + range_m[:, None] * directions
+        along = np.einsum("ni,ni->n", n, directions)
         along[along == 0.0] = np.inf  # nothing is met
         out = []
         for k in (0, 1):
             axis = self.axes[:, k][part]
             across = axis - np.einsum("ni,ni->n", axis, n)[:, None] * n
-            value = np.einsum("ni,ni->n", met.point_m, across) / (along * length[part])
+            value = np.einsum("ni,ni->n", hit, across) / (along * length[part])
             out.append(self._columns(k, part, value))
         return [*out, self._columns(2, part, -1.0 / along)]
 
@@ -249,7 +278,7 @@ class _Met:
     def surface(
         self,
         columns: Mapping[str, LazyColumn],
-        unknown: Callable[[], Sequence[Columns]] = tuple,
+        unknown: Callable[[np.ndarray], Sequence[Columns]] = lambda range_m: (),
     ) -> Surface:
         """As rows want it."""
         usable = self.cosine > np.cos(PARALLEL_RAD)
@@ -261,6 +290,19 @@ class _Met:
             columns=columns,
             unknown=unknown,
         )
+
+
+def _widths_m(patches_m: Mapping[str, float], points_m: np.ndarray) -> dict[str, float]:
+    """Kind of patch -> its width, in a room whose box holds the points (N, 3)."""
+    length, width, height = np.ptp(points_m, axis=0)
+    walls_m2 = 2.0 * (length * width + width * height + height * length)
+    scale = max(1.0, float(np.sqrt(walls_m2 / ROOM_M2)))
+    return {kind: scale * size_m for kind, size_m in patches_m.items()}
+
+
+def _and_none(normal: np.ndarray, distance_m: np.ndarray) -> np.ndarray:
+    """Planes (M + 1, 4), the last met by no beam."""
+    return np.vstack([np.column_stack([normal, distance_m]), [[0.0, 0.0, 0.0, np.inf]]])
 
 
 def _once(compute: Callable[[], Any]) -> Callable[[], Any]:

@@ -15,7 +15,7 @@ from calib.problem.spread import with_spread
 from calib.residuals.scan import ScanStop
 from calib.residuals.surfaces import PlaneSurface
 from calib.results.errors import Errors, body_errors, scan_errors
-from calib.solve.estimate import Estimate, Start
+from calib.solve.estimate import SD, Estimate, Start
 from calib.solve.fit import Progress, solve
 
 FOLDS = 5  # a fit leaves out about a fifth of the locations
@@ -131,7 +131,14 @@ def _without_planes(trained: Problem, start: Start | None) -> Start | None:
     if start is None or not found:
         return start
     planes = {meeting.variable for meeting in found}
-    return Start({name: x for name, x in start.state.items() if name not in planes})
+    return Start({n: x for n, x in start.state.items() if not _is_of(n, planes)})
+
+
+def _is_of(name: str, planes: set[str]) -> bool:
+    """Whether a value of a state is of planes or of their parts; how uneven walls are, others tell
+    as well."""
+    mine = any(name.startswith(f"{variable}/") for variable in planes)
+    return name in planes or (mine and not name.endswith(SD))
 
 
 def predict(unseen: Problem, trained: Problem, estimate: Estimate) -> Errors:

@@ -124,7 +124,7 @@ def squares(estimate: Estimate) -> Sums:
         total = float(np.square(estimate.values[name] / sigma).sum())
         seen = estimate.variance_of([name], np.eye(len(sigma)))
         sums = total, float(np.sum(1.0 - seen / np.square(sigma)))
-        found.setdefault((cells.column, "m"), []).append(sums)
+        found.setdefault((cells.kind, "m"), []).append(sums)
     return {key: tuple(np.sum(sums, axis=0).tolist()) for key, sums in found.items()}
 
 

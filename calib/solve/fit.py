@@ -64,6 +64,8 @@ def solve(
         loop.lost = loop.bodies_astray()
     if problem.scans:
         loop.lost = loop.lost or not loop.look_around()
+        if spread:
+            loop.begin_spread()
         loop.settle(tolerance)
         loop.reweigh(tolerance)
     return loop.estimate(tolerance if spread else None)

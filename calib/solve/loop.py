@@ -52,8 +52,10 @@ HOPEFUL, LOOKED = 8, 15
 # How many sigmas wide the residuals of most stops may be by then: in those recordings it is 1 to 4,
 # with scans at wrong stops 85.
 HOPELESS = 30.0
-SETTLED_SPREAD = 0.01  # relative change of a spread that is none: 50 members tell it to a tenth
-SPREAD = 5  # times: all but the beams' weights is linear, so the second changes next to nothing
+# Relative change of a spread that is none; and one for which the passes to the optimum are not
+# worth doing again, as 50 members tell it no better.
+SETTLED_SPREAD, NEAR_SPREAD = 0.01, 0.1
+SPREAD = 8  # times: where rows do not scatter, each halves what they were thought to
 
 
 ASKED = 2  # times: the first pass brings the LiDAR to where it is, near enough
@@ -166,23 +168,49 @@ class Loop(Descent):
         Args:
             tolerance: as of `settle`.
         """
-        for _ in range(0 if self.lost else SPREAD):
+        if self._near_spread(settled=True) and self.problem.scans:
+            self.settle(tolerance, self.seen, self._met())
+
+    def begin_spread(self) -> None:
+        """The same once it is known what beams meet, and before the passes to the optimum: most of
+        these are then with spreads that last."""
+        if not self.lost and self._by_chance():
+            self.fix_association()
+            self._near_spread(settled=False)
+
+    def _near_spread(self, settled: bool) -> bool:
+        """Estimate spreads, with a step before each, until they settle; whether they changed.
+
+        Args:
+            settled: whether this begins where no step leads further.
+        """
+        first, least = self.given, SETTLED_SPREAD
+        if settled and self.problem.scans:
+            least = NEAR_SPREAD
+        for _ in range(0 if self.lost or not self._by_chance() else SPREAD):
+            self.linearise_here()
+            if self.problem.scans and not (settled and self.given is first):
+                self.passes += 1
+                self.values = self.moved(self.values, self.step()[0])
             found = self._spread()
-            given = with_spread(self.given, found, SETTLED_SPREAD)
+            given = with_spread(self.given, found, least)
             if given is self.given:
                 break
-            self.given, self.problem = given, with_spread(self.problem, found, SETTLED_SPREAD)
+            self.given, self.problem = given, with_spread(self.problem, found, least)
             self.lay_out()
-            if self.problem.scans:
-                self.settle(tolerance, self.seen, self._met())
-            else:
+            least = SETTLED_SPREAD
+            if not self.problem.scans:
                 self.descend(STEADY, beams=False)
+        return self.given is not first
+
+    def _by_chance(self) -> list[str]:
+        """Names of the unknowns, and keys of what widens rows, whose spread is estimated."""
+        some = [u.name for u in by_chance(self.problem) if u.name not in self.held]
+        return [*some, *widening(self.problem)]
 
     def _spread(self) -> dict[str, float]:
-        """Key of a spread -> what it is, as all rows have it here."""
+        """Key of a spread -> what it is, as all rows have it where they were linearised last."""
         some, out = [u for u in by_chance(self.problem) if u.name not in self.held], {}
-        if some or widening(self.problem):
-            self.linearise_here()
         if some:
             names = [u.name for u in some]
             found = told(some, self.values, self.graph.covariance(self.values, names))

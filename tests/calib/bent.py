@@ -50,11 +50,11 @@ class RingElevation(Effect):
 
 def on_mesh(folder):
     """Beams on a mesh of which every part stands off."""
-    return bent(build([Source.open(rigs.write(folder / "mesh"))], Model()), surfaces=True)
+    return bent(build([Source.open(rigs.write(folder / "mesh"))], Model()))
 
 
 def on_planes(folder):
-    """Beams on planes, themselves unknown."""
+    """Beams on planes, themselves unknown, of which every part stands off."""
     source = Source.open(rigs.write(folder / "planes", reference=None))
     walls = np.repeat(np.arange(6), rigs.WALL_STEPS**2 * 2)
     vertices, triangles = rigs.room()
@@ -68,10 +68,10 @@ def on_planes(folder):
         tolerance_m=0.3,
     )
     met = {0: PlaneSurface(found, "planes")}
-    return bent(build([source], Model(), meetings=met), surfaces=False)
+    return bent(build([source], Model(), meetings=met))
 
 
-def bent(problem, surfaces):
+def bent(problem):
     """The problem with every kind of beam and surface error switched on, away from its start."""
     source = problem.sources[0]
     terms = [
@@ -82,14 +82,13 @@ def bent(problem, surfaces):
     problem.scans = [replace(s, terms=[*s.terms, *terms]) for s in problem.scans]
     values = rigs.shaken(problem.variables, problem.initial, 0.01)
     association = [s.associate(values, near_edges=False) for s in problem.scans]
-    if surfaces:
-        pairs = zip(problem.scans, association, strict=True)
-        views = [scan.rows(values, a).view for scan, a in pairs]
-        patches = ({kind: view[kind] for kind in ("region", "patch")} for view in views)
-        with_patches = [replace(a, patches=p) for a, p in zip(association, patches, strict=True)]
-        problem, association = with_surfaces(problem, with_patches)
-        cells = {name: problem.variables[name] for name in problem.cells}
-        values |= rigs.shaken(cells, problem.initial, 0.01)
+    pairs = zip(problem.scans, association, strict=True)
+    views = [scan.rows(values, a).view for scan, a in pairs]
+    patches = ({kind: view[kind] for kind in ("region", "patch")} for view in views)
+    with_patches = [replace(a, patches=p) for a, p in zip(association, patches, strict=True)]
+    problem, association = with_surfaces(problem, with_patches)
+    cells = {name: problem.variables[name] for name in problem.cells}
+    values |= rigs.shaken(cells, problem.initial, 0.01)
     return SimpleNamespace(problem=problem, values=values, association=association)
 
 

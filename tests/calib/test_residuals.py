@@ -39,7 +39,8 @@ def test_beam_derivatives_by_everything(meeting, stop, request):
     found = by_variable(scan, rows, case.values)
     extra = {"warp", "ring_elevation", "ring_range_offset"}
     cells = {f"0/reference_{kind}" for kind in ("surface", "region", "patch")}
-    extra |= {"faro", *cells} if meeting == "on_mesh" else {"planes"}
+    of_planes = {"planes", "planes/region", "planes/patch"}
+    extra |= {"faro", *cells} if meeting == "on_mesh" else of_planes
     assert extra <= set(found)
     for name, d in found.items():
         expected = rigs.differences(

@@ -27,6 +27,7 @@ class World:
         tracker_factor: how many times the tracker is worse than rig.yaml says.
         mesh_error_factor: how many times the mesh is worse than rig.yaml says.
         warp_m: how far the middle of one wall is bowed out of the mesh's plane.
+        uneven_m: standard deviation of how far surfaces lie off flat, smoothly; no mesh has it.
         clutter: share of the beams that hit boxes which are not in the mesh, about.
         hidden: effects with their sizes, of `effects.EFFECTS`.
     """
@@ -42,6 +43,7 @@ class World:
     tracker_factor: float = 1.0
     mesh_error_factor: float = 1.0
     warp_m: float = 0.0
+    uneven_m: float = 0.0
     clutter: float = 0.0
     hidden: tuple[tuple[str, float], ...] = ()
 

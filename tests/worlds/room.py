@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .knobs import World
 from .poses import turn
 
 SIZE_M = np.array([8.0, 7.0, 2.9])
@@ -174,6 +175,16 @@ def _waves(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     towards *= (2 * np.pi / length_m / np.linalg.norm(towards, axis=1))[:, None]
     size = rng.standard_normal(WAVES)
     return np.cos(points @ towards.T + rng.uniform(0, 2 * np.pi, WAVES)) @ size * np.sqrt(2 / WAVES)
+
+
+def bumps(world: World, points: np.ndarray, which: np.ndarray) -> np.ndarray:
+    """How far (N,) the rectangles (N,) lie behind flat at points (N, 3) m, of variance 1; 0 for -1.
+    It is the same at every stop."""
+    out = np.zeros(len(points))
+    for q in np.unique(which[which >= 0]).tolist():
+        mine = which == q
+        out[mine] = _waves(points[mine], world.rng(f"bumps {q}"))
+    return out
 
 
 def cluttered(

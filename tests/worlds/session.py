@@ -163,6 +163,9 @@ def scan(
     measured += effects.of_range(
         world.hidden, cosine, height, stops.time_s[k], stops.temperature_c[k]
     )
+    if world.uneven_m:
+        met = start + np.where(which >= 0, range_m, 0.0)[:, None] * towards
+        measured += world.uneven_m * room.bumps(world, met, which) / cosine
     back = (which >= 0) & (range_m > NEAREST_M) & (cosine > GRAZING)
     sigma_m = lidar.sigma(np.where(back, range_m, 1.0), white, cosine)
     mean_m, spread_m = averaged(lidar, rng, np.where(back, measured, 1.0), sigma_m, world.sweeps)
