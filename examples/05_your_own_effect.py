@@ -46,7 +46,7 @@ out = Path(sys.argv[1] if len(sys.argv) > 1 else tempfile.mkdtemp(prefix="rigcal
 (out / "mine.yaml").write_text(FORMULA)
 (out / "mine.py").write_text(CLASS)
 spec = Spec(
-    lidar="hesai_pandarxt32", room="box", locations=4, stops_per_location=2, column_step=200
+    lidar="hesai_pandarxt32", room="box", locations=6, stops_per_location=3, column_step=200
 )
 calib.simulate(spec, out / "recording", seed=2, hide={str(out / "mine.yaml"): 1.5})
 

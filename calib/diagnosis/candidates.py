@@ -18,6 +18,8 @@ from calib.rig import Rig
 
 BINS, PAIR_BINS = 12, 6
 AZIMUTH_BINS = 24
+# Of columns of the stops: with more parameters than a fifth of these, tests say nothing.
+STOPS_A_BIN = 5
 STEP = 0.01  # relative, to either side, for the derivative by a shape
 # What a range error may hang on alone, and the pairs that matter; others pair with range.
 POINT = ("range_m", "incidence_rad", "azimuth_rad", "elevation_rad", "intensity")
@@ -205,8 +207,10 @@ def structure(sources: Sequence[Source], sample: Mapping[str, np.ndarray]) -> li
     wanted = [(c,) for c in (*POINT, *own) if c in sample]
     wanted += [p for p in PAIRS if all(c in sample for c in p)]
     wanted += [(c, point) for c in own for point in WITH_OWN if point in sample]
+    stops = sum(len(s.recording.stops) for s in sources)
     for names in wanted:
-        edges = {c: _edges(sample[c], _bins(c, len(names))) for c in names}
+        by_stop = stops if set(names) & set(own) else 0
+        edges = {c: _edges(sample[c], _bins(c, len(names), by_stop)) for c in names}
         if all(len(e) for e in edges.values()):
             centres = {c: _centres(sample[c], e) for c, e in edges.items()}
             out.append(Binned(edges, centres, {c: _ends(sample[c]) for c in names}))
@@ -232,10 +236,13 @@ def _ends(values: np.ndarray) -> tuple[float, float]:
     return float(np.nanmin(values)), float(np.nanmax(values))
 
 
-def _bins(covariate: str, together: int) -> int:
-    if together > 1:
-        return PAIR_BINS
-    return AZIMUTH_BINS if covariate == "azimuth_rad" else BINS
+def _bins(covariate: str, together: int, stops: int) -> int:
+    """How many bins of a covariate, alone or of a pair; where one of them is the same for all beams
+    of a stop, no more than that many stops can tell."""
+    usual = PAIR_BINS if together > 1 else BINS
+    if stops:
+        return max(2, min(usual, round((stops / STOPS_A_BIN) ** (1.0 / together))))
+    return AZIMUTH_BINS if covariate == "azimuth_rad" and together == 1 else usual
 
 
 def _centres(values: np.ndarray, edges: np.ndarray) -> np.ndarray:
