@@ -22,7 +22,7 @@ from chains import se3
 Part = tuple[np.ndarray, csr_array]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class FrozenScan(ScanStop):
     """A stop whose rows keep the weights and sigmas that they had.
 
