@@ -64,7 +64,8 @@ class Model:
         named = effects.DEFAULT
         if chosen is not None:
             whole = all(map(effects.is_known, effects.split(chosen)))
-            own = () if whole else effects.own_effects(map(load_rig, recordings))
+            there = [r for r in recordings if not whole and (Path(r) / "rig.yaml").is_file()]
+            own = effects.own_effects(map(load_rig, there))
             named = effects.load_effects(chosen, own=own)
         return cls(named, tuple(fixed), tuple(without))
 
