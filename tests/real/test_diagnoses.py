@@ -11,6 +11,7 @@ from . import foreign
 GEOMETRIC = Model(("arm_link_length", "arm_joint_offset", "arm_axis_tilt"))
 
 
+@pytest.mark.slow
 def test_a_ur10_gives_way_and_errs_with_its_gears(shared, tmp_path):
     """Gravity and an error 17 times a turn: what stops that the fit never saw bear out."""
     recording = foreign.ur10("D", shared / "arms/ur10_tmac", tmp_path / "ur10")
