@@ -27,6 +27,7 @@ from calib.linear.layout import positions
 from calib.linear.system import Linearisation
 from calib.problem.problem import Problem
 from calib.residuals.groups import BEAMS, Group
+from calib.solve.components import squares_of_cells
 from calib.solve.graph import Graph
 
 # Of I - w H: below this a direction is held by the group alone (rounding of C is some 1e-9 of it).
@@ -124,21 +125,10 @@ def standing_alone(
     return alone
 
 
-def of_cells(whole: Linearisation, problem: Problem) -> dict[str, tuple[float, float]]:
-    """Kind of part of the mesh -> the sum of squares of what such parts stand off, whitened, and of
-    their redundancies."""
-    kept, out = _Others.of(whole).kept, {}
-    for name, cells in problem.cells.items():
-        sigma, columns = problem.variables[name].sigma, whole.layout.columns([name])
-        if cells.kind != cells.column:
-            continue  # of planes, whose spread is estimated
-        total, left = out.get(cells.column, (0.0, 0.0))
-        for some in np.array_split(np.arange(len(sigma)), -(-len(sigma) // TOGETHER)):
-            rows = np.zeros((len(some), whole.layout.size))
-            rows[np.arange(len(some)), columns[some]] = 1.0 / sigma[some]
-            left += float(np.sum(1.0 - np.diag(whole.covariance(rows, kept))))
-        out[cells.column] = total + float(np.square(whole.values[name] / sigma).sum()), left
-    return out
+def of_cells(whole: Linearisation, problem: Problem) -> dict[tuple[str, str], tuple[float, float]]:
+    """Of the parts of surfaces, by their kind, as `components.squares_of_cells` gives it."""
+    kept = _Others.of(whole).kept
+    return squares_of_cells(problem, whole.values, lambda n, rows: whole.variances(n, rows, kept))
 
 
 def _statistic(M: np.ndarray, u: np.ndarray, at: np.ndarray) -> float:

@@ -12,12 +12,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from scipy import special
 
-from calib.blunders.chance import after_looks
+from calib.blunders.chance import after_looks, at_least
 from calib.blunders.shifts import Shift, of_cells
 from calib.diagnosis.score import Scores
 from calib.effects import CATALOGUE, Scatter, Site
@@ -57,6 +58,11 @@ class Spread:
         """As people read it."""
         unit = {"m": "mm", "rad": "mrad"}[self.unit]
         return f"{1e3 * self.sd:.2f} ± {1e3 * self.sigma:.2f} {unit}"
+
+    def document(self, effect: str) -> dict[str, Any]:
+        """As the contract has what an effect scatters by."""
+        of = {"of": self.of} if self.of else {}
+        return {"effect": effect, **of, "sd": self.sd, "sigma": self.sigma, "unit": self.unit}
 
 
 @dataclass(frozen=True)
@@ -101,14 +107,6 @@ class Chance:
                 found.append(replace(self, spreads=each, statistic=statistic, p_value=p))
         return max(found, key=lambda chance: chance.statistic)
 
-    def told(self) -> list[dict[str, Any]]:
-        """How widely it scatters, as the contract has it."""
-        return [
-            {"effect": self.effect.name, **({"of": s.of} if s.of else {})}
-            | {"sd": s.sd, "sigma": s.sigma, "unit": s.unit}
-            for s in self.spreads
-        ]
-
     def document(self, step: int | None) -> dict[str, Any]:
         """As one of the candidates of diagnosis.json.
 
@@ -120,7 +118,7 @@ class Chance:
             "effect": self.effect.family,
             "add": self.effect.name,
             "site": "range" if self.effect.site is Site.BEAM else self.effect.site.value,
-            "p_value": self.p_value,
+            "p_value": at_least(self.p_value),
             "p_adjusted": self.p_adjusted,
             "statistic": self.statistic,
             "dof": len(self.spreads),
@@ -152,7 +150,7 @@ class Chance:
         else:
             what = f"{each.capitalize()}s scatter by {self.spreads[0].told} in range"
         return (
-            f"{what}; by chance as far as this data tell (p = {max(self.p_adjusted, 1e-99):.1g}). "
+            f"{what}; by chance as far as this data tell (p = {self.p_adjusted:.1g}). "
             f"{name} takes that into every sigma; it tells nothing of the next {each}, so no "
             f"held-out error falls."
         )
@@ -188,6 +186,7 @@ class AtZero:
         normal = np.random.default_rng(0).standard_normal((DRAWS, len(self.l)))
         return self.statistic(np.square(normal) * (1.0 + d * self.l))
 
+    @cached_property
     def tail(self) -> tuple[float, float]:
         """Share of what is not zero by chance, and the scale of the chi-square that it is."""
         drawn = self.drawn()
@@ -196,14 +195,14 @@ class AtZero:
 
     def p_value(self) -> tuple[float, float]:
         """The statistic, and how often chance alone makes one as large."""
-        share, scale = self.tail()
+        share, scale = self.tail
         statistic = float(self.statistic(self.w[None])[0])
         p = share * float(special.chdtrc(1, statistic / scale)) if statistic > 1e-9 else 1.0
         return statistic, p
 
     def detectable(self, alpha: float) -> float:
         """The sd that is found with 80 % power at a level."""
-        share, scale = self.tail()
+        share, scale = self.tail
         if share <= alpha:
             return np.inf
         limit = scale * float(special.chdtri(1, alpha / share))
@@ -262,7 +261,8 @@ def rows_by_chance(
         for unit, (total, left) in shift.squares.items():
             before = sums.get((shift.group.what, unit), (0.0, 0.0))
             sums[shift.group.what, unit] = before[0] + total, before[1] + left
-    sums |= {(part, "m"): each for part, each in of_cells(whole, problem).items()}
+    if any(effect.site is Site.REFERENCE for effect in effects):
+        sums |= of_cells(whole, problem)
     found = (_of_rows(effect, sums, problem) for effect in effects)
     return [chance for chance in found if chance is not None]
 
@@ -271,9 +271,9 @@ def _of_rows(effect: Scatter, sums: Sums, problem: Problem) -> Chance | None:
     """The test that rows have the variance that is stated: the sum of their squares is near
     chi-square with their redundancy for degrees of freedom."""
     known, spreads, p, statistic, detectable = sigmas(problem), [], [], 0.0, np.inf
-    of_bodies = effect.site is Site.TRACKER
-    mine = {key: each for key, each in sums.items() if (key[0] not in SURFACE_SHARES) == of_bodies}
-    checked = {key: each for key, each in mine.items() if each[1] >= FEWEST}
+    bodies = {block.body for block in problem.bodies}
+    mine = bodies if effect.site is Site.TRACKER else SURFACE_SHARES
+    checked = {key: each for key, each in sums.items() if key[0] in mine and each[1] >= FEWEST}
     for (what, unit), (total, left) in checked.items():
         sigma, beyond = known[what, unit]
         variance = sigma**2 - beyond**2

@@ -66,7 +66,7 @@ SLIGHT = 0.05  # of a direction's information: the others predict a cluster with
 
 
 @dataclass(frozen=True)
-class Chance:
+class ScoreSpread:
     """How a whitened score scatters where nothing is missing.
 
     Args:
@@ -91,7 +91,7 @@ class Chance:
         return float(special.fdtrc(self.nu, self.d, statistic / max(self.trace, 1e-300)))
 
 
-def by_signs(ways: Sequence[np.ndarray], stops: int) -> Chance:
+def by_signs(ways: Sequence[np.ndarray], stops: int) -> ScoreSpread:
     """Chance from the scores alone; see the module.
 
     Args:
@@ -107,7 +107,7 @@ def by_signs(ways: Sequence[np.ndarray], stops: int) -> Chance:
     size = np.square(ways[0]).sum(axis=1)
     # Were scores normal, their squares would scatter by 2 / nu.
     even = size.sum() ** 2 / max(np.square(size).sum(), 1e-300) * (1.0 + 2.0 / nu)
-    return Chance(by_stop + more, nu, (count - 1.0) * nu, min(float(count), float(even)))
+    return ScoreSpread(by_stop + more, nu, (count - 1.0) * nu, min(float(count), float(even)))
 
 
 def _freedom(shares: np.ndarray, count: int) -> float:
@@ -157,7 +157,7 @@ class Shares:
         else:
             to[key] = [score.copy(), information.copy()]
 
-    def left_out(self, nu: float) -> Chance:
+    def left_out(self, nu: float) -> ScoreSpread:
         """Chance from leaving out cluster after cluster; see the module.
 
         Args:
@@ -235,7 +235,9 @@ class Clusters:
         return beyond.T @ beyond + self.alone
 
 
-def by_leaving_out(ways: Sequence[Clusters], scores: Sequence[np.ndarray], nu: float) -> Chance:
+def by_leaving_out(
+    ways: Sequence[Clusters], scores: Sequence[np.ndarray], nu: float
+) -> ScoreSpread:
     """Chance from clusters and their scores (c, r), by stop, by surface, and by both."""
     by_stop, by_place, both = (w.covariance(s) for w, s in zip(ways, scores, strict=True))
     if ways[0].crowded or ways[1].crowded:
@@ -243,4 +245,4 @@ def by_leaving_out(ways: Sequence[Clusters], scores: Sequence[np.ndarray], nu: f
     more = _beyond(by_place, both)
     parts = np.array([np.trace(by_stop), np.trace(more)])
     d = parts.sum() ** 2 / max(float(np.sum(parts**2 / [ways[0].d, ways[1].d])), 1e-300)
-    return Chance(by_stop + more, nu, float(d), float(d) + 1.0)
+    return ScoreSpread(by_stop + more, nu, float(d), float(d) + 1.0)

@@ -18,7 +18,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import csr_array
 
 from calib.blunders.chance import at_least, log_tail
-from calib.diagnosis.jackknife import Chance, Shares, by_signs
+from calib.diagnosis.jackknife import ScoreSpread, Shares, by_signs
 from calib.diagnosis.linear import Linear
 
 GAUGE = 1e-6  # share of a direction's information that is left, below which there is none
@@ -163,7 +163,7 @@ class Test:
     columns: np.ndarray
     statistic: float
     whiten: np.ndarray
-    chances: tuple[Chance, ...]
+    chances: tuple[ScoreSpread, ...]
     clusters: int
     score: np.ndarray
 
@@ -172,7 +172,7 @@ class Test:
         return self.whiten.shape[1]
 
     @cached_property
-    def chance(self) -> Chance:
+    def chance(self) -> ScoreSpread:
         """That which counts, as it leaves least to chance; a true effect widens the first."""
         return min(self.chances, key=lambda chance: chance.p_value(self.statistic))
 

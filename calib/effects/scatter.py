@@ -57,6 +57,11 @@ class Scatter(Effect):
         at = {name: i for i, name in enumerate(self.members)}
         return np.array([at.get(f"{self.label}{name}", -1) for name in names.tolist()])
 
+    def one_each(self, view: View, along: np.ndarray) -> OneHot:
+        """The basis in which a row is off by its own member's value, along (3,) or (rows, 3)."""
+        index = np.broadcast_to(self.member(view), view.rows)
+        return OneHot(index, np.broadcast_to(along, (view.rows, 3)), max(1, len(self.members)))
+
 
 class StopRangeScatter(Scatter):
     """The range zero is another one at every stop, by chance: power cycles, settling, the hour."""
@@ -72,11 +77,7 @@ class StopRangeScatter(Scatter):
     source = "variance components: Searle, Casella and McCulloch 1992; size assumed"
 
     def basis(self, view: View) -> OneHot:
-        index = np.broadcast_to(self.member(view), view.rows)
-        along = np.zeros(3)
-        along[RANGE] = 1.0
-        values = np.broadcast_to(along, (view.rows, 3))
-        return OneHot(index, values, max(1, len(self.members)))
+        return self.one_each(view, np.eye(3)[RANGE])
 
 
 class LocationRangeScatter(StopRangeScatter):
@@ -142,5 +143,4 @@ class ReferenceScatter(Scatter):
         return super().params(rig) if rig.reference and rig.reference.mesh else ()
 
     def basis(self, view: View) -> OneHot:
-        index = np.broadcast_to(self.member(view), view.rows)
-        return OneHot(index, view["normal"], max(1, len(self.members)))
+        return self.one_each(view, view["normal"])

@@ -15,6 +15,7 @@ from calib.linear.layout import Layout
 from calib.linear.rows import OwnSums, Weighing
 
 Values = Mapping[str, np.ndarray]
+AT_ONCE = 256  # rows whose joint covariance is computed for their variances: it grows as the square
 
 
 @dataclass(frozen=True)
@@ -116,6 +117,21 @@ class Linearisation:
         self._through(by_twist, left)
         last = left[:, self.layout.kept] / sigma[self.layout.kept]
         return out + last @ kept @ last.T
+
+    def variances(self, names: Sequence[str], rows: np.ndarray, kept: np.ndarray) -> np.ndarray:
+        """Variances (m,) of ``rows @ tangents``.
+
+        Args:
+            names: unknowns.
+            rows: (m, n) over their tangents, in that order.
+            kept: (S, S) covariance of the kept.
+        """
+        columns, found = self.layout.columns(names), [np.zeros(0)]
+        for some in np.array_split(rows, -(-len(rows) // AT_ONCE)):
+            whole = np.zeros((len(some), self.layout.size))
+            whole[:, columns] = some
+            found.append(np.diag(self.covariance(whole, kept)))
+        return np.concatenate(found)
 
     def _through(self, by_twist: np.ndarray, left: np.ndarray) -> None:
         """Move what stands by the twists of all stops (q, 6 K) to the unknowns behind them."""

@@ -11,6 +11,7 @@ import numpy as np
 
 from calib import outputs
 from calib.blunders import told
+from calib.diagnosis.chance import Spread
 from calib.diagnosis.rejects import rejects
 from calib.diagnosis.search import search
 from calib.diagnosis.stand import Stand
@@ -104,12 +105,10 @@ def _scatter(run: Run) -> Iterator[dict[str, Any]]:
     parts = [run.solution.shared, *run.solution.recordings.values()]
     for effect in (e for e in model_of(run).effects if e.by_chance):
         for found in (part.effects[effect.name] for part in parts if effect.name in part.effects):
-            for name, unit, *each in zip(
-                found.names, found.units, found.estimate, found.sigma, strict=True
-            ):
-                of = {} if name == "sd" else {"of": name.rpartition(".")[0]}
-                numbers = dict(zip(("sd", "sigma"), map(float, each), strict=True))
-                yield {"effect": effect.name, **of, **numbers, "unit": unit}
+            numbers = zip(found.estimate.tolist(), found.sigma.tolist(), strict=True)
+            for name, unit, each in zip(found.names, found.units, numbers, strict=True):
+                of = name.rpartition(".")[0]  # of "sd", which is of nothing else, none
+                yield Spread(of, unit, *each).document(effect.name)
 
 
 def command_without(run: Run, tokens: Sequence[str]) -> str:

@@ -9,7 +9,7 @@ variances of greatest likelihood are those of restricted maximum likelihood (Pat
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -119,13 +119,30 @@ def squares(estimate: Estimate) -> Sums:
             rows = [each.reshape(count, -1, 3)[:, k] for each in (residual, left)]
             sums = float(np.square(rows[0]).sum()), float(rows[1].sum())
             found.setdefault((block.body, unit), []).append(sums)
-    for name, cells in estimate.problem.cells.items():
-        sigma = estimate.problem.variables[name].sigma
-        total = float(np.square(estimate.values[name] / sigma).sum())
-        seen = estimate.variance_of([name], np.eye(len(sigma)))
-        sums = total, float(np.sum(1.0 - seen / np.square(sigma)))
-        found.setdefault((cells.kind, "m"), []).append(sums)
-    return {key: tuple(np.sum(sums, axis=0).tolist()) for key, sums in found.items()}
+    cells = squares_of_cells(estimate.problem, estimate.values, estimate.variance_of)
+    return cells | {k: tuple(np.sum(sums, axis=0).tolist()) for k, sums in found.items()}
+
+
+def squares_of_cells(
+    problem: Problem,
+    values: Mapping[str, np.ndarray],
+    variance_of: Callable[[Sequence[str], np.ndarray], np.ndarray],
+) -> dict[tuple[str, str], tuple[float, float]]:
+    """The same of what parts of surfaces stand off, by their kind.
+
+    Args:
+        problem: with its cells.
+        values: as fitted.
+        variance_of: as `Estimate.variance_of` has it.
+    """
+    out: dict[tuple[str, str], tuple[float, float]] = {}
+    for name, cells in problem.cells.items():
+        sigma = problem.variables[name].sigma
+        seen = variance_of([name], np.eye(len(sigma)))
+        total, left = out.get((cells.kind, "m"), (0.0, 0.0))
+        total += float(np.square(values[name] / sigma).sum())
+        out[cells.kind, "m"] = total, left + float(np.sum(1.0 - seen / np.square(sigma)))
+    return out
 
 
 def wider(problem: Problem, sums: Sums) -> dict[str, float]:

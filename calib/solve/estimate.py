@@ -21,7 +21,6 @@ from calib.solve.graph import Graph
 # looked what they meet.
 DOFS, SEEN = ".dofs", ".seen"
 SD = ".sd"  # and, after a key of `problem.spread`, how widely something scatters by chance
-AT_ONCE = 256  # rows whose joint covariance is computed for their variances: it grows as the square
 
 
 @dataclass(frozen=True)
@@ -124,18 +123,8 @@ class Estimate:
         return self.linear.covariance(rows, self._kept)
 
     def variance_of(self, names: Sequence[str], rows: np.ndarray) -> np.ndarray:
-        """Variances (m,) of ``rows @ tangents``.
-
-        Args:
-            names: unknowns, none of them a surface's.
-            rows: (m, n) over their tangents, in that order.
-        """
-        columns, found = self.linear.layout.columns(names), [np.zeros(0)]
-        for some in np.array_split(rows, -(-len(rows) // AT_ONCE)):
-            whole = np.zeros((len(some), self.linear.layout.size))
-            whole[:, columns] = some
-            found.append(np.diag(self.linear.covariance(whole, self._kept)))
-        return np.concatenate(found)
+        """Variances (m,) of ``rows @ tangents``; see `Linearisation.variances`."""
+        return self.linear.variances(names, rows, self._kept)
 
     @cached_property
     def _kept(self) -> np.ndarray:

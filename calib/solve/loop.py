@@ -19,6 +19,7 @@ from calib.linear.parallel import in_order
 from calib.problem.problem import Block, Problem
 from calib.problem.spread import by_chance, widening, with_spread
 from calib.problem.surfaces import well_seen, with_surfaces
+from calib.problem.unknowns import Unknown
 from calib.residuals.beams import Association
 from calib.solve.added import begun
 from calib.solve.components import squares, told, wider
@@ -205,12 +206,15 @@ class Loop(Descent):
 
     def _by_chance(self) -> list[str]:
         """Names of the unknowns, and keys of what widens rows, whose spread is estimated."""
-        some = [u.name for u in by_chance(self.problem) if u.name not in self.held]
-        return [*some, *widening(self.problem)]
+        return [*(u.name for u in self._drawn()), *widening(self.problem)]
+
+    def _drawn(self) -> list[Unknown]:
+        """The unknowns by chance that no prior holds to an earlier estimate."""
+        return [u for u in by_chance(self.problem) if u.name not in self.held]
 
     def _spread(self) -> dict[str, float]:
         """Key of a spread -> what it is, as all rows have it where they were linearised last."""
-        some, out = [u for u in by_chance(self.problem) if u.name not in self.held], {}
+        some, out = self._drawn(), {}
         if some:
             names = [u.name for u in some]
             found = told(some, self.values, self.graph.covariance(self.values, names))

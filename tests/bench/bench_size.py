@@ -30,7 +30,7 @@ import numpy as np
 from scipy import stats
 from threadpoolctl import threadpool_limits
 
-from calib.diagnosis.jackknife import Chance, Clusters, by_leaving_out, by_signs
+from calib.diagnosis.jackknife import Clusters, ScoreSpread, by_leaving_out, by_signs
 
 PLACES, EACH = 25, 2
 STOPS, PARAMETERS = (6, 8, 12, 20, 30, 60), (1, 4, 16, 64)
@@ -143,7 +143,7 @@ def p_values(
     stop, place, both = (c.covariance(w) for c, w in zip(world.clusters, ways, strict=True))
     more = (place - both) * (np.trace(place - both) > 0.0)
     d = min(clusters.d for clusters in world.clusters[:2]) * signs.nu
-    wide = Chance(stop + more, signs.nu, d, d)
+    wide = ScoreSpread(stop + more, signs.nu, d, d)
     return found | {
         "CV3": wide.p_value(statistic),
         "webb": webb(world.clusters[0], ways[0], rng, bootstraps),

@@ -32,6 +32,7 @@ from sensors.documents import plain
 from ..mishaps.judge import Said, blunders, names, off, read_truth, rigcal
 from ..worlds import World, write
 from ..worlds.knobs import LIDARS
+from .blunders import read
 from .chance_table import show
 
 LIMIT_S = 120  # CPU, of a command; a fit takes 3 s, a diagnosis 5 s
@@ -180,14 +181,6 @@ def _arguments() -> argparse.Namespace:
     if unknown := [f for f in wanted.families if f not in FAMILIES]:
         parser.error(f"no such family: {', '.join(unknown)}; there are {', '.join(FAMILIES)}")
     return wanted
-
-
-def read(path: Path) -> dict[str, dict[str, Any]]:
-    """Results that a file holds, by case; those of cases that failed are left out."""
-    if not path.exists():
-        return {}
-    lines = map(json.loads, path.read_text(encoding="utf-8").splitlines())
-    return {line["case"]: line for line in lines if "error" not in line}
 
 
 def finished(wanted: Sequence[Case], jobs: int) -> Iterator[dict[str, Any]]:

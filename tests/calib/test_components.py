@@ -241,3 +241,15 @@ def test_a_tracker_worse_than_stated_is_named_and_then_nothing_is_missing(worse)
     grown = add(run, found.worth_adding, folder.parent / "grown")
     assert grown.summary["sigmas_widened_by"] == 1.0
     assert diagnose(grown).verdict == "adequate"
+
+
+def test_without_a_mesh_the_planes_are_no_bodies(tmp_path):
+    """Planes are as uneven as the data say; what bodies scatter by is told of bodies alone."""
+    spec = SPEC.model_copy(update={"mesh": False, "column_step": 20})
+    simulate(spec, tmp_path / "rec", 9, {"tracker_scatter": 3.0})
+    found = diagnose(fit([tmp_path / "rec"], tmp_path / "run"))
+    assert "tracker_scatter" in found.worth_adding
+    of = {each["of"] for each in found.scatter if each["effect"] == "tracker_scatter"}
+    assert of == {"base_markers", "mount_markers"}
+    (p,) = (c["p_value"] for c in found.candidates if c["effect"] == "tracker_scatter")
+    assert p >= 1e-6

@@ -165,7 +165,7 @@ def conclude(
         curves=curves(first.unnamed),
         too_few=stops_of(first) < FEWEST,
         rejected=rejected,
-        scatter=[told for each in found.chance for told in each.told()],
+        scatter=[s.document(each.effect.name) for each in found.chance for s in each.spreads],
     )
 
 

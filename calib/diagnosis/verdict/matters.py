@@ -86,8 +86,9 @@ class Consequences:
             explained = 1e3 * screen.rms_m(candidate)
             after = np.sqrt(max(self.error_mm**2 - explained**2, 0.0))
             fall = self.error_mm, float(after), self.floor_mm
-        moved = self._taken[:, candidate.test.columns] @ candidate.test.estimate()
-        shift = float(np.max(np.abs(moved) / self._sigma, initial=0.0))
+        taken, sigma = self._projected
+        moved = taken[:, candidate.test.columns] @ candidate.test.estimate()
+        shift = float(np.max(np.abs(moved) / sigma, initial=0.0))
         return Matters(fall[1] - fall[0], shift, fall[2])
 
     @cached_property
@@ -101,14 +102,6 @@ class Consequences:
         scale = np.sqrt(np.maximum(np.diag(block), 1e-300))
         inverse = np.linalg.inv(block / np.outer(scale, scale) + 1e-13 * np.eye(len(model)))
         return taken[ours], np.sqrt(np.diag(inverse)[ours]) / scale[ours]
-
-    @property
-    def _taken(self) -> np.ndarray:
-        return self._projected[0]
-
-    @property
-    def _sigma(self) -> np.ndarray:
-        return self._projected[1]
 
 
 @dataclass(frozen=True)

@@ -91,7 +91,7 @@ def _step_sentences(step: NamedEffect, candidate: Mapping[str, Any], worn: bool)
     out = [
         f"{step.effect.name} is missing: it bends {_residual(step.before)} by "
         f"{candidate['rms_mm']:.2f} mm rms, {candidate['unabsorbed_rms_mm']:.2f} mm of which the "
-        f"model cannot take on (p = {max(step.p_adjusted, 1e-99):.1g} after all that was looked "
+        f"model cannot take on (p = {step.p_adjusted:.1g} after all that was looked "
         f"at){fall}."
     ]
     for rival in candidate["rivals"][:LISTED]:
