@@ -145,8 +145,12 @@ class Chance:
         """What it says, and what to do about it."""
         each, name = self.effect.per, self.effect.name
         if self.effect.widens:
-            parts = [f"{s.of} {s.told}" for s in self.spreads if s.sd > s.sigma]
-            what = f"More scatter than rig.yaml says, beyond its sigma: {', '.join(parts)}"
+            sizes: dict[str, list[str]] = {}
+            for spread in (s for s in self.spreads if s.sd > s.sigma):
+                sizes.setdefault(spread.of, []).append(spread.told)
+            noun = "tracker" if self.effect.site is Site.TRACKER else "mesh"
+            told = ", ".join(f"{of} by {' and '.join(some)}" for of, some in sizes.items())
+            what = f"The {noun} scatters more than rig.yaml says: beyond its sigma, {told}"
         else:
             what = f"{each.capitalize()}s scatter by {self.spreads[0].told} in range"
         return (
