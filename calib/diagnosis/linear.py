@@ -14,13 +14,11 @@ import numpy as np
 from scipy.sparse import csr_array, diags_array
 
 from calib.linear.clusters import ClusteredRows, Gradients
-from calib.linear.layout import Layout, keys_of, positions
-from calib.linear.linearise import lidars, linearise, own_rows, spread_rows
-from calib.linear.parallel import in_order
-from calib.linear.rows import StopRows
+from calib.linear.layout import Layout, positions
+from calib.linear.linearise import linearise
 from calib.linear.system import Linearisation
-from calib.problem.problem import Block, Problem
-from calib.residuals.tracker import TrackedBody
+from calib.problem.problem import Problem
+from calib.solve.clustered import of_beams, of_graph, of_stops
 from calib.solve.estimate import Estimate
 from calib.solve.fit import Progress
 from calib.solve.graph import Graph
@@ -87,28 +85,11 @@ def rows_along(
     """
     wide, values = beside(wide, estimate)
     candidates = [name for name in wide.variables if name not in estimate.values]
-    layout, scans = Layout.of(wide, unbounded=candidates), wide.scans
+    layout = Layout.of(wide, unbounded=candidates)
     directions = np.concatenate([away[name] for name in layout.at])
-    placed = lidars(scans, values)
-    every, places = np.arange(directions.shape[1]), Gradients(layout.size)
-
-    def work(i: int) -> tuple[np.ndarray, np.ndarray, list[ClusteredRows]]:
-        rows = StopRows.of(scans[i], layout, values, placed[i], estimate.associations[i])
-        root = np.sqrt(rows.weight)
-        parts, cluster = rows.places()
-        stop = np.full(len(root), rows.stop)
-        A, b = rows.along(directions) * root[:, None], root * rows.b
-        found = [ClusteredRows(A, b, every, stop, cluster)]
-        if rows.rows.spread is not None:
-            more = spread_rows(rows.rows.spread, layout)
-            A, b = more.A @ directions[more.columns], more.b
-            found.append(ClusteredRows(A, b, every, stop, cluster))
-        return parts, cluster, found
-
-    for i, (parts, cluster, found) in enumerate(in_order(work, len(scans))):
-        progress(i, len(scans))
-        place = places.numbers(scans[i].room, parts)[cluster]  # here: threads would race for them
-        yield from (rows._replace(place=place) for rows in found)
+    places, met = Gradients(layout.size), estimate.associations
+    yield from of_beams(wide, layout, values, met, directions, places, progress=progress)
+    every = np.arange(directions.shape[1])
     for rows in other_rows(wide, layout, values, places):
         yield rows._replace(A=rows.A @ directions[rows.columns], columns=every)
 
@@ -155,12 +136,6 @@ def linearise_with(
             information[np.ix_(place, place)] += scaled.T @ scaled
             raw[np.ix_(place, place)] += scaled.T @ scaled
     unit = layout.sigma[layout.kept]
-
-    def directions(kept: np.ndarray) -> np.ndarray:
-        """In the unknowns' own units, as the equations are."""
-        scaled = np.vstack([kept / unit[:, None], np.zeros((1, kept.shape[1]))])
-        return linear.directions(scaled) * layout.sigma[:, None]
-
     table, stop, place = gradients.table()
     return Linear(
         candidates=tuple(candidates),
@@ -173,45 +148,28 @@ def linearise_with(
         place=place,
         weight_m2=linear.weight_m2 or sum(len(b.measured) / b.sigma_m**2 for b in wide.bodies),
         whole=linear,
-        directions=directions,
+        directions=linear.followed,
     )
 
 
 def other_rows(
     wide: Problem, layout: Layout, values: Mapping[str, np.ndarray], places: Gradients
 ) -> Iterator[ClusteredRows]:
-    """Rows of tracked bodies, targets and priors, with the stop and place that each errs with."""
-    for stop, found in own_rows(layout, values).items():
-        for rows in found.values():
-            every = np.full(len(rows.b), stop), np.full(len(rows.b), -1)
-            yield ClusteredRows(rows.A, rows.b, rows.columns, *every)
+    """Rows of tracked bodies, targets and priors, with the stop and place that each errs with: each
+    target, and each row of a prior that no stop has for itself, is a place of its own."""
+    yield from of_stops(layout, values)
     for name, cells in wide.cells.items():
         sigma = wide.variables[name].sigma
         A, b = csr_array(diags_array(1.0 / sigma)), -values[name] / sigma
         place = places.numbers(cells.room, cells.surface)
         yield ClusteredRows(A, b, np.r_[layout.at[name]], np.full(len(b), -1), place)
     graph = Graph(list(layout.outer().values()), layout.others, layout.unbounded)
-    for block, by, b in graph.linear_rows(values):
-        A, columns = np.hstack(list(by.values())), layout.columns(list(by))
-        if block is None and next(iter(by)) in wide.calibration:
-            A, b = A / WIDENED, b / WIDENED
-        yield ClusteredRows(A, b, columns, *_clusters(block, list(by), wide, layout, places))
-
-
-def _clusters(
-    block: Block | None, names: Sequence[str], wide: Problem, layout: Layout, places: Gradients
-) -> tuple[np.ndarray, np.ndarray]:
-    """Stop and place of each row of a block of the graph or, where that is None, of a prior. The
-    prior of an unknown that one stop alone touches belongs to that stop; each row of any other
-    prior is a cluster of its own."""
-    if isinstance(block, TrackedBody):
-        numbers = [layout.stops[key] for key in keys_of(block)]
-        return np.repeat(numbers, block.rows // len(numbers)), np.full(block.rows, -1)
-    if block is not None:
-        return np.full(block.rows, -1), np.full(block.rows, places.place(block.name))
-    (name,) = names
-    dofs, known = wide.variables[name].dofs, layout.touched.get(name, frozenset())
-    nowhere = np.full(len(dofs), -1)
-    if len(known) == 1 and -1 not in known:
-        return np.full(len(dofs), *known), nowhere
-    return nowhere, np.array([places.place((name, dof)) for dof in dofs], int)
+    for block, name, rows in of_graph(graph, layout, values):
+        if block is None and name in wide.calibration:
+            rows = rows._replace(A=rows.A / WIDENED, b=rows.b / WIDENED)
+        if block is not None and rows.stop[0] < 0:
+            rows = rows._replace(place=np.full(len(rows.b), places.place(block.name)))
+        elif rows.stop[0] < 0:
+            each = [places.place((name, dof)) for dof in wide.variables[name].dofs]
+            rows = rows._replace(place=np.array(each))
+        yield rows

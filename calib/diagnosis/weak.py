@@ -19,17 +19,17 @@ STANDS_IN = 0.97  # of what a candidate does, that an effect of the model can ta
 MOST_DIRECTIONS = 8
 
 
-def weak_directions(solution: Solution, widened: float, look: Look) -> list[dict[str, Any]]:
+def weak_directions(solution: Solution, look: Look) -> list[dict[str, Any]]:
     """Directions in which a solution leans on paper, then effects that may stand for others.
 
     Returns:
         For each its `parameters`, `sigma_mm` (of a length, or of an angle one metre out; none for
         effects), and what it `needs`.
     """
-    return [*leaning(solution, widened, look), *standing_in(look)]
+    return [*leaning(solution, look), *standing_in(look)]
 
 
-def leaning(solution: Solution, widened: float, look: Look) -> list[dict[str, Any]]:
+def leaning(solution: Solution, look: Look) -> list[dict[str, Any]]:
     """The weakest directions of a run's solution, in units of what was known before."""
     problem = look.stand.problem
     prior = {}
@@ -41,11 +41,7 @@ def leaning(solution: Solution, widened: float, look: Look) -> list[dict[str, An
     if not len(usable):
         return []
     known, names = known[usable], [solution.names[i] for i in usable]
-    scaled = (
-        solution.covariance[np.ix_(usable, usable)]
-        / np.outer(known, known)
-        / max(1.0, widened) ** 2
-    )
+    scaled = solution.intervals.graph[np.ix_(usable, usable)] / np.outer(known, known)
     values, axes = np.linalg.eigh(scaled)
     untold = values > UNTOLD
     gauges, _ = echelon(axes[:, untold], np.ones(len(known)))

@@ -144,10 +144,11 @@ class StopRows:
             weight_m2=float(self.weight.sum()),
         )
 
-    def places(self) -> tuple[np.ndarray, np.ndarray]:
-        """What the rows meet, (G,) surfaces or planes, and which of these each row meets (N,)."""
+    def places(self, kinds: Sequence[str] = PLACES) -> tuple[np.ndarray, np.ndarray]:
+        """What the rows meet, (G,) surfaces or planes, or others of these kinds, and which of these
+        each row meets (N,)."""
         view = self.rows.view
-        kind = next(name for name in PLACES if name in view.columns)
+        kind = next(name for name in kinds if name in view.columns)
         met = view[kind] + 1  # counting, as there are few of them: -1 is nothing
         parts = np.flatnonzero(np.bincount(met))
         number = np.zeros(parts[-1] + 1, int)

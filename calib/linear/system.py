@@ -79,6 +79,13 @@ class Linearisation:
                 out[each.columns] = -each.gain @ out[each.over]
         return out[:-1]
 
+    def followed(self, kept: np.ndarray) -> np.ndarray:
+        """Directions in all unknowns (U, q) that follow from those in the kept (S, q), in the
+        unknowns' own units."""
+        sigma = self.layout.sigma
+        scaled = np.vstack([kept / sigma[self.layout.kept, None], np.zeros((1, kept.shape[1]))])
+        return self.directions(scaled) * sigma[:, None]
+
     def _twists(self, out: np.ndarray) -> np.ndarray:
         used = np.unique(np.concatenate([np.zeros(0, int), *(c for _, _, c in self.twists)]))
         chain = np.zeros((6 * len(self.twists), len(used)))

@@ -17,6 +17,7 @@ from calib.forward import Placed, Stops, place
 from calib.problem import Problem
 from calib.problem.model import Source
 from calib.residuals.tracker import TrackedBody
+from calib.results.intervals import Intervals
 from calib.rig import Rig
 from calib.solve.estimate import Estimate
 from chains import se3
@@ -82,13 +83,13 @@ class Reach:
         }
 
 
-def reach(problem: Problem, estimate: Estimate, widened: float = 1.0) -> Reach | None:
+def reach(problem: Problem, estimate: Estimate, known: Intervals | None = None) -> Reach | None:
     """What an estimate predicts of the first rig's last tracked body beyond its joints.
 
     Args:
         problem: what was estimated.
         estimate: of that.
-        widened: factor on every sigma; see `solution_of`.
+        known: the intervals of the estimate; as the graph has them where None.
 
     Returns:
         None where there are scans, no arm, or no tracked body beyond it.
@@ -107,7 +108,8 @@ def reach(problem: Problem, estimate: Estimate, widened: float = 1.0) -> Reach |
     there = _stops(problem, at_stop, rng.uniform(*range_, (POSES, len(rig.joint_names))), root)
     seen, drawn = (_placed(stops, body, base, estimate.values) for stops in (here, there))
     names = list(seen.d)
-    errors = widened * _errors(estimate.covariance_of(names), rng)
+    at, known = estimate.positions(names), known or Intervals.plain(estimate.covariance)
+    errors = _errors(known.covariance[np.ix_(at, at)], rng)
     low, high = seen.T[:, :3, 3].min(axis=0), seen.T[:, :3, 3].max(axis=0)
     at = drawn.T[:, :3, 3]
     return Reach(

@@ -13,6 +13,7 @@ from calib.effects import FrameOffset
 from calib.problem import Problem
 from calib.problem.prior import JointPrior
 from calib.problem.unknowns import Unknown
+from calib.results.intervals import Intervals, intervals
 from calib.results.solution import Solution
 from calib.solve.estimate import Estimate
 from calib.solve.fit import Progress, solve
@@ -72,8 +73,9 @@ def earlier(problem: Problem, solution: Solution) -> JointPrior:
 
 def solve_from(
     problem: Problem, prior: JointPrior, progress: Progress
-) -> tuple[Estimate, list[Link]]:
-    """Estimate with an earlier solution as prior, letting go link by link of what has moved.
+) -> tuple[Estimate, Intervals, list[Link]]:
+    """Estimate with an earlier solution as prior, letting go link by link of what has moved; with
+    its intervals, and what became of each link.
 
     The link that explains the contradiction between prior and data best is taken to have moved by
     as much as CAD was unsure of it, and the fit repeated, until none is beyond chance (1 % over all
@@ -82,7 +84,8 @@ def solve_from(
     moved: dict[str, _Test] = {}
     while True:
         estimate = solve(problem, prior, progress=progress)
-        tests = _tests(prior, estimate)
+        known = intervals(estimate, progress)
+        tests = _tests(prior, estimate, known)
         found = {n: test for n, test in tests.items() if test is not None and n not in moved}
         worst = min(found, key=found.get, default=None)
         if worst is None or found[worst].p > ALARM / len(tests):
@@ -90,22 +93,27 @@ def solve_from(
         moved[worst] = found[worst]
         prior = prior.loosened(worst)
     tests |= moved
-    return estimate, [_link(v, prior, estimate, tests[v.name], v.name in moved) for v in prior.held]
+    at = estimate.positions([v.name for v in prior.held])
+    now, change = known.covariance[np.ix_(at, at)], _change(prior, estimate)
+    links = [_link(v, prior, change, now, tests[v.name], v.name in moved) for v in prior.held]
+    return estimate, known, links
 
 
-def _tests(prior: JointPrior, estimate: Estimate) -> dict[str, _Test | None]:
+def _tests(prior: JointPrior, estimate: Estimate, known: Intervals) -> dict[str, _Test | None]:
     """Per link, a test of its not having moved; None where the data cannot tell.
 
     Baarda's test of a group of observations, which the prior's means m of covariance S are. With
-    nothing moved, ``d = now - m ~ N(0, S - S_now)``; with P = S^-1, link k alone having moved shows
-    in ``T = (P d)_k^T [(P (S - S_now) P)_kk]^-1 (P d)_k``, chi2-distributed if it has not. Links
-    are strongly correlated, so the change of each by itself would accuse the wrong one.
+    nothing moved, ``d = now - m ~ N(0, V)``, ``V = S - S_now`` and what rows that err together add
+    to S_now; with P = S^-1, link k alone having moved shows in ``T = (P d)_k^T [(P V P)_kk]^-1
+    (P d)_k``, chi2-distributed if it has not. Links are strongly correlated, so the change of each
+    by itself would accuse the wrong one.
 
     Baarda 1968, A testing procedure for use in geodetic networks.
     """
     scale = np.sqrt(np.diag(prior.covariance))
     P = np.linalg.inv(prior.covariance / np.outer(scale, scale))
-    now = _covariance(estimate, prior.held) / np.outer(scale, scale)
+    at = estimate.positions([v.name for v in prior.held])
+    now = (2.0 * known.graph - known.covariance)[np.ix_(at, at)] / np.outer(scale, scale)
     force = P @ (_change(prior, estimate) / scale)
     spread = P - P @ now @ P
     blocks = _blocks(prior.held)
@@ -131,16 +139,26 @@ def _test(force: np.ndarray, spread: np.ndarray, precision: np.ndarray) -> _Test
 
 
 def _link(
-    variable: Unknown, prior: JointPrior, estimate: Estimate, test: _Test | None, moved: bool
+    variable: Unknown,
+    prior: JointPrior,
+    change: np.ndarray,
+    covariance: np.ndarray,
+    test: _Test | None,
+    moved: bool,
 ) -> Link:
     """The link, with the move that explains all changes best where it is the one that moved.
 
     With x = m + error + move, error ~ N(0, S) and move ~ N(0, D_k) of each link k that moved, after
     the fit ``move_k = G (x - m)``, ``G = D_k (S + D)^-1``, of ``G S_now G^T + D_k - G D_k``.
+
+    Args:
+        variable: the link.
+        prior: as it then was.
+        change, covariance: now minus then of all that it holds, and of all these now.
+        test: of the link.
+        moved: whether it did.
     """
     k = _blocks(prior.held)[variable.name]
-    change = _change(prior, estimate)
-    covariance = _covariance(estimate, prior.held)
     if moved:
         D = np.diag(np.square(variable.sigma))
         scale = np.sqrt(np.diag(prior.covariance))
@@ -165,13 +183,6 @@ def _change(prior: JointPrior, estimate: Estimate) -> np.ndarray:
     """Now minus then of all that the prior holds, as one tangent."""
     values = ((v, prior.means[v.name], estimate.values[v.name]) for v in prior.held)
     return np.concatenate([v.difference(then, now) for v, then, now in values])
-
-
-def _covariance(estimate: Estimate, held: Sequence[Unknown]) -> np.ndarray:
-    """Covariance of some of the estimate's variables, in the order given."""
-    blocks, order = _blocks(estimate.variables), np.arange(len(estimate.covariance))
-    index = np.concatenate([order[blocks[v.name]] for v in held])
-    return estimate.covariance[np.ix_(index, index)]
 
 
 def _blocks(variables: Sequence[Unknown]) -> dict[str, slice]:

@@ -12,6 +12,7 @@ from calib.effects import FrameOffset
 from calib.forward import Term
 from calib.problem import Problem
 from calib.problem.model import Source
+from calib.results.intervals import Intervals
 from calib.results.observability import not_estimated
 from calib.solve.components import spreads
 from calib.solve.estimate import Estimate
@@ -65,14 +66,19 @@ class Solution:
         recordings: rig name -> what belongs to it alone; empty where there is one rig.
         not_estimated: a `name` and a `why` for what the data could not tell.
         names: (P,) calibration parameters, ``variable.parameter``.
-        covariance: (P, P) joint covariance, m and rad.
+        intervals: of these, m and rad.
     """
 
     shared: Part
     recordings: dict[str, Part]
     not_estimated: list[dict[str, str]]
     names: tuple[str, ...]
-    covariance: np.ndarray
+    intervals: Intervals
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """(P, P) of the parameters, m and rad."""
+        return self.intervals.covariance
 
     def part(self, rig: str | None) -> Part:
         """All frames and effects that hold for one rig."""
@@ -87,14 +93,15 @@ class Solution:
         return out
 
 
-def solution_of(problem: Problem, estimate: Estimate, widened: float = 1.0) -> Solution:
+def solution_of(problem: Problem, estimate: Estimate, known: Intervals | None = None) -> Solution:
     """An estimate as frames and effects, with what it could not tell.
 
     Args:
         problem, estimate: what was estimated, and how it came out.
-        widened: factor on every sigma, above 1 where residuals are larger than theirs allow.
+        known: the intervals of the estimate; as the graph has them where None.
     """
-    told = widened**2 * estimate.covariance
+    known = known or Intervals.plain(estimate.covariance)
+    told = known.covariance
     start = np.cumsum([0] + [v.dim for v in estimate.variables])
     at = {v.name: slice(a, a + v.dim) for v, a in zip(estimate.variables, start, strict=False)}
     shared, recordings, scatter = Part(), {}, spreads(estimate)
@@ -104,7 +111,7 @@ def solution_of(problem: Problem, estimate: Estimate, widened: float = 1.0) -> S
             own = term.variable != term.effect.name
             part = recordings.setdefault(rig.name, Part()) if own else shared
             if term.effect.by_chance:
-                part.effects[term.effect.name] = _spread(term, scatter, widened)
+                part.effects[term.effect.name] = _spread(term, scatter)
                 continue
             theta = estimate.values[term.variable]
             covariance = told[at[term.variable], at[term.variable]]
@@ -117,8 +124,8 @@ def solution_of(problem: Problem, estimate: Estimate, widened: float = 1.0) -> S
             T = estimate.values[rig.reference_frame]
             shared.frames[rig.reference_frame] = _pose(rig.world, T, covariance)
         for name, edge in zip(rig.tree.edge_names, rig.tree.edges, strict=True):
-            known = name in shared.frames or name in recordings.get(rig.name, Part()).frames
-            if name in rig.frame_sigma and not known:
+            there = name in shared.frames or name in recordings.get(rig.name, Part()).frames
+            if name in rig.frame_sigma and not there:
                 shared.frames[name] = _pose(edge.parent, edge.T_parent_child, np.zeros((6, 6)))
     effects = frozenset(
         t.variable
@@ -133,7 +140,7 @@ def solution_of(problem: Problem, estimate: Estimate, widened: float = 1.0) -> S
         recordings=recordings,
         not_estimated=untold + _absent(problem),
         names=names,
-        covariance=told,
+        intervals=known,
     )
 
 
@@ -166,14 +173,14 @@ def _effect(
     return EffectEstimate(unit, tuple(p.name for p in params), estimate, sigma)
 
 
-def _spread(term: Term, told: Mapping[str, tuple[float, float]], widened: float) -> EffectEstimate:
+def _spread(term: Term, told: Mapping[str, tuple[float, float]]) -> EffectEstimate:
     """What is known of an effect by chance: how widely it scatters; of several bodies, each."""
     mine = {key: each for key, each in told.items() if key.startswith(f"{term.variable}.")}
     mine = mine or {f"{term.variable}.sd": told[term.variable]}
     names = tuple(key.removeprefix(f"{term.variable}.") for key in mine)
     units = [name.rpartition(".")[2] if term.effect.widens else term.effect.unit for name in names]
     sd, sigma = np.array(list(mine.values())).T
-    return EffectEstimate(one_unit(units), names, sd, widened * sigma)
+    return EffectEstimate(one_unit(units), names, sd, sigma)
 
 
 def _absent(problem: Problem) -> list[dict[str, str]]:

@@ -21,6 +21,7 @@ from calib.problem.model import Model, Source
 from calib.problem.without import leave_out
 from calib.results.errors import Errors, body_errors, misfit, row_errors, scan_errors
 from calib.results.holdout import held_out, unit_of
+from calib.results.intervals import intervals
 from calib.results.misfit import misfit_by, prior_rows, target_rows, tracker_rows
 from calib.results.reach import reach
 from calib.results.recalibrate import Link, earlier, solve_from
@@ -181,8 +182,9 @@ def _fit(
     links: list[Link] | None = None
     if before is None:
         estimate = solve(problem, progress=progress, start=start)
+        known = intervals(estimate, progress)
     else:
-        estimate, links = solve_from(problem, earlier(problem, before), progress)
+        estimate, known, links = solve_from(problem, earlier(problem, before), progress)
     unseen, by = Errors(), None
     if choices.hold_out != "none" and estimate.converged:
         unseen = held_out(sources, model, choices.hold_out, choices.folds, progress, estimate.start)
@@ -200,16 +202,18 @@ def _fit(
     worse = misfit(estimate, seen)
     bulk = misfit(estimate, seen, weighted=True)  # one wild row widens no sigma
     widened = max([1.0, *(x for x in bulk.values() if x > TOLERATED)])
-    solution = solution_of(problem, estimate, widened)
+    known = known.at_least(widened)
+    solution = solution_of(problem, estimate, known)
     write_yaml(folder / SOLUTION, solution.document())
-    np.savez(folder / COVARIANCE, names=np.array(solution.names), covariance=solution.covariance)
+    arrays = {"covariance": solution.covariance, "wider": known.wider}
+    np.savez(folder / COVARIANCE, names=np.array(solution.names), **arrays)
     write_state(folder, estimate.state, stored_met(estimate.start, sources))
     write_yaml(folder / MODEL, _model_document(sources, model, choices))
     summary = _summary(problem, estimate, nominal, seen, unseen)
     rows = tracker_rows(estimate), target_rows(estimate), prior_rows(estimate)
     write_rows(folder / RESIDUALS, *rows)
     summary |= {"misfit": worse, "misfit_by": misfit_by(estimate, *rows, by_stop)}
-    reached = reach(problem, estimate, widened)
+    reached = reach(problem, estimate, known)
     summary |= {"sigmas_widened_by": widened, "held_out_by": by, "without": list(model.without)}
     summary["set_aside"] = sorted(estimate.problem.set_aside)
     summary["predicted_mm"] = reached.document() if reached else None

@@ -81,7 +81,7 @@ def _found(
         found,
         falls,
         run.summary,
-        weak_directions(run.solution, float(run.summary["sigmas_widened_by"]), found.looks[0]),
+        weak_directions(run.solution, found.looks[0]),
         rejected,
         forbids(run),
         [told.of_rings(lidar, each) for lidar, each in harmful.items()],

@@ -101,6 +101,13 @@ class Estimate:
         seen = {f"{name}{SEEN}": x for name, x in self.seen.items()}
         return self.values | dofs | spread | seen
 
+    def positions(self, names: Sequence[str]) -> np.ndarray:
+        """Where parameters of some of the `variables` stand in the covariance, in the order
+        given."""
+        ends = np.cumsum([0, *(v.dim for v in self.variables)])
+        at = {v.name: np.arange(a, a + v.dim) for v, a in zip(self.variables, ends, strict=False)}
+        return np.concatenate([at[name] for name in names])
+
     def touched(self) -> np.ndarray:
         """Whether any measurement depends on each parameter of the calibration: (P,) bool."""
         layout, seen = self.linear.layout, self.linear.touched.copy()
@@ -120,14 +127,15 @@ class Estimate:
         columns = layout.columns(names)
         rows = np.zeros((len(columns), layout.size))
         rows[np.arange(len(columns)), columns] = 1.0
-        return self.linear.covariance(rows, self._kept)
+        return self.linear.covariance(rows, self.kept)
 
     def variance_of(self, names: Sequence[str], rows: np.ndarray) -> np.ndarray:
         """Variances (m,) of ``rows @ tangents``; see `Linearisation.variances`."""
-        return self.linear.variances(names, rows, self._kept)
+        return self.linear.variances(names, rows, self.kept)
 
     @cached_property
-    def _kept(self) -> np.ndarray:
+    def kept(self) -> np.ndarray:
+        """Covariance (S, S) of what no elimination has taken out of the graph."""
         return self.graph.covariance(self.values, list(self.linear.layout.outer()))
 
 

@@ -14,6 +14,7 @@ from calib.problem import build
 from calib.problem.model import Model, Source
 from calib.results.check import check
 from calib.results.holdout import BLOCKS, FOLDS, folds, pose_blocks, unit_of
+from calib.results.intervals import Intervals
 from calib.results.reach import Reach, joint_range, reach
 from calib.results.solution import solution_of
 from calib.runs.calibrate import calibrate
@@ -141,7 +142,8 @@ def test_what_is_predicted_is_what_the_covariance_does_to_the_chain(solved, sour
     assert found.anywhere_m == pytest.approx(apart(anywhere), rel=0.06)
     assert found.at_poses_m == pytest.approx(apart(seen), rel=0.06)
     assert found.is_small and found.box_share < 0.1 and "add poses" in found.warning
-    assert reach(problem, estimate, 2.0).anywhere_m == pytest.approx(2 * found.anywhere_m)
+    twice = Intervals.plain(estimate.covariance).at_least(2.0)
+    assert reach(problem, estimate, twice).anywhere_m == pytest.approx(2 * found.anywhere_m)
 
 
 def test_joints_without_limits_turn_once(source):

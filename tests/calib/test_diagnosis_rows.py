@@ -65,7 +65,7 @@ def sizes(A):
 def test_places_are_numbered_in_the_order_of_stops_however_many_threads(stand, monkeypatch):
     """The first stop takes longest, and each meets a place of its own."""
 
-    def places(rows):
+    def places(rows, kinds):
         time.sleep(0.05 if rows.stop == 0 else 0.0)
         return np.array([rows.stop]), np.zeros(len(rows.b), int)
 

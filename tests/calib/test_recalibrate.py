@@ -9,6 +9,7 @@ from scipy.stats import kstest
 from calib.problem.prior import JointPrior
 from calib.problem.unknowns import Unknown
 from calib.results import recalibrate
+from calib.results.intervals import Intervals
 
 NAMES = ("mount", "lidar", "arm", "unseen")
 DIM, CAD_SIGMA = 3, 1.0
@@ -49,12 +50,21 @@ def world(monkeypatch):
             weight = np.linalg.inv(prior.covariance)
             covariance = np.linalg.inv(weight + information)
             x = covariance @ (weight @ m + J.T @ y)
-            return SimpleNamespace(variables=variables, values=values(x), covariance=covariance)
+            names = [v.name for v in variables]
+            return SimpleNamespace(
+                variables=variables,
+                values=values(x),
+                covariance=covariance,
+                positions=lambda some: np.concatenate(
+                    [DIM * names.index(name) + np.arange(DIM) for name in some]
+                ),
+            )
 
         monkeypatch.setattr(recalibrate, "solve", solve)
+        monkeypatch.setattr(recalibrate, "intervals", lambda e, _: Intervals.plain(e.covariance))
         prior = JointPrior(variables, values(m), then)
         problem = SimpleNamespace(calibration=NAMES, variables={v.name: v for v in variables})
-        return {link.name: link for link in recalibrate.solve_from(problem, prior, None)[1]}
+        return {link.name: link for link in recalibrate.solve_from(problem, prior, None)[2]}
 
     return at
 

@@ -11,6 +11,7 @@ from calib.report.charts.bodies import Arrows, magnification
 from calib.report.charts.groups import groups
 from calib.report.charts.knowledge import tied
 from calib.report.verdict import judge
+from calib.results.intervals import Intervals
 from calib.results.solution import Solution
 from calib.runs.run import Run
 
@@ -22,7 +23,13 @@ def test_correlations_are_those_of_the_covariance_and_large_effects_are_summed_u
     covariance[3:, 3:] += 1.0
     covariance[2, 3:] = covariance[3:, 2] = -0.7
     chosen, matrix = tied(
-        Solution(shared=None, recordings={}, not_estimated=[], names=names, covariance=covariance),
+        Solution(
+            shared=None,
+            recordings={},
+            not_estimated=[],
+            names=names,
+            intervals=Intervals.plain(covariance),
+        ),
         None,
     )
     assert chosen == ["a.x", "a.y", "b.z", "mean of rings"]
@@ -35,7 +42,7 @@ def test_correlations_are_those_of_the_covariance_and_large_effects_are_summed_u
             recordings={},
             not_estimated=[],
             names=names[:3],
-            covariance=covariance[:3, :3],
+            intervals=Intervals.plain(covariance[:3, :3]),
         ),
         weak,
     )

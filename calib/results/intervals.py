@@ -1,0 +1,198 @@
+"""How well an estimate is known, told by rows that err together.
+
+The graph's covariance is right where rows err alone, and as much as their sigmas say. Rows of a
+stop share what the model lacks there, rows on a part of the room share what the mesh has wrong
+there, and a target's rows share its place. So the sums of rows, cluster by cluster, say how far
+they err together. At the optimum ``x = C J^T W b`` is 0 for every parameter x; its part of cluster
+c is ``t_c``, and ``h_c`` is the cluster's share of what is known of x, priors included. With p the
+share of the priors of the hardware, which no cluster has, the variance is, in units of C,
+
+    v = p + sum_stops u^2 + max(0, sum_parts u^2 - sum_both u^2),    u = t / (1 - h)
+
+for stops and targets, for parts of the room, and for both at once (Cameron, Gelbach and Miller
+2011). Dividing by ``1 - h`` compares each cluster with what all others predict (the cluster
+jackknife CV3 of MacKinnon, Nielsen and Webb 2022). From the h follow the degrees of freedom of each
+sum, were the model to hold (Bell and McCaffrey 2002), and Satterthwaite's of v. Where they are
+fewer than `FEWEST`, as one or two clusters tell nearly all that is known, v says nothing, and the
+graph is believed. No interval is narrower than the graph has it.
+
+Estimates are told with a sigma: it is half the 95 % interval over 1.96, of t with as many degrees
+of freedom.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+import numpy as np
+from scipy import special
+from scipy.sparse import csr_array
+
+from calib.linear.clusters import ClusteredRows, Gradients
+from calib.linear.layout import positions
+from calib.linear.rows import PLACES
+from calib.solve.clustered import of_beams, of_graph, of_stops
+from calib.solve.estimate import Estimate
+from calib.solve.fit import Progress
+from calib.solve.graph import KeptRows
+
+REGION = "region"
+PARTS = (REGION, *PLACES)  # of the room, whose beams share the error of the mesh or plane there
+FEWEST = 3.0  # degrees of freedom: with 2, t is more than twice as wide as a normal interval
+MANY = 1e6  # degrees of freedom at which t is normal
+# Of what is known of a parameter: a cluster with more leaves nothing to compare it with.
+ALONE = 0.999
+LEVEL = 0.975  # the quantile at which a 95 % interval ends
+NORMAL = float(special.ndtri(LEVEL))
+
+
+@dataclass(frozen=True)
+class Intervals:
+    """What is known of the calibration's P parameters.
+
+    Args:
+        graph: (P, P) covariance of their tangents, as the graph has it.
+        wider: (P,) how many times wider than that each interval is, at least 1.
+    """
+
+    graph: np.ndarray
+    wider: np.ndarray
+
+    @classmethod
+    def of(cls, covariance: np.ndarray, wider: np.ndarray) -> Intervals:
+        """From the covariance (P, P) of the intervals themselves."""
+        return cls(covariance / _times(wider), wider)
+
+    @classmethod
+    def plain(cls, covariance: np.ndarray) -> Intervals:
+        """As the graph has them."""
+        return cls(covariance, np.ones(len(covariance)))
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """(P, P): what comes on top of the graph's is correlated as that is."""
+        return self.graph * _times(self.wider)
+
+    def at_least(self, wider: float) -> Intervals:
+        """With every interval at least so many times wider than the graph has it."""
+        return replace(self, wider=np.maximum(self.wider, wider))
+
+
+def _times(wider: np.ndarray) -> np.ndarray:
+    """(P, P) how many times the graph's each covariance is."""
+    more = np.sqrt(np.square(wider) - 1.0)
+    return 1.0 + np.outer(more, more)
+
+
+def intervals(estimate: Estimate, progress: Progress = lambda what, done, total: None) -> Intervals:
+    """The intervals of an estimate.
+
+    Args:
+        estimate: with its graph and linearisation.
+        progress: called with what is being done, how many stops are done, and of how many.
+    """
+    linear, layout, values = estimate.linear, estimate.linear.layout, estimate.values
+    sigma = np.sqrt(np.diag(estimate.covariance))
+    at = positions(layout.size, layout.kept)[layout.columns([v.name for v in estimate.variables])]
+    directions = linear.followed(estimate.kept[:, at] / sigma)
+    sums, places, stops = _Sums(), Gradients(layout.size), len(layout.stops)
+    problem, met = estimate.problem, estimate.associations
+    tell = partial(progress, "how far rows err together")
+    for rows in of_beams(problem, layout, values, met, directions, places, PARTS, tell):
+        sums.add(rows)
+    others = [*of_stops(layout, values), *_of_cells(estimate, places)]
+    for block, _, rows in of_graph(estimate.graph, layout, values):
+        if block is not None and block.kind == "target":
+            rows, stops = rows._replace(stop=np.full(len(rows.b), stops)), stops + 1
+        if not isinstance(block, KeptRows):
+            others.append(rows)
+    for rows in others:
+        sums.add(rows._replace(A=rows.A @ directions[rows.columns]))
+    return Intervals(estimate.covariance, sums.wider())
+
+
+def _of_cells(estimate: Estimate, places: Gradients) -> list[ClusteredRows]:
+    """Priors of parts of the room, each with the region that it is in; those of whole surfaces are
+    with nothing else, as nothing is repeated of a surface."""
+    found, layout, region = [], estimate.linear.layout, _regions(estimate)
+    for name, cells in estimate.problem.cells.items():
+        sigma = estimate.problem.variables[name].sigma
+        where = region.get((cells.room, cells.column), {})
+        place = [
+            places.place((cells.room, where[part])) if part in where else -1
+            for part in cells.parts.tolist()
+        ]
+        A, b = csr_array(np.diag(1.0 / sigma)), -estimate.values[name] / sigma
+        columns, nowhere = np.r_[layout.at[name]], np.full(len(b), -1)
+        found.append(ClusteredRows(A, b, columns, nowhere, np.array(place, int)))
+    return found
+
+
+def _regions(estimate: Estimate) -> dict[tuple[object, str], dict[int, int]]:
+    """Room and kind of part -> the region that each part is in, or the first of several."""
+    found: dict[tuple[object, str], dict[int, int]] = {}
+    for scan, met in zip(estimate.scans, estimate.associations, strict=True):
+        if REGION not in met.patches:
+            continue
+        for kind, part in met.patches.items():
+            pairs = np.unique(np.stack([part, met.patches[REGION]], axis=1), axis=0)
+            known = found.setdefault((scan.room, kind), {})
+            for inner, region in pairs[pairs[:, 0] >= 0].tolist():
+                known.setdefault(inner, region)
+    return found
+
+
+@dataclass
+class _Sums:
+    """By cell of stop and part of the room: what rows add to each parameter, and their share of
+    what is known of it, in units of the graph's sigma and its square."""
+
+    cells: list[np.ndarray] = field(default_factory=list)
+    moved: list[np.ndarray] = field(default_factory=list)
+    share: list[np.ndarray] = field(default_factory=list)
+
+    def add(self, rows: ClusteredRows) -> None:
+        """Add whitened rows along the directions of the parameters."""
+        cells, at = np.unique([rows.stop, rows.place], axis=1, return_inverse=True)
+        self.cells.append(cells)
+        self.moved.append(_summed(rows.A * rows.b[:, None], at))
+        self.share.append(_summed(np.square(rows.A), at))
+
+    def wider(self) -> np.ndarray:
+        """How many times wider the intervals are than the graph has them (P,)."""
+        (stop, part), moved = np.hstack(self.cells), np.vstack(self.moved)
+        share = np.vstack(self.share)
+        paper = share[(stop < 0) & (part < 0)].sum(axis=0)
+        some = (stop >= 0) | (part >= 0)
+        stop, part, moved, share = stop[some], part[some], moved[some], share[some]
+        if not len(stop):
+            return np.ones(len(paper))
+        # What has no stop is a cluster of its part among the stops, and the other way round.
+        by_stop, d_stop = _spread(moved, share, np.where(stop >= 0, stop, -1 - part))
+        by_part, d_part = _spread(moved, share, np.where(part >= 0, part, -1 - stop))
+        both = np.unique([stop, part], axis=1, return_inverse=True)[1]
+        by_both, _ = _spread(moved, share, both)
+        beyond = np.maximum(by_part - by_both, 0.0)
+        variance = paper + by_stop + beyond
+        d = np.square(variance) / np.maximum(by_stop**2 / d_stop + beyond**2 / d_part, 1e-300)
+        wider = np.sqrt(variance) * special.stdtrit(np.clip(d, 1.0, MANY), LEVEL) / NORMAL
+        return np.where(d < FEWEST, 1.0, np.maximum(1.0, wider))
+
+
+def _spread(moved: np.ndarray, share: np.ndarray, number: np.ndarray) -> tuple[np.ndarray, ...]:
+    """The sum over clusters of squares (P,), and its degrees of freedom, from what cells (C, P) add
+    and their share; the `number` of the cluster of each (C,)."""
+    at = np.unique(number, return_inverse=True)[1]
+    moved, share = _summed(moved, at), np.minimum(_summed(share, at), ALONE)
+    size = share / (1.0 - share)  # expected of each square; and of the product of two:
+    common = np.square(size)
+    among = np.square(common.sum(axis=0)) - np.square(common).sum(axis=0)
+    d = np.square(size.sum(axis=0)) / np.maximum(np.square(size).sum(axis=0) + among, 1e-300)
+    return np.square(moved / (1.0 - share)).sum(axis=0), np.maximum(d, 1.0)
+
+
+def _summed(values: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Sums (G, P) of values (N, P) by group (N,), numbered from 0."""
+    pick = csr_array((np.ones(len(at)), at, np.arange(len(at) + 1)), shape=(len(at), at.max() + 1))
+    return pick.T @ values
