@@ -9,7 +9,7 @@ from typing import Any
 from calib.runs.belief import FAR_OFF, forbids, misfit_sentence, over_floor
 from calib.runs.calibrate import TOLERATED
 from calib.runs.run import Run
-from calib.show.misfit import standing_out
+from calib.show.misfit import standing_out, together_told
 
 AT_THE_FLOOR = 1.25  # times the noise floor: a held-out error as good as it
 MEANING = {"green": "use it", "amber": "use it with care", "red": "do not use it yet"}
@@ -90,6 +90,7 @@ def _doubtful(run: Run, diagnosis: Mapping[str, Any] | None) -> Iterator[str]:
     for kind, times in run.summary["misfit"].items():
         if TOLERATED < times <= FAR_OFF:
             yield misfit_sentence(kind, times)
+    yield from together_told(run.summary)
     yield from standing_out(run.summary)
     for weak in (diagnosis or {}).get("weak_directions", ()):
         if (weak["sigma_mm"] or 0.0) > FAR_OFF * rms["noise_floor"]:

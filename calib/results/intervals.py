@@ -22,6 +22,7 @@ of freedom.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -73,6 +74,16 @@ class Intervals:
     def covariance(self) -> np.ndarray:
         """(P, P): what comes on top of the graph's is correlated as that is."""
         return self.graph * _times(self.wider)
+
+    def document(self, names: Sequence[str]) -> dict[str, float | str]:
+        """As summary.json holds how much wider they are.
+
+        Args:
+            names: (P,) of the parameters.
+        """
+        most = int(np.argmax(self.wider))
+        median = float(np.median(self.wider))
+        return {"median": median, "most": float(self.wider[most]), "parameter": names[most]}
 
     def at_least(self, wider: float) -> Intervals:
         """With every interval at least so many times wider than the graph has it."""

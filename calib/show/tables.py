@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from rich.text import Text
 
 from calib.blunders.chance import LEAST_P
 from calib.runs.estimates import VariableEstimate, variable_estimates
-from calib.show.misfit import beams_told, standing_out
+from calib.show.misfit import beams_told, standing_out, together_told
 from calib.show.scale import shown
 from chains import escape
 
@@ -76,23 +76,26 @@ def print_run(run: Run) -> None:
         print_pairs(console, "how well the arm is known", [("", t) for t in predicted["told"]])
     if told := standing_out(summary):
         print_pairs(console, "what does not fit", [("", line) for line in told])
-    if summary.get("sigmas_widened_by", 1.0) > 1.0:
-        console.print(_warning(summary), style="bold", soft_wrap=True)
+    for warning in _warnings(summary):
+        console.print(warning, style="bold", soft_wrap=True)
         console.print()
     if "links" in summary:
         _print_moved(console, summary["links"])
     _print_reasons(console, "not told by the data", run.solution.not_estimated)
 
 
-def _warning(summary: dict[str, Any]) -> str:
-    """That residuals are larger than they may be, where, and what was done about it."""
-    factor = summary["sigmas_widened_by"]
-    kind = max(summary["misfit"], key=summary["misfit"].get)
-    what = "errors of the reference" if kind == "reference" else f"residuals of {kind}"
-    return (
-        f"the {what} are {factor:.1f} times larger than their sigmas allow: something is missing "
-        f"from the model, or a sigma in rig.yaml too small; every sigma above is widened by that"
-    )
+def _warnings(summary: dict[str, Any]) -> Iterator[str]:
+    """That residuals are larger than they may be, or err together, and what was done about it."""
+    if (factor := summary.get("sigmas_widened_by", 1.0)) > 1.0:
+        kind = max(summary["misfit"], key=summary["misfit"].get)
+        what = "errors of the reference" if kind == "reference" else f"residuals of {kind}"
+        yield (
+            f"the {what} are {factor:.1f} times larger than their sigmas allow: something is "
+            f"missing from the model, or a sigma in rig.yaml too small; every sigma above is "
+            f"widened by that"
+        )
+    for told in together_told(summary):
+        yield f"{told}; 'rigcal diagnose' looks for the cause"
 
 
 def effect_page(effect: Effect) -> dict[str, Any]:

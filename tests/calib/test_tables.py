@@ -371,3 +371,13 @@ def test_a_misfit_is_said_and_named(run, capsys):
     misfit = {"misfit": {"beams": 0.9, "tracker": 4.4}, "sigmas_widened_by": 4.4}
     tables.print_run(replace(run, summary=run.summary | misfit))
     assert "residuals of tracker are 4.4 times larger than their sigmas" in capsys.readouterr().out
+
+
+def test_rows_that_err_together_are_told(run, capsys):
+    wider = {"median": 1.87, "most": 2.4, "parameter": "ring_range_offset.ring_045"}
+    tables.print_run(replace(run, summary=run.summary | {"intervals_wider_by": wider}))
+    told = capsys.readouterr().out
+    assert "sigmas are 1.9 times what single rows would give (median; 2.4 for ring_range" in told
+    slight = {"intervals_wider_by": wider | {"median": 1.1}}
+    tables.print_run(replace(run, summary=run.summary | slight))
+    assert "single rows" not in capsys.readouterr().out
