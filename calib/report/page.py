@@ -166,7 +166,7 @@ def _told(candidate: dict[str, Any]) -> list[str]:
         cell = estimate_cell(parameters["estimate"][0], parameters["sigma"][0], unit)
         out.append(f"its size would be {cell} {shown(unit)[1]}".rstrip())
     if candidate["dressed_up"]:
-        out.append("bins without a name explain more, so it is not to be believed")
+        out.append("rejected: a generic function of other covariates (bins) explains more")
     for rival in candidate["rivals"]:
         out.append(f"this data cannot tell it from {rival['effect']}, {rival['separate']} would")
     return out

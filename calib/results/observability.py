@@ -100,12 +100,12 @@ def _grouped(owner: Sequence[str], names: Sequence[str]) -> str:
 def _why(touched: bool, partners: str) -> str:
     if partners:
         return (
-            f"tied to {partners}: all that is measured changes alike, so only their combination is "
-            f"estimated and the priors share it out; measure one of them directly to split it"
+            f"tied to {partners}: the data determine only their combination, and how it is divided "
+            f"follows from the sigmas in rig.yaml; to separate them, measure one of them directly"
         )
     if touched:
         return (
-            "tied to where the rig's root stands, which is unknown too: all that is measured "
-            "changes alike; track a body on the root, or measure it directly"
+            "tied to the pose of the rig's root, which is unknown too: the data determine only "
+            "their combination; track a body on the root, or measure it directly"
         )
-    return "nothing measured here depends on it, so it stays as well known as before"
+    return "no measurement depends on it, so its estimate and sigma are those of rig.yaml"

@@ -139,8 +139,8 @@ def weighed(
         matter[name] = told
         if told.worse:
             refused.append(
-                f"{name} takes on a part of it, and stops that were held out are predicted worse "
-                f"with it ({told.held_out_mm:+.3f} mm), so it is not to be believed."
+                f"{name} was tried and rejected: it absorbs part of the residuals, but stops that "
+                f"were held out are predicted worse with it ({told.held_out_mm:+.3f} mm)."
             )
         elif told.enough:
             named.append(step)

@@ -47,17 +47,17 @@ def sentences_of(
         out += _step_sentences(step, candidate, found.dressed_up(i))
     if verdict == UNNAMED and found.chance:
         beside = ", ".join(each.effect.name for each in found.chance)
-        out.append(f"What scatters beside it ({beside}) is judged once that is in the model.")
+        out.append(f"Random scatter ({beside}) is judged once that structure is in the model.")
     else:
         out += [each.sentence for each in found.chance]
     out += [*heavy.refused, *traces]
     if verdict == UNNAMED:
         beside = any(c["step"] and not c["dressed_up"] for c in candidates)
-        what = "Beside what is named here, something" if beside else "Something"
-        out.insert(0, f"{what} is here that no known effect explains.")
+        what = "Beside what is named here, there" if beside else "There"
+        out.insert(0, f"{what} is structure in the residuals that no known effect explains.")
     for each in unexplained[:2]:
         what = " and ".join(words(c) for c in each["covariates"])
-        out.append(f"What is left hangs on {what}: {each['rms_mm']:.2f} mm rms of {residual}.")
+        out.append(f"The residual structure depends on {what}: {each['rms_mm']:.2f} mm rms of {residual}.")
         if each["formula"]:
             out.append(
                 f"An empirical effect for it can be added by its name, '{each['formula']['name']}'."
@@ -66,8 +66,8 @@ def sentences_of(
     if found.scatter is not None:
         what = " and ".join(words(c) for c in found.scatter.effect.covariates)
         out.append(
-            f"The scatter grows with {what} otherwise than the LiDAR's model has it: "
-            f"{found.scatter.effect.name} would weigh the rows better, and move no mean."
+            f"The noise depends on {what} otherwise than the LiDAR's noise model says: "
+            f"{found.scatter.effect.name} would give the rows better weights; it changes no mean."
         )
     gone = [name for name, why in untestable.items() if why.startswith("the recordings")]
     if gone:
@@ -80,19 +80,18 @@ def _step_sentences(step: NamedEffect, candidate: Mapping[str, Any], worn: bool)
     """Of a named effect; `worn` where bins without a name explain more than it does."""
     before, after = (candidate["held_out_rms_mm"][k] for k in ("before", "after"))
     if candidate["dressed_up"]:
-        why = "bins without any name explain more"
+        why = "a generic function of other covariates (bins) explains more"
         if after and not worn:
             why = f"most of the held-out error stays ({before:.2f} to {after:.2f} mm)"
         return [
-            f"{step.effect.name} takes on a part of it, as a name will; {why}, so it is not to be "
-            f"believed."
+            f"{step.effect.name} was tried and rejected: it absorbs part of the residuals, but "
+            f"{why}."
         ]
     fall = f"; the held-out error goes from {before:.2f} to {after:.2f} mm" if after else ""
     out = [
-        f"{step.effect.name} is missing: it bends {_residual(step.before)} by "
-        f"{candidate['rms_mm']:.2f} mm rms, {candidate['unabsorbed_rms_mm']:.2f} mm of which the "
-        f"model cannot take on (p = {step.p_adjusted:.1g} after all that was looked "
-        f"at){fall}."
+        f"{step.effect.name} is missing: it changes {_residual(step.before)} by "
+        f"{candidate['rms_mm']:.2f} mm rms, of which {candidate['unabsorbed_rms_mm']:.2f} mm is not "
+        f"absorbed by the model (adjusted p = {step.p_adjusted:.1g}){fall}."
     ]
     for rival in candidate["rivals"][:LISTED]:
         out.append(

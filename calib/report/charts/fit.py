@@ -42,7 +42,7 @@ def ladder(evidence: Evidence) -> Iterator[Chart | Absent]:
         else f"The {kind} error is {last:.2f} mm, {near} the noise floor of {floor:.2f} mm",
         "A row per run, each named by what it added to the one above. Blue: rms error of stops "
         "that its fit never saw; hollow: of those it saw; green: what would be left if the model "
-        "were right. Further left is better, and left of green is as good as it gets.",
+        "were right. Further left is better; an error at the green mark cannot be told from noise.",
         lambda: _ladder(evidence),
         wide=True,
     )

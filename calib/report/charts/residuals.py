@@ -97,9 +97,9 @@ def _title(name: str, now: ResidualCurve, was: ResidualCurve | None, before: str
         earlier = f"; {before}: {size_mm:.2f} mm rms" if size_mm >= 0.005 else f"; nor {before}"
     what = spoken(name)
     if not bins:
-        return f"Of {what} nothing can be said: a single stop and surface"
+        return f"Nothing can be said of {what}: a single stop and surface"
     if hangs:
-        return f"What is left hangs on {what}: {1e3 * now.rms_m:.2f} mm rms{earlier}"
+        return f"The residuals depend on {what}: {1e3 * now.rms_m:.2f} mm rms{earlier}"
     inside = f"{bins - out} of {bins} bins within their band"
     return f"No clear trace of {what} is left ({inside}{earlier})"
 
