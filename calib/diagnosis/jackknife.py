@@ -32,11 +32,15 @@ at a nominal 0.05, with 1, 4, 16 and 64 parameters and 6 to 60 stops, 240 draws 
 alone, stops err together by up to three times a row's sigma, stops and surfaces do by half of it,
 three stops show most of the effect, or it acts within stops only, 0.02 to 0.07 of empty worlds
 show something, stops averaged over (0.12 in the worst of 192 cases); none, where parameters that
-act by stop are as many as the stops. Limits: 0.13 with few stops where surfaces err by three times
-a row's sigma and the model does not know it; and a model that itself has unknowns that differ by
-stop alone, as residuals then scatter less than errors: with three of these 0.15 for 6 to 12 stops
-and 0.09 for 30, and 0.3 for 16 parameters and 12 stops. An effect of 30 sigmas that three of thirty
-stops show is found at 0.001 in 0.9 of worlds, by signs alone in none.
+act by stop are as many as the stops. A limit: 0.13 with few stops where surfaces err by three times
+a row's sigma and the model does not know it. An effect of 30 sigmas that three of thirty stops show
+is found at 0.001 in 0.9 of worlds, by signs alone in none.
+
+A model that itself has unknowns which differ by stop alone, a drift say, fits a part of what stops
+err by, and residuals scatter less than errors. With n stops and k such unknowns, covariances by
+stop are widened by ``(n - 1) / (n - 1 - k)``, and k fewer stops count in d. With three of them the
+sizes above are then 0.00 to 0.08 for 6 to 30 stops and 1 to 16 parameters (0.11 in the worst of 12
+cases), and were 0.08 to 0.75 without.
 
 What was compared and left, on the same rows: leaving out with ``d nu`` in place of d and no least
 number of clusters finds something in 0.1 to 1.0 of empty worlds where stops err together and 4 or
@@ -91,12 +95,13 @@ class ScoreSpread:
         return float(special.fdtrc(self.nu, self.d, statistic / max(self.trace, 1e-300)))
 
 
-def by_signs(ways: Sequence[np.ndarray], stops: int) -> ScoreSpread:
+def by_signs(ways: Sequence[np.ndarray], stops: int, spent: int = 0) -> ScoreSpread:
     """Chance from the scores alone; see the module.
 
     Args:
         ways: shares (c, r) of the whitened score by stop, by surface, and by both.
         stops: how many stops have a share in it; one tells nothing.
+        spent: how many unknowns of the model differ by stop alone.
     """
     by_stop, by_place, both = (_evenly(shares) for shares in ways)
     more = _beyond(by_place, both)
@@ -107,7 +112,15 @@ def by_signs(ways: Sequence[np.ndarray], stops: int) -> ScoreSpread:
     size = np.square(ways[0]).sum(axis=1)
     # Were scores normal, their squares would scatter by 2 / nu.
     even = size.sum() ** 2 / max(np.square(size).sum(), 1e-300) * (1.0 + 2.0 / nu)
-    return ScoreSpread(by_stop + more, nu, (count - 1.0) * nu, min(float(count), float(even)))
+    left = max(count - 1.0 - spent, 0.0)
+    by_stop = by_stop * _widened(count, spent)
+    return ScoreSpread(by_stop + more, nu, left * nu, min(float(count), float(even)))
+
+
+def _widened(count: int, spent: int) -> float:
+    """How much wider scores of stops scatter than residuals show, where a model has spent so many
+    unknowns on stops."""
+    return (count - 1.0) / max(count - 1.0 - spent, 1.0) if spent else 1.0
 
 
 def _freedom(shares: np.ndarray, count: int) -> float:
@@ -157,11 +170,12 @@ class Shares:
         else:
             to[key] = [score.copy(), information.copy()]
 
-    def left_out(self, nu: float) -> ScoreSpread:
+    def left_out(self, nu: float, spent: int = 0) -> ScoreSpread:
         """Chance from leaving out cluster after cluster; see the module.
 
         Args:
             nu: degrees of freedom of the statistic, by signs.
+            spent: how many unknowns of the model differ by stop alone.
         """
         ways = [self._clusters(0), self._clusters(1), self.cells]
         scores = [np.stack([score for score, _ in way.values()]) for way in ways]
@@ -172,7 +186,7 @@ class Shares:
             )
             for way in ways
         ]
-        return by_leaving_out(clusters, scores, nu)
+        return by_leaving_out(clusters, scores, nu, spent)
 
     def _clusters(self, way: int) -> dict[int | tuple[int, int], list[np.ndarray]]:
         """Score and information of each cluster: by stop (0) or by place (1); by cell of rows that
@@ -236,13 +250,15 @@ class Clusters:
 
 
 def by_leaving_out(
-    ways: Sequence[Clusters], scores: Sequence[np.ndarray], nu: float
+    ways: Sequence[Clusters], scores: Sequence[np.ndarray], nu: float, spent: int = 0
 ) -> ScoreSpread:
-    """Chance from clusters and their scores (c, r), by stop, by surface, and by both."""
+    """Chance from clusters and their scores (c, r), by stop, by surface, and by both; the model has
+    spent so many unknowns on stops alone."""
     by_stop, by_place, both = (w.covariance(s) for w, s in zip(ways, scores, strict=True))
     if ways[0].crowded or ways[1].crowded:
         by_stop = UNKNOWN * np.eye(len(by_stop))
     more = _beyond(by_place, both)
-    parts = np.array([np.trace(by_stop), np.trace(more)])
-    d = parts.sum() ** 2 / max(float(np.sum(parts**2 / [ways[0].d, ways[1].d])), 1e-300)
+    by_stop = by_stop * _widened(ways[0].count, spent)
+    parts, of_stops = np.array([np.trace(by_stop), np.trace(more)]), max(ways[0].d - spent, 1.0)
+    d = parts.sum() ** 2 / max(float(np.sum(parts**2 / [of_stops, ways[1].d])), 1e-300)
     return ScoreSpread(by_stop + more, nu, float(d), float(d) + 1.0)

@@ -39,6 +39,7 @@ class Scores:
         cells: (C, Q) shares of the score, of rows of one stop and one place.
         stop, place: (C,) the numbers of these, -1 for none.
         weight_m2: of all beams, 1/m2.
+        spent: how many unknowns of the model differ by stop alone.
     """
 
     at: Mapping[str, slice]
@@ -49,6 +50,7 @@ class Scores:
     stop: np.ndarray
     place: np.ndarray
     weight_m2: float
+    spent: int = 0
 
     @cached_property
     def by_stop(self) -> np.ndarray:
@@ -117,8 +119,9 @@ def information_left(linear: Linear, names: Sequence[str]) -> np.ndarray:
     return (left + left.T) / 2
 
 
-def project(linear: Linear, names: Sequence[str]) -> Scores:
-    """Project variables off the model, be they candidates or of the model itself."""
+def project(linear: Linear, names: Sequence[str], spent: int = 0) -> Scores:
+    """Project variables off the model, be they candidates or of the model itself; that has spent
+    so many unknowns on stops alone."""
     at, start = {}, 0
     for name in names:
         size = len(linear.at[name])
@@ -136,6 +139,7 @@ def project(linear: Linear, names: Sequence[str]) -> Scores:
         stop=linear.stop,
         place=linear.place,
         weight_m2=linear.weight_m2,
+        spent=spent,
     )
 
 
@@ -158,6 +162,7 @@ class Test:
             leaving out; see `jackknife`.
         clusters: how many stops have a share in it.
         score: (q,).
+        spent: how many unknowns of the model differ by stop alone.
     """
 
     columns: np.ndarray
@@ -166,6 +171,7 @@ class Test:
     chances: tuple[ScoreSpread, ...]
     clusters: int
     score: np.ndarray
+    spent: int = 0
 
     @property
     def dof(self) -> int:
@@ -183,7 +189,8 @@ class Test:
 
     def judged(self, shares: Shares) -> Test:
         """The same with its clusters left out one by one."""
-        return replace(self, chances=(*self.chances, shares.left_out(self.chances[0].nu)))
+        left_out = shares.left_out(self.chances[0].nu, self.spent)
+        return replace(self, chances=(*self.chances, left_out))
 
     def p_value(self) -> float:
         """How often chance alone explains as much."""
@@ -237,7 +244,10 @@ def test(scores: Scores, columns: np.ndarray) -> Test:
         columns=columns,
         statistic=float(np.sum(np.square(whiten.T @ score))),
         whiten=whiten,
-        chances=(by_signs([way[:, columns] @ whiten for way in scores.ways], clusters),),
+        chances=(
+            by_signs([way[:, columns] @ whiten for way in scores.ways], clusters, scores.spent),
+        ),
         clusters=clusters,
         score=score,
+        spent=scores.spent,
     )

@@ -58,6 +58,19 @@ class Stand:
         """Every effect that could be missing."""
         return (*CATALOGUE, *self.own)
 
+    @cached_property
+    def spent(self) -> int:
+        """How many unknowns of the model differ by stop alone: those of effects that depend on
+        columns of the stops and on nothing else."""
+        terms = {t.variable: t for some in self.problem.terms for t in some}
+        columns = {c for s in self.sources for c in s.columns}
+        return sum(
+            len(term.free)
+            for term in terms.values()
+            if term.effect.covariates and not term.effect.by_chance
+            if columns.issuperset(term.effect.covariates)
+        )
+
     def with_effects(self, added: Sequence[Effect], progress: Progress) -> Stand:
         """The model with more effects, fitted from here."""
         return self._refitted(self.model.plus(tuple(added)), self.estimate.start, progress)
@@ -96,7 +109,7 @@ class Stand:
         there = set(self.model.names)
         unnamed = [e for e in structure(self.sources, sample) if e.name not in there]
         linear, at = self.linearise((*known, *unnamed), progress)
-        scores = project(linear, linear.candidates)
+        scores = project(linear, linear.candidates, self.spent)
         chance = [e for e in known if e.by_chance]
         named = [e for e in known if e.site is not Site.NOISE and not e.by_chance]
         named = screen(scores, named, at)

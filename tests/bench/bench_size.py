@@ -136,8 +136,9 @@ def p_values(
     """Of every test, by its name."""
     score = ways[0].sum(axis=0)
     statistic = float(score @ score)
-    signs = by_signs(ways, world.stops)
-    out = by_leaving_out(world.clusters, ways, signs.nu)
+    spent = world.family.model_by_stop
+    signs = by_signs(ways, world.stops, spent)
+    out = by_leaving_out(world.clusters, ways, signs.nu, spent)
     found = {"signs": signs.p_value(statistic), "out": out.p_value(statistic)}
     found["judged"] = min(found.values())
     stop, place, both = (c.covariance(w) for c, w in zip(world.clusters, ways, strict=True))

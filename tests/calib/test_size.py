@@ -40,6 +40,8 @@ def bench():
         ("three stops, stops err", 1, 30),
         ("within stops, stops err", 4, 12),
         ("both err", 1, 12),
+        ("model by stop, stops err", 1, 12),
+        ("model by stop, stops err", 4, 30),
     ],
 )
 def test_a_judged_test_has_its_size(bench, family, parameters, stops):
@@ -79,3 +81,21 @@ def test_no_p_value_is_told_below_the_least_nor_adjusted_below_itself():
         for looks in (1.0, 3.7, 300.0):
             assert told <= after_looks(p, looks) * (1 + 1e-9)
             assert after_looks(p, looks) == pytest.approx(after_looks(told, looks))
+
+
+def test_unknowns_that_stops_are_spent_on_count(bench):
+    """Where they are not counted, something is found in empty worlds too often."""
+    family, small = bench.FAMILIES["model by stop, stops err"], {0: [], 3: []}
+    for seed in range(8):
+        world, rng = bench.World(family, 12, 4, seed), np.random.default_rng(seed)
+        for _ in range(DRAWS // 8):
+            ways = world.scores(rng)
+            statistic = float(np.sum(np.square(ways[0].sum(axis=0))))
+            for spent, found in small.items():
+                found.append(by_signs(ways, 12, spent).p_value(statistic) < 0.05)
+    assert np.mean(small[3]) < 0.05 < HIGHEST < np.mean(small[0])
+
+
+def test_as_many_unknowns_as_stops_leave_nothing_to_tell():
+    shares = np.random.default_rng(0).normal(size=(6, 2))
+    assert by_signs([shares, shares, shares], 6, 5).p_value(1e9) == 1.0

@@ -55,14 +55,7 @@ def sentences_of(
         beside = any(c["step"] and not c["dressed_up"] for c in candidates)
         what = "Beside what is named here, there" if beside else "There"
         out.insert(0, f"{what} is structure in the residuals that no known effect explains.")
-    for each in unexplained[:2]:
-        what = " and ".join(words(c) for c in each["covariates"])
-        out.append(f"The residual structure depends on {what}: {each['rms_mm']:.2f} mm rms of {residual}.")
-        if each["formula"]:
-            out.append(
-                f"An empirical effect for it can be added by its name, '{each['formula']['name']}'."
-                f" {each['formula']['what']}"
-            )
+    out += _structure_sentences(unexplained[:2], residual)
     if found.scatter is not None:
         what = " and ".join(words(c) for c in found.scatter.effect.covariates)
         out.append(
@@ -73,6 +66,22 @@ def sentences_of(
     if gone:
         more = f" and {len(gone) - LISTED} more" if len(gone) > LISTED else ""
         out.append(f"Could not be tested on these recordings: {', '.join(gone[:LISTED])}{more}.")
+    return out
+
+
+def _structure_sentences(unexplained: Sequence[Mapping[str, Any]], residual: str) -> list[str]:
+    """Of structure without a name."""
+    out = []
+    for each in unexplained[:2]:
+        what = " and ".join(words(c) for c in each["covariates"])
+        out.append(
+            f"The residual structure depends on {what}: {each['rms_mm']:.2f} mm rms of {residual}."
+        )
+        if each["formula"]:
+            out.append(
+                f"An empirical effect for it can be added by its name, '{each['formula']['name']}'."
+                f" {each['formula']['what']}"
+            )
     return out
 
 
@@ -90,8 +99,8 @@ def _step_sentences(step: NamedEffect, candidate: Mapping[str, Any], worn: bool)
     fall = f"; the held-out error goes from {before:.2f} to {after:.2f} mm" if after else ""
     out = [
         f"{step.effect.name} is missing: it changes {_residual(step.before)} by "
-        f"{candidate['rms_mm']:.2f} mm rms, of which {candidate['unabsorbed_rms_mm']:.2f} mm is not "
-        f"absorbed by the model (adjusted p = {step.p_adjusted:.1g}){fall}."
+        f"{candidate['rms_mm']:.2f} mm rms, of which {candidate['unabsorbed_rms_mm']:.2f} mm is "
+        f"not absorbed by the model (adjusted p = {step.p_adjusted:.1g}){fall}."
     ]
     for rival in candidate["rivals"][:LISTED]:
         out.append(
