@@ -6,12 +6,12 @@ The step, the covariance and every test are read off it.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from calib.linear.elimination import Eliminated
-from calib.linear.layout import Layout
+from calib.linear.layout import Layout, positions
 from calib.linear.rows import OwnSums, Weighing
 
 Values = Mapping[str, np.ndarray]
@@ -58,6 +58,23 @@ class Linearisation:
     weighed: Sequence[Weighing] = ()
     beams_cost: float = 0.0
     cost_before: float | None = None
+
+    def onto(self, layout: Layout) -> Linearisation:
+        """The same rows over the unknowns of another layout, which lacks some of those kept."""
+        here = np.concatenate([np.r_[self.layout.at[name]] for name in layout.at])
+        to = positions(self.layout.size + 1, np.append(here, self.layout.size))
+        at = positions(self.layout.size, self.layout.kept)[here[layout.kept]]
+        withal = np.append(at, len(self.kept) - 1)
+        return replace(
+            self,
+            layout=layout,
+            kept=self.kept[np.ix_(withal, withal)],
+            raw=None if self.raw is None else self.raw[np.ix_(at, at)],
+            touched=self.touched[here],
+            eliminated=[each.onto(to) for each in self.eliminated],
+            twists=[(stop, d[:, to[c] >= 0], to[c[to[c] >= 0]]) for stop, d, c in self.twists],
+            scans={stop: sums.onto(to) for stop, sums in self.scans.items()},
+        )
 
     def directions(self, kept: np.ndarray) -> np.ndarray:
         """All unknowns (U, q) that follow from those kept (S + 1, q), in units of their sigmas.

@@ -23,7 +23,7 @@ from calib.problem.unknowns import Unknown
 from calib.residuals.beams import Association
 from calib.solve.added import begun
 from calib.solve.components import squares, told, wider
-from calib.solve.descent import AT_OPTIMUM, STEADY, UPHILL, Descent, Progress
+from calib.solve.descent import AT_OPTIMUM, LAST, STEADY, UPHILL, Descent, Progress
 from calib.solve.estimate import DOFS, SEEN, Estimate, Start, cost_of, started, values_of
 from calib.solve.graph import Graph
 from calib.solve.reweight import SETTLED as SETTLED_WEIGHT
@@ -145,12 +145,11 @@ class Loop(Descent):
                 self.lay_out()
                 break
             changed = True
-            if tolerance is None:
-                self.descend(max(STEADY, ROUGHLY * fall), beams=False)
-            else:
-                self.settle(tolerance, self.seen, self._met())
+            self.descend(max(STEADY, ROUGHLY * fall), beams=tolerance is not None)
         if changed and tolerance is None:
             self.solve_without_scans()
+        elif changed:
+            self.settle(tolerance, self.seen, self._met())
 
     def take_weights(self, settled: float = SETTLED_WEIGHT) -> bool:
         """Give every group of rows the weight that its residuals ask for; whether any changed."""
@@ -295,7 +294,7 @@ class Loop(Descent):
             self.fix_association(seen, met)
             if self.lost:
                 return
-            if not self.descend(tolerance):
+            if not self.descend(LAST, tolerance):
                 return
             pairs = ((scan.pose(self.seen), scan.pose(self.values)) for scan in self.problem.scans)
             if all(np.abs(se3.log(se3.inverse(a) @ b)).max() < STRAYED for a, b in pairs):
@@ -309,7 +308,7 @@ class Loop(Descent):
         if not self._raised():
             return
         self.values = values_of(self.problem, self.start.state)
-        self.descend(tolerance, hasten=False)
+        self.descend(LAST, tolerance, hasten=False)
         if self._raised():
             self.values = values_of(self.problem, self.start.state)
 
