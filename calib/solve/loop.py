@@ -42,8 +42,8 @@ LOOKS = 3  # how often, before a fit is given up
 # By how much new weights may still lower half the chi-square, and of it: a hundredth of what an
 # optimum allows, as each round may go but a tenth of the way; where nothing fits, it never ends.
 STILL, AS_GOOD = AT_OPTIMUM / 100, 1e-8
-# While weights still change, passes end when one lowers the cost by less than so much of what new
-# weights were to lower it by.
+# While weights still change, passes end when one lowers the cost by less than so much of what the
+# first was to lower it by.
 ROUGHLY = 0.01
 BEFORE_SCANS = 2  # times: bodies are then a start for the scans, and no result
 REWEIGHTED, ALONE = (10, SETTLED_WEIGHT), (200, 1e-3)
@@ -125,8 +125,9 @@ class Loop(Descent):
         graph = Graph(list(self.problem.variables.values()), blocks, self.held)
         return graph.solve(first)[0]
 
-    def reweigh(self, tolerance: float | None = None) -> None:
-        """Go on with robust weights until these settle, where any group of rows asks for one.
+    def reweigh(self, tolerance: float | None = None) -> bool:
+        """Go on with robust weights until these settle, where any group of rows asks for one;
+        whether any did.
 
         Args:
             tolerance: as of `settle`; of trackers and targets alone where None.
@@ -150,6 +151,7 @@ class Loop(Descent):
             self.solve_without_scans()
         elif changed:
             self.settle(tolerance, self.seen, self._met())
+        return changed
 
     def take_weights(self, settled: float = SETTLED_WEIGHT) -> bool:
         """Give every group of rows the weight that its residuals ask for; whether any changed."""
@@ -303,8 +305,14 @@ class Loop(Descent):
         self.lost = True
 
     def go_on(self, tolerance: float) -> None:
-        """From an earlier state to the optimum; the cost does not end above that of the state."""
-        self.settle(tolerance, self.seen_before(), self.start.met)
+        """From an earlier state to the optimum, robust weights included; the cost does not end
+        above that of the state."""
+        self.fix_association(self.seen_before(), self.start.met)
+        self.linearise_here()
+        _, fall = self.step()
+        self.descend(max(STEADY, ROUGHLY * fall))
+        if not self.reweigh(tolerance):
+            self.settle(tolerance, self.seen, self._met())
         if not self._raised():
             return
         self.values = values_of(self.problem, self.start.state)
