@@ -143,15 +143,11 @@ def _steps(
         looks[-1] = _adapted(looks[-1], left, progress, named=bool(found))
         if not found and _chance_leads(looks[-1]):
             break
-        step = _named(looks[-1], progress) if len(found) < most else None
-        if step is None:
+        more = _named(looks[-1], found, progress) if len(found) < most else found
+        if len(more) == len(found):
             break
-        found.append(step)
-        looks.append(step.after)
-        stand, swapped = step.after.stand.retuned([f.effect.name for f in found[:-1]], progress)
-        if swapped:
-            looks[-1] = stand.look(progress)
-            found = [f.with_effect(swapped.get(f.effect.name)) for f in found]
+        found = more
+        looks.append(found[-1].after)
     looks[-1], left = _restored(first, looks[-1], left, progress) if found else (looks[-1], left)
     return looks, found, left
 
@@ -256,8 +252,9 @@ def likeliest(here: Sequence[Blunder]) -> Blunder:
     return min(near, key=lambda b: b.likely)
 
 
-def _named(look: Look, progress: Progress) -> NamedEffect | None:
-    """The best candidate that is confirmed, fitted."""
+def _named(look: Look, found: list[NamedEffect], progress: Progress) -> list[NamedEffect]:
+    """What was found, and the best candidate that is confirmed, fitted; with it others may have
+    better shapes."""
     for candidate in suspects(look.named, ALPHA):
         test, p = judged(look, candidate, progress)
         if p < ALPHA:
@@ -265,9 +262,10 @@ def _named(look: Look, progress: Progress) -> NamedEffect | None:
             stand = look.stand.with_effects([effect], progress)
             if _taken_up(look.named, candidate, stand.theta(effect, whole=False)) < HELD_BACK:
                 continue
+            stand, swapped = stand.retuned([f.effect.name for f in found], progress)
             after = stand.look(progress)
             others = rivals(look.named, candidate, max(after.named.common, test.inflation))
-            return NamedEffect(
+            step = NamedEffect(
                 candidate=replace(candidate, effect=effect, p_value=test.p_value()),
                 before=look,
                 after=after,
@@ -275,7 +273,8 @@ def _named(look: Look, progress: Progress) -> NamedEffect | None:
                 p_adjusted=p,
                 rivals=others,
             )
-    return None
+            return [*(f.with_effect(swapped.get(f.effect.name)) for f in found), step]
+    return found
 
 
 def _taken_up(screen: Screen, candidate: Candidate, theta: np.ndarray) -> float:
