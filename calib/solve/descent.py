@@ -22,6 +22,9 @@ AT_OPTIMUM = 1e-3
 # The last step of a fit is to be so much smaller: weights follow the state, and where residuals are
 # far from normal each step lowers the cost by up to two thirds of what the one before it did.
 LAST = AT_OPTIMUM / 4
+# While weights still change, passes end when one lowers the cost by less than so much of what the
+# first was to lower it by.
+ROUGHLY = 0.01
 STEADY = 1e-9  # the same, of trackers and targets alone, whose steps cost little
 DIGITS = 1e-14  # of a cost: what is less is rounding
 UPHILL = 1e-9  # of a cost: a step that raises it by more is shortened
@@ -107,6 +110,12 @@ class Descent:
             wait = max(wait - 1, 0)
             newton, last = hasten and beams and not wait and length < last, length
         return False
+
+    def descend_roughly(self, beams: bool = True) -> None:
+        """Passes for as long as they lower the cost by much of what the first does."""
+        self.linearise_here(beams)
+        _, fall = self.step()
+        self.descend(max(LAST if beams else STEADY, ROUGHLY * fall), beams=beams)
 
     def _cost_before(self) -> float:
         """The cost here, beams weighed as they were before the step."""

@@ -122,9 +122,9 @@ class Estimate:
         rows[np.arange(len(columns)), columns] = 1.0
         return self.linear.covariance(rows, self._kept)
 
-    def variance_of(self, names: Sequence[str], rows: np.ndarray) -> np.ndarray:
-        """Variances (m,) of ``rows @ tangents``; see `Linearisation.variances`."""
-        return self.linear.variances(names, rows, self._kept)
+    def variances(self, some: Sequence[Mapping[str, np.ndarray]]) -> list[np.ndarray]:
+        """Variances (m,) of sets of rows; see `Linearisation.variances`."""
+        return self.linear.variances(some, self._kept)
 
     @cached_property
     def _kept(self) -> np.ndarray:

@@ -42,9 +42,6 @@ LOOKS = 3  # how often, before a fit is given up
 # By how much new weights may still lower half the chi-square, and of it: a hundredth of what an
 # optimum allows, as each round may go but a tenth of the way; where nothing fits, it never ends.
 STILL, AS_GOOD = AT_OPTIMUM / 100, 1e-8
-# While weights still change, passes end when one lowers the cost by less than so much of what the
-# first was to lower it by.
-ROUGHLY = 0.01
 BEFORE_SCANS = 2  # times: bodies are then a start for the scans, and no result
 REWEIGHTED, ALONE = (10, SETTLED_WEIGHT), (200, 1e-3)
 # So often is looked what beams meet before it is asked whether that leads anywhere, and so often at
@@ -146,7 +143,7 @@ class Loop(Descent):
                 self.lay_out()
                 break
             changed = True
-            self.descend(max(STEADY, ROUGHLY * fall), beams=tolerance is not None)
+            self.descend_roughly(beams=tolerance is not None)
         if changed and tolerance is None:
             self.solve_without_scans()
         elif changed:
@@ -308,9 +305,7 @@ class Loop(Descent):
         """From an earlier state to the optimum, robust weights included; the cost does not end
         above that of the state."""
         self.fix_association(self.seen_before(), self.start.met)
-        self.linearise_here()
-        _, fall = self.step()
-        self.descend(max(STEADY, ROUGHLY * fall))
+        self.descend_roughly()
         if not self.reweigh(tolerance):
             self.settle(tolerance, self.seen, self._met())
         if not self._raised():
