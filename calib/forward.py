@@ -36,7 +36,7 @@ class Term:
         """The effect's basis, of the free parameters only."""
         basis = self.effect.basis(view)
         if not isinstance(basis, OneHot):
-            return basis[..., self.free]
+            return basis if len(self.free) == basis.shape[-1] else basis[..., self.free]
         column = np.full(basis.size + 1, -1)  # the last stands for index -1: none
         column[self.free] = np.arange(len(self.free))
         return OneHot(column[basis.index], basis.values, len(self.free))

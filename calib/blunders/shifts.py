@@ -128,7 +128,7 @@ def standing_alone(
 def of_cells(whole: Linearisation, problem: Problem) -> dict[tuple[str, str], tuple[float, float]]:
     """Of the parts of surfaces, by their kind, as `components.squares_of_cells` gives it."""
     kept = _Others.of(whole).kept
-    return squares_of_cells(problem, whole.values, lambda n, rows: whole.variances(n, rows, kept))
+    return squares_of_cells(problem, whole.values, lambda some: whole.variances(some, kept))
 
 
 def _statistic(M: np.ndarray, u: np.ndarray, at: np.ndarray) -> float:

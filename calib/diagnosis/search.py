@@ -108,50 +108,48 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NAMES) -> Search:
         progress: as of `fit.solve`.
         most: how many effects are named at most.
     """
-    done = _searched(stand, progress, most)
+    looks, found, left = _steps(stand, progress, most)
     chance: list[Chance] = []
-    while strongest := next((c for c in done.looks[-1].chance if c.found), None):
+    while strongest := next((c for c in looks[-1].chance if c.found), None):
         chance.append(strongest)
-        done = (
-            _widened(done, strongest, progress)
-            if strongest.effect.widens
-            else _searched(stand.with_effects([c.effect for c in chance], progress), progress, most)
-        )
-    still = (c.beside(done.looks[-1].stand.estimate) for c in chance)
-    return replace(done, chance=[c for c in still if c.found])
+        if strongest.effect.widens:
+            wider = looks[-1].stand.with_effects([strongest.effect], progress)
+            looks.append(wider.look(progress))
+        else:
+            beside = stand.with_effects([c.effect for c in chance], progress)
+            looks, found, left = _steps(beside, progress, most)
+    last = looks[-1]
+    still = (c.beside(last.stand.estimate) for c in chance)
+    done = Search(
+        looks=looks,
+        found=found,
+        blunders=left,
+        unnamed=structures(last, progress),
+        scatter=_scatter(last, progress),
+        chance=[c for c in still if c.found],
+    )
+    if found and done.dressed_up(0):
+        return replace(done, at_first=structures(looks[0], progress))
+    return done
 
 
-def _widened(done: Search, by: Chance, progress: Progress) -> Search:
-    """A search, what it left looked at again with wider sigmas."""
-    look = done.looks[-1].stand.with_effects([by.effect], progress).look(progress)
-    unnamed, scatter = structures(look, progress), _scatter(look, progress)
-    return replace(done, looks=[*done.looks, look], unnamed=unnamed, scatter=scatter)
-
-
-def _searched(stand: Stand, progress: Progress, most: int) -> Search:
-    """As `search`, with no more by chance than the model has."""
+def _steps(
+    stand: Stand, progress: Progress, most: int
+) -> tuple[list[Look], list[NamedEffect], list[LeftOut]]:
+    """Effects and blunders, one after another, with no more by chance than the model has: the
+    looks, and both, as `Search` has them."""
     first, looks, found, left = stand, [stand.look(progress)], [], []
     while True:
         looks[-1] = _adapted(looks[-1], left, progress, named=bool(found))
         if not found and _chance_leads(looks[-1]):
             break
-        step = _named(looks[-1], progress) if len(found) < most else None
-        if step is None:
+        more = _named(looks[-1], found, progress) if len(found) < most else found
+        if len(more) == len(found):
             break
-        found.append(step)
-        looks.append(step.after)
-        stand, swapped = step.after.stand.retuned([f.effect.name for f in found[:-1]], progress)
-        if swapped:
-            looks[-1] = stand.look(progress)
-            found = [f.with_effect(swapped.get(f.effect.name)) for f in found]
+        found = more
+        looks.append(found[-1].after)
     looks[-1], left = _restored(first, looks[-1], left, progress) if found else (looks[-1], left)
-    last = looks[-1]
-    unnamed = structures(last, progress)
-    scatter = _scatter(last, progress)
-    done = Search(looks=looks, found=found, blunders=left, unnamed=unnamed, scatter=scatter)
-    if found and done.dressed_up(0):
-        return replace(done, at_first=structures(looks[0], progress))
-    return done
+    return looks, found, left
 
 
 def _adapted(look: Look, left: list[LeftOut], progress: Progress, named: bool) -> Look:
@@ -219,7 +217,7 @@ def _wild(look: Look) -> list[Blunder]:
     if len(worst) < 2:
         return worst
     some = [(b.shift, b.limit) for b in sorted(worst, key=lambda b: -b.evidence)]
-    alone = standing_alone(look.linear.whole, look.stand.estimate.problem, some)
+    alone = standing_alone(look.fitted, look.stand.estimate.problem, some)
     return [b for b in worst if b.group in alone]
 
 
@@ -254,8 +252,9 @@ def likeliest(here: Sequence[Blunder]) -> Blunder:
     return min(near, key=lambda b: b.likely)
 
 
-def _named(look: Look, progress: Progress) -> NamedEffect | None:
-    """The best candidate that is confirmed, fitted."""
+def _named(look: Look, found: list[NamedEffect], progress: Progress) -> list[NamedEffect]:
+    """What was found, and the best candidate that is confirmed, fitted; with it others may have
+    better shapes."""
     for candidate in suspects(look.named, ALPHA):
         test, p = judged(look, candidate, progress)
         if p < ALPHA:
@@ -263,9 +262,10 @@ def _named(look: Look, progress: Progress) -> NamedEffect | None:
             stand = look.stand.with_effects([effect], progress)
             if _taken_up(look.named, candidate, stand.theta(effect, whole=False)) < HELD_BACK:
                 continue
+            stand, swapped = stand.retuned([f.effect.name for f in found], progress)
             after = stand.look(progress)
             others = rivals(look.named, candidate, max(after.named.common, test.inflation))
-            return NamedEffect(
+            step = NamedEffect(
                 candidate=replace(candidate, effect=effect, p_value=test.p_value()),
                 before=look,
                 after=after,
@@ -273,7 +273,8 @@ def _named(look: Look, progress: Progress) -> NamedEffect | None:
                 p_adjusted=p,
                 rivals=others,
             )
-    return None
+            return [*(f.with_effect(swapped.get(f.effect.name)) for f in found), step]
+    return found
 
 
 def _taken_up(screen: Screen, candidate: Candidate, theta: np.ndarray) -> float:

@@ -24,6 +24,8 @@ from calib.diagnosis.linear import Linear, linearise_with, rows_along
 from calib.diagnosis.score import Test, away_from_model, project, test
 from calib.diagnosis.screen import Candidate, Screen, screen
 from calib.effects import CATALOGUE, Effect, Scatter, Site
+from calib.linear.layout import Layout
+from calib.linear.system import Linearisation
 from calib.problem import Problem
 from calib.problem.model import Model, Source
 from calib.problem.without import leave_out
@@ -271,15 +273,20 @@ class Look:
     columns: frozenset[str]
 
     @cached_property
+    def fitted(self) -> Linearisation:
+        """The rows, linearised, over the unknowns of the fit alone."""
+        return self.linear.whole.onto(Layout.of(self.stand.estimate.problem))
+
+    @cached_property
     def blunders(self) -> list[Blunder]:
         """All groups of rows, those that chance explains least first."""
-        return judge(self.linear.whole, self.stand.estimate.problem)
+        return judge(self.fitted, self.stand.estimate.problem)
 
     @cached_property
     def chance(self) -> list[Chance]:
         """What may scatter by chance, that which chance explains least first."""
         good = [blunder.shift for blunder in self.blunders if not blunder.found]
-        of_rows = rows_by_chance(self.wider, good, self.linear.whole, self.stand.estimate.problem)
+        of_rows = rows_by_chance(self.wider, good, self.fitted, self.stand.estimate.problem)
         return ranked([*self.values, *of_rows])
 
     @property

@@ -8,7 +8,7 @@ factored whatever the data leave open.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import cho_solve, cholesky, solve_triangular
@@ -41,6 +41,13 @@ class Eliminated:
     def twists(self) -> int:
         """How many of `over` are columns of twists."""
         return int(np.searchsorted(self.over != BY_TWIST, True))
+
+    def onto(self, to: np.ndarray) -> Eliminated:
+        """The same over fewer others: `to` (U + 1,) says where each column is then, -1 where it is
+        not."""
+        over = np.where(self.over == BY_TWIST, BY_TWIST, to[self.over])
+        there = over != -1
+        return replace(self, columns=to[self.columns], over=over[there], gain=self.gain[:, there])
 
     def solve(self, right: np.ndarray) -> np.ndarray:
         """``H_ee^-1 @ right``, of (e, q)."""

@@ -8,7 +8,7 @@ summed without zeros. Sums here are in the unknowns' own units; `assembly` scale
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -245,6 +245,12 @@ class OwnSums:
     score: np.ndarray
     cross: np.ndarray
     columns: np.ndarray
+
+    def onto(self, to: np.ndarray) -> OwnSums:
+        """The same beside fewer unknowns: `to` (U,) says where each column is then, -1 where it is
+        not."""
+        there = to[self.columns] >= 0
+        return replace(self, cross=self.cross[:, there], columns=to[self.columns[there]])
 
 
 def _zero(scan: ScanStop, rows: Rows) -> Iterator[int]:

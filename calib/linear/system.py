@@ -5,17 +5,18 @@ The step, the covariance and every test are read off it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.sparse import csr_array, vstack
 
 from calib.linear.elimination import Eliminated
-from calib.linear.layout import Layout
+from calib.linear.layout import Layout, positions
 from calib.linear.rows import OwnSums, Weighing
 
 Values = Mapping[str, np.ndarray]
-AT_ONCE = 256  # rows whose joint covariance is computed for their variances: it grows as the square
+AT_ONCE = 1024  # rows whose variances are computed at once: bounds the memory
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,23 @@ class Linearisation:
     weighed: Sequence[Weighing] = ()
     beams_cost: float = 0.0
     cost_before: float | None = None
+
+    def onto(self, layout: Layout) -> Linearisation:
+        """The same rows over the unknowns of another layout, which lacks some of those kept."""
+        here = np.concatenate([np.r_[self.layout.at[name]] for name in layout.at])
+        to = positions(self.layout.size + 1, np.append(here, self.layout.size))
+        at = positions(self.layout.size, self.layout.kept)[here[layout.kept]]
+        withal = np.append(at, len(self.kept) - 1)
+        return replace(
+            self,
+            layout=layout,
+            kept=self.kept[np.ix_(withal, withal)],
+            raw=None if self.raw is None else self.raw[np.ix_(at, at)],
+            touched=self.touched[here],
+            eliminated=[each.onto(to) for each in self.eliminated],
+            twists=[(stop, d[:, to[c] >= 0], to[c[to[c] >= 0]]) for stop, d, c in self.twists],
+            scans={stop: sums.onto(to) for stop, sums in self.scans.items()},
+        )
 
     def directions(self, kept: np.ndarray) -> np.ndarray:
         """All unknowns (U, q) that follow from those kept (S + 1, q), in units of their sigmas.
@@ -106,9 +124,19 @@ class Linearisation:
             rows: (q, U) over all unknowns.
             kept: (S, S) covariance of the kept.
         """
+        out = np.zeros((len(rows), len(rows)))
+        for some, mine, known in self._shares(rows, kept):
+            out[np.ix_(some, some)] += mine @ known
+        return out
+
+    def _shares(
+        self, rows: np.ndarray, kept: np.ndarray
+    ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """What each step of the elimination, and the kept, add to a covariance of rows: of which
+        rows (n,), these over some unknowns (n, e), and the unknowns' covariance with them (e, n);
+        arguments as of `covariance`."""
         sigma = self.layout.sigma
         left = np.hstack([rows * sigma, np.zeros((len(rows), 1))])
-        out = np.zeros((len(rows), len(rows)))
         by_twist = np.zeros((len(rows), 6 * len(self.twists)))
         for each in self.eliminated:
             if each.twists == 0 and by_twist.any():
@@ -117,28 +145,36 @@ class Linearisation:
             if not len(some):
                 continue
             mine = left[np.ix_(some, each.columns)]
-            out[np.ix_(some, some)] += mine @ each.solve(mine.T)
+            yield some, mine, each.solve(mine.T)
             further = mine @ each.gain
             by_twist[some, : each.twists] -= further[:, : each.twists]
             left[np.ix_(some, each.over[each.twists :])] -= further[:, each.twists :]
         self._through(by_twist, left)
         last = left[:, self.layout.kept] / sigma[self.layout.kept]
-        return out + last @ kept @ last.T
+        yield np.arange(len(rows)), last, kept @ last.T
 
-    def variances(self, names: Sequence[str], rows: np.ndarray, kept: np.ndarray) -> np.ndarray:
-        """Variances (m,) of ``rows @ tangents``.
+    def variances(
+        self, some: Sequence[Mapping[str, np.ndarray]], kept: np.ndarray
+    ) -> list[np.ndarray]:
+        """Variances (m,) of ``rows @ tangents``, of each of some sets of rows.
 
         Args:
-            names: unknowns.
-            rows: (m, n) over their tangents, in that order.
+            some: of each set, unknown -> (m, n) the rows over its tangents.
             kept: (S, S) covariance of the kept.
         """
-        columns, found = self.layout.columns(names), [np.zeros(0)]
-        for some in np.array_split(rows, -(-len(rows) // AT_ONCE)):
-            whole = np.zeros((len(some), self.layout.size))
-            whole[:, columns] = some
-            found.append(np.diag(self.covariance(whole, kept)))
-        return np.concatenate(found)
+        tables = [csr_array((0, self.layout.size))]
+        for by in some:
+            mine = csr_array(np.hstack(list(by.values())))
+            columns = self.layout.columns(list(by))[mine.indices]
+            shape = (mine.shape[0], self.layout.size)
+            tables.append(csr_array((mine.data, columns, mine.indptr), shape=shape))
+        rows = csr_array(vstack(tables))
+        found = np.zeros(rows.shape[0])
+        for first in range(0, len(found), AT_ONCE):
+            here = slice(first, first + AT_ONCE)
+            for at, mine, known in self._shares(rows[here].toarray(), kept):
+                found[here][at] += np.einsum("ij,ji->i", mine, known)
+        return np.split(found, np.cumsum([table.shape[0] for table in tables[1:-1]]))
 
     def _through(self, by_twist: np.ndarray, left: np.ndarray) -> None:
         """Move what stands by the twists of all stops (q, 6 K) to the unknowns behind them."""

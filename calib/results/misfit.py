@@ -82,7 +82,7 @@ def tracker_rows(estimate: Estimate) -> InstrumentRows | None:
         each = [(*stop, block.body, axis) for stop in stops for axis in DOF[axes]]
         sigma = np.repeat([block.sigma_rad, block.sigma_m], 3)[axes]
         residual, d = unweighted(block).evaluate(estimate.values, True)
-        left = 1.0 - estimate.variance_of(list(d), np.hstack(list(d.values())))
+        left = 1.0 - estimate.variances([d])[0]
         out.add(each, POSE_UNITS[axes] * len(stops), np.tile(sigma, len(stops)), residual, left)
     return out.rows(("recording", "stop", "body", "axis"))
 
@@ -100,8 +100,8 @@ def target_rows(estimate: Estimate) -> InstrumentRows | None:
         if id(block) in whose:
             weight = np.ones(len(PARTS)) if block.weight is None else block.weight
             root = np.repeat(np.sqrt(np.where(weight > 0, weight, np.inf)), 3)  # a part left out: 0
-            A, right = np.hstack(list(by.values())) / root[:, None], right / root
-            left = np.where(np.isfinite(root), 1.0 - estimate.variance_of(list(by), A), 0.0)
+            (seen,), right = estimate.variances([by]), right / root
+            left = np.where(np.isfinite(root), 1.0 - seen / np.square(root), 0.0)
             each = [(*whose[id(block)], part, axis) for part in PARTS for axis in XYZ]
             marker, sphere = block.sigma_marker_m, block.sigma_sphere_m
             out.add(each, ["m"] * 9, np.repeat([marker, marker, sphere], 3), -right, left)
@@ -120,7 +120,7 @@ def prior_rows(estimate: Estimate) -> InstrumentRows | None:
         if unknown.kind != "vector" or unknown.role is Role.TARGET:
             continue
         if unknown.role is Role.JOINTS:
-            seen = estimate.variance_of([unknown.name], np.eye(unknown.dim))
+            (seen,) = estimate.variances([{unknown.name: np.eye(unknown.dim)}])
         else:
             seen = at.get(unknown.name, np.full(unknown.dim, np.nan))
         left = 1.0 - seen / np.square(unknown.sigma)

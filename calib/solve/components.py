@@ -18,6 +18,7 @@ from scipy.linalg import cho_factor, cho_solve
 from calib.problem.problem import Problem
 from calib.problem.spread import by_chance, sigmas, widening
 from calib.problem.unknowns import Unknown
+from calib.residuals.tracker import BodiesTogether
 from calib.solve.estimate import Estimate
 
 ROUNDS = 500  # of the fixed point; from ten times too large or small 40 were measured
@@ -109,36 +110,38 @@ def squares(estimate: Estimate) -> Sums:
     """Whose rows and unit -> the sum of squares of these rows, whitened, and of their redundancies:
     both are about equal where sigmas are right (Foerstner 1979)."""
     found: dict[tuple[str, str], list[tuple[float, float]]] = {}
-    for block in estimate.problem.bodies:
-        residual, d = block.evaluate(estimate.values, True)
+    together = BodiesTogether.of(estimate.problem.bodies)
+    blocks = [block for each in together for block in each.blocks]
+    rows = [some for each in together for some in each.evaluate(estimate.values)]
+    variances = estimate.variances([d for _, d in rows])
+    for block, (residual, _), seen in zip(blocks, rows, variances, strict=True):
         count = len(block.measured)
         weight = np.ones(count) if block.weight is None else block.weight
-        seen = estimate.variance_of(list(d), np.hstack(list(d.values())))
         left = np.repeat(weight, len(residual) // count) - seen
         for k, unit in enumerate(("m",) if block.is_point else ("rad", "m")):
-            rows = [each.reshape(count, -1, 3)[:, k] for each in (residual, left)]
-            sums = float(np.square(rows[0]).sum()), float(rows[1].sum())
+            mine = [each.reshape(count, -1, 3)[:, k] for each in (residual, left)]
+            sums = float(np.square(mine[0]).sum()), float(mine[1].sum())
             found.setdefault((block.body, unit), []).append(sums)
-    cells = squares_of_cells(estimate.problem, estimate.values, estimate.variance_of)
+    cells = squares_of_cells(estimate.problem, estimate.values, estimate.variances)
     return cells | {k: tuple(np.sum(sums, axis=0).tolist()) for k, sums in found.items()}
 
 
 def squares_of_cells(
     problem: Problem,
     values: Mapping[str, np.ndarray],
-    variance_of: Callable[[Sequence[str], np.ndarray], np.ndarray],
+    variances: Callable[[Sequence[Mapping[str, np.ndarray]]], list[np.ndarray]],
 ) -> dict[tuple[str, str], tuple[float, float]]:
     """The same of what parts of surfaces stand off, by their kind.
 
     Args:
         problem: with its cells.
         values: as fitted.
-        variance_of: as `Estimate.variance_of` has it.
+        variances: as `Estimate.variances` has them.
     """
     out: dict[tuple[str, str], tuple[float, float]] = {}
-    for name, cells in problem.cells.items():
+    each = variances([{name: np.eye(problem.variables[name].dim)} for name in problem.cells])
+    for (name, cells), seen in zip(problem.cells.items(), each, strict=True):
         sigma = problem.variables[name].sigma
-        seen = variance_of([name], np.eye(len(sigma)))
         total, left = out.get((cells.kind, "m"), (0.0, 0.0))
         total += float(np.square(values[name] / sigma).sum())
         out[cells.kind, "m"] = total, left + float(np.sum(1.0 - seen / np.square(sigma)))

@@ -22,6 +22,9 @@ AT_OPTIMUM = 1e-3
 # The last step of a fit is to be so much smaller: weights follow the state, and where residuals are
 # far from normal each step lowers the cost by up to two thirds of what the one before it did.
 LAST = AT_OPTIMUM / 4
+# While weights still change, passes end when one lowers the cost by less than so much of what the
+# first was to lower it by.
+ROUGHLY = 0.01
 STEADY = 1e-9  # the same, of trackers and targets alone, whose steps cost little
 DIGITS = 1e-14  # of a cost: what is less is rounding
 UPHILL = 1e-9  # of a cost: a step that raises it by more is shortened
@@ -46,7 +49,8 @@ class Descent:
         self.held = frozenset(name for block in self.prior for name in block.variables)
         self.associations: list[Association] = []
         self.passes = 0
-        self.plain = False  # whether all was last linearised as for a result
+        # Whether beams were in what was linearised last; None where that was not at plain weights.
+        self.plain: bool | None = None
         self.linear: Linearisation | None = None
         self.graph: Graph | None = None
         self.lay_out()
@@ -60,14 +64,16 @@ class Descent:
         linear = self.linear
         return cost_of(linear, self.graph, linear.values) - linear.beams_chi2 / 2 + of_beams
 
-    def descend(self, tolerance: float, beams: bool = True, hasten: bool = True) -> bool:
+    def descend(
+        self, least: float, size: float = np.inf, beams: bool = True, hasten: bool = True
+    ) -> bool:
         """Gauss-Newton passes while beams meet what they met; whether they came to their end.
 
         Of each step so much is taken as lowers the cost, beams weighed as where it began.
 
         Args:
-            tolerance: of beams, the largest step of the last pass, m and rad; of trackers and
-                targets alone, by how much it may lower half the chi-square.
+            least: by how much the step of the last pass may lower half the chi-square.
+            size: how large it may be, m and rad.
             beams: False for trackers and targets alone.
             hasten: whether the curvature of the beams' cost may take the place of their weights.
         """
@@ -75,7 +81,10 @@ class Descent:
         before, tangent, cost, fall = None, None, np.inf, 0.0
         weighed: Sequence[Weighing] = ()
         for _ in range(MAX_PASSES):
-            self.linearise(newton=newton, beams=beams, weighed=weighed)
+            if before is None:
+                self.linearise_here(beams)
+            else:
+                self.linearise(newton=newton, beams=beams, weighed=weighed)
             self.passes += 1
             if before is not None:
                 fell = cost - self._cost_before()
@@ -90,17 +99,23 @@ class Descent:
                 part = max(1.0, lowest)
             before, cost, weighed = self.values, self.cost(), self.linear.weighed
             tangent, fall = self.step()
-            size = self.size(tangent)
+            length = self.size(tangent)
             self.values = self.moved(before, tangent, part)
-            if size < tolerance and fall < LAST if beams else fall < max(tolerance, DIGITS * cost):
+            if length < size and fall < max(least, DIGITS * cost):
                 return True
             # Where a row's curvature misleads, steps grow; its weight never does. It is tried again
             # after twice as many passes each time, lest the steps go round in circles.
-            if newton and size >= last:
+            if newton and length >= last:
                 misled, wait = misled + 1, 2 ** (misled + 1)
             wait = max(wait - 1, 0)
-            newton, last = hasten and beams and not wait and size < last, size
+            newton, last = hasten and beams and not wait and length < last, length
         return False
+
+    def descend_roughly(self, beams: bool = True) -> None:
+        """Passes for as long as they lower the cost by much of what the first does."""
+        self.linearise_here(beams)
+        _, fall = self.step()
+        self.descend(max(LAST if beams else STEADY, ROUGHLY * fall), beams=beams)
 
     def _cost_before(self) -> float:
         """The cost here, beams weighed as they were before the step."""
@@ -109,12 +124,13 @@ class Descent:
 
     def lay_out(self) -> None:
         """Take the problem as it is now."""
-        self.layout, self.plain = Layout.of(self.problem, kept=self.held), False
+        self.layout, self.plain = Layout.of(self.problem, kept=self.held), None
 
-    def linearise_here(self) -> None:
-        """Linearise everything at the present state, unless that was done last."""
-        if not self.plain or self.linear.values is not self.values:
-            self.linearise()
+    def linearise_here(self, beams: bool = True) -> None:
+        """Linearise everything at the present state, unless that was done last; without `beams`,
+        trackers and targets alone."""
+        if self.plain is not beams or self.linear.values is not self.values:
+            self.linearise(beams=beams)
 
     def linearise(
         self,
@@ -124,7 +140,7 @@ class Descent:
         weighed: Sequence[Weighing] = (),
     ) -> None:
         """Linearise everything at the present state, and graph what is left of it."""
-        self.plain = beams and not associate and not newton
+        self.plain = None if associate or newton else beams
         found = [None] * len(self.problem.scans) if associate else self.associations
         self.linear, self.graph = self.linearised(
             self.values, beams, associations=found, newton=newton, weighed=weighed

@@ -129,9 +129,9 @@ class Estimate:
         rows[np.arange(len(columns)), columns] = 1.0
         return self.linear.covariance(rows, self.kept)
 
-    def variance_of(self, names: Sequence[str], rows: np.ndarray) -> np.ndarray:
-        """Variances (m,) of ``rows @ tangents``; see `Linearisation.variances`."""
-        return self.linear.variances(names, rows, self.kept)
+    def variances(self, some: Sequence[Mapping[str, np.ndarray]]) -> list[np.ndarray]:
+        """Variances (m,) of sets of rows; see `Linearisation.variances`."""
+        return self.linear.variances(some, self.kept)
 
     @cached_property
     def kept(self) -> np.ndarray:

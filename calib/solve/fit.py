@@ -51,7 +51,6 @@ def solve(
         loop.doubt_bodies()
     if loop.start.state and problem.scans:
         loop.go_on(tolerance)
-        loop.reweigh(tolerance)
         return loop.estimate(tolerance if spread else None)
     loop.solve_without_scans()
     loop.reweigh()

@@ -23,7 +23,7 @@ from calib.problem.unknowns import Unknown
 from calib.residuals.beams import Association
 from calib.solve.added import begun
 from calib.solve.components import squares, told, wider
-from calib.solve.descent import AT_OPTIMUM, STEADY, UPHILL, Descent, Progress
+from calib.solve.descent import AT_OPTIMUM, LAST, STEADY, UPHILL, Descent, Progress
 from calib.solve.estimate import DOFS, SEEN, Estimate, Start, cost_of, started, values_of
 from calib.solve.graph import Graph
 from calib.solve.reweight import SETTLED as SETTLED_WEIGHT
@@ -42,9 +42,6 @@ LOOKS = 3  # how often, before a fit is given up
 # By how much new weights may still lower half the chi-square, and of it: a hundredth of what an
 # optimum allows, as each round may go but a tenth of the way; where nothing fits, it never ends.
 STILL, AS_GOOD = AT_OPTIMUM / 100, 1e-8
-# While weights still change, passes end when one lowers the cost by less than so much of what new
-# weights were to lower it by.
-ROUGHLY = 0.01
 BEFORE_SCANS = 2  # times: bodies are then a start for the scans, and no result
 REWEIGHTED, ALONE = (10, SETTLED_WEIGHT), (200, 1e-3)
 # So often is looked what beams meet before it is asked whether that leads anywhere, and so often at
@@ -125,8 +122,9 @@ class Loop(Descent):
         graph = Graph(list(self.problem.variables.values()), blocks, self.held)
         return graph.solve(first)[0]
 
-    def reweigh(self, tolerance: float | None = None) -> None:
-        """Go on with robust weights until these settle, where any group of rows asks for one.
+    def reweigh(self, tolerance: float | None = None) -> bool:
+        """Go on with robust weights until these settle, where any group of rows asks for one;
+        whether any did.
 
         Args:
             tolerance: as of `settle`; of trackers and targets alone where None.
@@ -145,12 +143,12 @@ class Loop(Descent):
                 self.lay_out()
                 break
             changed = True
-            if tolerance is None:
-                self.descend(max(STEADY, ROUGHLY * fall), beams=False)
-            else:
-                self.settle(tolerance, self.seen, self._met())
+            self.descend_roughly(beams=tolerance is not None)
         if changed and tolerance is None:
             self.solve_without_scans()
+        elif changed:
+            self.settle(tolerance, self.seen, self._met())
+        return changed
 
     def take_weights(self, settled: float = SETTLED_WEIGHT) -> bool:
         """Give every group of rows the weight that its residuals ask for; whether any changed."""
@@ -295,7 +293,7 @@ class Loop(Descent):
             self.fix_association(seen, met)
             if self.lost:
                 return
-            if not self.descend(tolerance):
+            if not self.descend(LAST, tolerance):
                 return
             pairs = ((scan.pose(self.seen), scan.pose(self.values)) for scan in self.problem.scans)
             if all(np.abs(se3.log(se3.inverse(a) @ b)).max() < STRAYED for a, b in pairs):
@@ -304,12 +302,16 @@ class Loop(Descent):
         self.lost = True
 
     def go_on(self, tolerance: float) -> None:
-        """From an earlier state to the optimum; the cost does not end above that of the state."""
-        self.settle(tolerance, self.seen_before(), self.start.met)
+        """From an earlier state to the optimum, robust weights included; the cost does not end
+        above that of the state."""
+        self.fix_association(self.seen_before(), self.start.met)
+        self.descend_roughly()
+        if not self.reweigh(tolerance):
+            self.settle(tolerance, self.seen, self._met())
         if not self._raised():
             return
         self.values = values_of(self.problem, self.start.state)
-        self.descend(tolerance, hasten=False)
+        self.descend(LAST, tolerance, hasten=False)
         if self._raised():
             self.values = values_of(self.problem, self.start.state)
 
