@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from scipy import special
@@ -136,12 +137,18 @@ def _judged(some: Sequence[Shift], looks: int) -> Iterator[Blunder]:
     dof = np.array([shift.dof for shift in wholes])
     ratio = np.array([shift.statistic for shift in wholes]) / special.chdtri(dof, 0.5)
     bulk = max(1.0, float(np.median(ratio))) if len(wholes) >= BULK else 1.0
+
+    @cache
+    def bounds(own: int) -> tuple[float, float, float]:
+        """Of groups of so many dofs: those of the bulk, the limit of F, and its noncentrality."""
+        known = MEDIAN * max(dof.sum() - own, 1) if len(wholes) >= BULK else KNOWN
+        limit = special.fdtri(own, known, (1.0 - ALPHA) ** (1.0 / looks))
+        return known, limit, special.ncfdtrinc(own, known, 1.0 - POWER, limit)
+
     for shift in some:
-        known = MEDIAN * max(dof.sum() - shift.dof, 1) if len(wholes) >= BULK else KNOWN
+        known, limit, enough = bounds(shift.dof)
         scaled = shift.statistic / bulk
         p = at_least(special.fdtrc(shift.dof, known, scaled / shift.dof))
-        limit = special.fdtri(shift.dof, known, (1.0 - ALPHA) ** (1.0 / looks))
-        enough = special.ncfdtrinc(shift.dof, known, 1.0 - POWER, limit)
         told = {u: np.diag(shift.information)[at].mean() for u, at in shift.parts.items()}
         yield Blunder(
             shift=shift,

@@ -241,9 +241,8 @@ def _exact_joints(whole: Linearisation, problem: Problem) -> Iterator[GroupRows]
     rigs: dict[int, Rig] = {}
     for block in _tracked(layout):
         if _is_exact(block.stops):
-            for k, key in enumerate(block.stop_names):
+            for key, sums in zip(block.stop_names, _JointSums.of_body(block, whole), strict=True):
                 rigs[layout.stops[key]] = block.stops.rig
-                sums = _JointSums.of_body(block, k, whole)
                 found.setdefault(layout.stops[key], []).append(sums)
     for scan in (s for s in problem.scans if _is_exact(s.stops)):
         stop = layout.stops[key_of(scan)]
@@ -285,20 +284,15 @@ class _JointSums:
     columns: np.ndarray
 
     @classmethod
-    def of_body(cls, block: TrackedBody, k: int, whole: Linearisation) -> _JointSums:
-        """The rows of a body at one of its stops."""
-        one = replace(
-            block,
-            weight=None,
-            stops=block.stops.some(np.array([k]), block.stops.root).with_joint_noise(NOISE),
-            measured=block.measured[[k]],
-            bases={n: b if len(b) == 1 else b[[k]] for n, b in block.bases.items()},
-        )
-        count = len(block.stops.rig.joint_names)
-        residual, d = one.evaluate({**whole.values, NOISE: np.zeros(count)}, True)
-        Z = d.pop(NOISE)
-        A = np.hstack(list(d.values()))
-        return cls(Z.T @ Z, -Z.T @ residual, Z.T @ A, whole.layout.columns(list(d)))
+    def of_body(cls, block: TrackedBody, whole: Linearisation) -> Iterator[_JointSums]:
+        """The rows of a body at each of its stops."""
+        noisy = replace(block, weight=None, stops=block.stops.with_joint_noise(NOISE))
+        count, K = len(block.stops.rig.joint_names), len(block.measured)
+        residual, d = noisy.evaluate({**whole.values, NOISE: np.zeros(count)}, True)
+        columns = whole.layout.columns([name for name in d if name != NOISE])
+        A = np.hstack([x for name, x in d.items() if name != NOISE])
+        for Z, A_k, r in zip(*(np.split(x, K) for x in (d[NOISE], A, residual)), strict=True):
+            yield cls(Z.T @ Z, -Z.T @ r, Z.T @ A_k, columns)
 
     @classmethod
     def of_scan(cls, scan: ScanStop, whole: Linearisation, stop: int) -> _JointSums:

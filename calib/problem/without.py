@@ -47,8 +47,8 @@ def _matching(source: Source, label: str, token: str) -> list[Group]:
     """What a token names in a recording: one group, or none. What belongs to a recording may bear
     its name, or what it is called beside others."""
     bare = {token, *(token.removeprefix(f"{n}/") for n in (label, source.recording.folder.name))}
-    here = dict.fromkeys([*source.without, *_groups(source, label)])
-    return [group for group in here if replace(group, recording="").token in bare]
+    every = (*source.without, *_groups(source, label))
+    return list(dict.fromkeys(g for g in every if f"{g.where}:{g.what}" in bare))
 
 
 def _groups(source: Source, label: str = "") -> list[Group]:

@@ -2,28 +2,34 @@
 
 import pytest
 
+from calib.diagnosis.verdict import worth_adding
 from calib.problem.model import Model
-from calib.runs.calibrate import calibrate, grow, grown_model
+from calib.runs.calibrate import calibrate
 from calib.runs.diagnose import diagnose
+from calib.runs.run import Run
 
+from ..test_examples import of_a_ur10
 from . import foreign
-
-GEOMETRIC = Model(("arm_link_length", "arm_joint_offset", "arm_axis_tilt"))
 
 
 @pytest.mark.slow
-def test_a_ur10_gives_way_and_errs_with_its_gears(shared, tmp_path):
+def test_a_ur10_gives_way_and_errs_with_its_gears(shared, once):
     """Gravity and an error 17 times a turn: what stops that the fit never saw bear out."""
-    recording = foreign.ur10("D", shared / "arms/ur10_tmac", tmp_path / "ur10")
-    run = calibrate([recording], tmp_path / "run", GEOMETRIC)
-    found = diagnose(run, refits=False)
-    assert found.verdict != "adequate"
-    first, second = found.worth_adding[:2]
-    assert first == "arm_gravity_sag" and second.startswith("arm_gear_error@1")
+    folder = once(of_a_ur10, shared / "arms/ur10_tmac")
+    run, sagging, grown = (
+        Run.open(folder / f"D-{name}")
+        for name in ("geometry", "arm_gravity_sag", "arm_gear_error@17")
+    )
+    assert run.effects == ("arm_link_length", "arm_joint_offset", "arm_axis_tilt")
+    assert grown.grown_from == sagging.folder and sagging.grown_from == run.folder
+    found = run.diagnosis()
+    assert found["verdict"] != "adequate"
+    first, second = worth_adding(found["candidates"])[:2]
+    assert first == sagging.effects[-1] == "arm_gravity_sag"
+    assert second.startswith("arm_gear_error@1")
     # Sizes are of the tracked position, where there are no ranges.
-    assert 0.2 < found.candidates[0]["unabsorbed_rms_mm"] < 0.3
-    assert "range" not in found.sentences[0].split("Could not")[0]
-    grown = grow(run, grown_model(run, [first, "arm_gear_error@17"]), tmp_path / "grown")
+    assert 0.2 < found["candidates"][0]["unabsorbed_rms_mm"] < 0.3
+    assert "range" not in found["sentences"][0].split("Could not")[0]
     held_out = [r.summary["rms_mm"]["held_out"] for r in (run, grown)]
     assert held_out[1] < 0.75 * held_out[0]
     sag = grown.solution.shared.effects[first]
