@@ -174,7 +174,7 @@ class Linearisation:
             here = slice(first, first + AT_ONCE)
             for at, mine, known in self._shares(rows[here].toarray(), kept):
                 found[here][at] += np.einsum("ij,ji->i", mine, known)
-        return np.split(found, np.cumsum([table.shape[0] for table in tables[1:-1]]))
+        return np.split(found, np.cumsum([table.shape[0] for table in tables[1:]]))[:-1]
 
     def _through(self, by_twist: np.ndarray, left: np.ndarray) -> None:
         """Move what stands by the twists of all stops (q, 6 K) to the unknowns behind them."""

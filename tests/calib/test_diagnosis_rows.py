@@ -13,6 +13,7 @@ from calib.diagnosis.linear import rows_along
 from calib.diagnosis.score import away_from_model, project
 from calib.diagnosis.score import test as score_test
 from calib.diagnosis.stand import Stand
+from calib.linear.layout import Layout
 from calib.linear.parallel import workers
 from calib.linear.rows import PLACES, StopRows
 from calib.problem.model import Model
@@ -83,6 +84,31 @@ def test_places_are_numbered_in_the_order_of_stops_however_many_threads(stand, m
 
 def problem_with(stand, names):
     return stand.problem_of(stand.model.plus(tuple(effects.find(name) for name in names)))
+
+
+@pytest.mark.parametrize("order", [True, False])
+def test_without_its_candidates_a_linearisation_is_that_of_the_fit(stand, order, monkeypatch):
+    """Whichever is eliminated first, stops or cells."""
+    monkeypatch.setattr(Layout, "stops_first", order)
+    wide = stand.linearise([effects.find(name) for name in ADDED], quiet)[0].whole
+    fitted = stand.linearise([], quiet)[0].whole
+    found = wide.onto(fitted.layout)
+    assert found.layout.size < wide.layout.size
+    size = np.sqrt(np.diag(fitted.kept))
+    size[size == 0.0] = 1.0
+    unit = np.outer(size, size)
+    np.testing.assert_allclose(found.kept / unit, fitted.kept / unit, atol=1e-9)
+    np.testing.assert_allclose(found.raw, fitted.raw, rtol=1e-9, atol=1e-9 * fitted.raw.max())
+    np.testing.assert_array_equal(found.touched, fitted.touched)
+    kept = np.diag(1.0 + np.arange(len(fitted.layout.kept)))
+    rows = np.random.default_rng(0).normal(size=(5, fitted.layout.size))
+    expected = fitted.covariance(rows, kept)
+    np.testing.assert_allclose(found.covariance(rows, kept), expected, rtol=1e-6)
+    for stop, sums in fitted.scans.items():
+        whole = np.zeros((2, len(sums.cross), fitted.layout.size))
+        for out, each in zip(whole, (sums, found.scans[stop]), strict=True):
+            np.add.at(out.T, each.columns, each.cross.T)
+        np.testing.assert_allclose(*whole, rtol=1e-9, atol=1e-9 * np.abs(whole).max())
 
 
 def test_gradients_by_cluster_add_up_to_that_of_all_rows(linear, every_row):

@@ -151,6 +151,25 @@ def test_covariances_of_rows_over_any_unknowns_are_those_of_dense_rows(case, ord
     np.testing.assert_array_equal(kept, before[1])
 
 
+def test_variances_of_sets_of_rows_are_the_diagonals_of_their_covariances(case, order, monkeypatch):
+    """Of no set, of one, of several; also where not all rows are looked at at once."""
+    linear = case.linear()
+    kept = case.estimate(linear).covariance_of(list(linear.layout.outer()))
+    names, rng = list(linear.layout.at), np.random.default_rng(6)
+    some = [names[:1], names[::-1], names[1:4]]
+    sets = [
+        {n: rng.normal(size=(k, linear.layout.unknowns[n].dim)) for n in by}
+        for k, by in enumerate(some, 2)
+    ]
+    monkeypatch.setattr("calib.linear.system.AT_ONCE", 4)
+    assert linear.variances([], kept) == []
+    for by, found in zip(sets, linear.variances(sets, kept), strict=True):
+        rows = np.zeros((len(found), linear.layout.size))
+        rows[:, linear.layout.columns(list(by))] = np.hstack(list(by.values()))
+        expected = np.diag(linear.covariance(rows, kept))
+        np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
 def test_what_beams_say_of_their_lidars_twist_is_what_their_rows_say(case, order):
     """Of a twist that one stop alone has: its information, its score, its products with all."""
     linear, dense = case.linear(gradients=Gradients(len(case.dense.sigma))), case.dense
