@@ -159,6 +159,7 @@ def test_a_fit_estimates_the_spread_and_each_stop(scattered):
     assert len(estimate.values[name]) == 24
 
 
+@pytest.mark.slow
 def test_it_is_found_said_to_be_chance_and_then_nothing_is_missing(scattered):
     run = fit([scattered / "rec"], scattered / "run")
     found = diagnose(run)
@@ -231,6 +232,7 @@ def test_a_fit_goes_on_with_the_spread_that_it_had(worse, effect):
     assert spread_of(again.problem) == pytest.approx(spread_of(estimate.problem))
 
 
+@pytest.mark.slow
 def test_a_tracker_worse_than_stated_is_named_and_then_nothing_is_missing(worse):
     source, _ = worse("tracker_scatter", 3.0)
     folder = source.recording.folder
@@ -243,6 +245,7 @@ def test_a_tracker_worse_than_stated_is_named_and_then_nothing_is_missing(worse)
     assert diagnose(grown).verdict == "adequate"
 
 
+@pytest.mark.slow
 def test_without_a_mesh_the_planes_are_no_bodies(tmp_path):
     """Planes are as uneven as the data say; what bodies scatter by is told of bodies alone."""
     spec = SPEC.model_copy(update={"mesh": False, "column_step": 20})

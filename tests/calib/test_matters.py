@@ -69,6 +69,7 @@ def test_either_of_them_is_enough(fall_mm, shift, enough):
     assert Matters(fall_mm, shift, 2.0).enough is enough
 
 
+@pytest.mark.slow
 def test_what_matters_stands_with_each_finding_and_a_trace_is_said_to_be_one(tmp_path):
     """0.08 mm of 1.6, of a pattern that no value of the calibration is like."""
     simulate(SPEC, tmp_path / "rec", 4, {"azimuth_range_harmonic": 0.03})

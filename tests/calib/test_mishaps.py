@@ -127,6 +127,7 @@ def test_what_lasts_is_an_effect_and_what_does_not_a_blunder(
     assert said["outcome"] == ("bad_data" if blunder else "missing_effect")
 
 
+@pytest.mark.slow
 def test_explain_leaves_it_out_and_goes_on(recording, tmp_path):
     """A body that is 5 mm off at one stop: a rung of its own, and an adequate model after that."""
     rec = shutil.copytree(recording, tmp_path / "rec")

@@ -48,6 +48,7 @@ def test_still_sweeps_prove_no_ring_offset(shared, tmp_path, model, thickest_mm)
     assert np.median(sigma) > 0.005
 
 
+@pytest.mark.slow
 def test_a_hidden_effect_does_not_pass_unseen(shared, tmp_path):
     """A range bias with incidence can hide in the surfaces: their errors then are past belief."""
     run = calibrate([shared / "recordings/known_incidence"], tmp_path / "run", hold_out="none")
