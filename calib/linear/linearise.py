@@ -33,6 +33,7 @@ def linearise(
     beams: bool = True,
     progress: Progress = lambda done, total: None,
     weighed: Sequence[Weighing] = (),
+    slowed: Sequence[Weighing] = (),
 ) -> Linearisation:
     """Linearise all rows of beams and tracked bodies at a state.
 
@@ -46,6 +47,7 @@ def linearise(
         beams: False for tracked bodies alone.
         progress: called with how many stops are done, and of how many.
         weighed: how the beams were weighed at another state, where costs are to be compared.
+        slowed: how they were weighed before, if robust scales are to go but half the way on.
     """
     layout = layout or Layout.of(problem)
     count = len(problem.scans) if beams else 0
@@ -56,7 +58,8 @@ def linearise(
     found: list[tuple[Weighing, float, float]] = []  # each stop's weighing, its cost, and before
 
     def work(i: int) -> tuple[StopSums, SpreadRows | None, tuple | None, tuple]:
-        rows = StopRows.of(problem.scans[i], layout, values, placed[i], associations[i], newton)
+        at = problem.scans[i], layout, values, placed[i], associations[i]
+        rows = StopRows.of(*at, newton, *slowed[i : i + 1])
         here = Weighing.of(rows.rows)
         costs = here.cost(rows.rows), weighed[i].cost(rows.rows) if weighed else 0.0
         by_cluster = None
@@ -69,9 +72,8 @@ def linearise(
         progress(i, count)
         found.append(told)
         assembly.add(sums)
-        places = None
-        if by_cluster is not None:
-            places = _add_clusters(gradients, problem.scans[i], sums.stop, by_cluster)
+        scan = problem.scans[i]
+        places = by_cluster and _add_clusters(gradients, scan, sums.stop, by_cluster)
         if spread is not None:
             rows = spread_rows(spread, layout)
             assembly.add_kept(rows)

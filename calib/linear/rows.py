@@ -87,10 +87,13 @@ class StopRows:
         placed: Placed,
         association: Association | None,
         newton: bool = False,
+        slowed: Weighing | None = None,
     ) -> StopRows:
         """The rows of a scan, linearised at a state where its LiDAR is `placed`; other arguments
         as of `linearise`."""
         rows = scan.rows(values, association, placed.T[0])
+        if slowed is not None:
+            rows = rows.scaled((slowed.scale + rows.scale) / 2)
         weight, residual = rows.whitened(newton)
         columns = [layout.columns(list(rows.dense))]
         index = np.empty((len(weight), len(rows.sparse)), np.int32)

@@ -12,13 +12,13 @@ scans. With hit point h, everything that moves the beam or the surface moves r b
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 
 from calib.effects import LazyColumn, OneHot, View
-from calib.residuals.robust import tukey_cost, tukey_curvature
+from calib.residuals.robust import tukey_cost, tukey_curvature, tukey_weight
 from calib.residuals.spread import SpreadRows
 from sensors.lidar import Beams
 
@@ -126,6 +126,11 @@ class Rows:
     def cost(self) -> float:
         """Half the robust chi-square."""
         return tukey_cost(self.residual_m / self.sigma_m, self.scale)
+
+    def scaled(self, scale: float) -> Rows:
+        """The same rows, weighed as if their bulk were so many sigmas wide."""
+        weight = tukey_weight(self.residual_m / self.sigma_m, scale)
+        return replace(self, scale=scale, weight=np.where(self.usable, weight, 0.0))
 
     def whitened(self, newton: bool) -> tuple[np.ndarray, np.ndarray]:
         """Weight over variance (N,) 1/m2, and the residual (N,) m that goes with it.

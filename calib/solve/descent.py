@@ -17,6 +17,11 @@ from calib.solve.graph import Graph, KeptRows
 
 Progress = Callable[[str, int, int], None]
 MAX_PASSES = 40
+# Passes of a descent, from which robust scales go half the way: they follow the state, and where
+# residuals are far from normal state and scales can swing about each other for ever (stops that
+# scatter by three times a beam's sigma: steps of 0.1 sigma without end). Good recordings take 3 to
+# 8 passes.
+SLOWED = 12
 # By how much a further step would lower half the chi-square: 1e-3 is a step of 0.04 sigma.
 AT_OPTIMUM = 1e-3
 # The last step of a fit is to be so much smaller: weights follow the state, and where residuals are
@@ -80,11 +85,12 @@ class Descent:
         newton, last, misled, wait, part = False, np.inf, 0, 0, 1.0
         before, tangent, cost, fall = None, None, np.inf, 0.0
         weighed: Sequence[Weighing] = ()
-        for _ in range(MAX_PASSES):
+        for count in range(MAX_PASSES):
             if before is None:
                 self.linearise_here(beams)
             else:
-                self.linearise(newton=newton, beams=beams, weighed=weighed)
+                slowed = self.linear.weighed if count >= SLOWED else ()
+                self.linearise(newton=newton, beams=beams, weighed=weighed, slowed=slowed)
             self.passes += 1
             if before is not None:
                 fell = cost - self._cost_before()
@@ -138,12 +144,13 @@ class Descent:
         newton: bool = False,
         beams: bool = True,
         weighed: Sequence[Weighing] = (),
+        slowed: Sequence[Weighing] = (),
     ) -> None:
         """Linearise everything at the present state, and graph what is left of it."""
-        self.plain = None if associate or newton else beams
+        self.plain = None if associate or newton or slowed else beams
         found = [None] * len(self.problem.scans) if associate else self.associations
         self.linear, self.graph = self.linearised(
-            self.values, beams, associations=found, newton=newton, weighed=weighed
+            self.values, beams, associations=found, newton=newton, weighed=weighed, slowed=slowed
         )
 
     def linearised(
@@ -153,6 +160,7 @@ class Descent:
         associations: Sequence[Association | None] = (),
         newton: bool = False,
         weighed: Sequence[Weighing] = (),
+        slowed: Sequence[Weighing] = (),
     ) -> tuple[Linearisation, Graph]:
         """The linearisation at a state, and the graph that it is in."""
         what = f"pass {self.passes + 1}"
@@ -164,6 +172,7 @@ class Descent:
             self.layout,
             beams=beams,
             weighed=weighed,
+            slowed=slowed,
             progress=lambda done, total: self.progress(what, done, total),
         )
         blocks = [*self.layout.others, *self.prior, *KeptRows.of(linear)]

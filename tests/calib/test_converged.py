@@ -16,6 +16,7 @@ from calib.runs.calibrate import calibrate
 from calib.solve.fit import solve
 from chains.errors import InputError
 
+from ..worlds import World, write
 from . import simulated
 
 ARMS = ("arm_axes_miss_each_other", "arm_base_creeps", "arm_payload")
@@ -212,3 +213,12 @@ def test_python_refuses_too(tiny, tmp_path, monkeypatch):
     run = calibrate([tiny], tmp_path / "run", hold_out="none")
     with pytest.raises(InputError, match="--force"):
         export(run, tmp_path / "out")
+
+
+@pytest.mark.slow
+def test_scales_that_swing_about_the_state_come_to_rest(tmp_path):
+    """Stops of an XT32 scatter by three times a beam's sigma: the scale of each scan's residuals
+    follows the state, and the state the scale. At half the way each time, both come to rest."""
+    write(World(seed=266072375, stop_scatter_m=3e-3), tmp_path / "rec")
+    estimate = solve(build([Source.open(tmp_path / "rec")], Model()))
+    assert estimate.converged and estimate.iterations < 100
