@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from calib.forward import Placed
 from calib.linear.elimination import square
@@ -171,10 +172,12 @@ class StopRows:
         mine, wide = directions[self.columns], self.dense.shape[1] - TWIST - 1
         twist = self.chain @ directions[self.chain_columns]
         out = self.dense[:, :TWIST] @ twist + self.dense[:, TWIST + 1 :] @ mine[:wide]
-        padded = np.vstack([mine[wide:], np.zeros((1, directions.shape[1]))])  # index -1: none
-        for g in range(self.index.shape[1]):
-            value = np.where(self.index[:, g] >= 0, self.value[:, g], 0.0)
-            out += value[:, None] * padded[self.index[:, g]]
+        if self.sparse:
+            rows, each = self.index.shape
+            value = np.where(self.index >= 0, self.value, 0.0).ravel()  # index -1: none
+            columns = np.maximum(self.index, 0).ravel()
+            entries = value, columns, each * np.arange(rows + 1)
+            out += csr_array(entries, shape=(rows, self.sparse)) @ mine[wide:]
         return out
 
 

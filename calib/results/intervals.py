@@ -147,10 +147,9 @@ def _regions(estimate: Estimate) -> dict[tuple[object, str], dict[int, int]]:
         if REGION not in met.patches:
             continue
         for kind, part in met.patches.items():
-            pairs = np.unique(np.stack([part, met.patches[REGION]], axis=1), axis=0)
-            known = found.setdefault((scan.room, kind), {})
-            for inner, region in pairs[pairs[:, 0] >= 0].tolist():
-                known.setdefault(inner, region)
+            inner, first = np.unique(part, return_index=True)
+            pairs = zip(inner.tolist(), met.patches[REGION][first].tolist(), strict=True)
+            found[scan.room, kind] = dict(pairs) | found.get((scan.room, kind), {})
     return found
 
 
@@ -165,8 +164,8 @@ class _Sums:
 
     def add(self, rows: ClusteredRows) -> None:
         """Add whitened rows along the directions of the parameters."""
-        cells, at = np.unique([rows.stop, rows.place], axis=1, return_inverse=True)
-        self.cells.append(cells)
+        _, first, at = np.unique(_pairs(rows.stop, rows.place), True, True)
+        self.cells.append(np.stack([rows.stop[first], rows.place[first]]))
         self.moved.append(_summed(rows.A * rows.b[:, None], at))
         self.share.append(_summed(np.square(rows.A), at))
 
@@ -182,8 +181,7 @@ class _Sums:
         # What has no stop is a cluster of its part among the stops, and the other way round.
         by_stop, d_stop = _spread(moved, share, np.where(stop >= 0, stop, -1 - part))
         by_part, d_part = _spread(moved, share, np.where(part >= 0, part, -1 - stop))
-        both = np.unique([stop, part], axis=1, return_inverse=True)[1]
-        by_both, _ = _spread(moved, share, both)
+        by_both, _ = _spread(moved, share, _pairs(stop, part))
         beyond = np.maximum(by_part - by_both, 0.0)
         variance = paper + by_stop + beyond
         d = np.square(variance) / np.maximum(by_stop**2 / d_stop + beyond**2 / d_part, 1e-300)
@@ -201,6 +199,11 @@ def _spread(moved: np.ndarray, share: np.ndarray, number: np.ndarray) -> tuple[n
     among = np.square(common.sum(axis=0)) - np.square(common).sum(axis=0)
     d = np.square(size.sum(axis=0)) / np.maximum(np.square(size).sum(axis=0) + among, 1e-300)
     return np.square(moved / (1.0 - share)).sum(axis=0), np.maximum(d, 1.0)
+
+
+def _pairs(stop: np.ndarray, part: np.ndarray) -> np.ndarray:
+    """A number of each pair of stop and part (N,), -1 for none."""
+    return (stop + 1) * (int(part.max()) + 2) + part + 1
 
 
 def _summed(values: np.ndarray, at: np.ndarray) -> np.ndarray:
