@@ -31,7 +31,6 @@ from scipy import special
 from scipy.sparse import csr_array
 
 from calib.linear.clusters import ClusteredRows, Gradients
-from calib.linear.layout import positions
 from calib.linear.rows import PLACES
 from calib.solve.clustered import of_beams, of_graph, of_stops
 from calib.solve.estimate import Estimate
@@ -50,64 +49,72 @@ NORMAL = float(special.ndtri(LEVEL))
 
 @dataclass(frozen=True)
 class Intervals:
-    """What is known of the calibration's P parameters.
+    """What is known of some unknowns, of Q tangents.
 
     Args:
-        graph: (P, P) covariance of their tangents, as the graph has it.
-        wider: (P,) how many times wider than that each interval is, at least 1.
+        names, dims: of the unknowns, in order.
+        graph: (Q, Q) covariance as the graph has it.
+        data: (Q, Q) what of that is the rows' that err together; the rest is paper's.
+        wider: (Q,) how many times wider than the graph has it each interval is, at least 1.
+        least: how many times wider all of them are at least.
     """
 
+    names: tuple[str, ...]
+    dims: tuple[int, ...]
     graph: np.ndarray
+    data: np.ndarray
     wider: np.ndarray
-
-    @classmethod
-    def of(cls, covariance: np.ndarray, wider: np.ndarray) -> Intervals:
-        """From the covariance (P, P) of the intervals themselves."""
-        return cls(covariance / _times(wider), wider)
-
-    @classmethod
-    def plain(cls, covariance: np.ndarray) -> Intervals:
-        """As the graph has them."""
-        return cls(covariance, np.ones(len(covariance)))
+    least: float = 1.0
 
     @property
     def covariance(self) -> np.ndarray:
-        """(P, P): what comes on top of the graph's is correlated as that is."""
-        return self.graph * _times(self.wider)
+        """(Q, Q): what comes on top of the graph's is correlated as the data's part is. What only
+        paper says of two unknowns that the data tie together stays as it is."""
+        more = np.maximum(np.square(self.wider) - self.least**2, 0.0) * np.diag(self.graph)
+        root = np.sqrt(more / np.maximum(np.diag(self.data), 1e-300))
+        return self.least**2 * self.graph + np.outer(root, root) * self.data
+
+    def of(self, names: Sequence[str]) -> Intervals:
+        """Those of some of the unknowns, in the order given."""
+        ends = np.cumsum([0, *self.dims])
+        at = {n: np.arange(a, b) for n, a, b in zip(self.names, ends, ends[1:], strict=False)}
+        some = np.concatenate([at[name] for name in names])
+        return replace(
+            self,
+            names=tuple(names),
+            dims=tuple(len(at[name]) for name in names),
+            graph=self.graph[np.ix_(some, some)],
+            data=self.data[np.ix_(some, some)],
+            wider=self.wider[some],
+        )
+
+    def at_least(self, wider: float) -> Intervals:
+        """With every interval at least so many times wider than the graph has it."""
+        return replace(self, least=wider)
 
     def document(self, names: Sequence[str]) -> dict[str, float | str]:
         """As summary.json holds how much wider they are.
 
         Args:
-            names: (P,) of the parameters.
+            names: (Q,) of the parameters.
         """
         most = int(np.argmax(self.wider))
         median = float(np.median(self.wider))
         return {"median": median, "most": float(self.wider[most]), "parameter": names[most]}
 
-    def at_least(self, wider: float) -> Intervals:
-        """With every interval at least so many times wider than the graph has it."""
-        return replace(self, wider=np.maximum(self.wider, wider))
-
-
-def _times(wider: np.ndarray) -> np.ndarray:
-    """(P, P) how many times the graph's each covariance is."""
-    more = np.sqrt(np.square(wider) - 1.0)
-    return 1.0 + np.outer(more, more)
-
 
 def intervals(estimate: Estimate, progress: Progress = lambda what, done, total: None) -> Intervals:
-    """The intervals of an estimate.
+    """The intervals of all unknowns of an estimate that are in its graph.
 
     Args:
         estimate: with its graph and linearisation.
         progress: called with what is being done, how many stops are done, and of how many.
     """
     linear, layout, values = estimate.linear, estimate.linear.layout, estimate.values
-    sigma = np.sqrt(np.diag(estimate.covariance))
-    at = positions(layout.size, layout.kept)[layout.columns([v.name for v in estimate.variables])]
-    directions = linear.followed(estimate.kept[:, at] / sigma)
-    sums, places, stops = _Sums(), Gradients(layout.size), len(layout.stops)
+    sigma = np.sqrt(np.diag(estimate.kept))
+    directions = linear.followed(estimate.kept / sigma)
+    sums = _Sums(np.zeros_like(estimate.kept))
+    places, stops = Gradients(layout.size), len(layout.stops)
     problem, met = estimate.problem, estimate.associations
     tell = partial(progress, "how far rows err together")
     for rows in of_beams(problem, layout, values, met, directions, places, PARTS, tell):
@@ -120,7 +127,14 @@ def intervals(estimate: Estimate, progress: Progress = lambda what, done, total:
             others.append(rows)
     for rows in others:
         sums.add(rows._replace(A=rows.A @ directions[rows.columns]))
-    return Intervals(estimate.covariance, sums.wider())
+    known = layout.outer()
+    return Intervals(
+        names=tuple(known),
+        dims=tuple(unknown.dim for unknown in known.values()),
+        graph=estimate.kept,
+        data=estimate.kept - sums.paper * np.outer(sigma, sigma),
+        wider=sums.wider(),
+    )
 
 
 def _of_cells(estimate: Estimate, places: Gradients) -> list[ClusteredRows]:
@@ -156,34 +170,38 @@ def _regions(estimate: Estimate) -> dict[tuple[object, str], dict[int, int]]:
 @dataclass
 class _Sums:
     """By cell of stop and part of the room: what rows add to each parameter, and their share of
-    what is known of it, in units of the graph's sigma and its square."""
+    what is known of it, in units of the graph's sigma and its square. What has neither stop nor
+    part is paper's: (P, P)."""
 
+    paper: np.ndarray
     cells: list[np.ndarray] = field(default_factory=list)
     moved: list[np.ndarray] = field(default_factory=list)
     share: list[np.ndarray] = field(default_factory=list)
 
     def add(self, rows: ClusteredRows) -> None:
         """Add whitened rows along the directions of the parameters."""
-        _, first, at = np.unique(_pairs(rows.stop, rows.place), True, True)
-        self.cells.append(np.stack([rows.stop[first], rows.place[first]]))
-        self.moved.append(_summed(rows.A * rows.b[:, None], at))
-        self.share.append(_summed(np.square(rows.A), at))
+        alone = (rows.stop < 0) & (rows.place < 0)
+        if alone.any():
+            self.paper += rows.A[alone].T @ rows.A[alone]
+        if not alone.all():
+            A, b, stop, part = (x[~alone] for x in (rows.A, rows.b, rows.stop, rows.place))
+            _, first, at = np.unique(_pairs(stop, part), True, True)
+            self.cells.append(np.stack([stop[first], part[first]]))
+            self.moved.append(_summed(A * b[:, None], at))
+            self.share.append(_summed(np.square(A), at))
 
     def wider(self) -> np.ndarray:
         """How many times wider the intervals are than the graph has them (P,)."""
+        if not self.cells:
+            return np.ones(len(self.paper))
         (stop, part), moved = np.hstack(self.cells), np.vstack(self.moved)
         share = np.vstack(self.share)
-        paper = share[(stop < 0) & (part < 0)].sum(axis=0)
-        some = (stop >= 0) | (part >= 0)
-        stop, part, moved, share = stop[some], part[some], moved[some], share[some]
-        if not len(stop):
-            return np.ones(len(paper))
         # What has no stop is a cluster of its part among the stops, and the other way round.
         by_stop, d_stop = _spread(moved, share, np.where(stop >= 0, stop, -1 - part))
         by_part, d_part = _spread(moved, share, np.where(part >= 0, part, -1 - stop))
         by_both, _ = _spread(moved, share, _pairs(stop, part))
         beyond = np.maximum(by_part - by_both, 0.0)
-        variance = paper + by_stop + beyond
+        variance = np.diag(self.paper) + by_stop + beyond
         d = np.square(variance) / np.maximum(by_stop**2 / d_stop + beyond**2 / d_part, 1e-300)
         wider = np.sqrt(variance) * special.stdtrit(np.clip(d, 1.0, MANY), LEVEL) / NORMAL
         return np.where(d < FEWEST, 1.0, np.maximum(1.0, wider))

@@ -89,7 +89,7 @@ def reach(problem: Problem, estimate: Estimate, known: Intervals | None = None) 
     Args:
         problem: what was estimated.
         estimate: of that.
-        known: the intervals of the estimate; as the graph has them where None.
+        known: its intervals; as the graph has them where None.
 
     Returns:
         None where there are scans, no arm, or no tracked body beyond it.
@@ -108,8 +108,8 @@ def reach(problem: Problem, estimate: Estimate, known: Intervals | None = None) 
     there = _stops(problem, at_stop, rng.uniform(*range_, (POSES, len(rig.joint_names))), root)
     seen, drawn = (_placed(stops, body, base, estimate.values) for stops in (here, there))
     names = list(seen.d)
-    at, known = estimate.positions(names), known or Intervals.plain(estimate.covariance)
-    errors = _errors(known.covariance[np.ix_(at, at)], rng)
+    covariance = known.of(names).covariance if known else estimate.covariance_of(names)
+    errors = _errors(covariance, rng)
     low, high = seen.T[:, :3, 3].min(axis=0), seen.T[:, :3, 3].max(axis=0)
     at = drawn.T[:, :3, 3]
     return Reach(

@@ -93,8 +93,7 @@ def solve_from(
         moved[worst] = found[worst]
         prior = prior.loosened(worst)
     tests |= moved
-    at = estimate.positions([v.name for v in prior.held])
-    now, change = known.covariance[np.ix_(at, at)], _change(prior, estimate)
+    now, change = known.of([v.name for v in prior.held]).covariance, _change(prior, estimate)
     links = [_link(v, prior, change, now, tests[v.name], v.name in moved) for v in prior.held]
     return estimate, known, links
 
@@ -112,8 +111,8 @@ def _tests(prior: JointPrior, estimate: Estimate, known: Intervals) -> dict[str,
     """
     scale = np.sqrt(np.diag(prior.covariance))
     P = np.linalg.inv(prior.covariance / np.outer(scale, scale))
-    at = estimate.positions([v.name for v in prior.held])
-    now = (2.0 * known.graph - known.covariance)[np.ix_(at, at)] / np.outer(scale, scale)
+    held = known.of([v.name for v in prior.held])
+    now = (2.0 * held.graph - held.covariance) / np.outer(scale, scale)
     force = P @ (_change(prior, estimate) / scale)
     spread = P - P @ now @ P
     blocks = _blocks(prior.held)

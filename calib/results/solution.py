@@ -66,19 +66,16 @@ class Solution:
         recordings: rig name -> what belongs to it alone; empty where there is one rig.
         not_estimated: a `name` and a `why` for what the data could not tell.
         names: (P,) calibration parameters, ``variable.parameter``.
-        intervals: of these, m and rad.
+        covariance: (P, P) joint covariance, m and rad; see `calib.results.intervals`.
+        graph: (P, P) the same as the graph has it; None where that is no other.
     """
 
     shared: Part
     recordings: dict[str, Part]
     not_estimated: list[dict[str, str]]
     names: tuple[str, ...]
-    intervals: Intervals
-
-    @property
-    def covariance(self) -> np.ndarray:
-        """(P, P) of the parameters, m and rad."""
-        return self.intervals.covariance
+    covariance: np.ndarray
+    graph: np.ndarray | None = None
 
     def part(self, rig: str | None) -> Part:
         """All frames and effects that hold for one rig."""
@@ -98,10 +95,10 @@ def solution_of(problem: Problem, estimate: Estimate, known: Intervals | None = 
 
     Args:
         problem, estimate: what was estimated, and how it came out.
-        known: the intervals of the estimate; as the graph has them where None.
+        known: its intervals; as the graph has them where None.
     """
-    known = known or Intervals.plain(estimate.covariance)
-    told = known.covariance
+    names = [variable.name for variable in estimate.variables]
+    told = known.of(names).covariance if known else estimate.covariance
     start = np.cumsum([0] + [v.dim for v in estimate.variables])
     at = {v.name: slice(a, a + v.dim) for v, a in zip(estimate.variables, start, strict=False)}
     shared, recordings, scatter = Part(), {}, spreads(estimate)
@@ -140,7 +137,8 @@ def solution_of(problem: Problem, estimate: Estimate, known: Intervals | None = 
         recordings=recordings,
         not_estimated=untold + _absent(problem),
         names=names,
-        intervals=known,
+        covariance=told,
+        graph=estimate.covariance,
     )
 
 

@@ -202,10 +202,10 @@ def _fit(
     worse = misfit(estimate, seen)
     bulk = misfit(estimate, seen, weighted=True)  # one wild row widens no sigma
     widened = max([1.0, *(x for x in bulk.values() if x > TOLERATED)])
-    together, known = known, known.at_least(widened)
+    known = known.at_least(widened)
     solution = solution_of(problem, estimate, known)
     write_yaml(folder / SOLUTION, solution.document())
-    arrays = {"covariance": solution.covariance, "wider": known.wider}
+    arrays = {"covariance": solution.covariance, "graph": solution.graph}
     np.savez(folder / COVARIANCE, names=np.array(solution.names), **arrays)
     write_state(folder, estimate.state, stored_met(estimate.start, sources))
     write_yaml(folder / MODEL, _model_document(sources, model, choices))
@@ -215,7 +215,8 @@ def _fit(
     summary |= {"misfit": worse, "misfit_by": misfit_by(estimate, *rows, by_stop)}
     reached = reach(problem, estimate, known)
     summary |= {"sigmas_widened_by": widened, "held_out_by": by, "without": list(model.without)}
-    summary["intervals_wider_by"] = together.document(solution.names)
+    calibration = known.of([variable.name for variable in estimate.variables])
+    summary["intervals_wider_by"] = calibration.document(solution.names)
     summary["set_aside"] = sorted(estimate.problem.set_aside)
     summary["predicted_mm"] = reached.document() if reached else None
     summary["seconds"] = time.monotonic() - began

@@ -16,7 +16,6 @@ import numpy as np
 
 from calib import outputs
 from calib.effects import Trust, trusted
-from calib.results.intervals import Intervals
 from calib.results.solution import EffectEstimate, FrameEstimate, Part, Solution
 from calib.runs.stored import AGAIN, read_arrays, read_json, read_model, read_summary
 from chains import se3
@@ -213,10 +212,9 @@ def read_solution(folder: Path) -> Solution:
     path, beside = folder / SOLUTION, folder / COVARIANCE
     data, stored = read_yaml(path)[0], read_arrays(beside)
     names, covariance = stored.get("names", np.zeros(1)), stored.get("covariance", np.zeros(0))
-    wider = stored.get("wider", np.ones(names.shape))
-    numbers = all(x.dtype.kind == "f" for x in (covariance, wider))
-    shapes = names.ndim == 1 and covariance.shape == 2 * names.shape and wider.shape == names.shape
-    if not numbers or not shapes:
+    graph = stored.get("graph", covariance)
+    shape = 2 * names.shape if names.ndim == 1 else None
+    if any(x.shape != shape or x.dtype.kind != "f" for x in (covariance, graph)):
         raise InputError(f"{beside} is no covariance of a run; {AGAIN}")
     try:
         return Solution(
@@ -224,7 +222,8 @@ def read_solution(folder: Path) -> Solution:
             recordings={n: _read_part(p) for n, p in data.get("recordings", {}).items()},
             not_estimated=[{"name": e["name"], "why": e["why"]} for e in data["not_estimated"]],
             names=tuple(names.tolist()),
-            intervals=Intervals.of(covariance, wider),
+            covariance=covariance,
+            graph=graph,
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(

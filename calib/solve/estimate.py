@@ -101,13 +101,6 @@ class Estimate:
         seen = {f"{name}{SEEN}": x for name, x in self.seen.items()}
         return self.values | dofs | spread | seen
 
-    def positions(self, names: Sequence[str]) -> np.ndarray:
-        """Where parameters of some of the `variables` stand in the covariance, in the order
-        given."""
-        ends = np.cumsum([0, *(v.dim for v in self.variables)])
-        at = {v.name: np.arange(a, a + v.dim) for v, a in zip(self.variables, ends, strict=False)}
-        return np.concatenate([at[name] for name in names])
-
     def touched(self) -> np.ndarray:
         """Whether any measurement depends on each parameter of the calibration: (P,) bool."""
         layout, seen = self.linear.layout, self.linear.touched.copy()

@@ -8,7 +8,6 @@ import numpy as np
 from calib.effects import FrameOffset, trust_in
 from calib.forward import Placed, Term, place
 from calib.problem.model import Model, Source
-from calib.results.intervals import Intervals
 from calib.results.solution import EffectEstimate, FrameEstimate, Part, Solution, one_unit
 from calib.rig import Rig
 from calib.runs.run import Run
@@ -57,7 +56,7 @@ def found_by_chance(
         recordings=own,
         not_estimated=untold,
         names=tuple(names),
-        intervals=Intervals.plain(root @ root.T),
+        covariance=root @ root.T,
     )
     trust = trust_in(model.effects)
     return Run(folders[0].parent / "run", document, summary, solution, trust=trust)

@@ -14,7 +14,7 @@ from calib.problem import build
 from calib.problem.model import Model, Source
 from calib.results.check import check
 from calib.results.holdout import BLOCKS, FOLDS, folds, pose_blocks, unit_of
-from calib.results.intervals import Intervals
+from calib.results.intervals import intervals
 from calib.results.reach import Reach, joint_range, reach
 from calib.results.solution import solution_of
 from calib.runs.calibrate import calibrate
@@ -142,7 +142,8 @@ def test_what_is_predicted_is_what_the_covariance_does_to_the_chain(solved, sour
     assert found.anywhere_m == pytest.approx(apart(anywhere), rel=0.06)
     assert found.at_poses_m == pytest.approx(apart(seen), rel=0.06)
     assert found.is_small and found.box_share < 0.1 and "add poses" in found.warning
-    twice = Intervals.plain(estimate.covariance).at_least(2.0)
+    known = intervals(estimate)
+    twice = replace(known, wider=np.ones(len(known.graph))).at_least(2.0)
     assert reach(problem, estimate, twice).anywhere_m == pytest.approx(2 * found.anywhere_m)
 
 
@@ -210,3 +211,16 @@ def test_a_lidar_without_scans_is_still_named(tmp_path):
     problem = build([Source.open(recording)], SMALL)
     untold = {each["name"] for each in solution_of(problem, solve(problem)).not_estimated}
     assert "lidar" in untold
+
+
+def test_an_arm_whose_base_nothing_tracks_is_predicted_in_the_trackers_frame(source):
+    """Where it stands is unknown as well, and no part of the calibration."""
+    bodies = {"mount_markers": source.recording.bodies["mount_markers"]}
+    tracker = replace(source.rig.tracker, bodies=("mount_markers",))
+    rig = replace(source.rig, tracker=tracker, moves="never")
+    alone = replace(source, rig=rig, recording=replace(source.recording, bodies=bodies))
+    problem = build([alone], SMALL)
+    estimate = solve(problem)
+    found, known = reach(problem, estimate), intervals(estimate)
+    twice = replace(known, wider=np.ones(len(known.graph))).at_least(2.0)
+    assert reach(problem, estimate, twice).anywhere_m == pytest.approx(2 * found.anywhere_m)

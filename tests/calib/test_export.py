@@ -8,7 +8,6 @@ import yaml
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from calib.exporters import FORMATS, export, read_extrinsics
-from calib.results.intervals import Intervals
 from calib.results.solution import EffectEstimate, FrameEstimate, Part, Solution
 from calib.runs.run import Run
 from chains.errors import InputError
@@ -58,7 +57,7 @@ def run(tmp_path):
             recordings=own,
             not_estimated=untold,
             names=(),
-            intervals=Intervals.plain(np.zeros((0, 0))),
+            covariance=np.zeros((0, 0)),
         ),
     )
 

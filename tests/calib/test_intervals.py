@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -53,7 +54,7 @@ def test_the_formula_is_that_of_the_module():
     whole = np.square(A).sum(axis=0) + np.square(paper).sum(axis=0)
     A, paper = A / np.sqrt(whole), paper / np.sqrt(whole)
     b = rng.normal(size=count) + rng.normal(size=12)[stop] + rng.normal(size=5)[part]
-    sums = _Sums()
+    sums = _Sums(np.zeros((3, 3)))
     for some in np.array_split(rng.permutation(count), 7):
         sums.add(rows(A[some], b[some], stop[some], part[some]))
     sums.add(rows(paper, np.zeros(2), np.full(2, -1), np.full(2, -1)))
@@ -84,7 +85,7 @@ def test_intervals_hold_the_truth_where_stops_err_together(stops, together, leas
         y = rng.normal(size=len(stop)) + together * rng.normal(size=stops)[stop]
         C = np.linalg.inv(J.T @ J)
         x, sigma = C @ J.T @ y, np.sqrt(np.diag(C))
-        sums = _Sums()
+        sums = _Sums(np.zeros((2, 2)))
         sums.add(rows(J @ C / sigma, y - J @ x, stop, np.full(len(stop), -1)))
         held.append(np.abs(x / sigma) < 1.96 * sums.wider())
         plain.append(np.abs(x / sigma) < 1.96)
@@ -95,23 +96,51 @@ def test_intervals_hold_the_truth_where_stops_err_together(stops, together, leas
 
 
 def test_where_nothing_can_be_compared_the_graph_is_believed():
-    one = _Sums()
+    one = _Sums(np.zeros((1, 1)))
     A = np.array([[0.6], [0.8]])
     one.add(rows(A, np.zeros(2), np.zeros(2, int), np.full(2, -1)))
-    none = _Sums()
+    none = _Sums(np.zeros((1, 1)))
     none.add(rows(A, np.zeros(2), np.full(2, -1), np.full(2, -1)))
     assert one.wider() == none.wider() == 1.0
 
 
-def test_what_comes_on_top_is_a_covariance():
-    root = np.random.default_rng(1).normal(size=(5, 5))
-    known = Intervals(root @ root.T, np.array([1.0, 1.3, 2.0, 1.0, 9.0]))
-    assert np.linalg.eigvalsh(known.covariance - known.graph).min() > -1e-9
-    ratio = np.sqrt(np.diag(known.covariance) / np.diag(known.graph))
-    np.testing.assert_allclose(ratio, known.wider)
-    again = Intervals.of(known.covariance, known.wider)
-    np.testing.assert_allclose(again.graph, known.graph)
-    np.testing.assert_allclose(known.at_least(1.5).wider, [1.5, 1.5, 2.0, 1.5, 9.0])
+def known(wider):
+    """Two parameters of which the data tell the sum alone to 0.01, paper each to 1; and another."""
+    J = np.array([[1.0, 1.0, 0.0], [0.0, 0.0, 0.1]]) / 0.01
+    graph = np.linalg.inv(J.T @ J + np.eye(3))
+    return Intervals(
+        names=("tied", "alone"),
+        dims=(2, 1),
+        graph=graph,
+        data=graph @ J.T @ J @ graph,
+        wider=np.array(wider),
+    )
+
+
+def test_what_comes_on_top_is_as_large_as_it_should_be_and_a_covariance():
+    found = known([1.1, 1.0, 4.0])
+    more = found.covariance - found.graph
+    assert np.linalg.eigvalsh(more).min() > -1e-12
+    ratio = np.sqrt(np.diag(found.covariance) / np.diag(found.graph))
+    np.testing.assert_allclose(ratio, found.wider)
+    np.testing.assert_allclose(found.of(["alone"]).covariance, found.covariance[2:, 2:])
+    least = np.sqrt(np.diag(found.at_least(1.5).covariance) / np.diag(found.graph))
+    np.testing.assert_allclose(least, [1.5, 1.5, 4.0])
+
+
+def test_what_the_data_determine_is_as_much_wider_as_they_say():
+    """Rows that err together make their sum twice as uncertain. Each of both, which paper alone
+    tells, is hardly wider for it; were that correlated as the graph is, the sum would not be."""
+    found, both = known([1.0, 1.0, 1.0]), np.array([1.0, 1.0, 0.0])
+    share = np.diag(found.data) / np.diag(found.graph)
+    found = replace(found, wider=np.sqrt(1 + 3 * share))
+    assert found.wider[:2] == pytest.approx(1.0, abs=1e-3)
+    before = both @ found.graph @ both
+    assert before == pytest.approx(1e-4, rel=1e-3)
+    assert both @ found.covariance @ both == pytest.approx(4 * before, rel=1e-3)
+    more = np.sqrt(np.square(found.wider) - 1)
+    naive = found.graph * (1 + np.outer(more, more))
+    assert both @ naive @ both == pytest.approx(before, rel=0.01)
 
 
 # ---------------------------------------------------------------------------------------- fits
@@ -133,7 +162,7 @@ def test_the_rows_of_a_fit_are_all_that_is_known_and_lead_nowhere(fitted, monkey
         seen.share = seen.share + np.square(rows.A).sum(axis=0)
 
     monkeypatch.setattr(_Sums, "add", add)
-    monkeypatch.setattr(_Sums, "wider", lambda self: np.ones(len(fitted.covariance)))
+    monkeypatch.setattr(_Sums, "wider", lambda self: np.ones(len(self.paper)))
     intervals(fitted)
     np.testing.assert_allclose(seen.share, 1.0, atol=1e-6)
     np.testing.assert_allclose(seen.moved, 0.0, atol=2e-3)
@@ -161,10 +190,9 @@ def rings_off(world, folder):
     write(world, folder)
     estimate = solve(problems.build([Source.open(folder)], Model()))
     truth = json.loads(folder.with_name(f"{folder.name}.truth.json").read_text())
-    at = estimate.positions(["ring_range_offset"])
     error = estimate.values["ring_range_offset"] - np.array(truth["ring_range_offset"])
-    known = intervals(estimate)
-    graph, wider = np.sqrt(np.diag(known.graph)[at]), known.wider[at]
+    known = intervals(estimate).of(["ring_range_offset"])
+    graph, wider = np.sqrt(np.diag(known.graph)), known.wider
     return np.sqrt(np.mean(np.square(error / graph))), np.sqrt(
         np.mean(np.square(error / graph / wider))
     )

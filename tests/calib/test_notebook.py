@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from calib.diagnosis.verdict import Diagnosis
-from calib.results.intervals import Intervals
 from calib.results.solution import EffectEstimate, FrameEstimate, Part, Solution
 from calib.runs.ladder import Rung
 from calib.runs.run import Run
@@ -33,7 +32,7 @@ def run():
         recordings={},
         not_estimated=[{"name": "lidar.tz", "why": "no <floor> in sight"}],
         names=NAMES,
-        intervals=Intervals.plain(np.diag(np.full(6, 9e-8))),
+        covariance=np.diag(np.full(6, 9e-8)),
     )
     rms = {"fit": 0.86, "held_out": 1.42, "noise_floor": 1.74}
     summary = {

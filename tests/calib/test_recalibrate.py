@@ -16,6 +16,11 @@ DIM, CAD_SIGMA = 3, 1.0
 SIZE = DIM * len(NAMES)
 
 
+def as_the_graph_has_them(estimate, _):
+    C, names = estimate.covariance, tuple(v.name for v in estimate.variables)
+    return Intervals(names=names, dims=(DIM,) * len(names), graph=C, data=C, wider=np.ones(len(C)))
+
+
 @pytest.fixture
 def world(monkeypatch):
     """A linear world: links of which sums are seen, once before and once after."""
@@ -50,18 +55,14 @@ def world(monkeypatch):
             weight = np.linalg.inv(prior.covariance)
             covariance = np.linalg.inv(weight + information)
             x = covariance @ (weight @ m + J.T @ y)
-            names = [v.name for v in variables]
             return SimpleNamespace(
                 variables=variables,
                 values=values(x),
                 covariance=covariance,
-                positions=lambda some: np.concatenate(
-                    [DIM * names.index(name) + np.arange(DIM) for name in some]
-                ),
             )
 
         monkeypatch.setattr(recalibrate, "solve", solve)
-        monkeypatch.setattr(recalibrate, "intervals", lambda e, _: Intervals.plain(e.covariance))
+        monkeypatch.setattr(recalibrate, "intervals", as_the_graph_has_them)
         prior = JointPrior(variables, values(m), then)
         problem = SimpleNamespace(calibration=NAMES, variables={v.name: v for v in variables})
         return {link.name: link for link in recalibrate.solve_from(problem, prior, None)[2]}

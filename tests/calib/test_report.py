@@ -12,7 +12,6 @@ import pytest
 from calib.report import Evidence, charts_of, plot, report
 from calib.report.budget import beam_jacobian, budget
 from calib.report.statistics import Z_EDGES
-from calib.results.intervals import Intervals
 from calib.results.solution import Solution
 from calib.runs.calibrate import calibrate, grow, grown_model
 from calib.runs.diagnose import diagnose
@@ -240,7 +239,7 @@ def test_a_budget_is_the_rms_of_what_one_variable_does(grown):
         recordings={},
         not_estimated=[],
         names=solution.names,
-        intervals=Intervals.plain(np.diag(np.where(rings, sigma**2, 0.0))),
+        covariance=np.diag(np.where(rings, sigma**2, 0.0)),
     )
     values = grown.values | {"ring_range_offset": np.full(32, 0.002)}
     found = budget(grown.problem, values, told)

@@ -11,7 +11,6 @@ from calib.report.charts.bodies import Arrows, magnification
 from calib.report.charts.groups import groups
 from calib.report.charts.knowledge import tied
 from calib.report.verdict import judge
-from calib.results.intervals import Intervals
 from calib.results.solution import Solution
 from calib.runs.run import Run
 
@@ -28,7 +27,7 @@ def test_correlations_are_those_of_the_covariance_and_large_effects_are_summed_u
             recordings={},
             not_estimated=[],
             names=names,
-            intervals=Intervals.plain(covariance),
+            covariance=covariance,
         ),
         None,
     )
@@ -42,7 +41,7 @@ def test_correlations_are_those_of_the_covariance_and_large_effects_are_summed_u
             recordings={},
             not_estimated=[],
             names=names[:3],
-            intervals=Intervals.plain(covariance[:3, :3]),
+            covariance=covariance[:3, :3],
         ),
         weak,
     )

@@ -9,7 +9,6 @@ import pytest
 from scipy.spatial.transform import RigidTransform
 
 from calib.effects import CATALOGUE
-from calib.results.intervals import Intervals
 from calib.results.solution import EffectEstimate, FrameEstimate, Part, Solution
 from calib.runs.run import Run
 from calib.show import tables
@@ -78,7 +77,7 @@ def run(box, tmp_path):
         recordings={},
         not_estimated=untold,
         names=names,
-        intervals=Intervals.plain(covariance),
+        covariance=covariance,
     )
     return Run(tmp_path / "first", model, SUMMARY, solution)
 
