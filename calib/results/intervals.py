@@ -1,23 +1,22 @@
-"""How well an estimate is known, told by rows that err together.
+"""Confidence intervals that allow for rows that err together.
 
-The graph's covariance is right where rows err alone, and as much as their sigmas say. Rows of a
-stop share what the model lacks there, rows on a part of the room share what the mesh has wrong
-there, and a target's rows share its place. So the sums of rows, cluster by cluster, say how far
-they err together. At the optimum ``x = C J^T W b`` is 0 for every parameter x; its part of cluster
-c is ``t_c``, and ``h_c`` is the cluster's share of what is known of x, priors included. With p the
-share of the priors of the hardware, which no cluster has, the variance is, in units of C,
+The covariance C of the factor graph is right where rows err independently. Rows of one stop do not:
+they share whatever the model lacks there. Nor do rows on one region of the room, which share the
+mesh's error there, nor the rows of a target. So variances are estimated from clusters of rows.
+At the optimum the contributions ``t_c`` of all clusters to a parameter add up to zero, with
+``t_c = C J_c^T W b_c``; ``h_c`` is the share of the parameter's information that is in cluster c,
+and p the share of the hardware's priors, which belong to no cluster. In units of its variance in C,
 
-    v = p + sum_stops u^2 + max(0, sum_parts u^2 - sum_both u^2),    u = t / (1 - h)
+    v = p + sum_stops u^2 + max(0, sum_regions u^2 - sum_both u^2),    u = t / (1 - h)
 
-for stops and targets, for parts of the room, and for both at once (Cameron, Gelbach and Miller
-2011). Dividing by ``1 - h`` compares each cluster with what all others predict (the cluster
-jackknife CV3 of MacKinnon, Nielsen and Webb 2022). From the h follow the degrees of freedom of each
-sum, were the model to hold (Bell and McCaffrey 2002), and Satterthwaite's of v. Where they are
-fewer than `FEWEST`, as one or two clusters tell nearly all that is known, v says nothing, and the
-graph is believed. No interval is narrower than the graph has it.
+where targets are clusters beside the stops, and "both" are the cells of stop and region (Cameron,
+Gelbach and Miller 2011). Dividing by ``1 - h`` compares a cluster with what all others predict (the
+cluster jackknife CV3 of MacKinnon, Nielsen and Webb 2022). The h also give the degrees of freedom
+of each sum (Bell and McCaffrey 2002), and Satterthwaite's formula those of v. With fewer than
+`FEWEST`, where one or two clusters hold nearly all the information, nothing can be compared, and C
+is kept. No interval is narrower than by C.
 
-Estimates are told with a sigma: it is half the 95 % interval over 1.96, of t with as many degrees
-of freedom.
+Estimates are reported with a sigma: half the 95 % interval (t quantile) divided by 1.96.
 """
 
 from __future__ import annotations
@@ -54,7 +53,7 @@ class Intervals:
     Args:
         names, dims: of the unknowns, in order.
         graph: (Q, Q) covariance as the graph has it.
-        data: (Q, Q) what of that is the rows' that err together; the rest is paper's.
+        data: (Q, Q) the part of that which is due to errors of rows; the rest is due to priors.
         wider: (Q,) how many times wider than the graph has it each interval is, at least 1.
         least: how many times wider all of them are at least.
     """
@@ -68,8 +67,8 @@ class Intervals:
 
     @property
     def covariance(self) -> np.ndarray:
-        """(Q, Q): what comes on top of the graph's is correlated as the data's part is. What only
-        paper says of two unknowns that the data tie together stays as it is."""
+        """(Q, Q). The variance on top of the graph's is correlated as the data's part is: as the
+        whole is, it would go to combinations that priors alone determine."""
         more = np.maximum(np.square(self.wider) - self.least**2, 0.0) * np.diag(self.graph)
         root = np.sqrt(more / np.maximum(np.diag(self.data), 1e-300))
         return self.least**2 * self.graph + np.outer(root, root) * self.data
@@ -132,7 +131,7 @@ def intervals(estimate: Estimate, progress: Progress = lambda what, done, total:
         names=tuple(known),
         dims=tuple(unknown.dim for unknown in known.values()),
         graph=estimate.kept,
-        data=estimate.kept - sums.paper * np.outer(sigma, sigma),
+        data=estimate.kept - sums.priors * np.outer(sigma, sigma),
         wider=sums.wider(),
     )
 
@@ -170,10 +169,10 @@ def _regions(estimate: Estimate) -> dict[tuple[object, str], dict[int, int]]:
 @dataclass
 class _Sums:
     """By cell of stop and part of the room: what rows add to each parameter, and their share of
-    what is known of it, in units of the graph's sigma and its square. What has neither stop nor
-    part is paper's: (P, P)."""
+    what is known of it, in units of the graph's sigma and its square. Rows of neither are priors,
+    of which the (P, P) sums of products are kept."""
 
-    paper: np.ndarray
+    priors: np.ndarray
     cells: list[np.ndarray] = field(default_factory=list)
     moved: list[np.ndarray] = field(default_factory=list)
     share: list[np.ndarray] = field(default_factory=list)
@@ -182,7 +181,7 @@ class _Sums:
         """Add whitened rows along the directions of the parameters."""
         alone = (rows.stop < 0) & (rows.place < 0)
         if alone.any():
-            self.paper += rows.A[alone].T @ rows.A[alone]
+            self.priors += rows.A[alone].T @ rows.A[alone]
         if not alone.all():
             A, b, stop, part = (x[~alone] for x in (rows.A, rows.b, rows.stop, rows.place))
             _, first, at = np.unique(_pairs(stop, part), True, True)
@@ -193,7 +192,7 @@ class _Sums:
     def wider(self) -> np.ndarray:
         """How many times wider the intervals are than the graph has them (P,)."""
         if not self.cells:
-            return np.ones(len(self.paper))
+            return np.ones(len(self.priors))
         (stop, part), moved = np.hstack(self.cells), np.vstack(self.moved)
         share = np.vstack(self.share)
         # What has no stop is a cluster of its part among the stops, and the other way round.
@@ -201,7 +200,7 @@ class _Sums:
         by_part, d_part = _spread(moved, share, np.where(part >= 0, part, -1 - stop))
         by_both, _ = _spread(moved, share, _pairs(stop, part))
         beyond = np.maximum(by_part - by_both, 0.0)
-        variance = np.diag(self.paper) + by_stop + beyond
+        variance = np.diag(self.priors) + by_stop + beyond
         d = np.square(variance) / np.maximum(by_stop**2 / d_stop + beyond**2 / d_part, 1e-300)
         wider = np.sqrt(variance) * special.stdtrit(np.clip(d, 1.0, MANY), LEVEL) / NORMAL
         return np.where(d < FEWEST, 1.0, np.maximum(1.0, wider))

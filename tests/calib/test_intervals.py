@@ -162,7 +162,7 @@ def test_the_rows_of_a_fit_are_all_that_is_known_and_lead_nowhere(fitted, monkey
         seen.share = seen.share + np.square(rows.A).sum(axis=0)
 
     monkeypatch.setattr(_Sums, "add", add)
-    monkeypatch.setattr(_Sums, "wider", lambda self: np.ones(len(self.paper)))
+    monkeypatch.setattr(_Sums, "wider", lambda self: np.ones(len(self.priors)))
     intervals(fitted)
     np.testing.assert_allclose(seen.share, 1.0, atol=1e-6)
     np.testing.assert_allclose(seen.moved, 0.0, atol=2e-3)
