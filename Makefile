@@ -1,4 +1,4 @@
-# make demo       simulates a recording, calibrates it, exports and reports the result, in demo/
+# make demo       hides an effect in a simulated recording, finds it, adds it, reports it, in demo/
 # make test       checks style and runs every test but the long ones
 # make test-long  runs the long ones: how often intervals hold, what else is found by its name
 # make bench-hidden  counts false alarms, intervals that hold, effects found by name; CASES=4 of each kind
@@ -39,18 +39,23 @@ endif
 .PHONY: demo test test-long bench-hidden system browser clean lock audit licences dist dist-check
 
 demo: system
-	@echo "== demo: a simulated recording of the default rig"
+	@echo "== demo: a simulated recording of the default rig, with an effect hidden in it"
 	rm -rf demo
-	$(BIN)/rigcal simulate default -o demo/recording --seed 1
+	$(BIN)/rigcal simulate default -o demo/recording --seed 1 --hide incidence_angle_bias=1
 	@echo "== demo: what the recording holds, and what can be estimated from it"
 	$(BIN)/rigcal check demo/recording
 	@echo "== demo: the joint calibration"
 	$(BIN)/rigcal fit demo/recording -o demo/run
-	$(BIN)/rigcal compare demo/run
+	@echo "== demo: what the model lacks"
+	$(BIN)/rigcal diagnose demo/run
+	@echo "== demo: the same with what was found, and whether that is all"
+	$(BIN)/rigcal add demo/run incidence_angle_bias -o demo/grown
+	$(BIN)/rigcal diagnose demo/grown
+	$(BIN)/rigcal compare demo/run demo/grown
 	@echo "== demo: the result for other programs, in demo/export"
-	$(BIN)/rigcal export demo/run -o demo/export
-	@echo "== demo: the result for people; open demo/report.html, or type $(BIN)/rigcal view demo/run"
-	$(BIN)/rigcal report demo/run -o demo/report.html
+	$(BIN)/rigcal export demo/grown -o demo/export
+	@echo "== demo: the result for people; open demo/report.html, or type $(BIN)/rigcal view demo/grown"
+	$(BIN)/rigcal report demo/grown -o demo/report.html
 
 test: system browser $(TESTED)
 	@echo "== test: style"
