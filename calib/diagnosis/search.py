@@ -106,11 +106,12 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NAMES) -> Search:
     Args:
         stand: a fitted model.
         progress: as of `fit.solve`.
-        most: how many effects are named at most.
+        most: how many effects are named at most; with none, blunders are all that is looked for:
+            away from an optimum any effect, structure or scatter seems missing.
     """
     looks, found, left = _steps(stand, progress, most)
     chance: list[Chance] = []
-    while strongest := next((c for c in looks[-1].chance if c.found), None):
+    while most and (strongest := next((c for c in looks[-1].chance if c.found), None)):
         chance.append(strongest)
         if strongest.effect.widens:
             wider = looks[-1].stand.with_effects([strongest.effect], progress)
@@ -124,8 +125,8 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NAMES) -> Search:
         looks=looks,
         found=found,
         blunders=left,
-        unnamed=structures(last, progress),
-        scatter=_scatter(last, progress),
+        unnamed=structures(last, progress) if most else (),
+        scatter=_scatter(last, progress) if most else None,
         chance=[c for c in still if c.found],
     )
     if found and done.dressed_up(0):

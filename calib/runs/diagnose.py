@@ -65,9 +65,10 @@ def _found(
     stand = stand_of(run, progress, candidates)
     rings = dict(_odd_rings(stand))
     harmful = {name: each for name, each in rings.items() if each.what != "reversed"}
-    # Away from an optimum every effect that moves the state towards one looks missing.
+    # Away from an optimum every effect that moves the state towards one looks missing, and beams
+    # are thrown away for no reason of their own.
     found = search(stand, progress) if run.converged else search(stand, progress, most=0)
-    rejected = rejects(found.looks[0].stand, progress)
+    rejected = rejects(found.looks[0].stand, progress) if run.converged else None
     falls = {}
     before = run.summary["rms_mm"]["held_out"]
     if refits and run.model["hold_out"] != "none" and before is not None:

@@ -24,6 +24,7 @@ from calib.solve.estimate import Estimate
 ROUNDS = 500  # of the fixed point; from ten times too large or small 40 were measured
 STEADY = 1e-6  # relative change of a variance that ends them
 LEAST = 1e-3  # of the sd that a group starts from: what is smaller counts as none
+MOST = 1e6  # times that: far from an optimum scores are of any size, and squares overflow
 SEEN = 1e-9  # of the largest information, below which a direction of values is not seen
 
 
@@ -60,14 +61,14 @@ class Told:
             start: (G,) sd to start from.
         """
         count = np.bincount(self.group, minlength=len(start))
-        least = np.square(LEAST * start)
+        least, most = np.square(LEAST * start), np.square(MOST * start)
         variance = np.square(start)
         for _ in range(ROUNDS):
             values, covariance = self._given(variance)
             # A value known no better than by its prior tells nothing of that (MacKay 1992).
             told = count - np.bincount(self.group, np.diag(covariance)) / variance
             new = np.bincount(self.group, np.square(values)) / np.maximum(told, 1e-12)
-            new = np.where(told > 1e-9, np.maximum(new, least), variance)
+            new = np.where(told > 1e-9, np.clip(new, least, most), variance)
             steady = np.all(np.abs(new - variance) < STEADY * variance)
             variance = new
             if steady:
