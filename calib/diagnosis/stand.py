@@ -63,7 +63,8 @@ class Stand:
     @cached_property
     def spent(self) -> int:
         """How many unknowns of the model differ by stop alone: those of effects that depend on
-        columns of the stops and on nothing else."""
+        columns of the stops and on nothing else. Geometry of the arm, which depends on joints, is
+        not counted: each stop has the rows of its tracked bodies to tell of it."""
         terms = {t.variable: t for some in self.problem.terms for t in some}
         columns = {c for s in self.sources for c in s.columns}
         return sum(

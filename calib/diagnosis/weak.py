@@ -41,7 +41,8 @@ def leaning(solution: Solution, look: Look) -> list[dict[str, Any]]:
     if not len(usable):
         return []
     known, names = known[usable], [solution.names[i] for i in usable]
-    scaled = solution.graph[np.ix_(usable, usable)] / np.outer(known, known)
+    graph = solution.covariance if solution.graph is None else solution.graph
+    scaled = graph[np.ix_(usable, usable)] / np.outer(known, known)
     values, axes = np.linalg.eigh(scaled)
     untold = values > UNTOLD
     gauges, _ = echelon(axes[:, untold], np.ones(len(known)))

@@ -72,8 +72,7 @@ def linearise(
         progress(i, count)
         found.append(told)
         assembly.add(sums)
-        scan = problem.scans[i]
-        places = by_cluster and _add_clusters(gradients, scan, sums.stop, by_cluster)
+        places = _add_clusters(gradients, problem.scans[i], sums.stop, by_cluster)
         if spread is not None:
             rows = spread_rows(spread, layout)
             assembly.add_kept(rows)
@@ -81,14 +80,20 @@ def linearise(
                 at = np.full(len(rows.b), sums.stop), places
                 gradients.add_rows(ClusteredRows(rows.A, rows.b, rows.columns, *at))
     cost, before = (sum(each[k] for each in found) for k in (1, 2))
-    here, before = [each for each, _, _ in found], before if weighed else None
-    return replace(assembly.done(values), weighed=here, beams_cost=cost, cost_before=before)
+    told = {"weighed": [each for each, _, _ in found], "beams_cost": cost}
+    return replace(assembly.done(values), cost_before=before if weighed else None, **told)
 
 
 def _add_clusters(
-    gradients: Gradients, scan: ScanStop, stop: int, by_cluster: tuple[np.ndarray, ...]
-) -> np.ndarray:
-    """Add the gradients of a stop's beams; the place (N,) that each of them errs with."""
+    gradients: Gradients | None,
+    scan: ScanStop,
+    stop: int,
+    by_cluster: tuple[np.ndarray, ...] | None,
+) -> np.ndarray | None:
+    """Add the gradients of a stop's beams, where they are wanted; the place (N,) that each of them
+    errs with."""
+    if by_cluster is None:
+        return None
     parts, cluster, gradient, columns = by_cluster
     places = gradients.numbers(scan.room, parts)
     gradients.add(gradient, columns, np.full(len(parts), stop), places)

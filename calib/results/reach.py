@@ -108,7 +108,7 @@ def reach(problem: Problem, estimate: Estimate, known: Intervals | None = None) 
     there = _stops(problem, at_stop, rng.uniform(*range_, (POSES, len(rig.joint_names))), root)
     seen, drawn = (_placed(stops, body, base, estimate.values) for stops in (here, there))
     names = list(seen.d)
-    covariance = known.of(names).covariance if known else estimate.covariance_of(names)
+    covariance = known.over(estimate, names) if known else estimate.covariance_of(names)
     errors = _errors(covariance, rng)
     low, high = seen.T[:, :3, 3].min(axis=0), seen.T[:, :3, 3].max(axis=0)
     at = drawn.T[:, :3, 3]

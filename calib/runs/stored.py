@@ -38,6 +38,12 @@ class _Rms(_Kinds):
     noise_floor: Number | None
 
 
+class _Wider(_Part):
+    median: Number
+    most: Number
+    parameter: str
+
+
 class _Summary(_Part):
     points: int
     stops: int
@@ -47,6 +53,7 @@ class _Summary(_Part):
     std_mm: _Kinds
     misfit: dict[str, Number | None]
     sigmas_widened_by: Number
+    intervals_wider_by: _Wider | None = None
     iterations: int
     converged: bool
 

@@ -41,8 +41,8 @@ def over_beams(rms_mm: float, summary: Mapping[str, Any], before: str = "") -> s
 
 def together_told(summary: Mapping[str, Any]) -> list[str]:
     """That rows err together more than the model has it, where intervals are much wider for it."""
-    wider = summary.get("intervals_wider_by", {"median": 1.0})
-    if wider["median"] <= TOGETHER:
+    wider = summary.get("intervals_wider_by") or {"median": 1.0}
+    if wider["median"] <= max(TOGETHER, summary.get("sigmas_widened_by", 1.0)):
         return []
     return [
         f"rows of one stop, or of one part of the room, err together more than the model has it: "

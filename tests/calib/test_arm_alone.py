@@ -213,11 +213,13 @@ def test_a_lidar_without_scans_is_still_named(tmp_path):
     assert "lidar" in untold
 
 
-def test_an_arm_whose_base_nothing_tracks_is_predicted_in_the_trackers_frame(source):
-    """Where it stands is unknown as well, and no part of the calibration."""
+@pytest.mark.parametrize("moves", ["never", "stop"])
+def test_an_arm_whose_base_nothing_tracks_is_predicted_in_the_trackers_frame(source, moves):
+    """Where it stands is unknown as well, and no part of the calibration: for all stops, or for
+    each, and then it is in no graph."""
     bodies = {"mount_markers": source.recording.bodies["mount_markers"]}
     tracker = replace(source.rig.tracker, bodies=("mount_markers",))
-    rig = replace(source.rig, tracker=tracker, moves="never")
+    rig = replace(source.rig, tracker=tracker, moves=moves)
     alone = replace(source, rig=rig, recording=replace(source.recording, bodies=bodies))
     problem = build([alone], SMALL)
     estimate = solve(problem)

@@ -7,8 +7,10 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy import stats
+from scipy.linalg import sqrtm
 
 from calib import problem as problems
 from calib.linear.clusters import ClusteredRows, Gradients
@@ -32,34 +34,41 @@ def rows(A, b, stop, part):
 
 
 def by_hand(moved, share, cluster):
-    """The jackknife's square and degrees of freedom, cluster by cluster."""
+    """Sum of squares and degrees of freedom, each parameter by itself."""
     clusters = np.unique(cluster)
     t = np.array([moved[cluster == c].sum(axis=0) for c in clusters])
     h = np.array([share[cluster == c].sum(axis=0) for c in clusters])
-    # Covariance of the t / (1 - h) where rows err alone, for each parameter by itself.
     d = []
-    for x in (h / (1 - h)).T:
-        covariance = -np.outer(x, x)
+    for x in h.T:  # covariance of the t / sqrt(1 - h) where rows err alone
+        covariance = -np.outer(x, x) / np.sqrt(np.outer(1 - x, 1 - x))
         np.fill_diagonal(covariance, x)
         d.append(np.trace(covariance) ** 2 / np.square(covariance).sum())
-    return np.square(t / (1 - h)).sum(axis=0), np.array(d)
+    return np.sum(np.square(t) / (1 - h), axis=0), np.array(d)
 
 
 def test_the_formula_is_that_of_the_module():
+    """Stops for all parameters at once, regions for each by itself, by dense algebra."""
     rng = np.random.default_rng(0)
     count = 400
     stop, part = rng.integers(0, 12, count), rng.integers(0, 5, count)
-    A = rng.normal(size=(count, 3))
-    paper = rng.normal(size=(2, 3))
-    whole = np.square(A).sum(axis=0) + np.square(paper).sum(axis=0)
-    A, paper = A / np.sqrt(whole), paper / np.sqrt(whole)
+    J = rng.normal(size=(count, 3)) + rng.normal(size=(12, 3))[stop]
+    J[:, 2] += 2 * J[:, 1]
+    prior = rng.normal(size=(2, 3))
     b = rng.normal(size=count) + rng.normal(size=12)[stop] + rng.normal(size=5)[part]
-    sums = _Sums(np.zeros((3, 3)))
+    C = np.linalg.inv(J.T @ J + prior.T @ prior)
+    sigma = np.sqrt(np.diag(C))
+    A, paper = J @ C / sigma, prior @ C / sigma
+    sums = _Sums.over(C / np.outer(sigma, sigma))
     for some in np.array_split(rng.permutation(count), 7):
         sums.add(rows(A[some], b[some], stop[some], part[some]))
     sums.add(rows(paper, np.zeros(2), np.full(2, -1), np.full(2, -1)))
+    root, by_stop = np.linalg.cholesky(C), np.zeros(3)
+    for c in range(12):
+        mine = J[stop == c] @ root
+        inner = np.linalg.inv(sqrtm(np.eye(3) - mine.T @ mine))
+        by_stop += np.square(root @ inner @ mine.T @ b[stop == c] / sigma)
     moved, share = A * b[:, None], np.square(A)
-    by_stop, d_stop = by_hand(moved, share, stop)
+    _, d_stop = by_hand(moved, share, stop)
     by_part, d_part = by_hand(moved, share, part)
     by_both, _ = by_hand(moved, share, 5 * stop + part)
     beyond = np.maximum(by_part - by_both, 0)
@@ -70,36 +79,45 @@ def test_the_formula_is_that_of_the_module():
 
 
 @pytest.mark.parametrize(
-    ("stops", "together", "least", "most"),
-    [(30, 0.0, 0.945, 0.975), (30, 1.0, 0.92, 0.97), (8, 1.0, 0.88, 0.97), (8, 0.0, 0.945, 0.985)],
+    ("stops", "parameters", "together", "least", "most"),
+    [
+        (30, 1, 0.0, 0.945, 0.975),
+        (30, 1, 1.0, 0.92, 0.97),
+        (8, 1, 0.0, 0.945, 0.985),
+        (8, 1, 1.0, 0.91, 0.97),
+        (4, 1, 1.0, 0.92, 0.98),
+        (12, 3, 1.0, 0.91, 0.97),
+        (24, 6, 1.0, 0.91, 0.97),
+    ],
 )
-def test_intervals_hold_the_truth_where_stops_err_together(stops, together, least, most):
-    """A mean and a slope of 40 rows a stop, which share an error of so many of their own. With 8
-    stops, some of which tell far more of the slope than others, 0.90 do (measured): degrees of
-    freedom are those of rows that err alone."""
+def test_intervals_hold_the_truth_where_stops_err_together(
+    stops, parameters, together, least, most
+):
+    """So many slopes of 40 rows a stop, which share an error of so many of their own; they are of
+    what differs by stop, some of which tell far more of it than others."""
     rng, each, held, plain = np.random.default_rng(stops), 40, [], []
     stop = np.repeat(np.arange(stops), each)
-    for _ in range(1500):
-        J = np.column_stack([np.ones(len(stop)), rng.normal(size=len(stop))])
-        J[:, 1] += rng.normal(size=stops)[stop]
+    for _ in range(1000):
+        J = 0.5 * rng.normal(size=(len(stop), 1 + parameters))
+        J[:, 0] = 1.0
+        J[:, 1:] += rng.normal(size=(stops, parameters))[stop]
         y = rng.normal(size=len(stop)) + together * rng.normal(size=stops)[stop]
         C = np.linalg.inv(J.T @ J)
         x, sigma = C @ J.T @ y, np.sqrt(np.diag(C))
-        sums = _Sums(np.zeros((2, 2)))
+        sums = _Sums.over(C / np.outer(sigma, sigma))
         sums.add(rows(J @ C / sigma, y - J @ x, stop, np.full(len(stop), -1)))
-        held.append(np.abs(x / sigma) < 1.96 * sums.wider())
-        plain.append(np.abs(x / sigma) < 1.96)
-    shares = np.mean(held, axis=0)
-    assert np.all((least < shares) & (shares < most)), shares
+        held.append((np.abs(x / sigma) < 1.96 * sums.wider())[1:])
+        plain.append((np.abs(x / sigma) < 1.96)[1:])
+    shares = np.mean(held)
+    assert least < shares < most
     if together:
         assert np.mean(plain) < 0.6  # what rows alone would have said
 
 
-def test_where_nothing_can_be_compared_the_graph_is_believed():
-    one = _Sums(np.zeros((1, 1)))
+def test_one_stop_alone_widens_nothing_nor_does_none():
     A = np.array([[0.6], [0.8]])
+    one, none = _Sums.over(np.eye(1)), _Sums.over(np.eye(1))
     one.add(rows(A, np.zeros(2), np.zeros(2, int), np.full(2, -1)))
-    none = _Sums(np.zeros((1, 1)))
     none.add(rows(A, np.zeros(2), np.full(2, -1), np.full(2, -1)))
     assert one.wider() == none.wider() == 1.0
 
@@ -166,6 +184,40 @@ def test_the_rows_of_a_fit_are_all_that_is_known_and_lead_nowhere(fitted, monkey
     intervals(fitted)
     np.testing.assert_allclose(seen.share, 1.0, atol=1e-6)
     np.testing.assert_allclose(seen.moved, 0.0, atol=2e-3)
+
+
+def test_priors_of_patches_are_with_their_region_and_each_target_is_a_cluster(fitted, monkeypatch):
+    cells: dict[tuple[int, int], int] = {}
+
+    def add(self, rows):
+        for pair in zip(rows.stop.tolist(), rows.place.tolist(), strict=True):
+            cells[pair] = cells.get(pair, 0) + 1
+
+    monkeypatch.setattr(_Sums, "add", add)
+    monkeypatch.setattr(_Sums, "wider", lambda self: np.ones(len(self.priors)))
+    intervals(fitted)
+    beams = {part for stop, part in cells if stop >= 0 and part >= 0}
+    patches = sum(n for (stop, part), n in cells.items() if stop < 0 and part in beams)
+    count = {c.column: len(c.parts) for c in fitted.problem.cells.values()}
+    assert patches == count["region"] + count["patch"]
+    stops = len(fitted.linear.layout.stops)
+    targets = [n for (stop, _), n in cells.items() if stop >= stops]
+    assert targets == [9] * len(fitted.problem.sources[0].recording.targets.names)
+
+
+def test_a_ring_without_returns_is_as_well_known_as_before(tmp_path):
+    """No row touches its zero; what is rounding there is not divided by."""
+    made(tmp_path / "rec", SMALL, 4)
+    for path in (tmp_path / "rec/scans").glob("*.parquet"):
+        table = pd.read_parquet(path)
+        table[table.ring != 7].to_parquet(path, index=False)
+    estimate = solve(problems.build([Source.open(tmp_path / "rec")], Model()))
+    known = intervals(estimate).of(["ring_range_offset"])
+    dofs = next(v.dofs for v in estimate.variables if v.name == "ring_range_offset")
+    sigma, graph = np.sqrt(np.diag(known.covariance)), np.sqrt(np.diag(known.graph))
+    assert np.isfinite(sigma).all() and (sigma >= graph * (1 - 1e-9)).all()
+    if "ring_007" in dofs:
+        assert sigma[dofs.index("ring_007")] == pytest.approx(graph[dofs.index("ring_007")])
 
 
 def test_beams_are_told_apart_by_region(fitted):

@@ -1,5 +1,6 @@
 """Recalibration: who has moved is found, and by how much, however much links have in common."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -16,9 +17,23 @@ DIM, CAD_SIGMA = 3, 1.0
 SIZE = DIM * len(NAMES)
 
 
+def as_the_rows_have_them(estimate, _):
+    """The data err by twice their sigmas."""
+    plain = as_the_graph_has_them(estimate, _)
+    data = estimate.covariance @ estimate.information @ estimate.covariance
+    wider = np.sqrt(1.0 + 3.0 * np.diag(data) / np.diag(estimate.covariance))
+    return replace(plain, data=data, wider=wider)
+
+
 def as_the_graph_has_them(estimate, _):
     C, names = estimate.covariance, tuple(v.name for v in estimate.variables)
-    return Intervals(names=names, dims=(DIM,) * len(names), graph=C, data=C, wider=np.ones(len(C)))
+    return Intervals(
+        names=names,
+        dims=(DIM,) * len(names),
+        graph=C,
+        data=C,
+        wider=np.ones(len(C)),
+    )
 
 
 @pytest.fixture
@@ -45,11 +60,12 @@ def world(monkeypatch):
     def values(x):
         return {name: x[DIM * i : DIM * (i + 1)] for i, name in enumerate(NAMES)}
 
-    def at(moved):
-        """Prior and data of one draw: the truth from CAD, the fit before, the move, new data."""
+    def at(moved, noise=1.0):
+        """Prior and data of one draw: the truth from CAD, the fit before, the move, new data, whose
+        noise is so many times what it is taken for."""
         truth = CAD_SIGMA * rng.normal(size=SIZE)
         m = then @ J.T @ (J @ truth + rng.normal(size=40))
-        y = J @ (truth + moved) + rng.normal(size=40)
+        y = J @ (truth + moved) + noise * rng.normal(size=40)
 
         def solve(problem, prior, progress):
             weight = np.linalg.inv(prior.covariance)
@@ -59,10 +75,12 @@ def world(monkeypatch):
                 variables=variables,
                 values=values(x),
                 covariance=covariance,
+                information=information,
             )
 
         monkeypatch.setattr(recalibrate, "solve", solve)
-        monkeypatch.setattr(recalibrate, "intervals", as_the_graph_has_them)
+        known = as_the_graph_has_them if noise == 1.0 else as_the_rows_have_them
+        monkeypatch.setattr(recalibrate, "intervals", known)
         prior = JointPrior(variables, values(m), then)
         problem = SimpleNamespace(calibration=NAMES, variables={v.name: v for v in variables})
         return {link.name: link for link in recalibrate.solve_from(problem, prior, None)[2]}
@@ -76,6 +94,12 @@ def test_chances_are_chances_where_nothing_moved(world):
         assert kstest([links[name].p_value for links in draws], "uniform").pvalue > 1e-3
     alarms = np.mean([any(link.moved for link in links.values()) for links in draws])
     assert alarms < 0.03
+
+
+def test_chances_are_chances_where_the_new_rows_err_together(world):
+    draws = [world(np.zeros(SIZE), noise=2.0) for _ in range(300)]
+    for name in ("mount", "lidar", "arm"):
+        assert kstest([links[name].p_value for links in draws], "uniform").pvalue > 1e-3
 
 
 def test_what_moved_is_found_and_its_move_has_an_honest_sigma(world):
