@@ -70,7 +70,7 @@ def export(run: Run, out: Path | str, formats: Sequence[str] = (), force: bool =
     out, done = Path(out), Exported()
     for name in formats:
         if name not in FORMATS:
-            raise InputError(f"--format {name} is unknown; known formats are {', '.join(FORMATS)}")
+            raise InputError(f"--format {name}: unknown format; there are {', '.join(FORMATS)}")
     with outputs.folder(out, outputs.EXPORT, [run.folder, *run.inputs]) as folder:
         fitted = Fitted(run)
         for name in dict.fromkeys(formats or FORMATS):
