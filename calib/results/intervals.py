@@ -51,7 +51,9 @@ MANY = 1e6  # degrees of freedom at which t is normal
 # Of what is known of a parameter: a cluster with more leaves nothing to compare it with.
 ALONE = 0.999
 SLIGHT = 1e-9  # of the same: what clusters hold of it is rounding
-WHOLE = 200  # stops, up to which each is left out for all parameters at once
+ROUNDING = 1e-12  # of correlations: unknowns that priors tie to each other make them near singular
+# Stops, up to which each is taken for all parameters at once; of more each holds next to nothing.
+WHOLE = 200
 LEVEL = 0.975  # the quantile at which a 95 % interval ends
 NORMAL = float(special.ndtri(LEVEL))
 
@@ -211,7 +213,8 @@ class _Sums:
     @classmethod
     def over(cls, correlation: np.ndarray) -> _Sums:
         """With no rows yet."""
-        return cls(np.linalg.cholesky(correlation), np.zeros_like(correlation))
+        safe = correlation + ROUNDING * np.eye(len(correlation))
+        return cls(np.linalg.cholesky(safe), np.zeros_like(correlation))
 
     def add(self, rows: ClusteredRows) -> None:
         """Add whitened rows along the directions of the parameters."""
