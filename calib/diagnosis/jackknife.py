@@ -39,8 +39,8 @@ is found at 0.001 in 0.9 of worlds, by signs alone in none.
 A model that itself has unknowns which differ by stop alone, a drift say, fits a part of what stops
 err by, and residuals scatter less than errors. With n stops and k such unknowns, covariances by
 stop are widened by ``(n - 1) / (n - 1 - k)``, and k fewer stops count in d. With three of them, 6
-to 30 stops and 1 to 16 parameters, 12 cases in all, the sizes are then 0.00 to 0.08, but for 0.11
-with 16 parameters and 8 stops; without, 0.08 to 0.75.
+to 60 stops and 1 to 64 parameters, the sizes are then 0.00 to 0.08 (the benchmark's family "model
+by stop", 240 draws each). Not counted, they were up to 0.75, with 16 parameters and 8 stops.
 
 What was compared and left, on the same rows: leaving out with ``d nu`` in place of d and no least
 number of clusters finds something in 0.1 to 1.0 of empty worlds where stops err together and 4 or

@@ -11,14 +11,14 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import csr_array, diags_array
+from scipy.sparse import csr_array
 
 from calib.linear.clusters import ClusteredRows, Gradients
 from calib.linear.layout import Layout, positions
 from calib.linear.linearise import linearise
 from calib.linear.system import Linearisation
 from calib.problem.problem import Problem
-from calib.solve.clustered import of_beams, of_graph, of_stops
+from calib.solve.clustered import of_beams, of_cells, of_graph, of_stops
 from calib.solve.estimate import Estimate
 from calib.solve.fit import Progress
 from calib.solve.graph import Graph
@@ -158,11 +158,8 @@ def other_rows(
     """Rows of tracked bodies, targets and priors, with the stop and place that each errs with: each
     target, and each row of a prior that no stop has for itself, is a place of its own."""
     yield from of_stops(layout, values)
-    for name, cells in wide.cells.items():
-        sigma = wide.variables[name].sigma
-        A, b = csr_array(diags_array(1.0 / sigma)), -values[name] / sigma
-        place = places.numbers(cells.room, cells.surface)
-        yield ClusteredRows(A, b, np.r_[layout.at[name]], np.full(len(b), -1), place)
+    for cells, rows in of_cells(wide, layout, values):
+        yield rows._replace(place=places.numbers(cells.room, cells.surface))
     graph = Graph(list(layout.outer().values()), layout.others, layout.unbounded)
     for block, name, rows in of_graph(graph, layout, values):
         if block is None and name in wide.calibration:

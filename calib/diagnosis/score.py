@@ -15,11 +15,11 @@ from functools import cached_property
 import numpy as np
 from scipy import special
 from scipy.linalg import cho_factor, cho_solve
-from scipy.sparse import csr_array
 
 from calib.blunders.chance import at_least, log_tail
 from calib.diagnosis.jackknife import ScoreSpread, Shares, by_signs
 from calib.diagnosis.linear import Linear
+from calib.linear.clusters import summed
 
 GAUGE = 1e-6  # share of a direction's information that is left, below which there is none
 UNFELT = 1e-9  # of an effect's largest column, below which no row feels a parameter
@@ -55,12 +55,12 @@ class Scores:
     @cached_property
     def by_stop(self) -> np.ndarray:
         """(K, Q) shares of the score of rows of each stop."""
-        return _sums(self.cells, self.stop)
+        return summed(self.cells, self.stop)
 
     @cached_property
     def by_place(self) -> np.ndarray:
         """(M, Q) shares of the score of rows of each place."""
-        return _sums(self.cells, self.place)
+        return summed(self.cells, self.place)
 
     @cached_property
     def both(self) -> np.ndarray:
@@ -141,12 +141,6 @@ def project(linear: Linear, names: Sequence[str], spent: int = 0) -> Scores:
         weight_m2=linear.weight_m2,
         spent=spent,
     )
-
-
-def _sums(cells: np.ndarray, index: np.ndarray) -> np.ndarray:
-    used = np.flatnonzero(index >= 0)
-    shape = (int(index.max(initial=-1)) + 1, len(index))
-    return csr_array((np.ones(len(used)), (index[used], used)), shape=shape) @ cells
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,13 @@ import numpy as np
 from scipy.sparse import csr_array, issparse, vstack
 
 
+def summed(values: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Sums (G, P) of values (N, P) by group (N,), numbered from 0; -1 for none."""
+    used = np.flatnonzero(at >= 0)
+    shape = (int(at.max(initial=-1)) + 1, len(at))
+    return csr_array((np.ones(len(used)), (at[used], used)), shape=shape) @ values
+
+
 class ClusteredRows(NamedTuple):
     """Whitened rows, and the cluster of each: rows of one stop and place err together.
 

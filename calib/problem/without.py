@@ -48,7 +48,7 @@ def _matching(source: Source, label: str, token: str) -> list[Group]:
     its name, or what it is called beside others."""
     bare = {token, *(token.removeprefix(f"{n}/") for n in (label, source.recording.folder.name))}
     every = (*source.without, *_groups(source, label))
-    return list(dict.fromkeys(g for g in every if f"{g.where}:{g.what}" in bare))
+    return list(dict.fromkeys(g for g in every if g.bare in bare))
 
 
 def _groups(source: Source, label: str = "") -> list[Group]:

@@ -34,9 +34,14 @@ class Group:
         return self.where if self.kind in ("body", "joints", "scan") else None
 
     @property
+    def bare(self) -> str:
+        """``WHERE:WHAT``, whatever the recording."""
+        return f"{self.where}:{self.what}"
+
+    @property
     def token(self) -> str:
         """As ``--without`` takes it: ``WHERE:WHAT``, the recording before it where that matters."""
-        return f"{self.recording}/{self.where}:{self.what}".removeprefix("/")
+        return f"{self.recording}/{self.bare}".removeprefix("/")
 
     def __str__(self) -> str:
         what = {SCAN: "the scan", JOINTS: "the joints"}.get(self.what, self.what)

@@ -18,26 +18,26 @@ h also give the degrees of freedom of each sum (Bell and McCaffrey), and Sattert
 those of v. No interval is narrower than by C.
 
 Where stops err together 0.92 to 0.95 of 95 % intervals hold, with 4 to 30 stops and 1 to 12
-parameters that differ by stop (400 draws each; leaving clusters out, ``(1 - K_c)^-1``, 0.95 to
-0.99); where rows err alone, 0.95 to 0.98.
+parameters that differ by stop (the worlds of `tests/calib/test_intervals.py`, 600 draws each);
+where rows err alone, 0.97 to 0.99.
 
 Estimates are reported with a sigma: half the 95 % interval (t quantile) divided by 1.96.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from types import MappingProxyType
 
 import numpy as np
 from scipy import special
 from scipy.linalg import solve_triangular
-from scipy.sparse import csr_array, diags_array
 
-from calib.linear.clusters import ClusteredRows, Gradients
+from calib.linear.clusters import ClusteredRows, Gradients, summed
 from calib.linear.rows import PLACES
-from calib.solve.clustered import of_beams, of_graph, of_stops
+from calib.solve.clustered import of_beams, of_cells, of_graph, of_stops
 from calib.solve.estimate import Estimate
 from calib.solve.fit import Progress
 from calib.solve.graph import KeptRows
@@ -164,17 +164,15 @@ def intervals(estimate: Estimate, progress: Progress = lambda what, done, total:
 def _of_cells(estimate: Estimate, places: Gradients) -> list[ClusteredRows]:
     """Priors of parts of the room, each with the region that it is in; those of whole surfaces are
     with nothing else, as nothing is repeated of a surface."""
-    found, layout, region = [], estimate.linear.layout, _regions(estimate)
-    for name, cells in estimate.problem.cells.items():
-        sigma = estimate.problem.variables[name].sigma
+    found, region = [], _regions(estimate)
+    layout, values = estimate.linear.layout, estimate.values
+    for cells, rows in of_cells(estimate.problem, layout, values):
         where = region.get((cells.room, cells.column), {})
         place = [
             places.place((cells.room, where[part])) if part in where else -1
             for part in cells.parts.tolist()
         ]
-        A, b = csr_array(diags_array(1.0 / sigma)), -estimate.values[name] / sigma
-        columns, nowhere = np.r_[layout.at[name]], np.full(len(b), -1)
-        found.append(ClusteredRows(A, b, columns, nowhere, np.array(place, int)))
+        found.append(rows._replace(place=np.array(place, int)))
     return found
 
 
@@ -226,8 +224,8 @@ class _Sums:
         A, b, stop, part = (x[~alone] for x in (rows.A, rows.b, rows.stop, rows.place))
         _, first, at = np.unique(_pairs(stop, part), True, True)
         self.cells.append(np.stack([stop[first], part[first]]))
-        self.moved.append(_summed(A * b[:, None], at))
-        self.share.append(_summed(np.square(A), at))
+        self.moved.append(summed(A * b[:, None], at))
+        self.share.append(summed(np.square(A), at))
         if len(self.stops) <= WHOLE:
             for one in np.unique(stop[stop >= 0]).tolist():
                 mine = A[stop == one]
@@ -240,7 +238,8 @@ class _Sums:
         (stop, part), moved = np.hstack(self.cells), np.vstack(self.moved)
         share = np.vstack(self.share)
         # What has no stop is a cluster of its part among the stops, and the other way round.
-        by_stop, d_stop = self._by_stop(moved, share, np.where(stop >= 0, stop, -1 - part))
+        stops = np.where(stop >= 0, stop, -1 - part)
+        by_stop, d_stop = _squares(moved, share, stops, self._of_stops(moved, stops))
         by_part, d_part = _squares(moved, share, np.where(part >= 0, part, -1 - stop))
         by_both, _ = _squares(moved, share, _pairs(stop, part))
         beyond = np.maximum(by_part - by_both, 0.0)
@@ -249,48 +248,45 @@ class _Sums:
         wider = np.sqrt(variance) * special.stdtrit(np.clip(d, FEWEST, MANY), LEVEL) / NORMAL
         return np.where(share.sum(axis=0) > SLIGHT, np.maximum(1.0, wider), 1.0)
 
-    def _by_stop(
-        self, moved: np.ndarray, share: np.ndarray, number: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """As `_squares`, for all parameters at once where stops are few."""
-        squares, d = _squares(moved, share, number)
-        if len(self.stops) > WHOLE:
-            return squares, d
-        for stop, products in self.stops.items():
-            mine = number == stop
-            t, h = moved[mine].sum(axis=0), np.minimum(share[mine].sum(axis=0), ALONE)
+    def _of_stops(self, moved: np.ndarray, number: np.ndarray) -> dict[int, np.ndarray]:
+        """Stop -> u (P,) of all parameters at once, where stops are few; from what cells (C, P)
+        add, and the number (C,) of the cluster of each."""
+        found = {}
+        for stop, products in self.stops.items() if len(self.stops) <= WHOLE else ():
             half = solve_triangular(self.root, products, lower=True)
             values, axes = np.linalg.eigh(solve_triangular(self.root, half.T, lower=True))
+            t = moved[number == stop].sum(axis=0)
             along = axes.T @ solve_triangular(self.root, t, lower=True)
-            u = self.root @ axes @ (along / np.sqrt(1.0 - np.clip(values, 0.0, ALONE)))
-            squares += np.square(u) - np.square(t) / (1.0 - h)
-        return np.maximum(squares, 0.0), d
+            u = along / np.sqrt(1.0 - np.clip(values, 0.0, ALONE))
+            found[stop] = self.root @ axes @ u
+        return found
 
 
 def _squares(
-    moved: np.ndarray, share: np.ndarray, number: np.ndarray
+    moved: np.ndarray,
+    share: np.ndarray,
+    number: np.ndarray,
+    known: Mapping[int, np.ndarray] = MappingProxyType({}),
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The sum over clusters of u^2 (P,), each parameter by itself, and its degrees of freedom; from
-    what cells (C, P) add, their share, and the number (C,) of the cluster of each."""
-    at = np.unique(number, return_inverse=True)[1]
-    moved, share = _summed(moved, at), np.minimum(_summed(share, at), ALONE)
-    return np.sum(np.square(moved) / (1.0 - share), axis=0), _freedom(share)
+    """The sum over clusters of u^2 (P,), and its degrees of freedom.
 
-
-def _freedom(share: np.ndarray) -> np.ndarray:
-    """Degrees of freedom (P,) of a sum of u^2 over clusters with these shares (G, P)."""
+    Args:
+        moved, share: (C, P) what cells add, and their share.
+        number: (C,) of the cluster of each.
+        known: number of a cluster -> its u (P,); of the others each parameter by itself.
+    """
+    clusters, at = np.unique(number, return_inverse=True)
+    share = np.minimum(summed(share, at), ALONE)
+    u = summed(moved, at) / np.sqrt(1.0 - share)
+    for cluster, whole in known.items():
+        u[np.searchsorted(clusters, cluster)] = whole
     product = np.square(share) / (1.0 - share)  # of two clusters' u, expected
     among = np.square(product.sum(axis=0)) - np.square(product).sum(axis=0)
-    size = np.square(share.sum(axis=0))
-    return np.maximum(size / np.maximum(np.square(share).sum(axis=0) + among, 1e-300), 1.0)
+    least = np.maximum(np.square(share).sum(axis=0) + among, 1e-300)
+    d = np.maximum(np.square(share.sum(axis=0)) / least, 1.0)
+    return np.square(u).sum(axis=0), d
 
 
 def _pairs(stop: np.ndarray, part: np.ndarray) -> np.ndarray:
     """A number of each pair of stop and part (N,), -1 for none."""
     return (stop + 1) * (int(part.max()) + 2) + part + 1
-
-
-def _summed(values: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Sums (G, P) of values (N, P) by group (N,), numbered from 0."""
-    pick = csr_array((np.ones(len(at)), at, np.arange(len(at) + 1)), shape=(len(at), at.max() + 1))
-    return pick.T @ values

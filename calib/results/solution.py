@@ -12,7 +12,6 @@ from calib.effects import FrameOffset
 from calib.forward import Term
 from calib.problem import Problem
 from calib.problem.model import Source
-from calib.results.intervals import Intervals
 from calib.results.observability import not_estimated
 from calib.solve.components import spreads
 from calib.solve.estimate import Estimate
@@ -90,15 +89,14 @@ class Solution:
         return out
 
 
-def solution_of(problem: Problem, estimate: Estimate, known: Intervals | None = None) -> Solution:
+def solution_of(problem: Problem, estimate: Estimate, told: np.ndarray | None = None) -> Solution:
     """An estimate as frames and effects, with what it could not tell.
 
     Args:
         problem, estimate: what was estimated, and how it came out.
-        known: its intervals; as the graph has them where None.
+        told: (P, P) covariance of its variables, as intervals have it; the graph's where None.
     """
-    names = [variable.name for variable in estimate.variables]
-    told = known.of(names).covariance if known else estimate.covariance
+    told = estimate.covariance if told is None else told
     start = np.cumsum([0] + [v.dim for v in estimate.variables])
     at = {v.name: slice(a, a + v.dim) for v, a in zip(estimate.variables, start, strict=False)}
     shared, recordings, scatter = Part(), {}, spreads(estimate)

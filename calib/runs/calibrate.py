@@ -203,7 +203,8 @@ def _fit(
     bulk = misfit(estimate, seen, weighted=True)  # one wild row widens no sigma
     widened = max([1.0, *(x for x in bulk.values() if x > TOLERATED)])
     known = known.at_least(widened)
-    solution = solution_of(problem, estimate, known)
+    calibration = known.of([variable.name for variable in estimate.variables])
+    solution = solution_of(problem, estimate, calibration.covariance)
     write_yaml(folder / SOLUTION, solution.document())
     arrays = {"covariance": solution.covariance, "graph": solution.graph}
     np.savez(folder / COVARIANCE, names=np.array(solution.names), **arrays)
@@ -215,7 +216,6 @@ def _fit(
     summary |= {"misfit": worse, "misfit_by": misfit_by(estimate, *rows, by_stop)}
     reached = reach(problem, estimate, known)
     summary |= {"sigmas_widened_by": widened, "held_out_by": by, "without": list(model.without)}
-    calibration = known.of([variable.name for variable in estimate.variables])
     summary["intervals_wider_by"] = calibration.document(solution.names)
     summary["set_aside"] = sorted(estimate.problem.set_aside)
     summary["predicted_mm"] = reached.document() if reached else None

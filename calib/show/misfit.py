@@ -19,8 +19,8 @@ STANDS_OUT = 3.0
 # recordings, with CAD as its sigmas say, the furthest of some 15 moves was 2.4.
 FAR_FROM_CAD = 4.0
 # Times what single rows would give, from which it is told how much wider intervals are (median): in
-# 54 worlds of another simulator with nothing to find and 8 or 30 stops it was 1.11 at most; where
-# stops scatter by 1 mm, 1.33 at least.
+# 24 worlds of another simulator with nothing to find and 8 or 30 stops it was 1.00; in 12 where
+# stops scatter by 1 mm, 1.35 at least.
 TOGETHER = 1.2
 TOLD = 6  # of what stands out, the worst; of the others, how many there are
 
@@ -45,9 +45,9 @@ def together_told(summary: Mapping[str, Any]) -> list[str]:
     if wider["median"] <= max(TOGETHER, summary.get("sigmas_widened_by", 1.0)):
         return []
     return [
-        f"rows of one stop, or of one part of the room, err together more than the model has it: "
-        f"sigmas are {times(wider['median'])} times what single rows would give (median; "
-        f"{times(wider['most'])} for {wider['parameter']})"
+        f"rows of one stop, or of one part of the room, have errors in common that the model does "
+        f"not account for: sigmas are {times(wider['median'])} times what single rows would give "
+        f"(median; {times(wider['most'])} for {wider['parameter']})"
     ]
 
 

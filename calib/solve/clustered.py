@@ -10,13 +10,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
+from scipy.sparse import csr_array, diags_array
 
 from calib.linear.clusters import ClusteredRows, Gradients
 from calib.linear.layout import Layout, keys_of
 from calib.linear.linearise import lidars, own_rows, spread_rows
 from calib.linear.parallel import in_order
 from calib.linear.rows import PLACES, StopRows
-from calib.problem.problem import Block, Problem
+from calib.problem.problem import Block, Problem, SurfaceCells
 from calib.residuals.beams import Association
 from calib.residuals.tracker import TrackedBody
 from calib.solve.graph import Graph
@@ -76,20 +77,31 @@ def of_stops(layout: Layout, values: Values) -> Iterator[ClusteredRows]:
             yield ClusteredRows(rows.A, rows.b, rows.columns, *every)
 
 
+def of_cells(
+    problem: Problem, layout: Layout, values: Values
+) -> Iterator[tuple[SurfaceCells, ClusteredRows]]:
+    """Parts of surfaces, and the priors of how far these stand off: of no stop, and of no place as
+    long as nobody says of which."""
+    for name, cells in problem.cells.items():
+        sigma = problem.variables[name].sigma
+        A, b = csr_array(diags_array(1.0 / sigma)), -values[name] / sigma
+        nowhere = np.full(len(b), -1)
+        yield cells, ClusteredRows(A, b, np.r_[layout.at[name]], nowhere, nowhere)
+
+
 def of_graph(
     graph: Graph, layout: Layout, values: Values
 ) -> Iterator[tuple[Block | None, str, ClusteredRows]]:
     """Rows of a graph that are in no linearisation: their block, none for a prior; the first of
     their unknowns; and the rows, of a stop where they are of one, and of no place."""
     for block, by, b in graph.linear_rows(values):
-        A, columns = np.hstack(list(by.values())), layout.columns(list(by))
-        stop = np.full(len(b), -1)
+        A, columns, name = np.hstack(list(by.values())), layout.columns(list(by)), next(iter(by))
+        stop = nowhere = np.full(len(b), -1)
         if isinstance(block, TrackedBody):
             numbers = [layout.stops[key] for key in keys_of(block)]
             stop = np.repeat(numbers, len(b) // len(numbers))
         elif block is None:
-            known = layout.touched.get(next(iter(by)), frozenset()) - {-1}
             # The prior of an unknown that one stop alone touches belongs to that stop.
-            if len(known) == 1 == len(layout.touched[next(iter(by))]):
-                stop = np.full(len(b), *known)
-        yield block, next(iter(by)), ClusteredRows(A, b, columns, stop, np.full(len(b), -1))
+            known = layout.touched.get(name, frozenset())
+            stop = np.full(len(b), *known) if len(known) == 1 else nowhere
+        yield block, name, ClusteredRows(A, b, columns, stop, nowhere)
