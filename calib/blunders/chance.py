@@ -5,6 +5,17 @@ from __future__ import annotations
 import numpy as np
 from scipy import special
 
+# Chance that a diagnosis claims anything where nothing is missing: 5 % in all, a part for each sort
+# of claim (Bonferroni, weighted). Half of what means have is for effects with a name: they cost
+# least looks, and are what can be added.
+LEVELS = {
+    "effect": 0.02,
+    "structure": 0.01,
+    "effect on the scatter": 0.005,
+    "scatter by chance": 0.005,
+    "blunder": 0.005,
+    "structure of what was rejected": 0.005,
+}
 LEAST_P = 1e-6  # nobody knows a tail further out: no p-value is said to be smaller
 
 

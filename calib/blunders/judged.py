@@ -13,13 +13,13 @@ from functools import cache
 import numpy as np
 from scipy import special
 
-from calib.blunders.chance import after_looks, at_least, log_tail
+from calib.blunders.chance import LEVELS, after_looks, at_least, log_tail
 from calib.blunders.shifts import Shift, shifts
 from calib.linear.system import Linearisation
 from calib.problem.problem import Problem
 from calib.residuals.groups import JOINTS, Group
 
-ALPHA = 0.01  # chance that any group is called a blunder where none is
+ALPHA = LEVELS["blunder"]
 POWER = 0.8  # with which a blunder of the smallest detectable size is found
 # How much the median of squares tells of their scale, against their mean, for Gaussian rows.
 MEDIAN = 0.37

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from scipy import special
 
-from calib.blunders.chance import after_looks, at_least
+from calib.blunders.chance import LEVELS, after_looks, at_least
 from calib.blunders.shifts import Shift, of_cells
 from calib.diagnosis.score import Scores
 from calib.effects import CATALOGUE, Scatter, Site
@@ -30,7 +30,7 @@ from calib.results.solution import one_unit
 from calib.solve.components import SEEN, Sums, Told, sigma_beyond, spreads, squares, told
 from calib.solve.estimate import Estimate
 
-ALPHA = 0.01  # chance that a scatter is found where there is none
+ALPHA = LEVELS["scatter by chance"]
 POWER = 0.8  # with which one of the smallest detectable spread is found
 FEWEST = 4  # members, or checks of a body's rows, below which nothing is said of their spread
 LOOKS = sum(effect.by_chance for effect in CATALOGUE)  # effects that are looked at

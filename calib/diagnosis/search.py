@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.blunders.aside import stray_scans
-from calib.blunders.chance import after_looks, log_tail
+from calib.blunders.chance import LEVELS, after_looks, log_tail
 from calib.blunders.judged import Blunder, LeftOut
 from calib.blunders.shifts import standing_alone
 from calib.diagnosis.chance import Chance
@@ -28,8 +28,9 @@ from calib.effects import Effect
 from calib.residuals.groups import CAD, JOINTS, MESH
 from calib.solve.fit import Progress
 
-ALPHA = 0.04  # chance that a named effect is found where nothing is missing
-ALPHA_UNNAMED = 0.01  # and that structure is
+ALPHA = LEVELS["effect"]
+ALPHA_UNNAMED = LEVELS["structure"]
+ALPHA_NOISE = LEVELS["effect on the scatter"]
 MOST_NAMES = 3  # an explanation that needs more names than this is none
 INSTEAD = 0.5  # of the leading structure's evidence, for another covariate to be named too
 FEWEST = 4  # stops, below which nothing is claimed
@@ -315,9 +316,9 @@ def _covered(screen: Screen, candidate: Candidate, by: Sequence[Candidate]) -> b
 
 
 def _scatter(look: Look, progress: Progress) -> Candidate | None:
-    for candidate in suspects(look.noise, ALPHA):
+    for candidate in suspects(look.noise, ALPHA_NOISE):
         test, p = judged(look, candidate, progress)
-        if p < ALPHA:
+        if p < ALPHA_NOISE:
             return replace(candidate, test=test, p_value=test.p_value(), p_adjusted=p)
     return None
 

@@ -31,6 +31,7 @@ from calib.problem.model import Model, Source
 from calib.problem.without import leave_out
 from calib.residuals.groups import Group
 from calib.residuals.scan import ScanStop
+from calib.results.intervals import Intervals, intervals
 from calib.solve.estimate import DOFS, SEEN, Estimate, Start
 from calib.solve.fit import Progress, solve
 
@@ -208,20 +209,18 @@ class Stand:
         raise ValueError(f"'{effect.name}' is not in the model")
 
     def sigma(self, effect: Effect) -> np.ndarray:
-        """Sigma of each free parameter of an effect of the model, as the graph has it."""
-        mine = {
-            t.variable
-            for terms in self.problem.terms
-            for t in terms
-            if t.effect.name == effect.name
-        }
-        start = 0
-        for variable in self.estimate.variables:
-            if variable.name in mine:
-                at = np.arange(start, start + variable.dim)
-                return np.sqrt(np.diag(self.estimate.covariance)[at])
-            start += variable.dim
-        raise ValueError(f"'{effect.name}' is not in the model")
+        """Sigma (q,) of each free parameter of an effect of the model: see `intervals`. Of several
+        rigs, the first that has the effect."""
+        terms = (t for some in self.problem.terms for t in some)
+        mine = next((t.variable for t in terms if t.effect.name == effect.name), None)
+        if mine is None:
+            raise ValueError(f"'{effect.name}' is not in the model")
+        return np.sqrt(np.diag(self.known.over(self.estimate, [mine])))
+
+    @cached_property
+    def known(self) -> Intervals:
+        """Intervals of all unknowns, as a fit of the model reports them."""
+        return intervals(self.estimate)
 
     @cached_property
     def columns(self) -> tuple[frozenset[str], dict[str, np.ndarray]]:

@@ -24,13 +24,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import special
 
-from calib.blunders.chance import LEAST_P, after_looks
+from calib.blunders.chance import LEAST_P, LEVELS, after_looks
 from calib.diagnosis.rejects.counts import Axis, Counts, Rejected, count
 from calib.diagnosis.rejects.found import CLUTTER, Place, Rejects
 from calib.diagnosis.stand import Stand
 from calib.solve.fit import Progress
 
-ALPHA = 0.01  # chance that structure is claimed where there is none
+ALPHA = LEVELS["structure of what was rejected"]
 MOST_PLACES = 4  # places that are told apart
 FEWEST = 4  # stops, below which nothing is claimed
 KINDS = {"all": (-1, 1), "long": (1,), "short": (-1,)}  # signs of the residuals that are counted

@@ -15,7 +15,15 @@ from calib.diagnosis.candidates import concerned, lacking
 from calib.diagnosis.curves import Curve, curves
 from calib.diagnosis.rejects import Rejects
 from calib.diagnosis.screen import Candidate, Screen
-from calib.diagnosis.search import ALPHA, FEWEST, ODDS, NamedEffect, Search, angle_deg
+from calib.diagnosis.search import (
+    ALPHA,
+    ALPHA_NOISE,
+    FEWEST,
+    ODDS,
+    NamedEffect,
+    Search,
+    angle_deg,
+)
 from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import formula, hangs_on, what_separates
 from calib.diagnosis.verdict.matters import Weighed, weighed
@@ -295,9 +303,9 @@ def _candidate(
     estimate, sigma = test.estimate(), test.sigma(max(clean, 1.0))
     if step:
         estimate = found.looks[-1].stand.theta(effect, whole=False)
-        wider = max(1.0, clean, found.found[step - 1].judged.inflation)
-        sigma = np.sqrt(wider) * found.looks[-1].stand.sigma(effect)
-    alpha = -np.expm1(np.log1p(-ALPHA) / candidate.looks)
+        sigma = found.looks[-1].stand.sigma(effect)
+    level = ALPHA_NOISE if noise else ALPHA
+    alpha = -np.expm1(np.log1p(-level) / candidate.looks)
     document = effect.document()
     return {
         "effect": effect.family,
