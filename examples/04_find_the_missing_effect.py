@@ -1,6 +1,6 @@
 """A fit looks fine and predicts badly. Which physical effect is missing from its model?
 
-The fit itself gives no alarm: its error is below the noise floor, as rings, mounts and surfaces of
+The fit itself gives no alarm: its error is below what is expected, as rings, mounts and surfaces of
 the room have bent themselves around what the model does not know. Stops that it never saw tell:
 there the error is several times the floor. The diagnosis tests every effect of the catalogue beside
 the model, names the one that the data ask for, says how sure it is and what else could look alike,
@@ -22,10 +22,10 @@ from calib.simulation import load_spec
 
 
 def errors(run: calib.Run) -> str:
-    """The error of stops that a run saw, of those that it did not, and the noise floor."""
+    """The error of stops that a run saw, of those that it did not, and what is expected."""
     rms = run.summary["rms_mm"]
     seen = f"{rms['fit']:.2f} mm seen, {rms['held_out']:.2f} mm held out"
-    return f"{run.folder.name}: {seen}, noise floor {rms['noise_floor']:.2f} mm"
+    return f"{run.folder.name}: {seen}, expected {rms['noise_floor']:.2f} mm"
 
 
 out = Path(sys.argv[1] if len(sys.argv) > 1 else tempfile.mkdtemp(prefix="rigcal-"))

@@ -3,7 +3,7 @@
 A simulated rig whose ranges grow with incidence is fitted without knowing it, diagnosed, fitted
 again with the effect that was found, and reported. The page needs nothing but itself: no network,
 no program. It has the verdict on top, with a light that says whether to use the result; the ladder
-of errors down to the noise floor; the chain with how far every link is from CAD; residuals along
+of errors down to the expected one; the chain with how far every link is from CAD; residuals along
 every covariate before and after, with bands that count stops and surfaces and not points; and what
 the data could not tell, with what would have to be measured.
 

@@ -65,7 +65,7 @@ def test_exported_extrinsics_are_those_of_the_rig(tmp_path):
 def test_the_missing_effect_is_found_and_sized(tmp_path):
     said = example(4, tmp_path)
     assert re.search(r"^incidence_angle_bias is missing", said, flags=re.M)
-    errors = re.findall(r"(\S+) mm seen, (\S+) mm held out, noise floor (\S+) mm", said)
+    errors = re.findall(r"(\S+) mm seen, (\S+) mm held out, expected (\S+) mm", said)
     (seen, unseen, floor), (_, after, _) = (map(float, numbers) for numbers in errors)
     assert seen < floor < unseen / 2 and after < unseen / 2
     found, sigma = map(float, re.search(r"bias: (\S+) ± (\S+) mm", said).groups())

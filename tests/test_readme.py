@@ -72,7 +72,7 @@ def test_the_loop_runs_and_leaves_what_it_names(loop):
     assert {"extrinsics.yaml", "arm.urdf", "rig.urdf", "rings.csv"} <= files
     assert "<svg" in (folder / "report.html").read_text(encoding="utf-8")
     assert re.search(r"mount -> lidar +[+-]\d+\.\d+ ± \d", said)
-    assert re.search(r"rms after, of stops held out +mm +\d", said)
+    assert re.search(r"rms of stops held out +mm +\d", said)
     assert "incidence_angle_bias.amount" in said
 
 

@@ -60,7 +60,7 @@ def _print_version(asked: bool) -> None:
 def manners(
     context: typer.Context,
     verbose: Annotated[
-        bool, typer.Option("-v", "--verbose", help="Tell every step on stderr, in a file too.")
+        bool, typer.Option("-v", "--verbose", help="Tell every step, on stderr, and all reasons.")
     ] = False,
     quiet: Annotated[
         bool, typer.Option("-q", "--quiet", help="Print nothing but errors, and what --json asks.")
@@ -74,6 +74,11 @@ def manners(
     _stdout, _verbose = sys.stdout, verbose
     if quiet:
         context.with_resource(redirect_stdout(io.StringIO()))
+
+
+def verbose() -> bool:
+    """Whether everything is to be said."""
+    return _verbose
 
 
 def effect_names(incomplete: str) -> list[str]:

@@ -20,6 +20,7 @@ from calib.cli.app import (
     print_json,
     progress_bar,
     say,
+    verbose,
 )
 from calib.linear.parallel import workers as threads
 from chains.errors import InputError
@@ -311,5 +312,5 @@ def _tell(run: Run, as_json: bool) -> None:
     else:
         from calib.show.tables import print_run
 
-        print_run(run)
+        print_run(run, whole=verbose())
     end_unless_converged(run)

@@ -86,7 +86,7 @@ class EncoderEccentricity(Effect):
 
 
 class EncoderSecondHarmonic(EncoderEccentricity):
-    """Two read heads cancel the first harmonic and leave the second."""
+    """Two read heads leave the second harmonic: the first cancels."""
 
     name = "encoder_second_harmonic"
     formula = "azimuth = true + a * sin(2 azimuth) + b * cos(2 azimuth)"

@@ -128,7 +128,8 @@ class NearRangeBias(RangeEffect):
 
 
 class RangeStep(RangeEffect):
-    """Beyond some range the sensor fires, or amplifies, in another mode."""
+    """Beyond some range the sensor works in another mode: it fires or
+    amplifies otherwise."""
 
     name = "range_step"
     sigma = 0.005

@@ -60,7 +60,7 @@ class OptitrackDistortion(Effect):
 
 
 class BodySlip(MountSlip):
-    """A tracked body beyond the arm slips once on what carries it, is knocked or taped anew, and
+    """A tracked body beyond the arm slips once: on what carries it, knocked or taped anew; it
     stays there.
 
     Without an arm, any body. Not one that is itself what `mount_slip` moves.
@@ -102,7 +102,8 @@ class BodySlip(MountSlip):
 
 
 class BaseSlip(BodySlip):
-    """A tracked body before the arm slips once on the base, or the arm on it, and stays there."""
+    """A tracked body before the arm slips once: on the base, or the arm on it; it stays
+    there."""
 
     name = "base_slip"
     confounded_with = ("arm_base", "mount_creep", "optitrack_distortion")

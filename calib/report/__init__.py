@@ -15,8 +15,8 @@ from calib.report.chart import Absent, Chart
 from calib.report.charts import SECTIONS
 from calib.report.evidence import Evidence
 from calib.report.page import Section, render
-from calib.report.verdict import Verdict, judge
 from calib.runs.run import Run
+from calib.show.verdict import Verdict, judge
 from calib.solve.fit import Progress
 from chains.errors import InputError
 from sensors.documents import nearest

@@ -14,11 +14,11 @@ from calib.effects import CATALOGUE
 from calib.report.chart import Absent, Chart
 from calib.report.charts.fit import error_mm
 from calib.report.evidence import Evidence, folder_name
-from calib.report.verdict import Verdict
 from calib.show.blunders import HEADINGS, blunder_cells
 from calib.show.misfit import over_beams
 from calib.show.scale import shown
 from calib.show.tables import chance, effect_page, estimate_cell, mm
+from calib.show.verdict import Verdict
 from chains import escape
 
 TOLD_CANDIDATES = 8  # candidates whose evidence is told
@@ -121,7 +121,7 @@ def _numbers(evidence: Evidence) -> list[tuple[str, str]]:
     value, _, share = over_beams(error, summary, before).partition(" over ")
     out = [
         (value, f"{told[kind]}, over {share}" if share else told[kind]),
-        (f"{rms['noise_floor']:.2f} mm", "noise floor, if the model were right"),
+        (f"{rms['noise_floor']:.2f} mm", "expected if the model is right"),
         (f"{rms['nominal']:.1f} mm", "before, with everything as in CAD"),
         (f"{summary['stops']}", "stops"),
     ]

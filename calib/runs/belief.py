@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from calib.runs.run import Run
 
-FAR_OFF = 3.0  # times its sigmas, or the floor: residuals that something large is behind
+FAR_OFF = 3.0  # times its sigmas, or what is expected: residuals that something large is behind
+OVER = "the held-out error is {:.1f} times as large as expected"
 
 
 def misfit_sentence(kind: str, times: float) -> str:
@@ -14,7 +15,7 @@ def misfit_sentence(kind: str, times: float) -> str:
 
 
 def over_floor(run: Run) -> float:
-    """The held-out error in noise floors; 0 where nothing was held out."""
+    """The held-out error over the expected one; 0 where nothing was held out."""
     rms = run.summary["rms_mm"]
     return (rms.get("held_out") or 0.0) / rms["noise_floor"]
 
@@ -27,5 +28,5 @@ def forbids(run: Run) -> list[str]:
     misfit = run.summary["misfit"].items()
     out += [misfit_sentence(kind, times) for kind, times in misfit if times > FAR_OFF]
     if (times := over_floor(run)) > FAR_OFF:
-        out.append(f"the held-out error is {times:.1f} times the noise floor")
+        out.append(OVER.format(times))
     return out

@@ -25,7 +25,7 @@ from sensors.documents import plain, write_json
 EXPLANATION = "explanation.json"
 MOST_RUNGS = 8
 LEAST_FALL = (
-    0.01  # of what the held-out error has above the noise floor: what an effect must take away
+    0.01  # of what the held-out error has above the expected one: what an effect must take away
 )
 
 
@@ -65,7 +65,7 @@ def explain(
     """Grow a model until it is adequate, or what is left has no name; every rung is kept.
 
     What a mishap spoiled is left out first, as a rung of its own. What is found is added only if
-    the held-out error falls, by a hundredth of what it has above the noise floor or more, and
+    the held-out error falls, by a hundredth of what it has above the expected one or more, and
     dropped again if later steps leave it nothing to lower. Rungs that an interrupted call has
     finished are taken up again.
 

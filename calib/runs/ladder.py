@@ -1,4 +1,4 @@
-"""The ladder of a study: runs that grew from each other, rung by rung down to the noise floor."""
+"""The ladder of a study: runs that grew from each other, down to the expected error."""
 
 from __future__ import annotations
 

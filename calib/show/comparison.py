@@ -31,7 +31,7 @@ STACKED = 4  # names in a cell
 
 
 def print_comparison(runs: Sequence[Run]) -> None:
-    """Print errors, noise floor and parameters of runs side by side, and the ladder of a study."""
+    """Print errors and parameters of runs side by side, and the ladder of a study."""
     console = terminal()
     for run in runs:
         console.print(str(run.folder), style="bold", soft_wrap=True)
@@ -49,7 +49,7 @@ def print_comparison(runs: Sequence[Run]) -> None:
 
 def ladder_table(rungs: Sequence[Rung]) -> Table:
     """What each rung changed of the model, and what that did to the error of stops held out."""
-    table = columns_table("ladder", "model", "held out, mm", "fit, mm", "noise floor, mm")
+    table = columns_table("ladder", "model", "held out, mm", "fit, mm", "expected, mm")
     for column in table.columns[2:]:
         column.justify = "right"
     for rung in rungs:

@@ -40,7 +40,8 @@ def print_diagnosis(diagnosis: Diagnosis, residual: str = "range") -> None:
     """
     console = terminal()
     _say_verdict(console, diagnosis)
-    if diagnosis.candidates:
+    adequate = diagnosis.verdict == "adequate" and not diagnosis.too_few
+    if diagnosis.candidates and not adequate:
         console.print(candidates_table(diagnosis.candidates[:LEADING], residual))
     rivals = [(c["add"], c["indistinguishable_from"]) for c in diagnosis.candidates]
     tied = [(name, ", ".join(those)) for name, those in rivals if those]
@@ -48,7 +49,7 @@ def print_diagnosis(diagnosis: Diagnosis, residual: str = "range") -> None:
         print_pairs(console, "what this data cannot tell apart", tied)
     if diagnosis.unexplained:
         console.print(unexplained_table(diagnosis.unexplained[:LEADING], residual))
-    if diagnosis.verdict == "adequate" and not diagnosis.too_few:
+    if adequate:
         console.print(detectable_table(diagnosis.candidates))
     _print_untestable(console, diagnosis.untestable)
     _print_weak(console, diagnosis.weak_directions)
@@ -123,17 +124,15 @@ def unexplained_table(unexplained: Sequence[Mapping[str, Any]], residual: str) -
 
 def detectable_table(candidates: Iterable[Mapping[str, Any]]) -> Table:
     """Of each effect the smallest size that would have been found, two effects abreast."""
-    table = columns_table(*("effect", "found from", "") * 2)
-    for column in (1, 4):
-        table.columns[column].justify = "right"
+    table = columns_table(*("effect", "found from") * 2)
     cells = []
     for each in sorted(candidates, key=lambda c: c["effect"]):
         size, units = each["smallest_detectable"], each["parameters"]["unit"].split(", ")
         scale, unit = shown(units[0])
         if len(set(units)) == 1 and size is not None and np.isfinite(size):
-            cells.append((each["effect"], f"{scale * size:.2g}", unit))
+            cells.append((each["effect"], f"{scale * size:.2g} {unit}".rstrip()))
     half = (len(cells) + 1) // 2
-    for left, right in zip(cells[:half], [*cells[half:], ("", "", "")], strict=False):
+    for left, right in zip(cells[:half], [*cells[half:], ("", "")], strict=False):
         table.add_row(*left, *right)
     table.add_row()
     return table

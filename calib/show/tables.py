@@ -1,7 +1,8 @@
-"""What people read in a terminal: tables in mm and mrad, at most 100 columns wide."""
+"""What people read in a terminal: tables in mm and mrad, at most 80 columns wide."""
 
 from __future__ import annotations
 
+import re
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -14,6 +15,7 @@ from rich.text import Text
 
 from calib.blunders.chance import LEAST_P
 from calib.runs.estimates import VariableEstimate, variable_estimates
+from calib.show.headline import closing, moved_sentence
 from calib.show.misfit import beams_told, standing_out, together_told
 from calib.show.scale import shown
 from chains import escape
@@ -23,13 +25,13 @@ if TYPE_CHECKING:
     from calib.results.check import Check
     from calib.runs.run import Run
 
-WIDTH = 100
+WIDTH = 80
 LISTED_PARAMETERS = 12  # an effect of more parameters than these is summarised
 ERROR_LABELS = {
-    "nominal": "before, all as in CAD",
+    "nominal": "all as in CAD",
     "fit": "after the fit",
-    "held_out": "after, of stops held out",
-    "noise_floor": "noise floor, if the model were right",
+    "held_out": "of stops held out",
+    "noise_floor": "expected if the model is right",
 }
 
 
@@ -38,7 +40,10 @@ def print_check(check: Check) -> None:
     console = terminal()
     print_pairs(console, "what is there", check.contents)
     if check.problems:
-        print_pairs(console, "what is wrong", [("", problem) for problem in check.problems])
+        console.print("what is wrong", style="bold")
+        for problem in check.problems:  # paths whole, ready to be copied
+            console.print(f"  {problem}", soft_wrap=True)
+        console.print()
     if check.odd:
         print_pairs(console, "what is worth a look", [("", sentence) for sentence in check.odd])
     if check.command:
@@ -54,14 +59,22 @@ def print_command(console: Console, command: str) -> None:
     console.print()
 
 
-def print_run(run: Run) -> None:
-    """Print a run: every link and effect with its sigma, the errors, and what was not told."""
+def print_run(run: Run, whole: bool = False) -> None:
+    """Print a run: what moved since an earlier one, every link and effect with its sigma, what was
+    not told, the errors, and last what matters.
+
+    Args:
+        run: a run that has just been fitted.
+        whole: also what each parameter that was not told is tied to.
+    """
     console, rows = terminal(), variable_estimates(run)
     summary = run.summary
     console.print(str(run.folder), style="bold", soft_wrap=True)
     for sentence in run.warning:
         console.print(sentence, style="bold red")
     console.print(f"{outcome(summary)}\n")
+    if "links" in summary:
+        _print_moved(console, summary["links"])
     console.print(links_table([row for row in rows if row.parent is not None]))
     effects = [row for row in rows if row.parent is None]
     if effects:
@@ -69,6 +82,10 @@ def print_run(run: Run) -> None:
     formulas = (e for e in run.model["effects"] if isinstance(e, Mapping))
     if own := [(str(e["name"]), str(e["what"])) for e in formulas if "what" in e]:
         print_pairs(console, "effects of your own", own)
+    if whole:
+        _print_reasons(console, "not told by the data", run.solution.not_estimated)
+    else:
+        _print_untold(console, run.solution.not_estimated)
     console.print(error_table(summary))
     if told := beams_told(summary):
         print_pairs(console, "of how many beams", [("", line) for line in told])
@@ -77,11 +94,12 @@ def print_run(run: Run) -> None:
     if told := standing_out(summary):
         print_pairs(console, "what does not fit", [("", line) for line in told])
     for warning in _warnings(summary):
-        console.print(warning, style="bold", soft_wrap=True)
+        console.print(warning, style="bold")
         console.print()
-    if "links" in summary:
-        _print_moved(console, summary["links"])
-    _print_reasons(console, "not told by the data", run.solution.not_estimated)
+    *lines, command = closing(run, None)
+    for line in lines:
+        console.print(line, style="bold")
+    console.print(command, style="bold", soft_wrap=True)
 
 
 def _warnings(summary: dict[str, Any]) -> Iterator[str]:
@@ -129,10 +147,11 @@ def print_catalogue(effects: Sequence[Effect], whole: bool) -> None:
                 console, name, [(k.replace("_", " "), text) for k, text in page.items() if text]
             )
         return
-    table = columns_table("effect", "where", "size", "what")
+    table = columns_table("effect", "what")
     for page in pages:
-        table.add_row(page["name"], page["site"], page["typical"], page["what"])
+        table.add_row(page["name"], re.split("[:;.]( |$)", page["what"])[0])
     console.print(table)
+    console.print("\n'rigcal effects NAME' has formula, unit, size, rivals and source of one.")
 
 
 # ---------------------------------------------------------------------------------------- numbers
@@ -194,12 +213,12 @@ def print_pairs(console: Console, title: str, rows: Iterable[tuple[str, str]]) -
 
 def links_table(rows: Sequence[VariableEstimate]) -> Table:
     """How far every frame lies from CAD, in its own axes, mm and mrad."""
-    table = columns_table("moved from CAD, own axes", "x", "y", "z", "", "not told by the data")
+    table = columns_table("from CAD, own axes", "x", "y", "z", "", "not told")
     for row in rows:
         for part, unit in ((slice(3, 6), "m"), (slice(0, 3), "rad")):
             cells = map(estimate_cell, row.estimate[part], row.sigma[part], (unit,) * 3)
             untold = " ".join(np.array(["x", "y", "z"])[~row.told[part]])
-            label = f"{row.parent} -> {row.variable}" if unit == "m" else ""
+            label = row.variable if unit == "m" else f"  on {row.parent}"
             table.add_row(label, *cells, shown(unit)[1], untold)
     table.add_row()
     return table
@@ -239,13 +258,13 @@ def _summary_cell(row: VariableEstimate, free: np.ndarray, unit: str) -> tuple[s
         return "held", unit
     digits = ".2f" if scale != 1.0 else ".3g"
     return (
-        f"mean {values.mean():+{digits}}, sd {values.std():{digits}}, {values.min():+{digits}} to "
-        f"{values.max():+{digits}}, sigma {scale * np.median(row.sigma[free]):.2g}"
+        f"mean {values.mean():+{digits}}, {values.min():+{digits}} to {values.max():+{digits}}, "
+        f"each ± {scale * np.median(row.sigma[free]):.2g}"
     ), unit
 
 
 def error_table(summary: Mapping[str, Any]) -> Table:
-    """The errors of a run's summary: before, after, of stops held out; and the noise floor."""
+    """The errors of a run's summary: before, after, of stops held out; and what is expected."""
     table = columns_table(f"{summary['residual']} residual, mm", "rms", "mean", "std")
     for column in table.columns[1:]:
         column.justify = "right"
@@ -259,20 +278,18 @@ def error_table(summary: Mapping[str, Any]) -> Table:
 
 def _print_moved(console: Console, links: Sequence[Mapping[str, Any]]) -> None:
     """What has moved since the run that was the prior, and what has not."""
-    rows, still, silent = [], [], []
+    console.print(moved_sentence(links), style="bold")
+    console.print()
+    rows, still = [], []
     for link in links:
         if link["moved"]:
             rows.append((link["name"], f"{_change(link)}; {chance(link['p_value'])}"))
-        elif link["p_value"] is None:
-            silent.append(link["name"])
-        else:
+        elif link["p_value"] is not None:
             still.append(f"{link['name']} ({chance(link['p_value'])})")
-    rows = rows or [("nothing", "no change is beyond the uncertainty of then and now")]
-    print_pairs(console, "moved since the earlier run", rows)
+    if rows:
+        print_pairs(console, "moved since the earlier run", rows)
     if still:
         print_pairs(console, "not moved", [("", ", ".join(still))])
-    if silent:
-        print_pairs(console, "the new data say nothing of", [("", ", ".join(silent))])
 
 
 def _change(link: Mapping[str, Any]) -> str:
@@ -309,6 +326,17 @@ def _print_reasons(console: Console, title: str, entries: Sequence[Mapping[str, 
         groups[why if colon else tied].append((entry["name"], tied if colon else ""))
     for why, rows in groups.items():
         print_pairs(console, f"{title}: {why}", rows)
+
+
+def _print_untold(console: Console, entries: Sequence[Mapping[str, str]]) -> None:
+    """Names of what was not told, those that are tied to others together, whatever to."""
+    tied = [entry["name"] for entry in entries if ": " in entry["why"]]
+    if tied:
+        why = "determined only together with others; 'rigcal -v fit' says with which"
+        print_pairs(console, f"not told by the data: {why}", [("", ", ".join(tied))])
+    _print_reasons(
+        console, "not told by the data", [each for each in entries if ": " not in each["why"]]
+    )
 
 
 def outcome(summary: Mapping[str, Any]) -> str:

@@ -173,7 +173,7 @@ def by_chance(p: float | None) -> str:
 
 
 def ladder(rungs: Sequence[Rung]) -> str:
-    """Every rung's held-out error as a bar, and the noise floor as a line through all of them."""
+    """Every rung's held-out error as a bar, and what is expected as a line through all of them."""
     errors = [_error(rung) for rung in rungs]
     floor = rungs[-1].run.summary["rms_mm"]["noise_floor"]
     most = max([*(mm for mm, _ in errors), floor]) * 1.02 or 1.0
@@ -181,7 +181,7 @@ def ladder(rungs: Sequence[Rung]) -> str:
         _rung(rung, mm, 100 * mm / most, 100 * floor / most)
         for rung, (mm, _) in zip(rungs, errors, strict=True)
     )
-    said = f"Error of {errors[-1][1]}; dashed: noise floor, {floor:.2f} mm"
+    said = f"Error of {errors[-1][1]}; dashed: {floor:.2f} mm expected"
     warning = "".join(
         f'<div data-is="warning" style="color:#b3261e;font-weight:600">{escape(sentence)}</div>'
         for sentence in rungs[-1].run.warning

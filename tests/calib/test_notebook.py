@@ -37,6 +37,7 @@ def run():
     rms = {"fit": 0.86, "held_out": 1.42, "noise_floor": 1.74}
     summary = {
         **{"points": 10, "stops": 2, "converged": True, "iterations": 3, "seconds": 1.0},
+        "misfit": {},
         **{"rms_mm": rms, "mean_mm": {"fit": 0.01}, "std_mm": {"fit": 0.86}, "residual": "range"},
     }
     model = {"effects": [], "fixed": [], "prior": None, "recordings": []}
@@ -125,7 +126,7 @@ def test_a_diagnosis_shows_its_verdict_sentences_and_candidates():
 
 def test_a_rung_shows_its_errors(run):
     rows = cells(rung_html(Rung(run, None)))
-    assert rows[0] == ["ladder", "model", "held out, mm", "fit, mm", "noise floor, mm"]
+    assert rows[0] == ["ladder", "model", "held out, mm", "fit, mm", "expected, mm"]
     assert rows[1] == ["a&b", "start", "1.42", "0.86", "1.74"]
 
 

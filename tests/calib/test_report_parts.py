@@ -10,9 +10,9 @@ import pytest
 from calib.report.charts.bodies import Arrows, magnification
 from calib.report.charts.groups import groups
 from calib.report.charts.knowledge import tied
-from calib.report.verdict import judge
 from calib.results.solution import Solution
 from calib.runs.run import Run
+from calib.show.verdict import judge
 
 
 def test_correlations_are_those_of_the_covariance_and_large_effects_are_summed_up():
@@ -97,7 +97,7 @@ def apart(part, what):
         ({}, None, "amber", "not diagnosed"),
         ({}, found("unexplained_structure"), "amber", "structure"),
         ({}, found(sigma_mm=3.5), "amber", "a.x may still be off by 3.5 mm"),
-        (rms(1.5), found(), "amber", "1.5 times the noise floor"),
+        (rms(1.5), found(), "amber", "1.5 times as large as expected"),
         (rms(None), found(), "amber", "no stops were held out"),
         ({"misfit": {"reference": 2.0}}, found(), "amber", "errors of the reference"),
         (
@@ -113,7 +113,7 @@ def apart(part, what):
             "a.tz: -133 mm from CAD, 100 of its sigmas",
         ),
         ({"misfit": {"tracker": 4.0}}, found(), "red", "residuals of the tracker"),
-        (rms(4.0), found(), "red", "4.0 times the noise floor"),
+        (rms(4.0), found(), "red", "4.0 times as large as expected"),
         ({"converged": False}, found(), "red", "not converged"),
         ({}, found("missing_effect"), "red", "worth adding"),
         ({}, found("bad_data"), "red", "to be mended or left out"),

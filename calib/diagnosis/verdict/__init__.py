@@ -132,7 +132,7 @@ def conclude(
 
     Args:
         found: the search.
-        held_out: effect -> held-out rms before and after it was truly fitted, and noise floor, mm.
+        held_out: effect -> held-out rms before and after it was truly fitted, and expected, mm.
         summary: of the run: its errors, and its misfit by instrument.
         weak: weak directions.
         rejected: what the fit threw away.
@@ -336,7 +336,7 @@ def _candidate(
 
 
 def _explained(before: float | None, after: float | None, floor: float | None) -> float | None:
-    """Share of what the held-out error has above the noise floor."""
+    """Share of what the held-out error has above what is expected."""
     if before is None or after is None or floor is None:
         return None
     return (before**2 - after**2) / max(before**2 - floor**2, before**2 - after**2, 1e-12)

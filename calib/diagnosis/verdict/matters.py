@@ -129,7 +129,7 @@ def weighed(
 
     Args:
         found: the search.
-        held_out: effect -> held-out rms before and after it was truly fitted, and noise floor, mm.
+        held_out: effect -> held-out rms before and after it was truly fitted, and expected, mm.
         rms_mm: as of `Consequences`.
     """
     matter, named, traces, refused = {}, [], [], []

@@ -11,8 +11,8 @@ from calib.report import plots
 from calib.report.chart import Absent, Chart
 from calib.report.evidence import Evidence, folder_name
 from calib.report.statistics import Z_EDGES
-from calib.report.verdict import AT_THE_FLOOR
 from calib.runs.ladder import Rung
+from calib.show.verdict import AT_THE_FLOOR
 
 if TYPE_CHECKING:
     from calib.report.plots import Figure
@@ -28,7 +28,7 @@ def error_mm(rung: Rung) -> tuple[str, float]:
 
 
 def ladder(evidence: Evidence) -> Iterator[Chart | Absent]:
-    """Errors rung by rung, down to the noise floor."""
+    """Errors rung by rung, and what is expected."""
     kind, last = error_mm(evidence.rungs[-1])
     floor = evidence.run.summary["rms_mm"]["noise_floor"]
     first = error_mm(evidence.rungs[0])[1]
@@ -37,9 +37,9 @@ def ladder(evidence: Evidence) -> Iterator[Chart | Absent]:
     near = "below" if last > first and last <= floor else near
     yield Chart(
         "ladder",
-        f"The {kind} error went{way} to {last:.2f} mm, {near} the noise floor of {floor:.2f} mm"
+        f"The {kind} error went{way} to {last:.2f} mm, {near} the {floor:.2f} mm expected"
         if way
-        else f"The {kind} error is {last:.2f} mm, {near} the noise floor of {floor:.2f} mm",
+        else f"The {kind} error is {last:.2f} mm, {near} the {floor:.2f} mm expected",
         "A row per run, each named by what it added to the one above. Blue: rms error of stops "
         "that its fit never saw; hollow: of those it saw; green: what would be left if the model "
         "were right. Further left is better; an error at the green mark cannot be told from noise.",
@@ -57,7 +57,7 @@ def _ladder(evidence: Evidence) -> Figure:
     ax.plot(rms[0]["nominal"], 0, "s", color=plots.BEFORE, label="nothing fitted")
     ax.plot([r["fit"] for r in rms], y, "o", mfc="white", color=plots.PALE, label="stops seen")
     floors = [r["noise_floor"] for r in rms]
-    ax.plot(floors, y, "|", ms=15, mew=3, color=plots.FLOOR, label="noise floor")
+    ax.plot(floors, y, "|", ms=15, mew=3, color=plots.FLOOR, label="expected")
     shown = [error_mm(r)[1] for r in rungs]
     label = "stops held out" if rms[-1].get("held_out") is not None else "fit; none held out"
     ax.plot(shown, y, "o-", ms=8, color=plots.AFTER, label=label)
@@ -98,7 +98,7 @@ def variance(evidence: Evidence) -> Iterator[Chart | Absent]:
 
 
 def variance_mm(evidence: Evidence) -> dict[str, float]:
-    """Parts of the error in mm, which add up in squares: to the noise floor, then to the error."""
+    """Parts of the error in mm, which add up in squares: to what is expected, then to all of it."""
     rms = evidence.run.summary["rms_mm"]
     error, floor = error_mm(evidence.rungs[-1])[1], rms["noise_floor"]
     parts = {n: 1e3 * np.sqrt(v) for n, v in evidence.after.variance_m2.items()}

@@ -6,12 +6,13 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from calib.runs.belief import FAR_OFF, forbids, misfit_sentence, over_floor
+from calib.runs.belief import FAR_OFF, OVER, forbids, misfit_sentence, over_floor
 from calib.runs.calibrate import TOLERATED
 from calib.runs.run import Run
 from calib.show.misfit import standing_out, together_told
 
-AT_THE_FLOOR = 1.25  # times the noise floor: a held-out error as good as it
+AT_THE_FLOOR = 1.25  # times what is expected: a held-out error as good as that
+UNASKED = "not diagnosed"
 MEANING = {"green": "use it", "amber": "use it with care", "red": "do not use it yet"}
 
 
@@ -39,7 +40,7 @@ def judge(run: Run, diagnosis: Mapping[str, Any] | None) -> Verdict:
     """The verdict on a run.
 
     Red where an effect is known to be missing, or residuals are several times larger than their
-    sigmas or than the noise floor allow; amber where that has not been looked at, or something is
+    sigmas or than is expected; amber where that has not been looked at, or something is
     weak or unexplained; green where the model is adequate, stops that the fit never saw are as well
     predicted as noise allows, and nothing that the data left open is several times larger than
     that noise.
@@ -62,9 +63,8 @@ def _undiagnosed(run: Run) -> str:
     rms = run.summary["rms_mm"]
     told = f"its residuals are {rms['fit']:.2f} mm, and no stops were held out"
     if rms.get("held_out") is not None:
-        told = f"stops that it never saw are off by {rms['held_out']:.2f} mm"
-    floor = f"noise is {rms['noise_floor']:.2f} mm"
-    return f"Nobody has asked yet what this model lacks: {told}; {floor}."
+        told = f"the held-out error is {rms['held_out']:.2f} mm"
+    return f"Not diagnosed yet: {told}; {rms['noise_floor']:.2f} mm are expected."
 
 
 def _wrong(run: Run, diagnosis: Mapping[str, Any] | None) -> Iterator[str]:
@@ -78,7 +78,7 @@ def _wrong(run: Run, diagnosis: Mapping[str, Any] | None) -> Iterator[str]:
 def _doubtful(run: Run, diagnosis: Mapping[str, Any] | None) -> Iterator[str]:
     rms = run.summary["rms_mm"]
     if diagnosis is None:
-        yield f"not diagnosed; 'rigcal diagnose {run.folder}' asks what is missing"
+        yield f"{UNASKED}; 'rigcal diagnose {run.folder}' asks what is missing"
     elif diagnosis["too_few_stops"]:
         yield "the stops are too few to say whether anything is missing"
     elif diagnosis["verdict"] == "unexplained_structure":
@@ -86,7 +86,7 @@ def _doubtful(run: Run, diagnosis: Mapping[str, Any] | None) -> Iterator[str]:
     if rms.get("held_out") is None:
         yield "no stops were held out, so nothing says how well it predicts"
     if AT_THE_FLOOR < (times := over_floor(run)) <= FAR_OFF:
-        yield f"the held-out error is {times:.1f} times the noise floor"
+        yield OVER.format(times)
     for kind, times in run.summary["misfit"].items():
         if TOLERATED < times <= FAR_OFF:
             yield misfit_sentence(kind, times)

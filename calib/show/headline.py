@@ -1,0 +1,81 @@
+"""What matters of a run, in a few lines: what moved, how large the error is, what to do next."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from calib.runs.run import Run
+from calib.show.misfit import over_beams
+from calib.show.scale import shown
+from calib.show.verdict import UNASKED, judge
+
+TOLD_AXES = 3.0  # sigmas of a change, from which the axis along which it went is named
+
+
+def moved_sentence(links: Sequence[Mapping[str, Any]]) -> str:
+    """What moved since the run that was the prior, and that nothing else did.
+
+    Args:
+        links: as `summary.json` has them.
+    """
+    moved = [link for link in links if link["moved"]]
+    silent = [link["name"] for link in links if link["p_value"] is None]
+    if moved:
+        out = "; ".join(f"{link['name']} {' and '.join(_changes(link))}" for link in moved)
+        out += "; nothing else moved" if len(moved) < len(links) - len(silent) else ""
+    else:
+        out = "nothing moved beyond the uncertainty of then and now"
+    if silent:
+        out += f"; of {', '.join(silent)} the new data say nothing"
+    return f"{out}."
+
+
+def _changes(link: Mapping[str, Any]) -> Iterator[str]:
+    """By how much a link moved: of a frame along and about the axes that show it, of an effect its
+    parameters that do, or, where these are many, their rms."""
+    names, change, sigma = link["parameters"], np.array(link["change"]), np.array(link["sigma"])
+    of_frame = {"tx", "rx"} <= set(names)
+    certain = np.abs(change) > TOLD_AXES * sigma
+    certain[np.argmax(np.abs(change) / sigma)] = True
+    for unit in dict.fromkeys(link["units"][::-1]):
+        mine = np.flatnonzero(certain & (np.array(link["units"]) == unit))
+        scale, told = shown(unit)
+        if not len(mine):
+            continue
+        if not of_frame and len(mine) > 1:
+            yield f"changed by {scale * np.sqrt(np.mean(change[mine] ** 2)):.2f} {told} rms"
+            continue
+        cells = [f"{scale * change[i]:+.2f} ± {scale * sigma[i]:.2f} {told}" for i in mine]
+        if not of_frame:
+            yield f"changed by {cells[0]} ({names[mine[0]]})"
+            continue
+        verb, way = ("moved", "in") if unit == "m" else ("turned", "about")
+        along = (f"{cell} {way} {names[i][1:]}" for cell, i in zip(cells, mine, strict=True))
+        yield f"{verb} {', '.join(along)}"
+
+
+def closing(run: Run, diagnosis: Mapping[str, Any] | None) -> list[str]:
+    """The error of a run beside what is expected, what it is worth, and the next command.
+
+    Args:
+        run: a run.
+        diagnosis: of it; None if it was not asked for.
+    """
+    rms, verdict = run.summary["rms_mm"], judge(run, diagnosis)
+    kind, before = ("held_out", "held_out_") if rms.get("held_out") is not None else ("fit", "")
+    what = {"held_out": "held-out error", "fit": "error of the fit, none held out"}[kind]
+    error = over_beams(rms[kind], run.summary, before).partition("; ")[0]
+    out = [f"{what}: {error}; {rms['noise_floor']:.2f} mm expected if the model is right"]
+    reasons = [each for each in verdict.reasons if not each.startswith(UNASKED)]
+    if reasons:
+        more = f" (and {len(reasons) - 1} more reasons)" if len(reasons) > 1 else ""
+        out.append(f"verdict so far: {verdict.meaning}; {reasons[0].partition(': ')[0]}{more}")
+    else:
+        out.append("verdict so far: nothing speaks against the model; diagnose has not been asked")
+    if diagnosis is None:
+        out.append(f"next: rigcal diagnose {shlex.quote(str(run.folder))}")
+    return out
