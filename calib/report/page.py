@@ -15,6 +15,7 @@ from calib.report.chart import Absent, Chart
 from calib.report.charts.fit import error_mm
 from calib.report.evidence import Evidence, folder_name
 from calib.show.blunders import HEADINGS, blunder_cells
+from calib.show.headline import moved_sentence
 from calib.show.misfit import over_beams
 from calib.show.scale import shown
 from calib.show.tables import chance, effect_page, estimate_cell, mm
@@ -83,7 +84,7 @@ def render(
         detectable=_detectable(evidence),
         weak=_weak(evidence),
         untold=_untold(evidence),
-        links=evidence.run.summary.get("links"),
+        moved=moved_sentence(links) if (links := evidence.run.summary.get("links")) else "",
         provenance=_provenance(evidence),
     )
     return escape.terminal(page)

@@ -144,7 +144,9 @@ class Page:
         """Everything anew, for the chosen run."""
         desk = self.desk
         self._fill(self._run, list(desk.runs), desk.chosen)
-        self._ladder.content = panels.ladder(desk.rungs()) + panels.standing_out(desk.run)
+        self._ladder.content = "".join(
+            (panels.moved(desk.run), panels.ladder(desk.rungs()), panels.standing_out(desk.run))
+        )
         self._undo.disabled = desk.rungs()[-1].below is None
         self._show_findings()
         self._tell(f"Reading the recordings of {desk.chosen} …")

@@ -13,6 +13,7 @@ from calib.blunders.chance import LEAST_P
 from calib.runs.ladder import Rung
 from calib.runs.run import Run
 from calib.show import misfit
+from calib.show.headline import moved_sentence
 from calib.view.colours import Scale, column
 from calib.view.desk import Findings
 from calib.view.scene import Points
@@ -53,6 +54,13 @@ def scan(points: Points | None, drawn: int, stop: str, ratios: Mapping[str, floa
     """What the stop's beams say, all of them, however few are drawn; and how large residuals of all
     that was measured there are, over their sigmas."""
     return _framed(_beams(points, drawn, stop) + _misfit(ratios))
+
+
+def moved(run: Run) -> str:
+    """What moved since the run that was its prior; nothing where there was none."""
+    links = run.summary.get("links")
+    told = f"Since the earlier run: {moved_sentence(links)}" if links else ""
+    return _framed(f'<p data-is="moved"><b>{escape(told)}</b></p>') if told else ""
 
 
 def standing_out(run: Run) -> str:

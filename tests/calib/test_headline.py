@@ -7,16 +7,21 @@ import pytest
 
 from calib.results.solution import Part, Solution
 from calib.runs.run import Run
-from calib.show.headline import closing
+from calib.show.headline import closing, moved_sentence
+from calib.view import panels
 
 RMS_MM = {"fit": 3.34, "held_out": 3.47, "noise_floor": 3.62}
 SUMMARY = {"residual": "range", "rms_mm": RMS_MM, "converged": True, "misfit": {"beams": 0.9}}
 
 
-def closing_lines(folder="somewhere/run", **summary):
+def fitted(folder="somewhere/run", **summary):
     part = Part({}, {})
     solution = Solution(shared=part, recordings={}, not_estimated=[], names=(), covariance=None)
-    return closing(Run(Path(folder), {}, SUMMARY | summary, solution), None)
+    return Run(Path(folder), {}, SUMMARY | summary, solution)
+
+
+def closing_lines(folder="somewhere/run", **summary):
+    return closing(fitted(folder, **summary), None)
 
 
 def test_the_last_lines_are_the_error_what_it_is_worth_and_the_next_command():
@@ -42,3 +47,40 @@ def test_what_speaks_against_a_run_stands_in_its_last_lines(summary, light, reas
 
 def test_a_folder_with_a_blank_is_ready_to_be_pasted():
     assert shlex.split(closing_lines("a folder/run")[2])[-1] == "a folder/run"
+
+
+def link(name, moved, change, sigma, parameters="rx ry rz tx ty tz", unit="rad rad rad m m m"):
+    return {
+        "name": name,
+        "moved": moved,
+        "p_value": 1e-5 if moved else 0.4,
+        "parameters": parameters.split(),
+        "units": unit.split(),
+        "change": change,
+        "sigma": sigma,
+    }
+
+
+LIDAR = link("lidar", True, [0, 0, 3.99e-3, 2.94e-3, 1e-5, 0], [9e-5] * 3 + [8e-5] * 3)
+
+
+def test_what_moved_is_said_along_the_axes_that_show_it():
+    said = moved_sentence([LIDAR, link("mount", False, [0] * 6, [1e-4] * 6)])
+    expected = "lidar moved +2.94 ± 0.08 mm in x and turned +3.99 ± 0.09 mrad about z"
+    assert said == f"{expected}; nothing else moved."
+
+
+def test_a_move_that_no_axis_shows_alone_is_said_along_the_clearest():
+    said = moved_sentence([link("lidar", True, [0] * 3 + [2e-4, 0, 0], [9e-5] * 6)])
+    assert said == "lidar moved +0.20 ± 0.09 mm in x."
+
+
+def test_what_the_new_data_do_not_show_is_not_said_to_stand_still():
+    silent = link("mount", False, [0] * 6, [1e-4] * 6) | {"p_value": None}
+    assert "nothing else moved" not in moved_sentence([LIDAR, silent])
+    assert moved_sentence([LIDAR, silent]).endswith("of mount the new data say nothing.")
+
+
+def test_the_workbench_says_what_moved():
+    assert "Since the earlier run: lidar moved +2.94" in panels.moved(fitted(links=[LIDAR]))
+    assert panels.moved(fitted()) == ""
