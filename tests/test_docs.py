@@ -55,6 +55,7 @@ def session(tmp_path_factory):
 def test_every_page_is_linked_from_readme():
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     assert PAGES and all(f"(docs/{page.name})" in readme for page in PAGES)
+    assert len(readme.splitlines()) <= 120
 
 
 @pytest.mark.slow
