@@ -157,29 +157,43 @@ def _steps(
 def _adapted(look: Look, left: list[LeftOut], progress: Progress, named: bool) -> Look:
     """A look without the blunders that explain more than any effect or structure would, or leave
     these nothing to explain; they are added to those left out. Once an effect was `named`, paper is
-    none: a name that is wrong trades with lengths, and would put the blame on them."""
+    none: a name that is wrong trades with lengths, and would put the blame on them.
+
+    Several blunders at once may look like an effect: where one of them that an effect outdoes is
+    left out, and the next then outdoes it, they are left out together if nothing stands out after.
+    """
+    on_trial: tuple[Look, int] | None = None  # where to go back to, and how many were left out
     for _ in range(ADAPTED):
         estimate = look.stand.estimate
         stray = list(stray_scans(estimate.problem, estimate.values, look.checked))
-        left += stray
         wild = [] if stray else _wild(look)
         wild = [b for b in wild if not (named and b.group.kind == "frame")]
         groups = [each.blunder.group for each in stray] + [b.group for b in wild]
-        if not groups:
+        if not groups or (on_trial and wild and _outdone(look, wild[0])):
             break
         after = look.stand.without(groups, progress).look(progress)
-        if wild and _outdone(look, wild[0]) and not _quiet(after):
-            break
-        loud = {b.group for b in after.blunders if b.found}
-        for each in wild:
-            near = (b for b in look.blunders if each.evidence - b.evidence < ODDS)
-            others = [b for b in near if b.found and b.group not in loud and b not in wild]
-            others = [b for b in others if b.group != each.group]
-            others = [b for b in others if b.possible or b.group.what == JOINTS]
-            met = [b.group for b in others if len(wild) == 1 or _meet(each, b)]
-            left.append(LeftOut(each, met))
+        quiet = _quiet(after)
+        if on_trial is None and wild and _outdone(look, wild[0]) and not quiet:
+            on_trial = look, len(left)
+        elif quiet:
+            on_trial = None
+        left += [*stray, *_left_out(look, wild, after)]
         look = after
+    if on_trial:
+        look, count = on_trial
+        del left[count:]
     return look
+
+
+def _left_out(look: Look, wild: Sequence[Blunder], after: Look) -> Iterator[LeftOut]:
+    """Blunders, each with what explained as much before, and explains nothing after."""
+    loud = {b.group for b in after.blunders if b.found}
+    for each in wild:
+        near = (b for b in look.blunders if each.evidence - b.evidence < ODDS)
+        others = [b for b in near if b.found and b.group not in loud and b not in wild]
+        others = [b for b in others if b.group != each.group]
+        others = [b for b in others if b.possible or b.group.what == JOINTS]
+        yield LeftOut(each, [b.group for b in others if len(wild) == 1 or _meet(each, b)])
 
 
 def _restored(

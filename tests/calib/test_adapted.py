@@ -1,0 +1,70 @@
+"""Which blunders are left out, where an effect explains as much as they do."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from calib.diagnosis import search
+from calib.diagnosis.search import _adapted
+
+
+class ScriptedLook:
+    """A look of which it is written what it finds, by how many blunders were left out."""
+
+    def __init__(self, script, count=0):
+        self.count, self.script = count, script
+        estimate = SimpleNamespace(problem=None, values=None)
+        self.stand = SimpleNamespace(estimate=estimate, without=self.without)
+        self.checked, self.blunders = set(), []
+        self.wild, self.outdone, self.quiet = script[count]
+
+    def without(self, groups, progress):
+        after = ScriptedLook(self.script, self.count + len(groups))
+        return SimpleNamespace(look=lambda progress: after)
+
+
+@pytest.fixture
+def left_out(monkeypatch):
+    """How many blunders are left out, by a script of looks: those to leave out, whether an effect
+    outdoes them, and whether nothing stands out."""
+    monkeypatch.setattr(search, "stray_scans", lambda problem, values, checked: [])
+    monkeypatch.setattr(search, "_wild", lambda look: look.wild)
+    monkeypatch.setattr(search, "_outdone", lambda look, by: look.outdone)
+    monkeypatch.setattr(search, "_quiet", lambda look: look.quiet)
+
+    def run(*script):
+        left = []
+        look = _adapted(ScriptedLook(script), left, lambda what, done, total: None, named=False)
+        assert look.count == len(left), "the look is that of what was left out"
+        return len(left)
+
+    return run
+
+
+ONE = [SimpleNamespace(group=SimpleNamespace(kind="surface", token="mesh:surface_4"), evidence=9.0)]
+QUIET = ([], False, True)
+
+
+def test_a_blunder_that_leads_is_left_out(left_out):
+    assert left_out((ONE, False, False), QUIET) == 1
+
+
+def test_one_that_an_effect_outdoes_is_left_out_if_nothing_stands_out_after(left_out):
+    assert left_out((ONE, True, False), QUIET) == 1
+
+
+def test_two_that_look_like_an_effect_together_are_left_out_together(left_out):
+    assert left_out((ONE, True, False), (ONE, False, False), QUIET) == 2
+
+
+def test_none_is_left_out_where_the_effect_still_outdoes_the_next(left_out):
+    assert left_out((ONE, True, False), (ONE, True, False), QUIET) == 0
+
+
+def test_none_is_left_out_where_something_stands_out_after_all(left_out):
+    assert left_out((ONE, True, False), (ONE, False, False), ([], False, False)) == 0
+
+
+def test_what_leads_stays_left_out_when_a_trial_after_it_fails(left_out):
+    looks = (ONE, False, False), (ONE, True, False), (ONE, True, False), QUIET
+    assert left_out(*looks) == 1
