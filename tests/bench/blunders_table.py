@@ -34,8 +34,9 @@ CLASSES = {
 
 
 def named(result: Result) -> list[list[str]]:
-    """What was named: blunders, each with what it may be taken for, then effects and covariates."""
-    return [*result["blunders"], *([name] for name in result["names"])]
+    """What was named: blunders and effects, each with what it may be taken for, and covariates."""
+    rivals = result.get("rivals", {})
+    return [*result["blunders"], *([name, *rivals.get(name, ())] for name in result["names"])]
 
 
 def verdict(result: Result) -> str:

@@ -38,6 +38,9 @@ def bad(*blunders, **more):
     return CALM | {"outcome": "bad_data", "blunders": list(blunders)} | more
 
 
+EFFECT = CALM | {"outcome": "missing_effect", "names": ["range_scale"]}
+
+
 @pytest.mark.parametrize(
     ("result", "wanted"),
     [
@@ -55,6 +58,8 @@ def bad(*blunders, **more):
         (bad(["C:joints"]), "alarm"),
         (bad(["B:scan"], outcome="not converged"), "right"),
         (CALM | {"outcome": "missing_effect", "names": ["range_scale"]}, "alarm"),
+        (EFFECT | {"rivals": {"range_scale": ["B:scan", "faro_scale"]}}, "group"),
+        (EFFECT | {"rivals": {"range_scale": ["faro_scale"]}}, "alarm"),
     ],
 )
 def test_a_case_has_its_class(result, wanted):

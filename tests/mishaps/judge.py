@@ -110,8 +110,9 @@ def asked(
     Returns:
         `outcome`: "refused", "fault", "endless", "not converged" or the verdict; `sentence`, `odd`
         (of check), `blunders` (names, most certain first, each with what it may be taken for),
-        `names` (of effects and covariates), `notes` (names of what does no harm), `misfit`,
-        `detectable`, `seconds` (check, fit, diagnose), `codes` of their exits.
+        `names` (of effects and covariates), `rivals` (effect -> what it may be as well), `notes`
+        (names of what does no harm), `misfit`, `detectable`, `seconds` (check, fit, diagnose),
+        `codes` of their exits.
     """
     checked = rigcal("check", recording, limit_s=limit_s)
     fit = rigcal("fit", recording, "-o", run, "--hold-out", "none", limit_s=limit_s)
@@ -122,6 +123,7 @@ def asked(
         "misfit": fit.document.get("misfit", {}),
         "blunders": [],
         "names": [],
+        "rivals": {},
         "detectable": {},
     }
     fitted = fit.code in (0, 3) and bool(fit.document)
@@ -131,7 +133,7 @@ def asked(
         said.append(rigcal("diagnose", run, "--no-refits", limit_s=limit_s))
         diagnosis = said[-1].document
         found |= {"blunders": blunders(diagnosis), "names": names(diagnosis)}
-        found["notes"] = notes(diagnosis)
+        found |= {"notes": notes(diagnosis), "rivals": rivals(diagnosis)}
         found["detectable"] = detectable(diagnosis)
         outcome = outcome or diagnosis.get("verdict")
     last = said[-1]
@@ -178,10 +180,18 @@ def names(diagnosis: Mapping[str, Any]) -> list[str]:
     return [*effects, *loose, *thrown]
 
 
+def rivals(diagnosis: Mapping[str, Any]) -> dict[str, list[str]]:
+    """Of a diagnosis: each effect that it would add -> what the data cannot tell from it."""
+    steps = [c for c in diagnosis.get("candidates", []) if c.get("step")]
+    return {c["effect"]: list(map(str, c["indistinguishable_from"])) for c in steps}
+
+
 def notes(diagnosis: Mapping[str, Any]) -> list[str]:
-    """Of a diagnosis: what is told and does no harm, as beams that hit what is not in the mesh."""
+    """Of a diagnosis: what is told and does no harm, as beams that hit what is not in the mesh, or
+    rings that are numbered from the other end, whose offsets then have those numbers."""
     clutter = (diagnosis.get("rejected") or {}).get("clutter", {})
-    return [f"{stop}:scan" for stop in clutter.get("stops", [])]
+    numbered = any(said.startswith("Rings of") for said in diagnosis.get("sentences", ()))
+    return [*(f"{stop}:scan" for stop in clutter.get("stops", [])), *(["rings"] * numbered)]
 
 
 def detectable(diagnosis: Mapping[str, Any]) -> dict[str, float]:

@@ -211,7 +211,7 @@ def _leave_most(found: Search, held_out: Mapping[str, tuple[float, float, float]
 
 
 def _names_hold(found: Search) -> bool:
-    """Whether the names explain as much, at their price, as a single structure without a name; so
+    """Whether the names explain as much as a single structure without a name, each at its price; so
     they do where there are none.
 
     Something that nobody has named is dressed up by a search in several names, each of which takes
@@ -224,7 +224,8 @@ def _names_hold(found: Search) -> bool:
     together = sum(t.statistic for t in tests), sum(t.dof for t in tests)
     price = sum(np.log(step.candidate.looks) for step in found.found)
     named = -log_tail(together[0] / common, together[1]) - price
-    bins = (c.test.evidence(common) for c in found.looks[0].unnamed.candidates)
+    unnamed = found.looks[0].unnamed.candidates
+    bins = (c.test.evidence(common) - np.log(c.looks) for c in unnamed)
     return named > max(bins, default=0.0) - ODDS
 
 
