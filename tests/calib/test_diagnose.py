@@ -5,10 +5,12 @@ import math
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from calib.diagnosis.verdict import _names_hold
 from calib.runs.calibrate import calibrate, grow, grown_model
 from calib.runs.diagnose import diagnose
 from calib.runs.run import Run
@@ -258,3 +260,19 @@ def test_a_column_of_ones_own_is_a_covariate_that_structure_may_hang_on(copied, 
     found = diagnose(run)
     assert found.verdict == "adequate"
     assert ("draught",) in {curve.covariates for curve in found.curves}
+
+
+@pytest.mark.parametrize(("looks", "hold"), [(1.0, False), (30.0, True)])
+def test_a_name_is_held_against_structure_at_the_price_of_both(looks, hold):
+    """Structure that explains a little more, found among many, is no better than a name."""
+
+    def explains(evidence, looks):
+        # Of two degrees of freedom the tail is exp(-x / 2).
+        test = SimpleNamespace(statistic=2 * evidence, dof=2, evidence=lambda common: evidence)
+        return SimpleNamespace(test=test, looks=looks)
+
+    named, bins = explains(50.0, 30.0), explains(52.0, looks)
+    look = SimpleNamespace(named=SimpleNamespace(common=1.0))
+    look.unnamed = SimpleNamespace(candidates=[bins])
+    found = SimpleNamespace(looks=[look], found=[SimpleNamespace(candidate=named)])
+    assert _names_hold(found) == hold
