@@ -2,6 +2,7 @@
 # make test       checks style and runs every test but the long ones
 # make test-long  runs the long ones: how often intervals hold, what else is found by its name
 # make bench-hidden  counts false alarms, intervals that hold, effects found by name; CASES=4 of each kind
+# make docs       builds the site of docs/ in build/docs
 # make clean      removes what these made
 #
 # With LOCKED=1 they install the versions in requirements.lock, each held to its hash, and no others.
@@ -36,7 +37,7 @@ INSTALLED = .venv/.installed
 TESTED = .venv/.tested
 endif
 
-.PHONY: demo test test-long bench-hidden system browser clean lock audit licences dist dist-check
+.PHONY: demo test test-long bench-hidden docs system browser clean lock audit licences dist dist-check
 
 demo: system
 	@echo "== demo: a simulated recording of the default rig, with an effect hidden in it"
@@ -75,6 +76,11 @@ bench-hidden: system $(TESTED)
 	$(BIN)/python -m tests.bench.chance --count $(CASES) -o build/chance.jsonl
 	@echo "== bench-hidden: effects, pairs and what no catalogue has"
 	$(BIN)/python -m tests.bench.hidden_effects --cases $(CASES) -o build/hidden_effects.jsonl
+
+docs: system
+	@echo "== docs: the site, in build/docs"
+	$(PIP) sphinx myst-parser furo
+	$(BIN)/python -m sphinx -W --keep-going -q -b html docs build/docs
 
 clean:
 	@echo "== clean: removing the environment, the demo and what the tools left"

@@ -2,6 +2,8 @@
 
 import re
 import shlex
+import subprocess
+import sys
 import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass
 from pathlib import Path
@@ -52,10 +54,45 @@ def session(tmp_path_factory):
     return run_through(ROOT / "docs/one_thing_wrong.md", tmp_path_factory.mktemp("docs"))
 
 
-def test_every_page_is_linked_from_readme():
+def test_readme_is_short_and_the_site_has_every_page():
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    assert PAGES and all(f"(docs/{page.name})" in readme for page in PAGES)
     assert len(readme.splitlines()) <= 120
+    index = (ROOT / "docs/index.md").read_text(encoding="utf-8").splitlines()
+    assert PAGES and all(page.stem in index for page in PAGES if page.stem != "index")
+
+
+def test_readme_links_to_every_page_that_is_not_of_the_site_alone():
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    alone = {"index", "start", "api", "glossary", *(p.stem for p in PAGES if "tutorial" in p.stem)}
+    assert all(f"(docs/{p.name})" in readme for p in PAGES if p.stem not in alone)
+
+
+def test_tutorials_show_programs_that_are_there():
+    shown = [
+        (page.parent / path).resolve()
+        for page in PAGES
+        for path in re.findall(r"literalinclude\} (\S+)", page.read_text(encoding="utf-8"))
+    ]
+    assert len(shown) >= 3 and all(path.parent == ROOT / "examples" for path in shown)
+    assert all(path.is_file() for path in shown)
+
+
+@pytest.mark.long
+def test_the_site_is_built_without_a_warning(tmp_path):
+    pytest.importorskip("sphinx", reason="the site needs what 'make docs' installs")
+    words = ["-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html", "docs", str(tmp_path)]
+    done = subprocess.run([sys.executable, *words], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    page = (tmp_path / "catalogue/incidence_angle_bias.html").read_text(encoding="utf-8")
+    assert "1 / cos(incidence) - 1" in page
+    assert "calib.fit" in re.sub("<[^>]+>", "", (tmp_path / "api.html").read_text("utf-8"))
+
+
+@pytest.mark.slow
+def test_the_first_page_shows_what_is_printed(tmp_path):
+    session = run_through(ROOT / "docs/start.md", tmp_path)
+    for block in re.findall(r"^```text\n(.*?)^```", session.text, flags=re.M | re.S):
+        assert shape(block) in shape(session.said), block
 
 
 @pytest.mark.slow

@@ -58,24 +58,20 @@ def _changes(link: Mapping[str, Any]) -> Iterator[str]:
         yield f"{verb} {', '.join(along)}"
 
 
-def closing(run: Run, diagnosis: Mapping[str, Any] | None) -> list[str]:
-    """The error of a run beside what is expected, what it is worth, and the next command.
-
-    Args:
-        run: a run.
-        diagnosis: of it; None if it was not asked for.
-    """
-    rms, verdict = run.summary["rms_mm"], judge(run, diagnosis)
+def closing(run: Run) -> list[str]:
+    """Of a run that has just been fitted: its error beside what is expected, what it is worth, and
+    the next command."""
+    rms, verdict = run.summary["rms_mm"], judge(run, None)
     kind, before = ("held_out", "held_out_") if rms.get("held_out") is not None else ("fit", "")
     what = {"held_out": "held-out error", "fit": "error of the fit, none held out"}[kind]
     error = over_beams(rms[kind], run.summary, before).partition("; ")[0]
-    out = [f"{what}: {error}; {rms['noise_floor']:.2f} mm expected if the model is right"]
-    reasons = [each for each in verdict.reasons if not each.startswith(UNASKED)]
-    if reasons:
-        more = f" (and {len(reasons) - 1} more reasons)" if len(reasons) > 1 else ""
-        out.append(f"verdict so far: {verdict.meaning}; {reasons[0].partition(': ')[0]}{more}")
-    else:
-        out.append("verdict so far: nothing speaks against the model; diagnose has not been asked")
-    if diagnosis is None:
-        out.append(f"next: rigcal diagnose {shlex.quote(str(run.folder))}")
-    return out
+    told = "nothing speaks against the model; diagnose has not been asked"
+    if reasons := [each for each in verdict.reasons if not each.startswith(UNASKED)]:
+        first, more = reasons[0].partition(": ")[0], len(reasons) - 1
+        others = f" (and {more} more reason{'s' * (more > 1)})" if more else ""
+        told = f"{verdict.meaning}; {first}{others}"
+    return [
+        f"{what}: {error}; {rms['noise_floor']:.2f} mm expected if the model is right",
+        f"verdict so far: {told}",
+        f"next: rigcal diagnose {shlex.quote(str(run.folder))}",
+    ]

@@ -96,7 +96,7 @@ def print_run(run: Run, whole: bool = False) -> None:
     for warning in _warnings(summary):
         console.print(warning, style="bold")
         console.print()
-    *lines, command = closing(run, None)
+    *lines, command = closing(run)
     for line in lines:
         console.print(line, style="bold")
     console.print(command, style="bold", soft_wrap=True)

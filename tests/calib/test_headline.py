@@ -21,7 +21,7 @@ def fitted(folder="somewhere/run", **summary):
 
 
 def closing_lines(folder="somewhere/run", **summary):
-    return closing(fitted(folder, **summary), None)
+    return closing(fitted(folder, **summary))
 
 
 def test_the_last_lines_are_the_error_what_it_is_worth_and_the_next_command():

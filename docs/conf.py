@@ -1,0 +1,75 @@
+"""How Sphinx makes the site of these pages: ``make docs``."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE.parent))
+
+from calib.effects import CATALOGUE  # noqa: E402
+from calib.show.tables import effect_page  # noqa: E402
+
+project, author, copyright = "rigcal", "the rigcal authors", "the rigcal authors"
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+html_theme = "furo"
+html_title = "rigcal"
+html_copy_source = False
+myst_enable_extensions = ["deflist"]
+myst_heading_anchors = 3
+autodoc_typehints = "none"
+autodoc_preserve_defaults = True
+# Pages link to files beside the site, as they do where the repository shows them.
+suppress_warnings = ["myst.xref_missing"]
+
+SITES = {
+    "beam": "The LiDAR's beams",
+    "arm": "The arm",
+    "base": "What carries the arm",
+    "mount": "The mount",
+    "tracker": "The tracker",
+    "target": "The targets",
+    "reference": "The room's scan",
+    "noise": "The scatter of ranges",
+}
+ROWS = ("formula", "shape", "unit", "typical", "covariates", "confounded_with", "source")
+
+
+def write_catalogue() -> None:
+    """A page for every effect, and their list by where they act; of the effects themselves."""
+    folder = HERE / "catalogue"
+    folder.mkdir(exist_ok=True)
+    sites: dict[str, list[str]] = {}
+    for page in map(effect_page, CATALOGUE):
+        sites.setdefault(page["site"], []).append(page["name"])
+        _write(folder / f"{page['name']}.md", _effect(page))
+    lines = ["# The catalogue", "", "Every way in which rigcal knows that hardware may lie.", ""]
+    for site, names in sites.items():
+        lines += [f"## {SITES.get(site, site.capitalize())}", "", "```{toctree}"]
+        lines += [":maxdepth: 1", "", *names, "```", ""]
+    _write(folder / "index.md", "\n".join(lines))
+
+
+def _effect(page: dict) -> str:
+    rows = []
+    for key in ROWS:
+        value = page[key]
+        if key == "confounded_with":
+            value = ", ".join(f"[{name}]({name}.md)" for name in value)
+        elif key == "covariates":
+            value = ", ".join(f"`{name}`" for name in value)
+        elif key == "formula":
+            value = f"`{value}`"
+        if value:
+            rows.append(f"{key.replace('_', ' ').capitalize()}\n: {value}\n")
+    return "\n".join([f"# {page['name']}", "", page["what"], "", page["notes"], "", *rows])
+
+
+def _write(path: Path, text: str) -> None:
+    """A page, unless it is there as it should be: Sphinx builds anew what is newer."""
+    if not path.is_file() or path.read_text(encoding="utf-8") != text:
+        path.write_text(text, encoding="utf-8")
+
+
+write_catalogue()
