@@ -53,8 +53,10 @@ def solve(
         loop.go_on(tolerance)
         return loop.estimate(tolerance if spread else None)
     loop.solve_without_scans()
-    loop.reweigh()
-    if prior is None and (loop.bodies_astray() or turned_far(problem, loop.values)):
+    astray = prior is None and loop.bodies_astray()
+    if not astray:
+        loop.reweigh()
+    if prior is None and (astray or loop.bodies_astray() or turned_far(problem, loop.values)):
         # A start that is right costs less before it is solved than a wrong one after.
         for cost, values in least_turned(problem):
             if cost < loop.cost():

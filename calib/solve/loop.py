@@ -28,7 +28,7 @@ from calib.solve.estimate import DOFS, SEEN, Estimate, Start, cost_of, started, 
 from calib.solve.graph import Graph
 from calib.solve.reweight import SETTLED as SETTLED_WEIGHT
 from calib.solve.reweight import reweighted
-from calib.solve.torn import CONTRADICTS, astray, borne_out, doubted, torn
+from calib.solve.torn import CONTRADICTS, borne_out, doubted, torn
 from chains import se3
 
 SETTLED = 1e-4  # m and rad: after that, which triangle a beam meets is kept
@@ -105,8 +105,8 @@ class Loop(Descent):
         """
         ended = (np.inf, self.values) if start is None else (self.cost(), self.values)
         self.values = first = self.values if start is None else dict(start)
-        settled = self.descend(STEADY, beams=False)
-        if not settled and not self.bodies_astray():
+        settled = self.descend_bodies(AT_OPTIMUM if self.problem.scans else STEADY)
+        if not settled and not self.problem.scans and not self.bodies_astray():
             ended = min(ended, (self.cost(), self.values), key=lambda each: each[0])
             self.values = self._damped(first)
             self.descend(STEADY, beams=False)
@@ -226,10 +226,6 @@ class Loop(Descent):
         """What beams meet now."""
         pairs = zip(self.problem.scans, self.associations, strict=True)
         return {key_of(scan): association.part for scan, association in pairs}
-
-    def bodies_astray(self) -> bool:
-        """Whether half of the stops have a body far from where the chain puts it."""
-        return astray(self.problem, self.values)
 
     def look_around(self) -> bool:
         """Passes that look each time anew what beams meet, until they settle; False where the fit

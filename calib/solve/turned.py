@@ -113,8 +113,10 @@ def _stood(values: Values, groups: Sequence[_Group]) -> tuple[float, Values]:
         for root, T in zip(
             group.roots, group.whole.measured @ se3.inverse(T_root_body), strict=True
         ):
-            said.setdefault(root, []).append(T)
-        stood = {root: mean_pose(np.stack(Ts)) for root, Ts in said.items()} | stood
+            if root not in stood:
+                said.setdefault(root, []).append(T)
+        each = said.items()
+        stood |= {root: mean_pose(np.stack(Ts)) if Ts[1:] else Ts[0] for root, Ts in each}
     cost = 0.0
     for group, T_root_body in zip(groups, placed, strict=True):
         T = np.stack([stood[root] for root in group.roots]) @ T_root_body
