@@ -79,7 +79,7 @@ class Descent:
         size: float = np.inf,
         beams: bool = True,
         hasten: bool = True,
-        passes: int = MAX_PASSES,
+        passes: int | None = None,
     ) -> bool:
         """Gauss-Newton passes while beams meet what they met; whether they came to their end.
 
@@ -90,12 +90,12 @@ class Descent:
             size: how large it may be, m and rad.
             beams: False for trackers and targets alone.
             hasten: whether the curvature of the beams' cost may take the place of their weights.
-            passes: how many at most.
+            passes: how many at most; `MAX_PASSES` where None.
         """
         newton, last, misled, wait, part = False, np.inf, 0, 0, 1.0
         before, tangent, cost, fall = None, None, np.inf, 0.0
         weighed: Sequence[Weighing] = ()
-        for count in range(passes):
+        for count in range(passes or MAX_PASSES):
             if before is None:
                 self.linearise_here(beams)
             else:
