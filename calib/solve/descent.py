@@ -94,12 +94,13 @@ class Descent:
         """
         newton, last, misled, wait, part = False, np.inf, 0, 0, 1.0
         before, tangent, cost, fall = None, None, np.inf, 0.0
+        swings = False
         weighed: Sequence[Weighing] = ()
         for count in range(passes or MAX_PASSES):
             if before is None:
                 self.linearise_here(beams)
             else:
-                slowed = self.linear.weighed if count >= SLOWED else ()
+                slowed = self.linear.weighed if count >= SLOWED or swings else ()
                 self.linearise(newton=newton, beams=beams, weighed=weighed, slowed=slowed)
             self.passes += 1
             if before is not None:
@@ -115,6 +116,7 @@ class Descent:
                 part = max(1.0, lowest)
             before, cost, weighed = self.values, self.cost(), self.linear.weighed
             tangent, fall = self.step()
+            swings = abs(cost - self._cost_before()) > fall
             length = self.size(tangent)
             self.values = self.moved(before, tangent, part)
             if length < size and fall < max(least, DIGITS * cost):

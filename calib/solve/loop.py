@@ -14,7 +14,6 @@ from dataclasses import replace
 import numpy as np
 
 from calib.linear.layout import StopKey, key_of
-from calib.linear.linearise import beams_cost
 from calib.linear.parallel import in_order
 from calib.problem.problem import Block, Problem
 from calib.problem.spread import by_chance, widening, with_spread
@@ -23,8 +22,8 @@ from calib.problem.unknowns import Unknown
 from calib.residuals.beams import Association
 from calib.solve.added import begun
 from calib.solve.components import squares, told, wider
-from calib.solve.descent import AT_OPTIMUM, LAST, STEADY, UPHILL, Descent, Progress
-from calib.solve.estimate import DOFS, SEEN, Estimate, Start, cost_of, started, values_of
+from calib.solve.descent import AT_OPTIMUM, LAST, SLOWED, STEADY, Descent, Progress
+from calib.solve.estimate import DOFS, SEEN, Estimate, Start, started, values_of
 from calib.solve.graph import Graph
 from calib.solve.reweight import SETTLED as SETTLED_WEIGHT
 from calib.solve.reweight import reweighted
@@ -122,32 +121,34 @@ class Loop(Descent):
         graph = Graph(list(self.problem.variables.values()), blocks, self.held)
         return graph.solve(first)[0]
 
-    def reweigh(self, tolerance: float | None = None) -> bool:
+    def reweigh(self, beams: bool) -> bool:
         """Go on with robust weights until these settle, where any group of rows asks for one;
         whether any did.
 
         Args:
-            tolerance: as of `settle`; of trackers and targets alone where None.
+            beams: False for trackers and targets alone.
         """
         times, settled = REWEIGHTED if self.problem.scans else ALONE
-        times = BEFORE_SCANS if tolerance is None and self.problem.scans else times
+        times = BEFORE_SCANS if self.problem.scans and not beams else times
         changed = False
         for _ in range(times):
             before = self.given, self.problem
             if self.lost or not self.take_weights(settled):
                 break
-            self.linearise(beams=tolerance is not None)
-            _, fall = self.step()
+            self.linearise(beams=beams)
+            tangent, fall = self.step()
             if fall < max(STILL, AS_GOOD * self.cost()):
                 self.given, self.problem = before
                 self.lay_out()
                 break
             changed = True
-            self.descend_roughly(beams=tolerance is not None)
-        if changed and tolerance is None:
+            if beams:  # whose own weights change with every step as well
+                self.values = self.moved(self.values, tangent)
+                self.passes += 1
+            else:
+                self.descend_roughly(beams=False)
+        if changed and not beams:
             self.solve_without_scans()
-        elif changed:
-            self.settle(tolerance, self.seen, self._met())
         return changed
 
     def take_weights(self, settled: float = SETTLED_WEIGHT) -> bool:
@@ -168,7 +169,7 @@ class Loop(Descent):
             tolerance: as of `settle`.
         """
         if self._near_spread(settled=True) and self.problem.scans:
-            self.settle(tolerance, self.seen, self._met())
+            self.settle_on(tolerance)
 
     def begin_spread(self) -> None:
         """The same once it is known what beams meet, and before the passes to the optimum: most of
@@ -289,35 +290,26 @@ class Loop(Descent):
             self.fix_association(seen, met)
             if self.lost:
                 return
-            if not self.descend(LAST, tolerance):
-                return
-            pairs = ((scan.pose(self.seen), scan.pose(self.values)) for scan in self.problem.scans)
-            if all(np.abs(se3.log(se3.inverse(a) @ b)).max() < STRAYED for a, b in pairs):
+            near = self.descend(LAST, tolerance, passes=SLOWED) or self.strayed()
+            if not (near or self.descend(LAST, tolerance)) or not self.strayed():
                 return
             seen, met = None, None
         self.lost = True
 
-    def go_on(self, tolerance: float) -> None:
-        """From an earlier state to the optimum, robust weights included; the cost does not end
-        above that of the state."""
-        self.fix_association(self.seen_before(), self.start.met)
-        self.descend_roughly()
-        if not self.reweigh(tolerance):
-            self.settle(tolerance, self.seen, self._met())
-        if not self._raised():
-            return
-        self.values = values_of(self.problem, self.start.state)
-        self.descend(LAST, tolerance, hasten=False)
-        if self._raised():
-            self.values = values_of(self.problem, self.start.state)
+    def settle_on(self, tolerance: float) -> None:
+        """The same from here: scans keep what they met, unless one has moved far already."""
+        self.settle(tolerance, *(() if self.strayed() else (self.seen, self._met())))
 
-    def _raised(self) -> bool:
-        """Whether the cost is above that of the start, all beams weighed as they are here."""
-        self.linearise_here()
-        first, cost = values_of(self.problem, self.start.state), self.cost()
-        linear, graph = self.linearised(first, beams=False)
-        beams = beams_cost(self.problem, first, self.associations, self.linear.weighed)
-        return cost > (cost_of(linear, graph, first) + beams) * (1 + UPHILL)
+    def strayed(self) -> bool:
+        """Whether a scan has moved far since it took what its beams meet."""
+        pairs = ((scan.pose(self.seen), scan.pose(self.values)) for scan in self.problem.scans)
+        return any(np.abs(se3.log(se3.inverse(a) @ b)).max() >= STRAYED for a, b in pairs)
+
+    def rows_hopeless(self) -> bool:
+        """Whether rows of trackers and targets, as weighed, were hopelessly wide before the last
+        step."""
+        rows = sum(block.rows for block in self.problem.blocks)
+        return 0 < rows * HOPELESS**2 < 2 * (self.cost() - self.linear.beams_cost)
 
     def seen_before(self) -> dict[str, np.ndarray]:
         """Where the start was when it took what its beams met."""
