@@ -136,14 +136,15 @@ class Descent:
         Args:
             least: as of `descend`.
         """
-        cost = np.inf
-        for _ in range(0, MAX_PASSES, USUAL):
+        before = np.inf
+        for _ in range(MAX_PASSES):
             if self.descend(least, beams=False, passes=USUAL):
                 return True
-            if self.cost() > cost / 2 and self.bodies_astray():
-                return False
-            cost = self.cost()
-        return False
+            if self.cost() > before / 2:
+                break
+            before = self.cost()
+        most = SLOWED if self.problem.scans else MAX_PASSES  # what a start for scans is worth
+        return not self.bodies_astray() and self.descend(least, beams=False, passes=most)
 
     def bodies_astray(self) -> bool:
         """Whether half of the stops have a body far from where the chain puts it."""

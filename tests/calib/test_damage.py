@@ -29,7 +29,6 @@ SLACK_S = 0.5  # beside it, CPU seconds: about one fit, for what machines and pa
 LONGEST_S = 60
 ENOUGH = 30  # cases that were run, for their times to be looked at
 
-HOPELESS_TAKE_LONG = "fits of hopeless recordings take more than twice as long as good ones"
 # Others of their sort are run always.
 LONG = (
     "* turned at one stop",
@@ -142,7 +141,6 @@ def test_damage_is_refused_or_named_or_harmless(good, tmp_path, kind):
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(reason=HOPELESS_TAKE_LONG, strict=True)
 def test_no_damage_takes_long(good):
     """What was run above; refusals too."""
     if len(TOOK_S) < ENOUGH:
