@@ -31,7 +31,8 @@ def solve(
     earlier state, what the beams meet is known and a few passes are all there is; the cost does not
     end above that of the state.
 
-    A fit whose bodies, or whose beams, are hopelessly far off is given up, not converged.
+    A fit whose bodies, beams, or rows of trackers and targets are hopelessly far off is given up,
+    not converged.
 
     Args:
         problem: what to estimate.

@@ -1,8 +1,8 @@
 """The state of a fit while it runs: linearise every stop, solve the graph, step downhill, repeat.
 
 Three things end a fit that does not end well: its last step would still lower the cost, what its
-beams meet changes as often as it is looked at, or half of the stops are hopelessly far off. None of
-them is called converged.
+beams meet changes as often as it is looked at, or bodies, beams or rows of trackers and targets are
+hopelessly far off. None of them is called converged.
 """
 
 from __future__ import annotations
@@ -47,7 +47,9 @@ REWEIGHTED, ALONE = (10, SETTLED_WEIGHT), (200, 1e-3)
 # most; good recordings, and one with the LiDAR 0.13 m from where CAD has it, take 2 to 6 passes.
 HOPEFUL, LOOKED = 8, 15
 # How many sigmas wide the residuals of most stops may be by then: in those recordings it is 1 to 4,
-# with scans at wrong stops 85.
+# with scans at wrong stops 85. And so wide may rows of trackers and targets be, as weighed, where
+# a fit has not settled: of the 90 kinds of damage it is 10 at most (a joint scaled, the mesh
+# scaled), and 80 with the markers of all targets exchanged.
 HOPELESS = 30.0
 # Relative change of a spread that is none; and one for which the passes to the optimum are not
 # worth doing again, as 50 members tell it no better.
