@@ -170,13 +170,11 @@ def place_each(stops: Sequence[Stops], frame: str, values: Values) -> Iterator[P
             for i, name in enumerate(whole.own)
         }
         placed = whole.in_reference(frame, {**values, **own})
+        by = {n: np.broadcast_to(x, (len(some), *x.shape[1:])) for n, x in placed.d.items()}
         for i, (k, each) in enumerate(zip(numbers, some, strict=True)):
             names = dict(zip(whole.own, each.own, strict=True))
-            d = {
-                names.get(n, n): np.broadcast_to(x, (len(some), *x.shape[1:]))[[i]]
-                for n, x in placed.d.items()
-            }
-            found[k] = Placed(placed.T[[i]], d)
+            d = {names.get(n, n): x[i : i + 1] for n, x in by.items()}
+            found[k] = Placed(placed.T[i : i + 1], d)
     return (found[k] for k in range(len(stops)))
 
 

@@ -14,13 +14,18 @@ from calib.problem.problem import Block, Problem
 from calib.residuals.beams import Association
 from calib.solve.estimate import cost_of
 from calib.solve.graph import Graph, KeptRows
+from calib.solve.torn import astray
 
 Progress = Callable[[str, int, int], None]
 MAX_PASSES = 40
+# Passes over trackers and targets alone to their optimum, on good recordings (12 stops of a world
+# with an arm, CAD off by its sigmas).
+USUAL = 4
 # Passes of a descent, from which robust scales go half the way: they follow the state, and where
 # residuals are far from normal state and scales can swing about each other for ever (stops that
 # scatter by three times a beam's sigma: steps of 0.1 sigma without end). In 24 worlds of another
-# simulator with nothing to find a descent took 4 to 9 passes.
+# simulator with nothing to find a descent took 4 to 9 passes. Before that they go half the way
+# where new scales change the cost by more than the next step is to lower it.
 SLOWED = 12
 # By how much a further step would lower half the chi-square: 1e-3 is a step of 0.04 sigma.
 AT_OPTIMUM = 1e-3
@@ -70,7 +75,12 @@ class Descent:
         return cost_of(linear, self.graph, linear.values) - linear.beams_chi2 / 2 + of_beams
 
     def descend(
-        self, least: float, size: float = np.inf, beams: bool = True, hasten: bool = True
+        self,
+        least: float,
+        size: float = np.inf,
+        beams: bool = True,
+        hasten: bool = True,
+        passes: int | None = None,
     ) -> bool:
         """Gauss-Newton passes while beams meet what they met; whether they came to their end.
 
@@ -81,15 +91,17 @@ class Descent:
             size: how large it may be, m and rad.
             beams: False for trackers and targets alone.
             hasten: whether the curvature of the beams' cost may take the place of their weights.
+            passes: how many at most; `MAX_PASSES` where None, and never more.
         """
         newton, last, misled, wait, part = False, np.inf, 0, 0, 1.0
         before, tangent, cost, fall = None, None, np.inf, 0.0
+        swings = False
         weighed: Sequence[Weighing] = ()
-        for count in range(MAX_PASSES):
+        for count in range(min(passes or MAX_PASSES, MAX_PASSES)):
             if before is None:
                 self.linearise_here(beams)
             else:
-                slowed = self.linear.weighed if count >= SLOWED else ()
+                slowed = self.linear.weighed if count >= SLOWED or swings else ()
                 self.linearise(newton=newton, beams=beams, weighed=weighed, slowed=slowed)
             self.passes += 1
             if before is not None:
@@ -105,6 +117,7 @@ class Descent:
                 part = max(1.0, lowest)
             before, cost, weighed = self.values, self.cost(), self.linear.weighed
             tangent, fall = self.step()
+            swings = abs(cost - self._cost_before()) > fall
             length = self.size(tangent)
             self.values = self.moved(before, tangent, part)
             if length < size and fall < max(least, DIGITS * cost):
@@ -117,11 +130,35 @@ class Descent:
             newton, last = hasten and beams and not wait and length < last, length
         return False
 
+    def descend_bodies(self, least: float) -> bool:
+        """Descend by trackers and targets alone; whether that came to its end. Given up where
+        bodies are far off and their cost does not fall by half in as many passes as are usual.
+
+        Args:
+            least: as of `descend`.
+        """
+        before = np.inf
+        for _ in range(MAX_PASSES):
+            if self.descend(least, beams=False, passes=USUAL):
+                return True
+            if self.cost() > before / 2:
+                break
+            before = self.cost()
+        most = SLOWED if self.problem.scans else MAX_PASSES  # what a start for scans is worth
+        return not self.bodies_astray() and self.descend(least, beams=False, passes=most)
+
+    def bodies_astray(self) -> bool:
+        """Whether half of the stops have a body far from where the chain puts it."""
+        return astray(self.problem, self.values)
+
     def descend_roughly(self, beams: bool = True) -> None:
         """Passes for as long as they lower the cost by much of what the first does."""
         self.linearise_here(beams)
         _, fall = self.step()
-        self.descend(max(LAST if beams else STEADY, ROUGHLY * fall), beams=beams)
+        if beams:
+            self.descend(max(LAST, ROUGHLY * fall))
+        else:
+            self.descend_bodies(max(STEADY, ROUGHLY * fall))
 
     def _cost_before(self) -> float:
         """The cost here, beams weighed as they were before the step."""

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from calib.linear.linearise import beams_cost
 from calib.problem.problem import Block, Problem
-from calib.solve.estimate import Estimate, Start
+from calib.solve.descent import LAST, SLOWED, UPHILL
+from calib.solve.estimate import Estimate, Start, cost_of, values_of
 from calib.solve.loop import CONVERGED, Loop, Progress
 from calib.solve.turned import least_turned, turned_far
 from chains.errors import InputError
@@ -29,7 +31,8 @@ def solve(
     earlier state, what the beams meet is known and a few passes are all there is; the cost does not
     end above that of the state.
 
-    A fit whose bodies, or whose beams, are hopelessly far off is given up, not converged.
+    A fit whose bodies, beams, or rows of trackers and targets are hopelessly far off is given up,
+    not converged.
 
     Args:
         problem: what to estimate.
@@ -50,24 +53,66 @@ def solve(
     else:
         loop.doubt_bodies()
     if loop.start.state and problem.scans:
-        loop.go_on(tolerance)
+        _go_on(loop, tolerance)
         return loop.estimate(tolerance if spread else None)
     loop.solve_without_scans()
-    loop.reweigh()
-    if prior is None and (loop.bodies_astray() or turned_far(problem, loop.values)):
+    astray = prior is None and loop.bodies_astray()
+    if not astray:
+        loop.reweigh(beams=False)
+    if prior is None and (astray or loop.bodies_astray() or turned_far(problem, loop.values)):
         # A start that is right costs less before it is solved than a wrong one after.
         for cost, values in least_turned(problem):
             if cost < loop.cost():
                 loop.solve_without_scans(values)
-        loop.reweigh()
+        loop.reweigh(beams=False)
         loop.lost = loop.bodies_astray()
     if problem.scans:
         loop.lost = loop.lost or not loop.look_around()
         if spread:
             loop.begin_spread()
-        loop.settle(tolerance)
-        loop.reweigh(tolerance)
+        _arrive(loop, tolerance)
     return loop.estimate(tolerance if spread else None)
+
+
+def _arrive(loop: Loop, tolerance: float) -> None:
+    """From where it is known what beams meet to the optimum, robust weights included.
+
+    A fit that is not there in as many passes as good ones take is asked for weights at once; where
+    trackers and targets are then still hopelessly far off, it is given up.
+    """
+    loop.fix_association()
+    settled = loop.lost or loop.descend(LAST, tolerance, passes=SLOWED)
+    if settled and loop.strayed():
+        loop.settle(tolerance)
+    changed = loop.reweigh(beams=True)
+    if not settled:
+        loop.lost = loop.rows_hopeless()
+    if changed or not settled:
+        loop.settle_on(tolerance)
+
+
+def _go_on(loop: Loop, tolerance: float) -> None:
+    """From an earlier state to the optimum, robust weights included; the cost does not end above
+    that of the state."""
+    loop.fix_association(loop.seen_before(), loop.start.met)
+    loop.descend_roughly()
+    loop.reweigh(beams=True)
+    loop.settle_on(tolerance)
+    if not _raised(loop):
+        return
+    loop.values = values_of(loop.problem, loop.start.state)
+    loop.descend(LAST, tolerance, hasten=False)
+    if _raised(loop):
+        loop.values = values_of(loop.problem, loop.start.state)
+
+
+def _raised(loop: Loop) -> bool:
+    """Whether the cost is above that of the start, all beams weighed as they are here."""
+    loop.linearise_here()
+    first, cost = values_of(loop.problem, loop.start.state), loop.cost()
+    linear, graph = loop.linearised(first, beams=False)
+    beams = beams_cost(loop.problem, first, loop.associations, loop.linear.weighed)
+    return cost > (cost_of(linear, graph, first) + beams) * (1 + UPHILL)
 
 
 def preview(problem: Problem, progress: Progress = lambda what, done, total: None) -> Estimate:
@@ -75,7 +120,7 @@ def preview(problem: Problem, progress: Progress = lambda what, done, total: Non
     loop = Loop(problem, None, progress)
     loop.doubt_bodies()
     loop.solve_without_scans()
-    loop.reweigh()
+    loop.reweigh(beams=False)
     if problem.scans:
         loop.fix_association()
     return loop.estimate()

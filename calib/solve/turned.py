@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from calib.forward import Placed
 from calib.problem.problem import Problem
 from calib.residuals.tracker import BodiesTogether, TrackedBody
 from chains import se3
@@ -32,17 +33,26 @@ def least_turned(problem: Problem) -> list[tuple[float, Values]]:
             of the priors of what may be turned.
     """
     bodies = [b for b in problem.bodies if not b.is_point]
-    angles = _angles(problem, bodies)
+    first = dict(problem.initial)
+    groups = [_Group.of(together, first) for together in BodiesTogether.of(bodies)]
+    groups.sort(key=lambda group: group.joints)
+    felt = frozenset[str]().union(*(group.felt for group in groups))
+    angles = [angle for angle in _angles(problem, bodies) if angle[0] in felt]
     if not angles:
         return []
-    groups = sorted(map(_Group.of, BodiesTogether.of(bodies)), key=lambda group: group.joints)
-    found: list[tuple[float, Values]] = []
+    found: list[tuple[float, Values, Sequence[np.ndarray]]] = []
+    start = np.inf, first, [group.place(first) for group in groups]
     for _ in range(TOGETHER):
-        before = found[:WIDTH] or [(np.inf, dict(problem.initial))]
-        tried = [_stood(each, groups) for _, v in before for each in _turned(v, angles)]
-        found += [(cost + _prior(problem, v, angles), v) for cost, v in tried]
+        for _, values, placed in found[:WIDTH] or [start]:
+            for name, turned in _turned(values, angles):
+                at = [
+                    group.place(turned) if name in group.felt else Ts
+                    for group, Ts in zip(groups, placed, strict=True)
+                ]
+                cost, stood = _stood(turned, groups, at)
+                found.append((cost + _prior(problem, turned, angles), stood, at))
         found.sort(key=lambda each: each[0])
-    return found[:KEPT]
+    return [(cost, values) for cost, values, _ in found[:KEPT]]
 
 
 def turned_far(problem: Problem, values: Mapping[str, np.ndarray]) -> bool:
@@ -62,23 +72,32 @@ class _Group:
         whole: the body's rows at all of them.
         roots: (K,) unknown of where the rig stands.
         joints: how many there are before the body.
+        felt: unknowns that move the body against where the rig stands.
     """
 
     whole: TrackedBody
     roots: Sequence[str]
     joints: int
+    felt: frozenset[str]
 
     @classmethod
-    def of(cls, together: BodiesTogether) -> _Group:
+    def of(cls, together: BodiesTogether, values: Values) -> _Group:
         roots = [b.stops.root for b in together.blocks for _ in b.measured]
         whole = together.whole
-        return cls(whole=whole, roots=roots, joints=len(whole.stops.rig.joints_to(whole.body)))
+        joints = len(whole.stops.rig.joints_to(whole.body))
+        moved = _in_root(whole, values).d.items()
+        return cls(whole, roots, joints, felt=frozenset(name for name, d in moved if d.any()))
 
     def place(self, values: Values) -> np.ndarray:
-        """T_root_body (K, 4, 4), what encoders misreport at single stops left out."""
-        stops = self.whole.stops
-        own = {stops.noise: np.zeros(stops.joints.shape)} if stops.noise else {}
-        return stops.in_root(self.whole.body, {**values, **own}).T
+        """T_root_body (K, 4, 4)."""
+        return _in_root(self.whole, values).T
+
+
+def _in_root(body: TrackedBody, values: Values) -> Placed:
+    """T_root_body, what encoders misreport at single stops left out."""
+    stops = body.stops
+    own = {stops.noise: np.zeros(stops.joints.shape)} if stops.noise else {}
+    return stops.in_root(body.body, {**values, **own})
 
 
 def _angles(problem: Problem, bodies: Sequence[TrackedBody]) -> list[tuple[str, int]]:
@@ -96,25 +115,29 @@ def _angles(problem: Problem, bodies: Sequence[TrackedBody]) -> list[tuple[str, 
 
 def _turned(
     values: Mapping[str, np.ndarray], angles: Sequence[tuple[str, int]]
-) -> Iterator[Values]:
+) -> Iterator[tuple[str, Values]]:
     for name, i in angles:
         for turn in TURNS:
             theta = values[name].copy()
             theta[i] += turn
-            yield {**values, name: theta}
+            yield name, {**values, name: theta}
 
 
-def _stood(values: Values, groups: Sequence[_Group]) -> tuple[float, Values]:
-    """The cost of all bodies, and the values with the rig standing where the bodies with the fewest
-    joints before them say."""
-    placed, stood = [group.place(values) for group in groups], {}
+def _stood(
+    values: Values, groups: Sequence[_Group], placed: Sequence[np.ndarray]
+) -> tuple[float, Values]:
+    """The cost of all bodies, each `placed` (K, 4, 4) in its root, and the values with the rig
+    standing where the bodies with the fewest joints before them say."""
+    stood: dict[str, np.ndarray] = {}
     for group, T_root_body in zip(groups, placed, strict=True):
         said: dict[str, list[np.ndarray]] = {}
         for root, T in zip(
             group.roots, group.whole.measured @ se3.inverse(T_root_body), strict=True
         ):
-            said.setdefault(root, []).append(T)
-        stood = {root: mean_pose(np.stack(Ts)) for root, Ts in said.items()} | stood
+            if root not in stood:
+                said.setdefault(root, []).append(T)
+        each = said.items()
+        stood |= {root: mean_pose(np.stack(Ts)) if Ts[1:] else Ts[0] for root, Ts in each}
     cost = 0.0
     for group, T_root_body in zip(groups, placed, strict=True):
         T = np.stack([stood[root] for root in group.roots]) @ T_root_body

@@ -13,6 +13,7 @@ from calib.problem import build
 from calib.problem.model import Model, Source
 from calib.residuals.robust import tukey_cost
 from calib.runs.calibrate import calibrate
+from calib.solve.descent import MAX_PASSES, Descent
 from calib.solve.fit import solve
 from chains.errors import InputError
 
@@ -198,6 +199,16 @@ def test_a_hopeless_fit_takes_no_more_passes_than_a_good_one_might(tiny, tmp_pat
     source = Source.open(edited(tiny, tmp_path / "rec", shifted))
     found = solve(build([source], Model()))
     assert not found.converged and found.iterations <= 11
+
+
+@pytest.mark.parametrize("damage", [swapped, misread])
+def test_bodies_that_no_start_brings_near_are_not_followed_far(damage, tiny, tmp_path, monkeypatch):
+    """All starts together, with and without weights, take no more steps than one descent may; two
+    to four descents went to their end before."""
+    steps, step = [], Descent.step
+    monkeypatch.setattr(Descent, "step", lambda self: steps.append(1) or step(self))
+    found = solve(build([Source.open(edited(tiny, tmp_path / "rec", damage))], Model()))
+    assert not found.converged and len(steps) <= MAX_PASSES
 
 
 def test_a_fit_that_is_not_at_its_optimum_is_not_called_converged(tiny, monkeypatch):

@@ -28,8 +28,10 @@ LIMIT = 2.0  # times as long as the good recording's fit
 SLACK_S = 0.5  # beside it, CPU seconds: about one fit, for what machines and passes vary
 LONGEST_S = 60
 ENOUGH = 30  # cases that were run, for their times to be looked at
+# Its fit comes to an optimum, after 52 passes where a good one takes 11: nothing that the model has
+# brings the scans onto a mesh of wrong scale, and what they meet changes as they move.
+TAKES_LONGER = {"mesh scaled"}
 
-HOPELESS_TAKE_LONG = "fits of hopeless recordings take more than twice as long as good ones"
 # Others of their sort are run always.
 LONG = (
     "* turned at one stop",
@@ -142,11 +144,10 @@ def test_damage_is_refused_or_named_or_harmless(good, tmp_path, kind):
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(reason=HOPELESS_TAKE_LONG, strict=True)
 def test_no_damage_takes_long(good):
     """What was run above; refusals too."""
     if len(TOOK_S) < ENOUGH:
         pytest.skip(f"only {len(TOOK_S)} kinds of damage were tried")
     allowed_s = LIMIT * good.found["seconds"][1] + SLACK_S
     long = {kind: took_s for kind, took_s in TOOK_S.items() if took_s > allowed_s}
-    assert not long, f"more than {allowed_s:.1f} s: {long}"
+    assert set(long) <= TAKES_LONGER, f"more than {allowed_s:.1f} s: {long}"
