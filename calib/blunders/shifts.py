@@ -16,7 +16,7 @@ weights of other stops stay as they are, so that one wild row does not hide the 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -27,7 +27,7 @@ from calib.linear.layout import positions
 from calib.linear.system import Linearisation
 from calib.problem.problem import Problem
 from calib.residuals.groups import BEAMS, Group
-from calib.solve.components import squares_of_cells
+from calib.solve.components import Sums, squares_beside_bodies
 from calib.solve.graph import Graph
 
 # Of I - w H: below this a direction is held by the group alone (rounding of C is some 1e-9 of it).
@@ -125,10 +125,18 @@ def standing_alone(
     return alone
 
 
-def of_cells(whole: Linearisation, problem: Problem) -> dict[tuple[str, str], tuple[float, float]]:
-    """Of the parts of surfaces, by their kind, as `components.squares_of_cells` gives it."""
-    kept = _Others.of(whole).kept
-    return squares_of_cells(problem, whole.values, lambda some: whole.variances(some, kept))
+def beside_bodies(
+    whole: Linearisation,
+    problem: Problem,
+    whose: Collection[tuple[str, str]],
+    wild: Collection[Group],
+) -> Sums:
+    """What rows that are of no body say of their sigmas; arguments as of
+    `components.squares_beside_bodies`."""
+    others = _Others.of(whole)
+    return squares_beside_bodies(
+        problem, whole.values, whole, others.kept, whose, others.graph_rows, wild
+    )
 
 
 def _statistic(M: np.ndarray, u: np.ndarray, at: np.ndarray) -> float:

@@ -19,15 +19,24 @@ import numpy as np
 from scipy import special
 
 from calib.blunders.chance import after_looks, at_least
-from calib.blunders.shifts import Shift, of_cells
+from calib.blunders.judged import Blunder
+from calib.blunders.shifts import beside_bodies
 from calib.diagnosis.score import Scores
 from calib.effects import CATALOGUE, Scatter, Site
 from calib.linear.system import Linearisation
 from calib.problem import Problem
-from calib.problem.spread import sigmas
-from calib.problem.surfaces import SURFACE_SHARES
+from calib.problem.spread import OF_TARGETS, rows_at, sigmas
 from calib.results.solution import one_unit
-from calib.solve.components import SEEN, Sums, Told, sigma_beyond, spreads, squares, told
+from calib.solve.components import (
+    SEEN,
+    Checks,
+    Sums,
+    Told,
+    sigma_beyond,
+    spreads,
+    squares,
+    told,
+)
 from calib.solve.estimate import Estimate
 
 ALPHA = 0.01  # chance that a scatter is found where there is none
@@ -35,6 +44,13 @@ POWER = 0.8  # with which one of the smallest detectable spread is found
 FEWEST = 4  # members, or checks of a body's rows, below which nothing is said of their spread
 LOOKS = sum(effect.by_chance for effect in CATALOGUE)  # effects that are looked at
 DRAWS = 2000
+# Of wider rows: who scatters.
+NOUNS = {
+    Site.TRACKER: "The tracker scatters",
+    Site.JOINTS: "Joint readings scatter",
+    Site.TARGET: "Targets scatter",
+    Site.REFERENCE: "The mesh scatters",
+}
 GRID = np.append(0.0, np.geomspace(1e-3, 1e3, 61))  # of d, in units of the mean 1 / l
 
 
@@ -74,7 +90,7 @@ class Chance:
         spreads: how widely it scatters; of several bodies, in each of their units.
         statistic: the likelihood ratio against none.
         p_value: how often as much is seen where there is none.
-        detectable: spread that is found with 80 % power; of bodies that of a position.
+        detectable: spread that is found with 80 % power, in the effect's leading unit.
     """
 
     effect: Scatter
@@ -113,7 +129,8 @@ class Chance:
         Args:
             step: in which it was added, counting from 1; None where it was not.
         """
-        size_mm = 1e3 * max(spread.sd for spread in self.spreads if spread.unit == "m")
+        sizes_m = [spread.sd for spread in self.spreads if spread.unit == "m"]
+        size_mm = 1e3 * max(sizes_m) if sizes_m else None
         return {
             "effect": self.effect.family,
             "add": self.effect.name,
@@ -147,10 +164,9 @@ class Chance:
         if self.effect.widens:
             sizes: dict[str, list[str]] = {}
             for spread in (s for s in self.spreads if s.sd > s.sigma):
-                sizes.setdefault(spread.of, []).append(spread.told)
-            noun = "tracker" if self.effect.site is Site.TRACKER else "mesh"
+                sizes.setdefault(spread.of.removeprefix(OF_TARGETS), []).append(spread.told)
             told = ", ".join(f"{of} by {' and '.join(some)}" for of, some in sizes.items())
-            what = f"The {noun} scatters more than rig.yaml says: beyond its sigma, {told}"
+            what = f"{NOUNS[self.effect.site]} more than rig.yaml says: beyond its sigma, {told}"
         else:
             what = f"{each.capitalize()}s scatter by {self.spreads[0].told} in range"
         return (
@@ -244,55 +260,56 @@ def chances(
 
 
 def ranked(some: Sequence[Chance]) -> list[Chance]:
-    """Those that chance explains least first."""
-    return sorted(some, key=lambda chance: (chance.p_value, -chance.statistic))
+    """Those that chance explains least first; of those that are found, the likeliest: no p-value
+    is told that far out."""
+    found = sorted((c for c in some if c.found), key=lambda chance: -chance.statistic)
+    return found + sorted((c for c in some if not c.found), key=lambda chance: chance.p_value)
 
 
 def rows_by_chance(
-    effects: Sequence[Scatter], good: Sequence[Shift], whole: Linearisation, problem: Problem
+    effects: Sequence[Scatter], blunders: Sequence[Blunder], whole: Linearisation, problem: Problem
 ) -> list[Chance]:
-    """The tests that rows of tracked bodies, and the mesh's surfaces, scatter beyond their sigmas;
-    of those that next to nothing checks there is none.
+    """The tests that rows scatter beyond their sigmas, those of blunders left out; of those that
+    next to nothing checks there is none.
 
     Args:
         effects: that say so.
-        good: the groups of rows that are no blunders.
+        blunders: all groups of rows.
         whole: all rows, linearised at the fit.
         problem: of the fit.
     """
-    sums: dict[tuple[str, str], tuple[float, float]] = {}
-    for shift in (s for s in good if s.group.kind == "body"):
-        for unit, (total, left) in shift.squares.items():
-            before = sums.get((shift.group.what, unit), (0.0, 0.0))
-            sums[shift.group.what, unit] = before[0] + total, before[1] + left
-    if any(effect.site is Site.REFERENCE for effect in effects):
-        sums |= of_cells(whole, problem)
+    sums: dict[tuple[str, str], Checks] = {}
+    for shift in (b.shift for b in blunders if not b.found and b.group.kind == "body"):
+        for unit, squares_there in shift.squares.items():
+            here, before = Checks.alone(*squares_there), sums.get((shift.group.what, unit))
+            sums[shift.group.what, unit] = here if before is None else before + here
+    sites = {effect.site for effect in effects} - {Site.TRACKER}
+    if whose := {each for site in sites for each in rows_at(problem, site)}:
+        sums |= beside_bodies(whole, problem, whose, [b.group for b in blunders if b.found])
     found = (_of_rows(effect, sums, problem) for effect in effects)
     return [chance for chance in found if chance is not None]
 
 
 def _of_rows(effect: Scatter, sums: Sums, problem: Problem) -> Chance | None:
-    """The test that rows have the variance that is stated: the sum of their squares is near
-    chi-square with their redundancy for degrees of freedom."""
+    """The test that rows have the variance that is stated, as `Checks` have it."""
     known, spreads, p, statistic, detectable = sigmas(problem), [], [], 0.0, np.inf
-    bodies = {block.body for block in problem.bodies}
-    mine = bodies if effect.site is Site.TRACKER else SURFACE_SHARES
-    checked = {key: each for key, each in sums.items() if key[0] in mine and each[1] >= FEWEST}
-    for (what, unit), (total, left) in checked.items():
+    mine = [whose for whose in rows_at(problem, effect.site) if whose in sums]
+    checked = {whose: sums[whose] for whose in mine if sums[whose].left >= FEWEST}
+    for (what, unit), checks in checked.items():
         sigma, beyond = known[what, unit]
         variance = sigma**2 - beyond**2
-        total *= sigma**2 / variance  # as its first sigma has it
-        factor = total / left
-        sd = float(np.sqrt(max(factor - 1.0, 0.0) * variance))
-        of = sigma_beyond(sd, max(factor, 1.0) * variance, left)
-        spreads.append(Spread(what, unit, sd, of))
-        p.append(float(special.chdtrc(left, total)))
-        statistic += left * (factor - 1.0 - np.log(factor)) if factor > 1.0 else 0.0
-        if unit == "m":
-            limit = special.chdtri(left, ALPHA / LOOKS / len(checked))
-            least = np.sqrt(variance * (limit / special.chdtri(left, POWER) - 1.0))
-            detectable = min(detectable, float(least))
-    if not any(spread.unit == "m" for spread in spreads):
+        at_first = checks.had_variance(variance / sigma**2)
+        grown = max(at_first.growth(), 0.0)
+        sd = float(np.sqrt(grown * variance))
+        spreads.append(Spread(what, unit, sd, sigma_beyond(sd, variance * at_first.sigma(grown))))
+        p.append(float(special.chdtrc(at_first.dof, at_first.scaled)))
+        statistic += at_first.statistic(grown)
+        if unit == effect.leading:
+            limit = special.chdtri(at_first.dof, ALPHA / LOOKS / len(checked))
+            enough = limit / special.chdtri(at_first.dof, POWER) - 1.0
+            share = at_first.told / at_first.left
+            detectable = min(detectable, float(np.sqrt(variance * enough / share)))
+    if not any(spread.unit == effect.leading for spread in spreads):
         return None
     p_value = float(after_looks(min(p), len(p)))
     return Chance(effect, spreads, statistic, p_value=p_value, detectable=detectable)

@@ -286,8 +286,8 @@ class Look:
     @cached_property
     def chance(self) -> list[Chance]:
         """What may scatter by chance, that which chance explains least first."""
-        good = [blunder.shift for blunder in self.blunders if not blunder.found]
-        of_rows = rows_by_chance(self.wider, good, self.fitted, self.stand.estimate.problem)
+        problem = self.stand.estimate.problem
+        of_rows = rows_by_chance(self.wider, self.blunders, self.fitted, problem)
         return ranked([*self.values, *of_rows])
 
     @property

@@ -51,10 +51,12 @@ from calib.effects.range import (
 from calib.effects.reference import FaroScale, MovedSurface
 from calib.effects.rig import BaseFlex, FrameOffset, MountBending, MountCreep, MountSlip
 from calib.effects.scatter import (
+    JointScatter,
     LocationRangeScatter,
     ReferenceScatter,
     Scatter,
     StopRangeScatter,
+    TargetScatter,
     TrackerScatter,
 )
 from calib.effects.targets import TargetRodTilt, TargetSphereOffset
@@ -111,6 +113,8 @@ CATALOGUE: tuple[Effect, ...] = (
     StopRangeScatter(),
     LocationRangeScatter(),
     TrackerScatter(),
+    JointScatter(),
+    TargetScatter(),
     ReferenceScatter(),
 )
 DEFAULT = ("arm_link_length", "arm_joint_offset", "ring_range_offset")

@@ -39,6 +39,11 @@ class Scatter(Effect):
     members: tuple[str, ...] = ()
     label: str = ""
 
+    @property
+    def leading(self) -> str:
+        """The unit in which its size is told; of bodies that of a position."""
+        return self.unit.rpartition(", ")[2]
+
     def among(self, members: Iterable[str], label: str = "") -> Self:
         """The effect with a parameter for each of these members."""
         chosen = copy.copy(self)
@@ -61,6 +66,15 @@ class Scatter(Effect):
         """The basis in which a row is off by its own member's value, along (3,) or (rows, 3)."""
         index = np.broadcast_to(self.member(view), view.rows)
         return OneHot(index, np.broadcast_to(along, (view.rows, 3)), max(1, len(self.members)))
+
+    def several(self, view: View, size: int) -> np.ndarray:
+        """The basis (rows, size, members * size) in which a row has so many values, each off by its
+        own member's."""
+        member, count = self.member(view), max(1, len(self.members))
+        basis = np.zeros((len(member), size, count, size))
+        rows = np.flatnonzero(member >= 0)
+        basis[rows, :, member[rows], :] = np.eye(size)
+        return basis.reshape(len(member), size, -1)
 
 
 class StopRangeScatter(Scatter):
@@ -115,13 +129,59 @@ class TrackerScatter(Scatter):
         )
 
     def basis(self, view: View) -> np.ndarray:
-        bodies, member = len(view.rig.tracker.bodies), self.member(view)
-        count = max(1, len(self.members))
-        basis = np.zeros((len(member), bodies, 6, count, bodies, 6))
-        rows, seen = np.arange(len(member)), member >= 0
-        for b in range(bodies):
-            basis[rows[seen], b, :, member[seen], b, :] = np.eye(6)
-        return basis.reshape(len(member), bodies, 6, -1)
+        bodies = len(view.rig.tracker.bodies)
+        basis = self.several(view, 6 * bodies)
+        return basis.reshape(len(basis), bodies, 6, -1)
+
+
+class JointScatter(Scatter):
+    """Joint readings scatter more from stop to stop than rig.yaml says: brakes that let go, loose
+    couplings, readings rounded on their way."""
+
+    name = "joint_scatter"
+    site = Site.JOINTS
+    unit, sigma = "rad", 0.0002
+    per = "stop"
+    widens = True
+    covariates = ("stop", "joints")
+    formula = "q_i = reported_i + a_stop,i, by chance with a spread of sd, beyond its sigma"
+    typical = "as much as the sigma on paper, size assumed"
+    confounded_with = ("tracker_scatter", "arm_backlash", "arm_gear_error")
+    source = "variance components of groups of observations: Foerstner 1979; size assumed"
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        """None where the joints count as exact."""
+        joints = zip(rig.joint_names, rig.joint_kinds, strict=True) if rig.sigma_joint_rad else ()
+        units = {name: "rad" if kind == "revolute" else "m" for name, kind in joints}
+        each = self.members or ("each",)
+        return tuple(Param(f"{m}.{j}", unit, self.sigma) for m in each for j, unit in units.items())
+
+    def basis(self, view: View) -> np.ndarray:
+        return self.several(view, view.joints.shape[1])
+
+
+class TargetScatter(Scatter):
+    """Spheres, or the markers above them, are found worse than rig.yaml says: rods that swing or
+    are bent, spheres fitted to few points."""
+
+    name = "target_scatter"
+    site = Site.TARGET
+    unit, sigma = "m", 0.001
+    per = "target"
+    widens = True
+    formula = "sphere = hung + a_target, a_target by chance with a spread of sd, beyond its sigma"
+    typical = "as much as the sigma on paper, size assumed"
+    confounded_with = ("target_rod_tilt", "optitrack_scale", "faro_scale")
+    source = "variance components of groups of observations: Foerstner 1979; size assumed"
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        each = (self.members or ("each",)) if rig.target else ()
+        return tuple(
+            Param(f"{member}.{axis}", "m", self.sigma) for member in each for axis in "xyz"
+        )
+
+    def basis(self, view: View) -> np.ndarray:
+        return self.several(view, 3)
 
 
 class ReferenceScatter(Scatter):

@@ -6,12 +6,12 @@ from scipy import optimize, stats
 
 from calib import add, diagnose, fit
 from calib.diagnosis.chance import AtZero
-from calib.effects import find
+from calib.effects import CATALOGUE, find
 from calib.problem import build
 from calib.problem.model import Model, Source
 from calib.problem.spread import spread_of
 from calib.simulation import Spec, simulate
-from calib.solve.components import Told, spreads, squares
+from calib.solve.components import Checks, Told, spreads, squares
 from calib.solve.fit import resume, solve
 
 SD, PLACE_SD = 0.7, 0.4
@@ -139,6 +139,71 @@ def test_a_spread_of_the_smallest_detectable_size_is_found_four_times_out_of_fiv
     assert 0.72 < np.mean(hits) < 0.88
 
 
+# ------------------------------------------------------------------- rows worse than their sigmas
+
+
+class Shared:
+    """Rows whose errors e show little in their residuals: ``y = A e + X b + n``, e about 0 with a
+    sigma of 1 as joint readings are, and n noise with a sigma of `others`."""
+
+    def __init__(self, seed, sd=1.0, members=40, others=2.0):
+        rng, design = np.random.default_rng(seed), np.random.default_rng(7)
+        self.A = design.standard_normal((2 * members, members)) * np.geomspace(0.05, 0.5, members)
+        self.X = design.standard_normal((2 * members, 5))
+        self.others = others
+        e = sd * rng.standard_normal(members)
+        noise = others * rng.standard_normal(2 * members)
+        self.y = self.A @ e + self.X @ [1.0, 2.0, -1.0, 0.5, 3.0] + noise
+
+    def checks(self, sigma=1.0):
+        """From a fit of e and b together, as a graph does it, whose rows of e have this sigma."""
+        count = self.A.shape[1]
+        prior = np.hstack([np.eye(count), np.zeros((count, 5))]) / sigma
+        rows = np.vstack([prior, np.hstack([self.A, self.X]) / self.others])
+        C = np.linalg.inv(rows.T @ rows)
+        best = C @ rows.T @ np.concatenate([np.zeros(count), self.y / self.others])
+        return Checks.of(prior @ best, np.eye(count) - prior @ C @ prior.T)
+
+    def minus_log_likelihood(self, variance):
+        """Restricted, from the dense covariance of all rows (Patterson and Thompson 1971)."""
+        V = variance * self.A @ self.A.T + self.others**2 * np.eye(len(self.y))
+        inverse = np.linalg.inv(V)
+        inner = self.X.T @ inverse @ self.X
+        P = inverse - inverse @ self.X @ np.linalg.solve(inner, self.X.T @ inverse)
+        return (np.linalg.slogdet(V)[1] + np.linalg.slogdet(inner)[1] + self.y @ P @ self.y) / 2
+
+
+@pytest.mark.parametrize("sd", [0.5, 1.0, 3.0])
+def test_rows_grow_to_the_greatest_restricted_likelihood_from_any_sigma(sd):
+    world = Shared(1, sd)
+    best = optimize.minimize_scalar(world.minus_log_likelihood, (0.1, 10), (1e-3, 100)).x
+    for sigma in (1.0, 2.0):
+        found = (1.0 + world.checks(sigma).growth()) * sigma**2
+        assert found == pytest.approx(best, rel=1e-3)
+    checks, grown = world.checks(), best - 1.0
+    gained = world.minus_log_likelihood(1.0) - world.minus_log_likelihood(best)
+    assert checks.statistic(grown) == pytest.approx(2 * gained, rel=1e-6)
+
+
+def test_what_rows_would_say_with_another_sigma_needs_no_other_fit():
+    world = Shared(2, 2.0)
+    there, at_first = world.checks(3.0).had_variance(1 / 9), world.checks(1.0)
+    for name in ("total", "left", "told", "scaled", "dof"):
+        assert getattr(there, name) == pytest.approx(getattr(at_first, name), rel=1e-9)
+
+
+def test_rows_that_show_little_are_found_worse_no_more_often_than_is_said():
+    """Their squares scatter far less than those of a chi-square with their redundancy."""
+    checks = [Shared(seed).checks() for seed in range(400)]
+    assert checks[0].told < 0.6 * checks[0].left
+    p = np.array([stats.chi2.sf(c.scaled, c.dof) for c in checks])
+    for level in (0.01, 0.05, 0.2, 0.5):
+        least, most = stats.binom.ppf([0.001, 0.999], 400, level)
+        assert least <= np.sum(p < level) <= most
+    grown = np.array([c.growth() for c in checks])
+    assert abs(grown.mean()) < 0.1 and grown.std() == pytest.approx(checks[0].sigma(0.0), rel=0.2)
+
+
 # ------------------------------------------------------------------------------------ in recordings
 
 
@@ -189,12 +254,14 @@ def test_two_recordings_share_the_spread_and_nothing_else(scattered, tmp_path):
     [
         ("tracker_scatter", 3.0, {"base_markers.rad", "mount_markers.rad"}),
         ("tracker_scatter", 3.0, {"base_markers.m", "mount_markers.m"}),
+        ("joint_scatter", 3.0, {"joints.rad"}),
+        ("target_scatter", 3.0, {"target/sphere.m"}),
         ("reference_scatter", 3.0, {"surface.m"}),
     ],
 )
 def test_rows_that_scatter_beyond_their_sigma_tell_by_how_much(worse, effect, size, keys):
-    """Bodies at 24 stops each; some 70 surfaces of the mesh, those furthest off of which meet no
-    beam that is believed."""
+    """Bodies and joints at 24 stops each, five targets; some 70 surfaces of the mesh, of which
+    those furthest off meet no beam that is believed."""
     _, estimate = worse(effect, size)
     sigma = find(effect).sigma * size
     found = {key.partition(".")[2]: each for key, each in spreads(estimate).items()}
@@ -203,9 +270,9 @@ def test_rows_that_scatter_beyond_their_sigma_tell_by_how_much(worse, effect, si
         least = 0.7 * sigma if effect == "reference_scatter" else sigma - 3 * of
         assert least < sd < sigma + 3 * of and 0.05 < of / sd < 0.3
     again = squares(estimate)
-    for what, (total, left) in again.items():
+    for what, checks in again.items():
         if f"{what[0]}.{what[1]}" in keys:
-            assert total / left == pytest.approx(1.0, abs=0.05)  # its sigmas are right now
+            assert checks.total / checks.left == pytest.approx(1.0, abs=0.05)  # they fit
 
 
 @pytest.fixture(scope="module")
@@ -224,7 +291,7 @@ def worse(tmp_path_factory):
     return make
 
 
-@pytest.mark.parametrize("effect", ["tracker_scatter", "reference_scatter"])
+@pytest.mark.parametrize("effect", [e.name for e in CATALOGUE if e.by_chance and e.widens])
 def test_a_fit_goes_on_with_the_spread_that_it_had(worse, effect):
     source, estimate = worse(effect, 3.0)
     problem = build([source], Model().plus([find(effect)]))

@@ -25,6 +25,8 @@ class World:
         stop_scatter_m: standard deviation of a range zero that each stop has of its own.
         location_scatter_m: the same of each location.
         tracker_factor: how many times the tracker is worse than rig.yaml says.
+        joint_factor: the same of the encoders.
+        sphere_factor: the same of the targets' spheres.
         mesh_error_factor: how many times the mesh is worse than rig.yaml says.
         warp_m: how far the middle of one wall is bowed out of the mesh's plane.
         uneven_m: standard deviation of how far surfaces lie off flat, smoothly; no mesh has it.
@@ -41,6 +43,8 @@ class World:
     stop_scatter_m: float = 0.0
     location_scatter_m: float = 0.0
     tracker_factor: float = 1.0
+    joint_factor: float = 1.0
+    sphere_factor: float = 1.0
     mesh_error_factor: float = 1.0
     warp_m: float = 0.0
     uneven_m: float = 0.0
