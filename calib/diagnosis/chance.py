@@ -20,14 +20,15 @@ from scipy import special
 
 from calib.blunders.chance import after_looks, at_least
 from calib.blunders.judged import Blunder
-from calib.blunders.shifts import beside_bodies
+from calib.blunders.shifts import beside_bodies, of_poses
 from calib.diagnosis.score import Scores
 from calib.effects import CATALOGUE, Scatter, Site
 from calib.linear.system import Linearisation
 from calib.problem import Problem
-from calib.problem.spread import OF_TARGETS, rows_at, sigmas
+from calib.problem.spread import OF_TARGETS, by_chance, rows_at, sigmas, spread_keys
 from calib.results.solution import one_unit
 from calib.solve.components import (
+    LEAST,
     SEEN,
     Checks,
     Sums,
@@ -113,14 +114,13 @@ class Chance:
         """The same as a fit has it that it is part of, tested beside all else in that."""
         if self.effect.widens:
             return _of_rows(self.effect, squares(estimate), estimate.problem) or self
-        found = []
-        for name, (sd, sigma) in spreads(estimate).items():
-            if name.rpartition("/")[2] == self.effect.name:  # before it: of several rigs, which
-                unknown = estimate.problem.variables[name]
-                test = AtZero(told([unknown], estimate.values, estimate.covariance_of([name])))
-                statistic, p = test.p_value()
-                each = [Spread("", self.effect.unit, sd, sigma)]
-                found.append(replace(self, spreads=each, statistic=statistic, p_value=p))
+        known, found = spreads(estimate), []
+        for unknown in by_chance(estimate.problem):
+            if unknown.name.rpartition("/")[2] == self.effect.name:  # before it: of which rig
+                rows = told([unknown], estimate.values, estimate.covariance_of([unknown.name]))
+                pairs = zip(units_of(self.effect), spread_keys(unknown), strict=True)
+                each = [Spread("", unit, *known[key]) for unit, key in pairs]
+                found.append(replace(_of_values(self.effect, rows), spreads=each))
         return max(found, key=lambda chance: chance.statistic)
 
     def document(self, step: int | None) -> dict[str, Any]:
@@ -147,7 +147,7 @@ class Chance:
             "unabsorbed_rms_mm": size_mm,
             "parameters": {
                 "unit": one_unit([spread.unit for spread in self.spreads]),
-                "names": [f"{s.of}.{s.unit}" if s.of else "sd" for s in self.spreads],
+                "names": [self._name(spread) for spread in self.spreads],
                 "estimate": [spread.sd for spread in self.spreads],
                 "sigma": [spread.sigma for spread in self.spreads],
             },
@@ -156,6 +156,11 @@ class Chance:
             "rivals": [],
             "matters": None,
         }
+
+    def _name(self, spread: Spread) -> str:
+        """As solution.yaml has it."""
+        several = spread.of or len(self.spreads) > 1
+        return f"{spread.of or 'sd'}.{spread.unit}" if several else "sd"
 
     @property
     def sentence(self) -> str:
@@ -168,7 +173,8 @@ class Chance:
             told = ", ".join(f"{of} by {' and '.join(some)}" for of, some in sizes.items())
             what = f"{NOUNS[self.effect.site]} more than rig.yaml says: beyond its sigma, {told}"
         else:
-            what = f"{each.capitalize()}s scatter by {self.spreads[0].told} in range"
+            told = " and ".join(spread.told for spread in self.spreads)
+            what = f"{each.capitalize()}s scatter by {told} {self.effect.what}"
         return (
             f"{what}; by chance as far as this data tell (p = {self.p_adjusted:.1g}). "
             f"{name} takes that into every sigma; it tells nothing of the next {each}, so no "
@@ -185,7 +191,7 @@ class AtZero:
 
     def __init__(self, told: Told) -> None:
         values, axes = np.linalg.eigh(told.information)
-        seen = values > SEEN * values[-1]
+        seen = values > SEEN * max(values[-1], 0.0)
         self.l = values[seen]
         self.w = np.square(axes[:, seen].T @ told.score) / self.l
         self.d = GRID / np.mean(self.l) if len(self.l) else GRID
@@ -200,6 +206,15 @@ class AtZero:
         grown = 1.0 + self.d[:, None] * self.l
         gain = w @ (1.0 - 1.0 / grown).T - np.log(grown).sum(axis=1)
         return gain.max(axis=1)
+
+    def spread(self) -> float:
+        """The likeliest sd."""
+        gain = [float(self._gain(d)) for d in self.d]
+        return float(np.sqrt(self.d[int(np.argmax(gain))]))
+
+    def _gain(self, d: float) -> float:
+        grown = 1.0 + d * self.l
+        return self.w @ (1.0 - 1.0 / grown) - np.log(grown).sum()
 
     def drawn(self, d: float = 0.0) -> np.ndarray:
         """The statistic (DRAWS,) of draws at a variance."""
@@ -244,19 +259,50 @@ def chances(
         some: those to test.
         columns: effect's name -> its columns among the scores.
     """
-    out = []
+    found = []
     for effect in some:
         at = columns[effect.name]
-        rows = Told(scores.score[at], scores.information[np.ix_(at, at)], np.zeros(len(at), int))
-        test = AtZero(rows)
-        if test.members < FEWEST:
-            continue
-        sd = rows.spread(np.array([effect.sigma]))
-        statistic, p = test.p_value()
-        spread = Spread("", effect.unit, float(sd[0]), float(rows.sigma(sd)[0]))
-        detectable = test.detectable(ALPHA / LOOKS)
-        out.append(Chance(effect, [spread], statistic, p_value=p, detectable=detectable))
-    return out
+        score, information = scores.score[at], scores.information[np.ix_(at, at)]
+        found.append(_of_values(effect, Told(score, information, np.zeros(len(at), int))))
+    return [chance for chance in found if chance is not None]
+
+
+def of_lidar(
+    some: Sequence[Scatter], blunders: Sequence[Blunder], whole: Linearisation, problem: Problem
+) -> list[Chance]:
+    """The same of effects on where the LiDAR is at each stop, scans that are blunders left out;
+    arguments as of `rows_by_chance`."""
+    wild = [blunder.group for blunder in blunders if blunder.found]
+    rows = of_poses(whole, problem, wild) if some else None
+    found = [_of_values(effect, rows) for effect in some if rows is not None]
+    return [chance for chance in found if chance is not None]
+
+
+def units_of(effect: Scatter) -> list[str]:
+    """Of its spreads, in the order of their groups."""
+    return sorted(effect.unit.split(", "))
+
+
+def _of_values(effect: Scatter, rows: Told) -> Chance | None:
+    """The test of values, each spread against none; None where too few are told of."""
+    units = units_of(effect)
+    tests = [AtZero(rows.of(group)) for group in range(len(units))]
+    if any(test.members < FEWEST for test in tests):
+        return None
+    statistic, p_value = max((test.p_value() for test in tests), key=lambda each: -each[1])
+    p_value = float(after_looks(p_value, len(tests)))
+    sd = np.array([test.spread() for test in tests])
+    if len(tests) == 1 or after_looks(p_value, LOOKS) < ALPHA:  # the others are worth no effort
+        sd = rows.spread(np.full(len(tests), effect.sigma))
+        statistic = max(rows.statistic(sd), statistic)
+    pairs = zip(units, sd.tolist(), rows.sigma(np.maximum(sd, LEAST * effect.sigma)), strict=True)
+    return Chance(
+        effect,
+        spreads=[Spread("", unit, each, float(sigma)) for unit, each, sigma in pairs],
+        statistic=statistic,
+        p_value=p_value,
+        detectable=tests[units.index(effect.leading)].detectable(ALPHA / LOOKS / len(tests)),
+    )
 
 
 def ranked(some: Sequence[Chance]) -> list[Chance]:

@@ -231,11 +231,12 @@ def _outdone(look: Look, by: Blunder) -> bool:
 
 
 def _chance_leads(look: Look) -> bool:
-    """Whether values by chance explain more than any effect or structure does; wider sigmas would
-    take in whatever is missing."""
+    """Whether values by chance explain more than any effect or structure does, and than wider
+    sigmas, which would take in whatever is missing."""
     every = (*look.named.candidates, *look.unnamed.candidates)
     best = max((c.test.statistic for c in every), default=0.0)
-    return any(c.found and c.statistic > best for c in look.chance if not c.effect.widens)
+    found = [c for c in look.chance if c.found]
+    return bool(found) and not found[0].effect.widens and found[0].statistic > best
 
 
 def _quiet(look: Look) -> bool:

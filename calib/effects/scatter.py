@@ -29,6 +29,7 @@ class Scatter(Effect):
     Attributes:
         per: column of the stops that says which member each belongs to.
         sigma: sd to start from.
+        what: in what its members scatter, as people read it; of values.
         members: names of all members; unknown until `among` says so, and then taken for one.
         label: before the names of the members of this recording, where there are several.
     """
@@ -36,6 +37,7 @@ class Scatter(Effect):
     by_chance = True
     per: ClassVar[str]
     sigma: ClassVar[float]
+    what: ClassVar[str] = ""
     members: tuple[str, ...] = ()
     label: str = ""
 
@@ -84,6 +86,7 @@ class StopRangeScatter(Scatter):
     site = Site.BEAM
     unit, sigma = "m", 0.0003
     per = "stop"
+    what = "in range"
     covariates = ("stop",)
     formula = "range = true + a_stop, a_stop by chance with a spread of sd"
     typical = "sd of 0.1 to 1 mm, size assumed"
@@ -102,6 +105,37 @@ class LocationRangeScatter(StopRangeScatter):
     covariates = ("location",)
     formula = "range = true + a_location, a_location by chance with a spread of sd"
     confounded_with = ("stop_range_scatter", "temperature_drift", "warmup_drift")
+
+
+class StopPoseScatter(Scatter):
+    """The LiDAR sits elsewhere at every stop, by chance: a mount that gives way or settles. What it
+    turns by and what it shifts by have a spread each."""
+
+    name = "stop_pose_scatter"
+    site = Site.EDGE
+    unit, sigma = "rad, m", 0.0003
+    per = "stop"
+    of_lidar = True
+    what = "in where the LiDAR sits on what carries it"
+    covariates = ("stop",)
+    formula = "T_parent_lidar = T_cad exp(a_stop), a_stop by chance with two spreads, an axis"
+    typical = "sd of 0.1 to 1 mm and mrad, size assumed"
+    confounded_with = ("tracker_scatter", "joint_scatter", "mount_slip")
+    source = "variance components: Searle, Casella and McCulloch 1992; size assumed"
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        hangs = rig.lidar and rig.tree.path(rig.lidar_frame)
+        return tuple(
+            Param(f"{member}.{dof}", unit, self.sigma)
+            for member in ((self.members or ("each",)) if hangs else ())
+            for dof, unit in zip(DOF, UNITS, strict=True)
+        )
+
+    def basis(self, view: View) -> np.ndarray:
+        tree, each = view.rig.tree, self.several(view, len(DOF))
+        basis = np.zeros((len(each), len(tree.edges), *each.shape[1:]))
+        basis[:, tree.path(view.rig.lidar_frame)[-1]] = each
+        return basis
 
 
 class TrackerScatter(Scatter):

@@ -1,6 +1,7 @@
 """How widely things scatter by chance, as a problem has it: values of unknowns, and rows.
 
-A spread has a key: the name of the unknown whose values scatter; or, where rows have a wider sigma,
+A spread has a key: the name of the unknown whose values scatter, with ``.sd.unit`` after it where
+these are of several units; or, where rows have a wider sigma,
 ``effect.whose.unit``, whose being a tracked body, the joints, what of targets, or a kind of part of
 the mesh; or, of how uneven the planes of a recording are, which no effect needs to say,
 ``planes/region.m``.
@@ -29,6 +30,16 @@ OF_TARGETS = "target/"  # before what of targets a spread is of: no body is call
 def by_chance(problem: Problem) -> list[Unknown]:
     """The unknowns whose spread is estimated."""
     return [u for u in problem.variables.values() if u.role is Role.SCATTER]
+
+
+def spread_keys(unknown: Unknown) -> dict[str, np.ndarray]:
+    """Key of each spread of an unknown by chance -> which (n,) of its values have it."""
+    units = np.array(unknown.units)
+    every = {
+        f"{unknown.name}.sd.{unit}": np.flatnonzero(units == unit)
+        for unit in sorted(dict.fromkeys(unknown.units))
+    }
+    return every if len(every) > 1 else {unknown.name: np.arange(len(units))}
 
 
 def widening(problem: Problem) -> dict[str, tuple[str, str]]:
@@ -87,7 +98,11 @@ def sigmas(problem: Problem) -> dict[tuple[str, str], tuple[float, float]]:
 def spread_of(problem: Problem) -> dict[str, float]:
     """Key of every spread, an unknown's by chance or what widens rows -> what it is."""
     known = sigmas(problem)
-    out = {unknown.name: float(unknown.sigma[0]) for unknown in by_chance(problem)}
+    out = {
+        key: float(unknown.sigma[at[0]])
+        for unknown in by_chance(problem)
+        for key, at in spread_keys(unknown).items()
+    }
     return out | {key: float(known[whose][1]) for key, whose in widening(problem).items()}
 
 
@@ -99,13 +114,16 @@ def with_spread(problem: Problem, spread: Mapping[str, float], settled: float = 
         spread: by the keys of `spread_of`; of some of them.
         settled: relative change of a sigma that is none.
     """
-    known = problem.variables
-    changed = {
-        name: replace(known[name], sigma=np.full(known[name].dim, sd))
-        for name, sd in spread.items()
-        if name in known and abs(known[name].sigma[0] - sd) > settled * sd
-    }
-    problem = replace(problem, variables=known | changed) if changed else problem
+    changed = {}
+    for unknown in by_chance(problem):
+        sigma = unknown.sigma.copy()
+        for key, at in spread_keys(unknown).items():
+            sd = spread.get(key, sigma[at[0]])
+            if abs(sigma[at[0]] - sd) > settled * sd:
+                sigma[at] = sd
+        if not np.array_equal(sigma, unknown.sigma):
+            changed[unknown.name] = replace(unknown, sigma=sigma)
+    problem = replace(problem, variables=problem.variables | changed) if changed else problem
     now = sigmas(problem)
     for key, whose in widening(problem).items():
         sigma, beyond = now[whose]

@@ -21,7 +21,7 @@ from scipy.optimize import minimize_scalar
 from calib.linear.system import Linearisation, Values
 from calib.problem.places import joints_at
 from calib.problem.problem import Block, Problem, SurfaceCells
-from calib.problem.spread import OF_TARGETS, by_chance, read, sigmas, widening
+from calib.problem.spread import OF_TARGETS, by_chance, read, sigmas, spread_keys, widening
 from calib.problem.unknowns import Unknown
 from calib.problem.without import ROD
 from calib.residuals.groups import JOINTS, Group
@@ -54,7 +54,7 @@ class Told:
     group: np.ndarray
 
     @classmethod
-    def of(
+    def fitted(
         cls, values: np.ndarray, covariance: np.ndarray, variance: np.ndarray, group: np.ndarray
     ) -> Told:
         """From the values (Q,) as fitted, their covariance (Q, Q) and the variances (Q,) that they
@@ -86,6 +86,19 @@ class Told:
                 break
         return np.sqrt(variance)
 
+    def of(self, group: int) -> Told:
+        """Of one group, all others being 0."""
+        at = np.flatnonzero(self.group == group)
+        return Told(self.score[at], self.information[np.ix_(at, at)], np.zeros(len(at), int))
+
+    def statistic(self, sd: np.ndarray) -> float:
+        """Twice the log of the likelihood ratio of the sds (G,) against none."""
+        root = sd[self.group]
+        inner = np.eye(len(root)) + root[:, None] * self.information * root
+        whole = cho_factor(inner)
+        scaled = root * self.score
+        return float(scaled @ cho_solve(whole, scaled) - 2 * np.log(np.diag(whole[0])).sum())
+
     def _given(self, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The values (Q,) and their covariance, given the variances of the groups."""
         root = np.sqrt(variance)[self.group]
@@ -107,12 +120,29 @@ class Told:
 
 def told(some: Sequence[Unknown], values: Mapping[str, np.ndarray], covariance: np.ndarray) -> Told:
     """What all rows say of some unknowns by chance; `covariance` is their joint one, as fitted."""
-    return Told.of(
+    return Told.fitted(
         np.concatenate([values[u.name] for u in some]),
         covariance,
         np.square(np.concatenate([u.sigma for u in some])),
-        np.repeat(np.arange(len(some)), [u.dim for u in some]),
+        groups(some),
     )
+
+
+def groups(some: Sequence[Unknown]) -> np.ndarray:
+    """Which spread (Q,) each value of some unknowns by chance has, in the order of their keys."""
+    out, count = [], 0
+    for unknown in some:
+        of = np.zeros(unknown.dim, int)
+        for at in spread_keys(unknown).values():
+            of[at] = count
+            count += 1
+        out.append(of)
+    return np.concatenate(out)
+
+
+def sds(some: Sequence[Unknown]) -> dict[str, float]:
+    """Key of each spread of some unknowns by chance -> what it is."""
+    return {key: float(u.sigma[at[0]]) for u in some for key, at in spread_keys(u).items()}
 
 
 @dataclass(frozen=True)
@@ -345,11 +375,11 @@ def spreads(estimate: Estimate) -> dict[str, tuple[float, float]]:
     """Key of a spread, an unknown by chance or what widens rows -> that spread, and its sigma."""
     some, out = by_chance(estimate.problem), {}
     if some:
-        names = [u.name for u in some]
-        found = told(some, estimate.values, estimate.covariance_of(names))
-        sd = np.array([u.sigma[0] for u in some])
+        found = told(some, estimate.values, estimate.covariance_of([u.name for u in some]))
+        now = sds(some)
+        sd = np.array(list(now.values()))
         pairs = zip(sd.tolist(), found.sigma(sd).tolist(), strict=True)
-        out |= dict(zip(names, pairs, strict=True))
+        out |= dict(zip(now, pairs, strict=True))
     if keys := widening(estimate.problem):
         sums, known = squares(estimate), sigmas(estimate.problem)
         for key, whose in keys.items():

@@ -45,6 +45,7 @@ FAMILIES: dict[str, dict[str, Any]] = {
     "tracker": {"tracker_factor": 2.0},
     "joints": {"joint_factor": 3.0},
     "spheres": {"sphere_factor": 4.0},
+    "mount": {"mount_shift_m": 0.001, "mount_turn_rad": 0.001},
     "mesh": {"mesh_error_factor": 3.0},
     "warped": {"warp_m": WARP_M},
     "stops-6": {"locations": 3, "stops": 2},

@@ -27,6 +27,7 @@ THERE = {
     "tracker": ("*_scatter",),
     "joints": ("*_scatter",),
     "spheres": ("*_scatter",),
+    "mount": ("*_scatter",),
     "mesh": ("*_scatter",),
     "warped": ("mesh:*", "moved_surface", "*_scatter"),
 }

@@ -91,7 +91,7 @@ def test_values_as_fitted_say_the_same_whatever_held_them():
     for sd in (0.2, 3.0):
         variance = np.full(28, sd**2)
         covariance = np.linalg.inv(told.information + np.diag(1 / variance))
-        again = Told.of(covariance @ told.score, covariance, variance, told.group)
+        again = Told.fitted(covariance @ told.score, covariance, variance, told.group)
         np.testing.assert_allclose(again.score, told.score, rtol=1e-7)
         np.testing.assert_allclose(again.information, told.information, atol=1e-8)
 

@@ -71,6 +71,8 @@ def visited(world: World, rig: Hardware) -> Stops:
     T_faro_base = moved(T_faro_base, settle[:, :3], settle[:, 3:])
     T_opti_base = inverse(rig.T_faro_opti) @ T_faro_base
     scatter = world.rng("scatter")
+    off = world.rng("mount").standard_normal((2, count, 3))
+    T_base_lidar = moved(T_base_lidar, world.mount_shift_m * off[0], world.mount_turn_rad * off[1])
     return Stops(
         location=location,
         time_s=time_s,
