@@ -92,6 +92,7 @@ class Chance:
         statistic: the likelihood ratio against none.
         p_value: how often as much is seen where there is none.
         detectable: spread that is found with 80 % power, in the effect's leading unit.
+        rivals: names of others that explain as much.
     """
 
     effect: Scatter
@@ -99,6 +100,7 @@ class Chance:
     statistic: float
     p_value: float
     detectable: float
+    rivals: Sequence[str] = ()
 
     @property
     def p_adjusted(self) -> float:
@@ -113,14 +115,16 @@ class Chance:
     def beside(self, estimate: Estimate) -> Chance:
         """The same as a fit has it that it is part of, tested beside all else in that."""
         if self.effect.widens:
-            return _of_rows(self.effect, squares(estimate), estimate.problem) or self
+            again = _of_rows(self.effect, squares(estimate), estimate.problem)
+            return replace(again, rivals=self.rivals) if again else self
         known, found = spreads(estimate), []
         for unknown in by_chance(estimate.problem):
             if unknown.name.rpartition("/")[2] == self.effect.name:  # before it: of which rig
                 rows = told([unknown], estimate.values, estimate.covariance_of([unknown.name]))
                 pairs = zip(units_of(self.effect), spread_keys(unknown), strict=True)
                 each = [Spread("", unit, *known[key]) for unit, key in pairs]
-                found.append(replace(_of_values(self.effect, rows), spreads=each))
+                again = _of_values(self.effect, rows) or self
+                found.append(replace(again, spreads=each, rivals=self.rivals))
         return max(found, key=lambda chance: chance.statistic)
 
     def document(self, step: int | None) -> dict[str, Any]:
@@ -152,7 +156,7 @@ class Chance:
                 "sigma": [spread.sigma for spread in self.spreads],
             },
             "smallest_detectable": self.detectable,
-            "indistinguishable_from": [],
+            "indistinguishable_from": list(self.rivals),
             "rivals": [],
             "matters": None,
         }
@@ -175,8 +179,9 @@ class Chance:
         else:
             told = " and ".join(spread.told for spread in self.spreads)
             what = f"{each.capitalize()}s scatter by {told} {self.effect.what}"
+        rivals = f"This data cannot tell it from {', '.join(self.rivals)}. " if self.rivals else ""
         return (
-            f"{what}; by chance as far as this data tell (p = {self.p_adjusted:.1g}). "
+            f"{what}; by chance as far as this data tell (p = {self.p_adjusted:.1g}). {rivals}"
             f"{name} takes that into every sigma; it tells nothing of the next {each}, so no "
             f"held-out error falls."
         )

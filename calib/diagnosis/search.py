@@ -112,7 +112,9 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NAMES) -> Search:
     looks, found, left = _steps(stand, progress, most)
     chance: list[Chance] = []
     while most and (strongest := next((c for c in looks[-1].chance if c.found), None)):
-        chance.append(strongest)
+        near = (c for c in looks[-1].chance if strongest.statistic - c.statistic < 2 * ODDS)
+        rivals = [c.effect.name for c in near if c.found and c is not strongest]
+        chance.append(replace(strongest, rivals=rivals))
         if strongest.effect.widens:
             wider = looks[-1].stand.with_effects([strongest.effect], progress)
             looks.append(wider.look(progress))

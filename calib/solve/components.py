@@ -35,6 +35,7 @@ LEAST = 1e-3  # of the sd that a group starts from: what is smaller counts as no
 MOST = 1e6  # times that: far from an optimum scores are of any size, and squares overflow
 SEEN = 1e-9  # of the largest information, below which a direction of values is not seen
 GROWN = np.geomspace(1e-3, 1e4, 50) - 1.0  # of a variance: no less and no more is found at once
+UNSEEN = 1e-6  # of a redundancy: rounding of a covariance is some 1e-9 of it
 UNTOLD = 1e-6  # rows: what fewer tell of a variance is nothing
 TOGETHER = 400  # joint readings whose covariance is computed at once: bounds the memory
 
@@ -172,8 +173,9 @@ class Checks:
     def of(cls, residual: np.ndarray, redundancy: np.ndarray) -> Checks:
         """Of residuals (m,) whose covariance is the redundancy (m, m), where sigmas are right."""
         values, axes = np.linalg.eigh(redundancy)
-        values = np.clip(values, 0.0, 1.0)
-        return cls(np.square(axes.T @ residual), values, np.ones(len(values)))
+        seen = values > UNSEEN  # in the others nothing checks the rows, and residuals are 0
+        square = np.square(axes[:, seen].T @ residual)
+        return cls(square, np.minimum(values[seen], 1.0), np.ones(int(seen.sum())))
 
     def __add__(self, other: Checks) -> Checks:
         pairs = zip(astuple(self), astuple(other), strict=True)
@@ -306,14 +308,13 @@ def _of_joints(
     at = [u.read(unit) for u in some]
     residual = [(values[u.name] / u.prior_sigma)[i] for u, i in zip(some, at, strict=True)]
     sigma = [u.prior_sigma[i] for u, i in zip(some, at, strict=True)]
-    weight = [np.full(len(i), u.weight) for u, i in zip(some, at, strict=True)]
     columns = [linear.layout.columns([u.name])[i] for u, i in zip(some, at, strict=True)]
-    parts = (np.concatenate(each) for each in (residual, sigma, weight, columns))
+    parts = (np.concatenate(each) for each in (residual, sigma, columns))
     found = []
-    for v, s, w, c in zip(*(_batches(part) for part in parts), strict=True):
+    for v, s, c in zip(*(_batches(part) for part in parts), strict=True):
         rows = np.zeros((len(c), linear.layout.size))
         rows[np.arange(len(c)), c] = 1.0 / s
-        found.append(Checks.of(v, np.diag(w) - linear.covariance(rows, kept)))
+        found.append(Checks.of(v, np.eye(len(c)) - linear.covariance(rows, kept)))
     return reduce(add, found)
 
 
