@@ -177,7 +177,8 @@ class Chance:
             told = ", ".join(f"{of} by {' and '.join(some)}" for of, some in sizes.items())
             what = f"{NOUNS[self.effect.site]} more than rig.yaml says: beyond its sigma, {told}"
         else:
-            told = " and ".join(spread.told for spread in self.spreads)
+            told = [s.told for s in self.spreads if s.sd > s.sigma] or [self.spreads[0].told]
+            told = " and ".join(told)
             what = f"{each.capitalize()}s scatter by {told} {self.effect.what}"
         rivals = f"This data cannot tell it from {', '.join(self.rivals)}. " if self.rivals else ""
         return (

@@ -109,14 +109,16 @@ class Told:
 
     def sigma(self, sd: np.ndarray) -> np.ndarray:
         """Of the sds (G,), from the expected information of the variances: ``tr(P E_i P E_j) / 2``
-        with ``P = M - M C M``."""
+        with ``P = M - M C M``; of one that is no more than that, the sd of such a variance."""
         _, covariance = self._given(np.square(sd))
         P = self.information - self.information @ covariance @ self.information
         sums = np.zeros((len(sd), len(sd)))
         np.add.at(sums, (self.group[:, None], self.group), np.square(P) / 2)
         scale = np.sqrt(np.maximum(np.diag(sums), 1e-300))
         inverse = np.linalg.pinv(sums / np.outer(scale, scale)) / np.outer(scale, scale)
-        return np.sqrt(np.maximum(np.diag(inverse), 0.0)) / (2 * sd)
+        of_variance = np.sqrt(np.maximum(np.diag(inverse), 0.0))
+        beyond = np.sqrt(np.square(sd) + of_variance) - sd
+        return np.where(of_variance < 2 * np.square(sd), of_variance / (2 * sd), beyond)
 
 
 def told(some: Sequence[Unknown], values: Mapping[str, np.ndarray], covariance: np.ndarray) -> Told:

@@ -235,6 +235,39 @@ def test_it_is_found_said_to_be_chance_and_then_nothing_is_missing(scattered):
     assert any("Stops scatter by" in sentence for sentence in found.sentences)
 
 
+def test_shift_and_turn_of_the_lidar_have_a_spread_each(tmp_path):
+    """0.9 mm and 0.9 mrad at size 3; the spreads come without the other ways to scatter."""
+    simulate(SPEC, tmp_path / "rec", 7, {"stop_pose_scatter": 3.0})
+    source = Source.open(tmp_path / "rec")
+    problem = build([source], Model().plus([find("stop_pose_scatter")]))
+    estimate = solve(problem)
+    found = spreads(estimate)
+    assert set(found) == {"stop_pose_scatter.sd.m", "stop_pose_scatter.sd.rad"}
+    for sd, sigma in found.values():
+        assert abs(sd - 0.0009) < 3 * sigma and 0.05 < sigma / sd < 0.15
+    again = resume(problem, estimate.start)
+    assert spread_of(again.problem) == pytest.approx(spread_of(estimate.problem))
+
+
+WAYS = {
+    "stop_pose_scatter": 3.0,
+    "tracker_scatter": 3.0,
+    "joint_scatter": 3.0,
+    "target_scatter": 4.0,
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", WAYS)
+def test_which_way_to_the_lidar_scatters_is_told(tmp_path, name):
+    """From base and mount, and by the scan: two of them tell what the third is off."""
+    simulate(SPEC, tmp_path / "rec", 9, {name: WAYS[name]})
+    run = fit([tmp_path / "rec"], tmp_path / "run")
+    found = diagnose(run)
+    assert found.verdict == "missing_effect" and found.worth_adding == [name]
+    assert diagnose(add(run, [name], tmp_path / "grown")).verdict == "adequate"
+
+
 def test_two_recordings_share_the_spread_and_nothing_else(scattered, tmp_path):
     simulate(
         SPEC.model_copy(update={"locations": 4}), tmp_path / "other", 8, {"stop_range_scatter": 3.0}
