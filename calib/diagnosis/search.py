@@ -112,15 +112,19 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NAMES) -> Search:
     looks, found, left = _steps(stand, progress, most)
     chance: list[Chance] = []
     while most and (strongest := next((c for c in looks[-1].chance if c.found), None)):
-        near = (c for c in looks[-1].chance if strongest.statistic - c.statistic < 2 * ODDS)
-        rivals = [c.effect.name for c in near if c.found and c is not strongest]
-        chance.append(replace(strongest, rivals=rivals))
+        others = [c for c in looks[-1].chance if c.found and c is not strongest]
+        chance.append(strongest)
         if strongest.effect.widens:
             wider = looks[-1].stand.with_effects([strongest.effect], progress)
             looks.append(wider.look(progress))
         else:
             beside = stand.with_effects([c.effect for c in chance], progress)
             looks, found, left = _steps(beside, progress, most)
+        tested = {c.effect.name for c in looks[-1].chance}  # with it, and others that still can be
+        near = (c for c in others if strongest.statistic - c.statistic < 2 * ODDS)
+        alike = [*near, *(c for c in others if c.effect.name not in tested)]
+        rivals = tuple(dict.fromkeys(c.effect.name for c in alike))
+        chance[-1] = replace(strongest, rivals=rivals)
     last = looks[-1]
     still = (c.beside(last.stand.estimate) for c in chance)
     done = Search(

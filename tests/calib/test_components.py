@@ -268,6 +268,18 @@ def test_which_way_to_the_lidar_scatters_is_told(tmp_path, name):
     assert diagnose(add(run, [name], tmp_path / "grown")).verdict == "adequate"
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["stop_pose_scatter", "tracker_scatter"])
+def test_on_one_tracked_body_a_mount_that_gives_is_a_tracker_that_scatters(tmp_path, name):
+    spec = SPEC.model_copy(update={"arm": False, "column_step": 60})
+    simulate(spec, tmp_path / "rec", 9, {name: 3.0})
+    found = diagnose(fit([tmp_path / "rec"], tmp_path / "run"))
+    (added,) = found.worth_adding
+    (one,) = (c for c in found.candidates if c["add"] == added)
+    assert {added, *one["indistinguishable_from"]} == {"stop_pose_scatter", "tracker_scatter"}
+    assert any("cannot tell it from tracker_scatter" in each for each in found.sentences)
+
+
 def test_two_recordings_share_the_spread_and_nothing_else(scattered, tmp_path):
     simulate(
         SPEC.model_copy(update={"locations": 4}), tmp_path / "other", 8, {"stop_range_scatter": 3.0}
