@@ -198,7 +198,11 @@ def place(
     """
     view = View(rig, len(joints), columns, joints)
     at = {
-        site: {t.variable: t.basis(view) for t in terms if t.effect.site is site}
+        site: {
+            t.variable: t.basis(view)
+            for t in terms
+            if t.effect.site is site and not t.effect.widens
+        }
         for site in (Site.EDGE, Site.JOINTS)
     }
     return Stops(

@@ -77,7 +77,7 @@ def group_rows(
     yield from _bodies(whole)
     yield from _targets(whole, graph_rows)
     yield from _paper(whole, problem)
-    yield from _scans(whole, problem)
+    yield from scan_rows(whole, problem)
     yield from _exact_joints(whole, problem)
 
 
@@ -214,7 +214,7 @@ def _geometry(problem: Problem) -> dict[str, Effect]:
     }
 
 
-def _scans(whole: Linearisation, problem: Problem) -> Iterator[GroupRows]:
+def scan_rows(whole: Linearisation, problem: Problem) -> Iterator[GroupRows]:
     """Every scan: through the place of its LiDAR, and through a range zero of its own."""
     for scan in problem.scans:
         sums = whole.scans[whole.layout.stops[key_of(scan)]]

@@ -16,18 +16,18 @@ weights of other stops stay as they are, so that one wild row does not hide the 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.linalg import block_diag, cho_factor, cho_solve
 
-from calib.blunders.rows import GraphRows, GroupRows, group_rows
+from calib.blunders.rows import GraphRows, GroupRows, group_rows, scan_rows
 from calib.linear.layout import positions
 from calib.linear.system import Linearisation
 from calib.problem.problem import Problem
 from calib.residuals.groups import BEAMS, Group
-from calib.solve.components import squares_of_cells
+from calib.solve.components import Sums, Told, squares_beside_bodies
 from calib.solve.graph import Graph
 
 # Of I - w H: below this a direction is held by the group alone (rounding of C is some 1e-9 of it).
@@ -125,10 +125,41 @@ def standing_alone(
     return alone
 
 
-def of_cells(whole: Linearisation, problem: Problem) -> dict[tuple[str, str], tuple[float, float]]:
-    """Of the parts of surfaces, by their kind, as `components.squares_of_cells` gives it."""
-    kept = _Others.of(whole).kept
-    return squares_of_cells(problem, whole.values, lambda some: whole.variances(some, kept))
+def beside_bodies(
+    whole: Linearisation,
+    problem: Problem,
+    whose: Collection[tuple[str, str]],
+    wild: Collection[Group],
+) -> Sums:
+    """What rows that are of no body say of their sigmas; arguments as of
+    `components.squares_beside_bodies`."""
+    others = _Others.of(whole)
+    return squares_beside_bodies(
+        problem, whole.values, whole, others.kept, whose, others.graph_rows, wild
+    )
+
+
+def of_poses(whole: Linearisation, problem: Problem, wild: Collection[Group]) -> Told | None:
+    """What all rows say of twists (6 K) of the LiDAR at stops, those of a kind in one group: 0 of
+    shifts, 1 of turns. Of the `wild` scans, nothing; None where there is no other."""
+    every = [
+        rows
+        for rows in scan_rows(whole, problem)
+        if list(rows.axes) != [BEAMS] and not set(wild) & set(rows.groups)
+    ]
+    if not every:
+        return None
+    H, b = _Others.of(whole).against(every)
+    raw = block_diag(*(rows.information for rows in every))
+    size = np.sqrt(np.maximum(np.diag(raw), 1e-300))
+    values, axes = np.linalg.eigh((raw - H) / np.outer(size, size))
+    axes = axes[:, values > UNCHECKED]
+    told, along = size[:, None] * axes * values[values > UNCHECKED], size[:, None] * axes
+    return Told(
+        score=along @ (axes.T @ (b / size)),
+        information=told @ along.T,
+        group=np.tile(np.repeat([1, 0], 3), len(every)),
+    )
 
 
 def _statistic(M: np.ndarray, u: np.ndarray, at: np.ndarray) -> float:

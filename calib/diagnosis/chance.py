@@ -19,15 +19,25 @@ import numpy as np
 from scipy import special
 
 from calib.blunders.chance import LEVELS, after_looks, at_least
-from calib.blunders.shifts import Shift, of_cells
+from calib.blunders.judged import Blunder
+from calib.blunders.shifts import beside_bodies, of_poses
 from calib.diagnosis.score import Scores
 from calib.effects import CATALOGUE, Scatter, Site
 from calib.linear.system import Linearisation
 from calib.problem import Problem
-from calib.problem.spread import sigmas
-from calib.problem.surfaces import SURFACE_SHARES
+from calib.problem.spread import OF_TARGETS, by_chance, rows_at, sigmas, spread_keys
 from calib.results.solution import one_unit
-from calib.solve.components import SEEN, Sums, Told, sigma_beyond, spreads, squares, told
+from calib.solve.components import (
+    LEAST,
+    SEEN,
+    Checks,
+    Sums,
+    Told,
+    sigma_beyond,
+    spreads,
+    squares,
+    told,
+)
 from calib.solve.estimate import Estimate
 
 ALPHA = LEVELS["scatter by chance"]
@@ -35,6 +45,13 @@ POWER = 0.8  # with which one of the smallest detectable spread is found
 FEWEST = 4  # members, or checks of a body's rows, below which nothing is said of their spread
 LOOKS = sum(effect.by_chance for effect in CATALOGUE)  # effects that are looked at
 DRAWS = 2000
+# Of wider rows: who scatters.
+NOUNS = {
+    Site.TRACKER: "The tracker scatters",
+    Site.JOINTS: "Joint readings scatter",
+    Site.TARGET: "Targets scatter",
+    Site.REFERENCE: "The mesh scatters",
+}
 GRID = np.append(0.0, np.geomspace(1e-3, 1e3, 61))  # of d, in units of the mean 1 / l
 
 
@@ -74,7 +91,8 @@ class Chance:
         spreads: how widely it scatters; of several bodies, in each of their units.
         statistic: the likelihood ratio against none.
         p_value: how often as much is seen where there is none.
-        detectable: spread that is found with 80 % power; of bodies that of a position.
+        detectable: spread that is found with 80 % power, in the effect's leading unit.
+        rivals: names of others that explain as much.
     """
 
     effect: Scatter
@@ -82,6 +100,7 @@ class Chance:
     statistic: float
     p_value: float
     detectable: float
+    rivals: Sequence[str] = ()
 
     @property
     def p_adjusted(self) -> float:
@@ -96,15 +115,16 @@ class Chance:
     def beside(self, estimate: Estimate) -> Chance:
         """The same as a fit has it that it is part of, tested beside all else in that."""
         if self.effect.widens:
-            return _of_rows(self.effect, squares(estimate), estimate.problem) or self
-        found = []
-        for name, (sd, sigma) in spreads(estimate).items():
-            if name.rpartition("/")[2] == self.effect.name:  # before it: of several rigs, which
-                unknown = estimate.problem.variables[name]
-                test = AtZero(told([unknown], estimate.values, estimate.covariance_of([name])))
-                statistic, p = test.p_value()
-                each = [Spread("", self.effect.unit, sd, sigma)]
-                found.append(replace(self, spreads=each, statistic=statistic, p_value=p))
+            again = _of_rows(self.effect, squares(estimate), estimate.problem)
+            return replace(again, rivals=self.rivals) if again else self
+        known, found = spreads(estimate), []
+        for unknown in by_chance(estimate.problem):
+            if unknown.name.rpartition("/")[2] == self.effect.name:  # before it: of which rig
+                rows = told([unknown], estimate.values, estimate.covariance_of([unknown.name]))
+                pairs = zip(units_of(self.effect), spread_keys(unknown), strict=True)
+                each = [Spread("", unit, *known[key]) for unit, key in pairs]
+                again = _of_values(self.effect, rows) or self
+                found.append(replace(again, spreads=each, rivals=self.rivals))
         return max(found, key=lambda chance: chance.statistic)
 
     def document(self, step: int | None) -> dict[str, Any]:
@@ -113,7 +133,8 @@ class Chance:
         Args:
             step: in which it was added, counting from 1; None where it was not.
         """
-        size_mm = 1e3 * max(spread.sd for spread in self.spreads if spread.unit == "m")
+        sizes_m = [spread.sd for spread in self.spreads if spread.unit == "m"]
+        size_mm = 1e3 * max(sizes_m) if sizes_m else None
         return {
             "effect": self.effect.family,
             "add": self.effect.name,
@@ -130,15 +151,20 @@ class Chance:
             "unabsorbed_rms_mm": size_mm,
             "parameters": {
                 "unit": one_unit([spread.unit for spread in self.spreads]),
-                "names": [f"{s.of}.{s.unit}" if s.of else "sd" for s in self.spreads],
+                "names": [self._name(spread) for spread in self.spreads],
                 "estimate": [spread.sd for spread in self.spreads],
                 "sigma": [spread.sigma for spread in self.spreads],
             },
             "smallest_detectable": self.detectable,
-            "indistinguishable_from": [],
+            "indistinguishable_from": list(self.rivals),
             "rivals": [],
             "matters": None,
         }
+
+    def _name(self, spread: Spread) -> str:
+        """As solution.yaml has it."""
+        several = spread.of or len(self.spreads) > 1
+        return f"{spread.of or 'sd'}.{spread.unit}" if several else "sd"
 
     @property
     def sentence(self) -> str:
@@ -147,14 +173,16 @@ class Chance:
         if self.effect.widens:
             sizes: dict[str, list[str]] = {}
             for spread in (s for s in self.spreads if s.sd > s.sigma):
-                sizes.setdefault(spread.of, []).append(spread.told)
-            noun = "tracker" if self.effect.site is Site.TRACKER else "mesh"
+                sizes.setdefault(spread.of.removeprefix(OF_TARGETS), []).append(spread.told)
             told = ", ".join(f"{of} by {' and '.join(some)}" for of, some in sizes.items())
-            what = f"The {noun} scatters more than rig.yaml says: beyond its sigma, {told}"
+            what = f"{NOUNS[self.effect.site]} more than rig.yaml says: beyond its sigma, {told}"
         else:
-            what = f"{each.capitalize()}s scatter by {self.spreads[0].told} in range"
+            told = [s.told for s in self.spreads if s.sd > s.sigma] or [self.spreads[0].told]
+            told = " and ".join(told)
+            what = f"{each.capitalize()}s scatter by {told} {self.effect.what}"
+        rivals = f"This data cannot tell it from {', '.join(self.rivals)}. " if self.rivals else ""
         return (
-            f"{what}; by chance as far as this data tell (p = {self.p_adjusted:.1g}). "
+            f"{what}; by chance as far as this data tell (p = {self.p_adjusted:.1g}). {rivals}"
             f"{name} takes that into every sigma; it tells nothing of the next {each}, so no "
             f"held-out error falls."
         )
@@ -169,7 +197,7 @@ class AtZero:
 
     def __init__(self, told: Told) -> None:
         values, axes = np.linalg.eigh(told.information)
-        seen = values > SEEN * values[-1]
+        seen = values > SEEN * max(values[-1], 0.0)
         self.l = values[seen]
         self.w = np.square(axes[:, seen].T @ told.score) / self.l
         self.d = GRID / np.mean(self.l) if len(self.l) else GRID
@@ -184,6 +212,15 @@ class AtZero:
         grown = 1.0 + self.d[:, None] * self.l
         gain = w @ (1.0 - 1.0 / grown).T - np.log(grown).sum(axis=1)
         return gain.max(axis=1)
+
+    def spread(self) -> float:
+        """The likeliest sd."""
+        gain = [float(self._gain(d)) for d in self.d]
+        return float(np.sqrt(self.d[int(np.argmax(gain))]))
+
+    def _gain(self, d: float) -> float:
+        grown = 1.0 + d * self.l
+        return self.w @ (1.0 - 1.0 / grown) - np.log(grown).sum()
 
     def drawn(self, d: float = 0.0) -> np.ndarray:
         """The statistic (DRAWS,) of draws at a variance."""
@@ -228,71 +265,103 @@ def chances(
         some: those to test.
         columns: effect's name -> its columns among the scores.
     """
-    out = []
+    found = []
     for effect in some:
         at = columns[effect.name]
-        rows = Told(scores.score[at], scores.information[np.ix_(at, at)], np.zeros(len(at), int))
-        test = AtZero(rows)
-        if test.members < FEWEST:
-            continue
-        sd = rows.spread(np.array([effect.sigma]))
-        statistic, p = test.p_value()
-        spread = Spread("", effect.unit, float(sd[0]), float(rows.sigma(sd)[0]))
-        detectable = test.detectable(ALPHA / LOOKS)
-        out.append(Chance(effect, [spread], statistic, p_value=p, detectable=detectable))
-    return out
+        score, information = scores.score[at], scores.information[np.ix_(at, at)]
+        found.append(_of_values(effect, Told(score, information, np.zeros(len(at), int))))
+    return [chance for chance in found if chance is not None]
+
+
+def of_lidar(
+    some: Sequence[Scatter], blunders: Sequence[Blunder], whole: Linearisation, problem: Problem
+) -> list[Chance]:
+    """The same of effects on where the LiDAR is at each stop, scans that are blunders left out;
+    arguments as of `rows_by_chance`."""
+    wild = [blunder.group for blunder in blunders if blunder.found]
+    rows = of_poses(whole, problem, wild) if some else None
+    found = [_of_values(effect, rows) for effect in some if rows is not None]
+    return [chance for chance in found if chance is not None]
+
+
+def units_of(effect: Scatter) -> list[str]:
+    """Of its spreads, in the order of their groups."""
+    return sorted(effect.unit.split(", "))
+
+
+def _of_values(effect: Scatter, rows: Told) -> Chance | None:
+    """The test of values, each spread against none; None where too few are told of."""
+    units = units_of(effect)
+    tests = [AtZero(rows.of(group)) for group in range(len(units))]
+    if any(test.members < FEWEST for test in tests):
+        return None
+    statistic, p_value = max((test.p_value() for test in tests), key=lambda each: -each[1])
+    p_value = float(after_looks(p_value, len(tests)))
+    sd = np.array([test.spread() for test in tests])
+    if len(tests) == 1 or after_looks(p_value, LOOKS) < ALPHA:  # the others are worth no effort
+        sd = rows.spread(np.full(len(tests), effect.sigma))
+        statistic = max(rows.statistic(sd), statistic)
+    pairs = zip(units, sd.tolist(), rows.sigma(np.maximum(sd, LEAST * effect.sigma)), strict=True)
+    return Chance(
+        effect,
+        spreads=[Spread("", unit, each, float(sigma)) for unit, each, sigma in pairs],
+        statistic=statistic,
+        p_value=p_value,
+        detectable=tests[units.index(effect.leading)].detectable(ALPHA / LOOKS / len(tests)),
+    )
 
 
 def ranked(some: Sequence[Chance]) -> list[Chance]:
-    """Those that chance explains least first."""
-    return sorted(some, key=lambda chance: (chance.p_value, -chance.statistic))
+    """Those that chance explains least first; of those that are found, the likeliest: no p-value
+    is told that far out."""
+    found = sorted((c for c in some if c.found), key=lambda chance: -chance.statistic)
+    return found + sorted((c for c in some if not c.found), key=lambda chance: chance.p_value)
 
 
 def rows_by_chance(
-    effects: Sequence[Scatter], good: Sequence[Shift], whole: Linearisation, problem: Problem
+    effects: Sequence[Scatter], blunders: Sequence[Blunder], whole: Linearisation, problem: Problem
 ) -> list[Chance]:
-    """The tests that rows of tracked bodies, and the mesh's surfaces, scatter beyond their sigmas;
-    of those that next to nothing checks there is none.
+    """The tests that rows scatter beyond their sigmas, those of blunders left out; of those that
+    next to nothing checks there is none.
 
     Args:
         effects: that say so.
-        good: the groups of rows that are no blunders.
+        blunders: all groups of rows.
         whole: all rows, linearised at the fit.
         problem: of the fit.
     """
-    sums: dict[tuple[str, str], tuple[float, float]] = {}
-    for shift in (s for s in good if s.group.kind == "body"):
-        for unit, (total, left) in shift.squares.items():
-            before = sums.get((shift.group.what, unit), (0.0, 0.0))
-            sums[shift.group.what, unit] = before[0] + total, before[1] + left
-    if any(effect.site is Site.REFERENCE for effect in effects):
-        sums |= of_cells(whole, problem)
+    sums: dict[tuple[str, str], Checks] = {}
+    for shift in (b.shift for b in blunders if not b.found and b.group.kind == "body"):
+        for unit, squares_there in shift.squares.items():
+            here, before = Checks.alone(*squares_there), sums.get((shift.group.what, unit))
+            sums[shift.group.what, unit] = here if before is None else before + here
+    sites = {effect.site for effect in effects} - {Site.TRACKER}
+    if whose := {each for site in sites for each in rows_at(problem, site)}:
+        sums |= beside_bodies(whole, problem, whose, [b.group for b in blunders if b.found])
     found = (_of_rows(effect, sums, problem) for effect in effects)
     return [chance for chance in found if chance is not None]
 
 
 def _of_rows(effect: Scatter, sums: Sums, problem: Problem) -> Chance | None:
-    """The test that rows have the variance that is stated: the sum of their squares is near
-    chi-square with their redundancy for degrees of freedom."""
+    """The test that rows have the variance that is stated, as `Checks` have it."""
     known, spreads, p, statistic, detectable = sigmas(problem), [], [], 0.0, np.inf
-    bodies = {block.body for block in problem.bodies}
-    mine = bodies if effect.site is Site.TRACKER else SURFACE_SHARES
-    checked = {key: each for key, each in sums.items() if key[0] in mine and each[1] >= FEWEST}
-    for (what, unit), (total, left) in checked.items():
+    mine = [whose for whose in rows_at(problem, effect.site) if whose in sums]
+    checked = {whose: sums[whose] for whose in mine if sums[whose].left >= FEWEST}
+    for (what, unit), checks in checked.items():
         sigma, beyond = known[what, unit]
         variance = sigma**2 - beyond**2
-        total *= sigma**2 / variance  # as its first sigma has it
-        factor = total / left
-        sd = float(np.sqrt(max(factor - 1.0, 0.0) * variance))
-        of = sigma_beyond(sd, max(factor, 1.0) * variance, left)
-        spreads.append(Spread(what, unit, sd, of))
-        p.append(float(special.chdtrc(left, total)))
-        statistic += left * (factor - 1.0 - np.log(factor)) if factor > 1.0 else 0.0
-        if unit == "m":
-            limit = special.chdtri(left, ALPHA / LOOKS / len(checked))
-            least = np.sqrt(variance * (limit / special.chdtri(left, POWER) - 1.0))
-            detectable = min(detectable, float(least))
-    if not any(spread.unit == "m" for spread in spreads):
+        at_first = checks.had_variance(variance / sigma**2)
+        grown = max(at_first.growth(), 0.0)
+        sd = float(np.sqrt(grown * variance))
+        spreads.append(Spread(what, unit, sd, sigma_beyond(sd, variance * at_first.sigma(grown))))
+        p.append(float(special.chdtrc(at_first.dof, at_first.scaled)))
+        statistic += at_first.statistic(grown)
+        if unit == effect.leading:
+            limit = special.chdtri(at_first.dof, ALPHA / LOOKS / len(checked))
+            enough = limit / special.chdtri(at_first.dof, POWER) - 1.0
+            share = at_first.told / at_first.left
+            detectable = min(detectable, float(np.sqrt(variance * enough / share)))
+    if not any(spread.unit == effect.leading for spread in spreads):
         return None
     p_value = float(after_looks(min(p), len(p)))
     return Chance(effect, spreads, statistic, p_value=p_value, detectable=detectable)

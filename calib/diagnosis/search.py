@@ -113,6 +113,7 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NAMES) -> Search:
     looks, found, left = _steps(stand, progress, most)
     chance: list[Chance] = []
     while most and (strongest := next((c for c in looks[-1].chance if c.found), None)):
+        others = [c for c in looks[-1].chance if c.found and c is not strongest]
         chance.append(strongest)
         if strongest.effect.widens:
             wider = looks[-1].stand.with_effects([strongest.effect], progress)
@@ -120,6 +121,11 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NAMES) -> Search:
         else:
             beside = stand.with_effects([c.effect for c in chance], progress)
             looks, found, left = _steps(beside, progress, most)
+        tested = {c.effect.name for c in looks[-1].chance}  # with it, and others that still can be
+        near = (c for c in others if strongest.statistic - c.statistic < 2 * ODDS)
+        alike = [*near, *(c for c in others if c.effect.name not in tested)]
+        rivals = tuple(dict.fromkeys(c.effect.name for c in alike))
+        chance[-1] = replace(strongest, rivals=rivals)
     last = looks[-1]
     still = (c.beside(last.stand.estimate) for c in chance)
     done = Search(
@@ -246,11 +252,12 @@ def _outdone(look: Look, by: Blunder) -> bool:
 
 
 def _chance_leads(look: Look) -> bool:
-    """Whether values by chance explain more than any effect or structure does; wider sigmas would
-    take in whatever is missing."""
+    """Whether values by chance explain more than any effect or structure does, and than wider
+    sigmas, which would take in whatever is missing."""
     every = (*look.named.candidates, *look.unnamed.candidates)
     best = max((c.test.statistic for c in every), default=0.0)
-    return any(c.found and c.statistic > best for c in look.chance if not c.effect.widens)
+    found = [c for c in look.chance if c.found]
+    return bool(found) and not found[0].effect.widens and found[0].statistic > best
 
 
 def _quiet(look: Look) -> bool:

@@ -18,7 +18,7 @@ from calib.diagnosis.candidates import (
     stops_view,
     structure,
 )
-from calib.diagnosis.chance import Chance, chances, ranked, rows_by_chance
+from calib.diagnosis.chance import Chance, chances, of_lidar, ranked, rows_by_chance
 from calib.diagnosis.jackknife import Shares
 from calib.diagnosis.linear import Linear, linearise_with, rows_along
 from calib.diagnosis.score import Test, away_from_model, project, test
@@ -108,8 +108,8 @@ class Stand:
         """Test everything that the model lacks."""
         columns, sample = self.columns
         known = known_effects(self.model, self.sources, columns, self.catalogue)
-        wider = [e for e in known if e.widens]
-        known = [e for e in known if not e.widens]
+        by_rows = [e for e in known if e.by_chance and e.site is not Site.BEAM]
+        known = [e for e in known if e not in by_rows]
         there = set(self.model.names)
         unnamed = [e for e in structure(self.sources, sample) if e.name not in there]
         linear, at = self.linearise((*known, *unnamed), progress)
@@ -126,7 +126,7 @@ class Stand:
             unnamed=rest,
             noise=noise,
             values=chances(scores, chance, at),
-            wider=wider,
+            by_rows=by_rows,
             columns=columns,
         )
 
@@ -259,7 +259,7 @@ class Look:
         unnamed: structure, tested.
         noise: effects on the scatter, tested; they move no mean.
         values: effects whose values are drawn anew by chance, tested.
-        wider: effects by chance that widen the sigmas of rows, not in the model.
+        by_rows: those that need no columns of their own: what groups of rows are off tells of them.
         columns: what points and stops carry.
     """
 
@@ -269,7 +269,7 @@ class Look:
     unnamed: Screen
     noise: Screen
     values: Sequence[Chance]
-    wider: Sequence[Scatter]
+    by_rows: Sequence[Scatter]
     columns: frozenset[str]
 
     @cached_property
@@ -285,9 +285,12 @@ class Look:
     @cached_property
     def chance(self) -> list[Chance]:
         """What may scatter by chance, that which chance explains least first."""
-        good = [blunder.shift for blunder in self.blunders if not blunder.found]
-        of_rows = rows_by_chance(self.wider, good, self.fitted, self.stand.estimate.problem)
-        return ranked([*self.values, *of_rows])
+        problem = self.stand.estimate.problem
+        wider = [e for e in self.by_rows if e.widens]
+        posed = [e for e in self.by_rows if not e.widens]
+        of_rows = rows_by_chance(wider, self.blunders, self.fitted, problem)
+        of_poses = of_lidar(posed, self.blunders, self.fitted, problem)
+        return ranked([*self.values, *of_poses, *of_rows])
 
     @property
     def checked(self) -> set[Group]:

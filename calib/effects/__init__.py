@@ -51,10 +51,13 @@ from calib.effects.range import (
 from calib.effects.reference import FaroScale, MovedSurface
 from calib.effects.rig import BaseFlex, FrameOffset, MountBending, MountCreep, MountSlip
 from calib.effects.scatter import (
+    JointScatter,
     LocationRangeScatter,
     ReferenceScatter,
     Scatter,
+    StopPoseScatter,
     StopRangeScatter,
+    TargetScatter,
     TrackerScatter,
 )
 from calib.effects.targets import TargetRodTilt, TargetSphereOffset
@@ -110,7 +113,10 @@ CATALOGUE: tuple[Effect, ...] = (
     NoiseIntensity(),
     StopRangeScatter(),
     LocationRangeScatter(),
+    StopPoseScatter(),
     TrackerScatter(),
+    JointScatter(),
+    TargetScatter(),
     ReferenceScatter(),
 )
 DEFAULT = ("arm_link_length", "arm_joint_offset", "ring_range_offset")

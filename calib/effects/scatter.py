@@ -29,6 +29,7 @@ class Scatter(Effect):
     Attributes:
         per: column of the stops that says which member each belongs to.
         sigma: sd to start from.
+        what: in what its members scatter, as people read it; of values.
         members: names of all members; unknown until `among` says so, and then taken for one.
         label: before the names of the members of this recording, where there are several.
     """
@@ -36,8 +37,14 @@ class Scatter(Effect):
     by_chance = True
     per: ClassVar[str]
     sigma: ClassVar[float]
+    what: ClassVar[str] = ""
     members: tuple[str, ...] = ()
     label: str = ""
+
+    @property
+    def leading(self) -> str:
+        """The unit in which its size is told; of bodies that of a position."""
+        return self.unit.rpartition(", ")[2]
 
     def among(self, members: Iterable[str], label: str = "") -> Self:
         """The effect with a parameter for each of these members."""
@@ -62,6 +69,15 @@ class Scatter(Effect):
         index = np.broadcast_to(self.member(view), view.rows)
         return OneHot(index, np.broadcast_to(along, (view.rows, 3)), max(1, len(self.members)))
 
+    def several(self, view: View, size: int) -> np.ndarray:
+        """The basis (rows, size, members * size) in which a row has so many values, each off by its
+        own member's."""
+        member, count = self.member(view), max(1, len(self.members))
+        basis = np.zeros((len(member), size, count, size))
+        rows = np.flatnonzero(member >= 0)
+        basis[rows, :, member[rows], :] = np.eye(size)
+        return basis.reshape(len(member), size, -1)
+
 
 class StopRangeScatter(Scatter):
     """The range zero is another one at every stop, by chance: power cycles, settling, the hour."""
@@ -70,6 +86,7 @@ class StopRangeScatter(Scatter):
     site = Site.BEAM
     unit, sigma = "m", 0.0003
     per = "stop"
+    what = "in range"
     covariates = ("stop",)
     formula = "range = true + a_stop, a_stop by chance with a spread of sd"
     typical = "sd of 0.1 to 1 mm, size assumed"
@@ -88,6 +105,37 @@ class LocationRangeScatter(StopRangeScatter):
     covariates = ("location",)
     formula = "range = true + a_location, a_location by chance with a spread of sd"
     confounded_with = ("stop_range_scatter", "temperature_drift", "warmup_drift")
+
+
+class StopPoseScatter(Scatter):
+    """The LiDAR sits elsewhere at every stop, by chance: a mount that gives way or settles. What it
+    turns by and what it shifts by have a spread each."""
+
+    name = "stop_pose_scatter"
+    site = Site.EDGE
+    unit, sigma = "rad, m", 0.0003
+    per = "stop"
+    of_lidar = True
+    what = "in where the LiDAR sits on what carries it"
+    covariates = ("stop",)
+    formula = "T_parent_lidar = T_cad exp(a_stop), a_stop by chance with two spreads, an axis"
+    typical = "sd of 0.1 to 1 mm and mrad, size assumed"
+    confounded_with = ("tracker_scatter", "joint_scatter", "mount_slip")
+    source = "variance components: Searle, Casella and McCulloch 1992; size assumed"
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        hangs = rig.lidar and rig.tree.path(rig.lidar_frame)
+        return tuple(
+            Param(f"{member}.{dof}", unit, self.sigma)
+            for member in ((self.members or ("each",)) if hangs else ())
+            for dof, unit in zip(DOF, UNITS, strict=True)
+        )
+
+    def basis(self, view: View) -> np.ndarray:
+        tree, each = view.rig.tree, self.several(view, len(DOF))
+        basis = np.zeros((len(each), len(tree.edges), *each.shape[1:]))
+        basis[:, tree.path(view.rig.lidar_frame)[-1]] = each
+        return basis
 
 
 class TrackerScatter(Scatter):
@@ -115,13 +163,59 @@ class TrackerScatter(Scatter):
         )
 
     def basis(self, view: View) -> np.ndarray:
-        bodies, member = len(view.rig.tracker.bodies), self.member(view)
-        count = max(1, len(self.members))
-        basis = np.zeros((len(member), bodies, 6, count, bodies, 6))
-        rows, seen = np.arange(len(member)), member >= 0
-        for b in range(bodies):
-            basis[rows[seen], b, :, member[seen], b, :] = np.eye(6)
-        return basis.reshape(len(member), bodies, 6, -1)
+        bodies = len(view.rig.tracker.bodies)
+        basis = self.several(view, 6 * bodies)
+        return basis.reshape(len(basis), bodies, 6, -1)
+
+
+class JointScatter(Scatter):
+    """Joint readings scatter more from stop to stop than rig.yaml says: brakes that let go, loose
+    couplings, readings rounded on their way."""
+
+    name = "joint_scatter"
+    site = Site.JOINTS
+    unit, sigma = "rad", 0.0002
+    per = "stop"
+    widens = True
+    covariates = ("stop", "joints")
+    formula = "q_i = reported_i + a_stop,i, by chance with a spread of sd, beyond its sigma"
+    typical = "as much as the sigma on paper, size assumed"
+    confounded_with = ("tracker_scatter", "arm_backlash", "arm_gear_error")
+    source = "variance components of groups of observations: Foerstner 1979; size assumed"
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        """None where the joints count as exact."""
+        joints = zip(rig.joint_names, rig.joint_kinds, strict=True) if rig.sigma_joint_rad else ()
+        units = {name: "rad" if kind == "revolute" else "m" for name, kind in joints}
+        each = self.members or ("each",)
+        return tuple(Param(f"{m}.{j}", unit, self.sigma) for m in each for j, unit in units.items())
+
+    def basis(self, view: View) -> np.ndarray:
+        return self.several(view, view.joints.shape[1])
+
+
+class TargetScatter(Scatter):
+    """Spheres, or the markers above them, are found worse than rig.yaml says: rods that swing or
+    are bent, spheres fitted to few points."""
+
+    name = "target_scatter"
+    site = Site.TARGET
+    unit, sigma = "m", 0.001
+    per = "target"
+    widens = True
+    formula = "sphere = hung + a_target, a_target by chance with a spread of sd, beyond its sigma"
+    typical = "as much as the sigma on paper, size assumed"
+    confounded_with = ("target_rod_tilt", "optitrack_scale", "faro_scale")
+    source = "variance components of groups of observations: Foerstner 1979; size assumed"
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        each = (self.members or ("each",)) if rig.target else ()
+        return tuple(
+            Param(f"{member}.{axis}", "m", self.sigma) for member in each for axis in "xyz"
+        )
+
+    def basis(self, view: View) -> np.ndarray:
+        return self.several(view, 3)
 
 
 class ReferenceScatter(Scatter):

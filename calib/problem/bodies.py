@@ -79,7 +79,7 @@ def add_targets(problem: Problem, part: SourceStops, places: Places) -> None:
     shifts, scanned = (
         {t.variable: np.broadcast_to(b := t.basis(view), (*shape, b.shape[2])) for t in terms}
         for terms in (
-            [t for t in part.terms if t.effect.site is Site.TARGET],
+            [t for t in part.terms if t.effect.site is Site.TARGET and not t.effect.widens],
             [t for t in part.terms if t.effect.of_scanner],
         )
     )

@@ -15,6 +15,7 @@ from calib.problem.problem import Problem, SourceStops
 from calib.problem.unknowns import Role, Unknown
 from calib.residuals.groups import CAD
 from calib.residuals.surfaces import Meeting
+from calib.rig import Rig
 from chains.errors import InputError
 
 FREE = 1.0  # m or rad: what is known of a value on paper that is left out, the rig's own size
@@ -100,10 +101,14 @@ def with_members(terms: Sequence[Sequence[Term]], sources: Sequence[Source]) -> 
             names = source.columns[term.effect.per].tolist()
             members.setdefault(term.variable, []).extend(f"{label}{name}" for name in names)
 
-    def bound(term: Term, label: str) -> Term:
+    def bound(term: Term, label: str, rig: Rig) -> Term:
         if term.variable not in members:
             return term
         effect = term.effect.among(members[term.variable], label)
-        return Term(effect, term.variable, np.arange(len(effect.members)))
+        return Term(effect, term.variable, np.arange(len(effect.params(rig))))
 
-    return [[bound(t, label) for t in some] for some, label in zip(terms, labelled, strict=True)]
+    rigs = [source.rig for source in sources]
+    return [
+        [bound(t, label, rig) for t in some]
+        for some, label, rig in zip(terms, labelled, rigs, strict=True)
+    ]

@@ -8,16 +8,24 @@ import numpy as np
 
 from calib.forward import Stops, place
 from calib.problem import start
-from calib.problem.model import Model
+from calib.problem.model import Model, labels
 from calib.problem.problem import Problem, SourceStops
-from calib.problem.unknowns import UNKNOWN_POSE, Role, Unknown, pose_unknown
-from calib.residuals.groups import JOINTS
+from calib.problem.unknowns import EXACT, UNKNOWN_POSE, UNREAD, Role, Unknown, pose_unknown
+from calib.residuals.groups import JOINTS, Group
 from chains import se3
 from chains.errors import InputError
 
 GUESSED_POSE = np.repeat([0.2, 0.3], 3)  # rad, m: a base_guess is set up by hand
-UNREAD = 1.0  # rad or m: a joint whose reading at a stop is left out
-EXACT = 1e-7  # rad or m: an encoder without error beside one that is left out
+
+
+def _joints(prefix: str, stop: str) -> str:
+    return f"{prefix}joints@{stop}"
+
+
+def joints_at(problem: Problem, group: Group) -> str:
+    """Name of what encoders misreport at the stop that a group is of."""
+    called = labels(problem.sources)
+    return _joints(f"{called.index(group.recording)}/" if len(called) > 1 else "", group.where)
 
 
 @dataclass
@@ -158,7 +166,7 @@ class Places:
         sigma = self._joint_sigma(index)
         if not sigma.any():
             return stops
-        name = f"{self.part.prefix}joints@{source.recording.stops[index[0]]}"
+        name = _joints(self.part.prefix, source.recording.stops[index[0]])
         count = len(source.rig.joint_names)
         units = tuple("rad" if kind == "revolute" else "m" for kind in source.rig.joint_kinds)
         self.problem.add(

@@ -1,8 +1,10 @@
 """How widely things scatter by chance, as a problem has it: values of unknowns, and rows.
 
-A spread has a key: the name of the unknown whose values scatter; or, where the rows of a tracked
-body or parts of the mesh have a wider sigma, ``effect.body.unit`` or ``effect.surface.m``; or, of
-how uneven the planes of a recording are, which no effect needs to say, ``planes/region.m``.
+A spread has a key: the name of the unknown whose values scatter, with ``.sd.unit`` after it where
+these are of several units; or, where rows have a wider sigma,
+``effect.whose.unit``, whose being a tracked body, the joints, what of targets, or a kind of part of
+the mesh; or, of how uneven the planes of a recording are, which no effect needs to say,
+``planes/region.m``.
 """
 
 from __future__ import annotations
@@ -13,12 +15,16 @@ from dataclasses import replace
 import numpy as np
 
 from calib.effects import Site
-from calib.problem.problem import Problem
+from calib.problem.problem import Block, Problem
 from calib.problem.surfaces import SURFACE_SHARES, cell_sigma_m, kinds_of
 from calib.problem.unknowns import Role, Unknown
+from calib.residuals.groups import JOINTS
 from calib.residuals.scan import ScanStop
 from calib.residuals.surfaces import PlaneSurface
+from calib.residuals.targets import SIGMAS, HangingTarget
 from calib.residuals.tracker import TrackedBody
+
+OF_TARGETS = "target/"  # before what of targets a spread is of: no body is called so
 
 
 def by_chance(problem: Problem) -> list[Unknown]:
@@ -26,21 +32,46 @@ def by_chance(problem: Problem) -> list[Unknown]:
     return [u for u in problem.variables.values() if u.role is Role.SCATTER]
 
 
+def spread_keys(unknown: Unknown) -> dict[str, np.ndarray]:
+    """Key of each spread of an unknown by chance -> which (n,) of its values have it."""
+    units = np.array(unknown.units)
+    every = {
+        f"{unknown.name}.sd.{unit}": np.flatnonzero(units == unit)
+        for unit in sorted(dict.fromkeys(unknown.units))
+    }
+    return every if len(every) > 1 else {unknown.name: np.arange(len(units))}
+
+
 def widening(problem: Problem) -> dict[str, tuple[str, str]]:
-    """Key of every spread that widens the sigma of rows -> whose, a tracked body's or those of a
-    kind of part of the mesh or of planes, and its unit."""
-    out, bodies = {}, {block.body: block.is_point for block in problem.bodies}
+    """Key of every spread that widens the sigma of rows -> whose, and its unit."""
+    out: dict[str, tuple[str, str]] = {}
     for term in (t for some in problem.terms for t in some if t.effect.widens):
-        if term.effect.site is Site.TRACKER:
-            for body, is_point in bodies.items():
-                for unit in ("m",) if is_point else ("rad", "m"):
-                    out[f"{term.variable}.{body}.{unit}"] = body, unit
-        elif any(scan.reference_sigma_m for scan in problem.scans if not _on_planes(scan)):
-            out |= {f"{term.variable}.{part}.m": (part, "m") for part in SURFACE_SHARES}
+        mine = rows_at(problem, term.effect.site)
+        out |= {f"{term.variable}.{what}.{unit}": (what, unit) for what, unit in mine}
     planes = (
         kind for scan in problem.scans if _on_planes(scan) for kind in kinds_of(scan).values()
     )
     return out | {f"{kind}.m": (kind, "m") for kind in planes}
+
+
+def rows_at(problem: Problem, site: Site) -> list[tuple[str, str]]:
+    """Whose rows, and their unit, have a sigma that an effect at a site may widen."""
+    if site is Site.TRACKER:
+        bodies = {block.body: block.is_point for block in problem.bodies}
+        return [(b, u) for b, point in bodies.items() for u in (("m",) if point else ("rad", "m"))]
+    if site is Site.JOINTS:
+        return [(JOINTS, unit) for unit in ("rad", "m") if read(problem, unit)]
+    if site is Site.TARGET:
+        there = any(isinstance(block, HangingTarget) for block in problem.blocks)
+        return [(f"{OF_TARGETS}{part}", "m") for part in SIGMAS] if there else []
+    meshes = any(scan.reference_sigma_m for scan in problem.scans if not _on_planes(scan))
+    return [(part, "m") for part in SURFACE_SHARES] if meshes else []
+
+
+def read(problem: Problem, unit: str) -> list[Unknown]:
+    """What encoders misreport, wherever that has a sigma in this unit."""
+    every = (u for u in problem.variables.values() if u.role is Role.JOINTS)
+    return [unknown for unknown in every if len(unknown.read(unit))]
 
 
 def sigmas(problem: Problem) -> dict[tuple[str, str], tuple[float, float]]:
@@ -50,6 +81,13 @@ def sigmas(problem: Problem) -> dict[tuple[str, str], tuple[float, float]]:
         for block in problem.bodies
         for unit in ("rad", "m")
     }
+    for unit in ("rad", "m"):
+        for unknown in read(problem, unit)[:1]:
+            sigma = float(unknown.sigma[unknown.read(unit)[0]])
+            out[JOINTS, unit] = sigma, unknown.scatter.get(unit, 0.0)
+    for block in (b for b in problem.blocks if isinstance(b, HangingTarget)):
+        for part, beyond in block.scatter.items():
+            out[f"{OF_TARGETS}{part}", "m"] = getattr(block, f"sigma_{part}_m"), beyond
     for scan in problem.scans:
         for part, kind in kinds_of(scan).items():
             beyond = scan.reference_scatter_m.get(part, 0.0)
@@ -60,7 +98,11 @@ def sigmas(problem: Problem) -> dict[tuple[str, str], tuple[float, float]]:
 def spread_of(problem: Problem) -> dict[str, float]:
     """Key of every spread, an unknown's by chance or what widens rows -> what it is."""
     known = sigmas(problem)
-    out = {unknown.name: float(unknown.sigma[0]) for unknown in by_chance(problem)}
+    out = {
+        key: float(unknown.sigma[at[0]])
+        for unknown in by_chance(problem)
+        for key, at in spread_keys(unknown).items()
+    }
     return out | {key: float(known[whose][1]) for key, whose in widening(problem).items()}
 
 
@@ -72,13 +114,16 @@ def with_spread(problem: Problem, spread: Mapping[str, float], settled: float = 
         spread: by the keys of `spread_of`; of some of them.
         settled: relative change of a sigma that is none.
     """
-    known = problem.variables
-    changed = {
-        name: replace(known[name], sigma=np.full(known[name].dim, sd))
-        for name, sd in spread.items()
-        if name in known and abs(known[name].sigma[0] - sd) > settled * sd
-    }
-    problem = replace(problem, variables=known | changed) if changed else problem
+    changed = {}
+    for unknown in by_chance(problem):
+        sigma = unknown.sigma.copy()
+        for key, at in spread_keys(unknown).items():
+            sd = spread.get(key, sigma[at[0]])
+            if abs(sigma[at[0]] - sd) > settled * sd:
+                sigma[at] = sd
+        if not np.array_equal(sigma, unknown.sigma):
+            changed[unknown.name] = replace(unknown, sigma=sigma)
+    problem = replace(problem, variables=problem.variables | changed) if changed else problem
     now = sigmas(problem)
     for key, whose in widening(problem).items():
         sigma, beyond = now[whose]
@@ -89,13 +134,13 @@ def with_spread(problem: Problem, spread: Mapping[str, float], settled: float = 
 
 
 def _widened(problem: Problem, whose: tuple[str, str], sd: float) -> Problem:
-    """The problem with another spread of a body's rows, or of a kind of part of surfaces."""
+    """The problem with another spread of some rows."""
     what, unit = whose
-    if any(block.body == what for block in problem.bodies):
-        blocks = [
-            b.scattering(unit, sd) if isinstance(b, TrackedBody) and b.body == what else b
-            for b in problem.blocks
-        ]
+    if what == JOINTS:
+        joints = {u.name: u.scattering(unit, sd) for u in read(problem, unit)}
+        return replace(problem, variables=problem.variables | joints)
+    if what.startswith(OF_TARGETS) or any(block.body == what for block in problem.bodies):
+        blocks = [_block_scattering(block, what, unit, sd) for block in problem.blocks]
         return replace(problem, blocks=blocks)
     scans, aside = (
         [_scattering(scan, what, sd) for scan in some] for some in (problem.scans, problem.aside)
@@ -108,6 +153,14 @@ def _widened(problem: Problem, whose: tuple[str, str], sd: float) -> Problem:
         if name in problem.cells and problem.cells[name].kind == what
     }
     return replace(wider, variables=problem.variables | cells)
+
+
+def _block_scattering(block: Block, what: str, unit: str, sd: float) -> Block:
+    """The block with another spread, if it is a target, or of the body, whose that is."""
+    if isinstance(block, HangingTarget) and what.startswith(OF_TARGETS):
+        return block.scattering(what.removeprefix(OF_TARGETS), sd)
+    mine = isinstance(block, TrackedBody) and block.body == what
+    return block.scattering(unit, sd) if mine else block
 
 
 def _scattering(scan: ScanStop, what: str, sd: float) -> ScanStop:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Literal
 
@@ -15,6 +16,8 @@ Kind = Literal["vector", "pose", "direction"]
 # What is known of a pose before any data: the room it is in.
 UNKNOWN_POSE = np.repeat([3.0, 10.0], 3)
 POSE_UNITS = ("rad",) * 3 + ("m",) * 3
+UNREAD = 1.0  # rad or m: a joint whose reading at a stop is left out
+EXACT = 1e-7  # rad or m: an encoder without error beside one that is left out
 
 
 class Role(Enum):
@@ -44,6 +47,7 @@ class Unknown:
         owner: of SURFACE, the mesh or the recording whose planes they are: those of one have the
             same.
         weight: robust weight of what was known before, 0 to 1.
+        scatter: unit -> how widely it scatters beyond what its sigmas in it were at first.
     """
 
     name: str
@@ -55,6 +59,7 @@ class Unknown:
     role: Role = Role.CALIBRATION
     owner: int | str = 0
     weight: float = 1.0
+    scatter: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def dim(self) -> int:
@@ -64,6 +69,17 @@ class Unknown:
     def prior_sigma(self) -> np.ndarray:
         """(dim,) of the rows that hold it to its mean: larger where these have less weight."""
         return self.sigma / np.sqrt(self.weight)
+
+    def read(self, unit: str) -> np.ndarray:
+        """Of joint readings, those (n,) in a unit that are neither exact nor left out."""
+        known = (self.sigma > EXACT) & (self.sigma < UNREAD)
+        return np.flatnonzero(known & (np.array(self.units) == unit))
+
+    def scattering(self, unit: str, sd: float) -> Unknown:
+        """Joint readings with another spread beyond their sigma in this unit."""
+        sigma, mine = self.sigma.copy(), self.read(unit)
+        sigma[mine] = np.sqrt(sigma[mine] ** 2 - self.scatter.get(unit, 0.0) ** 2 + sd**2)
+        return replace(self, sigma=sigma, scatter={**self.scatter, unit: sd})
 
     def moved(self, value: np.ndarray, step: np.ndarray) -> np.ndarray:
         """A vector or pose after a step (dim,) of its tangent: ``T exp(step)``, ``x + step``."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from calib.forward import Derivatives, Values
 from calib.residuals.groups import Group
 
 PARTS = ("lower", "upper", "sphere")  # of a target, three rows each
+SIGMAS = {"sphere": ("sphere",), "marker": ("lower", "upper")}  # of which parts
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,7 @@ class HangingTarget:
         scanned: (3, P) per variable: where it truly sits beyond where it was scanned, faro frame.
         groups: (3,) the names of the rows of each of `PARTS`.
         weight: (3,) of the rows of each, robust, and 0 for a part that was left out; 1 where None.
+        scatter: "sphere" or "marker" -> how widely it scatters beyond what its sigma was at first.
     """
 
     name: str
@@ -49,6 +51,7 @@ class HangingTarget:
     scanned: Mapping[str, np.ndarray] = field(default_factory=dict)
     groups: tuple[Group, ...] = ()
     weight: np.ndarray | None = None
+    scatter: Mapping[str, float] = field(default_factory=lambda: dict.fromkeys(SIGMAS, 0.0))
 
     kind = "target"
     rows = 9
@@ -56,6 +59,13 @@ class HangingTarget:
     @property
     def variables(self) -> tuple[str, ...]:
         return (self.marker, self.gravity, self.reference, *self.shift, *self.scanned)
+
+    def scattering(self, of: str, sd: float) -> HangingTarget:
+        """The target with another spread beyond the sigma of its sphere, or of its markers."""
+        sigma_m = getattr(self, f"sigma_{of}_m")
+        wider = np.sqrt(sigma_m**2 - self.scatter[of] ** 2 + sd**2)
+        changed = {f"sigma_{of}_m": float(wider), "scatter": {**self.scatter, of: sd}}
+        return replace(self, **changed)
 
     def evaluate(self, values: Values, derivatives: bool) -> tuple[np.ndarray, Derivatives | None]:
         """Nine whitened rows [lower marker, upper marker across the rod, sphere]."""

@@ -174,7 +174,7 @@ def _spread(term: Term, told: Mapping[str, tuple[float, float]]) -> EffectEstima
     mine = {key: each for key, each in told.items() if key.startswith(f"{term.variable}.")}
     mine = mine or {f"{term.variable}.sd": told[term.variable]}
     names = tuple(key.removeprefix(f"{term.variable}.") for key in mine)
-    units = [name.rpartition(".")[2] if term.effect.widens else term.effect.unit for name in names]
+    units = [name.rpartition(".")[2] if "." in name else term.effect.unit for name in names]
     sd, sigma = np.array(list(mine.values())).T
     return EffectEstimate(one_unit(units), names, sd, sigma)
 

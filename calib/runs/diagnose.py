@@ -108,7 +108,7 @@ def _scatter(run: Run) -> Iterator[dict[str, Any]]:
         for found in (part.effects[effect.name] for part in parts if effect.name in part.effects):
             numbers = zip(found.estimate.tolist(), found.sigma.tolist(), strict=True)
             for name, unit, each in zip(found.names, found.units, numbers, strict=True):
-                of = name.rpartition(".")[0]  # of "sd", which is of nothing else, none
+                of = name.rpartition(".")[0].removeprefix("sd")  # of nothing else, none
                 yield Spread(of, unit, *each).document(effect.name)
 
 

@@ -176,6 +176,8 @@ def _estimate(parameters: Mapping[str, Any]) -> str:
     return f"{len(names)} of {', '.join(parts)} rms" if names else ""
 
 
-def _size(size_mm: float) -> str:
-    """A length in mm, however large."""
+def _size(size_mm: float | None) -> str:
+    """A length in mm, however large; of what has none, nothing."""
+    if size_mm is None:
+        return ""
     return mm(size_mm) if size_mm < 1e4 else f"{size_mm:.0e}"

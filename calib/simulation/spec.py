@@ -64,11 +64,12 @@ class Spec(Document):
 
     @property
     def names(self) -> dict[str, list[str]]:
-        """Of all stops, of the location (K,) of each, and of surfaces."""
+        """Of all stops, of the location (K,) of each, of targets, and of surfaces."""
         places = [(a, b) for a in range(self.locations) for b in range(self.stops_per_location)]
         return {
             "stop": [f"L{a:02d}P{b:02d}" for a, b in places],
             "location": [f"L{a:02d}" for a, _ in places],
+            "target": [f"T{m + 1}" for m in range(self.targets)],
             "surface": [str(k) for k in range(SURFACES)],
         }
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -236,18 +236,19 @@ class World:
 
 
 def hang_targets(
-    truth: Truth, count: int, noise: float, rng: np.random.Generator
+    truth: Truth, names: Sequence[str], noise: float, rng: np.random.Generator
 ) -> dict[str, np.ndarray]:
-    """Targets as measured: `faro`, `upper` and `lower` (M, 3) m, spread through the room.
+    """Targets (M,) as measured: `faro`, `upper` and `lower` (M, 3) m, spread through the room.
 
     The sphere hangs ``sphere_below_lower_marker_m`` below the lower marker along gravity, which is
     the FARO's -z; effects displace it from there.
     """
-    spec = truth.rig.target
+    spec, count = truth.rig.target, len(names)
     sets = FLOOR_CENTRE_M + rng.uniform((-2.8, -1.9, 0.5), (2.8, 1.9, 1.9), (200, count, 3))
     spread = np.linalg.svd(sets - sets.mean(axis=1, keepdims=True), compute_uv=False)[:, -1]
     sphere = sets[spread.argmax()]
-    view = View(truth.rig, count, {"point_m": sphere}, np.zeros((1, 0)))
+    columns = {"point_m": sphere, "target": np.array(names)}
+    view = View(truth.rig, count, columns, np.zeros((1, 0)))
     up = truth.T_opti_faro[:3, 2]
     nominal = se3.apply(truth.T_opti_faro, sphere) - truth.error(Site.TARGET, view, (3,))
     lower = nominal + spec.sphere_below_lower_marker_m * up

@@ -52,8 +52,8 @@ def write_stops(path: Path, world: World, spec: Spec, rng: np.random.Generator) 
 
 def write_targets(path: Path, truth: Truth, spec: Spec, rng: np.random.Generator) -> None:
     """Write targets.csv: spheres and markers as measured."""
-    measured = hang_targets(truth, spec.targets, spec.noise, rng)
-    columns: dict[str, Iterable] = {"target": [f"T{m + 1}" for m in range(spec.targets)]}
+    measured = hang_targets(truth, spec.names["target"], spec.noise, rng)
+    columns: dict[str, Iterable] = {"target": spec.names["target"]}
     for name, at in measured.items():
         columns |= {f"{name}_{axis}": at[:, i] for i, axis in enumerate("xyz")}
     write_columns(path, columns)

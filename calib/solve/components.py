@@ -9,16 +9,24 @@ variances of greatest likelihood are those of restricted maximum likelihood (Pat
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import astuple, dataclass, replace
+from functools import reduce
+from operator import add
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
+from scipy.optimize import minimize_scalar
 
-from calib.problem.problem import Problem
-from calib.problem.spread import by_chance, sigmas, widening
+from calib.linear.system import Linearisation, Values
+from calib.problem.places import joints_at
+from calib.problem.problem import Block, Problem, SurfaceCells
+from calib.problem.spread import OF_TARGETS, by_chance, read, sigmas, spread_keys, widening
 from calib.problem.unknowns import Unknown
-from calib.residuals.tracker import BodiesTogether
+from calib.problem.without import ROD
+from calib.residuals.groups import JOINTS, Group
+from calib.residuals.targets import PARTS, SIGMAS, HangingTarget
+from calib.residuals.tracker import BodiesTogether, TrackedBody
 from calib.solve.estimate import Estimate
 
 ROUNDS = 500  # of the fixed point; from ten times too large or small 40 were measured
@@ -26,6 +34,10 @@ STEADY = 1e-6  # relative change of a variance that ends them
 LEAST = 1e-3  # of the sd that a group starts from: what is smaller counts as none
 MOST = 1e6  # times that: far from an optimum scores are of any size, and squares overflow
 SEEN = 1e-9  # of the largest information, below which a direction of values is not seen
+GROWN = np.geomspace(1e-3, 1e4, 50) - 1.0  # of a variance: no less and no more is found at once
+UNSEEN = 1e-6  # of a redundancy: rounding of a covariance is some 1e-9 of it
+UNTOLD = 1e-6  # rows: what fewer tell of a variance is nothing
+TOGETHER = 400  # joint readings whose covariance is computed at once: bounds the memory
 
 
 @dataclass(frozen=True)
@@ -43,7 +55,7 @@ class Told:
     group: np.ndarray
 
     @classmethod
-    def of(
+    def fitted(
         cls, values: np.ndarray, covariance: np.ndarray, variance: np.ndarray, group: np.ndarray
     ) -> Told:
         """From the values (Q,) as fitted, their covariance (Q, Q) and the variances (Q,) that they
@@ -75,6 +87,19 @@ class Told:
                 break
         return np.sqrt(variance)
 
+    def of(self, group: int) -> Told:
+        """Of one group, all others being 0."""
+        at = np.flatnonzero(self.group == group)
+        return Told(self.score[at], self.information[np.ix_(at, at)], np.zeros(len(at), int))
+
+    def statistic(self, sd: np.ndarray) -> float:
+        """Twice the log of the likelihood ratio of the sds (G,) against none."""
+        root = sd[self.group]
+        inner = np.eye(len(root)) + root[:, None] * self.information * root
+        whole = cho_factor(inner)
+        scaled = root * self.score
+        return float(scaled @ cho_solve(whole, scaled) - 2 * np.log(np.diag(whole[0])).sum())
+
     def _given(self, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The values (Q,) and their covariance, given the variances of the groups."""
         root = np.sqrt(variance)[self.group]
@@ -84,34 +109,155 @@ class Told:
 
     def sigma(self, sd: np.ndarray) -> np.ndarray:
         """Of the sds (G,), from the expected information of the variances: ``tr(P E_i P E_j) / 2``
-        with ``P = M - M C M``."""
+        with ``P = M - M C M``; of one that is no more than that, the sd of such a variance."""
         _, covariance = self._given(np.square(sd))
         P = self.information - self.information @ covariance @ self.information
         sums = np.zeros((len(sd), len(sd)))
         np.add.at(sums, (self.group[:, None], self.group), np.square(P) / 2)
         scale = np.sqrt(np.maximum(np.diag(sums), 1e-300))
         inverse = np.linalg.pinv(sums / np.outer(scale, scale)) / np.outer(scale, scale)
-        return np.sqrt(np.maximum(np.diag(inverse), 0.0)) / (2 * sd)
+        of_variance = np.sqrt(np.maximum(np.diag(inverse), 0.0))
+        beyond = np.sqrt(np.square(sd) + of_variance) - sd
+        return np.where(of_variance < 2 * np.square(sd), of_variance / (2 * sd), beyond)
 
 
 def told(some: Sequence[Unknown], values: Mapping[str, np.ndarray], covariance: np.ndarray) -> Told:
     """What all rows say of some unknowns by chance; `covariance` is their joint one, as fitted."""
-    return Told.of(
+    return Told.fitted(
         np.concatenate([values[u.name] for u in some]),
         covariance,
         np.square(np.concatenate([u.sigma for u in some])),
-        np.repeat(np.arange(len(some)), [u.dim for u in some]),
+        groups(some),
     )
 
 
-Sums = Mapping[tuple[str, str], tuple[float, float]]
+def groups(some: Sequence[Unknown]) -> np.ndarray:
+    """Which spread (Q,) each value of some unknowns by chance has, in the order of their keys."""
+    out, count = [], 0
+    for unknown in some:
+        of = np.zeros(unknown.dim, int)
+        for at in spread_keys(unknown).values():
+            of[at] = count
+            count += 1
+        out.append(of)
+    return np.concatenate(out)
+
+
+def sds(some: Sequence[Unknown]) -> dict[str, float]:
+    """Key of each spread of some unknowns by chance -> what it is."""
+    return {key: float(u.sigma[at[0]]) for u in some for key, at in spread_keys(u).items()}
+
+
+@dataclass(frozen=True)
+class Checks:
+    """What residuals (n,) of rows with one sigma, whitened and independent, say of that sigma.
+
+    A residual has the variance ``r + d r^2``, r its redundancy and d by how much more the rows'
+    variance is than their sigma has it. Rows that check each other alone have r = 1; joint readings
+    also show what bodies and beams err by, and little of what they err by themselves.
+
+    Args:
+        square: (n,) of each residual; sum of so many.
+        redundancy: (n,) r.
+        count: (n,) how many there are of each.
+    """
+
+    square: np.ndarray
+    redundancy: np.ndarray
+    count: np.ndarray
+
+    @classmethod
+    def alone(cls, total: float, left: float) -> Checks:
+        """Of rows that check each other: the sum of their squares, and of their redundancies."""
+        return cls(np.array([total]), np.ones(1), np.array([left]))
+
+    @classmethod
+    def of(cls, residual: np.ndarray, redundancy: np.ndarray) -> Checks:
+        """Of residuals (m,) whose covariance is the redundancy (m, m), where sigmas are right."""
+        values, axes = np.linalg.eigh(redundancy)
+        seen = values > UNSEEN  # in the others nothing checks the rows, and residuals are 0
+        square = np.square(axes[:, seen].T @ residual)
+        return cls(square, np.minimum(values[seen], 1.0), np.ones(int(seen.sum())))
+
+    def __add__(self, other: Checks) -> Checks:
+        pairs = zip(astuple(self), astuple(other), strict=True)
+        return Checks(*(np.concatenate(pair) for pair in pairs))
+
+    @property
+    def total(self) -> float:
+        """Sum of squares, about `left` where the sigma is right (Foerstner 1979)."""
+        return float(self.square.sum())
+
+    @property
+    def left(self) -> float:
+        """The redundancy of all rows."""
+        return float(self.count @ self.redundancy)
+
+    @property
+    def told(self) -> float:
+        """How many rows without error beside them would tell as much of the variance."""
+        return float(self.count @ np.square(self.redundancy))
+
+    @property
+    def dof(self) -> float:
+        """Of the chi-square that `total` is in `scaled` units, of the same mean and variance
+        (Satterthwaite 1946)."""
+        return self.left**2 / self.told
+
+    @property
+    def scaled(self) -> float:
+        return self.total * self.left / self.told
+
+    def growth(self) -> float:
+        """The d of greatest restricted likelihood, down to -1 where nothing tells."""
+        if self.told <= 0:
+            return -1.0
+        best = int(np.argmax([self.statistic(d) for d in GROWN]))
+        around = GROWN[max(best - 1, 0)], GROWN[min(best + 1, len(GROWN) - 1)]
+        found = minimize_scalar(
+            lambda x: -self.statistic(np.expm1(x)), bounds=np.log1p(around), method="bounded"
+        )
+        return float(np.expm1(found.x))
+
+    def sigma(self, d: float) -> float:
+        """Sigma of `growth` where that is d."""
+        weight = self.count @ np.square(self.redundancy / (1.0 + d * self.redundancy))
+        return float(np.sqrt(2.0 / max(weight, UNTOLD)))
+
+    def statistic(self, d: float) -> float:
+        """Twice the log of the likelihood ratio of d against none."""
+        grown = 1.0 + d * self.redundancy
+        return float(self.square @ (d / grown) - self.count @ np.log(grown))
+
+    def had_variance(self, share: float) -> Checks:
+        """What they would be had the rows' sigma this share of its variance."""
+        r = self.redundancy
+        grown = 1.0 - r + share * r
+        return Checks(share * self.square / grown**2, share * r / grown, self.count)
+
+
+Sums = Mapping[tuple[str, str], Checks]
+# A block, the whitened derivative by each unknown, and minus the residuals: see `Graph`.
+GraphRow = tuple[Block | None, Mapping[str, np.ndarray], np.ndarray]
+NOTHING = Checks.alone(0.0, 0.0)
 
 
 def squares(estimate: Estimate) -> Sums:
-    """Whose rows and unit -> the sum of squares of these rows, whitened, and of their redundancies:
-    both are about equal where sigmas are right (Foerstner 1979)."""
+    """Whose rows and unit -> what these rows say of their sigma; of those that a spread widens."""
+    problem = estimate.problem
+    whose = frozenset(widening(problem).values())
+    rows = estimate.graph.linear_rows(estimate.values)
+    out = squares_beside_bodies(
+        problem, estimate.values, estimate.linear, estimate.kept, whose, rows
+    )
+    bodies = [block for block in problem.bodies if (block.body, "m") in whose]
+    return out | _of_bodies(bodies, estimate)
+
+
+def _of_bodies(bodies: Sequence[TrackedBody], estimate: Estimate) -> Sums:
+    """Of tracked bodies."""
     found: dict[tuple[str, str], list[tuple[float, float]]] = {}
-    together = BodiesTogether.of(estimate.problem.bodies)
+    together = BodiesTogether.of(bodies)
     blocks = [block for each in together for block in each.blocks]
     rows = [some for each in together for some in each.evaluate(estimate.values)]
     variances = estimate.variances([d for _, d in rows])
@@ -123,29 +269,98 @@ def squares(estimate: Estimate) -> Sums:
             mine = [each.reshape(count, -1, 3)[:, k] for each in (residual, left)]
             sums = float(np.square(mine[0]).sum()), float(mine[1].sum())
             found.setdefault((block.body, unit), []).append(sums)
-    cells = squares_of_cells(estimate.problem, estimate.values, estimate.variances)
-    return cells | {k: tuple(np.sum(sums, axis=0).tolist()) for k, sums in found.items()}
+    return {key: Checks.alone(*np.sum(sums, axis=0)) for key, sums in found.items()}
 
 
-def squares_of_cells(
+def squares_beside_bodies(
     problem: Problem,
-    values: Mapping[str, np.ndarray],
-    variances: Callable[[Sequence[Mapping[str, np.ndarray]]], list[np.ndarray]],
-) -> dict[tuple[str, str], tuple[float, float]]:
-    """The same of what parts of surfaces stand off, by their kind.
+    values: Values,
+    linear: Linearisation,
+    kept: np.ndarray,
+    whose: Collection[tuple[str, str]],
+    graph_rows: Iterable[GraphRow],
+    wild: Collection[Group] = (),
+) -> dict[tuple[str, str], Checks]:
+    """The same of joint readings, of targets, and of what parts of surfaces stand off, by kind.
 
     Args:
         problem: with its cells.
-        values: as fitted.
-        variances: as `Estimate.variances` has them.
+        values: the state.
+        linear: there, or one step before.
+        kept: covariance of what no elimination has taken out of it.
+        whose: of which of them.
+        graph_rows: rows, at the state, of the graph that it is in.
+        wild: blunders, of which nothing is told.
     """
-    out: dict[tuple[str, str], tuple[float, float]] = {}
-    each = variances([{name: np.eye(problem.variables[name].dim)} for name in problem.cells])
-    for (name, cells), seen in zip(problem.cells.items(), each, strict=True):
+    cells = {name: each for name, each in problem.cells.items() if (each.kind, "m") in whose}
+    out = _of_cells(problem, values, cells, lambda some: linear.variances(some, kept))
+    if any(what.startswith(OF_TARGETS) for what, _ in whose):
+        out |= _of_targets(linear, kept, graph_rows, wild)
+    off = {joints_at(problem, group) for group in wild if group.kind == "joints"}
+    for unit in (unit for what, unit in whose if what == JOINTS):
+        if good := [u for u in read(problem, unit) if u.name not in off]:
+            out[JOINTS, unit] = _of_joints(good, unit, values, linear, kept)
+    return out
+
+
+def _of_joints(
+    some: Sequence[Unknown], unit: str, values: Values, linear: Linearisation, kept: np.ndarray
+) -> Checks:
+    """Of what encoders misreport, about the zero that they say."""
+    at = [u.read(unit) for u in some]
+    residual = [(values[u.name] / u.prior_sigma)[i] for u, i in zip(some, at, strict=True)]
+    sigma = [u.prior_sigma[i] for u, i in zip(some, at, strict=True)]
+    columns = [linear.layout.columns([u.name])[i] for u, i in zip(some, at, strict=True)]
+    parts = (np.concatenate(each) for each in (residual, sigma, columns))
+    found = []
+    for v, s, c in zip(*(_batches(part) for part in parts), strict=True):
+        rows = np.zeros((len(c), linear.layout.size))
+        rows[np.arange(len(c)), c] = 1.0 / s
+        found.append(Checks.of(v, np.eye(len(c)) - linear.covariance(rows, kept)))
+    return reduce(add, found)
+
+
+def _batches(rows: np.ndarray) -> list[np.ndarray]:
+    return np.array_split(rows, -(-len(rows) // TOGETHER))
+
+
+def _of_targets(
+    linear: Linearisation,
+    kept: np.ndarray,
+    graph_rows: Iterable[GraphRow],
+    wild: Collection[Group],
+) -> dict[tuple[str, str], Checks]:
+    """Of spheres and of markers; the upper one counts across its rod alone."""
+    rows = [row for row in graph_rows if isinstance(row[0], HangingTarget)]
+    variances = linear.variances([by for _, by, _ in rows], kept)
+    sums: dict[str, list[tuple[float, float]]] = {}
+    for (block, _, residual), seen in zip(rows, variances, strict=True):
+        weight = np.ones(len(PARTS)) if block.weight is None else block.weight
+        whole = replace(block.groups[0], what=ROD) in wild
+        for of, parts in SIGMAS.items():
+            for i in (PARTS.index(part) for part in parts):
+                if not whole and block.groups[i] not in wild:
+                    here, count = slice(3 * i, 3 * i + 3), 2 if PARTS[i] == "upper" else 3
+                    left = count * weight[i] - seen[here].sum()
+                    sums.setdefault(of, []).append((np.square(residual[here]).sum(), left))
+    return {(f"{OF_TARGETS}{of}", "m"): Checks.alone(*np.sum(s, axis=0)) for of, s in sums.items()}
+
+
+def _of_cells(
+    problem: Problem,
+    values: Values,
+    cells: Mapping[str, SurfaceCells],
+    variances: Callable[[Sequence[Mapping[str, np.ndarray]]], list[np.ndarray]],
+) -> dict[tuple[str, str], Checks]:
+    """Of what parts of surfaces stand off, by their kind."""
+    out: dict[tuple[str, str], Checks] = {}
+    each = variances([{n: np.eye(problem.variables[n].dim)} for n in cells])
+    for (name, some), seen in zip(cells.items(), each, strict=True):
         sigma = problem.variables[name].sigma
-        total, left = out.get((cells.kind, "m"), (0.0, 0.0))
-        total += float(np.square(values[name] / sigma).sum())
-        out[cells.kind, "m"] = total, left + float(np.sum(1.0 - seen / np.square(sigma)))
+        total = float(np.square(values[name] / sigma).sum())
+        found = Checks.alone(total, float(np.sum(1.0 - seen / np.square(sigma))))
+        before = out.get((some.kind, "m"))
+        out[some.kind, "m"] = found if before is None else before + found
     return out
 
 
@@ -153,9 +368,9 @@ def wider(problem: Problem, sums: Sums) -> dict[str, float]:
     """Key of a spread -> how widely rows scatter beyond their first sigma, as they have it."""
     out, known = {}, sigmas(problem)
     for key, whose in widening(problem).items():
-        (total, redundancy), (sigma, beyond) = sums.get(whose, (0.0, 0.0)), known[whose]
-        factor = total / redundancy if redundancy > 0 else 0.0
-        out[key] = float(np.sqrt(max(factor * sigma**2 - (sigma**2 - beyond**2), 0.0)))
+        sigma, beyond = known[whose]
+        grown = sums.get(whose, NOTHING).growth()
+        out[key] = float(np.sqrt(max(grown * sigma**2 + beyond**2, 0.0)))
     return out
 
 
@@ -163,20 +378,20 @@ def spreads(estimate: Estimate) -> dict[str, tuple[float, float]]:
     """Key of a spread, an unknown by chance or what widens rows -> that spread, and its sigma."""
     some, out = by_chance(estimate.problem), {}
     if some:
-        names = [u.name for u in some]
-        found = told(some, estimate.values, estimate.covariance_of(names))
-        sd = np.array([u.sigma[0] for u in some])
+        found = told(some, estimate.values, estimate.covariance_of([u.name for u in some]))
+        now = sds(some)
+        sd = np.array(list(now.values()))
         pairs = zip(sd.tolist(), found.sigma(sd).tolist(), strict=True)
-        out |= dict(zip(names, pairs, strict=True))
+        out |= dict(zip(now, pairs, strict=True))
     if keys := widening(estimate.problem):
         sums, known = squares(estimate), sigmas(estimate.problem)
         for key, whose in keys.items():
             sigma, beyond = known[whose]
-            out[key] = beyond, sigma_beyond(beyond, sigma**2, sums[whose][1])
+            checks = sums.get(whose, NOTHING)
+            out[key] = beyond, sigma_beyond(beyond, sigma**2 * checks.sigma(0.0))
     return out
 
 
-def sigma_beyond(sd: float, variance: float, redundancy: float) -> float:
-    """Sigma of a spread beyond a known sigma, from a variance that rows of some redundancy tell."""
-    of_variance = variance * np.sqrt(2.0 / max(redundancy, 1.0))
+def sigma_beyond(sd: float, of_variance: float) -> float:
+    """Sigma of a spread beyond a known sigma, from that of the variance."""
     return float(np.sqrt(sd**2 + of_variance) - sd)

@@ -21,7 +21,7 @@ from calib.problem.surfaces import well_seen, with_surfaces
 from calib.problem.unknowns import Unknown
 from calib.residuals.beams import Association
 from calib.solve.added import begun
-from calib.solve.components import squares, told, wider
+from calib.solve.components import sds, squares, told, wider
 from calib.solve.descent import AT_OPTIMUM, LAST, SLOWED, STEADY, Descent, Progress
 from calib.solve.estimate import DOFS, SEEN, Estimate, Start, started, values_of
 from calib.solve.graph import Graph
@@ -219,8 +219,9 @@ class Loop(Descent):
         if some:
             names = [u.name for u in some]
             found = told(some, self.values, self.graph.covariance(self.values, names))
-            sd = found.spread(np.array([u.sigma[0] for u in some]))
-            out |= dict(zip(names, sd.tolist(), strict=True))
+            now = sds(some)
+            sd = found.spread(np.array(list(now.values())))
+            out |= dict(zip(now, sd.tolist(), strict=True))
         if widening(self.problem):
             out |= wider(self.problem, squares(self.as_it_stands(True, whole=True)))
         return out

@@ -5,9 +5,9 @@
 
 Every case is a recording of `tests.worlds`, which shares no code with the program, fitted and
 diagnosed as a user would. Nothing is missing from the model in any of them, yet the families are
-worse than the plain one by chance: stops scatter, the tracker or the mesh are worse than on paper,
-stops or sweeps are few, things stand in the room that were not scanned. FILE gets a line of JSON
-per case as it is done; with ``--resume`` those that it holds are not run again.
+worse than the plain one by chance: stops scatter, the tracker, the joints, targets or the mesh are
+worse than on paper, stops or sweeps are few, things stand in the room that were not scanned. FILE
+gets a line of JSON per case as it is done; with ``--resume`` those that it holds are not run again.
 """
 
 from __future__ import annotations
@@ -43,6 +43,9 @@ FAMILIES: dict[str, dict[str, Any]] = {
     "scatter-1": {"stop_scatter_m": 0.001},
     "scatter-3": {"stop_scatter_m": 0.003},
     "tracker": {"tracker_factor": 2.0},
+    "joints": {"joint_factor": 3.0},
+    "spheres": {"sphere_factor": 4.0},
+    "mount": {"mount_shift_m": 0.001, "mount_turn_rad": 0.001},
     "mesh": {"mesh_error_factor": 3.0},
     "warped": {"warp_m": WARP_M},
     "stops-6": {"locations": 3, "stops": 2},

@@ -1,8 +1,9 @@
 """False alarms, intervals and p-values of nulls, counted.
 
 A false alarm is a verdict other than adequate, or a name. What truly is there may be named: where
-stops scatter, the tracker or the mesh are worse than on paper, an effect whose name ends in
-``_scatter``; where a wall is warped, a surface of the mesh. These cases have a column of their own.
+stops scatter, or the tracker, joints, targets or the mesh are worse than on paper, an effect whose
+name ends in ``_scatter``; where a wall is warped, a surface of the mesh. These cases have a column
+of their own.
 """
 
 from __future__ import annotations
@@ -24,6 +25,9 @@ CALM = ("adequate", "too few stops")
 THERE = {
     "scatter-*": ("*_scatter",),
     "tracker": ("*_scatter",),
+    "joints": ("*_scatter",),
+    "spheres": ("*_scatter",),
+    "mount": ("*_scatter",),
     "mesh": ("*_scatter",),
     "warped": ("mesh:*", "moved_surface", "*_scatter"),
 }

@@ -6,12 +6,12 @@ from scipy import optimize, stats
 
 from calib import add, diagnose, fit
 from calib.diagnosis.chance import AtZero
-from calib.effects import find
+from calib.effects import CATALOGUE, find
 from calib.problem import build
 from calib.problem.model import Model, Source
 from calib.problem.spread import spread_of
 from calib.simulation import Spec, simulate
-from calib.solve.components import Told, spreads, squares
+from calib.solve.components import Checks, Told, spreads, squares
 from calib.solve.fit import resume, solve
 
 SD, PLACE_SD = 0.7, 0.4
@@ -91,7 +91,7 @@ def test_values_as_fitted_say_the_same_whatever_held_them():
     for sd in (0.2, 3.0):
         variance = np.full(28, sd**2)
         covariance = np.linalg.inv(told.information + np.diag(1 / variance))
-        again = Told.of(covariance @ told.score, covariance, variance, told.group)
+        again = Told.fitted(covariance @ told.score, covariance, variance, told.group)
         np.testing.assert_allclose(again.score, told.score, rtol=1e-7)
         np.testing.assert_allclose(again.information, told.information, atol=1e-8)
 
@@ -139,6 +139,71 @@ def test_a_spread_of_the_smallest_detectable_size_is_found_four_times_out_of_fiv
     assert 0.72 < np.mean(hits) < 0.88
 
 
+# ------------------------------------------------------------------- rows worse than their sigmas
+
+
+class Shared:
+    """Rows whose errors e show little in their residuals: ``y = A e + X b + n``, e about 0 with a
+    sigma of 1 as joint readings are, and n noise with a sigma of `others`."""
+
+    def __init__(self, seed, sd=1.0, members=40, others=2.0):
+        rng, design = np.random.default_rng(seed), np.random.default_rng(7)
+        self.A = design.standard_normal((2 * members, members)) * np.geomspace(0.05, 0.5, members)
+        self.X = design.standard_normal((2 * members, 5))
+        self.others = others
+        e = sd * rng.standard_normal(members)
+        noise = others * rng.standard_normal(2 * members)
+        self.y = self.A @ e + self.X @ [1.0, 2.0, -1.0, 0.5, 3.0] + noise
+
+    def checks(self, sigma=1.0):
+        """From a fit of e and b together, as a graph does it, whose rows of e have this sigma."""
+        count = self.A.shape[1]
+        prior = np.hstack([np.eye(count), np.zeros((count, 5))]) / sigma
+        rows = np.vstack([prior, np.hstack([self.A, self.X]) / self.others])
+        C = np.linalg.inv(rows.T @ rows)
+        best = C @ rows.T @ np.concatenate([np.zeros(count), self.y / self.others])
+        return Checks.of(prior @ best, np.eye(count) - prior @ C @ prior.T)
+
+    def minus_log_likelihood(self, variance):
+        """Restricted, from the dense covariance of all rows (Patterson and Thompson 1971)."""
+        V = variance * self.A @ self.A.T + self.others**2 * np.eye(len(self.y))
+        inverse = np.linalg.inv(V)
+        inner = self.X.T @ inverse @ self.X
+        P = inverse - inverse @ self.X @ np.linalg.solve(inner, self.X.T @ inverse)
+        return (np.linalg.slogdet(V)[1] + np.linalg.slogdet(inner)[1] + self.y @ P @ self.y) / 2
+
+
+@pytest.mark.parametrize("sd", [0.5, 1.0, 3.0])
+def test_rows_grow_to_the_greatest_restricted_likelihood_from_any_sigma(sd):
+    world = Shared(1, sd)
+    best = optimize.minimize_scalar(world.minus_log_likelihood, (0.1, 10), (1e-3, 100)).x
+    for sigma in (1.0, 2.0):
+        found = (1.0 + world.checks(sigma).growth()) * sigma**2
+        assert found == pytest.approx(best, rel=1e-3)
+    checks, grown = world.checks(), best - 1.0
+    gained = world.minus_log_likelihood(1.0) - world.minus_log_likelihood(best)
+    assert checks.statistic(grown) == pytest.approx(2 * gained, rel=1e-6)
+
+
+def test_what_rows_would_say_with_another_sigma_needs_no_other_fit():
+    world = Shared(2, 2.0)
+    there, at_first = world.checks(3.0).had_variance(1 / 9), world.checks(1.0)
+    for name in ("total", "left", "told", "scaled", "dof"):
+        assert getattr(there, name) == pytest.approx(getattr(at_first, name), rel=1e-9)
+
+
+def test_rows_that_show_little_are_found_worse_no_more_often_than_is_said():
+    """Their squares scatter far less than those of a chi-square with their redundancy."""
+    checks = [Shared(seed).checks() for seed in range(400)]
+    assert checks[0].told < 0.6 * checks[0].left
+    p = np.array([stats.chi2.sf(c.scaled, c.dof) for c in checks])
+    for level in (0.01, 0.05, 0.2, 0.5):
+        least, most = stats.binom.ppf([0.001, 0.999], 400, level)
+        assert least <= np.sum(p < level) <= most
+    grown = np.array([c.growth() for c in checks])
+    assert abs(grown.mean()) < 0.1 and grown.std() == pytest.approx(checks[0].sigma(0.0), rel=0.2)
+
+
 # ------------------------------------------------------------------------------------ in recordings
 
 
@@ -170,6 +235,51 @@ def test_it_is_found_said_to_be_chance_and_then_nothing_is_missing(scattered):
     assert any("Stops scatter by" in sentence for sentence in found.sentences)
 
 
+def test_shift_and_turn_of_the_lidar_have_a_spread_each(tmp_path):
+    """0.9 mm and 0.9 mrad at size 3; the spreads come without the other ways to scatter."""
+    simulate(SPEC, tmp_path / "rec", 7, {"stop_pose_scatter": 3.0})
+    source = Source.open(tmp_path / "rec")
+    problem = build([source], Model().plus([find("stop_pose_scatter")]))
+    estimate = solve(problem)
+    found = spreads(estimate)
+    assert set(found) == {"stop_pose_scatter.sd.m", "stop_pose_scatter.sd.rad"}
+    for sd, sigma in found.values():
+        assert abs(sd - 0.0009) < 3 * sigma and 0.05 < sigma / sd < 0.15
+    again = resume(problem, estimate.start)
+    assert spread_of(again.problem) == pytest.approx(spread_of(estimate.problem))
+
+
+WAYS = {
+    "stop_pose_scatter": 3.0,
+    "tracker_scatter": 3.0,
+    "joint_scatter": 3.0,
+    "target_scatter": 4.0,
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", WAYS)
+def test_which_way_to_the_lidar_scatters_is_told(tmp_path, name):
+    """From base and mount, and by the scan: two of them tell what the third is off."""
+    simulate(SPEC, tmp_path / "rec", 9, {name: WAYS[name]})
+    run = fit([tmp_path / "rec"], tmp_path / "run")
+    found = diagnose(run)
+    assert found.verdict == "missing_effect" and found.worth_adding == [name]
+    assert diagnose(add(run, [name], tmp_path / "grown")).verdict == "adequate"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["stop_pose_scatter", "tracker_scatter"])
+def test_on_one_tracked_body_a_mount_that_gives_is_a_tracker_that_scatters(tmp_path, name):
+    spec = SPEC.model_copy(update={"arm": False, "column_step": 60})
+    simulate(spec, tmp_path / "rec", 9, {name: 3.0})
+    found = diagnose(fit([tmp_path / "rec"], tmp_path / "run"))
+    (added,) = found.worth_adding
+    (one,) = (c for c in found.candidates if c["add"] == added)
+    assert {added, *one["indistinguishable_from"]} == {"stop_pose_scatter", "tracker_scatter"}
+    assert any("cannot tell it from tracker_scatter" in each for each in found.sentences)
+
+
 def test_two_recordings_share_the_spread_and_nothing_else(scattered, tmp_path):
     simulate(
         SPEC.model_copy(update={"locations": 4}), tmp_path / "other", 8, {"stop_range_scatter": 3.0}
@@ -189,12 +299,14 @@ def test_two_recordings_share_the_spread_and_nothing_else(scattered, tmp_path):
     [
         ("tracker_scatter", 3.0, {"base_markers.rad", "mount_markers.rad"}),
         ("tracker_scatter", 3.0, {"base_markers.m", "mount_markers.m"}),
+        ("joint_scatter", 3.0, {"joints.rad"}),
+        ("target_scatter", 3.0, {"target/sphere.m"}),
         ("reference_scatter", 3.0, {"surface.m"}),
     ],
 )
 def test_rows_that_scatter_beyond_their_sigma_tell_by_how_much(worse, effect, size, keys):
-    """Bodies at 24 stops each; some 70 surfaces of the mesh, those furthest off of which meet no
-    beam that is believed."""
+    """Bodies and joints at 24 stops each, five targets; some 70 surfaces of the mesh, of which
+    those furthest off meet no beam that is believed."""
     _, estimate = worse(effect, size)
     sigma = find(effect).sigma * size
     found = {key.partition(".")[2]: each for key, each in spreads(estimate).items()}
@@ -203,9 +315,9 @@ def test_rows_that_scatter_beyond_their_sigma_tell_by_how_much(worse, effect, si
         least = 0.7 * sigma if effect == "reference_scatter" else sigma - 3 * of
         assert least < sd < sigma + 3 * of and 0.05 < of / sd < 0.3
     again = squares(estimate)
-    for what, (total, left) in again.items():
+    for what, checks in again.items():
         if f"{what[0]}.{what[1]}" in keys:
-            assert total / left == pytest.approx(1.0, abs=0.05)  # its sigmas are right now
+            assert checks.total / checks.left == pytest.approx(1.0, abs=0.05)  # they fit
 
 
 @pytest.fixture(scope="module")
@@ -224,7 +336,7 @@ def worse(tmp_path_factory):
     return make
 
 
-@pytest.mark.parametrize("effect", ["tracker_scatter", "reference_scatter"])
+@pytest.mark.parametrize("effect", [e.name for e in CATALOGUE if e.by_chance and e.widens])
 def test_a_fit_goes_on_with_the_spread_that_it_had(worse, effect):
     source, estimate = worse(effect, 3.0)
     problem = build([source], Model().plus([find(effect)]))

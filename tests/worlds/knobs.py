@@ -25,6 +25,10 @@ class World:
         stop_scatter_m: standard deviation of a range zero that each stop has of its own.
         location_scatter_m: the same of each location.
         tracker_factor: how many times the tracker is worse than rig.yaml says.
+        joint_factor: the same of the encoders.
+        sphere_factor: the same of the targets' spheres.
+        mount_shift_m, mount_turn_rad: standard deviations, an axis, of where the LiDAR sits on its
+            mount and how it is turned there, anew at each stop.
         mesh_error_factor: how many times the mesh is worse than rig.yaml says.
         warp_m: how far the middle of one wall is bowed out of the mesh's plane.
         uneven_m: standard deviation of how far surfaces lie off flat, smoothly; no mesh has it.
@@ -41,6 +45,10 @@ class World:
     stop_scatter_m: float = 0.0
     location_scatter_m: float = 0.0
     tracker_factor: float = 1.0
+    joint_factor: float = 1.0
+    sphere_factor: float = 1.0
+    mount_shift_m: float = 0.0
+    mount_turn_rad: float = 0.0
     mesh_error_factor: float = 1.0
     warp_m: float = 0.0
     uneven_m: float = 0.0

@@ -63,13 +63,16 @@ def visited(world: World, rig: Hardware) -> Stops:
     # Zeros and effects are in what is true, the encoders' noise in what is read.
     angles = true_rad - rig.zero_rad
     true_rad = true_rad + effects.of_joints(world.hidden, angles)
-    reported = angles + SIGMA_JOINT_RAD * rng.standard_normal((count, 6))
+    misread = SIGMA_JOINT_RAD * rng.standard_normal((count, 6))
+    reported = angles + world.joint_factor * misread
     T_base_mount, T_base_lidar = rig.of_base(true_rad)
     T_faro_base = _bases(world, rng)[location]
     settle = rng.standard_normal((count, 6)) * ([SETTLES_M] * 3 + [SETTLES_RAD] * 3)
     T_faro_base = moved(T_faro_base, settle[:, :3], settle[:, 3:])
     T_opti_base = inverse(rig.T_faro_opti) @ T_faro_base
     scatter = world.rng("scatter")
+    off = world.rng("mount").standard_normal((2, count, 3))
+    T_base_lidar = moved(T_base_lidar, world.mount_shift_m * off[0], world.mount_turn_rad * off[1])
     return Stops(
         location=location,
         time_s=time_s,
@@ -125,8 +128,8 @@ def targets(world: World, rig: Hardware) -> np.ndarray:
     upper = apply(T_opti_faro, sphere + (BELOW_M + ROD_M) * up)
     noise = rng.standard_normal((3, TARGETS, 3))
     seen = SIGMA_MARKER_M * world.tracker_factor
-    read = (sphere + SIGMA_SPHERE_M * noise[0], upper + seen * noise[1], lower + seen * noise[2])
-    return np.column_stack(read)
+    found = sphere + SIGMA_SPHERE_M * world.sphere_factor * noise[0]
+    return np.column_stack([found, upper + seen * noise[1], lower + seen * noise[2]])
 
 
 def scan(
