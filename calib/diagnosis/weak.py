@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -42,7 +43,20 @@ def leaning(solution: Solution, look: Look) -> list[dict[str, Any]]:
         return []
     known, names = known[usable], [solution.names[i] for i in usable]
     graph = solution.covariance if solution.graph is None else solution.graph
-    scaled = graph[np.ix_(usable, usable)] / np.outer(known, known)
+    return hardly_known(names, graph[np.ix_(usable, usable)], known)
+
+
+def hardly_known(
+    names: Sequence[str], covariance: np.ndarray, known: np.ndarray
+) -> list[dict[str, Any]]:
+    """The directions that data hardly determine, the weakest first.
+
+    Args:
+        names: (P,) of the parameters.
+        covariance: (P, P) of them.
+        known: (P,) their sigmas before any data.
+    """
+    scaled = covariance / np.outer(known, known)
     values, axes = np.linalg.eigh(scaled)
     untold = values > UNTOLD
     gauges, _ = echelon(axes[:, untold], np.ones(len(known)))

@@ -1,0 +1,47 @@
+"""What to measure next."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from calib.cli.app import Json, Trust, Workers, app, print_json, progress_bar
+from calib.linear.parallel import workers as threads
+
+FOR = "all; frames, effects or parameters to know better, with commas; effects to tell apart."
+
+
+@app.command()
+def plan(
+    run: Path,
+    stops: Annotated[int, typer.Option(metavar="N", min=1, help="How many to plan.")] = 5,
+    purpose: Annotated[
+        str | None,
+        typer.Option("--for", metavar="WHAT", help=FOR, show_default="what diagnose found"),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", metavar="FILE.csv", help="Where to write them.")
+    ] = None,
+    candidates: Annotated[
+        int, typer.Option(metavar="N", min=1, help="Random poses that are looked at.")
+    ] = 500,
+    seed: Annotated[int, typer.Option(min=0, help="Same seed, same stops.")] = 0,
+    trust: Trust = None,
+    workers: Workers = None,
+    as_json: Json = False,
+) -> None:
+    """The next stops: what to measure to separate what cannot be told apart, and what it gives."""
+    from calib.planning import plan as choose
+    from calib.runs.run import Run
+
+    opened = Run.open(run, trust or ())
+    with threads(workers), progress_bar() as progress:
+        found = choose(opened, stops, purpose, candidates, seed, out, progress)
+    if as_json:
+        print_json(found.document())
+    else:
+        from calib.show.plan import print_plan
+
+        print_plan(found)

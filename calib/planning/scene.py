@@ -1,0 +1,187 @@
+"""A run's fit with planned stops beside its own: what each of them says, and what all say."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from calib.diagnosis.linear import beside
+from calib.diagnosis.stand import Stand
+from calib.effects import Effect
+from calib.forward import Term
+from calib.linear.layout import key_of
+from calib.linear.parallel import in_order
+from calib.planning.information import Information, Key, of_all, of_each
+from calib.planning.stops import (
+    PlannedScan,
+    PlannedStore,
+    Poses,
+    at_their_places,
+    extended,
+    pattern,
+    thinned,
+)
+from calib.problem import Problem, build
+from calib.problem.model import Source
+from calib.problem.surfaces import with_surfaces
+from calib.residuals.beams import Association
+from calib.solve.estimate import started
+from calib.solve.reweight import weighted_as
+from sensors.lidar import Beams
+from sensors.recording import Scan
+
+# How many beams of a candidate stop are looked at; they stand for all.
+BEAMS = 600
+COMPARED = 6  # stops that were measured, by which it is found how many one of them is worth
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A fit, and effects that it lacks but whose columns are wanted; planned stops are of the first
+    of its recordings.
+
+    Args:
+        stand: the fit.
+        added: those effects.
+    """
+
+    stand: Stand
+    added: Sequence[Effect] = ()
+
+    @property
+    def source(self) -> Source:
+        """The recording that planned stops are added to."""
+        return self.stand.sources[0]
+
+    @property
+    def values(self) -> dict[str, np.ndarray]:
+        """Of the fit."""
+        return self.stand.estimate.values
+
+    @property
+    def T_world_reference(self) -> np.ndarray:
+        """(4, 4) as estimated; none where both are one frame."""
+        return self.values.get(self.source.rig.reference_frame, np.eye(4))
+
+    @cached_property
+    def _wide(self) -> tuple[Problem, dict[str, np.ndarray]]:
+        problem = self.stand.problem_of(self.stand.model.plus(tuple(self.added)))
+        return beside(problem, self.stand.estimate)
+
+    @property
+    def problem(self) -> Problem:
+        """Of the recordings as they are, with the added effects."""
+        return self._wide[0]
+
+    @property
+    def calibration(self) -> list[str]:
+        """Unknowns of the model that describe the hardware."""
+        return self.stand.estimate.problem.calibration
+
+    def terms_of(self, name: str) -> list[Term]:
+        """Those of an effect, or of a frame: one, or one for each rig."""
+        every = (t for some in self.problem.terms for t in some)
+        found = {t.variable: t for t in every if name in (t.effect.name, t.effect.family)}
+        return list(found.values())
+
+    def unit_of(self, name: str) -> str:
+        """Of an effect's parameters; the first one's, where they differ."""
+        return self.terms_of(name)[0].effect.params(self.source.rig)[0].unit
+
+    @property
+    def unbounded(self) -> list[str]:
+        """Unknowns of the added effects."""
+        known = self.stand.estimate.values
+        return [name for name in self._wide[0].variables if name not in known]
+
+    @cached_property
+    def now(self) -> Information:
+        """What the recordings say."""
+        return of_all(*self._wide, self.stand.estimate.associations, self.unbounded)
+
+    @cached_property
+    def _beams(self) -> tuple[Scan, Beams] | None:
+        return pattern(self.source) if self.scanned else None
+
+    @property
+    def scanned(self) -> bool:
+        """Whether stops are scanned, on a mesh."""
+        return bool(self.stand.estimate.scans) and self.source.reference is not None
+
+    def worth(self, patterns: Sequence[tuple[Scan, Beams]]) -> float:
+        """How many beams of a recorded scan one of a pattern is worth, in the median: the sums of
+        weights over variances of scans that were recorded, and of the pattern there."""
+        estimate, folder = self.stand.estimate, self.source.recording.folder
+        mine = [i for i, s in enumerate(estimate.scans) if s.recording.folder == folder]
+        some = np.unique(np.linspace(0, len(mine) - 1, COMPARED).round().astype(int))
+        first = len(self.source.recording.stops)
+        store = PlannedStore(
+            self.source.recording,
+            self.source.rig.lidar.beam_origin_m,
+            given=self.source.store,
+            patterns=patterns,
+        )
+
+        def ratio(k: int) -> float:
+            i = mine[some[k]]
+            scan = estimate.scans[i]
+            there = PlannedScan.of(scan, 1.0, store=store, index=first + k)
+            met = there.associate(self.values, near_edges=True)
+            each = (scan.rows(self.values, estimate.associations[i]), there.rows(self.values, met))
+            real, planned = (float(np.sum(r.weight / np.square(r.sigma_m))) for r in each)
+            return real / max(planned, 1e-300)
+
+        return float(np.median(list(in_order(ratio, len(some)))))
+
+    def each(self, poses: Poses, keys: Sequence[Key]) -> np.ndarray:
+        """What each of some planned stops says by itself (n, S, S), of the components `keys`."""
+        patterns = thinned(self._beams, BEAMS) if self.scanned else []
+        problem, values = self._with(poses, patterns, apart=True, alone=True)
+        first = len(self.source.recording.stops)
+        return of_each(problem, values, keys, first, len(poses.joints), self.unbounded)
+
+    def after(self, poses: Poses) -> Information:
+        """What the recordings and planned stops say together."""
+        patterns = [self._beams] if self.scanned else []
+        problem, values = self._with(poses, patterns, apart=False, alone=False)
+        estimate = self.stand.estimate
+        pairs = zip(estimate.scans, estimate.associations, strict=True)
+        known = {key_of(scan): met for scan, met in pairs}
+
+        def meets(i: int) -> Association:
+            scan = problem.scans[i]
+            met = known.get(key_of(scan))
+            return met or scan.associate(values, near_edges=True)
+
+        found = list(in_order(meets, len(problem.scans)))
+        problem, found = with_surfaces(problem, found)
+        for name in problem.cells:
+            unknown = problem.variables[name]
+            values[name] = started(unknown, estimate.state, unknown.mean)
+        return of_all(problem, values, found, self.unbounded)
+
+    def _with(
+        self, poses: Poses, patterns: Sequence[tuple[Scan, Beams]], apart: bool, alone: bool
+    ) -> tuple[Problem, dict[str, np.ndarray]]:
+        """The problem of all stops, or of the planned ones alone, and where all of it lies."""
+        stand, first = self.stand, len(self.source.recording.stops)
+        source = extended(self.source, poses, patterns, self.T_world_reference, apart)
+        sources = [source, *stand.sources[1:]]
+        use = None
+        if alone:
+            use = [np.zeros(len(s.recording.stops), bool) for s in sources]
+            use[0][first:] = True
+        model = stand.model.plus(tuple(self.added))
+        problem = build(sources, model, use, meetings=stand.problem.meetings)
+        problem = weighted_as(problem, stand.estimate.problem)
+        problem = problem.setting_aside(stand.estimate.problem.set_aside)
+        each = self.worth(patterns) if patterns else 1.0
+        known = {
+            name: started(unknown, stand.estimate.state, problem.initial[name])
+            for name, unknown in problem.variables.items()
+            if name in self.values
+        }
+        return at_their_places(problem, known, source, first, poses, each)
