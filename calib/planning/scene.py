@@ -103,8 +103,8 @@ class Scene:
         return of_all(*self._wide, self.stand.estimate.associations, self.unbounded)
 
     @cached_property
-    def _beams(self) -> tuple[Scan, Beams] | None:
-        return pattern(self.source) if self.scanned else None
+    def _pattern(self) -> tuple[Scan, Beams, float]:
+        return pattern(self.source)
 
     @property
     def scanned(self) -> bool:
@@ -128,7 +128,7 @@ class Scene:
         def ratio(k: int) -> float:
             i = mine[some[k]]
             scan = estimate.scans[i]
-            there = PlannedScan.of(scan, 1.0, store=store, index=first + k)
+            there = PlannedScan.of(scan, store=store, index=first + k, nearest_m=self._pattern[2])
             met = there.associate(self.values, near_edges=True)
             each = (scan.rows(self.values, estimate.associations[i]), there.rows(self.values, met))
             real, planned = (float(np.sum(r.weight / np.square(r.sigma_m))) for r in each)
@@ -138,14 +138,14 @@ class Scene:
 
     def each(self, poses: Poses, keys: Sequence[Key]) -> np.ndarray:
         """What each of some planned stops says by itself (n, S, S), of the components `keys`."""
-        patterns = thinned(self._beams, BEAMS) if self.scanned else []
+        patterns = thinned(self._pattern[:2], BEAMS) if self.scanned else []
         problem, values = self._with(poses, patterns, apart=True, alone=True)
         first = len(self.source.recording.stops)
         return of_each(problem, values, keys, first, len(poses.joints), self.unbounded)
 
     def after(self, poses: Poses) -> Information:
         """What the recordings and planned stops say together."""
-        patterns = [self._beams] if self.scanned else []
+        patterns = [self._pattern[:2]] if self.scanned else []
         problem, values = self._with(poses, patterns, apart=False, alone=False)
         estimate = self.stand.estimate
         pairs = zip(estimate.scans, estimate.associations, strict=True)
@@ -178,10 +178,12 @@ class Scene:
         problem = build(sources, model, use, meetings=stand.problem.meetings)
         problem = weighted_as(problem, stand.estimate.problem)
         problem = problem.setting_aside(stand.estimate.problem.set_aside)
-        each = self.worth(patterns) if patterns else 1.0
+        planned = {}
+        if patterns:
+            planned = {"each": self.worth(patterns), "nearest_m": self._pattern[2]}
         known = {
             name: started(unknown, stand.estimate.state, problem.initial[name])
             for name, unknown in problem.variables.items()
             if name in self.values
         }
-        return at_their_places(problem, known, source, first, poses, each)
+        return at_their_places(problem, known, source, first, poses, **planned)

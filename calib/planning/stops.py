@@ -23,6 +23,7 @@ from sensors.lidar import Beams
 from sensors.recording import Scan
 
 SCANS = 8  # of a recording, from which the directions of its beams are taken
+NEAREST = 0.01  # of recorded beams are shorter than those of planned stops that are counted on
 MARK = "~"  # after the name of a location that is visited again: the base stands elsewhere by then
 
 
@@ -77,15 +78,17 @@ class PlannedScan(ScanStop):
 
     Args:
         each: how many beams of a recorded scan each of these is worth.
+        nearest_m: shorter beams are not counted on, whatever the model's data sheet says.
     """
 
     each: float = field(default=1.0, kw_only=True)
+    nearest_m: float = field(default=0.0, kw_only=True)
 
     @classmethod
-    def of(cls, scan: ScanStop, each: float, **changed: object) -> PlannedScan:
+    def of(cls, scan: ScanStop, **changed: object) -> PlannedScan:
         """A scan of a problem, planned."""
         own = {f.name: getattr(scan, f.name) for f in fields(ScanStop)}
-        return cls(**{**own, **changed}, each=each)
+        return cls(**{**own, **changed})
 
     def rows(
         self,
@@ -96,7 +99,8 @@ class PlannedScan(ScanStop):
         """The stop's rows at a state; arguments as of `ScanStop.rows`."""
         found, lidar = super().rows(values, association, T), self.lidar
         range_m = np.asarray(found.view["range_m"])
-        usable = found.usable & (range_m > lidar.min_range_m) & (range_m < lidar.max_range_m)
+        nearest_m = max(self.nearest_m, lidar.min_range_m)
+        usable = found.usable & (range_m > nearest_m) & (range_m < lidar.max_range_m)
         return replace(
             found,
             residual_m=np.zeros(len(range_m)),
@@ -112,8 +116,9 @@ class PlannedScan(ScanStop):
         return self.meeting.associate(T, ray, values, near_edges)  # it may meet nothing
 
 
-def pattern(source: Source) -> tuple[Scan, Beams]:
-    """Every beam that some scans of a recording hold, each once, as it pointed there.
+def pattern(source: Source) -> tuple[Scan, Beams, float]:
+    """Every beam that some scans of a recording hold, each once, as it pointed there, and the
+    range, m, below which they hold next to none.
 
     Sweeps, and columns of the maker's own, are as they are in the median.
     """
@@ -134,7 +139,9 @@ def pattern(source: Source) -> tuple[Scan, Beams]:
         for name in read[0][0].extra
         if all(name in scan.extra for scan, _ in read)
     }
-    return _scan(origin, direction, ring[first], column[first], float(np.median(count)), extra)
+    nearest_m = float(np.quantile(np.concatenate([beams.range_m for _, beams in read]), NEAREST))
+    found = _scan(origin, direction, ring[first], column[first], float(np.median(count)), extra)
+    return *found, nearest_m
 
 
 def _scan(
@@ -251,7 +258,7 @@ def at_their_places(
     source: Source,
     first: int,
     poses: Poses,
-    each: float,
+    **planned: float,
 ) -> tuple[Problem, dict[str, np.ndarray]]:
     """A problem in which planned stops lie where they are planned, and are seen there.
 
@@ -261,7 +268,7 @@ def at_their_places(
         source: the recording with them, from this stop on (`first`).
         first: number of the first planned stop.
         poses: of the planned stops.
-        each: see `PlannedScan`.
+        planned: fields of `PlannedScan`.
 
     Returns:
         The problem, and all values.
@@ -275,7 +282,7 @@ def at_their_places(
         if k >= first and root not in known:
             values[root] = poses.Ts_world_root[k - first]
     scans = [
-        PlannedScan.of(scan, each)
+        PlannedScan.of(scan, **planned)
         if scan.recording.folder == folder and scan.index >= first
         else scan
         for scan in problem.scans
