@@ -8,7 +8,7 @@ linearisation of all stops together, measured and planned (`scene`).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,55 +16,22 @@ from typing import Any
 import numpy as np
 
 from calib import outputs
-from calib.diagnosis.weak import hardly_known
 from calib.linear.parallel import one_blas_thread
-from calib.planning.criteria import (
-    Apart,
-    Criterion,
-    Variance,
-    Volume,
-    chosen,
-    indices,
-    information_left,
-    smallest,
-)
-from calib.planning.information import Information
-from calib.planning.path import in_order_of_path
-from calib.planning.poses import reachable, where_it_stood
+from calib.planning.planner import Planner
 from calib.planning.purpose import Purpose, purpose_of
 from calib.planning.scene import Scene
 from calib.planning.stops import Poses
-from calib.problem.unknowns import Role
+from calib.planning.worth import Known
 from calib.runs.diagnose import stand_of
 from calib.runs.run import Run
 from calib.solve.fit import Progress
 from chains.errors import InputError
 from sensors.stops import write_columns
 
-__all__ = ["Plan", "plan"]
+__all__ = ["Plan", "plan", "planner_of"]
 
 CANDIDATES = 500  # poses that are looked at; see docs/plan.md for what more of them gain
 STOPS = 5  # that are planned where nobody says how many
-
-
-@dataclass(frozen=True)
-class Known:
-    """What is known of a calibration, with some stops.
-
-    Args:
-        stops: how many.
-        sigma: (P,) of each parameter, m or rad.
-        smallest: effect -> root mean square size of its parameters, from which it is found beside
-            the model, and beside the model and its rivals.
-        weak: the directions that are hardly determined, as diagnosis.json has them.
-        indices: the observability indices.
-    """
-
-    stops: int
-    sigma: np.ndarray
-    smallest: Mapping[str, tuple[float, float]]
-    weak: Sequence[Mapping[str, Any]]
-    indices: Mapping[str, float]
 
 
 @dataclass(frozen=True)
@@ -190,6 +157,26 @@ def _planned(
     run: Run, stops: int, purpose: str | None, candidates: int, seed: int, progress: Progress
 ) -> Plan:
     """As `plan`, and nothing is written."""
+    planner = planner_of(run, purpose, progress)
+    poses = planner.candidates(candidates, seed)
+    some = planner.in_order(planner.choose(poses, stops))
+    scene, rig = planner.scene, planner.scene.source.rig
+    return Plan(
+        run=run.folder,
+        purpose=planner.aim,
+        poses=some,
+        joints=list(zip(rig.joint_names, rig.joint_kinds, strict=True)),
+        names=planner.names,
+        units=planner.units,
+        now=planner.now,
+        after=planner.after(some),
+        effect_units={name: scene.unit_of(name) for name in planner.aim.rivals},
+        candidates=len(poses.joints),
+    )
+
+
+def planner_of(run: Run, purpose: str | None, progress: Progress) -> Planner:
+    """What plans stops for a run; arguments and errors as of `plan`."""
     stand = stand_of(run, progress)
     aim = purpose_of(run, stand, purpose)
     scene = Scene(stand, aim.added)
@@ -198,111 +185,4 @@ def _planned(
             f"{scene.source.recording.folder}: there is no mesh, so nothing says what the beams of "
             "a planned stop would meet; add reference/mesh.ply"
         )
-    places = where_it_stood(stand.estimate.problem, scene.values)
-    rng = np.random.default_rng(seed)
-    poses = reachable(scene.source, places, scene.T_world_reference, candidates, rng)
-    if len(poses.joints) < stops:
-        raise InputError(
-            f"--stops {stops}: only {len(poses.joints)} of the poses that were drawn are clear of "
-            "the arm itself and of the mesh; ask for fewer stops, or draw more"
-        )
-    lasting = _lasting(scene)
-    progress("looking at candidates", 0, 1)
-    each = scene.each(poses, lasting.keys)
-    found = chosen(
-        _criterion(scene, aim, lasting), each, stops, lambda k, n: progress("choosing", k, n)
-    )
-    some = poses.some(found)
-    order = in_order_of_path(some.joints, some.location, list(places))
-    some = some.some(order)
-    return _told(run, scene, aim, some, len(poses.joints))
-
-
-def _lasting(scene: Scene) -> Information:
-    """What is known now of all that planned stops speak of; targets hang where they hang."""
-    roles = {name: u.role for name, u in scene.problem.variables.items()}
-    keep = [i for i, (name, _) in enumerate(scene.now.keys) if roles[name] is not Role.TARGET]
-    return scene.now.onto(np.array(keep))
-
-
-def _criterion(scene: Scene, aim: Purpose, known: Information) -> Criterion:
-    """By what stops are chosen: D of all, A of some components, T of rivals."""
-    if aim.rivals:
-        return Apart(known, [_rival(scene, known, name) for name in aim.rivals])
-    model = known.without(scene.unbounded)
-    if aim.components:
-        wanted = set(aim.components)
-        return Variance(model, np.array([i for i, k in enumerate(model.keys) if k in wanted]))
-    return Volume(model, model.at(scene.calibration))
-
-
-def _rival(scene: Scene, known: Information, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Where the components (q,) of an effect stand, and of what size they are taken to be."""
-    variables = [term.variable for term in scene.terms_of(name)]
-    size = np.concatenate([scene.problem.variables[v].sigma for v in variables])
-    at = known.at(variables)
-    return at, size / known.unit[at]
-
-
-def _told(run: Run, scene: Scene, aim: Purpose, poses: Poses, candidates: int) -> Plan:
-    """What is known now, and with the planned stops."""
-    rig, count = scene.source.rig, len(scene.source.recording.stops)
-    calibration = scene.calibration
-    now, after = scene.now, scene.after(poses)
-    keys = [now.keys[i] for i in now.at(calibration)]
-    names = [".".join(key) for key in keys]
-    reported = dict(zip(run.solution.names, np.sqrt(np.diag(run.solution.covariance)), strict=True))
-    before = np.array([reported[name] for name in names])
-    sigmas = [_sigma(each, scene) for each in (now, after)]
-    variables = scene.problem.variables
-    units = dict(u for name in calibration for u in _units(name, variables[name]))
-    parts = (now, count, before), (after, count + len(poses.joints), before * sigmas[1] / sigmas[0])
-    known = [_known(scene, aim, each, stops, sigma) for each, stops, sigma in parts]
-    return Plan(
-        run=run.folder,
-        purpose=aim,
-        poses=poses,
-        joints=list(zip(rig.joint_names, rig.joint_kinds, strict=True)),
-        names=names,
-        units=[units[name] for name in names],
-        now=known[0],
-        after=known[1],
-        effect_units={n: scene.unit_of(n) for n in aim.rivals},
-        candidates=candidates,
-    )
-
-
-def _units(name: str, unknown: Any) -> Iterator[tuple[str, str]]:
-    pairs = zip(unknown.dofs, unknown.units, strict=True)
-    yield from ((f"{name}.{dof}", unit) for dof, unit in pairs)
-
-
-def _sigma(known: Information, scene: Scene) -> np.ndarray:
-    """Of the calibration (P,), as the graph has it."""
-    model = known.without(scene.unbounded)
-    return np.sqrt(np.diag(model.covariance(model.at(scene.calibration))))
-
-
-def _known(scene: Scene, aim: Purpose, known: Information, stops: int, sigma: np.ndarray) -> Known:
-    calibration = scene.calibration
-    model = known.without(scene.unbounded)
-    own = [n for n in calibration if n != scene.source.rig.reference_frame]
-    at, every = model.at(own), model.at(calibration)
-    names = [".".join(model.keys[i]) for i in at]
-    rows = Apart(known, []).start
-    least = {}
-    for name in aim.rivals:
-        of, _ = _rival(scene, known, name)
-        own = np.outer(known.unit[of], known.unit[of])
-        whole, others = known.data[np.ix_(of, of)] / own, known.at(scene.unbounded)
-        least[name] = tuple(
-            smallest(information_left(rows, of, without) / own, whole)
-            for without in (np.setdiff1d(others, of), np.zeros(0, int))
-        )
-    return Known(
-        stops=stops,
-        sigma=sigma,
-        smallest=least,
-        weak=hardly_known(names, model.covariance(at), model.unit[at]),
-        indices=indices(model, every, stops),
-    )
+    return Planner(run, scene, aim, progress)

@@ -22,6 +22,7 @@ from calib.linear.parallel import in_order
 from calib.planning.information import Information, inverse
 
 AT_ONCE = 32  # designs whose matrices are held at once
+ROUNDING = 1e-13  # of a component's information
 LEAST = 1e-9  # information, in squared sigmas: less is none
 
 
@@ -61,12 +62,12 @@ class Volume(Criterion):
 
 
 class Variance(Criterion):
-    """A-optimality of some components (n,)."""
+    """A-optimality of some components (n,), in units of the sigmas (n,) that are wanted of them."""
 
-    def __init__(self, known: Information, of: np.ndarray) -> None:
+    def __init__(self, known: Information, of: np.ndarray, wanted: np.ndarray) -> None:
         self.start, self.at = known.data + known.paper, of
         self.wanted = np.zeros((len(known.keys), len(of)))
-        self.wanted[of, np.arange(len(of))] = 1.0
+        self.wanted[of, np.arange(len(of))] = 1.0 / np.square(wanted)
 
     def of(self, M: np.ndarray) -> np.ndarray:
         found = np.linalg.solve(M, np.broadcast_to(self.wanted, (len(M), *self.wanted.shape)))
@@ -88,7 +89,7 @@ class Apart(Criterion):
     def of(self, M: np.ndarray) -> np.ndarray:
         out = []
         for at, size in self.effects:
-            left = np.stack([information_left(each, at) for each in M])
+            left = information_left(M, at)
             out.append(np.log(np.maximum(np.einsum("kij,i,j->k", left, size, size), LEAST)))
         return np.mean(out, axis=0)
 
@@ -96,17 +97,24 @@ class Apart(Criterion):
 def information_left(
     M: np.ndarray, at: np.ndarray, without: Sequence[int] | np.ndarray = ()
 ) -> np.ndarray:
-    """Information (q, q) on some components that no other can take on; some play no part."""
-    others = np.setdiff1d(np.arange(len(M)), np.concatenate([at, without]).astype(int))
-    block = M[np.ix_(others, others)]
-    seen = np.diag(block) > 0
-    others, block = others[seen], block[np.ix_(seen, seen)]
-    scale = 1.0 / np.sqrt(np.diag(block))
-    # As in `calib.diagnosis.score`: a direction that rows leave open must not stop the elimination.
-    block = block * np.outer(scale, scale) + 1e-13 * np.eye(len(others))
-    half = np.linalg.solve(np.linalg.cholesky(block), M[np.ix_(others, at)] * scale[:, None])
-    left = M[np.ix_(at, at)] - half.T @ half
-    return (left + left.T) / 2
+    """Information (n, q, q) on some components that no other can take on; some play no part.
+
+    Args:
+        M: (n, S, S) of designs.
+        at: (q,) the components.
+        without: those that play no part.
+    """
+    others = np.setdiff1d(np.arange(M.shape[1]), np.concatenate([at, without]).astype(int))
+    block, cross = M[:, others[:, None], others], M[:, others[:, None], at]
+    scale = np.einsum("nii->ni", block)
+    scale = np.where(scale > 0, 1.0 / np.sqrt(np.where(scale > 0, scale, 1.0)), 0.0)
+    block = block * scale[:, :, None] * scale[:, None]
+    # As in `calib.diagnosis.score`: a direction that rows leave open must not stop the elimination,
+    # nor a component that no row feels.
+    block += np.einsum("ni,ij->nij", np.where(scale > 0, ROUNDING, 1.0), np.eye(len(others)))
+    cross = cross * scale[:, :, None]
+    left = M[:, at[:, None], at] - cross.mT @ np.linalg.solve(block, cross)
+    return (left + left.mT) / 2
 
 
 def smallest(left: np.ndarray, whole: np.ndarray) -> float:

@@ -25,6 +25,7 @@ class Purpose:
         text: as the option ``--for`` has it.
         why: where it comes from, as a clause; empty where the user said it.
         components: those of the model that are to be known better; empty for all of them.
+        tolerance: of each of those the sigma that is wanted, in its unit; empty without any.
         rivals: names of effects, each of which is to be told from the others and from the model;
             empty where that is not the purpose.
         added: those of them that are not in the model.
@@ -33,6 +34,7 @@ class Purpose:
     text: str
     why: str = ""
     components: tuple[Key, ...] = ()
+    tolerance: tuple[float, ...] = ()
     rivals: tuple[str, ...] = ()
     added: tuple[Effect, ...] = field(default=(), repr=False)
 

@@ -1,0 +1,111 @@
+"""The steps of a plan: candidates, what each would tell, which to take, what they are worth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from calib.planning.criteria import chosen
+from calib.planning.information import Information
+from calib.planning.path import in_order_of_path
+from calib.planning.poses import reachable, where_it_stood
+from calib.planning.purpose import Purpose
+from calib.planning.scene import Scene
+from calib.planning.stops import Poses
+from calib.planning.worth import Known, criterion
+from calib.problem.unknowns import Role
+from calib.runs.run import Run
+from calib.solve.fit import Progress
+from chains.errors import InputError
+
+
+@dataclass(frozen=True)
+class Planner:
+    """Plans stops for a run.
+
+    Args:
+        run: fitted.
+        scene: its fit.
+        aim: what stops are for.
+        progress: called with what is being done, and how far it is.
+    """
+
+    run: Run
+    scene: Scene
+    aim: Purpose
+    progress: Progress
+
+    @cached_property
+    def places(self) -> dict[str, np.ndarray]:
+        """Location -> T_world_root (4, 4) where the base stood."""
+        return where_it_stood(self.scene.stand.estimate.problem, self.scene.values)
+
+    def candidates(self, count: int, seed: int) -> Poses:
+        """So many random poses; see `reachable`."""
+        scene, rng = self.scene, np.random.default_rng(seed)
+        return reachable(scene.source, self.places, scene.T_world_reference, count, rng)
+
+    def choose(self, poses: Poses, stops: int) -> Poses:
+        """The best of some poses.
+
+        Raises:
+            InputError: there are fewer.
+        """
+        if len(poses.joints) < stops:
+            raise InputError(
+                f"{len(poses.joints)} of the poses that were drawn are clear of the arm itself and "
+                f"of the mesh, which is less than {stops} stops; ask for fewer, or draw more"
+            )
+        self.progress("looking at candidates", 0, 1)
+        each = self.scene.each(poses, self.lasting.keys)
+        by = criterion(self.scene, self.aim, self.lasting)
+        return poses.some(chosen(by, each, stops, lambda k, n: self.progress("choosing", k, n)))
+
+    def in_order(self, poses: Poses) -> Poses:
+        """Some poses in the order in which to drive to them."""
+        return poses.some(in_order_of_path(poses.joints, poses.location, list(self.places)))
+
+    @cached_property
+    def lasting(self) -> Information:
+        """What is known now of all that planned stops speak of; targets hang where they hang."""
+        roles, now = self.scene.problem.variables, self.scene.now
+        keep = [i for i, (n, _) in enumerate(now.keys) if roles[n].role is not Role.TARGET]
+        return now.onto(np.array(keep))
+
+    @cached_property
+    def names(self) -> list[str]:
+        """(P,) of the parameters of the calibration."""
+        now = self.scene.now
+        return [".".join(now.keys[i]) for i in now.at(self.scene.calibration)]
+
+    @cached_property
+    def units(self) -> list[str]:
+        """(P,) of those."""
+        known: Mapping = self.scene.problem.variables
+        return [unit for name in self.scene.calibration for unit in known[name].units]
+
+    @cached_property
+    def now(self) -> Known:
+        """What is known without any planned stop."""
+        return self._known(self.scene.now, 0)
+
+    def after(self, poses: Poses) -> Known:
+        """What will be known with planned stops, by one linearisation of all."""
+        return self._known(self.scene.after(poses), len(poses.joints))
+
+    def _known(self, information: Information, more: int) -> Known:
+        stops = len(self.scene.source.recording.stops) + more
+        return Known.of(self.scene, self.aim, information, stops, self._wider)
+
+    @cached_property
+    def _wider(self) -> np.ndarray:
+        """(P,) how many times wider than the graph has them the run reports its sigmas, as rows of
+        a stop err together; they are taken to go on doing so."""
+        solution = self.run.solution
+        sigma = dict(zip(solution.names, np.sqrt(np.diag(solution.covariance)), strict=True))
+        model = self.scene.now.without(self.scene.unbounded)
+        graph = model.covariance(model.at(self.scene.calibration))
+        return np.array([sigma[name] for name in self.names]) / np.sqrt(np.diag(graph))
