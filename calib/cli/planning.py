@@ -10,16 +10,28 @@ import typer
 from calib.cli.app import Json, Trust, Workers, app, print_json, progress_bar
 from calib.linear.parallel import workers as threads
 
+UNTIL = "The fewest stops until sigmas are so small: 'lidar 0.3 mm, rings 1 mm'."
 FOR = "all; frames, effects or parameters to know better, with commas; effects to tell apart."
 
 
 @app.command()
 def plan(
     run: Path,
-    stops: Annotated[int, typer.Option(metavar="N", min=1, help="How many to plan.")] = 5,
+    stops: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N",
+            min=1,
+            help="How many; with --until how many at most.",
+            show_default="5, 30",
+        ),
+    ] = None,
     purpose: Annotated[
         str | None,
         typer.Option("--for", metavar="WHAT", help=FOR, show_default="what diagnose found"),
+    ] = None,
+    until: Annotated[
+        str | None, typer.Option(metavar="SIGMAS", help=UNTIL, show_default=False)
     ] = None,
     out: Annotated[
         Path | None, typer.Option("-o", "--out", metavar="FILE.csv", help="Where to write them.")
@@ -38,7 +50,7 @@ def plan(
 
     opened = Run.open(run, trust or ())
     with threads(workers), progress_bar() as progress:
-        found = choose(opened, stops, purpose, candidates, seed, out, progress)
+        found = choose(opened, stops, purpose, until, candidates, seed, out, progress)
     if as_json:
         print_json(found.document())
     else:

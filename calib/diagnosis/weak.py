@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -28,6 +28,22 @@ def weak_directions(solution: Solution, look: Look) -> list[dict[str, Any]]:
         effects), and what it `needs`.
     """
     return [*leaning(solution, look), *standing_in(look)]
+
+
+def to_be_told_apart(
+    candidates: Sequence[Mapping[str, Any]], weak: Sequence[Mapping[str, Any]]
+) -> list[str]:
+    """The effects, of which other stops would say which it is; none where nothing is open.
+
+    Args:
+        candidates: of a diagnosis; of those confirmed the first that has rivals counts.
+        weak: its weak directions; of effects that may stand for each other the first.
+    """
+    confirmed = [c for c in candidates if c["step"] and not c["dressed_up"]]
+    for each in sorted(confirmed, key=lambda c: c["step"]):
+        if each["indistinguishable_from"]:
+            return [each["add"], *each["indistinguishable_from"]]
+    return next((list(w["parameters"]) for w in weak if w["sigma_mm"] is None), [])
 
 
 def leaning(solution: Solution, look: Look) -> list[dict[str, Any]]:

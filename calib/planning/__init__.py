@@ -17,10 +17,11 @@ import numpy as np
 
 from calib import outputs
 from calib.linear.parallel import one_blas_thread
-from calib.planning.planner import Planner
+from calib.planning.planner import Planner, Step
 from calib.planning.purpose import Purpose, purpose_of
 from calib.planning.scene import Scene
 from calib.planning.stops import Poses
+from calib.planning.tolerance import purpose_until
 from calib.planning.worth import Known
 from calib.runs.diagnose import stand_of
 from calib.runs.run import Run
@@ -31,7 +32,11 @@ from sensors.stops import write_columns
 __all__ = ["Plan", "plan", "planner_of"]
 
 CANDIDATES = 500  # poses that are looked at; see docs/plan.md for what more of them gain
-STOPS = 5  # that are planned where nobody says how many
+STOPS, MOST = 5, 30  # that are planned where nobody says how many; and until sigmas are small
+
+
+def _silent(what: str, done: int, total: int) -> None:
+    """Progress that nobody sees."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +52,7 @@ class Plan:
         now, after: what is known without and with them; sigmas as a run reports them.
         effect_units: of the effects in `Known.smallest`.
         candidates: how many poses they were chosen among.
+        curve: how far from their tolerances sigmas are with how many of them; empty without any.
     """
 
     run: Path
@@ -59,6 +65,7 @@ class Plan:
     after: Known
     effect_units: Mapping[str, str]
     candidates: int
+    curve: Sequence[Step] = ()
 
     @property
     def _names(self) -> list[str]:
@@ -100,8 +107,16 @@ class Plan:
                 for name in self.now.smallest
             },
             "weak_directions": {"now": list(self.now.weak), "after": list(self.after.weak)},
+            "learning_curve": [step.document() for step in self.curve],
+            "reached": self.reached,
             "observability": {"now": dict(self.now.indices), "after": dict(self.after.indices)},
         }
+
+    @property
+    def reached(self) -> bool | None:
+        """Whether every tolerance is kept; None where there is none."""
+        last = (s.worst <= 1.0 for s in self.curve if s.stops == self.after.stops)
+        return next(last, None)
 
     def columns(self) -> dict[str, np.ndarray]:
         """The stops as columns (n,): ``location``, and the joints by name."""
@@ -117,19 +132,22 @@ def _now_after(plan: Plan, name: str, which: int) -> dict[str, float | None]:
 @one_blas_thread
 def plan(
     run: Run,
-    stops: int = STOPS,
+    stops: int | None = None,
     purpose: str | None = None,
+    until: str | None = None,
     candidates: int = CANDIDATES,
     seed: int = 0,
     out: Path | str | None = None,
-    progress: Progress = lambda what, done, total: None,
+    progress: Progress = _silent,
 ) -> Plan:
     """The stops to measure next.
 
     Args:
         run: a fitted run, with its recordings where they were; stops are planned for the first.
-        stops: how many.
+        stops: how many; at most so many where it is said until when.
         purpose: what they are for; see `calib.planning.purpose.purpose_of`.
+        until: instead, how well what is to be known: the fewest stops that reach that are planned;
+            see `calib.planning.tolerance.purpose_until`.
         candidates: how many random poses they are chosen among.
         seed: of these.
         out: a CSV file to write, a row for each stop: ``location``, and the joints by name.
@@ -139,30 +157,34 @@ def plan(
         InputError: the recordings are not what they were; nothing goes by a name in `purpose`; the
             rig has no arm, or scans without a mesh; or there are fewer poses than stops.
     """
+    if until is not None and purpose is not None:
+        raise InputError("--until says what the stops are for, so it takes no --for beside it")
+    stops = (MOST if until else STOPS) if stops is None else stops
     if stops < 1 or candidates < stops:
         raise InputError(
             f"{stops} stops out of {candidates} candidates: give at least 1, and no more"
         )
     if out is None:
-        return _planned(run, stops, purpose, candidates, seed, progress)
+        return _planned(planner_of(run, purpose, until, progress), stops, candidates, seed)
     if Path(out).suffix != ".csv":
         raise InputError(f"{out}: the stops are written as a table; give FILE.csv")
     with outputs.file(out, [run.folder, *run.inputs]) as file:
-        found = _planned(run, stops, purpose, candidates, seed, progress)
+        found = _planned(planner_of(run, purpose, until, progress), stops, candidates, seed)
         write_columns(file, found.columns())
     return found
 
 
-def _planned(
-    run: Run, stops: int, purpose: str | None, candidates: int, seed: int, progress: Progress
-) -> Plan:
+def _planned(planner: Planner, stops: int, candidates: int, seed: int) -> Plan:
     """As `plan`, and nothing is written."""
-    planner = planner_of(run, purpose, progress)
-    poses = planner.candidates(candidates, seed)
-    some = planner.in_order(planner.choose(poses, stops))
+    poses, curve = planner.candidates(candidates, seed), []
+    if planner.aim.tolerance:
+        some, curve = planner.enough(poses, stops)
+    else:
+        some = planner.choose(poses, stops)
+    some = planner.in_order(some)
     scene, rig = planner.scene, planner.scene.source.rig
     return Plan(
-        run=run.folder,
+        run=planner.run.folder,
         purpose=planner.aim,
         poses=some,
         joints=list(zip(rig.joint_names, rig.joint_kinds, strict=True)),
@@ -172,13 +194,16 @@ def _planned(
         after=planner.after(some),
         effect_units={name: scene.unit_of(name) for name in planner.aim.rivals},
         candidates=len(poses.joints),
+        curve=curve,
     )
 
 
-def planner_of(run: Run, purpose: str | None, progress: Progress) -> Planner:
+def planner_of(
+    run: Run, purpose: str | None, until: str | None = None, progress: Progress = _silent
+) -> Planner:
     """What plans stops for a run; arguments and errors as of `plan`."""
     stand = stand_of(run, progress)
-    aim = purpose_of(run, stand, purpose)
+    aim = purpose_until(stand, until) if until else purpose_of(run, stand, purpose)
     scene = Scene(stand, aim.added)
     if stand.estimate.scans and not scene.scanned:
         raise InputError(

@@ -163,7 +163,11 @@ def indices(known: Information, at: np.ndarray, stops: int) -> dict[str, float]:
 
 
 def chosen(
-    criterion: Criterion, each: np.ndarray, count: int, tell: Callable[[int, int], None]
+    criterion: Criterion,
+    each: np.ndarray,
+    count: int,
+    tell: Callable[[int, int], None],
+    exchange: bool = True,
 ) -> list[int]:
     """Which stops to measure, from what each of them says: the best one after another (greedy), and
     then each in turn against all others, as long as that gains (exchange: Fedorov 1972).
@@ -173,6 +177,7 @@ def chosen(
         each: (n, S, S) information of each.
         count: how many.
         tell: called with how many are chosen, and of how many.
+        exchange: whether to; without, the first are the best of fewer, too.
     """
     base, found = criterion.start.copy(), []
     for k in range(count):
@@ -181,7 +186,7 @@ def chosen(
         value[found] = -np.inf
         found.append(int(np.argmax(value)))
         base += each[found[-1]]
-    for _ in range(ROUNDS):
+    for _ in range(ROUNDS if exchange else 0):
         before = list(found)
         for i, old in enumerate(before):
             rest = base - each[old]

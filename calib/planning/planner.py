@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
 
@@ -20,6 +21,25 @@ from calib.problem.unknowns import Role
 from calib.runs.run import Run
 from calib.solve.fit import Progress
 from chains.errors import InputError
+
+
+@dataclass(frozen=True)
+class Step:
+    """How far from their tolerances sigmas are with so many stops.
+
+    Args:
+        stops: measured and planned.
+        worst: the largest sigma, in its tolerance.
+        parameter: whose that is.
+    """
+
+    stops: int
+    worst: float
+    parameter: str
+
+    def document(self) -> dict[str, Any]:
+        """As JSON has it."""
+        return {"stops": self.stops, "worst": self.worst, "parameter": self.parameter}
 
 
 @dataclass(frozen=True)
@@ -48,8 +68,8 @@ class Planner:
         scene, rng = self.scene, np.random.default_rng(seed)
         return reachable(scene.source, self.places, scene.T_world_reference, count, rng)
 
-    def choose(self, poses: Poses, stops: int) -> Poses:
-        """The best of some poses.
+    def choose(self, poses: Poses, stops: int, exchange: bool = True) -> Poses:
+        """The best of some poses; without `exchange` one best after another.
 
         Raises:
             InputError: there are fewer.
@@ -62,7 +82,31 @@ class Planner:
         self.progress("looking at candidates", 0, 1)
         each = self.scene.each(poses, self.lasting.keys)
         by = criterion(self.scene, self.aim, self.lasting)
-        return poses.some(chosen(by, each, stops, lambda k, n: self.progress("choosing", k, n)))
+        tell = partial(self.progress, "choosing")
+        return poses.some(chosen(by, each, stops, tell, exchange))
+
+    def enough(self, poses: Poses, most: int) -> tuple[Poses, list[Step]]:
+        """The fewest stops, one best after another, with which every tolerance is kept, or `most`
+        where that many do not; and what was known with how many of them."""
+        best, curve = self.choose(poses, most, exchange=False), {0: self._step(self.now)}
+
+        def kept(count: int) -> bool:
+            if count not in curve:
+                self.progress("how many are enough", len(curve), most)
+                curve[count] = self._step(self.after(best.some(range(count))))
+            return curve[count].worst <= 1.0
+
+        low, high = (0, most) if kept(most) else (most - 1, most)
+        while high - low > 1:
+            middle = (low + high) // 2
+            low, high = (low, middle) if kept(middle) else (middle, high)
+        return best.some(range(high)), [curve[n] for n in sorted(curve)]
+
+    def _step(self, known: Known) -> Step:
+        at = [self.names.index(".".join(key)) for key in self.aim.components]
+        over = known.sigma[at] / np.array(self.aim.tolerance)
+        worst = int(np.argmax(over))
+        return Step(known.stops, float(over[worst]), self.names[at[worst]])
 
     def in_order(self, poses: Poses) -> Poses:
         """Some poses in the order in which to drive to them."""

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from calib.diagnosis.stand import Stand
-from calib.effects import CATALOGUE, Effect, find, split
+from calib.diagnosis.weak import to_be_told_apart
+from calib.effects import CATALOGUE, Effect, Site, find, split
 from calib.planning.information import Key
 from calib.runs.reopen import proposed
 from calib.runs.run import Run
@@ -61,7 +62,7 @@ def purpose_of(run: Run, stand: Stand, text: str | None) -> Purpose:
     if text == ALL:
         return Purpose(ALL)
     names = split(text)
-    found = [_components(stand, name) for name in names]
+    found = [components(stand, name) for name in names]
     if not names or all(found):
         return Purpose(text, components=tuple(dict.fromkeys(key for some in found for key in some)))
     missing = [name for name, some in zip(names, found, strict=True) if not some]
@@ -70,12 +71,10 @@ def purpose_of(run: Run, stand: Stand, text: str | None) -> Purpose:
 
 def _from_diagnosis(run: Run, stand: Stand) -> Purpose:
     document = run.diagnosis() or {"candidates": [], "weak_directions": []}
-    confirmed = [c for c in document["candidates"] if c["step"] and not c["dressed_up"]]
-    for each in sorted(confirmed, key=lambda c: c["step"]):
-        if each["indistinguishable_from"]:
-            text = ",".join([each["add"], *each["indistinguishable_from"]])
-            why = f"the diagnosis cannot tell {each['add']} from its rivals"
-            return replace(purpose_of(run, stand, text), why=why)
+    rivals = to_be_told_apart(document["candidates"], document["weak_directions"])
+    if rivals:
+        why = "the diagnosis cannot tell them apart"
+        return replace(purpose_of(run, stand, ",".join(rivals)), why=why)
     weak = [name for w in document["weak_directions"] for name in w["parameters"]]
     components = {key: None for name in weak for key in _single(stand, name)}
     if components:
@@ -98,7 +97,7 @@ def _single(stand: Stand, name: str) -> Iterator[Key]:
         yield variable, dof
 
 
-def _components(stand: Stand, name: str) -> list[Key]:
+def components(stand: Stand, name: str) -> list[Key]:
     """The components of the model that go by a name: a frame's or effect's, or one of them."""
     known = _known(stand)
     whole = [(v, dof) for v in known if name in (v, v.rpartition("/")[2]) for dof in known[v]]
@@ -107,18 +106,29 @@ def _components(stand: Stand, name: str) -> list[Key]:
 
 def _effects(run: Run, stand: Stand, names: Sequence[str]) -> Iterator[Effect]:
     """Effects of the catalogue, of the user's own, or that a diagnosis has described."""
-    known = {effect.family for effect in CATALOGUE}
+    known = [effect.family for effect in CATALOGUE]
     own = [*stand.own, *proposed(run, [n for n in names if n.partition("@")[0] not in known])]
     for name in names:
         try:
             effect = find(name, own)
         except InputError:
-            every = [*known, *_known(stand), ALL]
+            every = list(dict.fromkeys([*_known(stand), *known, ALL]))
             raise InputError(
                 f"--for {name}: neither in the model nor an effect{nearest(name, every)}; give a "
                 f"frame, effect or parameter of the model, effects to be told apart, or {ALL}"
             ) from None
-        if effect.by_chance or not any(effect.params(source.rig) for source in stand.sources):
-            why = "it is drawn by chance" if effect.by_chance else "this rig has nothing of it"
-            raise InputError(f"--for {name}: {why}, so no stop can be planned for it")
-        yield effect
+        yield _possible(effect, name, stand)
+
+
+def _possible(effect: Effect, name: str, stand: Stand) -> Effect:
+    """The effect, if stops can tell of it."""
+    why = ""
+    if effect.by_chance:
+        why = "it is drawn by chance"
+    elif effect.site is Site.NOISE:
+        why = "it moves no mean, and how beams will scatter is not predicted"
+    elif not any(effect.params(source.rig) for source in stand.sources):
+        why = "this rig has nothing that it acts on"
+    if why:
+        raise InputError(f"--for {name}: {why}, so no stop can be planned for it")
+    return effect

@@ -22,6 +22,8 @@ def print_plan(plan: Plan) -> None:
     """Print a plan: what it is for, the stops, and what they are worth."""
     console, document = terminal(), plan.document()
     console.print(f"{len(plan.stops)} stops {_aim(document)}", style="bold", soft_wrap=True)
+    for sentence in _reached(plan):
+        console.print(sentence)
     console.print()
     console.print("Joints in degrees or mm; in the order of a short way that nothing has checked.")
     tables = [_stops_table(plan), _sigma_table(document["sigma"])]
@@ -46,9 +48,25 @@ def print_plan(plan: Plan) -> None:
     console.print(table)
 
 
+def _reached(plan: Plan) -> Iterator[str]:
+    """Whether tolerances are kept, and with how many stops what is far off."""
+    if plan.reached is False:
+        first, last = plan.curve[0], plan.curve[-1]
+        still = first.parameter == last.parameter and last.worst > FALLS * first.worst
+        what = "no stop tells more of it, so measure it directly" if still else "more stops may do"
+        yield f"NOT REACHED: {last.parameter} is not known so well with them; {what}."
+    for step in plan.curve:
+        yield (
+            f"with {step.stops:3d} stops {step.parameter} is the worst, at {step.worst:.2f} times "
+            "what is wanted"
+        )
+
+
 def _aim(document: Mapping[str, Any]) -> str:
     what = document["for"]
-    if document["rivals"]:
+    if document["learning_curve"]:
+        told = f"until {document['for']}"
+    elif document["rivals"]:
         first, *others = document["rivals"]
         told = f"to tell {first} from {', '.join(others) or 'the model'}"
     else:

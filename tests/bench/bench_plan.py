@@ -74,7 +74,7 @@ def cases(seed: int, folder: Path, pairs: tuple = PAIRS) -> Iterator[Case]:
 
 @one_blas_thread
 def _case(run: Run, design: str, pair: tuple[str, str], seed: int) -> Case | None:
-    planner = planner_of(run, ",".join(pair), lambda what, done, total: None)
+    planner = planner_of(run, ",".join(pair))
     found = planner.now.smallest
     hidden = max(pair, key=lambda name: found[name][1] / found[name][0])
     alone, beside = found[hidden]

@@ -49,3 +49,18 @@ def test_sigmas_are_as_promised(narrow, tmp_path):
     kept = sigma(later) / sigma(narrow)
     assert promised.min() < 0.2 and np.median(promised) < 0.95
     np.testing.assert_allclose(kept, promised, rtol=0.15)
+
+
+def test_a_diagnosis_names_the_plan_that_would_tell_its_rivals_apart():
+    """Of a confirmed effect with rivals, or of effects of the model that may be another."""
+    from calib.diagnosis.weak import to_be_told_apart
+
+    plain = {"step": None, "dressed_up": False, "indistinguishable_from": ["x"], "add": "w"}
+    found = plain | {"step": 2, "add": "arm_gravity_sag", "indistinguishable_from": ["base_flex"]}
+    weak = [
+        {"parameters": ["lidar.tz"], "sigma_mm": 0.6},
+        {"parameters": ["range_scale", "faro_scale"], "sigma_mm": None},
+    ]
+    assert to_be_told_apart([plain, found], weak) == ["arm_gravity_sag", "base_flex"]
+    assert to_be_told_apart([plain, found | {"dressed_up": True}], weak) == weak[1]["parameters"]
+    assert to_be_told_apart([plain], weak[:1]) == []
