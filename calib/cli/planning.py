@@ -16,7 +16,9 @@ FOR = "all; frames, effects or parameters to know better, with commas; effects t
 
 @app.command()
 def plan(
-    run: Path,
+    run: Annotated[
+        Path, typer.Argument(metavar="RUN_OR_RIG", help="A run; or a rig's folder, with --region.")
+    ],
     stops: Annotated[
         int | None,
         typer.Option(
@@ -33,6 +35,10 @@ def plan(
     until: Annotated[
         str | None, typer.Option(metavar="SIGMAS", help=UNTIL, show_default=False)
     ] = None,
+    region: Annotated[
+        tuple[float, float, float, float] | None,
+        typer.Option(metavar="X0 Y0 X1 Y1", help="Where on the floor the base may stand, m."),
+    ] = None,
     out: Annotated[
         Path | None, typer.Option("-o", "--out", metavar="FILE.csv", help="Where to write them.")
     ] = None,
@@ -45,12 +51,13 @@ def plan(
     as_json: Json = False,
 ) -> None:
     """The next stops: what to measure to separate what cannot be told apart, and what it gives."""
+    from calib.planning import is_rig
     from calib.planning import plan as choose
     from calib.runs.run import Run
 
-    opened = Run.open(run, trust or ())
+    opened = run if is_rig(run) else Run.open(run, trust or ())
     with threads(workers), progress_bar() as progress:
-        found = choose(opened, stops, purpose, until, candidates, seed, out, progress)
+        found = choose(opened, stops, purpose, until, region, candidates, seed, out, progress)
     if as_json:
         print_json(found.document())
     else:

@@ -17,19 +17,21 @@ import numpy as np
 
 from calib import outputs
 from calib.linear.parallel import one_blas_thread
+from calib.planning.alone import nothing_measured
+from calib.planning.places import in_region, where_it_stood
 from calib.planning.planner import Planner, Step
-from calib.planning.purpose import Purpose, purpose_of
+from calib.planning.purpose import ALL, Purpose, purpose_of
 from calib.planning.scene import Scene
 from calib.planning.stops import Poses
 from calib.planning.tolerance import purpose_until
 from calib.planning.worth import Known
 from calib.runs.diagnose import stand_of
-from calib.runs.run import Run
+from calib.runs.run import MODEL, Run
 from calib.solve.fit import Progress
 from chains.errors import InputError
 from sensors.stops import write_columns
 
-__all__ = ["Plan", "plan", "planner_of"]
+__all__ = ["Plan", "is_rig", "plan", "planner_of"]
 
 CANDIDATES = 500  # poses that are looked at; see docs/plan.md for what more of them gain
 STOPS, MOST = 5, 30  # that are planned where nobody says how many; and until sigmas are small
@@ -39,12 +41,17 @@ def _silent(what: str, done: int, total: int) -> None:
     """Progress that nobody sees."""
 
 
+def is_rig(folder: Path) -> bool:
+    """Whether a folder is one of a rig, and no run."""
+    return (folder / "rig.yaml").is_file() and not (folder / MODEL).is_file()
+
+
 @dataclass(frozen=True)
 class Plan:
     """Stops to measure next, and what they are worth.
 
     Args:
-        run: the run's folder.
+        run: the folder of the run, or of the rig.
         purpose: what they were chosen for.
         poses: of the stops, in the order in which to drive to them.
         joints: (J,) name and kind, revolute or prismatic, of each.
@@ -131,10 +138,11 @@ def _now_after(plan: Plan, name: str, which: int) -> dict[str, float | None]:
 
 @one_blas_thread
 def plan(
-    run: Run,
+    run: Run | Path | str,
     stops: int | None = None,
     purpose: str | None = None,
     until: str | None = None,
+    region: Sequence[float] | None = None,
     candidates: int = CANDIDATES,
     seed: int = 0,
     out: Path | str | None = None,
@@ -144,10 +152,13 @@ def plan(
 
     Args:
         run: a fitted run, with its recordings where they were; stops are planned for the first.
+            Or the folder of a rig of which nothing was measured yet: rig.yaml, URDF and mesh.
         stops: how many; at most so many where it is said until when.
         purpose: what they are for; see `calib.planning.purpose.purpose_of`.
         until: instead, how well what is to be known: the fewest stops that reach that are planned;
             see `calib.planning.tolerance.purpose_until`.
+        region: x and y of two corners, m, in the reference's frame, between which the base may
+            stand anywhere; without it where it stood.
         candidates: how many random poses they are chosen among.
         seed: of these.
         out: a CSV file to write, a row for each stop: ``location``, and the joints by name.
@@ -165,11 +176,16 @@ def plan(
             f"{stops} stops out of {candidates} candidates: give at least 1, and no more"
         )
     if out is None:
-        return _planned(planner_of(run, purpose, until, progress), stops, candidates, seed)
+        return _planned(
+            planner_of(run, purpose, until, region, seed, progress), stops, candidates, seed
+        )
     if Path(out).suffix != ".csv":
         raise InputError(f"{out}: the stops are written as a table; give FILE.csv")
-    with outputs.file(out, [run.folder, *run.inputs]) as file:
-        found = _planned(planner_of(run, purpose, until, progress), stops, candidates, seed)
+    inputs = [run.folder, *run.inputs] if isinstance(run, Run) else [run]
+    with outputs.file(out, inputs) as file:
+        found = _planned(
+            planner_of(run, purpose, until, region, seed, progress), stops, candidates, seed
+        )
         write_columns(file, found.columns())
     return found
 
@@ -184,7 +200,7 @@ def _planned(planner: Planner, stops: int, candidates: int, seed: int) -> Plan:
     some = planner.in_order(some)
     scene, rig = planner.scene, planner.scene.source.rig
     return Plan(
-        run=planner.run.folder,
+        run=planner.folder,
         purpose=planner.aim,
         poses=some,
         joints=list(zip(rig.joint_names, rig.joint_kinds, strict=True)),
@@ -199,15 +215,40 @@ def _planned(planner: Planner, stops: int, candidates: int, seed: int) -> Plan:
 
 
 def planner_of(
-    run: Run, purpose: str | None, until: str | None = None, progress: Progress = _silent
+    run: Run | Path | str,
+    purpose: str | None,
+    until: str | None = None,
+    region: Sequence[float] | None = None,
+    seed: int = 0,
+    progress: Progress = _silent,
 ) -> Planner:
-    """What plans stops for a run; arguments and errors as of `plan`."""
-    stand = stand_of(run, progress)
-    aim = purpose_until(stand, until) if until else purpose_of(run, stand, purpose)
+    """What plans stops; arguments and errors as of `plan`."""
+    fitted = run if isinstance(run, Run) else None
+    stand = stand_of(run, progress) if fitted else nothing_measured(run)
+    if fitted is None and region is None:
+        raise InputError(
+            f"{run}: nothing was measured with this rig, so say with --region x0 y0 x1 y1 where on "
+            f"the floor its base may stand, m in the frame '{stand.sources[0].rig.reference_frame}'"
+        )
+    if until:
+        aim = purpose_until(stand, until)
+    else:
+        aim = purpose_of(fitted, stand, purpose if fitted else purpose or ALL)
     scene = Scene(stand, aim.added)
     if stand.estimate.scans and not scene.scanned:
         raise InputError(
             f"{scene.source.recording.folder}: there is no mesh, so nothing says what the beams of "
             "a planned stop would meet; add reference/mesh.ply"
         )
-    return Planner(run, scene, aim, progress)
+    places = where_it_stood(stand.estimate.problem, scene.values)
+    if region is not None:
+        rng = np.random.default_rng(seed)
+        places = in_region(scene.source, region, places, scene.T_world_reference, rng)
+    return Planner(
+        folder=fitted.folder if fitted else Path(run),
+        scene=scene,
+        aim=aim,
+        places=places,
+        solution=fitted.solution if fitted else None,
+        progress=progress,
+    )

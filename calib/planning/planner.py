@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,13 +13,13 @@ import numpy as np
 from calib.planning.criteria import chosen
 from calib.planning.information import Information
 from calib.planning.path import in_order_of_path
-from calib.planning.poses import reachable, where_it_stood
+from calib.planning.poses import reachable
 from calib.planning.purpose import Purpose
 from calib.planning.scene import Scene
 from calib.planning.stops import Poses
 from calib.planning.worth import Known, criterion
 from calib.problem.unknowns import Role
-from calib.runs.run import Run
+from calib.results.solution import Solution
 from calib.solve.fit import Progress
 from chains.errors import InputError
 
@@ -44,24 +45,23 @@ class Step:
 
 @dataclass(frozen=True)
 class Planner:
-    """Plans stops for a run.
+    """Plans stops for a run, or for a rig of which nothing was measured yet.
 
     Args:
-        run: fitted.
-        scene: its fit.
+        folder: of the run, or of the rig.
+        scene: the fit.
         aim: what stops are for.
+        places: location -> T_world_root (4, 4) where the base may stand.
+        solution: what the run found; None without one.
         progress: called with what is being done, and how far it is.
     """
 
-    run: Run
+    folder: Path
     scene: Scene
     aim: Purpose
+    places: Mapping[str, np.ndarray]
+    solution: Solution | None
     progress: Progress
-
-    @cached_property
-    def places(self) -> dict[str, np.ndarray]:
-        """Location -> T_world_root (4, 4) where the base stood."""
-        return where_it_stood(self.scene.stand.estimate.problem, self.scene.values)
 
     def candidates(self, count: int, seed: int) -> Poses:
         """So many random poses; see `reachable`."""
@@ -148,7 +148,9 @@ class Planner:
     def _wider(self) -> np.ndarray:
         """(P,) how many times wider than the graph has them the run reports its sigmas, as rows of
         a stop err together; they are taken to go on doing so."""
-        solution = self.run.solution
+        if self.solution is None:
+            return np.ones(len(self.names))
+        solution = self.solution
         sigma = dict(zip(solution.names, np.sqrt(np.diag(solution.covariance)), strict=True))
         model = self.scene.now.without(self.scene.unbounded)
         graph = model.covariance(model.at(self.scene.calibration))

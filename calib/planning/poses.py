@@ -11,7 +11,6 @@ from collections.abc import Mapping
 import numpy as np
 
 from calib.planning.stops import Poses
-from calib.problem import Problem
 from calib.problem.model import Source
 from calib.results.reach import joint_range
 from chains import se3
@@ -20,23 +19,6 @@ from chains.errors import InputError
 CLEAR_M = 0.1  # between parts of the arm, and to the room: about the width of arms' tubes, assumed
 SAMPLED = 4  # points of each tube that are held against the others
 DRAWN = 20  # times as many poses as are wanted are drawn at most
-
-
-def where_it_stood(problem: Problem, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Location -> T_world_root (4, 4) at the first stop there, of the first recording."""
-    recording = problem.sources[0].recording
-    found: dict[int, str] = {}
-    for scan in problem.scans:
-        if scan.recording.folder == recording.folder:
-            found.setdefault(scan.index, scan.stops.root)
-    for block in problem.bodies:
-        for folder, k in block.stop_names:
-            if folder == recording.folder:
-                found.setdefault(k, block.stops.root)
-    out: dict[str, np.ndarray] = {}
-    for k in sorted(found):
-        out.setdefault(str(recording.location[k]), values[found[k]])
-    return out
 
 
 def reachable(
@@ -65,7 +47,8 @@ def reachable(
             "where to carry a rig"
         )
     names, Ts = list(places), np.stack(list(places.values()))
-    low, high = joint_range(rig, recording.joints)
+    measured = recording.joints if len(recording.joints) else np.zeros((1, len(rig.joint_names)))
+    low, high = joint_range(rig, measured)
     clear = _Clear.of(source, places, T_world_reference)
     found: list[tuple[np.ndarray, np.ndarray]] = []
     for _ in range(DRAWN):

@@ -44,11 +44,11 @@ class Purpose:
         return {"for": self.text, "why": self.why or None, "rivals": list(self.rivals)}
 
 
-def purpose_of(run: Run, stand: Stand, text: str | None) -> Purpose:
+def purpose_of(run: Run | None, stand: Stand, text: str | None) -> Purpose:
     """What a plan for a run is for.
 
     Args:
-        run: with its diagnosis, if there is one.
+        run: with its diagnosis, if there is one; None of a rig alone, of which `text` says it.
         stand: its fit.
         text: ``all``; names of frames, effects or single parameters of the model, with commas; or
             effects, of which one at least is not in the model. By default what the diagnosis says
@@ -104,10 +104,11 @@ def components(stand: Stand, name: str) -> list[Key]:
     return whole or list(_single(stand, name))
 
 
-def _effects(run: Run, stand: Stand, names: Sequence[str]) -> Iterator[Effect]:
+def _effects(run: Run | None, stand: Stand, names: Sequence[str]) -> Iterator[Effect]:
     """Effects of the catalogue, of the user's own, or that a diagnosis has described."""
     known = [effect.family for effect in CATALOGUE]
-    own = [*stand.own, *proposed(run, [n for n in names if n.partition("@")[0] not in known])]
+    described = [n for n in names if n.partition("@")[0] not in known]
+    own = [*stand.own, *(proposed(run, described) if run else ())]
     for name in names:
         try:
             effect = find(name, own)

@@ -20,6 +20,7 @@ from calib.planning.stops import (
     PlannedStore,
     Poses,
     at_their_places,
+    drawn,
     extended,
     pattern,
     thinned,
@@ -69,6 +70,9 @@ class Scene:
     @cached_property
     def _wide(self) -> tuple[Problem, dict[str, np.ndarray]]:
         problem = self.stand.problem_of(self.stand.model.plus(tuple(self.added)))
+        known = self.stand.estimate.problem
+        for name in (n for n in known.calibration if n not in problem.variables):
+            problem.calibration.append(problem.add(known.variables[name]))
         return beside(problem, self.stand.estimate)
 
     @property
@@ -104,16 +108,21 @@ class Scene:
 
     @cached_property
     def _pattern(self) -> tuple[Scan, Beams, float]:
-        return pattern(self.source)
+        alone = not self.source.recording.stops
+        return drawn(self.source.rig.lidar) if alone else pattern(self.source)
 
     @property
     def scanned(self) -> bool:
         """Whether stops are scanned, on a mesh."""
-        return bool(self.stand.estimate.scans) and self.source.reference is not None
+        some = bool(self.stand.estimate.scans) or not self.source.recording.stops
+        return some and self.source.rig.lidar is not None and self.source.reference is not None
 
     def worth(self, patterns: Sequence[tuple[Scan, Beams]]) -> float:
         """How many beams of a recorded scan one of a pattern is worth, in the median: the sums of
-        weights over variances of scans that were recorded, and of the pattern there."""
+        weights over variances of scans that were recorded, and of the pattern there. Where none
+        was recorded, as many as it stands for."""
+        if not self.source.recording.stops:
+            return len(self._pattern[0].ring) / len(patterns[0][0].ring)
         estimate, folder = self.stand.estimate, self.source.recording.folder
         mine = [i for i, s in enumerate(estimate.scans) if s.recording.folder == folder]
         some = np.unique(np.linspace(0, len(mine) - 1, COMPARED).round().astype(int))

@@ -19,9 +19,10 @@ from calib.residuals.scan import ScanStop
 from calib.residuals.store import BeamStore
 from calib.residuals.tracker import TrackedBody
 from chains import se3
-from sensors.lidar import Beams
+from sensors.lidar import Beams, LidarModel, beams
 from sensors.recording import Scan
 
+SWEEPS = 20.0  # of a stop, where no recording says how many: 2 s at 10 Hz
 SCANS = 8  # of a recording, from which the directions of its beams are taken
 NEAREST = 0.01  # of recorded beams are shorter than those of planned stops that are counted on
 MARK = "~"  # after the name of a location that is visited again: the base stands elsewhere by then
@@ -131,7 +132,7 @@ def pattern(source: Source) -> tuple[Scan, Beams, float]:
     )
     _, first = np.unique(ring * (column.max() + 1) + column, return_index=True)
     origin, direction = (
-        np.concatenate([getattr(beams, name) for _, beams in read])[first]
+        np.concatenate([getattr(rays, name) for _, rays in read])[first]
         for name in ("origin_m", "direction")
     )
     extra = {
@@ -139,9 +140,18 @@ def pattern(source: Source) -> tuple[Scan, Beams, float]:
         for name in read[0][0].extra
         if all(name in scan.extra for scan, _ in read)
     }
-    nearest_m = float(np.quantile(np.concatenate([beams.range_m for _, beams in read]), NEAREST))
+    nearest_m = float(np.quantile(np.concatenate([rays.range_m for _, rays in read]), NEAREST))
     found = _scan(origin, direction, ring[first], column[first], float(np.median(count)), extra)
     return *found, nearest_m
+
+
+def drawn(lidar: LidarModel) -> tuple[Scan, Beams, float]:
+    """The same of a LiDAR of which no scan is there, as its model has it."""
+    grid = np.meshgrid(np.arange(lidar.rings), np.arange(lidar.columns), indexing="ij")
+    ring, column = (each.ravel() for each in grid)
+    far = beams(lidar.max_range_m * lidar.directions(ring, column), lidar.beam_origin_m)
+    found = _scan(far.origin_m, far.direction, ring, column, SWEEPS, {})
+    return *found, lidar.min_range_m
 
 
 def _scan(
@@ -168,7 +178,7 @@ def _scan(
 def thinned(whole: tuple[Scan, Beams], most: int) -> list[tuple[Scan, Beams]]:
     """Parts of a pattern of about so many beams, spread evenly over each ring, every ring from
     another column on; together they hold all."""
-    scan, beams = whole
+    scan, whole_rays = whole
     step = max(1, round(len(scan.ring) / most))
     order = np.lexsort((scan.column, scan.ring))
     starts = np.searchsorted(scan.ring[order], scan.ring[order])
@@ -178,7 +188,7 @@ def thinned(whole: tuple[Scan, Beams], most: int) -> list[tuple[Scan, Beams]]:
     out = []
     for part in range(step):
         at = order[turn == part]
-        rays = beams.origin_m[at], beams.direction[at]
+        rays = whole_rays.origin_m[at], whole_rays.direction[at]
         extra = {name: values[at] for name, values in scan.extra.items()}
         out.append(_scan(*rays, scan.ring[at], scan.column[at], float(scan.count[0]), extra))
     return out
@@ -209,7 +219,7 @@ def extended(
         visits = [f"{MARK}{k}" if apart else MARK for k in range(count)]
         location = np.char.add(location, visits)
     later = np.full(count, np.nan)
-    if recording.timed:
+    if recording.timed and len(recording.time_s):
         gaps = np.diff(np.sort(recording.time_s))
         later[:] = recording.time_s.max() + (np.median(gaps) if len(gaps) else 0.0)
     guess = se3.inverse(T_world_reference) @ poses.Ts_world_root
@@ -243,7 +253,8 @@ def extended(
 
 def _seen(source: Source, body: str, poses: Poses) -> np.ndarray:
     """About where a body would be seen (n, 7); NaN where it never was, or as a point."""
-    ever = np.isfinite(source.recording.bodies[body]).any(axis=0)
+    seen = source.recording.bodies[body]
+    ever = np.isfinite(seen).any(axis=0) | (len(seen) == 0)
     placed = source.rig.tree.place(body, poses.joints).Ts_root_frame
     return np.where(ever, _pose(poses.Ts_world_root @ placed), np.nan)
 
