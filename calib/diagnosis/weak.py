@@ -36,10 +36,11 @@ def to_be_told_apart(
     """The effects, of which other stops would say which it is; none where nothing is open.
 
     Args:
-        candidates: of a diagnosis; of those confirmed the first that has rivals counts.
+        candidates: of a diagnosis; of those confirmed the first that has rivals counts, though
+            something without a name may be dressed up in it: other stops would say that too.
         weak: its weak directions; of effects that may stand for each other the first.
     """
-    confirmed = [c for c in candidates if c["step"] and not c["dressed_up"]]
+    confirmed = (c for c in candidates if c["step"])
     for each in sorted(confirmed, key=lambda c: c["step"]):
         if each["indistinguishable_from"]:
             return [each["add"], *each["indistinguishable_from"]]

@@ -24,7 +24,7 @@ class Purpose:
 
     Args:
         text: as the option ``--for`` has it.
-        why: where it comes from, as a clause; empty where the user said it.
+        why: what it is, where a diagnosis says it; empty where the user did.
         components: those of the model that are to be known better; empty for all of them.
         tolerance: of each of those the sigma that is wanted, in its unit; empty without any.
         rivals: names of effects, each of which is to be told from the others and from the model;
@@ -73,14 +73,14 @@ def _from_diagnosis(run: Run, stand: Stand) -> Purpose:
     document = run.diagnosis() or {"candidates": [], "weak_directions": []}
     rivals = to_be_told_apart(document["candidates"], document["weak_directions"])
     if rivals:
-        why = "the diagnosis cannot tell them apart"
+        why = "what the diagnosis cannot tell apart"
         return replace(purpose_of(run, stand, ",".join(rivals)), why=why)
     weak = [name for w in document["weak_directions"] for name in w["parameters"]]
     components = {key: None for name in weak for key in _single(stand, name)}
     if components:
         names = ",".join(".".join(key) for key in components)
         return Purpose(
-            names, "the diagnosis finds these hardly determined", components=tuple(components)
+            names, "what the diagnosis finds hardly determined", components=tuple(components)
         )
     return Purpose(ALL)
 

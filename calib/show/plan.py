@@ -26,9 +26,10 @@ def print_plan(plan: Plan) -> None:
         console.print(sentence)
     console.print()
     console.print("Joints in degrees or mm; in the order of a short way that nothing has checked.")
-    tables = [_stops_table(plan), _sigma_table(document["sigma"])]
+    tables = [_stops_table(plan)]
     if document["smallest_detectable"]:
         tables.append(_detectable_table(document["smallest_detectable"]))
+    tables.append(_sigma_table(document["sigma"]))
     for table in tables:
         console.print(table)
         console.print()
@@ -70,8 +71,8 @@ def _aim(document: Mapping[str, Any]) -> str:
         first, *others = document["rivals"]
         told = f"to tell {first} from {', '.join(others) or 'the model'}"
     else:
-        told = "for the whole calibration" if what == "all" else f"for {what}"
-    return f"{told}; {document['why']}" if document["why"] else told
+        told = "for the whole calibration" if what == "all" else f"for {document['why'] or what}"
+    return f"{told}: {document['why']}" if document["rivals"] and document["why"] else told
 
 
 def _stops_table(plan: Plan) -> Table:
