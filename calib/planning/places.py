@@ -97,6 +97,8 @@ def _free(mesh: Reference, at: np.ndarray) -> np.ndarray:
     turn = np.linspace(0, 2 * np.pi, 24, endpoint=False)
     around = np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=1)
     known = np.flatnonzero(np.isfinite(at).all(axis=1))
+    if not len(known):
+        return known
     start = np.repeat(at[known] + [0.0, 0.0, BASE_HEIGHT_M], len(turn), axis=0)
     range_m = mesh.cast(start, np.tile(around, (len(known), 1))).range_m
     return known[range_m.reshape(len(known), -1).min(axis=1) > BASE_CLEAR_M]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -23,18 +23,20 @@ from calib.results.solution import Solution
 from calib.solve.fit import Progress
 from chains.errors import InputError
 
+AGAIN = 1e4  # times that all candidates are measured for what no number of stops gets beyond
+
 
 @dataclass(frozen=True)
 class Step:
     """How far from their tolerances sigmas are with so many stops.
 
     Args:
-        stops: measured and planned.
+        stops: measured and planned; None for any number.
         worst: the largest sigma, in its tolerance.
         parameter: whose that is.
     """
 
-    stops: int
+    stops: int | None
     worst: float
     parameter: str
 
@@ -68,27 +70,24 @@ class Planner:
         scene, rng = self.scene, np.random.default_rng(seed)
         return reachable(scene.source, self.places, scene.T_world_reference, count, rng)
 
-    def choose(self, poses: Poses, stops: int, exchange: bool = True) -> Poses:
-        """The best of some poses; without `exchange` one best after another.
+    def choose(self, poses: Poses, stops: int) -> Poses:
+        """The best of some poses.
 
         Raises:
             InputError: there are fewer.
         """
-        if len(poses.joints) < stops:
-            raise InputError(
-                f"{len(poses.joints)} of the poses that were drawn are clear of the arm itself and "
-                f"of the mesh, which is less than {stops} stops; ask for fewer, or draw more"
-            )
-        self.progress("looking at candidates", 0, 1)
-        each = self.scene.each(poses, self.lasting.keys)
-        by = criterion(self.scene, self.aim, self.lasting)
-        tell = partial(self.progress, "choosing")
-        return poses.some(chosen(by, each, stops, tell, exchange))
+        return self._best(poses, self._each(poses, stops), stops, exchange=True)
 
     def enough(self, poses: Poses, most: int) -> tuple[Poses, list[Step]]:
         """The fewest stops, one best after another, with which every tolerance is kept, or `most`
-        where that many do not; and what was known with how many of them."""
-        best, curve = self.choose(poses, most, exchange=False), {0: self._step(self.now)}
+        where that many do not; and what was known with how many of them. The last step is what all
+        candidates tell, measured again and again: less than that no stop of the arm reaches.
+
+        Raises:
+            InputError: there are fewer poses.
+        """
+        each = self._each(poses, most)
+        best, curve = self._best(poses, each, most, exchange=False), {0: self._step(self.now)}
 
         def kept(count: int) -> bool:
             if count not in curve:
@@ -97,10 +96,28 @@ class Planner:
             return curve[count].worst <= 1.0
 
         low, high = (0, most) if kept(most) else (most - 1, most)
-        while high - low > 1:
+        while high - low > 1 and not kept(0):
             middle = (low + high) // 2
             low, high = (low, middle) if kept(middle) else (middle, high)
-        return best.some(range(high)), [curve[n] for n in sorted(curve)]
+        needed = 0 if kept(0) else high
+        base = self.lasting
+        endless = replace(base, data=base.data + AGAIN * each.sum(axis=0))
+        last = replace(self._step(self._known(endless, 0)), stops=None)
+        return best.some(range(needed)), [*(curve[n] for n in sorted(curve)), last]
+
+    def _each(self, poses: Poses, stops: int) -> np.ndarray:
+        """What each of some poses tells (n, S, S), of which so many are wanted."""
+        if len(poses.joints) < stops:
+            raise InputError(
+                f"{len(poses.joints)} of the poses that were drawn are clear of the arm itself and "
+                f"of the mesh, which is less than {stops} stops; ask for fewer, or draw more"
+            )
+        self.progress("looking at candidates", 0, 1)
+        return self.scene.each(poses, self.lasting.keys)
+
+    def _best(self, poses: Poses, each: np.ndarray, stops: int, exchange: bool) -> Poses:
+        by, tell = criterion(self.scene, self.aim, self.lasting), partial(self.progress, "choosing")
+        return poses.some(chosen(by, each, stops, tell, exchange))
 
     def _step(self, known: Known) -> Step:
         at = [self.names.index(".".join(key)) for key in self.aim.components]

@@ -147,10 +147,14 @@ class Scene:
 
     def each(self, poses: Poses, keys: Sequence[Key]) -> np.ndarray:
         """What each of some planned stops says by itself (n, S, S), of the components `keys`."""
-        patterns = thinned(self._pattern[:2], BEAMS) if self.scanned else []
-        problem, values = self._with(poses, patterns, apart=True, alone=True)
+        problem, values = self.planned_alone(poses)
         first = len(self.source.recording.stops)
         return of_each(problem, values, keys, first, len(poses.joints), self.unbounded)
+
+    def planned_alone(self, poses: Poses) -> tuple[Problem, dict[str, np.ndarray]]:
+        """The problem of some planned stops, each a visit of its own, and where all of it lies."""
+        patterns = thinned(self._pattern[:2], BEAMS) if self.scanned else []
+        return self._with(poses, patterns, apart=True, alone=True)
 
     def after(self, poses: Poses) -> Information:
         """What the recordings and planned stops say together."""

@@ -51,12 +51,14 @@ def print_plan(plan: Plan) -> None:
 
 def _reached(plan: Plan) -> Iterator[str]:
     """Whether tolerances are kept, and with how many stops what is far off."""
+    if not plan.curve:
+        return
+    *steps, endless = plan.curve
     if plan.reached is False:
-        first, last = plan.curve[0], plan.curve[-1]
-        still = first.parameter == last.parameter and last.worst > FALLS * first.worst
-        what = "no stop tells more of it, so measure it directly" if still else "more stops may do"
-        yield f"NOT REACHED: {last.parameter} is not known so well with them; {what}."
-    for step in plan.curve:
+        still = endless.worst > 1.0
+        why = f"no stop of this arm tells {endless.parameter} so well, so measure it directly"
+        yield f"NOT REACHED: {why if still else 'with more stops it would be'}."
+    for step in steps:
         yield (
             f"with {step.stops:3d} stops {step.parameter} is the worst, at {step.worst:.2f} times "
             "what is wanted"

@@ -67,13 +67,14 @@ def cases(seed: int, folder: Path, pairs: tuple = PAIRS) -> Iterator[Case]:
         write(World(**{"seed": seed, "locations": 3, "stops": 3, "beams": 1200, **knobs}), at)
         run = calib.fit([at], f"{at} run", hold_out="none")
         for pair in pairs:
-            case = _case(run, design, pair, seed)
+            case = case_of(run, design, pair, seed)
             if case is not None:
                 yield case
 
 
 @one_blas_thread
-def _case(run: Run, design: str, pair: tuple[str, str], seed: int) -> Case | None:
+def case_of(run: Run, design: str, pair: tuple[str, str], seed: int) -> Case | None:
+    """What planned stops, and random ones, do for a pair in a design; None if it hides nothing."""
     planner = planner_of(run, ",".join(pair))
     found = planner.now.smallest
     hidden = max(pair, key=lambda name: found[name][1] / found[name][0])
