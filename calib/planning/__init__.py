@@ -25,6 +25,7 @@ from calib.planning.scene import Scene
 from calib.planning.stops import Poses
 from calib.planning.tolerance import purpose_until
 from calib.planning.worth import Known
+from calib.results.recalibrate import earlier
 from calib.runs.diagnose import stand_of
 from calib.runs.run import MODEL, Run
 from calib.solve.fit import Progress
@@ -234,7 +235,10 @@ def planner_of(
         aim = purpose_until(stand, until)
     else:
         aim = purpose_of(fitted, stand, purpose if fitted else purpose or ALL)
-    scene = Scene(stand, aim.added)
+    prior = None
+    if fitted and fitted.prior:
+        prior = earlier(stand.estimate.problem, Run.open(fitted.prior).solution)
+    scene = Scene(stand, aim.added, prior)
     if stand.estimate.scans and not scene.scanned:
         raise InputError(
             f"{scene.source.recording.folder}: there is no mesh, so nothing says what the beams of "

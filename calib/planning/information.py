@@ -10,7 +10,7 @@ one linearisation of all stops, in which the mesh errs once.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -21,6 +21,7 @@ from calib.linear.linearise import lidars, linearise
 from calib.linear.parallel import in_order
 from calib.linear.rows import TWIST, StopRows, StopSums
 from calib.problem import Problem
+from calib.problem.prior import JointPrior
 from calib.problem.surfaces import with_surfaces
 from calib.problem.unknowns import Role, Unknown
 from calib.residuals.beams import Association
@@ -69,6 +70,15 @@ class Information:
             data=data,
             paper=self.paper[np.ix_(keep, keep)],
         )
+
+    def believing(self, prior: JointPrior) -> Information:
+        """The same where an earlier estimate stands for what paper says of some unknowns."""
+        held = [(v.name, dof) for v in prior.held for dof in v.dofs]
+        at, paper = np.array([self.keys.index(key) for key in held]), self.paper.copy()
+        paper[at] = paper[:, at] = 0.0
+        whole = inverse(prior.covariance, np.arange(len(at)))
+        paper[np.ix_(at, at)] = whole * np.outer(self.unit[at], self.unit[at])
+        return replace(self, paper=paper)
 
     def onto(self, keep: np.ndarray) -> Information:
         """The same of some components (n,), those others being known as well as they are."""

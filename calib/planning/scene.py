@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -27,6 +27,7 @@ from calib.planning.stops import (
 )
 from calib.problem import Problem, build
 from calib.problem.model import Source
+from calib.problem.prior import JointPrior
 from calib.problem.surfaces import with_surfaces
 from calib.residuals.beams import Association
 from calib.solve.estimate import started
@@ -47,10 +48,12 @@ class Scene:
     Args:
         stand: the fit.
         added: those effects.
+        prior: an earlier estimate that stands for paper; None where paper does.
     """
 
     stand: Stand
     added: Sequence[Effect] = ()
+    prior: JointPrior | None = None
 
     @property
     def source(self) -> Source:
@@ -104,7 +107,7 @@ class Scene:
     @cached_property
     def now(self) -> Information:
         """What the recordings say."""
-        return of_all(*self._wide, self.stand.estimate.associations, self.unbounded)
+        return self._known(*self._wide, self.stand.estimate.associations)
 
     @cached_property
     def _pattern(self) -> tuple[Scan, Beams, float]:
@@ -174,7 +177,16 @@ class Scene:
         for name in problem.cells:
             unknown = problem.variables[name]
             values[name] = started(unknown, estimate.state, unknown.mean)
-        return of_all(problem, values, found, self.unbounded)
+        return self._known(problem, values, found)
+
+    def _known(
+        self,
+        problem: Problem,
+        values: Mapping[str, np.ndarray],
+        associations: Sequence[Association],
+    ) -> Information:
+        found = of_all(problem, values, associations, self.unbounded)
+        return found.believing(self.prior) if self.prior else found
 
     def _with(
         self, poses: Poses, patterns: Sequence[tuple[Scan, Beams]], apart: bool, alone: bool

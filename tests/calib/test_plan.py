@@ -250,3 +250,11 @@ def test_a_diagnosis_names_the_plan_that_would_tell_its_rivals_apart():
     assert to_be_told_apart([plain, found], weak) == ["arm_gravity_sag", "base_flex"]
     assert to_be_told_apart([plain], weak) == ["range_scale", "faro_scale"]
     assert to_be_told_apart([plain], weak[:1]) == []
+
+
+def test_an_earlier_run_stands_for_paper_where_it_did_in_the_fit(narrow, tmp_path):
+    write(replace(NARROW, locations=1), tmp_path / "rec")
+    run = calib.fit([tmp_path / "rec"], tmp_path / "run", hold_out="none", prior=narrow.folder)
+    scene = planner_of(run, "all").scene
+    known = scene.now.covariance(scene.now.at(scene.calibration))
+    np.testing.assert_allclose(np.sqrt(np.diag(known)), sigma(run), rtol=1e-4)
