@@ -34,7 +34,9 @@ from sensors.stops import write_columns
 
 __all__ = ["Plan", "is_rig", "plan", "planner_of"]
 
-CANDIDATES = 500  # poses that are looked at; see docs/plan.md for what more of them gain
+# Poses that are looked at. On the page's example 50, 200, 500, 1500 of them bring the smallest sag
+# that is told from its rival to 0.071, 0.062, 0.061, 0.059 mrad/(N m) (mean of two seeds).
+CANDIDATES = 500
 STOPS, MOST = 5, 30  # that are planned where nobody says how many; and until sigmas are small
 
 

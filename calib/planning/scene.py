@@ -14,6 +14,7 @@ from calib.effects import Effect
 from calib.forward import Term
 from calib.linear.layout import key_of
 from calib.linear.parallel import in_order
+from calib.planning.brightness import Brightness
 from calib.planning.information import Information, Key, of_all, of_each
 from calib.planning.stops import (
     PlannedScan,
@@ -35,7 +36,9 @@ from calib.solve.reweight import weighted_as
 from sensors.lidar import Beams
 from sensors.recording import Scan
 
-# How many beams of a candidate stop are looked at; they stand for all.
+# How many beams of a candidate stop are looked at; they stand for all. Of the 8,192 of an OS0-128,
+# with 300, 600, 1200 the gains of 40 stops have ranks that are correlated by 0.92, 0.96, 0.99 with
+# those of all, and sigmas after five stops are at most 6, 3, 1 % off; 16, 17, 25 ms each, all 51.
 BEAMS = 600
 COMPARED = 6  # stops that were measured, by which it is found how many one of them is worth
 
@@ -120,15 +123,29 @@ class Scene:
         some = bool(self.stand.estimate.scans) or not self.source.recording.stops
         return some and self.source.rig.lidar is not None and self.source.reference is not None
 
+    @cached_property
+    def _compared(self) -> list[int]:
+        """Numbers of some scans of its recording that were fitted to."""
+        folder = self.source.recording.folder
+        scans = enumerate(self.stand.estimate.scans)
+        mine = [i for i, scan in scans if scan.recording.folder == folder]
+        some = np.linspace(0, max(len(mine) - 1, 0), COMPARED).round().astype(int)
+        return [mine[k] for k in np.unique(some)] if mine else []
+
+    @cached_property
+    def brightness(self) -> Brightness | None:
+        """Of beams; None where no scan says."""
+        estimate, some = self.stand.estimate, self._compared
+        rows = (estimate.scans[i].rows(self.values, estimate.associations[i]) for i in some)
+        return Brightness.of(rows) if some else None
+
     def worth(self, patterns: Sequence[tuple[Scan, Beams]]) -> float:
         """How many beams of a recorded scan one of a pattern is worth, in the median: the sums of
         weights over variances of scans that were recorded, and of the pattern there. Where none
         was recorded, as many as it stands for."""
         if not self.source.recording.stops:
             return len(self._pattern[0].ring) / len(patterns[0][0].ring)
-        estimate, folder = self.stand.estimate, self.source.recording.folder
-        mine = [i for i, s in enumerate(estimate.scans) if s.recording.folder == folder]
-        some = np.unique(np.linspace(0, len(mine) - 1, COMPARED).round().astype(int))
+        estimate, some = self.stand.estimate, self._compared
         first = len(self.source.recording.stops)
         store = PlannedStore(
             self.source.recording,
@@ -138,7 +155,7 @@ class Scene:
         )
 
         def ratio(k: int) -> float:
-            i = mine[some[k]]
+            i = some[k]
             scan = estimate.scans[i]
             there = PlannedScan.of(scan, store=store, index=first + k, nearest_m=self._pattern[2])
             met = there.associate(self.values, near_edges=True)
@@ -205,7 +222,11 @@ class Scene:
         problem = problem.setting_aside(stand.estimate.problem.set_aside)
         planned = {}
         if patterns:
-            planned = {"each": self.worth(patterns), "nearest_m": self._pattern[2]}
+            planned = {
+                "each": self.worth(patterns),
+                "nearest_m": self._pattern[2],
+                "brightness": self.brightness,
+            }
         known = {
             name: started(unknown, stand.estimate.state, problem.initial[name])
             for name, unknown in problem.variables.items()

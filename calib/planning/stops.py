@@ -12,9 +12,11 @@ from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
+from calib.effects import View
+from calib.planning.brightness import Brightness
 from calib.problem import Problem
 from calib.problem.model import Source
-from calib.residuals.beams import Association, Rows
+from calib.residuals.beams import Association, Rows, Surface
 from calib.residuals.scan import ScanStop
 from calib.residuals.store import BeamStore
 from calib.residuals.tracker import TrackedBody
@@ -80,10 +82,12 @@ class PlannedScan(ScanStop):
     Args:
         each: how many beams of a recorded scan each of these is worth.
         nearest_m: shorter beams are not counted on, whatever the model's data sheet says.
+        brightness: of its beams; None where nothing is known of it.
     """
 
     each: float = field(default=1.0, kw_only=True)
     nearest_m: float = field(default=0.0, kw_only=True)
+    brightness: Brightness | None = field(default=None, kw_only=True)
 
     @classmethod
     def of(cls, scan: ScanStop, **changed: object) -> PlannedScan:
@@ -110,6 +114,14 @@ class PlannedScan(ScanStop):
             scale=1.0,
             spread=None,
         )
+
+    def _view(self, scan: Scan, ray: Beams, surface: Surface) -> View:
+        view = super()._view(scan, ray, surface)
+        if self.brightness is None:
+            return view
+        met = self.brightness.at, surface.predicted_m, surface.cosine
+        columns = {**view.columns, "intensity": lambda: met[0](view["label"], *met[1:])}
+        return replace(view, columns=columns)
 
     def _associate(
         self, T: np.ndarray, ray: Beams, values: Mapping[str, np.ndarray], near_edges: bool
@@ -269,7 +281,7 @@ def at_their_places(
     source: Source,
     first: int,
     poses: Poses,
-    **planned: float,
+    **planned: object,
 ) -> tuple[Problem, dict[str, np.ndarray]]:
     """A problem in which planned stops lie where they are planned, and are seen there.
 

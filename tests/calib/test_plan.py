@@ -107,6 +107,21 @@ def test_a_stop_says_what_its_rows_say_without_what_it_has_alone(planner):
     assert not found[others].any()
 
 
+def test_beams_are_as_bright_as_those_recorded(planner):
+    """The worlds' own law is another one: reflectance times the cosine to the power of 0.4."""
+    stand = planner.scene.stand
+    scan, met = stand.estimate.scans[4], stand.estimate.associations[4]
+    rows = scan.rows(stand.estimate.values, met)
+    bright = planner.scene.brightness
+    cosine = np.cos(rows.view["incidence_rad"])
+    there = bright.at(rows.view["label"], rows.view["range_m"], cosine)[rows.usable]
+    assert bright.slant == pytest.approx(0.4, abs=0.05) and abs(bright.fall) < 0.05
+    np.testing.assert_allclose(
+        np.median(there / rows.view["intensity"][rows.usable]), 1.0, atol=0.03
+    )
+    assert np.std(np.log(there / rows.view["intensity"][rows.usable])) < 0.2
+
+
 def test_candidates_turn_all_that_the_arm_can_and_stay_clear_of_the_room(planner):
     poses, source = planner.candidates(200, 1), planner.scene.source
     assert np.abs(poses.joints).max() < 2.97
