@@ -146,24 +146,26 @@ class Scene:
         if not self.source.recording.stops:
             return len(self._pattern[0].ring) / len(patterns[0][0].ring)
         estimate, some = self.stand.estimate, self._compared
-        first = len(self.source.recording.stops)
-        store = PlannedStore(
-            self.source.recording,
-            self.source.rig.lidar.beam_origin_m,
-            given=self.source.store,
-            patterns=patterns,
-        )
 
         def ratio(k: int) -> float:
             i = some[k]
-            scan = estimate.scans[i]
-            there = PlannedScan.of(scan, store=store, index=first + k, nearest_m=self._pattern[2])
-            met = there.associate(self.values, near_edges=True)
-            each = (scan.rows(self.values, estimate.associations[i]), there.rows(self.values, met))
-            real, planned = (float(np.sum(r.weight / np.square(r.sigma_m))) for r in each)
-            return real / max(planned, 1e-300)
+            real = estimate.scans[i].rows(self.values, estimate.associations[i])
+            there = self.anew(i, patterns)
+            planned = there.rows(self.values, there.associate(self.values, near_edges=True))
+            told, wanted = (float(np.sum(r.weight / np.square(r.sigma_m))) for r in (planned, real))
+            return wanted / max(told, 1e-300)
 
         return float(np.median(list(in_order(ratio, len(some)))))
+
+    def anew(
+        self, scan: int, patterns: Sequence[tuple[Scan, Beams]], **planned: object
+    ) -> PlannedScan:
+        """A scan that was measured, by its number in the problem, planned where it was."""
+        source, recording = self.source, self.source.recording
+        origin = source.rig.lidar.beam_origin_m
+        store = PlannedStore(recording, origin, given=source.store, patterns=patterns)
+        known = {"nearest_m": self._pattern[2], "store": store, "index": len(recording.stops)}
+        return PlannedScan.of(self.stand.estimate.scans[scan], **known, **planned)
 
     def each(self, poses: Poses, keys: Sequence[Key]) -> np.ndarray:
         """What each of some planned stops says by itself (n, S, S), of the components `keys`."""
