@@ -43,7 +43,7 @@ def plan(
         Path | None, typer.Option("-o", "--out", metavar="FILE.csv", help="Where to write them.")
     ] = None,
     candidates: Annotated[
-        int, typer.Option(metavar="N", min=1, help="Random poses that are looked at.")
+        int, typer.Option(metavar="N", min=1, max=3000, help="Random poses that are looked at.")
     ] = 500,
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same stops.")] = 0,
     trust: Trust = None,

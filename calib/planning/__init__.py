@@ -62,6 +62,7 @@ class Plan:
         now, after: what is known without and with them; sigmas as a run reports them.
         effect_units: of the effects in `Known.smallest`.
         candidates: how many poses they were chosen among.
+        untold: directions that no stops of this arm determine, however many.
         curve: how far from their tolerances sigmas are with how many of them; empty without any.
     """
 
@@ -75,6 +76,7 @@ class Plan:
     after: Known
     effect_units: Mapping[str, str]
     candidates: int
+    untold: Sequence[Mapping[str, Any]] = ()
     curve: Sequence[Step] = ()
 
     @property
@@ -116,7 +118,11 @@ class Plan:
                 }
                 for name in self.now.smallest
             },
-            "weak_directions": {"now": list(self.now.weak), "after": list(self.after.weak)},
+            "weak_directions": {
+                "now": list(self.now.weak),
+                "after": list(self.after.weak),
+                "with_any_number": list(self.untold),
+            },
             "learning_curve": [step.document() for step in self.curve],
             "reached": self.reached,
             "observability": {"now": dict(self.now.indices), "after": dict(self.after.indices)},
@@ -196,10 +202,11 @@ def plan(
 def _planned(planner: Planner, stops: int, candidates: int, seed: int) -> Plan:
     """As `plan`, and nothing is written."""
     poses, curve = planner.candidates(candidates, seed), []
+    each = planner.look(poses, stops)
     if planner.aim.tolerance:
-        some, curve = planner.enough(poses, stops)
+        some, curve = planner.enough(poses, each, stops)
     else:
-        some = planner.choose(poses, stops)
+        some = planner.choose(poses, each, stops)
     some = planner.in_order(some)
     scene, rig = planner.scene, planner.scene.source.rig
     return Plan(
@@ -211,6 +218,7 @@ def _planned(planner: Planner, stops: int, candidates: int, seed: int) -> Plan:
         units=planner.units,
         now=planner.now,
         after=planner.after(some),
+        untold=planner.endless(each).weak,
         effect_units={name: scene.unit_of(name) for name in planner.aim.rivals},
         candidates=len(poses.joints),
         curve=curve,

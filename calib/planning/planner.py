@@ -70,24 +70,37 @@ class Planner:
         scene, rng = self.scene, np.random.default_rng(seed)
         return reachable(scene.source, self.places, scene.T_world_reference, count, rng)
 
-    def choose(self, poses: Poses, stops: int) -> Poses:
-        """The best of some poses.
+    def look(self, poses: Poses, stops: int) -> np.ndarray:
+        """What each of some poses tells (n, S, S), so many of which are wanted.
 
         Raises:
             InputError: there are fewer.
         """
-        return self._best(poses, self._each(poses, stops), stops, exchange=True)
+        if len(poses.joints) < stops:
+            raise InputError(
+                f"{len(poses.joints)} of the poses that were drawn are clear of the arm itself and "
+                f"of the mesh, which is less than {stops} stops; ask for fewer, or draw more"
+            )
+        self.progress("looking at candidates", 0, 1)
+        return self.scene.each(poses, self.lasting.keys)
 
-    def enough(self, poses: Poses, most: int) -> tuple[Poses, list[Step]]:
+    def choose(self, poses: Poses, each: np.ndarray, stops: int, exchange: bool = True) -> Poses:
+        """The best of some poses, from what each tells; without `exchange` the best first."""
+        by, tell = criterion(self.scene, self.aim, self.lasting), partial(self.progress, "choosing")
+        return poses.some(chosen(by, each, stops, tell, exchange))
+
+    def endless(self, each: np.ndarray) -> Known:
+        """What all candidates tell, measured again and again: no stops of the arm tell more. As the
+        mesh's errors are taken to differ from stop to stop, even these may not tell as much."""
+        base = self.lasting
+        return self._known(replace(base, data=base.data + AGAIN * each.sum(axis=0)), 0)
+
+    def enough(self, poses: Poses, each: np.ndarray, most: int) -> tuple[Poses, list[Step]]:
         """The fewest stops, one best after another, with which every tolerance is kept, or `most`
-        where that many do not; and what was known with how many of them. The last step is what all
-        candidates tell, measured again and again: less than that no stop of the arm reaches.
-
-        Raises:
-            InputError: there are fewer poses.
-        """
-        each = self._each(poses, most)
-        best, curve = self._best(poses, each, most, exchange=False), {0: self._step(self.now)}
+        where that many do not; and what was known with how many of them, the last of it with any
+        number."""
+        best = self.choose(poses, each, most, exchange=False)
+        curve = {0: self._step(self.now)}
 
         def kept(count: int) -> bool:
             if count not in curve:
@@ -100,24 +113,8 @@ class Planner:
             middle = (low + high) // 2
             low, high = (low, middle) if kept(middle) else (middle, high)
         needed = 0 if kept(0) else high
-        base = self.lasting
-        endless = replace(base, data=base.data + AGAIN * each.sum(axis=0))
-        last = replace(self._step(self._known(endless, 0)), stops=None)
+        last = replace(self._step(self.endless(each)), stops=None)
         return best.some(range(needed)), [*(curve[n] for n in sorted(curve)), last]
-
-    def _each(self, poses: Poses, stops: int) -> np.ndarray:
-        """What each of some poses tells (n, S, S), of which so many are wanted."""
-        if len(poses.joints) < stops:
-            raise InputError(
-                f"{len(poses.joints)} of the poses that were drawn are clear of the arm itself and "
-                f"of the mesh, which is less than {stops} stops; ask for fewer, or draw more"
-            )
-        self.progress("looking at candidates", 0, 1)
-        return self.scene.each(poses, self.lasting.keys)
-
-    def _best(self, poses: Poses, each: np.ndarray, stops: int, exchange: bool) -> Poses:
-        by, tell = criterion(self.scene, self.aim, self.lasting), partial(self.progress, "choosing")
-        return poses.some(chosen(by, each, stops, tell, exchange))
 
     def _step(self, known: Known) -> Step:
         at = [self.names.index(".".join(key)) for key in self.aim.components]

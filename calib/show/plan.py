@@ -15,6 +15,11 @@ if TYPE_CHECKING:
 
 MANY = 12  # parameters of an effect, from which on their sigmas are told together
 LISTED = 4  # directions that are shown
+WEAK = {
+    "now": "hardly determined now",
+    "after": "and after these stops",
+    "with_any_number": "and after any number of stops of this arm: measure it directly",
+}
 FALLS = 0.99  # of a sigma: one that falls by less is told together with all such
 
 
@@ -37,7 +42,7 @@ def print_plan(plan: Plan) -> None:
     if same:
         print_pairs(console, "as well known as before", [("", _together(same))])
     weak = document["weak_directions"]
-    for when, title in (("now", "hardly determined now"), ("after", "and still after them")):
+    for when, title in WEAK.items():
         pairs = [("", " and ".join(each["parameters"])) for each in weak[when][:LISTED]]
         more = len(weak[when]) - LISTED
         pairs += [("", f"and {more} more")] if more > 0 else []

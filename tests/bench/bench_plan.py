@@ -83,7 +83,7 @@ def case_of(run: Run, design: str, pair: tuple[str, str], seed: int) -> Case | N
         return None
     poses, rng = planner.candidates(CANDIDATES, seed), np.random.default_rng(seed)
     start = time.perf_counter()
-    best = planner.choose(poses, STOPS)
+    best = planner.choose(poses, planner.look(poses, STOPS), STOPS)
     seconds = time.perf_counter() - start
     drawn = [rng.choice(len(poses.joints), STOPS, replace=False) for _ in range(DRAWS)]
     planned, *random = (

@@ -173,6 +173,18 @@ def test_until_takes_as_few_stops_as_do(narrow, rigcal, tmp_path):
     assert table.to_dict("records") == document["stops"]
 
 
+def test_what_a_still_joint_hides_is_told_and_what_cad_alone_knows_is_not(narrow):
+    """While joint 5 stays at 0, joints 4 and 6 turn about one axis, and their zeros are as one; of
+    the base's height only sums are ever seen."""
+    plan = calib.plan(narrow, **FEW)
+    now, after, ever = (
+        {name for direction in weak for name in direction["parameters"]}
+        for weak in (plan.now.weak, plan.after.weak, plan.untold)
+    )
+    assert "arm_joint_offset.joint_4" in now - after - ever
+    assert "arm_base.tz" in now & after & ever
+
+
 def test_until_says_what_no_stop_tells(narrow, rigcal):
     words = ["plan", narrow.folder, "--until", "lidar.xyz 0.1 mm", "--candidates", 20]
     code, said, _ = rigcal(*words, "--stops", 2)
