@@ -12,8 +12,7 @@ import numpy as np
 
 from calib.planning.criteria import chosen
 from calib.planning.information import Information
-from calib.planning.path import in_order_of_path
-from calib.planning.poses import reachable
+from calib.planning.poses import in_order_of_path, reachable
 from calib.planning.purpose import Purpose
 from calib.planning.scene import Scene
 from calib.planning.stops import Poses

@@ -1,4 +1,4 @@
-"""Poses that the arm can take where its base was: within its limits, clear of itself and the room.
+"""Poses that an arm can take: within its limits, clear of itself and the room; and a way over them.
 
 The arm is taken for tubes between its joints: the URDF's shapes are not read. What came closer than
 that at a stop that was measured is no collision, as the arm stood so.
@@ -6,7 +6,7 @@ that at a stop that was measured is no collision, as the arm stood so.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -146,3 +146,48 @@ class _Clear:
         low, high = mesh.vertices_m.min(axis=0), mesh.vertices_m.max(axis=0)
         inside = ((at > low) & (at < high)).all(axis=2)
         return apart_m, np.where(inside, room_m, -room_m)
+
+
+def in_order_of_path(
+    joints: np.ndarray, location: np.ndarray, locations: Sequence[str]
+) -> list[int]:
+    """An order (n,) of stops: the base moves as seldom as can be, the arm by short ways.
+
+    At each location the nearest stop comes next, then the way is untangled (2-opt: Croes 1958). A
+    way's length is the sum of the joints' Euclidean steps; nothing checks what lies on it.
+
+    Args:
+        joints: (n, J) rad or m.
+        location: (n,) of each stop.
+        locations: in the order in which they are visited.
+    """
+    order: list[int] = []
+    for place in locations:
+        here = np.flatnonzero(location == place)
+        if len(here):
+            from_ = joints[order[-1]] if order else None
+            order += here[_way(joints[here], from_)].tolist()
+    return order
+
+
+def _way(joints: np.ndarray, start: np.ndarray | None) -> np.ndarray:
+    """A short open way over all of some stops (n, J), from somewhere."""
+    step = np.linalg.norm(joints[:, None] - joints[None], axis=2)
+    first = 0 if start is None else int(np.argmin(np.linalg.norm(joints - start, axis=1)))
+    way, left = [first], set(range(len(joints))) - {first}
+    while left:
+        way.append(min(sorted(left), key=lambda k: step[way[-1], k]))
+        left.remove(way[-1])
+    better = True
+    while better:
+        better = False
+        for i in range(1, len(way) - 1):
+            for k in range(i + 1, len(way)):
+                turned = way[:i] + way[i : k + 1][::-1] + way[k + 1 :]
+                if _length(step, turned) < _length(step, way) - 1e-12:
+                    way, better = turned, True
+    return np.array(way)
+
+
+def _length(step: np.ndarray, way: Sequence[int]) -> float:
+    return float(step[way[:-1], way[1:]].sum())
