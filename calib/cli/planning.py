@@ -7,7 +7,15 @@ from typing import Annotated
 
 import typer
 
-from calib.cli.app import Json, Trust, Workers, app, print_json, progress_bar
+from calib.cli.app import (
+    Json,
+    Trust,
+    Workers,
+    app,
+    end_unless_converged,
+    print_json,
+    progress_bar,
+)
 from calib.linear.parallel import workers as threads
 
 UNTIL = "The fewest stops until sigmas are so small: 'lidar 0.3 mm, rings 1 mm'."
@@ -64,3 +72,5 @@ def plan(
         from calib.show.plan import print_plan
 
         print_plan(found)
+    if isinstance(opened, Run):
+        end_unless_converged(opened)

@@ -119,9 +119,11 @@ class PlannedScan(ScanStop):
         view = super()._view(scan, ray, surface)
         if self.brightness is None:
             return view
-        met = self.brightness.at, surface.predicted_m, surface.cosine
-        columns = {**view.columns, "intensity": lambda: met[0](view["label"], *met[1:])}
-        return replace(view, columns=columns)
+
+        def intensity() -> np.ndarray:
+            return self.brightness.at(view["label"], surface.predicted_m, surface.cosine)
+
+        return replace(view, columns={**view.columns, "intensity": intensity})
 
     def _associate(
         self, T: np.ndarray, ray: Beams, values: Mapping[str, np.ndarray], near_edges: bool
@@ -190,19 +192,19 @@ def _scan(
 def thinned(whole: tuple[Scan, Beams], most: int) -> list[tuple[Scan, Beams]]:
     """Parts of a pattern of about so many beams, spread evenly over each ring, every ring from
     another column on; together they hold all."""
-    scan, whole_rays = whole
+    scan, rays = whole
     step = max(1, round(len(scan.ring) / most))
     order = np.lexsort((scan.column, scan.ring))
     starts = np.searchsorted(scan.ring[order], scan.ring[order])
     # Golden section: rings and parts begin as far from each other as they can.
     phase = np.floor(step * ((0.618034 * scan.ring[order]) % 1.0)).astype(int)
     turn = (np.arange(len(order)) - starts + phase) % step
-    out = []
+    out, count = [], float(scan.count[0])
     for part in range(step):
         at = order[turn == part]
-        rays = whole_rays.origin_m[at], whole_rays.direction[at]
+        origin, direction = rays.origin_m[at], rays.direction[at]
         extra = {name: values[at] for name, values in scan.extra.items()}
-        out.append(_scan(*rays, scan.ring[at], scan.column[at], float(scan.count[0]), extra))
+        out.append(_scan(origin, direction, scan.ring[at], scan.column[at], count, extra))
     return out
 
 
