@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from calib.evaluation import evaluate
     from calib.evaluation.apply import apply
     from calib.exporters import export
+    from calib.planning import plan
     from calib.problem.model import Model
     from calib.rig.recording import Recording
     from calib.runs.add import add
@@ -31,6 +32,7 @@ __all__ = [
     "explain",
     "export",
     "fit",
+    "plan",
     "simulate",
 ]
 
@@ -45,6 +47,7 @@ _HOME = {
     "explain": "calib.runs.explain:explain",
     "export": "calib.exporters:export",
     "fit": "calib.runs.calibrate:calibrate",
+    "plan": "calib.planning:plan",
     "simulate": "calib.simulation:simulate",
 }
 _SHOWN = {"Run", "add", "diagnose", "explain", "fit"}  # a notebook shows their results as tables

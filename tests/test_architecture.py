@@ -51,7 +51,8 @@ ROOMS = {
     "calib": (
         *("outputs", "rig", "effects", "forward", "residuals", "problem", "linear", "solve"),
         *("results", "blunders", "diagnosis"),
-        *("runs", "show", "simulation", "evaluation", "intake", "exporters", "report", "view"),
+        *("runs", "planning"),
+        *("show", "simulation", "evaluation", "intake", "exporters", "report", "view"),
         "cli",
     ),
 }

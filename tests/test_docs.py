@@ -149,6 +149,21 @@ def test_the_page_about_chance_shows_what_is_printed(tmp_path):
 
 
 @pytest.mark.slow
+def test_the_page_about_plans_shows_what_is_printed(tmp_path):
+    """But for the numbers; those of what is planned for agree to a tenth."""
+    session = run_through(ROOT / "docs/plan.md", tmp_path)
+    shown = re.findall(r"^```text\n(.*?)^```", session.text, flags=re.M | re.S)
+    said = shape(" ".join(session.said.split()))
+    assert len(shown) == 2 and all(shape(" ".join(part.split())) in said for part in shown)
+    row = r"arm_gravity_sag, told from rivals +mrad/\(N m\) +(\S+) +(\S+)"
+    numbers = ([float(x) for x in re.search(row, t).groups()] for t in (session.text, session.said))
+    assert next(numbers) == pytest.approx(next(numbers), rel=0.1)
+    table = (tmp_path / "stops.csv").read_text().splitlines()
+    assert table[0] == "location," + ",".join(f"joint_{k}" for k in range(1, 7))
+    assert len(table) == 6
+
+
+@pytest.mark.slow
 def test_what_the_page_shows_is_what_is_printed(session):
     """But for the numbers; the size agrees to a tenth."""
     shown = re.findall(r"^```text\n(.*?)^```", session.text, flags=re.M | re.S)

@@ -20,7 +20,11 @@ FOLDERS = {
     "export": ["export run --format yaml --force"],
     "apply": ["apply run rec", "apply run rec/scans/L00P00.parquet"],
 }
-FILES = {"report": ["report run", "report run again"], "plot": ["plot run chain"]}
+FILES = {
+    "report": ["report run", "report run again"],
+    "plot": ["plot run chain"],
+    "plan": ["plan run"],
+}
 INSIDE = {"diagnose", "evaluate"}  # what they find stands in the run itself
 READ = {
     "check",
@@ -29,7 +33,7 @@ READ = {
     "reproduce",
     "view",
 }  # view makes runs by the same functions as add
-ENDS = {"report": ".html", "plot": ".png"}
+ENDS = {"report": ".html", "plot": ".png", "plan": ".csv"}
 
 
 @pytest.fixture(scope="module")
@@ -92,6 +96,8 @@ def test_a_file_that_is_not_its_own_is_refused(made, rigcal, monkeypatch, words,
         ("report run", "run/solution.yaml"),
         ("report run", "page"),
         ("plot run chain", "run/solution.yaml"),
+        ("plan run", "run/solution.yaml"),
+        ("plan run", "stops"),
         ("evaluate run", "run"),
         ("evaluate run", "again"),
         ("evaluate run again", "."),
@@ -133,6 +139,7 @@ def test_it_is_refused_before_any_work(made, rigcal, monkeypatch):
         *("runs.calibrate.leave_out", "runs.calibrate.reopened", "evaluation.reopened"),
         *("evaluation.apply.Correction", "exporters.Fitted", "intake.gather", "simulation._record"),
         *("report.Evidence.of", "runs.explain.calibrate", "runs.diagnose.stand_of"),
+        *("planning.stand_of",),
     ):
         monkeypatch.setattr(f"calib.{place}", work)
     for command, (words, *_) in {**FOLDERS, **FILES}.items():

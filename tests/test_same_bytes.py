@@ -24,6 +24,7 @@ fit {rec} -o run --effects ring_range_offset --hold-out none --workers {n}
 add run arm_gravity_sag ../mine.yaml -o deeper/run --workers {n}
 fit {rec} -o later --prior run --hold-out stop --without L01P01:joint_2 --workers {n}
 diagnose later --candidates ../mine.yaml --workers {n}
+plan later --stops 2 -o stops.csv --workers {n}
 evaluate deeper/run
 report later -o report.html
 plot run rings -o rings.svg
@@ -38,6 +39,7 @@ check {rec} --json
 compare run deeper/run later --json
 effects --json
 reproduce deeper/run --json
+plan later --stops 1 --for lidar,arm_gravity_sag --json
 """
 SERVING = {"view"}
 WAYS = {  # PYTHONHASHSEED, threads of a BLAS call, threads over stops

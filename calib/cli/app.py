@@ -25,8 +25,8 @@ Progress = Callable[[str, int, int], None]
 
 # As people meet them; `rigcal --help` lists them so.
 ORDER = (
-    *("import", "simulate", "check", "fit", "diagnose", "add", "explain", "compare"),
-    *("reproduce", "evaluate", "report", "view", "plot", "export", "apply", "effects"),
+    *("import", "simulate", "check", "fit", "diagnose", "plan", "add", "explain"),
+    *("compare", "reproduce", "evaluate", "report", "view", "plot", "export", "apply", "effects"),
 )
 
 

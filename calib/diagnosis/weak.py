@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,23 @@ def weak_directions(solution: Solution, look: Look) -> list[dict[str, Any]]:
     return [*leaning(solution, look), *standing_in(look)]
 
 
+def to_be_told_apart(
+    candidates: Sequence[Mapping[str, Any]], weak: Sequence[Mapping[str, Any]]
+) -> list[str]:
+    """The effects, of which other stops would say which it is; none where nothing is open.
+
+    Args:
+        candidates: of a diagnosis; of those confirmed the first that has rivals counts, though
+            something without a name may be dressed up in it: other stops would say that too.
+        weak: its weak directions; of effects that may stand for each other the first.
+    """
+    confirmed = (c for c in candidates if c["step"])
+    for each in sorted(confirmed, key=lambda c: c["step"]):
+        if each["indistinguishable_from"]:
+            return [each["add"], *each["indistinguishable_from"]]
+    return next((list(w["parameters"]) for w in weak if w["sigma_mm"] is None), [])
+
+
 def leaning(solution: Solution, look: Look) -> list[dict[str, Any]]:
     """The weakest directions of a run's solution, in units of what was known before."""
     problem = look.stand.problem
@@ -42,7 +60,20 @@ def leaning(solution: Solution, look: Look) -> list[dict[str, Any]]:
         return []
     known, names = known[usable], [solution.names[i] for i in usable]
     graph = solution.covariance if solution.graph is None else solution.graph
-    scaled = graph[np.ix_(usable, usable)] / np.outer(known, known)
+    return hardly_known(names, graph[np.ix_(usable, usable)], known)
+
+
+def hardly_known(
+    names: Sequence[str], covariance: np.ndarray, known: np.ndarray
+) -> list[dict[str, Any]]:
+    """The directions that data hardly determine, the weakest first.
+
+    Args:
+        names: (P,) of the parameters.
+        covariance: (P, P) of them.
+        known: (P,) their sigmas before any data.
+    """
+    scaled = covariance / np.outer(known, known)
     values, axes = np.linalg.eigh(scaled)
     untold = values > UNTOLD
     gauges, _ = echelon(axes[:, untold], np.ones(len(known)))

@@ -72,6 +72,11 @@ class TrackedBody:
         weight = np.where(gone, 0.0, np.where(now > 0, now, 1.0))
         return replace(self, weight=None if (weight == 1.0).all() else weight)
 
+    def seen(self, values: Values) -> np.ndarray:
+        """T_world_body (K, 4, 4) that the tracker should see."""
+        added = sum((basis @ values[name] for name, basis in self.bases.items()), np.zeros((1, 6)))
+        return self.stops.in_world(self.body, values).T @ se3.exp(added)
+
     def evaluate(self, values: Values, derivatives: bool) -> tuple[np.ndarray, Derivatives | None]:
         """Whitened rows, stop by stop [rotation, position], and their derivatives."""
         placed = self.stops.in_world(self.body, values)

@@ -16,7 +16,7 @@ from calib.diagnosis.rejects import rejects
 from calib.diagnosis.search import search
 from calib.diagnosis.stand import Stand
 from calib.diagnosis.verdict import Diagnosis, conclude
-from calib.diagnosis.weak import weak_directions
+from calib.diagnosis.weak import to_be_told_apart, weak_directions
 from calib.effects import DEFAULT, own_effects
 from calib.linear.parallel import one_blas_thread
 from calib.problem import build
@@ -88,8 +88,10 @@ def _found(
         [told.of_rings(lidar, each) for lidar, each in harmful.items()],
     )
     tokens = told.tokens(result.blunders)
+    apart = to_be_told_apart(result.candidates, result.weak_directions)
     return replace(
         result,
+        plan=command_to_plan(run, apart) if apart else "",
         scatter=[*_scatter(run), *result.scatter],
         sentences=[
             *run.doubts,
@@ -110,6 +112,11 @@ def _scatter(run: Run) -> Iterator[dict[str, Any]]:
             for name, unit, each in zip(found.names, found.units, numbers, strict=True):
                 of = name.rpartition(".")[0].removeprefix("sd")  # of nothing else, none
                 yield Spread(of, unit, *each).document(effect.name)
+
+
+def command_to_plan(run: Run, effects: Sequence[str]) -> str:
+    """The command that plans stops at which effects differ."""
+    return shlex.join(["rigcal", "plan", str(run.folder), "--for", ",".join(effects)])
 
 
 def command_without(run: Run, tokens: Sequence[str]) -> str:

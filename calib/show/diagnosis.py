@@ -47,6 +47,8 @@ def print_diagnosis(diagnosis: Diagnosis, residual: str = "range") -> None:
     tied = [(name, ", ".join(those)) for name, those in rivals if those]
     if tied:
         print_pairs(console, "what this data cannot tell apart", tied)
+    if diagnosis.plan:
+        print_command(console, diagnosis.plan, "Stops that would tell it apart are planned by:")
     if diagnosis.unexplained:
         console.print(unexplained_table(diagnosis.unexplained[:LEADING], residual))
     if adequate:

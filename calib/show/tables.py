@@ -52,9 +52,11 @@ def print_check(check: Check) -> None:
     _print_reasons(console, "what cannot", check.cannot)
 
 
-def print_command(console: Console, command: str) -> None:
-    """Print the command that leaves out what is wrong, in one line, ready to be pasted."""
-    console.print("Mend it in the recording; or leave it out:")
+def print_command(
+    console: Console, command: str, what: str = "Mend it in the recording; or leave it out:"
+) -> None:
+    """Print a command in one line, ready to be pasted, and what it does."""
+    console.print(what)
     console.print(command, style="bold", soft_wrap=True)
     console.print()
 

@@ -33,6 +33,8 @@ class World:
         warp_m: how far the middle of one wall is bowed out of the mesh's plane.
         uneven_m: standard deviation of how far surfaces lie off flat, smoothly; no mesh has it.
         clutter: share of the beams that hit boxes which are not in the mesh, about.
+        turned: share of its range that each joint goes through, about its middle; 0 never turns.
+        then: stops that follow: the number of a location, and what the encoders are to say there.
         hidden: effects with their sizes, of `effects.EFFECTS`.
     """
 
@@ -53,6 +55,8 @@ class World:
     warp_m: float = 0.0
     uneven_m: float = 0.0
     clutter: float = 0.0
+    turned: tuple[float, ...] = (1.0,) * 6
+    then: tuple[tuple[int, tuple[float, ...]], ...] = ()
     hidden: tuple[tuple[str, float], ...] = ()
 
     def rng(self, part: str) -> np.random.Generator:

@@ -53,30 +53,41 @@ class Stops:
 
 def visited(world: World, rig: Hardware) -> Stops:
     """Where the rig stands and how the arm is held, at every stop."""
-    rng, count = world.rng("stops"), world.locations * world.stops
+    rng, later = world.rng("stops"), world.rng("then")
+    count, more = world.locations * world.stops, len(world.then)
     location = np.repeat(np.arange(world.locations), world.stops)
-    time_s = 120 + np.cumsum(50 + 5 * rng.standard_normal(count) + 300 * _arrives(location))
+    location = np.append(location, [at for at, _ in world.then]).astype(int)
+
+    def normal(*size: int) -> np.ndarray:
+        """Of every stop; stops that follow change nothing of those before."""
+        return np.concatenate(
+            [r.standard_normal((n, *size)) for r, n in ((rng, count), (later, more))]
+        )
+
+    time_s = 120 + np.cumsum(50 + 5 * normal() + 300 * _arrives(location))
     hours = time_s / 3600
     temperature = 22 + 4 * (1 - np.exp(-hours / 0.4)) + 0.8 * np.sin(7 * hours + rng.uniform(0, 6))
-    humidity = 0.45 + np.cumsum(0.015 * rng.standard_normal(count))
-    true_rad = arm.HALF_RANGE_RAD * rng.uniform(-1, 1, (count, 6))
+    humidity = 0.45 + np.cumsum(0.015 * normal())
+    share = np.array(world.turned) * rng.uniform(-1, 1, (count, 6))
+    wanted = np.reshape([q for _, q in world.then], (more, 6))
+    true_rad = np.concatenate([arm.HALF_RANGE_RAD * share, wanted + rig.zero_rad])
     # Zeros and effects are in what is true, the encoders' noise in what is read.
     angles = true_rad - rig.zero_rad
     true_rad = true_rad + effects.of_joints(world.hidden, angles)
-    misread = SIGMA_JOINT_RAD * rng.standard_normal((count, 6))
-    reported = angles + world.joint_factor * misread
+    reported = angles + world.joint_factor * SIGMA_JOINT_RAD * normal(6)
     T_base_mount, T_base_lidar = rig.of_base(true_rad)
     T_faro_base = _bases(world, rng)[location]
-    settle = rng.standard_normal((count, 6)) * ([SETTLES_M] * 3 + [SETTLES_RAD] * 3)
+    settle = normal(6) * ([SETTLES_M] * 3 + [SETTLES_RAD] * 3)
     T_faro_base = moved(T_faro_base, settle[:, :3], settle[:, 3:])
     T_opti_base = inverse(rig.T_faro_opti) @ T_faro_base
     scatter = world.rng("scatter")
-    off = world.rng("mount").standard_normal((2, count, 3))
-    T_base_lidar = moved(T_base_lidar, world.mount_shift_m * off[0], world.mount_turn_rad * off[1])
+    off = world.rng("mount").standard_normal((count + more, 2, 3))
+    shift, turn = world.mount_shift_m * off[:, 0], world.mount_turn_rad * off[:, 1]
+    T_base_lidar = moved(T_base_lidar, shift, turn)
     return Stops(
         location=location,
         time_s=time_s,
-        temperature_c=temperature + 0.1 * rng.standard_normal(count),
+        temperature_c=temperature + 0.1 * normal(),
         humidity=humidity,
         reported_rad=reported,
         T_faro_lidar=T_faro_base @ T_base_lidar,
@@ -84,7 +95,7 @@ def visited(world: World, rig: Hardware) -> Stops:
             "base_markers": T_opti_base @ rig.frames["base_markers"],
             "mount_markers": T_opti_base @ T_base_mount @ rig.frames["mount_markers"],
         },
-        zero_m=world.stop_scatter_m * scatter.standard_normal(count)
+        zero_m=world.stop_scatter_m * scatter.standard_normal(count + more)
         + world.location_scatter_m * scatter.standard_normal(world.locations)[location],
     )
 

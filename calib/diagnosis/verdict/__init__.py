@@ -62,6 +62,7 @@ class Diagnosis:
         curves: mean residual against covariates.
         too_few: whether the stops are too few to say anything, whatever the verdict.
         command: what fits the same without the blunders, ready to be typed; empty without any.
+        plan: what plans stops that tell apart what these cannot, ready to be typed; or empty.
         rejected: what the fit threw away; None without scans, or where nobody looked.
         scatter: how widely things scatter by chance, of the model and of what it lacks.
     """
@@ -78,6 +79,7 @@ class Diagnosis:
     groups: Sequence[Blunder] = field(default=(), repr=False)
     too_few: bool = False
     command: str = ""
+    plan: str = ""
     rejected: Rejects | None = None
     scatter: Sequence[Mapping[str, Any]] = ()
 
@@ -105,6 +107,7 @@ class Diagnosis:
             "untestable": dict(self.untestable),
             "blunders": list(self.blunders),
             "command": self.command or None,
+            "plan": self.plan or None,
             **told.groups(self.groups),
             "scatter": list(self.scatter),
             "misfit": dict(self.misfit),

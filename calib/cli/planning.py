@@ -1,0 +1,76 @@
+"""What to measure next."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from calib.cli.app import (
+    Json,
+    Trust,
+    Workers,
+    app,
+    end_unless_converged,
+    print_json,
+    progress_bar,
+)
+from calib.linear.parallel import workers as threads
+
+UNTIL = "The fewest stops until sigmas are so small: 'lidar 0.3 mm, rings 1 mm'."
+FOR = "all; frames, effects or parameters to know better, with commas; effects to tell apart."
+
+
+@app.command()
+def plan(
+    run: Annotated[
+        Path, typer.Argument(metavar="RUN_OR_RIG", help="A run; or a rig's folder, with --region.")
+    ],
+    stops: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N",
+            min=1,
+            help="How many; with --until how many at most.",
+            show_default="5, 30",
+        ),
+    ] = None,
+    purpose: Annotated[
+        str | None,
+        typer.Option("--for", metavar="WHAT", help=FOR, show_default="what diagnose found"),
+    ] = None,
+    until: Annotated[
+        str | None, typer.Option(metavar="SIGMAS", help=UNTIL, show_default=False)
+    ] = None,
+    region: Annotated[
+        tuple[float, float, float, float] | None,
+        typer.Option(metavar="X0 Y0 X1 Y1", help="Where on the floor the base may stand, m."),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", metavar="FILE.csv", help="Where to write them.")
+    ] = None,
+    candidates: Annotated[
+        int, typer.Option(metavar="N", min=1, max=3000, help="Random poses that are looked at.")
+    ] = 500,
+    seed: Annotated[int, typer.Option(min=0, help="Same seed, same stops.")] = 0,
+    trust: Trust = None,
+    workers: Workers = None,
+    as_json: Json = False,
+) -> None:
+    """The next stops: what to measure to separate what cannot be told apart, and what it gives."""
+    from calib.planning import is_rig
+    from calib.planning import plan as choose
+    from calib.runs.run import Run
+
+    opened = run if is_rig(run) else Run.open(run, trust or ())
+    with threads(workers), progress_bar() as progress:
+        found = choose(opened, stops, purpose, until, region, candidates, seed, out, progress)
+    if as_json:
+        print_json(found.document())
+    else:
+        from calib.show.plan import print_plan
+
+        print_plan(found)
+    if isinstance(opened, Run):
+        end_unless_converged(opened)

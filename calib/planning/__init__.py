@@ -1,0 +1,268 @@
+"""What to measure next: the stops that tell most, and what will be known after them.
+
+Candidates are random poses of the arm where its base stood. What each of them would tell is
+linearised at a run's estimate by the residuals of the fit (`stops`, `information`), and those are
+chosen that serve a purpose best (`purpose`, `criteria`). What is told of the chosen ones is one
+linearisation of all stops together, measured and planned (`scene`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib import outputs
+from calib.linear.parallel import one_blas_thread
+from calib.planning.alone import nothing_measured
+from calib.planning.places import in_region, where_it_stood
+from calib.planning.planner import Planner, Step
+from calib.planning.purpose import ALL, Purpose, purpose_of
+from calib.planning.scene import Scene
+from calib.planning.stops import Poses
+from calib.planning.tolerance import purpose_until
+from calib.planning.worth import Known
+from calib.results.recalibrate import earlier
+from calib.runs.diagnose import stand_of
+from calib.runs.run import MODEL, Run
+from calib.solve.fit import Progress
+from chains.errors import InputError
+from sensors.stops import write_columns
+
+__all__ = ["Plan", "is_rig", "plan", "planner_of"]
+
+# Poses that are looked at. On the page's example 50, 200, 500, 1500 of them bring the smallest sag
+# that is told from its rival to 0.071, 0.062, 0.061, 0.059 mrad/(N m) (mean of two seeds).
+CANDIDATES = 500
+STOPS, MOST = 5, 30  # that are planned where nobody says how many; and until sigmas are small
+
+
+def _silent(what: str, done: int, total: int) -> None:
+    """Progress that nobody sees."""
+
+
+def is_rig(folder: Path) -> bool:
+    """Whether a folder is one of a rig, and no run."""
+    return (folder / "rig.yaml").is_file() and not (folder / MODEL).is_file()
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Stops to measure next, and what they are worth.
+
+    Args:
+        run: the folder of the run, or of the rig.
+        purpose: what they were chosen for.
+        poses: of the stops, in the order in which to drive to them.
+        joints: (J,) name and kind, revolute or prismatic, of each.
+        names, units: (P,) of the parameters of the calibration.
+        now, after: what is known without and with them; sigmas as a run reports them.
+        effect_units: of the effects in `Known.smallest`.
+        candidates: how many poses they were chosen among.
+        untold: directions that no stops of this arm determine, however many.
+        curve: how far from their tolerances sigmas are with how many of them; empty without any.
+    """
+
+    run: Path
+    purpose: Purpose
+    poses: Poses
+    joints: Sequence[tuple[str, str]]
+    names: Sequence[str]
+    units: Sequence[str]
+    now: Known
+    after: Known
+    effect_units: Mapping[str, str]
+    candidates: int
+    untold: Sequence[Mapping[str, Any]] = ()
+    curve: Sequence[Step] = ()
+
+    @property
+    def _names(self) -> list[str]:
+        return [name for name, _ in self.joints]
+
+    @property
+    def stops(self) -> list[dict[str, Any]]:
+        """A row for each stop: its location, and the joints by name, rad or m."""
+        pairs = zip(self.poses.location.tolist(), self.poses.joints.tolist(), strict=True)
+        return [
+            {"location": str(at), **dict(zip(self._names, joints, strict=True))}
+            for at, joints in pairs
+        ]
+
+    def document(self) -> dict[str, Any]:
+        """As ``--json`` prints it."""
+        return {
+            "run": str(self.run),
+            **self.purpose.document(),
+            "candidates": self.candidates,
+            "stops": self.stops,
+            "number": {"now": self.now.stops, "after": self.after.stops},
+            "sigma": {
+                name: {"unit": unit, "now": now, "after": after}
+                for name, unit, now, after in zip(
+                    self.names,
+                    self.units,
+                    self.now.sigma.tolist(),
+                    self.after.sigma.tolist(),
+                    strict=True,
+                )
+            },
+            "smallest_detectable": {
+                name: {
+                    "unit": self.effect_units[name],
+                    "beside_model": _now_after(self, name, 0),
+                    "beside_rivals": _now_after(self, name, 1),
+                }
+                for name in self.now.smallest
+            },
+            "weak_directions": {
+                "now": list(self.now.weak),
+                "after": list(self.after.weak),
+                "with_any_number": list(self.untold),
+            },
+            "learning_curve": [step.document() for step in self.curve],
+            "reached": self.reached,
+            "observability": {"now": dict(self.now.indices), "after": dict(self.after.indices)},
+        }
+
+    @property
+    def reached(self) -> bool | None:
+        """Whether every tolerance is kept; None where there is none."""
+        last = (s.worst <= 1.0 for s in self.curve if s.stops == self.after.stops)
+        return next(last, None)
+
+    def columns(self) -> dict[str, np.ndarray]:
+        """The stops as columns (n,): ``location``, and the joints by name."""
+        joints = dict(zip(self._names, self.poses.joints.T, strict=True))
+        return {"location": self.poses.location.astype(str), **joints}
+
+
+def _now_after(plan: Plan, name: str, which: int) -> dict[str, float | None]:
+    sizes = {"now": plan.now.smallest[name][which], "after": plan.after.smallest[name][which]}
+    return {when: size if np.isfinite(size) else None for when, size in sizes.items()}
+
+
+@one_blas_thread
+def plan(
+    run: Run | Path | str,
+    stops: int | None = None,
+    purpose: str | None = None,
+    until: str | None = None,
+    region: Sequence[float] | None = None,
+    candidates: int = CANDIDATES,
+    seed: int = 0,
+    out: Path | str | None = None,
+    progress: Progress = _silent,
+) -> Plan:
+    """The stops to measure next.
+
+    Args:
+        run: a fitted run, with its recordings where they were; stops are planned for the first.
+            Or the folder of a rig of which nothing was measured yet: rig.yaml, URDF and mesh.
+        stops: how many; at most so many where it is said until when.
+        purpose: what they are for; see `calib.planning.purpose.purpose_of`.
+        until: instead, how well what is to be known: the fewest stops that reach that are planned;
+            see `calib.planning.tolerance.purpose_until`.
+        region: x and y of two corners, m, in the reference's frame, between which the base may
+            stand anywhere; without it where it stood.
+        candidates: how many random poses they are chosen among.
+        seed: of these.
+        out: a CSV file to write, a row for each stop: ``location``, and the joints by name.
+        progress: called with what is being done, and how far it is.
+
+    Raises:
+        InputError: the recordings are not what they were; nothing goes by a name in `purpose`; the
+            rig has no arm, or scans without a mesh; or there are fewer poses than stops.
+    """
+    if until is not None and purpose is not None:
+        raise InputError("--until says what the stops are for, so it takes no --for beside it")
+    stops = (MOST if until else STOPS) if stops is None else stops
+    if stops < 1 or candidates < stops:
+        raise InputError(
+            f"{stops} stops out of {candidates} candidates: give at least 1, and no more"
+        )
+    if out is None:
+        return _planned(
+            planner_of(run, purpose, until, region, seed, progress), stops, candidates, seed
+        )
+    if Path(out).suffix != ".csv":
+        raise InputError(f"{out}: the stops are written as a table; give FILE.csv")
+    inputs = [run.folder, *run.inputs] if isinstance(run, Run) else [run]
+    with outputs.file(out, inputs) as file:
+        found = _planned(
+            planner_of(run, purpose, until, region, seed, progress), stops, candidates, seed
+        )
+        write_columns(file, found.columns())
+    return found
+
+
+def _planned(planner: Planner, stops: int, candidates: int, seed: int) -> Plan:
+    """As `plan`, and nothing is written."""
+    poses, curve = planner.candidates(candidates, seed), []
+    each = planner.look(poses, stops)
+    if planner.aim.tolerance:
+        some, curve = planner.enough(poses, each, stops)
+    else:
+        some = planner.choose(poses, each, stops)
+    some = planner.in_order(some)
+    scene, rig = planner.scene, planner.scene.source.rig
+    return Plan(
+        run=planner.folder,
+        purpose=planner.aim,
+        poses=some,
+        joints=list(zip(rig.joint_names, rig.joint_kinds, strict=True)),
+        names=planner.names,
+        units=planner.units,
+        now=planner.now,
+        after=planner.after(some),
+        untold=planner.endless(each).weak,
+        effect_units={name: scene.unit_of(name) for name in planner.aim.rivals},
+        candidates=len(poses.joints),
+        curve=curve,
+    )
+
+
+def planner_of(
+    run: Run | Path | str,
+    purpose: str | None,
+    until: str | None = None,
+    region: Sequence[float] | None = None,
+    seed: int = 0,
+    progress: Progress = _silent,
+) -> Planner:
+    """What plans stops; arguments and errors as of `plan`."""
+    fitted = run if isinstance(run, Run) else None
+    stand = stand_of(run, progress) if fitted else nothing_measured(run)
+    if fitted is None and region is None:
+        raise InputError(
+            f"{run}: nothing was measured with this rig, so say with --region x0 y0 x1 y1 where on "
+            f"the floor its base may stand, m in the frame '{stand.sources[0].rig.reference_frame}'"
+        )
+    if until:
+        aim = purpose_until(stand, until)
+    else:
+        aim = purpose_of(fitted, stand, purpose if fitted else purpose or ALL)
+    prior = None
+    if fitted and fitted.prior:
+        prior = earlier(stand.estimate.problem, Run.open(fitted.prior).solution)
+    scene = Scene(stand, aim.added, prior)
+    if stand.estimate.scans and not scene.scanned:
+        raise InputError(
+            f"{scene.source.recording.folder}: there is no mesh, so nothing says what the beams of "
+            "a planned stop would meet; add reference/mesh.ply"
+        )
+    places = where_it_stood(stand.estimate.problem, scene.values)
+    if region is not None:
+        rng = np.random.default_rng(seed)
+        places = in_region(scene.source, region, places, scene.T_world_reference, rng)
+    return Planner(
+        folder=fitted.folder if fitted else Path(run),
+        scene=scene,
+        aim=aim,
+        places=places,
+        solution=fitted.solution if fitted else None,
+        progress=progress,
+    )

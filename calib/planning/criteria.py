@@ -1,0 +1,205 @@
+"""How good a design is, from the information of its stops; each is larger for a better one.
+
+In M, the information of all stops and priors, n components are of interest and the others not.
+
+- D: minus the log of the volume of the ellipsoid in which the n components lie.
+- A: minus the log of the mean of their variances, each in units of what was known before.
+- T: how far apart the data put two rivals (Atkinson and Fedorov 1975): how much of the one is left
+  once the other, and all that the model can take on, is taken off; the mean of the logs of both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from scipy import special
+
+from calib.diagnosis.linear import WIDENED
+from calib.diagnosis.score import POWER
+from calib.diagnosis.search import ALPHA
+from calib.linear.parallel import in_order
+from calib.planning.information import Information, inverse
+
+AT_ONCE = 32  # designs whose matrices are held at once
+ROUNDING = 1e-13  # of a component's information
+LEAST = 1e-9  # information, in squared sigmas: less is none
+
+
+class Criterion:
+    """What a design is chosen by.
+
+    Args:
+        start: what is known without the planned stops.
+    """
+
+    start: np.ndarray
+
+    def of(self, M: np.ndarray) -> np.ndarray:
+        """Of designs (n,), from the information (n, S, S) of all their stops and priors."""
+        raise NotImplementedError
+
+    def each(self, base: np.ndarray, more: np.ndarray) -> np.ndarray:
+        """Of designs (n,) that add one stop each, (n, S, S), to the same others (S, S)."""
+        cuts = range(0, len(more), AT_ONCE)
+        return np.concatenate(
+            list(in_order(lambda i: self.of(base + more[cuts[i] : cuts[i] + AT_ONCE]), len(cuts)))
+        )
+
+
+class Volume(Criterion):
+    """D-optimality of some components (n,)."""
+
+    def __init__(self, known: Information, of: np.ndarray) -> None:
+        self.start = known.data + known.paper
+        self.rest = np.setdiff1d(np.arange(len(known.keys)), of)
+
+    def of(self, M: np.ndarray) -> np.ndarray:
+        out = np.linalg.slogdet(M)[1]
+        if len(self.rest):
+            out = out - np.linalg.slogdet(M[:, self.rest[:, None], self.rest])[1]
+        return out
+
+
+class Variance(Criterion):
+    """A-optimality of some components (n,), in units of the sigmas (n,) that are wanted of them."""
+
+    def __init__(self, known: Information, of: np.ndarray, wanted: np.ndarray) -> None:
+        self.start, self.at = known.data + known.paper, of
+        self.wanted = np.zeros((len(known.keys), len(of)))
+        self.wanted[of, np.arange(len(of))] = 1.0 / np.square(wanted)
+
+    def of(self, M: np.ndarray) -> np.ndarray:
+        found = np.linalg.solve(M, np.broadcast_to(self.wanted, (len(M), *self.wanted.shape)))
+        return -np.log(np.einsum("kjj->k", found[:, self.at]) / len(self.at))
+
+
+class Apart(Criterion):
+    """T-optimality: each of some effects against its rivals.
+
+    Args:
+        known: with the columns of all of them.
+        of: of each effect its components (q,) and the size (q,) that it is taken to have.
+    """
+
+    def __init__(self, known: Information, of: Sequence[tuple[np.ndarray, np.ndarray]]) -> None:
+        self.start = known.data + known.paper / WIDENED**2
+        self.effects = of
+
+    def of(self, M: np.ndarray) -> np.ndarray:
+        out = []
+        for at, size in self.effects:
+            left = information_left(M, at)
+            out.append(np.log(np.maximum(np.einsum("kij,i,j->k", left, size, size), LEAST)))
+        return np.mean(out, axis=0)
+
+
+def information_left(
+    M: np.ndarray, at: np.ndarray, without: Sequence[int] | np.ndarray = ()
+) -> np.ndarray:
+    """Information (n, q, q) on some components that no other can take on; some play no part.
+
+    Args:
+        M: (n, S, S) of designs.
+        at: (q,) the components.
+        without: those that play no part.
+    """
+    others = np.setdiff1d(np.arange(M.shape[1]), np.concatenate([at, without]).astype(int))
+    block, cross = M[:, others[:, None], others], M[:, others[:, None], at]
+    scale = np.einsum("nii->ni", block)
+    scale = np.where(scale > 0, 1.0 / np.sqrt(np.where(scale > 0, scale, 1.0)), 0.0)
+    block = block * scale[:, :, None] * scale[:, None]
+    # As in `calib.diagnosis.score`: a direction that rows leave open must not stop the elimination,
+    # nor a component that no row feels.
+    block += np.einsum("ni,ij->nij", np.where(scale > 0, ROUNDING, 1.0), np.eye(len(others)))
+    cross = cross * scale[:, :, None]
+    left = M[:, at[:, None], at] - cross.mT @ np.linalg.solve(block, cross)
+    return (left + left.mT) / 2
+
+
+def smallest(left: np.ndarray, whole: np.ndarray) -> float:
+    """The root mean square size of an effect's parameters at which it is found.
+
+    With a power of 80 % at the level of a diagnosis, in the effect's unit, on average over the
+    directions of its parameters; infinite where nothing tells it from what is in the model.
+
+    Args:
+        left: (q, q) its information that nothing else can take on.
+        whole: (q, q) all of it.
+    """
+    size = np.sqrt(np.maximum(np.diag(whole), 1e-300))
+    values = np.linalg.eigvalsh(left / np.outer(size, size))
+    dof = int((values > 1e-6).sum())
+    if not dof:
+        return float("inf")
+    limit = special.chdtri(dof, ALPHA)
+    noncentral = special.chndtrinc(limit, dof, 1.0 - POWER)
+    return float(np.sqrt(noncentral / (np.trace(left) / len(left))))
+
+
+def indices(known: Information, at: np.ndarray, stops: int) -> dict[str, float]:
+    """The observability indices O1 to O5 of a calibration.
+
+    Of the singular values s of its Jacobian, all else eliminated, in units of what was known
+    before, priors counted as rows (so that each s is at least about 1).
+
+    O1 = (s_1 ... s_n)^(1/n) / sqrt(stops) (Borm and Menq 1989), O2 = s_n / s_1 (Driels and Pathre
+    1990), O3 = s_n (Nahvi, Hollerbach and Hayward 1994), O4 = s_n^2 / s_1 (Nahvi and Hollerbach
+    1996), O5 = 1 / (1/s_1 + ... + 1/s_n) (Sun and Hollerbach 2008).
+
+    Args:
+        known: what all stops say.
+        at: (n,) the components of the calibration.
+        stops: how many there are.
+    """
+    s = 1.0 / np.sqrt(np.linalg.eigvalsh(inverse(known.data + known.paper, at)))
+    return {
+        "O1": float(np.exp(np.mean(np.log(s))) / np.sqrt(max(stops, 1))),
+        "O2": float(s.min() / s.max()),
+        "O3": float(s.min()),
+        "O4": float(s.min() ** 2 / s.max()),
+        "O5": float(1.0 / np.sum(1.0 / s)),
+    }
+
+
+def chosen(
+    criterion: Criterion,
+    each: np.ndarray,
+    count: int,
+    tell: Callable[[int, int], None],
+    exchange: bool = True,
+) -> list[int]:
+    """Which stops to measure, from what each of them says: the best one after another (greedy), and
+    then each in turn against all others, as long as that gains (exchange: Fedorov 1972).
+
+    Args:
+        criterion: of the design.
+        each: (n, S, S) information of each.
+        count: how many.
+        tell: called with how many are chosen, and of how many.
+        exchange: whether to; without, the first are the best of fewer, too.
+    """
+    base, found = criterion.start.copy(), []
+    for k in range(count):
+        tell(k, count)
+        value = criterion.each(base, each)
+        value[found] = -np.inf
+        found.append(int(np.argmax(value)))
+        base += each[found[-1]]
+    for _ in range(ROUNDS if exchange else 0):
+        before = list(found)
+        for i, old in enumerate(before):
+            rest = base - each[old]
+            value = criterion.each(rest, each)
+            now = value[old]
+            value[found] = -np.inf
+            best = int(np.argmax(value))
+            if value[best] > now + GAIN:
+                found[i], base = best, rest + each[best]
+        if found == before:
+            break
+    return found
+
+
+ROUNDS = 3  # of exchange: in the designs of tests/bench/bench_plan.py a third changed nothing
+GAIN = 1e-9  # of a criterion: less is rounding

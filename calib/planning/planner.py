@@ -1,0 +1,170 @@
+"""The steps of a plan: candidates, what each would tell, which to take, what they are worth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib.planning.criteria import chosen
+from calib.planning.information import Information
+from calib.planning.poses import in_order_of_path, reachable
+from calib.planning.purpose import Purpose
+from calib.planning.scene import Scene
+from calib.planning.stops import Poses
+from calib.planning.worth import Known, criterion
+from calib.problem.unknowns import Role
+from calib.results.solution import Solution
+from calib.solve.fit import Progress
+from chains.errors import InputError
+
+AGAIN = 1e4  # times that all candidates are measured for what no number of stops gets beyond
+
+
+@dataclass(frozen=True)
+class Step:
+    """How far from their tolerances sigmas are with so many stops.
+
+    Args:
+        stops: measured and planned; None for any number.
+        worst: the largest sigma, in its tolerance.
+        parameter: whose that is.
+    """
+
+    stops: int | None
+    worst: float
+    parameter: str
+
+    def document(self) -> dict[str, Any]:
+        """As JSON has it."""
+        return {"stops": self.stops, "worst": self.worst, "parameter": self.parameter}
+
+
+@dataclass(frozen=True)
+class Planner:
+    """Plans stops for a run, or for a rig of which nothing was measured yet.
+
+    Args:
+        folder: of the run, or of the rig.
+        scene: the fit.
+        aim: what stops are for.
+        places: location -> T_world_root (4, 4) where the base may stand.
+        solution: what the run found; None without one.
+        progress: called with what is being done, and how far it is.
+    """
+
+    folder: Path
+    scene: Scene
+    aim: Purpose
+    places: Mapping[str, np.ndarray]
+    solution: Solution | None
+    progress: Progress
+
+    def candidates(self, count: int, seed: int) -> Poses:
+        """So many random poses; see `reachable`."""
+        scene, rng = self.scene, np.random.default_rng(seed)
+        return reachable(scene.source, self.places, scene.T_world_reference, count, rng)
+
+    def look(self, poses: Poses, stops: int) -> np.ndarray:
+        """What each of some poses tells (n, S, S), so many of which are wanted.
+
+        Raises:
+            InputError: there are fewer.
+        """
+        if len(poses.joints) < stops:
+            raise InputError(
+                f"{len(poses.joints)} of the poses that were drawn are clear of the arm itself and "
+                f"of the mesh, which is less than {stops} stops; ask for fewer, or draw more"
+            )
+        self.progress("looking at candidates", 0, 1)
+        return self.scene.each(poses, self.lasting.keys)
+
+    def choose(self, poses: Poses, each: np.ndarray, stops: int, exchange: bool = True) -> Poses:
+        """The best of some poses, from what each tells; without `exchange` the best first."""
+        by, tell = criterion(self.scene, self.aim, self.lasting), partial(self.progress, "choosing")
+        return poses.some(chosen(by, each, stops, tell, exchange))
+
+    def endless(self, each: np.ndarray) -> Known:
+        """What all candidates tell, measured again and again: no stops of the arm tell more. As the
+        mesh's errors are taken to differ from stop to stop, even these may not tell as much."""
+        base = self.lasting
+        return self._known(replace(base, data=base.data + AGAIN * each.sum(axis=0)), 0)
+
+    def enough(self, poses: Poses, each: np.ndarray, most: int) -> tuple[Poses, list[Step]]:
+        """The fewest stops, one best after another, with which every tolerance is kept, or `most`
+        where that many do not; and what was known with how many of them, the last of it with any
+        number."""
+        best = self.choose(poses, each, most, exchange=False)
+        curve = {0: self._step(self.now)}
+
+        def kept(count: int) -> bool:
+            if count not in curve:
+                self.progress("how many are enough", len(curve), most)
+                curve[count] = self._step(self.after(best.some(range(count))))
+            return curve[count].worst <= 1.0
+
+        low, high = (0, most) if kept(most) else (most - 1, most)
+        while high - low > 1 and not kept(0):
+            middle = (low + high) // 2
+            low, high = (low, middle) if kept(middle) else (middle, high)
+        needed = 0 if kept(0) else high
+        last = replace(self._step(self.endless(each)), stops=None)
+        return best.some(range(needed)), [*(curve[n] for n in sorted(curve)), last]
+
+    def _step(self, known: Known) -> Step:
+        at = [self.names.index(".".join(key)) for key in self.aim.components]
+        over = known.sigma[at] / np.array(self.aim.tolerance)
+        worst = int(np.argmax(over))
+        return Step(known.stops, float(over[worst]), self.names[at[worst]])
+
+    def in_order(self, poses: Poses) -> Poses:
+        """Some poses in the order in which to drive to them."""
+        return poses.some(in_order_of_path(poses.joints, poses.location, list(self.places)))
+
+    @cached_property
+    def lasting(self) -> Information:
+        """What is known now of all that planned stops speak of; targets hang where they hang."""
+        roles, now = self.scene.problem.variables, self.scene.now
+        keep = [i for i, (n, _) in enumerate(now.keys) if roles[n].role is not Role.TARGET]
+        return now.onto(np.array(keep))
+
+    @cached_property
+    def names(self) -> list[str]:
+        """(P,) of the parameters of the calibration."""
+        now = self.scene.now
+        return [".".join(now.keys[i]) for i in now.at(self.scene.calibration)]
+
+    @cached_property
+    def units(self) -> list[str]:
+        """(P,) of those."""
+        known: Mapping = self.scene.problem.variables
+        return [unit for name in self.scene.calibration for unit in known[name].units]
+
+    @cached_property
+    def now(self) -> Known:
+        """What is known without any planned stop."""
+        return self._known(self.scene.now, 0)
+
+    def after(self, poses: Poses) -> Known:
+        """What will be known with planned stops, by one linearisation of all."""
+        return self._known(self.scene.after(poses), len(poses.joints))
+
+    def _known(self, information: Information, more: int) -> Known:
+        stops = len(self.scene.source.recording.stops) + more
+        return Known.of(self.scene, self.aim, information, stops, self._wider)
+
+    @cached_property
+    def _wider(self) -> np.ndarray:
+        """(P,) how many times wider than the graph has them the run reports its sigmas, as rows of
+        a stop err together; they are taken to go on doing so."""
+        if self.solution is None:
+            return np.ones(len(self.names))
+        solution = self.solution
+        sigma = dict(zip(solution.names, np.sqrt(np.diag(solution.covariance)), strict=True))
+        model = self.scene.now.without(self.scene.unbounded)
+        graph = model.covariance(model.at(self.scene.calibration))
+        return np.array([sigma[name] for name in self.names]) / np.sqrt(np.diag(graph))

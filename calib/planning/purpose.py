@@ -1,0 +1,135 @@
+"""What planned stops are for: the whole calibration, some of it, or telling rivals apart."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from calib.diagnosis.stand import Stand
+from calib.diagnosis.weak import to_be_told_apart
+from calib.effects import CATALOGUE, Effect, Site, find, split
+from calib.planning.information import Key
+from calib.runs.reopen import proposed
+from calib.runs.run import Run
+from chains.errors import InputError
+from sensors.documents import nearest
+
+ALL = "all"
+
+
+@dataclass(frozen=True)
+class Purpose:
+    """What a plan is for.
+
+    Args:
+        text: as the option ``--for`` has it.
+        why: what it is, where a diagnosis says it; empty where the user did.
+        components: those of the model that are to be known better; empty for all of them.
+        tolerance: of each of those the sigma that is wanted, in its unit; empty without any.
+        rivals: names of effects, each of which is to be told from the others and from the model;
+            empty where that is not the purpose.
+        added: those of them that are not in the model.
+    """
+
+    text: str
+    why: str = ""
+    components: tuple[Key, ...] = ()
+    tolerance: tuple[float, ...] = ()
+    rivals: tuple[str, ...] = ()
+    added: tuple[Effect, ...] = field(default=(), repr=False)
+
+    def document(self) -> dict[str, Any]:
+        """As JSON has it."""
+        return {"for": self.text, "why": self.why or None, "rivals": list(self.rivals)}
+
+
+def purpose_of(run: Run | None, stand: Stand, text: str | None) -> Purpose:
+    """What a plan for a run is for.
+
+    Args:
+        run: with its diagnosis, if there is one; None of a rig alone, of which `text` says it.
+        stand: its fit.
+        text: ``all``; names of frames, effects or single parameters of the model, with commas; or
+            effects, of which one at least is not in the model. By default what the diagnosis says
+            cannot be told apart, then what it says is hardly determined, then all.
+
+    Raises:
+        InputError: a name is not known.
+    """
+    if text is None:
+        return _from_diagnosis(run, stand)
+    if text == ALL:
+        return Purpose(ALL)
+    names = split(text)
+    found = [components(stand, name) for name in names]
+    if not names or all(found):
+        return Purpose(text, components=tuple(dict.fromkeys(key for some in found for key in some)))
+    missing = [name for name, some in zip(names, found, strict=True) if not some]
+    return Purpose(text, rivals=tuple(names), added=tuple(_effects(run, stand, missing)))
+
+
+def _from_diagnosis(run: Run, stand: Stand) -> Purpose:
+    document = run.diagnosis() or {"candidates": [], "weak_directions": []}
+    rivals = to_be_told_apart(document["candidates"], document["weak_directions"])
+    if rivals:
+        why = "what the diagnosis cannot tell apart"
+        return replace(purpose_of(run, stand, ",".join(rivals)), why=why)
+    weak = [name for w in document["weak_directions"] for name in w["parameters"]]
+    components = {key: None for name in weak for key in _single(stand, name)}
+    if components:
+        names = ",".join(".".join(key) for key in components)
+        return Purpose(
+            names, "what the diagnosis finds hardly determined", components=tuple(components)
+        )
+    return Purpose(ALL)
+
+
+def _known(stand: Stand) -> Mapping[str, tuple[str, ...]]:
+    variables = stand.estimate.problem.variables
+    return {name: variables[name].dofs for name in stand.estimate.problem.calibration}
+
+
+def _single(stand: Stand, name: str) -> Iterator[Key]:
+    """The component ``variable.dof``, where the model has it."""
+    variable, _, dof = name.rpartition(".")
+    if dof in _known(stand).get(variable, ()):
+        yield variable, dof
+
+
+def components(stand: Stand, name: str) -> list[Key]:
+    """The components of the model that go by a name: a frame's or effect's, or one of them."""
+    known = _known(stand)
+    whole = [(v, dof) for v in known if name in (v, v.rpartition("/")[2]) for dof in known[v]]
+    return whole or list(_single(stand, name))
+
+
+def _effects(run: Run | None, stand: Stand, names: Sequence[str]) -> Iterator[Effect]:
+    """Effects of the catalogue, of the user's own, or that a diagnosis has described."""
+    known = [effect.family for effect in CATALOGUE]
+    described = [n for n in names if n.partition("@")[0] not in known]
+    own = [*stand.own, *(proposed(run, described) if run else ())]
+    for name in names:
+        try:
+            effect = find(name, own)
+        except InputError:
+            every = list(dict.fromkeys([*_known(stand), *known, ALL]))
+            raise InputError(
+                f"--for {name}: neither in the model nor an effect{nearest(name, every)}; give a "
+                f"frame, effect or parameter of the model, effects to be told apart, or {ALL}"
+            ) from None
+        yield _possible(effect, name, stand)
+
+
+def _possible(effect: Effect, name: str, stand: Stand) -> Effect:
+    """The effect, if stops can tell of it."""
+    why = ""
+    if effect.by_chance:
+        why = "it is drawn by chance"
+    elif effect.site is Site.NOISE:
+        why = "it moves no mean, and how beams will scatter is not predicted"
+    elif not any(effect.params(source.rig) for source in stand.sources):
+        why = "this rig has nothing that it acts on"
+    if why:
+        raise InputError(f"--for {name}: {why}, so no stop can be planned for it")
+    return effect

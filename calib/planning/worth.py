@@ -1,0 +1,101 @@
+"""What is known of a calibration with some stops, in the words of a run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from calib.diagnosis.weak import hardly_known
+from calib.planning.criteria import (
+    Apart,
+    Criterion,
+    Variance,
+    Volume,
+    indices,
+    information_left,
+    smallest,
+)
+from calib.planning.information import Information
+from calib.planning.purpose import Purpose
+from calib.planning.scene import Scene
+
+
+@dataclass(frozen=True)
+class Known:
+    """What is known of a calibration, with some stops.
+
+    Args:
+        stops: how many.
+        sigma: (P,) of each parameter, m or rad.
+        smallest: effect -> root mean square size of its parameters, from which it is found beside
+            the model, and beside the model and its rivals.
+        weak: the directions that are hardly determined, as diagnosis.json has them.
+        indices: the observability indices.
+    """
+
+    stops: int
+    sigma: np.ndarray
+    smallest: Mapping[str, tuple[float, float]]
+    weak: Sequence[Mapping[str, Any]]
+    indices: Mapping[str, float]
+
+    @classmethod
+    def of(
+        cls, scene: Scene, aim: Purpose, known: Information, stops: int, wider: np.ndarray
+    ) -> Known:
+        """As the information of all stops has it.
+
+        Args:
+            scene, aim: what is planned, and what for.
+            known: of all stops.
+            stops: how many they are.
+            wider: (P,) how many times wider than the graph's the sigmas of the run are.
+        """
+        model = known.without(scene.unbounded)
+        every = model.at(scene.calibration)
+        own = model.at([n for n in scene.calibration if n != scene.source.rig.reference_frame])
+        names = [".".join(model.keys[i]) for i in own]
+        return cls(
+            stops=stops,
+            sigma=wider * np.sqrt(np.diag(model.covariance(every))),
+            smallest=dict(zip(aim.rivals, _smallest(scene, aim, known), strict=True)),
+            weak=hardly_known(names, model.covariance(own), model.unit[own]),
+            indices=indices(model, every, stops),
+        )
+
+
+def criterion(scene: Scene, aim: Purpose, known: Information) -> Criterion:
+    """By what stops are chosen: D of all, A of some components, T of rivals."""
+    if aim.rivals:
+        return Apart(known, [_rival(scene, known, name) for name in aim.rivals])
+    if not aim.components:
+        return Volume(known, known.at(scene.calibration))
+    at = np.array([known.keys.index(key) for key in aim.components])
+    wanted = np.array(aim.tolerance) / known.unit[at] if aim.tolerance else np.ones(len(at))
+    return Variance(known, at, wanted)
+
+
+def _rival(scene: Scene, known: Information, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Where the components (q,) of an effect stand, and of what size they are taken to be."""
+    variables = [term.variable for term in scene.terms_of(name)]
+    size = np.concatenate([scene.problem.variables[v].sigma for v in variables])
+    at = known.at(variables)
+    return at, size / known.unit[at]
+
+
+def _smallest(scene: Scene, aim: Purpose, known: Information) -> list[tuple[float, float]]:
+    """Of each effect the size from which it is found; see `Known`."""
+    out, rows = [], Apart(known, []).start
+    for name in aim.rivals:
+        of, _ = _rival(scene, known, name)
+        own = np.outer(known.unit[of], known.unit[of])
+        whole, others = known.data[np.ix_(of, of)] / own, known.at(scene.unbounded)
+        alone, beside = (
+            smallest(information_left(rows[None], of, without)[0] / own, whole)
+            for without in (np.setdiff1d(others, of), np.zeros(0, int))
+        )
+        out.append((alone, beside))
+    return out

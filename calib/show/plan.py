@@ -1,0 +1,144 @@
+"""What people read of a plan: the stops, and what is known now and will be after them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rich.table import Table
+
+from calib.show.tables import columns_table, print_pairs, shown, terminal
+
+if TYPE_CHECKING:
+    from calib.planning import Plan
+
+MANY = 12  # parameters of an effect, from which on their sigmas are told together
+LISTED = 4  # directions that are shown
+WEAK = {
+    "now": "hardly determined now",
+    "after": "and after these stops",
+    "with_any_number": "and after any number of stops of this arm: measure it directly",
+}
+FALLS = 0.99  # of a sigma: one that falls by less is told together with all such
+
+
+def print_plan(plan: Plan) -> None:
+    """Print a plan: what it is for, the stops, and what they are worth."""
+    console, document = terminal(), plan.document()
+    console.print(f"{len(plan.stops)} stops {_aim(document)}", style="bold", soft_wrap=True)
+    for sentence in _reached(plan):
+        console.print(sentence)
+    console.print()
+    console.print("Joints in degrees or mm; in the order of a short way that nothing has checked.")
+    tables = [_stops_table(plan)]
+    if document["smallest_detectable"]:
+        tables.append(_detectable_table(document["smallest_detectable"]))
+    tables.append(_sigma_table(document["sigma"]))
+    for table in tables:
+        console.print(table)
+        console.print()
+    same = [name for name, _, now, after in _rows(document["sigma"]) if after >= FALLS * now]
+    if same:
+        print_pairs(console, "as well known as before", [("", _together(same))])
+    weak = document["weak_directions"]
+    for when, title in WEAK.items():
+        pairs = [("", " and ".join(each["parameters"])) for each in weak[when][:LISTED]]
+        more = len(weak[when]) - LISTED
+        pairs += [("", f"and {more} more")] if more > 0 else []
+        print_pairs(console, title, pairs or [("", "nothing")])
+    now, after = document["observability"]["now"], document["observability"]["after"]
+    table = columns_table("observability", *now)
+    for name, row in (("now", now), ("after", after)):
+        table.add_row(name, *(f"{value:.3g}" for value in row.values()))
+    console.print(table)
+
+
+def _reached(plan: Plan) -> Iterator[str]:
+    """Whether tolerances are kept, and with how many stops what is far off."""
+    if not plan.curve:
+        return
+    *steps, endless = plan.curve
+    if plan.reached is False:
+        still = endless.worst > 1.0
+        why = f"no stop of this arm tells {endless.parameter} so well, so measure it directly"
+        yield f"NOT REACHED: {why if still else 'with more stops it would be'}."
+    for step in steps:
+        yield (
+            f"with {step.stops:3d} stops {step.parameter} is the worst, at {step.worst:.2f} times "
+            "what is wanted"
+        )
+
+
+def _aim(document: Mapping[str, Any]) -> str:
+    what = document["for"]
+    if document["learning_curve"]:
+        told = f"until {document['for']}"
+    elif document["rivals"]:
+        first, *others = document["rivals"]
+        told = f"to tell {first} from {', '.join(others) or 'the model'}"
+    else:
+        told = "for the whole calibration" if what == "all" else f"for {document['why'] or what}"
+    return f"{told}: {document['why']}" if document["rivals"] and document["why"] else told
+
+
+def _stops_table(plan: Plan) -> Table:
+    table = columns_table("stop", "location", *(name for name, _ in plan.joints))
+    scales = [_scale(kind) for _, kind in plan.joints]
+    for k, row in enumerate(plan.stops, start=1):
+        values = [row[name] for name, _ in plan.joints]
+        cells = (f"{s * value:.1f}" for s, value in zip(scales, values, strict=True))
+        table.add_row(str(k), row["location"], *cells)
+    return table
+
+
+def _scale(kind: str) -> float:
+    """From rad to degrees, or from m to mm."""
+    return float(np.degrees(1.0)) if kind == "revolute" else 1e3
+
+
+def _sigma_table(sigma: Mapping[str, Mapping[str, Any]]) -> Table:
+    table = columns_table("expected sigma", "", "now", "after")
+    for name, unit, now, after in _rows(sigma):
+        if after < FALLS * now:
+            factor, unit = shown(unit)
+            table.add_row(name, unit, f"{factor * now:.3g}", f"{factor * after:.3g}")
+    return table
+
+
+def _rows(sigma: Mapping[str, Mapping[str, Any]]) -> Iterator[tuple[str, str, float, float]]:
+    """A row a parameter; of an effect with many, their root mean square."""
+    by_variable: dict[str, list[str]] = {}
+    for name in sigma:
+        by_variable.setdefault(name.rpartition(".")[0], []).append(name)
+    for variable, names in by_variable.items():
+        if len(names) < MANY:
+            yield from ((n, *(sigma[n][key] for key in ("unit", "now", "after"))) for n in names)
+            continue
+        both = (
+            float(np.sqrt(np.mean([sigma[n][key] ** 2 for n in names]))) for key in ("now", "after")
+        )
+        yield f"{variable}, rms of {len(names)}", sigma[names[0]]["unit"], *both
+
+
+def _together(names: list[str]) -> str:
+    """Parameters, those of one variable together."""
+    by_variable: dict[str, list[str]] = {}
+    for name in names:
+        variable, _, dof = name.rpartition(".")
+        by_variable.setdefault(variable or name, []).append(dof)
+    return "; ".join(f"{variable} {', '.join(dofs)}" for variable, dofs in by_variable.items())
+
+
+def _detectable_table(smallest: Mapping[str, Mapping[str, Any]]) -> Table:
+    table = columns_table("smallest that is found", "", "now", "after")
+    for name, each in smallest.items():
+        factor, unit = shown(each["unit"])
+        for key, what in (("beside_model", name), ("beside_rivals", f"{name}, told from rivals")):
+            sizes = each[key]
+            cells = (
+                "never" if sizes[when] is None else f"{factor * sizes[when]:.3g}"
+                for when in ("now", "after")
+            )
+            table.add_row(what, unit, *cells)
+    return table
