@@ -33,7 +33,7 @@ def views(tmp_path_factory):
     beams = replace(beams, rig=coarse(beams.rig))
     count = len(source.recording.stops)
     stops = View(source.rig, count, source.columns, source.recording.joints)
-    targets = View(source.rig, 4, {}, np.zeros((1, 0)))
+    targets = View(source.rig, 4, {"target": np.arange(4)}, np.zeros((1, 0)))
     return {
         **dict.fromkeys((Site.BEAM, Site.REFERENCE, Site.NOISE), beams),
         **dict.fromkeys((Site.JOINTS, Site.EDGE, Site.TRACKER), stops),
@@ -90,7 +90,9 @@ def test_the_catalogue_says_what_an_effect_is(effect, views):
     columns = {name: view.columns[name] for name in effect.covariates if name != "joints"}
     if "time_s" in columns:
         columns |= {n: c for n, c in view.columns.items() if n.startswith("moved.")}
-    normal = {"normal": view.columns["normal"]} if effect.site is Site.REFERENCE else {}
+    # What says which row it is of.
+    own = {Site.REFERENCE: "normal", Site.TARGET: "target"}.get(effect.site)
+    normal = {own: view.columns[own]} if own else {}
     joints = view.joints if {"joints", "time_s"} & set(effect.covariates) else view.joints * np.nan
     effect.basis(View(view.rig, view.rows, columns | normal, joints))
 
@@ -118,6 +120,7 @@ def test_a_rig_without_what_it_acts_on_has_no_such_effect(effect, bare):
     of_lidar = effect.site in (Site.BEAM, Site.NOISE) and effect.name not in unknown
     assert bool(effect.params(lidar)) == of_lidar
     unknown = {"arm_gravity_sag", "base_flex", "mount_bending", "mount_slip", "mount_creep"}
+    unknown |= {"stop_pose_scatter"}  # of a LiDAR
     of_arm = effect.site in (Site.JOINTS, Site.EDGE) and effect.name not in unknown
     assert bool(effect.params(arm)) == of_arm
 

@@ -96,11 +96,15 @@ def test_values_are_taken_over_by_the_names_of_their_parameters(cold):
 
 
 def test_what_a_state_does_not_know_starts_at_its_mean(cold):
-    """Nothing but the poses is known: the rest is found again."""
+    """Nothing but the poses is known: the rest is found again. Which plane a beam at its edge meets
+    has several answers, each of which stays as it is when it is looked at again."""
     source, first = cold
     poses = {name: value for name, value in first.values.items() if value.shape == (4, 4)}
     again = solve(build([source], SMALL), start=Start(poses))
-    assert again.converged and sigmas_apart(first, again) < 0.15
+    pairs = list(zip(first.associations, again.associations, strict=True))
+    differ = sum(np.count_nonzero(a.part != b.part) for a, b in pairs)
+    assert differ <= sum(len(a.part) for a, _ in pairs) / 500
+    assert again.converged and sigmas_apart(first, again) < (0.25 if differ else 0.01)
 
 
 def test_from_afar_beams_look_anew_what_they_meet(tmp_path):
