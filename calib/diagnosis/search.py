@@ -111,7 +111,7 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NAMES) -> Search:
             away from an optimum any effect, structure or scatter seems missing.
     """
     looks, found, left = _steps(stand, progress, most)
-    chance: list[Chance] = []
+    begun, chance = looks[0], list[Chance]()
     while most and (strongest := next((c for c in looks[-1].chance if c.found), None)):
         others = [c for c in looks[-1].chance if c.found and c is not strongest]
         chance.append(strongest)
@@ -136,20 +136,34 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NAMES) -> Search:
         scatter=_scatter(last, progress) if most else None,
         chance=[c for c in still if c.found],
     )
-    if found and done.dressed_up(0):
-        return replace(done, at_first=structures(looks[0], progress))
+    if done.chance and done.unnamed and structures(begun, progress):
+        done = _without_chance(done, stand, progress, most)
+    if done.found and done.dressed_up(0):
+        return replace(done, at_first=structures(done.looks[0], progress))
     return done
 
 
+def _without_chance(done: Search, stand: Stand, progress: Progress, most: int) -> Search:
+    """The same without values by chance in the model, if structure is left then: values by stop
+    take in most of a structure that differs from stop to stop, and what still stands beside them
+    would seem to be a trace."""
+    looks, found, left = _steps(stand, progress, most, chance_leads=False)
+    unnamed = structures(looks[-1], progress)
+    if not unnamed:
+        return done
+    scatter = _scatter(looks[-1], progress)
+    return replace(done, looks=looks, found=found, blunders=left, unnamed=unnamed, scatter=scatter)
+
+
 def _steps(
-    stand: Stand, progress: Progress, most: int
+    stand: Stand, progress: Progress, most: int, chance_leads: bool = True
 ) -> tuple[list[Look], list[NamedEffect], list[LeftOut]]:
     """Effects and blunders, one after another, with no more by chance than the model has: the
     looks, and both, as `Search` has them."""
     first, looks, found, left = stand, [stand.look(progress)], [], []
     while True:
         looks[-1] = _adapted(looks[-1], left, progress, named=bool(found))
-        if not found and _chance_leads(looks[-1]):
+        if chance_leads and not found and _chance_leads(looks[-1]):
             break
         more = _named(looks[-1], found, progress) if len(found) < most else found
         if len(more) == len(found):
