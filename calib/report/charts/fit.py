@@ -91,8 +91,8 @@ def variance(evidence: Evidence) -> Iterator[Chart | Absent]:
         f"{100 * parts[largest] ** 2 / floor**2:.0f} % of the variance",
         "Independent parts, which add up in squares. Range and angle noise and the reference are "
         "what the rows' own sigmas hold; the pose is what is not known of where the LiDAR is at a "
-        "stop that the fit never saw, and chance what each stop draws anew; with these the noise "
-        "floor is complete. What the error has beyond the floor nothing explains.",
+        "stop that the fit never saw, and chance what each stop draws anew. These make up the "
+        "expected error; what the error has beyond it nothing explains.",
         lambda: _bars(parts, "contribution to the rms error, mm"),
     )
 
