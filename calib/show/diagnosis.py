@@ -85,7 +85,7 @@ def _say_verdict(console: Console, diagnosis: Diagnosis) -> None:
 def candidates_table(candidates: Sequence[Mapping[str, Any]], residual: str) -> Table:
     """The leading candidates; those that were confirmed carry the number of their step."""
     table = columns_table("", "effect", "p", "explains", "held out", "would be")
-    for column in table.columns:
+    for column in table.columns[:5]:  # where it is narrow, the last one is broken into lines
         column.no_wrap = True
     for column in table.columns[2:5]:
         column.justify = "right"
