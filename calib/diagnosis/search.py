@@ -101,6 +101,9 @@ class Search:
         return step.candidate.test.evidence(common) < max(bins, default=0.0) - ODDS
 
 
+Steps = tuple[list[Look], list[NamedEffect], list[LeftOut]]
+
+
 def search(stand: Stand, progress: Progress, most: int = MOST_NAMES) -> Search:
     """Name what is missing, one effect after another, then ask whether that is all.
 
@@ -110,14 +113,14 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NAMES) -> Search:
         most: how many effects are named at most; with none, blunders are all that is looked for:
             away from an optimum any effect, structure or scatter seems missing.
     """
-    looks, found, left = _steps(stand, progress, most)
-    begun, chance = looks[0], list[Chance]()
+    looks, found, left = plain = _steps(stand, progress, most)
+    chance: list[Chance] = []
     while most and (strongest := next((c for c in looks[-1].chance if c.found), None)):
         others = [c for c in looks[-1].chance if c.found and c is not strongest]
         chance.append(strongest)
         if strongest.effect.widens:
             wider = looks[-1].stand.with_effects([strongest.effect], progress)
-            looks.append(wider.look(progress))
+            looks = [*looks, wider.look(progress)]
         else:
             beside = stand.with_effects([c.effect for c in chance], progress)
             looks, found, left = _steps(beside, progress, most)
@@ -136,28 +139,27 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NAMES) -> Search:
         scatter=_scatter(last, progress) if most else None,
         chance=[c for c in still if c.found],
     )
-    if done.chance and done.unnamed and structures(begun, progress):
-        done = _without_chance(done, stand, progress, most)
+    if done.chance and done.unnamed and structures(plain[0][0], progress):
+        if not plain[1] and _chance_leads(plain[0][-1]):
+            plain = _steps(stand, progress, most, chance_leads=False)
+        done = _without_chance(done, plain, progress)
     if done.found and done.dressed_up(0):
         return replace(done, at_first=structures(done.looks[0], progress))
     return done
 
 
-def _without_chance(done: Search, stand: Stand, progress: Progress, most: int) -> Search:
+def _without_chance(done: Search, steps: Steps, progress: Progress) -> Search:
     """The same without values by chance in the model, if structure is left then: values by stop
     take in most of a structure that differs from stop to stop, and what still stands beside them
     would seem to be a trace."""
-    looks, found, left = _steps(stand, progress, most, chance_leads=False)
-    unnamed = structures(looks[-1], progress)
-    if not unnamed:
+    looks, found, left = steps
+    if not (unnamed := structures(looks[-1], progress)):
         return done
     scatter = _scatter(looks[-1], progress)
     return replace(done, looks=looks, found=found, blunders=left, unnamed=unnamed, scatter=scatter)
 
 
-def _steps(
-    stand: Stand, progress: Progress, most: int, chance_leads: bool = True
-) -> tuple[list[Look], list[NamedEffect], list[LeftOut]]:
+def _steps(stand: Stand, progress: Progress, most: int, chance_leads: bool = True) -> Steps:
     """Effects and blunders, one after another, with no more by chance than the model has: the
     looks, and both, as `Search` has them."""
     first, looks, found, left = stand, [stand.look(progress)], [], []

@@ -154,7 +154,7 @@ class ArmGearError(ArmJointEccentricity):
 
 
 class ArmGravitySag(Effect):
-    """A joint gives way under the arm's weight: by so much per unit of gravity's torque.
+    """A joint gives way under the arm's weight. It turns by so much per unit of gravity's torque.
 
     The weights are those of the URDF's links, and `payload_kg` at the arm's tip where stops say
     it; the root's z axis is taken to point up. ``c > 0`` droops.
@@ -201,7 +201,7 @@ class ArmBacklash(Effect):
 
 
 class ArmThermalGrowth(Effect):
-    """The arm's links grow with the temperature: all by one coefficient."""
+    """The arm's links grow with the temperature. All have one coefficient."""
 
     name = "arm_thermal_growth"
     site = Site.EDGE

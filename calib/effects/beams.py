@@ -86,7 +86,7 @@ class EncoderEccentricity(Effect):
 
 
 class EncoderSecondHarmonic(EncoderEccentricity):
-    """Two read heads leave the second harmonic: the first cancels."""
+    """Two read heads leave the second harmonic. They cancel the first."""
 
     name = "encoder_second_harmonic"
     formula = "azimuth = true + a * sin(2 azimuth) + b * cos(2 azimuth)"

@@ -128,8 +128,7 @@ class NearRangeBias(RangeEffect):
 
 
 class RangeStep(RangeEffect):
-    """Beyond some range the sensor works in another mode: it fires or
-    amplifies otherwise."""
+    """Beyond some range the sensor works in another mode. It fires, or amplifies, differently."""
 
     name = "range_step"
     sigma = 0.005

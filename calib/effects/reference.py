@@ -10,7 +10,7 @@ from calib.rig import Rig
 
 
 class FaroScale(Effect):
-    """The scanner's metre is too long or too short: in the mesh and in the spheres' places,
+    """The scanner's metre is too long or too short. Its mesh and its spheres share that:
     ``true = scanned * (1 + s)``."""
 
     name = "faro_scale"

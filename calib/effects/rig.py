@@ -145,7 +145,7 @@ class MountCreep(MountSlip):
 
 
 class MountBending(Effect):
-    """The mount bends under the LiDAR's weight: alike to all sides.
+    """The mount bends under the LiDAR's weight. It gives way alike to all sides.
 
     The lever points from the mount to the LiDAR as CAD has it, gravity along -z of the root.
     """

@@ -10,7 +10,7 @@ share count as so many independent ones.
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import ClassVar, Self
 
 import numpy as np
@@ -20,7 +20,7 @@ from calib.effects.basis import RANGE
 from calib.effects.rig import DOF
 from calib.rig import Rig
 
-UNITS = ("rad",) * 3 + ("m",) * 3  # of `DOF`
+OF_POSE = dict(zip(DOF, ("rad",) * 3 + ("m",) * 3, strict=True))  # with their units
 
 
 class Scatter(Effect):
@@ -56,6 +56,14 @@ class Scatter(Effect):
         members = self.members or ("each",)
         return tuple(Param(m, self.unit, self.sigma) for m in members if rig.lidar)
 
+    def params_of_each(self, units: Mapping[str, str]) -> tuple[Param, ...]:
+        """For every member a parameter for each of these names, which have these units."""
+        return tuple(
+            Param(f"{member}.{name}", unit, self.sigma)
+            for member in self.members or ("each",)
+            for name, unit in units.items()
+        )
+
     def member(self, view: View) -> np.ndarray:
         """Number (rows,) or (1,) of the member that a row belongs to, -1 for none."""
         names = np.atleast_1d(view[self.per])
@@ -80,7 +88,7 @@ class Scatter(Effect):
 
 
 class StopRangeScatter(Scatter):
-    """The range zero is another one at every stop, by chance: power cycles, settling, the hour."""
+    """Every stop has a range zero of its own, by chance: power cycles, settling, the hour."""
 
     name = "stop_range_scatter"
     site = Site.BEAM
@@ -98,7 +106,7 @@ class StopRangeScatter(Scatter):
 
 
 class LocationRangeScatter(StopRangeScatter):
-    """The range zero is another one at every location, by chance: each has its own air and day."""
+    """Every location has a range zero of its own, by chance: each has its own air and day."""
 
     name = "location_range_scatter"
     per = "location"
@@ -125,11 +133,7 @@ class StopPoseScatter(Scatter):
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
         hangs = rig.lidar and rig.tree.path(rig.lidar_frame)
-        return tuple(
-            Param(f"{member}.{dof}", unit, self.sigma)
-            for member in ((self.members or ("each",)) if hangs else ())
-            for dof, unit in zip(DOF, UNITS, strict=True)
-        )
+        return self.params_of_each(OF_POSE) if hangs else ()
 
     def basis(self, view: View) -> np.ndarray:
         tree, each = view.rig.tree, self.several(view, len(DOF))
@@ -139,7 +143,7 @@ class StopPoseScatter(Scatter):
 
 
 class TrackerScatter(Scatter):
-    """The tracker scatters more from stop to stop than rig.yaml says, in turn or in place: glints,
+    """The tracker scatters more than rig.yaml says, from stop to stop, in turn or in place: glints,
     cameras that were bumped, markers that are hidden one by one."""
 
     name = "tracker_scatter"
@@ -155,12 +159,7 @@ class TrackerScatter(Scatter):
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
         bodies = rig.tracker.bodies if rig.tracker else ()
-        return tuple(
-            Param(f"{member}.{body}.{dof}", unit, self.sigma)
-            for member in self.members or ("each",)
-            for body in bodies
-            for dof, unit in zip(DOF, UNITS, strict=True)
-        )
+        return self.params_of_each({f"{b}.{dof}": u for b in bodies for dof, u in OF_POSE.items()})
 
     def basis(self, view: View) -> np.ndarray:
         bodies = len(view.rig.tracker.bodies)
@@ -169,7 +168,7 @@ class TrackerScatter(Scatter):
 
 
 class JointScatter(Scatter):
-    """Joint readings scatter more from stop to stop than rig.yaml says: brakes that let go, loose
+    """Joint readings scatter more than rig.yaml says: from stop to stop, as brakes let go, loose
     couplings, readings rounded on their way."""
 
     name = "joint_scatter"
@@ -187,16 +186,15 @@ class JointScatter(Scatter):
         """None where the joints count as exact."""
         joints = zip(rig.joint_names, rig.joint_kinds, strict=True) if rig.sigma_joint_rad else ()
         units = {name: "rad" if kind == "revolute" else "m" for name, kind in joints}
-        each = self.members or ("each",)
-        return tuple(Param(f"{m}.{j}", unit, self.sigma) for m in each for j, unit in units.items())
+        return self.params_of_each(units)
 
     def basis(self, view: View) -> np.ndarray:
         return self.several(view, view.joints.shape[1])
 
 
 class TargetScatter(Scatter):
-    """Spheres, or the markers above them, are found worse than rig.yaml says: rods that swing or
-    are bent, spheres fitted to few points."""
+    """Targets are found worse than rig.yaml says: spheres, or the markers above them, as rods swing
+    or are bent, or spheres are fitted to few points."""
 
     name = "target_scatter"
     site = Site.TARGET
@@ -209,10 +207,7 @@ class TargetScatter(Scatter):
     source = "variance components of groups of observations: Foerstner 1979; size assumed"
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
-        each = (self.members or ("each",)) if rig.target else ()
-        return tuple(
-            Param(f"{member}.{axis}", "m", self.sigma) for member in each for axis in "xyz"
-        )
+        return self.params_of_each(dict.fromkeys("xyz", "m")) if rig.target else ()
 
     def basis(self, view: View) -> np.ndarray:
         return self.several(view, 3)

@@ -60,8 +60,7 @@ class OptitrackDistortion(Effect):
 
 
 class BodySlip(MountSlip):
-    """A tracked body beyond the arm slips once: on what carries it, knocked or taped anew; it
-    stays there.
+    """A tracked body beyond the arm slips once. It was knocked or taped anew, and stays there.
 
     Without an arm, any body. Not one that is itself what `mount_slip` moves.
     """
@@ -102,8 +101,8 @@ class BodySlip(MountSlip):
 
 
 class BaseSlip(BodySlip):
-    """A tracked body before the arm slips once: on the base, or the arm on it; it stays
-    there."""
+    """A tracked body before the arm slips once. Or the arm does, on the base; either
+    stays there."""
 
     name = "base_slip"
     confounded_with = ("arm_base", "mount_creep", "optitrack_distortion")
