@@ -20,7 +20,7 @@ from calib.blunders.chance import after_looks, at_least, log_tail
 from calib.diagnosis.formulas.factors import Columns, Factor, columns_of, factors
 from calib.diagnosis.formulas.smooths import Bases, Smooth, screen_smooths
 from calib.diagnosis.formulas.table import Projection, Table
-from calib.diagnosis.score import test
+from calib.diagnosis.score import Test, test
 from calib.solve.fit import Progress
 
 KEPT = 4  # factors of each covariate whose products are tried
@@ -29,6 +29,8 @@ TRIES = 60  # evaluations for each constant that is refined
 STEP = 0.05  # of a covariate's range: by how much constants are changed first
 APART = 2.0  # sigmas by which stops must prefer a form for it to be told from a simpler one
 MOST_TERMS = 4
+TRIES = 3  # smooth functions that are judged before nothing is said to be there
+PLAUSIBLE = 0.1  # adjusted p-value of a smooth function, from which forms are tried
 RIVALS = 2  # sets of covariates, beside the best one, over which forms are tried
 INSTEAD = 0.8  # of the best set's statistic that another must explain for that
 AS = {"ring": "elevation_rad"}  # what goes along with another covariate
@@ -105,12 +107,14 @@ class Form:
         statistic: what it explains, in squared sigmas.
         dof: in how many directions.
         left: (K,) what it leaves of each stop's chi-square.
+        tried: of how many it is the best.
     """
 
     term: Term
     statistic: float
     dof: int
     left: np.ndarray
+    tried: int = 1
 
     def other_than(self, term: Term) -> bool:
         """Whether it says something else than a term: not one with more columns than that, nor the
@@ -137,12 +141,13 @@ def forms(projection: Projection, bases: Bases, covariates: Sequence[str]) -> li
     """
     table = projection.table
     best = [_best_factors(projection, bases, covariates, c) for c in covariates]
-    terms = [Term(each) for each in product(*best)]
+    tried = int(np.prod([count for _, count in best]))
+    terms = [Term(each) for each in product(*(some for some, _ in best))]
     statistic, dof = _explained(projection, [t.columns(table.covariates) for t in terms])
     evidence = np.array([_evidence(s, d) for s, d in zip(statistic, dof, strict=True)])
     first = [terms[i] for i in np.argsort(-evidence, kind="stable")[:REFINED]]
     refined = dict.fromkeys(refine(projection, term) for term in first)
-    found = [form(projection, term) for term in refined]
+    found = [form(projection, term, tried) for term in refined]
     return sorted((f for f in found if f.dof), key=lambda f: -f.evidence)
 
 
@@ -172,8 +177,9 @@ def pursue(table: Table, alpha: float, progress: Progress, most: int = MOST_TERM
 
 def _step(fitted: Projection, bases: Bases, smooths: Sequence[Smooth], alpha: float) -> Step | None:
     """The best term over the sets of covariates that explain most, judged."""
-    best = smooths[0] if smooths else None
-    if best is None or best.evidence < np.log(best.looks / alpha):
+    likely = (s for s in smooths[:TRIES] if s.evidence > np.log(s.looks / alpha))
+    best = next((s for s in likely if _stands_out(fitted, bases, s)), None)
+    if best is None:
         return None
     inside = [s for s in smooths if set(s.covariates) < set(best.covariates)]
     others = [s for s in smooths if not set(s.covariates) >= set(best.covariates)]
@@ -194,22 +200,37 @@ def _step(fitted: Projection, bases: Bases, smooths: Sequence[Smooth], alpha: fl
     )
 
 
-def _by_chance(fitted: Projection, form: Form, smooth: Smooth) -> float:
-    """How often chance makes a form of these covariates that explains as much: no more than it
-    makes a smooth function that does (the S-method of Scheffe 1953), stops left out one by one, and
-    beams weighed as they are once the form is known."""
-    columns = form.term.columns(fitted.table.covariates)
+def _stands_out(fitted: Projection, bases: Bases, smooth: Smooth) -> bool:
+    """Whether chance hardly makes so large a smooth function: of others no forms are tried, which
+    takes time."""
+    p = _judged(fitted, bases.of(smooth.covariates)).p_value()
+    return float(after_looks(p, smooth.looks)) < PLAUSIBLE
+
+
+def _judged(fitted: Projection, columns: np.ndarray) -> Test:
+    """The test of columns (N, k), stops left out one by one, and beams weighed as they are once
+    these are known: what is clipped before would seem to differ from stop to stop."""
     known = fitted.table.projection(columns)
     found = test(known.scores({}, columns), np.arange(columns.shape[1]))
-    chance = known.judged(found, columns).chance
+    return known.judged(found, columns)
+
+
+def _by_chance(fitted: Projection, form: Form, smooth: Smooth) -> float:
+    """How often chance makes a form of these covariates that explains as much: no more than it
+    makes a smooth function that does (the S-method of Scheffe 1953), nor more than as many forms
+    do as were tried (Bonferroni); the smaller of both bounds, twice."""
+    found = _judged(fitted, form.term.columns(fitted.table.covariates))
+    chance = found.chance
     if chance.d <= 0.0:
         return 1.0
+    each = max(chance.trace / found.dof, 1.0)
     dof = max(smooth.test.dof, found.dof)
-    each = dof * max(chance.trace / found.dof, 1.0)
-    return at_least(special.fdtrc(dof, chance.d, found.statistic / each))
+    together = special.fdtrc(dof, chance.d, found.statistic / each / dof)
+    alone = special.fdtrc(chance.nu, chance.d, found.statistic / each / found.dof)
+    return at_least(min(1.0, 2 * min(together, alone * form.tried)))
 
 
-def form(projection: Projection, term: Term) -> Form:
+def form(projection: Projection, term: Term, tried: int) -> Form:
     """A term with what it leaves of each stop."""
     table = projection.table
     columns = term.columns(table.covariates)
@@ -219,7 +240,13 @@ def form(projection: Projection, term: Term) -> Form:
     size = np.maximum(np.sqrt(np.square(root[:, None] * columns).sum(axis=0)), 1e-300)
     theta = np.linalg.lstsq(root[:, None] * kept / size, root * projection.left_m, rcond=1e-3)[0]
     left = np.square(root * (projection.left_m - kept @ (theta / size)))
-    return Form(term, float(statistic), int(dof), np.bincount(table.stop, left))
+    return Form(
+        term=term,
+        statistic=float(statistic),
+        dof=int(dof),
+        left=np.bincount(table.stop, left),
+        tried=tried,
+    )
 
 
 def simplest(found: Sequence[Form]) -> tuple[Form, list[Form]]:
@@ -239,8 +266,9 @@ def _told_apart(form: Form, best: Form) -> bool:
 
 def _best_factors(
     projection: Projection, bases: Bases, covariates: Sequence[str], name: str
-) -> list[Factor]:
-    """The functions of one covariate that explain most beside any smooth one of the others."""
+) -> tuple[list[Factor], int]:
+    """The functions of one covariate that explain most beside any smooth one of the others, and of
+    how many."""
     table = projection.table
     others = bases.of([c for c in covariates if c != name], len(covariates))
     names = [name, "ring"] if name == "elevation_rad" and "ring" in table.covariates else [name]
@@ -260,7 +288,7 @@ def _best_factors(
     plain = next((every[i] for i in order if every[i].kind in ("line", "class")), None)
     if plain is not None and plain not in chosen:
         chosen.append(plain)
-    return chosen
+    return chosen, len(every)
 
 
 def _explained(
