@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from calib.residuals.groups import CAD
 from calib.runs.run import Run
 
 FAR_OFF = 3.0  # times its sigmas, or what is expected: residuals that something large is behind
+# Residuals so much larger than their sigmas are no accident: the result's sigmas are widened.
+TOLERATED = 1.2
 OVER = "the held-out error is {:.1f} times as large as expected"
 
 
 def misfit_sentence(kind: str, times: float) -> str:
     """How far the residuals of an instrument exceed their sigmas."""
+    if kind == CAD:
+        return f"frames are {times:.1f} times further from CAD than its sigmas allow"
     what = "errors of the reference" if kind == "reference" else f"residuals of the {kind}"
     return f"the {what} are {times:.1f} times larger than their sigmas allow"
 
@@ -18,6 +23,12 @@ def over_floor(run: Run) -> float:
     """The held-out error over the expected one; 0 where nothing was held out."""
     rms = run.summary["rms_mm"]
     return (rms.get("held_out") or 0.0) / rms["noise_floor"]
+
+
+def cautions(run: Run) -> list[str]:
+    """Which residuals are larger than they should be, and not so large as to forbid belief."""
+    misfit = run.summary["misfit"].items()
+    return [misfit_sentence(kind, times) for kind, times in misfit if TOLERATED < times <= FAR_OFF]
 
 
 def forbids(run: Run) -> list[str]:

@@ -23,7 +23,7 @@ from calib.problem import build
 from calib.results.errors import Errors
 from calib.results.holdout import held_out
 from calib.rig.scanned import ScanSums, numbering
-from calib.runs.belief import forbids
+from calib.runs.belief import cautions, forbids
 from calib.runs.reopen import model_of, reopened, start_of, state_of
 from calib.runs.run import DIAGNOSIS, Run
 from calib.solve.fit import Progress, resume
@@ -96,6 +96,7 @@ def _found(
         sentences=[
             *run.doubts,
             *result.sentences,
+            *map(told.whole, cautions(run)),
             *run.omissions,
             *(told.whole(each.sentence) for each in rings.values() if each not in harmful.values()),
         ],
