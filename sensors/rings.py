@@ -50,6 +50,17 @@ def ring_elevations(sums_rad: ArrayLike, counts: ArrayLike) -> Array:
     return np.where(counts > 0, np.asarray(sums_rad) / np.maximum(counts, 1), np.nan)
 
 
+def least_off_rad(lidar: LidarModel) -> float:
+    """Rms of elevations from the model's, rad, below which no ring is taken for another; infinite
+    where rings are too few to tell."""
+    few = len(lidar.elevation_rad) < _LEAST_RINGS
+    return np.inf if few else _CLEARLY_OFF * _step_rad(lidar)
+
+
+def _step_rad(lidar: LidarModel) -> float:
+    return float(np.median(np.diff(np.sort(lidar.elevation_rad))))
+
+
 def odd_rings(lidar: LidarModel, elevation_rad: ArrayLike) -> RingFinding | None:
     """Return what is wrong with the numbers of rings, None where they are as the model has them.
 
@@ -64,9 +75,9 @@ def odd_rings(lidar: LidarModel, elevation_rad: ArrayLike) -> RingFinding | None
     rings = np.flatnonzero(np.isfinite(seen))
     if len(rings) < _LEAST_RINGS:
         return None
-    step_rad = float(np.median(np.abs(np.diff(np.sort(lidar.elevation_rad)))))
+    step_rad = _step_rad(lidar)
     off_rad = _rms(seen[rings] - lidar.elevation_rad[rings])
-    if off_rad < _CLEARLY_OFF * step_rad:
+    if off_rad < least_off_rad(lidar):
         return None
     others = [
         (_rms(seen[at] - table[at]), words)

@@ -1,7 +1,8 @@
 """Which groups of rows chance does not put so far out: blunders, named, sized, told apart.
 
 How far out a group lies is measured against others of its kind: a tracker five times worse than its
-sigma makes all bodies stick out, and none a blunder.
+sigma makes all bodies stick out, and none a blunder. How far out their kind is, they themselves
+tell, and so does the sigma that is stated of them.
 """
 
 from __future__ import annotations
@@ -25,6 +26,9 @@ POWER = 0.8  # with which a blunder of the smallest detectable size is found
 MEDIAN = 0.37
 BULK = 4  # groups of a kind, below which these are taken at their sigmas
 KNOWN = 1e6  # degrees of freedom of a scale that is taken as known
+# Degrees of freedom of a sigma that somebody states: a half over the square of its relative
+# uncertainty, a quarter (GUM G.4.2). Where groups are few, it tells more of their scale than they.
+STATED = 8.0
 # Of groups that nothing tells apart, that which goes wrong most often is named first: bodies are
 # touched, knocked and occluded, scans mixed up; all joints of an arm are seldom wrong at once.
 LIKELY = ("body", "scan", "target", "frame", "surface", "joints", "rings")
@@ -141,7 +145,7 @@ def _judged(some: Sequence[Shift], looks: int) -> Iterator[Blunder]:
     @cache
     def bounds(own: int) -> tuple[float, float, float]:
         """Of groups of so many dofs: those of the bulk, the limit of F, and its noncentrality."""
-        known = MEDIAN * max(dof.sum() - own, 1) if len(wholes) >= BULK else KNOWN
+        known = STATED + MEDIAN * max(dof.sum() - own, 1) if len(wholes) >= BULK else KNOWN
         limit = special.fdtri(own, known, (1.0 - ALPHA) ** (1.0 / looks))
         return known, limit, special.ncfdtrinc(own, known, 1.0 - POWER, limit)
 

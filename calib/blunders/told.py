@@ -18,9 +18,12 @@ LARGE = 1000.0  # mm or mrad, from which on metres and radians are read more eas
 SIGN = 0.05  # of twice a value on paper, within which it is off as a wrong sign would have it
 
 
-def groups(looked_at: Iterable[Blunder]) -> dict[str, Any]:
-    """How far out every group that was looked at is, and the size from which a mishap to it would
-    be found, as diagnosis.json has them; of a group that is there twice, as it is at first."""
+def groups(
+    looked_at: Iterable[Blunder], others: Mapping[str, Mapping[str, float]]
+) -> dict[str, Any]:
+    """How far out every group that was looked at is, and the size from which a mishap to it, or to
+    what is no group of rows, would be found, as diagnosis.json has them; of a group that is there
+    twice, as it is at first."""
     first: dict[str, Blunder] = {}
     sizes: dict[str, dict[str, float]] = {}
     for blunder in looked_at:
@@ -39,7 +42,7 @@ def groups(looked_at: Iterable[Blunder]) -> dict[str, Any]:
             }
             for token, b in first.items()
         ],
-        "detectable": sizes,
+        "detectable": {**sizes, **others},
     }
 
 

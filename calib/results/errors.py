@@ -7,13 +7,20 @@ from dataclasses import astuple, dataclass
 
 import numpy as np
 
+from calib.effects import FrameOffset
+from calib.problem.problem import Problem
 from calib.problem.unknowns import Role, Unknown
 from calib.residuals.beams import Association, Rows
+from calib.residuals.groups import CAD
 from calib.residuals.scan import ScanStop
 from calib.residuals.tracker import TrackedBody
 from calib.solve.estimate import Estimate
 from calib.solve.reweight import unweighted
 from chains import se3
+
+# Redundancy of all that CAD says of frames, below which nothing is told of how right it is: with
+# less than one row's worth, chance alone puts the ratio anywhere.
+CHECKED = 1.0
 
 
 @dataclass(frozen=True)
@@ -157,8 +164,10 @@ def misfit(estimate: Estimate, beams: Errors, weighted: bool = False) -> dict[st
 
     For trackers and targets the root of chi-square over its degrees of freedom, their own unknowns
     taken off; for beams the rms of inliers over what is expected of them; for the reference how far
-    its surfaces had to be moved, over how far they may be off. About 1 or less when all is well: an
-    effect that is missing in the LiDAR may be laid on beams or on surfaces, and shows in either.
+    its surfaces had to be moved, over how far they may be off; for CAD the root of chi-square of
+    how far frames moved from there, over the redundancy of these moves. About 1 or less when all is
+    well: an effect that is missing in the LiDAR may be laid on beams or on surfaces, and shows in
+    either.
 
     Args:
         estimate: the solution.
@@ -187,7 +196,28 @@ def misfit(estimate: Estimate, beams: Errors, weighted: bool = False) -> dict[st
     if surfaces:
         worst = max(_prior_cost(u, values[u.name]) / u.dim for u in surfaces)
         out["reference"] = float(np.sqrt(worst))
-    return out
+    return out | _of_cad(estimate, weighted)
+
+
+def in_cad(problem: Problem) -> frozenset[str]:
+    """Unknowns of frames that CAD places."""
+    terms = (term for terms in problem.terms for term in terms)
+    return frozenset(t.variable for t in terms if isinstance(t.effect, FrameOffset))
+
+
+def _of_cad(estimate: Estimate, weighted: bool) -> dict[str, float]:
+    """Of the places that frames have in CAD, as far as others contradict them (Birge 1932)."""
+    frames = in_cad(estimate.problem)
+    start = np.cumsum([0, *(u.dim for u in estimate.variables)])
+    variance = np.diag(estimate.covariance)
+    chi2 = left = 0.0
+    for unknown, first in zip(estimate.variables, start, strict=False):
+        if unknown.name in frames:
+            weight = unknown.weight if weighted else 1.0
+            chi2 += weight * _prior_cost(unknown, estimate.values[unknown.name])
+            told = variance[first : first + unknown.dim] / np.square(unknown.sigma)
+            left += float(np.sum(1.0 - weight * told))
+    return {CAD: float(np.sqrt(chi2 / left))} if left > CHECKED else {}
 
 
 def _prior_cost(unknown: Unknown, value: np.ndarray) -> float:

@@ -37,6 +37,7 @@ from scipy.linalg import solve_triangular
 
 from calib.linear.clusters import ClusteredRows, Gradients, summed
 from calib.linear.rows import PLACES
+from calib.results.errors import in_cad
 from calib.solve.clustered import of_beams, of_cells, of_graph, of_stops
 from calib.solve.estimate import Estimate
 from calib.solve.fit import Progress
@@ -66,25 +67,31 @@ class Intervals:
         names, dims: of the unknowns, in order.
         graph: (Q, Q) covariance as the graph has it.
         data: (Q, Q) the part of that which is due to errors of rows; the rest is due to priors.
+        paper: (Q, Q) the part of it that is due to errors of CAD.
         wider: (Q,) how many times wider than the graph has it each interval is, at least 1.
         least: how many times wider all of them are at least.
+        cad: how many times wider than stated values of CAD scatter, at least 1.
     """
 
     names: tuple[str, ...]
     dims: tuple[int, ...]
     graph: np.ndarray
     data: np.ndarray
+    paper: np.ndarray
     wider: np.ndarray
     least: float = 1.0
+    cad: float = 1.0
 
     @property
     def covariance(self) -> np.ndarray:
         """(Q, Q). The variance on top of the graph's is correlated as the data's part is: as the
-        whole is, it would go to combinations that priors alone determine."""
+        whole is, it would go to combinations that priors alone determine. The part of CAD is as
+        much larger as CAD is worse than it says."""
         share = np.diag(self.data) / np.diag(self.graph)
         more = np.maximum(np.square(self.wider) - self.least**2, 0.0)
         root = np.sqrt(np.where(share > SLIGHT, more / np.maximum(share, SLIGHT), 0.0))
-        return self.least**2 * self.graph + np.outer(root, root) * self.data
+        paper = max(self.cad**2 - self.least**2, 0.0) * self.paper
+        return self.least**2 * self.graph + np.outer(root, root) * self.data + paper
 
     def of(self, names: Sequence[str]) -> Intervals:
         """Those of some of the unknowns, in the order given."""
@@ -97,6 +104,7 @@ class Intervals:
             dims=tuple(len(at[name]) for name in names),
             graph=self.graph[np.ix_(some, some)],
             data=self.data[np.ix_(some, some)],
+            paper=self.paper[np.ix_(some, some)],
             wider=self.wider[some],
         )
 
@@ -109,9 +117,10 @@ class Intervals:
         found[np.ix_(held, held)] += some.covariance - self.least**2 * some.graph
         return found
 
-    def at_least(self, wider: float) -> Intervals:
-        """With every interval at least so many times wider than the graph has it."""
-        return replace(self, least=wider)
+    def at_least(self, wider: float, cad: float = 1.0) -> Intervals:
+        """With every interval at least so many times wider than the graph has it, and what CAD
+        adds to each so many times larger."""
+        return replace(self, least=wider, cad=cad)
 
     def document(self, names: Sequence[str]) -> dict[str, float | str]:
         """As summary.json holds how much wider they are.
@@ -144,7 +153,11 @@ def intervals(estimate: Estimate, progress: Progress = lambda what, done, total:
     for rows in of_beams(problem, layout, values, met, directions, places, PARTS, tell):
         sums.add(rows)
     others = [*of_stops(layout, values), *_of_cells(estimate, places)]
-    for block, _, rows in of_graph(estimate.graph, layout, values):
+    frames, paper = in_cad(problem), np.zeros_like(estimate.kept)
+    for block, name, rows in of_graph(estimate.graph, layout, values):
+        if block is None and name in frames:
+            A = rows.A @ directions[rows.columns]
+            paper += A.T @ A
         if block is not None and block.kind == "target":
             rows, stops = rows._replace(stop=np.full(len(rows.b), stops)), stops + 1
         if not isinstance(block, KeptRows):
@@ -157,6 +170,7 @@ def intervals(estimate: Estimate, progress: Progress = lambda what, done, total:
         dims=tuple(unknown.dim for unknown in known.values()),
         graph=estimate.kept,
         data=estimate.kept - sums.priors * np.outer(sigma, sigma),
+        paper=paper * np.outer(sigma, sigma),
         wider=sums.wider(),
     )
 

@@ -2,16 +2,34 @@
 
 from __future__ import annotations
 
+from calib.residuals.groups import CAD
 from calib.runs.run import Run
 
 FAR_OFF = 3.0  # times its sigmas, or what is expected: residuals that something large is behind
+# Residuals so much larger than their sigmas are no accident: the result's sigmas are widened.
+TOLERATED = 1.2
+# Of frames few moves from CAD are checked by anything: beyond this chance puts 6 of them in one rig
+# of a hundred, and 17, as of an arm with two bodies, in one of 10,000.
+TOLERATED_OF_CAD = 1.7
 OVER = "the held-out error is {:.1f} times as large as expected"
 
 
 def misfit_sentence(kind: str, times: float) -> str:
     """How far the residuals of an instrument exceed their sigmas."""
+    if kind == CAD:
+        return f"frames are {times:.1f} times further from CAD than its sigmas allow"
     what = "errors of the reference" if kind == "reference" else f"residuals of the {kind}"
     return f"the {what} are {times:.1f} times larger than their sigmas allow"
+
+
+def _misfit(run: Run, kind: str, times: float) -> str:
+    """The same of a run; of CAD, with the frame that is furthest from it."""
+    said, found = misfit_sentence(kind, times), run.summary.get("misfit_by", {}).get("prior", {})
+    frames = {name: move for name, move in found.items() if "." not in name}
+    if kind != CAD or not frames:
+        return said
+    worst = max(frames, key=lambda name: frames[name]["move_sigmas"])
+    return f"{said}, {worst} by {frames[worst]['move_sigmas']:.1f} of them"
 
 
 def over_floor(run: Run) -> float:
@@ -20,13 +38,20 @@ def over_floor(run: Run) -> float:
     return (rms.get("held_out") or 0.0) / rms["noise_floor"]
 
 
+def cautions(run: Run) -> list[str]:
+    """Which residuals are larger than they should be, and not so large as to forbid belief."""
+    misfit = run.summary["misfit"].items()
+    least = {kind: TOLERATED_OF_CAD if kind == CAD else TOLERATED for kind, _ in misfit}
+    return [_misfit(run, kind, x) for kind, x in misfit if least[kind] < x <= FAR_OFF]
+
+
 def forbids(run: Run) -> list[str]:
     """Why a run is not to be believed, a clause each; none where nothing speaks against it."""
     out = [] if run.converged else ["the fit has not converged"]
     if run.set_aside:
         out.append(f"{', '.join(run.set_aside)} contradict everything else, and were set aside")
     misfit = run.summary["misfit"].items()
-    out += [misfit_sentence(kind, times) for kind, times in misfit if times > FAR_OFF]
+    out += [_misfit(run, kind, times) for kind, times in misfit if times > FAR_OFF]
     if (times := over_floor(run)) > FAR_OFF:
         out.append(OVER.format(times))
     return out

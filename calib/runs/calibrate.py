@@ -19,6 +19,7 @@ from calib.linear.parallel import one_blas_thread
 from calib.problem import Problem
 from calib.problem.model import Model, Source
 from calib.problem.without import leave_out
+from calib.residuals.groups import CAD
 from calib.results.errors import Errors, body_errors, misfit, row_errors, scan_errors
 from calib.results.holdout import held_out, unit_of
 from calib.results.intervals import intervals
@@ -26,6 +27,7 @@ from calib.results.misfit import misfit_by, prior_rows, target_rows, tracker_row
 from calib.results.reach import reach
 from calib.results.recalibrate import Link, earlier, solve_from
 from calib.results.solution import solution_of
+from calib.runs.belief import TOLERATED
 from calib.runs.reopen import model_of, proposed, reopened, start_of, stored_met
 from calib.runs.residual_table import recording_of, residual_table, table_path, write_rows
 from calib.runs.run import (
@@ -46,9 +48,6 @@ from calib.solve.fit import Progress, solve
 from chains.errors import InputError
 from sensors.documents import write_json, write_yaml
 from sensors.recording import write_table
-
-# Residuals so much larger than their sigmas are no accident: the result's sigmas are widened.
-TOLERATED = 1.2
 
 
 @one_blas_thread
@@ -201,8 +200,10 @@ def _fit(
         )
     worse = misfit(estimate, seen)
     bulk = misfit(estimate, seen, weighted=True)  # one wild row widens no sigma
-    widened = max([1.0, *(x for x in bulk.values() if x > TOLERATED)])
-    known = known.at_least(widened)
+    large = {kind: times for kind, times in bulk.items() if times > TOLERATED}
+    cad = large.pop(CAD, 1.0) if before is None else 1.0  # an earlier run stands in place of CAD
+    widened = max([1.0, *large.values()])
+    known = known.at_least(widened, cad)
     calibration = known.of([variable.name for variable in estimate.variables])
     solution = solution_of(problem, estimate, calibration.covariance)
     write_yaml(folder / SOLUTION, solution.document())
@@ -215,7 +216,8 @@ def _fit(
     write_rows(folder / RESIDUALS, *rows)
     summary |= {"misfit": worse, "misfit_by": misfit_by(estimate, *rows, by_stop)}
     reached = reach(problem, estimate, known)
-    summary |= {"sigmas_widened_by": widened, "held_out_by": by, "without": list(model.without)}
+    summary |= {"sigmas_widened_by": widened, "cad_widened_by": cad}
+    summary |= {"held_out_by": by, "without": list(model.without)}
     summary["intervals_wider_by"] = calibration.document(solution.names)
     summary["set_aside"] = sorted(estimate.problem.set_aside)
     summary["predicted_mm"] = reached.document() if reached else None

@@ -25,12 +25,12 @@ from calib.problem import build
 from calib.results.errors import Errors
 from calib.results.holdout import held_out
 from calib.rig.scanned import ScanSums, numbering
-from calib.runs.belief import forbids
+from calib.runs.belief import cautions, forbids
 from calib.runs.reopen import model_of, reopened, start_of, state_of
 from calib.runs.run import DIAGNOSIS, Run
 from calib.solve.fit import Progress, resume
 from sensors.documents import write_json
-from sensors.rings import RingFinding
+from sensors.rings import RingFinding, least_off_rad
 
 LOOKED = 3  # scans from which the numbers of rings are checked: each holds all rings
 
@@ -100,9 +100,11 @@ def _found(
         result,
         plan=command_to_plan(run, apart) if apart else "",
         scatter=[*_scatter(run), *result.scatter],
+        detectable=_detectable(stand),
         sentences=[
             *run.doubts,
             *result.sentences,
+            *map(told.whole, cautions(run)),
             *run.omissions,
             *(told.whole(each.sentence) for each in rings.values() if each not in harmful.values()),
         ],
@@ -158,6 +160,13 @@ def _odd_rings(stand: Stand) -> Iterator[tuple[str, RingFinding]]:
             found = numbering(sums)
             if found is not None:
                 yield source.rig.lidar.name, found
+
+
+def _detectable(stand: Stand) -> dict[str, dict[str, float]]:
+    """From which rms of elevations other numbers of rings are told, of all LiDARs."""
+    lidars = [s.rig.lidar for s in stand.sources if s.rig.lidar and s.recording.has_scan.any()]
+    sizes = [size for size in map(least_off_rad, lidars) if np.isfinite(size)]
+    return {"rings": {"rad": max(sizes)}} if sizes else {}
 
 
 def _unseen(stand: Stand, run: Run, progress: Progress) -> Errors:

@@ -14,6 +14,8 @@ from rich.table import Table
 from rich.text import Text
 
 from calib.blunders.chance import LEAST_P
+from calib.residuals.groups import CAD
+from calib.runs.belief import TOLERATED_OF_CAD, misfit_sentence
 from calib.runs.estimates import VariableEstimate, variable_estimates
 from calib.show.headline import closing, moved_sentence
 from calib.show.misfit import beams_told, standing_out, together_told
@@ -106,8 +108,14 @@ def print_run(run: Run, whole: bool = False) -> None:
 
 def _warnings(summary: dict[str, Any]) -> Iterator[str]:
     """That residuals are larger than they may be, or err together, and what was done about it."""
+    if (factor := summary.get("cad_widened_by", 1.0)) > TOLERATED_OF_CAD:
+        yield (
+            f"{misfit_sentence(CAD, factor)}: a value of CAD is wrong, or a sigma in rig.yaml too "
+            f"small; of every sigma above, the part that is due to CAD is widened by that"
+        )
     if (factor := summary.get("sigmas_widened_by", 1.0)) > 1.0:
-        kind = max(summary["misfit"], key=summary["misfit"].get)
+        instruments = {kind: x for kind, x in summary["misfit"].items() if kind != CAD}
+        kind = max(instruments, key=instruments.get)
         what = "errors of the reference" if kind == "reference" else f"residuals of {kind}"
         yield (
             f"the {what} are {factor:.1f} times larger than their sigmas allow: something is "

@@ -6,8 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from calib.runs.belief import FAR_OFF, OVER, forbids, misfit_sentence, over_floor
-from calib.runs.calibrate import TOLERATED
+from calib.runs.belief import FAR_OFF, OVER, cautions, forbids, over_floor
 from calib.runs.run import Run
 from calib.show.misfit import standing_out, together_told
 
@@ -87,9 +86,7 @@ def _doubtful(run: Run, diagnosis: Mapping[str, Any] | None) -> Iterator[str]:
         yield "no stops were held out, so nothing says how well it predicts"
     if AT_THE_FLOOR < (times := over_floor(run)) <= FAR_OFF:
         yield OVER.format(times)
-    for kind, times in run.summary["misfit"].items():
-        if TOLERATED < times <= FAR_OFF:
-            yield misfit_sentence(kind, times)
+    yield from cautions(run)
     yield from together_told(run.summary)
     yield from standing_out(run.summary)
     for weak in (diagnosis or {}).get("weak_directions", ()):

@@ -305,6 +305,21 @@ def test_by_chance_nothing_is_found_more_often_than_is_said(drawn, sigma, monkey
     assert np.sum(np.array(smallest) < 0.01) < 6
 
 
+def test_a_stated_sigma_counts_beside_a_few_groups(drawn, monkeypatch):
+    """Of CAD there are a dozen values: alone they tell their scale so badly that one of them could
+    be off by 12 of its sigmas. Judged with what is stated, every named size is smaller."""
+    frames = {g: s for g, s in drawn.shifts.items() if g.kind == "frame"}
+    assert sum(s.dof for s in frames.values()) < 60
+    limits = {}
+    for stated in (0.0, judged.STATED):
+        monkeypatch.setattr(judged, "STATED", stated)
+        limits[stated] = drawn.judged({}, monkeypatch)
+    for group in frames:
+        alone, both = (limits[stated][group] for stated in (0.0, 8.0))
+        taken = stats.chi2(both.shift.dof).isf(judged.ALPHA / both.looks)
+        assert taken < both.limit < 0.8 * alone.limit, "beyond chance, were the sigma known"
+
+
 def test_a_shift_of_the_detectable_size_is_found_four_times_in_five(drawn, monkeypatch):
     """Of one group, the others being as they are in the recording, along any of its axes."""
     rng, hits = np.random.default_rng(1), []

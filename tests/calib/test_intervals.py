@@ -131,6 +131,7 @@ def known(wider):
         dims=(2, 1),
         graph=graph,
         data=graph @ J.T @ J @ graph,
+        paper=graph @ np.diag([1.0, 1.0, 0.0]) @ graph,
         wider=np.array(wider),
     )
 
@@ -159,6 +160,20 @@ def test_what_the_data_determine_is_as_much_wider_as_they_say():
     more = np.sqrt(np.square(found.wider) - 1)
     naive = found.graph * (1 + np.outer(more, more))
     assert both @ naive @ both == pytest.approx(before, rel=0.01)
+
+
+def test_what_rests_on_cad_alone_is_as_much_wider_as_cad_is_worse():
+    found = known([1.0, 1.0, 4.0]).at_least(1.0, cad=3.0)
+    ratio = np.sqrt(np.diag(found.covariance) / np.diag(found.graph))
+    np.testing.assert_allclose(ratio[:2], 3.0, rtol=1e-3)
+    both = np.array([1.0, 1.0, 0.0])
+    assert both @ found.covariance @ both == pytest.approx(both @ found.graph @ both, rel=1e-3)
+    assert ratio[2] == pytest.approx(4.0)  # CAD says nothing of it
+    assert np.linalg.eigvalsh(found.covariance - found.graph).min() > -1e-12
+    # What widens everything is not counted twice.
+    np.testing.assert_allclose(
+        found.at_least(5.0, cad=3.0).covariance, found.at_least(5.0).covariance
+    )
 
 
 # ---------------------------------------------------------------------------------------- fits

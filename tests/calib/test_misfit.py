@@ -85,6 +85,37 @@ def test_a_wrong_cad_value_moves_its_frame_by_many_of_its_sigmas(tmp_path):
     assert lidar["move_sigmas"] == pytest.approx(abs(lidar["change"]) / lidar["sigma"])
 
 
+def of_cad(run):
+    """Of frames in residuals.parquet: how far each moved in its sigmas, and its redundancy."""
+    table = pq.read_table(run.folder / "residuals.parquet/_prior.parquet").to_pydict()
+    mine = np.isin(table["unknown"], list(rigs.drawing()["frames"]))
+    return (np.array(table[name])[mine] for name in ("whitened", "redundancy"))
+
+
+def test_cad_that_contradicts_itself_widens_what_rests_on_it(tmp_path, good):
+    """The LiDAR and the mount's markers sit on one mount, and nothing tells which of the two is 10
+    sigmas off. The truth is then within a few of the sigmas told, and what does not rest on CAD is
+    as well known as before."""
+    frames = rigs.drawing()["frames"]
+    frames["lidar"]["rpy_rad"][2] += 10 * frames["lidar"]["sigma_rad"]
+    run = fitted(tmp_path, frames=frames)
+    moved, redundancy = of_cad(run)
+    times = np.sqrt(np.square(moved).sum() / redundancy.sum())
+    assert run.summary["misfit"]["cad"] == pytest.approx(times, rel=1e-6)
+    assert good.summary["misfit"]["cad"] < 1.2 and good.summary["cad_widened_by"] == 1.0
+    wider = run.summary["cad_widened_by"]
+    assert 1.5 < wider <= times and run.summary["sigmas_widened_by"] == 1.0
+    before, after = (
+        dict(zip(r.solution.names, np.sqrt(np.diag(r.solution.covariance)), strict=True))
+        for r in (good, run)
+    )
+    assert after["lidar.rz"] == pytest.approx(wider * before["lidar.rz"], rel=0.05)
+    rings = [name for name in after if name.startswith("ring_range_offset")]
+    assert np.median([after[n] / before[n] for n in rings]) == pytest.approx(1.0, abs=0.05)
+    graph = dict(zip(run.solution.names, np.sqrt(np.diag(run.solution.graph)), strict=True))
+    assert graph["lidar.rz"] == pytest.approx(before["lidar.rz"], rel=0.1)
+
+
 def test_redundancy_is_that_of_the_hat_matrix(tmp_path):
     """Against the projection of all rows, priors included, written out densely."""
     problem = build([Source.open(arm_alone(tmp_path / "rec"))], SMALL)

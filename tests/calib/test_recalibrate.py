@@ -32,6 +32,7 @@ def as_the_graph_has_them(estimate, _):
         dims=(DIM,) * len(names),
         graph=C,
         data=C,
+        paper=np.zeros_like(C),
         wider=np.ones(len(C)),
     )
 

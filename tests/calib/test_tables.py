@@ -378,6 +378,17 @@ def test_a_misfit_is_said_and_named(run, capsys):
     assert "residuals of tracker are 4.4 times larger than their sigmas" in capsys.readouterr().out
 
 
+def test_cad_that_is_not_as_good_as_it_says_is_told(run, capsys):
+    misfit = {"misfit": {"beams": 0.9, "cad": 2.2}, "cad_widened_by": 2.2}
+    tables.print_run(replace(run, summary=run.summary | misfit))
+    told = " ".join(capsys.readouterr().out.split())
+    assert "frames are 2.2 times further from CAD than its sigmas allow: a value of CAD is" in told
+    assert "larger than their sigmas" not in told
+    slight = {"misfit": {"beams": 0.9, "cad": 1.4}, "cad_widened_by": 1.4}  # as chance may have it
+    tables.print_run(replace(run, summary=run.summary | slight))
+    assert "further from CAD" not in " ".join(capsys.readouterr().out.split())
+
+
 def test_rows_that_err_together_are_told(run, capsys):
     wider = {"median": 1.87, "most": 2.4, "parameter": "ring_range_offset.ring_045"}
     tables.print_run(replace(run, summary=run.summary | {"intervals_wider_by": wider}))

@@ -2,13 +2,14 @@
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from sensors.lidar import catalog, load_lidar
-from sensors.rings import odd_rings, ring_elevations
+from sensors.rings import least_off_rad, odd_rings, ring_elevations
 
 HESAI = {
     "hesai_corrections/Pandar40P_Angle Correction File.csv": "hesai_pandar40p",
@@ -105,6 +106,22 @@ def test_a_frame_upside_down_and_a_foreign_table_are_told_apart():
     assert odd_rings(lidar, -lidar.elevation_rad).what == "upside_down"
     scrambled = np.random.default_rng(1).permutation(lidar.elevation_rad)
     assert odd_rings(lidar, scrambled).what == "unknown"
+
+
+@pytest.mark.parametrize("model", ["hesai_pandarxt32", "ouster_os0_128_rev6"])
+def test_other_numbers_are_told_from_the_least_size_on(model):
+    """Of rings whose numbers are right in one part of the table and one off in the rest, more and
+    more of them."""
+    lidar, told = load_lidar(model), []
+    table = lidar.elevation_rad
+    for wrong in range(0, lidar.rings, 4):
+        seen = table.copy()
+        seen[:wrong] = table[1 : wrong + 1]
+        off_rad = np.sqrt(np.mean((seen - table) ** 2))
+        told.append((odd_rings(lidar, seen) is not None, off_rad >= least_off_rad(lidar)))
+    found, large = np.array(told).T
+    assert not (found & ~large).any() and found.any()
+    assert np.isinf(least_off_rad(replace(lidar, elevation_rad=table[:4])))
 
 
 def test_too_few_rings_tell_nothing():

@@ -57,6 +57,7 @@ class Diagnosis:
         plan: what plans stops that tell apart what these cannot, ready to be typed; or empty.
         rejected: what the fit threw away; None without scans, or where nobody looked.
         scatter: how widely things scatter by chance, of the model and of what it lacks.
+        detectable: of what is no group of rows: name -> unit -> least size of a mishap to be found.
     """
 
     verdict: str
@@ -74,6 +75,7 @@ class Diagnosis:
     plan: str = ""
     rejected: Rejects | None = None
     scatter: Sequence[Mapping[str, Any]] = ()
+    detectable: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
     @property
     def heading(self) -> str:
@@ -106,7 +108,7 @@ class Diagnosis:
             "blunders": list(self.blunders),
             "command": self.command or None,
             "plan": self.plan or None,
-            **told.groups(self.groups),
+            **told.groups(self.groups, self.detectable),
             "scatter": list(self.scatter),
             "misfit": dict(self.misfit),
             "rejected": self.rejected.document() if self.rejected else None,
