@@ -102,7 +102,7 @@ class ArmGeometry(Effect):
 
     name = "arm_geometry"
     site = Site.EDGE
-    unit = "m"
+    unit = "rad, m"
     formula = "origin of joint i -> origin * exp(tilts, shifts), both across the axis"
     typical = "0.1 to 2 mrad, 0.1 to 2 mm"
     covariates = ("joints",)

@@ -97,10 +97,11 @@ def rows_of(name: str) -> list[DhRow]:
     rows = []
     for i, row in enumerate(TABLES[name], start=1):
         kind = "prismatic" if row[0] == "P" else "revolute"
-        a, alpha, d, theta = row[-4:]
         lower, upper = (-0.3, 0.3) if kind == "prismatic" else (-2.6, 2.6)
-        limits = {"lower": lower, "upper": upper, "mass_kg": 3.0}
-        rows.append(DhRow(f"j{i}", a, alpha, d, theta, kind, **limits))
+        numbers = dict(zip(("a_m", "alpha_rad", "d_m", "theta_rad"), row[-4:], strict=True))
+        rows.append(
+            DhRow(name=f"j{i}", kind=kind, lower=lower, upper=upper, mass_kg=3.0, **numbers)
+        )
     return rows
 
 

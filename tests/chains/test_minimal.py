@@ -106,8 +106,9 @@ def test_all_that_geometry_can_be_and_nothing_twice(tmp_path, name, drawn):
 
 @pytest.mark.parametrize("name", TABLES)
 def test_the_threshold_does_not_decide(tmp_path, monkeypatch, name):
-    """A direction is new or it is not; and where a URDF holds calibrated axes, parallel ones 0.3 mrad
-    from it say, no direction becomes new."""
+    """A direction is new or it is not; and where a URDF holds calibrated axes, parallel ones
+    0.3 mrad from it say, no direction becomes new."""
+
     edges, rng = edges_of(tmp_path, name), np.random.default_rng(5)
 
     def found(edges):
@@ -139,8 +140,9 @@ def test_axes_that_are_drawn_as_meeting_may_miss_each_other(tmp_path):
 
 
 def test_an_arm_without_joints_has_no_geometry_of_its_own():
-    edges = [Edge("a", "base", "tip", se3.exp(np.ones(6)))]
+    edges = [Edge(name="a", parent="base", child="tip", T_parent_child=se3.exp(np.ones(6)))]
     assert own_slips(FrameTree(edges), ("a",), False, False) == ()
-    turn = Edge("b", "tip", "end", np.eye(4), Joint("b", "revolute", np.array([0.0, 0, 1])))
+    joint = Joint("b", "revolute", np.array([0.0, 0, 1]))
+    turn = Edge(name="b", parent="tip", child="end", T_parent_child=np.eye(4), joint=joint)
     tree = FrameTree([*edges, turn])
     assert [s.edge for s in own_slips(tree, ("a", "b"), False, False)] == ["b"] * 4
