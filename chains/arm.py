@@ -16,6 +16,7 @@ from chains import se3
 from chains.errors import InputError
 from chains.frames import Edge, FrameTree, Joint, unknown_name
 from chains.se3 import Array
+from chains.serial import SerialChain
 from chains.xml import parse_xml
 
 G = 9.80665  # m/s^2
@@ -100,11 +101,11 @@ def gravity_torque(tree: FrameTree, masses: Sequence[Mass], joints: Array) -> Ar
     """
     torque = np.zeros(np.shape(joints))
     for mass in masses:
-        placed = tree.place(mass.frame, joints)
-        turn, shift = placed.d_joint[:, :3], placed.d_joint[:, 3:]
-        moved = shift - se3.skew(mass.centre_m) @ turn
-        rise = np.einsum("ki,kij->kj", placed.Ts_root_frame[:, 2, :3], moved)
-        torque -= G * np.reshape(mass.kg, (-1, 1)) * rise
+        chain = SerialChain([tree.edges[i] for i in tree.path(mass.frame)])
+        ours = [tree.joint_names.index(name) for name in chain.joint_names]
+        axes = chain.axes(joints[:, ours])
+        centre_m = axes.T[:, :3, :3] @ mass.centre_m + axes.T[:, :3, 3]
+        torque[:, ours] -= G * np.reshape(mass.kg, (-1, 1)) * axes.velocities(centre_m)[..., 2]
     return torque
 
 

@@ -203,6 +203,8 @@ def default_effects(recordings: Sequence[Path | str]) -> tuple[str, ...]:
     """
     rows, most = 0, 0
     for folder in recordings:
+        if not (Path(folder) / "rig.yaml").is_file():
+            continue  # what it is instead, the fit says
         rig = load_rig(folder)
         if rig.tracker and rig.joint_names:
             recording = Recording.open(folder, rig.joint_names, rig.tracker.bodies)
