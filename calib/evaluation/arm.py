@@ -23,7 +23,7 @@ from chains.errors import InputError
 from chains.serial import CHUNK, SerialChain
 
 Columns = Mapping[str, np.ndarray]
-STEPS = 30  # of the inverse; three do unless the arm is stretched
+USUAL, STEPS = 3, 30  # of the inverse, where the arm is not stretched and where it is
 REACHED = 1e-8  # of the arm's length, and rad: no more steps
 # Least damping of a step, of squares of the arm's length; beyond it half the squared error, which
 # keeps steps short where an arm is stretched (Sugihara 2011, IEEE Trans. Robotics 27(5)).
@@ -143,36 +143,44 @@ class Arm:
             near: (K, J) joints that bring the tip about there; those found lie next to them.
             columns: as of `corrected`.
         """
-        near, columns, found = self._checked(near), columns or {}, []
-        for first in range(0, len(near), CHUNK):
-            some = slice(first, first + CHUNK)
-            here = {name: np.asarray(column)[some] for name, column in columns.items()}
-            found.append(self._solved(Ts_base_tip[some], near[some], here))
-        command, off = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        command, columns = self._checked(near).copy(), columns or {}
+        off = np.empty((len(command), 6))
+        for first in range(0, len(command), CHUNK):
+            some = np.arange(first, min(first + CHUNK, len(command)))
+            self._solve(Ts_base_tip, columns, command, off, some, USUAL)
+        far = np.abs(off).max(axis=1, initial=0.0) > REACHED * self._length_m
+        self._solve(Ts_base_tip, columns, command, off, np.flatnonzero(far), STEPS)
         turned, shifted = np.linalg.norm(off.reshape(-1, 2, 3), axis=2).T
         return Command(joints=command, off_m=shifted, off_rad=turned / self._length_m)
 
-    def _solved(
-        self, Ts_base_tip: np.ndarray, near: np.ndarray, columns: Columns
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Joints (K, J), and what is then left (K, 6), as `_off` has it."""
-        command = near.copy()
-        off = self._off(Ts_base_tip, command, columns)
-        damped = np.ones(len(command))
-        for _ in range(STEPS):
-            moving = np.abs(off).max(axis=1) > REACHED * self._length_m
-            moving = np.flatnonzero(moving & (damped < GIVEN_UP))
+    def _solve(
+        self,
+        wanted: np.ndarray,
+        columns: Columns,
+        command: np.ndarray,
+        off: np.ndarray,
+        moving: np.ndarray,
+        steps: int,
+    ) -> None:
+        """Move the commands (K, J) of some poses, and write what is then left, (K, 6) of `_off`."""
+        given = {name: np.asarray(column) for name, column in columns.items()}
+
+        def left(joints: np.ndarray, at: np.ndarray) -> np.ndarray:
+            return self._off(wanted[at], joints, {name: c[at] for name, c in given.items()})
+
+        off[moving], damped = left(command[moving], moving), np.ones(len(command))
+        for _ in range(steps):
+            far = np.abs(off[moving]).max(axis=1, initial=0.0) > REACHED * self._length_m
+            moving = moving[far & (damped[moving] < GIVEN_UP)]
             if not len(moving):
                 break
             tried = command[moving]
             tried[:, self._ours] += self._step(tried, off[moving], damped[moving])
-            here = {name: np.asarray(column)[moving] for name, column in columns.items()}
-            left = self._off(Ts_base_tip[moving], tried, here)
-            nearer = np.linalg.norm(left, axis=1) < np.linalg.norm(off[moving], axis=1)
+            then = left(tried, moving)
+            nearer = np.linalg.norm(then, axis=1) < np.linalg.norm(off[moving], axis=1)
             damped[moving] *= np.where(nearer, 0.1, 10.0)
-            moving = moving[nearer]
-            command[moving], off[moving] = tried[nearer], left[nearer]
-        return command, off
+            better = moving[nearer]
+            command[better], off[better] = tried[nearer], then[nearer]
 
     def _step(self, joints: np.ndarray, off: np.ndarray, damped: np.ndarray) -> np.ndarray:
         """How far to turn joints between base and tip (K, n) for tips that are so far off (K, 6),
