@@ -18,7 +18,7 @@ def export(
         list[str] | None,
         typer.Option(
             "--format",
-            help="yaml, urdf, ros2, autoware, kalibr, rings, hesai, ouster, tree, latex, markdown; "
+            help="yaml, urdf, dh, ros2, autoware, kalibr, rings, hesai, ouster, tree, latex, markdown; "
             "all that have anything to hold if not given.",
         ),
     ] = None,
