@@ -20,35 +20,41 @@ CHUNK = 2048  # poses at once: what they need stays in a processor's own memory
 class Axes:
     """The joints' axes at K poses, in the frame that the chain starts from.
 
-    ``direction`` (K, J, 3) unit vectors; ``at_m`` (K, J, 3) a point of each axis; ``T`` (K, 4, 4)
-    of the chain's end; ``turns`` (J,) whether a joint turns, or else slides.
+    ``direction`` (K, M, 3) unit vectors; ``at_m`` (K, M, 3) a point of each axis; ``T`` (K, 4, 4)
+    of the chain's end; ``turns`` (M,) whether an axis turns, or else slides; ``by`` (J, M) how far
+    each axis goes by each joint.
     """
 
     direction: Array
     at_m: Array
     T: Array
     turns: Array
+    by: Array
 
     def velocities(self, points_m: Array) -> Array:
         """Return how points (K, 3) behind all joints move, (K, J, 3) m per rad or m."""
         across = np.cross(self.direction, points_m[:, None] - self.at_m)
-        return np.where(self.turns[:, None], across, self.direction)
+        return self.by @ np.where(self.turns[:, None], across, self.direction)
 
     def jacobian(self) -> Array:
         """Return the end's motion (K, 6, J), rotation over translation, in the start's axes."""
-        turn = self.direction * self.turns[:, None]
+        turn = self.by @ (self.direction * self.turns[:, None])
         return np.concatenate([turn, self.velocities(self.T[:, :3, 3])], axis=2).mT
 
 
 class SerialChain:
     """Edges one after the other, each ``T_parent_child @ motion(q)``.
 
-    ``joint_names`` of its J joints; ``fixed``, J + 1 matrices (4, 4): what lies between these.
+    ``joint_names`` of its J joints; ``by`` (J, M) how far each of its M axes goes by each joint;
+    ``fixed``, M + 1 matrices (4, 4): what lies between the axes.
     """
 
     def __init__(self, edges: Sequence[Edge]) -> None:
         joints = [edge.joint for edge in edges if edge.joint is not None]
-        self.joint_names = tuple(joint.name for joint in joints)
+        self.joint_names = tuple(dict.fromkeys(joint.name for joint in joints))
+        self.by = np.zeros((len(self.joint_names), len(joints)))
+        for axis, joint in enumerate(joints):
+            self.by[self.joint_names.index(joint.name), axis] = joint.factor
         self.turns = np.array([joint.kind == "revolute" for joint in joints], bool)
         self.fixed, before = [], np.eye(4)
         for edge in edges:
@@ -70,14 +76,16 @@ class SerialChain:
         """Return where the axes are at joints (K, J)."""
         T, found = self._walk(joints)
         stacked = np.stack(found, axis=1) if found else np.zeros((len(joints), 0, 2, 3))
-        return Axes(direction=stacked[:, :, 0], at_m=stacked[:, :, 1], T=T, turns=self.turns)
+        return Axes(
+            direction=stacked[:, :, 0], at_m=stacked[:, :, 1], T=T, turns=self.turns, by=self.by
+        )
 
     def _walk(self, joints: Array) -> tuple[Array, list[Array]]:
         """Return the end (K, 4, 4), and every axis (K, 2, 3): its direction and a point of it.
 
         Columns of T, not its rows, lie together: x, y, z and the origin, (4, K, 3).
         """
-        count, found = len(joints), []
+        joints, count, found = joints @ self.by, len(joints), []
         columns = np.zeros((4, count, 3))
         columns[[0, 1, 2], :, [0, 1, 2]] = 1.0
         cosine, sine = np.cos(joints.T)[..., None], np.sin(joints.T)[..., None]

@@ -85,7 +85,7 @@ class ArmAxisTilt(Effect):
         tree = view.rig.tree
         basis = np.zeros((1, len(tree.edges), 6, 2 * len(view.rig.joint_names)))
         for e, edge in enumerate(tree.edges):
-            if edge.joint is not None:
+            if edge.joint is not None and edge.joint.leads:
                 p = 2 * view.rig.joint_names.index(edge.joint.name)
                 basis[0, e, :3, p : p + 2] = across(edge.joint.axis)
         return basis

@@ -37,6 +37,8 @@ def write_dh(fit: FittedRig, folder: Path) -> Written:
     drawn = [tree.edges[tree.edge_names.index(name)] for name in fit.rig.arm_edges]
     if not fit.rig.joint_names:
         raise Unheld("the rig has no arm")
+    if any(edge.joint is not None and not edge.joint.leads for edge in drawn):
+        raise Unheld("a joint follows another, and such a table has no place for it")
     edges = [replace(edge, T_parent_child=fit.origins[edge.name]) for edge in drawn]
     document = {"calibrated": _document(edges, drawn), "drawn": _document(drawn, drawn)}
     not_held = [SIGMAS, *fit.not_held(fit.fixed)]

@@ -167,7 +167,7 @@ def _stops(problem: Problem, at_stop: np.ndarray, joints: np.ndarray, root: str)
 def joint_range(rig: Rig, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Least and largest value (J,) of each joint, rad or m, as the URDF says; a whole turn where
     it does not, and of a prismatic one what was seen of it in `joints` (K, J)."""
-    known = {e.joint.name: e.joint for e in rig.tree.edges if e.joint is not None}
+    known = {j.name: j for e in rig.tree.edges if (j := e.joint) is not None and j.leads}
     turns = np.array(rig.joint_kinds) == "revolute"
     free = np.stack([np.where(turns, -np.pi, joints.min(0)), np.where(turns, np.pi, joints.max(0))])
     said = np.array([[known[n].lower, known[n].upper] for n in rig.joint_names]).T

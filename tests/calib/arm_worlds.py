@@ -34,7 +34,7 @@ class ArmWorld:
 
     @property
     def joints(self) -> list[str]:
-        return [e.joint.name for e in self.edges if e.joint is not None]
+        return [e.joint.name for e in self.edges if e.joint is not None and e.joint.leads]
 
     def tip(self, reported: np.ndarray) -> RigidTransform:
         """T_base_tip at reported joints (K, J), the tool's frame left out."""
@@ -57,7 +57,7 @@ class ArmWorld:
 
     def draw(self, rng: np.random.Generator, count: int) -> np.ndarray:
         """Joints (count, J) between their limits."""
-        moving = [e.joint for e in self.edges if e.joint is not None]
+        moving = [e.joint for e in self.edges if e.joint is not None and e.joint.leads]
         return rng.uniform(
             [j.lower for j in moving], [j.upper for j in moving], (count, len(moving))
         )
