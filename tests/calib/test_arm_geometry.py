@@ -130,6 +130,23 @@ def off_by(estimate, source, world, joints):
     return np.einsum("ki,kij,kj->k", off, np.linalg.inv(spread), off)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name", TABLES)
+def test_bent_links_are_named_and_with_them_the_model_is_adequate(tmp_path, name):
+    """By 1 mm and 1 mrad in all ways. A SCARA's axes are parallel: its tilts alone do nearly all,
+    and the whole geometry is named as what cannot be told from them."""
+    rng = np.random.default_rng([5, list(TABLES).index(name)])
+    folder = tmp_path / name
+    folder.mkdir()
+    opened(folder, name, arm_worlds.bent(folder, name, rng), rng, poses=150)
+    less = calibrate([folder], tmp_path / "less", Model(LESS), hold_out="none")
+    first = diagnose(less, refits=False).candidates[0]
+    assert "arm_geometry" in (first["effect"], *first["indistinguishable_from"])
+    assert first["effect"] == "arm_geometry" or name == "scara"
+    whole = calibrate([folder], tmp_path / "whole", hold_out="none")
+    assert diagnose(whole, refits=False).verdict == "adequate"
+
+
 # ------------------------------------------------------------------------------------- recordings
 
 
