@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from calib.evaluation import evaluate
     from calib.evaluation.apply import apply
+    from calib.evaluation.arm import Arm
     from calib.exporters import export
     from calib.planning import plan
     from calib.problem.model import Model
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from calib.simulation import simulate
 
 __all__ = [
+    "Arm",
     "Model",
     "Recording",
     "Run",
@@ -37,6 +39,7 @@ __all__ = [
 ]
 
 _HOME = {
+    "Arm": "calib.evaluation.arm:Arm",
     "Model": "calib.problem.model:Model",
     "Recording": "calib.rig.recording:Recording",
     "Run": "calib.runs.run:Run",

@@ -5,7 +5,7 @@ stands in the child's frame, and what is left out has the defaults given there.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 from xml.etree.ElementTree import Element
@@ -16,6 +16,7 @@ from chains import se3
 from chains.errors import InputError
 from chains.frames import Edge, FrameTree, Joint, unknown_name
 from chains.se3 import Array
+from chains.serial import SerialChain
 from chains.xml import parse_xml
 
 G = 9.80665  # m/s^2
@@ -40,9 +41,10 @@ def read_arm(urdf_path: str | Path, base: str, tip: str) -> list[Edge]:
     """Return the edges from link ``base`` to link ``tip``, one per URDF joint, in order.
 
     Edges carry the joint's name, frames the links' names; fixed joints are edges without a Joint,
-    continuous ones revolute without limits. Metres and radians. Raises InputError where the file
-    cannot be read, a link is missing, no chain leads from base to tip, a joint's type is not
-    supported, or a length can only be millimetres.
+    continuous ones revolute without limits. One that mimics another moves by the other's name, its
+    URDF offset in its origin. Metres and radians. Raises InputError where the file cannot be read,
+    a link is missing, no chain leads from base to tip, a joint's type is not supported, one mimics
+    a joint that there is not or itself, or a length can only be millimetres.
     """
     path = Path(urdf_path)
     robot = _parse(path)
@@ -51,7 +53,8 @@ def read_arm(urdf_path: str | Path, base: str, tip: str) -> list[Edge]:
         if link not in links:
             raise InputError(f"{path}: {unknown_name('link', link, links)}")
     try:
-        return [_edge(joint) for joint in _chain(robot, base, tip)]
+        edges = [_following(_edge(joint), joint, robot) for joint in _chain(robot, base, tip)]
+        return _led(edges)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
 
@@ -100,11 +103,11 @@ def gravity_torque(tree: FrameTree, masses: Sequence[Mass], joints: Array) -> Ar
     """
     torque = np.zeros(np.shape(joints))
     for mass in masses:
-        placed = tree.place(mass.frame, joints)
-        turn, shift = placed.d_joint[:, :3], placed.d_joint[:, 3:]
-        moved = shift - se3.skew(mass.centre_m) @ turn
-        rise = np.einsum("ki,kij->kj", placed.Ts_root_frame[:, 2, :3], moved)
-        torque -= G * np.reshape(mass.kg, (-1, 1)) * rise
+        chain = SerialChain([tree.edges[i] for i in tree.path(mass.frame)])
+        ours = [tree.joint_names.index(name) for name in chain.joint_names]
+        axes = chain.axes(joints[:, ours])
+        centre_m = axes.T[:, :3, :3] @ mass.centre_m + axes.T[:, :3, 3]
+        torque[:, ours] -= G * np.reshape(mass.kg, (-1, 1)) * axes.velocities(centre_m)[..., 2]
     return torque
 
 
@@ -175,10 +178,6 @@ def _motion(joint: Element) -> Joint | None:
             f"joint '{name}' is of type '{kind}'; only fixed, revolute, continuous and prismatic "
             f"joints can be placed"
         )
-    if joint.find("mimic") is not None:
-        raise InputError(
-            f"joint '{name}' mimics another; only joints that move alone can be placed"
-        )
     axis = _numbers(joint, "axis", "xyz", [1, 0, 0])
     length = np.linalg.norm(axis)
     if length == 0:
@@ -190,6 +189,43 @@ def _motion(joint: Element) -> Joint | None:
     if lower > upper:
         raise InputError(f"joint '{name}': limit lower {lower:g} lies above upper {upper:g}")
     return Joint(name=name, kind=_KIND[kind], axis=axis / length, lower=lower, upper=upper)
+
+
+def _following(edge: Edge, element: Element, robot: Element) -> Edge:
+    """Return the edge as it is, or one that mimics another: ``q = multiplier * q_other + offset``,
+    through as many as there are."""
+    by_name = {joint.get("name"): joint for joint in robot.findall("joint")}
+    factor, shift, seen = 1.0, 0.0, [edge.name]
+    while (mimic := element.find("mimic")) is not None:
+        shift += factor * float(_numbers(element, "mimic", "offset", [0.0])[0])
+        factor *= float(_numbers(element, "mimic", "multiplier", [1.0])[0])
+        other = mimic.get("joint", "")
+        if other not in by_name or other in seen:
+            what = "follows itself so" if other in seen else "there is no such joint"
+            raise InputError(f"joint '{edge.name}' mimics '{other}', and {what}")
+        seen.append(other)
+        element = by_name[other]
+    if edge.joint is None or len(seen) == 1:
+        return edge
+    if not factor:
+        raise InputError(f"joint '{edge.name}' mimics '{seen[1]}' 0 times; make it a fixed joint")
+    T = edge.T_parent_child @ se3.exp(shift * edge.joint.screw)
+    joint = replace(edge.joint, name=seen[-1], factor=factor, leads=False, shift=shift)
+    return replace(edge, T_parent_child=T, joint=joint)
+
+
+def _led(edges: list[Edge]) -> list[Edge]:
+    """Return the edges; where the joint that others follow is not among them, the first of these
+    leads, within its own limits."""
+    there = {edge.joint.name for edge in edges if edge.joint is not None and edge.joint.leads}
+    for i, edge in enumerate(edges):
+        joint = edge.joint
+        if joint is not None and joint.name not in there:
+            there.add(joint.name)
+            limits = sorted((at - joint.shift) / joint.factor for at in (joint.lower, joint.upper))
+            joint = replace(joint, leads=True, lower=limits[0], upper=limits[1])
+            edges[i] = replace(edge, joint=joint)
+    return edges
 
 
 def _link(joint: Element, role: str) -> str:

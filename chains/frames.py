@@ -15,20 +15,33 @@ from chains.se3 import Array
 
 @dataclass(frozen=True)
 class Joint:
-    """One moving axis: name, kind, unit axis (3,) in the child's frame, limits in rad or m."""
+    """One moving axis: name, kind, unit axis (3,) in the child's frame, limits in rad or m.
+
+    Several edges may move by one name, each by ``factor`` times that joint's value: the one that
+    leads, and those that follow it (mimic). ``shift`` is what a follower's origin has of the offset
+    that its URDF gives.
+    """
 
     name: str
     kind: Literal["revolute", "prismatic"]
     axis: Array
     lower: float = -np.inf
     upper: float = np.inf
+    factor: float = 1.0
+    leads: bool = True
+    shift: float = 0.0
 
     @property
     def screw(self) -> Array:
-        """Return the tangent (6,) of the motion per radian or metre."""
-        still = np.zeros(3)
-        parts = [self.axis, still] if self.kind == "revolute" else [still, self.axis]
+        """Return the tangent (6,) of the motion per radian or metre of the joint's value."""
+        moving, still = self.factor * self.axis, np.zeros(3)
+        parts = [moving, still] if self.kind == "revolute" else [still, moving]
         return np.concatenate(parts)
+
+    @property
+    def unshifted(self) -> Array:
+        """Return what takes the shift out of a follower's origin again, (4, 4)."""
+        return se3.exp(-self.shift / self.factor * self.screw) if self.shift else np.eye(4)
 
 
 @dataclass(frozen=True)
@@ -87,8 +100,8 @@ class FrameTree:
         self.frames = tuple(routes)
         order = dict.fromkeys(i for route in routes.values() for i in route)
         joints = [joint for i in order if (joint := self.edges[i].joint) is not None]
-        self.joint_names = tuple(joint.name for joint in joints)
-        _refuse_twice(self.joint_names, "joint")
+        self.joint_names = tuple(dict.fromkeys(joint.name for joint in joints))
+        _refuse_twice([joint.name for joint in joints if joint.leads], "joint")
         self._paths = {frame: self._prepare(route) for frame, route in routes.items()}
 
     def _prepare(self, route: Sequence[int]) -> _Path:
@@ -131,7 +144,8 @@ class FrameTree:
 
         to_frame = se3.adjoint(se3.inverse(Ts_twist_frame))
         d_joint = np.zeros((len(joints), 6, len(self.joint_names)))
-        d_joint[:, :, path.joints] = np.matvec(to_frame[:, path.moving], path.screws).mT
+        by_axis = np.matvec(to_frame[:, path.moving], path.screws).mT
+        np.add.at(d_joint, (..., path.joints), by_axis)  # several axes may move by one joint
         d_twist = np.zeros((len(joints), 6, len(self.edges), 6))
         if xi is not None:
             to_frame = to_frame @ se3.right_jacobian(xi)

@@ -251,14 +251,26 @@ def evaluate(
         ),
     ] = None,
     raw: Annotated[bool, typer.Option("--raw", help="Of the returns before correction.")] = False,
+    at: Annotated[
+        Path | None,
+        typer.Option(
+            "--at", metavar="FILE.csv", help="Poses (stop, joints) to predict the arm's error at."
+        ),
+    ] = None,
     trust: Trust = None,
     as_json: Json = False,
 ) -> None:
-    """Accuracy and precision of every return, by ring, distance, incidence and label."""
+    """Accuracy and precision of every return, by ring, distance, incidence and label.
+
+    With --at, where the arm truly is at poses that need not be measured, and its sigma.
+    """
     from calib.evaluation import evaluate_all
     from calib.runs.run import Run
 
     opened = [Run.open(run, trust or ()) for run in runs]
+    if at is not None:
+        _predict(opened, at, out, raw, as_json)
+        return
     with progress_bar() as progress:
         evaluations = evaluate_all(opened, out, raw, progress)
     if as_json:
@@ -267,6 +279,21 @@ def evaluate(
         from calib.show.evaluation import print_evaluations
 
         print_evaluations(evaluations)
+
+
+def _predict(runs: list[Run], at: Path, out: Path | None, raw: bool, as_json: bool) -> None:
+    if len(runs) > 1 or raw:
+        raise InputError("evaluate --at is of one run, and without --raw")
+    from calib.evaluation.at_poses import evaluate_at
+
+    with progress_bar() as progress:
+        found = evaluate_at(runs[0], at, out, progress)
+    if as_json:
+        print_json(found.document())
+    else:
+        from calib.show.evaluation import print_predicted
+
+        print_predicted(found.document(), out)
 
 
 @app.command()

@@ -12,6 +12,7 @@ from calib.effects.arm import (
     ArmAxisTilt,
     ArmBacklash,
     ArmGearError,
+    ArmGeometry,
     ArmGravitySag,
     ArmJointEccentricity,
     ArmJointOffset,
@@ -90,6 +91,7 @@ CATALOGUE: tuple[Effect, ...] = (
     ArmLinkLength(),
     ArmJointOffset(),
     ArmAxisTilt(),
+    ArmGeometry(),
     ArmJointScale(),
     ArmJointEccentricity(),
     ArmGravitySag(),
@@ -120,10 +122,12 @@ CATALOGUE: tuple[Effect, ...] = (
     ReferenceScatter(),
 )
 DEFAULT = ("arm_link_length", "arm_joint_offset", "ring_range_offset")
+GEOMETRY = ("arm_link_length", "arm_joint_offset", "arm_geometry")  # all that an arm's can be
 
 __all__ = [
     "CATALOGUE",
     "DEFAULT",
+    "GEOMETRY",
     "Basis",
     "Effect",
     "FrameOffset",

@@ -9,6 +9,7 @@ from calib.effects.basis import finite
 from calib.effects.range import AMBIENT_C
 from calib.rig import Rig
 from chains.arm import Mass, gravity_torque
+from chains.minimal import Slip, across, own_slips
 
 
 class ArmLinkLength(Effect):
@@ -84,10 +85,49 @@ class ArmAxisTilt(Effect):
         tree = view.rig.tree
         basis = np.zeros((1, len(tree.edges), 6, 2 * len(view.rig.joint_names)))
         for e, edge in enumerate(tree.edges):
-            if edge.joint is not None:
+            if edge.joint is not None and edge.joint.leads:
                 p = 2 * view.rig.joint_names.index(edge.joint.name)
-                basis[0, e, :3, p : p + 2] = np.linalg.svd(edge.joint.axis[None])[2][1:].T
+                basis[0, e, :3, p : p + 2] = across(edge.joint.axis)
         return basis
+
+
+class ArmGeometry(Effect):
+    """Axes lean and miss each other. With lengths and zeros this is all that geometry can be.
+
+    A joint's axis can be off in four ways, a sliding joint's in two, and six numbers place the
+    tool: 4 R + 2 P + 6. Of these the frames of ``rig.yaml`` hold the base and the tool,
+    `arm_link_length` and `arm_joint_offset` theirs, and this effect the rest: tilts and shifts
+    across each axis, for which none of the others can stand.
+    """
+
+    name = "arm_geometry"
+    site = Site.EDGE
+    unit = "rad, m"
+    formula = "origin of joint i -> origin * exp(tilts, shifts), both across the axis"
+    typical = "0.1 to 2 mrad, 0.1 to 2 mm"
+    covariates = ("joints",)
+    confounded_with = ("arm_link_length", "arm_axis_tilt")
+    source = "He et al. 2010, IEEE Trans. Robotics 26(3): a complete and minimal local model"
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        sigma = {"rad": 0.003, "m": 0.005}  # of arm_axis_tilt and arm_link_length
+        return tuple(Param(f"{s.edge}.{s.name}", s.unit, sigma[s.unit]) for s in _slips(rig))
+
+    def basis(self, view: View) -> np.ndarray:
+        slips, names = _slips(view.rig), view.rig.tree.edge_names
+        basis = np.zeros((1, len(names), 6, len(slips)))
+        for p, slip in enumerate(slips):
+            basis[0, names.index(slip.edge), :, p] = slip.twist
+        return basis
+
+
+def _slips(rig: Rig) -> tuple[Slip, ...]:
+    """Where the tracker sees a body on the base and CAD is sure of all below the arm, the base is
+    held by nothing; the tool where CAD is sure of all beyond the arm."""
+    unsure = {name for name, sigma in rig.frame_sigma.items() if np.any(sigma)}
+    bodies = rig.tracker.bodies if rig.tracker else ()
+    base_held = bool(unsure - rig.beyond_arm) or all(rig.joints_to(body) for body in bodies)
+    return own_slips(rig.tree, rig.arm_edges, base_held, bool(unsure & rig.beyond_arm))
 
 
 class ArmJointScale(Effect):

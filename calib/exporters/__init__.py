@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from calib import outputs
+from calib.exporters.dh import write_dh
 from calib.exporters.fitted import Fitted, Format
 from calib.exporters.rings import write_hesai, write_ouster, write_rings
 from calib.exporters.tables import write_latex, write_markdown
@@ -24,6 +25,7 @@ __all__ = ["FORMATS", "Exported", "export", "read_extrinsics"]
 FORMATS: dict[str, Format] = {
     "yaml": write_extrinsics,
     "urdf": write_urdf,
+    "dh": write_dh,
     "ros2": write_ros2,
     "autoware": write_autoware,
     "kalibr": write_kalibr,

@@ -100,7 +100,7 @@ class FittedRig:
                 T = edge.T_parent_child @ se3.exp(twist)
                 if edge.joint is not None:
                     turn = offsets[self.rig.joint_names.index(edge.joint.name)]
-                    T = T @ se3.exp(turn * edge.joint.screw)
+                    T = T @ se3.exp(turn * edge.joint.screw) @ edge.joint.unshifted
                 origins[edge.name] = T
         return origins
 

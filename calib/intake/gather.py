@@ -56,7 +56,7 @@ class Gathered:
     @property
     def joints(self) -> list[str]:
         """Names of the arm's moving joints, in order."""
-        return [edge.joint.name for edge in self.edges if edge.joint is not None]
+        return [j.name for edge in self.edges if (j := edge.joint) is not None and j.leads]
 
 
 def sources(words: Sequence[str]) -> list[Given]:
@@ -112,7 +112,7 @@ def gather(
     arms += [_read(kind, files, options, progress) for kind, files in given if kind in ARMS]
     arm = _only([f.arm for f in arms if f.arm], "describe an arm", [k for k, _ in given])
     edges = chain(arm)
-    kinds = {e.joint.name: e.joint.kind for e in edges if e.joint is not None}
+    kinds = {j.name: j.kind for e in edges if (j := e.joint) is not None and j.leads}
     options = replace(options, joints=kinds)
     rest = [_read(kind, files, options, progress) for kind, files in given if kind not in ARMS]
     if arm is None:

@@ -24,6 +24,8 @@ from sensors.documents import nearest
 from sensors.recording import Recording
 from sensors.reference import Reference
 
+ROWS_A_PARAMETER = 10  # of an arm, for its whole geometry to be estimated; see `default_effects`
+
 
 @dataclass(frozen=True)
 class Model:
@@ -52,17 +54,18 @@ class Model:
         without: Sequence[str] = (),
         recordings: Sequence[Path | str] = (),
     ) -> Model:
-        """The model that a command line names: effects with commas, or the default ones.
+        """The model that a command line names: effects with commas, or `default_effects`.
 
         Args:
             chosen, fixed, without: as the command line has them.
-            recordings: those whose ``rig.yaml`` names effects that go by their names here.
+            recordings: to be fitted; effects that their ``rig.yaml`` names go by their names here.
 
         Raises:
             InputError: an effect that there is not, in the catalogue or in a file.
         """
-        named = effects.DEFAULT
-        if chosen is not None:
+        if chosen is None:
+            named = default_effects(recordings)
+        else:
             whole = all(map(effects.is_known, effects.split(chosen)))
             there = [r for r in recordings if not whole and (Path(r) / "rig.yaml").is_file()]
             own = effects.own_effects(map(load_rig, there))
@@ -186,6 +189,32 @@ class Model:
                     f"--fix {name}: no such frame, effect or parameter in the model; it has "
                     f"{', '.join(sorted(e.name for e in chosen))} and name.parameter of each"
                 )
+
+
+def default_effects(recordings: Sequence[Path | str]) -> tuple[str, ...]:
+    """The effects that are estimated where nobody chooses any.
+
+    Without the arm's whole geometry the sigmas of its lengths and zeros are too small, so it is
+    there wherever the tracked poses can tell it: from ten rows on for each parameter of the arm
+    (Harrell 2015, Regression Modeling Strategies, 4.4), six rows a pose and three a point.
+
+    Raises:
+        InputError: what is wrong with a recording's rig or stops.
+    """
+    rows, most = 0, 0
+    for folder in recordings:
+        if not (Path(folder) / "rig.yaml").is_file():
+            continue  # what it is instead, the fit says
+        rig = load_rig(folder)
+        if rig.tracker and rig.joint_names:
+            recording = Recording.open(folder, rig.joint_names, rig.tracker.bodies)
+            for body in filter(rig.joints_to, rig.tracker.bodies):
+                pose = np.isfinite(recording.bodies[body])
+                rows += 3 * int(pose[:, :3].all(axis=1).sum() + pose.all(axis=1).sum())
+            arm = [effects.find(name) for name in effects.GEOMETRY]
+            most = max(most, sum(p.sigma > 0 for effect in arm for p in effect.params(rig)))
+    told = 0 < ROWS_A_PARAMETER * most <= rows
+    return (*effects.DEFAULT, *(n for n in effects.GEOMETRY if told and n not in effects.DEFAULT))
 
 
 def owned(effect: Effect, rig: Rig) -> bool:

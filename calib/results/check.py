@@ -199,7 +199,9 @@ class _Checker:
 
     def _try_graph(self, source: Source, scans: ScanSums) -> None:
         """Build the graph and linearise it once, without scans that are a problem already."""
-        problem = self._attempt(problems.build, [source], Model())
+        problem = self._attempt(
+            problems.build, [source], Model.of(None, (), (), [source.recording.folder])
+        )
         if problem is None:
             return
         readable = [scan for scan in problem.scans if scan.name in scans.points]

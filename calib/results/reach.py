@@ -95,18 +95,16 @@ def reach(problem: Problem, estimate: Estimate, known: Intervals | None = None) 
         None where there are scans, no arm, or no tracked body beyond it.
     """
     source, rig = problem.sources[0], problem.sources[0].rig
-    blocks = [b for b in problem.bodies if _is_of(b, source)]
-    beyond = [b for b in blocks if rig.joints_to(b.body)]
-    if problem.scans or not beyond:
+    beyond = None if problem.scans else body_beyond(problem)
+    if beyond is None:
         return None
-    body, root = beyond[-1].body, beyond[-1].stops.root
-    base = next((b.body for b in blocks if not rig.joints_to(b.body)), None)
-    stops = np.array([k for b in beyond if b.body == body for _, k in b.stop_names])
+    body, root, base = beyond.body, beyond.root, beyond.base
+    stops = beyond.stops
     rng, range_ = np.random.default_rng(0), joint_range(rig, source.recording.joints[stops])
     at_stop = rng.choice(stops, POSES)
     here = _stops(problem, stops, source.recording.joints[stops], root)
     there = _stops(problem, at_stop, rng.uniform(*range_, (POSES, len(rig.joint_names))), root)
-    seen, drawn = (_placed(stops, body, base, estimate.values) for stops in (here, there))
+    seen, drawn = (placed(each, body, base, estimate.values) for each in (here, there))
     names = list(seen.d)
     covariance = known.over(estimate, names) if known else estimate.covariance_of(names)
     errors = _errors(covariance, rng)
@@ -118,6 +116,39 @@ def reach(problem: Problem, estimate: Estimate, known: Intervals | None = None) 
         anywhere_m=_error(drawn, names, errors),
         box_m=high - low,
         box_share=float(np.mean(np.all((at >= low) & (at <= high), axis=1))),
+    )
+
+
+@dataclass(frozen=True)
+class Beyond:
+    """A tracked body that the arm carries.
+
+    Args:
+        body: its name.
+        root: variable of T_world_root at the last of the stops that saw it.
+        base: a tracked body before the joints, or None.
+        stops: (n,) those that saw it.
+    """
+
+    body: str
+    root: str
+    base: str | None
+    stops: np.ndarray
+
+
+def body_beyond(problem: Problem) -> Beyond | None:
+    """The last tracked body beyond the joints of the first rig; None where there is none."""
+    source, rig = problem.sources[0], problem.sources[0].rig
+    blocks = [b for b in problem.bodies if _is_of(b, source)]
+    beyond = [b for b in blocks if rig.joints_to(b.body)]
+    if not beyond:
+        return None
+    body = beyond[-1].body
+    return Beyond(
+        body=body,
+        root=beyond[-1].stops.root,
+        base=next((b.body for b in blocks if not rig.joints_to(b.body)), None),
+        stops=np.array([k for b in beyond if b.body == body for _, k in b.stop_names]),
     )
 
 
@@ -136,14 +167,14 @@ def _stops(problem: Problem, at_stop: np.ndarray, joints: np.ndarray, root: str)
 def joint_range(rig: Rig, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Least and largest value (J,) of each joint, rad or m, as the URDF says; a whole turn where
     it does not, and of a prismatic one what was seen of it in `joints` (K, J)."""
-    known = {e.joint.name: e.joint for e in rig.tree.edges if e.joint is not None}
+    known = {j.name: j for e in rig.tree.edges if (j := e.joint) is not None and j.leads}
     turns = np.array(rig.joint_kinds) == "revolute"
     free = np.stack([np.where(turns, -np.pi, joints.min(0)), np.where(turns, np.pi, joints.max(0))])
     said = np.array([[known[n].lower, known[n].upper] for n in rig.joint_names]).T
     return tuple(np.where(np.isfinite(said), said, free))
 
 
-def _placed(stops: Stops, body: str, base: str | None, values: Mapping[str, np.ndarray]) -> Placed:
+def placed(stops: Stops, body: str, base: str | None, values: Mapping[str, np.ndarray]) -> Placed:
     """Where a body is: from a tracked one before the joints, or else in the tracker's frame."""
     if base is None:
         return stops.in_world(body, values)

@@ -111,13 +111,13 @@ class Rig:
     @property
     def joint_kinds(self) -> tuple[str, ...]:
         """ "revolute" or "prismatic", by joint."""
-        kinds = {e.joint.name: e.joint.kind for e in self.tree.edges if e.joint is not None}
+        kinds = {j.name: j.kind for e in self.tree.edges if (j := e.joint) is not None and j.leads}
         return tuple(kinds[name] for name in self.joint_names)
 
     def joints_to(self, frame: str) -> tuple[str, ...]:
         """The moving joints between the root and a frame."""
         edges = (self.tree.edges[i] for i in self.tree.path(frame))
-        return tuple(edge.joint.name for edge in edges if edge.joint is not None)
+        return tuple(dict.fromkeys(edge.joint.name for edge in edges if edge.joint is not None))
 
 
 def _file_name(name: str) -> str:

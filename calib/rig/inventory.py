@@ -128,7 +128,7 @@ def odd_joints(rig: Rig, recording: Recording) -> Iterator[str]:
     values = dict(zip(rig.joint_names, recording.joints.T, strict=True))
     if still := [name for name, at in values.items() if np.ptp(at) < STILL]:
         yield f"{listed(still)} hardly moved, too little to tell their own errors; move them"
-    for joint in (edge.joint for edge in rig.tree.edges if edge.joint is not None):
+    for joint in (j for edge in rig.tree.edges if (j := edge.joint) is not None and j.leads):
         at, unit = values[joint.name], "rad" if joint.kind == "revolute" else "m"
         beyond = (at < joint.lower - LIMIT_SLACK) | (at > joint.upper + LIMIT_SLACK)
         if beyond.any():

@@ -54,7 +54,7 @@ from sensors.recording import write_table
 def calibrate(
     recordings: Sequence[Path | str],
     out: Path | str,
-    model: Model = Model(),  # noqa: B008 - frozen
+    model: Model | None = None,
     hold_out: str = "location",
     folds: int = 1,
     prior: Path | str | None = None,
@@ -65,7 +65,7 @@ def calibrate(
     Args:
         recordings: folders; what is the same hardware is one variable.
         out: the run folder to make; an earlier run there is replaced, anything else is refused.
-        model: what is estimated.
+        model: what is estimated; the default effects where None.
         hold_out: "location", "stop" or "none": what the held-out error leaves out of its fit.
         folds: how many folds of about a fifth each the held-out error is taken over.
         prior: an earlier run, whose solution replaces CAD as what is known before.
@@ -77,6 +77,7 @@ def calibrate(
     inputs = [*recordings, *([prior] if prior else [])]
     with outputs.folder(out, outputs.RUN, inputs) as folder:
         _refuse_twice([Path(r).resolve() for r in recordings])
+        model = model or Model.of(None, (), (), recordings)
         sources = leave_out([Source.open(r) for r in recordings], model.without)
         _fit(sources, model, folder, _Choices(Path(out), hold_out, folds, prior), progress)
     return Run.open(out, trust_in(model.effects))

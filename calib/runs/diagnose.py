@@ -19,9 +19,10 @@ from calib.diagnosis.stand import Stand
 from calib.diagnosis.verdict import Diagnosis, believed, conclude
 from calib.diagnosis.verdict.unnamed import Unnamed, unnamed
 from calib.diagnosis.weak import to_be_told_apart, weak_directions
-from calib.effects import DEFAULT, own_effects
+from calib.effects import own_effects
 from calib.linear.parallel import one_blas_thread
 from calib.problem import build
+from calib.problem.model import default_effects
 from calib.results.errors import Errors
 from calib.results.holdout import held_out
 from calib.rig.scanned import ScanSums, numbering
@@ -139,10 +140,11 @@ def command_without(run: Run, tokens: Sequence[str]) -> str:
         trust = [part for file in dict.fromkeys(named) for part in ("--trust", str(file))]
         new = without[-2 * len(tokens) :]
         return shlex.join(["rigcal", "add", str(run.folder), *out, *new, *trust])
-    chosen = [] if tuple(effects) == DEFAULT else ["--effects", ",".join(effects)]
+    usual = default_effects(run.recordings)
+    chosen = [] if tuple(effects) == usual else ["--effects", ",".join(effects)]
     chosen += [part for name in run.model["fixed"] for part in ("--fix", name)]
-    for key, usual in (("hold_out", "location"), ("folds", 1)):
-        if run.model[key] != usual:
+    for key, as_a_rule in (("hold_out", "location"), ("folds", 1)):
+        if run.model[key] != as_a_rule:
             chosen += [f"--{key.replace('_', '-')}", str(run.model[key])]
     chosen += ["--prior", str(run.prior)] if run.prior else []
     return shlex.join(["rigcal", "fit", *map(str, run.recordings), *out, *chosen, *without])

@@ -58,7 +58,7 @@ class Explanation:
 def explain(
     recordings: Sequence[Path | str],
     out: Path | str,
-    model: Model = Model(),  # noqa: B008 - frozen
+    model: Model | None = None,
     progress: Progress = lambda what, done, total: None,
     candidates: str | Sequence[str] = (),
 ) -> Explanation:
@@ -72,7 +72,7 @@ def explain(
     Args:
         recordings: folders.
         out: folder of the runs ``00``, ``01``, …, made if it is not there.
-        model: what is estimated at first.
+        model: what is estimated at first; the default effects where None.
         progress: as of `fit.solve`.
         candidates: files of effects of the user's own, as of `diagnose`.
 
@@ -85,7 +85,7 @@ def explain(
             outputs.settle(out / f"{number:02d}")
         own_effects((), candidates)  # what is wrong with a file is said before the first fit
         climb = _Climb([Path(r) for r in recordings], out, progress, candidates)
-        climb.first(model)
+        climb.first(model or Model.of(None, (), (), recordings))
         diagnosis = diagnose(climb.run, climb.tell, False, candidates)
         while len(climb.runs) < MOST_RUNGS and climb.improve(diagnosis):
             diagnosis = diagnose(climb.run, climb.tell, False, candidates)

@@ -45,6 +45,24 @@ _LINES = {
 }
 
 
+def print_predicted(found: Mapping[str, Any], out: Path | None) -> None:
+    """Print how far off an arm is at poses, and how well that is known, in short.
+
+    Args:
+        found: what ``rigcal evaluate --at --json`` prints.
+        out: the table of every pose, if it was written.
+    """
+    console = terminal()
+    table = columns_table("mm", "mean", "largest")
+    for column in table.columns[1:]:
+        column.justify = "right"
+    for name, what in (("error_mm", "true less drawn place"), ("sigma_mm", "its sigma")):
+        table.add_row(what, mm(found[name]["mean"]), mm(found[name]["max"]))
+    console.print(f"'{found['body']}' at {found['poses']} poses, in the axes of '{found['frame']}'")
+    console.print(table)
+    console.print(f"pose by pose: {out}" if out else "-o FILE.csv writes it pose by pose")
+
+
 def print_evaluation(evaluation: Mapping[str, Any]) -> None:
     """Print an evaluation: as a whole, then by what it may depend on."""
     console = terminal()

@@ -111,7 +111,7 @@ def _bases(
 def _joints(rig: Rig, spec: Spec, placed: int, count: int, rng: np.random.Generator) -> np.ndarray:
     """Joints (count, J) well within their limits, as the spec has them where the base stands after
     so many placings; `level` keeps the arm's tip upright."""
-    moving = {e.joint.name: e.joint for e in rig.tree.edges if e.joint is not None}
+    moving = {j.name: j for e in rig.tree.edges if (j := e.joint) is not None and j.leads}
     limits = np.array([[moving[j].lower, moving[j].upper] for j in rig.joint_names]).reshape(-1, 2)
     q = rng.uniform(*(0.85 * limits.T), (count, len(limits)))
     if spec.poses == "one_joint":

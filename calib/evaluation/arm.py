@@ -1,0 +1,285 @@
+"""An arm as a run found it: where its tip truly is, and what to command so that it is elsewhere.
+
+Both hold for reported joints, as `calib.forward` has them, and for many poses at once: what does
+not change from pose to pose is multiplied out beforehand.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+
+from calib.effects import Effect, Site, View
+from calib.results.solution import Part
+from calib.rig import Rig
+from calib.runs.reopen import model_of, reopened
+from calib.runs.run import Run
+from chains import se3
+from chains.errors import InputError
+from chains.serial import CHUNK, SerialChain
+
+Columns = Mapping[str, np.ndarray]
+USUAL, STEPS = 3, 30  # of the inverse, where the arm is not stretched and where it is
+REACHED = 1e-8  # of the arm's length, and rad: no more steps
+# Least damping of a step, of squares of the arm's length; beyond it half the squared error, which
+# keeps steps short where an arm is stretched (Sugihara 2011, IEEE Trans. Robotics 27(5)).
+DAMPING = 1e-8
+GIVEN_UP = 1e4  # times the damping: no step brings the tip nearer
+
+
+@dataclass(frozen=True)
+class Command:
+    """Joints to command, and how far the tip then is from where it should be.
+
+    Args:
+        joints: (K, J) rad or m, as the encoders report them.
+        off_m, off_rad: (K,) what is left; next to nothing but for arms of less than six joints,
+            and where an arm is stretched.
+    """
+
+    joints: np.ndarray
+    off_m: np.ndarray
+    off_rad: np.ndarray
+
+
+@dataclass(frozen=True)
+class Arm:
+    """An arm as a run found it.
+
+    Args:
+        rig: as on paper.
+        effects: those of the model that bend it, each with its estimate (P,).
+        frames: T_parent_child (4, 4) of the frames of ``rig.yaml`` as fitted.
+        base, tip: from where to where: the arm's own, or any frame before and behind it.
+    """
+
+    rig: Rig
+    effects: Sequence[tuple[Effect, np.ndarray]]
+    frames: Mapping[str, np.ndarray]
+    base: str
+    tip: str
+
+    @classmethod
+    def of(cls, run: Run, tip: str | None = None, rig: str | None = None) -> Self:
+        """The arm of a run.
+
+        Args:
+            run: the run.
+            tip: a frame that the arm carries; its own tip where None.
+            rig: whose, where the run has several.
+
+        Raises:
+            InputError: the rig has no arm or no such frame, the run's recordings are not what they
+                were, or an effect of a Python file may not run.
+        """
+        sources = reopened(run)
+        found = [s for s in sources if rig in (None, s.rig.name)]
+        if not found:
+            raise InputError(f"{run.folder}: it has no rig '{rig}'")
+        part = run.solution.part(found[0].rig.name if run.solution.recordings else None)
+        known = {effect.name: effect for effect in model_of(run).effects}
+        return cls.as_found(found[0].rig, part, known, tip)
+
+    @classmethod
+    def as_found(
+        cls, rig: Rig, part: Part, known: Mapping[str, Effect], tip: str | None = None
+    ) -> Self:
+        """The arm of a rig, of which a part of a solution says what was found; see `of`."""
+        if not rig.joint_names:
+            raise InputError(f"rig {rig.name} has no arm")
+        edges = [rig.tree.edges[rig.tree.edge_names.index(name)] for name in rig.arm_edges]
+        base, tip = edges[0].parent, tip or edges[-1].child
+        above = rig.tree.path(base)
+        if rig.tree.path(tip)[: len(above)] != above or not rig.joints_to(tip):
+            raise InputError(f"frame '{tip}' is not carried by the arm; name one that it carries")
+        bends = {n: e for n, e in known.items() if e.site in (Site.EDGE, Site.JOINTS)}
+        bends = {n: e for n, e in bends.items() if n in part.effects and not e.by_chance}
+        return cls(
+            rig=rig,
+            effects=[(effect, part.effects[name].estimate) for name, effect in bends.items()],
+            frames={name: frame.T_parent_child for name, frame in part.frames.items()},
+            base=base,
+            tip=tip,
+        )
+
+    def corrected(self, joints: np.ndarray, columns: Columns | None = None) -> np.ndarray:
+        """T_base_tip (K, 4, 4), true as far as the model tells.
+
+        Args:
+            joints: (K, J) reported, rad or m, in the order of `Rig.joint_names`.
+            columns: (K,) of stops that effects of the model ask for, ``temperature_c`` say.
+
+        Raises:
+            InputError: a column that an effect asks for is not given.
+        """
+        joints, columns = self._checked(joints), columns or {}
+        T = np.empty((len(joints), 4, 4))
+        for first in range(0, len(joints), CHUNK):
+            some = slice(first, first + CHUNK)
+            here = {name: np.asarray(column)[some] for name, column in columns.items()}
+            T[some] = self._placed(joints[some], here)
+        return T
+
+    def to_command(self, joints: np.ndarray, columns: Columns | None = None) -> Command:
+        """Joints to command so that the true tip is where the drawn arm has it at these joints.
+
+        Args:
+            joints, columns: as of `corrected`.
+        """
+        joints = self._checked(joints)
+        return self.joints_for(self.drawn.place(joints[:, self._ours]), joints, columns)
+
+    def joints_for(
+        self, Ts_base_tip: np.ndarray, near: np.ndarray, columns: Columns | None = None
+    ) -> Command:
+        """Joints to command so that the true tip is at these places.
+
+        Args:
+            Ts_base_tip: (K, 4, 4) wanted.
+            near: (K, J) joints that bring the tip about there; those found lie next to them.
+            columns: as of `corrected`.
+        """
+        command, columns = self._checked(near).copy(), columns or {}
+        off = np.empty((len(command), 6))
+        for first in range(0, len(command), CHUNK):
+            some = np.arange(first, min(first + CHUNK, len(command)))
+            self._solve(Ts_base_tip, columns, command, off, some, USUAL)
+        far = np.abs(off).max(axis=1, initial=0.0) > REACHED * self._length_m
+        self._solve(Ts_base_tip, columns, command, off, np.flatnonzero(far), STEPS)
+        turned, shifted = np.linalg.norm(off.reshape(-1, 2, 3), axis=2).T
+        return Command(joints=command, off_m=shifted, off_rad=turned / self._length_m)
+
+    def _solve(
+        self,
+        wanted: np.ndarray,
+        columns: Columns,
+        command: np.ndarray,
+        off: np.ndarray,
+        moving: np.ndarray,
+        steps: int,
+    ) -> None:
+        """Move the commands (K, J) of some poses, and write what is then left, (K, 6) of `_off`."""
+        given = {name: np.asarray(column) for name, column in columns.items()}
+
+        def left(joints: np.ndarray, at: np.ndarray) -> np.ndarray:
+            return self._off(wanted[at], joints, {name: c[at] for name, c in given.items()})
+
+        off[moving], damped = left(command[moving], moving), np.ones(len(command))
+        for _ in range(steps):
+            far = np.abs(off[moving]).max(axis=1, initial=0.0) > REACHED * self._length_m
+            moving = moving[far & (damped[moving] < GIVEN_UP)]
+            if not len(moving):
+                break
+            tried = command[moving]
+            tried[:, self._ours] += self._step(tried, off[moving], damped[moving])
+            then = left(tried, moving)
+            nearer = np.linalg.norm(then, axis=1) < np.linalg.norm(off[moving], axis=1)
+            damped[moving] *= np.where(nearer, 0.1, 10.0)
+            better = moving[nearer]
+            command[better], off[better] = tried[nearer], then[nearer]
+
+    def _step(self, joints: np.ndarray, off: np.ndarray, damped: np.ndarray) -> np.ndarray:
+        """How far to turn joints between base and tip (K, n) for tips that are so far off (K, 6),
+        least where more turns do, and shorter the more they are damped (K,)."""
+        J = self._fixed.axes(joints[:, self._ours]).jacobian()
+        J[:, :3] *= self._length_m
+        damping = damped * (np.square(off).sum(axis=1) / 2 + DAMPING * self._length_m**2)
+        square = J.mT @ J + damping[:, None, None] * np.eye(J.shape[2])
+        return np.linalg.solve(square, np.vecmat(off, J)[..., None])[..., 0]
+
+    def _off(self, wanted: np.ndarray, joints: np.ndarray, columns: Columns | None) -> np.ndarray:
+        """How far (K, 6) tips are from where they are wanted, in the base's axes: rotation times
+        the arm's length, and m."""
+        T = self.corrected(joints, columns)
+        turn = se3.so3_log(wanted[:, :3, :3] @ T[:, :3, :3].mT)
+        return np.hstack([self._length_m * turn, wanted[:, :3, 3] - T[:, :3, 3]])
+
+    def _placed(self, joints: np.ndarray, columns: Columns) -> np.ndarray:
+        view = View(self.rig, len(joints), columns, joints)
+        for effect, theta in self.effects:
+            if effect.site is Site.JOINTS:
+                joints = joints + np.matvec(effect.basis(view), theta)
+        if not self._varying:
+            return self._fixed.place(joints[:, self._ours])
+        twists = self._twists + sum(effect.basis(view) @ theta for effect, theta in self._varying)
+        tree = self.rig.tree
+        T_base, T_tip = (tree.place(f, joints, twists).Ts_root_frame for f in (self.base, self.tip))
+        return se3.inverse(T_base) @ T_tip
+
+    @cached_property
+    def drawn(self) -> SerialChain:
+        """The arm as its maker draws it, with the frames of ``rig.yaml`` as fitted."""
+        return self._chain(self._frame_twists)
+
+    @cached_property
+    def _fixed(self) -> SerialChain:
+        """The arm with all that bends it alike wherever it stands."""
+        return self._chain(self._twists)
+
+    def _chain(self, twists: np.ndarray) -> SerialChain:
+        edges, route = self.rig.tree.edges, self.rig.tree.path(self.tip)
+        route = route[len(self.rig.tree.path(self.base)) :]
+        bent = [edges[i].T_parent_child @ se3.exp(twists[i]) for i in route]
+        pairs = zip(route, bent, strict=True)
+        return SerialChain([replace(edges[i], T_parent_child=T) for i, T in pairs])
+
+    @cached_property
+    def _ours(self) -> np.ndarray:
+        """Which of the rig's joints lie between base and tip."""
+        return np.array([self.rig.joint_names.index(name) for name in self.drawn.joint_names])
+
+    @cached_property
+    def _length_m(self) -> float:
+        """The links' lengths together."""
+        return sum(float(np.linalg.norm(T[:3, 3])) for T in self.drawn.fixed) or 1.0
+
+    @cached_property
+    def _frame_twists(self) -> np.ndarray:
+        """(E, 6) by which the frames of ``rig.yaml`` lie off CAD."""
+        tree = self.rig.tree
+        twists = np.zeros((len(tree.edges), 6))
+        for e, edge in enumerate(tree.edges):
+            if edge.name in self.frames:
+                twists[e] = se3.log(se3.inverse(edge.T_parent_child) @ self.frames[edge.name])
+        return twists
+
+    @cached_property
+    def _twists(self) -> np.ndarray:
+        """(E, 6) of every edge that are the same wherever the arm stands."""
+        return self._frame_twists + sum(
+            basis[0] @ theta
+            for (effect, theta), basis in zip(self.effects, self._known, strict=True)
+            if effect.site is Site.EDGE and basis is not None
+        )
+
+    @cached_property
+    def _varying(self) -> list[tuple[Effect, np.ndarray]]:
+        """Effects of edges that change from pose to pose."""
+        pairs = zip(self.effects, self._known, strict=True)
+        return [each for each, basis in pairs if each[0].site is Site.EDGE and basis is None]
+
+    @cached_property
+    def _known(self) -> list[np.ndarray | None]:
+        """The basis of each effect where one row stands for all poses."""
+        found: list[np.ndarray | None] = []
+        view = View(self.rig, 2, {}, np.zeros((2, len(self.rig.joint_names))))
+        for effect, _ in self.effects:
+            try:
+                basis = effect.basis(view)
+            except (InputError, KeyError):  # it asks for a column
+                basis = np.zeros(2)
+            found.append(basis if len(basis) == 1 else None)
+        return found
+
+    def _checked(self, joints: np.ndarray) -> np.ndarray:
+        joints, wanted = np.asarray(joints, float), len(self.rig.joint_names)
+        if joints.ndim != 2 or joints.shape[1] != wanted:
+            raise InputError(
+                f"joints are of shape {joints.shape}; (K, {wanted}) is wanted, a row a pose and a "
+                f"column each of {', '.join(self.rig.joint_names)}"
+            )
+        return joints

@@ -1,0 +1,159 @@
+"""How far off an arm is at any pose, and how well that is known: ``rigcal evaluate RUN --at``.
+
+The error is where the arm truly brings a body less where the arm as drawn would, both standing and
+holding it as fitted. Its sigma is that of the true place under the run's covariance, the place of
+the base included where nothing else tells it. It speaks of what is in the model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib import outputs
+from calib.effects import FrameOffset
+from calib.forward import Placed, place
+from calib.linear.parallel import one_blas_thread
+from calib.problem.model import Source, stop_columns
+from calib.results.intervals import intervals
+from calib.results.reach import body_beyond, placed
+from calib.runs.reopen import problem_of, reopened, start_of, state_of
+from calib.runs.run import Run
+from calib.solve.fit import Progress, solve
+from chains import se3
+from chains.errors import InputError
+from sensors.stops import CsvTable, write_columns
+
+AXES = ("x", "y", "z")
+
+
+@dataclass(frozen=True)
+class Predicted:
+    """What is predicted of a body at K poses, in the axes of the base, or else of the tracker.
+
+    Args:
+        body: whose place.
+        frame: in whose axes, a tracked body before the joints, or the tracker's frame.
+        names: of the poses.
+        error: (K, 6) rotation rad, then m: true less drawn.
+        covariance: (K, 6, 6) of the true place.
+    """
+
+    body: str
+    frame: str
+    names: Sequence[str]
+    error: np.ndarray
+    covariance: np.ndarray
+
+    @property
+    def sigma_m(self) -> np.ndarray:
+        """(K,) of the place: root mean square over directions in space, added."""
+        return np.sqrt(np.trace(self.covariance[:, 3:, 3:], axis1=1, axis2=2))
+
+    def columns(self) -> dict[str, Any]:
+        """As the CSV holds it, a row a pose."""
+        sigma = np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
+        out: dict[str, Any] = {"pose": list(self.names)}
+        out["error_mm"] = 1e3 * np.linalg.norm(self.error[:, 3:], axis=1)
+        out["sigma_mm"] = 1e3 * self.sigma_m
+        for name, values in (("error", self.error), ("sigma", sigma)):
+            out |= {f"{name}_{a}_mm": 1e3 * values[:, 3 + i] for i, a in enumerate(AXES)}
+            out |= {f"{name}_r{a}_mrad": 1e3 * values[:, i] for i, a in enumerate(AXES)}
+        return out
+
+    def document(self) -> dict[str, Any]:
+        """In short, as ``--json`` prints it."""
+        told = {"error_mm": np.linalg.norm(self.error[:, 3:], axis=1), "sigma_mm": self.sigma_m}
+        return {
+            "body": self.body,
+            "frame": self.frame,
+            "poses": len(self.names),
+            **{n: {"mean": 1e3 * v.mean(), "max": 1e3 * v.max()} for n, v in told.items()},
+        }
+
+
+@one_blas_thread
+def evaluate_at(
+    run: Run,
+    poses: Path | str,
+    out: Path | str | None = None,
+    progress: Progress = lambda what, done, total: None,
+) -> Predicted:
+    """Predict the arm's error at poses of a CSV file.
+
+    Args:
+        run: of an arm and a tracker.
+        poses: a row a pose: `stop`, the joints by name, and the covariates that effects ask for.
+        out: the CSV file to write; none where None.
+        progress: called with what is being done, and how far it is.
+
+    Raises:
+        InputError: the file lacks a joint or a covariate, or no tracked body hangs from the arm.
+    """
+    sources = reopened(run)
+    problem, source = problem_of(run, sources), sources[0]
+    state_of(run, problem)
+    estimate = solve(problem, progress=progress, start=start_of(run, sources))
+    beyond = body_beyond(problem)
+    if beyond is None:
+        raise InputError(
+            f"{run.folder}: no tracked body hangs from an arm in its recordings, so there is no "
+            f"place to predict"
+        )
+    rig = source.rig
+    if beyond.base is None and rig.moves != "never":
+        raise InputError(
+            f"{run.folder}: the base moves and no body on it is tracked, so nothing tells where it "
+            f"is at these poses"
+        )
+    names, joints, columns = _read(Path(poses), source)
+    stops = place(rig, problem.terms[0], joints, columns, beyond.root, None)
+    true = placed(stops, beyond.body, beyond.base, estimate.values)
+    bends = {t.variable for t in problem.terms[0] if not isinstance(t.effect, FrameOffset)}
+    still = {name: 0 * v if name in bends else v for name, v in estimate.values.items()}
+    drawn = placed(stops, beyond.body, beyond.base, still)
+    known = intervals(estimate, progress).at_least(run.summary["sigmas_widened_by"])
+    found = Predicted(
+        body=beyond.body,
+        frame=beyond.base or rig.world,
+        names=names,
+        error=_apart(drawn.T, true.T),
+        covariance=_covariance(true, known.over(estimate, list(true.d))),
+    )
+    if out is not None:
+        if Path(out).suffix != ".csv":
+            raise InputError(f"{out}: the poses are written as a table; give FILE.csv")
+        with outputs.file(out, [run.folder, *run.inputs, poses]) as file:
+            write_columns(file, found.columns())
+    return found
+
+
+def _read(path: Path, source: Source) -> tuple[list[str], np.ndarray, dict[str, np.ndarray]]:
+    """Names, joints (K, J) and per-stop covariates of a table of poses."""
+    if not path.is_file():
+        raise InputError(f"{path} does not exist; give a table with a row for every pose")
+    rig = source.rig
+    table = CsvTable(path, key="stop", text=("location",))
+    names = table.names()
+    joints, times = table.joints(rig.joint_names), table.times("time_s")
+    return names, joints, {**stop_columns(rig, joints, times), **table.rest()}
+
+
+def _apart(drawn: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """(K, 6) what brings the drawn pose to the true one: a turn, rad, and a shift, m, in the axes
+    of the frame that both are in."""
+    turn = se3.so3_log(true[:, :3, :3] @ drawn[:, :3, :3].mT)
+    return np.hstack([turn, true[:, :3, 3] - drawn[:, :3, 3]])
+
+
+def _covariance(true: Placed, covariance: np.ndarray) -> np.ndarray:
+    """(K, 6, 6) of the true poses, in the same axes."""
+    parts = [np.broadcast_to(d, (len(true.T), *d.shape[1:])) for d in true.d.values()]
+    R = true.T[:, :3, :3]
+    d = np.concatenate(parts, axis=2)
+    d = np.concatenate([R @ d[:, :3], R @ d[:, 3:]], axis=1)
+    return d @ covariance @ d.mT

@@ -1,0 +1,62 @@
+"""dh.yaml: the arm as a table of Denavit and Hartenberg, calibrated, and as drawn beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib.exporters.fitted import FittedRig, for_every_rig
+from calib.exporters.written import SIGMAS, Unheld, Written, commented, write_text
+from chains import se3
+from chains.frames import Edge
+from chains.readers.dh_out import table_of
+from sensors.documents import yaml_text
+
+CONVENTIONS = (
+    "T_base_tip = base * link 1 * ... * last joint * tip. A link is the matrix product",
+    "Rz(theta + q) Tz(d) Tx(a) Rx(alpha) Ry(beta) of a joint that turns; one that slides has its q",
+    "in d. The last joint is Rz(q) or Tz(q). q is as the encoder reports it: offsets are in theta.",
+    "Where the maker draws two axes parallel d is 0 and beta (Hayati) is free; elsewhere beta is 0",
+    "and x lies along the cross product of the two axes. base and tip: xyz_m, then rpy_rad about",
+    "fixed x, y, z. calibrated is as fitted, drawn as the maker's URDF has it.",
+)
+
+
+@for_every_rig
+def write_dh(fit: FittedRig, folder: Path) -> Written:
+    """Write dh.yaml.
+
+    Raises:
+        Unheld: the rig has no arm that moves.
+    """
+    tree = fit.rig.tree
+    drawn = [tree.edges[tree.edge_names.index(name)] for name in fit.rig.arm_edges]
+    if not fit.rig.joint_names:
+        raise Unheld("the rig has no arm")
+    if any(edge.joint is not None and not edge.joint.leads for edge in drawn):
+        raise Unheld("a joint follows another, and such a table has no place for it")
+    edges = [replace(edge, T_parent_child=fit.origins[edge.name]) for edge in drawn]
+    document = {"calibrated": _document(edges, drawn), "drawn": _document(drawn, drawn)}
+    not_held = [SIGMAS, *fit.not_held(fit.fixed)]
+    path = fit.file(folder, "dh.yaml")
+    write_text(path, commented(fit.head(CONVENTIONS, not_held)) + yaml_text(document))
+    return Written([path], not_held)
+
+
+def _document(edges: Sequence[Edge], drawn: Sequence[Edge]) -> dict[str, Any]:
+    table = table_of(edges, drawn)
+    last = next(edge.joint for edge in reversed(edges) if edge.joint is not None)
+    return {
+        "base": _pose(table.T_base_first),
+        "links": [vars(link) for link in table.links],
+        "last": {"joint": last.name, "kind": last.kind},
+        "tip": _pose(table.T_last_tip),
+    }
+
+
+def _pose(T: np.ndarray) -> dict[str, Any]:
+    return {"xyz_m": T[:3, 3], "rpy_rad": se3.to_rpy(T)}
