@@ -25,8 +25,9 @@ from calib.solve.fit import Progress
 
 KEPT = 4  # factors of each covariate whose products are tried
 REFINED = 5  # products whose constants are refined
-TRIES = 60  # evaluations for each constant that is refined
-STEP = 0.05  # of a covariate's range: by how much constants are changed first
+TRIED = 30  # evaluations for each constant, when they are refined together
+CLOSER = (0.04, 0.04, 0.01, 0.0025)  # of a covariate's range, between places that are tried
+BESIDE = (0, -4, -3, -2, -1, 1, 2, 3, 4)  # which of them; where none is better, it stays
 APART = 2.0  # sigmas by which stops must prefer a form for it to be told from a simpler one
 MOST_TERMS = 4
 TRIES = 3  # smooth functions that are judged before nothing is said to be there
@@ -305,21 +306,31 @@ def _explained(
 
 
 def refine(projection: Projection, term: Term) -> Term:
-    """A term with those constants that explain most, from where they are."""
+    """A term with those constants that explain most, from where they are: places beside each are
+    tried, ever closer, as where an edge is has no slope; then all together (Nelder and Mead)."""
     if not term.constants:
         return term
     covariates = projection.table.covariates
-    ranges = [np.ptp(covariates[f.covariate]) for f in term.factors for _ in range(f.free)]
-    start, scale = np.array(term.constants), STEP * np.array(ranges)
+    wide = [np.ptp(covariates[f.covariate]) for f in term.factors for _ in range(f.free)]
+    for size in CLOSER:
+        for i in range(len(wide)):
+            tried = [term.at(_moved(term.constants, i, size * k * wide[i])) for k in BESIDE]
+            explained, _ = projection.explained([t.columns(covariates) for t in tried])
+            term = tried[int(np.argmax(explained))]
+    start, scale = np.array(term.constants), CLOSER[-1] * np.array(wide)
 
     def worse(x: np.ndarray) -> float:
         columns = term.at((start + scale * x).tolist()).columns(covariates)
         return -float(projection.explained([columns])[0][0])
 
     simplex = np.vstack([np.zeros(len(start)), np.eye(len(start))])
-    options = {"initial_simplex": simplex, "maxfev": TRIES * len(start), "xatol": 1e-3}
+    options = {"initial_simplex": simplex, "maxfev": TRIED * len(start), "xatol": 1e-2}
     found = minimize(worse, simplex[0], method="Nelder-Mead", options=options)
     return term.at((start + scale * found.x).tolist()) if found.fun < worse(simplex[0]) else term
+
+
+def _moved(constants: Sequence[float], i: int, by: float) -> list[float]:
+    return [c + by * (k == i) for k, c in enumerate(constants)]
 
 
 def _evidence(statistic: float, dof: int) -> float:
