@@ -50,6 +50,8 @@ KINDS = {
     "line": Kind(("({x} - {0}) / {1}", "1"), 1.0),
     "square": Kind(("(({x} - {0}) / {1})**2", "({x} - {0}) / {1}", "1"), 2.5),
     "logarithm": Kind(("log({x} / {0})", "1"), 1.5),
+    "saturation": Kind(("log(1 + {x} / {0})",), 2.0, free=1),
+    "share": Kind(("{x} / ({x} + {0})",), 2.0, free=1),
     "root": Kind(("sqrt({x} / {0})",), 1.5),
     "power": Kind(("({x} / {0})**{1}",), 1.5),
     "reciprocal": Kind(("{0} / {x}",), 1.5),
@@ -162,6 +164,9 @@ def _smooth(name: str, known: np.ndarray) -> Iterator[Factor]:
         yield Factor(name, "root", (scale,))
         yield Factor(name, "reciprocal", (scale,))
         yield from (Factor(name, "power", (scale, p)) for p in (2.0, 3.0))
+    if low >= 0.0 and high > WIDE * low:
+        sorts = ("saturation", "share")
+        yield from (Factor(name, sort, (share * wide,)) for sort in sorts for share in SCALES)
     for share in SCALES:
         yield Factor(name, "decay", (share * wide, low))
         yield Factor(name, "growth", (share * wide, high))

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.diagnosis.formulas.factors import columns_of
+from calib.diagnosis.formulas.factors import Factor, columns_of
 from calib.diagnosis.formulas.picture import picture_of
 from calib.diagnosis.formulas.pursuit import Form, Step, Term, refine
 from calib.diagnosis.formulas.table import Projection, Table
@@ -70,7 +70,8 @@ class Formula:
     @property
     def alike(self) -> list[Form]:
         """Other forms that stops cannot tell from the first term."""
-        return [form for form in self.steps[0].alike if form.other_than(self.parts[0].term)]
+        chosen = self.steps[0].form
+        return [form for form in self.steps[0].alike if form.other_than(chosen)]
 
     @property
     def covariates(self) -> tuple[str, ...]:
@@ -137,6 +138,8 @@ def settled(table: Table, steps: Sequence[Step]) -> list[Formula]:
             columns[i] = terms[i].columns(table.covariates)
     kept = _kept(model, columns)
     columns = [c[:, k] for c, k in zip(columns, kept, strict=True)]
+    plain = [_reduced(*each) for each in zip(terms, kept, strict=True)]
+    terms, kept = [t for t, _ in plain], [k for _, k in plain]
     model = table.projection(np.hstack(columns))
     parts = _parts(model, terms, columns, kept)
     fit = model.fitted(np.hstack(columns))[0]
@@ -180,6 +183,25 @@ def _kept(model: Projection, columns: Sequence[np.ndarray]) -> list[list[int]]:
             return kept
         i, c = owner[worst]
         kept[i].remove(c)
+
+
+def _reduced(term: Term, kept: Sequence[int]) -> tuple[Term, list[int]]:
+    """A term without factors that none of its kept columns has, squares of which but the line is
+    kept as lines; and which columns of it are kept."""
+    rows = [list(product(*(f.texts for f in term.factors)))[i] for i in kept]
+    factors, at = [], []
+    for i, each in enumerate(term.factors):
+        texts = {row[i] for row in rows}
+        if texts == {"1"}:
+            continue
+        if each.kind == "square" and each.texts[0] not in texts:
+            each = Factor(each.covariate, "line", each.constants)
+        factors.append(each)
+        at.append(i)
+    if not factors:
+        return term, list(kept)
+    every = list(product(*(f.texts for f in factors)))
+    return Term(tuple(factors)), [every.index(tuple(row[i] for i in at)) for row in rows]
 
 
 def _taken_on(model: Projection, columns: np.ndarray) -> np.ndarray:

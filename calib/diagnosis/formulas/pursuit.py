@@ -35,6 +35,7 @@ PLAUSIBLE = 0.1  # adjusted p-value of a smooth function, from which forms are t
 RIVALS = 2  # sets of covariates, beside the best one, over which forms are tried
 INSTEAD = 0.8  # of the best set's statistic that another must explain for that
 AS = {"ring": "elevation_rad"}  # what goes along with another covariate
+SAME = 1e-6  # of what two forms explain: one is the other and what the model takes on
 AT_ONCE = 400  # columns: bounds the memory
 
 
@@ -117,15 +118,17 @@ class Form:
     left: np.ndarray
     tried: int = 1
 
-    def other_than(self, term: Term) -> bool:
-        """Whether it says something else than a term: not one with more columns than that, nor the
-        same function of a covariate that goes along."""
+    def other_than(self, form: Form) -> bool:
+        """Whether it says something else than another: not that with more columns, nor the same
+        function written otherwise, or of a covariate that goes along."""
         mine, its = (
-            {(AS.get(f.covariate, f.covariate), f.kind) for f in t.factors}
-            for t in (self.term, term)
+            {(AS.get(f.covariate, f.covariate), f.kind) for f in each.term.factors}
+            for each in (self, form)
         )
-        nested = self.term.cost > term.cost and set(term.texts) <= set(self.term.texts)
-        return mine != its and not nested
+        more = self.term.cost > form.term.cost and set(form.term.texts) <= set(self.term.texts)
+        alike = abs(self.statistic - form.statistic) < SAME * form.statistic
+        same = alike and {c for c, _ in mine} == {c for c, _ in its}
+        return not (mine == its or more or same)
 
     @property
     def evidence(self) -> float:
