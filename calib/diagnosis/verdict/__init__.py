@@ -266,7 +266,8 @@ def _structure(
     """What has no name: formulas, or bins where there are none; and what was `thrown` away."""
     taken = found.looks[0].stand.model.names
     if formulas.formulas:
-        return [*formulas.documents(taken), *thrown]
+        drawn = {c for each in formulas.formulas for c in each.covariates}
+        return [*formulas.documents(taken), *(t for t in thrown if not drawn >= {*t["covariates"]})]
     left = _without_a_name(found, verdict)
     return [*thrown, *(_unexplained(c, screen, taken) for screen, c in left)]
 
