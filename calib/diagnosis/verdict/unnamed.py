@@ -70,14 +70,16 @@ def unnamed(
     formulas = find(last.estimate, progress)
     if not formulas or unseen is None:
         return Unnamed(formulas)
-    before = falls[found.found[-1].effect.name][1] if found.found else unseen(last).rms_mm
-    errors = unseen(_with(last, formulas, progress))
-    if before - errors.rms_mm > FALL * errors.floor_mm:
-        return Unnamed(formulas, False, (before, errors.rms_mm))
+    before, after = unseen(last), unseen(_with(last, formulas, progress))
+    fall_mm = before.rms_mm, after.rms_mm
+    # A gross structure is rejected, not fitted: what falls then is the share of such beams.
+    fewer = before.rejected_share - after.rejected_share > FALL
+    if fewer or fall_mm[0] - fall_mm[1] > FALL * after.floor_mm:
+        return Unnamed(formulas, False, fall_mm)
     over = " and ".join(words(c) for c in formulas[0].covariates)
     return Unnamed(
         refused=f"A formula over {over} fits part of the residuals, but stops that were held out "
-        f"are predicted no better with it ({before:.2f} to {errors.rms_mm:.2f} mm)."
+        f"are predicted no better with it ({fall_mm[0]:.2f} to {fall_mm[1]:.2f} mm)."
     )
 
 
