@@ -1,0 +1,180 @@
+"""What nobody has named: is its formula found? Hidden range errors that no catalogue lists.
+
+    python -m tests.bench.formulas [--count 50] [--rigs arm,head,planes] [--times 1,0.4]
+                                   [--nulls 100] [--jobs 1] [--seed 0] [-o FILE --resume]
+
+Every case is a recording of `tests.worlds`, which shares no code with the program, with a formula
+of `formulas_effects` added to its ranges; it is fitted, diagnosed, and what the diagnosis proposes
+is added, as a user would, until it proposes nothing. Judged: covariates, held-out error, form,
+seconds; and how often a formula is proposed where nothing is hidden. Recordings of the independent
+simulator whose formula is known come last. FILE gets a line of JSON per case.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+import traceback
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from rich.progress import track
+from threadpoolctl import threadpool_limits
+
+from sensors.documents import plain
+
+from .blunders import read
+from .formulas_effects import covariates, value
+from .formulas_judge import WITHIN, climbed, form, formulas, held_out, looks_at, named
+from .formulas_table import show
+from .formulas_worlds import RIGS, Case, cases, written
+
+SHARED = Path(__file__).resolve().parents[3] / "shared" / "data" / "recordings"
+# Recordings of the independent simulator, and their formulas, of the parameters in truth.json.
+KNOWN = {
+    "known_ring_by_temperature": (
+        "x_temp_ring",
+        "{0} * (temperature_c - 27) / 4 * (2 * ring / {1} - 1)",
+    ),
+    "known_sector": ("x_sector", "{0} * (azimuth_rad > {1}) * (azimuth_rad < {1} + 0.7)"),
+}
+
+
+def run(case: Case) -> dict[str, Any]:
+    """What the program finds of a case, and how right that is."""
+    with threadpool_limits(1), tempfile.TemporaryDirectory() as folder:
+        made = written(case, Path(folder) / "case")
+        about = {
+            "case": case.name,
+            "rig": case.rig,
+            "lidar": case.world.lidar,
+            "times": case.times,
+            "scatter_mm": 1e3 * case.scatter_m,
+            "beams": len(made.beams),
+            "size_mm": 1e3 * made.size_m,
+        }
+        beams = made.beams.assign(error_m=made.error_m)
+        return about | judged(made.folder, Path(folder), list(case.formulas), beams)
+
+
+def run_known(name: str) -> dict[str, Any]:
+    """The same of a recording of the independent simulator."""
+    recording = SHARED / name
+    key, text = KNOWN[name]
+    truth = json.loads(Path(f"{recording}.truth.json").read_text())
+    formula = text.format(*truth["params"][key])
+    stops = pd.read_csv(recording / "stops.csv")
+    beams = pd.concat(
+        pd.read_parquet(recording / "scans" / f"{stop}.parquet").assign(stop=stop)
+        for stop in stops["stop"]
+    )
+    beams = beams.merge(stops[["stop", "temperature_c"]], on="stop")
+    beams["azimuth_rad"] = np.arctan2(beams["y"], beams["x"])
+    beams["error_m"] = value(formula, {n: beams[n].to_numpy() for n in beams})
+    about = {"case": name, "rig": "known", "lidar": truth["sensor"], "beams": len(beams)}
+    with threadpool_limits(1), tempfile.TemporaryDirectory() as folder:
+        return about | judged(recording, Path(folder), [formula], beams)
+
+
+def judged(
+    recording: Path, folder: Path, hidden: Sequence[str], beams: pd.DataFrame
+) -> dict[str, Any]:
+    """Run the program on a recording, and hold what it finds against the truth.
+
+    Args:
+        recording: a folder.
+        folder: where runs go.
+        hidden: formulas.
+        beams: as of `formulas_judge.form`.
+    """
+    ladder = climbed(recording, folder)
+    found, stops = formulas(ladder), pd.read_csv(recording / "stops.csv")
+    wanted = frozenset().union(*map(covariates, hidden))
+    errors = [held_out(each) for each in ladder.runs if (each / "summary.json").exists()]
+    last, floor = errors[-1] if errors else (None, np.nan)
+    result = {
+        "hidden": list(hidden),
+        "wanted": sorted(wanted),
+        "found": [sorted(looks_at([rung])) for rung in found],
+        "says": [rung.get("says") for rung in found],
+        "basis": [rung["formula"]["basis"] for rung in found],
+        "p_value": [rung.get("p_value") for rung in found],
+        "named": named(ladder),
+        "verdicts": [said["verdict"] for said in ladder.said],
+        "stopped": ladder.stopped,
+        "held_out_mm": [mm for mm, _ in errors],
+        "floor_mm": floor,
+        "fit_s": ladder.fit_s,
+        "search_s": [said["cpu_s"] for said in ladder.said],
+        "covariates_right": looks_at(found) == wanted,
+        "at_floor": last is not None and last < (1 + WITHIN) * floor,
+    }
+    if hidden and ladder.rungs and len(ladder.runs) == 1 + len(ladder.rungs):
+        result["form"] = form(ladder.runs[-1], found, stops, beams)
+    return plain(result)
+
+
+def main() -> None:
+    """Run what is asked for, and print the table."""
+    asked = _arguments()
+    done = read(asked.out) if asked.resume and asked.out else {}
+    if asked.out and not asked.resume:
+        asked.out.write_text("", encoding="utf-8")
+    known = [name for name in KNOWN if (SHARED / name).is_dir()] if asked.known else []
+    listed = cases(asked.count, asked.nulls, asked.rigs, asked.times, asked.seed)
+    if asked.only:
+        listed = [case for case in listed if case.name in asked.only]
+    jobs = {**{case.name: case for case in listed}, **{name: name for name in known}}
+    left = [job for name, job in jobs.items() if name not in done]
+    for result in track(finished(left, asked.jobs), "formulas", len(left)):
+        done[result["case"]] = result
+        if asked.out:
+            with asked.out.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(result) + "\n")
+    show([done[name] for name in jobs])
+
+
+def _arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--count", type=int, default=50, help="hidden ones, of each size")
+    parser.add_argument("--nulls", type=int, default=100, help="where nothing is hidden")
+    parser.add_argument("--rigs", default=",".join(RIGS), help="with commas")
+    parser.add_argument("--times", default="1,0.4", help="sizes in sigmas of a shot, with commas")
+    parser.add_argument("--only", default="", help="names of cases, with commas")
+    parser.add_argument("--no-known", dest="known", action="store_false")
+    parser.add_argument("--jobs", type=int, choices=(1, 2), default=1)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("-o", dest="out", type=Path, help="a line of JSON per case is added here")
+    parser.add_argument("--resume", action="store_true", help="keep what the file has")
+    asked = parser.parse_args()
+    asked.rigs, asked.only = asked.rigs.split(","), [n for n in asked.only.split(",") if n]
+    asked.times = [float(each) for each in asked.times.split(",")] if asked.count else []
+    if unknown := [rig for rig in asked.rigs if rig not in RIGS]:
+        parser.error(f"no such rig: {', '.join(unknown)}; there are {', '.join(RIGS)}")
+    return asked
+
+
+def finished(jobs: Sequence[Case | str], count: int) -> Iterator[dict[str, Any]]:
+    """Results as they come."""
+    if count == 1:
+        yield from map(_guarded, jobs)
+        return
+    with ProcessPoolExecutor(count) as pool:
+        yield from pool.map(_guarded, jobs)
+
+
+def _guarded(job: Case | str) -> dict[str, Any]:
+    try:
+        return run_known(job) if isinstance(job, str) else run(job)
+    except Exception:
+        name = job if isinstance(job, str) else job.name
+        return {"case": name, "error": traceback.format_exc()}
+
+
+if __name__ == "__main__":
+    main()

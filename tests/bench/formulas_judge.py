@@ -1,0 +1,176 @@
+"""What the program finds of a hidden formula, run as a user would, held against the truth."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from calib.diagnosis.verdict import worth_adding
+from calib.effects.own.expression import Expression
+
+from ..mishaps.judge import rigcal, solution
+from .formulas_effects import same
+from .formulas_size import Absorbs, rms
+
+MOST = 4  # rungs: two that are hidden, one that was wrong, and one that is too much
+LIMIT_S = 600  # CPU, of a command
+WITHIN = 0.1  # of the floor, and of the effect's rms
+SIGMAS = 2.0
+KEY = ["stop", "ring", "column"]
+
+
+@dataclass
+class Ladder:
+    """What was found, added and left, rung by rung.
+
+    Args:
+        runs: fits, first to last.
+        rungs: of each rung after the first what it adds: ``effects``; of a formula ``covariates``,
+            ``formula`` (its document), ``says`` and ``p_value``.
+        said: per diagnosis its verdict and the seconds it took.
+        fit_s: CPU seconds of the first fit.
+        stopped: why no further rung was tried.
+    """
+
+    runs: list[Path]
+    fit_s: float
+    rungs: list[dict[str, Any]] = field(default_factory=list)
+    said: list[dict[str, Any]] = field(default_factory=list)
+    stopped: str = ""
+
+
+def climbed(recording: Path, folder: Path, most: int = MOST) -> Ladder:
+    """Fit, then diagnose and add what it proposes, until it proposes nothing."""
+    run = folder / "run0"
+    first = rigcal("fit", recording, "-o", run, limit_s=LIMIT_S)
+    ladder = Ladder([run], first.seconds)
+    if first.code != 0:
+        ladder.stopped = f"fit: {complaint(first)}"
+        return ladder
+    while True:
+        begin = time.perf_counter()
+        told = rigcal("diagnose", ladder.runs[-1], limit_s=LIMIT_S)
+        document = told.document
+        seconds = {"cpu_s": told.seconds, "wall_s": time.perf_counter() - begin}
+        ladder.said.append({"verdict": document.get("verdict", complaint(told)), **seconds})
+        rung = proposed(document)
+        if not rung or len(ladder.rungs) == most:
+            ladder.stopped = "nothing more" if not rung else "too many"
+            return ladder
+        run = folder / f"run{len(ladder.runs)}"
+        grown = rigcal(
+            "add", ladder.runs[-1], ",".join(rung["effects"]), "-o", run, limit_s=LIMIT_S
+        )
+        ladder.rungs.append(rung)
+        if grown.code != 0:
+            ladder.stopped = f"add {', '.join(rung['effects'])}: {complaint(grown)}"
+            return ladder
+        ladder.runs.append(run)
+
+
+def complaint(said: Any) -> str:
+    """Why a command failed."""
+    return said.complaint.strip().splitlines()[-1][:300] if said.complaint.strip() else "endless"
+
+
+def proposed(diagnosis: Mapping[str, Any]) -> dict[str, Any]:
+    """What a user would add: effects of the catalogue that are worth it, else the first formula."""
+    named = worth_adding(diagnosis.get("candidates", []))
+    if diagnosis.get("verdict") == "missing_effect" and named:
+        return {"effects": list(named)}
+    for each in diagnosis.get("unexplained", []):
+        if each.get("formula"):
+            kept = {key: each.get(key) for key in ("covariates", "formula", "says", "p_value")}
+            return {"effects": [each["formula"]["name"]], **kept}
+    return {}
+
+
+def formulas(ladder: Ladder) -> list[dict[str, Any]]:
+    """The rungs that are formulas."""
+    return [rung for rung in ladder.rungs if "formula" in rung]
+
+
+def named(ladder: Ladder) -> list[str]:
+    """What was added by the catalogue's names."""
+    return [n for rung in ladder.rungs if "formula" not in rung for n in rung["effects"]]
+
+
+def looks_at(rungs: Sequence[Mapping[str, Any]]) -> frozenset[str]:
+    """All covariates of formulas, those that are one thing by one name."""
+    return same(name for rung in rungs for name in rung["covariates"])
+
+
+def held_out(run: Path) -> tuple[float | None, float]:
+    """Held-out error and the floor of a run, mm."""
+    said = json.loads((run / "summary.json").read_text())["rms_mm"]
+    return said["held_out"], said["noise_floor"]
+
+
+def fitted(run: Path, rungs: Sequence[Mapping[str, Any]], stops: pd.DataFrame) -> pd.DataFrame:
+    """What formulas of a run add to ranges, at its beams.
+
+    Returns:
+        ``stop``, ``ring``, ``column``; ``fitted_m`` and its ``sigma_m``, estimates taken as
+        independent.
+    """
+    table = rows_of(run, stops)
+    columns = {name: table[name].to_numpy() for name in table}
+    found, total, variance = solution(run)["effects"], 0.0, 0.0
+    for rung in rungs:
+        document = rung["formula"]
+        if document["site"] != "range":
+            continue
+        said = found[document["name"]]
+        for text, estimate, sigma in zip(
+            document["basis"], said["estimate"], said["sigma"], strict=True
+        ):
+            basis = Expression(text, document["name"]).value(columns.__getitem__)
+            total = total + estimate * basis
+            variance = variance + (sigma * basis) ** 2
+    table = table[KEY].copy()
+    table["fitted_m"], table["sigma_m"] = total, np.sqrt(variance)
+    return table
+
+
+def rows_of(run: Path, stops: pd.DataFrame) -> pd.DataFrame:
+    """The residual table of a run, every covariate of its stops beside."""
+    folder = run / "residuals.parquet"
+    parts = [
+        pd.read_parquet(file).assign(stop=file.stem)
+        for file in sorted(folder.glob("[!_]*.parquet"))
+    ]
+    rows = pd.concat(parts, ignore_index=True)
+    stops = stops.assign(elapsed_s=stops["time_s"] - stops["time_s"].min())
+    more = [c for c in stops.select_dtypes("number") if c not in rows]
+    return rows.merge(stops[["stop", *more]], on="stop", how="left")
+
+
+def form(
+    run: Path, rungs: Sequence[Mapping[str, Any]], stops: pd.DataFrame, beams: pd.DataFrame
+) -> dict[str, Any]:
+    """Whether formulas are the truth over the data's range, after what the model absorbs.
+
+    Args:
+        run: the last of a ladder.
+        rungs: its formulas.
+        stops: stops.csv.
+        beams: `KEY`, what `Absorbs.of` takes, and ``error_m``, the truth.
+
+    Returns:
+        ``effect_mm``, ``off_mm`` and ``sigma_mm``, rms; ``right``.
+    """
+    both = fitted(run, rungs, stops).merge(beams, on=KEY, how="inner", validate="1:1")
+    absorbs = Absorbs.of(both)
+    true = absorbs.off(both["error_m"].to_numpy(float))
+    off_m = rms(absorbs.off(both["fitted_m"].to_numpy(float)) - true)
+    sigma_m, effect_m = rms(both["sigma_m"]), rms(true)
+    found = {"effect_mm": effect_m, "off_mm": off_m, "sigma_mm": sigma_m}
+    right = bool(rungs) and off_m < max(SIGMAS * sigma_m, WITHIN * effect_m)
+    return {name: round(1e3 * x, 4) for name, x in found.items()} | {"right": bool(right)}
