@@ -1,7 +1,8 @@
 """What nobody has named: is its formula found? Hidden range errors that no catalogue lists.
 
     python -m tests.bench.formulas [--count 50] [--rigs arm,head,planes] [--times 1,0.4]
-                                   [--nulls 100] [--jobs 1] [--seed 0] [-o FILE --resume]
+                                   [--nulls 100] [--beams 2000] [--jobs 1] [--seed 0]
+                                   [-o FILE --resume]
 
 Every case is a recording of `tests.worlds`, which shares no code with the program, with a formula
 of `formulas_effects` added to its ranges; it is fitted, diagnosed, and what the diagnosis proposes
@@ -18,6 +19,7 @@ import tempfile
 import traceback
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +32,7 @@ from sensors.documents import plain
 
 from .blunders import read
 from .formulas_effects import covariates, value
-from .formulas_judge import WITHIN, climbed, form, formulas, held_out, looks_at, named
+from .formulas_judge import WITHIN, climbed, form, formulas, held_out, looks_at, named, oracle
 from .formulas_table import show
 from .formulas_worlds import RIGS, Case, cases, written
 
@@ -114,6 +116,8 @@ def judged(
         "covariates_right": looks_at(found) == wanted,
         "at_floor": last is not None and last < (1 + WITHIN) * floor,
     }
+    if hidden and errors:
+        result["oracle"] = oracle(ladder.runs[0], hidden, folder)
     if hidden and ladder.rungs and len(ladder.runs) == 1 + len(ladder.rungs):
         result["form"] = form(ladder.runs[-1], found, stops, beams)
     return plain(result)
@@ -127,6 +131,7 @@ def main() -> None:
         asked.out.write_text("", encoding="utf-8")
     known = [name for name in KNOWN if (SHARED / name).is_dir()] if asked.known else []
     listed = cases(asked.count, asked.nulls, asked.rigs, asked.times, asked.seed)
+    listed = [replace(case, beams=asked.beams) for case in listed]
     if asked.only:
         listed = [case for case in listed if case.name in asked.only]
     jobs = {**{case.name: case for case in listed}, **{name: name for name in known}}
@@ -145,6 +150,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--nulls", type=int, default=100, help="where nothing is hidden")
     parser.add_argument("--rigs", default=",".join(RIGS), help="with commas")
     parser.add_argument("--times", default="1,0.4", help="sizes in sigmas of a shot, with commas")
+    parser.add_argument("--beams", type=int, default=2000, help="of a stop, about")
     parser.add_argument("--only", default="", help="names of cases, with commas")
     parser.add_argument("--no-known", dest="known", action="store_false")
     parser.add_argument("--jobs", type=int, choices=(1, 2), default=1)

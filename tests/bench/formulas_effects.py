@@ -1,7 +1,8 @@
 """Range errors that no catalogue lists, for the search of formulas to find.
 
-Each is arithmetic on columns of a recording, evaluated by numpy alone: angles rad, ranges m, times
-s; ``label`` a whole number. A formula is scaled to its size afterwards, so only its shape counts.
+Each is arithmetic on columns of a recording, in the words of a user's own effects, and evaluated
+here by numpy alone: angles rad, ranges m, times s; ``label`` a whole number. A formula is scaled to
+its size afterwards, so only its shape counts.
 
 What the model itself absorbs is avoided: a function of the ring alone is taken by the rings' zeros,
 one of the place in the room by the surfaces' errors. So is what the catalogue lists: a power or an
@@ -41,8 +42,8 @@ ONE = (
     "exp(-(((range_m - 3.2) / 0.4) ** 2))",
 )
 TWO = (
-    "(2 * (ring % 2) - 1) * (temperature_c - 26)",
-    "(ring % 8 < 4) * (humidity - 0.45)",
+    "cos(pi * ring) * (temperature_c - 26)",
+    "(sin(pi * (2 * ring + 1) / 8) > 0) * (humidity - 0.45)",
     "elevation_rad * log(humidity / 0.45)",
     "sin(azimuth_rad) * (temperature_c - 26)",
     "cos(2 * azimuth_rad) * (fan_rpm / 3000 - 1)",
@@ -55,7 +56,7 @@ TWO = (
     "log(range_m) * (temperature_c - 26)",
     "(label == 2) * (range_m - 3)",
     "(label == 1) * (temperature_c - 26)",
-    "(intensity - 0.5) * (fan_rpm / 3000 - 1)",
+    "intensity * (fan_rpm / 3000 - 1)",
     "sin(joint_2) * elevation_rad",
     "cos(joint_5) * sin(azimuth_rad)",
     "sin(2 * joint_3) * cos(azimuth_rad)",
@@ -65,7 +66,7 @@ TWO = (
     "exp(-time_s / 900) * elevation_rad",
     "(fan_rpm > 3300) * sin(4 * azimuth_rad)",
     "(azimuth_rad > 0) * elevation_rad",
-    "(ring % 2) * (range_m > 3)",
+    "cos(pi * ring) * (range_m > 3)",
     "exp(-range_m / 1.5) * (battery_v - 24)",
 )
 THREE = (
@@ -76,7 +77,7 @@ THREE = (
     "(label == 2) * (1 / cos(incidence_rad) - 1) * (temperature_c - 26)",
     "cos(2 * azimuth_rad) * log(range_m) * (humidity - 0.45)",
     "ambient * elevation_rad * (fan_rpm / 3000 - 1)",
-    "(2 * (ring % 2) - 1) * sin(azimuth_rad) * (battery_v - 24)",
+    "cos(pi * ring) * sin(azimuth_rad) * (battery_v - 24)",
 )
 SINGLES = (*ONE, *TWO, *THREE)
 # Two at once, each of half the variance: places in `SINGLES`.

@@ -65,14 +65,30 @@ def climbed(recording: Path, folder: Path, most: int = MOST) -> Ladder:
             ladder.stopped = "nothing more" if not rung else "too many"
             return ladder
         run = folder / f"run{len(ladder.runs)}"
-        grown = rigcal(
-            "add", ladder.runs[-1], ",".join(rung["effects"]), "-o", run, limit_s=LIMIT_S
-        )
+        grown = rigcal("add", ladder.runs[-1], *rung["effects"], "-o", run, limit_s=LIMIT_S)
         ladder.rungs.append(rung)
         if grown.code != 0:
             ladder.stopped = f"add {', '.join(rung['effects'])}: {complaint(grown)}"
             return ladder
         ladder.runs.append(run)
+
+
+def oracle(fitted: Path, hidden: Sequence[str], folder: Path) -> dict[str, Any]:
+    """What is to be had: the hidden formulas themselves, added to a fit.
+
+    Returns:
+        ``held_out_mm`` and ``floor_mm``; empty where that fit fails.
+    """
+    file, run = folder / "truth.yaml", folder / "oracle"
+    effects = [
+        {"name": f"truth_{i}", "site": "range", "unit": "m", "sigma": 0.1, "basis": text}
+        for i, text in enumerate(hidden)
+    ]
+    file.write_text(json.dumps(effects))  # YAML holds JSON
+    if rigcal("add", fitted, file, "-o", run, limit_s=LIMIT_S).code != 0:
+        return {}
+    error, floor = held_out(run)
+    return {"held_out_mm": error, "floor_mm": floor}
 
 
 def complaint(said: Any) -> str:

@@ -89,8 +89,10 @@ def _line(r: Result) -> str:
     errors = " ".join("?" if mm is None else f"{mm:.2f}" for mm in r["held_out_mm"])
     form = r.get("form", {})
     off = f"off {form['off_mm']:.2f} of {form['effect_mm']:.2f} mm" if form else ""
+    best = r.get("oracle", {}).get("held_out_mm")
+    best = "" if best is None else f", {best:.2f} with the truth itself"
     return (
         f"{marks} {r['case']} {r['rig']} {r['lidar']}: {' + '.join(r['hidden']) or 'nothing'}\n"
         f"      found {r['found']} {'; '.join(said)} named {r['named']} {r['verdicts']} "
-        f"held out {errors} of {r['floor_mm']:.2f} mm {off} [{r['stopped']}]"
+        f"held out {errors} of {r['floor_mm']:.2f} mm{best} {off} [{r['stopped']}]"
     )

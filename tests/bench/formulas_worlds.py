@@ -36,6 +36,7 @@ class Case:
             a single shot.
         scatter_m: of the stops' own range zeros.
         seed: of all cases.
+        beams: of a stop, about.
     """
 
     name: str
@@ -45,6 +46,7 @@ class Case:
     times: float = 0.0
     scatter_m: float = 0.0
     seed: int = 0
+    beams: int = 2000
 
     @property
     def world(self) -> World:
@@ -55,6 +57,7 @@ class Case:
             lidar=LIDARS[(self.number // len(RIGS)) % len(LIDARS)],
             locations=LOCATIONS,
             stops=4 if self.rig == "head" else STOPS,
+            beams=self.beams,
             stop_scatter_m=self.scatter_m,
         )
 
@@ -161,8 +164,7 @@ def _logged(stops: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
     # The battery empties, and is changed twice.
     spent = (hours / hours.max() * 2.7 + rng.uniform(0, 1)) % 1
     stops["battery_v"] = 25.2 - 2.6 * spent + 0.08 * steps[2]
-    speed = rng.choice([2400.0, 3000.0, 3900.0], count)
-    stops["fan_rpm"] = speed + 40 * rng.standard_normal(count)
+    stops["fan_rpm"] = np.round(rng.uniform(2200, 4200, count))
     return stops
 
 
@@ -179,7 +181,6 @@ def _scan(recording: Path, truth: Path, name: str, world: World) -> pd.DataFrame
     scan.to_parquet(file, index=False)
     extra = true.drop(columns=["ring", "column"])
     extra["azimuth_rad"], extra["elevation_rad"] = np.arctan2(y, x), np.arctan2(z, flat)
-    scan["intensity"] = scan["intensity"]
     return pd.concat([scan, extra], axis=1).assign(stop=name)
 
 
