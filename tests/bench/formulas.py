@@ -2,7 +2,7 @@
 
     python -m tests.bench.formulas [--count 50] [--rigs arm,head,planes] [--times 1,0.4]
                                    [--nulls 100] [--beams 2000] [--jobs 1] [--seed 0]
-                                   [-o FILE --resume]
+                                   [--rungs 4] [--keep TABLES] [-o FILE --resume]
 
 Every case is a recording of `tests.worlds`, which shares no code with the program, with a formula
 of `formulas_effects` added to its ranges; it is fitted, diagnosed, and what the diagnosis proposes
@@ -17,9 +17,10 @@ import argparse
 import json
 import tempfile
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,20 @@ from sensors.documents import plain
 
 from .blunders import read
 from .formulas_effects import covariates, value
-from .formulas_judge import WITHIN, climbed, form, formulas, held_out, looks_at, named, oracle
+from .formulas_judge import (
+    MOST,
+    RUN,
+    at_floor,
+    climbed,
+    errors,
+    form,
+    formulas,
+    looks_at,
+    named,
+    oracle,
+    rows_of,
+)
+from .formulas_size import rms
 from .formulas_table import show
 from .formulas_worlds import RIGS, Case, cases, written
 
@@ -47,8 +61,14 @@ KNOWN = {
 }
 
 
-def run(case: Case) -> dict[str, Any]:
-    """What the program finds of a case, and how right that is."""
+def run(case: Case, keep: Path | None = None, most: int = MOST) -> dict[str, Any]:
+    """What the program finds of a case, and how right that is.
+
+    Args:
+        case: which.
+        keep: a folder that gets CASE.parquet, the residuals of the first fit, and CASE.json.
+        most: as of `judged`.
+    """
     with threadpool_limits(1), tempfile.TemporaryDirectory() as folder:
         made = written(case, Path(folder) / "case")
         about = {
@@ -61,10 +81,22 @@ def run(case: Case) -> dict[str, Any]:
             "size_mm": 1e3 * made.size_m,
         }
         beams = made.beams.assign(error_m=made.error_m)
-        return about | judged(made.folder, Path(folder), list(case.formulas), beams)
+        result = about | judged(made.folder, Path(folder), list(case.formulas), beams, most)
+        if keep is not None and result["held_out_mm"]:
+            _keep(keep, result, rows_of(Path(folder) / RUN, pd.read_csv(made.folder / "stops.csv")))
+        return result
 
 
-def run_known(name: str) -> dict[str, Any]:
+def _keep(folder: Path, result: Mapping[str, Any], rows: pd.DataFrame) -> None:
+    """For `formulas_baselines`."""
+    folder.mkdir(parents=True, exist_ok=True)
+    rows.to_parquet(folder / f"{result['case']}.parquet", index=False)
+    floor_mm = 1e3 * rms(rows["sigma_m"])
+    about = {name: result[name] for name in ("case", "rig", "hidden", "wanted")}
+    (folder / f"{result['case']}.json").write_text(json.dumps(about | {"floor_mm": floor_mm}))
+
+
+def run_known(name: str, most: int = MOST) -> dict[str, Any]:
     """The same of a recording of the independent simulator."""
     recording = SHARED / name
     key, text = KNOWN[name]
@@ -80,11 +112,11 @@ def run_known(name: str) -> dict[str, Any]:
     beams["error_m"] = value(formula, {n: beams[n].to_numpy() for n in beams})
     about = {"case": name, "rig": "known", "lidar": truth["sensor"], "beams": len(beams)}
     with threadpool_limits(1), tempfile.TemporaryDirectory() as folder:
-        return about | judged(recording, Path(folder), [formula], beams)
+        return about | judged(recording, Path(folder), [formula], beams, most)
 
 
 def judged(
-    recording: Path, folder: Path, hidden: Sequence[str], beams: pd.DataFrame
+    recording: Path, folder: Path, hidden: Sequence[str], beams: pd.DataFrame, most: int = MOST
 ) -> dict[str, Any]:
     """Run the program on a recording, and hold what it finds against the truth.
 
@@ -93,12 +125,13 @@ def judged(
         folder: where runs go.
         hidden: formulas.
         beams: as of `formulas_judge.form`.
+        most: rungs; with none, only what is to be had is told.
     """
-    ladder = climbed(recording, folder)
+    ladder = climbed(recording, folder, most)
     found, stops = formulas(ladder), pd.read_csv(recording / "stops.csv")
     wanted = frozenset().union(*map(covariates, hidden))
-    errors = [held_out(each) for each in ladder.runs if (each / "summary.json").exists()]
-    last, floor = errors[-1] if errors else (None, np.nan)
+    steps = [errors(each) for each in ladder.runs if (each / "summary.json").exists()]
+    best = oracle(ladder.runs[0], hidden, folder) if hidden and steps else {}
     result = {
         "hidden": list(hidden),
         "wanted": sorted(wanted),
@@ -108,16 +141,18 @@ def judged(
         "p_value": [rung.get("p_value") for rung in found],
         "named": named(ladder),
         "verdicts": [said["verdict"] for said in ladder.said],
+        "blunders": [said["blunders"] for said in ladder.said],
+        "formulas": [said["formulas"] for said in ladder.said],
         "stopped": ladder.stopped,
-        "held_out_mm": [mm for mm, _ in errors],
-        "floor_mm": floor,
+        "held_out_mm": [step["held_out_mm"] for step in steps],
+        "floor_mm": [step["floor_mm"] for step in steps],
+        "rejected": [step["rejected"] for step in steps],
+        "oracle": best,
         "fit_s": ladder.fit_s,
         "search_s": [said["cpu_s"] for said in ladder.said],
         "covariates_right": looks_at(found) == wanted,
-        "at_floor": last is not None and last < (1 + WITHIN) * floor,
+        "at_floor": bool(steps) and at_floor(steps[-1], best or steps[0]),
     }
-    if hidden and errors:
-        result["oracle"] = oracle(ladder.runs[0], hidden, folder)
     if hidden and ladder.rungs and len(ladder.runs) == 1 + len(ladder.rungs):
         result["form"] = form(ladder.runs[-1], found, stops, beams)
     return plain(result)
@@ -136,7 +171,7 @@ def main() -> None:
         listed = [case for case in listed if case.name in asked.only]
     jobs = {**{case.name: case for case in listed}, **{name: name for name in known}}
     left = [job for name, job in jobs.items() if name not in done]
-    for result in track(finished(left, asked.jobs), "formulas", len(left)):
+    for result in track(finished(left, asked.jobs, asked.keep, asked.rungs), "formulas", len(left)):
         done[result["case"]] = result
         if asked.out:
             with asked.out.open("a", encoding="utf-8") as file:
@@ -151,10 +186,12 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--rigs", default=",".join(RIGS), help="with commas")
     parser.add_argument("--times", default="1,0.4", help="sizes in sigmas of a shot, with commas")
     parser.add_argument("--beams", type=int, default=2000, help="of a stop, about")
+    parser.add_argument("--rungs", type=int, default=MOST, help="at most; 0: only the truth added")
     parser.add_argument("--only", default="", help="names of cases, with commas")
     parser.add_argument("--no-known", dest="known", action="store_false")
     parser.add_argument("--jobs", type=int, choices=(1, 2), default=1)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--keep", type=Path, help="a folder for the residuals of first fits")
     parser.add_argument("-o", dest="out", type=Path, help="a line of JSON per case is added here")
     parser.add_argument("--resume", action="store_true", help="keep what the file has")
     asked = parser.parse_args()
@@ -165,18 +202,21 @@ def _arguments() -> argparse.Namespace:
     return asked
 
 
-def finished(jobs: Sequence[Case | str], count: int) -> Iterator[dict[str, Any]]:
+def finished(
+    jobs: Sequence[Case | str], count: int, keep: Path | None, most: int
+) -> Iterator[dict[str, Any]]:
     """Results as they come."""
+    guarded = partial(_guarded, keep=keep, most=most)
     if count == 1:
-        yield from map(_guarded, jobs)
+        yield from map(guarded, jobs)
         return
     with ProcessPoolExecutor(count) as pool:
-        yield from pool.map(_guarded, jobs)
+        yield from pool.map(guarded, jobs)
 
 
-def _guarded(job: Case | str) -> dict[str, Any]:
+def _guarded(job: Case | str, keep: Path | None, most: int) -> dict[str, Any]:
     try:
-        return run_known(job) if isinstance(job, str) else run(job)
+        return run_known(job, most) if isinstance(job, str) else run(job, keep, most)
     except Exception:
         name = job if isinstance(job, str) else job.name
         return {"case": name, "error": traceback.format_exc()}

@@ -15,7 +15,7 @@ import pandas as pd
 from calib.diagnosis.verdict import worth_adding
 from calib.effects.own.expression import Expression
 
-from ..mishaps.judge import rigcal, solution
+from ..mishaps.judge import blunders, rigcal, solution
 from .formulas_effects import same
 from .formulas_size import Absorbs, rms
 
@@ -23,6 +23,8 @@ MOST = 4  # rungs: two that are hidden, one that was wrong, and one that is too 
 LIMIT_S = 600  # CPU, of a command
 WITHIN = 0.1  # of the floor, and of the effect's rms
 SIGMAS = 2.0
+THROWN = 0.01  # of the beams; of the window of `known_sector` it is a tenth
+RUN = "run0"  # the first fit
 KEY = ["stop", "ring", "column"]
 
 
@@ -34,7 +36,7 @@ class Ladder:
         runs: fits, first to last.
         rungs: of each rung after the first what it adds: ``effects``; of a formula ``covariates``,
             ``formula`` (its document), ``says`` and ``p_value``.
-        said: per diagnosis its verdict and the seconds it took.
+        said: per diagnosis its verdict, blunders, how many formulas it has, and seconds.
         fit_s: CPU seconds of the first fit.
         stopped: why no further rung was tried.
     """
@@ -48,21 +50,24 @@ class Ladder:
 
 def climbed(recording: Path, folder: Path, most: int = MOST) -> Ladder:
     """Fit, then diagnose and add what it proposes, until it proposes nothing."""
-    run = folder / "run0"
+    run = folder / RUN
     first = rigcal("fit", recording, "-o", run, limit_s=LIMIT_S)
     ladder = Ladder([run], first.seconds)
     if first.code != 0:
         ladder.stopped = f"fit: {complaint(first)}"
         return ladder
-    while True:
+    while len(ladder.rungs) < most:
         begin = time.perf_counter()
         told = rigcal("diagnose", ladder.runs[-1], limit_s=LIMIT_S)
         document = told.document
         seconds = {"cpu_s": told.seconds, "wall_s": time.perf_counter() - begin}
-        ladder.said.append({"verdict": document.get("verdict", complaint(told)), **seconds})
+        verdict = document.get("verdict") or complaint(told)
+        loose = sum(bool(each.get("formula")) for each in document.get("unexplained", []))
+        told_of = {"verdict": verdict, "blunders": blunders(document), "formulas": loose}
+        ladder.said.append(told_of | seconds)
         rung = proposed(document)
-        if not rung or len(ladder.rungs) == most:
-            ladder.stopped = "nothing more" if not rung else "too many"
+        if not rung:
+            ladder.stopped = "nothing more"
             return ladder
         run = folder / f"run{len(ladder.runs)}"
         grown = rigcal("add", ladder.runs[-1], *rung["effects"], "-o", run, limit_s=LIMIT_S)
@@ -71,13 +76,15 @@ def climbed(recording: Path, folder: Path, most: int = MOST) -> Ladder:
             ladder.stopped = f"add {', '.join(rung['effects'])}: {complaint(grown)}"
             return ladder
         ladder.runs.append(run)
+    ladder.stopped = "too many"
+    return ladder
 
 
 def oracle(fitted: Path, hidden: Sequence[str], folder: Path) -> dict[str, Any]:
     """What is to be had: the hidden formulas themselves, added to a fit.
 
     Returns:
-        ``held_out_mm`` and ``floor_mm``; empty where that fit fails.
+        As `errors`; empty where that fit fails.
     """
     file, run = folder / "truth.yaml", folder / "oracle"
     effects = [
@@ -87,8 +94,7 @@ def oracle(fitted: Path, hidden: Sequence[str], folder: Path) -> dict[str, Any]:
     file.write_text(json.dumps(effects))  # YAML holds JSON
     if rigcal("add", fitted, file, "-o", run, limit_s=LIMIT_S).code != 0:
         return {}
-    error, floor = held_out(run)
-    return {"held_out_mm": error, "floor_mm": floor}
+    return errors(run)
 
 
 def complaint(said: Any) -> str:
@@ -123,10 +129,22 @@ def looks_at(rungs: Sequence[Mapping[str, Any]]) -> frozenset[str]:
     return same(name for rung in rungs for name in rung["covariates"])
 
 
-def held_out(run: Path) -> tuple[float | None, float]:
-    """Held-out error and the floor of a run, mm."""
-    said = json.loads((run / "summary.json").read_text())["rms_mm"]
-    return said["held_out"], said["noise_floor"]
+def errors(run: Path) -> dict[str, float | None]:
+    """Held-out error and the floor of a run, mm, and the share of the beams that it leaves out."""
+    said = json.loads((run / "summary.json").read_text())
+    rms_mm = said["rms_mm"]
+    return {
+        "held_out_mm": rms_mm["held_out"],
+        "floor_mm": rms_mm["noise_floor"],
+        "rejected": said["rejected_share"],
+    }
+
+
+def at_floor(last: Mapping[str, Any], best: Mapping[str, Any]) -> bool:
+    """Whether a run's held-out error is within a tenth of the floor, and not because it throws
+    away what is hidden, as a window of azimuth: no more beams than with the truth, to `THROWN`."""
+    near = last["held_out_mm"] is not None and last["held_out_mm"] < (1 + WITHIN) * last["floor_mm"]
+    return near and last["rejected"] < best["rejected"] + THROWN
 
 
 def fitted(run: Path, rungs: Sequence[Mapping[str, Any]], stops: pd.DataFrame) -> pd.DataFrame:

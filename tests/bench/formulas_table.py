@@ -42,9 +42,14 @@ def groups(hidden: Sequence[Result]) -> Iterator[tuple[str, list[Result]]]:
             yield value, [r for r in hidden if key(r) == value]
 
 
+def near(step: Result) -> bool:
+    """Whether a held-out error is within a tenth of the floor."""
+    return step["held_out_mm"] is not None and step["held_out_mm"] < 1.1 * step["floor_mm"]
+
+
 def false(null: Result) -> bool:
     """Whether a formula was proposed where nothing is hidden."""
-    return bool(null["found"]) or any("formula" in said for said in null["says"] if said)
+    return any(null["formulas"])
 
 
 def show(results: Sequence[Result], console: Console | None = None) -> None:
@@ -55,6 +60,8 @@ def show(results: Sequence[Result], console: Console | None = None) -> None:
     hidden = [r for r in good if r["hidden"] and r["rig"] != "known"]
     nulls = [r for r in good if not r["hidden"]]
     if hidden:
+        attainable = [r for r in hidden if r["oracle"] and near(r["oracle"])]
+        console.print(f"{len(attainable)} of {len(hidden)} come to the floor with the truth itself")
         console.print(_shares(hidden))
     if nulls:
         count = sum(map(false, nulls))
@@ -79,6 +86,12 @@ def _shares(hidden: Sequence[Result]) -> Table:
     return table
 
 
+def _blunders(r: Result) -> str:
+    """What was taken for a blunder."""
+    names = [name for some in r.get("blunders", []) for name, *_ in some]
+    return f"blunders {', '.join(dict.fromkeys(names))} " if names else ""
+
+
 def _line(r: Result) -> str:
     """What a case hid, and what was found of it."""
     said = [s or " | ".join(b)[:120] for s, b in zip(r["says"], r["basis"], strict=True)]
@@ -89,10 +102,13 @@ def _line(r: Result) -> str:
     errors = " ".join("?" if mm is None else f"{mm:.2f}" for mm in r["held_out_mm"])
     form = r.get("form", {})
     off = f"off {form['off_mm']:.2f} of {form['effect_mm']:.2f} mm" if form else ""
-    best = r.get("oracle", {}).get("held_out_mm")
-    best = "" if best is None else f", {best:.2f} with the truth itself"
+    floor = ", ".join(f"{mm:.2f}" for mm in r["floor_mm"][-1:])
+    thrown = ", ".join(f"{x:.1%}" for x in r["rejected"][-1:])
+    best = r.get("oracle", {})
+    best = f" (with the truth {best['held_out_mm']:.2f}, {best['rejected']:.1%})" if best else ""
     return (
         f"{marks} {r['case']} {r['rig']} {r['lidar']}: {' + '.join(r['hidden']) or 'nothing'}\n"
         f"      found {r['found']} {'; '.join(said)} named {r['named']} {r['verdicts']} "
-        f"held out {errors} of {r['floor_mm']:.2f} mm{best} {off} [{r['stopped']}]"
+        f"{_blunders(r)}held out {errors} of {floor} mm, {thrown} left out{best} {off} "
+        f"[{r['stopped']}]"
     )

@@ -36,7 +36,7 @@ class Case:
             a single shot.
         scatter_m: of the stops' own range zeros.
         seed: of all cases.
-        beams: of a stop, about.
+        beams: of a stop, about; twice as many where planes must be found in them.
     """
 
     name: str
@@ -57,7 +57,7 @@ class Case:
             lidar=LIDARS[(self.number // len(RIGS)) % len(LIDARS)],
             locations=LOCATIONS,
             stops=4 if self.rig == "head" else STOPS,
-            beams=self.beams,
+            beams=self.beams * (2 if self.rig == "planes" else 1),
             stop_scatter_m=self.scatter_m,
         )
 
