@@ -79,7 +79,7 @@ def data(table: pd.DataFrame) -> Data:
     mm = np.clip(mm - np.median(mm), -CLIP * spread, CLIP * spread)
     held = pd.factorize(table["stop"].str[:3])[0] % 3 == 2
     x = scaled.to_numpy()
-    return Data(list(scaled), x[~held], mm[~held], x[held], mm[held])
+    return Data(list(scaled), x[~held], mm[~held], test=x[held], test_mm=mm[held])
 
 
 def trees(data: Data) -> Answer:

@@ -6,7 +6,7 @@ import json
 import shutil
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -77,13 +77,12 @@ def cases(
         fit = [rig for rig in (*rigs[k % len(rigs) :], *rigs) if has_all(rig, formulas)]
         if fit:
             scatter = SCATTER_M * (k // 3 % 2)
-            out += [
-                Case(f"{k:02d}x{size:g}", formulas, fit[0], k, size, scatter, seed)
-                for size in times
-            ]
+            case = Case("", formulas, fit[0], k, scatter_m=scatter, seed=seed)
+            out += [replace(case, name=f"{k:02d}x{size:g}", times=size) for size in times]
     for k in range(nulls):
         scatter = SCATTER_M * (k // 3 % 2)
-        out.append(Case(f"null{k:03d}", (), rigs[k % len(rigs)], 1000 + k, 0.0, scatter, seed))
+        rig = rigs[k % len(rigs)]
+        out.append(Case(f"null{k:03d}", (), rig, 1000 + k, scatter_m=scatter, seed=seed))
     return out
 
 
@@ -134,7 +133,7 @@ def written(case: Case, folder: Path) -> Written:
     error_m = np.broadcast_to(error_m, len(beams))
     _lengthen(recording, beams, error_m)
     left_m = rms(Absorbs.of(beams).off(error_m)) if case.formulas else 0.0
-    return Written(recording, beams, error_m, left_m, shot_m)
+    return Written(recording, beams, error_m, size_m=left_m, shot_m=shot_m)
 
 
 def _scaled(
