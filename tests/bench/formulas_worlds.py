@@ -20,6 +20,7 @@ from .formulas_size import Absorbs, rms
 RIGS = ("arm", "head", "planes")
 SCATTER_M = 0.0003
 LOCATIONS, STOPS = 6, 5  # of the arm's rigs; a tracked head, 6 x 4
+FOR_PLANES = 4000  # with half as many, some stops of OS0 and XT32 have no flat patch
 LEAST_LEFT = 0.3  # of an effect, that rings and motions do not absorb: else it is none to look for
 
 
@@ -36,7 +37,7 @@ class Case:
             a single shot.
         scatter_m: of the stops' own range zeros.
         seed: of all cases.
-        beams: of a stop, about; twice as many where planes must be found in them.
+        beams: of a stop, about; at least `FOR_PLANES` where planes must be found in them.
     """
 
     name: str
@@ -57,7 +58,7 @@ class Case:
             lidar=LIDARS[(self.number // len(RIGS)) % len(LIDARS)],
             locations=LOCATIONS,
             stops=4 if self.rig == "head" else STOPS,
-            beams=self.beams * (2 if self.rig == "planes" else 1),
+            beams=max(self.beams, FOR_PLANES) if self.rig == "planes" else self.beams,
             stop_scatter_m=self.scatter_m,
         )
 
