@@ -38,11 +38,13 @@ class Site(Enum):
 
 @dataclass(frozen=True)
 class Param:
-    """One unknown of an effect: name, unit, and how large it may plausibly be; 0 holds it."""
+    """One unknown of an effect: name, unit, and how large it may plausibly be; 0 holds it. A fit
+    begins at `start`: where that is far out, beams are judged by it."""
 
     name: str
     unit: str
     sigma: float
+    start: float = 0.0
 
 
 LazyColumn = np.ndarray | Callable[[], np.ndarray]

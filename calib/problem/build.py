@@ -46,7 +46,8 @@ def build(
     for source, terms in zip(sources, problem.terms, strict=True):
         for term in (t for t in terms if not t.effect.widens):
             unknown = effect_unknown(term, source)
-            problem.add(unknown)
+            params = term.effect.params(source.rig)
+            problem.add(unknown, np.array([params[i].start for i in term.free], float))
             if unknown.role is Role.CALIBRATION:
                 problem.calibration.append(unknown.name)
     problem.calibration = list(dict.fromkeys(problem.calibration))

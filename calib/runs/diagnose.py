@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,8 @@ from calib.diagnosis.chance import Spread
 from calib.diagnosis.rejects import rejects
 from calib.diagnosis.search import search
 from calib.diagnosis.stand import Stand
-from calib.diagnosis.verdict import Diagnosis, conclude
+from calib.diagnosis.verdict import Diagnosis, believed, conclude
+from calib.diagnosis.verdict.unnamed import Unnamed, unnamed
 from calib.diagnosis.weak import to_be_told_apart, weak_directions
 from calib.effects import DEFAULT, own_effects
 from calib.linear.parallel import one_blas_thread
@@ -71,13 +73,17 @@ def _found(
     rejected = rejects(found.looks[0].stand, progress) if run.converged else None
     falls = {}
     before = run.summary["rms_mm"]["held_out"]
-    if refits and run.model["hold_out"] != "none" and before is not None:
+    before = before if refits and run.model["hold_out"] != "none" else None
+    if before is not None:
         if found.looks[0].stand is not stand and found.found:
             before = _unseen(found.looks[0].stand, run, progress).rms_mm
         for step in found.found:
             unseen = _unseen(step.after.stand, run, progress)
             falls[step.effect.name] = (before, unseen.rms_mm, unseen.floor_mm)
             before = unseen.rms_mm
+    unseen = partial(_unseen, run=run, progress=progress) if before is not None else None
+    doubtful = not believed(found, falls)
+    formulas = unnamed(found, falls, doubtful, unseen, progress) if run.converged else Unnamed()
     result = conclude(
         found,
         falls,
@@ -86,6 +92,7 @@ def _found(
         rejected,
         forbids(run),
         [told.of_rings(lidar, each) for lidar, each in harmful.items()],
+        formulas,
     )
     tokens = told.tokens(result.blunders)
     apart = to_be_told_apart(result.candidates, result.weak_directions)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -11,13 +11,13 @@ from typing import Any
 from calib import outputs
 from calib.blunders import told
 from calib.diagnosis import Diagnosis
-from calib.effects import Effect, is_known, load_effects, own_effects, trust_in
+from calib.effects import Effect, is_known, load_effects, own_effects, read, trust_in
 from calib.problem.model import Model, Source
 from calib.rig import load_rig
 from calib.runs.calibrate import calibrate, grow, recordings_document
 from calib.runs.diagnose import diagnose
 from calib.runs.reopen import model_of
-from calib.runs.run import Run
+from calib.runs.run import DIAGNOSIS, Run
 from calib.solve.fit import Progress
 from chains.errors import InputError
 from sensors.documents import plain, write_json
@@ -110,6 +110,7 @@ class _Climb:
         self.runs: list[Run] = []
         self.steps: list[dict[str, Any]] = []
         self.refused: list[str] = []
+        self._formulas: Mapping[str, Mapping[str, Any]] = {}
 
     @property
     def run(self) -> Run:
@@ -135,7 +136,8 @@ class _Climb:
             return True
         if not self.run.converged:  # of such a run nothing else is learnt
             return False
-        names = diagnosis.worth_adding
+        self._formulas = diagnosis.formulas
+        names = [*diagnosis.worth_adding, *self._formulas]
         earlier = [name for step in self.steps for name in step["added"]]
         before = len(self.runs)
         for name in names:
@@ -155,7 +157,11 @@ class _Climb:
                 outputs.remove(folder)
 
     def _add(self, name: str) -> None:
-        effects = load_effects((name,), own=() if is_known(name) else self._own)
+        described = self._formulas.get(name)
+        if described is not None:
+            effects = (read(described, self.run.folder / DIAGNOSIS, {}),)
+        else:
+            effects = load_effects((name,), own=() if is_known(name) else self._own)
         families = {effect.family for effect in self._model.effects}
         if name not in self.refused and effects[0].family not in families:
             self._try(self._model.plus(effects), [name], [])
@@ -192,6 +198,7 @@ class _Climb:
             {
                 "run": str(run.folder),
                 "added": added,
+                "empirical": [name for name in added if name in self._formulas],
                 "dropped": dropped,
                 "left_out": list(left_out),
                 "held_out_rms_mm": rms["held_out"],

@@ -15,22 +15,14 @@ from calib.diagnosis.candidates import concerned, lacking
 from calib.diagnosis.curves import Curve, curves
 from calib.diagnosis.rejects import Rejects
 from calib.diagnosis.screen import Candidate, Screen
-from calib.diagnosis.search import (
-    ALPHA,
-    ALPHA_NOISE,
-    FEWEST,
-    ODDS,
-    NamedEffect,
-    Search,
-    angle_deg,
-)
+from calib.diagnosis.search import FEWEST, ODDS, Search
 from calib.diagnosis.stand import Look
-from calib.diagnosis.suggest import formula, hangs_on, what_separates
-from calib.diagnosis.verdict.matters import Weighed, weighed
+from calib.diagnosis.suggest import formula, hangs_on
+from calib.diagnosis.verdict.candidates import candidate_documents, explained
+from calib.diagnosis.verdict.matters import weighed
 from calib.diagnosis.verdict.sentences import BAD, UNNAMED, sentences_of, stops_of
-from calib.effects import Site
+from calib.diagnosis.verdict.unnamed import Unnamed
 from calib.problem.model import labels
-from calib.results.solution import one_unit
 from calib.rig import Rig
 
 VERDICTS = {
@@ -94,6 +86,12 @@ class Diagnosis:
         that something without a name is dressed up in."""
         return worth_adding(self.candidates)
 
+    @property
+    def formulas(self) -> dict[str, Mapping[str, Any]]:
+        """Name -> the effect that draws what has no name; none beside a verdict that needs none."""
+        found = [u for u in self.unexplained if self.verdict in (UNNAMED, "missing_effect")]
+        return {u["formula"]["name"]: u["formula"] for u in found if "says" in u}
+
     def document(self) -> dict[str, Any]:
         """As written to diagnosis.json."""
         return {
@@ -130,6 +128,7 @@ def conclude(
     rejected: Rejects | None = None,
     forbids: Sequence[str] = (),
     rings: Sequence[Mapping[str, Any]] = (),
+    formulas: Unnamed = Unnamed(),  # noqa: B008 - frozen
 ) -> Diagnosis:
     """Sum up a search.
 
@@ -141,27 +140,28 @@ def conclude(
         rejected: what the fit threw away.
         forbids: why the run is not to be believed, whatever its model explains; a clause each.
         rings: whose numbers are wrong, as blunders.
+        formulas: of what has no name.
     """
     heavy = weighed(found, held_out, summary["rms_mm"])
     found, first = heavy.found, found.looks[0]
     spoilt = [*rings, *(rejected.blunders() if rejected and not found.found else [])]
-    hold = _names_hold(found) and not _leave_most(found, held_out)
+    hold = believed(found, held_out) and not formulas.instead
     thrown = bool(heavy.refused) or (rejected is not None and not rejected.explained)
-    verdict = BAD if spoilt or found.blunders else _verdict(found, hold, thrown)
+    more = thrown or bool(formulas.formulas)
+    verdict = BAD if spoilt or found.blunders else _verdict(found, hold, more)
     if verdict == "adequate" and forbids:
         verdict = BAD
-    candidates = _candidates(heavy, held_out, verdict == UNNAMED, hold)
+    candidates = candidate_documents(heavy, held_out, verdict == UNNAMED, hold)
     untestable = _untestable(first)
     thrown = rejected.unexplained() if rejected and verdict == UNNAMED else []
-    taken = first.stand.model.names
-    unexplained = [_unexplained(c, screen, taken) for screen, c in _without_a_name(found, verdict)]
-    unexplained = [*thrown, *unexplained]
+    unexplained = _structure(found, verdict, formulas, thrown)
     blunders = [*spoilt, *(told.document(left, _rig(left, first)) for left in found.blunders)]
     sentences = sentences_of(verdict, heavy, candidates, unexplained, untestable, blunders)
     if forbids and verdict == BAD and not blunders:
         sentences.insert(0, f"This run is not to be believed as it stands: {'; '.join(forbids)}.")
+    sentences += [formulas.refused] if formulas.refused else []
     if rejected:
-        first_of_all = verdict == UNNAMED and not rejected.explained
+        first_of_all = not formulas.formulas and verdict == UNNAMED and not rejected.explained
         sentences.insert(0 if first_of_all else len(sentences), rejected.sentence)
     return Diagnosis(
         verdict=verdict,
@@ -203,6 +203,16 @@ def _verdict(found: Search, hold: bool, more: bool) -> str:
     return "missing_effect" if named else UNNAMED
 
 
+def believed(found: Search, held_out: Mapping[str, tuple[float, float, float]]) -> bool:
+    """Whether the names that a search found are the answer; so they are where there are none.
+
+    Args:
+        found: the search.
+        held_out: as of `conclude`.
+    """
+    return _names_hold(found) and not _leave_most(found, held_out)
+
+
 def _leave_most(found: Search, held_out: Mapping[str, tuple[float, float, float]]) -> bool:
     """Whether the names leave most of the held-out error, where that is further above its floor
     than chance puts it."""
@@ -210,7 +220,7 @@ def _leave_most(found: Search, held_out: Mapping[str, tuple[float, float, float]
     if not falls or not found.looks[0].stand.estimate.scans:
         return False
     after, floor = falls[-1][1:]
-    return after > BY_CHANCE * floor and _explained(falls[0][0], after, floor) < ABSORBED
+    return after > BY_CHANCE * floor and explained(falls[0][0], after, floor) < ABSORBED
 
 
 def _names_hold(found: Search) -> bool:
@@ -241,18 +251,6 @@ def _absorbed(found: Search) -> float:
     return 1.0 - max(after, 0.0) / max(before, after, 1e-9)
 
 
-def _ranked(found: Search) -> list[Candidate]:
-    """Those confirmed first, in the order in which they were; then by what they explain."""
-    confirmed = [step.candidate for step in found.found]
-    families = {c.effect.family for c in confirmed}
-    rest = (c for c in found.looks[0].named.candidates if c.effect.family not in families)
-    noise = found.looks[-1].noise.candidates
-    if found.scatter is not None:
-        family = found.scatter.effect.family
-        noise = [found.scatter, *(c for c in noise if c.effect.family != family)]
-    return [*confirmed, *rest, *noise]
-
-
 def _without_a_name(found: Search, verdict: str) -> list[tuple[Screen, Candidate]]:
     """What is left without a name; as it stood at first if the first name is not to be believed."""
     worn = verdict == UNNAMED and bool(found.found) and found.dressed_up(0)
@@ -260,106 +258,15 @@ def _without_a_name(found: Search, verdict: str) -> list[tuple[Screen, Candidate
     return [(found.looks[look].unnamed, c) for c in left]
 
 
-def _candidates(
-    heavy: Weighed,
-    held_out: Mapping[str, tuple[float, float, float]],
-    unnamed: bool,
-    hold: bool,
-) -> list[dict[str, Any]]:
-    """All of them, those first that were confirmed.
-
-    Args:
-        heavy: what of the search matters.
-        held_out: as of `conclude`.
-        unnamed: whether something has no name.
-        hold: whether the names are to be believed nevertheless, where bins do not do better.
-    """
-    found = heavy.found
-    named, out = len(found.found), [_candidate(c, found, held_out) for c in _ranked(found)]
-    for each in out:
-        told_of = heavy.matter.get(each["add"])
-        each["matters"] = told_of.document() if told_of else None
-        worn = bool(each["step"]) and (not hold or found.dressed_up(each["step"] - 1))
-        each["dressed_up"] = unnamed and worn
-    # What has no name may scatter as chance does: that is judged once it is in the model.
-    chance = [
-        each.document(None if unnamed else named + i) for i, each in enumerate(found.chance, 1)
-    ]
-    others = [each.document(None) for each in found.looks[-1].chance]
-    return [*out[:named], *chance, *out[named:], *others]
-
-
-def _candidate(
-    candidate: Candidate, found: Search, held_out: Mapping[str, tuple[float, float, float]]
-) -> dict[str, Any]:
-    """As the contract has it."""
-    effect, test, look = candidate.effect, candidate.test, found.looks[0].named
-    step = next((i for i, s in enumerate(found.found, 1) if s.effect.name == effect.name), None)
-    if step:
-        look = found.found[step - 1].before.named
-    rig = next(s.rig for s in found.looks[0].stand.sources if effect.params(s.rig))
-    params = [p for p in effect.params(rig) if p.sigma]
-    whole = len(params) == len(test.columns)
-    before, after, floor = held_out.get(effect.name, (None, None, None))
-    noise = effect.site is Site.NOISE
-    clean = (found.looks[-1].noise if noise else found.looks[-1].named).common
-    rivals = _rivals(found.found[step - 1]) if step else []
-    estimate, sigma = test.estimate(), test.sigma(max(clean, 1.0))
-    if step:
-        estimate = found.looks[-1].stand.theta(effect, whole=False)
-        sigma = found.looks[-1].stand.sigma(effect)
-    level = ALPHA_NOISE if noise else ALPHA
-    alpha = -np.expm1(np.log1p(-level) / candidate.looks)
-    document = effect.document()
-    return {
-        "effect": effect.family,
-        "add": effect.name,
-        # Of a user's own: what `rigcal add` reads, wherever its file is by then.
-        **({} if isinstance(document, str) else {"document": document}),
-        "site": "range" if effect.site is Site.BEAM else effect.site.value,
-        "p_value": candidate.p_value,
-        "p_adjusted": found.found[step - 1].p_adjusted if step else candidate.p_adjusted,
-        "statistic": test.statistic,
-        "dof": test.dof,
-        "step": step,
-        "dressed_up": False,
-        "held_out_rms_mm": {"before": before, "after": after},
-        "error_explained": _explained(before, after, floor),
-        "rms_mm": None if noise else 1e3 * look.size_m(candidate),
-        "unabsorbed_rms_mm": None if noise else 1e3 * look.rms_m(candidate),
-        "parameters": {
-            "unit": one_unit([p.unit for p in params]),
-            "names": [p.name for p in params] if whole else [],
-            "estimate": estimate if whole else [],
-            "sigma": sigma if whole else [],
-        },
-        "smallest_detectable": test.smallest_detectable(clean, alpha),
-        "indistinguishable_from": [r["effect"] for r in rivals],
-        "rivals": rivals,
-    }
-
-
-def _explained(before: float | None, after: float | None, floor: float | None) -> float | None:
-    """Share of what the held-out error has above what is expected."""
-    if before is None or after is None or floor is None:
-        return None
-    return (before**2 - after**2) / max(before**2 - floor**2, before**2 - after**2, 1e-12)
-
-
-def _rivals(step: NamedEffect) -> list[dict[str, Any]]:
-    screen = step.before.named
-    scale = max(step.after.named.common, step.judged.inflation)
-    own = step.candidate.test.evidence(scale)
-    return [
-        {
-            "effect": other.effect.family,
-            "add": other.effect.name,
-            "angle_deg": angle_deg(screen, step.candidate, other),
-            "odds": float(np.exp(own - other.test.evidence(scale))),
-            "separate": what_separates(step.effect, other.effect),
-        }
-        for other in step.rivals
-    ]
+def _structure(
+    found: Search, verdict: str, formulas: Unnamed, thrown: Sequence[Mapping[str, Any]]
+) -> list[Mapping[str, Any]]:
+    """What has no name: formulas, or bins where there are none; and what was `thrown` away."""
+    taken = found.looks[0].stand.model.names
+    if formulas.formulas:
+        return [*formulas.documents(taken), *thrown]
+    left = _without_a_name(found, verdict)
+    return [*thrown, *(_unexplained(c, screen, taken) for screen, c in left)]
 
 
 def _unexplained(candidate: Candidate, screen: Screen, taken: Sequence[str]) -> dict[str, Any]:

@@ -77,11 +77,27 @@ def _structure_sentences(unexplained: Sequence[Mapping[str, Any]], residual: str
         out.append(
             f"The residual structure depends on {what}: {each['rms_mm']:.2f} mm rms of {residual}."
         )
-        if each["formula"]:
+        if "says" in each:
+            out += _formula_sentences(each)
+        elif each["formula"]:
             out.append(
                 f"An empirical effect for it can be added by its name, '{each['formula']['name']}'."
                 f" {each['formula']['what']}"
             )
+    return out
+
+
+def _formula_sentences(each: Mapping[str, Any]) -> list[str]:
+    """Of structure whose formula was found."""
+    before, after = (each["held_out_rms_mm"][k] for k in ("before", "after"))
+    fall = f" The held-out error goes from {before:.2f} to {after:.2f} mm." if after else ""
+    name = each["formula"]["name"]
+    out = [
+        f"Its formula: {each['says']} (adjusted p = {each['p_adjusted']:.1g}).{fall} "
+        f"It can be added by its name, '{name}'. {each['formula']['what']}"
+    ]
+    for other in each["alike"][:1]:
+        out.append(f"This data cannot tell it from {other['says']}; {other['separate']} would.")
     return out
 
 

@@ -32,6 +32,8 @@ FUNCTIONS: dict[str, tuple[int, Callable]] = {
     "abs": (1, np.abs),
     "minimum": (2, np.minimum),
     "maximum": (2, np.maximum),
+    "floor": (1, np.floor),
+    "mod": (2, np.mod),
     "where": (3, lambda condition, yes, no: np.where(condition != 0, yes, no)),
 }
 OPERATORS: dict[type, Callable] = {

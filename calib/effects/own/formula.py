@@ -39,6 +39,8 @@ class FormulaFile(Document):
         sigma: how large a parameter may plausibly be.
         basis: a formula per parameter: the error at the site per unit of it.
         parameters: their names; numbered where there are none.
+        start: where a fit begins, a number per parameter; 0 where there are none. Beams that are
+            off by more than noise explains are rejected until the effect is about right.
         what, typical, source: for its page.
     """
 
@@ -48,6 +50,7 @@ class FormulaFile(Document):
     sigma: Sigma
     basis: Annotated[tuple[Text, ...], pydantic.Field(min_length=1)]
     parameters: tuple[Text, ...] = ()
+    start: tuple[Number, ...] = ()
     what: str = ""
     typical: str = ""
     source: str = ""
@@ -63,6 +66,11 @@ class FormulaFile(Document):
             raise ValueError(
                 f"{len(self.parameters)} parameters are named, and basis has {len(self.basis)} "
                 f"formulas; name one for each"
+            )
+        if self.start and len(self.start) != len(self.basis):
+            raise ValueError(
+                f"start has {len(self.start)} numbers, and basis {len(self.basis)} formulas; "
+                f"give one for each"
             )
         if len(set(self.parameters)) < len(self.parameters):
             raise ValueError("two parameters have one name; give each its own")
@@ -115,7 +123,9 @@ class FormulaEffect(Effect):
             return ()
         elif self.site is Site.TRACKER:
             self._body(rig)
-        return tuple(Param(name, self.file.unit, self.file.sigma) for name in self.parameters)
+        start = self.file.start or (0.0,) * len(self.parameters)
+        pairs = zip(self.parameters, start, strict=True)
+        return tuple(Param(name, self.file.unit, self.file.sigma, at) for name, at in pairs)
 
     def basis(self, view: View) -> np.ndarray:
         values = [finite(np.atleast_1d(self._value(e, view))) for e in self.expressions]

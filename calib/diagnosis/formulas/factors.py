@@ -1,0 +1,203 @@
+"""Functions of one covariate that formulas are made of: without a unit, as text and as columns.
+
+A factor has columns whose coefficients are linear, and constants that are not: where a step is, how
+long a period. Its text is what `calib.effects.own.expression` reads, so what is fitted, written and
+added is one thing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from calib.effects.own.expression import Expression
+
+Columns = Mapping[str, np.ndarray]
+
+STEPS = 16  # places at which a step is tried first
+WINDOW = 12  # edges between which a window is tried first
+CENTRES, WIDTHS = 8, (0.06, 0.15)  # of bumps; of the covariate's range
+SCALES = (0.1, 0.25, 0.6)  # of exponentials, of the covariate's range
+PERIODS = tuple(np.geomspace(0.1, 1.5, 24))  # of waves, of the covariate's range
+ORDERS = 12  # of harmonics of an angle
+FEWEST_VALUES = 3  # of a covariate that is not a class
+WIDE = 1.5  # largest over smallest value, from which powers differ from a line
+LEAST_SHARE = 0.005  # of the beams that a class must have
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A sort of factor.
+
+    Args:
+        columns: its columns; ``{x}`` is the covariate, ``{0}``, ``{1}`` the constants.
+        cost: how much there is to it: what takes the place of what, where data cannot tell.
+        free: how many of the constants, from the first, are to be found.
+        whole: whether constants are whole numbers.
+    """
+
+    columns: tuple[str, ...]
+    cost: float
+    free: int = 0
+    whole: bool = False
+
+
+# The 1 beside a line, a square and a logarithm lets the place of their zero be found.
+KINDS = {
+    "line": Kind(("({x} - {0}) / {1}", "1"), 1.0),
+    "square": Kind(("(({x} - {0}) / {1})**2", "({x} - {0}) / {1}", "1"), 2.5),
+    "logarithm": Kind(("log({x} / {0})", "1"), 1.5),
+    "root": Kind(("sqrt({x} / {0})",), 1.5),
+    "power": Kind(("({x} / {0})**{1}",), 1.5),
+    "reciprocal": Kind(("{0} / {x}",), 1.5),
+    "decay": Kind(("exp(-({x} - {1}) / {0})",), 2.0, free=1),
+    "growth": Kind(("exp(({x} - {1}) / {0})",), 2.0, free=1),
+    "wave": Kind(("sin(2 * pi * {x} / {0})", "cos(2 * pi * {x} / {0})"), 2.5, free=1),
+    "harmonic": Kind(("sin({0} * {x})", "cos({0} * {x})"), 2.0, whole=True),
+    "step": Kind(("{x} > {0}",), 2.0, free=1),
+    "window": Kind(("({x} > {0}) * ({x} < {1})",), 2.5, free=2),
+    "outside": Kind(("({x} < {0}) + ({x} > {1})",), 2.5, free=2),
+    "ramp": Kind(("maximum(0, {x} - {0}) / {1}",), 2.0, free=1),
+    "ramp down": Kind(("maximum(0, {0} - {x}) / {1}",), 2.0, free=1),
+    "bump": Kind(("exp(-(({x} - {0}) / {1})**2)",), 2.5, free=2),
+    "over cosine": Kind(("1 / cos({x}) - 1",), 1.0),
+    "tangent": Kind(("tan({x})",), 1.0),
+    "tangent squared": Kind(("tan({x})**2",), 1.5),
+    "sine": Kind(("sin({x})",), 1.0),
+    "cosine": Kind(("cos({x})", "1"), 1.2),
+    "every other": Kind(("where(mod({x}, 2) > 0.5, 1, -1)",), 1.5),
+    "one of": Kind(("mod({x}, {0}) == {1}",), 2.0, whole=True),
+    "class": Kind(("{x} == {0}",), 1.0, whole=True),
+}
+
+
+@dataclass(frozen=True)
+class Factor:
+    """One function of one covariate.
+
+    Args:
+        covariate: its name.
+        kind: of `KINDS`.
+        constants: those that the kind's columns have.
+    """
+
+    covariate: str
+    kind: str
+    constants: tuple[float, ...] = ()
+
+    @property
+    def texts(self) -> tuple[str, ...]:
+        """Its columns as formulas."""
+        numbers = [f"{c:.6g}" for c in self.constants]
+        found = (text.format(*numbers, x=self.covariate) for text in KINDS[self.kind].columns)
+        return tuple(_plain(text, self.covariate) for text in found)
+
+    @property
+    def cost(self) -> float:
+        return KINDS[self.kind].cost
+
+    @property
+    def free(self) -> int:
+        """How many constants, from the first, are to be found."""
+        return KINDS[self.kind].free
+
+    def columns(self, covariates: Columns) -> np.ndarray:
+        """(N, k), with 0 where there is no value."""
+        return columns_of(self.texts, covariates)
+
+    def at(self, constants: tuple[float, ...]) -> Factor:
+        """The same with other free constants."""
+        return replace(self, constants=(*constants, *self.constants[len(constants) :]))
+
+
+def columns_of(texts: tuple[str, ...], covariates: Columns) -> np.ndarray:
+    """Columns (N, k) of formulas, with 0 where there is no value."""
+    rows = len(next(iter(covariates.values())))
+    found = [Expression(t, "a finding").value(covariates.__getitem__) for t in texts]
+    out = np.stack([np.broadcast_to(f, rows) for f in found], axis=1).astype(float)
+    out[~np.isfinite(out)] = 0.0
+    return out
+
+
+def _plain(text: str, x: str) -> str:
+    """A formula without what changes nothing: a zero taken off, a factor of one, two signs."""
+    text = text.replace(f"({x} - -0)", x).replace(f"({x} - 0)", x)
+    return text.replace(f"(1 * {x})", f"({x})").replace("- -", "+ ")
+
+
+def factors(name: str, values: np.ndarray, levels: int) -> list[Factor]:
+    """All that are tried first of a covariate.
+
+    Args:
+        name: the covariate.
+        values: (N,) of it.
+        levels: how many values of it may be told apart: of a column of the stops, the stops.
+    """
+    known = values[np.isfinite(values)]
+    distinct, count = np.unique(known, return_counts=True)
+    if name == "label":
+        often = distinct[count > LEAST_SHARE * len(known)]
+        return [Factor(name, "class", (float(k),)) for k in often]
+    if len(distinct) < FEWEST_VALUES:
+        return [Factor(name, "step", (float(distinct.mean()),))] if len(distinct) > 1 else []
+    out = [*_smooth(name, known), *_sharp(name, known, distinct, levels)]
+    if name == "ring":
+        out.append(Factor(name, "every other"))
+        out += [Factor(name, "one of", (4.0, float(k))) for k in range(4)]
+    return out
+
+
+def _smooth(name: str, known: np.ndarray) -> Iterator[Factor]:
+    low, high = float(known.min()), float(known.max())
+    wide, middle = high - low, _rounded((low + high) / 2, (high - low) / 2)
+    half = _rounded(wide / 2, wide / 2)
+    yield Factor(name, "line", (middle, half))
+    yield Factor(name, "square", (middle, half))
+    if low > 0.0 and high > WIDE * low:
+        scale = _rounded(float(np.sqrt(low * high)), wide)
+        yield Factor(name, "logarithm", (scale,))
+        yield Factor(name, "root", (scale,))
+        yield Factor(name, "reciprocal", (scale,))
+        yield from (Factor(name, "power", (scale, p)) for p in (2.0, 3.0))
+    for share in SCALES:
+        yield Factor(name, "decay", (share * wide, low))
+        yield Factor(name, "growth", (share * wide, high))
+    if name == "incidence_rad":
+        sorts = ("over cosine", "tangent", "tangent squared", "sine", "cosine")
+        yield from (Factor(name, sort) for sort in sorts)
+    elif name == "elevation_rad":
+        yield from (Factor(name, sort) for sort in ("tangent", "sine", "cosine"))
+    if name == "azimuth_rad" or name.startswith("joint"):
+        yield from (Factor(name, "harmonic", (float(m),)) for m in range(1, ORDERS + 1))
+    else:
+        yield from (Factor(name, "wave", (share * wide,)) for share in PERIODS)
+
+
+def _sharp(name: str, known: np.ndarray, distinct: np.ndarray, levels: int) -> Iterator[Factor]:
+    low, high = float(known.min()), float(known.max())
+    wide = high - low
+    places = np.unique(np.quantile(known, np.arange(1, STEPS + 1) / (STEPS + 1)))
+    if len(distinct) < 4 * STEPS:  # between values: where a step is among them cannot be told
+        at = np.unique(np.clip(np.searchsorted(distinct, places), 1, len(distinct) - 1))
+        places = (distinct[at] + distinct[at - 1]) / 2
+    yield from (Factor(name, "step", (float(t),)) for t in places)
+    yield from (Factor(name, "ramp", (float(t), wide)) for t in places[1:-1:2])
+    yield from (Factor(name, "ramp down", (float(t), wide)) for t in places[1:-1:2])
+    if levels < 2 * WINDOW:
+        return
+    edges = np.linspace(low, high, WINDOW + 2)[1:-1]
+    for a, b in combinations(edges.tolist(), 2):
+        yield Factor(name, "window", (a, b))
+        if name == "azimuth_rad":
+            yield Factor(name, "outside", (a, b))
+    for centre in np.linspace(low, high, CENTRES + 2)[1:-1].tolist():
+        yield from (Factor(name, "bump", (centre, share * wide)) for share in WIDTHS)
+
+
+def _rounded(value: float, of: float) -> float:
+    """A number to as many digits as a tenth of a range has: a constant that nobody fits."""
+    digits = 1 - int(np.floor(np.log10(max(abs(of), 1e-12))))
+    return float(np.round(value, digits))

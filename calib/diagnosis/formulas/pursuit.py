@@ -1,0 +1,307 @@
+"""The fewest terms that say what a residual does: products of functions of one covariate each.
+
+Orthogonal matching pursuit (Pati, Rezaiifar and Krishnaprasad 1993) on the beams' table: of all
+covariates those that a smooth function needs; of all products of their `factors` that which
+explains most, its constants refined; beside it the next, until nothing stands out. Where several
+forms do equally well, stop by stop (Vuong 1989), the simplest is taken and the others are told.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from scipy import special
+from scipy.optimize import minimize
+
+from calib.blunders.chance import after_looks, at_least, log_tail
+from calib.diagnosis.formulas.factors import Columns, Factor, columns_of, factors
+from calib.diagnosis.formulas.smooths import Bases, Smooth, screen_smooths
+from calib.diagnosis.formulas.table import Projection, Table
+from calib.diagnosis.score import test
+from calib.solve.fit import Progress
+
+KEPT = 4  # factors of each covariate whose products are tried
+REFINED = 5  # products whose constants are refined
+TRIES = 60  # evaluations for each constant that is refined
+STEP = 0.05  # of a covariate's range: by how much constants are changed first
+APART = 2.0  # sigmas by which stops must prefer a form for it to be told from a simpler one
+MOST_TERMS = 4
+RIVALS = 2  # sets of covariates, beside the best one, over which forms are tried
+INSTEAD = 0.5  # of the best set's statistic that another must explain for that
+AS = {"ring": "elevation_rad"}  # what goes along with another covariate
+AT_ONCE = 400  # columns: bounds the memory
+
+
+@dataclass(frozen=True)
+class Term:
+    """A product of functions of different covariates; its columns are all products of theirs.
+
+    Args:
+        factors: these.
+    """
+
+    factors: tuple[Factor, ...]
+
+    @property
+    def covariates(self) -> tuple[str, ...]:
+        return tuple(f.covariate for f in self.factors)
+
+    @property
+    def texts(self) -> tuple[str, ...]:
+        """Its columns as formulas."""
+        return tuple(_times(texts) for texts in product(*(f.texts for f in self.factors)))
+
+    @property
+    def cost(self) -> float:
+        """How much there is to it."""
+        return sum(f.cost for f in self.factors)
+
+    @property
+    def constants(self) -> tuple[float, ...]:
+        """Those that are to be found."""
+        return tuple(c for f in self.factors for c in f.constants[: f.free])
+
+    def at(self, constants: Sequence[float]) -> Term:
+        """The same with other constants."""
+        left, out = list(constants), []
+        for f in self.factors:
+            out.append(f.at(tuple(left[: f.free])))
+            del left[: f.free]
+        return Term(tuple(out))
+
+    def columns(self, covariates: Columns) -> np.ndarray:
+        """(N, k)."""
+        return columns_of(self.texts, covariates)
+
+
+@dataclass(frozen=True)
+class Step:
+    """A term that is confirmed.
+
+    Args:
+        form: that.
+        alike: other forms that stops cannot tell from it.
+        p_value: how often chance alone explains as much, in some form over these covariates.
+        p_adjusted: or over any.
+        smooth: what any smooth function of its covariates explains, in squared sigmas.
+    """
+
+    form: Form
+    alike: Sequence[Form]
+    p_value: float
+    p_adjusted: float
+    smooth: float
+
+
+@dataclass(frozen=True, eq=False)
+class Form:
+    """A term beside what the model has.
+
+    Args:
+        term: with its constants refined.
+        statistic: what it explains, in squared sigmas.
+        dof: in how many directions.
+        left: (K,) what it leaves of each stop's chi-square.
+    """
+
+    term: Term
+    statistic: float
+    dof: int
+    left: np.ndarray
+
+    def other_than(self, term: Term) -> bool:
+        """Whether it says something else than a term: not one with more columns than that, nor the
+        same function of a covariate that goes along."""
+        mine, its = (
+            {(AS.get(f.covariate, f.covariate), f.kind) for f in t.factors}
+            for t in (self.term, term)
+        )
+        nested = self.term.cost > term.cost and set(term.texts) <= set(self.term.texts)
+        return mine != its and not nested
+
+    @property
+    def evidence(self) -> float:
+        return _evidence(self.statistic, self.dof)
+
+
+def forms(projection: Projection, bases: Bases, covariates: Sequence[str]) -> list[Form]:
+    """The best terms over some covariates, that which explains most first.
+
+    Args:
+        projection: the table, and the model fitted to it.
+        bases: its smooth functions.
+        covariates: which.
+    """
+    table = projection.table
+    best = [_best_factors(projection, bases, covariates, c) for c in covariates]
+    terms = [Term(each) for each in product(*best)]
+    statistic, dof = _explained(projection, [t.columns(table.covariates) for t in terms])
+    evidence = np.array([_evidence(s, d) for s, d in zip(statistic, dof, strict=True)])
+    first = [terms[i] for i in np.argsort(-evidence, kind="stable")[:REFINED]]
+    refined = dict.fromkeys(refine(projection, term) for term in first)
+    found = [form(projection, term) for term in refined]
+    return sorted((f for f in found if f.dof), key=lambda f: -f.evidence)
+
+
+def pursue(table: Table, alpha: float, progress: Progress, most: int = MOST_TERMS) -> list[Step]:
+    """Terms that stand out from chance, one beside the other, strongest first.
+
+    Args:
+        table: beams at a solution.
+        alpha: chance that any is told where nothing is missing.
+        progress: called with what is being done, how far it is, and of how much.
+        most: how many terms there are at most.
+    """
+    bases = Bases(table, int(table.stop.max()) + 1)
+    found: list[Step] = []
+    while len(found) < most:
+        columns = [s.form.term.columns(table.covariates) for s in found]
+        fitted = table.beside(np.hstack(columns)).projection() if found else table.projection()
+        smooths = screen_smooths(
+            fitted, bases, lambda done, total: progress("what residuals hang on", done, total)
+        )
+        step = _step(fitted, bases, smooths, alpha)
+        if step is None or step.p_adjusted >= alpha:
+            break
+        found.append(step)
+    return found
+
+
+def _step(fitted: Projection, bases: Bases, smooths: Sequence[Smooth], alpha: float) -> Step | None:
+    """The best term over the sets of covariates that explain most, judged."""
+    best = smooths[0] if smooths else None
+    if best is None or best.evidence < np.log(best.looks / alpha):
+        return None
+    inside = [s for s in smooths if set(s.covariates) < set(best.covariates)]
+    others = [s for s in smooths if not set(s.covariates) >= set(best.covariates)]
+    rivals = [s for s in others if s.test.statistic > INSTEAD * best.test.statistic]
+    sets = list({s.covariates: s for s in (best, *inside[:1], *rivals[:RIVALS])}.values())
+    over = {f: s for s in sets for f in forms(fitted, bases, s.covariates)}
+    if not over:
+        return None
+    chosen, alike = simplest(sorted(over, key=lambda f: -f.evidence))
+    smooth = over[chosen]
+    p = _by_chance(fitted, chosen, smooth)
+    return Step(
+        form=chosen,
+        alike=alike,
+        p_value=p,
+        p_adjusted=float(after_looks(p, best.looks)),
+        smooth=smooth.test.statistic,
+    )
+
+
+def _by_chance(fitted: Projection, form: Form, smooth: Smooth) -> float:
+    """How often chance makes a form of these covariates that explains as much: no more than it
+    makes a smooth function that does (the S-method of Scheffe 1953), stops left out one by one, and
+    beams weighed as they are once the form is known."""
+    columns = form.term.columns(fitted.table.covariates)
+    known = fitted.at(fitted.table.beside(columns).projection().weight)
+    found = test(known.scores({}, columns), np.arange(columns.shape[1]))
+    chance = known.judged(found, columns).chance
+    if chance.d <= 0.0:
+        return 1.0
+    dof = max(smooth.test.dof, found.dof)
+    each = dof * max(chance.trace / found.dof, 1.0)
+    return at_least(special.fdtrc(dof, chance.d, found.statistic / each))
+
+
+def form(projection: Projection, term: Term) -> Form:
+    """A term with what it leaves of each stop."""
+    table = projection.table
+    columns = term.columns(table.covariates)
+    (statistic,), (dof,) = projection.explained([columns])
+    kept, _ = projection.off(columns)
+    root = np.sqrt(projection.weight)
+    size = np.maximum(np.sqrt(np.square(root[:, None] * columns).sum(axis=0)), 1e-300)
+    theta = np.linalg.lstsq(root[:, None] * kept / size, root * projection.left_m, rcond=1e-3)[0]
+    left = np.square(root * (projection.left_m - kept @ (theta / size)))
+    return Form(term, float(statistic), int(dof), np.bincount(table.stop, left))
+
+
+def simplest(found: Sequence[Form]) -> tuple[Form, list[Form]]:
+    """The simplest of the forms that stops cannot tell from the best, and the others of these."""
+    near = [f for f in found if not _told_apart(f, found[0])]
+    chosen = min(near, key=lambda f: (f.term.cost, f.dof, -f.statistic))
+    return chosen, [f for f in near if f is not chosen]
+
+
+def _told_apart(form: Form, best: Form) -> bool:
+    worse = (form.left - best.left)[best.left > 0.0]
+    if form is best or worse.sum() <= APART**2:
+        return False
+    scatter = np.sqrt(len(worse) * np.var(worse, ddof=1)) if len(worse) > 1 else np.inf
+    return bool(worse.sum() > APART * scatter)
+
+
+def _best_factors(
+    projection: Projection, bases: Bases, covariates: Sequence[str], name: str
+) -> list[Factor]:
+    """The functions of one covariate that explain most beside any smooth one of the others."""
+    table = projection.table
+    others = bases.of([c for c in covariates if c != name], len(covariates))
+    names = [name, "ring"] if name == "elevation_rad" and "ring" in table.covariates else [name]
+    levels = bases.stops if name in table.by_stop else len(table)
+    every = [f for n in names for f in factors(n, table.covariates[n], levels)]
+    blocks = []
+    for each in every:
+        mine = each.columns(table.covariates)
+        block = (mine[:, :, None] * others[:, None, :]).reshape(len(mine), -1)
+        blocks.append(block[:, np.any(block != 0.0, axis=0)])
+    statistic, dof = _explained(projection, blocks)
+    evidence = [_evidence(s, d) for s, d in zip(statistic, dof, strict=True)]
+    order = np.argsort(-np.array(evidence), kind="stable").tolist()
+    kinds: dict[tuple[str, str], int] = {}  # of each kind the best: others become it when refined
+    for i in order:
+        kinds.setdefault((every[i].covariate, every[i].kind), i)
+    chosen = [every[i] for i in list(kinds.values())[:KEPT]]
+    plain = next((every[i] for i in order if every[i].kind in ("line", "class")), None)
+    if plain is not None and plain not in chosen:
+        chosen.append(plain)
+    return chosen
+
+
+def _explained(
+    projection: Projection, blocks: Sequence[np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """As `Projection.explained`, some columns at a time."""
+    parts: list[list[np.ndarray]] = [[]]
+    for block in blocks:
+        if sum(b.shape[1] for b in parts[-1]) + block.shape[1] > AT_ONCE and parts[-1]:
+            parts.append([])
+        parts[-1].append(block)
+    found = [projection.explained(part) for part in parts]
+    return tuple(np.concatenate(each) for each in zip(*found, strict=True))
+
+
+def refine(projection: Projection, term: Term) -> Term:
+    """A term with those constants that explain most, from where they are."""
+    if not term.constants:
+        return term
+    covariates = projection.table.covariates
+    ranges = [np.ptp(covariates[f.covariate]) for f in term.factors for _ in range(f.free)]
+    start, scale = np.array(term.constants), STEP * np.array(ranges)
+
+    def worse(x: np.ndarray) -> float:
+        columns = term.at((start + scale * x).tolist()).columns(covariates)
+        return -float(projection.explained([columns])[0][0])
+
+    simplex = np.vstack([np.zeros(len(start)), np.eye(len(start))])
+    options = {"initial_simplex": simplex, "maxfev": TRIES * len(start), "xatol": 1e-3}
+    found = minimize(worse, simplex[0], method="Nelder-Mead", options=options)
+    return term.at((start + scale * found.x).tolist()) if found.fun < worse(simplex[0]) else term
+
+
+def _evidence(statistic: float, dof: int) -> float:
+    return -log_tail(statistic, dof) if dof else 0.0
+
+
+def _times(texts: Sequence[str]) -> str:
+    """A product of formulas; ones are left out."""
+    some = [text for text in texts if text != "1"]
+    if len(some) < 2:
+        return some[0] if some else "1"
+    return " * ".join(f"({text})" for text in some)

@@ -1,0 +1,182 @@
+"""What a residual hangs on: smooth functions of one, two or three covariates, tested together.
+
+Every column that beams or stops have is looked at, alone, in pairs, and with the best pairs a
+third. One price is paid for all looks (Westfall and Young 1993), and stops and surfaces are the
+clusters, as for the catalogue's effects.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import combinations
+
+import numpy as np
+
+from calib.diagnosis.formulas.table import Projection, Table
+from calib.diagnosis.score import Scores, Test, test
+from calib.diagnosis.screen import looked
+
+# Knots of a function of one covariate, of each of two and of three. A pair of 5 x 5 sees what turns
+# three times over its range; finer things are found alone or as formulas.
+KNOTS = {1: 12, 2: 5, 3: 3}
+TURN_KNOTS = {1: 24, 2: 8, 3: 4}  # of azimuth, evenly round
+STOPS_A_KNOT = 5  # of columns of the stops, as of bins: with fewer, tests say nothing
+FEW = 8  # values of a column, up to which each is a class of its own
+MOST_THIRDS = 2  # pairs to which a third covariate is tried
+MOST_CLASSES = 6  # of a label, those of most beams
+PATTERN = 4  # rings after which electronics repeat: chips of 4, 8 and 16 channels
+
+
+@dataclass(frozen=True)
+class Smooth:
+    """A smooth function of some covariates, tested.
+
+    Args:
+        covariates: their names.
+        test: of its columns.
+        looks: by how many independent looks a p-value pays.
+        evidence: see `Test.evidence`.
+    """
+
+    covariates: tuple[str, ...]
+    test: Test
+    looks: float
+    evidence: float
+
+
+@dataclass(frozen=True)
+class Bases:
+    """Columns of smooth functions of each covariate, made when asked.
+
+    Args:
+        table: the beams.
+        stops: how many there are.
+    """
+
+    table: Table
+    stops: int
+    _made: dict[tuple[str, int], np.ndarray] = field(default_factory=dict, repr=False)
+
+    def names(self) -> list[str]:
+        """Covariates that differ; rings stand for elevations where these are the same."""
+        return [n for n, v in self.table.covariates.items() if n != "ring" and _differs(v)]
+
+    def of(self, covariates: Sequence[str], together: int = 0) -> np.ndarray:
+        """(N, K) columns of a function of some covariates together, or of so many."""
+        out = np.ones((len(self.table), 1))
+        for name in covariates:
+            key = name, together or len(covariates)
+            if key not in self._made:
+                self._made[key] = self._one(*key)
+            mine = self._made[key]
+            out = (out[:, :, None] * mine[:, None, :]).reshape(len(out), -1)
+        return out
+
+    def _one(self, name: str, together: int) -> np.ndarray:
+        """(N, K) columns of one covariate beside others."""
+        values = self.table.covariates[name]
+        distinct = np.unique(values[np.isfinite(values)])
+        usual = KNOTS[together]
+        if name in self.table.by_stop:
+            usual = max(2, min(usual, round((self.stops / STOPS_A_KNOT) ** (1 / together))))
+        if name == "label" or len(distinct) <= min(FEW, usual):
+            often, count = np.unique(values[np.isfinite(values)], return_counts=True)
+            often = often[np.argsort(-count, kind="stable")[:MOST_CLASSES]]
+            columns = (values[:, None] == often).astype(float)
+        elif name == "azimuth_rad":
+            columns = _round_hats(values, TURN_KNOTS[together])
+        else:
+            knots = np.unique(np.quantile(distinct, np.linspace(0, 1, usual)))
+            columns = hats(values, knots)
+        if name == "elevation_rad" and "ring" in self.table.covariates:
+            which = np.mod(self.table.covariates["ring"], PATTERN).astype(int)
+            columns = np.hstack([columns, np.eye(PATTERN)[which][:, 1:]])
+        columns[~np.isfinite(values)] = 0.0
+        return columns
+
+
+def hats(values: np.ndarray, knots: np.ndarray) -> np.ndarray:
+    """(N, K) piecewise linear functions, each 1 at one knot and 0 at the others."""
+    if len(knots) < 2:
+        return np.ones((len(values), 1))
+    at = np.clip(np.nan_to_num(values, nan=knots[0]), knots[0], knots[-1])
+    i = np.clip(np.searchsorted(knots, at, side="right") - 1, 0, len(knots) - 2)
+    share = (at - knots[i]) / (knots[i + 1] - knots[i])
+    out = np.zeros((len(values), len(knots)))
+    every = np.arange(len(values))
+    out[every, i], out[every, i + 1] = 1.0 - share, share
+    return out
+
+
+def _round_hats(values: np.ndarray, count: int) -> np.ndarray:
+    """The same round a circle."""
+    turn = np.mod(np.nan_to_num(values), 2 * np.pi) / (2 * np.pi) * count
+    i = np.floor(turn).astype(int) % count
+    share = turn - np.floor(turn)
+    out = np.zeros((len(values), count))
+    every = np.arange(len(values))
+    out[every, i] += 1.0 - share
+    out[every, (i + 1) % count] += share
+    return out
+
+
+def _differs(values: np.ndarray) -> bool:
+    known = values[np.isfinite(values)]
+    return len(known) > 0 and bool(np.ptp(known) > 0.0)
+
+
+def screen_smooths(
+    projection: Projection,
+    bases: Bases,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> list[Smooth]:
+    """All smooth functions that could be missing, those with most evidence first."""
+    table = bases.table
+    names = bases.names()
+    points = [n for n in names if n not in table.by_stop]
+    sets: list[tuple[str, ...]] = [(n,) for n in names]
+    sets += [p for p in combinations(names, 2) if set(p) & set(points)]
+    found = dict(_tested(projection, bases, sets, progress))
+    common = _common([t for t, _ in found.values()])
+    pairs = sorted((s for s in found if len(s) == 2), key=lambda s: -found[s][0].evidence(common))
+    thirds = {
+        tuple(sorted((*pair, n), key=names.index)): None
+        for pair in pairs[:MOST_THIRDS]
+        for n in names
+        if n not in pair and "label" not in (n, *pair)
+    }
+    found |= dict(_tested(projection, bases, list(thirds), progress))
+    drawn = [chance for _, chance in found.values()]
+    looks = looked(np.min(drawn, axis=0)) if drawn else 1.0
+    every = [Smooth(s, t, looks, t.evidence(common)) for s, (t, _) in found.items()]
+    return sorted(every, key=lambda s: -s.evidence)
+
+
+def _tested(
+    projection: Projection,
+    bases: Bases,
+    sets: Sequence[tuple[str, ...]],
+    progress: Callable[[int, int], None],
+) -> Iterator[tuple[tuple[str, ...], tuple[Test, np.ndarray]]]:
+    """Each set's test, and by rank the p-values (R,) of the same on scores by chance."""
+    for i, names in enumerate(sets):
+        progress(i, len(sets))
+        columns = bases.of(names)
+        columns = columns[:, np.any(columns != 0.0, axis=0)]
+        scores = projection.scores({}, columns)
+        found = test(scores, np.arange(columns.shape[1]))
+        if found.dof:
+            yield names, (found, _by_chance(scores, found))
+
+
+def _by_chance(scores: Scores, found: Test) -> np.ndarray:
+    # Every set has the same clusters in the same order, so the same draw of signs is one world.
+    statistic = np.sum(np.square(scores.draws @ found.whiten), axis=1)
+    rank = np.empty(len(statistic))
+    rank[np.argsort(-statistic, kind="stable")] = np.arange(1, len(statistic) + 1)
+    return rank / (len(statistic) + 1)
+
+
+def _common(tests: Sequence[Test]) -> float:
+    return float(np.median([t.inflation for t in tests])) if tests else 1.0

@@ -1,0 +1,342 @@
+"""Some of the beams at a solution, with all that they may hang on: a table to try formulas on.
+
+A formula is a column of the range: what it adds to each beam. What of it the model can take on
+(poses, links, ring zeros, parts of surfaces) is projected off, exactly as for an effect of the
+catalogue; here for so few beams that thousands of columns are tried in seconds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.sparse import block_diag, csr_array, eye_array, hstack, vstack
+
+from calib.diagnosis.jackknife import Shares
+from calib.diagnosis.linear import beside, other_rows
+from calib.diagnosis.score import GAUGE, Scores, Test
+from calib.linear.clusters import ClusteredRows, Gradients, summed
+from calib.linear.layout import Layout
+from calib.linear.linearise import lidars
+from calib.linear.parallel import in_order
+from calib.linear.rows import TWIST, StopRows
+from calib.residuals.robust import MAD
+from calib.solve.estimate import Estimate
+
+# Beams in the table. What limits a formula is stops and surfaces that err together, not beams: of
+# `known_ring_by_temperature` the constants of 10,000, 40,000 and all beams agree to 0.3 of their
+# sigma.
+MOST_BEAMS = 20_000
+HUBER = 1.345  # sigmas: 95 % efficiency on normal rows (Huber 1981)
+# Columns that name a part of the room, a beam or a stop, and so are no covariate; the rest of the
+# room is in range, incidence and label.
+NOT_COVARIATES = {"surface", "region", "patch", "plane", "column", "elapsed_s"}
+NOT_COVARIATES |= {"reference_intensity", "stop", "location", "tracked", "normal", "point_m"}
+
+
+@dataclass(frozen=True)
+class Table:
+    """N beams, drawn at random from each stop alike.
+
+    Args:
+        covariates: name -> (N,) value, those of the stop too.
+        by_stop: which of them are the same for all beams of a stop.
+        residual_m, sigma_m: (N,) measured - predicted, and how far that may be off.
+        stop, place: (N,) the stop of each, and the surface that it meets.
+        share: of all beams that are here.
+        twists: (N, V) derivative of the residual by twists of the LiDAR, stop by stop, and by the
+            U unknowns that act on beams otherwise.
+        chain: (V, U) of these by all unknowns.
+        others: (R, U) whitened rows of trackers, targets and priors; others_b: (R,) their right
+            side; others_stop, others_place: (R,) of which they are, -1 for none.
+    """
+
+    covariates: Mapping[str, np.ndarray]
+    by_stop: frozenset[str]
+    residual_m: np.ndarray
+    sigma_m: np.ndarray
+    stop: np.ndarray
+    place: np.ndarray
+    share: float
+    twists: csr_array
+    chain: csr_array
+    others: csr_array
+    others_b: np.ndarray
+    others_stop: np.ndarray
+    others_place: np.ndarray
+
+    @classmethod
+    def of(
+        cls,
+        estimate: Estimate,
+        progress: Callable[[int, int], None] = lambda done, total: None,
+        most: int = MOST_BEAMS,
+    ) -> Table:
+        """The table of a fit with scans, drawn alike whenever it is drawn.
+
+        Args:
+            estimate: the fit.
+            progress: called with how many stops are done, and of how many.
+            most: how many beams there are at most.
+        """
+        problem, values = beside(estimate.problem, estimate)
+        layout, scans = Layout.of(problem), problem.scans
+        placed, places = lidars(scans, values), Gradients(layout.size)
+        beams = [int(np.count_nonzero(a.part >= 0)) for a in estimate.associations]
+        share = min(1.0, most / max(sum(beams), 1))
+
+        def work(i: int) -> _Drawn:
+            rows = StopRows.of(scans[i], layout, values, placed[i], estimate.associations[i])
+            return _Drawn.of(rows, share, i)
+
+        drawn = []
+        for i, each in enumerate(in_order(work, len(scans))):
+            progress(i, len(scans))
+            drawn.append(each.numbered(places, scans[i].room))
+        names = [n for n in drawn[0].columns if all(n in d.columns for d in drawn)]
+        others = [
+            (_rows_over(rows.A, rows.columns, layout.size), rows.b, rows.stop, rows.place)
+            for rows in other_rows(problem, layout, values, places)
+        ]
+        wide, b, others_stop, others_place = zip(*others, strict=True)
+        begin, every = TWIST * len(scans), [d.covariates(names) for d in drawn]
+        chains = [_rows_over(d.rows.chain, d.rows.chain_columns, layout.size) for d in drawn]
+        twists = [
+            _twists(d.rows, d.picked, TWIST * i, begin, begin + layout.size)
+            for i, d in enumerate(drawn)
+        ]
+        return cls(
+            covariates={n: np.concatenate([columns[n] for columns in every]) for n in names},
+            by_stop=frozenset(n for n in names if all(len(d.columns[n]) == 1 for d in drawn)),
+            residual_m=np.concatenate([d.rows.rows.residual_m[d.picked] for d in drawn]),
+            sigma_m=np.concatenate([d.rows.rows.sigma_m[d.picked] for d in drawn]),
+            stop=np.concatenate([np.full(len(d.picked), d.rows.stop) for d in drawn]),
+            place=np.concatenate([d.place for d in drawn]),
+            share=share,
+            twists=csr_array(vstack(twists)),
+            chain=csr_array(vstack([*chains, eye_array(layout.size, format="csr")])),
+            others=csr_array(vstack(wide)),
+            others_b=np.concatenate(b),
+            others_stop=np.concatenate(others_stop),
+            others_place=np.concatenate(others_place),
+        )
+
+    def __len__(self) -> int:
+        return len(self.residual_m)
+
+    @cached_property
+    def of_others(self) -> tuple[np.ndarray, np.ndarray]:
+        """What trackers, targets and priors say: (U, U) information, (U,) right side."""
+        return (self.others.T @ self.others).toarray(), self.others.T @ self.others_b
+
+    @cached_property
+    def cells(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Rows of one stop and place, of beams and then of others: the stop and the place (C,) of
+        each such cell, and the cell of each row."""
+        stop = np.concatenate([self.stop, self.others_stop])
+        place = np.concatenate([self.place, self.others_place])
+        wide = int(place.max(initial=0)) + 2
+        found, cell = np.unique((stop + 1) * wide + place + 1, return_inverse=True)
+        return found // wide - 1, found % wide - 1, cell
+
+    def beside(self, columns_m: np.ndarray) -> Table:
+        """The table of a model that has such columns (N, F) of the range, too: its last unknowns,
+        of which nothing was known."""
+        more = columns_m.shape[1]
+        own = csr_array(columns_m)
+        chain = block_diag([self.chain, eye_array(more)], format="csr")
+        others = hstack([self.others, csr_array((self.others.shape[0], more))], format="csr")
+        twists = hstack([self.twists, -own], format="csr")
+        return replace(self, twists=twists, chain=chain, others=others)
+
+    def projection(self, known_m: np.ndarray | float = 0.0) -> Projection:
+        """The model fitted to the table, once something of the ranges (N,) m is known.
+
+        Beams are weighed as Huber has it: those far out are held in bounds and none is thrown
+        away, as what is thrown away may be what is missing.
+        """
+        z = (self.residual_m - known_m) / self.sigma_m
+        for _ in range(2):
+            scale = max(1.0, MAD * float(np.median(np.abs(z))))
+            weight = np.minimum(1.0, HUBER * scale / np.maximum(np.abs(z), 1e-300))
+            out = Projection.of(self, weight / self.sigma_m**2 / self.share, known_m)
+            z = out.left_m / self.sigma_m
+        return out
+
+
+@dataclass(frozen=True)
+class Projection:
+    """The table at weights, with the model fitted to it.
+
+    Args:
+        table: that.
+        weight: (N,) over variance, 1/m2, as if all beams were here.
+        left_m: (N,) residuals that the model leaves.
+        step: (U,) by which its unknowns go.
+        factor: of its normal equations.
+    """
+
+    table: Table
+    weight: np.ndarray
+    left_m: np.ndarray
+    step: np.ndarray
+    factor: tuple[np.ndarray, bool]
+
+    @classmethod
+    def of(cls, table: Table, weight: np.ndarray, known_m: np.ndarray | float) -> Projection:
+        """Fit the model at these weights (N,), with something of the ranges known."""
+        T, chain = table.twists, table.chain
+        gram = T.T @ T.multiply(weight[:, None]).tocsr()
+        information, right = table.of_others
+        H = information + (chain.T @ gram @ chain).toarray()
+        H[np.diag_indices(len(H))] *= 1.0 + 1e-12
+        H[np.diag_indices(len(H))] += 1e-12 * np.median(np.diag(H))
+        factor = cho_factor(H)  # upper
+        raw = table.residual_m - known_m
+        step = cho_solve(factor, right - chain.T @ (T.T @ (weight * raw)))
+        return cls(table, weight, raw + T @ (chain @ step), step, factor)
+
+    def off(self, columns_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """What is left of columns (N, Q) of the range, in the beams (N, Q), and how the model's
+        unknowns (U, Q) take on the rest."""
+        T, chain = self.table.twists, self.table.chain
+        taken = cho_solve(self.factor, -(chain.T @ (T.T @ (self.weight[:, None] * columns_m))))
+        return columns_m + T @ (chain @ taken), taken
+
+    def at(self, weight: np.ndarray) -> Projection:
+        """The same at other weights (N,)."""
+        return Projection.of(self.table, weight, 0.0)
+
+    def leaving(self, left_m: np.ndarray, step: np.ndarray) -> Projection:
+        """The same where the model and more have been fitted, and leave these residuals (N,)."""
+        return replace(self, left_m=left_m, step=step)
+
+    def explained(self, blocks: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """What blocks of columns (N, k) of the range would explain, each alone: in squared sigmas
+        (B,), and in how many directions (B,)."""
+        columns = np.hstack(blocks)
+        T, chain = self.table.twists, self.table.chain
+        weighted = self.weight[:, None] * columns
+        root = solve_triangular(self.factor[0], chain.T @ (T.T @ weighted), trans=1)
+        score = self.left_m @ weighted
+        found, start = [], 0
+        for block in blocks:
+            at = slice(start, start := start + block.shape[1])
+            whole = weighted[:, at].T @ block
+            found.append(_explained(score[at], whole, whole - root[:, at].T @ root[:, at]))
+        statistic, dof = zip(*found, strict=True)
+        return np.array(statistic), np.array(dof)
+
+    def scores(self, at: Mapping[str, slice], columns_m: np.ndarray) -> Scores:
+        """Scores of columns (N, Q) of the range, by candidate; see `calib.diagnosis.score`."""
+        table, kept = self.table, self.off(columns_m)
+        weighted = self.weight[:, None] * columns_m
+        information = weighted.T @ kept[0]
+        away = table.others @ self.step - table.others_b
+        shares = [
+            kept[0] * (self.weight * self.left_m)[:, None],
+            (table.others @ kept[1]) * away[:, None],
+        ]
+        stop, place, cell = table.cells
+        cells = summed(np.vstack(shares), cell)
+        return Scores(
+            at=at,
+            score=cells.sum(axis=0),
+            information=(information + information.T) / 2,
+            whole=weighted.T @ columns_m,
+            cells=cells,
+            stop=stop,
+            place=place,
+            weight_m2=float(self.weight.sum()),
+        )
+
+    def judged(self, found: Test, columns_m: np.ndarray) -> Test:
+        """A test of columns (N, q) with its clusters left out one by one: see `jackknife`."""
+        table, kept = self.table, self.off(columns_m)
+        root, every = np.sqrt(self.weight), np.arange(found.dof)
+        away = table.others @ self.step - table.others_b
+        shares = Shares()
+        for A, b, stop, place in (
+            (root[:, None] * (kept[0] @ found.whiten), root * self.left_m, table.stop, table.place),
+            (table.others @ (kept[1] @ found.whiten), away, table.others_stop, table.others_place),
+        ):
+            shares.add(ClusteredRows(A, b, every, stop, place))
+        return found.judged(shares)
+
+
+def _explained(score: np.ndarray, whole: np.ndarray, left: np.ndarray) -> tuple[float, int]:
+    size = np.sqrt(np.maximum(np.diag(whole), 1e-300))
+    values, axes = np.linalg.eigh(left / np.outer(size, size))
+    seen = values > GAUGE
+    along = (score / size) @ axes[:, seen]
+    return float(np.sum(np.square(along) / values[seen])), int(seen.sum())
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    """Beams of one stop.
+
+    Args:
+        rows: all of the stop's.
+        picked: (n,) which of them.
+        columns: covariates (n,) of these; (1,) of the stop.
+        met: (n,) what each meets, of the surfaces (G,) that any does.
+        place: (n,) its number among all stops.
+    """
+
+    rows: StopRows
+    picked: np.ndarray
+    columns: Mapping[str, np.ndarray]
+    surfaces: np.ndarray
+    met: np.ndarray
+    place: np.ndarray | None = None
+
+    @classmethod
+    def of(cls, rows: StopRows, share: float, seed: int) -> _Drawn:
+        """A share of a stop's beams."""
+        usable = np.flatnonzero(rows.rows.usable & np.isfinite(rows.rows.residual_m))
+        drawn = np.random.default_rng(seed).choice(usable, round(share * len(usable)), False)
+        picked, columns = np.sort(drawn), {}
+        for name, column in rows.rows.view.columns.items():
+            if name in NOT_COVARIATES or name.startswith("moved."):
+                continue
+            values = np.asarray(column() if callable(column) else column)
+            if values.ndim == 1 and values.dtype.kind in "biuf":
+                columns[name] = (values[picked] if len(values) > 1 else values).astype(float)
+        surfaces, met = rows.places()
+        return cls(rows, picked, columns, surfaces, met=met[picked])
+
+    def numbered(self, places: Gradients, room: object) -> _Drawn:
+        """With what its beams meet numbered as in all stops: one after another, as threads would
+        race for numbers."""
+        return replace(self, place=places.numbers(room, self.surfaces)[self.met])
+
+    def covariates(self, names: Sequence[str]) -> dict[str, np.ndarray]:
+        """Some of them (n,)."""
+        return {n: np.broadcast_to(self.columns[n], len(self.picked)) for n in names}
+
+
+def _twists(rows: StopRows, picked: np.ndarray, first: int, begin: int, size: int) -> csr_array:
+    """Derivative (n, size) of the residuals of some beams of a scan, whose twist has the columns
+    from `first`; those of unknowns begin at `begin`."""
+    wide = rows.dense.shape[1] - TWIST - 1
+    dense = np.hstack([rows.dense[picked, :TWIST], rows.dense[picked, TWIST + 1 :]])
+    own = np.concatenate([np.arange(first, first + TWIST), begin + rows.columns[:wide]])
+    found = rows.index[picked]
+    met = found >= 0
+    sparse = begin + rows.columns[wide:][np.where(met, found, 0)] if rows.sparse else found
+    at = np.hstack([np.broadcast_to(own, dense.shape), sparse])
+    values = np.hstack([dense, np.where(met, rows.value[picked], 0.0)])
+    ends = np.arange(len(picked) + 1) * at.shape[1]
+    out = csr_array((values.ravel(), at.ravel(), ends), (len(picked), size))
+    out.eliminate_zeros()
+    return out
+
+
+def _rows_over(A: np.ndarray | csr_array, columns: np.ndarray, size: int) -> csr_array:
+    """Rows over some columns as rows over all of them."""
+    found = csr_array(A)
+    return csr_array((found.data, columns[found.indices], found.indptr), (found.shape[0], size))

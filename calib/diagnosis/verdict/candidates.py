@@ -1,0 +1,129 @@
+"""Candidates as the contract has them: what each would explain, and beside what."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from calib.diagnosis.screen import Candidate
+from calib.diagnosis.search import ALPHA, ALPHA_NOISE, NamedEffect, Search, angle_deg
+from calib.diagnosis.suggest import what_separates
+from calib.diagnosis.verdict.matters import Weighed
+from calib.effects import Site
+from calib.results.solution import one_unit
+
+
+def candidate_documents(
+    heavy: Weighed,
+    held_out: Mapping[str, tuple[float, float, float]],
+    unnamed: bool,
+    hold: bool,
+) -> list[dict[str, Any]]:
+    """All of them, those first that were confirmed.
+
+    Args:
+        heavy: what of the search matters.
+        held_out: as of `conclude`.
+        unnamed: whether something has no name.
+        hold: whether the names are to be believed nevertheless, where bins do not do better.
+    """
+    found = heavy.found
+    named, out = len(found.found), [_candidate(c, found, held_out) for c in _ranked(found)]
+    for each in out:
+        told_of = heavy.matter.get(each["add"])
+        each["matters"] = told_of.document() if told_of else None
+        worn = bool(each["step"]) and (not hold or found.dressed_up(each["step"] - 1))
+        each["dressed_up"] = unnamed and worn
+    # What has no name may scatter as chance does: that is judged once it is in the model.
+    chance = [
+        each.document(None if unnamed else named + i) for i, each in enumerate(found.chance, 1)
+    ]
+    others = [each.document(None) for each in found.looks[-1].chance]
+    return [*out[:named], *chance, *out[named:], *others]
+
+
+def _ranked(found: Search) -> list[Candidate]:
+    """Those confirmed first, in the order in which they were; then by what they explain."""
+    confirmed = [step.candidate for step in found.found]
+    families = {c.effect.family for c in confirmed}
+    rest = (c for c in found.looks[0].named.candidates if c.effect.family not in families)
+    noise = found.looks[-1].noise.candidates
+    if found.scatter is not None:
+        family = found.scatter.effect.family
+        noise = [found.scatter, *(c for c in noise if c.effect.family != family)]
+    return [*confirmed, *rest, *noise]
+
+
+def _candidate(
+    candidate: Candidate, found: Search, held_out: Mapping[str, tuple[float, float, float]]
+) -> dict[str, Any]:
+    """As the contract has it."""
+    effect, test, look = candidate.effect, candidate.test, found.looks[0].named
+    step = next((i for i, s in enumerate(found.found, 1) if s.effect.name == effect.name), None)
+    if step:
+        look = found.found[step - 1].before.named
+    rig = next(s.rig for s in found.looks[0].stand.sources if effect.params(s.rig))
+    params = [p for p in effect.params(rig) if p.sigma]
+    whole = len(params) == len(test.columns)
+    before, after, floor = held_out.get(effect.name, (None, None, None))
+    noise = effect.site is Site.NOISE
+    clean = (found.looks[-1].noise if noise else found.looks[-1].named).common
+    rivals = _rivals(found.found[step - 1]) if step else []
+    estimate, sigma = test.estimate(), test.sigma(max(clean, 1.0))
+    if step:
+        estimate = found.looks[-1].stand.theta(effect, whole=False)
+        sigma = found.looks[-1].stand.sigma(effect)
+    level = ALPHA_NOISE if noise else ALPHA
+    alpha = -np.expm1(np.log1p(-level) / candidate.looks)
+    document = effect.document()
+    return {
+        "effect": effect.family,
+        "add": effect.name,
+        # Of a user's own: what `rigcal add` reads, wherever its file is by then.
+        **({} if isinstance(document, str) else {"document": document}),
+        "site": "range" if effect.site is Site.BEAM else effect.site.value,
+        "p_value": candidate.p_value,
+        "p_adjusted": found.found[step - 1].p_adjusted if step else candidate.p_adjusted,
+        "statistic": test.statistic,
+        "dof": test.dof,
+        "step": step,
+        "dressed_up": False,
+        "held_out_rms_mm": {"before": before, "after": after},
+        "error_explained": explained(before, after, floor),
+        "rms_mm": None if noise else 1e3 * look.size_m(candidate),
+        "unabsorbed_rms_mm": None if noise else 1e3 * look.rms_m(candidate),
+        "parameters": {
+            "unit": one_unit([p.unit for p in params]),
+            "names": [p.name for p in params] if whole else [],
+            "estimate": estimate if whole else [],
+            "sigma": sigma if whole else [],
+        },
+        "smallest_detectable": test.smallest_detectable(clean, alpha),
+        "indistinguishable_from": [r["effect"] for r in rivals],
+        "rivals": rivals,
+    }
+
+
+def explained(before: float | None, after: float | None, floor: float | None) -> float | None:
+    """Share of what the held-out error has above what is expected."""
+    if before is None or after is None or floor is None:
+        return None
+    return (before**2 - after**2) / max(before**2 - floor**2, before**2 - after**2, 1e-12)
+
+
+def _rivals(step: NamedEffect) -> list[dict[str, Any]]:
+    screen = step.before.named
+    scale = max(step.after.named.common, step.judged.inflation)
+    own = step.candidate.test.evidence(scale)
+    return [
+        {
+            "effect": other.effect.family,
+            "add": other.effect.name,
+            "angle_deg": angle_deg(screen, step.candidate, other),
+            "odds": float(np.exp(own - other.test.evidence(scale))),
+            "separate": what_separates(step.effect, other.effect),
+        }
+        for other in step.rivals
+    ]

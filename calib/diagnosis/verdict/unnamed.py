@@ -1,0 +1,131 @@
+"""Formulas of what no known effect explains, and whether they stand in for names."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from calib.diagnosis.formulas import Formula, find
+from calib.diagnosis.formulas.why import why
+from calib.diagnosis.search import Search
+from calib.diagnosis.stand import Stand
+from calib.diagnosis.suggest import UNITS, what_differs, words
+from calib.diagnosis.verdict.matters import FALL
+from calib.effects.own.formula import FormulaEffect
+from calib.results.errors import Errors
+from calib.solve.fit import Progress
+
+ALIKE = 3  # other forms that are told
+Falls = Mapping[str, tuple[float, float, float]]
+
+
+@dataclass(frozen=True)
+class Unnamed:
+    """Formulas of what ranges do beyond a model and the effects named.
+
+    Args:
+        formulas: strongest first.
+        instead: whether they take the place of the names, which predict unseen stops worse.
+        fall_mm: the held-out error before and after all of them were fitted; None where nobody
+            looked.
+        refused: a sentence, where held-out stops are predicted no better with them.
+    """
+
+    formulas: Sequence[Formula] = ()
+    instead: bool = False
+    fall_mm: tuple[float, float] | None = None
+    refused: str = ""
+
+    def documents(self, taken: Sequence[str]) -> list[dict[str, Any]]:
+        """As in diagnosis.json, to be added by names that the model has not."""
+        return [_document(each, taken, self.fall_mm) for each in self.formulas]
+
+
+def unnamed(
+    found: Search,
+    falls: Falls,
+    doubtful: bool,
+    unseen: Callable[[Stand], Errors] | None,
+    progress: Progress,
+) -> Unnamed:
+    """Look for formulas of what a search left.
+
+    Args:
+        found: the search.
+        falls: effect -> held-out rms before and after it was fitted, and expected, mm.
+        doubtful: whether its names leave much, so that one formula may explain more.
+        unseen: errors of a fit at stops that were held out; None if nobody is to look.
+        progress: as of `fit.solve`.
+    """
+    first, last = found.looks[0].stand, found.looks[-1].stand
+    if found.found and doubtful and unseen is not None:
+        formulas = find(first.estimate, progress)
+        if formulas:
+            after = unseen(_with(first, formulas, progress)).rms_mm
+            before, _, _ = falls[found.found[0].effect.name]
+            named = falls[found.found[-1].effect.name][1]
+            if after < named - FALL * before:
+                return Unnamed(formulas, True, (before, after))
+    formulas = find(last.estimate, progress)
+    if not formulas or unseen is None:
+        return Unnamed(formulas)
+    before = falls[found.found[-1].effect.name][1] if found.found else unseen(last).rms_mm
+    errors = unseen(_with(last, formulas, progress))
+    if before - errors.rms_mm > FALL * errors.floor_mm:
+        return Unnamed(formulas, False, (before, errors.rms_mm))
+    over = " and ".join(words(c) for c in formulas[0].covariates)
+    return Unnamed(
+        refused=f"A formula over {over} fits part of the residuals, but stops that were held out "
+        f"are predicted no better with it ({before:.2f} to {errors.rms_mm:.2f} mm)."
+    )
+
+
+def _with(stand: Stand, formulas: Sequence[Formula], progress: Progress) -> Stand:
+    """A model with formulas, fitted."""
+    taken = list(stand.model.names)
+    effects = []
+    for each in formulas:
+        effects.append(FormulaEffect.read(each.effect(taken, ""), "diagnosis.json", {}))
+        taken.append(effects[-1].name)
+    return stand.with_effects(effects, progress)
+
+
+def _document(
+    found: Formula, taken: Sequence[str], fall_mm: tuple[float, float] | None
+) -> dict[str, Any]:
+    seen = " and ".join(_span(name, *ends) for name, ends in found.seen.items())
+    what = f"Empirical: it describes and explains nothing, and was seen at {seen}."
+    first = found.steps[0]
+    return {
+        "covariates": list(found.covariates),
+        "rms_mm": 1e3 * found.rms_m,
+        "p_value": first.p_value,
+        "p_adjusted": first.p_adjusted,
+        "says": found.says,
+        "terms": [
+            {"text": text, "estimate": amount, "sigma": sigma, "unit": "m"}
+            for part in found.parts
+            for text, amount, sigma in zip(part.texts, part.amount_m, part.sigma_m, strict=True)
+        ],
+        "alike": [
+            {
+                "says": " + ".join(f"a{i} * {text}" for i, text in enumerate(form.term.texts, 1)),
+                "covariates": list(form.term.covariates),
+                "separate": what_differs(found.covariates, form.term.covariates),
+            }
+            for form in found.alike[:ALIKE]
+        ],
+        "held_out_rms_mm": dict(zip(("before", "after"), fall_mm or (None, None), strict=True)),
+        "why": why(found.covariates),
+        "formula": found.effect(taken, what),
+        "seen": {name: list(ends) for name, ends in found.seen.items()},
+        "picture": found.picture,
+    }
+
+
+def _span(name: str, low: float, high: float) -> str:
+    """From where to where a covariate went, in words."""
+    unit, scale = UNITS.get(f"_{name.rpartition('_')[2]}", ("", 1.0))
+    ends = (f"{scale * x:.0f}" if abs(x) > 1e4 else f"{scale * x:.3g}" for x in (low, high))
+    return f"{words(name)} from {' to '.join(ends)} {unit}".rstrip()
