@@ -25,6 +25,7 @@ WITHIN = 0.1  # of the floor, and of the effect's rms
 SIGMAS = 2.0
 THROWN = 0.01  # of the beams; of the window of `known_sector` it is a tenth
 RUN = "run0"  # the first fit
+KEPT = ("covariates", "formula", "says", "p_value", "alike")
 KEY = ["stop", "ring", "column"]
 
 
@@ -34,8 +35,8 @@ class Ladder:
 
     Args:
         runs: fits, first to last.
-        rungs: of each rung after the first what it adds: ``effects``; of a formula ``covariates``,
-            ``formula`` (its document), ``says`` and ``p_value``.
+        rungs: of each rung after the first the names of the ``effects`` that it adds: those
+            ``named`` by the catalogue, and ``formulas``, of each what is `KEPT`.
         said: per diagnosis its verdict, blunders, how many formulas it has, and seconds.
         fit_s: CPU seconds of the first fit.
         stopped: why no further rung was tried.
@@ -103,30 +104,28 @@ def complaint(said: Any) -> str:
 
 
 def proposed(diagnosis: Mapping[str, Any]) -> dict[str, Any]:
-    """What a user would add: effects of the catalogue that are worth it, else the first formula."""
+    """What a user would add: effects of the catalogue that are worth it, and all formulas."""
     named = worth_adding(diagnosis.get("candidates", []))
-    if diagnosis.get("verdict") == "missing_effect" and named:
-        return {"effects": list(named)}
-    for each in diagnosis.get("unexplained", []):
-        if each.get("formula"):
-            kept = {key: each.get(key) for key in ("covariates", "formula", "says", "p_value")}
-            return {"effects": [each["formula"]["name"]], **kept}
-    return {}
+    named = list(named) if diagnosis.get("verdict") == "missing_effect" else []
+    told = [each for each in diagnosis.get("unexplained", []) if each.get("formula")]
+    kept = [{key: each.get(key) for key in KEPT} for each in told]
+    names = [each["formula"]["name"] for each in told]
+    return {"effects": [*named, *names], "named": named, "formulas": kept} if named + names else {}
 
 
 def formulas(ladder: Ladder) -> list[dict[str, Any]]:
-    """The rungs that are formulas."""
-    return [rung for rung in ladder.rungs if "formula" in rung]
+    """All formulas that were added."""
+    return [each for rung in ladder.rungs for each in rung["formulas"]]
 
 
 def named(ladder: Ladder) -> list[str]:
     """What was added by the catalogue's names."""
-    return [n for rung in ladder.rungs if "formula" not in rung for n in rung["effects"]]
+    return [name for rung in ladder.rungs for name in rung["named"]]
 
 
-def looks_at(rungs: Sequence[Mapping[str, Any]]) -> frozenset[str]:
+def looks_at(found: Sequence[Mapping[str, Any]]) -> frozenset[str]:
     """All covariates of formulas, those that are one thing by one name."""
-    return same(name for rung in rungs for name in rung["covariates"])
+    return same(name for each in found for name in each["covariates"])
 
 
 def errors(run: Path) -> dict[str, float | None]:
@@ -147,7 +146,7 @@ def at_floor(last: Mapping[str, Any], best: Mapping[str, Any]) -> bool:
     return near and last["rejected"] < best["rejected"] + THROWN
 
 
-def fitted(run: Path, rungs: Sequence[Mapping[str, Any]], stops: pd.DataFrame) -> pd.DataFrame:
+def fitted(run: Path, told: Sequence[Mapping[str, Any]], stops: pd.DataFrame) -> pd.DataFrame:
     """What formulas of a run add to ranges, at its beams.
 
     Returns:
@@ -157,8 +156,8 @@ def fitted(run: Path, rungs: Sequence[Mapping[str, Any]], stops: pd.DataFrame) -
     table = rows_of(run, stops)
     columns = {name: table[name].to_numpy() for name in table}
     found, total, variance = solution(run)["effects"], 0.0, 0.0
-    for rung in rungs:
-        document = rung["formula"]
+    for each in told:
+        document = each["formula"]
         if document["site"] != "range":
             continue
         said = found[document["name"]]
@@ -187,24 +186,24 @@ def rows_of(run: Path, stops: pd.DataFrame) -> pd.DataFrame:
 
 
 def form(
-    run: Path, rungs: Sequence[Mapping[str, Any]], stops: pd.DataFrame, beams: pd.DataFrame
+    run: Path, told: Sequence[Mapping[str, Any]], stops: pd.DataFrame, beams: pd.DataFrame
 ) -> dict[str, Any]:
     """Whether formulas are the truth over the data's range, after what the model absorbs.
 
     Args:
         run: the last of a ladder.
-        rungs: its formulas.
+        told: its formulas.
         stops: stops.csv.
         beams: `KEY`, what `Absorbs.of` takes, and ``error_m``, the truth.
 
     Returns:
         ``effect_mm``, ``off_mm`` and ``sigma_mm``, rms; ``right``.
     """
-    both = fitted(run, rungs, stops).merge(beams, on=KEY, how="inner", validate="1:1")
+    both = fitted(run, told, stops).merge(beams, on=KEY, how="inner", validate="1:1")
     absorbs = Absorbs.of(both)
     true = absorbs.off(both["error_m"].to_numpy(float))
     off_m = rms(absorbs.off(both["fitted_m"].to_numpy(float)) - true)
     sigma_m, effect_m = rms(both["sigma_m"]), rms(true)
     found = {"effect_mm": effect_m, "off_mm": off_m, "sigma_mm": sigma_m}
-    right = bool(rungs) and off_m < max(SIGMAS * sigma_m, WITHIN * effect_m)
+    right = bool(told) and off_m < max(SIGMAS * sigma_m, WITHIN * effect_m)
     return {name: round(1e3 * x, 4) for name, x in found.items()} | {"right": bool(right)}

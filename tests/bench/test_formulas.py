@@ -178,12 +178,13 @@ def test_what_is_thrown_away_is_not_explained(held_out, rejected, right):
     assert at_floor(last, {"rejected": 0.02}) is right
 
 
-def test_a_user_adds_what_is_named_first_and_else_the_first_formula():
+def test_a_user_adds_all_that_is_proposed():
     loose = {"covariates": ["ring"], "formula": None}
-    shown = {"covariates": ["ring"], "formula": {"name": "f"}, "says": "it"}
+    shown = [{"covariates": ["ring"], "formula": {"name": name}, "says": name} for name in "fg"]
     assert proposed({"verdict": "adequate", "unexplained": [loose]}) == {}
-    found = proposed({"verdict": "unexplained_structure", "unexplained": [loose, shown]})
-    assert found["effects"] == ["f"] and found["says"] == "it"
+    found = proposed({"verdict": "unexplained_structure", "unexplained": [loose, *shown]})
+    assert found["effects"] == ["f", "g"] and found["formulas"][1]["says"] == "g"
+    assert not found["named"]
 
 
 RESULT = {
