@@ -42,11 +42,13 @@ Answer = tuple[list[str], np.ndarray]  # covariates, prediction (M,) for what wa
 
 @dataclass(frozen=True)
 class Data:
-    """Covariates (N, P) and (M, P), and residuals (N,) mm clipped, to learn on and to be tested."""
+    """Covariates (N, P) and (M, P), and residuals (N,) mm clipped, to learn on and to be tested;
+    and the location (N,) of those to learn on."""
 
     names: list[str]
     learn: np.ndarray
     mm: np.ndarray
+    place: np.ndarray
     test: np.ndarray
     test_mm: np.ndarray
 
@@ -77,9 +79,16 @@ def data(table: pd.DataFrame) -> Data:
     mm = 1e3 * table["residual_m"].to_numpy(float)
     spread = 1.4826 * np.median(np.abs(mm - np.median(mm)))
     mm = np.clip(mm - np.median(mm), -CLIP * spread, CLIP * spread)
-    held = pd.factorize(table["stop"].str[:3])[0] % 3 == 2
-    x = scaled.to_numpy()
-    return Data(list(scaled), x[~held], mm[~held], test=x[held], test_mm=mm[held])
+    place = pd.factorize(table["stop"].str[:3])[0]
+    held, x = place % 3 == 2, scaled.to_numpy()
+    return Data(
+        names=list(scaled),
+        learn=x[~held],
+        mm=mm[~held],
+        place=place[~held],
+        test=x[held],
+        test_mm=mm[held],
+    )
 
 
 def trees(data: Data) -> Answer:
@@ -110,19 +119,18 @@ def additive(data: Data) -> Answer:
 
 def sparse(data: Data) -> Answer:
     """Sequentially thresholded least squares over products and waves of two covariates, as SINDy's;
-    its threshold by a third of the rows to learn on."""
+    its threshold by one of the locations to learn on."""
     from pysindy import STLSQ
 
     library, uses = _library(data)
-    third = np.arange(len(data.mm)) % 3 == 0
-    x, scale = library(data.learn), 1.0
+    held, x = data.place == data.place[0], library(data.learn)
     scale = x.std(axis=0)
     x = x / scale
     best, least = None, np.inf
-    for threshold in (0.1, 0.2, 0.4, 0.8, 1.6):
+    for threshold in (0.2, 0.4, 0.8, 1.6, 3.2):
         model = STLSQ(threshold=threshold, alpha=1e-3, max_iter=20)
-        model.fit(x[~third], data.mm[~third, None])
-        left = rms(data.mm[third] - x[third] @ model.coef_.ravel())
+        model.fit(x[~held], data.mm[~held, None])
+        left = rms(data.mm[held] - x[held] @ model.coef_.ravel())
         if left < 0.999 * least or best is None:
             best, least = model.coef_.ravel(), left
     found = {name for k in np.flatnonzero(best) for name in uses[k]}
