@@ -14,7 +14,7 @@ import numpy as np
 from calib.diagnosis.formulas.factors import columns_of
 from calib.diagnosis.formulas.picture import picture_of
 from calib.diagnosis.formulas.pursuit import Form, Step, Term, refine
-from calib.diagnosis.formulas.table import Table
+from calib.diagnosis.formulas.table import Projection, Table
 from calib.diagnosis.score import GAUGE, test
 from calib.effects.own.formula import FormulaEffect
 
@@ -129,90 +129,88 @@ def settled(table: Table, steps: Sequence[Step]) -> list[Formula]:
     terms = [step.form.term for step in steps]
     columns = [t.columns(table.covariates) for t in terms]
     for _ in range(PASSES):
-        weight = table.beside(np.hstack(columns)).projection().weight
+        model = table.projection(np.hstack(columns))
         for i, term in enumerate(terms):
             others = [c for k, c in enumerate(columns) if k != i]
-            alone = table.beside(np.hstack(others)) if others else table
-            terms[i] = refine(alone.projection().at(weight), term)
+            beside = model.beside(np.hstack(others)) if others else model
+            terms[i] = refine(beside, term)
             columns[i] = terms[i].columns(table.covariates)
-    kept = _kept(table, terms, columns, weight)
-    parts = _parts(table, terms, columns, kept, weight)
+    kept = _kept(model, columns)
+    columns = [c[:, k] for c, k in zip(columns, kept, strict=True)]
+    model = table.projection(np.hstack(columns))
+    parts = _parts(model, terms, columns, kept)
+    fit = model.fitted(np.hstack(columns))[0]
     groups: dict[frozenset[str], list[int]] = {}
     for i, term in enumerate(terms):
         groups.setdefault(frozenset(term.covariates), []).append(i)
-    weigh, out = table.projection().at(weight), []
-    fit = table.beside(np.hstack([c[:, p.at] for c, p in zip(columns, parts, strict=True)]))
-    fit = fit.projection()
+    out = []
     for some in groups.values():
         mine = [parts[i] for i in some]
-        value = sum(columns[i][:, p.at] @ p.amount_m for i, p in zip(some, mine, strict=True))
-        left = weigh.off(value[:, None])[0][:, 0]
-        names = dict.fromkeys(c for p in mine for c in p.term.covariates)
+        value = sum(columns[i] @ p.amount_m for i, p in zip(some, mine, strict=True))
+        left = model.off(value[:, None])[0][:, 0]
+        names = list(dict.fromkeys(c for p in mine for c in p.term.covariates))
         out.append(
             Formula(
                 parts=mine,
                 steps=[steps[i] for i in some],
-                rms_m=float(np.sqrt(weight @ np.square(left) / weight.sum())),
+                rms_m=float(np.sqrt(model.weight @ np.square(left) / model.weight.sum())),
                 seen={n: _ends(table.covariates[n]) for n in names},
-                picture=picture_of(table, list(names), value, fit),
+                picture=picture_of(table, names, value, fit),
             )
         )
     return out
 
 
-def _kept(
-    table: Table, terms: Sequence[Term], columns: Sequence[np.ndarray], weight: np.ndarray
-) -> list[list[int]]:
+def _kept(model: Projection, columns: Sequence[np.ndarray]) -> list[list[int]]:
     """Of each term the columns that the data need: not those that the model takes on, nor those
     that chance explains."""
     kept = [list(range(c.shape[1])) for c in columns]
-    alone = table.projection().at(weight)
     while True:
         some = np.hstack([c[:, k] for c, k in zip(columns, kept, strict=True)])
-        scores = alone.scores({}, some)
-        size = np.maximum(np.diag(scores.whole), 1e-300)
-        found = test(scores, np.arange(some.shape[1]))
-        left = np.linalg.pinv(found.whiten @ found.whiten.T).diagonal() / size
-        t = np.abs(found.estimate()) / np.maximum(_sigma(table, some, some, weight), 1e-300)
-        t = np.where((np.diag(scores.information) / size > GAUGE) & (left > GAUGE), t, 0.0)
         owner = [(i, c) for i, k in enumerate(kept) for c in k]
         can = [j for j, (i, _) in enumerate(owner) if len(kept[i]) > 1]
-        worst = min(can, key=lambda j: t[j], default=None)
-        if worst is None or t[worst] > CLEAR:
+        if not can:
+            return kept
+        beside, theta = model.fitted(some)
+        found = test(beside.scores({}, some), np.arange(some.shape[1]))
+        t = np.abs(theta) / np.maximum(found.sigma(1.0), 1e-300)
+        t[_taken_on(model, some)] = 0.0
+        worst = min(can, key=lambda j: t[j])
+        if t[worst] > CLEAR:
             return kept
         i, c = owner[worst]
         kept[i].remove(c)
 
 
+def _taken_on(model: Projection, columns: np.ndarray) -> np.ndarray:
+    """Which columns (N, k) the model, or those before, can take on."""
+    kept, _ = model.off(columns)
+    root = np.sqrt(model.weight)[:, None]
+    size = np.sqrt(np.square(root * columns).sum(axis=0))
+    own = np.abs(np.diag(np.linalg.qr(root * kept / np.maximum(size, 1e-300), mode="r")))
+    return own < np.sqrt(GAUGE)
+
+
 def _parts(
-    table: Table,
+    model: Projection,
     terms: Sequence[Term],
     columns: Sequence[np.ndarray],
     kept: Sequence[Sequence[int]],
-    weight: np.ndarray,
 ) -> list[Part]:
-    some = [c[:, k] for c, k in zip(columns, kept, strict=True)]
-    fit = table.beside(np.hstack(some)).projection()
-    amount = fit.step[-sum(c.shape[1] for c in some) :]
-    slopes, start = [], 0
-    for term, mine, k in zip(terms, some, kept, strict=True):
-        own = amount[start : (start := start + mine.shape[1])]
-        slopes.append(_slopes(table, term, k, own))
-    sigma = _sigma(table, np.hstack(some), np.hstack([*some, *slopes]), fit.weight)
-    out, start, more = [], 0, len(amount)
-    for term, mine, k, slope in zip(terms, some, kept, slopes, strict=True):
-        at = slice(start, start := start + mine.shape[1])
-        of = slice(more, more := more + slope.shape[1])
-        out.append(
-            Part(
-                term=term,
-                at=tuple(k),
-                amount_m=amount[at],
-                sigma_m=sigma[at],
-                constants_sigma=sigma[of],
-            )
-        )
-    return out
+    """Terms with what their columns are multiplied by, and the sigmas of that and of their
+    constants, all of them unknown together."""
+    beside, amount = model.fitted(np.hstack(columns))
+    ends = np.cumsum([c.shape[1] for c in columns])[:-1]
+    amounts = np.split(amount, ends)
+    slopes = [_slopes(model.table, *each) for each in zip(terms, kept, amounts, strict=True)]
+    every = np.hstack([*columns, *slopes])
+    sigma = test(beside.scores({}, every), np.arange(every.shape[1])).sigma(1.0)
+    sigmas = np.split(sigma[: len(amount)], ends)
+    others = np.split(sigma[len(amount) :], np.cumsum([s.shape[1] for s in slopes])[:-1])
+    return [
+        Part(term=term, at=tuple(k), amount_m=a, sigma_m=s, constants_sigma=o)
+        for term, k, a, s, o in zip(terms, kept, amounts, sigmas, others, strict=True)
+    ]
 
 
 def _slopes(table: Table, term: Term, kept: Sequence[int], amount: np.ndarray) -> np.ndarray:
@@ -227,17 +225,6 @@ def _slopes(table: Table, term: Term, kept: Sequence[int], amount: np.ndarray) -
             sides.append(term.at(constants).columns(table.covariates)[:, kept] @ amount)
         out.append((sides[0] - sides[1]) / (2 * NUDGE * wide))
     return np.stack(out, axis=1) if out else np.zeros((len(table), 0))
-
-
-def _sigma(table: Table, fitted: np.ndarray, columns: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Sigma (q,) of what columns (N, q) are multiplied by, where some are fitted; clusters
-    counted, no less than rows alone have it."""
-    alone = table.projection().at(weight)
-    beside = table.beside(fitted).projection().at(weight)
-    unknowns = len(alone.step)
-    at_best = alone.leaving(beside.left_m, beside.step[:unknowns])
-    found = test(at_best.scores({}, columns), np.arange(columns.shape[1]))
-    return found.sigma(1.0)
 
 
 def _ends(values: np.ndarray) -> tuple[float, float]:

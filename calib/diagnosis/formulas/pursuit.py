@@ -30,7 +30,7 @@ STEP = 0.05  # of a covariate's range: by how much constants are changed first
 APART = 2.0  # sigmas by which stops must prefer a form for it to be told from a simpler one
 MOST_TERMS = 4
 RIVALS = 2  # sets of covariates, beside the best one, over which forms are tried
-INSTEAD = 0.5  # of the best set's statistic that another must explain for that
+INSTEAD = 0.8  # of the best set's statistic that another must explain for that
 AS = {"ring": "elevation_rad"}  # what goes along with another covariate
 AT_ONCE = 400  # columns: bounds the memory
 
@@ -199,7 +199,7 @@ def _by_chance(fitted: Projection, form: Form, smooth: Smooth) -> float:
     makes a smooth function that does (the S-method of Scheffe 1953), stops left out one by one, and
     beams weighed as they are once the form is known."""
     columns = form.term.columns(fitted.table.covariates)
-    known = fitted.at(fitted.table.beside(columns).projection().weight)
+    known = fitted.table.projection(columns)
     found = test(known.scores({}, columns), np.arange(columns.shape[1]))
     chance = known.judged(found, columns).chance
     if chance.d <= 0.0:
@@ -249,8 +249,7 @@ def _best_factors(
     blocks = []
     for each in every:
         mine = each.columns(table.covariates)
-        block = (mine[:, :, None] * others[:, None, :]).reshape(len(mine), -1)
-        blocks.append(block[:, np.any(block != 0.0, axis=0)])
+        blocks.append((mine[:, :, None] * others[:, None, :]).reshape(len(mine), -1))
     statistic, dof = _explained(projection, blocks)
     evidence = [_evidence(s, d) for s, d in zip(statistic, dof, strict=True)]
     order = np.argsort(-np.array(evidence), kind="stable").tolist()

@@ -163,16 +163,16 @@ def _tested(
     for i, names in enumerate(sets):
         progress(i, len(sets))
         columns = bases.of(names)
-        columns = columns[:, np.any(columns != 0.0, axis=0)]
         scores = projection.scores({}, columns)
         found = test(scores, np.arange(columns.shape[1]))
         if found.dof:
-            yield names, (found, _by_chance(scores, found))
+            yield names, (found, _by_chance(scores, found, projection.table.signs))
 
 
-def _by_chance(scores: Scores, found: Test) -> np.ndarray:
+def _by_chance(scores: Scores, found: Test, signs: np.ndarray) -> np.ndarray:
     # Every set has the same clusters in the same order, so the same draw of signs is one world.
-    statistic = np.sum(np.square(scores.draws @ found.whiten), axis=1)
+    shares = np.vstack([scores.by_stop, scores.by_place]) @ found.whiten
+    statistic = np.sum(np.square(signs @ shares), axis=1)
     rank = np.empty(len(statistic))
     rank[np.argsort(-statistic, kind="stable")] = np.arange(1, len(statistic) + 1)
     return rank / (len(statistic) + 1)
