@@ -38,9 +38,11 @@ from .formulas_judge import (
     RUN,
     at_floor,
     climbed,
+    covariates_right,
     errors,
     form,
     formulas,
+    in_texts,
     looks_at,
     named,
     oracle,
@@ -129,13 +131,14 @@ def judged(
     """
     ladder = climbed(recording, folder, most)
     found, stops = formulas(ladder), pd.read_csv(recording / "stops.csv")
-    wanted = frozenset().union(*map(covariates, hidden))
+    wanted = [covariates(formula) for formula in hidden]
     steps = [errors(each) for each in ladder.runs if (each / "summary.json").exists()]
     best = oracle(ladder.runs[0], hidden, folder) if hidden and steps else {}
     result = {
         "hidden": list(hidden),
-        "wanted": sorted(wanted),
+        "wanted": sorted(frozenset().union(*wanted)),
         "found": [sorted(looks_at([each])) for each in found],
+        "in_texts": [sorted(in_texts(each)) for each in found],
         "says": [each.get("says") for each in found],
         "basis": [each["formula"]["basis"] for each in found],
         "p_value": [each.get("p_value") for each in found],
@@ -151,7 +154,7 @@ def judged(
         "oracle": best,
         "fit_s": ladder.fit_s,
         "search_s": [said["cpu_s"] for said in ladder.said],
-        "covariates_right": looks_at(found) == wanted,
+        "covariates_right": covariates_right(found, wanted),
         "at_floor": bool(steps) and at_floor(steps[-1], best or steps[0]),
     }
     if hidden and ladder.rungs and len(ladder.runs) == 1 + len(ladder.rungs):

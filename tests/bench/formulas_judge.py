@@ -128,6 +128,19 @@ def looks_at(found: Sequence[Mapping[str, Any]]) -> frozenset[str]:
     return same(name for each in found for name in each["covariates"])
 
 
+def in_texts(each: Mapping[str, Any]) -> frozenset[str]:
+    """The covariates that a formula's texts look at, which are those that it says, one hopes."""
+    texts = each["formula"]["basis"]
+    return same(n for text in texts for n in Expression(text, each["formula"]["name"]).names)
+
+
+def covariates_right(found: Sequence[Mapping[str, Any]], hidden: Sequence[frozenset[str]]) -> bool:
+    """Whether what formulas say that they hang on is what was hidden, no more and no less; and each
+    looks at one of what was hidden, or at all of it."""
+    every = frozenset().union(*hidden)
+    return looks_at(found) == every and all(in_texts(each) in (*hidden, every) for each in found)
+
+
 def errors(run: Path) -> dict[str, float | None]:
     """Held-out error and the floor of a run, mm, and the share of the beams that it leaves out."""
     said = json.loads((run / "summary.json").read_text())

@@ -18,7 +18,7 @@ from sensors.documents import write_yaml
 from ..worlds.poses import turn_vector
 from . import formulas
 from .formulas_effects import PAIRS, SINGLES, covariates, same, value
-from .formulas_judge import at_floor, form, proposed
+from .formulas_judge import at_floor, covariates_right, form, proposed
 from .formulas_size import Absorbs, rms
 from .formulas_table import show
 from .formulas_worlds import RIGS, Case, cases, has_all, written
@@ -167,6 +167,32 @@ def test_a_form_is_right_within_a_tenth_or_two_sigmas(small, run, factor, sigma,
     if text == FORMULA:
         wanted = abs(factor - 1) * found["effect_mm"]
         assert found["off_mm"] == pytest.approx(wanted, rel=1e-3, abs=1e-3)
+
+
+ONE, TWO = frozenset({"humidity"}), frozenset({"azimuth_rad", "ring"})
+
+
+@pytest.mark.parametrize(
+    ("said", "right"),
+    [
+        (
+            [("humidity", "log(humidity)"), ("azimuth_rad elevation_rad", "azimuth_rad * ring")],
+            True,
+        ),
+        ([("humidity azimuth_rad ring", "humidity + azimuth_rad * ring")], True),
+        ([("humidity", "humidity")], False),
+        ([("humidity time_s", "humidity"), ("azimuth_rad ring", "azimuth_rad * ring")], False),
+        # What one of three looks at was not hidden by itself.
+        ([("humidity azimuth_rad ring", "humidity + azimuth_rad * ring"), ("ring", "ring")], False),
+        ([], False),
+    ],
+)
+def test_covariates_are_right_where_they_are_what_was_hidden(said, right):
+    found = [
+        {"covariates": names.split(), "formula": {"name": "f", "basis": [text]}}
+        for names, text in said
+    ]
+    assert covariates_right(found, [ONE, TWO]) is right
 
 
 @pytest.mark.parametrize(
