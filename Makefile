@@ -76,6 +76,8 @@ bench-hidden: system $(TESTED)
 	$(BIN)/python -m tests.bench.chance --count $(CASES) -o build/chance.jsonl
 	@echo "== bench-hidden: effects, pairs and what no catalogue has"
 	$(BIN)/python -m tests.bench.hidden_effects --cases $(CASES) -o build/hidden_effects.jsonl
+	@echo "== bench-hidden: formulas that nobody has named"
+	$(BIN)/python -m tests.bench.formulas --count $(CASES) --nulls $(CASES) -o build/formulas.jsonl
 
 docs: system
 	@echo "== docs: the site, in build/docs"

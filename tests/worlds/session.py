@@ -145,8 +145,9 @@ def targets(world: World, rig: Hardware) -> np.ndarray:
 
 def scan(
     world: World, lidar: Lidar, rig: Hardware, there: room.Quads, stops: Stops, k: int
-) -> dict[str, np.ndarray]:
-    """Columns of the scan of stop k.
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Columns of the scan of stop k, and what is true of its beams: range and incidence without
+    any error, label, and the surface's normal in the LiDAR's frame, which faces it.
 
     Args:
         world, lidar, rig: what is scanned with.
@@ -185,6 +186,15 @@ def scan(
     mean_m, spread_m = averaged(lidar, rng, np.where(back, measured, 1.0), sigma_m, world.sweeps)
     brightness = white * cosine**0.4 * np.exp(0.05 * rng.standard_normal(len(white)))
     xyz = (mean_m[:, None] * named)[back].astype(np.float32)
+    facing = there.normal[which] * -np.sign(np.sum(towards * there.normal[which], axis=1))[:, None]
+    true = {
+        "ring": ring,
+        "column": column,
+        "range_m": range_m,
+        "incidence_rad": np.arccos(cosine),
+        "label": there.label[which],
+        **dict(zip(("normal_x", "normal_y", "normal_z"), (facing @ T[:3, :3]).T, strict=True)),
+    }
     return {
         **dict(zip("xyz", xyz.T, strict=True)),
         "intensity": np.clip(brightness, 0, 1)[back].astype(np.float32),
@@ -192,7 +202,7 @@ def scan(
         "column": column[back].astype(np.uint16),
         "count": np.full(int(back.sum()), world.sweeps, np.uint16),
         "range_std_m": spread_m[back].astype(np.float32),
-    }
+    }, {name: each[back] for name, each in true.items()}
 
 
 def _mixed(

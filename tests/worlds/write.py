@@ -20,12 +20,13 @@ POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
 TARGET = [f"{part}_{axis}" for part in ("faro", "upper", "lower") for axis in "xyz"]
 
 
-def write(world: World, folder: Path) -> dict[str, Any]:
+def write(world: World, folder: Path, beams: Path | None = None) -> dict[str, Any]:
     """Write a recording, and FOLDER.truth.json beside it.
 
     Args:
         world: what is recorded.
         folder: does not exist yet.
+        beams: a folder that exists; it gets STOP.parquet of what is true of every beam.
 
     Returns:
         The truth.
@@ -46,7 +47,7 @@ def write(world: World, folder: Path) -> dict[str, Any]:
     sigma_m = SIGMA_MESH_M * world.mesh_error_factor
     mesh = room.scanned(there, world.rng("mesh"), sigma_m, world.warp_m)
     _write_reference(mesh, folder / "reference")
-    share = _scans(world, rig, stops, there, folder)
+    share = _scans(world, rig, stops, there, (folder / "scans", beams))
     truth = _truth(world, rig, stops) | {"clutter_share": share}
     Path(f"{folder}.truth.json").write_text(json.dumps(truth, indent=1) + "\n")
     return truth
@@ -58,8 +59,14 @@ def names(stops: Stops) -> list[str]:
     return [f"L{x:02d}P{p:02d}" for x, p in zip(stops.location, within, strict=True)]
 
 
-def _scans(world: World, rig: Hardware, stops: Stops, there: room.Quads, folder: Path) -> float:
-    """Write every scan; the share of beams that met clutter."""
+def _scans(
+    world: World,
+    rig: Hardware,
+    stops: Stops,
+    there: room.Quads,
+    folders: tuple[Path, Path | None],
+) -> float:
+    """Write every scan, and what is true of its beams; the share of beams that met clutter."""
     lidar, met, named = model(world.lidar), [], names(stops)
     beams = lidar.directions(world.beams)[0]
     for location in range(world.locations):
@@ -70,8 +77,10 @@ def _scans(world: World, rig: Hardware, stops: Stops, there: room.Quads, folder:
         more = room.cluttered(there, rng, world.clutter, T[:, :3, 3], towards)
         everything = there.and_(more)
         for k in at:
-            table = pd.DataFrame(scan(world, lidar, rig, everything, stops, k))
-            table.to_parquet(folder / "scans" / f"{named[k]}.parquet", index=False)
+            tables = scan(world, lidar, rig, everything, stops, k)
+            for table, folder in zip(tables, folders, strict=True):
+                if folder is not None:
+                    pd.DataFrame(table).to_parquet(folder / f"{named[k]}.parquet", index=False)
         hits = [everything.hit(*each)[1] for each in zip(T[:, :3, 3], towards, strict=True)]
         met.append(np.mean(np.array(hits) >= len(there.corner)))
     return float(np.mean(met))
