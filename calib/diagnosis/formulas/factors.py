@@ -22,6 +22,8 @@ WINDOW = 12  # edges between which a window is tried first
 CENTRES, WIDTHS = 8, (0.06, 0.15)  # of bumps; of the covariate's range
 SCALES = (0.1, 0.25, 0.6)  # of exponentials, of the covariate's range
 PERIODS = tuple(np.geomspace(0.1, 1.5, 24))  # of waves, of the covariate's range
+WIDEST, NARROWEST = 3.0, 0.005  # scales and widths, of the covariate's range
+BLOCKS = (2.0, 4.0, 8.0, 16.0, 32.0)  # rings that a chip, or a bank of chips, has
 ORDERS = 12  # of harmonics of an angle
 FEWEST_VALUES = 3  # of a covariate that is not a class
 WIDE = 1.5  # largest over smallest value, from which powers differ from a line
@@ -36,13 +38,13 @@ class Kind:
         columns: its columns; ``{x}`` is the covariate, ``{0}``, ``{1}`` the constants.
         cost: how much there is to it: what takes the place of what, where data cannot tell.
         free: how many of the constants, from the first, are to be found.
-        whole: whether constants are whole numbers.
+        scales: which of these are a scale, not a place.
     """
 
     columns: tuple[str, ...]
     cost: float
     free: int = 0
-    whole: bool = False
+    scales: tuple[int, ...] = ()
 
 
 # The 1 beside a line, a square and a logarithm lets the place of their zero be found.
@@ -50,29 +52,30 @@ KINDS = {
     "line": Kind(("({x} - {0}) / {1}", "1"), 1.0),
     "square": Kind(("(({x} - {0}) / {1})**2", "({x} - {0}) / {1}", "1"), 2.5),
     "logarithm": Kind(("log({x} / {0})", "1"), 1.5),
-    "saturation": Kind(("log(1 + {x} / {0})",), 2.0, free=1),
-    "share": Kind(("{x} / ({x} + {0})",), 2.0, free=1),
+    "saturation": Kind(("log(1 + {x} / {0})",), 2.0, free=1, scales=(0,)),
+    "share": Kind(("{x} / ({x} + {0})",), 2.0, free=1, scales=(0,)),
     "root": Kind(("sqrt({x} / {0})",), 1.5),
     "power": Kind(("({x} / {0})**{1}",), 1.5),
     "reciprocal": Kind(("{0} / {x}",), 1.5),
-    "decay": Kind(("exp(-({x} - {1}) / {0})",), 2.0, free=1),
-    "growth": Kind(("exp(({x} - {1}) / {0})",), 2.0, free=1),
-    "wave": Kind(("sin(2 * pi * {x} / {0})", "cos(2 * pi * {x} / {0})"), 2.5, free=1),
-    "harmonic": Kind(("sin({0} * {x})", "cos({0} * {x})"), 2.0, whole=True),
+    "decay": Kind(("exp(-({x} - {1}) / {0})",), 2.0, free=1, scales=(0,)),
+    "growth": Kind(("exp(({x} - {1}) / {0})",), 2.0, free=1, scales=(0,)),
+    "wave": Kind(("sin(2 * pi * {x} / {0})", "cos(2 * pi * {x} / {0})"), 2.5, free=1, scales=(0,)),
+    "harmonic": Kind(("sin({0} * {x})", "cos({0} * {x})"), 2.0),
     "step": Kind(("{x} > {0}",), 2.0, free=1),
     "window": Kind(("({x} > {0}) * ({x} < {1})",), 2.5, free=2),
     "outside": Kind(("({x} < {0}) + ({x} > {1})",), 2.5, free=2),
     "ramp": Kind(("maximum(0, {x} - {0}) / {1}",), 2.0, free=1),
     "ramp down": Kind(("maximum(0, {0} - {x}) / {1}",), 2.0, free=1),
-    "bump": Kind(("exp(-(({x} - {0}) / {1})**2)",), 2.5, free=2),
+    "bump": Kind(("exp(-(({x} - {0}) / {1})**2)",), 2.5, free=2, scales=(1,)),
     "over cosine": Kind(("1 / cos({x}) - 1",), 1.0),
     "tangent": Kind(("tan({x})",), 1.0),
     "tangent squared": Kind(("tan({x})**2",), 1.5),
     "sine": Kind(("sin({x})",), 1.0),
     "cosine": Kind(("cos({x})", "1"), 1.2),
     "every other": Kind(("where(mod({x}, 2) > 0.5, 1, -1)",), 1.5),
-    "one of": Kind(("mod({x}, {0}) == {1}",), 2.0, whole=True),
-    "class": Kind(("{x} == {0}",), 1.0, whole=True),
+    "block": Kind(("where(mod(floor({x} / {0}), 2) > 0.5, 1, -1)",), 1.8),
+    "one of": Kind(("mod({x}, {0}) == {1}",), 2.0),
+    "class": Kind(("{x} == {0}",), 1.0),
 }
 
 
@@ -105,6 +108,15 @@ class Factor:
     def free(self) -> int:
         """How many constants, from the first, are to be found."""
         return KINDS[self.kind].free
+
+    def bounds(self, values: np.ndarray) -> np.ndarray:
+        """(free, 2) least and largest value of the constants to be found: a place is among the
+        covariate's values; a scale, or a width, is no larger than `WIDEST` times their range, where
+        it could not be told from a line, nor so small that it is one value."""
+        low, high = float(np.nanmin(values)), float(np.nanmax(values))
+        scale = (high - low) * np.array([NARROWEST, WIDEST])
+        kinds = KINDS[self.kind]
+        return np.array([scale if i in kinds.scales else (low, high) for i in range(self.free)])
 
     def columns(self, covariates: Columns) -> np.ndarray:
         """(N, k), with 0 where there is no value."""
@@ -148,6 +160,7 @@ def factors(name: str, values: np.ndarray, levels: int) -> list[Factor]:
     out = [*_smooth(name, known), *_sharp(name, known, distinct, levels)]
     if name == "ring":
         out.append(Factor(name, "every other"))
+        out += [Factor(name, "block", (size,)) for size in BLOCKS]
         out += [Factor(name, "one of", (4.0, float(k))) for k in range(4)]
     return out
 

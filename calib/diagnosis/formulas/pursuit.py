@@ -314,26 +314,31 @@ def refine(projection: Projection, term: Term) -> Term:
     if not term.constants:
         return term
     covariates = projection.table.covariates
+    ends = np.concatenate([f.bounds(covariates[f.covariate]) for f in term.factors])
     wide = [np.ptp(covariates[f.covariate]) for f in term.factors for _ in range(f.free)]
     for size in CLOSER:
         for i in range(len(wide)):
-            tried = [term.at(_moved(term.constants, i, size * k * wide[i])) for k in BESIDE]
+            places = np.clip(term.constants[i] + size * wide[i] * np.array(BESIDE), *ends[i])
+            tried = [term.at(_with(term.constants, i, place)) for place in places.tolist()]
             explained, _ = projection.explained([t.columns(covariates) for t in tried])
             term = tried[int(np.argmax(explained))]
     start, scale = np.array(term.constants), CLOSER[-1] * np.array(wide)
 
+    def at(x: np.ndarray) -> Term:
+        return term.at(np.clip(start + scale * x, *ends.T).tolist())
+
     def worse(x: np.ndarray) -> float:
-        columns = term.at((start + scale * x).tolist()).columns(covariates)
+        columns = at(x).columns(covariates)
         return -float(projection.explained([columns])[0][0])
 
     simplex = np.vstack([np.zeros(len(start)), np.eye(len(start))])
     options = {"initial_simplex": simplex, "maxfev": TRIED * len(start), "xatol": 1e-2}
     found = minimize(worse, simplex[0], method="Nelder-Mead", options=options)
-    return term.at((start + scale * found.x).tolist()) if found.fun < worse(simplex[0]) else term
+    return at(found.x) if found.fun < worse(simplex[0]) else term
 
 
-def _moved(constants: Sequence[float], i: int, by: float) -> list[float]:
-    return [c + by * (k == i) for k, c in enumerate(constants)]
+def _with(constants: Sequence[float], i: int, value: float) -> list[float]:
+    return [value if k == i else c for k, c in enumerate(constants)]
 
 
 def _evidence(statistic: float, dof: int) -> float:
