@@ -220,9 +220,9 @@ def own_effects(rigs: Iterable[Rig], named: str | Iterable[str] = ()) -> tuple[E
 
 
 def split(texts: str | Iterable[str]) -> list[str]:
-    """Items of a command line, which may be one text with commas."""
-    texts = texts.split(",") if isinstance(texts, str) else texts
-    return [text.strip() for text in texts if text.strip()]
+    """Items of a command line: one text or several, each with commas or without."""
+    texts = [texts] if isinstance(texts, str) else texts
+    return [text.strip() for each in texts for text in each.split(",") if text.strip()]
 
 
 def is_known(text: str) -> bool:
