@@ -105,10 +105,11 @@ class Stops:
 
         def stacked(bases: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
             shared = [name for name in bases[0] if name != first.noise]
+            counts = [len(s.joints) for s in stops]
             each = {
                 n: [
-                    np.broadcast_to(b[n], (len(s.joints), *b[n].shape[1:]))
-                    for b, s in zip(bases, stops, strict=True)
+                    b[n] if len(b[n]) == k else np.repeat(b[n], k, axis=0)
+                    for b, k in zip(bases, counts, strict=True)
                 ]
                 for n in shared
             }
