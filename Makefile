@@ -37,6 +37,10 @@ INSTALLED = .venv/.installed
 TESTED = .venv/.tested
 endif
 
+# Python keeps what it compiles here, whatever the user has set: each worker of pytest, and each
+# program that tests start, would compile all of rigcal anew (4 s).
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: demo test test-long bench-hidden docs system browser clean lock audit licences dist dist-check
 
 demo: system

@@ -105,10 +105,11 @@ class Stops:
 
         def stacked(bases: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
             shared = [name for name in bases[0] if name != first.noise]
+            counts = [len(s.joints) for s in stops]
             each = {
                 n: [
-                    np.broadcast_to(b[n], (len(s.joints), *b[n].shape[1:]))
-                    for b, s in zip(bases, stops, strict=True)
+                    b[n] if len(b[n]) == k else np.repeat(b[n], k, axis=0)
+                    for b, k in zip(bases, counts, strict=True)
                 ]
                 for n in shared
             }
@@ -124,13 +125,16 @@ class Stops:
         )
         return out if first.noise is None else out.with_joint_noise(NOISE)
 
-    def in_root(self, frame: str, values: Values) -> Placed:
-        """T_root_frame under all effects of edges and joints."""
+    def in_root(self, frame: str, values: Values, derivatives: bool = True) -> Placed:
+        """T_root_frame under all effects of edges and joints; here and below, without
+        `derivatives` there are none."""
         joints, twists = self.joints, np.zeros((1, len(self.rig.tree.edges), 6))
         for name, basis in self.joint_bases.items():
             joints = joints + np.matvec(basis, values[name])
         for name, basis in self.edge_bases.items():
             twists = twists + basis @ values[name]
+        if not derivatives:
+            return Placed(self.rig.tree.transform(frame, joints, twists), {})
         placed = self.rig.tree.place(frame, joints, twists)
         count = len(joints)
         by_twist = placed.d_twist.reshape(count, 6, -1)
@@ -139,18 +143,22 @@ class Stops:
             d[name] = d.get(name, 0.0) + placed.d_joint @ basis
         return Placed(placed.Ts_root_frame, d)
 
-    def in_world(self, frame: str, values: Values) -> Placed:
+    def in_world(self, frame: str, values: Values, derivatives: bool = True) -> Placed:
         """T_world_frame = T_world_root @ T_root_frame."""
-        inner = self.in_root(frame, values)
-        d = inner.d | {self.root: se3.adjoint(se3.inverse(inner.T))}
-        return Placed(values[self.root] @ inner.T, d)
+        inner = self.in_root(frame, values, derivatives)
+        T = values[self.root] @ inner.T
+        if not derivatives:
+            return Placed(T, {})
+        return Placed(T, inner.d | {self.root: se3.adjoint(se3.inverse(inner.T))})
 
-    def in_reference(self, frame: str, values: Values) -> Placed:
+    def in_reference(self, frame: str, values: Values, derivatives: bool = True) -> Placed:
         """T_reference_frame = inverse(T_world_reference) @ T_world_frame."""
-        outer = self.in_world(frame, values)
+        outer = self.in_world(frame, values, derivatives)
         if self.reference is None:
             return outer
         T = se3.inverse(values[self.reference]) @ outer.T
+        if not derivatives:
+            return Placed(T, {})
         return Placed(T, outer.d | {self.reference: -se3.adjoint(se3.inverse(T))})
 
 

@@ -125,6 +125,20 @@ class FrameTree:
         """Return the indices of the edges from the root to ``frame``; InputError if unknown."""
         return tuple(self._find(frame).edges.tolist())
 
+    def _along(
+        self, frame: str, joints: ArrayLike, twists: ArrayLike | None
+    ) -> tuple[_Path, Array, Array | None]:
+        """The way to a frame, the joints, and the twists along it."""
+        joints = np.asarray(joints, float)
+        if joints.ndim != 2 or joints.shape[1] != len(self.joint_names):
+            raise ValueError(f"joints must be (K, {len(self.joint_names)}), not {joints.shape}")
+        path = self._find(frame)
+        return path, joints, None if twists is None else np.asarray(twists, float)[:, path.edges]
+
+    def transform(self, frame: str, joints: ArrayLike, twists: ArrayLike | None = None) -> Array:
+        """Return Ts_root_frame (K, 4, 4) alone, for what `place` takes and as it raises."""
+        return _chain(*self._along(frame, joints, twists))[0]
+
     def place(self, frame: str, joints: ArrayLike, twists: ArrayLike | None = None) -> Placement:
         """Return where ``frame`` is at K stops, and its derivatives by edge twist and joint.
 
@@ -135,13 +149,8 @@ class FrameTree:
         d/dq = Ad(S^-1) screw, as a motion leaves its own screw in place. Raises InputError for an
         unknown frame, naming the nearest, and ValueError for a wrong number of joints.
         """
-        joints = np.asarray(joints, float)
-        if joints.ndim != 2 or joints.shape[1] != len(self.joint_names):
-            raise ValueError(f"joints must be (K, {len(self.joint_names)}), not {joints.shape}")
-        path = self._find(frame)
-        xi = None if twists is None else np.asarray(twists, float)[:, path.edges]
+        path, joints, xi = self._along(frame, joints, twists)
         Ts_root_frame, Ts_twist_frame = _chain(path, joints, xi)
-
         to_frame = se3.adjoint(se3.inverse(Ts_twist_frame))
         d_joint = np.zeros((len(joints), 6, len(self.joint_names)))
         by_axis = np.matvec(to_frame[:, path.moving], path.screws).mT

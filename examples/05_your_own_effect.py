@@ -6,8 +6,8 @@ in a Python file does what arithmetic cannot. Either is then an effect like all 
 hidden in a simulation, fitted, added to a run, diagnosed, compared.
 
 Whether it is worth having is for the stops that were held out to say. The diagnosis of the first
-fit does not know your effect, and still finds on what the error hangs: time beside humidity, as the
-air grew damper from stop to stop; only physics or other weather can part the two.
+fit does not know your effect, and still finds on what the error hangs: humidity, and humidity with
+the range.
 
     python examples/05_your_own_effect.py [FOLDER]
 """
@@ -46,7 +46,7 @@ out = Path(sys.argv[1] if len(sys.argv) > 1 else tempfile.mkdtemp(prefix="rigcal
 (out / "mine.yaml").write_text(FORMULA)
 (out / "mine.py").write_text(CLASS)
 spec = Spec(
-    lidar="hesai_pandarxt32", room="box", locations=6, stops_per_location=3, column_step=200
+    lidar="hesai_pandarxt32", room="box", locations=4, stops_per_location=3, column_step=200
 )
 calib.simulate(spec, out / "recording", seed=2, hide={str(out / "mine.yaml"): 1.5})
 

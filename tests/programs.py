@@ -57,11 +57,11 @@ def _how(folder: Path, variables: dict[str, str]) -> dict[str, object]:
 
 
 def execute(
-    command: Sequence[object], folder: Path = ROOT, **variables: str
+    command: Sequence[object], folder: Path = ROOT, limit_s: float = LIMIT_S, **variables: str
 ) -> subprocess.CompletedProcess[str]:
     """A program that has ended, and what it printed."""
     how = _how(folder, variables)
-    return subprocess.run(list(map(str, command)), **how, capture_output=True, timeout=LIMIT_S)
+    return subprocess.run(list(map(str, command)), **how, capture_output=True, timeout=limit_s)
 
 
 @contextmanager

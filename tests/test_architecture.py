@@ -4,6 +4,7 @@ import ast
 import subprocess
 import sys
 from collections import Counter
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -58,12 +59,21 @@ ROOMS = {
 }
 AT_THE_ROOT_OF_CALIB = {"__init__", "forward"}
 
-SOURCES = {
-    path.relative_to(ROOT).as_posix(): ast.parse(path.read_text(encoding="utf-8"))
-    for folder in (*PACKAGES, "examples", "tests")
-    for path in sorted((ROOT / folder).rglob("*.py"))
-}
-PACKAGE_SOURCES = {path: tree for path, tree in SOURCES.items() if path.split("/")[0] in PACKAGES}
+
+@cache
+def sources() -> dict[str, ast.Module]:
+    """Every source by its path. No worker reads them but the one that runs these tests."""
+    return {
+        path.relative_to(ROOT).as_posix(): ast.parse(path.read_text(encoding="utf-8"))
+        for folder in (*PACKAGES, "examples", "tests")
+        for path in sorted((ROOT / folder).rglob("*.py"))
+    }
+
+
+@cache
+def packages() -> dict[str, ast.Module]:
+    """Those of the packages."""
+    return {path: tree for path, tree in sources().items() if path.split("/")[0] in PACKAGES}
 
 
 def none(offenders: list[str]) -> None:
@@ -75,7 +85,7 @@ def test_packages_import_only_those_before_them():
     none(
         [
             f"{path} imports {name}"
-            for path, tree in PACKAGE_SOURCES.items()
+            for path, tree in packages().items()
             for name in imports(path, ast.walk(tree), set())
             if name.split(".")[0] in PACKAGES[PACKAGES.index(path.split("/")[0]) + 1 :]
         ]
@@ -87,7 +97,7 @@ def test_the_simulator_shares_nothing_of_the_fit():
     none(
         [
             f"{path} imports {name}"
-            for path, tree in PACKAGE_SOURCES.items()
+            for path, tree in packages().items()
             if path.startswith("calib/simulation/")
             for name in imports(path, ast.walk(tree), set())
             if name.startswith(("calib.residuals", "calib.linear", "calib.solve"))
@@ -100,18 +110,18 @@ def test_every_folder_of_code_is_a_package():
     none(
         [
             f"{folder} has no __init__.py"
-            for folder in sorted({Path(path).parent for path in PACKAGE_SOURCES})
+            for folder in sorted({Path(path).parent for path in packages()})
             if not (ROOT / folder / "__init__.py").exists()
         ]
     )
 
 
 def test_rooms_import_only_those_before_them():
-    none(sorted(upward(PACKAGE_SOURCES, ROOMS)))
+    none(sorted(upward(packages(), ROOMS)))
 
 
 def test_every_room_has_its_place():
-    folders = {module_name(path).rpartition(".")[0] for path in PACKAGE_SOURCES}
+    folders = {module_name(path).rpartition(".")[0] for path in packages()}
     for package, rooms in ROOMS.items():
         inner = (f.removeprefix(f"{package}.") for f in folders if f.startswith(f"{package}."))
         assert {name.split(".")[0] for name in inner} <= set(rooms)
@@ -131,7 +141,7 @@ def test_a_room_that_imports_one_above_it_would_be_found():
 
 
 def test_modules_import_each_other_in_no_circle():
-    none(import_cycle(PACKAGE_SOURCES))
+    none(import_cycle(packages()))
 
 
 def test_a_circle_would_be_found():
@@ -153,7 +163,7 @@ def test_each_heavy_library_has_one_door():
     none(
         [
             f"{path} imports {name}, whose door is {door}"
-            for path, tree in PACKAGE_SOURCES.items()
+            for path, tree in packages().items()
             for name in imports(path, ast.walk(tree), set())
             if (door := DOORS.get(name.split(".")[0], path)) != path
         ]
@@ -180,17 +190,17 @@ def test_the_command_line_starts_light(arguments):
 
 
 def test_nothing_else_lies_at_the_root_of_calib():
-    at_root = {Path(path).stem for path in PACKAGE_SOURCES if Path(path).parent == Path("calib")}
+    at_root = {Path(path).stem for path in packages() if Path(path).parent == Path("calib")}
     assert at_root == AT_THE_ROOT_OF_CALIB
 
 
 def test_rooms_are_small():
-    files = Counter(Path(p).parent.as_posix() for p in PACKAGE_SOURCES if "__init__" not in p)
+    files = Counter(Path(p).parent.as_posix() for p in packages() if "__init__" not in p)
     none([room for room, count in files.items() if count > MOST_FILES])
 
 
 def test_files_are_short():
-    lines = {path: len((ROOT / path).read_text().splitlines()) for path in SOURCES}
+    lines = {path: len((ROOT / path).read_text().splitlines()) for path in sources()}
     none([f"{path}: {n} lines" for path, n in lines.items() if n > LONGEST_FILE])
 
 
@@ -198,7 +208,7 @@ def test_functions_are_short():
     none(
         [
             f"{path}:{node.lineno} {node.name}: {length} lines"
-            for path, tree in SOURCES.items()
+            for path, tree in sources().items()
             for node in ast.walk(tree)
             if isinstance(node, ast.FunctionDef)
             and (length := node.end_lineno - node.lineno + 1) > LONGEST_FUNCTION
@@ -211,7 +221,7 @@ def test_functions_take_few_parameters():
     none(
         [
             f"{path}:{node.lineno} {node.name}: {count} parameters"
-            for path, tree in SOURCES.items()
+            for path, tree in sources().items()
             for node in ast.walk(tree)
             if isinstance(node, ast.FunctionDef)
             if not any("app.command(" in ast.unparse(each) for each in node.decorator_list)
@@ -222,8 +232,10 @@ def test_functions_take_few_parameters():
 
 def test_dataclasses_are_filled_by_keyword():
     """Where there are more than a few fields, a position says too little."""
-    classes = dataclasses(SOURCES)
-    wide = {p for p, tree in SOURCES.items() if any(wide_calls(p, tree, classes, MOST_POSITIONAL))}
+    classes = dataclasses(sources())
+    wide = {
+        p for p, tree in sources().items() if any(wide_calls(p, tree, classes, MOST_POSITIONAL))
+    }
     none(sorted(wide))
 
 
@@ -241,7 +253,7 @@ def test_a_wide_call_would_be_found():
 
 def test_nothing_follows_the_order_of_a_set():
     """Texts hash otherwise each time Python starts: what is made in a set's order is chance."""
-    none([f"{path}:{w}" for path, tree in PACKAGE_SOURCES.items() for w in walks_over_sets(tree)])
+    none([f"{path}:{w}" for path, tree in packages().items() for w in walks_over_sets(tree)])
 
 
 def test_a_walk_over_a_set_would_be_found():
@@ -258,7 +270,7 @@ def test_everything_public_has_a_docstring():
     none(
         [
             name
-            for path, tree in PACKAGE_SOURCES.items()
+            for path, tree in packages().items()
             for name, node in public(tree.body, module_name(path))
             if not ast.get_docstring(node)
         ]
@@ -277,7 +289,7 @@ def test_everything_public_is_typed():
     none(
         [
             f"{path}:{node.lineno} {node.name}: {', '.join(lacking)}"
-            for path, tree in PACKAGE_SOURCES.items()
+            for path, tree in packages().items()
             for body in (tree, *(n for n in ast.walk(tree) if isinstance(n, ast.ClassDef)))
             for node in body.body
             if isinstance(node, ast.FunctionDef) and not node.name.startswith("_")

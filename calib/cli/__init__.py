@@ -5,7 +5,10 @@ from __future__ import annotations
 import logging
 import os
 import sys
-from typing import NoReturn
+from functools import cache
+from typing import Any, NoReturn
+
+import typer
 
 # BLAS threads on shared cores cost many times what they save; set before numpy is imported.
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -30,11 +33,17 @@ logging.getLogger("rigcal").addHandler(_OnStderr())
 INTERRUPTED = 130  # as shells have it: 128 and the signal's number
 
 
+@cache
+def _command() -> Any:
+    """All commands as the parser has them: typer itself would build it anew at each call, 60 ms."""
+    return typer.main.get_command(app)
+
+
 def main() -> None:
     """Run the command line: exit code 0 done, 2 bad input or usage, 3 done but not
     converged, 1 a fault of the program."""
     try:
-        code = app(sys.argv[1:] or ["--help"], prog_name="rigcal", standalone_mode=False)
+        code = _command()(sys.argv[1:] or ["--help"], prog_name="rigcal", standalone_mode=False)
     except InputError as error:
         _fail(str(error), 2)
     except MemoryError:

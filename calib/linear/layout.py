@@ -9,7 +9,7 @@ others are *kept*: they go to the factor graph.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -41,6 +41,7 @@ class Layout:
         unbounded: unknowns that have no prior.
         touched: unknown -> numbers of the stops whose place, or tracked bodies, depend on it; -1
             for a target.
+        asked: names of unknowns -> their columns, of those that were asked for.
     """
 
     unknowns: Mapping[str, Unknown]
@@ -55,6 +56,7 @@ class Layout:
     others: Sequence[Block]
     unbounded: frozenset[str]
     touched: Mapping[str, frozenset[int]]
+    asked: dict[tuple[str, ...], np.ndarray] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -118,8 +120,12 @@ class Layout:
         return len(self.sigma)
 
     def columns(self, names: Sequence[str]) -> np.ndarray:
-        """Columns of some unknowns, in the order given."""
-        return _join(self.at, names)
+        """Columns of some unknowns, in the order given; not to be written to, as it is kept."""
+        wanted = tuple(names)
+        if wanted not in self.asked:
+            self.asked[wanted] = _join(self.at, wanted)
+            self.asked[wanted].flags.writeable = False
+        return self.asked[wanted]
 
     def inner(self) -> Iterator[str]:
         """Unknowns that are eliminated before the graph is solved."""

@@ -100,7 +100,7 @@ def _find_planes(problem: Problem, part: SourceStops, places: Places) -> Planes:
     finder = PlaneFinder(noise_m=rig.lidar.sigma_range_m)
     for k, stops in places.scanned():
         _, ray = part.source.store.read(k)
-        T = stops.in_reference(rig.lidar_frame, problem.initial).T[0]
+        T = stops.in_reference(rig.lidar_frame, problem.initial, False).T[0]
         points_m = ray.origin_m + ray.range_m[:, None] * ray.direction
         finder.add(k, se3.apply(T, points_m), T[:3, 3])
     planes = finder.planes(min_points=LEAST_BEAMS)

@@ -139,7 +139,7 @@ class ScanStop:
 
     def pose(self, values: Values) -> np.ndarray:
         """T_reference_lidar (4, 4) at a state."""
-        return self.stops.in_reference(self.stops.rig.lidar_frame, values).T[0]
+        return self.stops.in_reference(self.stops.rig.lidar_frame, values, False).T[0]
 
     def associate(self, values: Values, near_edges: bool) -> Association:
         """Which part of the surface each beam meets, at a state."""

@@ -75,19 +75,20 @@ class TrackedBody:
     def seen(self, values: Values) -> np.ndarray:
         """T_world_body (K, 4, 4) that the tracker should see."""
         added = sum((basis @ values[name] for name, basis in self.bases.items()), np.zeros((1, 6)))
-        return self.stops.in_world(self.body, values).T @ se3.exp(added)
+        return self.stops.in_world(self.body, values, False).T @ se3.exp(added)
 
     def evaluate(self, values: Values, derivatives: bool) -> tuple[np.ndarray, Derivatives | None]:
         """Whitened rows, stop by stop [rotation, position], and their derivatives."""
-        placed = self.stops.in_world(self.body, values)
+        placed = self.stops.in_world(self.body, values, derivatives)
         d_seen = {name: np.asarray(d) for name, d in placed.d.items()}
         seen = placed.T
         if self.bases:
             added = sum(basis @ values[name] for name, basis in self.bases.items())
             seen = seen @ se3.exp(added)
-            back = se3.adjoint(se3.inverse(se3.exp(added)))
-            d_seen = {name: back @ d for name, d in d_seen.items()}
-            d_seen |= {n: se3.right_jacobian(added) @ b for n, b in self.bases.items()}
+            if derivatives:
+                back = se3.adjoint(se3.inverse(se3.exp(added)))
+                d_seen = {name: back @ d for name, d in d_seen.items()}
+                d_seen |= {n: se3.right_jacobian(added) @ b for n, b in self.bases.items()}
         rows, by_twist = _pose_error(seen, self.measured)
         weight = 1.0 / np.repeat([self.sigma_rad, self.sigma_m], 3)
         keep = slice(3, 6) if self.is_point else slice(0, 6)

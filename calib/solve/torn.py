@@ -44,7 +44,7 @@ def away(problem: Problem, values: Values) -> dict[str, list[tuple[TrackedBody, 
     chain puts it, in m or rad, whichever is more."""
     out: dict[str, list[tuple[TrackedBody, np.ndarray]]] = {}
     for block in problem.bodies:
-        T = block.stops.in_world(block.body, values).T
+        T = block.stops.in_world(block.body, values, False).T
         far = np.linalg.norm(block.measured[:, :3, 3] - T[:, :3, 3], axis=1)
         if not block.is_point:
             turn = se3.so3_log(T[:, :3, :3].mT @ block.measured[:, :3, :3])
@@ -133,7 +133,7 @@ def _stands(problem: Problem, scan: ScanStop, values: Values) -> Iterator[tuple[
     for block in problem.bodies:
         if key_of(scan) in block.stop_names and not block.is_point:
             k = block.stop_names.index(key_of(scan))
-            T_root_body = block.stops.in_root(block.body, values).T
+            T_root_body = block.stops.in_root(block.body, values, False).T
             T = T_root_body[k if len(T_root_body) > 1 else 0]
             yield block.groups[k], block.measured[k] @ se3.inverse(T)
 

@@ -12,7 +12,7 @@ from rich.console import Console
 from ..mishaps import MISHAPS, Scene
 from .blunders import QUICK, QUICK_RIG, Case, cases, run
 from .blunders_table import NOTHING, false_names, show, verdict
-from .blunders_worlds import RIGS, SHARED, made
+from .blunders_worlds import RIGS, SHARED, made, preset
 
 CALM = {
     "case": "all/0/two scans exchanged x10",
@@ -103,7 +103,8 @@ def test_sizes_of_a_kind_are_in_one_recording():
 
 
 @pytest.mark.slow
-def test_a_case_is_run_from_the_files_to_the_judgement(tmp_path):
+def test_a_case_is_run_from_the_files_to_the_judgement(tmp_path, monkeypatch):
+    monkeypatch.setitem(RIGS, "own all", preset("tiny"))  # twelve stops
     null = run(Case("own all", 0), tmp_path, {})
     assert null["outcome"] == "adequate" and null["told_off"] < 4
     assert json.loads(json.dumps(null)) == null

@@ -42,7 +42,9 @@ def whitened(problem, values):
 
 
 @pytest.mark.parametrize("name", ARMS)
-@pytest.mark.parametrize("effects", [ARM[:2], ARM[:3], ARM], ids=len)
+@pytest.mark.parametrize(
+    "effects", [ARM[:2], pytest.param(ARM[:3], marks=pytest.mark.long), ARM], ids=len
+)
 def test_an_arm_under_a_tracker_reaches_the_attainable_cost(name, effects, shared):
     """scipy's trust region from the same start, derivatives by differences, finds none lower; with
     the robust weights that the fit came to."""

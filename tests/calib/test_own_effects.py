@@ -200,8 +200,12 @@ def test_an_export_has_its_formula(made, diagnosed, tmp_path):
 
 @pytest.mark.slow
 def test_what_no_catalogue_has_is_sized_as_an_independent_simulator_made_it(shared, tmp_path):
-    """Ranges that depend on ring x temperature, by 15 mm; see the recordings' README."""
-    rec = shared / "recordings/known_ring_by_temperature"
+    """Ranges that depend on ring x temperature, by 15 mm; see the recordings' README. Every other
+    stop of thirty is enough for that."""
+    made = shared / "recordings/known_ring_by_temperature"
+    rec = shutil.copytree(made, tmp_path / "rec")
+    head, *stops = (made / "stops.csv").read_text().splitlines()
+    (rec / "stops.csv").write_text("\n".join([head, *stops[::2], ""]))
     basis = ["(temperature - 27) / 4 * (2 * ring / 63 - 1)"]
     effect = HUMID | {"name": "ring_by_temperature", "unit": "m", "basis": basis}
     (tmp_path / "mine.yaml").write_text(yaml.safe_dump(effect))
@@ -213,7 +217,7 @@ def test_what_no_catalogue_has_is_sized_as_an_independent_simulator_made_it(shar
         getattr(grown.solution.shared.effects["ring_by_temperature"], which)[0]
         for which in ("estimate", "sigma")
     )
-    true, _ = json.loads(rec.with_suffix(".truth.json").read_text())["params"]["x_temp_ring"]
+    true, _ = json.loads(made.with_suffix(".truth.json").read_text())["params"]["x_temp_ring"]
     assert abs(size - true) < 4 * sigma < 1e-3
     before, after = (each.summary["rms_mm"]["held_out"] for each in (run, grown))
     assert after < 0.5 * before
