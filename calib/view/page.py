@@ -90,6 +90,7 @@ class Page:
         gui = self.client.gui
         with gui.add_folder("Findings"):
             self._findings = gui.add_html("")
+            self._formulas = gui.add_html("")
             self._effect = self._menu("Effect", [NOTHING], self._choose_curve)
             self._add = gui.add_button("Add", hint="Refit with this effect, from this run")
             self._diagnose = gui.add_button("Diagnose", visible=False)
@@ -238,6 +239,7 @@ class Page:
             self.findings = Findings.read(self.desk.run)
         finally:
             self._findings.content = panels.findings(self.findings)
+            self._formulas.content = panels.formulas(self.findings)
             self._blunders.show(self.findings.blunders if self.findings else [])
             self._diagnose.visible = self.findings is None
             self._fill(self._effect, list(self.desk.addable(self.findings)) or [NOTHING])
