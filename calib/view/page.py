@@ -243,7 +243,8 @@ class Page:
             self._blunders.show(self.findings.blunders if self.findings else [])
             self._diagnose.visible = self.findings is None
             self._fill(self._effect, list(self.desk.addable(self.findings)) or [NOTHING])
-            worth = self.findings is not None and bool(self.findings.worth_adding)
+            found = self.findings
+            worth = found is not None and bool(found.worth_adding or found.formulas)
             self._add.color = None if worth else "gray"
             self._choose_curve()
 
