@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -24,6 +25,7 @@ from calib.cli.app import (
 )
 from calib.linear.parallel import workers as threads
 from chains.errors import InputError
+from chains.escape import terminal
 
 if TYPE_CHECKING:
     from calib.runs.run import Run
@@ -164,7 +166,7 @@ def diagnose(
     else:
         from calib.show.diagnosis import print_diagnosis
 
-        print_diagnosis(diagnosis, fitted.summary["residual"])
+        print_diagnosis(diagnosis, fitted.summary["residual"], whole=verbose())
     end_unless_converged(fitted)
 
 
@@ -271,6 +273,8 @@ def evaluate(
     if at is not None:
         _predict(opened, at, out, raw, as_json)
         return
+    for sentence in dict.fromkeys(each for run in opened for each in run.extrapolated):
+        print(terminal(sentence), file=sys.stderr)
     with progress_bar() as progress:
         evaluations = evaluate_all(opened, out, raw, progress)
     if as_json:

@@ -76,7 +76,8 @@ def formula(candidate: Candidate, taken: Collection[str] = ()) -> dict[str, Any]
     name = "_".join(["empirical", *(re.sub(r"\W", "_", c, flags=re.ASCII) for c in bare)])
     numbered = (f"{name}_{i}" for i in count(2))
     name = name if name not in taken else next(n for n in numbered if n not in taken)
-    found = {"name": name, **rest, "what": f"{DESCRIBES} {seen(effect)}."}
+    spans = {n: outward(*ends) for n, ends in effect.seen.items()}
+    found = {"name": name, **rest, "seen": spans, "what": f"{DESCRIBES} {seen(effect)}."}
     try:
         FormulaEffect.read(found, "diagnosis.json", {})
     except InputError:
@@ -86,13 +87,24 @@ def formula(candidate: Candidate, taken: Collection[str] = ()) -> dict[str, Any]
 
 def seen(effect: Binned | JointShape) -> str:
     """From where to where each covariate of structure went, in words."""
-    parts = []
-    for name, ends in effect.seen.items():
-        suffix = "_rad" if isinstance(effect, JointShape) else f"_{name.rpartition('_')[2]}"
-        unit, scale = UNITS.get(suffix, ("", 1.0))
-        low, high = (f"{scale * x:.0f}" if abs(x) > 1e4 else f"{scale * x:.3g}" for x in ends)
-        parts.append(f"{words(name)} from {low} to {high} {unit}".rstrip())
-    return " and ".join(parts)
+    suffix = "_rad" if isinstance(effect, JointShape) else ""
+    return " and ".join(span(name, *ends, suffix) for name, ends in effect.seen.items())
+
+
+def span(name: str, low: float, high: float, suffix: str = "") -> str:
+    """From where to where a column goes, in words; `suffix` where its name says no unit."""
+    unit, scale = UNITS.get(suffix or f"_{name.rpartition('_')[2]}", ("", 1.0))
+    ends = (f"{scale * x:.0f}" if abs(x) > 1e4 else f"{scale * x:.3g}" for x in (low, high))
+    return f"{words(name)} from {' to '.join(ends)} {unit}".rstrip()
+
+
+def outward(low: float, high: float) -> list[float]:
+    """Both ends with three digits of what lies between them, not inside of where they were."""
+    wide = high - low or max(abs(high), 1.0)
+    digits = 2 - int(np.floor(np.log10(wide)))
+    step = 10.0**-digits
+    ends = np.floor(low / step) * step, np.ceil(high / step) * step
+    return [round(float(end), digits) for end in ends]
 
 
 def hangs_on(effect: Effect) -> tuple[str, ...]:

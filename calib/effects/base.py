@@ -12,6 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
+from types import MappingProxyType
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -117,6 +118,8 @@ class Effect(ABC):
         of_lidar: True when the effect belongs to the mounted LiDAR, so that rigs do not share it.
         by_chance: True where its parameters are drawn by chance, and their spread is estimated.
         widens: of those, True where the rows that it acts on get a wider sigma instead of values.
+        seen: column -> its least and largest value where the effect was found, of one that only
+            describes; empty of one that rests on how the hardware is made.
     """
 
     name: str
@@ -132,6 +135,7 @@ class Effect(ABC):
     whole: ClassVar[bool] = False
     by_chance: ClassVar[bool] = False
     widens: ClassVar[bool] = False
+    seen: Mapping[str, tuple[float, float]] = MappingProxyType({})
     origin: Mapping[str, Any] | None = None
 
     @property

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from calib import outputs
+from calib.diagnosis.formulas.seen import Reach
 from calib.effects import Effect, LazyColumn, Site, View
 from calib.linear.parallel import one_blas_thread
 from calib.problem.model import Source
@@ -117,12 +118,14 @@ class Correction:
 
 @dataclass(frozen=True)
 class Applied:
-    """A cloud or recording that was corrected: where, how many points, and what was left out."""
+    """A cloud or recording that was corrected: where, how many points, by how much, what was left
+    out, and which effects went beyond where they were seen, a sentence each."""
 
     path: Path
     points: int
     rms_m: float
     left_out: dict[str, str]
+    extrapolated: Sequence[str] = ()
 
 
 @one_blas_thread
@@ -171,9 +174,10 @@ def apply(
 def _apply_file(correction: Correction, cloud: Path, target: Path) -> Applied:
     parquet = cloud.suffix.lower() == ".parquet"
     columns = read_table(cloud) if parquet else read_cloud(cloud)
-    rms_m, left_out = _correct(correction, cloud, columns)
+    reach = Reach(e for e, _ in correction.effects)
+    rms_m, left_out = _correct(correction, cloud, columns, reach)
     (write_table if parquet else write_cloud)(target, columns)
-    return Applied(target, len(columns["x"]), rms_m, left_out)
+    return Applied(target, len(columns["x"]), rms_m, left_out, extrapolated=reach.sentences())
 
 
 def _apply_recording(
@@ -183,16 +187,18 @@ def _apply_recording(
     met = dict(_met(run, folder))  # but for scans that were left out, or set aside
     stops = (dict(_unmet(Source.open(folder))) | met).items()
     points, squares, left_out = 0, 0.0, {}
+    reach = Reach(e for e, _ in correction.effects)
     shutil.copytree(folder, target)
     for i, (stop, known) in enumerate(stops):
         progress("correcting", i, len(stops))
         path = target / "scans" / f"{stop}.parquet"
         columns = read_table(path)
-        rms_m, without = _correct(correction, path, columns, known)
+        rms_m, without = _correct(correction, path, columns, reach, known)
         write_table(path, columns)
         points, left_out = points + len(columns["x"]), left_out | without
         squares += len(columns["x"]) * rms_m**2
-    return Applied(target, points, float(np.sqrt(squares / max(points, 1))), left_out)
+    rms_m = float(np.sqrt(squares / max(points, 1)))
+    return Applied(target, points, rms_m, left_out, extrapolated=reach.sentences())
 
 
 def _unmet(source: Source) -> list[tuple[str, Known]]:
@@ -219,9 +225,14 @@ def _met(run: Run, folder: Path) -> list[tuple[str, Known]]:
 
 
 def _correct(
-    correction: Correction, path: Path, columns: Columns, known: Known = lambda ray: {}
+    correction: Correction,
+    path: Path,
+    columns: Columns,
+    reach: Reach,
+    known: Known = lambda ray: {},
 ) -> tuple[float, dict[str, str]]:
-    """Correct a cloud's columns x y z in place; by how much, rms in m, and what was left out."""
+    """Correct a cloud's columns x y z in place, and show `reach` what effects look at; by how much,
+    rms in m, and what was left out."""
     lacking = [axis for axis in "xyz" if axis not in columns]
     if lacking:
         raise InputError(f"{path}: column {lacking[0]} is missing; a cloud has x, y and z in m")
@@ -229,7 +240,8 @@ def _correct(
     seen = np.flatnonzero(np.isfinite(xyz_m).all(axis=1) & xyz_m.any(axis=1))
     _check_rings(correction.rig, path, columns, seen)
     numbers = {n: c for n, c in columns.items() if c.ndim == 1 and c.dtype.kind in "fiu"}
-    told = known(beams(xyz_m[seen], correction.rig.lidar.beam_origin_m))
+    ray = beams(xyz_m[seen], correction.rig.lidar.beam_origin_m)
+    told = known(ray)
     there = {n: c[seen] for n, c in numbers.items()} | told
     if "ring" in there:  # some formats hold it as a float
         there["ring"] = there["ring"].astype(np.int64)
@@ -241,6 +253,7 @@ def _correct(
         if blind.any():
             why = f"needs incidence, and {blind.mean():.1%} of the points lie on no plane"
             left_out |= dict.fromkeys(needy, why)
+    reach.look({"range_m": ray.range_m, **_angles(ray), **there})
     corrected_m = usable.apply(xyz_m[seen], there)
     moved_m = np.linalg.norm(corrected_m - xyz_m[seen], axis=1)
     for k, axis in enumerate("xyz"):

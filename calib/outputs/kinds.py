@@ -72,8 +72,15 @@ def _lacks_export(folder: Path) -> str:
 
 def _lacks_ladder(folder: Path) -> str:
     others = [path for path in visible(folder) if not _is_rung(path)]
-    others = [path.name for path in others if path.name != "explanation.json"]
+    others = [path.name for path in others if not _is_of_ladder(path)]
     return f"it holds {others[0]}" if others else ""
+
+
+def _is_of_ladder(path: Path) -> bool:
+    """Whether it is what stands beside the rungs: the explanation, and formulas that it keeps."""
+    if path.name == "effects" and path.is_dir():
+        return all(each.suffix == ".yaml" and is_exported(each) for each in visible(path))
+    return path.name == "explanation.json"
 
 
 def _is_rung(path: Path) -> bool:

@@ -27,6 +27,7 @@ AFTER, BEFORE, FLOOR, INK, PALE = "#0072b2", "#d55e00", "#009e73", "#333333", "#
 LINES = (AFTER, BEFORE, FLOOR, "#cc79a7", "#e69f00", "#56b4e9")
 SIGNED, UNSIGNED = "PuOr_r", "cividis"
 HALF, WIDE = 5.6, 8.0  # inches: of a column of the page, and of both
+NARROW = 4.2  # of the workbench's panel
 FORMATS = ("png", "svg", "pdf")
 PAPER_DPI, MAP_DPI = 300, 110
 LONGEST_NAME = {"x": 24, "y": 44}  # letters along an axis: longer ones leave no room for the rest
@@ -134,6 +135,14 @@ def signed_map(
     ax.grid(False)
     options = {"aspect": "auto", "origin": "lower", "interpolation": "nearest"}
     return ax.imshow(values, scale, vmin=-limit, vmax=limit, extent=extent, **options)
+
+
+def signed_cells(ax: Axes, x: np.ndarray, y: np.ndarray, values: np.ndarray, limit: float) -> Any:
+    """As `signed_map`, of cells (rows, columns) with these edges, which need not be even."""
+    ax.set_facecolor("#d8d8d8")
+    ax.grid(False)
+    known = np.ma.masked_invalid(values)
+    return ax.pcolormesh(x, y, known, cmap=SIGNED, vmin=-limit, vmax=limit, rasterized=True)
 
 
 def share_map(ax: Axes, values: np.ndarray, extent: Sequence[float], most: float) -> Any:

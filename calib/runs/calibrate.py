@@ -14,6 +14,7 @@ import numpy as np
 from calib import outputs
 from calib import problem as problems
 from calib.blunders.chance import at_least
+from calib.diagnosis.formulas.seen import Reach
 from calib.effects import Effect, is_known, load_effects, split, trust_in
 from calib.linear.parallel import one_blas_thread
 from calib.problem import Problem
@@ -190,7 +191,8 @@ def _fit(
         unseen = held_out(sources, model, choices.hold_out, choices.folds, progress, estimate.start)
         by = unit_of(sources, choices.hold_out) if unseen.count else None
     nominal = _nominal(problem, progress)
-    by_stop = _write_residuals(problem, estimate, folder / RESIDUALS, progress)
+    seen_at = Reach(model.effects)
+    by_stop = _write_residuals(problem, estimate, folder / RESIDUALS, progress, seen_at)
     seen = sum(by_stop.values(), Errors())
     if not estimate.scans:
         seen = body_errors(problem.bodies, estimate.values, None)
@@ -221,6 +223,7 @@ def _fit(
     summary |= {"held_out_by": by, "without": list(model.without)}
     summary["intervals_wider_by"] = calibration.document(solution.names)
     summary["set_aside"] = sorted(estimate.problem.set_aside)
+    summary["extrapolated"] = seen_at.sentences()
     summary["predicted_mm"] = reached.document() if reached else None
     summary["seconds"] = time.monotonic() - began
     if links is not None:
@@ -246,9 +249,10 @@ def _nominal(problem: Problem, progress: Progress) -> Errors:
 
 
 def _write_residuals(
-    problem: Problem, estimate: Estimate, folder: Path, progress: Progress
+    problem: Problem, estimate: Estimate, folder: Path, progress: Progress, seen: Reach
 ) -> dict[tuple[str, str], Errors]:
-    """Write every beam's residual, stop by stop; their sums, by recording and stop."""
+    """Write every beam's residual, stop by stop, and show `seen` what effects look at; sums of
+    the residuals, by recording and stop."""
     folder.mkdir()
     found = {}
     for i, (scan, association) in enumerate(
@@ -256,6 +260,7 @@ def _write_residuals(
     ):
         progress("writing residuals", i, len(estimate.scans))
         rows = scan.rows(estimate.values, association)
+        seen.look(rows.view.columns, rows.usable)
         write_table(table_path(folder, scan, problem.sources), residual_table(rows))
         found[recording_of(scan, problem.sources), scan.name] = row_errors(rows)
     return found

@@ -95,7 +95,6 @@ def _found(
         [told.of_rings(lidar, each) for lidar, each in harmful.items()],
         formulas,
     )
-    tokens = told.tokens(result.blunders)
     apart = to_be_told_apart(result.candidates, result.weak_directions)
     return replace(
         result,
@@ -109,8 +108,18 @@ def _found(
             *run.omissions,
             *(told.whole(each.sentence) for each in rings.values() if each not in harmful.values()),
         ],
-        command=command_without(run, tokens) if tokens else "",
+        command=_command(run, result),
     )
+
+
+def _command(run: Run, found: Diagnosis) -> str:
+    """What to do next: leave out what is wrong, or add what no known effect explains."""
+    if tokens := told.tokens(found.blunders):
+        return command_without(run, tokens)
+    if not found.formulas:
+        return ""
+    names = [*found.worth_adding, *found.formulas]
+    return shlex.join(["rigcal", "add", str(run.folder), *names, "-o", f"{run.folder}-formula"])
 
 
 def _scatter(run: Run) -> Iterator[dict[str, Any]]:

@@ -20,9 +20,9 @@ from calib.runs.reopen import model_of
 from calib.runs.run import DIAGNOSIS, Run
 from calib.solve.fit import Progress
 from chains.errors import InputError
-from sensors.documents import plain, write_json
+from sensors.documents import plain, write_json, write_yaml
 
-EXPLANATION = "explanation.json"
+EXPLANATION, KEPT = "explanation.json", "effects"
 MOST_RUNGS = 8
 LEAST_FALL = (
     0.01  # of what the held-out error has above the expected one: what an effect must take away
@@ -38,12 +38,14 @@ class Explanation:
         steps: per run what was added, dropped or left out, and its held-out error.
         refused: effects that were found and did not lower the held-out error.
         diagnosis: of the last run.
+        kept: files of the formulas that the last run has, for other recordings to use.
     """
 
     runs: Sequence[Run]
     steps: Sequence[dict[str, Any]]
     refused: Sequence[str]
     diagnosis: Diagnosis
+    kept: Sequence[Path] = ()
 
     def document(self) -> dict[str, Any]:
         """As written to explanation.json."""
@@ -52,6 +54,7 @@ class Explanation:
             "sentences": list(self.diagnosis.sentences),
             "ladder": list(self.steps),
             "refused": list(self.refused),
+            "kept": [str(path) for path in self.kept],
         }
 
 
@@ -66,7 +69,8 @@ def explain(
 
     What a mishap spoiled is left out first, as a rung of its own. What is found is added only if
     the held-out error falls, by a hundredth of what it has above the expected one or more, and
-    dropped again if later steps leave it nothing to lower. Rungs that an interrupted call has
+    dropped again if later steps leave it nothing to lower. What has no name is added as a formula,
+    which ``effects/NAME.yaml`` keeps for other recordings. Rungs that an interrupted call has
     finished are taken up again.
 
     Args:
@@ -90,9 +94,30 @@ def explain(
         while len(climb.runs) < MOST_RUNGS and climb.improve(diagnosis):
             diagnosis = diagnose(climb.run, climb.tell, False, candidates)
         climb.clear_above()
-        result = Explanation(climb.runs, climb.steps, climb.refused, diagnosis)
+        kept = _keep_formulas(climb.run, entries)
+        files = [out / KEPT / path.name for path in kept]
+        result = Explanation(climb.runs, climb.steps, climb.refused, diagnosis, kept=files)
         write_json(entries / EXPLANATION, result.document())
+        if not kept and (out / KEPT).is_dir():
+            outputs.remove(out / KEPT)
     return result
+
+
+def _keep_formulas(run: Run, entries: Path) -> list[Path]:
+    """Write the effects of a run that only describe into files that ``--effects`` takes, each to
+    begin with what the run found."""
+    written = []
+    for effect in (e for e in model_of(run).effects if e.seen):
+        (entries / KEPT).mkdir(exist_ok=True)
+        parts = (run.solution.shared, *run.solution.recordings.values())
+        found = next(part.effects[effect.name] for part in parts if effect.name in part.effects)
+        document = effect.document() | {
+            "start": [float(f"{x:.4g}") for x in found.estimate],
+            "source": f"found by 'rigcal explain' in {', '.join(r.name for r in run.recordings)}",
+        }
+        written.append(entries / KEPT / f"{effect.name}.yaml")
+        write_yaml(written[-1], document)
+    return written
 
 
 class _Climb:

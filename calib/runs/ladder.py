@@ -11,6 +11,9 @@ from calib.rig.suspect import listed
 from calib.runs.run import Run
 from chains.errors import InputError
 
+DESCRIBED = "~"  # before an effect that was added and only describes
+FORMULA = "a formula that describes what was measured, and explains nothing"
+
 
 @dataclass(frozen=True)
 class Rung:
@@ -37,6 +40,11 @@ class Rung:
         return [name for name in self.run.effects if name not in self.below.effects]
 
     @property
+    def empirical(self) -> list[str]:
+        """Those of the effects added that only describe what was measured."""
+        return [name for name in self.added or () if name in self.run.empirical]
+
+    @property
     def dropped(self) -> list[str] | None:
         """Effects that only the run below has; None where that is gone."""
         if self.below is None:
@@ -56,7 +64,9 @@ class Rung:
         """What the run changed of the one below, in words."""
         if self.grown_from and self.below is None:
             return f"grew from {self.grown_from.name}, which is gone"
-        changes = [f"+ {name}" for name in self.added] + [f"- {name}" for name in self.dropped]
+        signs = dict.fromkeys(self.empirical, DESCRIBED)
+        changes = [f"{signs.get(name, '+')} {name}" for name in self.added]
+        changes += [f"- {name}" for name in self.dropped]
         changes += [f"without {listed(self.left_out)}"] if self.left_out else []
         return ", ".join(changes if self.below else ["start", *changes]) or "the same model"
 
@@ -67,6 +77,7 @@ class Rung:
             "run": str(self.run.folder),
             "grown_from": str(self.grown_from) if self.grown_from else None,
             "added": self.added,
+            "empirical": self.empirical,
             "dropped": self.dropped,
             "left_out": self.left_out,
             "held_out_rms_mm": rms["held_out"],

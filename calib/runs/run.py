@@ -118,6 +118,12 @@ class Run:
         return bool(self.summary["converged"])
 
     @property
+    def empirical(self) -> tuple[str, ...]:
+        """Those of its effects that only describe what was measured, and say where."""
+        formulas = (e for e in self.model["effects"] if not isinstance(e, str))
+        return tuple(_effect_name(e) for e in formulas if e.get("seen"))
+
+    @property
     def doubts(self) -> list[str]:
         """Why the fit may not be what it should be, a sentence each."""
         out = [] if self.converged else [NOT_CONVERGED]
@@ -130,12 +136,17 @@ class Run:
     @property
     def warning(self) -> list[str]:
         """What is to stand above everything that is shown of the run, a sentence each."""
-        return [*self.doubts, *self.omissions]
+        return [*self.doubts, *self.omissions, *self.extrapolated]
 
     @property
     def omissions(self) -> list[str]:
         """What was left out of its recordings, as a sentence; none where nothing was."""
         return [f"Left out: {', '.join(self.left_out)}"] if self.left_out else []
+
+    @property
+    def extrapolated(self) -> list[str]:
+        """Effects that only describe, used beyond where they were seen; a sentence each."""
+        return list(self.summary.get("extrapolated", ()))
 
     @property
     def set_aside(self) -> list[str]:

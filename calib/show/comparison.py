@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from calib.runs.estimates import comparison
-from calib.runs.ladder import Rung, ladder
+from calib.runs.ladder import DESCRIBED, FORMULA, Rung, ladder
 from calib.show.misfit import worst_of
 from calib.show.scale import shown
 from calib.show.tables import (
@@ -58,6 +58,9 @@ def ladder_table(rungs: Sequence[Rung]) -> Table:
         held_out = " -> ".join(filter(None, (mm(r.get("held_out")) for r in (below, rms))))
         name = rung.run.folder.name or str(rung.run.folder)
         table.add_row(name, rung.step, held_out, mm(rms["fit"]), mm(rms["noise_floor"]))
+    if any(rung.empirical for rung in rungs):
+        table.caption = f"{DESCRIBED} {FORMULA}"
+        table.caption_justify, table.caption_style = "left", ""
     return table
 
 

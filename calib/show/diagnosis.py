@@ -10,6 +10,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from calib.diagnosis.verdict.sentences import UNNAMED
 from calib.runs.ladder import Rung, ladder
 from calib.show.comparison import ladder_table
 from calib.show.tables import (
@@ -31,15 +32,23 @@ LEADING = 8  # candidates that are shown; diagnosis.json has all
 WEAKEST = 4  # directions that are shown
 
 
-def print_diagnosis(diagnosis: Diagnosis, residual: str = "range") -> None:
+def print_diagnosis(diagnosis: Diagnosis, residual: str = "range", whole: bool = False) -> None:
     """Print what is missing from a model: in sentences, then in tables.
 
     Args:
         diagnosis: what was found.
         residual: what its sizes are of, as a run's summary has it.
+        whole: also what was tried and is not the answer, where a formula is.
     """
     console = terminal()
     _say_verdict(console, diagnosis)
+    if diagnosis.verdict == UNNAMED and diagnosis.formulas and not whole:
+        console.print("'rigcal -v diagnose' has the names that were tried, and all the rest.")
+    else:
+        _print_tables(console, diagnosis, residual)
+
+
+def _print_tables(console: Console, diagnosis: Diagnosis, residual: str) -> None:
     adequate = diagnosis.verdict == "adequate" and not diagnosis.too_few
     if diagnosis.candidates and not adequate:
         console.print(candidates_table(diagnosis.candidates[:LEADING], residual))
@@ -70,6 +79,8 @@ def print_explanation(explanation: Explanation) -> None:
     if explanation.refused:
         names = ", ".join(dict.fromkeys(explanation.refused))
         console.print(f"Found, and not added, as the held-out error did not fall: {names}.")
+    for path in explanation.kept:
+        console.print(f"Kept for other recordings ('rigcal fit --effects'): {path}")
     _say_verdict(console, explanation.diagnosis)
 
 
@@ -79,7 +90,8 @@ def _say_verdict(console: Console, diagnosis: Diagnosis) -> None:
         console.print(sentence)
     console.print()
     if diagnosis.command:
-        print_command(console, diagnosis.command)
+        what = {"what": "Add it to the model:"} if diagnosis.formulas else {}
+        print_command(console, diagnosis.command, **what)
 
 
 def candidates_table(candidates: Sequence[Mapping[str, Any]], residual: str) -> Table:

@@ -14,6 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from calib.blunders.chance import LEAST_P
+from calib.diagnosis.suggest import span
 from calib.residuals.groups import CAD
 from calib.runs.belief import TOLERATED_OF_CAD, misfit_sentence
 from calib.runs.estimates import VariableEstimate, variable_estimates
@@ -139,6 +140,7 @@ def effect_page(effect: Effect) -> dict[str, Any]:
         "unit": effect.unit,
         "typical": effect.typical,
         "covariates": list(effect.covariates),
+        "seen": " and ".join(span(name, *ends) for name, ends in effect.seen.items()),
         "confounded_with": list(effect.confounded_with),
         "source": effect.source,
     }

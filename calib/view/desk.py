@@ -12,6 +12,8 @@ import numpy as np
 
 from calib.diagnosis.verdict import worth_adding
 from calib.effects import CATALOGUE, Trust, find
+from calib.report.chart import Chart
+from calib.report.charts.formulas import charts_of
 from calib.runs.ladder import Rung, ladder
 from calib.runs.run import Run
 from chains.errors import InputError
@@ -28,6 +30,7 @@ class Findings:
         unexplained: structure without a name.
         blunders: what is wrong in the recording.
         curves: mean residual against one covariate each, by its name.
+        formulas: a chart for each formula of what has no name.
     """
 
     heading: str
@@ -36,6 +39,7 @@ class Findings:
     unexplained: Sequence[Mapping[str, Any]]
     blunders: Sequence[Mapping[str, Any]]
     curves: Mapping[str, DiagnosisCurve]
+    formulas: Sequence[Chart] = ()
 
     @classmethod
     def read(cls, run: Run) -> Findings | None:
@@ -51,7 +55,8 @@ class Findings:
         curves = {c["covariates"][0]: DiagnosisCurve.read(c) for c in single}
         names = ("sentences", "candidates", "unexplained", "blunders")
         lists = {name: document[name] for name in names}
-        return cls(heading=document["heading"], curves=curves, **lists)
+        charts = charts_of(document, narrow=True)
+        return cls(heading=document["heading"], curves=curves, formulas=charts, **lists)
 
     @property
     def worth_adding(self) -> list[str]:

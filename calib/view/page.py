@@ -90,6 +90,7 @@ class Page:
         gui = self.client.gui
         with gui.add_folder("Findings"):
             self._findings = gui.add_html("")
+            self._formulas = gui.add_html("")
             self._effect = self._menu("Effect", [NOTHING], self._choose_curve)
             self._add = gui.add_button("Add", hint="Refit with this effect, from this run")
             self._diagnose = gui.add_button("Diagnose", visible=False)
@@ -238,10 +239,12 @@ class Page:
             self.findings = Findings.read(self.desk.run)
         finally:
             self._findings.content = panels.findings(self.findings)
+            self._formulas.content = panels.formulas(self.findings)
             self._blunders.show(self.findings.blunders if self.findings else [])
             self._diagnose.visible = self.findings is None
             self._fill(self._effect, list(self.desk.addable(self.findings)) or [NOTHING])
-            worth = self.findings is not None and bool(self.findings.worth_adding)
+            found = self.findings
+            worth = found is not None and bool(found.worth_adding or found.formulas)
             self._add.color = None if worth else "gray"
             self._choose_curve()
 

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from calib.blunders.chance import LEAST_P
-from calib.runs.ladder import Rung
+from calib.report import plots
+from calib.runs.ladder import FORMULA, Rung
 from calib.runs.run import Run
 from calib.show import misfit
 from calib.show.headline import moved_sentence
@@ -21,6 +22,8 @@ from chains.escape import html as escape
 
 SHOWN_CANDIDATES = 6  # candidates in the table; the menu has all
 LARGE = ((1e6, " million"), (1.0, ""))
+BAR = "#7fb2d9"
+STRIPED = f"repeating-linear-gradient(45deg,{BAR} 0 6px,#dcebf6 6px 10px)"  # of a rung by a formula
 _FRAME = "padding:0 1.2em .4em .75em;font-size:12px;line-height:1.4;color:#222"
 _QUIET = "color:#555"
 _CUT = "overflow:hidden;text-overflow:ellipsis;white-space:nowrap"
@@ -136,6 +139,18 @@ def findings(diagnosed: Findings | None) -> str:
     return _framed(f'<b data-is="verdict">{verdict}</b>{sentences}{_candidates(diagnosed)}')
 
 
+def formulas(diagnosed: Findings | None) -> str:
+    """A picture for each formula: what was measured, the formula, and what is left."""
+    return "".join(
+        _framed(
+            f'<div data-is="formula"><b>{escape(chart.title)}</b>'
+            f"{plots.svg(chart.figure(), chart.id)}"
+            f'<div style="{_QUIET}">{escape(chart.reading)}</div></div>'
+        )
+        for chart in (diagnosed.formulas if diagnosed else ())
+    )
+
+
 def blunders(found: Sequence[Mapping[str, Any]]) -> str:
     """What is wrong in the recording, in the sentences of the diagnosis."""
     lines = "".join(f'<li style="margin:.3em 0">{escape(b["sentence"])}</li>' for b in found)
@@ -190,6 +205,7 @@ def ladder(rungs: Sequence[Rung]) -> str:
         for rung, (mm, _) in zip(rungs, errors, strict=True)
     )
     said = f"Error of {errors[-1][1]}; dashed: {floor:.2f} mm expected"
+    said += f"; striped: {FORMULA}" if any(rung.empirical for rung in rungs) else ""
     warning = "".join(
         f'<div data-is="warning" style="color:#b3261e;font-weight:600">{escape(sentence)}</div>'
         for sentence in rungs[-1].run.warning
@@ -209,12 +225,13 @@ def _rung(rung: Rung, mm: float, width: float, floor: float) -> str:
     """One bar, `width` and `floor` in percent of the panel."""
     name = escape(rung.run.folder.name or str(rung.run.folder))
     step = rung.step if rung.below else f"{rung.step}: {rung.run.folder.name}"
+    colour = STRIPED if rung.empirical else BAR
     line = f"position:absolute;top:0;bottom:0;left:{floor:.2f}%;border-left:2px dashed #00664a"
     return (
         f'<div style="display:flex;gap:.6em" title="{name}">'
         f'<span style="{_CUT};flex:1">{escape(step)}</span><b>{mm:.2f} mm</b></div>'
-        f'<div style="position:relative"><div style="background:#7fb2d9;height:.9em;'
-        f'width:{width:.2f}%" data-mm="{mm:.4f}"></div><div style="{line}"></div></div>'
+        f'<div style="position:relative"><div style="background:{colour};'
+        f'height:.9em;width:{width:.2f}%" data-mm="{mm:.4f}"></div><div style="{line}"></div></div>'
     )
 
 

@@ -90,7 +90,7 @@ def test_names_are_columns_and_their_aliases():
         ("range range", "position"),
         ("x = 3", "position 3"),
         ("sine(x)", "position 1: sine is no function here; did you mean sin?"),
-        ("1 + foo(x)", "position 5: foo is no function here; known are sin, cos"),
+        ("1 + cbrt(x)", "position 5: cbrt is no function here; known are sin, cos"),
         ("sin(x, y)", "sin takes 1 value"),
         ("where(x > 1, y)", "where takes 3 values"),
         ("sin(x=1)", "sin takes 1 value"),

@@ -48,6 +48,7 @@ class World:
         spoiled = [token for token in self.spoiled if token not in run.model["without"]]
         return SimpleNamespace(
             worth_adding=adding,
+            formulas={},
             blunders=[{"without": token} for token in spoiled],
             verdict="bad_data" if spoiled else verdict,
             sentences=[str(sorted(names))],

@@ -16,6 +16,7 @@ from calib.diagnosis.formulas.picture import picture_of
 from calib.diagnosis.formulas.pursuit import Form, Step, Term, refine
 from calib.diagnosis.formulas.table import Projection, Table
 from calib.diagnosis.score import GAUGE, test
+from calib.diagnosis.suggest import outward
 from calib.effects.own.formula import FormulaEffect
 
 # Sigmas from zero, below which a column of a term is left out again: of ten columns that are not
@@ -116,6 +117,7 @@ class Formula:
             "sigma": float(f"{max(WIDER * largest, 0.01):.1g}"),
             "basis": list(self.texts),
             "start": [float(f"{amount:.4g}") for amount in self.amount_m],
+            "seen": {name: outward(*ends) for name, ends in self.seen.items()},
             "what": what,
         }
         FormulaEffect.read(document, "diagnosis.json", {})
@@ -264,7 +266,7 @@ def _said(part: Part) -> str:
         _shifted(part)
         or _turned(part)
         or " ".join(
-            f"{_signed(amount, sigma)} mm * {_bare(text)}"
+            f"{_signed(amount, sigma)} mm * {bare(text)}"
             for text, amount, sigma in zip(part.texts, part.amount_m, part.sigma_m, strict=True)
         )
     )
@@ -286,7 +288,7 @@ def _shifted(part: Part) -> str:
     relative = np.hypot(part.sigma_m[1], ratio * part.sigma_m[0]) / abs(part.amount_m[0])
     zero = with_sigma(middle - half * ratio, half * relative)
     texts = [f"({line.covariate} - {zero}) / {half:g}" if k == i else t for k, t in enumerate(long)]
-    product_ = " * ".join(_bare(t) for t in texts if t != "1")
+    product_ = " * ".join(bare(t) for t in texts if t != "1")
     return f"{_signed(part.amount_m[0], part.sigma_m[0])} mm * {product_.replace('- -', '+ ')}"
 
 
@@ -302,10 +304,10 @@ def _turned(part: Part) -> str:
     before, _, after = texts[0].partition(PHASE[0])
     inside, _, rest = after.partition(")")
     turned = f"{before}sin({inside} + {with_sigma(float(np.arctan2(b, a)), phase)}){rest}"
-    return f"{_signed(size, sigma)} mm * {_bare(turned).replace('+ -', '- ')}"
+    return f"{_signed(size, sigma)} mm * {bare(turned).replace('+ -', '- ')}"
 
 
-def _bare(text: str) -> str:
+def bare(text: str) -> str:
     """A column as people write it: in brackets where it is a sum or a comparison."""
     outside = text
     while (inner := re.sub(r"\([^()]*\)", "", outside)) != outside:

@@ -53,7 +53,8 @@ class Diagnosis:
         misfit: instrument -> how many times larger than their sigmas its residuals are.
         curves: mean residual against covariates.
         too_few: whether the stops are too few to say anything, whatever the verdict.
-        command: what fits the same without the blunders, ready to be typed; empty without any.
+        command: what fits the same without the blunders, or adds the formulas of what has no name,
+            ready to be typed; empty without any.
         plan: what plans stops that tell apart what these cannot, ready to be typed; or empty.
         rejected: what the fit threw away; None without scans, or where nobody looked.
         scatter: how widely things scatter by chance, of the model and of what it lacks.

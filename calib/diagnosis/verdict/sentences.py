@@ -12,6 +12,7 @@ from calib.diagnosis.verdict.matters import Weighed
 
 UNNAMED, BAD = "unexplained_structure", "bad_data"
 LISTED = 6  # untestable effects and rivals that a sentence names
+SHORT = 60  # letters of another form that a sentence has
 
 
 def sentences_of(
@@ -26,25 +27,15 @@ def sentences_of(
     found, traces = heavy.found, heavy.traces
     look = found.looks[0]
     residual = _residual(look)
-    out = []
-    stops = stops_of(look)
-    if stops < FEWEST:
-        out.append(
-            f"Nothing can be said: {stops} stops are too few to name an effect, as all of them may "
-            f"share one error; {FEWEST} are the least, and 20 are better."
-        )
-    elif verdict == "adequate":
-        out.append(
-            f"The model is adequate: of {len(look.named.candidates)} known effects and "
-            f"{len(look.unnamed.candidates)} kinds of structure none "
-            f"{'that matters ' if traces else ''}stands out from chance."
-        )
+    out = _first_sentences(verdict, look, bool(traces))
     out += [each["sentence"] for each in blunders[:LISTED]]
     if len(blunders) > LISTED:
         out.append(f"And {len(blunders) - LISTED} more, in diagnosis.json.")
+    formulas = [each for each in unexplained if "says" in each]
     for i, step in enumerate(found.found):
         candidate = next(c for c in candidates if c["add"] == step.effect.name)
-        out += _step_sentences(step, candidate, found.dressed_up(i))
+        if not (formulas and candidate["dressed_up"]):  # what was tried before helps nobody then
+            out += _step_sentences(step, candidate, found.dressed_up(i))
     if verdict == UNNAMED and found.chance:
         beside = ", ".join(each.effect.name for each in found.chance)
         out.append(f"Random scatter ({beside}) is judged once that structure is in the model.")
@@ -54,8 +45,14 @@ def sentences_of(
     if verdict == UNNAMED:
         beside = any(c["step"] and not c["dressed_up"] for c in candidates)
         what = "Beside what is named here, there" if beside else "There"
-        out.insert(0, f"{what} is structure in the residuals that no known effect explains.")
-    out += _structure_sentences(unexplained[:2], residual)
+        out = [
+            f"{what} is structure in the residuals that no known effect explains.",
+            *(line for each in formulas for line in _formula_sentences(each, residual)),
+            *out,
+        ]
+    else:
+        out += [line for each in formulas for line in _formula_sentences(each, residual)]
+    out += _structure_sentences([each for each in unexplained if "says" not in each], residual)
     if found.scatter is not None:
         what = " and ".join(words(c) for c in found.scatter.effect.covariates)
         out.append(
@@ -69,6 +66,27 @@ def sentences_of(
     return out
 
 
+def _first_sentences(verdict: str, look: Look, traces: bool) -> list[str]:
+    """That nothing can be said, or that nothing is missing."""
+    stops = stops_of(look)
+    if stops < FEWEST:
+        return [
+            f"Nothing can be said: {stops} stops are too few to name an effect, as all of them may "
+            f"share one error; {FEWEST} are the least, and 20 are better."
+        ]
+    if verdict != "adequate":
+        return []
+    out = [
+        f"The model is adequate: of {len(look.named.candidates)} known effects and "
+        f"{len(look.unnamed.candidates)} kinds of structure none "
+        f"{'that matters ' if traces else ''}stands out from chance."
+    ]
+    described = [effect.name for effect in look.stand.model.effects if effect.seen]
+    if described:
+        out.append(f"Part of it only describes, and nobody knows why: {', '.join(described)}.")
+    return out
+
+
 def _structure_sentences(unexplained: Sequence[Mapping[str, Any]], residual: str) -> list[str]:
     """Of structure without a name."""
     out = []
@@ -77,9 +95,7 @@ def _structure_sentences(unexplained: Sequence[Mapping[str, Any]], residual: str
         out.append(
             f"The residual structure depends on {what}: {each['rms_mm']:.2f} mm rms of {residual}."
         )
-        if "says" in each:
-            out += _formula_sentences(each)
-        elif each["formula"]:
+        if each["formula"]:
             out.append(
                 f"An empirical effect for it can be added by its name, '{each['formula']['name']}'."
                 f" {each['formula']['what']}"
@@ -87,17 +103,41 @@ def _structure_sentences(unexplained: Sequence[Mapping[str, Any]], residual: str
     return out
 
 
-def _formula_sentences(each: Mapping[str, Any]) -> list[str]:
-    """Of structure whose formula was found."""
+def _formula_sentences(each: Mapping[str, Any], residual: str) -> list[str]:
+    """Of structure whose formula was found: what it does, how it is added, and why it may be so."""
     before, after = (each["held_out_rms_mm"][k] for k in ("before", "after"))
     fall = f" The held-out error goes from {before:.2f} to {after:.2f} mm." if after else ""
-    name = each["formula"]["name"]
     out = [
-        f"Its formula: {each['says']} (adjusted p = {each['p_adjusted']:.1g}).{fall} "
-        f"It can be added by its name, '{name}'. {each['formula']['what']}"
+        f"Its formula: {each['says']}.",
+        f"The model does not absorb {each['rms_mm']:.2f} mm rms of what it does to {residual} "
+        f"(adjusted p = {each['p_adjusted']:.1g}).{fall}",
+        f"It can be added by its name, '{each['formula']['name']}'. {each['formula']['what']}",
     ]
     for other in each["alike"][:1]:
-        out.append(f"This data cannot tell it from {other['says']}; {other['separate']} would.")
+        out.append(
+            f"This data cannot tell it from {_other(other)}; {other['separate']} would tell."
+        )
+    return [*out, *_why_sentences(each["why"])]
+
+
+def _other(form: Mapping[str, Any]) -> str:
+    """Another form: as it is where it is short, else by what it hangs on."""
+    if len(form["says"]) <= SHORT:
+        return form["says"]
+    return f"another formula, over {' and '.join(words(c) for c in form['covariates'])}"
+
+
+def _why_sentences(why: Mapping[str, Any]) -> list[str]:
+    """What could be behind a formula, and what would confirm it."""
+    out = [
+        f"What {words(name)} may do: {what}. To confirm it: {why['experiments'][name]}."
+        for name, what in why["mechanisms"].items()
+    ]
+    if why["known"]:
+        out.append(
+            f"Known effects of the same columns may look like it on other recordings: "
+            f"{', '.join(why['known'][:LISTED])}."
+        )
     return out
 
 

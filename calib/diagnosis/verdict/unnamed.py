@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from calib.diagnosis.formulas import Formula, find
+from calib.diagnosis.formulas.found import bare
 from calib.diagnosis.formulas.why import why
 from calib.diagnosis.search import Search
 from calib.diagnosis.stand import Stand
-from calib.diagnosis.suggest import UNITS, what_differs, words
+from calib.diagnosis.suggest import DESCRIBES, span, what_differs, words
 from calib.diagnosis.verdict.matters import FALL
 from calib.effects.own.formula import FormulaEffect
 from calib.results.errors import Errors
@@ -96,8 +97,8 @@ def _with(stand: Stand, formulas: Sequence[Formula], progress: Progress) -> Stan
 def _document(
     found: Formula, taken: Sequence[str], fall_mm: tuple[float, float] | None
 ) -> dict[str, Any]:
-    seen = " and ".join(_span(name, *ends) for name, ends in found.seen.items())
-    what = f"Empirical: it describes and explains nothing, and was seen at {seen}."
+    seen = " and ".join(span(name, *ends) for name, ends in found.seen.items())
+    what = f"{DESCRIBES} {seen}."
     first = found.steps[0]
     return {
         "covariates": list(found.covariates),
@@ -112,7 +113,10 @@ def _document(
         ],
         "alike": [
             {
-                "says": " + ".join(f"a{i} * {text}" for i, text in enumerate(form.term.texts, 1)),
+                "says": " + ".join(
+                    f"a{i}" if text == "1" else f"a{i} * {bare(text)}"
+                    for i, text in enumerate(form.term.texts, 1)
+                ),
                 "covariates": list(form.term.covariates),
                 "separate": what_differs(found.covariates, form.term.covariates),
             }
@@ -124,10 +128,3 @@ def _document(
         "seen": {name: list(ends) for name, ends in found.seen.items()},
         "picture": found.picture,
     }
-
-
-def _span(name: str, low: float, high: float) -> str:
-    """From where to where a covariate went, in words."""
-    unit, scale = UNITS.get(f"_{name.rpartition('_')[2]}", ("", 1.0))
-    ends = (f"{scale * x:.0f}" if abs(x) > 1e4 else f"{scale * x:.3g}" for x in (low, high))
-    return f"{words(name)} from {' to '.join(ends)} {unit}".rstrip()

@@ -11,11 +11,11 @@ import pydantic
 
 from calib.effects.base import Effect, Param, Site, View
 from calib.effects.basis import finite
-from calib.effects.own.expression import Expression
+from calib.effects.own.expression import ALIASES, Expression
 from calib.effects.rig import DOF
 from calib.rig import Rig
 from chains.errors import InputError
-from sensors.documents import Document, Marks, Number, nearest, validate
+from sensors.documents import Document, Marks, Number, nearest, plain, validate
 
 AXES = {"range": 0, "azimuth": 1, "elevation": 2}
 OF_TARGET = {"target.x": 0, "target.y": 1, "target.z": 2}
@@ -41,6 +41,8 @@ class FormulaFile(Document):
         parameters: their names; numbered where there are none.
         start: where a fit begins, a number per parameter; 0 where there are none. Beams that are
             off by more than noise explains are rejected until the effect is about right.
+        seen: of one that only describes what was measured: column -> its least and largest value
+            there. Where it is used beyond that, a warning says so.
         what, typical, source: for its page.
     """
 
@@ -51,6 +53,7 @@ class FormulaFile(Document):
     basis: Annotated[tuple[Text, ...], pydantic.Field(min_length=1)]
     parameters: tuple[Text, ...] = ()
     start: tuple[Number, ...] = ()
+    seen: dict[str, tuple[Number, Number]] = pydantic.Field(default_factory=dict)
     what: str = ""
     typical: str = ""
     source: str = ""
@@ -74,6 +77,9 @@ class FormulaFile(Document):
             )
         if len(set(self.parameters)) < len(self.parameters):
             raise ValueError("two parameters have one name; give each its own")
+        for name, (low, high) in self.seen.items():
+            if not low <= high:
+                raise ValueError(f"seen of {name}: give its least value, then its largest")
         return self
 
 
@@ -86,6 +92,10 @@ class FormulaEffect(Effect):
         owner = f"effect '{file.name}'"
         self.expressions = tuple(Expression(text, owner) for text in file.basis)
         self.covariates = tuple(dict.fromkeys(n for e in self.expressions for n in e.names))
+        self.seen = {ALIASES.get(name, name): ends for name, ends in file.seen.items()}
+        for name in (n for n in self.seen if n not in self.covariates):
+            what = f"{owner}: seen has {name}, which its formulas do not look at"
+            raise InputError(what + nearest(name, self.covariates))
         self.unit, self.typical, self.source = file.unit, file.typical, file.source or "its user"
         named = zip(self.parameters, file.basis, strict=True)
         self.formula = f"{file.site} + " + " + ".join(f"{p} * ({text})" for p, text in named)
@@ -103,8 +113,7 @@ class FormulaEffect(Effect):
 
     def document(self) -> dict[str, Any]:
         """The mapping that describes it."""
-        found = self.file.model_dump(exclude_defaults=True)
-        return {k: list(v) if isinstance(v, tuple) else v for k, v in found.items()}
+        return plain(self.file.model_dump(exclude_defaults=True))
 
     @property
     def parameters(self) -> tuple[str, ...]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 
 from calib.report.chart import Absent, Chart
-from calib.report.charts import bodies, fit, groups, knowledge, links, misfit, residuals
+from calib.report.charts import bodies, fit, formulas, groups, knowledge, links, misfit, residuals
 from calib.report.evidence import Evidence
 
 Charts = Callable[[Evidence], Iterator[Chart | Absent]]
@@ -13,7 +13,7 @@ Charts = Callable[[Evidence], Iterator[Chart | Absent]]
 SECTIONS: Mapping[str, tuple[Charts, ...]] = {
     "How good it is": (fit.ladder, fit.variance, fit.scatter),
     "What does not fit": (groups.groups, misfit.by_stop, misfit.moves_from_cad),
-    "What was found": (knowledge.findings,),
+    "What was found": (formulas.formulas, knowledge.findings),
     "The chain": (links.chain, links.moves, links.effects, knowledge.budget),
     "What is left": (
         *(residuals.ring_map, residuals.thrown_away, residuals.curves),

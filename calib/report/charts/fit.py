@@ -11,7 +11,7 @@ from calib.report import plots
 from calib.report.chart import Absent, Chart
 from calib.report.evidence import Evidence, folder_name
 from calib.report.statistics import Z_EDGES
-from calib.runs.ladder import Rung
+from calib.runs.ladder import FORMULA, Rung
 from calib.show.verdict import AT_THE_FLOOR
 
 if TYPE_CHECKING:
@@ -42,7 +42,8 @@ def ladder(evidence: Evidence) -> Iterator[Chart | Absent]:
         else f"The {kind} error is {last:.2f} mm, {near} the {floor:.2f} mm expected",
         "A row per run, each named by what it added to the one above. Blue: rms error of stops "
         "that its fit never saw; hollow: of those it saw; green: what would be left if the model "
-        "were right. Further left is better; an error at the green mark cannot be told from noise.",
+        "were right. Further left is better; an error at the green mark cannot be told from noise."
+        + (f" A diamond: {FORMULA}." if any(rung.empirical for rung in evidence.rungs) else ""),
         lambda: _ladder(evidence),
         wide=True,
     )
@@ -61,6 +62,10 @@ def _ladder(evidence: Evidence) -> Figure:
     shown = [error_mm(r)[1] for r in rungs]
     label = "stops held out" if rms[-1].get("held_out") is not None else "fit; none held out"
     ax.plot(shown, y, "o-", ms=8, color=plots.AFTER, label=label)
+    described = [i for i, rung in enumerate(rungs) if rung.empirical]
+    if described:
+        at = np.array(shown)[described], y[described]
+        ax.plot(*at, "D", ms=9, mfc="white", mew=2, color=plots.AFTER, label="with a formula")
     for value, at in zip([rms[0]["nominal"], *shown], range(len(rungs) + 1), strict=True):
         ax.annotate(f"{value:.2f}", (value, at), (0, 8), textcoords="offset points", ha="center")
     ax.set_yticks(range(len(rungs) + 1), ["as in CAD", *names])
@@ -70,7 +75,7 @@ def _ladder(evidence: Evidence) -> Figure:
         plots.log_axis(ax, min(values), max(values))
     ax.set_xlabel(f"rms of the {evidence.run.summary['residual']} residual, mm")
     ax.margins(x=0.08)
-    figure.legend(loc="outside upper left", ncols=4)
+    figure.legend(loc="outside upper left", ncols=5)
     return figure
 
 

@@ -69,7 +69,7 @@ def _bare(covariate: str) -> str:
     return covariate
 
 
-def _unit(covariate: str) -> tuple[str, float]:
+def shown_unit(covariate: str) -> tuple[str, float]:
     """Unit and factor in which a covariate is shown."""
     return next((u for suffix, u in AXIS_UNITS.items() if covariate.endswith(suffix)), ("", 1.0))
 
@@ -78,6 +78,12 @@ def spoken(covariate: str) -> str:
     """A covariate as a title names it."""
     known = words(covariate)
     return known if known != covariate else _bare(covariate).replace("_", " ")
+
+
+def axis_label(covariate: str) -> str:
+    """A covariate along an axis, with the unit in which it is shown."""
+    unit = shown_unit(covariate)[0]
+    return f"{spoken(covariate)}, {unit}" if unit else spoken(covariate)
 
 
 def outside(curve: ResidualCurve) -> tuple[int, int, bool]:
@@ -143,7 +149,7 @@ def _reach(curve: ResidualCurve) -> float:
 def _x(curve: ResidualCurve) -> np.ndarray:
     if curve.axis.names:
         return np.arange(curve.axis.bins, dtype=float)
-    return _unit(curve.axis.name)[1] * curve.at
+    return shown_unit(curve.axis.name)[1] * curve.at
 
 
 def _draw(ax: Axes, curve: ResidualCurve, colour: str, label: str | None) -> None:
@@ -165,8 +171,7 @@ def _line(ax: Axes, curve: ResidualCurve, values_m: np.ndarray, colour: str) -> 
 
 
 def _name_bins(ax: Axes, curve: ResidualCurve) -> None:
-    unit = _unit(curve.axis.name)[0]
-    ax.set_xlabel(f"{spoken(curve.axis.name)}, {unit}" if unit else spoken(curve.axis.name))
+    ax.set_xlabel(axis_label(curve.axis.name))
     names = curve.axis.names
     if names and len(names) <= MOST_NAMES:
         ax.set_xticks(range(len(names)), names, rotation=45 if len(names) > UPRIGHT_NAMES else 0,

@@ -1,0 +1,67 @@
+"""Where an effect that only describes was seen, and whether it is used beyond that."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+
+from calib.diagnosis.suggest import span
+from calib.effects import Effect
+
+# Of what lies between the least and largest value: a formula is judged in bins of that width; see
+# `calib.diagnosis.formulas.picture.BINS`.
+BEYOND = 0.05
+
+
+class Reach:
+    """From where to where the columns go that effects hang on, batch by batch.
+
+    Args:
+        effects: those with `Effect.seen` are asked about.
+    """
+
+    def __init__(self, effects: Iterable[Effect]) -> None:
+        self._effects = [effect for effect in effects if effect.seen]
+        self._ends: dict[str, tuple[float, float]] = {}
+
+    def look(self, columns: Mapping[str, Any], rows: np.ndarray | slice = slice(None)) -> None:
+        """Take in one batch.
+
+        Args:
+            columns: name -> (N,), or (1,) where one value holds for all, or a function that gives
+                it; those of no effect are left alone.
+            rows: which rows count.
+        """
+        names = dict.fromkeys(name for effect in self._effects for name in effect.seen)
+        for name in filter(columns.__contains__, names):
+            values = np.asarray(columns[name]() if callable(columns[name]) else columns[name])
+            values = values[rows] if len(values) > 1 else values
+            values = values[np.isfinite(values)]
+            if len(values):
+                low, high = self._ends.get(name, (np.inf, -np.inf))
+                self._ends[name] = min(low, float(values.min())), max(high, float(values.max()))
+
+    def sentences(self) -> list[str]:
+        """A warning for each effect that is used beyond where it was seen."""
+        return list(filter(None, map(self._sentence, self._effects)))
+
+    def _sentence(self, effect: Effect) -> str:
+        beyond = []
+        for name, (low, high) in effect.seen.items():
+            here = self._ends.get(name, (low, high))
+            slack = BEYOND * (high - low)
+            if here[0] < low - slack or here[1] > high + slack:
+                beyond.append(f"{span(name, low, high)}, and here goes {_ends_of(name, *here)}")
+        if not beyond:
+            return ""
+        return (
+            f"{effect.name} only describes what was measured: it was seen at "
+            f"{' and at '.join(beyond)}; what it says beyond is a guess."
+        )
+
+
+def _ends_of(name: str, low: float, high: float) -> str:
+    """The ends, without the name."""
+    return "from" + span(name, low, high).partition(" from")[2]
