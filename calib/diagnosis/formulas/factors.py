@@ -116,7 +116,8 @@ class Factor:
         low, high = float(np.nanmin(values)), float(np.nanmax(values))
         scale = (high - low) * np.array([NARROWEST, WIDEST])
         kinds = KINDS[self.kind]
-        return np.array([scale if i in kinds.scales else (low, high) for i in range(self.free)])
+        found = [scale if i in kinds.scales else (low, high) for i in range(self.free)]
+        return np.reshape(found, (self.free, 2))
 
     def columns(self, covariates: Columns) -> np.ndarray:
         """(N, k), with 0 where there is no value."""
