@@ -1,11 +1,9 @@
 """From one look to a named effect: the best explanation is judged, then fitted, then looked past.
 
-What is left once it is fitted is looked at again: an effect that nobody has named dresses up as
-several that somebody has. What then still scatters from stop to stop may be chance, of which names
-and structure make what they can: the model gets that scatter, and all is looked at again beside it.
-A blunder is an explanation like any other: where it is the best, its
-rows are left out, the model is fitted without them, and looked at again (detection, identification
-and adaptation: Teunissen 1990).
+An effect that nobody has named dresses up as several that somebody has. What scatters from stop to
+stop may be chance: the model gets that scatter, and all is looked at again beside it. A blunder is
+an explanation like any other: its rows are left out, and the rest is fitted and looked at again
+(detection, identification and adaptation: Teunissen 1990).
 """
 
 from __future__ import annotations
@@ -122,7 +120,10 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NAMES) -> Search:
             wider = looks[-1].stand.with_effects([strongest.effect], progress)
             looks = [*looks, wider.look(progress)]
         else:
-            beside = stand.with_effects([c.effect for c in chance], progress)
+            beside = stand.tried([c.effect for c in chance], progress)
+            if beside is None:
+                chance.pop()
+                break
             looks, found, left = _steps(beside, progress, most)
         tested = {c.effect.name for c in looks[-1].chance}  # with it, and others that still can be
         near = (c for c in others if strongest.statistic - c.statistic < 2 * ODDS)

@@ -34,6 +34,7 @@ from calib.residuals.scan import ScanStop
 from calib.results.intervals import Intervals, intervals
 from calib.solve.estimate import DOFS, SEEN, Estimate, Start
 from calib.solve.fit import Progress, solve
+from chains.errors import InputError
 
 FINER = 9  # shapes tried between the two beside the best one
 BETTER_SHAPE = 9.0  # squared sigmas by which another shape must fit better
@@ -78,6 +79,13 @@ class Stand:
     def with_effects(self, added: Sequence[Effect], progress: Progress) -> Stand:
         """The model with more effects, fitted from here."""
         return self._refitted(self.model.plus(tuple(added)), self.estimate.start, progress)
+
+    def tried(self, added: Sequence[Effect], progress: Progress) -> Stand | None:
+        """As `with_effects`; None where the LiDAR leaves the room, so that no beam meets it."""
+        try:
+            return self.with_effects(added, progress)
+        except InputError:
+            return None
 
     def without(
         self, groups: Sequence[Group], progress: Progress, of: Stand | None = None
