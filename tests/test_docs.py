@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from calib.diagnosis.formulas.factors import KINDS
 from calib.effects import CATALOGUE
 from calib.effects.own.formula import FormulaEffect
 from calib.problem.model import Source
@@ -126,6 +127,32 @@ def test_the_page_about_ones_own_effects_shows_what_is_printed(tmp_path):
             place = place.replace(word, name)
         assert FormulaEffect.read(effect | {"site": place}, "mine.yaml", {}).params(rig), place
     assert len(places) == 9
+
+
+@pytest.mark.slow
+def test_the_page_about_formulas_shows_what_is_printed(tmp_path, shared):
+    """But for the numbers; the errors agree to a hundredth."""
+    name = "known_ring_by_temperature"
+    (tmp_path / name).symlink_to(shared / "recordings" / name)
+    session = run_through(ROOT / "docs/formulas.md", tmp_path)
+    shown = re.findall(r"^```text\n(.*?)^```", session.text, flags=re.M | re.S)
+    said = shape(" ".join(session.said.split()))
+    assert len(shown) == 2
+    for part in shown:
+        assert shape(" ".join(part.split())) in said, part
+    fall = r"held-out error goes from (\S+) to (\S+) mm"
+    texts = (" ".join(each.split()) for each in (session.text, session.said))
+    there, here = ([float(x) for x in re.search(fall, text).groups()] for text in texts)
+    assert here == pytest.approx(there, rel=0.01)
+    assert (tmp_path / "formula.png").is_file()
+
+
+def test_the_page_about_formulas_has_every_term():
+    text = (ROOT / "docs/formulas.md").read_text(encoding="utf-8")
+    table = re.search(r"\| term \| formula \|\n\|---\|---\|\n(.*?)\n\n", text, flags=re.S)[1]
+    listed = set(re.findall(r"`([^`]+)`", table))
+    columns = {text.format("a", "b", x="x") for kind in KINDS.values() for text in kind.columns}
+    assert listed == columns - {"1"}
 
 
 def test_the_page_about_same_bytes_shows_what_is_printed(tmp_path):

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from calib.diagnosis.search import ALPHA
+from calib.diagnosis.verdict.sentences import UNNAMED
 from calib.effects import CATALOGUE
 from calib.report.chart import Absent, Chart
 from calib.report.charts.fit import error_mm
@@ -81,6 +82,7 @@ def render(
         headings=HEADINGS,
         blunders=[blunder_cells(b) for b in (evidence.diagnosis or {}).get("blunders", ())],
         candidates=_candidates(evidence),
+        formulas=_formulas(evidence),
         detectable=_detectable(evidence),
         weak=_weak(evidence),
         untold=_untold(evidence),
@@ -149,6 +151,12 @@ def _candidates(evidence: Evidence) -> list[dict[str, str]]:
         }
         for c in [c for c in candidates if c["step"] or c["p_adjusted"] < ALPHA][:TOLD_CANDIDATES]
     ]
+
+
+def _formulas(evidence: Evidence) -> bool:
+    """Whether formulas are the answer, and no effect that is known."""
+    found = evidence.diagnosis or {"verdict": "", "unexplained": []}
+    return found["verdict"] == UNNAMED and any("says" in each for each in found["unexplained"])
 
 
 def _told(candidate: dict[str, Any]) -> list[str]:

@@ -219,11 +219,10 @@ def _fit(
     write_rows(folder / RESIDUALS, *rows)
     summary |= {"misfit": worse, "misfit_by": misfit_by(estimate, *rows, by_stop)}
     reached = reach(problem, estimate, known)
-    summary |= {"sigmas_widened_by": widened, "cad_widened_by": cad}
-    summary |= {"held_out_by": by, "without": list(model.without)}
+    summary |= {"sigmas_widened_by": widened, "cad_widened_by": cad, "held_out_by": by}
+    summary |= {"without": list(model.without), "extrapolated": seen_at.sentences()}
     summary["intervals_wider_by"] = calibration.document(solution.names)
     summary["set_aside"] = sorted(estimate.problem.set_aside)
-    summary["extrapolated"] = seen_at.sentences()
     summary["predicted_mm"] = reached.document() if reached else None
     summary["seconds"] = time.monotonic() - began
     if links is not None:

@@ -158,8 +158,8 @@ def blunders(found: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _candidates(diagnosed: Findings) -> str:
-    if not diagnosed.candidates:
-        return ""
+    if not diagnosed.candidates or (diagnosed.formulas and not diagnosed.worth_adding):
+        return ""  # where a formula is the answer, what was tried before is in the menu
     head = "".join(
         f'<th style="text-align:{side};font-weight:600;padding-right:.6em">{text}</th>'
         for text, side in (("effect", "left"), ("mm", "right"), ("by chance", "left"))

@@ -1,6 +1,7 @@
 """What a fit throws away: a structured error is found there, and clutter is told from one."""
 
 import json
+import re
 import shutil
 
 import numpy as np
@@ -81,7 +82,10 @@ def test_a_sector_is_no_adequate_model_and_its_formula_takes_it_up(studied, tmp_
     _, run = studied("added", sector(0.3, 1.0, 0.025))
     diagnosis = diagnose(run)
     assert diagnosis.verdict == "unexplained_structure"
-    assert "azimuth 21 to 51 deg" in diagnosis.sentences[0] and "25.0 ±" in diagnosis.sentences[0]
+    (size,) = re.findall(r"^Its formula: range = true \+ ([\d.]+)", diagnosis.sentences[1])
+    assert float(size) == pytest.approx(25.0, abs=0.1)
+    told = next(each for each in diagnosis.sentences if "thrown away; of the beams" in each)
+    assert "azimuth 21 to 51 deg" in told and "25.0 ±" in told
     document = json.loads((run.folder / "diagnosis.json").read_text())
     assert document["rejected"]["covariates"] == ["azimuth_rad"]
     assert document["rejected"]["p_adjusted"] >= 1e-6

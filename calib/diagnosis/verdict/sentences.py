@@ -8,7 +8,7 @@ from typing import Any
 from calib.diagnosis.search import FEWEST, NamedEffect
 from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import words
-from calib.diagnosis.verdict.matters import Weighed
+from calib.diagnosis.verdict.matters import FALL, Weighed
 
 UNNAMED, BAD = "unexplained_structure", "bad_data"
 LISTED = 6  # untestable effects and rivals that a sentence names
@@ -107,6 +107,9 @@ def _formula_sentences(each: Mapping[str, Any], residual: str) -> list[str]:
     """Of structure whose formula was found: what it does, how it is added, and why it may be so."""
     before, after = (each["held_out_rms_mm"][k] for k in ("before", "after"))
     fall = f" The held-out error goes from {before:.2f} to {after:.2f} mm." if after else ""
+    was, now = (each["rejected_share"][k] for k in ("before", "after"))
+    if None not in (was, now) and was - now > FALL:
+        fall += f" Beams thrown away go from {100 * was:.1f} to {100 * now:.1f} %."
     out = [
         f"Its formula: {each['says']}.",
         f"The model does not absorb {each['rms_mm']:.2f} mm rms of what it does to {residual} "

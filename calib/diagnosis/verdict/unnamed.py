@@ -30,17 +30,25 @@ class Unnamed:
         instead: whether they take the place of the names, which predict unseen stops worse.
         fall_mm: the held-out error before and after all of them were fitted; None where nobody
             looked.
+        thrown: the share of the held-out beams without weight, before and after; None where that
+            is not known.
         refused: a sentence, where held-out stops are predicted no better with them.
     """
 
     formulas: Sequence[Formula] = ()
     instead: bool = False
     fall_mm: tuple[float, float] | None = None
+    thrown: tuple[float, float] | None = None
     refused: str = ""
 
     def documents(self, taken: Sequence[str]) -> list[dict[str, Any]]:
         """As in diagnosis.json, to be added by names that the model has not."""
-        return [_document(each, taken, self.fall_mm) for each in self.formulas]
+        both = {"held_out_rms_mm": self.fall_mm, "rejected_share": self.thrown}
+        fell = {
+            key: dict(zip(("before", "after"), pair or (None, None), strict=True))
+            for key, pair in both.items()
+        }
+        return [_document(each, taken) | fell for each in self.formulas]
 
 
 def unnamed(
@@ -76,7 +84,7 @@ def unnamed(
     # A gross structure is rejected, not fitted: what falls then is the share of such beams.
     fewer = before.rejected_share - after.rejected_share > FALL
     if fewer or fall_mm[0] - fall_mm[1] > FALL * after.floor_mm:
-        return Unnamed(formulas, False, fall_mm)
+        return Unnamed(formulas, False, fall_mm, (before.rejected_share, after.rejected_share))
     over = " and ".join(words(c) for c in formulas[0].covariates)
     return Unnamed(
         refused=f"A formula over {over} fits part of the residuals, but stops that were held out "
@@ -94,9 +102,7 @@ def _with(stand: Stand, formulas: Sequence[Formula], progress: Progress) -> Stan
     return stand.with_effects(effects, progress)
 
 
-def _document(
-    found: Formula, taken: Sequence[str], fall_mm: tuple[float, float] | None
-) -> dict[str, Any]:
+def _document(found: Formula, taken: Sequence[str]) -> dict[str, Any]:
     seen = " and ".join(span(name, *ends) for name, ends in found.seen.items())
     what = f"{DESCRIBES} {seen}."
     first = found.steps[0]
@@ -122,7 +128,6 @@ def _document(
             }
             for form in found.alike[:ALIKE]
         ],
-        "held_out_rms_mm": dict(zip(("before", "after"), fall_mm or (None, None), strict=True)),
         "why": why(found.covariates),
         "formula": found.effect(taken, what),
         "seen": {name: list(ends) for name, ends in found.seen.items()},

@@ -106,6 +106,9 @@ def pictures(diagnosis: Mapping[str, Any] | None) -> list[Picture]:
 
 def formulas(evidence: Evidence) -> Iterator[Chart | Absent]:
     """A chart for each formula of what has no name."""
+    if evidence.diagnosis is None:
+        yield Absent("formula", f"not diagnosed; 'rigcal diagnose {evidence.run.folder}' does it")
+        return
     found = charts_of(evidence.diagnosis)
     yield from found or [Absent("formula", "the diagnosis found no formula of what has no name")]
 
