@@ -1,9 +1,8 @@
 """From one look to a named effect: the best explanation is judged, then fitted, then looked past.
 
-An effect that nobody has named dresses up as several that somebody has. What scatters from stop to
-stop may be chance: the model gets that scatter, and all is looked at again beside it. A blunder is
-an explanation like any other: its rows are left out, and the rest is fitted and looked at again
-(detection, identification and adaptation: Teunissen 1990).
+What scatters from stop to stop may be chance: the model gets that scatter, and all is looked at
+again beside it. A blunder is an explanation like any other: its rows are left out, and the rest is
+fitted and looked at again (detection, identification and adaptation: Teunissen 1990).
 """
 
 from __future__ import annotations

@@ -80,6 +80,10 @@ class Stand:
         """The model with more effects, fitted from here."""
         return self._refitted(self.model.plus(tuple(added)), self.estimate.start, progress)
 
+    def lacking(self, names: Collection[str], progress: Progress) -> Stand:
+        """The model without some of its effects, fitted from here."""
+        return self._refitted(self.model.minus(names), self.estimate.start, progress)
+
     def tried(self, added: Sequence[Effect], progress: Progress) -> Stand | None:
         """As `with_effects`; None where the LiDAR leaves the room, so that no beam meets it."""
         try:

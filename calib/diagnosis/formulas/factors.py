@@ -24,6 +24,7 @@ SCALES = (0.1, 0.25, 0.6)  # of exponentials, of the covariate's range
 PERIODS = tuple(np.geomspace(0.1, 1.5, 24))  # of waves, of the covariate's range
 WIDEST, NARROWEST = 3.0, 0.005  # scales and widths, of the covariate's range
 BLOCKS = (2.0, 4.0, 8.0, 16.0, 32.0)  # rings that a chip, or a bank of chips, has
+A_PERIOD = 6  # values that a period must have, of those that can be told apart
 ORDERS = 12  # of harmonics of an angle
 FEWEST_VALUES = 3  # of a covariate that is not a class
 WIDE = 1.5  # largest over smallest value, from which powers differ from a line
@@ -158,7 +159,7 @@ def factors(name: str, values: np.ndarray, levels: int) -> list[Factor]:
         return [Factor(name, "class", (float(k),)) for k in often]
     if len(distinct) < FEWEST_VALUES:
         return [Factor(name, "step", (float(distinct.mean()),))] if len(distinct) > 1 else []
-    out = [*_smooth(name, known), *_sharp(name, known, distinct, levels)]
+    out = [*_smooth(name, known, levels), *_sharp(name, known, distinct, levels)]
     if name == "ring":
         out.append(Factor(name, "every other"))
         out += [Factor(name, "block", (size,)) for size in BLOCKS]
@@ -166,7 +167,7 @@ def factors(name: str, values: np.ndarray, levels: int) -> list[Factor]:
     return out
 
 
-def _smooth(name: str, known: np.ndarray) -> Iterator[Factor]:
+def _smooth(name: str, known: np.ndarray, levels: int) -> Iterator[Factor]:
     low, high = float(known.min()), float(known.max())
     wide, middle = high - low, _rounded((low + high) / 2, (high - low) / 2)
     half = _rounded(wide / 2, wide / 2)
@@ -190,9 +191,11 @@ def _smooth(name: str, known: np.ndarray) -> Iterator[Factor]:
     elif name == "elevation_rad":
         yield from (Factor(name, sort) for sort in ("tangent", "sine", "cosine"))
     if name == "azimuth_rad" or name.startswith("joint"):
-        yield from (Factor(name, "harmonic", (float(m),)) for m in range(1, ORDERS + 1))
+        orders = min(ORDERS, max(1, levels // A_PERIOD))
+        yield from (Factor(name, "harmonic", (float(m),)) for m in range(1, orders + 1))
     else:
-        yield from (Factor(name, "wave", (share * wide,)) for share in PERIODS)
+        slow = (share for share in PERIODS if share * levels > A_PERIOD)
+        yield from (Factor(name, "wave", (share * wide,)) for share in slow)
 
 
 def _sharp(name: str, known: np.ndarray, distinct: np.ndarray, levels: int) -> Iterator[Factor]:

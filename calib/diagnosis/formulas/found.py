@@ -140,7 +140,7 @@ def settled(table: Table, steps: Sequence[Step]) -> list[Formula]:
             beside = model.beside(np.hstack(others)) if others else model
             terms[i] = refine(beside, term)
             columns[i] = terms[i].columns(table.covariates)
-    kept = _kept(model, columns)
+    kept = _kept(model, terms, columns)
     there = [i for i, k in enumerate(kept) if k]
     columns = [columns[i][:, kept[i]] for i in there]
     steps = [steps[i] for i in there]
@@ -172,9 +172,11 @@ def settled(table: Table, steps: Sequence[Step]) -> list[Formula]:
     return out
 
 
-def _kept(model: Projection, columns: Sequence[np.ndarray]) -> list[list[int]]:
+def _kept(
+    model: Projection, terms: Sequence[Term], columns: Sequence[np.ndarray]
+) -> list[list[int]]:
     """Of each term the columns that the data need: not those that the model takes on, nor those
-    that chance explains."""
+    that chance, or other constants, explain."""
     kept = [list(range(c.shape[1])) for c in columns]
     while True:
         some = np.hstack([c[:, k] for c, k in zip(columns, kept, strict=True)])
@@ -182,8 +184,11 @@ def _kept(model: Projection, columns: Sequence[np.ndarray]) -> list[list[int]]:
         if not owner:
             return kept
         beside, theta = model.fitted(some)
-        found = test(beside.scores({}, some), np.arange(some.shape[1]))
-        t = np.abs(theta) / np.maximum(found.sigma(1.0), 1e-300)
+        amounts = np.split(theta, np.cumsum([len(k) for k in kept])[:-1])
+        each = zip(terms, kept, amounts, strict=True)
+        every = np.hstack([some, *(_slopes(model.table, *one) for one in each)])
+        found = test(beside.scores({}, every), np.arange(every.shape[1]))
+        t = np.abs(theta) / np.maximum(found.sigma(1.0)[: len(theta)], 1e-300)
         t[_taken_on(model, some)] = 0.0
         worst = int(np.argmin(t))
         if t[worst] > CLEAR:

@@ -35,6 +35,7 @@ PLAUSIBLE = 0.1  # adjusted p-value of a smooth function, from which forms are t
 RIVALS = 2  # sets of covariates, beside the best one, over which forms are tried
 INSTEAD = 0.8  # of the best set's statistic that another must explain for that
 AS = {"ring": "elevation_rad"}  # what goes along with another covariate
+COVERS = 0.9  # of what a form explains, that a smooth function must for the form to be one of them
 SAME = 1e-6  # of what two forms explain: one is the other and what the model takes on
 AT_ONCE = 400  # columns: bounds the memory
 
@@ -220,16 +221,17 @@ def _judged(fitted: Projection, columns: np.ndarray) -> Test:
 
 
 def _by_chance(fitted: Projection, form: Form, smooth: Smooth) -> float:
-    """How often chance makes a form of these covariates that explains as much: no more than it
-    makes a smooth function that does (the S-method of Scheffe 1953), nor more than as many forms
-    do as were tried (Bonferroni); the smaller of both bounds, twice."""
+    """How often chance makes a form of these covariates that explains as much: no more than as
+    many forms do as were tried (Bonferroni); where a smooth function explains it, nor more than
+    such functions do (the S-method of Scheffe 1953). The smaller of both bounds, twice."""
     found = _judged(fitted, form.term.columns(fitted.table.covariates))
     chance = found.chance
     if chance.d <= 0.0:
         return 1.0
     each = max(chance.trace / found.dof, 1.0)
     dof = max(smooth.test.dof, found.dof)
-    together = special.fdtrc(dof, chance.d, found.statistic / each / dof)
+    covers = smooth.test.statistic > COVERS * form.statistic
+    together = special.fdtrc(dof, chance.d, found.statistic / each / dof) if covers else 1.0
     alone = special.fdtrc(chance.nu, chance.d, found.statistic / each / found.dof)
     return at_least(min(1.0, 2 * min(together, alone * form.tried)))
 

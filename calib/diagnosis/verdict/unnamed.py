@@ -76,6 +76,10 @@ def unnamed(
             named = falls[found.found[-1].effect.name][1]
             if after < named - FALL * before:
                 return Unnamed(formulas, True, (before, after))
+    # Values by chance take in most of a structure that differs from stop to stop.
+    there = set(last.model.names)
+    chance = [c.effect.name for c in found.chance if c.effect.name in there]
+    last = last.lacking(chance, progress) if chance else last
     formulas = find(last.estimate, progress)
     if not formulas or unseen is None:
         return Unnamed(formulas)
