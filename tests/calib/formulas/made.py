@@ -69,13 +69,13 @@ def table(
     shape = (rows, begin + unknowns)
     twists = csr_array((values.ravel(), (np.repeat(every, 9), at.ravel())), shape)
     poses = np.eye(begin, unknowns)  # the twist of each stop is that of its own pose
-    priors = np.full(unknowns, 100.0)  # 10 mm of rings and surfaces
+    priors = np.ones(unknowns)  # of rings and surfaces as good as nothing is known beforehand
     priors[:begin] = np.tile(np.repeat(1 / np.array(TRACKED), 3), stops)
-    priors[begin] = 1.0
     noise = rng.standard_normal(rows) * SIGMA
     noise += scatter_m * rng.standard_normal(stops)[stop]
     noise += 0.05 * (rng.random(rows) < outliers)
     true = 0.1 * rng.standard_normal(unknowns) / priors  # a fit has been here
+    true[begin:] *= 0.01
     residual = noise - twists @ np.concatenate([poses @ true, true])
     return Table(
         covariates=columns,
@@ -88,7 +88,7 @@ def table(
         twists=twists,
         chain=csr_array(vstack([csr_array(poses), csr_array(np.eye(unknowns))])),
         others=csr_array(np.diag(priors)),
-        others_b=rng.standard_normal(unknowns),
+        others_b=rng.standard_normal(unknowns) * np.where(priors > 1.0, 1.0, 0.01),
         others_stop=np.concatenate([np.repeat(np.arange(stops), 6), np.full(unknowns - begin, -1)]),
         others_place=np.full(unknowns, -1),
     )

@@ -40,7 +40,7 @@ def test_the_model_alone_leaves_what_dense_least_squares_leave(case):
     step, _ = solved(rows, off)
     left = (off + rows @ step)[: len(model.table)] / np.sqrt(model.weight)
     assert model.left_m == pytest.approx(left, abs=1e-9)
-    assert model.step == pytest.approx(step, abs=1e-8)
+    assert model.step == pytest.approx(step, abs=1e-7)
 
 
 def test_columns_explain_what_they_take_off_dense_least_squares(case):
@@ -69,7 +69,7 @@ def test_columns_are_fitted_as_by_dense_least_squares(case):
     step, _ = solved(rows, off)
     fit, theta = model.fitted(columns)
     assert theta == pytest.approx(step[-2:], rel=1e-6)
-    assert fit.step == pytest.approx(step[:-2], abs=1e-8)
+    assert fit.step == pytest.approx(step[:-2], abs=1e-7)
     left = (off + rows @ step)[: len(model.table)] / np.sqrt(model.weight)
     assert fit.left_m == pytest.approx(left, abs=1e-9)
 
@@ -79,7 +79,7 @@ def test_a_model_with_columns_beside_it_is_the_larger_model(case):
     larger = model.beside(columns[:, 1:])
     rows, off = dense(model.table, model.weight, columns[:, 1:])
     step, whole = solved(rows, off)
-    assert larger.step == pytest.approx(step, abs=1e-8)
+    assert larger.step == pytest.approx(step, abs=1e-7)
     _, both = solved(*dense(model.table, model.weight, columns))
     assert larger.explained([columns[:, :1]])[0] == pytest.approx([whole - both], rel=1e-6)
 
