@@ -7,7 +7,7 @@ from anywhere. So what was added begins there, all else held, if Tukey's cost is
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 from scipy.sparse import csr_array, hstack
@@ -69,6 +69,14 @@ def begun(
             break
     lower = sums(theta)[2] < first
     return {name: theta[i] for name, i in at.items()} if lower else {}
+
+
+def declared(problem: Problem, held: Collection[str]) -> dict[str, np.ndarray]:
+    """Where those unknowns begin whose effect says so, of those that single beams feel and of which
+    no earlier estimate (`held`) tells."""
+    known, initial = problem.variables, problem.initial
+    felt = {t.variable for scan in problem.scans for t in scan.terms} & set(known) - set(held)
+    return {n: initial[n] for n in felt if not np.array_equal(initial[n], known[n].mean)}
 
 
 def _normal(rows: Rows, at: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, float]:

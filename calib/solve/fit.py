@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from calib.linear.linearise import beams_cost
 from calib.problem.problem import Block, Problem
+from calib.solve.added import declared
 from calib.solve.descent import LAST, SLOWED, UPHILL
 from calib.solve.estimate import Estimate, Start, cost_of, values_of
 from calib.solve.loop import CONVERGED, Loop, Progress
@@ -67,6 +68,7 @@ def solve(
         loop.reweigh(beams=False)
         loop.lost = loop.bodies_astray()
     if problem.scans:
+        loop.values |= declared(problem, loop.held)  # of which nothing was known without scans
         loop.lost = loop.lost or not loop.look_around()
         if spread:
             loop.begin_spread()

@@ -28,6 +28,24 @@ def covariates(rng: np.random.Generator, stops: int, each: int) -> dict[str, np.
     }
 
 
+def derivative(
+    columns: dict[str, np.ndarray], stop: np.ndarray, place: np.ndarray, rng: np.random.Generator
+) -> csr_array:
+    """(N, 6 K + U) of the residual by the twists of K stops, and by the unknowns: the poses of
+    these, a range zero, rings and surfaces; see `Table`."""
+    rows, begin = len(stop), 6 * (int(stop.max()) + 1)
+    azimuth, elevation = columns["azimuth_rad"], columns["elevation_rad"]
+    flat = np.cos(elevation)
+    along = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=1)
+    turned = np.cross(along, rng.standard_normal((rows, 3)))  # surfaces lie any way
+    first, own = 2 * begin, 6 * stop[:, None] + np.arange(6)
+    zeros = [np.full(rows, first), first + 1 + columns["ring"], first + 1 + RINGS + place]
+    at = np.column_stack([own, *zeros]).astype(int)
+    values = np.hstack([along, turned, -np.ones((rows, 3))])
+    shape = (rows, first + 1 + RINGS + SURFACES)
+    return csr_array((values.ravel(), (np.repeat(np.arange(rows), 9), at.ravel())), shape)
+
+
 def table(
     seed: int = 0,
     stops: int = 30,
@@ -53,21 +71,8 @@ def table(
     rows, stop = stops * each, np.repeat(np.arange(stops), each)
     place = rng.integers(0, SURFACES, rows)
     unknowns = 6 * stops + 1 + RINGS + SURFACES
-    azimuth, elevation = columns["azimuth_rad"], columns["elevation_rad"]
-    flat = np.cos(elevation)
-    along = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=1)
-    turned = np.cross(along, rng.standard_normal((rows, 3)))  # surfaces lie any way
-    by_pose = np.hstack([along, turned])
     begin = 6 * stops
-    every = np.arange(rows)
-    own = 6 * stop[:, None] + np.arange(6)
-    first = begin + 6 * stops
-    at = np.column_stack(
-        [own, np.full(rows, first), first + 1 + columns["ring"], first + 1 + RINGS + place]
-    ).astype(int)
-    values = np.hstack([by_pose, -np.ones((rows, 3))])
-    shape = (rows, begin + unknowns)
-    twists = csr_array((values.ravel(), (np.repeat(every, 9), at.ravel())), shape)
+    twists = derivative(columns, stop, place, rng)
     poses = np.eye(begin, unknowns)  # the twist of each stop is that of its own pose
     priors = np.ones(unknowns)  # of rings and surfaces as good as nothing is known beforehand
     priors[:begin] = np.tile(np.repeat(1 / np.array(TRACKED), 3), stops)
