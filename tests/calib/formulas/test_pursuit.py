@@ -242,10 +242,15 @@ def test_the_same_function_of_a_covariate_that_goes_along_says_nothing_else():
     ring = Term((Factor("ring", "line", (15.5, 15.5)),))
     height = Term((Factor("elevation_rad", "line", (0.0, 0.3)),))
     square = Term((Factor("ring", "square", (15.5, 15.5)),))
-    as_form = Form(height, 9.0, 1, np.ones(3))
-    assert not as_form.other_than(ring)
-    assert not replace(as_form, term=square).other_than(ring)  # only adds a column
-    assert as_form.other_than(WAVE)
+    as_form, best = Form(height, 9.0, 1, np.ones(3)), Form(ring, 9.1, 1, np.ones(3))
+    assert not as_form.other_than(best)
+    assert not replace(as_form, term=square).other_than(best)  # only adds a column
+    assert as_form.other_than(replace(best, term=WAVE))
+    outside = Term((Factor("azimuth_rad", "outside", (0.1, 0.9)),))
+    window = Term((Factor("azimuth_rad", "window", (0.1, 0.9)),))
+    same = Form(outside, 9.1 + 1e-9, 1, np.ones(3))
+    assert not same.other_than(replace(best, term=window))  # one is 1 less the other
+    assert replace(same, statistic=8.0).other_than(replace(best, term=window))
 
 
 def test_texts_of_a_term_are_formulas_that_a_file_can_have(found):
