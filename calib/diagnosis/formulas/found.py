@@ -132,22 +132,39 @@ def settled(table: Table, steps: Sequence[Step]) -> list[Formula]:
     """All terms fitted together, their constants refined; those over the same covariates are one
     formula."""
     terms = [step.form.term for step in steps]
-    columns = [t.columns(table.covariates) for t in terms]
+    kept = [list(range(len(term.texts))) for term in terms]
     for _ in range(PASSES):
-        model = table.projection(np.hstack(columns))
-        for i, term in enumerate(terms):
-            others = [c for k, c in enumerate(columns) if k != i]
-            beside = model.beside(np.hstack(others)) if others else model
-            terms[i] = refine(beside, term)
-            columns[i] = terms[i].columns(table.covariates)
-    kept = _kept(model, terms, columns)
+        terms = _refined(table, terms, kept)
+    columns = [t.columns(table.covariates) for t in terms]
+    kept = _kept(table.projection(np.hstack(columns)), terms, columns)
     there = [i for i, k in enumerate(kept) if k]
-    columns = [columns[i][:, kept[i]] for i in there]
-    steps = [steps[i] for i in there]
-    plain = [_reduced(terms[i], kept[i]) for i in there]
-    terms, kept = [t for t, _ in plain], [k for _, k in plain]
-    if not terms:
+    if not there:
         return []
+    plain = [_reduced(terms[i], kept[i]) for i in there]
+    kept = [k for _, k in plain]
+    # Without a column that was dropped, other constants are best.
+    terms = _refined(table, [t for t, _ in plain], kept)
+    return _grouped(table, terms, kept, [steps[i] for i in there])
+
+
+def _refined(table: Table, terms: Sequence[Term], kept: Sequence[Sequence[int]]) -> list[Term]:
+    """Terms with the constants that are best for the columns kept of each, beside the others."""
+    terms = list(terms)
+    columns = [t.columns(table.covariates)[:, k] for t, k in zip(terms, kept, strict=True)]
+    model = table.projection(np.hstack(columns))
+    for i, term in enumerate(terms):
+        others = [c for k, c in enumerate(columns) if k != i]
+        beside = model.beside(np.hstack(others)) if others else model
+        terms[i] = refine(beside, term, kept[i])
+        columns[i] = terms[i].columns(table.covariates)[:, kept[i]]
+    return terms
+
+
+def _grouped(
+    table: Table, terms: Sequence[Term], kept: Sequence[Sequence[int]], steps: Sequence[Step]
+) -> list[Formula]:
+    """Formulas of terms, each with its numbers."""
+    columns = [t.columns(table.covariates)[:, k] for t, k in zip(terms, kept, strict=True)]
     model = table.projection(np.hstack(columns))
     parts = _parts(model, terms, columns, kept)
     fit = model.fitted(np.hstack(columns))[0]

@@ -310,9 +310,16 @@ def _explained(
     return tuple(np.concatenate(each) for each in zip(*found, strict=True))
 
 
-def refine(projection: Projection, term: Term) -> Term:
+def refine(projection: Projection, term: Term, kept: Sequence[int] = ()) -> Term:
     """A term with those constants that explain most, from where they are: places beside each are
-    tried, ever closer, as where an edge is has no slope; then all together (Nelder and Mead)."""
+    tried, ever closer, as where an edge is has no slope; then all together (Nelder and Mead).
+
+    Args:
+        projection: the table, and the model fitted to it.
+        term: with the constants to start from.
+        kept: which of its columns count; all where there are none.
+    """
+    kept = list(kept) or list(range(len(term.texts)))
     if not term.constants:
         return term
     covariates = projection.table.covariates
@@ -322,7 +329,7 @@ def refine(projection: Projection, term: Term) -> Term:
         for i in range(len(wide)):
             places = np.clip(term.constants[i] + size * wide[i] * np.array(BESIDE), *ends[i])
             tried = [term.at(_with(term.constants, i, place)) for place in places.tolist()]
-            explained, _ = projection.explained([t.columns(covariates) for t in tried])
+            explained, _ = projection.explained([t.columns(covariates)[:, kept] for t in tried])
             term = tried[int(np.argmax(explained))]
     start, scale = np.array(term.constants), CLOSER[-1] * np.array(wide)
 
@@ -330,7 +337,7 @@ def refine(projection: Projection, term: Term) -> Term:
         return term.at(np.clip(start + scale * x, *ends.T).tolist())
 
     def worse(x: np.ndarray) -> float:
-        columns = at(x).columns(covariates)
+        columns = at(x).columns(covariates)[:, kept]
         return -float(projection.explained([columns])[0][0])
 
     simplex = np.vstack([np.zeros(len(start)), np.eye(len(start))])

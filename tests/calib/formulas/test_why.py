@@ -58,10 +58,11 @@ class World:
     """
 
     def __init__(self, monkeypatch, names=0, first=None, last=None):
-        self.stands = [SimpleNamespace(estimate=i) for i in range(names + 1)]
+        model = SimpleNamespace(names=())
+        self.stands = [SimpleNamespace(estimate=i, model=model) for i in range(names + 1)]
         found = [SimpleNamespace(effect=SimpleNamespace(name=f"effect_{i}")) for i in range(names)]
         self.search = SimpleNamespace(
-            looks=[SimpleNamespace(stand=s) for s in self.stands], found=found
+            looks=[SimpleNamespace(stand=s) for s in self.stands], found=found, chance=()
         )
         self.falls = {f"effect_{i}": (4.0 - 0.5 * i, 3.5 - 0.5 * i, 0.0) for i in range(names)}
         after = {0: first, names: last} if names else {0: last}
@@ -77,8 +78,8 @@ class World:
 
     def unnamed(self, doubtful=False, looks=True):
         def unseen(stand):
-            rms = 4.0 if stand in self.stands else stand
-            return SimpleNamespace(rms_mm=rms, floor_mm=FLOOR)
+            rms = 4.0 - 0.5 * stand.estimate if stand in self.stands else stand
+            return SimpleNamespace(rms_mm=rms, floor_mm=FLOOR, rejected_share=0.0)
 
         return unnamed(
             self.search, self.falls, doubtful, unseen if looks else None, lambda *_: None
