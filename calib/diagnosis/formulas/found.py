@@ -205,7 +205,8 @@ def _kept(
         each = zip(terms, kept, amounts, strict=True)
         every = np.hstack([some, *(_slopes(model.table, *one) for one in each)])
         found = test(beside.scores({}, every), np.arange(every.shape[1]))
-        t = np.abs(theta) / np.maximum(found.sigma(1.0)[: len(theta)], 1e-300)
+        sigma = found.sigma(1.0)[: len(theta)]
+        t = np.where(sigma > 0.0, np.abs(theta) / np.maximum(sigma, 1e-300), 0.0)  # 0: not seen
         t[_taken_on(model, some)] = 0.0
         worst = int(np.argmin(t))
         if t[worst] > CLEAR:
