@@ -121,13 +121,17 @@ def _common(tests: Sequence[tuple[Effect, Test]]) -> float:
 def _by_chance(scores: Scores, tests: Mapping[str, Test]) -> dict[str, np.ndarray]:
     """p-values (R,) of every test on scores that are nothing but chance: each by its rank."""
     drawn = scores.draws
-    out = {}
-    for name, t in tests.items():
-        statistic = np.sum(np.square(drawn[:, t.columns] @ t.whiten), axis=1)
-        rank = np.empty(len(drawn))
-        rank[np.argsort(-statistic, kind="stable")] = np.arange(1, len(drawn) + 1)
-        out[name] = rank / (len(drawn) + 1)
-    return out
+    return {
+        name: by_rank(np.sum(np.square(drawn[:, t.columns] @ t.whiten), axis=1))
+        for name, t in tests.items()
+    }
+
+
+def by_rank(statistic: np.ndarray) -> np.ndarray:
+    """p-value (R,) of each of some draws of a statistic among all of them."""
+    rank = np.empty(len(statistic))
+    rank[np.argsort(-statistic, kind="stable")] = np.arange(1, len(statistic) + 1)
+    return rank / (len(statistic) + 1)
 
 
 def looked(smallest: np.ndarray) -> float:

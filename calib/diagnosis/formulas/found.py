@@ -15,7 +15,7 @@ from calib.diagnosis.formulas.factors import Factor, columns_of
 from calib.diagnosis.formulas.picture import picture_of
 from calib.diagnosis.formulas.pursuit import Form, Step, Term, refine
 from calib.diagnosis.formulas.table import Projection, Table
-from calib.diagnosis.score import GAUGE, test
+from calib.diagnosis.score import GAUGE
 from calib.diagnosis.suggest import outward
 from calib.effects.own.formula import FormulaEffect
 
@@ -204,8 +204,7 @@ def _kept(
         amounts = np.split(theta, np.cumsum([len(k) for k in kept])[:-1])
         each = zip(terms, kept, amounts, strict=True)
         every = np.hstack([some, *(_slopes(model.table, *one) for one in each)])
-        found = test(beside.scores({}, every), np.arange(every.shape[1]))
-        sigma = found.sigma(1.0)[: len(theta)]
+        sigma = beside.test(every).sigma(1.0)[: len(theta)]
         t = np.where(sigma > 0.0, np.abs(theta) / np.maximum(sigma, 1e-300), 0.0)  # 0: not seen
         t[_taken_on(model, some)] = 0.0
         worst = int(np.argmin(t))
@@ -256,7 +255,7 @@ def _parts(
     amounts = np.split(amount, ends)
     slopes = [_slopes(model.table, *each) for each in zip(terms, kept, amounts, strict=True)]
     every = np.hstack([*columns, *slopes])
-    sigma = test(beside.scores({}, every), np.arange(every.shape[1])).sigma(1.0)
+    sigma = beside.test(every).sigma(1.0)
     sigmas = np.split(sigma[: len(amount)], ends)
     others = np.split(sigma[len(amount) :], np.cumsum([s.shape[1] for s in slopes])[:-1])
     return [

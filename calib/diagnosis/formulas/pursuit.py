@@ -20,7 +20,7 @@ from calib.blunders.chance import after_looks, at_least, log_tail
 from calib.diagnosis.formulas.factors import Columns, Factor, columns_of, factors
 from calib.diagnosis.formulas.smooths import Bases, Smooth, screen_smooths
 from calib.diagnosis.formulas.table import Projection, Table
-from calib.diagnosis.score import Test, test
+from calib.diagnosis.score import Test
 from calib.solve.fit import Progress
 
 KEPT = 4  # factors of each covariate whose products are tried
@@ -91,14 +91,12 @@ class Step:
         alike: other forms that stops cannot tell from it.
         p_value: how often chance alone explains as much, in some form over these covariates.
         p_adjusted: or over any.
-        smooth: what any smooth function of its covariates explains, in squared sigmas.
     """
 
     form: Form
     alike: Sequence[Form]
     p_value: float
     p_adjusted: float
-    smooth: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,14 +192,12 @@ def _step(fitted: Projection, bases: Bases, smooths: Sequence[Smooth], alpha: fl
     if not over:
         return None
     chosen, alike = simplest(sorted(over, key=lambda f: -f.evidence))
-    smooth = over[chosen]
-    p = _by_chance(fitted, chosen, smooth)
+    p = _by_chance(fitted, chosen, over[chosen])
     return Step(
         form=chosen,
         alike=alike,
         p_value=p,
         p_adjusted=float(after_looks(p, best.looks)),
-        smooth=smooth.test.statistic,
     )
 
 
@@ -215,9 +211,7 @@ def _stands_out(fitted: Projection, bases: Bases, smooth: Smooth) -> bool:
 def _judged(fitted: Projection, columns: np.ndarray) -> Test:
     """The test of columns (N, k), stops left out one by one, and beams weighed as they are once
     these are known: what is clipped before would seem to differ from stop to stop."""
-    known = fitted.table.projection(columns)
-    found = test(known.scores({}, columns), np.arange(columns.shape[1]))
-    return known.judged(found, columns)
+    return fitted.table.projection(columns).judged(columns)
 
 
 def _by_chance(fitted: Projection, form: Form, smooth: Smooth) -> float:

@@ -15,7 +15,7 @@ import numpy as np
 
 from calib.diagnosis.formulas.table import Projection, Table
 from calib.diagnosis.score import Scores, Test, test
-from calib.diagnosis.screen import looked
+from calib.diagnosis.screen import by_rank, looked
 
 # Knots of a function of one covariate, of each of two and of three. A pair of 5 x 5 sees what turns
 # three times over its range; finer things are found alone or as formulas.
@@ -163,7 +163,7 @@ def _tested(
     for i, names in enumerate(sets):
         progress(i, len(sets))
         columns = bases.of(names)
-        scores = projection.scores({}, columns)
+        scores = projection.scores(columns)
         found = test(scores, np.arange(columns.shape[1]))
         if found.dof:
             yield names, (found, _by_chance(scores, found, projection.table.signs))
@@ -172,10 +172,7 @@ def _tested(
 def _by_chance(scores: Scores, found: Test, signs: np.ndarray) -> np.ndarray:
     # Every set has the same clusters in the same order, so the same draw of signs is one world.
     shares = np.vstack([scores.by_stop, scores.by_place]) @ found.whiten
-    statistic = np.sum(np.square(signs @ shares), axis=1)
-    rank = np.empty(len(statistic))
-    rank[np.argsort(-statistic, kind="stable")] = np.arange(1, len(statistic) + 1)
-    return rank / (len(statistic) + 1)
+    return by_rank(np.sum(np.square(signs @ shares), axis=1))
 
 
 def _common(tests: Sequence[Test]) -> float:

@@ -224,9 +224,8 @@ class Projection:
     def fitted(self, columns_m: np.ndarray) -> tuple[Projection, np.ndarray]:
         """With columns (N, k) fitted beside the model, and what they are multiplied by (k,); 0 of
         what the model can take on."""
-        kept, taken = self.off(columns_m)
-        found = test(self.scores({}, columns_m), np.arange(columns_m.shape[1]))
-        theta = found.estimate()
+        kept, taken = left = self.off(columns_m)
+        theta = self._test(columns_m, left).estimate()
         beside = replace(self, left_m=self.left_m - kept @ theta, step=self.step - taken @ theta)
         return beside, theta
 
@@ -253,9 +252,20 @@ class Projection:
         statistic, dof = zip(*found, strict=True)
         return np.array(statistic), np.array(dof)
 
-    def scores(self, at: Mapping[str, slice], columns_m: np.ndarray) -> Scores:
-        """Scores of columns (N, Q) of the range, by candidate; see `calib.diagnosis.score`."""
-        table, kept = self.table, self.off(columns_m)
+    def scores(self, columns_m: np.ndarray) -> Scores:
+        """Scores of columns (N, Q) of the range, of one candidate; see `calib.diagnosis.score`."""
+        return self._scores(columns_m, self.off(columns_m))
+
+    def test(self, columns_m: np.ndarray) -> Test:
+        """The test of columns (N, q) together."""
+        return self._test(columns_m, self.off(columns_m))
+
+    def _test(self, columns_m: np.ndarray, kept: tuple[np.ndarray, np.ndarray]) -> Test:
+        return test(self._scores(columns_m, kept), np.arange(columns_m.shape[1]))
+
+    def _scores(self, columns_m: np.ndarray, kept: tuple[np.ndarray, np.ndarray]) -> Scores:
+        """As `scores`, with what `off` gives."""
+        table = self.table
         weighted = self.weight[:, None] * columns_m
         information = weighted.T @ kept[0]
         away = table.others @ self.step - table.others_b
@@ -266,7 +276,7 @@ class Projection:
         stop, place, cell = table.cells
         cells = summed(np.vstack(shares), cell)
         return Scores(
-            at=at,
+            at={},
             score=cells.sum(axis=0),
             information=(information + information.T) / 2,
             whole=weighted.T @ columns_m,
@@ -276,9 +286,10 @@ class Projection:
             weight_m2=float(self.weight.sum()),
         )
 
-    def judged(self, found: Test, columns_m: np.ndarray) -> Test:
-        """A test of columns (N, q) with its clusters left out one by one: see `jackknife`."""
+    def judged(self, columns_m: np.ndarray) -> Test:
+        """The test of columns (N, q) with its clusters left out one by one: see `jackknife`."""
         table, kept = self.table, self.off(columns_m)
+        found = self._test(columns_m, kept)
         root, every = np.sqrt(self.weight), np.arange(found.dof)
         away = table.others @ self.step - table.others_b
         shares = Shares()

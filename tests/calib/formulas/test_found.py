@@ -169,7 +169,7 @@ def test_its_name_is_of_its_covariates_and_not_taken():
 def steps_of(beams, *terms: Term) -> list[Step]:
     model = beams.projection()
     forms = [form(model, term, 1) for term in terms]
-    return [Step(form=f, alike=[], p_value=1e-6, p_adjusted=1e-6, smooth=100.0) for f in forms]
+    return [Step(form=f, alike=[], p_value=1e-6, p_adjusted=1e-6) for f in forms]
 
 
 def test_terms_over_the_same_covariates_are_one_formula():

@@ -51,7 +51,7 @@ def test_columns_explain_what_they_take_off_dense_least_squares(case):
     statistic, dof = model.explained(blocks)
     assert statistic == pytest.approx(fall, rel=1e-6)
     assert dof.tolist() == [2, 1, 1]
-    tests = [score_test(model.scores({}, b), np.arange(b.shape[1])) for b in blocks]
+    tests = [score_test(model.scores(b), np.arange(b.shape[1])) for b in blocks]
     assert [t.statistic for t in tests] == pytest.approx(fall, rel=1e-6)
 
 
@@ -59,7 +59,7 @@ def test_information_is_the_inverse_of_their_covariance(case):
     model, columns = case
     rows, _ = dense(model.table, model.weight, columns)
     covariance = np.linalg.inv(rows.T @ rows)[-2:, -2:]
-    information = model.scores({}, columns).information
+    information = model.scores(columns).information
     assert information == pytest.approx(np.linalg.inv(covariance), rel=1e-6)
 
 
@@ -105,7 +105,7 @@ def test_a_column_that_is_added_comes_back_as_its_amount():
     beams = table(2, stops=20, each=150, hidden=lambda c: 0.01 * c["range_m"] * c["humidity"])
     column = (beams.covariates["range_m"] * beams.covariates["humidity"])[:, None]
     fit, theta = beams.projection(column).fitted(column)
-    sigma = score_test(fit.scores({}, column), np.arange(1)).sigma(1.0)
+    sigma = score_test(fit.scores(column), np.arange(1)).sigma(1.0)
     assert theta[0] > 0 and abs(theta[0] - 0.01) < 4 * sigma[0] < 0.004
     assert np.std(fit.left_m) < 1.05 * SIGMA
 
@@ -135,7 +135,7 @@ def test_leaving_out_stops_scatters_a_score_as_stops_do():
         beams = table(5, stops=25, each=80, scatter_m=scatter_m)
         column = (beams.covariates["temperature_c"] - 25)[:, None]
         model = beams.projection()
-        found = model.judged(score_test(model.scores({}, column), np.arange(1)), column)
+        found = model.judged(column)
         assert len(found.chances) == 2
         return float(found.chances[1].covariance[0, 0])
 
