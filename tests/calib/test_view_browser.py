@@ -166,16 +166,15 @@ def test_a_click_reads_the_point_that_it_meets(small):
 
 def test_stops_and_colours_are_chosen(small):
     with shown(small.folder) as (watched, page):
-        page_text = watched.page.locator("body")
-        assert "short" in page_text.inner_text() and page._stop.value == "L00P00"
+        watched.page.get_by_text("mm, short").wait_for()
+        assert page._stop.value == "L00P00"
         for label, option in (("Stop", "L01P01"), ("Colour", "incidence, deg")):
             watched.page.get_by_label(label, exact=True).click()
             watched.page.get_by_role("option", name=option, exact=True).click()
-        watched.page.get_by_text("deg", exact=False).first.wait_for()
-        watched.page.wait_for_timeout(1000)
-        assert page._stop.value == "L01P01" and "short" not in page_text.inner_text()
+        watched.page.get_by_text("mm, short").wait_for(state="hidden")
+        assert page._stop.value == "L01P01"
         count = len(page.stage.scene.points(0, "L01P01").inlier)
-        assert f"{count:,} beams" in page_text.inner_text()
+        watched.page.get_by_text(f"{count:,} beams").wait_for()
 
 
 @pytest.mark.parametrize("width", [1400, 700])

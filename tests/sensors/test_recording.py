@@ -1,7 +1,7 @@
 """Recordings: what is written is what is read, and what is wrong is named."""
 
 import shutil
-import time
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -279,13 +279,12 @@ def test_the_digest_changes_with_any_file_and_only_then(write):
     assert len({before, after, open_cart(folder).digest()}) == 3
 
 
-def test_recordings_by_an_independent_simulator_open_at_once_and_read_whole(shared, tmp_path):
+def test_recordings_by_an_independent_simulator_open_without_their_scans(shared, tmp_path):
     names = [f"joint_{i}" for i in range(1, 7)]
     bodies = ["base_markers", "mount_markers"]
     folder = shared / "recordings/known_nothing_hidden"
-    start = time.perf_counter()
-    recording = Recording.open(folder, names, bodies, rings=128)
-    assert time.perf_counter() - start < 0.5
+    with patch("sensors.recording.read_table", side_effect=AssertionError("a scan was read")):
+        recording = Recording.open(folder, names, bodies, rings=128)
     assert recording.joints.shape == (30, 6) and recording.has_scan.all()
     assert len(recording.targets.names) == 5 and list(recording.covariates) == [
         "temperature_c",
