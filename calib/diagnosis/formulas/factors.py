@@ -7,7 +7,7 @@ added is one thing.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -40,12 +40,14 @@ class Kind:
         cost: how much there is to it: what takes the place of what, where data cannot tell.
         free: how many of the constants, from the first, are to be found.
         scales: which of these are a scale, not a place.
+        edges: whether these are edges, of which values between two neighbours are one.
     """
 
     columns: tuple[str, ...]
     cost: float
     free: int = 0
     scales: tuple[int, ...] = ()
+    edges: bool = False
 
 
 # The 1 beside a line, a square and a logarithm lets the place of their zero be found.
@@ -62,9 +64,9 @@ KINDS = {
     "growth": Kind(("exp(({x} - {1}) / {0})",), 2.0, free=1, scales=(0,)),
     "wave": Kind(("sin(2 * pi * {x} / {0})", "cos(2 * pi * {x} / {0})"), 2.5, free=1, scales=(0,)),
     "harmonic": Kind(("sin({0} * {x})", "cos({0} * {x})"), 2.0),
-    "step": Kind(("{x} > {0}",), 2.0, free=1),
-    "window": Kind(("({x} > {0}) * ({x} < {1})",), 2.5, free=2),
-    "outside": Kind(("({x} < {0}) + ({x} > {1})",), 2.5, free=2),
+    "step": Kind(("{x} > {0}",), 2.0, free=1, edges=True),
+    "window": Kind(("({x} > {0}) * ({x} < {1})",), 2.5, free=2, edges=True),
+    "outside": Kind(("({x} < {0}) + ({x} > {1})",), 2.5, free=2, edges=True),
     "ramp": Kind(("maximum(0, {x} - {0}) / {1}",), 2.0, free=1),
     "ramp down": Kind(("maximum(0, {0} - {x}) / {1}",), 2.0, free=1),
     "bump": Kind(("exp(-(({x} - {0}) / {1})**2)",), 2.5, free=2, scales=(1,)),
@@ -97,7 +99,11 @@ class Factor:
     @property
     def texts(self) -> tuple[str, ...]:
         """Its columns as formulas."""
-        numbers = [f"{c:.6g}" for c in self.constants]
+        return self.written(())
+
+    def written(self, free: Sequence[str]) -> tuple[str, ...]:
+        """The same with these in place of its first constants."""
+        numbers = [*free, *(f"{c:.6g}" for c in self.constants[len(free) :])]
         found = (text.format(*numbers, x=self.covariate) for text in KINDS[self.kind].columns)
         return tuple(_plain(text, self.covariate) for text in found)
 
@@ -119,6 +125,16 @@ class Factor:
         kinds = KINDS[self.kind]
         found = [scale if i in kinds.scales else (low, high) for i in range(self.free)]
         return np.reshape(found, (self.free, 2))
+
+    def gaps(self, values: np.ndarray) -> np.ndarray:
+        """(free, 2) the values (N,) on both sides of each edge, between which it may be anywhere;
+        of other constants these themselves."""
+        found = np.repeat(np.reshape(self.constants[: self.free], (-1, 1)), 2, axis=1)
+        known = np.unique(values[np.isfinite(values)])
+        if not KINDS[self.kind].edges or len(known) < 2:
+            return found
+        after = np.clip(np.searchsorted(known, found[:, 0], side="right"), 1, len(known) - 1)
+        return np.stack([known[after - 1], known[after]], axis=1)
 
     def columns(self, covariates: Columns) -> np.ndarray:
         """(N, k), with 0 where there is no value."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from calib.diagnosis.formulas.factors import Factor, columns_of
 from calib.diagnosis.formulas.picture import picture_of
-from calib.diagnosis.formulas.pursuit import Form, Step, Term, refine
+from calib.diagnosis.formulas.pursuit import Form, Step, Term, refine, times
 from calib.diagnosis.formulas.table import Projection, Table
 from calib.diagnosis.score import GAUGE
 from calib.diagnosis.suggest import outward
@@ -49,6 +49,20 @@ class Part:
     def texts(self) -> tuple[str, ...]:
         """Its columns as formulas."""
         return tuple(self.term.texts[i] for i in self.at)
+
+    @property
+    def rows(self) -> list[tuple[str, ...]]:
+        """Of each column the texts of its factors, with ``@i@`` for the i-th constant found."""
+        every = (f"@{i}@" for i in count())
+        written = [f.written([next(every) for _ in range(f.free)]) for f in self.term.factors]
+        rows = list(product(*written))
+        return [rows[i] for i in self.at]
+
+    @property
+    def numbers(self) -> list[str]:
+        """The constants found, with their sigmas."""
+        pairs = zip(self.term.constants, self.constants_sigma, strict=True)
+        return [with_sigma(c, s) if s > 0.0 else f"{c:.6g}" for c, s in pairs]
 
 
 @dataclass(frozen=True)
@@ -143,7 +157,7 @@ def settled(table: Table, steps: Sequence[Step]) -> list[Formula]:
     plain = [_reduced(terms[i], kept[i]) for i in there]
     kept = [k for _, k in plain]
     # Without a column that was dropped, other constants are best.
-    terms = _refined(table, [t for t, _ in plain], kept)
+    terms = [_centred(t, table) for t in _refined(table, [t for t, _ in plain], kept)]
     return _grouped(table, terms, kept, [steps[i] for i in there])
 
 
@@ -158,6 +172,11 @@ def _refined(table: Table, terms: Sequence[Term], kept: Sequence[Sequence[int]])
         terms[i] = refine(beside, term, kept[i])
         columns[i] = terms[i].columns(table.covariates)[:, kept[i]]
     return terms
+
+
+def _centred(term: Term, table: Table) -> Term:
+    """A term with its edges midway between the values that they part."""
+    return term.at(term.gaps(table.covariates).mean(axis=1).tolist())
 
 
 def _grouped(
@@ -258,6 +277,9 @@ def _parts(
     sigma = beside.test(every).sigma(1.0)
     sigmas = np.split(sigma[: len(amount)], ends)
     others = np.split(sigma[len(amount) :], np.cumsum([s.shape[1] for s in slopes])[:-1])
+    # An edge is anywhere between its neighbours, by a uniform distribution (GUM 4.3.7).
+    gaps = [t.gaps(model.table.covariates) for t in terms]
+    others = [np.hypot(o, np.ptp(g, axis=1) / 12**0.5) for o, g in zip(others, gaps, strict=True)]
     return [
         Part(term=term, at=tuple(k), amount_m=a, sigma_m=s, constants_sigma=o)
         for term, k, a, s, o in zip(terms, kept, amounts, sigmas, others, strict=True)
@@ -284,25 +306,24 @@ def _ends(values: np.ndarray) -> tuple[float, float]:
 
 def _said(part: Part) -> str:
     """A term as people write it."""
-    return (
+    each = zip(part.rows, part.amount_m, part.sigma_m, strict=True)
+    says = (
         _shifted(part)
         or _turned(part)
-        or " ".join(
-            f"{_signed(amount, sigma)} mm * {bare(text)}"
-            for text, amount, sigma in zip(part.texts, part.amount_m, part.sigma_m, strict=True)
-        )
+        or " ".join(f"{_signed(amount, sigma)} mm * {_product(row)}" for row, amount, sigma in each)
     )
+    for i, number in enumerate(part.numbers):
+        says = says.replace(f"@{i}@", number)
+    return says.replace("- -", "+ ").replace("+ -", "- ")
 
 
 def _shifted(part: Part) -> str:
     """Of a line, or lines, whose zero is found too: two columns that differ by one line's text."""
-    lines = [f for f in part.term.factors if f.kind == "line"]
     if len(part.at) != 2:
         return ""
-    rows = list(product(*(f.texts for f in part.term.factors)))
-    long, short = (rows[i] for i in part.at)
+    long, short = part.rows
     differ = [i for i, (a, b) in enumerate(zip(long, short, strict=True)) if a != b]
-    if len(differ) != 1 or short[differ[0]] != "1" or part.term.factors[differ[0]] not in lines:
+    if len(differ) != 1 or short[differ[0]] != "1" or part.term.factors[differ[0]].kind != "line":
         return ""
     (i,) = differ
     line, ratio = part.term.factors[i], part.amount_m[1] / part.amount_m[0]
@@ -310,13 +331,12 @@ def _shifted(part: Part) -> str:
     relative = np.hypot(part.sigma_m[1], ratio * part.sigma_m[0]) / abs(part.amount_m[0])
     zero = with_sigma(middle - half * ratio, half * relative)
     texts = [f"({line.covariate} - {zero}) / {half:g}" if k == i else t for k, t in enumerate(long)]
-    product_ = " * ".join(bare(t) for t in texts if t != "1")
-    return f"{_signed(part.amount_m[0], part.sigma_m[0])} mm * {product_.replace('- -', '+ ')}"
+    return f"{_signed(part.amount_m[0], part.sigma_m[0])} mm * {_product(texts)}"
 
 
 def _turned(part: Part) -> str:
     """Of a sine and a cosine: an amplitude and a phase."""
-    texts = part.texts
+    texts = [times(row) for row in part.rows]
     if len(texts) != 2 or texts[0].replace(*PHASE) != texts[1] or texts[0].count(PHASE[0]) != 1:
         return ""
     a, b = part.amount_m
@@ -326,7 +346,12 @@ def _turned(part: Part) -> str:
     before, _, after = texts[0].partition(PHASE[0])
     inside, _, rest = after.partition(")")
     turned = f"{before}sin({inside} + {with_sigma(float(np.arctan2(b, a)), phase)}){rest}"
-    return f"{_signed(size, sigma)} mm * {bare(turned).replace('+ -', '- ')}"
+    return f"{_signed(size, sigma)} mm * {bare(turned)}"
+
+
+def _product(row: Sequence[str]) -> str:
+    """Factors as people write their product."""
+    return " * ".join(bare(text) for text in row if text != "1") or "1"
 
 
 def bare(text: str) -> str:

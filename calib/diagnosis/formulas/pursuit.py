@@ -57,7 +57,7 @@ class Term:
     @property
     def texts(self) -> tuple[str, ...]:
         """Its columns as formulas."""
-        return tuple(_times(texts) for texts in product(*(f.texts for f in self.factors)))
+        return tuple(times(texts) for texts in product(*(f.texts for f in self.factors)))
 
     @property
     def cost(self) -> float:
@@ -80,6 +80,14 @@ class Term:
     def columns(self, covariates: Columns) -> np.ndarray:
         """(N, k)."""
         return columns_of(self.texts, covariates)
+
+    def gaps(self, covariates: Columns) -> np.ndarray:
+        """(c, 2) as of `Factor.gaps`, among the beams where the other factors are not zero."""
+        there = [np.any(f.columns(covariates) != 0.0, axis=1) for f in self.factors]
+        every = np.ones_like(there[0])
+        seen = [np.all([every, *(t for t in there if t is not mine)], axis=0) for mine in there]
+        pairs = zip(self.factors, seen, strict=True)
+        return np.vstack([f.gaps(covariates[f.covariate][at]) for f, at in pairs])
 
 
 @dataclass(frozen=True)
@@ -348,7 +356,7 @@ def _evidence(statistic: float, dof: int) -> float:
     return -log_tail(statistic, dof) if dof else 0.0
 
 
-def _times(texts: Sequence[str]) -> str:
+def times(texts: Sequence[str]) -> str:
     """A product of formulas; ones are left out."""
     some = [text for text in texts if text != "1"]
     if len(some) < 2:

@@ -136,6 +136,20 @@ def test_sentences_read_like_physics():
     assert turned == "range = true + 5.00(7) mm * sin(3 * azimuth_rad + 0.927(14))"
 
 
+def test_constants_that_were_found_have_their_sigmas():
+    wave = replace(part([WAVE], [0, 1], [3.0, 4.0], 0.02), constants_sigma=np.array([0.03]))
+    assert formula(wave).says == (
+        "range = true + 5.00(7) mm * sin(2 * pi * ring / 7.50(3) + 0.927(14))"
+    )
+    bump = Factor("azimuth_rad", "bump", (-1.0, 0.5))
+    two = part([bump, WARM], [0], [2.0], 0.02)
+    two = replace(two, constants_sigma=np.array([0.02, 0.004]))
+    assert formula(two).says == (
+        "range = true + 2.00(4) mm * exp(-((azimuth_rad + 1.00(2)) / 0.500(4))**2)"
+        " * (temperature_c - 25) / 10"
+    )
+
+
 # The effect ---------------------------------------------------------------------------------------
 
 
@@ -225,6 +239,28 @@ def test_sigmas_cover():
     # A standard deviation of 40 is known to 11 %, a mean to 0.16.
     assert np.std(z, axis=0) == pytest.approx(np.ones(3), abs=0.35)
     assert np.mean(z, axis=0) == pytest.approx(np.zeros(3), abs=0.5)
+
+
+def test_an_edge_is_told_no_closer_than_the_values_beside_it():
+    """Errors of a window's edges in their sigmas, of 30 worlds; a ring's edge lies midway."""
+    edges, z = np.array([-1.0, 0.5]), []
+    start = Term((Factor("azimuth_rad", "window", (-1.2, 0.6)), Factor("ring", "step", (14.2,))))
+
+    def hidden(c):
+        inside = (c["azimuth_rad"] > edges[0]) & (c["azimuth_rad"] < edges[1])
+        return 0.03 * inside * (c["ring"] > 15)
+
+    for seed in range(30):
+        beams = table(300 + seed, stops=12, each=80, hidden=hidden)
+        (found,) = settled(beams, steps_of(beams, start))
+        (part,) = found.parts
+        z.append((np.array(part.term.constants[:2]) - edges) / part.constants_sigma[:2])
+        assert part.term.constants[2] == 15.5
+        assert part.constants_sigma[2] == pytest.approx(1 / 12**0.5, rel=0.05)
+        assert "(ring > 15.5(3))" in found.says
+    # Uniform errors are within 1.73 sigma; a few gaps are of beams that noise puts on a wrong side.
+    assert np.mean(np.abs(z) < 2) > 0.9
+    assert np.sqrt(np.mean(np.square(z))) < 1.3
 
 
 # The picture --------------------------------------------------------------------------------------
