@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import combinations
 
 import numpy as np
@@ -138,7 +139,9 @@ class Factor:
 
     def columns(self, covariates: Columns) -> np.ndarray:
         """(N, k), with 0 where there is no value."""
-        return columns_of(self.texts, covariates)
+        numbers = {f"c{i}": np.float64(f"{c:.6g}") for i, c in enumerate(self.constants)}
+        at = {"x": covariates[self.covariate], **numbers}
+        return _stacked([e.value(at.__getitem__) for e in _expressions(self.kind)], len(at["x"]))
 
     def at(self, constants: tuple[float, ...]) -> Factor:
         """The same with other free constants."""
@@ -147,8 +150,19 @@ class Factor:
 
 def columns_of(texts: tuple[str, ...], covariates: Columns) -> np.ndarray:
     """Columns (N, k) of formulas, with 0 where there is no value."""
-    rows = len(next(iter(covariates.values())))
     found = [Expression(t, "a finding").value(covariates.__getitem__) for t in texts]
+    return _stacked(found, len(next(iter(covariates.values()))))
+
+
+@cache
+def _expressions(kind: str) -> tuple[Expression, ...]:
+    """A kind's columns, of ``x`` and of constants ``c0``, ``c1``: parsed once."""
+    texts = (text.format("c0", "c1", x="x") for text in KINDS[kind].columns)
+    return tuple(Expression(text, "a finding") for text in texts)
+
+
+def _stacked(found: Sequence[np.ndarray], rows: int) -> np.ndarray:
+    """(N, k), with 0 where there is no value."""
     out = np.stack([np.broadcast_to(f, rows) for f in found], axis=1).astype(float)
     out[~np.isfinite(out)] = 0.0
     return out

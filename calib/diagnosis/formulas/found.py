@@ -13,8 +13,9 @@ import numpy as np
 
 from calib.diagnosis.formulas.factors import Factor, columns_of
 from calib.diagnosis.formulas.picture import picture_of
-from calib.diagnosis.formulas.pursuit import Form, Step, Term, refine, times
+from calib.diagnosis.formulas.pursuit import Form, Step
 from calib.diagnosis.formulas.table import Projection, Table
+from calib.diagnosis.formulas.terms import Term, refine, slopes, times
 from calib.diagnosis.score import GAUGE
 from calib.diagnosis.suggest import outward
 from calib.effects.own.formula import FormulaEffect
@@ -22,7 +23,6 @@ from calib.effects.own.formula import FormulaEffect
 # Sigmas from zero, below which a column of a term is left out again: of ten columns that are not
 # there, one in forty formulas keeps one.
 CLEAR = 3.0
-NUDGE = 0.01  # of a covariate's range, for the derivative by a constant
 WIDER = 3.0  # times the largest amplitude: the sigma that the prior of an amplitude has
 PASSES = 2  # of refining every term beside the others
 PHASE = ("sin(", "cos(")
@@ -222,7 +222,7 @@ def _kept(
         beside, theta = model.fitted(some)
         amounts = np.split(theta, np.cumsum([len(k) for k in kept])[:-1])
         each = zip(terms, kept, amounts, strict=True)
-        every = np.hstack([some, *(_slopes(model.table, *one) for one in each)])
+        every = np.hstack([some, *(slopes(model.table.covariates, *one) for one in each)])
         sigma = beside.test(every).sigma(1.0)[: len(theta)]
         t = np.where(sigma > 0.0, np.abs(theta) / np.maximum(sigma, 1e-300), 0.0)  # 0: not seen
         t[_taken_on(model, some)] = 0.0
@@ -272,11 +272,12 @@ def _parts(
     beside, amount = model.fitted(np.hstack(columns))
     ends = np.cumsum([c.shape[1] for c in columns])[:-1]
     amounts = np.split(amount, ends)
-    slopes = [_slopes(model.table, *each) for each in zip(terms, kept, amounts, strict=True)]
-    every = np.hstack([*columns, *slopes])
+    each = zip(terms, kept, amounts, strict=True)
+    along = [slopes(model.table.covariates, *one) for one in each]
+    every = np.hstack([*columns, *along])
     sigma = beside.test(every).sigma(1.0)
     sigmas = np.split(sigma[: len(amount)], ends)
-    others = np.split(sigma[len(amount) :], np.cumsum([s.shape[1] for s in slopes])[:-1])
+    others = np.split(sigma[len(amount) :], np.cumsum([s.shape[1] for s in along])[:-1])
     # An edge is anywhere between its neighbours, by a uniform distribution (GUM 4.3.7).
     gaps = [t.gaps(model.table.covariates) for t in terms]
     others = [np.hypot(o, np.ptp(g, axis=1) / 12**0.5) for o, g in zip(others, gaps, strict=True)]
@@ -284,20 +285,6 @@ def _parts(
         Part(term=term, at=tuple(k), amount_m=a, sigma_m=s, constants_sigma=o)
         for term, k, a, s, o in zip(terms, kept, amounts, sigmas, others, strict=True)
     ]
-
-
-def _slopes(table: Table, term: Term, kept: Sequence[int], amount: np.ndarray) -> np.ndarray:
-    """Derivative (N, c) of a term by its constants."""
-    ranges = [np.ptp(table.covariates[f.covariate]) for f in term.factors for _ in range(f.free)]
-    out = []
-    for i, wide in enumerate(ranges):
-        sides = []
-        for by in (NUDGE * wide, -NUDGE * wide):
-            constants = list(term.constants)
-            constants[i] += by
-            sides.append(term.at(constants).columns(table.covariates)[:, kept] @ amount)
-        out.append((sides[0] - sides[1]) / (2 * NUDGE * wide))
-    return np.stack(out, axis=1) if out else np.zeros((len(table), 0))
 
 
 def _ends(values: np.ndarray) -> tuple[float, float]:

@@ -14,20 +14,17 @@ from itertools import product
 
 import numpy as np
 from scipy import special
-from scipy.optimize import minimize
 
 from calib.blunders.chance import after_looks, at_least, log_tail
-from calib.diagnosis.formulas.factors import Columns, Factor, columns_of, factors
+from calib.diagnosis.formulas.factors import Factor, factors
 from calib.diagnosis.formulas.smooths import Bases, Smooth, screen_smooths
 from calib.diagnosis.formulas.table import Projection, Table
+from calib.diagnosis.formulas.terms import Term, refine
 from calib.diagnosis.score import Test
 from calib.solve.fit import Progress
 
 KEPT = 4  # factors of each covariate whose products are tried
 REFINED = 5  # products whose constants are refined
-TRIED = 30  # evaluations for each constant, when they are refined together
-CLOSER = (0.04, 0.04, 0.01, 0.0025)  # of a covariate's range, between places that are tried
-BESIDE = (0, -4, -3, -2, -1, 1, 2, 3, 4)  # which of them; where none is better, it stays
 APART = 2.0  # sigmas by which stops must prefer a form for it to be told from a simpler one
 MOST_TERMS = 4
 TRIES = 3  # smooth functions that are judged before nothing is said to be there
@@ -38,56 +35,6 @@ AS = {"ring": "elevation_rad"}  # what goes along with another covariate
 COVERS = 0.9  # of what a form explains, that a smooth function must for the form to be one of them
 SAME = 1e-6  # of what two forms explain: one is the other and what the model takes on
 AT_ONCE = 400  # columns: bounds the memory
-
-
-@dataclass(frozen=True)
-class Term:
-    """A product of functions of different covariates; its columns are all products of theirs.
-
-    Args:
-        factors: these.
-    """
-
-    factors: tuple[Factor, ...]
-
-    @property
-    def covariates(self) -> tuple[str, ...]:
-        return tuple(f.covariate for f in self.factors)
-
-    @property
-    def texts(self) -> tuple[str, ...]:
-        """Its columns as formulas."""
-        return tuple(times(texts) for texts in product(*(f.texts for f in self.factors)))
-
-    @property
-    def cost(self) -> float:
-        """How much there is to it."""
-        return sum(f.cost for f in self.factors)
-
-    @property
-    def constants(self) -> tuple[float, ...]:
-        """Those that are to be found."""
-        return tuple(c for f in self.factors for c in f.constants[: f.free])
-
-    def at(self, constants: Sequence[float]) -> Term:
-        """The same with other constants."""
-        left, out = list(constants), []
-        for f in self.factors:
-            out.append(f.at(tuple(left[: f.free])))
-            del left[: f.free]
-        return Term(tuple(out))
-
-    def columns(self, covariates: Columns) -> np.ndarray:
-        """(N, k)."""
-        return columns_of(self.texts, covariates)
-
-    def gaps(self, covariates: Columns) -> np.ndarray:
-        """(c, 2) as of `Factor.gaps`, among the beams where the other factors are not zero."""
-        there = [np.any(f.columns(covariates) != 0.0, axis=1) for f in self.factors]
-        every = np.ones_like(there[0])
-        seen = [np.all([every, *(t for t in there if t is not mine)], axis=0) for mine in there]
-        pairs = zip(self.factors, seen, strict=True)
-        return np.vstack([f.gaps(covariates[f.covariate][at]) for f, at in pairs])
 
 
 @dataclass(frozen=True)
@@ -240,21 +187,19 @@ def _by_chance(fitted: Projection, form: Form, smooth: Smooth) -> float:
 
 def form(projection: Projection, term: Term, tried: int) -> Form:
     """A term with what it leaves of each stop."""
-    table = projection.table
-    columns = term.columns(table.covariates)
+    columns = term.columns(projection.table.covariates)
     (statistic,), (dof,) = projection.explained([columns])
+    return Form(term, float(statistic), int(dof), left=_left(projection, columns), tried=tried)
+
+
+def _left(projection: Projection, columns: np.ndarray) -> np.ndarray:
+    """(K,) what columns (N, k) beside the model leave of each stop's chi-square."""
     kept, _ = projection.off(columns)
     root = np.sqrt(projection.weight)
     size = np.maximum(np.sqrt(np.square(root[:, None] * columns).sum(axis=0)), 1e-300)
     theta = np.linalg.lstsq(root[:, None] * kept / size, root * projection.left_m, rcond=1e-3)[0]
     left = np.square(root * (projection.left_m - kept @ (theta / size)))
-    return Form(
-        term=term,
-        statistic=float(statistic),
-        dof=int(dof),
-        left=np.bincount(table.stop, left),
-        tried=tried,
-    )
+    return np.bincount(projection.table.stop, left)
 
 
 def simplest(found: Sequence[Form]) -> tuple[Form, list[Form]]:
@@ -312,53 +257,5 @@ def _explained(
     return tuple(np.concatenate(each) for each in zip(*found, strict=True))
 
 
-def refine(projection: Projection, term: Term, kept: Sequence[int] = ()) -> Term:
-    """A term with those constants that explain most, from where they are: places beside each are
-    tried, ever closer, as where an edge is has no slope; then all together (Nelder and Mead).
-
-    Args:
-        projection: the table, and the model fitted to it.
-        term: with the constants to start from.
-        kept: which of its columns count; all where there are none.
-    """
-    kept = list(kept) or list(range(len(term.texts)))
-    if not term.constants:
-        return term
-    covariates = projection.table.covariates
-    ends = np.concatenate([f.bounds(covariates[f.covariate]) for f in term.factors])
-    wide = [np.ptp(covariates[f.covariate]) for f in term.factors for _ in range(f.free)]
-    for size in CLOSER:
-        for i in range(len(wide)):
-            places = np.clip(term.constants[i] + size * wide[i] * np.array(BESIDE), *ends[i])
-            tried = [term.at(_with(term.constants, i, place)) for place in places.tolist()]
-            explained, _ = projection.explained([t.columns(covariates)[:, kept] for t in tried])
-            term = tried[int(np.argmax(explained))]
-    start, scale = np.array(term.constants), CLOSER[-1] * np.array(wide)
-
-    def at(x: np.ndarray) -> Term:
-        return term.at(np.clip(start + scale * x, *ends.T).tolist())
-
-    def worse(x: np.ndarray) -> float:
-        columns = at(x).columns(covariates)[:, kept]
-        return -float(projection.explained([columns])[0][0])
-
-    simplex = np.vstack([np.zeros(len(start)), np.eye(len(start))])
-    options = {"initial_simplex": simplex, "maxfev": TRIED * len(start), "xatol": 1e-2}
-    found = minimize(worse, simplex[0], method="Nelder-Mead", options=options)
-    return at(found.x) if found.fun < worse(simplex[0]) else term
-
-
-def _with(constants: Sequence[float], i: int, value: float) -> list[float]:
-    return [value if k == i else c for k, c in enumerate(constants)]
-
-
 def _evidence(statistic: float, dof: int) -> float:
     return -log_tail(statistic, dof) if dof else 0.0
-
-
-def times(texts: Sequence[str]) -> str:
-    """A product of formulas; ones are left out."""
-    some = [text for text in texts if text != "1"]
-    if len(some) < 2:
-        return some[0] if some else "1"
-    return " * ".join(f"({text})" for text in some)

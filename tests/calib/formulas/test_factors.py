@@ -5,7 +5,7 @@ import pytest
 import yaml
 
 from calib.diagnosis.formulas.factors import KINDS, Factor, columns_of, factors
-from calib.diagnosis.formulas.pursuit import Term
+from calib.diagnosis.formulas.terms import Term
 from calib.effects import View
 from calib.effects.own.expression import Expression
 from calib.effects.own.formula import FormulaEffect

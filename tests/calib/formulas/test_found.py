@@ -10,7 +10,8 @@ import pytest
 from calib.diagnosis.formulas.factors import Factor
 from calib.diagnosis.formulas.found import Formula, Part, settled, with_sigma
 from calib.diagnosis.formulas.picture import picture_of
-from calib.diagnosis.formulas.pursuit import Step, Term, form
+from calib.diagnosis.formulas.pursuit import Step, form
+from calib.diagnosis.formulas.terms import Term
 from calib.effects import View
 from calib.effects.own.expression import Expression
 from calib.effects.own.formula import FormulaEffect

@@ -8,7 +8,8 @@ import pytest
 
 from calib.diagnosis.formulas.factors import Factor
 from calib.diagnosis.formulas.found import Formula, Part, settled
-from calib.diagnosis.formulas.pursuit import Form, Step, Term, form, pursue, refine, simplest
+from calib.diagnosis.formulas.pursuit import Form, Step, form, pursue, simplest
+from calib.diagnosis.formulas.terms import Term, refine
 
 from .made import table
 
