@@ -54,6 +54,7 @@ class Kind:
 # The 1 beside a line, a square and a logarithm lets the place of their zero be found.
 KINDS = {
     "line": Kind(("({x} - {0}) / {1}", "1"), 1.0),
+    "proportional": Kind(("{x} / {0}",), 0.9),
     "square": Kind(("(({x} - {0}) / {1})**2", "({x} - {0}) / {1}", "1"), 2.5),
     "logarithm": Kind(("log({x} / {0})", "1"), 1.5),
     "saturation": Kind(("log(1 + {x} / {0})",), 2.0, free=1, scales=(0,)),
@@ -154,6 +155,14 @@ def columns_of(texts: tuple[str, ...], covariates: Columns) -> np.ndarray:
     return _stacked(found, len(next(iter(covariates.values()))))
 
 
+def product_of(columns: Sequence[np.ndarray]) -> np.ndarray:
+    """(N, k) all products of columns (N, q) of several, those of the last side by side."""
+    out = columns[0]
+    for each in columns[1:]:
+        out = (out[:, :, None] * each[:, None, :]).reshape(len(out), -1)
+    return out
+
+
 @cache
 def _expressions(kind: str) -> tuple[Expression, ...]:
     """A kind's columns, of ``x`` and of constants ``c0``, ``c1``: parsed once."""
@@ -171,6 +180,7 @@ def _stacked(found: Sequence[np.ndarray], rows: int) -> np.ndarray:
 def _plain(text: str, x: str) -> str:
     """A formula without what changes nothing: a zero taken off, a factor of one, two signs."""
     text = text.replace(f"({x} - -0)", x).replace(f"({x} - 0)", x)
+    text = x if text == f"{x} / 1" else text
     return text.replace(f"(1 * {x})", f"({x})").replace("- -", "+ ")
 
 
@@ -210,6 +220,7 @@ def _smooth(name: str, known: np.ndarray, levels: int) -> Iterator[Factor]:
         yield Factor(name, "reciprocal", (scale,))
         yield from (Factor(name, "power", (scale, p)) for p in (2.0, 3.0))
     if low >= 0.0 and high > WIDE * low:
+        yield Factor(name, "proportional", (_rounded(high, wide),))
         sorts = ("saturation", "share")
         yield from (Factor(name, sort, (share * wide,)) for sort in sorts for share in SCALES)
     for share in SCALES:

@@ -11,18 +11,15 @@ from typing import Any
 
 import numpy as np
 
-from calib.diagnosis.formulas.factors import Factor, columns_of
+from calib.diagnosis.formulas.factors import columns_of
+from calib.diagnosis.formulas.needed import needed, reduced
 from calib.diagnosis.formulas.picture import picture_of
 from calib.diagnosis.formulas.pursuit import Form, Step
 from calib.diagnosis.formulas.table import Projection, Table
 from calib.diagnosis.formulas.terms import Term, refine, slopes, times
-from calib.diagnosis.score import GAUGE
 from calib.diagnosis.suggest import outward
 from calib.effects.own.formula import FormulaEffect
 
-# Sigmas from zero, below which a column of a term is left out again: of ten columns that are not
-# there, one in forty formulas keeps one.
-CLEAR = 3.0
 WIDER = 3.0  # times the largest amplitude: the sigma that the prior of an amplitude has
 PASSES = 2  # of refining every term beside the others
 PHASE = ("sin(", "cos(")
@@ -150,11 +147,11 @@ def settled(table: Table, steps: Sequence[Step]) -> list[Formula]:
     for _ in range(PASSES):
         terms = _refined(table, terms, kept)
     columns = [t.columns(table.covariates) for t in terms]
-    kept = _kept(table.projection(np.hstack(columns)), terms, columns)
+    kept = needed(table.projection(np.hstack(columns)), terms, columns)
     there = [i for i, k in enumerate(kept) if k]
     if not there:
         return []
-    plain = [_reduced(terms[i], kept[i]) for i in there]
+    plain = [reduced(terms[i], kept[i]) for i in there]
     kept = [k for _, k in plain]
     # Without a column that was dropped, other constants are best.
     terms = [_centred(t, table) for t in _refined(table, [t for t, _ in plain], kept)]
@@ -206,59 +203,6 @@ def _grouped(
             )
         )
     return out
-
-
-def _kept(
-    model: Projection, terms: Sequence[Term], columns: Sequence[np.ndarray]
-) -> list[list[int]]:
-    """Of each term the columns that the data need: not those that the model takes on, nor those
-    that chance, or other constants, explain."""
-    kept = [list(range(c.shape[1])) for c in columns]
-    while True:
-        some = np.hstack([c[:, k] for c, k in zip(columns, kept, strict=True)])
-        owner = [(i, c) for i, k in enumerate(kept) for c in k]
-        if not owner:
-            return kept
-        beside, theta = model.fitted(some)
-        amounts = np.split(theta, np.cumsum([len(k) for k in kept])[:-1])
-        each = zip(terms, kept, amounts, strict=True)
-        every = np.hstack([some, *(slopes(model.table.covariates, *one) for one in each)])
-        sigma = beside.test(every).sigma(1.0)[: len(theta)]
-        t = np.where(sigma > 0.0, np.abs(theta) / np.maximum(sigma, 1e-300), 0.0)  # 0: not seen
-        t[_taken_on(model, some)] = 0.0
-        worst = int(np.argmin(t))
-        if t[worst] > CLEAR:
-            return kept
-        i, c = owner[worst]
-        kept[i].remove(c)
-
-
-def _reduced(term: Term, kept: Sequence[int]) -> tuple[Term, list[int]]:
-    """A term without factors that none of its kept columns has, squares of which but the line is
-    kept as lines; and which columns of it are kept."""
-    rows = [list(product(*(f.texts for f in term.factors)))[i] for i in kept]
-    factors, at = [], []
-    for i, each in enumerate(term.factors):
-        texts = {row[i] for row in rows}
-        if texts == {"1"}:
-            continue
-        if each.kind == "square" and each.texts[0] not in texts:
-            each = Factor(each.covariate, "line", each.constants)
-        factors.append(each)
-        at.append(i)
-    if not factors:
-        return term, list(kept)
-    every = list(product(*(f.texts for f in factors)))
-    return Term(tuple(factors)), [every.index(tuple(row[i] for i in at)) for row in rows]
-
-
-def _taken_on(model: Projection, columns: np.ndarray) -> np.ndarray:
-    """Which columns (N, k) the model, or those before, can take on."""
-    kept, _ = model.off(columns)
-    root = np.sqrt(model.weight)[:, None]
-    size = np.sqrt(np.square(root * columns).sum(axis=0))
-    own = np.abs(np.diag(np.linalg.qr(root * kept / np.maximum(size, 1e-300), mode="r")))
-    return own < np.sqrt(GAUGE)
 
 
 def _parts(

@@ -13,6 +13,8 @@ from itertools import combinations
 
 import numpy as np
 
+from calib.blunders.chance import log_tail
+from calib.diagnosis.formulas.factors import product_of
 from calib.diagnosis.formulas.table import Projection, Table
 from calib.diagnosis.score import Scores, Test, test
 from calib.diagnosis.screen import by_rank, looked
@@ -20,10 +22,11 @@ from calib.diagnosis.screen import by_rank, looked
 # Knots of a function of one covariate, of each of two and of three. A pair of 5 x 5 sees what turns
 # three times over its range; finer things are found alone or as formulas.
 KNOTS = {1: 12, 2: 5, 3: 3}
-TURN_KNOTS = {1: 24, 2: 8, 3: 4}  # of azimuth, evenly round
+TURN_KNOTS = {1: 24, 2: 8, 3: 6}  # of azimuth, evenly round: 4 would not see two waves in a turn
 STOPS_A_KNOT = 5  # of columns of the stops, as of bins: with fewer, tests say nothing
 FEW = 8  # values of a column, up to which each is a class of its own
-MOST_THIRDS = 2  # pairs to which a third covariate is tried
+MOST_THIRDS = 2  # pairs to which a third covariate is tried; also threes, by their product alone
+AT_ONCE = 200  # of threes: bounds the memory
 MOST_CLASSES = 6  # of a label, those of most beams
 PATTERN = 4  # rings after which electronics repeat: chips of 4, 8 and 16 channels
 
@@ -64,14 +67,11 @@ class Bases:
 
     def of(self, covariates: Sequence[str], together: int = 0) -> np.ndarray:
         """(N, K) columns of a function of some covariates together, or of so many."""
-        out = np.ones((len(self.table), 1))
-        for name in covariates:
-            key = name, together or len(covariates)
+        keys = [(name, together or len(covariates)) for name in covariates]
+        for key in keys:
             if key not in self._made:
                 self._made[key] = self._one(*key)
-            mine = self._made[key]
-            out = (out[:, :, None] * mine[:, None, :]).reshape(len(out), -1)
-        return out
+        return product_of([np.ones((len(self.table), 1)), *(self._made[key] for key in keys)])
 
     def _one(self, name: str, together: int) -> np.ndarray:
         """(N, K) columns of one covariate beside others."""
@@ -146,11 +146,45 @@ def screen_smooths(
         for n in names
         if n not in pair and "label" not in (n, *pair)
     }
-    found |= dict(_tested(projection, bases, list(thirds), progress))
+    threes, tried = _threes(projection, bases, names, points)
+    found |= dict(_tested(projection, bases, list(thirds | dict.fromkeys(threes)), progress))
     drawn = [chance for _, chance in found.values()]
     looks = looked(np.min(drawn, axis=0)) if drawn else 1.0
-    every = [Smooth(s, t, looks, t.evidence(common)) for s, (t, _) in found.items()]
+    every = [
+        # Of threes that were chosen by their products, all that there are have been looked at.
+        Smooth(s, t, looks + tried * (s in threes and s not in thirds), t.evidence(common))
+        for s, (t, _) in found.items()
+    ]
     return sorted(every, key=lambda s: -s.evidence)
+
+
+def _threes(
+    projection: Projection, bases: Bases, names: Sequence[str], points: Sequence[str]
+) -> tuple[list[tuple[str, ...]], int]:
+    """The three covariates whose product alone explains most, as may be where no two of them
+    together explain anything, and the next; and of how many."""
+    plain = [n for n in names if n != "label"]
+    sets = [s for s in combinations(plain, 3) if set(s) & set(points)]
+    if not sets:
+        return [], 0
+    lines = {n: _lines(n, bases.table.covariates[n]) for n in plain}
+    explained = []
+    for i in range(0, len(sets), AT_ONCE):
+        some = [product_of([lines[n] for n in s]) for s in sets[i : i + AT_ONCE]]
+        statistic, dof = projection.explained(some)
+        explained += [-log_tail(x, d) if d else 0.0 for x, d in zip(statistic, dof, strict=True)]
+    best = np.argsort(-np.array(explained), kind="stable")[:MOST_THIRDS]
+    return [sets[i] for i in best], len(sets)
+
+
+def _lines(name: str, values: np.ndarray) -> np.ndarray:
+    """(N, 1) a line with a mean of zero; of azimuth the first two harmonics."""
+    if name == "azimuth_rad":
+        turns = [f(m * values) for m in (1, 2) for f in (np.sin, np.cos)]
+        columns = np.stack(turns, axis=1)
+    else:
+        columns = ((values - np.nanmean(values)) / np.nanstd(values))[:, None]
+    return np.nan_to_num(columns)
 
 
 def _tested(

@@ -16,6 +16,7 @@ PI = np.pi
 FORMS = {
     "line": ((0.9, 0.5), lambda x, a, b: [(x - a) / b, 1]),
     "square": ((0.9, 0.5), lambda x, a, b: [np.square((x - a) / b), (x - a) / b, 1]),
+    "proportional": ((0.7,), lambda x, a: [x / a]),
     "logarithm": ((0.7,), lambda x, a: [np.log(x) - np.log(a), 1]),
     "root": ((0.7,), lambda x, a: [(x / a) ** 0.5]),
     "power": ((0.7, 3.0), lambda x, a, p: [np.exp(p * np.log(x / a))]),
@@ -45,6 +46,20 @@ FORMS_OF_RINGS = {
     "one of": ((4.0, 3.0), lambda x, n, k: [np.isin(x, [3, 7])]),
     "class": ((5.0,), lambda x, k: [np.isin(x, [5])]),
 }
+
+
+@pytest.mark.parametrize("name", ["range_m", "azimuth_rad", "ring", "temperature_c"])
+def test_columns_are_what_the_texts_say(name):
+    """Those that are fitted, from constants, and those that a file has, from text."""
+    rng = np.random.default_rng(0)
+    low = -3.0 if name == "azimuth_rad" else 0.0
+    values = np.round(rng.uniform(low, 30.0, 500)) if name == "ring" else rng.uniform(low, 3, 500)
+    values[::50] = np.nan
+    each = factors(name, values, 500)
+    assert len(each) > 40
+    for one in each:
+        same = columns_of(one.texts, {name: values})
+        assert one.columns({name: values}) == pytest.approx(same, abs=1e-9), one
 
 
 def stacked(columns: list, rows: int) -> np.ndarray:

@@ -49,6 +49,23 @@ PLANTED = {
         {"ring", "range_m"},
     ),
     "a step": (lambda c: 3e-3 * (c["incidence_rad"] > 0.8), {"incidence_rad"}),
+    # Whose average over any of the three is nothing.
+    "three together": (
+        lambda c: (
+            4e-3
+            * np.sin(2 * c["azimuth_rad"])
+            * (c["temperature_c"] - 25)
+            / 10
+            * (c["intensity"] - 0.525)
+            / 0.5
+        ),
+        {"azimuth_rad", "temperature_c", "intensity"},
+    ),
+    # Whose scale and amount can hardly be told apart, and which is there all the same.
+    "through zero": (
+        lambda c: 3e-3 * (c["temperature_c"] - 25) / 10 * np.log(c["range_m"] / 5) * c["intensity"],
+        {"range_m", "temperature_c", "intensity"},
+    ),
 }
 
 
@@ -121,8 +138,17 @@ def kinds(formula):
         ("a decay", {("range_m", "decay")}),
         ("a wave", {("range_m", "wave")}),
         ("a class times a line", {("label", "class"), ("incidence_rad", "line")}),
-        ("parity of rings times a line", {("ring", "every other"), ("range_m", "line")}),
+        # Where the line is zero is what the rings' own zeros take on.
+        ("parity of rings times a line", {("ring", "every other"), ("range_m", "proportional")}),
         ("a step", {("incidence_rad", "step")}),
+        (
+            "three together",
+            {("azimuth_rad", "harmonic"), ("temperature_c", "line"), ("intensity", "line")},
+        ),
+        (
+            "through zero",
+            {("range_m", "logarithm"), ("temperature_c", "line"), ("intensity", "proportional")},
+        ),
     ],
 )
 def test_the_form_is_that_which_was_planted(found, name, expected):
