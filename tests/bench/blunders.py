@@ -48,7 +48,7 @@ QUICK = (
     "rows of zeros where nothing was seen",
     "quaternions of either sign",
 )
-LIMIT_S = 20  # CPU, of a command; a good fit takes 2 s
+LIMIT_S = 60  # CPU, of a command; a good fit takes 2 s, a diagnosis that finds a formula 20
 WORST = 5  # estimates that are kept of a case
 
 

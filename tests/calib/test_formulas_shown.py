@@ -48,9 +48,10 @@ def formula(*covariates, **changes):
     picture = {
         "covariates": list(covariates),
         "edges": edges,
-        "measured_mm": (value + left).tolist(),
-        "formula_mm": value.tolist(),
-        "left_mm": left.tolist(),
+        "unit": "mm",
+        "measured": (value + left).tolist(),
+        "formula": value.tolist(),
+        "left": left.tolist(),
     }
     return {
         "covariates": list(covariates),
@@ -87,18 +88,18 @@ def test_bins_hold_the_weighted_means_of_their_beams():
     assert edges[[0, -1]] == pytest.approx([x.min(), x.max()])
     inside = (x > edges[7]) & (x < edges[8]) & (y == 3)
     assert inside.sum() > 20
-    for key, of in (("measured_mm", left + value), ("formula_mm", value), ("left_mm", left)):
+    for key, of in (("measured", left + value), ("formula", value), ("left", left)):
         expected = 1e3 * (weight[inside] * of[inside]).sum() / weight[inside].sum()
         assert found[key][7][3] == pytest.approx(expected)
     single = picture_of(beams, ["ring"], value, fit)
     expected = 1e3 * np.average(left[y == 2], weights=weight[y == 2])
-    assert single["left_mm"][2] == pytest.approx(expected)
+    assert single["left"][2] == pytest.approx(expected)
 
 
 def test_bins_with_hardly_a_beam_are_empty():
     beams = Beams(ring=np.array([0.0, 0.0, 0.0, 0.0, 1.0]))
     fit = SimpleNamespace(weight=np.ones(5), left_m=np.ones(5))
-    assert np.isnan(picture_of(beams, ["ring"], np.ones(5), fit)["left_mm"]).tolist() == [0, 1]
+    assert np.isnan(picture_of(beams, ["ring"], np.ones(5), fit)["left"]).tolist() == [0, 1]
 
 
 def test_three_maps_stand_on_one_scale_in_the_units_of_people():
@@ -121,7 +122,7 @@ def test_three_maps_stand_on_one_scale_in_the_units_of_people():
 
 
 def test_one_column_is_a_plot_with_the_curve_and_what_is_left_on_the_same_scale():
-    (chart,) = charts_of({"unexplained": [formula("temperature_c", measured_mm=[-5, -5, 9, 5])]})
+    (chart,) = charts_of({"unexplained": [formula("temperature_c", measured=[-5, -5, 9, 5])]})
     figure = chart.figure()
     top, bottom = figure.axes
     assert top.get_ylim() == bottom.get_ylim() and top.get_ylim()[1] > 9
@@ -143,8 +144,8 @@ def test_a_third_column_is_said_to_be_averaged_over():
     [
         {"edges": [[0.0, 1.0]]},
         {"edges": [[0.0, 2.0, 1.0, 3.0, 4.0]]},
-        {"left_mm": "none"},
-        {"formula_mm": [[1.0, 2.0, 3.0, 4.0]]},
+        {"left": "none"},
+        {"formula": [[1.0, 2.0, 3.0, 4.0]]},
         {"covariates": []},
     ],
 )

@@ -2,25 +2,47 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import numpy as np
+
 from calib.blunders.chance import LEVELS
-from calib.diagnosis.formulas.found import Formula, settled
-from calib.diagnosis.formulas.pursuit import pursue
-from calib.diagnosis.formulas.table import Table
-from calib.solve.estimate import Estimate
+from calib.diagnosis.formulas.arm import joint_tables
+from calib.diagnosis.formulas.found import JOINT, RANGE, Formula, settled
+from calib.diagnosis.formulas.pursuit import Step, pursue
+from calib.diagnosis.formulas.table import Projection, Table
+from calib.diagnosis.stand import Stand
 from calib.solve.fit import Progress
 
 __all__ = ["Formula", "find"]
 
 
-def find(estimate: Estimate, progress: Progress) -> list[Formula]:
-    """Formulas of what ranges do beyond a fit, strongest first; none where chance explains it all.
+def find(stand: Stand, progress: Progress) -> list[Formula]:
+    """Formulas of what ranges do beyond a fit, strongest first; without scans, of what that joint
+    does which explains most. None where chance explains it all.
 
     Args:
-        estimate: a fit; without scans nothing is found.
+        stand: a model, fitted.
         progress: as of `fit.solve`.
     """
-    if not estimate.scans:
+    if stand.estimate.scans:
+        table = Table.of(
+            stand.estimate, lambda done, total: progress("reading residuals", done, total)
+        )
+        tables = [(RANGE, table)]
+    else:
+        tables = [(JOINT + name, table) for name, table in joint_tables(stand)]
+    alpha = LEVELS["structure"] / max(len(tables), 1)
+    pursued = [(site, table, pursue(table, alpha, progress)) for site, table in tables]
+    there = [each for each in pursued if each[2]]
+    if not there:
         return []
-    table = Table.of(estimate, lambda done, total: progress("reading residuals", done, total))
-    steps = pursue(table, LEVELS["structure"], progress)
-    return settled(table, steps) if steps else []
+    site, table, steps = min(there, key=_left)
+    return settled(table, steps, site)
+
+
+def _left(pursued: tuple[str, Table, Sequence[Step]]) -> float:
+    """Chi-square of all that was measured, beside the terms found of a site."""
+    _, table, steps = pursued
+    columns = np.hstack([step.form.term.columns(table.covariates) for step in steps])
+    return Projection.of(table, table.sigma_m**-2.0).fitted(columns)[0].chi2

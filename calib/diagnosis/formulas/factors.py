@@ -184,13 +184,14 @@ def _plain(text: str, x: str) -> str:
     return text.replace(f"(1 * {x})", f"({x})").replace("- -", "+ ")
 
 
-def factors(name: str, values: np.ndarray, levels: int) -> list[Factor]:
+def factors(name: str, values: np.ndarray, levels: int, angle: bool = False) -> list[Factor]:
     """All that are tried first of a covariate.
 
     Args:
         name: the covariate.
         values: (N,) of it.
         levels: how many values of it may be told apart: of a column of the stops, the stops.
+        angle: whether it goes round, as azimuth does, and has harmonics.
     """
     known = values[np.isfinite(values)]
     distinct, count = np.unique(known, return_counts=True)
@@ -199,7 +200,7 @@ def factors(name: str, values: np.ndarray, levels: int) -> list[Factor]:
         return [Factor(name, "class", (float(k),)) for k in often]
     if len(distinct) < FEWEST_VALUES:
         return [Factor(name, "step", (float(distinct.mean()),))] if len(distinct) > 1 else []
-    out = [*_smooth(name, known, levels), *_sharp(name, known, distinct, levels)]
+    out = [*_smooth(name, known, levels, angle), *_sharp(name, known, distinct, levels)]
     if name == "ring":
         out.append(Factor(name, "every other"))
         out += [Factor(name, "block", (size,)) for size in BLOCKS]
@@ -207,7 +208,7 @@ def factors(name: str, values: np.ndarray, levels: int) -> list[Factor]:
     return out
 
 
-def _smooth(name: str, known: np.ndarray, levels: int) -> Iterator[Factor]:
+def _smooth(name: str, known: np.ndarray, levels: int, angle: bool) -> Iterator[Factor]:
     low, high = float(known.min()), float(known.max())
     wide, middle = high - low, _rounded((low + high) / 2, (high - low) / 2)
     half = _rounded(wide / 2, wide / 2)
@@ -231,7 +232,7 @@ def _smooth(name: str, known: np.ndarray, levels: int) -> Iterator[Factor]:
         yield from (Factor(name, sort) for sort in sorts)
     elif name == "elevation_rad":
         yield from (Factor(name, sort) for sort in ("tangent", "sine", "cosine"))
-    if name == "azimuth_rad" or name.startswith("joint"):
+    if angle or name == "azimuth_rad":
         orders = min(ORDERS, max(1, levels // A_PERIOD))
         yield from (Factor(name, "harmonic", (float(m),)) for m in range(1, orders + 1))
     else:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import count, product
 from typing import Any
@@ -23,6 +23,10 @@ from calib.effects.own.formula import FormulaEffect
 WIDER = 3.0  # times the largest amplitude: the sigma that the prior of an amplitude has
 PASSES = 2  # of refining every term beside the others
 PHASE = ("sin(", "cos(")
+RANGE, JOINT = "range", "joint:"  # sites; of the latter the joint's name follows
+UNITS = {"m": "mm", "rad": "mrad"}  # of amounts -> in which they are said
+# The prior of an amount is no narrower: errors of ranges and of joints that a rig may have.
+LEAST_SIGMA = {"m": 0.01, "rad": 0.003}
 
 
 @dataclass(frozen=True)
@@ -64,15 +68,17 @@ class Part:
 
 @dataclass(frozen=True)
 class Formula:
-    """What the ranges do, over some covariates, beyond the model.
+    """What the ranges, or a joint, do, over some covariates, beyond the model.
 
     Args:
-        parts: its terms.
+        parts: its terms; amounts are in m, or in rad of a joint.
         steps: how each of them was found.
-        rms_m: of what it changes the ranges by, beyond what the model takes on.
+        rms_m: of what it changes the residuals by, beyond what the model takes on.
         seen: covariate -> its least and largest value.
         picture: of residuals over two of the covariates, as measured, as the formula has them and
             what is left; see `picture_of`.
+        site: what it changes, as a file of formulas has it.
+        joints: which covariates are joints of the arm.
     """
 
     parts: Sequence[Part]
@@ -80,6 +86,8 @@ class Formula:
     rms_m: float
     seen: dict[str, tuple[float, float]]
     picture: dict[str, Any]
+    site: str = RANGE
+    joints: frozenset[str] = frozenset()
 
     @property
     def alike(self) -> list[Form]:
@@ -104,12 +112,20 @@ class Formula:
     @property
     def says(self) -> str:
         """The formula as people write it, each number with the sigma of its last digits."""
-        return "range = true " + " ".join(_said(part) for part in self.parts)
+        what = "range = true" if self.site == RANGE else f"{self.site.removeprefix(JOINT)} = read"
+        return " ".join([what, *(_said(part, UNITS[self.unit]) for part in self.parts)])
+
+    @property
+    def unit(self) -> str:
+        """Of its amounts."""
+        return "m" if self.site == RANGE else "rad"
 
     def name(self, taken: Collection[str] = ()) -> str:
         """Of its effect; another where that is taken."""
-        bare = (c.removesuffix("_rad").removesuffix("_m") for c in self.covariates)
-        name = "_".join(["empirical", *(re.sub(r"\W", "_", c, flags=re.ASCII) for c in bare)])
+        joint = self.site.removeprefix(JOINT)
+        bare = (c.removesuffix("_rad").removesuffix("_m") for c in self.covariates if c != joint)
+        of = [] if self.site == RANGE else [re.sub(r"\W", "_", joint, flags=re.ASCII)]
+        name = "_".join(["empirical", *of, *(re.sub(r"\W", "_", c, flags=re.ASCII) for c in bare)])
         every = (name if i == 1 else f"{name}_{i}" for i in count(1))
         return next(each for each in every if each not in taken)
 
@@ -123,9 +139,9 @@ class Formula:
         largest = float(np.abs(self.amount_m).max())
         document = {
             "name": self.name(taken),
-            "site": "range",
-            "unit": "m",
-            "sigma": float(f"{max(WIDER * largest, 0.01):.1g}"),
+            "site": self.site,
+            "unit": self.unit,
+            "sigma": float(f"{max(WIDER * largest, LEAST_SIGMA[self.unit]):.1g}"),
             "basis": list(self.texts),
             "start": [float(f"{amount:.4g}") for amount in self.amount_m],
             "seen": {name: outward(*ends) for name, ends in self.seen.items()},
@@ -139,9 +155,9 @@ class Formula:
         return columns_of(self.texts, covariates) @ self.amount_m
 
 
-def settled(table: Table, steps: Sequence[Step]) -> list[Formula]:
+def settled(table: Table, steps: Sequence[Step], site: str = RANGE) -> list[Formula]:
     """All terms fitted together, their constants refined; those over the same covariates are one
-    formula."""
+    formula of the site."""
     terms = [step.form.term for step in steps]
     kept = [list(range(len(term.texts))) for term in terms]
     for _ in range(PASSES):
@@ -155,7 +171,7 @@ def settled(table: Table, steps: Sequence[Step]) -> list[Formula]:
     kept = [k for _, k in plain]
     # Without a column that was dropped, other constants are best.
     terms = [_centred(t, table) for t in _refined(table, [t for t, _ in plain], kept)]
-    return _grouped(table, terms, kept, [steps[i] for i in there])
+    return [replace(f, site=site) for f in _grouped(table, terms, kept, [steps[i] for i in there])]
 
 
 def _refined(table: Table, terms: Sequence[Term], kept: Sequence[Sequence[int]]) -> list[Term]:
@@ -197,9 +213,10 @@ def _grouped(
             Formula(
                 parts=mine,
                 steps=[steps[i] for i in some],
-                rms_m=float(np.sqrt(model.weight @ np.square(left) / model.weight.sum())),
+                rms_m=float(np.sqrt(model.weight @ np.square(left) / model.weight_m2)),
                 seen={n: _ends(table.covariates[n]) for n in names},
-                picture=picture_of(table, names, value, fit),
+                picture=picture_of(table, names, value, fit, UNITS[table.unit]),
+                joints=table.joints & set(names),
             )
         )
     return out
@@ -235,20 +252,20 @@ def _ends(values: np.ndarray) -> tuple[float, float]:
     return float(np.nanmin(values)), float(np.nanmax(values))
 
 
-def _said(part: Part) -> str:
+def _said(part: Part, unit: str) -> str:
     """A term as people write it."""
     each = zip(part.rows, part.amount_m, part.sigma_m, strict=True)
     says = (
-        _shifted(part)
-        or _turned(part)
-        or " ".join(f"{_signed(amount, sigma)} mm * {_product(row)}" for row, amount, sigma in each)
+        _shifted(part, unit)
+        or _turned(part, unit)
+        or " ".join(f"{_signed(amount, s)} {unit} * {_product(row)}" for row, amount, s in each)
     )
     for i, number in enumerate(part.numbers):
         says = says.replace(f"@{i}@", number)
     return says.replace("- -", "+ ").replace("+ -", "- ")
 
 
-def _shifted(part: Part) -> str:
+def _shifted(part: Part, unit: str) -> str:
     """Of a line, or lines, whose zero is found too: two columns that differ by one line's text."""
     if len(part.at) != 2:
         return ""
@@ -262,10 +279,10 @@ def _shifted(part: Part) -> str:
     relative = np.hypot(part.sigma_m[1], ratio * part.sigma_m[0]) / abs(part.amount_m[0])
     zero = with_sigma(middle - half * ratio, half * relative)
     texts = [f"({line.covariate} - {zero}) / {half:g}" if k == i else t for k, t in enumerate(long)]
-    return f"{_signed(part.amount_m[0], part.sigma_m[0])} mm * {_product(texts)}"
+    return f"{_signed(part.amount_m[0], part.sigma_m[0])} {unit} * {_product(texts)}"
 
 
-def _turned(part: Part) -> str:
+def _turned(part: Part, unit: str) -> str:
     """Of a sine and a cosine: an amplitude and a phase."""
     texts = [times(row) for row in part.rows]
     if len(texts) != 2 or texts[0].replace(*PHASE) != texts[1] or texts[0].count(PHASE[0]) != 1:
@@ -277,7 +294,7 @@ def _turned(part: Part) -> str:
     before, _, after = texts[0].partition(PHASE[0])
     inside, _, rest = after.partition(")")
     turned = f"{before}sin({inside} + {with_sigma(float(np.arctan2(b, a)), phase)}){rest}"
-    return f"{_signed(size, sigma)} mm * {bare(turned)}"
+    return f"{_signed(size, sigma)} {unit} * {bare(turned)}"
 
 
 def _product(row: Sequence[str]) -> str:
@@ -293,9 +310,9 @@ def bare(text: str) -> str:
     return f"({text})" if re.search(r"[<>=]| [-+] ", outside) else text
 
 
-def _signed(amount_m: float, sigma_m: float) -> str:
-    sign = "-" if amount_m < 0 else "+"
-    return f"{sign} {with_sigma(1e3 * abs(amount_m), 1e3 * sigma_m)}"
+def _signed(amount: float, sigma: float) -> str:
+    sign = "-" if amount < 0 else "+"
+    return f"{sign} {with_sigma(1e3 * abs(amount), 1e3 * sigma)}"
 
 
 def with_sigma(value: float, sigma: float) -> str:

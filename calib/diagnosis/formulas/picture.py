@@ -14,19 +14,24 @@ FEWEST = 3  # beams of a bin that is shown
 
 
 def picture_of(
-    table: Table, covariates: Sequence[str], value_m: np.ndarray, fit: Projection
+    table: Table,
+    covariates: Sequence[str],
+    value: np.ndarray,
+    fit: Projection,
+    unit: str = "mm",
 ) -> dict[str, Any]:
     """Means in bins of the first two covariates.
 
     Args:
         table: the beams.
         covariates: of the formula; a third is averaged over.
-        value_m: (N,) of the formula.
+        value: (N,) of the formula, m or rad.
         fit: the model with all formulas fitted to the table.
+        unit: in which the picture is: mm, or mrad of a joint.
 
     Returns:
-        ``covariates``, ``edges`` of the bins of each, and per bin ``measured_mm`` (what the model
-        leaves when the formula is taken out again), ``formula_mm`` and ``left_mm``; null where no
+        ``unit``, ``covariates``, ``edges`` of the bins of each, and per bin ``measured`` (what the
+        model leaves when the formula is taken out again), ``formula`` and ``left``; null where no
         beams are.
     """
     names = list(covariates[:2])
@@ -38,19 +43,20 @@ def picture_of(
     shape = tuple(len(ends) - 1 for ends in edges)
     weight = fit.weight
 
-    def mean_mm(of_m: np.ndarray) -> list:
+    def mean(of: np.ndarray) -> list:
         size = int(np.prod(shape))
-        total = np.bincount(index, weight * of_m, size)
+        total = np.bincount(index, weight * of, size)
         count = np.bincount(index, minlength=size)
-        mean = 1e3 * total / np.maximum(np.bincount(index, weight, size), 1e-300)
-        return np.where(count >= FEWEST, mean, np.nan).reshape(shape).tolist()
+        means = 1e3 * total / np.maximum(np.bincount(index, weight, size), 1e-300)
+        return np.where(count >= FEWEST, means, np.nan).reshape(shape).tolist()
 
     return {
+        "unit": unit,
         "covariates": names,
         "edges": [ends.tolist() for ends in edges],
-        "measured_mm": mean_mm(fit.left_m + value_m),
-        "formula_mm": mean_mm(value_m),
-        "left_mm": mean_mm(fit.left_m),
+        "measured": mean(fit.left_m + value),
+        "formula": mean(value),
+        "left": mean(fit.left_m),
     }
 
 

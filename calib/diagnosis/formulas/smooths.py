@@ -134,7 +134,7 @@ def screen_smooths(
     """All smooth functions that could be missing, those with most evidence first."""
     table = bases.table
     names = bases.names()
-    points = [n for n in names if n not in table.by_stop]
+    points = [n for n in names if n not in table.by_stop] or names  # of an arm, all are of stops
     sets: list[tuple[str, ...]] = [(n,) for n in names]
     sets += [p for p in combinations(names, 2) if set(p) & set(points)]
     found = dict(_tested(projection, bases, sets, progress))

@@ -54,6 +54,9 @@ class Table:
         chain: (V, U) of these by all unknowns.
         others: (R, U) whitened rows of trackers, targets and priors; others_b: (R,) their right
             side; others_stop, others_place: (R,) of which they are, -1 for none.
+        unit: of `residual_m` and `sigma_m`: m of a range, or rad of a joint; see `joint_tables`.
+        joints: which covariates are joints of the arm.
+        weight_m2: of all that was measured, 1/m2; None where that is these rows.
     """
 
     covariates: Mapping[str, np.ndarray]
@@ -69,6 +72,9 @@ class Table:
     others_b: np.ndarray
     others_stop: np.ndarray
     others_place: np.ndarray
+    unit: str = "m"
+    joints: frozenset[str] = frozenset()
+    weight_m2: float | None = None
 
     @classmethod
     def of(
@@ -124,6 +130,7 @@ class Table:
             others_b=np.concatenate(b),
             others_stop=np.concatenate(others_stop),
             others_place=np.concatenate(others_place),
+            joints=frozenset(drawn[0].rows.rows.view.rig.joint_names),
         )
 
     def __len__(self) -> int:
@@ -202,6 +209,17 @@ class Projection:
     left_m: np.ndarray
     step: np.ndarray
     factor: tuple[np.ndarray, bool]
+
+    @property
+    def chi2(self) -> float:
+        """Of these rows at their weights, and of all others."""
+        away = self.table.others @ self.step - self.table.others_b
+        return float(self.weight @ np.square(self.left_m) + away @ away)
+
+    @property
+    def weight_m2(self) -> float:
+        """Of all that was measured, 1/m2."""
+        return float(self.weight.sum()) if self.table.weight_m2 is None else self.table.weight_m2
 
     @classmethod
     def of(cls, table: Table, weight: np.ndarray) -> Projection:
@@ -283,7 +301,7 @@ class Projection:
             cells=cells,
             stop=stop,
             place=place,
-            weight_m2=float(self.weight.sum()),
+            weight_m2=self.weight_m2,
         )
 
     def judged(self, columns_m: np.ndarray) -> Test:

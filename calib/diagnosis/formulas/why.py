@@ -6,7 +6,7 @@ experiments are those of calibration practice.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 from calib.effects import CATALOGUE, Site
@@ -60,14 +60,40 @@ JOINT = (
     "cables pull on the LiDAR or its supply sags as the arm moves, or the arm bends",
     "the same view reached with other values of this joint",
 )
+# The same of what hangs on an arm's joint: Hollerbach, Khalil and Gautier 2016.
+OF_ARM = {
+    "payload_kg": (
+        "gears and links bend under the load",
+        "the same poses with the load and without it",
+    ),
+    "temperature_c": (
+        "links grow and gears change with temperature",
+        "the same poses cold and after an hour of work",
+    ),
+    "time_s": (
+        "the base, the tracker or a mount creeps or warms up",
+        "the first poses again at the end",
+    ),
+}
+ARM_JOINT = (
+    "encoders and gears err by parts of a turn, and gears and links bend under the arm's weight",
+    "this joint alone moved through its range, up and down, with the arm stretched and folded",
+)
 OTHER = (
     "no mechanism is known for this column; it may stand in for another that changes along with it",
     "this column changed on purpose while nothing else does",
 )
 
 
-def why(covariates: Sequence[str]) -> dict[str, Any]:
-    """What could be behind a formula over some covariates of the range.
+def why(
+    covariates: Sequence[str], joints: Collection[str] = (), of_arm: bool = False
+) -> dict[str, Any]:
+    """What could be behind a formula over some covariates of the range, or of a joint.
+
+    Args:
+        covariates: these.
+        joints: which of them are joints of the arm.
+        of_arm: whether the formula is one of a joint.
 
     Returns:
         ``known``: effects of the catalogue that hang on some of them and on nothing else;
@@ -77,15 +103,14 @@ def why(covariates: Sequence[str]) -> dict[str, Any]:
     known = {
         e.family
         for e in CATALOGUE
-        if e.site is Site.BEAM and e.covariates and mine.issuperset(e.covariates)
+        if e.site is (Site.JOINTS if of_arm else Site.BEAM)
+        and e.covariates
+        and (mine | {"joints"} if of_arm and joints else mine).issuperset(e.covariates)
     }
-    found = {name: _of(name) for name in covariates}
+    by_name, of_joint = (OF_ARM, ARM_JOINT) if of_arm else (MECHANISMS, JOINT)
+    found = {n: of_joint if n in joints else by_name.get(n, OTHER) for n in covariates}
     return {
         "known": sorted(known),
         "mechanisms": {name: mechanism for name, (mechanism, _) in found.items()},
         "experiments": {name: experiment for name, (_, experiment) in found.items()},
     }
-
-
-def _of(name: str) -> tuple[str, str]:
-    return MECHANISMS.get(name, JOINT if name.startswith("joint") else OTHER)

@@ -23,7 +23,7 @@ Falls = Mapping[str, tuple[float, float, float]]
 
 @dataclass(frozen=True)
 class Unnamed:
-    """Formulas of what ranges do beyond a model and the effects named.
+    """Formulas of what ranges, or a joint, do beyond a model and the effects named.
 
     Args:
         formulas: strongest first.
@@ -58,7 +58,7 @@ def unnamed(
     unseen: Callable[[Stand], Errors] | None,
     progress: Progress,
 ) -> Unnamed:
-    """Look for formulas of what a search left.
+    """Look for formulas of what a search left: of the ranges, or of a joint where there are none.
 
     Args:
         found: the search.
@@ -69,7 +69,7 @@ def unnamed(
     """
     first, last = found.looks[0].stand, found.looks[-1].stand
     if found.found and doubtful and unseen is not None:
-        formulas = find(first.estimate, progress)
+        formulas = find(first, progress)
         if formulas:
             after = unseen(_with(first, formulas, progress)).rms_mm
             before, _, _ = falls[found.found[0].effect.name]
@@ -80,13 +80,13 @@ def unnamed(
     there = set(last.model.names)
     chance = [c.effect.name for c in found.chance if c.effect.name in there]
     last = last.lacking(chance, progress) if chance else last
-    formulas = find(last.estimate, progress)
+    formulas = find(last, progress)
     if not formulas or unseen is None:
         return Unnamed(formulas)
     before, after = unseen(last), unseen(_with(last, formulas, progress))
     fall_mm = before.rms_mm, after.rms_mm
     # A gross structure is rejected, not fitted: what falls then is the share of such beams.
-    fewer = before.rejected_share - after.rejected_share > FALL
+    fewer = (before.rejected_share or 0.0) - (after.rejected_share or 0.0) > FALL
     if fewer or fall_mm[0] - fall_mm[1] > FALL * after.floor_mm:
         return Unnamed(formulas, False, fall_mm, (before.rejected_share, after.rejected_share))
     over = " and ".join(words(c) for c in formulas[0].covariates)
@@ -117,7 +117,7 @@ def _document(found: Formula, taken: Sequence[str]) -> dict[str, Any]:
         "p_adjusted": first.p_adjusted,
         "says": found.says,
         "terms": [
-            {"text": text, "estimate": amount, "sigma": sigma, "unit": "m"}
+            {"text": text, "estimate": amount, "sigma": sigma, "unit": found.unit}
             for part in found.parts
             for text, amount, sigma in zip(part.texts, part.amount_m, part.sigma_m, strict=True)
         ],
@@ -132,7 +132,7 @@ def _document(found: Formula, taken: Sequence[str]) -> dict[str, Any]:
             }
             for form in found.alike[:ALIKE]
         ],
-        "why": why(found.covariates),
+        "why": why(found.covariates, found.joints, found.unit == "rad"),
         "formula": found.effect(taken, what),
         "seen": {name: list(ends) for name, ends in found.seen.items()},
         "picture": found.picture,

@@ -35,7 +35,8 @@ class Picture:
     Args:
         covariates: their names.
         edges: of the bins of each, in the column's unit.
-        measured_mm, formula_mm, left_mm: (B,) or (B, C) of the bins; NaN where no beams are.
+        unit: of the three: mm, or mrad of a joint.
+        measured, formula, left: (B,) or (B, C) of the bins; NaN where no beams are.
         title: the finding, in a sentence.
         says: the formula.
         averaged: further columns of the formula, which the picture averages over.
@@ -43,9 +44,10 @@ class Picture:
 
     covariates: tuple[str, ...]
     edges: tuple[np.ndarray, ...]
-    measured_mm: np.ndarray
-    formula_mm: np.ndarray
-    left_mm: np.ndarray
+    unit: str
+    measured: np.ndarray
+    formula: np.ndarray
+    left: np.ndarray
     title: str
     says: str
     averaged: tuple[str, ...]
@@ -59,13 +61,15 @@ class Picture:
         """
         try:
             document = each["picture"]
+            unit = str(document["unit"])
             names = tuple(map(str, document["covariates"]))
             edges = tuple(np.array(e, float) for e in document["edges"])
-            keys = ("measured_mm", "formula_mm", "left_mm")
+            keys = ("measured", "formula", "left")
             values = [np.array(document[key], float) for key in keys]
             over = tuple(map(str, each["covariates"]))
             held_out = [each["held_out_rms_mm"][key] for key in ("before", "after")]
-            title = _title(over, held_out)
+            what = "Ranges depend" if unit == "mm" else "A joint's angle depends"
+            title = _title(f"{what} on {' and '.join(map(spoken, over))}", held_out)
             says = str(each["says"])
         except (KeyError, TypeError, ValueError, AttributeError):
             raise InputError(WRONG) from None
@@ -74,14 +78,19 @@ class Picture:
         if not known or len(names) not in (1, 2) or any(v.shape != shape for v in values):
             raise InputError(WRONG)
         rest = tuple(name for name in over if name not in names)
-        return cls(names, edges, *values, title=title, says=says, averaged=rest)
+        return cls(names, edges, unit, *values, title=title, says=says, averaged=rest)
 
     @property
-    def limit_mm(self) -> float:
+    def limit(self) -> float:
         """The end of the scale, the same for all three."""
-        sizes = np.abs(np.concatenate([v.ravel() for v in (self.measured_mm, self.formula_mm)]))
+        sizes = np.abs(np.concatenate([v.ravel() for v in (self.measured, self.formula)]))
         known = sizes[np.isfinite(sizes)]
         return round_up(float(np.quantile(known, WITHIN))) if len(known) else 1.0
+
+    @property
+    def label(self) -> str:
+        """Of its scale."""
+        return f"mean residual, {self.unit}"
 
     def figure(self, narrow: bool = False) -> Figure:
         """The three of them, side by side, or one below the other where it is to be narrow."""
@@ -132,8 +141,7 @@ def charts_of(diagnosis: Mapping[str, Any] | None, narrow: bool = False) -> list
     ]
 
 
-def _title(over: tuple[str, ...], held_out: list[float | None]) -> str:
-    what = f"Ranges depend on {' and '.join(map(spoken, over))}"
+def _title(what: str, held_out: list[float | None]) -> str:
     if None in held_out:
         return f"{what}, and a formula describes it"
     before, after = map(float, held_out)
@@ -143,13 +151,13 @@ def _title(over: tuple[str, ...], held_out: list[float | None]) -> str:
 
 def _parts(picture: Picture) -> dict[str, np.ndarray]:
     parts = {
-        "measured": picture.measured_mm,
-        "formula": picture.formula_mm,
-        "left": picture.left_mm,
+        "measured": picture.measured,
+        "formula": picture.formula,
+        "left": picture.left,
     }
     rms = {k: np.sqrt(np.nanmean(np.square(v))) if np.isfinite(v).any() else 0.0
            for k, v in parts.items()}  # fmt: skip
-    return {f"{name}, {rms[name]:.2f} mm rms": values for name, values in parts.items()}
+    return {f"{name}, {rms[name]:.2f} {picture.unit} rms": values for name, values in parts.items()}
 
 
 def _maps(picture: Picture, narrow: bool) -> Figure:
@@ -161,14 +169,14 @@ def _maps(picture: Picture, narrow: bool) -> Figure:
     figure, grid = plots.axes(*size, sharex=True, sharey=True)
     for ax, (title, values) in zip(grid.flat, _parts(picture).items(), strict=True):
         rows = values.T if up == 1 else values
-        drawn = plots.signed_cells(ax, x, y, rows, picture.limit_mm)
+        drawn = plots.signed_cells(ax, x, y, rows, picture.limit)
         ax.set_title(title)
     for ax in grid[-1]:
         ax.set_xlabel(axis_label(names[across]))
     for ax in grid[:, 0]:
         ax.set_ylabel(axis_label(names[up]))
     where = {"orientation": "horizontal", "aspect": 35} if narrow else {"aspect": 25}
-    figure.colorbar(drawn, ax=list(grid.flat), extend="both", label="mean residual, mm", **where)
+    figure.colorbar(drawn, ax=list(grid.flat), extend="both", label=picture.label, **where)
     return figure
 
 
@@ -179,12 +187,12 @@ def _curve(picture: Picture) -> Figure:
     x = (edges[1:] + edges[:-1]) / 2
     figure, grid = plots.axes(plots.HALF, 3.6, 2, sharex=True, sharey=True)
     top, bottom = grid[:, 0]
-    top.plot(x, picture.measured_mm, "o", ms=3.5, color=plots.BEFORE, label="measured")
-    top.stairs(picture.formula_mm, edges, baseline=None, lw=1.5, color=plots.INK, label="formula")
-    bottom.plot(x, picture.left_mm, "o", ms=3.5, color=plots.AFTER, label="left")
+    top.plot(x, picture.measured, "o", ms=3.5, color=plots.BEFORE, label="measured")
+    top.stairs(picture.formula, edges, baseline=None, lw=1.5, color=plots.INK, label="formula")
+    bottom.plot(x, picture.left, "o", ms=3.5, color=plots.AFTER, label="left")
     for ax in (top, bottom):
         ax.axhline(0, color=plots.PALE, linewidth=1, zorder=1)
-        ax.set_ylabel("mean residual, mm")
+        ax.set_ylabel(picture.label)
     bottom.set_xlabel(axis_label(name))
     figure.legend(loc="outside upper left", ncols=3)
     return figure

@@ -280,9 +280,7 @@ def pictured():
 
 def test_a_picture_shows_what_was_planted_and_that_little_is_left(pictured):
     _, _, picture = pictured
-    measured, drawn, left = (
-        np.array(picture[k], float) for k in ("measured_mm", "formula_mm", "left_mm")
-    )
+    measured, drawn, left = (np.array(picture[k], float) for k in ("measured", "formula", "left"))
     edges = [np.array(e) for e in picture["edges"]]
     assert measured.shape == tuple(len(e) - 1 for e in edges)
     middle = [(e[1:] + e[:-1]) / 2 for e in edges]
@@ -299,5 +297,5 @@ def test_bins_without_beams_are_null(pictured):
     far[:2] = 40.0, 41.0
     moved = replace(beams, covariates={**beams.covariates, "far": far})
     picture = picture_of(moved, ["far"], value, moved.projection())
-    shown = json.loads(json_text(picture))["measured_mm"]
+    shown = json.loads(json_text(picture))["measured"]
     assert len(shown) == 48 and None in shown and shown[0] is not None

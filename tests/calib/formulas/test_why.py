@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 
 from calib.diagnosis.formulas.table import NOT_COVARIATES
-from calib.diagnosis.formulas.why import JOINT, MECHANISMS, OTHER, why
+from calib.diagnosis.formulas.why import ARM_JOINT, JOINT, MECHANISMS, OF_ARM, OTHER, why
 from calib.diagnosis.verdict import unnamed as module
 from calib.diagnosis.verdict.unnamed import unnamed
 from calib.effects import CATALOGUE, Site
@@ -21,8 +21,13 @@ def test_each_covariate_of_the_catalogue_has_a_mechanism_and_an_experiment(name)
 
 
 def test_a_joint_and_a_column_of_the_users_own_have_theirs():
-    found = why(["joint_3", "wind"])
-    assert found["mechanisms"] == {"joint_3": JOINT[0], "wind": OTHER[0]}
+    found = why(["elbow", "wind"], {"elbow"})
+    assert found["mechanisms"] == {"elbow": JOINT[0], "wind": OTHER[0]}
+    of_arm = why(["elbow", "wind", "payload_kg"], {"elbow"}, of_arm=True)
+    payload = OF_ARM["payload_kg"][0]
+    assert of_arm["mechanisms"] == {"elbow": ARM_JOINT[0], "wind": OTHER[0], "payload_kg": payload}
+    sites = {e.family: e.site for e in CATALOGUE}
+    assert of_arm["known"] and {sites[name] for name in of_arm["known"]} == {Site.JOINTS}
 
 
 @pytest.mark.parametrize(
@@ -68,10 +73,10 @@ class World:
         after = {0: first, names: last} if names else {0: last}
         self.asked = []
 
-        def find(estimate, progress):
-            self.asked.append(estimate)
-            formulas = [SimpleNamespace(covariates=("wind",), after=after[estimate])]
-            return [] if after[estimate] is None else formulas
+        def find(stand, progress):
+            self.asked.append(stand.estimate)
+            error = after[stand.estimate]
+            return [] if error is None else [SimpleNamespace(covariates=("wind",), after=error)]
 
         monkeypatch.setattr(module, "find", find)
         monkeypatch.setattr(module, "_with", lambda stand, formulas, progress: formulas[0].after)

@@ -1,0 +1,135 @@
+"""Poses of an arm under a tracker, as a table to try formulas of a joint on.
+
+What trackers see at a pose is turned so that one row is how far a joint seems to be from its
+reading, and no other row depends on that joint (Householder 1958). That row takes the place of a
+beam; all others stay beside it, as do targets and priors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+from scipy.sparse import csr_array, eye_array
+
+from calib.diagnosis.candidates import stops_view
+from calib.diagnosis.formulas.table import NOT_COVARIATES, Table
+from calib.diagnosis.linear import beside, other_rows
+from calib.diagnosis.stand import Stand
+from calib.effects.own.formula import FormulaEffect
+from calib.linear.clusters import Gradients
+from calib.linear.layout import Layout
+
+LARGEST = 3000  # unknowns: with more, as where every stop has some of its own, no table is made
+SEEN = 1e-6  # of the largest: a joint whose angle changes less at a pose is not seen there
+
+
+def joint_tables(stand: Stand) -> Iterator[tuple[str, Table]]:
+    """Each revolute joint that the trackers see, and its table in rad: `residual_m` is how much
+    further it is turned than it says, `sigma_m` how well one pose tells."""
+    rig = stand.sources[0].rig
+    kinds = zip(rig.joint_names, rig.joint_kinds, strict=True)
+    levers = [_lever(i, name) for i, (name, kind) in enumerate(kinds) if kind == "revolute"]
+    wide, values = beside(
+        stand.problem_of(stand.model.plus(tuple(effect for _, effect in levers))), stand.estimate
+    )
+    of = [next(n for n in wide.variables if n.startswith(effect.name)) for _, effect in levers]
+    layout = Layout.of(wide, unbounded=of)
+    if layout.size > LARGEST:
+        return
+    rows = list(other_rows(wide, layout, values, Gradients(layout.size)))
+    A = np.vstack([_over(r.A, r.columns, layout.size) for r in rows])
+    b, stop, place = (np.concatenate([getattr(r, k) for r in rows]) for k in ("b", "stop", "place"))
+    model = np.setdiff1d(np.arange(layout.size), [layout.at[n].start for n in of])
+    covariates = _covariates(stand, layout)
+    for (joint, _), name in zip(levers, of, strict=True):
+        if found := _table(A, b, stop, place, layout.at[name].start, model, covariates):
+            weight = sum(len(body.measured) / body.sigma_m**2 for body in wide.bodies)
+            yield joint, replace(found, weight_m2=weight, joints=frozenset(rig.joint_names))
+
+
+def _lever(number: int, joint: str) -> tuple[str, FormulaEffect]:
+    """A joint turned by a constant angle."""
+    document = {
+        "name": f"turned_{number}",
+        "site": f"joint:{joint}",
+        "unit": "rad",
+        "sigma": 1.0,
+        "basis": "1",
+    }
+    return joint, FormulaEffect.read(document, "a table of poses", {})
+
+
+def _over(A: np.ndarray | csr_array, columns: np.ndarray, size: int) -> np.ndarray:
+    out = np.zeros((A.shape[0], size))
+    out[:, columns] = A.toarray() if isinstance(A, csr_array) else A
+    return out
+
+
+def _table(
+    A: np.ndarray,
+    b: np.ndarray,
+    stop: np.ndarray,
+    place: np.ndarray,
+    lever: int,
+    model: np.ndarray,
+    covariates: dict[str, np.ndarray],
+) -> Table | None:
+    """The table of one joint, of whitened rows A (R, U), b (R,), whose column `lever` is how they
+    change as it turns; those of `model` are unknown."""
+    a = np.where(stop >= 0, A[:, lever], 0.0)
+    size = np.sqrt(np.bincount(np.maximum(stop, 0), np.square(a)))
+    seen = size > SEEN * size.max(initial=0.0)
+    if not seen.any():
+        return None
+    at = np.flatnonzero(stop >= 0)
+    first = at[np.unique(stop[at], return_index=True)[1]]  # of each stop, by its number
+    first = first[seen[stop[first]]]
+    # The reflection that turns a stop's lever into its first row.
+    v = a.copy()
+    v[first] += np.where(a[first] < 0, -1.0, 1.0) * size[stop[first]]
+    length = np.bincount(np.maximum(stop, 0), np.square(v))
+    v = np.where((stop >= 0) & seen[np.maximum(stop, 0)], v, 0.0)
+    full = np.column_stack([A[:, model], b])
+    groups = csr_array((v, (np.maximum(stop, 0), np.arange(len(v)))), (len(size), len(v)))
+    along = (groups @ full) * (2 / np.maximum(length, 1e-300))[:, None]
+    full -= v[:, None] * along[np.maximum(stop, 0)]
+    sign = np.where(a[first] < 0, 1.0, -1.0)
+    scale = sign / size[stop[first]]
+    rest = np.setdiff1d(np.arange(len(b)), first)
+    return Table(
+        covariates={n: c[stop[first]] for n, c in covariates.items()},
+        by_stop=frozenset(covariates),
+        residual_m=full[first, -1] * scale,
+        sigma_m=1 / size[stop[first]],
+        stop=stop[first],
+        place=np.full(len(first), -1),
+        share=1.0,
+        twists=csr_array(-full[first, :-1] * scale[:, None]),
+        chain=csr_array(eye_array(len(model), format="csr")),
+        others=csr_array(full[rest, :-1]),
+        others_b=full[rest, -1],
+        others_stop=stop[rest],
+        others_place=place[rest],
+        unit="rad",
+    )
+
+
+def _covariates(stand: Stand, layout: Layout) -> dict[str, np.ndarray]:
+    """Columns (K,) of all stops, in the layout's order, that every recording has."""
+    rows, every = {}, []
+    for number, source in enumerate(stand.sources):
+        view, stops = stops_view(source), len(source.recording.stops)
+        columns = {}
+        for name in view.columns:
+            values = np.asarray(view[name])
+            if name in NOT_COVARIATES or name.startswith("moved."):
+                continue
+            if values.ndim == 1 and values.dtype.kind in "biuf":
+                columns[name] = np.broadcast_to(values, stops).astype(float)
+        every.append(columns)
+        rows |= {(source.recording.folder, i): (number, i) for i in range(stops)}
+    names = [n for n in every[0] if all(n in c for c in every)]
+    at = [rows[key] for key in layout.stops]
+    return {n: np.array([every[k][n][i] for k, i in at]) for n in names}
