@@ -142,18 +142,23 @@ def _strongest_waves(candidate: Candidate) -> tuple[int, ...]:
 def what_separates(a: Effect, b: Effect) -> str:
     """The measurement that would tell two effects apart, from what they hang on."""
     arm = (Site.EDGE, Site.JOINTS)
-    if set(a.covariates) == set(b.covariates) and (a.site in arm or b.site in arm):
-        return "arm poses of other kinds: elbow up and down, wrist turned, another payload"
-    return what_differs(a.covariates, b.covariates)
+    return what_differs(a.covariates, b.covariates, a.site in arm or b.site in arm)
 
 
-def what_differs(a: Collection[str], b: Collection[str]) -> str:
-    """The measurement that would tell what hangs on some covariates from what does on others."""
+def what_differs(a: Collection[str], b: Collection[str], of_arm: bool = False) -> str:
+    """The measurement that would tell what hangs on some covariates from what does on others.
+
+    Args:
+        a, b: the covariates of both.
+        of_arm: whether one of them is an effect of the arm.
+    """
     mine, other = set(a), set(b)
     if mine - other and other - mine:
         return f"stops at which {_list(mine - other)} changes while {_list(other - mine)} does not"
     if mine ^ other:
         return f"stops that spread {_list(mine ^ other)} more widely"
+    if of_arm:
+        return "arm poses of other kinds: elbow up and down, wrist turned, another payload"
     return f"a wider spread of {_list(mine or {'poses'})}, the sensor rolled and tilted"
 
 

@@ -109,7 +109,7 @@ def _with(stand: Stand, formulas: Sequence[Formula], progress: Progress) -> Stan
 def _document(found: Formula, taken: Sequence[str]) -> dict[str, Any]:
     seen = " and ".join(span(name, *ends) for name, ends in found.seen.items())
     what = f"{DESCRIBES} {seen}."
-    first = found.steps[0]
+    first, of_arm = found.steps[0], found.unit == "rad"
     return {
         "covariates": list(found.covariates),
         "rms_mm": 1e3 * found.rms_m,
@@ -128,11 +128,11 @@ def _document(found: Formula, taken: Sequence[str]) -> dict[str, Any]:
                     for i, text in enumerate(form.term.texts, 1)
                 ),
                 "covariates": list(form.term.covariates),
-                "separate": what_differs(found.covariates, form.term.covariates),
+                "separate": what_differs(found.covariates, form.term.covariates, of_arm),
             }
             for form in found.alike[:ALIKE]
         ],
-        "why": why(found.covariates, found.joints, found.unit == "rad"),
+        "why": why(found.covariates, found.joints, of_arm),
         "formula": found.effect(taken, what),
         "seen": {name: list(ends) for name, ends in found.seen.items()},
         "picture": found.picture,
