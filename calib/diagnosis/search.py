@@ -20,7 +20,7 @@ from calib.diagnosis.chance import Chance
 from calib.diagnosis.score import Test
 from calib.diagnosis.score import test as joint_test
 from calib.diagnosis.screen import Candidate, Screen
-from calib.diagnosis.stand import Look, Stand
+from calib.diagnosis.stand import Look, Stand, tried
 from calib.effects import Effect
 from calib.residuals.groups import CAD, JOINTS, MESH
 from calib.solve.fit import Progress
@@ -119,7 +119,7 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NAMES) -> Search:
             wider = looks[-1].stand.with_effects([strongest.effect], progress)
             looks = [*looks, wider.look(progress)]
         else:
-            beside = stand.tried([c.effect for c in chance], progress)
+            beside = tried(stand.with_effects, [c.effect for c in chance], progress)
             if beside is None:
                 chance.pop()
                 break
@@ -193,7 +193,9 @@ def _adapted(look: Look, left: list[LeftOut], progress: Progress, named: bool) -
         groups = [each.blunder.group for each in stray] + [b.group for b in wild]
         if not groups or (on_trial and wild and _outdone(look, wild[0])):
             break
-        after = look.stand.without(groups, progress).look(progress)
+        if (stand := tried(look.stand.without, groups, progress)) is None:
+            break
+        after = stand.look(progress)
         quiet = _quiet(after)
         if on_trial is None and wild and _outdone(look, wild[0]) and not quiet:
             on_trial = look, len(left)
@@ -212,9 +214,8 @@ def _left_out(look: Look, wild: Sequence[Blunder], after: Look) -> Iterator[Left
     loud = {b.group for b in after.blunders if b.found}
     for each in wild:
         near = (b for b in look.blunders if each.evidence - b.evidence < ODDS)
-        others = [b for b in near if b.found and b.group not in loud and b not in wild]
-        others = [b for b in others if b.group != each.group]
-        others = [b for b in others if b.possible or b.group.what == JOINTS]
+        others = [b for b in near if b.found and b.group not in {*loud, each.group}]
+        others = [b for b in others if b not in wild and (b.possible or b.group.what == JOINTS)]
         yield LeftOut(each, [b.group for b in others if len(wild) == 1 or _meet(each, b)])
 
 
@@ -224,9 +225,10 @@ def _restored(
     """What was left out of the first fit is tested once more, beside the effects that have been
     named since: those that explain it leave no blunder there (backward elimination)."""
     aside = [each.blunder.group for each in left if each.aside]
-    if len(aside) == len(left):
+    less = len(aside) < len(left)
+    if (stand := tried(last.stand.without, aside, progress, first) if less else None) is None:
         return last, left
-    look = last.stand.without(aside, progress, of=first).look(progress)
+    look = stand.look(progress)
     found = {blunder.group for blunder in look.blunders if blunder.found}
     kept = [each for each in left if each.aside or each.blunder.group in found]
     if len(kept) == len(left):
@@ -284,8 +286,7 @@ def _quiet(look: Look) -> bool:
 
 
 def likeliest(here: Sequence[Blunder]) -> Blunder:
-    """Of groups of one place, furthest out first, that which goes wrong most often among those that
-    can stand in for the first."""
+    """Of groups of one place, furthest out first, the likeliest that can stand for the first."""
     here = [b for b in here if b.possible] or here
     near = (b for b in here if here[0].evidence - b.evidence < ODDS)
     return min(near, key=lambda b: b.likely)
@@ -298,8 +299,9 @@ def _named(look: Look, found: list[NamedEffect], progress: Progress) -> list[Nam
         test, p = judged(look, candidate, progress)
         if p < ALPHA:
             effect = look.stand.finest(candidate.effect, progress)
-            stand = look.stand.with_effects([effect], progress)
-            if _taken_up(look.named, candidate, stand.theta(effect, whole=False)) < HELD_BACK:
+            stand = tried(look.stand.with_effects, [effect], progress)
+            theta = stand.theta(effect, whole=False) if stand else 0 * test.estimate()
+            if _taken_up(look.named, candidate, theta) < HELD_BACK:
                 continue
             stand, swapped = stand.retuned([f.effect.name for f in found], progress)
             after = stand.look(progress)
@@ -325,8 +327,7 @@ def _taken_up(screen: Screen, candidate: Candidate, theta: np.ndarray) -> float:
 
 
 def structures(look: Look, progress: Progress) -> list[Candidate]:
-    """Structure that is confirmed: what stands out most, what does beside it, and single covariates
-    that could stand for it."""
+    """Structure that is confirmed, strongest first; single covariates that could stand for it."""
     out: list[Candidate] = []
     for candidate in look.unnamed.candidates:
         if not _stands_out(candidate, ALPHA_UNNAMED):
@@ -361,8 +362,7 @@ def _scatter(look: Look, progress: Progress) -> Candidate | None:
 
 
 def judged(look: Look, candidate: Candidate, progress: Progress) -> tuple[Test, float]:
-    """A candidate's test with its clusters jackknifed; its p-value, all that was looked at paid
-    for."""
+    """A candidate's test, its clusters jackknifed, and its p-value once all looks are paid for."""
     found = look.judged(candidate, progress)
     return found, float(after_looks(found.p_value(), candidate.looks))
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain
+from typing import Any
 
 import numpy as np
 
@@ -83,13 +84,6 @@ class Stand:
     def lacking(self, names: Collection[str], progress: Progress) -> Stand:
         """The model without some of its effects, fitted from here."""
         return self._refitted(self.model.minus(names), self.estimate.start, progress)
-
-    def tried(self, added: Sequence[Effect], progress: Progress) -> Stand | None:
-        """As `with_effects`; None where the LiDAR leaves the room, so that no beam meets it."""
-        try:
-            return self.with_effects(added, progress)
-        except InputError:
-            return None
 
     def without(
         self, groups: Sequence[Group], progress: Progress, of: Stand | None = None
@@ -324,6 +318,14 @@ class Look:
         for rows in rows_along(wide, stand.estimate, by_name, tell):
             shares.add(rows)
         return found.judged(shares)
+
+
+def tried(fit: Callable[..., Stand], *of: Any) -> Stand | None:
+    """What a fit gives; None where the LiDAR leaves the room, so that no beam meets it."""
+    try:
+        return fit(*of)
+    except InputError:
+        return None
 
 
 def _variables(problem: Problem, effects: set[str]) -> dict[str, list[str]]:
