@@ -245,7 +245,9 @@ def test_the_table_counts():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("rig", "most"), [("arm", 0), ("head", 1), ("planes", 0)])
+@pytest.mark.parametrize(
+    ("rig", "most"), [("arm", 0), ("head", 1), pytest.param("planes", 0, marks=pytest.mark.long)]
+)
 def test_a_case_is_run_from_the_world_to_the_count(rig, most, tmp_path):
     """With the truth itself the error comes down to the floor: it is there to be found."""
     sector = "(azimuth_rad > 0.4) * (azimuth_rad < 1.1)"

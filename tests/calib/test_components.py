@@ -254,10 +254,14 @@ WAYS = {  # a tracker that scatters is told further below
     "joint_scatter": 3.0,
     "target_scatter": 4.0,
 }
+# Others are long: stop_pose_scatter is named further below, joints as targets are.
+QUICK = ("target_scatter",)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", WAYS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=() if n in QUICK else pytest.mark.long) for n in WAYS]
+)
 def test_which_way_to_the_lidar_scatters_is_told(tmp_path, name):
     """From base and mount, and by the scan: two of them tell what the third is off."""
     simulate(SPEC, tmp_path / "rec", 9, {name: WAYS[name]})

@@ -88,6 +88,12 @@ LONG = (
     "CAD axes exchanged",
     "a rod moved*",
     "two targets exchanged",
+    "all returns of ring zero",
+    "sensor shifted*",
+    "a joint zeroed*",
+    "rods longer than stated",
+    "mesh mirrored",
+    "a link of the URDF too long",
 )
 
 # Kind -> passes over all scans of its fit, and whether that was given up; in this session.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -128,39 +129,52 @@ def test_a_blunder_is_left_out_by_a_click_and_undone(copied):
         assert not watched.page.get_by_text("Left out:").first.is_visible()
 
 
+def on_screen(watched: Watched, page: Page) -> np.ndarray:
+    """Where the points (N, 2) are drawn that the stage shows, by the camera as the page tells it,
+    px."""
+    camera = page.client.camera
+    box = watched.page.locator("canvas").first.bounding_box()
+    ahead = camera.look_at - camera.position
+    ahead /= np.linalg.norm(ahead)
+    right = np.cross(ahead, [0, 0, 1])
+    right /= np.linalg.norm(right)
+    axes = np.stack([right, np.cross(right, ahead), ahead])
+    from_eye = page.stage.points.xyz_m[page.stage.shown] - page.stage._middle_m - camera.position
+    x, y, depth = axes @ from_eye.T
+    focal = box["height"] / 2 / np.tan(camera.fov / 2)
+    middle = [box["x"] + box["width"] / 2, box["y"] + box["height"] / 2]
+    return middle + focal * np.stack([x / depth, -y / depth], axis=1)
+
+
 def test_a_click_reads_the_point_that_it_meets(small):
+    """Once the browser has turned its camera to where it was told to."""
     with shown(small.folder) as (watched, page):
-        points, shown_points = page.stage.points, page.stage.shown
-        watched.page.wait_for_timeout(3000)
-        client = page.client
-        box = watched.page.locator("canvas").first.bounding_box()
-        eye = client.camera.position
-        ahead = client.camera.look_at - eye
-        ahead /= np.linalg.norm(ahead)
-        right = np.cross(ahead, [0, 0, 1])
-        right /= np.linalg.norm(right)
-        axes = np.stack([right, np.cross(right, ahead), ahead])
-        local = (points.xyz_m[shown_points] - page.stage._middle_m - eye) @ axes.T
-        focal = box["height"] / 2 / np.tan(client.camera.fov / 2)
-        x = box["x"] + box["width"] / 2 + focal * local[:, 0] / local[:, 2]
-        y = box["y"] + box["height"] / 2 - focal * local[:, 1] / local[:, 2]
-        inside = (x > 300) & (x < 1400 - PANEL_PX - 20) & (y > 200) & (y < 880)
-        wanted = np.flatnonzero(inside)[0]
-        watched.page.mouse.click(x[wanted], y[wanted])
-        table = watched.page.locator("[data-is=point]")
-        table.wait_for()
-        cells = table.locator("td").all_inner_texts()
-        rows = dict(zip(cells[::2], cells[1::2], strict=True))
-        ring, column = map(int, rows["ring, column"].split(", "))
-        found = np.flatnonzero(
-            (points.columns["ring"] == ring) & (points.columns["column"] == column)
-        )
-        spot = np.flatnonzero(shown_points == found[0])[0]
-        assert np.hypot(x[spot] - x[wanted], y[spot] - y[wanted]) < 12
-        assert float(rows["range"].split()[0]) == pytest.approx(
-            points.columns["range_m"][found[0]], abs=1e-3
-        )
-        assert rows["residual"].startswith(f"{1e3 * points.columns['residual_m'][found[0]]:+.2f}")
+        columns, told = page.stage.points.columns, watched.page.locator("[data-is=point]")
+
+        def clicked() -> tuple[dict[str, str], int | None, float]:
+            """What is told after a click on a point, of which, and how many px off that is."""
+            at = on_screen(watched, page)
+            x, y = at.T
+            inside = (x > 300) & (x < 1400 - PANEL_PX - 20) & (y > 200) & (y < 880)
+            for wanted in np.flatnonzero(inside)[:1]:
+                watched.page.mouse.click(*at[wanted])
+                watched.page.wait_for_timeout(100)
+                cells = told.locator("td").all_inner_texts() if told.is_visible() else []
+                rows = dict(zip(cells[::2], cells[1::2], strict=True))
+                if rows:
+                    ring, column = map(int, rows["ring, column"].split(", "))
+                    same = (columns["ring"] == ring) & (columns["column"] == column)
+                    (found,) = np.flatnonzero(same[page.stage.shown])
+                    off = np.linalg.norm(at[found] - at[wanted])
+                    return rows, page.stage.shown[found], off
+            return {}, None, np.inf
+
+        end, off = time.monotonic() + SOON_MS / 1e3, np.inf
+        while off >= 12:
+            assert time.monotonic() < end, f"{off:.0f} px off"
+            rows, found, off = clicked()
+        assert float(rows["range"].split()[0]) == pytest.approx(columns["range_m"][found], abs=1e-3)
+        assert rows["residual"].startswith(f"{1e3 * columns['residual_m'][found]:+.2f}")
         assert set(rows) == {"residual", "ring, column", "range", "incidence", "label", "intensity"}
 
 

@@ -6,7 +6,6 @@ import shutil
 import signal
 import socket
 import sys
-import time
 import urllib.request
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -284,7 +283,6 @@ def test_view_serves_this_machine_alone_and_ends_with_ctrl_c(first):
         taken = execute([*command, "--port", port])
         assert taken.returncode == 2
         assert f"--port {port} is taken" in taken.stderr
-        time.sleep(1)
         process.send_signal(signal.SIGINT)
         assert process.wait(30) == 0
         assert process.stdout.read() == ""

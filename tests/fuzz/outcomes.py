@@ -39,7 +39,7 @@ class Sample:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a sample."""
+    """What came of a sample, how much memory it took (MB) and how much of the processor (s)."""
 
     outcome: str
     said: str

@@ -2,6 +2,7 @@
 
 import threading
 import time
+from concurrent.futures import Future
 
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
@@ -13,6 +14,7 @@ from calib.results.check import check
 from calib.runs.calibrate import grow
 
 COUNTS = (1, 2, 5)
+SOON_S = 30
 
 
 @pytest.mark.parametrize("count", COUNTS)
@@ -45,10 +47,12 @@ def test_an_exception_of_any_one_is_passed_on_in_its_turn_and_the_rest_is_not_be
     assert max(begun) <= bad + 2 * count
 
 
-def test_what_waits_when_one_fails_is_cancelled():
+def test_what_waits_when_one_fails_is_cancelled(monkeypatch):
     """Two threads, once the first is done: one fails and takes up another, the other is busy; what
     waits behind these never begins."""
-    begun, busy = [], threading.Event()
+    begun, busy, cancelled = [], threading.Event(), threading.Event()
+    cancel = Future.cancel
+    monkeypatch.setattr(Future, "cancel", lambda each: cancel(each) and cancelled.set())
 
     def work(i):
         begun.append(i)
@@ -57,7 +61,7 @@ def test_what_waits_when_one_fails_is_cancelled():
             raise ZeroDivisionError
         if i > 1:
             busy.set()
-            time.sleep(0.3)
+            assert cancelled.wait(SOON_S)
 
     with workers(2), pytest.raises(ZeroDivisionError):
         list(in_order(work, 30))
@@ -118,11 +122,16 @@ def test_no_more_than_a_few_results_are_held(count):
 @pytest.mark.parametrize("count", COUNTS)
 def test_no_more_than_so_many_work_at_once_and_as_many_do(count):
     lock, now, most = threading.Lock(), [0], [0]
+    all_there = threading.Event()
 
     def work(i):
         with lock:
             now[0] += 1
             most[0] = max(most[0], now[0])
+        if now[0] == count:
+            all_there.set()
+        if i > 0:  # which is done before there are threads
+            assert all_there.wait(SOON_S)
         time.sleep(0.01)
         with lock:
             now[0] -= 1
