@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import chdtrc
@@ -69,6 +69,18 @@ def earlier(problem: Problem, solution: Solution) -> JointPrior:
             "of the same rig"
         )
     return JointPrior(held, means, solution.covariance[np.ix_(rows, rows)])
+
+
+def as_let_go(prior: JointPrior, links: Iterable[Mapping[str, Any]]) -> JointPrior:
+    """An earlier solution, less sure of those links that had moved.
+
+    Args:
+        prior: that solution.
+        links: what became of each, as `summary.json` has it.
+    """
+    for link in links:
+        prior = prior.loosened(link["name"]) if link["moved"] else prior
+    return prior
 
 
 class Fitted(NamedTuple):

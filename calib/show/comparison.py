@@ -26,6 +26,7 @@ from calib.show.tables import (
 )
 
 if TYPE_CHECKING:
+    from rich.console import Console
     from rich.table import Table
 
     from calib.runs.run import Run
@@ -56,9 +57,10 @@ def moved_document(found: Moved) -> dict[str, Any]:
     return found.document() | {"sentence": moved_sentence(found.links, _words(found))}
 
 
-def print_moved(found: Moved) -> None:
-    """Print what changed between two runs: the sentence, the links, and how the two go together."""
-    console = terminal()
+def print_moved(found: Moved, console: Console | None = None) -> None:
+    """Print what changed between two runs: the sentence, the links, and how the two go together; on
+    the terminal where no console is given."""
+    console = console or terminal()
     for run in found.runs:
         for sentence in run.doubts:
             console.print(f"{run.folder}: {sentence}", style="bold red", soft_wrap=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 from rich.console import Console
@@ -198,9 +198,10 @@ class _Terminal(Console):
         return super().render_str(escape.terminal(text), **options)
 
 
-def terminal() -> Console:
-    """Where people read: at most `WIDTH` columns wide, and as wide where nobody looks."""
-    console = _Terminal(markup=False, highlight=False, emoji=False)
+def terminal(file: IO[str] | None = None) -> Console:
+    """Where people read: at most `WIDTH` columns wide, and as wide where nobody looks; stdout where
+    no file is given."""
+    console = _Terminal(file=file, markup=False, highlight=False, emoji=False)
     console.width = min(console.width, WIDTH) if console.is_terminal else WIDTH
     return console
 

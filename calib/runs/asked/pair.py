@@ -55,7 +55,7 @@ class Pair:
         places = [{name: i for i, name in enumerate(r.solution.names)} for r in (a, b)]
         earlier, later = _estimates(a.solution), _estimates(b.solution)
         held, then, now, rows, is_frame = [], {}, {}, [], []
-        for unknown, theta in _unknowns(b):
+        for unknown, theta in unknowns_of(b):
             names = [f"{unknown.name}.{dof}" for dof in unknown.dofs]
             if unknown.name not in earlier or not set(names) <= places[0].keys():
                 continue
@@ -94,10 +94,13 @@ class Pair:
         return np.concatenate(list(each))
 
 
-def _unknowns(run: Run) -> Iterator[tuple[Unknown, np.ndarray]]:
+def unknowns_of(run: Run) -> Iterator[tuple[Unknown, np.ndarray]]:
     """What a run estimated of the hardware, and how far each parameter is from CAD (dim,).
 
     Values on paper that are far off had less weight in the fit; that is found again.
+
+    Raises:
+        InputError: the run has no table of them.
     """
     path = run.folder / RESIDUALS / PRIORS
     if not path.is_file():
