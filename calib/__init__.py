@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from calib.problem.model import Model
     from calib.rig.recording import Recording
     from calib.runs.add import add
+    from calib.runs.asked.moved import moved
     from calib.runs.calibrate import calibrate as fit
     from calib.runs.diagnose import diagnose
     from calib.runs.explain import explain
@@ -34,6 +35,7 @@ __all__ = [
     "explain",
     "export",
     "fit",
+    "moved",
     "plan",
     "simulate",
 ]
@@ -50,10 +52,12 @@ _HOME = {
     "explain": "calib.runs.explain:explain",
     "export": "calib.exporters:export",
     "fit": "calib.runs.calibrate:calibrate",
+    "moved": "calib.runs.asked.moved:moved",
     "plan": "calib.planning:plan",
     "simulate": "calib.simulation:simulate",
 }
-_SHOWN = {"Run", "add", "diagnose", "explain", "fit"}  # a notebook shows their results as tables
+# With these come the methods of runs, and how notebooks show them.
+_SHOWN = {"Run", "add", "diagnose", "explain", "fit", "moved"}
 
 
 def __getattr__(name: str) -> Any:
@@ -62,7 +66,7 @@ def __getattr__(name: str) -> Any:
     module, _, attribute = _HOME[name].partition(":")
     value = getattr(import_module(module), attribute)
     if name in _SHOWN:
-        import_module("calib.show.notebook")
+        import_module("calib.report.methods")
     globals()[name] = value
     return value
 

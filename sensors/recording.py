@@ -71,7 +71,7 @@ class Scan:
 
     def to_pandas(self) -> "pandas.DataFrame":
         """The points as a `pandas.DataFrame`; InputError where pandas is not installed."""
-        return _data_frame(self.columns())
+        return data_frame(self.columns())
 
     def to_open3d(self) -> Any:
         """The points as an `open3d.t.geometry.PointCloud` with every column as an attribute.
@@ -158,7 +158,7 @@ class Recording:
         InputError where pandas is not installed.
         """
         poses = self.bodies | ({} if self.base_guess is None else {"base_guess": self.base_guess})
-        return _data_frame(
+        return data_frame(
             {
                 "stop": np.array(self.stops),
                 "location": self.location,
@@ -240,11 +240,12 @@ def unpack_zstd(data: bytes, size: int) -> bytes:
         raise ValueError(str(error)) from None
 
 
-def _data_frame(columns: Mapping[str, np.ndarray]) -> "pandas.DataFrame":
+def data_frame(columns: Mapping[str, np.ndarray]) -> "pandas.DataFrame":
+    """Columns (N,) as a `pandas.DataFrame`; InputError where pandas is not installed."""
     try:
         import pandas
     except ImportError:
-        raise InputError("to_pandas needs pandas: pip install pandas") from None
+        raise InputError("a table needs pandas: pip install pandas") from None
     return pandas.DataFrame(dict(columns))
 
 

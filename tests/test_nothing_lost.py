@@ -30,6 +30,7 @@ READ = {
     "check",
     "compare",
     "effects",
+    "moved",
     "reproduce",
     "view",
 }  # view makes runs by the same functions as add

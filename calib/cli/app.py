@@ -26,7 +26,8 @@ Progress = Callable[[str, int, int], None]
 # As people meet them; `rigcal --help` lists them so.
 ORDER = (
     *("import", "simulate", "check", "fit", "diagnose", "plan", "add", "explain"),
-    *("compare", "reproduce", "evaluate", "report", "view", "plot", "export", "apply", "effects"),
+    *("compare", "moved", "reproduce", "evaluate", "report", "view", "plot", "export", "apply"),
+    "effects",
 )
 
 

@@ -215,6 +215,26 @@ def compare(runs: Runs, as_json: Json = False) -> None:
 
 
 @app.command()
+def moved(
+    first: Annotated[Path, typer.Argument(metavar="RUN_A", help="The earlier run.")],
+    second: Annotated[Path, typer.Argument(metavar="RUN_B", help="The later run.")],
+    as_json: Json = False,
+) -> None:
+    """What changed between two runs, in a sentence and a table, with honest sigmas."""
+    from calib.runs.asked.moved import moved as compare_two
+    from calib.runs.run import Run
+    from calib.show.comparison import moved_document, print_moved
+
+    found = compare_two(Run.open(first), Run.open(second))
+    if as_json:
+        print_json(moved_document(found))
+    else:
+        print_moved(found)
+    for run in found.runs:
+        end_unless_converged(run)
+
+
+@app.command()
 def reproduce(
     run: Path,
     recordings: Annotated[

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from calib import outputs
 from calib.linear.parallel import one_blas_thread
@@ -21,7 +21,10 @@ from calib.solve.fit import Progress
 from chains.errors import InputError
 from sensors.documents import nearest
 
-__all__ = ["Evidence", "Written", "charts_of", "plot", "report"]
+if TYPE_CHECKING:
+    from calib.report.plots import Figure
+
+__all__ = ["Evidence", "WrittenReport", "charts_of", "figure", "plot", "report"]
 
 
 PAGES = (".html", ".htm")
@@ -114,6 +117,12 @@ def report(
         page = render(evidence, verdict, sections, contents.absent)
         file.write_text(page, encoding="utf-8")
     return WrittenReport(Path(out), verdict, contents)
+
+
+@one_blas_thread
+def figure(evidence: Evidence, name: str) -> Figure:
+    """One figure, for matplotlib; arguments and errors as of `plot`."""
+    return _find(evidence, name).figure()
 
 
 @one_blas_thread

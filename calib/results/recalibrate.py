@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import chdtrc
@@ -71,21 +71,63 @@ def earlier(problem: Problem, solution: Solution) -> JointPrior:
     return JointPrior(held, means, solution.covariance[np.ix_(rows, rows)])
 
 
+def as_let_go(prior: JointPrior, links: Iterable[Mapping[str, Any]]) -> JointPrior:
+    """An earlier solution, less sure of those links that had moved.
+
+    Args:
+        prior: that solution.
+        links: what became of each, as `summary.json` has it.
+    """
+    for link in links:
+        prior = prior.loosened(link["name"]) if link["moved"] else prior
+    return prior
+
+
+class Fitted(NamedTuple):
+    """What a joint prior holds, fitted to newer data.
+
+    ``change`` (P,) is now minus then; ``graph`` and ``covariance`` (P, P) say how well it is known
+    now, as rows that err alone have it and as its intervals have it.
+    """
+
+    change: np.ndarray
+    graph: np.ndarray
+    covariance: np.ndarray
+
+
 def solve_from(
     problem: Problem, prior: JointPrior, progress: Progress
 ) -> tuple[Estimate, Intervals, list[Link]]:
     """Estimate with an earlier solution as prior, letting go link by link of what has moved; with
-    its intervals, and what became of each link.
+    its intervals, and what became of each link; see `let_go`."""
+    found: list[tuple[Estimate, Intervals]] = []
+
+    def fit(prior: JointPrior) -> Fitted:
+        estimate = solve(problem, prior, progress=progress)
+        known = intervals(estimate, progress)
+        found.append((estimate, known))
+        held = known.of([v.name for v in prior.held])
+        return Fitted(_change(prior, estimate), held.graph, held.covariance)
+
+    links = let_go(prior, fit)
+    return *found[-1], links
+
+
+def let_go(prior: JointPrior, fit: Callable[[JointPrior], Fitted]) -> list[Link]:
+    """What became of each link since an earlier solution.
 
     The link that explains the contradiction between prior and data best is taken to have moved by
     as much as CAD was unsure of it, and the fit repeated, until none is beyond chance (1 % over all
     links).
+
+    Args:
+        prior: the earlier solution.
+        fit: from it, or from the same where links were let go, to the newer data.
     """
     moved: dict[str, _Test] = {}
     while True:
-        estimate = solve(problem, prior, progress=progress)
-        known = intervals(estimate, progress)
-        tests = _tests(prior, estimate, known)
+        now = fit(prior)
+        tests = _tests(prior, now)
         found = {n: test for n, test in tests.items() if test is not None and n not in moved}
         worst = min(found, key=found.get, default=None)
         if worst is None or found[worst].p > ALARM / len(tests):
@@ -93,12 +135,10 @@ def solve_from(
         moved[worst] = found[worst]
         prior = prior.loosened(worst)
     tests |= moved
-    now, change = known.of([v.name for v in prior.held]).covariance, _change(prior, estimate)
-    links = [_link(v, prior, change, now, tests[v.name], v.name in moved) for v in prior.held]
-    return estimate, known, links
+    return [_link(v, prior, now, tests[v.name], v.name in moved) for v in prior.held]
 
 
-def _tests(prior: JointPrior, estimate: Estimate, known: Intervals) -> dict[str, _Test | None]:
+def _tests(prior: JointPrior, now: Fitted) -> dict[str, _Test | None]:
     """Per link, a test of its not having moved; None where the data cannot tell.
 
     Baarda's test of a group of observations, which the prior's means m of covariance S are. With
@@ -111,11 +151,10 @@ def _tests(prior: JointPrior, estimate: Estimate, known: Intervals) -> dict[str,
     """
     scale = np.sqrt(np.diag(prior.covariance))
     P = np.linalg.inv(prior.covariance / np.outer(scale, scale))
-    held = known.of([v.name for v in prior.held])
-    now = (2.0 * held.graph - held.covariance) / np.outer(scale, scale)
-    force = P @ (_change(prior, estimate) / scale)
-    spread = P - P @ now @ P
-    blocks = _blocks(prior.held)
+    known = (2.0 * now.graph - now.covariance) / np.outer(scale, scale)
+    force = P @ (now.change / scale)
+    spread = P - P @ known @ P
+    blocks = blocks_of(prior.held)
     return {name: _test(force[k], spread[k, k], P[k, k]) for name, k in blocks.items()}
 
 
@@ -140,8 +179,7 @@ def _test(force: np.ndarray, spread: np.ndarray, precision: np.ndarray) -> _Test
 def _link(
     variable: Unknown,
     prior: JointPrior,
-    change: np.ndarray,
-    covariance: np.ndarray,
+    now: Fitted,
     test: _Test | None,
     moved: bool,
 ) -> Link:
@@ -153,11 +191,11 @@ def _link(
     Args:
         variable: the link.
         prior: as it then was.
-        change, covariance: now minus then of all that it holds, and of all these now.
+        now: all that it holds, fitted.
         test: of the link.
         moved: whether it did.
     """
-    k = _blocks(prior.held)[variable.name]
+    k, change, covariance = blocks_of(prior.held)[variable.name], now.change, now.covariance
     if moved:
         D = np.diag(np.square(variable.sigma))
         scale = np.sqrt(np.diag(prior.covariance))
@@ -184,7 +222,8 @@ def _change(prior: JointPrior, estimate: Estimate) -> np.ndarray:
     return np.concatenate([v.difference(then, now) for v, then, now in values])
 
 
-def _blocks(variables: Sequence[Unknown]) -> dict[str, slice]:
+def blocks_of(variables: Sequence[Unknown]) -> dict[str, slice]:
+    """Name -> where each stands among the tangents of all."""
     ends = np.cumsum([v.dim for v in variables])
     return {v.name: slice(end - v.dim, end) for v, end in zip(variables, ends, strict=True)}
 

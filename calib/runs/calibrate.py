@@ -226,7 +226,7 @@ def _fit(
     summary["predicted_mm"] = reached.document() if reached else None
     summary["seconds"] = time.monotonic() - began
     if links is not None:
-        summary["links"] = [_link_document(link) for link in links]
+        summary["links"] = [link_document(link) for link in links]
     write_json(folder / SUMMARY, summary)
 
 
@@ -339,7 +339,8 @@ def _steps(below: Run) -> list[dict[str, Any]] | None:
     return None if lower is None else [*lower, model_of(below).document()]
 
 
-def _link_document(link: Link) -> dict[str, Any]:
+def link_document(link: Link) -> dict[str, Any]:
+    """What became of a link, as summary.json holds it."""
     return {
         "name": link.name,
         "moved": link.moved,

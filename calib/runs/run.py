@@ -41,7 +41,7 @@ _OF_STATE, _OF_MET = "state/", "met/"  # before every name in that file: numpy r
 NOT_CONVERGED = "NOT CONVERGED: the fit did not end at an optimum; its numbers are not to be used"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Run:
     """A run folder, read.
 
@@ -81,6 +81,9 @@ class Run:
                 raise InputError(f"{folder / name} is missing; the run is incomplete, fit it again")
         model, summary = read_model(folder / MODEL), read_summary(folder / SUMMARY)
         return cls(folder, model, summary, read_solution(folder), trust=may_run)
+
+    def __repr__(self) -> str:
+        return f"Run('{self.folder}')"
 
     @property
     def recordings(self) -> list[Path]:

@@ -1,4 +1,5 @@
-"""Runs side by side in a terminal, and the ladder by which they grew: ``rigcal compare``."""
+"""Runs side by side in a terminal, and the ladder by which they grew: ``rigcal compare``; what
+changed between two: ``rigcal moved``."""
 
 from __future__ import annotations
 
@@ -7,8 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from calib.runs.asked.moved import SHARED, Moved
 from calib.runs.estimates import comparison
 from calib.runs.ladder import DESCRIBED, FORMULA, Rung, ladder
+from calib.show.headline import DIFFERS, MOVED, Words, moved_sentence
 from calib.show.misfit import worst_of
 from calib.show.scale import shown
 from calib.show.tables import (
@@ -18,10 +21,12 @@ from calib.show.tables import (
     estimate_cell,
     mm,
     outcome,
+    print_links,
     terminal,
 )
 
 if TYPE_CHECKING:
+    from rich.console import Console
     from rich.table import Table
 
     from calib.runs.run import Run
@@ -45,6 +50,27 @@ def print_comparison(runs: Sequence[Run]) -> None:
     if rungs:
         console.print()
         console.print(ladder_table(rungs))
+
+
+def moved_document(found: Moved) -> dict[str, Any]:
+    """What changed between two runs, as ``rigcal moved --json`` gives it."""
+    return found.document() | {"sentence": moved_sentence(found.links, _words(found))}
+
+
+def print_moved(found: Moved, console: Console | None = None) -> None:
+    """Print what changed between two runs: the sentence, the links, and how the two go together; on
+    the terminal where no console is given."""
+    console = console or terminal()
+    for run in found.runs:
+        for sentence in run.doubts:
+            console.print(f"{run.folder}: {sentence}", style="bold red", soft_wrap=True)
+    print_links(console, found.links, _words(found))
+    for remark in found.remarks:
+        console.print(f"{remark}.")
+
+
+def _words(found: Moved) -> Words:
+    return DIFFERS if found.relation == SHARED else MOVED
 
 
 def ladder_table(rungs: Sequence[Rung]) -> Table:

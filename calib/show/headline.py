@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,25 +16,56 @@ from calib.show.verdict import UNASKED, judge
 TOLD_AXES = 3.0  # sigmas of a change, from which the axis along which it went is named
 
 
-def moved_sentence(links: Sequence[Mapping[str, Any]]) -> str:
+class Words(NamedTuple):
+    """How a change is told: of a length, of an angle, of an effect; that there is no other, that
+    there is none at all, that nothing is known; and what stands above links with and without."""
+
+    shifted: str
+    turned: str
+    changed: str
+    no_other: str
+    none: str
+    silent: str
+    title: str
+    title_of_none: str
+
+
+MOVED = Words(
+    *("moved", "turned", "changed by", "nothing else moved"),
+    none="nothing moved beyond the uncertainty of then and now",
+    silent="of {} the new data say nothing",
+    title="moved since the earlier run",
+    title_of_none="not moved",
+)
+DIFFERS = Words(  # of one recording: nothing moved, two models tell it otherwise
+    *("differs by", "differs by", "differs by", "no other estimate differs beyond chance"),
+    none="no estimate differs beyond chance",
+    silent="of {} nothing is known",
+    title="differs beyond chance",
+    title_of_none="does not differ beyond chance",
+)
+
+
+def moved_sentence(links: Sequence[Mapping[str, Any]], words: Words = MOVED) -> str:
     """What moved since the run that was the prior, and that nothing else did.
 
     Args:
         links: as `summary.json` has them.
+        words: in which it is told.
     """
     moved = [link for link in links if link["moved"]]
     silent = [link["name"] for link in links if link["p_value"] is None]
     if moved:
-        out = "; ".join(f"{link['name']} {' and '.join(_changes(link))}" for link in moved)
-        out += "; nothing else moved" if len(moved) < len(links) - len(silent) else ""
+        out = "; ".join(f"{link['name']} {' and '.join(_changes(link, words))}" for link in moved)
+        out += f"; {words.no_other}" if len(moved) < len(links) - len(silent) else ""
     else:
-        out = "nothing moved beyond the uncertainty of then and now"
+        out = words.none
     if silent:
-        out += f"; of {', '.join(silent)} the new data say nothing"
+        out += f"; {words.silent.format(', '.join(silent))}"
     return f"{out}."
 
 
-def _changes(link: Mapping[str, Any]) -> Iterator[str]:
+def _changes(link: Mapping[str, Any], words: Words) -> Iterator[str]:
     """By how much a link moved: of a frame along and about the axes that show it, of an effect its
     parameters that do, or, where these are many, their rms."""
     names, change, sigma = link["parameters"], np.array(link["change"]), np.array(link["sigma"])
@@ -47,13 +78,13 @@ def _changes(link: Mapping[str, Any]) -> Iterator[str]:
         if not len(mine):
             continue
         if not of_frame and len(mine) > 1:
-            yield f"changed by {scale * np.sqrt(np.mean(change[mine] ** 2)):.2f} {told} rms"
+            yield f"{words.changed} {scale * np.sqrt(np.mean(change[mine] ** 2)):.2f} {told} rms"
             continue
         cells = [f"{scale * change[i]:+.2f} ± {scale * sigma[i]:.2f} {told}" for i in mine]
         if not of_frame:
-            yield f"changed by {cells[0]} ({names[mine[0]]})"
+            yield f"{words.changed} {cells[0]} ({names[mine[0]]})"
             continue
-        verb, way = ("moved", "in") if unit == "m" else ("turned", "about")
+        verb, way = (words.shifted, "in") if unit == "m" else (words.turned, "about")
         along = (f"{cell} {way} {names[i][1:]}" for cell, i in zip(cells, mine, strict=True))
         yield f"{verb} {', '.join(along)}"
 

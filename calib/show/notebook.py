@@ -1,27 +1,30 @@
-"""What a notebook shows of results: the tables of the terminal, as HTML.
+"""What Python shows of results: the tables of the terminal, as HTML in a notebook and as text.
 
-Importing this gives runs, rungs and diagnoses their `_repr_html_`: results know nothing of how they
-are shown. `calib` imports it with the first of them that is asked of it.
+Importing this gives runs, rungs and diagnoses their `_repr_html_`, and what is printed its
+`__str__`: results know nothing of how they are shown. `calib.report.methods` imports it.
 """
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from calib.diagnosis import Diagnosis
+from calib.runs.asked.moved import Moved
 from calib.runs.estimates import variable_estimates
 from calib.runs.ladder import Rung
 from calib.runs.run import Run
 from calib.show.blunders import blunders_table
-from calib.show.comparison import ladder_table
+from calib.show.comparison import ladder_table, print_moved
 from calib.show.diagnosis import (
     LEADING,
     candidates_table,
     detectable_table,
     unexplained_table,
 )
-from calib.show.tables import effects_table, error_table, links_table
+from calib.show.headline import closing, moved_sentence
+from calib.show.tables import effects_table, error_table, links_table, outcome, terminal
 from chains import escape
 
 if TYPE_CHECKING:
@@ -58,6 +61,34 @@ def run_html(run: Run) -> str:
     tables += [effects_table(effects)] if effects else []
     untold = [f"not told: {each['name']}: {each['why']}" for each in run.solution.not_estimated]
     return _html(str(run.folder), [*run.warning, *untold], [*tables, error_table(run.summary)])
+
+
+def run_text(run: Run) -> str:
+    """A run in short: what moved, every link and effect with its sigma, and what matters."""
+    file, rows = io.StringIO(), variable_estimates(run)
+    console = terminal(file)
+    for line in (str(run.folder), *run.warning, outcome(run.summary)):
+        console.print(line)
+    if "links" in run.summary:
+        console.print(moved_sentence(run.summary["links"]))
+    console.print()
+    console.print(links_table([row for row in rows if row.parent is not None]))
+    if effects := [row for row in rows if row.parent is None]:
+        console.print(effects_table(effects))
+    for line in closing(run):
+        console.print(line)
+    return _plain(file)
+
+
+def moved_text(found: Moved) -> str:
+    """What changed between two runs, as ``rigcal moved`` prints it."""
+    file = io.StringIO()
+    print_moved(found, terminal(file))
+    return _plain(file)
+
+
+def _plain(file: io.StringIO) -> str:
+    return "\n".join(line.rstrip() for line in file.getvalue().rstrip().splitlines())
 
 
 def diagnosis_html(diagnosis: Diagnosis) -> str:
@@ -100,3 +131,4 @@ def _rows(table: Table) -> dict[str, Any]:
 
 for _kind, _html_of in ((Run, run_html), (Rung, rung_html), (Diagnosis, diagnosis_html)):
     _kind._repr_html_ = _html_of
+Run.__str__, Moved.__str__ = run_text, moved_text

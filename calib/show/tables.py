@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 from rich.console import Console
@@ -18,7 +18,7 @@ from calib.diagnosis.suggest import span
 from calib.residuals.groups import CAD
 from calib.runs.belief import TOLERATED_OF_CAD, misfit_sentence
 from calib.runs.estimates import VariableEstimate, variable_estimates
-from calib.show.headline import closing, moved_sentence
+from calib.show.headline import MOVED, Words, closing, moved_sentence
 from calib.show.misfit import beams_told, standing_out, together_told
 from calib.show.scale import shown
 from chains import escape
@@ -79,7 +79,7 @@ def print_run(run: Run, whole: bool = False) -> None:
         console.print(sentence, style="bold red")
     console.print(f"{outcome(summary)}\n")
     if "links" in summary:
-        _print_moved(console, summary["links"])
+        print_links(console, summary["links"])
     console.print(links_table([row for row in rows if row.parent is not None]))
     effects = [row for row in rows if row.parent is None]
     if effects:
@@ -198,9 +198,10 @@ class _Terminal(Console):
         return super().render_str(escape.terminal(text), **options)
 
 
-def terminal() -> Console:
-    """Where people read: at most `WIDTH` columns wide, and as wide where nobody looks."""
-    console = _Terminal(markup=False, highlight=False, emoji=False)
+def terminal(file: IO[str] | None = None) -> Console:
+    """Where people read: at most `WIDTH` columns wide, and as wide where nobody looks; stdout where
+    no file is given."""
+    console = _Terminal(file=file, markup=False, highlight=False, emoji=False)
     console.width = min(console.width, WIDTH) if console.is_terminal else WIDTH
     return console
 
@@ -288,9 +289,9 @@ def error_table(summary: Mapping[str, Any]) -> Table:
     return table
 
 
-def _print_moved(console: Console, links: Sequence[Mapping[str, Any]]) -> None:
-    """What has moved since the run that was the prior, and what has not."""
-    console.print(moved_sentence(links), style="bold")
+def print_links(console: Console, links: Sequence[Mapping[str, Any]], words: Words = MOVED) -> None:
+    """Print what has moved since an earlier run, and what has not."""
+    console.print(moved_sentence(links, words), style="bold")
     console.print()
     rows, still = [], []
     for link in links:
@@ -299,9 +300,9 @@ def _print_moved(console: Console, links: Sequence[Mapping[str, Any]]) -> None:
         elif link["p_value"] is not None:
             still.append(f"{link['name']} ({chance(link['p_value'])})")
     if rows:
-        print_pairs(console, "moved since the earlier run", rows)
+        print_pairs(console, words.title, rows)
     if still:
-        print_pairs(console, "not moved", [("", ", ".join(still))])
+        print_pairs(console, words.title_of_none, [("", ", ".join(still))])
 
 
 def _change(link: Mapping[str, Any]) -> str:

@@ -15,7 +15,7 @@ from calib.problem.spread import spread_of
 from calib.problem.unknowns import Unknown
 from calib.residuals.beams import Association
 from calib.residuals.scan import ScanStop
-from calib.solve.graph import Graph
+from calib.solve.graph import FactorGraph, Graph
 
 # Of a state, beside an unknown's NAME: the parameters of a vector, and the value at which the beams
 # looked what they meet.
@@ -83,6 +83,10 @@ class Estimate:
     def cost(self) -> float:
         """Half the weighted chi-square, priors included."""
         return cost_of(self.linear, self.graph, self.values)
+
+    def handed_out(self) -> FactorGraph:
+        """The graph at the optimum, as GTSAM has it."""
+        return self.graph.handed_out(self.values, self.linear.chi2)
 
     @property
     def start(self) -> Start:

@@ -133,6 +133,8 @@ def resume(
     start: Start,
     progress: Progress = lambda what, done, total: None,
     converged: bool = True,
+    prior: Block | None = None,
+    whole: bool = False,
 ) -> Estimate:
     """A fit as it stood: what its beams met and its surfaces' unknowns again, and not one step.
 
@@ -141,12 +143,16 @@ def resume(
         start: where that fit was left.
         progress: as of `solve`.
         converged: whether it had.
+        prior: as of `solve`.
+        whole: whether all is linearised once, for the graph and the covariance.
 
     Returns:
-        The estimate, without a covariance.
+        The estimate, without graph and covariance where these were not asked for.
     """
-    loop = Loop(problem, None, progress, start)
+    loop = Loop(problem, prior, progress, start)
     if problem.scans:
         loop.fix_association(loop.seen_before())
     loop.take_weights()
-    return loop.as_it_stands(converged)
+    if whole:
+        loop.linearise_here()
+    return loop.as_it_stands(converged, whole)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -66,9 +67,30 @@ class KeptRows:
         """Half their sum of squares, where they were linearised."""
         return float(self.constant @ self.constant) / 2
 
+    def plus(self, chi2: float) -> KeptRows:
+        """With a row of so much chi-square that no unknown changes."""
+        by = {name: np.vstack([d, np.zeros(d.shape[1])]) for name, d in self.by.items()}
+        return KeptRows(np.append(self.constant, np.sqrt(max(chi2, 0.0))), by)
+
     def evaluate(self, values: Values, derivatives: bool) -> tuple[np.ndarray, Derivatives | None]:
         """The rows as they were linearised: a Gauss-Newton step asks for nothing else."""
         return self.constant, dict(self.by) if derivatives else None
+
+
+class FactorGraph(NamedTuple):
+    """A fit as GTSAM has it, to go on from.
+
+    Args:
+        graph: priors; rows of trackers and targets, and of an earlier run that was the prior, as
+            they are; and one linear factor, which holds what beams, and tracked bodies at stops
+            whose place only they know, say of all others. Its error is half the chi-square.
+        values: the optimum, of what is in the graph: vectors, and poses as `gtsam.Pose3`.
+        keys: unknown -> its key.
+    """
+
+    graph: gtsam.NonlinearFactorGraph
+    values: gtsam.Values
+    keys: dict[str, int]
 
 
 class Graph:
@@ -136,6 +158,24 @@ class Graph:
         start = self._to_gtsam(initial)
         optimizer = gtsam.LevenbergMarquardtOptimizer(self._graph, start, params)
         return self._from_gtsam(optimizer.optimize()), optimizer.iterations()
+
+    def handed_out(self, values: Values, chi2: float) -> FactorGraph:
+        """The graph for who goes on from it: rows of a linearisation change with the values there.
+
+        Args:
+            values: the state of the linearisation.
+            chi2: of all rows in it, those that were eliminated included.
+        """
+        at, graph = self._to_gtsam(values), gtsam.NonlinearFactorGraph()
+        first = self._graph.size() - len(self.blocks)
+        for i in range(self._graph.size()):
+            block = self.blocks[i - first] if i >= first else None
+            if isinstance(block, KeptRows):
+                linear = self._factor(block.plus(chi2 - 2 * block.cost)).linearize(at)
+                graph.add(gtsam.LinearContainerFactor(linear, at))
+            else:
+                graph.add(self._graph.at(i))
+        return FactorGraph(graph, at, dict(self._key))
 
     def step(self, values: Values) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], float]:
         """One Gauss-Newton step: the values after it, the tangent step of each unknown, and by how

@@ -1,0 +1,46 @@
+"""The factor graph of a run, as its fit left it."""
+
+from __future__ import annotations
+
+from calib.linear.parallel import one_blas_thread
+from calib.problem import Problem
+from calib.problem.prior import JointPrior
+from calib.results.recalibrate import as_let_go, earlier
+from calib.runs.reopen import problem_of, reopened, start_of, state_of
+from calib.runs.run import Run
+from calib.solve.estimate import Estimate
+from calib.solve.fit import Progress, resume
+from calib.solve.graph import FactorGraph
+
+
+@one_blas_thread
+def graph_of(run: Run, progress: Progress = lambda what, done, total: None) -> FactorGraph:
+    """The factor graph of a run at its optimum, for those who go on in GTSAM.
+
+    Surfaces, and what is of one stop alone (where the rig stands, what its encoders misreport), are
+    eliminated: with them the graph would have thousands of unknowns.
+
+    Args:
+        run: the run; its recordings are read again.
+        progress: called with what is being done, how many stops are done, and of how many.
+
+    Raises:
+        InputError: a recording is not where or what it was, or the run is of an earlier version.
+    """
+    return estimate_of(run, progress).handed_out()
+
+
+def estimate_of(run: Run, progress: Progress = lambda what, done, total: None) -> Estimate:
+    """The estimate of a run as its fit left it, linearised there; arguments as of `graph_of`."""
+    sources = reopened(run)
+    problem = problem_of(run, sources)
+    state_of(run, problem)  # or it would be linearised elsewhere, unseen
+    start, prior = start_of(run, sources), prior_of(run, problem)
+    return resume(problem, start, progress, run.converged, prior, whole=True)
+
+
+def prior_of(run: Run, problem: Problem) -> JointPrior | None:
+    """What stood for CAD in a run's fit, less sure of what had moved; None where CAD did."""
+    if run.prior is None:
+        return None
+    return as_let_go(earlier(problem, Run.open(run.prior).solution), run.summary["links"])
