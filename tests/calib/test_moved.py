@@ -12,10 +12,11 @@ from calib.problem.prior import JointPrior
 from calib.problem.unknowns import Unknown
 from calib.results.recalibrate import Fitted, let_go
 from calib.runs.asked.moved import _apart, _differences, moved
-from calib.runs.asked.pair import Known, Pair
+from calib.runs.asked.pair import Known, Pair, unknowns_of
 from calib.runs.run import Run
 from calib.show.comparison import moved_document
 from chains.errors import InputError
+from sensors.recording import write_table
 
 from .bumps import BUMP, bumped
 
@@ -166,6 +167,27 @@ def test_where_it_is_not_known_how_two_runs_go_together_a_bound_is_given():
             at = slice(0, DIM)
             least = [np.sqrt(np.diag(k.reported))[at] for k in (each.first, each.second)]
             assert (links[0].sigma >= sum(least) - 1e-12).all()
+
+
+def test_names_of_parameters_may_have_dots(tmp_path):
+    """As those of an arm's geometry do: joint_2.tx of arm_geometry."""
+    columns = {
+        "unknown": np.array(["arm_geometry", "arm_geometry", "lidar"]),
+        "parameter": np.array(["joint_2.tx", "joint_2.ty", "tx"]),
+        "unit": np.array(["m"] * 3),
+        "residual": np.array([0.1, 0.2, 0.3]),
+        "sigma": np.array([1.0, 2.0, 3.0]),
+        "whitened": np.array([0.1, 0.1, 0.1]),
+    }
+    (tmp_path / "residuals.parquet").mkdir()
+    write_table(tmp_path / "residuals.parquet/_prior.parquet", columns)
+    names = ("arm_geometry.joint_2.tx", "arm_geometry.joint_2.ty", "lidar.tx")
+    run = SimpleNamespace(folder=tmp_path, solution=SimpleNamespace(names=names))
+    found = {unknown.name: (unknown.dofs, theta.tolist()) for unknown, theta in unknowns_of(run)}
+    assert found == {
+        "arm_geometry": (("joint_2.tx", "joint_2.ty"), [0.1, 0.2]),
+        "lidar": (("tx",), [0.3]),
+    }
 
 
 @pytest.fixture(scope="module")

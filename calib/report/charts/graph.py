@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
 NAMES = {
     "beams": "{rows} beams\nof {blocks} scans",
-    "tracker": "{rows} numbers of\n{blocks} tracked bodies",
-    "target": "{rows} numbers of\n{blocks} targets",
+    "tracker": "{rows} numbers\nof the tracker",
+    "target": "{rows} numbers\nof {blocks} targets",
     "prior": "the earlier run,\n{rows} numbers",
 }
 SHORT = {"target": "targets", "prior": "earlier"}
