@@ -97,6 +97,25 @@ def test_the_first_page_shows_what_is_printed(tmp_path):
 
 
 @pytest.mark.slow
+def test_the_page_about_python_runs_and_shows_what_is_printed(tmp_path):
+    """The measurement that its graph takes up moves what it is of, and makes it better known."""
+    session = run_through(ROOT / "docs/api.md", tmp_path)
+    said = shape(session.said)
+    for block in re.findall(r"^```text\n(.*?)^```", session.text, flags=re.M | re.S):
+        assert shape(block) in said, block
+    assert "the recordings are the same" in " ".join(session.said.split()).lower()
+    found = re.search(r"moves by (\S+) mm, and is known to (\S+) mm", session.said).groups()
+    solution = Run.open(tmp_path / "grown").solution
+    at = solution.names.index("lidar.tx")
+    variance = 1e6 * solution.graph[at, at]
+    share = variance / (variance + 0.3**2)
+    now = 0.2 * share, (variance * (1.0 - share)) ** 0.5
+    assert [float(each) for each in found] == pytest.approx(now, abs=0.001)
+    for figure in ("chain.png", "graph.png"):
+        assert (tmp_path / figure).read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.slow
 def test_the_page_about_trust_runs(tmp_path):
     """Its file of code leaves no effect in what was exported, and is evaluated when trusted."""
     session = run_through(ROOT / "docs/trust.md", tmp_path)

@@ -36,7 +36,8 @@ def plot(
     as_json: Json = False,
 ) -> None:
     """One figure of a run's report, for a paper."""
-    from calib.report import Evidence, charts_of, refuse_figure
+    from calib.report import Evidence, refuse_figure
+    from calib.report import listed as figures
     from calib.report import plot as draw
     from calib.runs.run import Run
 
@@ -46,7 +47,7 @@ def plot(
     with progress_bar() as progress:
         evidence = Evidence.of([opened], progress)
         if listed:
-            charts = [chart.document() for chart in charts_of(evidence).charts]
+            charts = [chart.document() for chart in figures(evidence)]
     if listed:
         text = "\n".join(f"{chart['id']:24}  {chart['title']}" for chart in charts)
         say({"charts": charts}, text, as_json)

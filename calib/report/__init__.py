@@ -12,7 +12,7 @@ from calib import outputs
 from calib.linear.parallel import one_blas_thread
 from calib.report import plots
 from calib.report.chart import Absent, Chart
-from calib.report.charts import SECTIONS
+from calib.report.charts import ALONE, SECTIONS
 from calib.report.evidence import Evidence
 from calib.report.page import Section, render
 from calib.runs.run import Run
@@ -24,7 +24,7 @@ from sensors.documents import nearest
 if TYPE_CHECKING:
     from calib.report.plots import Figure
 
-__all__ = ["Evidence", "WrittenReport", "charts_of", "figure", "plot", "report"]
+__all__ = ["Evidence", "WrittenReport", "charts_of", "figure", "listed", "plot", "report"]
 
 
 PAGES = (".html", ".htm")
@@ -81,6 +81,13 @@ def charts_of(evidence: Evidence) -> ReportContents:
         sections[title] = [each for each in results if isinstance(each, Chart)]
         absent += [each for each in results if isinstance(each, Absent)]
     return ReportContents(sections, absent)
+
+
+@one_blas_thread
+def listed(evidence: Evidence) -> list[Chart]:
+    """Every figure that can be asked for by name; errors as of `charts_of`."""
+    alone = (each for make in ALONE for each in make(evidence))
+    return [*charts_of(evidence).charts, *(each for each in alone if isinstance(each, Chart))]
 
 
 @one_blas_thread
@@ -157,7 +164,7 @@ def _inputs(runs: Sequence[Run]) -> list[Path]:
 def _find(evidence: Evidence, name: str) -> Chart:
     """The figure of that name; none behind it is looked at."""
     known = []
-    for make in chain(*SECTIONS.values()):
+    for make in chain(*SECTIONS.values(), ALONE):
         for each in make(evidence):
             if each.id == name and isinstance(each, Chart):
                 return each

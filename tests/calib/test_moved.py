@@ -11,21 +11,18 @@ from scipy.stats import kstest
 from calib.problem.prior import JointPrior
 from calib.problem.unknowns import Unknown
 from calib.results.recalibrate import Fitted, let_go
-from calib.runs.add import add
 from calib.runs.asked.moved import _apart, _differences, moved
-from calib.runs.asked.pair import Known, Pair
-from calib.runs.calibrate import calibrate
+from calib.runs.asked.pair import Known, Pair, unknowns_of
 from calib.runs.run import Run
 from calib.show.comparison import moved_document
-from calib.simulation import load_spec, simulate
-from chains import se3
 from chains.errors import InputError
-from sensors.recording import read_table, write_table
+from sensors.recording import write_table
+
+from .bumps import BUMP, bumped
 
 NAMES, DIM = ("mount", "lidar", "arm", "unseen"), 3
 SIZE = DIM * len(NAMES)
 CAD = np.repeat([0.5, 1.0, 2.0, 1.0], DIM)  # sigmas
-BUMP = np.array([0, 0, 0.004, 0.003, 0, 0])
 RUN = SimpleNamespace(summary={"sigmas_widened_by": 1.0})
 
 
@@ -172,39 +169,32 @@ def test_where_it_is_not_known_how_two_runs_go_together_a_bound_is_given():
             assert (links[0].sigma >= sum(least) - 1e-12).all()
 
 
-# ------------------------------------------------------------------------------------- recordings
-
-
-def keep(recording, locations):
-    """Leave only the stops at these locations."""
-    head, *stops = (recording / "stops.csv").read_text().splitlines()
-    kept = [stop for stop in stops if stop.split(",")[1] in locations]
-    (recording / "stops.csv").write_text("\n".join([head, *kept, ""]))
-
-
-def bump(recording):
-    """Move the LiDAR on its mount: it sees every point from elsewhere."""
-    for path in (recording / "scans").glob("*.parquet"):
-        scan = read_table(path)
-        points = se3.apply(se3.exp(-BUMP), np.stack([scan[axis] for axis in "xyz"], axis=1))
-        write_table(path, scan | dict(zip("xyz", points.T.astype(np.float32), strict=True)))
+def test_names_of_parameters_may_have_dots(tmp_path):
+    """As those of an arm's geometry do: joint_2.tx of arm_geometry."""
+    columns = {
+        "unknown": np.array(["arm_geometry", "arm_geometry", "lidar"]),
+        "parameter": np.array(["joint_2.tx", "joint_2.ty", "tx"]),
+        "unit": np.array(["m"] * 3),
+        "residual": np.array([0.1, 0.2, 0.3]),
+        "sigma": np.array([1.0, 2.0, 3.0]),
+        "whitened": np.array([0.1, 0.1, 0.1]),
+    }
+    (tmp_path / "residuals.parquet").mkdir()
+    write_table(tmp_path / "residuals.parquet/_prior.parquet", columns)
+    names = ("arm_geometry.joint_2.tx", "arm_geometry.joint_2.ty", "lidar.tx")
+    run = SimpleNamespace(folder=tmp_path, solution=SimpleNamespace(names=names))
+    found = {unknown.name: (unknown.dofs, theta.tolist()) for unknown, theta in unknowns_of(run)}
+    assert found == {
+        "arm_geometry": (("joint_2.tx", "joint_2.ty"), [0.1, 0.2]),
+        "lidar": (("tx",), [0.3]),
+    }
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory):
+def runs(once):
     """Runs of a rig before and after somebody bumped into its LiDAR, by name."""
-    out = tmp_path_factory.mktemp("moved")
-    spec = load_spec("tiny").model_copy(update={"locations": 6, "column_step": 200})
-    simulate(spec, out / "before", seed=1)
-    shutil.copytree(out / "before", out / "after")
-    keep(out / "before", ("L00", "L01", "L02"))
-    keep(out / "after", ("L03", "L04", "L05"))
-    bump(out / "after")
-    calibrate([out / "before"], out / "a", hold_out="none")
-    calibrate([out / "after"], out / "b", hold_out="none")
-    calibrate([out / "after"], out / "from_a", hold_out="none", prior=out / "a")
-    add(Run.open(out / "a"), ["range_scale"], out / "grown")
-    return {name: Run.open(out / name) for name in ("a", "b", "from_a", "grown")}
+    folder = once(bumped)
+    return {name: Run.open(folder / name) for name in ("a", "b", "from_a", "grown")}
 
 
 @pytest.mark.slow

@@ -266,7 +266,7 @@ def test_a_figure_is_written_for_a_paper(first, tmp_path, ending):
 def test_the_command_line_lists_and_draws(rigcal, runs, tmp_path, first):
     code, out, _ = rigcal("plot", runs[0].folder, "--list", "--json")
     listed = [chart["id"] for chart in json.loads(out)["charts"]]
-    assert code == 0 and listed == [chart.id for chart in charts_of(first).charts]
+    assert code == 0 and listed == [*(c.id for c in charts_of(first).charts), "graph"]
     code, out, _ = rigcal("plot", runs[0].folder, "chain", "-o", tmp_path / "chain.png", "--json")
     assert code == 0 and json.loads(out)["id"] == "chain" and (tmp_path / "chain.png").is_file()
     code, out, err = rigcal("plot", runs[0].folder, "chainn", "-o", tmp_path / "x.png")

@@ -5,7 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 
 from calib.report.chart import Absent, Chart
-from calib.report.charts import bodies, fit, formulas, groups, knowledge, links, misfit, residuals
+from calib.report.charts import (
+    bodies,
+    fit,
+    formulas,
+    graph,
+    groups,
+    knowledge,
+    links,
+    misfit,
+    residuals,
+)
 from calib.report.evidence import Evidence
 
 Charts = Callable[[Evidence], Iterator[Chart | Absent]]
@@ -21,3 +31,4 @@ SECTIONS: Mapping[str, tuple[Charts, ...]] = {
     ),
     "What could not be determined": (knowledge.correlation,),
 }
+ALONE: tuple[Charts, ...] = (graph.graph,)  # figures that no report has: ask for them by name

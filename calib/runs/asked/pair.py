@@ -109,8 +109,9 @@ def unknowns_of(run: Run) -> Iterator[tuple[Unknown, np.ndarray]]:
     names = np.char.add(np.char.add(table["unknown"], "."), table["parameter"]).tolist()
     rows = {name: i for i, name in enumerate(names)}
     owners: dict[str, list[str]] = {}
-    for name in run.solution.names:
-        owners.setdefault(name.rpartition(".")[0], []).append(name)
+    for name in run.solution.names:  # a parameter's name may have dots, but for those of a pose
+        owner = str(table["unknown"][rows[name]]) if name in rows else name.rpartition(".")[0]
+        owners.setdefault(owner, []).append(name)
     vectors = {o: [rows[n] for n in own] for o, own in owners.items() if set(own) <= rows.keys()}
     norms = np.array([np.linalg.norm(table["whitened"][at]) for at in vectors.values()])
     weights = huber_weight(norms, np.array([len(at) for at in vectors.values()]))
