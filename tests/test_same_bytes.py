@@ -37,6 +37,7 @@ apply run {rec} -o applied
 SAYING = """
 check {rec} --json
 compare run deeper/run later --json
+moved run deeper/run --json
 effects --json
 reproduce deeper/run --json
 plan later --stops 1 --for lidar,arm_gravity_sag --json
@@ -128,5 +129,5 @@ def test_every_command_is_among_them():
 
 @pytest.mark.slow
 def test_what_is_made_again_is_identical(made):
-    documents = (json.loads((folder / "saying-3.txt").read_text()) for folder in made)
+    documents = (json.loads((folder / "saying-4.txt").read_text()) for folder in made)
     assert [each["identical"] for each in documents] == [True, True]

@@ -29,20 +29,19 @@ def find(stand: Stand, progress: Progress) -> list[Formula]:
         table = Table.of(
             stand.estimate, lambda done, total: progress("reading residuals", done, total)
         )
-        tables = [(RANGE, table)]
-    else:
-        tables = [(JOINT + name, table) for name, table in joint_tables(stand)]
+        steps = pursue(table, LEVELS["structure"], progress)
+        return settled(table, steps, RANGE) if steps else []
+    tables = dict(joint_tables(stand))
     alpha = LEVELS["structure"] / max(len(tables), 1)
-    pursued = [(site, table, pursue(table, alpha, progress)) for site, table in tables]
-    there = [each for each in pursued if each[2]]
-    if not there:
+    first = {name: pursue(table, alpha, progress, most=1) for name, table in tables.items()}
+    left = {name: _left(tables[name], steps) for name, steps in first.items() if steps}
+    if not left:
         return []
-    site, table, steps = min(there, key=_left)
-    return settled(table, steps, site)
+    joint = min(left, key=left.__getitem__)
+    return settled(tables[joint], pursue(tables[joint], alpha, progress), JOINT + joint)
 
 
-def _left(pursued: tuple[str, Table, Sequence[Step]]) -> float:
-    """Chi-square of all that was measured, beside the terms found of a site."""
-    _, table, steps = pursued
+def _left(table: Table, steps: Sequence[Step]) -> float:
+    """Chi-square of all that was measured, beside some terms."""
     columns = np.hstack([step.form.term.columns(table.covariates) for step in steps])
     return Projection.of(table, table.sigma_m**-2.0).fitted(columns)[0].chi2
