@@ -20,6 +20,23 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, lambda *_: None)
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
+# Heaviest first, by seconds of a core (105 to 25): the last files should be short ones.
+HEAVY = [
+    "test_docs",
+    "test_damage",
+    "test_components",
+    "test_view_browser",
+    "test_examples",
+    "test_same_bytes",
+    "test_outputs_killed",
+    "test_own_effects",
+    "test_linearise",
+    "test_formulas",
+    "test_converged",
+    "test_report_odd",
+    "test_formulas_shown",
+    "test_readme",
+]
 LIMIT_S = {"slow": 600, "long": 3600}  # of others: see pyproject.toml
 
 
@@ -31,7 +48,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             if item.get_closest_marker(mark):
                 item.add_marker(pytest.mark.timeout(limit_s), append=False)
                 slow[item.path] += 1
-    items.sort(key=lambda item: -slow[item.path])
+    rank = {name: at - len(HEAVY) for at, name in enumerate(HEAVY)}
+    items.sort(key=lambda item: (rank.get(item.path.stem, 0), -slow[item.path]))
 
 
 @pytest.fixture(scope="session", autouse=True)
