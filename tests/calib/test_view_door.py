@@ -212,7 +212,7 @@ def test_each_browser_has_a_view_of_its_own_and_only_the_key_changes_anything(be
     try:
         pages = attend(served, bench)
         with browser(served.address) as one, browser(served.look_address) as two:
-            until(lambda: len(pages) == 2 and all(p.stage.points for p in pages.values()))
+            until(lambda: len(pages) == len(bench._hearers) == 2)  # once shown, a page listens
             mine = next(p for p in pages.values() if p.may_change)
             other = next(p for p in pages.values() if not p.may_change)
             assert mine.desk.chosen == other.desk.chosen == "run"
@@ -280,7 +280,7 @@ def test_a_run_that_one_browser_makes_is_offered_in_all(bench, monkeypatch, tmp_
     try:
         pages = attend(served, bench)
         with browser(served.address), browser(served.address):
-            until(lambda: len(pages) == 2 and all(p.stage.points for p in pages.values()))
+            until(lambda: len(pages) == len(bench._hearers) == 2)  # once shown, a page listens
             one, two = pages.values()
             one._on_add()
             until(lambda: one.desk.chosen == "made" and "made" in two._run.options)
