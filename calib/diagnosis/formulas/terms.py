@@ -82,8 +82,7 @@ def refine(projection: Projection, term: Term, kept: Sequence[int] = ()) -> Term
     if not term.constants:
         return term
     covariates = projection.table.covariates
-    ends = np.concatenate([f.bounds(covariates[f.covariate]) for f in term.factors])
-    wide = _wide(term, covariates)
+    ends, wide = _ends(term, covariates), _wide(term, covariates)
     for size in CLOSER:
         for i in range(len(wide)):
             places = np.clip(term.constants[i] + size * wide[i] * np.array(BESIDE), *ends[i])
@@ -96,12 +95,13 @@ def refine(projection: Projection, term: Term, kept: Sequence[int] = ()) -> Term
 
 def slopes(covariates: Columns, term: Term, kept: Sequence[int], amount: np.ndarray) -> np.ndarray:
     """Derivative (N, c) by its constants of a term whose columns `kept` have amounts (k,)."""
-    wide = _wide(term, covariates)
-    out = []
-    for i, by in enumerate(NUDGE * wide):
-        sides = [term.at(_with(term.constants, i, term.constants[i] + d)) for d in (by, -by)]
+    ends, out = _ends(term, covariates), []
+    for i, by in enumerate(NUDGE * _wide(term, covariates)):
+        # Within bounds: a scale that changes its sign overflows.
+        high, low = np.clip([term.constants[i] + by, term.constants[i] - by], *ends[i]).tolist()
+        sides = [term.at(_with(term.constants, i, value)) for value in (high, low)]
         up, down = (c[:, kept] @ amount for c in _changed(term, sides, covariates))
-        out.append((up - down) / (2 * by))
+        out.append((up - down) / max(high - low, 1e-300))
     rows = len(next(iter(covariates.values())))
     return np.stack(out, axis=1) if out else np.zeros((rows, 0))
 
@@ -147,6 +147,11 @@ def _changed(term: Term, some: Sequence[Term], covariates: Columns) -> list[np.n
 
 def _made(factor: Factor, made: dict[Factor, np.ndarray], covariates: Columns) -> np.ndarray:
     return made[factor] if factor in made else factor.columns(covariates)
+
+
+def _ends(term: Term, covariates: Columns) -> np.ndarray:
+    """(c, 2) of each constant the least and largest value."""
+    return np.concatenate([f.bounds(covariates[f.covariate]) for f in term.factors])
 
 
 def _wide(term: Term, covariates: Columns) -> np.ndarray:

@@ -9,7 +9,7 @@ import pytest
 from calib.diagnosis.formulas.factors import Factor
 from calib.diagnosis.formulas.found import Formula, Part, settled
 from calib.diagnosis.formulas.pursuit import Form, Step, form, pursue, simplest
-from calib.diagnosis.formulas.terms import Term, refine
+from calib.diagnosis.formulas.terms import Term, refine, slopes
 
 from .made import table
 
@@ -181,6 +181,22 @@ def test_no_more_terms_than_asked_for():
 
 
 # Refining -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("share", [0.005, 0.006, 0.3, 3.0])
+def test_slopes_are_derivatives_also_where_a_scale_is_at_its_end(share):
+    """Of a decay: one over the square of its scale; where it is nearly a step, at least finite."""
+    beams = table(17, stops=5)
+    x = beams.covariates["range_m"]
+    low, scale = x.min(), share * np.ptp(x)
+    term = Term((Factor("range_m", "decay", (scale, low)),))
+    (slope,) = slopes(beams.covariates, term, [0], np.array([2.0])).T
+    true = 2.0 * np.exp(-(x - low) / scale) * (x - low) / scale**2
+    assert np.isfinite(slope).all()
+    if 0.01 < share < 3.0:
+        assert slope == pytest.approx(true, abs=0.01 * true.max())
+    else:
+        assert slope @ true > 0.0
 
 
 @pytest.mark.parametrize(
