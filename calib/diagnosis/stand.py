@@ -141,7 +141,7 @@ class Stand:
     ) -> tuple[Linear, dict[str, np.ndarray]]:
         """All rows with these candidates beside the model, and each one's columns among theirs."""
         wide = self.problem_of(self.model.plus(tuple(candidates)))
-        variables = _variables(wide, {e.name for e in candidates})
+        variables = variables_of(wide, {e.name for e in candidates})
         linear = linearise_with(wide, self.estimate, [*chain(*variables.values())], progress)
         at, start = {}, 0
         for name, theirs in variables.items():
@@ -307,7 +307,7 @@ class Look:
         """A candidate's test with its clusters jackknifed: see `jackknife`."""
         stand, found = self.stand, candidate.test
         wide = stand.problem_of(stand.model.plus((candidate.effect,)))
-        names = _variables(wide, {candidate.effect.name})[candidate.effect.name]
+        names = variables_of(wide, {candidate.effect.name})[candidate.effect.name]
         away = away_from_model(self.linear, names) @ found.whiten
         by_name = {name: away[at] for name, at in self.linear.columns.items()}
         shares = Shares()
@@ -328,7 +328,7 @@ def tried(fit: Callable[..., Stand], *of: Any) -> Stand | None:
         return None
 
 
-def _variables(problem: Problem, effects: set[str]) -> dict[str, list[str]]:
+def variables_of(problem: Problem, effects: set[str]) -> dict[str, list[str]]:
     """Effect -> its variables: one, or one per rig."""
     found: dict[str, dict[str, None]] = {}
     for terms in problem.terms:

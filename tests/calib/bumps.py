@@ -10,24 +10,27 @@ from calib.runs.calibrate import calibrate
 from calib.runs.run import Run
 from calib.simulation import load_spec, simulate
 from chains import se3
-from sensors.recording import read_table, write_table
+
+from ..mishaps import Scene
+from ..mishaps.scene import XYZ
 
 BUMP = np.array([0, 0, 0.004, 0.003, 0, 0])  # rad, m
 
 
 def keep(recording: Path, locations: tuple[str, ...]) -> None:
     """Leave only the stops at these locations."""
-    head, *stops = (recording / "stops.csv").read_text().splitlines()
-    kept = [stop for stop in stops if stop.split(",")[1] in locations]
-    (recording / "stops.csv").write_text("\n".join([head, *kept, ""]))
+    with Scene(recording, np.random.default_rng()).sheet("stops.csv") as stops:
+        stops.keep([i for i, at in enumerate(stops.columns["location"]) if at in locations])
 
 
 def bump(recording: Path) -> None:
     """Move the LiDAR on its mount: it sees every point from elsewhere."""
-    for path in (recording / "scans").glob("*.parquet"):
-        scan = read_table(path)
-        points = se3.apply(se3.exp(-BUMP), np.stack([scan[axis] for axis in "xyz"], axis=1))
-        write_table(path, scan | dict(zip("xyz", points.T.astype(np.float32), strict=True)))
+
+    def moved(scan: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        points = se3.apply(se3.exp(-BUMP), np.stack([scan[axis] for axis in XYZ], axis=1))
+        return scan | dict(zip(XYZ, points.T, strict=True))
+
+    Scene(recording, np.random.default_rng()).each_scan(moved)
 
 
 def bumped(out: Path) -> None:

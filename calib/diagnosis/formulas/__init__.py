@@ -38,7 +38,8 @@ def find(stand: Stand, progress: Progress) -> list[Formula]:
     if not left:
         return []
     joint = min(left, key=left.__getitem__)
-    return settled(tables[joint], pursue(tables[joint], alpha, progress), JOINT + joint)
+    steps = pursue(tables[joint], alpha, progress, found=first[joint])
+    return settled(tables[joint], steps, JOINT + joint)
 
 
 def _left(table: Table, steps: Sequence[Step]) -> float:

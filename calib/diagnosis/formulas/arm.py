@@ -9,14 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 from scipy.sparse import csr_array, eye_array
 
 from calib.diagnosis.candidates import stops_view
-from calib.diagnosis.formulas.table import NOT_COVARIATES, Table
-from calib.diagnosis.linear import beside, other_rows
-from calib.diagnosis.stand import Stand
+from calib.diagnosis.formulas.factors import covariates_of
+from calib.diagnosis.formulas.table import Table, rows_of_others
+from calib.diagnosis.linear import beside
+from calib.diagnosis.stand import Stand, variables_of
 from calib.effects.own.formula import FormulaEffect
 from calib.linear.clusters import Gradients
 from calib.linear.layout import Layout
@@ -34,17 +36,16 @@ def joint_tables(stand: Stand) -> Iterator[tuple[str, Table]]:
     wide, values = beside(
         stand.problem_of(stand.model.plus(tuple(effect for _, effect in levers))), stand.estimate
     )
-    of = [next(n for n in wide.variables if n.startswith(effect.name)) for _, effect in levers]
-    layout = Layout.of(wide, unbounded=of)
+    turned = variables_of(wide, {effect.name for _, effect in levers})
+    layout = Layout.of(wide, unbounded=[*chain(*turned.values())])
     if layout.size > LARGEST:
         return
-    rows = list(other_rows(wide, layout, values, Gradients(layout.size)))
-    A = np.vstack([_over(r.A, r.columns, layout.size) for r in rows])
-    b, stop, place = (np.concatenate([getattr(r, k) for r in rows]) for k in ("b", "stop", "place"))
-    model = np.setdiff1d(np.arange(layout.size), [layout.at[n].start for n in of])
-    covariates = _covariates(stand, layout)
-    for (joint, _), name in zip(levers, of, strict=True):
-        if found := _table(A, b, stop, place, layout.at[name].start, model, covariates):
+    A, *of_rows = rows_of_others(wide, layout, values, Gradients(layout.size))
+    A, covariates = A.toarray(), _covariates(stand, layout)
+    at = {joint: layout.columns(turned[effect.name]) for joint, effect in levers}
+    model = np.setdiff1d(np.arange(layout.size), np.concatenate(list(at.values())))
+    for joint, columns in at.items():
+        if found := _table(A[:, model], A[:, columns].sum(axis=1), *of_rows, covariates):
             weight = sum(len(body.measured) / body.sigma_m**2 for body in wide.bodies)
             yield joint, replace(found, weight_m2=weight, joints=frozenset(rig.joint_names))
 
@@ -61,24 +62,17 @@ def _lever(number: int, joint: str) -> tuple[str, FormulaEffect]:
     return joint, FormulaEffect.read(document, "a table of poses", {})
 
 
-def _over(A: np.ndarray | csr_array, columns: np.ndarray, size: int) -> np.ndarray:
-    out = np.zeros((A.shape[0], size))
-    out[:, columns] = A.toarray() if isinstance(A, csr_array) else A
-    return out
-
-
 def _table(
     A: np.ndarray,
+    lever: np.ndarray,
     b: np.ndarray,
     stop: np.ndarray,
     place: np.ndarray,
-    lever: int,
-    model: np.ndarray,
     covariates: dict[str, np.ndarray],
 ) -> Table | None:
-    """The table of one joint, of whitened rows A (R, U), b (R,), whose column `lever` is how they
-    change as it turns; those of `model` are unknown."""
-    a = np.where(stop >= 0, A[:, lever], 0.0)
+    """The table of one joint, of whitened rows A (R, U), b (R,); `lever` (R,) is how they change as
+    it turns."""
+    a = np.where(stop >= 0, lever, 0.0)
     size = np.sqrt(np.bincount(np.maximum(stop, 0), np.square(a)))
     seen = size > SEEN * size.max(initial=0.0)
     if not seen.any():
@@ -91,7 +85,7 @@ def _table(
     v[first] += np.where(a[first] < 0, -1.0, 1.0) * size[stop[first]]
     length = np.bincount(np.maximum(stop, 0), np.square(v))
     v = np.where((stop >= 0) & seen[np.maximum(stop, 0)], v, 0.0)
-    full = np.column_stack([A[:, model], b])
+    full = np.column_stack([A, b])
     groups = csr_array((v, (np.maximum(stop, 0), np.arange(len(v)))), (len(size), len(v)))
     along = (groups @ full) * (2 / np.maximum(length, 1e-300))[:, None]
     full -= v[:, None] * along[np.maximum(stop, 0)]
@@ -107,7 +101,7 @@ def _table(
         place=np.full(len(first), -1),
         share=1.0,
         twists=csr_array(-full[first, :-1] * scale[:, None]),
-        chain=csr_array(eye_array(len(model), format="csr")),
+        chain=csr_array(eye_array(A.shape[1], format="csr")),
         others=csr_array(full[rest, :-1]),
         others_b=full[rest, -1],
         others_stop=stop[rest],
@@ -121,14 +115,8 @@ def _covariates(stand: Stand, layout: Layout) -> dict[str, np.ndarray]:
     rows, every = {}, []
     for number, source in enumerate(stand.sources):
         view, stops = stops_view(source), len(source.recording.stops)
-        columns = {}
-        for name in view.columns:
-            values = np.asarray(view[name])
-            if name in NOT_COVARIATES or name.startswith("moved."):
-                continue
-            if values.ndim == 1 and values.dtype.kind in "biuf":
-                columns[name] = np.broadcast_to(values, stops).astype(float)
-        every.append(columns)
+        columns = covariates_of(view)
+        every.append({n: np.broadcast_to(c, stops).astype(float) for n, c in columns})
         rows |= {(source.recording.folder, i): (number, i) for i in range(stops)}
     names = [n for n in every[0] if all(n in c for c in every)]
     at = [rows[key] for key in layout.stops]

@@ -14,6 +14,7 @@ from itertools import combinations
 
 import numpy as np
 
+from calib.effects import View
 from calib.effects.own.expression import Expression
 
 Columns = Mapping[str, np.ndarray]
@@ -30,6 +31,10 @@ ORDERS = 12  # of harmonics of an angle
 FEWEST_VALUES = 3  # of a covariate that is not a class
 WIDE = 1.5  # largest over smallest value, from which powers differ from a line
 LEAST_SHARE = 0.005  # of the beams that a class must have
+# Columns that name a part of the room, a beam or a stop, and so are no covariate; the rest of the
+# room is in range, incidence and label.
+NOT_COVARIATES = {"surface", "region", "patch", "plane", "column", "elapsed_s"}
+NOT_COVARIATES |= {"reference_intensity", "stop", "location", "tracked", "normal", "point_m"}
 
 
 @dataclass(frozen=True)
@@ -147,6 +152,16 @@ class Factor:
     def at(self, constants: tuple[float, ...]) -> Factor:
         """The same with other free constants."""
         return replace(self, constants=(*constants, *self.constants[len(constants) :]))
+
+
+def covariates_of(view: View) -> Iterator[tuple[str, np.ndarray]]:
+    """Names and columns that residuals may hang on: (N,), or (1,) where one value holds for all."""
+    for name in view.columns:
+        if name in NOT_COVARIATES or name.startswith("moved."):
+            continue
+        values = np.asarray(view[name])
+        if values.ndim == 1 and values.dtype.kind in "biuf":
+            yield name, values
 
 
 def columns_of(texts: tuple[str, ...], covariates: Columns) -> np.ndarray:

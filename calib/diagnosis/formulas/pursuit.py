@@ -109,7 +109,13 @@ def forms(projection: Projection, bases: Bases, covariates: Sequence[str]) -> li
     return sorted((f for f in found if f.dof), key=lambda f: -f.evidence)
 
 
-def pursue(table: Table, alpha: float, progress: Progress, most: int = MOST_TERMS) -> list[Step]:
+def pursue(
+    table: Table,
+    alpha: float,
+    progress: Progress,
+    most: int = MOST_TERMS,
+    found: Sequence[Step] = (),
+) -> list[Step]:
     """Terms that stand out from chance, one beside the other, strongest first.
 
     Args:
@@ -117,9 +123,9 @@ def pursue(table: Table, alpha: float, progress: Progress, most: int = MOST_TERM
         alpha: chance that any is told where nothing is missing.
         progress: called with what is being done, how far it is, and of how much.
         most: how many terms there are at most.
+        found: those that are known already, to go on from.
     """
-    bases = Bases(table, int(table.stop.max()) + 1)
-    found: list[Step] = []
+    bases, found = Bases(table, int(table.stop.max()) + 1), list(found)
     while len(found) < most:
         columns = [s.form.term.columns(table.covariates) for s in found]
         fitted = table.beside(np.hstack(columns)).projection() if found else table.projection()

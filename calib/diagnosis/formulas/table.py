@@ -15,6 +15,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from scipy.sparse import block_diag, csr_array, eye_array, hstack, vstack
 
+from calib.diagnosis.formulas.factors import covariates_of
 from calib.diagnosis.jackknife import Shares
 from calib.diagnosis.linear import beside, other_rows
 from calib.diagnosis.score import GAUGE, Scores, Test, test
@@ -23,6 +24,7 @@ from calib.linear.layout import Layout
 from calib.linear.linearise import lidars
 from calib.linear.parallel import in_order
 from calib.linear.rows import TWIST, StopRows
+from calib.problem import Problem
 from calib.residuals.robust import MAD
 from calib.solve.estimate import Estimate
 
@@ -33,10 +35,6 @@ MOST_BEAMS = 20_000
 DRAWS = 499  # scores of chance: 25 of them beyond the quantile that counts looks
 PASSES = 3  # of weighing, after which weights of a gross structure change by less than 1 %
 HUBER = 1.345  # sigmas: 95 % efficiency on normal rows (Huber 1981)
-# Columns that name a part of the room, a beam or a stop, and so are no covariate; the rest of the
-# room is in range, incidence and label.
-NOT_COVARIATES = {"surface", "region", "patch", "plane", "column", "elapsed_s"}
-NOT_COVARIATES |= {"reference_intensity", "stop", "location", "tracked", "normal", "point_m"}
 
 
 @dataclass(frozen=True)
@@ -105,11 +103,7 @@ class Table:
             progress(i, len(scans))
             drawn.append(each.numbered(places, scans[i].room))
         names = [n for n in drawn[0].columns if all(n in d.columns for d in drawn)]
-        others = [
-            (_rows_over(rows.A, rows.columns, layout.size), rows.b, rows.stop, rows.place)
-            for rows in other_rows(problem, layout, values, places)
-        ]
-        wide, b, others_stop, others_place = zip(*others, strict=True)
+        others, b, others_stop, others_place = rows_of_others(problem, layout, values, places)
         begin, every = TWIST * len(scans), [d.covariates(names) for d in drawn]
         chains = [_rows_over(d.rows.chain, d.rows.chain_columns, layout.size) for d in drawn]
         twists = [
@@ -126,10 +120,10 @@ class Table:
             share=share,
             twists=csr_array(vstack(twists)),
             chain=csr_array(vstack([*chains, eye_array(layout.size, format="csr")])),
-            others=csr_array(vstack(wide)),
-            others_b=np.concatenate(b),
-            others_stop=np.concatenate(others_stop),
-            others_place=np.concatenate(others_place),
+            others=others,
+            others_b=b,
+            others_stop=others_stop,
+            others_place=others_place,
             joints=frozenset(drawn[0].rows.rows.view.rig.joint_names),
         )
 
@@ -352,12 +346,8 @@ class _Drawn:
         usable = np.flatnonzero(rows.rows.usable & np.isfinite(rows.rows.residual_m))
         drawn = np.random.default_rng(seed).choice(usable, round(share * len(usable)), False)
         picked, columns = np.sort(drawn), {}
-        for name, column in rows.rows.view.columns.items():
-            if name in NOT_COVARIATES or name.startswith("moved."):
-                continue
-            values = np.asarray(column() if callable(column) else column)
-            if values.ndim == 1 and values.dtype.kind in "biuf":
-                columns[name] = (values[picked] if len(values) > 1 else values).astype(float)
+        for name, values in covariates_of(rows.rows.view):
+            columns[name] = (values[picked] if len(values) > 1 else values).astype(float)
         surfaces, met = rows.places()
         return cls(rows, picked, columns, surfaces, met=met[picked])
 
@@ -386,6 +376,17 @@ def _twists(rows: StopRows, picked: np.ndarray, first: int, begin: int, size: in
     out = csr_array((values.ravel(), at.ravel(), ends), (len(picked), size))
     out.eliminate_zeros()
     return out
+
+
+def rows_of_others(
+    problem: Problem, layout: Layout, values: Mapping[str, np.ndarray], places: Gradients
+) -> tuple[csr_array, np.ndarray, np.ndarray, np.ndarray]:
+    """Rows of trackers, targets and priors: (R, U) whitened, (R,) their right side, and the stop
+    and place (R,) of each."""
+    rows = list(other_rows(problem, layout, values, places))
+    A = csr_array(vstack([_rows_over(r.A, r.columns, layout.size) for r in rows]))
+    b, stop, place = (np.concatenate([getattr(r, k) for r in rows]) for k in ("b", "stop", "place"))
+    return A, b, stop, place
 
 
 def _rows_over(A: np.ndarray | csr_array, columns: np.ndarray, size: int) -> csr_array:

@@ -34,7 +34,8 @@ def test_a_table_of_poses_explains_what_dense_least_squares_does(rows):
     """The lever of a stop times a function of the stop, beside all unknowns but the lever."""
     A, b, stop, place, functions = rows
     lever, model = UNKNOWNS, np.arange(UNKNOWNS)
-    table = _table(A, b, stop, place, lever, model, {"wind": np.arange(STOPS, dtype=float)})
+    wind = {"wind": np.arange(STOPS, dtype=float)}
+    table = _table(A[:, model], A[:, lever], b, stop, place, wind)
     assert len(table) == STOPS and table.unit == "rad"
     columns = np.where(stop[:, None] >= 0, A[:, [lever]] * functions[np.maximum(stop, 0)], 0.0)
 
@@ -56,8 +57,7 @@ def test_a_table_of_poses_explains_what_dense_least_squares_does(rows):
 
 def test_a_joint_that_no_body_feels_has_no_table(rows):
     A, b, stop, place, _ = rows
-    A[:, UNKNOWNS] = 0.0
-    assert _table(A, b, stop, place, UNKNOWNS, np.arange(UNKNOWNS), {}) is None
+    assert _table(A, np.zeros(len(b)), b, stop, place, {}) is None
 
 
 def fitted(folder) -> Stand:

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from calib.diagnosis.formulas.table import NOT_COVARIATES
+from calib.diagnosis.formulas.factors import NOT_COVARIATES
 from calib.diagnosis.formulas.why import ARM_JOINT, JOINT, MECHANISMS, OF_ARM, OTHER, why
 from calib.diagnosis.verdict import unnamed as module
 from calib.diagnosis.verdict.unnamed import unnamed
