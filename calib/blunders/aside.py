@@ -47,6 +47,7 @@ def stray_scans(
             p_adjusted=float(after_looks(p, looks)),
             evidence=-chance,
             limit=CONTRADICTS**2,
+            enough=CONTRADICTS**2,
             detectable={"m": CONTRADICTS * sigma_m},
             looks=looks,
         )

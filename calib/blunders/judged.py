@@ -47,7 +47,8 @@ class Blunder:
         p_adjusted: the same, all groups looked at being paid for.
         evidence: minus the log of the p-value of independent rows, at the scale of its kind.
         limit: of the statistic, beyond which it is named.
-        detectable: unit -> size that is found with 80 % power.
+        enough: of the statistic's noncentrality, to be found with 80 % power.
+        detectable: unit -> size that is so.
         looks: how many groups were looked at.
     """
 
@@ -56,6 +57,7 @@ class Blunder:
     p_adjusted: float
     evidence: float
     limit: float
+    enough: float
     detectable: Mapping[str, float]
     looks: int
 
@@ -160,6 +162,7 @@ def _judged(some: Sequence[Shift], looks: int) -> Iterator[Blunder]:
             p_adjusted=float(after_looks(p, looks)),
             evidence=-log_tail(scaled, shift.dof),
             limit=float(limit * shift.dof * bulk),
+            enough=float(enough * bulk),
             detectable={u: float(np.sqrt(enough * bulk / t)) for u, t in told.items() if t > 0},
             looks=looks,
         )

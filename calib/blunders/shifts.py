@@ -20,19 +20,14 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.linalg import block_diag, cho_factor, cho_solve
+from scipy.linalg import block_diag
 
-from calib.blunders.rows import GraphRows, GroupRows, group_rows, scan_rows
-from calib.linear.layout import positions
+from calib.blunders.others import UNCHECKED, Others, at_their_sigmas, batches, whitening
+from calib.blunders.rows import GroupRows, group_rows, scan_rows
 from calib.linear.system import Linearisation
 from calib.problem.problem import Problem
 from calib.residuals.groups import BEAMS, Group
 from calib.solve.components import Sums, Told, squares_beside_bodies
-from calib.solve.graph import Graph
-
-# Of I - w H: below this a direction is held by the group alone (rounding of C is some 1e-9 of it).
-UNCHECKED = 1e-6
-TOGETHER = 400  # rows whose covariance is computed at once: bounds the memory
 
 
 @dataclass(frozen=True)
@@ -80,11 +75,11 @@ def shifts(whole: Linearisation, problem: Problem) -> Iterator[Shift]:
         whole: all rows at the solution of a fit, with its scans.
         problem: of that fit; candidates beside it change nothing.
     """
-    others = _Others.of(whole)
+    others = Others.of(whole)
     sets: dict[tuple[str, str], list[GroupRows]] = {}
     for rows in group_rows(whole, problem, others.graph_rows):
         sets.setdefault(rows.at, []).append(rows)
-    for some in _batches(list(sets.values())):
+    for some in batches(list(sets.values())):
         yield from _against(others, some)
 
 
@@ -102,7 +97,7 @@ def standing_alone(
         some: shifts of these, and the limit of the statistic beyond which each stands out; the
             worst first.
     """
-    others = _Others.of(whole)
+    others = Others.of(whole)
     wanted = {(shift.group, shift.of_ranges) for shift, _ in some}
     mine = {
         key: rows
@@ -112,7 +107,7 @@ def standing_alone(
     }
     order = [shift.group for shift, _ in some]
     every = [mine[shift.group, shift.of_ranges] for shift, _ in some]
-    H, b = _at_their_sigmas(every, *others.against(every))
+    H, b = at_their_sigmas(every, *others.against(every))
     own = block_diag(*(rows.groups[group] for group, rows in zip(order, every, strict=True)))
     raw = block_diag(*(np.eye(len(r.A)) if r.information is None else r.information for r in every))
     M, u = own.T @ (raw - H) @ own, own.T @ b
@@ -133,7 +128,7 @@ def beside_bodies(
 ) -> Sums:
     """What rows that are of no body say of their sigmas; arguments as of
     `components.squares_beside_bodies`."""
-    others = _Others.of(whole)
+    others = Others.of(whole)
     return squares_beside_bodies(
         problem, whole.values, whole, others.kept, whose, others.graph_rows, wild
     )
@@ -149,7 +144,7 @@ def of_poses(whole: Linearisation, problem: Problem, wild: Collection[Group]) ->
     ]
     if not every:
         return None
-    H, b = _Others.of(whole).against(every)
+    H, b = Others.of(whole).against(every)
     raw = block_diag(*(rows.information for rows in every))
     size = np.sqrt(np.maximum(np.diag(raw), 1e-300))
     values, axes = np.linalg.eigh((raw - H) / np.outer(size, size))
@@ -167,87 +162,17 @@ def _statistic(M: np.ndarray, u: np.ndarray, at: np.ndarray) -> float:
     if not len(at):
         return 0.0
     size = np.sqrt(np.maximum(np.diag(M)[at], 1e-300))
-    return float(np.sum(np.square(_whitening(M[np.ix_(at, at)], size).T @ u[at])))
+    return float(np.sum(np.square(whitening(M[np.ix_(at, at)], size).T @ u[at])))
 
 
-def _whitening(M: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """What takes a score (r,) of information M (r, r) to independent ones (dof,) of unit variance,
-    in the directions that anything contradicts, in units of `size` (r,)."""
-    values, axes = np.linalg.eigh(M / np.outer(size, size))
-    seen = values > UNCHECKED
-    return axes[:, seen] / np.sqrt(values[seen]) / size[:, None]
-
-
-@dataclass(frozen=True)
-class _Others:
-    """What all rows of a fit say, against which some of them are held.
-
-    Args:
-        whole: they, linearised.
-        graph_rows: those of the kept unknowns that are not in it.
-        kept: (S, S) covariance of the kept unknowns.
-        step: (U,) one more step of all unknowns.
-    """
-
-    whole: Linearisation
-    graph_rows: GraphRows
-    kept: np.ndarray
-    step: np.ndarray
-
-    @classmethod
-    def of(cls, whole: Linearisation) -> _Others:
-        layout = whole.layout
-        graph = Graph(list(layout.outer().values()), layout.others, layout.unbounded)
-        graph_rows = list(graph.linear_rows(whole.values))
-        kept = _kept_covariance(whole, graph_rows)
-        return cls(whole, graph_rows, kept, step=_step(whole, graph_rows, kept))
-
-    def against(self, every: Sequence[GroupRows]) -> tuple[np.ndarray, np.ndarray]:
-        """H and b of these rows."""
-        ends = np.cumsum([0, *(len(rows.A) for rows in every)])
-        A = np.zeros((ends[-1], self.whole.layout.size))
-        for rows, start in zip(every, ends, strict=False):
-            np.add.at(A[start : start + len(rows.A)].T, rows.columns, rows.A.T)
-        b = np.concatenate([rows.b for rows in every]) - A @ self.step
-        return self.whole.covariance(A, self.kept), b
-
-
-def _batches(sets: Sequence[Sequence[GroupRows]]) -> Iterator[list[Sequence[GroupRows]]]:
-    """Sets of groups, no more at once than memory should hold."""
-    batch, count = [], 0
-    for some in sets:
-        batch.append(some)
-        count += sum(len(rows.A) for rows in some)
-        if count > TOGETHER:
-            yield batch
-            batch, count = [], 0
-    if batch:
-        yield batch
-
-
-def _against(others: _Others, sets: Sequence[Sequence[GroupRows]]) -> Iterator[Shift]:
+def _against(others: Others, sets: Sequence[Sequence[GroupRows]]) -> Iterator[Shift]:
     """Groups against all other rows."""
     H, b = others.against([rows for some in sets for rows in some])
     first = 0
     for some in sets:
         mine = slice(first, first + sum(len(rows.A) for rows in some))
         first = mine.stop
-        yield from _of_set(some, *_at_their_sigmas(some, H[mine, mine], b[mine]))
-
-
-def _at_their_sigmas(
-    some: Sequence[GroupRows], H: np.ndarray, b: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """H and b had these rows not lost any weight: only so is the one that did judged as the others
-    that it contradicts. Rows g that get the weight 1 - w back change what is known by
-    ``C' = C - C A_g^T (1 / (1 - w) + A_g C A_g^T)^-1 A_g C``."""
-    back = np.concatenate([1.0 - rows.weight for rows in some])
-    g = np.flatnonzero(back > 0)
-    if not len(g):
-        return H, b
-    gain = np.linalg.solve(np.diag(1.0 / back[g]) + H[np.ix_(g, g)], H[g])
-    H = H - H[:, g] @ gain
-    return H, b - H[:, g] @ (back[g] * b[g])
+        yield from _of_set(some, *at_their_sigmas(some, H[mine, mine], b[mine]))
 
 
 def _of_set(some: Sequence[GroupRows], H: np.ndarray, b: np.ndarray) -> Iterator[Shift]:
@@ -266,7 +191,7 @@ def _of_sums(group: Group, rows: GroupRows, score: np.ndarray, explained: np.nda
     left, score = own.T @ (rows.information - explained) @ own, own.T @ score
     size = np.sqrt(np.maximum(np.diag(own.T @ rows.information @ own), 1e-300))
     at = np.argmax(own, axis=0)
-    whiten = _whitening(left, size)
+    whiten = whitening(left, size)
     score = whiten.T @ score
     return Shift(
         group=group,
@@ -309,32 +234,3 @@ def _squares(rows: GroupRows, b: np.ndarray, H: np.ndarray) -> dict[str, tuple[f
         unit: (float(np.square(b[units == unit]).sum()), float(left[units == unit].sum()))
         for unit in dict.fromkeys(rows.units)
     }
-
-
-def _kept_covariance(whole: Linearisation, graph_rows: GraphRows) -> np.ndarray:
-    """Covariance (S, S) of what was kept, with every prior at its word; 0 for candidates."""
-    layout = whole.layout
-    information, at = whole.kept[:-1, :-1].copy(), positions(layout.size, layout.kept)
-    for _, by, _ in graph_rows:
-        columns = layout.columns(list(by))
-        rows = np.hstack(list(by.values())) * layout.sigma[columns]
-        information[np.ix_(at[columns], at[columns])] += rows.T @ rows
-    candidates = at[layout.columns(sorted(layout.unbounded))]
-    model = np.setdiff1d(np.arange(len(information)), candidates)
-    out = np.zeros_like(information)
-    block = cho_factor(information[np.ix_(model, model)])
-    out[np.ix_(model, model)] = cho_solve(block, np.eye(len(model)))
-    return out * np.outer(layout.sigma[layout.kept], layout.sigma[layout.kept])
-
-
-def _step(whole: Linearisation, graph_rows: GraphRows, kept: np.ndarray) -> np.ndarray:
-    """The step (U,) to the optimum of all rows as they were linearised and weighted: next to
-    nothing where the fit had converged."""
-    layout = whole.layout
-    at, right = positions(layout.size, layout.kept), whole.kept[:-1, -1].copy()
-    for _, by, b in graph_rows:
-        columns = layout.columns(list(by))
-        right[at[columns]] += (np.hstack(list(by.values())) * layout.sigma[columns]).T @ b
-    unit = layout.sigma[layout.kept]
-    scaled = (kept @ (right / unit)) / unit
-    return whole.directions(np.append(scaled, -1.0)[:, None])[:, 0] * layout.sigma

@@ -9,6 +9,7 @@ import numpy as np
 
 from calib.blunders.chance import LEAST_P
 from calib.blunders.judged import Blunder, LeftOut
+from calib.blunders.reach import Reach
 from calib.residuals.groups import BEAMS, JOINTS, MESH, Group
 from calib.rig import Rig
 from sensors.rings import RingFinding
@@ -19,11 +20,13 @@ SIGN = 0.05  # of twice a value on paper, within which it is off as a wrong sign
 
 
 def groups(
-    looked_at: Iterable[Blunder], others: Mapping[str, Mapping[str, float]]
+    looked_at: Iterable[Blunder],
+    others: Mapping[str, Mapping[str, float]],
+    unseen: Mapping[Group, Reach],
 ) -> dict[str, Any]:
     """How far out every group that was looked at is, and the size from which a mishap to it, or to
-    what is no group of rows, would be found, as diagnosis.json has them; of a group that is there
-    twice, as it is at first."""
+    what is no group of rows, would be found, and how far one that is not would move an estimate, as
+    diagnosis.json has them; of a group that is there twice, as it is at first."""
     first: dict[str, Blunder] = {}
     sizes: dict[str, dict[str, float]] = {}
     for blunder in looked_at:
@@ -39,6 +42,7 @@ def groups(
                 "dof": b.shift.dof,
                 "limit": b.limit,
                 "p_value": b.p_value,
+                "unseen": unseen[b.group].document() if b.group in unseen else None,
             }
             for token, b in first.items()
         ],

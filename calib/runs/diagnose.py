@@ -12,10 +12,11 @@ import numpy as np
 
 from calib import outputs
 from calib.blunders import told
+from calib.blunders.reach import Reach, hardly_checked, reaches
 from calib.diagnosis.chance import Spread
 from calib.diagnosis.rejects import rejects
 from calib.diagnosis.search import search
-from calib.diagnosis.stand import Stand
+from calib.diagnosis.stand import Look, Stand
 from calib.diagnosis.verdict import Diagnosis, believed, conclude
 from calib.diagnosis.verdict.unnamed import Unnamed, unnamed
 from calib.diagnosis.weak import to_be_told_apart, weak_directions
@@ -23,6 +24,7 @@ from calib.effects import own_effects
 from calib.linear.parallel import one_blas_thread
 from calib.problem import build
 from calib.problem.model import default_effects
+from calib.residuals.groups import Group
 from calib.results.errors import Errors
 from calib.results.holdout import held_out
 from calib.rig.scanned import ScanSums, numbering
@@ -95,15 +97,18 @@ def _found(
         [told.of_rings(lidar, each) for lidar, each in harmful.items()],
         formulas,
     )
+    unseen = _reaches(found.looks[0], run) if run.converged else {}
     apart = to_be_told_apart(result.candidates, result.weak_directions)
     return replace(
         result,
         plan=command_to_plan(run, apart) if apart else "",
         scatter=[*_scatter(run), *result.scatter],
         detectable=_detectable(stand),
+        unseen=unseen,
         sentences=[
             *run.doubts,
             *result.sentences,
+            *hardly_checked(unseen),
             *map(told.whole, cautions(run)),
             *run.omissions,
             *(told.whole(each.sentence) for each in rings.values() if each not in harmful.values()),
@@ -178,6 +183,13 @@ def _detectable(stand: Stand) -> dict[str, dict[str, float]]:
     lidars = [s.rig.lidar for s in stand.sources if s.rig.lidar and s.recording.has_scan.any()]
     sizes = [size for size in map(least_off_rad, lidars) if np.isfinite(size)]
     return {"rings": {"rad": max(sizes)}} if sizes else {}
+
+
+def _reaches(look: Look, run: Run) -> dict[Group, Reach]:
+    """How far mishaps that are not found could move what a run reports."""
+    sigma = np.sqrt(np.diag(run.solution.covariance)).tolist()
+    known = dict(zip(run.solution.names, sigma, strict=True))
+    return reaches(look.fitted, look.stand.estimate.problem, look.blunders, known)
 
 
 def _unseen(stand: Stand, run: Run, progress: Progress) -> Errors:

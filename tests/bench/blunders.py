@@ -19,7 +19,7 @@ import shutil
 import tempfile
 import traceback
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from fnmatch import fnmatch
@@ -33,7 +33,7 @@ from threadpoolctl import threadpool_limits
 from sensors.documents import plain
 
 from ..mishaps import MISHAPS, TIMES, Done, Scene
-from ..mishaps.judge import as_truth, asked, largest, off, read_truth
+from ..mishaps.judge import as_truth, asked, largest, matches, off, read_truth
 from .blunders_table import NOTHING, show
 from .blunders_worlds import RIGS, made
 
@@ -121,8 +121,16 @@ def run(case: Case, worlds: Path, null: Mapping[str, Any]) -> dict[str, Any]:
                 "right": sorted(done.right) if done else [],
                 "group": sorted(done.group) if done else [],
                 "without_it": {key: null[key] for key in ("outcome", "names", "odd") if null},
+                "could_move": _could_move(null, done.right) if done else 0.0,
             }
         )
+
+
+def _could_move(null: Mapping[str, Any], right: Collection[str]) -> float:
+    """By how many sigmas the diagnosis of the good recording says that such a mishap could move an
+    estimate, unseen."""
+    unseen = null.get("unseen", {})
+    return max((far for token, far in unseen.items() if matches(token, right)), default=0.0)
 
 
 def _errors(

@@ -96,6 +96,9 @@ def show(results: Sequence[Result], console: Console | None = None) -> None:
     for title, which in (("SILENTLY WRONG", "silent"), ("FAULTS", "fault"), ("ENDLESS", "endless")):
         for r in (r for r in good if verdict(r) == which):
             console.print(f"{title}: {r['case']}: {_why(r)}", markup=False)
+    for r in (r for r in good if verdict(r) == "moved"):
+        said = f"the good recording's diagnosis says up to {r['could_move']:.1f}, unseen"
+        console.print(f"MOVED: {r['case']}: by {r['moved']:.1f} sigma; {said}", markup=False)
     for r in (r for r in good if false_names(r)):
         console.print(f"FALSE NAMES: {r['case']}: {', '.join(false_names(r))}", markup=False)
     for r in failed:

@@ -111,8 +111,8 @@ def asked(
         `outcome`: "refused", "fault", "endless", "not converged" or the verdict; `sentence`, `odd`
         (of check), `blunders` (names, most certain first, each with what it may be taken for),
         `names` (of effects and covariates), `rivals` (effect -> what it may be as well), `notes`
-        (names of what does no harm), `misfit`, `detectable`, `seconds` (check, fit, diagnose),
-        `codes` of their exits.
+        (names of what does no harm), `misfit`, `detectable`, `unseen`, `seconds` (check, fit,
+        diagnose), `codes` of their exits.
     """
     checked = rigcal("check", recording, limit_s=limit_s)
     fit = rigcal("fit", recording, "-o", run, "--hold-out", "none", limit_s=limit_s)
@@ -125,6 +125,7 @@ def asked(
         "names": [],
         "rivals": {},
         "detectable": {},
+        "unseen": {},
     }
     fitted = fit.code in (0, 3) and bool(fit.document)
     loose = fit.code == 3 or (fitted and not fit.document["converged"])
@@ -135,6 +136,7 @@ def asked(
         found |= {"blunders": blunders(diagnosis), "names": names(diagnosis)}
         found |= {"notes": notes(diagnosis), "rivals": rivals(diagnosis)}
         found["detectable"] = detectable(diagnosis)
+        found["unseen"] = unseen(diagnosis)
         outcome = outcome or diagnosis.get("verdict")
     last = said[-1]
     if fit.refused:
@@ -202,6 +204,13 @@ def detectable(diagnosis: Mapping[str, Any]) -> dict[str, float]:
         for unit, size in by_unit.items()
         if np.isfinite(size) and size > 0
     }
+
+
+def unseen(diagnosis: Mapping[str, Any]) -> dict[str, float]:
+    """Of a diagnosis: token of a group -> by how many sigmas a mishap that it would not find could
+    move an estimate."""
+    groups = (each for each in diagnosis.get("groups", ()) if each["unseen"])
+    return {each["token"]: float(each["unseen"]["sigmas"]) for each in groups}
 
 
 def matches(name: str, patterns: Sequence[str] | frozenset[str]) -> bool:

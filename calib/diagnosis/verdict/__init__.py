@@ -11,6 +11,7 @@ import numpy as np
 from calib.blunders import told
 from calib.blunders.chance import log_tail
 from calib.blunders.judged import Blunder, LeftOut
+from calib.blunders.reach import Reach
 from calib.diagnosis.candidates import concerned, lacking
 from calib.diagnosis.curves import Curve, curves
 from calib.diagnosis.rejects import Rejects
@@ -23,6 +24,7 @@ from calib.diagnosis.verdict.matters import weighed
 from calib.diagnosis.verdict.sentences import BAD, UNNAMED, sentences_of, stops_of
 from calib.diagnosis.verdict.unnamed import Unnamed
 from calib.problem.model import labels
+from calib.residuals.groups import Group
 from calib.rig import Rig
 
 VERDICTS = {
@@ -59,6 +61,7 @@ class Diagnosis:
         rejected: what the fit threw away; None without scans, or where nobody looked.
         scatter: how widely things scatter by chance, of the model and of what it lacks.
         detectable: of what is no group of rows: name -> unit -> least size of a mishap to be found.
+        unseen: group of rows -> how far a mishap to it that is not found could move an estimate.
     """
 
     verdict: str
@@ -77,6 +80,7 @@ class Diagnosis:
     rejected: Rejects | None = None
     scatter: Sequence[Mapping[str, Any]] = ()
     detectable: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    unseen: Mapping[Group, Reach] = field(default_factory=dict, repr=False)
 
     @property
     def heading(self) -> str:
@@ -109,7 +113,7 @@ class Diagnosis:
             "blunders": list(self.blunders),
             "command": self.command or None,
             "plan": self.plan or None,
-            **told.groups(self.groups, self.detectable),
+            **told.groups(self.groups, self.detectable, self.unseen),
             "scatter": list(self.scatter),
             "misfit": dict(self.misfit),
             "rejected": self.rejected.document() if self.rejected else None,

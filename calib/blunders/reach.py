@@ -1,0 +1,146 @@
+"""How far a mishap that is too small to be found could move an estimate.
+
+An offset e of a group's whitened rows ``A`` moves estimates by ``C A^T e``, and is found with 80 %
+power where ``e^T (I - H) e`` reaches the noncentrality d of its test. Of all offsets of that size
+the worst moves estimate j, whose row of C is c, by
+
+    sqrt(d) |(I - H)^(-1/2) A c|
+
+(external reliability: Baarda 1968, A testing procedure for use in geodetic networks). Where a group
+is hardly checked by others, this is large however small its rows are against all others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.blunders.judged import Blunder
+from calib.blunders.others import Others, at_their_sigmas, batches, whitening
+from calib.blunders.rows import GroupRows, group_rows
+from calib.linear.layout import positions
+from calib.linear.system import Linearisation
+from calib.problem.problem import Problem
+from calib.residuals.groups import BEAMS, CAD, Group
+
+FAR = 3.0  # sigmas: what the diagnosis promises to name; see docs/one_thing_wrong.md
+
+
+@dataclass(frozen=True)
+class Reach:
+    """The estimate that a mishap could move furthest, unseen.
+
+    Args:
+        estimate: its name, as ``lidar.tx``.
+        sigmas: by how many of its sigmas.
+    """
+
+    estimate: str
+    sigmas: float
+
+    def document(self) -> dict[str, str | float]:
+        """As diagnosis.json has it."""
+        return {"estimate": self.estimate, "sigmas": self.sigmas}
+
+
+def reaches(
+    whole: Linearisation,
+    problem: Problem,
+    blunders: Sequence[Blunder],
+    sigma: Mapping[str, float],
+) -> dict[Group, Reach]:
+    """Group -> how far a mishap to it could move an estimate, unseen; of a scan, its
+    place or its range zero, whichever is further.
+
+    Args:
+        whole, problem: as of `judge`.
+        blunders: what it gave.
+        sigma: estimates that count, each with its sigma in its own unit.
+    """
+    names, columns = _estimates(whole, problem, sigma)
+    others = Others.of(whole)
+    enough = {_key(b.group, b.shift.of_ranges): b.enough for b in blunders}
+    kept = positions(whole.layout.size, whole.layout.kept)[columns]
+    towards = whole.followed(others.kept[:, kept])
+    wide = np.array([sigma[name] for name in names])
+    sets: dict[tuple[str, str], list[GroupRows]] = {}
+    for rows in group_rows(whole, problem, others.graph_rows):
+        sets.setdefault(rows.at, []).append(rows)
+    found: dict[Group, Reach] = {}
+    for some in batches(list(sets.values())):
+        for group, of_ranges, moved in _moved(others, some, towards):
+            key = _key(group, of_ranges)
+            if key not in enough or not len(names):
+                continue
+            by = np.sqrt(enough[key]) * moved / wide
+            worst = int(np.argmax(by))
+            reach = Reach(names[worst], float(by[worst]))
+            found[group] = max(found.get(group, reach), reach, key=lambda r: r.sigmas)
+    return found
+
+
+def hardly_checked(found: Mapping[Group, Reach]) -> list[str]:
+    """In a sentence, which measurements could be wrong, unseen, and move an estimate further than
+    anything should; none where none could. Of values on paper that nothing measured checks, the
+    weak directions tell."""
+    measured = [(group, each) for group, each in found.items() if group.where != CAD]
+    far = sorted((m for m in measured if m[1].sigmas > FAR), key=lambda m: -m[1].sigmas)
+    if not far:
+        return []
+    group, worst = far[0]
+    more = f", and so could {len(far) - 1} others in diagnosis.json" if len(far) > 1 else ""
+    return [
+        f"A mishap too small to be found ({group}) could move {worst.estimate} by up to "
+        f"{worst.sigmas:.1f} of its sigmas{more}: more stops would check it."
+    ]
+
+
+def _key(group: Group, of_ranges: bool) -> tuple[Group, bool]:
+    return group, of_ranges
+
+
+def _estimates(
+    whole: Linearisation, problem: Problem, sigma: Mapping[str, float]
+) -> tuple[list[str], np.ndarray]:
+    """Names of the estimates that count, and their columns among all unknowns."""
+    names, columns = [], []
+    for variable in problem.calibration:
+        at = whole.layout.at[variable]
+        for dof, column in zip(problem.variables[variable].dofs, np.r_[at], strict=True):
+            if sigma.get(name := f"{variable}.{dof}", 0.0) > 0.0:
+                names.append(name)
+                columns.append(column)
+    return names, np.array(columns, int)
+
+
+def _moved(
+    others: Others, sets: Sequence[Sequence[GroupRows]], towards: np.ndarray
+) -> Iterator[tuple[Group, bool, np.ndarray]]:
+    """Groups, whether it is their range zero that is off, and by how much an offset of one squared
+    sigma in the test moves each estimate (P,) at most; `towards` (U, P) are these columns of C."""
+    every = [rows for some in sets for rows in some]
+    A, _ = others.spread(every)
+    H, K = others.whole.covariance(A, others.kept), A @ towards
+    first = 0
+    for some in sets:
+        mine = slice(first, first + sum(len(rows.A) for rows in some))
+        first = mine.stop
+        left, moved = at_their_sigmas(some, H[mine, mine], K[mine])
+        yield from _of_set(some, left, moved)
+
+
+def _of_set(
+    some: Sequence[GroupRows], H: np.ndarray, K: np.ndarray
+) -> Iterator[tuple[Group, bool, np.ndarray]]:
+    first = 0
+    for rows in some:
+        here = slice(first, first + len(rows.A))
+        first = here.stop
+        raw = np.eye(len(rows.A)) if rows.information is None else rows.information
+        for group, own in rows.groups.items():
+            checked = own.T @ (raw - H[here, here]) @ own
+            size = np.sqrt(np.maximum(np.diag(own.T @ raw @ own), 1e-300))
+            along = whitening(checked, size).T @ own.T @ K[here]
+            yield group, list(rows.axes) == [BEAMS], np.linalg.norm(along, axis=0)
