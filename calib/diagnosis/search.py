@@ -120,7 +120,7 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NAMES) -> Search:
             looks = [*looks, wider.look(progress)]
         else:
             beside = tried(stand.with_effects, [c.effect for c in chance], progress)
-            if beside is None:
+            if beside is None or not beside.estimate.converged:  # nothing is known of such a spread
                 chance.pop()
                 break
             looks, found, left = _steps(beside, progress, most)

@@ -154,11 +154,11 @@ def judged(
         "oracle": best,
         "fit_s": ladder.fit_s,
         "search_s": [said["cpu_s"] for said in ladder.said],
-        "covariates_right": covariates_right(found, wanted),
+        "covariates_right": covariates_right(found, wanted, named(ladder)),
         "at_floor": bool(steps) and at_floor(steps[-1], best or steps[0]),
     }
     if hidden and ladder.rungs and len(ladder.runs) == 1 + len(ladder.rungs):
-        result["form"] = form(ladder.runs[-1], found, stops, beams)
+        result["form"] = form(ladder.runs[-1], found, stops, beams, named(ladder))
     return plain(result)
 
 

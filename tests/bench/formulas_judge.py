@@ -16,7 +16,7 @@ from calib.diagnosis.verdict import worth_adding
 from calib.effects.own.expression import Expression
 
 from ..mishaps.judge import blunders, rigcal, solution
-from .formulas_effects import same
+from .formulas_effects import covariates, same, value
 from .formulas_size import Absorbs, rms
 
 MOST = 4  # rungs: two that are hidden, one that was wrong, and one that is too much
@@ -27,6 +27,17 @@ THROWN = 0.01  # of the beams; of the window of `known_sector` it is a tenth
 RUN = "run0"  # the first fit
 KEPT = ("covariates", "formula", "says", "p_value", "alike")
 KEY = ["stop", "ring", "column"]
+# What effects of the catalogue are of the range, each of any size, as their pages say.
+CATALOGUE = {
+    "temperature_drift": ("temperature_c",),
+    "azimuth_range_harmonic": tuple(
+        f"{f}({m} * azimuth_rad)" for m in range(1, 5) for f in ("sin", "cos")
+    ),
+    "intensity_range_walk": ("log(intensity)",),
+    "incidence_angle_bias": ("1 / cos(incidence_rad)",),
+    "range_scale": ("range_m",),
+}
+BY_CHANCE = "_scatter"  # how names end of what scatters by chance
 
 
 @dataclass
@@ -134,11 +145,21 @@ def in_texts(each: Mapping[str, Any]) -> frozenset[str]:
     return same(n for text in texts for n in Expression(text, each["formula"]["name"]).names)
 
 
-def covariates_right(found: Sequence[Mapping[str, Any]], hidden: Sequence[frozenset[str]]) -> bool:
-    """Whether what formulas say that they hang on is what was hidden, no more and no less; and each
-    looks at one of what was hidden, or at all of it."""
+def covariates_right(
+    found: Sequence[Mapping[str, Any]],
+    hidden: Sequence[frozenset[str]],
+    names: Sequence[str] = (),
+) -> bool:
+    """Whether what formulas, and effects of the catalogue beside them, say that ranges hang on is
+    what was hidden, no more and no less; and each formula looks at one of what was hidden, or at
+    all of it. Names of what scatters by chance say nothing of that."""
     every = frozenset().union(*hidden)
-    return looks_at(found) == every and all(in_texts(each) in (*hidden, every) for each in found)
+    told = [name for name in names if not name.endswith(BY_CHANCE)]
+    if not set(told) <= set(CATALOGUE):
+        return False
+    beside = frozenset().union(*(covariates(text) for name in told for text in CATALOGUE[name]))
+    mine = all(in_texts(each) in (*hidden, every) for each in found)
+    return looks_at(found) | beside == every and mine
 
 
 def errors(run: Path) -> dict[str, float | None]:
@@ -199,7 +220,11 @@ def rows_of(run: Path, stops: pd.DataFrame) -> pd.DataFrame:
 
 
 def form(
-    run: Path, told: Sequence[Mapping[str, Any]], stops: pd.DataFrame, beams: pd.DataFrame
+    run: Path,
+    told: Sequence[Mapping[str, Any]],
+    stops: pd.DataFrame,
+    beams: pd.DataFrame,
+    names: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Whether formulas are the truth over the data's range, after what the model absorbs.
 
@@ -208,6 +233,8 @@ def form(
         told: its formulas.
         stops: stops.csv.
         beams: `KEY`, what `Absorbs.of` takes, and ``error_m``, the truth.
+        names: effects of the catalogue that the run has beside, which are taken to be as large as
+            makes the most of them.
 
     Returns:
         ``effect_mm``, ``off_mm`` and ``sigma_mm``, rms; ``right``.
@@ -215,7 +242,13 @@ def form(
     both = fitted(run, told, stops).merge(beams, on=KEY, how="inner", validate="1:1")
     absorbs = Absorbs.of(both)
     true = absorbs.off(both["error_m"].to_numpy(float))
-    off_m = rms(absorbs.off(both["fitted_m"].to_numpy(float)) - true)
+    off = absorbs.off(both["fitted_m"].to_numpy(float)) - true
+    columns = {name: both[name].to_numpy() for name in both}
+    texts = [text for name in names for text in CATALOGUE.get(name, ())]
+    if texts:
+        beside = absorbs.off(np.stack([value(text, columns) for text in texts], axis=1))
+        off = off - beside @ np.linalg.lstsq(beside, off, rcond=1e-9)[0]
+    off_m = rms(off)
     sigma_m, effect_m = rms(both["sigma_m"]), rms(true)
     found = {"effect_mm": effect_m, "off_mm": off_m, "sigma_mm": sigma_m}
     right = bool(told) and off_m < max(SIGMAS * sigma_m, WITHIN * effect_m)

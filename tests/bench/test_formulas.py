@@ -196,6 +196,36 @@ def test_covariates_are_right_where_they_are_what_was_hidden(said, right):
 
 
 @pytest.mark.parametrize(
+    ("names", "right"),
+    [
+        (["temperature_drift"], True),
+        (["temperature_drift", "stop_range_scatter"], True),
+        ([], False),
+        (["azimuth_range_harmonic"], False),
+        (["temperature_drift", "range_scale"], False),
+        (["temperature_drift", "warmup_drift@600"], False),
+    ],
+)
+def test_what_the_catalogue_names_beside_a_formula_counts(names, right):
+    found = [{"covariates": ["ring"], "formula": {"name": "f", "basis": ["sqrt(ring)"]}}]
+    hidden = [frozenset({"ring"}), frozenset({"temperature_c"})]
+    assert covariates_right(found, hidden, names) is right
+
+
+def test_a_form_is_right_with_what_the_catalogue_names_beside_it(small, run):
+    """A formula and a drift that the truth has not, of any size: what the drift is fitted to is
+    what the formula lacks."""
+    stops = pd.read_csv(small.folder / "stops.csv")
+    size = rms(small.error_m) / rms(value(FORMULA, small.beams))
+    text = f"{FORMULA} + temperature_c"
+    folder, rungs = run(size, 0.0, text)
+    beams = small.beams.assign(error_m=small.error_m)
+    assert not form(folder, rungs, stops, beams)["right"]
+    assert form(folder, rungs, stops, beams, ["temperature_drift"])["right"]
+    assert not form(folder, rungs, stops, beams, ["azimuth_range_harmonic"])["right"]
+
+
+@pytest.mark.parametrize(
     ("held_out", "rejected", "right"),
     [(1.05, 0.02, True), (1.15, 0.02, False), (1.0, 0.12, False), (None, 0.02, False)],
 )

@@ -25,7 +25,9 @@ from calib.solve.fit import Progress
 
 KEPT = 4  # factors of each covariate whose products are tried
 REFINED = 5  # products whose constants are refined
-APART = 2.0  # sigmas by which stops must prefer a form for it to be told from a simpler one
+# Sigmas by which stops must prefer a form for it to be told from a simpler one; of one that hangs
+# on more, as little likely among as many covariates as those might have been.
+APART = 2.0
 MOST_TERMS = 4
 TRIES = 3  # smooth functions that are judged before nothing is said to be there
 PLAUSIBLE = 0.1  # adjusted p-value of a smooth function, from which forms are tried
@@ -152,7 +154,7 @@ def _step(fitted: Projection, bases: Bases, smooths: Sequence[Smooth], alpha: fl
     over = {f: s for s in sets for f in forms(fitted, bases, s.covariates)}
     if not over:
         return None
-    chosen, alike = simplest(sorted(over, key=lambda f: -f.evidence))
+    chosen, alike = simplest(sorted(over, key=lambda f: -f.evidence), len(bases.names()))
     p = _by_chance(fitted, chosen, over[chosen])
     return Step(
         form=chosen,
@@ -208,19 +210,26 @@ def _left(projection: Projection, columns: np.ndarray) -> np.ndarray:
     return np.bincount(projection.table.stop, left)
 
 
-def simplest(found: Sequence[Form]) -> tuple[Form, list[Form]]:
-    """The simplest of the forms that stops cannot tell from the best, and the others of these."""
-    near = [f for f in found if not _told_apart(f, found[0])]
+def simplest(found: Sequence[Form], covariates: int) -> tuple[Form, list[Form]]:
+    """The simplest of the forms that stops cannot tell from the best, and the others of these.
+
+    Args:
+        found: best first.
+        covariates: how many there are.
+    """
+    near = [f for f in found if not _told_apart(f, found[0], covariates)]
     chosen = min(near, key=lambda f: (f.term.cost, f.dof, -f.statistic))
     return chosen, [f for f in near if f is not chosen]
 
 
-def _told_apart(form: Form, best: Form) -> bool:
+def _told_apart(form: Form, best: Form, covariates: int) -> bool:
     worse = (form.left - best.left)[best.left > 0.0]
-    if form is best or worse.sum() <= APART**2:
+    further = len(set(best.term.covariates) - set(form.term.covariates))
+    limit = -float(special.ndtri(special.ndtr(-APART) / max(covariates, 1) ** further))
+    if form is best or worse.sum() <= limit**2:
         return False
     scatter = np.sqrt(len(worse) * np.var(worse, ddof=1)) if len(worse) > 1 else np.inf
-    return bool(worse.sum() > APART * scatter)
+    return bool(worse.sum() > limit * scatter)
 
 
 def _best_factors(

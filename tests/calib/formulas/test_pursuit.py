@@ -238,6 +238,9 @@ LINE, WAVE = (
 )
 
 
+MANY = 20  # covariates
+
+
 def rivals(more: np.ndarray) -> list[Form]:
     """A wave, and a line that leaves so much more of each stop's chi-square."""
     left = np.full(len(more), 100.0)
@@ -247,26 +250,39 @@ def rivals(more: np.ndarray) -> list[Form]:
 
 def test_the_simpler_form_is_taken_where_stops_do_not_tell():
     wave, line = rivals(np.random.default_rng(0).normal(0.3, 1.0, 30))
-    assert simplest([wave, line]) == (line, [wave])
+    assert simplest([wave, line], MANY) == (line, [wave])
 
 
 def test_the_better_form_is_taken_where_stops_agree():
     wave, line = rivals(np.random.default_rng(0).normal(2.0, 1.0, 30))
-    assert simplest([wave, line]) == (wave, [])
+    assert simplest([wave, line], MANY) == (wave, [])
 
 
 def test_one_stop_alone_does_not_tell():
     more = np.zeros(30)
     more[4] = 60.0
     wave, line = rivals(more)
-    assert simplest([wave, line]) == (line, [wave])
+    assert simplest([wave, line], MANY) == (line, [wave])
 
 
 def test_stops_that_share_nothing_do_not_count():
     more = np.concatenate([np.full(3, 2.0), np.zeros(40)])
     wave, line = rivals(more)
     wave, line = (replace(f, left=np.where(np.arange(43) < 3, f.left, 0.0)) for f in (wave, line))
-    assert simplest([wave, line])[0] is wave
+    assert simplest([wave, line], MANY)[0] is wave
+
+
+@pytest.mark.parametrize(("covariates", "taken"), [(1, True), (2, True), (MANY, False)])
+def test_what_hangs_on_more_is_told_by_more(covariates, taken):
+    """2.4 sigmas: enough for another function of the same, or for a second covariate that could
+    have been no other, but the best of twenty is often as good by chance."""
+    more = np.random.default_rng(0).normal(0.0, 1.0, 30)
+    more = 2.0 + (more - more.mean()) * 2.0 * np.sqrt(30) / 2.4 / more.std(ddof=1)
+    best, line = rivals(more)
+    product = Term((*LINE.factors, Factor("humidity", "line", (0.45, 0.1))))
+    further = replace(best, term=product)
+    assert (simplest([further, line], covariates)[0] is further) is taken
+    assert simplest([best, line], MANY)[0] is best
 
 
 def test_what_a_form_leaves_of_stops_is_what_it_does_not_explain():
