@@ -200,11 +200,19 @@ class Test:
         return self.whiten @ (self.whiten.T @ self.score)
 
     def sigma(self, common: float) -> np.ndarray:
-        """Of the estimate (q,), by clusters; no less than with the candidates' `common` inflation,
-        as few clusters of a difference of covariances may say anything."""
+        """Of the estimate (q,); see `covariance`."""
+        return np.sqrt(np.diag(self.covariance(common)))
+
+    def covariance(self, common: float) -> np.ndarray:
+        """Of the estimate (q, q), by clusters; no variance is less than with the candidates'
+        `common` inflation, as few clusters of a difference of covariances may say anything."""
         W = self.whiten
-        own = np.einsum("qr,rs,qs->q", W, self.chance.covariance, W)
-        return np.sqrt(np.maximum(own, common * np.square(W).sum(axis=1)))
+        own = W @ self.chance.covariance @ W.T
+        variance = np.maximum(np.diag(own), common * np.square(W).sum(axis=1))
+        wider = np.sqrt(variance / np.maximum(np.diag(own), 1e-300))
+        out = own * np.outer(wider, wider)
+        out[np.diag_indices(len(out))] = variance
+        return out
 
     def smallest_detectable(self, common: float, alpha: float) -> float:
         """Root mean square of its parameters' size at which it is found with 80 % power, where its

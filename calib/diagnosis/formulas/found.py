@@ -6,7 +6,7 @@ import re
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import count, product
+from itertools import count, pairwise, product
 from typing import Any
 
 import numpy as np
@@ -36,15 +36,25 @@ class Part:
     Args:
         term: with its constants.
         at: which of its columns are kept.
-        amount_m: (k,) by which each is multiplied; sigma_m: (k,) of that.
+        amount: (k,) by which each is multiplied, in the unit of the formula.
+        covariance: (k, k) of these.
         constants_sigma: (c,) of the term's constants.
     """
 
     term: Term
     at: tuple[int, ...]
-    amount_m: np.ndarray
-    sigma_m: np.ndarray
+    amount: np.ndarray
+    covariance: np.ndarray
     constants_sigma: np.ndarray
+
+    @property
+    def sigma(self) -> np.ndarray:
+        """(k,) of the amounts."""
+        return np.sqrt(np.diag(self.covariance))
+
+    def sigma_of(self, slope: Sequence[float]) -> float:
+        """Of a function of the amounts that has these derivatives (k,) by them."""
+        return float(np.sqrt(max(np.array(slope) @ self.covariance @ np.array(slope), 0.0)))
 
     @property
     def texts(self) -> tuple[str, ...]:
@@ -105,9 +115,9 @@ class Formula:
         return tuple(text for part in self.parts for text in part.texts)
 
     @cached_property
-    def amount_m(self) -> np.ndarray:
+    def amount(self) -> np.ndarray:
         """(k,) by which each is multiplied."""
-        return np.concatenate([part.amount_m for part in self.parts])
+        return np.concatenate([part.amount for part in self.parts])
 
     @property
     def says(self) -> str:
@@ -136,14 +146,14 @@ class Formula:
             taken: names that the model has already.
             what: for its page.
         """
-        largest = float(np.abs(self.amount_m).max())
+        largest = float(np.abs(self.amount).max())
         document = {
             "name": self.name(taken),
             "site": self.site,
             "unit": self.unit,
             "sigma": float(f"{max(WIDER * largest, LEAST_SIGMA[self.unit]):.1g}"),
             "basis": list(self.texts),
-            "start": [float(f"{amount:.4g}") for amount in self.amount_m],
+            "start": [float(f"{amount:.4g}") for amount in self.amount],
             "seen": {name: outward(*ends) for name, ends in self.seen.items()},
             "what": what,
         }
@@ -152,7 +162,7 @@ class Formula:
 
     def value_m(self, covariates: dict[str, np.ndarray]) -> np.ndarray:
         """What it adds to ranges (N,)."""
-        return columns_of(self.texts, covariates) @ self.amount_m
+        return columns_of(self.texts, covariates) @ self.amount
 
 
 def settled(table: Table, steps: Sequence[Step], site: str = RANGE) -> list[Formula]:
@@ -206,7 +216,7 @@ def _grouped(
     out = []
     for some in groups.values():
         mine = [parts[i] for i in some]
-        value = sum(columns[i] @ p.amount_m for i, p in zip(some, mine, strict=True))
+        value = sum(columns[i] @ p.amount for i, p in zip(some, mine, strict=True))
         left = model.off(value[:, None])[0][:, 0]
         names = list(dict.fromkeys(c for p in mine for c in p.term.covariates))
         out.append(
@@ -236,15 +246,17 @@ def _parts(
     each = zip(terms, kept, amounts, strict=True)
     along = [slopes(model.table.covariates, *one) for one in each]
     every = np.hstack([*columns, *along])
-    sigma = beside.test(every).sigma(1.0)
-    sigmas = np.split(sigma[: len(amount)], ends)
-    others = np.split(sigma[len(amount) :], np.cumsum([s.shape[1] for s in along])[:-1])
+    covariance = beside.test(every).covariance(1.0)
+    starts = np.array([0, *ends, len(amount)])
+    blocks = [covariance[a:b, a:b] for a, b in pairwise(starts.tolist())]
+    others = np.sqrt(np.diag(covariance)[len(amount) :])
+    others = np.split(others, np.cumsum([s.shape[1] for s in along])[:-1])
     # An edge is anywhere between its neighbours, by a uniform distribution (GUM 4.3.7).
     gaps = [t.gaps(model.table.covariates) for t in terms]
     others = [np.hypot(o, np.ptp(g, axis=1) / 12**0.5) for o, g in zip(others, gaps, strict=True)]
     return [
-        Part(term=term, at=tuple(k), amount_m=a, sigma_m=s, constants_sigma=o)
-        for term, k, a, s, o in zip(terms, kept, amounts, sigmas, others, strict=True)
+        Part(term=term, at=tuple(k), amount=a, covariance=c, constants_sigma=o)
+        for term, k, a, c, o in zip(terms, kept, amounts, blocks, others, strict=True)
     ]
 
 
@@ -254,7 +266,7 @@ def _ends(values: np.ndarray) -> tuple[float, float]:
 
 def _said(part: Part, unit: str) -> str:
     """A term as people write it."""
-    each = zip(part.rows, part.amount_m, part.sigma_m, strict=True)
+    each = zip(part.rows, part.amount, part.sigma, strict=True)
     says = (
         _shifted(part, unit)
         or _turned(part, unit)
@@ -274,12 +286,13 @@ def _shifted(part: Part, unit: str) -> str:
     if len(differ) != 1 or short[differ[0]] != "1" or part.term.factors[differ[0]].kind != "line":
         return ""
     (i,) = differ
-    line, ratio = part.term.factors[i], part.amount_m[1] / part.amount_m[0]
+    slope, level = part.amount
+    line, ratio = part.term.factors[i], level / slope
     middle, half = line.constants
-    relative = np.hypot(part.sigma_m[1], ratio * part.sigma_m[0]) / abs(part.amount_m[0])
-    zero = with_sigma(middle - half * ratio, half * relative)
+    sigma = part.sigma_of((-ratio / slope, 1 / slope))
+    zero = with_sigma(middle - half * ratio, half * sigma)
     texts = [f"({line.covariate} - {zero}) / {half:g}" if k == i else t for k, t in enumerate(long)]
-    return f"{_signed(part.amount_m[0], part.sigma_m[0])} {unit} * {_product(texts)}"
+    return f"{_signed(slope, part.sigma[0])} {unit} * {_product(texts)}"
 
 
 def _turned(part: Part, unit: str) -> str:
@@ -287,10 +300,10 @@ def _turned(part: Part, unit: str) -> str:
     texts = [times(row) for row in part.rows]
     if len(texts) != 2 or texts[0].replace(*PHASE) != texts[1] or texts[0].count(PHASE[0]) != 1:
         return ""
-    a, b = part.amount_m
+    a, b = part.amount
     size = float(np.hypot(a, b))
-    sigma = float(np.hypot(a * part.sigma_m[0], b * part.sigma_m[1]) / size)
-    phase = float(np.hypot(b * part.sigma_m[0], a * part.sigma_m[1]) / size**2)
+    sigma = part.sigma_of((a / size, b / size))
+    phase = part.sigma_of((-b / size**2, a / size**2))
     before, _, after = texts[0].partition(PHASE[0])
     inside, _, rest = after.partition(")")
     turned = f"{before}sin({inside} + {with_sigma(float(np.arctan2(b, a)), phase)}){rest}"

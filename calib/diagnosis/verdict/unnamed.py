@@ -119,7 +119,7 @@ def _document(found: Formula, taken: Sequence[str]) -> dict[str, Any]:
         "terms": [
             {"text": text, "estimate": amount, "sigma": sigma, "unit": found.unit}
             for part in found.parts
-            for text, amount, sigma in zip(part.texts, part.amount_m, part.sigma_m, strict=True)
+            for text, amount, sigma in zip(part.texts, part.amount, part.sigma, strict=True)
         ],
         "alike": [
             {

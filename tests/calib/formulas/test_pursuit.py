@@ -305,7 +305,7 @@ def test_the_same_function_of_a_covariate_that_goes_along_says_nothing_else():
     others = [Form(term, 8.0, 1, np.ones(3)) for term in (height, square, WAVE)]
     step = Step(form=chosen, alike=others, p_value=1e-6, p_adjusted=1e-6)
     none = np.zeros(0)
-    part = Part(term=ring, at=(0,), amount_m=none, sigma_m=none, constants_sigma=none)
+    part = Part(term=ring, at=(0,), amount=none, covariance=np.zeros((0, 0)), constants_sigma=none)
     found = Formula(parts=[part], steps=[step], rms_m=0.0, seen={}, picture={})
     # The square only adds a column.
     assert [f.term for f in found.alike] == [WAVE]
