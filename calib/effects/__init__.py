@@ -49,7 +49,7 @@ from calib.effects.range import (
     TemperatureDrift,
     WarmupDrift,
 )
-from calib.effects.reference import FaroScale, MovedSurface
+from calib.effects.reference import FaroScale, MeshShift, MovedSurface
 from calib.effects.rig import BaseFlex, FrameOffset, MountBending, MountCreep, MountSlip
 from calib.effects.scatter import (
     JointScatter,
@@ -109,6 +109,7 @@ CATALOGUE: tuple[Effect, ...] = (
     TargetRodTilt(),
     TargetSphereOffset(),
     FaroScale(),
+    MeshShift(),
     MovedSurface(),
     NoiseRange(),
     NoiseIncidence(),

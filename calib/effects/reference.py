@@ -29,6 +29,38 @@ class FaroScale(Effect):
         return finite(view["point_m"])[:, :, None]
 
 
+class MeshShift(Effect):
+    """The mesh is not in the frame of the spheres: a scan was registered wrongly, or the mesh was
+    exported in another frame."""
+
+    name = "mesh_shift"
+    site = Site.REFERENCE
+    unit = "m, rad"
+    formula = "surface = mesh + t + r x point, about the origin of the reference's frame"
+    typical = "1 to 10 mm and up to 1 mrad of a registration by targets or clouds, size assumed"
+    covariates = ("point_m",)
+    confounded_with = ("target_rod_tilt", "target_sphere_offset", "stop_pose_scatter")
+    source = "size assumed"
+
+    @property
+    def of_scanner(self) -> bool:
+        """The spheres stay where they are."""
+        return False
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        if not (rig.reference and rig.target):
+            return ()
+        return tuple(Param(n, "m", 0.005) for n in ("tx", "ty", "tz")) + tuple(
+            Param(n, "rad", 0.001) for n in ("rx", "ry", "rz")
+        )
+
+    def basis(self, view: View) -> np.ndarray:
+        point_m = finite(view["point_m"])
+        shift = np.broadcast_to(np.eye(3), (len(point_m), 3, 3))
+        turn = np.cross(np.eye(3)[:, None], point_m).transpose(1, 2, 0)
+        return np.concatenate([shift, turn], axis=2)
+
+
 class MovedSurface(Effect):
     """Things were moved after the mesh was made: each label by its own way along the normal."""
 

@@ -11,6 +11,7 @@ from calib.forward import Term, place
 from calib.problem.model import Source, stop_columns, tracked_poses
 from calib.rig import load_rig
 from calib.simulation import PRESETS, simulate
+from chains import se3
 from chains.errors import InputError
 from sensors.lidar import beams
 
@@ -320,6 +321,16 @@ def test_the_mesh_is_stretched_about_its_origin(source):
     columns = {"point_m": np.array([[1.0, -2, 3], [np.inf] * 3])}
     found = find("faro_scale").basis(View(source.rig, 2, columns, np.zeros((1, 6))))
     np.testing.assert_array_equal(found @ [1e-3], [[1e-3, -2e-3, 3e-3], [0, 0, 0]])
+
+
+def test_the_mesh_is_moved_as_a_rigid_body_and_the_spheres_are_not(source):
+    effect, twist = find("mesh_shift"), np.array([3e-3, -1e-3, 2e-3, 1e-5, -3e-5, 2e-5])
+    point_m = np.random.default_rng(0).normal(size=(6, 3))
+    view = View(source.rig, 6, {"point_m": point_m}, np.zeros((1, 6)))
+    T = se3.exp(np.r_[twist[3:], twist[:3]])
+    moved = point_m @ T[:3, :3].T + T[:3, 3] - point_m
+    np.testing.assert_allclose(effect.basis(view) @ twist, moved, atol=1e-7)
+    assert not effect.of_scanner and find("faro_scale").of_scanner
 
 
 def test_labels_have_names_and_only_theirs_move(source, tmp_path):

@@ -104,6 +104,7 @@ def test_where_nothing_was_done_nothing_is_named(tmp_path, seed):
     [
         ("mesh scaled", None, "faro_scale"),
         ("one surface moved", "mesh:surface_", None),
+        ("mesh shifted against the spheres", None, "mesh_shift"),
         *(
             pytest.param(*each, marks=pytest.mark.long)
             for each in (

@@ -291,7 +291,7 @@ def mesh_shifted_against_the_spheres(scene: Scene, times: float) -> Done:
     scene.remesh(lambda at, triangles: at + move)
     # Spheres that hang lower and rods that lean, all alike, are a shift of all spheres.
     alike = {"target_sphere_offset", "target_rod_tilt"}
-    return done({"mesh:*", "*:sphere", "*:rod"}, alike, unsure={"faro"})
+    return done({"mesh_shift", "mesh:*", "*:sphere", "*:rod"}, alike, unsure={"faro"})
 
 
 def _planes(at: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
