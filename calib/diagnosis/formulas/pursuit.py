@@ -211,13 +211,16 @@ def _left(projection: Projection, columns: np.ndarray) -> np.ndarray:
 
 
 def simplest(found: Sequence[Form], covariates: int) -> tuple[Form, list[Form]]:
-    """The simplest of the forms that stops cannot tell from the best, and the others of these.
+    """The simplest of the forms that stops cannot tell from the best, nor from the best of the same
+    covariates, and the others of these.
 
     Args:
         found: best first.
         covariates: how many there are.
     """
-    near = [f for f in found if not _told_apart(f, found[0], covariates)]
+    best = {frozenset(f.term.covariates): f for f in reversed(found)}
+    both = [(f, {found[0], best[frozenset(f.term.covariates)]}) for f in found]
+    near = [f for f, than in both if not any(_told_apart(f, b, covariates) for b in than)]
     chosen = min(near, key=lambda f: (f.term.cost, f.dof, -f.statistic))
     return chosen, [f for f in near if f is not chosen]
 

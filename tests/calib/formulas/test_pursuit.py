@@ -285,6 +285,17 @@ def test_what_hangs_on_more_is_told_by_more(covariates, taken):
     assert simplest([best, line], MANY)[0] is best
 
 
+def test_the_best_of_other_covariates_does_not_shelter_a_poor_form():
+    """Stops tell the line from the wave of the same covariate, and neither from what hangs on two
+    others: the wave is taken, though the line is simpler."""
+    rng = np.random.default_rng(0)
+    wave, line = rivals(rng.normal(1.0, 1.0, 30) * 3)
+    others = Term((Factor("humidity", "line", (0.4, 0.1)), Factor("intensity", "line", (0.5, 0.5))))
+    best = Form(others, 400.0, 1, wave.left - rng.normal(3.0, 12.0, 30))
+    chosen, alike = simplest([best, wave, line], MANY)
+    assert line not in (chosen, *alike) and wave in (chosen, *alike)
+
+
 def test_what_a_form_leaves_of_stops_is_what_it_does_not_explain():
     beams = table(16, stops=10, each=100, hidden=lambda c: 3e-3 * np.sin(c["range_m"]))
     model = beams.projection()
