@@ -24,7 +24,7 @@ SECTIONS: Mapping[str, tuple[Charts, ...]] = {
     "How good it is": (fit.ladder, fit.variance, fit.scatter),
     "What does not fit": (groups.groups, misfit.by_stop, misfit.moves_from_cad),
     "What was found": (formulas.formulas, knowledge.findings),
-    "The chain": (links.chain, links.moves, links.effects, knowledge.budget),
+    "The calibration": (links.chain, links.moves, links.effects, knowledge.budget),
     "What is left": (
         *(residuals.ring_map, residuals.thrown_away, residuals.curves),
         *(bodies.tracked, bodies.targets),
