@@ -17,6 +17,8 @@ from chains import escape, se3
 
 SIX = ("x, mm", "y, mm", "z, mm", "roll, deg", "pitch, deg", "yaw, deg")
 NUMBERS = ("sigma", "sigma before", "unit", "in its sigmas", "in sigmas before", "told by the data")
+
+
 def calibration_tables(evidence: Evidence) -> list[Table]:
     """Poses of all links, their differences from CAD, and effects; those that have rows."""
     links = [row for row in evidence.estimates if row.parent is not None]
@@ -29,7 +31,7 @@ def calibration_tables(evidence: Evidence) -> list[Table]:
             id="table-links",
             title="How far every link is from CAD",
             reading="Of each link T_cad exp(twist) in the child's own axes: tx ty tz along them, "
-            f"rx ry rz about them. Without a difference, no CAD says where it should be.",
+            "rx ry rz about them. Without a difference, no CAD says where it should be.",
             columns=("link", "in", "parameter", "difference", *NUMBERS),
             rows=[
                 [Cell(row.variable), Cell(row.parent), *cells]
