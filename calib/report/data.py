@@ -11,7 +11,7 @@ from urllib.parse import quote
 from chains import escape
 
 DIGITS = 9  # significant digits of a number in CSV: more than any instrument of a rig has
-UNQUOTED = ",:;()*'!"  # signs that stand for themselves in the address of a link, beside letters
+UNQUOTED = ",:;"  # signs that stand for themselves in the address of a link, beside letters
 
 
 @dataclass(frozen=True)

@@ -125,8 +125,8 @@ def _maps(ax: Axes) -> Iterator[Rows]:
 def _map(ax: Axes, image: Any, x: np.ndarray, y: np.ndarray) -> Rows:
     across, up = _labels(ax)
     what = _title(ax, "")
-    if image.colorbar is not None:
-        bar = image.colorbar.ax
+    bars = [image.colorbar, *(each.colorbar for other in ax.figure.axes for each in other.images)]
+    if bar := next((bar.ax for bar in bars if bar), None):  # maps may share one
         what = f"{what}: {bar.get_xlabel() or bar.get_ylabel()}".removeprefix(": ")
     cells = np.ma.filled(np.ma.asarray(image.get_array(), float), np.nan)
     cells = cells.reshape(len(y), len(x))
@@ -158,7 +158,8 @@ def _labels(ax: Axes) -> tuple[str, str]:
     everyone = [ax, *ax.figure.axes]
     across = [each.get_xlabel() for each in everyone if each in x]
     up = [each.get_ylabel() for each in everyone if each in y]
-    return max(across, key=bool) or "x", max(up, key=bool) or "y"
+    x, y = (max(labels, key=bool).replace("\n", ", ") for labels in (across, up))
+    return x or "x", y or "y"
 
 
 def _name(artist: Any) -> str:

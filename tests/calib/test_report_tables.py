@@ -239,6 +239,7 @@ def test_every_figure_of_numbers_gives_them(made, page):
     ids = page.eval_on_selector_all("figure", "all => all.map(f => f.id)")
     given = page.eval_on_selector_all("figure a.csv", "all => all.map(a => a.download)")
     assert [f"{name}.csv" for name in ids if name != "chain"] == given
+    assert "unseen: no stops were held out" in page.locator("main").inner_text()
     told = read_yaml(made / "run" / "solution.yaml")[0]["effects"]["ring_range_offset"]
     rows = downloaded(page, "rings")
     assert rows[0] == ["series", "ring", "ring_range_offset, mm", "from", "to"]

@@ -15,6 +15,7 @@ from calib.report.charts import (
     links,
     misfit,
     residuals,
+    unseen,
 )
 from calib.report.evidence import Evidence
 
@@ -26,6 +27,7 @@ SECTIONS: Mapping[str, tuple[Charts, ...]] = {
     "What was found": (formulas.formulas, knowledge.findings),
     "The calibration": (links.chain, links.moves, links.effects, knowledge.budget),
     "What is left": (
+        unseen.unseen,
         *(residuals.ring_map, residuals.thrown_away, residuals.curves),
         *(bodies.tracked, bodies.targets),
     ),
