@@ -40,11 +40,11 @@ def calibration_tables(evidence: Evidence) -> list[Table]:
             ],
             folded=True,
         ),
-        _effects("table-effects", "Effects: zeros, lengths and the rest", few, prior),
+        _effects("table-effects", "Joints, lengths and other effects", few, prior),
     ]
     for row in effects:
         if len(row.parameters) > LISTED_PARAMETERS:
-            name = f"table-{escape.identifier(row.variable)}"
+            name = f"table-effect-{escape.identifier(row.variable)}"
             tables.append(_effects(name, row.variable, [row], prior, folded=True))
     return [table for table in tables if table.rows]
 
@@ -75,7 +75,7 @@ def _numbers(
         if sigma == 0.0:
             continue
         before = prior.get(f"{row.variable}.{row.parameters[k]}", np.nan)
-        before = before if before < np.inf else np.nan
+        before = np.nan if np.isnan(estimate) else before  # of a link without CAD it is no drawing
         scale, unit = shown(row.units[k])
         value, spread = estimate_texts(estimate, sigma, row.units[k])
         yield [

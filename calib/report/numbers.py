@@ -98,7 +98,7 @@ def _lines(ax: Axes, series: Mapping[str, str]) -> Iterator[Series]:
 
 def _band(collection: Any) -> tuple[np.ndarray, np.ndarray]:
     """Where a shaded band is (n,) and its ends there (n, 2); empty of what is no band."""
-    if "FillBetween" not in type(collection).__name__:
+    if "PolyCollection" not in type(collection).__name__:
         return np.zeros(0), np.zeros((0, 2))
     corners = np.concatenate([np.zeros((0, 2)), *(p.vertices for p in collection.get_paths())])
     at, place = np.unique(corners[:, 0], return_inverse=True)

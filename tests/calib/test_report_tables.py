@@ -118,7 +118,7 @@ def test_differences_lead_from_cad_to_the_fit(made, page):
 
 def test_rings_and_joints_are_those_of_the_solution(made, page):
     effects = read_yaml(made / "run" / "solution.yaml")[0]["effects"]
-    rings = downloaded(page, "table-ring_5f_range_5f_offset")[1:]
+    rings = downloaded(page, "table-effect-ring_5f_range_5f_offset")[1:]
     told = effects["ring_range_offset"]
     assert [row[1] for row in rings] == told["names"]
     np.testing.assert_allclose([float(r[2]) / 1e3 for r in rings], told["estimate"], rtol=1e-7)
