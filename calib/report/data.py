@@ -29,7 +29,7 @@ class Cell:
     @property
     def exact(self) -> str:
         """As CSV has it."""
-        return self.text if self.value is None else f"{self.value:.{DIGITS}g}"
+        return self.text if self.value is None else f"{self.value:z.{DIGITS}g}"
 
 
 @dataclass(frozen=True)

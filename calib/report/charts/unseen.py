@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from textwrap import wrap
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from calib.report.plots import Figure
 
 MOST_STOPS = 4  # that are drawn, the worst: as many as a screen holds in a row each
+NAME = 20  # letters of a stop's name that stand along a map
 WITHIN = 0.95  # of the cells of stops held out: those that lie inside the scale
 
 
@@ -60,7 +62,7 @@ def _unseen(stops: Sequence[StopMaps]) -> Figure:
             picture = plots.signed_map(ax, 1e3 * map_m, extent, limit)
             ax.set_title(f"{what}: {1e3 * rms_m:.2f} mm")
             ax.set_xticks(range(-180, 181, 90))
-        row[0].set_ylabel(f"{stop.name}\nring")
+        row[0].set_ylabel("\n".join([*wrap(stop.name, NAME), "ring"]), fontsize=8)
     for ax in grid[-1]:
         ax.set_xlabel("azimuth, deg")
     bar = figure.colorbar(picture, ax=grid, orientation="horizontal", aspect=60, extend="both")
