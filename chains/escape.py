@@ -84,12 +84,21 @@ def csv_cell(text: str) -> str:
     """For a cell of a CSV file that a spreadsheet may open: a number stays one, and what looks like
     a formula gets an apostrophe before it, which spreadsheets take for "this is text"."""
     text = line(text)
-    return f"'{text}" if _FORMULA.match(text.lstrip()) and not _is_number(text) else text
+    return f"'{text}" if _FORMULA.match(text.lstrip()) and not is_number(text) else text
 
 
 def from_csv_cell(cell: str) -> str:
     """What `csv_cell` was given, but for control characters and a number."""
     return cell[1:] if cell[:1] == "'" and _FORMULA.match(cell[1:].lstrip()) else cell
+
+
+def is_number(text: str) -> bool:
+    """Whether a spreadsheet may take it for a number, NaN and infinity among them."""
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _spelled(found: re.Match[str]) -> str:
@@ -98,11 +107,3 @@ def _spelled(found: re.Match[str]) -> str:
 
 def _numbered(sign: str) -> str:
     return f"\\u{ord(sign):04x}"
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True

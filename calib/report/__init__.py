@@ -14,7 +14,8 @@ from calib.report import plots
 from calib.report.chart import Absent, Chart
 from calib.report.charts import ALONE, SECTIONS
 from calib.report.evidence import Evidence
-from calib.report.page import Section, render
+from calib.report.numbers import figure_csv
+from calib.report.page import Drawn, Section, render
 from calib.runs.run import Run
 from calib.show.verdict import Verdict, judge
 from calib.solve.fit import Progress
@@ -118,7 +119,9 @@ def report(
             drawn = []
             for chart in charts:
                 progress("drawing", done, total)
-                drawn.append((chart, plots.svg(chart.figure(), chart.id)))
+                picture = chart.figure()
+                svg = plots.svg(picture, chart.id)
+                drawn.append(Drawn(chart, svg, figure_csv(picture)))
                 done += 1
             sections.append(Section(title, drawn))
         page = render(evidence, verdict, sections, contents.absent)

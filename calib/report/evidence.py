@@ -19,14 +19,16 @@ from calib.report.statistics import (
     PLACES,
     Axis,
     Statistics,
+    StopMaps,
     StopResiduals,
     residual_statistics,
+    stop_map,
 )
 from calib.residuals.scan import ScanStop
 from calib.runs.estimates import VariableEstimate, variable_estimates
 from calib.runs.ladder import Rung, ladder
 from calib.runs.reopen import problem_of, reopened, start_of, state_of
-from calib.runs.residual_table import residual_table, table_path
+from calib.runs.residual_table import UNSEEN, residual_table, table_path
 from calib.runs.run import RESIDUALS, SUMMARY, Run
 from calib.solve.estimate import Start, values_of
 from calib.solve.fit import Progress
@@ -198,6 +200,19 @@ class Evidence:
             self._tables(self.below, what), self.axes, self.rings, self.azimuths
         )
 
+    @cached_property
+    def unseen(self) -> list[StopMaps]:
+        """Stops that were held out, the one furthest off first; none where none were."""
+        found = []
+        for scan in self.problem.scans:
+            path = table_path(self.run.folder / RESIDUALS / UNSEEN, scan, self.sources)
+            if path.is_file():
+                tables = [self._columns(r, scan) for r in (self.below, self.run)]
+                tables.append(_checked(path))
+                maps = [stop_map(each, self.rings, self.azimuths) for each in tables]
+                found.append(StopMaps(path.stem, *zip(*maps, strict=True)))
+        return sorted(found, key=lambda stop: -stop.rms_m[-1])
+
     def _tables(self, run: Run | None, what: str) -> Iterator[StopResiduals]:
         meshes = [source.reference for source in self.sources]
         rooms = [next(i for i, m in enumerate(meshes) if same_mesh(m, mesh)) for mesh in meshes]
@@ -219,14 +234,7 @@ class Evidence:
         path = table_path(run.folder / RESIDUALS, scan, self.sources)
         if not path.is_file():
             raise InputError(f"{path} is missing; the run is incomplete, fit it again")
-        columns = read_table(path)
-        lacking = NEEDED - columns.keys()
-        if lacking:
-            raise InputError(
-                f"{path} has no column {min(lacking)}: written by another version of rigcal, or "
-                f"edited; fit the run again"
-            )
-        return columns
+        return _checked(path)
 
     def _source(self, scan: ScanStop) -> int:
         return next(i for i, s in enumerate(self.sources) if s.recording is scan.recording)
@@ -242,6 +250,18 @@ class Evidence:
             if (told or name in source.rig.joint_names) and np.ndim(column) == 1:
                 out[name] = float(column[scan.index])
         return out
+
+
+def _checked(path: Path) -> dict[str, np.ndarray]:
+    """The columns of a table of residuals, which may be of another version."""
+    columns = read_table(path)
+    lacking = NEEDED - columns.keys()
+    if lacking:
+        raise InputError(
+            f"{path} has no column {min(lacking)}: written by another version of rigcal, or "
+            f"edited; fit the run again"
+        )
+    return columns
 
 
 def _check(run: Run) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 from calib.diagnosis.search import ALPHA
 from calib.diagnosis.verdict.sentences import UNNAMED
 from calib.effects import CATALOGUE
+from calib.report.calibration import calibration_tables
 from calib.report.chart import Absent, Chart
 from calib.report.charts.fit import error_mm
 from calib.report.evidence import Evidence, folder_name
@@ -28,23 +29,42 @@ LISTED_DIRECTIONS = 12  # weak directions that are told
 
 
 @dataclass(frozen=True)
+class Drawn:
+    """A chart as the page has it.
+
+    Args:
+        chart: what it says.
+        svg: its picture.
+        csv: the address of its numbers, as of `csv_link`; empty where it has none.
+    """
+
+    chart: Chart
+    svg: str
+    csv: str
+
+
+@dataclass(frozen=True)
 class Section:
-    """A heading and its charts, each with its SVG."""
+    """A heading and its charts."""
 
     title: str
-    charts: Sequence[tuple[Chart, str]]
+    charts: Sequence[Drawn]
 
     @property
     def id(self) -> str:
         return self.title.lower().replace(" ", "-")
 
     @property
-    def shown(self) -> list[tuple[Chart, str]]:
-        return [pair for pair in self.charts if not pair[0].tail]
+    def shown(self) -> list[Drawn]:
+        return [drawn for drawn in self.charts if not drawn.chart.tail]
 
     @property
-    def folded(self) -> list[tuple[Chart, str]]:
-        return [pair for pair in self.charts if pair[0].tail]
+    def folded(self) -> list[Drawn]:
+        return [drawn for drawn in self.charts if drawn.chart.tail]
+
+    def read_as(self, chart: Chart) -> str:
+        """The id of the first chart of the section that is read as this one is; its own, maybe."""
+        return next(d.chart.id for d in self.charts if d.chart.reading == chart.reading)
 
 
 def render(
@@ -68,15 +88,18 @@ def render(
         lstrip_blocks=True,
         undefined=jinja2.StrictUndefined,
     )
-    css = (Path(__file__).parent / "page.css").read_text(encoding="utf-8")
+    here = Path(__file__).parent
+    css, script = ((here / f"page.{end}").read_text(encoding="utf-8") for end in ("css", "js"))
     page = environment.get_template("page.html.j2").render(
         css=markupsafe.Markup(css),
-        policy=policy(css),
+        script=markupsafe.Markup(script),
+        policy=policy(css, script),
         run=evidence.run,
         name=folder_name(evidence.run.folder),
         verdict=verdict,
         numbers=_numbers(evidence),
         sections=sections,
+        tables=calibration_tables(evidence),
         absent=absent,
         diagnosis=evidence.diagnosis,
         headings=HEADINGS,
@@ -92,24 +115,30 @@ def render(
     return escape.terminal(page)
 
 
-def policy(css: str) -> str:
-    """What a browser may do with the page: show it. It runs no script and loads nothing.
+def policy(css: str, script: str) -> str:
+    """What a browser may do with the page: show it, and run its own script. It loads nothing.
 
     Args:
         css: the text of its only style element, which is let in by its hash; matplotlib's figures
             have style attributes besides.
+        script: the text of its only script, which is let in by its hash as well.
     """
-    digest = base64.b64encode(hashlib.sha256(css.encode()).digest()).decode()
     rules = {
         "default-src": "'none'",
         "img-src": "data:",  # maps within figures
+        "script-src": _hash(script),
         "style-src": "'unsafe-inline'",  # for browsers that do not know the next two
-        "style-src-elem": f"'sha256-{digest}'",
+        "style-src-elem": _hash(css),
         "style-src-attr": "'unsafe-inline'",
         "base-uri": "'none'",
         "form-action": "'none'",
     }
     return "; ".join(f"{name} {value}" for name, value in rules.items())
+
+
+def _hash(text: str) -> str:
+    digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+    return f"'sha256-{digest}'"
 
 
 def _numbers(evidence: Evidence) -> list[tuple[str, str]]:

@@ -242,6 +242,34 @@ def residual_statistics(
     )
 
 
+@dataclass(frozen=True)
+class StopMaps:
+    """A stop that was held out: before, in the fit of all stops, and in a fit without it.
+
+    Args:
+        name: of the stop.
+        map_m: of each (rings, azimuths) mean residual; NaN where no beam went.
+        rms_m: of each the rms over its beams that were not thrown out.
+    """
+
+    name: str
+    map_m: tuple[np.ndarray, ...]
+    rms_m: tuple[float, ...]
+
+
+def stop_map(
+    columns: Mapping[str, np.ndarray], rings: int, azimuths: int
+) -> tuple[np.ndarray, float]:
+    """Of one stop's residuals the mean (rings, azimuths) and the rms, as `StopMaps` has them."""
+    kept = columns["weight"] > 0
+    residual = columns["residual_m"][kept].astype(float)
+    cell = _cell(columns, rings, azimuths)[kept]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean, count = (np.bincount(cell, v, rings * azimuths) for v in (residual, None))
+        shown = (mean / count).reshape(rings, azimuths)
+    return shown, float(np.sqrt(np.mean(np.square(residual)))) if len(residual) else 0.0
+
+
 def _cell(columns: Mapping[str, np.ndarray], rings: int, azimuths: int) -> np.ndarray:
     """(N,) which cell of the map of ring and azimuth each row is in."""
     turn = ((columns["azimuth_rad"] / (2 * np.pi) + 0.5) * azimuths).astype(int)

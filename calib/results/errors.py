@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import astuple, dataclass
 
 import numpy as np
@@ -21,6 +21,7 @@ from chains import se3
 # Redundancy of all that CAD says of frames, below which nothing is told of how right it is: with
 # less than one row's worth, chance alone puts the ratio anywhere.
 CHECKED = 1.0
+Keep = Callable[[ScanStop, Rows], None]  # what becomes of the rows of a stop
 
 
 @dataclass(frozen=True)
@@ -87,6 +88,7 @@ def scan_errors(
     values: Mapping[str, np.ndarray],
     association: Association | None,
     predicted: Estimate | None,
+    keep: Keep = lambda scan, rows: None,
 ) -> Errors:
     """Range residuals of a stop's beams that meet a surface.
 
@@ -96,8 +98,10 @@ def scan_errors(
         association: what each beam meets; found anew where None.
         predicted: where the stop's pose was predicted and not fitted to this scan, the estimate
             whose marginals say how well; its share belongs to what is expected.
+        keep: shown the stop and its rows.
     """
     rows = scan.rows(values, association)
+    keep(scan, rows)
     if predicted is None:
         return row_errors(rows)
     variance = _predicted_variance(scan, values, predicted, rows.by_twist)

@@ -14,7 +14,7 @@ from calib.problem.problem import Block
 from calib.problem.spread import with_spread
 from calib.residuals.scan import ScanStop
 from calib.residuals.surfaces import PlaneSurface
-from calib.results.errors import Errors, body_errors, scan_errors
+from calib.results.errors import Errors, Keep, body_errors, scan_errors
 from calib.solve.estimate import SD, Estimate, Start
 from calib.solve.fit import Progress, solve
 
@@ -100,6 +100,7 @@ def held_out(
     count: int,
     progress: Progress,
     start: Start | None = None,
+    keep: Keep = lambda scan, rows: None,
 ) -> Errors:
     """Residuals of stops left out of the fit, their poses told by tracker and arm alone.
 
@@ -110,6 +111,7 @@ def held_out(
         count: how many folds to evaluate.
         progress: as of `fit.solve`.
         start: a fit of all stops: each fold's fit is near it, and starts from there.
+        keep: shown every stop left out and its rows, where there are scans.
     """
     out = Errors()
     for number, fold in enumerate(folds(sources, by)[:count], 1):
@@ -121,7 +123,7 @@ def held_out(
         estimate = solve(trained, progress=tell, start=_without_planes(trained, start))
         unseen = problems.build(sources, model, fold, trained.meetings)
         unseen = with_spread(unseen, estimate.start.spread)
-        out += predict(unseen, trained, estimate)
+        out += predict(unseen, trained, estimate, keep)
     return out
 
 
@@ -141,14 +143,20 @@ def _is_of(name: str, planes: set[str]) -> bool:
     return name in planes or (mine and not name.endswith(SD))
 
 
-def predict(unseen: Problem, trained: Problem, estimate: Estimate) -> Errors:
+def predict(
+    unseen: Problem,
+    trained: Problem,
+    estimate: Estimate,
+    keep: Keep = lambda scan, rows: None,
+) -> Errors:
     """Residuals of a problem whose calibration comes from an estimate of another; see `placed`."""
     scans, bodies = unseen.scans, unseen.bodies
     predicted, told = placed(unseen, trained, estimate)
     if not scans:
         judged = [b for b in bodies if not _among(b, unseen.blocks) and b.stops.root in told]
         return body_errors(judged, predicted.values, predicted)
-    return sum((_scan(scan, predicted, scan.stops.root in told) for scan in scans), Errors())
+    each = (_scan(scan, predicted, scan.stops.root in told, keep) for scan in scans)
+    return sum(each, Errors())
 
 
 def _among(block: Block, blocks: Sequence[Block]) -> bool:
@@ -182,6 +190,6 @@ def placed(unseen: Problem, trained: Problem, estimate: Estimate) -> tuple[Estim
     return solve(unseen, prior, spread=False), told
 
 
-def _scan(scan: ScanStop, predicted: Estimate, told: bool) -> Errors:
+def _scan(scan: ScanStop, predicted: Estimate, told: bool, keep: Keep) -> Errors:
     association = scan.associate(predicted.values, near_edges=True)
-    return scan_errors(scan, predicted.values, association, predicted if told else None)
+    return scan_errors(scan, predicted.values, association, predicted if told else None, keep)

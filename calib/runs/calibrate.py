@@ -6,6 +6,7 @@ import os
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,9 @@ from calib.linear.parallel import one_blas_thread
 from calib.problem import Problem
 from calib.problem.model import Model, Source
 from calib.problem.without import leave_out
+from calib.residuals.beams import Rows
 from calib.residuals.groups import CAD
+from calib.residuals.scan import ScanStop
 from calib.results.errors import Errors, body_errors, misfit, row_errors, scan_errors
 from calib.results.holdout import held_out, unit_of
 from calib.results.intervals import intervals
@@ -30,7 +33,13 @@ from calib.results.recalibrate import Link, earlier, solve_from
 from calib.results.solution import solution_of
 from calib.runs.belief import TOLERATED
 from calib.runs.reopen import model_of, proposed, reopened, start_of, stored_met
-from calib.runs.residual_table import recording_of, residual_table, table_path, write_rows
+from calib.runs.residual_table import (
+    UNSEEN,
+    recording_of,
+    residual_table,
+    table_path,
+    write_rows,
+)
 from calib.runs.run import (
     COVARIANCE,
     DIAGNOSIS,
@@ -186,10 +195,7 @@ def _fit(
         known = intervals(estimate, progress)
     else:
         estimate, known, links = solve_from(problem, earlier(problem, before), progress)
-    unseen, by = Errors(), None
-    if choices.hold_out != "none" and estimate.converged:
-        unseen = held_out(sources, model, choices.hold_out, choices.folds, progress, estimate.start)
-        by = unit_of(sources, choices.hold_out) if unseen.count else None
+    unseen, by = _held_out(sources, model, estimate, folder / RESIDUALS, choices, progress)
     nominal = _nominal(problem, progress)
     seen_at = Reach(model.effects)
     by_stop = _write_residuals(problem, estimate, folder / RESIDUALS, progress, seen_at)
@@ -252,7 +258,7 @@ def _write_residuals(
 ) -> dict[tuple[str, str], Errors]:
     """Write every beam's residual, stop by stop, and show `seen` what effects look at; sums of
     the residuals, by recording and stop."""
-    folder.mkdir()
+    folder.mkdir(exist_ok=True)
     found = {}
     for i, (scan, association) in enumerate(
         zip(estimate.scans, estimate.associations, strict=True)
@@ -263,6 +269,30 @@ def _write_residuals(
         write_table(table_path(folder, scan, problem.sources), residual_table(rows))
         found[recording_of(scan, problem.sources), scan.name] = row_errors(rows)
     return found
+
+
+def _held_out(
+    sources: Sequence[Source],
+    model: Model,
+    estimate: Estimate,
+    folder: Path,
+    choices: _Choices,
+    progress: Progress,
+) -> tuple[Errors, str | None]:
+    """The errors of stops held out, whose residuals are written, and what was left out whole; of
+    a fit that did not converge, none."""
+    if choices.hold_out == "none" or not estimate.converged:
+        return Errors(), None
+    keep = partial(_write_unseen, sources, folder / UNSEEN)
+    how = (choices.hold_out, choices.folds, progress, estimate.start, keep)
+    unseen = held_out(sources, model, *how)
+    return unseen, unit_of(sources, choices.hold_out) if unseen.count else None
+
+
+def _write_unseen(sources: Sequence[Source], folder: Path, scan: ScanStop, rows: Rows) -> None:
+    """Write the residuals of a stop as a fit without it predicts them."""
+    folder.mkdir(parents=True, exist_ok=True)
+    write_table(table_path(folder, scan, sources), residual_table(rows))
 
 
 def _summary(

@@ -57,7 +57,7 @@ def variable_estimates(run: Run) -> list[VariableEstimate]:
     for prefix, part in parts.items():
         chosen = [r for r in rigs if not prefix or r.name == prefix[:-1]]
         for name, frame in part.frames.items():
-            out.append(_frame(prefix + name, frame, _drawn(name, chosen), sigma, untold))
+            out.append(_frame(prefix + name, frame, drawn(name, chosen), sigma, untold))
     for prefix, part in parts.items():
         out += [_effect(prefix + name, effect, untold) for name, effect in part.effects.items()]
     return out
@@ -105,8 +105,9 @@ def _rigs(run: Run) -> list[Rig]:
     return rigs
 
 
-def _drawn(frame: str, rigs: Iterable[Rig]) -> np.ndarray | None:
-    """T_parent_child (4, 4) of a frame as rig.yaml has it."""
+def drawn(frame: str, rigs: Iterable[Rig]) -> np.ndarray | None:
+    """T_parent_child (4, 4) of a frame as the first of these rigs that has it draws it in rig.yaml;
+    None where none does."""
     for rig in rigs:
         if frame in rig.frame_sigma:
             return rig.tree.edges[rig.tree.edge_names.index(frame)].T_parent_child

@@ -131,8 +131,11 @@ def reproduce(
 
 def compared(run: Run, again: Run) -> Reproduction:
     """What differs between a run and the same made again."""
-    tables = {p.name for r in (run, again) for p in (r.folder / RESIDUALS).glob("*.parquet")}
-    files = [SOLUTION, COVARIANCE, STATE, SUMMARY, *(f"{RESIDUALS}/{n}" for n in sorted(tables))]
+    pairs = [
+        (r.folder, p) for r in (run, again) for p in r.folder.glob(f"{RESIDUALS}/**/*.parquet")
+    ]
+    tables = {path.relative_to(folder).as_posix() for folder, path in pairs}
+    files = [SOLUTION, COVARIANCE, STATE, SUMMARY, *sorted(tables)]
     differences = [_difference(name, run.folder, again.folder) for name in files]
     was, here = run.model.get("versions", {}), versions()
     other = {name: (was.get(name, "not known"), now) for name, now in here.items()}

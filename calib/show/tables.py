@@ -173,14 +173,21 @@ def estimate_cell(estimate: float, sigma: float, unit: str) -> str:
     """An estimate and its sigma in the unit shown, as ``+1.234 ± 0.056``."""
     if sigma == 0.0:
         return "held"
+    value, spread = estimate_texts(estimate, sigma, unit)
+    return f"{value} ± {spread}".lstrip()
+
+
+def estimate_texts(estimate: float, sigma: float, unit: str) -> tuple[str, str]:
+    """An estimate and its sigma in the unit shown, to as many digits as the sigma lets matter; an
+    estimate of NaN is no text."""
     scale, _ = shown(unit)
     sigma = scale * sigma
     if scale == 1.0 or "/" in unit:
-        spread, value = f"± {sigma:.2g}", f"{scale * estimate:+.4g}"
+        spread, value = f"{sigma:.2g}", f"{scale * estimate:+.4g}"
     else:
         digits = 2 if sigma >= 0.095 else 3
-        spread, value = f"± {sigma:.{digits}f}", f"{scale * estimate:+z.{digits}f}"
-    return spread if np.isnan(estimate) else f"{value} {spread}"
+        spread, value = f"{sigma:.{digits}f}", f"{scale * estimate:+z.{digits}f}"
+    return "" if np.isnan(estimate) else value, spread
 
 
 def mm(value: float | None, sign: str = "") -> str:

@@ -15,6 +15,7 @@ from calib.report.statistics import Z_EDGES
 from calib.results.solution import Solution
 from calib.runs.calibrate import calibrate, grow, grown_model
 from calib.runs.diagnose import diagnose
+from calib.runs.residual_table import UNSEEN
 from calib.runs.run import RESIDUALS, SUMMARY, Run
 from calib.simulation import Spec, simulate
 from chains.errors import InputError
@@ -39,7 +40,7 @@ ALWAYS = (
     "correlation",
 )
 OF_BEAMS = (
-    *("variance", "scatter", "rings", "map", "targets", "findings", "groups"),
+    *("unseen", "variance", "scatter", "rings", "map", "targets", "findings", "groups"),
     *(f"residual-{c}" for c in ("incidence", "range", "ring", "azimuth", "elevation", "intensity")),
     *(f"residual-{c}" for c in ("label", "stop", "elapsed", "temperature", "humidity", "near-ir")),
 )
@@ -111,10 +112,17 @@ def test_a_browser_shows_every_chart_and_asks_nobody_for_anything(pages, shown):
     for chart in pages[0].contents.charts:
         figure = page.locator(f"figure[id='{chart.id}']")
         assert figure.locator("h4").inner_text() == chart.title
-        assert chart.reading in figure.locator("figcaption").inner_text()
+        assert told_below(chart, pages[0].contents) in figure.locator("figcaption").inner_text()
         box = figure.locator("svg").bounding_box()
         assert box["width"] > 300 and box["height"] > 80, chart.id
     shown.assert_clean()
+
+
+def told_below(chart, contents):
+    """How it is read, or which figure above it in its section is read so."""
+    section = next(charts for charts in contents.sections.values() if chart in charts)
+    first = next(each for each in section if each.reading == chart.reading)
+    return chart.reading if first is chart else f"Read as {first.id}."
 
 
 def test_nothing_is_wider_than_the_window(shown):
@@ -178,7 +186,7 @@ def test_a_page_fetches_nothing(pages):
     text = pages[0].file.read_text(encoding="utf-8")
     links = re.findall(r"""(?:src|href)=["']?([^"'\s>]+)""", text)
     assert links and all(link.startswith(("#", "data:")) for link in links)
-    assert "<script" not in text and "@import" not in text
+    assert text.count("<script") == 1 and "@import" not in text
     assert pages[0].file.stat().st_size < 4e6
 
 
@@ -195,6 +203,28 @@ def test_residuals_before_are_those_of_the_run_below_and_else_of_cad(first, grow
     rms = 1e3 * np.sqrt(np.average(curve.std_m**2 + curve.mean_m**2, weights=curve.count))
     assert rms == pytest.approx(nominal, rel=0.3)  # robustly weighted, and that is not
     assert rms > 5 * runs[0].summary["rms_mm"]["fit"]
+
+
+def test_stops_held_out_are_those_of_the_summary_and_the_worst_is_first(grown):
+    tables = {p.stem: read_table(p) for p in (grown.run.folder / RESIDUALS / UNSEEN).iterdir()}
+    left_out = {name[:3] for name in tables}
+    assert len(left_out) == 1 and len(tables) == 2  # one location of the three, whole
+    kept = {n: t["residual_m"][t["weight"] > 0].astype(float) for n, t in tables.items()}
+    rms_mm = 1e3 * np.sqrt(np.mean(np.concatenate(list(kept.values())) ** 2))
+    assert rms_mm == pytest.approx(grown.run.summary["rms_mm"]["held_out"], rel=1e-5)
+    stops = grown.unseen
+    rms_m = [np.sqrt(np.mean(kept[stop.name] ** 2)) for stop in stops]
+    assert rms_m == sorted(rms_m, reverse=True)
+    for stop, rms in zip(stops, rms_m, strict=True):
+        assert stop.rms_m[2] == pytest.approx(rms) and stop.rms_m[1] < stop.rms_m[2]
+        table, (rings, azimuths) = tables[stop.name], stop.map_m[2].shape
+        for ring, part in ((0, 0), (rings - 1, azimuths // 2)):
+            from_rad = 2 * np.pi * part / azimuths - np.pi
+            there = (table["ring"] == ring) & (table["weight"] > 0)
+            there &= table["azimuth_rad"] >= from_rad
+            there &= table["azimuth_rad"] < from_rad + 2 * np.pi / azimuths
+            mean = table["residual_m"][there].mean() if there.any() else np.nan
+            assert stop.map_m[2][ring, part] == pytest.approx(mean, rel=1e-5, nan_ok=True)
 
 
 def test_the_noise_floor_is_taken_apart_into_all_of_it(grown):

@@ -15,6 +15,7 @@ from calib.report.charts import (
     links,
     misfit,
     residuals,
+    unseen,
 )
 from calib.report.evidence import Evidence
 
@@ -24,8 +25,9 @@ SECTIONS: Mapping[str, tuple[Charts, ...]] = {
     "How good it is": (fit.ladder, fit.variance, fit.scatter),
     "What does not fit": (groups.groups, misfit.by_stop, misfit.moves_from_cad),
     "What was found": (formulas.formulas, knowledge.findings),
-    "The chain": (links.chain, links.moves, links.effects, knowledge.budget),
+    "The calibration": (links.chain, links.moves, links.effects, knowledge.budget),
     "What is left": (
+        unseen.unseen,
         *(residuals.ring_map, residuals.thrown_away, residuals.curves),
         *(bodies.tracked, bodies.targets),
     ),
