@@ -15,9 +15,9 @@ from calib.runs.ladder import FORMULA, Rung
 from calib.runs.run import Run
 from calib.show import misfit
 from calib.show.headline import moved_sentence
-from calib.view.colours import Scale, column
 from calib.view.desk import Findings
 from calib.view.scene import Points
+from calib.view.shown.colours import Scale, column
 from chains.escape import html as escape
 
 SHOWN_CANDIDATES = 6  # candidates in the table; the menu has all
@@ -39,10 +39,11 @@ def legend(scale: Scale) -> str:
         )
         return _framed(items)
     middle, unit = (scale.low + scale.high) / 2, f" {scale.unit}" if scale.unit else ""
-    signed = "+" if scale.low == -scale.high else ""
-    ends = [f"{value:{signed if value else ''}.3g}" for value in (scale.low, middle, scale.high)]
-    if signed:
-        ends = [f"{ends[0]}{unit}, short", ends[1], f"{ends[2]}{unit}, long"]
+    sign = "+" if scale.signed else ""
+    ends = [f"{value:{sign if value else ''}.3g}" for value in (scale.low, middle, scale.high)]
+    if scale.signed:
+        less, more = scale.signed
+        ends = [f"{ends[0]}{unit}, {less}", ends[1], f"{ends[2]}{unit}, {more}"]
     else:
         ends = [f"{end}{unit}" for end in ends]
     bar = f"height:.9em;background:linear-gradient(to right,{','.join(scale.stops)})"
@@ -57,6 +58,16 @@ def scan(points: Points | None, drawn: int, stop: str, ratios: Mapping[str, floa
     """What the stop's beams say, all of them, however few are drawn; and how large residuals of all
     that was measured there are, over their sigmas."""
     return _framed(_beams(points, drawn, stop) + _misfit(ratios))
+
+
+def plotted(points: Points, rows: np.ndarray, up: str, low: float, high: float) -> str:
+    """What a plot of the beams (n,) shows, and how many of them are off its scale."""
+    values = points.columns[up][rows] * column(up).scale
+    beyond = int(np.sum((values < low) | (values > high)))
+    off = f"; {beyond:,} are beyond the scale" if beyond else ""
+    return _framed(
+        f'<span data-is="plotted">{len(rows):,} beams{off}. Line: mean of the inliers.</span>'
+    )
 
 
 def moved(run: Run) -> str:
@@ -76,11 +87,13 @@ def standing_out(run: Run) -> str:
 def _beams(points: Points | None, drawn: int, stop: str) -> str:
     if points is None:
         return f"Stop {escape(stop)} has no scan in this fit."
+    here = len(points.inlier)
+    some = "" if here == points.measured else f", {here:,} of them looked at"
     if not points.inlier.any():
-        return f"{len(points.inlier):,} beams, none of which the fit took for an inlier."
+        return f"{points.measured:,} beams{some}, none of which the fit took for an inlier."
     residual = 1e3 * points.columns["residual_m"][points.inlier].astype(float)
     return (
-        f"{len(points.inlier):,} beams, {drawn:,} drawn; residual of the inliers "
+        f"{points.measured:,} beams{some}, {drawn:,} drawn; residual of the inliers "
         f"{math.sqrt(np.mean(residual**2)):.2f} mm rms, {residual.mean():+.2f} mm mean"
     )
 
