@@ -123,7 +123,7 @@ class Picture:
             "up": column(self._up.value, ""),
             "over": column(self._over.value, ""),
             "below": f"{self._below.value:.2f}",
-            "camera": ",".join(f"{x:.3f}" for x in self.stage.camera()),
+            "camera": ",".join(f"{x:.6g}" for x in np.round(self.stage.camera(), 3) + 0.0),
         }
 
     def show(self, scene: Scene, others: Mapping[str, Run], below: str | None = None) -> None:

@@ -98,6 +98,9 @@ class Stage:
         """Draw the points that are kept (N,) in their colours (N, 3) uint8; how many they are."""
         points = self.points
         self.shown = points.drawn(below_m, among=kept)
+        if not len(self.shown):
+            self.client.scene.remove_by_name(POINTS)
+            return 0
         span = float(np.linalg.norm(np.subtract(*scenes.box(points.xyz_m))))
         size = float(np.clip(span / 2 / np.sqrt(len(self.shown) + 1), FINEST_M, span * COARSEST))
         xyz = points.xyz_m[self.shown] - self._middle_m
