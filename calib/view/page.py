@@ -10,11 +10,13 @@ from typing import Any
 
 import numpy as np
 
+from calib.runs.ladder import Rung
 from calib.view import panels
 from calib.view.bench import Bench
 from calib.view.desk import DiagnosisCurve, Findings
 from calib.view.job import Told
 from calib.view.leave_out import LeaveOut
+from calib.view.own import OwnFormula, document
 from calib.view.picture import NOTHING, Picture
 from calib.view.server import Visitor
 from calib.view.shown import colours, look
@@ -91,6 +93,7 @@ class Page:
             self._formulas = gui.add_html("")
             self._effect = self._menu("Effect", [NOTHING], self._choose_curve)
             self._add = gui.add_button("Add", hint="Refit with this effect, from this run")
+            self._own = OwnFormula(gui, self._guarded, self._on_own)
             self._diagnose = gui.add_button("Diagnose", visible=False)
             self._bar = gui.add_progress_bar(0.0, visible=False)
             self._doing = gui.add_html("", visible=False)
@@ -220,6 +223,10 @@ class Page:
             raise InputError(f"'{name}' is not an effect that can be added to this run")
         self._start(self.desk.run.folder, what, self.desk.folder_for(name))
 
+    def _on_own(self, text: str, site: str) -> None:
+        effect = document(text, site, self.picture.beams(), self.desk.run.effects)
+        self._start(self.desk.run.folder, effect, self.desk.folder_for(effect["name"]))
+
     def _on_leave_out(self, tokens: Sequence[str]) -> None:
         def leave_out() -> None:
             run, out = self.desk.run.folder, self.desk.folder_without()
@@ -256,6 +263,7 @@ class Page:
         self._cancel.visible = busy and self.may_change
         self._add.disabled = self._diagnose.disabled = busy or not self.may_change
         self._blunders.busy(busy or not self.may_change)
+        self._own.busy(busy or not self.may_change)
         self._bar.value, self._doing.content = 0.0, panels.note("Starting …")
 
     def _hear(self, told: Told, by: Any) -> None:
@@ -275,9 +283,10 @@ class Page:
         if here:
             self.desk.choose(self.desk.name_of(folder))
             self._show_run()
+            self._tell(panels.new_run(self.desk.rungs()[-1]))
         else:
             self._fill(self._run, list(self.desk.runs), self.desk.chosen)
-        self._tell(panels.new_run(folder))
+            self._tell(panels.new_run(Rung(self.desk.runs[self.desk.name_of(folder)], None)))
 
     def _ended(self, told: Told, here: bool) -> None:
         self._show_busy()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -259,9 +258,14 @@ def note(text: str, bad: bool = False) -> str:
     )
 
 
-def new_run(folder: Path) -> str:
-    """Which run has just been made."""
-    return f"Made {folder}, an ordinary run folder."
+def new_run(rung: Rung) -> str:
+    """Which run has just been made, and what stops held out make of it."""
+    made = f"Made {rung.run.folder}, an ordinary run folder."
+    below = rung.below.summary["rms_mm"]["held_out"] if rung.below else None
+    here = rung.run.summary["rms_mm"]["held_out"]
+    if below is None or here is None:
+        return made
+    return f"{made} Error of stops held out: {below:.2f} → {here:.2f} mm."
 
 
 def _framed(inner: str) -> str:

@@ -152,6 +152,19 @@ class Picture:
         if gone:
             raise InputError(f"the address asks for {', '.join(gone)}, which is not here")
 
+    def beams(self) -> Points:
+        """Some beams of all stops.
+
+        Raises:
+            InputError: there are none.
+        """
+        if self.stage.scene is None:
+            raise InputError("nothing of this run can be shown, so nothing can be tried")
+        points = gathered(self.stage.scene, self._at, self.stage.scene.stops(self._at))
+        if points is None:
+            raise InputError("this run has no beams, which is what a formula here acts on")
+        return points
+
     def clear(self) -> None:
         """Show nothing."""
         self.stage.clear()

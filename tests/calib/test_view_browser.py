@@ -154,7 +154,7 @@ def test_stops_and_colours_are_chosen(small):
         watched.page.get_by_text("mm, short").wait_for(state="hidden")
         assert page.picture.stop.value == "L01P01"
         count = len(page.picture.stage.scene.points(0, "L01P01").inlier)
-        watched.page.get_by_text(f"{count:,} beams").wait_for()
+        watched.page.get_by_text(f"{count:,} beams,").wait_for()
 
 
 @pytest.mark.parametrize("width", [1400, 700])

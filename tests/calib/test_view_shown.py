@@ -6,7 +6,10 @@ import shutil
 import numpy as np
 import pytest
 
+from calib.runs.calibrate import calibrate
 from calib.runs.run import Run
+from calib.simulation import simulate
+from calib.view.own import document
 from calib.view.scene import Points, Scene
 from calib.view.shown import colours, look, plot
 from calib.view.shown.columns import comparable, gathered, kept
@@ -14,7 +17,7 @@ from chains.errors import InputError
 from sensors.documents import read_yaml, write_yaml
 from sensors.recording import read_table, write_table
 from tests.calib.viewed import diagnosed, small_run
-from tests.calib.workbench import choose, field, shown
+from tests.calib.workbench import FIT_MS, bars, button, choose, field, shown
 
 TABLES = "residuals.parquet"
 
@@ -165,6 +168,27 @@ def test_an_address_says_what_it_was_made_of():
     assert [look.numbers(t, 2) for t in ("1", "1,x", "1,nan", "1,inf")] == [None] * 4
 
 
+# ------------------------------------------------------------------------- a formula of one's own
+
+
+def test_a_formula_of_ones_own_becomes_an_effect_of_a_plausible_size():
+    points = cloud(range_m=np.full(50, 4.0), residual_m=np.ones(50), humidity=np.full(50, 0.5))
+    found = document(" humidity * range ", "range", points, ["own_humidity_range"])
+    assert found["name"] == "own_humidity_range_2" and found["basis"] == ["humidity * range"]
+    assert found["sigma"] * 2.0 == pytest.approx(0.01) and found["unit"] == "m"
+    assert document("ring + 1", "azimuth", points, [])["unit"] == "rad"
+    for text, why in (
+        ("residual * 2", "what a fit leaves"),
+        ("difference_m", "what a fit leaves"),
+        ("0 * range", "is 0 at every beam"),
+        ("1 / (range - 4)", "no number at some"),
+        ("humid", "did you mean humidity"),
+        ("  ", "write a formula first"),
+    ):
+        with pytest.raises(InputError, match=why):
+            document(text, "range", points, [])
+
+
 # ----------------------------------------------------------------------------------- in a browser
 
 
@@ -221,3 +245,31 @@ def test_keys_go_from_stop_to_stop_and_a_link_shows_the_same(run, other):
         assert tab.get_by_text("mm, shorter").inner_text() == legend.replace("short", "shorter")
         link, camera = link.split("camera=")
         tab.wait_for_url(lambda url: url.startswith(link) and near(url.split("camera=")[1], camera))
+
+
+@pytest.mark.slow
+def test_a_formula_of_ones_own_is_tried_and_stops_held_out_answer(once, tmp_path):
+    """What was hidden is written as a formula; a wrong one is told beside its box."""
+    folder = shutil.copytree(once(hidden) / "run", tmp_path / "run")
+    with shown(folder) as (watched, page):
+        field(watched, "Own formula").fill("abs(residual)")
+        button(watched, "Try").click()
+        watched.page.get_by_text("residual_m is what a fit leaves").wait_for()
+        assert not page.bench.busy
+        field(watched, "Own formula").fill("1 / maximum(cos(incidence), 0.2) - 1")
+        button(watched, "Try").click()
+        watched.page.get_by_text("Error of stops held out:").wait_for(timeout=FIT_MS)
+        page.bench.stop()
+        before, after = bars(watched)
+        assert after < before / 2
+        made = page.desk.run
+        assert made.folder.parent == tmp_path and made.grown_from == folder.resolve()
+        assert made.effects[-1] == "own_1_maximum_cos_incidence_0_2_1"
+        assert made.summary["rms_mm"]["held_out"] == pytest.approx(after, abs=1e-3)
+        button(watched, "Cancel").wait_for(state="hidden", timeout=FIT_MS)
+
+
+def hidden(folder) -> None:
+    """A run whose model lacks what was hidden in its recording."""
+    simulate("tiny", folder / "rec", 1, {"incidence_angle_bias": 2.0})
+    calibrate([folder / "rec"], folder / "run")

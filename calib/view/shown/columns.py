@@ -74,10 +74,18 @@ def kept(points: Points, text: str) -> np.ndarray:
     Raises:
         InputError: it is no formula, or looks at what there is not.
     """
-    everywhere = np.ones(len(points.xyz_m), bool)
     if not text.strip():
-        return everywhere
-    expression = Expression(text, "'Only where'")
+        return np.ones(len(points.xyz_m), bool)
+    value = value_of(points, Expression(text, "'Only where'"))
+    return np.isfinite(value) & (value != 0)
+
+
+def value_of(points: Points, expression: Expression) -> np.ndarray:
+    """A formula's value (N,) at beams; units of columns need not be written.
+
+    Raises:
+        InputError: it looks at what there is not.
+    """
 
     def column(name: str) -> np.ndarray:
         found = next((n for n in (name, *(name + u for u in UNITS)) if n in points.columns), None)
@@ -87,8 +95,7 @@ def kept(points: Points, text: str) -> np.ndarray:
             raise expression.wrong(f"there is no column {name} here{nearest(name, known)}")
         return points.columns[found].astype(float)
 
-    value = expression.value(column)
-    return everywhere & np.isfinite(value) & (value != 0)
+    return np.broadcast_to(expression.value(column), len(points.xyz_m))
 
 
 def _of_stop(
