@@ -50,7 +50,6 @@ class Page:
         self._covariates: dict[str, str] = {}  # heading -> covariate that has a curve
         self._lock = threading.RLock()
         gui = client.gui
-        gui.configure_theme(show_logo=False, show_share_button=False)
         gui.main_panel.dock_right()
         gui.main_panel.set_width(PANEL_PX)
         gui.add_html(panels.note(LOOKS), visible=not self.may_change)
@@ -60,6 +59,9 @@ class Page:
         self._add_ladder_widgets()
         self._blunders = LeaveOut(gui, self._on_leave_out)
         self._add_findings_widgets()
+        self._dark = gui.add_checkbox("Dark", bool(self._asks.get("dark")))
+        self._dark.on_update(self._guarded(self._paint_page))
+        self._paint_page()
         client.camera.on_update(self._on_camera)
 
     def open(self) -> None:
@@ -137,9 +139,14 @@ class Page:
 
         return call
 
+    def _paint_page(self) -> None:
+        dark = self._dark.value
+        self.client.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=dark)
+
     def _readdress(self) -> None:
         """Have the browser's address ask for what is shown."""
-        text = look.write({"run": self.desk.chosen, **self.picture.look()})
+        dark = "1" if self._dark.value else ""
+        text = look.write({"run": self.desk.chosen, "dark": dark, **self.picture.look()})
         if text != self._address:
             self._address = text
             self._visitor.readdress(text)

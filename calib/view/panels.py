@@ -23,8 +23,8 @@ SHOWN_CANDIDATES = 6  # candidates in the table; the menu has all
 LARGE = ((1e6, " million"), (1.0, ""))
 BAR = "#7fb2d9"
 STRIPED = f"repeating-linear-gradient(45deg,{BAR} 0 6px,#dcebf6 6px 10px)"  # of a rung by a formula
-_FRAME = "padding:0 1.2em .4em .75em;font-size:12px;line-height:1.4;color:#222"
-_QUIET = "color:#555"
+_FRAME = "padding:0 1.2em .4em .75em;font-size:12px;line-height:1.4"
+_QUIET = "opacity:.7"
 _CUT = "overflow:hidden;text-overflow:ellipsis;white-space:nowrap"
 
 
@@ -156,7 +156,7 @@ def formulas(diagnosed: Findings | None) -> str:
     return "".join(
         _framed(
             f'<div data-is="formula"><b>{escape(chart.title)}</b>'
-            f"{plots.svg(chart.figure(), chart.id)}"
+            f'<div style="background:#fff">{plots.svg(chart.figure(), chart.id)}</div>'
             f'<div style="{_QUIET}">{escape(chart.reading)}</div></div>'
         )
         for chart in (diagnosed.formulas if diagnosed else ())
@@ -185,7 +185,7 @@ def _candidate(each: Mapping[str, Any], diagnosed: Findings) -> str:
     size = each["unabsorbed_rms_mm"]
     held = [each["held_out_rms_mm"][k] for k in ("before", "after")]
     held_out = f"{held[0]:.2f} → {held[1]:.2f}" if None not in held else ""
-    worth = "color:#222" if each["add"] in diagnosed.worth_adding else _QUIET
+    worth = "" if each["add"] in diagnosed.worth_adding else _QUIET
     return (
         f'<tr style="{worth}"><td>{escape(each["add"]).replace("_", "_<wbr>")}</td>'
         f'<td style="text-align:right;padding-right:.6em">{"" if size is None else f"{size:.2f}"}'

@@ -193,8 +193,10 @@ def test_a_formula_of_ones_own_becomes_an_effect_of_a_plausible_size():
 
 
 def near(one: str, other: str) -> bool:
-    """Whether two cameras stand and look the same, to what a turning browser rounds."""
-    return np.allclose(look.numbers(one, 6), look.numbers(other, 6), atol=0.01)
+    """Whether two addresses ask for the same, cameras to what a turning browser rounds."""
+    looks = [look.read(url.rpartition("/")[2]) for url in (one, other)]
+    cameras = [look.numbers(each.pop("camera"), 6) for each in looks]
+    return looks[0] == looks[1] and np.allclose(*cameras, atol=0.01)
 
 
 @pytest.mark.slow
@@ -219,8 +221,9 @@ def test_keys_go_from_stop_to_stop_and_a_link_shows_the_same(run, other):
             ("Over", "temperature, °C"),
         ):
             choose(watched, label, option)
+        field(watched, "Dark").check(force=True)
         field(watched, "Only where").fill("ring > 40")
-        tab.wait_for_url(re.compile("only=ring.*over=temperature"))
+        tab.wait_for_url(re.compile("only=ring.*over=temperature.*dark=1"))
         tables = (read_table(run.folder / TABLES / f"L01P0{i}.parquet") for i in range(2))
         count = sum(int((table["ring"] > 40).sum()) for table in tables)
         tab.locator("[data-is=plotted]", has_text=f"{count:,} beams").wait_for()
@@ -243,8 +246,12 @@ def test_keys_go_from_stop_to_stop_and_a_link_shows_the_same(run, other):
         ):
             assert tab.get_by_label(label, exact=True).input_value() == value
         assert tab.get_by_text("mm, shorter").inner_text() == legend.replace("short", "shorter")
-        link, camera = link.split("camera=")
-        tab.wait_for_url(lambda url: url.startswith(link) and near(url.split("camera=")[1], camera))
+        assert tab.locator("html").get_attribute("data-mantine-color-scheme") == "dark"
+        tab.wait_for_url(lambda url: near(url, link))
+        tab.goto("about:blank")
+        tab.goto(link.replace("stop=L01P00", "stop=gone"))
+        tab.get_by_text("the address asks for stop 'gone', which is not here").wait_for()
+        tab.wait_for_url(re.compile("stop=L00P00"))
 
 
 @pytest.mark.slow

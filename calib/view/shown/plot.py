@@ -12,7 +12,7 @@ from calib.view.shown.colours import column
 
 MOST_DOTS = 3000  # more would hide each other on a panel of 400 pixels
 BINS, FEWEST = 16, 5  # of the line of means, and beams in one: of fewer a mean says little
-MEAN = "#111111"
+MEAN = "#d6278a"  # apart from all colours of dots, on light and on dark
 Chart = tuple[tuple[np.ndarray, ...], tuple[Mapping[str, Any], ...]]
 EMPTY: Chart = ((np.zeros(2), np.full(2, np.nan)), ({"label": ""}, {"label": ""}))
 
