@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import time
 
@@ -16,7 +17,7 @@ from calib.view.page import Page
 from calib.view.stage import PANEL_PX, PLOT_PX
 from tests.browser import Watched
 from tests.calib.viewed import blunder, diagnosed, small_run
-from tests.calib.workbench import FIT_MS, SOON_MS, bars, button, shown
+from tests.calib.workbench import FIT_MS, SOON_MS, bars, button, field, shown
 
 pytestmark = pytest.mark.slow
 
@@ -155,6 +156,17 @@ def test_stops_and_colours_are_chosen(small):
         assert page.picture.stop.value == "L01P01"
         count = len(page.picture.stage.scene.points(0, "L01P01").inlier)
         watched.page.get_by_text(f"{count:,} beams,").wait_for()
+
+        def legend() -> list[str]:
+            return watched.page.get_by_text(re.compile(r"^[\d.]+ deg$")).all_inner_texts()
+
+        kept = legend()
+        watched.page.keyboard.press("n")
+        watched.page.wait_for_url(re.compile("stop=L00P00&"))
+        assert legend() == kept and len(kept) == 3
+        field(watched, "Keep scales").uncheck(force=True)
+        watched.page.wait_for_url(re.compile("scales=free"))
+        assert legend() != kept
 
 
 @pytest.mark.parametrize("width", [1400, 700])
