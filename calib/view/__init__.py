@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from calib.view.bench import Bench
     from calib.view.page import Page
-    from calib.view.server import Served
+    from calib.view.server import Served, Visitor
 
 
 def view(
@@ -80,10 +80,11 @@ def attend(served: Served, bench: Bench) -> dict[int, Page]:
 
     pages: dict[int, Page] = {}
 
-    def arrive(client: Any, may_change: bool) -> None:
-        page = pages[client.client_id] = Page(client, bench, may_change)
+    def arrive(visitor: Visitor) -> None:
+        number = visitor.client.client_id
+        page = pages[number] = Page(visitor, bench)
         page.open()
-        if client.client_id not in pages:  # it left meanwhile
+        if number not in pages:  # it left meanwhile
             page.close()
 
     def leave(client: Any) -> None:

@@ -4,7 +4,7 @@ The server listens on this machine alone, but other people use this machine too,
 a browser shows can send requests to it. So a request is let in only
 
 - with a key, the first part of its path (a query would not reach the websocket, and a cookie would
-  go to every other server on this machine);
+  go to every other server on this machine); what follows in the path says what to show;
 - addressed to this machine by name: a page whose own name was made to point here (DNS rebinding)
   has another name in `Host`;
 - on the websocket, from the page that was served here: `Origin` is what `Host` says.
@@ -26,12 +26,12 @@ class Visit:
     """A request that was let in.
 
     Args:
-        path: of what is asked for, without the key.
         may_change: whether it may start a fit, or only look.
+        asks: what stands after the key: what the page is to show, as `look` has it.
     """
 
-    path: str
     may_change: bool
+    asks: str = ""
 
 
 def _new_key() -> str:
@@ -70,7 +70,7 @@ class Keys:
         may_change, may_look = (
             secrets.compare_digest(given, known.encode()) for known in (self.change, self.look)
         )
-        return Visit(f"/{rest}", may_change) if may_change or may_look else None
+        return Visit(may_change, rest) if may_change or may_look else None
 
 
 def _is_local(host: str) -> bool:

@@ -10,19 +10,21 @@ from typing import Any
 
 import numpy as np
 
-from calib.problem.model import recording_names
-from calib.show.misfit import of_stop
-from calib.view import colours, panels
+from calib.runs.ladder import Rung
+from calib.view import panels
 from calib.view.bench import Bench
 from calib.view.desk import DiagnosisCurve, Findings
 from calib.view.job import Told
 from calib.view.leave_out import LeaveOut
-from calib.view.scene import Points
-from calib.view.stage import AXES, PANEL_PX, RIG, ROOM, Stage
+from calib.view.own import OwnFormula, document
+from calib.view.picture import NOTHING, Picture
+from calib.view.server import Visitor
+from calib.view.shown import colours, look
+from calib.view.stage import PANEL_PX
 from chains.errors import InputError
 
 CURVE_PX = 180
-NOTHING = "—"
+SETTLED_S = 0.4  # the camera rests for so long before the address tells where it is
 LOOKS = "Opened to look at: this address cannot change anything."
 
 
@@ -33,34 +35,38 @@ class Page:
     Every widget's callback ends in a redrawing of what it changed.
 
     Args:
-        client: viser's, of the browser.
+        visitor: the browser, whether a fit may be started from it, and what its address asks for.
         bench: what all browsers share.
-        may_change: whether a fit may be started from here.
     """
 
-    def __init__(self, client: Any, bench: Bench, may_change: bool) -> None:
-        self.client, self.bench, self.may_change = client, bench, may_change
+    def __init__(self, visitor: Visitor, bench: Bench) -> None:
+        client = visitor.client
+        self.client, self.bench, self.may_change = client, bench, visitor.may_change
         self.desk = bench.desk()
-        self.stage = Stage(client)
         self.findings: Findings | None = None
-        self._columns: dict[str, str] = {}  # heading -> column that points can be coloured by
+        self._visitor, self._asks = visitor, look.read(visitor.asks)
+        self._settling: threading.Timer | None = None
+        self._address = ""
         self._covariates: dict[str, str] = {}  # heading -> covariate that has a curve
         self._lock = threading.RLock()
         gui = client.gui
-        gui.configure_theme(show_logo=False, show_share_button=False)
         gui.main_panel.dock_right()
         gui.main_panel.set_width(PANEL_PX)
-        gui.add_html(panels.note(LOOKS), visible=not may_change)
+        gui.add_html(panels.note(LOOKS), visible=not self.may_change)
         self._note = gui.add_html("", visible=False)
-        self._add_scan_widgets()
+        self._run = self._menu("Run", list(self.desk.runs), self._on_run)
+        self.picture = Picture(client, self._guarded, self._asks)
         self._add_ladder_widgets()
         self._blunders = LeaveOut(gui, self._on_leave_out)
         self._add_findings_widgets()
-        client.scene.on_click()(self._guarded(self._on_point, with_event=True))
+        self._dark = gui.add_checkbox("Dark", bool(self._asks.get("dark")))
+        self._dark.on_update(self._guarded(self._paint_page))
+        self._paint_page()
+        client.camera.on_update(self._on_camera)
 
     def open(self) -> None:
         """Show the chosen run, and from now on what is being made."""
-        self._guarded(self._show_run)()
+        self._guarded(self._begin)()
         if self.desk.refused:
             self._tell("; ".join(self.desk.refused), bad=True)
         self.bench.listen(self._hear)
@@ -69,22 +75,18 @@ class Page:
     def close(self) -> None:
         """Its browser has gone."""
         self.bench.forget(self._hear)
+        if self._settling is not None:
+            self._settling.cancel()
+
+    def _begin(self) -> None:
+        asked = self._asks.get("run")
+        if asked in self.desk.runs:
+            self.desk.choose(asked)
+        self._show_run()
+        if asked is not None and asked not in self.desk.runs:
+            raise InputError(f"the address asks for run '{asked}', which is not here")
 
     # ------------------------------------------------------------------------------------ widgets
-
-    def _add_scan_widgets(self) -> None:
-        gui = self.client.gui
-        self._run = self._menu("Run", list(self.desk.runs), self._on_run)
-        self._recording = self._menu("Recording", [NOTHING], self._on_recording)
-        self._stop = self._menu("Stop", [NOTHING], self._on_stop)
-        self._colour = self._menu("Colour", [NOTHING], lambda: self._paint())
-        self._legend = gui.add_html("")
-        self._below = gui.add_slider("Show up to, m", 0.0, 1.0, 0.01, 1.0, visible=False)
-        self._below.on_update(self._guarded(self._paint))
-        self._what = gui.add_button_group("Hide, show", ("room", "rig", "frames"))
-        self._what.on_click(self._guarded(self._on_what))
-        self._scan = gui.add_html("")
-        self._point = gui.add_html(panels.note("Click a point to read it."))
 
     def _add_findings_widgets(self) -> None:
         gui = self.client.gui
@@ -93,6 +95,7 @@ class Page:
             self._formulas = gui.add_html("")
             self._effect = self._menu("Effect", [NOTHING], self._choose_curve)
             self._add = gui.add_button("Add", hint="Refit with this effect, from this run")
+            self._own = OwnFormula(gui, self._guarded, self._on_own)
             self._diagnose = gui.add_button("Diagnose", visible=False)
             self._bar = gui.add_progress_bar(0.0, visible=False)
             self._doing = gui.add_html("", visible=False)
@@ -132,8 +135,29 @@ class Page:
                     self._tell(str(error), bad=True)
                 except Exception as error:
                     self._tell(f"internal fault: {type(error).__name__}: {error}", bad=True)
+                self._readdress()
 
         return call
+
+    def _paint_page(self) -> None:
+        dark = self._dark.value
+        self.client.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=dark)
+
+    def _readdress(self) -> None:
+        """Have the browser's address ask for what is shown."""
+        dark = "1" if self._dark.value else ""
+        text = look.write({"run": self.desk.chosen, "dark": dark, **self.picture.look()})
+        if text != self._address:
+            self._address = text
+            self._visitor.readdress(text)
+
+    def _on_camera(self, _: Any) -> None:
+        """The camera moves at every frame: wait until it rests."""
+        if self._settling is not None:
+            self._settling.cancel()
+        self._settling = threading.Timer(SETTLED_S, self._guarded(lambda: None))
+        self._settling.daemon = True
+        self._settling.start()
 
     def _tell(self, text: str, bad: bool = False) -> None:
         """Put a sentence above everything else; an empty one takes it away."""
@@ -154,82 +178,16 @@ class Page:
         try:
             scene = self.bench.scene(desk.run)
         except InputError:
-            self._show_nothing()
+            self.picture.clear()
             raise
-        self._fill(self._recording, scene.names, self._recording.value)
-        self._recording.visible = len(scene.names) > 1
-        self.stage.scene = scene
-        self._on_recording()
+        others = {name: run for name, run in desk.runs.items() if name != desk.chosen}
+        below = desk.rungs()[-1].below
+        self.picture.show(scene, others, desk.name_of(below.folder) if below else None)
         self._tell("")
-
-    def _show_nothing(self) -> None:
-        self.stage.clear()
-        self._below.visible = False
-        for menu in (self._recording, self._stop, self._colour):
-            self._fill(menu, [NOTHING])
-        for html in (self._legend, self._scan, self._point):
-            html.content = ""
 
     def _on_run(self) -> None:
         self.desk.choose(self._run.value)
         self._show_run()
-
-    def _on_recording(self) -> None:
-        stops = self.stage.scene.stops(self._at)
-        if not stops:
-            self._show_nothing()
-            raise InputError(f"{self._recording.value}: nothing was measured at any of its stops")
-        self.stage.open(self.stage.scene, self._at)
-        self._fill(self._stop, stops, self._stop.value)
-        self._on_stop()
-
-    def _on_stop(self) -> None:
-        points = self.stage.show(self._at, self._stop.value)
-        self._below.visible = self._colour.visible = points is not None
-        self._point.content = panels.note("Click a point to read it.") if points else ""
-        if points is None:
-            self._legend.content = ""
-            self._tell_scan(None, 0)
-            return
-        self._columns = {colours.column(n).heading: n for n in colours.choices(points)}
-        self._fill(self._colour, list(self._columns), self._colour.value)
-        low, high, free = self.stage.ceiling_m()
-        self._below.min, self._below.max = np.floor(low * 100) / 100, np.ceil(high * 100) / 100
-        self._below.value = float(np.clip(free, self._below.min, self._below.max))
-        self._paint()
-
-    def _paint(self) -> None:
-        points = self.stage.points
-        if points is None:
-            return
-        colour, scale = colours.coloured(points, self._columns[self._colour.value], self._labels)
-        drawn = self.stage.paint(colour, self._below.value + 0.01)
-        self._legend.content = panels.legend(scale)
-        self._tell_scan(points, drawn)
-
-    def _tell_scan(self, points: Points | None, drawn: int) -> None:
-        stop, names = self._stop.value, recording_names(self.stage.scene.sources)
-        label = f"{names[self._at]}.{stop}" if len(names) > 1 else stop
-        found = self.desk.run.summary.get("misfit_by", {"stop": {}})["stop"].get(label, {})
-        self._scan.content = panels.scan(points, drawn, stop, of_stop(found))
-
-    def _on_what(self) -> None:
-        self.stage.toggle({"room": ROOM, "rig": RIG, "frames": AXES}[self._what.value])
-
-    def _on_point(self, event: Any) -> None:
-        index = self.stage.pick(np.array(event.ray_origin), np.array(event.ray_direction))
-        if index is not None:
-            self._point.content = panels.point(self.stage.points, index, self._labels)
-
-    @property
-    def _at(self) -> int:
-        """Number of the chosen recording."""
-        return self.stage.scene.names.index(self._recording.value)
-
-    @property
-    def _labels(self) -> dict[int, str]:
-        mesh = self.stage.scene.sources[self._at].reference
-        return mesh.label_names if mesh else {}
 
     # ------------------------------------------------------------------------------- the findings
 
@@ -272,6 +230,10 @@ class Page:
             raise InputError(f"'{name}' is not an effect that can be added to this run")
         self._start(self.desk.run.folder, what, self.desk.folder_for(name))
 
+    def _on_own(self, text: str, site: str) -> None:
+        effect = document(text, site, self.picture.beams(), self.desk.run.effects)
+        self._start(self.desk.run.folder, effect, self.desk.folder_for(effect["name"]))
+
     def _on_leave_out(self, tokens: Sequence[str]) -> None:
         def leave_out() -> None:
             run, out = self.desk.run.folder, self.desk.folder_without()
@@ -308,6 +270,7 @@ class Page:
         self._cancel.visible = busy and self.may_change
         self._add.disabled = self._diagnose.disabled = busy or not self.may_change
         self._blunders.busy(busy or not self.may_change)
+        self._own.busy(busy or not self.may_change)
         self._bar.value, self._doing.content = 0.0, panels.note("Starting …")
 
     def _hear(self, told: Told, by: Any) -> None:
@@ -327,9 +290,10 @@ class Page:
         if here:
             self.desk.choose(self.desk.name_of(folder))
             self._show_run()
+            self._tell(panels.new_run(self.desk.rungs()[-1]))
         else:
             self._fill(self._run, list(self.desk.runs), self.desk.chosen)
-        self._tell(panels.new_run(folder))
+            self._tell(panels.new_run(Rung(self.desk.runs[self.desk.name_of(folder)], None)))
 
     def _ended(self, told: Told, here: bool) -> None:
         self._show_busy()

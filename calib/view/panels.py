@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,17 +14,17 @@ from calib.runs.ladder import FORMULA, Rung
 from calib.runs.run import Run
 from calib.show import misfit
 from calib.show.headline import moved_sentence
-from calib.view.colours import Scale, column
 from calib.view.desk import Findings
 from calib.view.scene import Points
+from calib.view.shown.colours import Scale, column
 from chains.escape import html as escape
 
 SHOWN_CANDIDATES = 6  # candidates in the table; the menu has all
 LARGE = ((1e6, " million"), (1.0, ""))
 BAR = "#7fb2d9"
 STRIPED = f"repeating-linear-gradient(45deg,{BAR} 0 6px,#dcebf6 6px 10px)"  # of a rung by a formula
-_FRAME = "padding:0 1.2em .4em .75em;font-size:12px;line-height:1.4;color:#222"
-_QUIET = "color:#555"
+_FRAME = "padding:0 1.2em .4em .75em;font-size:12px;line-height:1.4"
+_QUIET = "opacity:.7"
 _CUT = "overflow:hidden;text-overflow:ellipsis;white-space:nowrap"
 
 
@@ -39,10 +38,11 @@ def legend(scale: Scale) -> str:
         )
         return _framed(items)
     middle, unit = (scale.low + scale.high) / 2, f" {scale.unit}" if scale.unit else ""
-    signed = "+" if scale.low == -scale.high else ""
-    ends = [f"{value:{signed if value else ''}.3g}" for value in (scale.low, middle, scale.high)]
-    if signed:
-        ends = [f"{ends[0]}{unit}, short", ends[1], f"{ends[2]}{unit}, long"]
+    sign = "+" if scale.signed else ""
+    ends = [f"{value:{sign if value else ''}.3g}" for value in (scale.low, middle, scale.high)]
+    if scale.signed:
+        less, more = scale.signed
+        ends = [f"{ends[0]}{unit}, {less}", ends[1], f"{ends[2]}{unit}, {more}"]
     else:
         ends = [f"{end}{unit}" for end in ends]
     bar = f"height:.9em;background:linear-gradient(to right,{','.join(scale.stops)})"
@@ -57,6 +57,16 @@ def scan(points: Points | None, drawn: int, stop: str, ratios: Mapping[str, floa
     """What the stop's beams say, all of them, however few are drawn; and how large residuals of all
     that was measured there are, over their sigmas."""
     return _framed(_beams(points, drawn, stop) + _misfit(ratios))
+
+
+def plotted(points: Points, rows: np.ndarray, up: str, low: float, high: float) -> str:
+    """What a plot of the beams (n,) shows, and how many of them are off its scale."""
+    values = points.columns[up][rows] * column(up).scale
+    beyond = int(np.sum((values < low) | (values > high)))
+    off = f"; {beyond:,} are beyond the scale" if beyond else ""
+    return _framed(
+        f'<span data-is="plotted">{len(rows):,} beams{off}. Line: mean of the inliers.</span>'
+    )
 
 
 def moved(run: Run) -> str:
@@ -76,11 +86,13 @@ def standing_out(run: Run) -> str:
 def _beams(points: Points | None, drawn: int, stop: str) -> str:
     if points is None:
         return f"Stop {escape(stop)} has no scan in this fit."
+    here = len(points.inlier)
+    some = "" if here == points.measured else f", {here:,} of them looked at"
     if not points.inlier.any():
-        return f"{len(points.inlier):,} beams, none of which the fit took for an inlier."
+        return f"{points.measured:,} beams{some}, none of which the fit took for an inlier."
     residual = 1e3 * points.columns["residual_m"][points.inlier].astype(float)
     return (
-        f"{len(points.inlier):,} beams, {drawn:,} drawn; residual of the inliers "
+        f"{points.measured:,} beams{some}, {drawn:,} drawn; residual of the inliers "
         f"{math.sqrt(np.mean(residual**2)):.2f} mm rms, {residual.mean():+.2f} mm mean"
     )
 
@@ -144,7 +156,7 @@ def formulas(diagnosed: Findings | None) -> str:
     return "".join(
         _framed(
             f'<div data-is="formula"><b>{escape(chart.title)}</b>'
-            f"{plots.svg(chart.figure(), chart.id)}"
+            f'<div style="background:#fff">{plots.svg(chart.figure(), chart.id)}</div>'
             f'<div style="{_QUIET}">{escape(chart.reading)}</div></div>'
         )
         for chart in (diagnosed.formulas if diagnosed else ())
@@ -173,7 +185,7 @@ def _candidate(each: Mapping[str, Any], diagnosed: Findings) -> str:
     size = each["unabsorbed_rms_mm"]
     held = [each["held_out_rms_mm"][k] for k in ("before", "after")]
     held_out = f"{held[0]:.2f} → {held[1]:.2f}" if None not in held else ""
-    worth = "color:#222" if each["add"] in diagnosed.worth_adding else _QUIET
+    worth = "" if each["add"] in diagnosed.worth_adding else _QUIET
     return (
         f'<tr style="{worth}"><td>{escape(each["add"]).replace("_", "_<wbr>")}</td>'
         f'<td style="text-align:right;padding-right:.6em">{"" if size is None else f"{size:.2f}"}'
@@ -246,9 +258,14 @@ def note(text: str, bad: bool = False) -> str:
     )
 
 
-def new_run(folder: Path) -> str:
-    """Which run has just been made."""
-    return f"Made {folder}, an ordinary run folder."
+def new_run(rung: Rung) -> str:
+    """Which run has just been made, and what stops held out make of it."""
+    made = f"Made {rung.run.folder}, an ordinary run folder."
+    below = rung.below.summary["rms_mm"]["held_out"] if rung.below else None
+    here = rung.run.summary["rms_mm"]["held_out"]
+    if below is None or here is None:
+        return made
+    return f"{made} Error of stops held out: {below:.2f} → {here:.2f} mm."
 
 
 def _framed(inner: str) -> str:

@@ -33,26 +33,36 @@ _NEEDED += ("residual_m", "sigma_m", "weight")
 
 @dataclass(frozen=True)
 class Points:
-    """The beams of one stop that the fit used, N of them.
+    """The beams of a stop, or of several, that the fit used, N of them.
 
     Args:
         xyz_m: (N, 3) in the reference's frame.
-        eye_m: (3,) where the LiDAR is, in the same.
+        eye_m: (3,) where the LiDAR is, at the first stop, in the same.
         columns: (N,) each, as in the residual table.
+        measured: how many beams the stops have, N of which are here.
     """
 
     xyz_m: np.ndarray
     eye_m: np.ndarray
     columns: Mapping[str, np.ndarray]
+    measured: int
 
     @property
     def inlier(self) -> np.ndarray:
         """(N,) bool, those with any weight in the fit."""
         return self.columns["weight"] > 0
 
-    def drawn(self, below_m: float = np.inf, most: int = MOST_POINTS) -> np.ndarray:
-        """Indices (n,) of those to draw: lower than `below_m`, every so many of them."""
-        low = np.flatnonzero(self.xyz_m[:, 2] < below_m)
+    def drawn(
+        self, below_m: float = np.inf, most: int = MOST_POINTS, among: np.ndarray | bool = True
+    ) -> np.ndarray:
+        """Indices (n,) of those to draw: lower than `below_m`, every so many of them.
+
+        Args:
+            below_m: height.
+            most: of them.
+            among: (N,) bool, those that may be.
+        """
+        low = np.flatnonzero((self.xyz_m[:, 2] < below_m) & among)
         return low[:: max(1, -(-len(low) // most))]
 
     def picked(
@@ -164,7 +174,24 @@ class Scene:
         scan = self._scans.get((recording, stop))
         if scan is None:
             return None
-        path = table_path(self.run.folder / RESIDUALS, scan, self.sources)
+        columns = self._table(self.run, scan)
+        T = scan.pose(self.state)
+        xyz_m = se3.apply(T, _beam_ends(columns, scan.lidar.beam_origin_m))
+        return Points(xyz_m, T[:3, 3], columns, len(xyz_m))
+
+    def table(self, recording: int, stop: str, other: Run) -> Mapping[str, np.ndarray] | None:
+        """What another run of the same recordings left of the stop's beams, as in its residual
+        table; None where it left out the stop's scan.
+
+        Raises:
+            InputError: the table is of another version.
+        """
+        scan = self._scans[recording, stop]
+        gone = not table_path(other.folder / RESIDUALS, scan, self.sources).is_file()
+        return None if gone else self._table(other, scan)
+
+    def _table(self, run: Run, scan: ScanStop) -> Mapping[str, np.ndarray]:
+        path = table_path(run.folder / RESIDUALS, scan, self.sources)
         try:
             columns = read_table(path)
         except InputError as error:
@@ -172,9 +199,7 @@ class Scene:
         missing = [name for name in _NEEDED if name not in columns]
         if missing:
             raise InputError(f"{path} has no column {missing[0]}; fit the run again")
-        T = scan.pose(self.state)
-        xyz_m = se3.apply(T, _beam_ends(columns, scan.lidar.beam_origin_m))
-        return Points(xyz_m, T[:3, 3], columns)
+        return columns
 
     def room(self, recording: int) -> tuple[np.ndarray, np.ndarray] | None:
         """Vertices (V, 3) m and triangles (F, 3) of the mesh, its faces turned to the LiDAR.

@@ -12,6 +12,7 @@ import dataclasses
 import http
 import http.client
 import io
+import json
 import logging
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
@@ -30,8 +31,35 @@ POLICY = (
     "style-src 'unsafe-inline'; img-src data: blob:; font-src data:; "
     "connect-src {here} data: blob:; frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
 )
+PAGE = "/"  # all that viser serves but the websocket, whatever stands after the key
 # Of the connection that a message came by; viser's callbacks run in its context.
-_may_change: ContextVar[bool] = ContextVar("may_change", default=False)
+_visit_here: ContextVar[Visit | None] = ContextVar("visit", default=None)
+# A menu that was used lets go of the keyboard, whose keys would be letters in it.
+READDRESS = """
+history.replaceState(null, "", "/" + location.pathname.split("/")[1] + "/" + ASKS);
+const used = document.activeElement;
+if (used?.ariaHasPopup === "listbox" && used.ariaExpanded !== "true") used.blur();
+"""
+NOBODY = Visit(may_change=False)
+
+
+class Visitor:
+    """A browser that has come.
+
+    Args:
+        client: viser's.
+        visit: how it was let in.
+    """
+
+    def __init__(self, client: Any, visit: Visit) -> None:
+        self.client, self.may_change, self.asks = client, visit.may_change, visit.asks
+
+    def readdress(self, asks: str) -> None:
+        """Have its address ask for something else, behind the same key, and load nothing."""
+        from viser import _messages  # viser has no public way to do this
+
+        source = READDRESS.replace("ASKS", json.dumps(asks))
+        self.client._websock_connection.queue_message(_messages.RunJavascriptMessage(source))
 
 
 class Served:
@@ -44,13 +72,12 @@ class Served:
 
     def __init__(self, server: Any, keys: Keys) -> None:
         self.server, self.keys = server, keys
-        self._changing: set[int] = set()  # clients that came with the key for that
+        self._visits: dict[int, Visit] = {}  # by client
         server.request_share_url = _refuse
 
         @server.on_client_connect
         async def remember(client: Any) -> None:
-            if _may_change.get():
-                self._changing.add(client.client_id)
+            self._visits[client.client_id] = _visit_here.get() or NOBODY
 
     @property
     def address(self) -> str:
@@ -62,15 +89,15 @@ class Served:
         """Where a browser can look but not change anything."""
         return self._under(self.keys.look)
 
-    def welcome(self, arrive: Callable[[Any, bool], None], leave: Callable[[Any], None]) -> None:
-        """Have every browser that comes, or is there, told of: viser's client, and whether it may
-        change anything; and every one that goes."""
+    def welcome(self, arrive: Callable[[Visitor], None], leave: Callable[[Any], None]) -> None:
+        """Have every browser that comes, or is there, told of; and viser's client of every one that
+        goes."""
 
         def came(client: Any) -> None:
-            arrive(client, client.client_id in self._changing)
+            arrive(Visitor(client, self._visits.get(client.client_id, NOBODY)))
 
         def went(client: Any) -> None:
-            self._changing.discard(client.client_id)
+            self._visits.pop(client.client_id, None)
             leave(client)
 
         self.server.on_client_disconnect(went)
@@ -126,14 +153,13 @@ def _guarded(keys: Keys) -> Iterator[None]:
             visit = _visit(keys, request)
             if visit is None:
                 return connection.respond(http.HTTPStatus.FORBIDDEN, REFUSED)
-            answer = process_request(connection, dataclasses.replace(request, path=visit.path))
+            answer = process_request(connection, dataclasses.replace(request, path=PAGE))
             if answer is not None:
                 _restrict(answer.headers, request.headers["Host"])
             return answer
 
         async def enter(connection: Any) -> None:
-            visit = _visit(keys, connection.request)
-            _may_change.set(visit is not None and visit.may_change)
+            _visit_here.set(_visit(keys, connection.request))
             await handle(connection)
 
         return start(enter, *args, process_request=admit, **options | {"logger": quiet})

@@ -17,7 +17,8 @@ FINEST_M, COARSEST = 0.006, 1 / 350  # of a point: metres, and a share of the ro
 BEHIND_M = 0.01  # the room is drawn so far behind its surface
 OVERHEAD = 0.75  # of the way from the LiDAR to the ceiling: points above that hide the rest
 LETTER_M = 0.03  # frames are centimetres apart: their names are read from close by
-PANEL_PX = 400  # width of the panel beside the picture
+PANEL_PX, PLOT_PX = 400, 380  # widths of the panels to the right and to the left of the picture
+NARROW_PX = 1200  # of a window with hardly room for a picture between two panels
 FOV_RAD = np.radians(50.0)
 
 
@@ -26,10 +27,11 @@ class Stage:
 
     Args:
         client: viser's, of that browser.
+        camera: where the eye stands and what it looks at, as `camera` has it; None: as shows all.
     """
 
-    def __init__(self, client: Any) -> None:
-        self.client = client
+    def __init__(self, client: Any, camera: tuple[float, ...] | None = None) -> None:
+        self.client, self._camera = client, camera
         self.scene: Scene | None = None
         self.points: Points | None = None
         self.shown = np.zeros(0, int)
@@ -70,22 +72,21 @@ class Stage:
                 visible=ROOM not in self.hidden,
             )
 
-    def show(self, recording: int, stop: str) -> Points | None:
-        """Draw the rig at a stop, and read its points; `paint` draws those.
-
-        Raises:
-            InputError: the points cannot be read.
-        """
+    def show(self, recording: int, stop: str, points: Points | None) -> None:
+        """Draw the rig at a stop, and take these points, which `paint` draws."""
         self.client.scene.remove_by_name(PICKED)
         self._draw_rig(recording, stop)
-        self.points = None
-        self.points = self.scene.points(recording, stop)
-        if self.points is None:
+        self.points = points
+        if points is None:
             self.client.scene.remove_by_name(POINTS)
         if self._around is None:
             self._around = self._extent(recording, stop) - self._middle_m
             self._aim()
-        return self.points
+
+    def camera(self) -> tuple[float, ...]:
+        """Where the eye stands (3), and what it looks at (3), m from the room's middle."""
+        camera = self.client.camera
+        return (*map(float, camera.position), *map(float, camera.look_at))
 
     def ceiling_m(self) -> tuple[float, float, float]:
         """Height of the lowest and highest point, and that below which the view is free."""
@@ -93,10 +94,13 @@ class Stage:
         eye = self.points.eye_m[2]
         return float(low), float(high), float(eye + OVERHEAD * max(high - eye, 0.0))
 
-    def paint(self, colours: np.ndarray, below_m: float) -> int:
-        """Draw the stop's points (N,) in their colours (N, 3) uint8; how many are drawn."""
+    def paint(self, colours: np.ndarray, below_m: float, kept: np.ndarray) -> int:
+        """Draw the points that are kept (N,) in their colours (N, 3) uint8; how many they are."""
         points = self.points
-        self.shown = points.drawn(below_m)
+        self.shown = points.drawn(below_m, among=kept)
+        if not len(self.shown):
+            self.client.scene.remove_by_name(POINTS)
+            return 0
         span = float(np.linalg.norm(np.subtract(*scenes.box(points.xyz_m))))
         size = float(np.clip(span / 2 / np.sqrt(len(self.shown) + 1), FINEST_M, span * COARSEST))
         xyz = points.xyz_m[self.shown] - self._middle_m
@@ -173,11 +177,14 @@ class Stage:
     def _aim(self) -> None:
         """Let the person at the page look at all of it, from above one corner."""
         client = self.client
-        # What is told is the window: the panel stands beside the picture, or below it on a phone.
+        # What is told is the window: the panels stand beside the picture, or below it on a phone.
         width, height = client.camera.image_width, client.camera.image_height
+        width -= PLOT_PX if width >= NARROW_PX else 0
         width -= PANEL_PX if width > 1.5 * PANEL_PX else 0
         wide = min(1.0, width / max(height, 1))  # the angle of view is the height's
         angle = 2 * np.arctan(np.tan(FOV_RAD / 2) * wide)
         eye, target = scenes.camera(*scenes.box(self._around), angle)
         client.camera.fov = FOV_RAD
+        if self._camera:
+            eye, target = np.array(self._camera[:3]), np.array(self._camera[3:])
         client.camera.position, client.camera.look_at = eye, target

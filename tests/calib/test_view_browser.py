@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,48 +13,13 @@ from calib.runs.calibrate import calibrate
 from calib.runs.diagnose import diagnose
 from calib.runs.run import Run
 from calib.simulation import simulate
-from calib.view import attend
-from calib.view.bench import Bench
-from calib.view.desk import Desk
 from calib.view.page import Page
-from calib.view.server import serve
-from calib.view.stage import PANEL_PX
-from tests.browser import SOFTWARE_GL, Watched, browser_page
+from calib.view.stage import PANEL_PX, PLOT_PX
+from tests.browser import Watched
 from tests.calib.viewed import blunder, diagnosed, small_run
+from tests.calib.workbench import FIT_MS, SOON_MS, bars, button, field, shown
 
 pytestmark = pytest.mark.slow
-SOON_MS, FIT_MS = 60_000, 300_000
-
-
-@contextmanager
-def shown(*runs: Path, width: int = 1400) -> Iterator[tuple[Watched, Page]]:
-    """The workbench of runs in a browser, its first picture drawn."""
-    served, bench = serve(0), Bench(Desk.of(runs))
-    try:
-        with browser_page(width, 900, *SOFTWARE_GL) as watched:
-            pages = attend(served, bench)
-            watched.page.set_default_timeout(SOON_MS)
-            watched.page.goto(served.address)
-            button(watched, "Add").wait_for()
-            watched.page.get_by_text("drawn; residual").or_(
-                watched.page.get_by_text("is no")
-            ).first.wait_for()
-            (page,) = pages.values()
-            yield watched, page
-            watched.assert_clean()
-    finally:
-        bench.stop()
-        served.stop()
-
-
-def bars(watched: Watched) -> list[float]:
-    """Held-out errors that the ladder shows, mm."""
-    found = watched.page.locator("[data-is=ladder] [data-mm]").all()
-    return [float(bar.get_attribute("data-mm")) for bar in found]
-
-
-def button(watched: Watched, name: str):
-    return watched.page.get_by_role("button", name=name, exact=True)
 
 
 @pytest.fixture(scope="module")
@@ -139,7 +102,11 @@ def on_screen(watched: Watched, page: Page) -> np.ndarray:
     right = np.cross(ahead, [0, 0, 1])
     right /= np.linalg.norm(right)
     axes = np.stack([right, np.cross(right, ahead), ahead])
-    from_eye = page.stage.points.xyz_m[page.stage.shown] - page.stage._middle_m - camera.position
+    from_eye = (
+        page.picture.stage.points.xyz_m[page.picture.stage.shown]
+        - page.picture.stage._middle_m
+        - camera.position
+    )
     x, y, depth = axes @ from_eye.T
     focal = box["height"] / 2 / np.tan(camera.fov / 2)
     middle = [box["x"] + box["width"] / 2, box["y"] + box["height"] / 2]
@@ -149,13 +116,13 @@ def on_screen(watched: Watched, page: Page) -> np.ndarray:
 def test_a_click_reads_the_point_that_it_meets(small):
     """Once the browser has turned its camera to where it was told to."""
     with shown(small.folder) as (watched, page):
-        columns, told = page.stage.points.columns, watched.page.locator("[data-is=point]")
+        columns, told = page.picture.stage.points.columns, watched.page.locator("[data-is=point]")
 
         def clicked() -> tuple[dict[str, str], int | None, float]:
             """What is told after a click on a point, of which, and how many px off that is."""
             at = on_screen(watched, page)
             x, y = at.T
-            inside = (x > 300) & (x < 1400 - PANEL_PX - 20) & (y > 200) & (y < 880)
+            inside = (x > PLOT_PX + 20) & (x < 1400 - PANEL_PX - 20) & (y > 200) & (y < 880)
             for wanted in np.flatnonzero(inside)[:1]:
                 watched.page.mouse.click(*at[wanted])
                 watched.page.wait_for_timeout(100)
@@ -164,9 +131,9 @@ def test_a_click_reads_the_point_that_it_meets(small):
                 if rows:
                     ring, column = map(int, rows["ring, column"].split(", "))
                     same = (columns["ring"] == ring) & (columns["column"] == column)
-                    (found,) = np.flatnonzero(same[page.stage.shown])
+                    (found,) = np.flatnonzero(same[page.picture.stage.shown])
                     off = np.linalg.norm(at[found] - at[wanted])
-                    return rows, page.stage.shown[found], off
+                    return rows, page.picture.stage.shown[found], off
             return {}, None, np.inf
 
         end, off = time.monotonic() + SOON_MS / 1e3, np.inf
@@ -181,14 +148,25 @@ def test_a_click_reads_the_point_that_it_meets(small):
 def test_stops_and_colours_are_chosen(small):
     with shown(small.folder) as (watched, page):
         watched.page.get_by_text("mm, short").wait_for()
-        assert page._stop.value == "L00P00"
+        assert page.picture.stop.value == "L00P00"
         for label, option in (("Stop", "L01P01"), ("Colour", "incidence, deg")):
             watched.page.get_by_label(label, exact=True).click()
             watched.page.get_by_role("option", name=option, exact=True).click()
         watched.page.get_by_text("mm, short").wait_for(state="hidden")
-        assert page._stop.value == "L01P01"
-        count = len(page.stage.scene.points(0, "L01P01").inlier)
-        watched.page.get_by_text(f"{count:,} beams").wait_for()
+        assert page.picture.stop.value == "L01P01"
+        count = len(page.picture.stage.scene.points(0, "L01P01").inlier)
+        watched.page.get_by_text(f"{count:,} beams,").wait_for()
+
+        def legend() -> list[str]:
+            return watched.page.get_by_text(re.compile(r"^[\d.]+ deg$")).all_inner_texts()
+
+        kept = legend()
+        watched.page.keyboard.press("n")
+        watched.page.wait_for_url(re.compile("stop=L00P00&"))
+        assert legend() == kept and len(kept) == 3
+        field(watched, "Keep scales").uncheck(force=True)
+        watched.page.wait_for_url(re.compile("scales=free"))
+        assert legend() != kept
 
 
 @pytest.mark.parametrize("width", [1400, 700])

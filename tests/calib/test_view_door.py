@@ -63,7 +63,13 @@ def status(*request: object, **headers: str | None) -> int:
 def test_the_key_opens_and_nothing_else_does(served, upgrade):
     good = 101 if upgrade else 200
     change, look = served.keys.change, served.keys.look
-    for path in (f"/{change}/", f"/{change}", f"/{look}/", f"/{change}/?x=1"):
+    for path in (
+        f"/{change}/",
+        f"/{change}",
+        f"/{look}/",
+        f"/{change}/?x=1",
+        f"/{look}/stop=a%2Fb",
+    ):
         assert status(served, path, upgrade) == good, path
     wrong = (
         "/",
@@ -118,7 +124,8 @@ def test_a_foreign_page_that_has_the_key_is_refused(served, origin):
 def test_headers_given_twice_are_refused():
     keys = Keys()
     host, origin = "localhost:1", "http://localhost:1"
-    assert keys.visit(f"/{keys.look}/a?b", [host], [origin], True).path == "/a"
+    visit = keys.visit(f"/{keys.look}/a?b", [host], [origin], True)
+    assert visit.asks == "a" and not visit.may_change
     assert keys.visit(f"/{keys.look}/", [host, "evil"], [], False) is None
     assert keys.visit(f"/{keys.look}/", [host], [origin, "http://evil"], True) is None
 
@@ -218,11 +225,11 @@ def test_each_browser_has_a_view_of_its_own_and_only_the_key_changes_anything(be
             assert mine.desk.chosen == other.desk.chosen == "run"
 
             # What is chosen in one browser does not change another's view.
-            two(**pressed(other._stop), updates={"value": "L01P01"})
+            two(**pressed(other.picture.stop), updates={"value": "L01P01"})
             one(**pressed(mine._run), updates={"value": "other"})
-            until(lambda: other._stop.value == "L01P01" and mine.desk.chosen == "other")
-            assert mine._stop.value == "L00P00" and other.desk.chosen == "run"
-            assert mine.stage.points is not None
+            until(lambda: other.picture.stop.value == "L01P01" and mine.desk.chosen == "other")
+            assert mine.picture.stop.value == "L00P00" and other.desk.chosen == "run"
+            assert mine.picture.stage.points is not None
 
             # Buttons are pressed by messages: those that they do not have, and another's.
             for press in (other._add, other._diagnose, other._cancel, mine._add, mine._diagnose):

@@ -8,9 +8,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from calib.runs.run import Run
 from calib.show.scale import round_up
-from calib.view import colours
-from calib.view.colours import RISING, SIGNED, coloured
 from calib.view.scene import Points, Scene, camera, sunk
+from calib.view.shown import colours
+from calib.view.shown.colours import RISING, SIGNED, coloured
 from chains.errors import InputError
 from sensors.recording import read_table, write_table
 from tests.calib import rigs
@@ -36,7 +36,7 @@ def copied(run, tmp_path) -> Run:
 def cloud(xyz_m: np.ndarray, **columns: np.ndarray) -> Points:
     count = len(xyz_m)
     given = {"weight": np.ones(count), "residual_m": np.zeros(count), **columns}
-    return Points(np.asarray(xyz_m, float), np.zeros(3), given)
+    return Points(np.asarray(xyz_m, float), np.zeros(3), given, count)
 
 
 def off_mesh_m(scene: Scene, xyz_m: np.ndarray) -> np.ndarray:

@@ -9,6 +9,7 @@ import numpy as np
 
 from calib.show.scale import round_up
 from calib.view.scene import Points
+from calib.view.shown.columns import DIFFERENCE, LOCATION, OTHER, STOP
 
 # Blue to vermilion about a grey that shows on white walls: told apart by every kind of sight.
 SIGNED = ("#08306b", "#2171b5", "#6baed6", "#b9bdc1", "#fd8d3c", "#d94801", "#7f2704")
@@ -23,11 +24,13 @@ SHARE = 0.98  # of the points lie within the scale
 
 @dataclass(frozen=True)
 class Column:
-    """How a column is shown: its name, its unit, and what a value is multiplied by."""
+    """How a column is shown: its name, its unit, what a value is multiplied by; and of one that is
+    shown about 0, what less and more than 0 are called."""
 
     title: str
     unit: str = ""
     scale: float = 1.0
+    signed: tuple[str, str] | None = None
 
     @property
     def heading(self) -> str:
@@ -36,7 +39,9 @@ class Column:
 
 
 COLUMNS = {
-    "residual_m": Column("residual", "mm", 1e3),
+    "residual_m": Column("residual", "mm", 1e3, ("short", "long")),
+    OTHER: Column("residual in the other run", "mm", 1e3, ("short", "long")),
+    DIFFERENCE: Column("difference to the other run", "mm", 1e3, ("shorter", "longer")),
     "range_m": Column("range", "m"),
     "incidence_rad": Column("incidence", "deg", 180 / np.pi),
     "ring": Column("ring"),
@@ -49,7 +54,10 @@ COLUMNS = {
     "weight": Column("weight in the fit"),
     "time_s": Column("time", "s"),
     "temperature_c": Column("temperature", "°C"),
+    STOP: Column("number of the stop"),
+    LOCATION: Column("location"),
 }
+NAMES = ("label", LOCATION)  # numbers that stand for names
 HIDDEN = {"surface", "region", "patch", "plane"}  # numbers that mean nothing to people
 
 
@@ -63,6 +71,7 @@ class Scale:
         low, high: values at the ends of `stops`; None where colours stand for names.
         stops: colours at even steps from low to high.
         names: name -> colour.
+        signed: what less and more than 0 are called, where 0 is in the middle.
     """
 
     title: str
@@ -71,6 +80,7 @@ class Scale:
     high: float | None
     stops: tuple[str, ...]
     names: Mapping[str, str]
+    signed: tuple[str, str] | None = None
 
 
 def column(name: str) -> Column:
@@ -82,43 +92,65 @@ def choices(points: Points) -> list[str]:
     """Columns that the points can be coloured by, the residual first."""
     known = [name for name in COLUMNS if name in points.columns]
     own = [n for n in points.columns if n not in COLUMNS and n not in HIDDEN]
-    told = (n for n in known if np.isfinite(points.columns[n]).any())
-    return [*told, *own]
+    return [n for n in (*known, *own) if np.isfinite(points.columns[n]).any()]
 
 
-def coloured(points: Points, name: str, label_names: Mapping[int, str]) -> tuple[np.ndarray, Scale]:
+def scale_key(name: str) -> str:
+    """The column whose scale another shares: all residuals have one."""
+    return "residual_m" if column(name).signed else name
+
+
+def limits(points: Points, name: str) -> tuple[float, float]:
+    """Ends of a scale that nearly all points are within, in the unit that is shown."""
+    shown = column(name)
+    known = points.columns[name] * shown.scale
+    known = known[np.isfinite(known)]
+    if shown.signed:
+        high = round_up(float(np.quantile(np.abs(known), SHARE)) if len(known) else 0.0)
+        return -high, high
+    edge = (1 - SHARE) / 2
+    low, high = np.quantile(known, [edge, 1 - edge]) if len(known) else (0.0, 1.0)
+    return float(low), float(high)
+
+
+def coloured(
+    points: Points,
+    name: str,
+    names: Mapping[int, str],
+    ends: tuple[float, float] | None = None,
+) -> tuple[np.ndarray, Scale]:
     """Colours (N, 3) uint8 of all points by one column, and what they mean.
 
     Args:
         points: of a stop.
         name: the column.
-        label_names: of the reference's labels.
+        names: what its numbers stand for, of one of `NAMES`.
+        ends: of the scale; `limits` where there are none.
     """
     shown, values = column(name), points.columns[name]
-    if name == "label":
-        return _by_name(values.astype(int), label_names)
-    values = values * shown.scale
-    known = values[np.isfinite(values)]
-    if name == "residual_m":
-        high = round_up(float(np.quantile(np.abs(known), SHARE)) if len(known) else 0.0)
-        low, stops = -high, SIGNED
-    else:
-        edge = (1 - SHARE) / 2
-        low, high = np.quantile(known, [edge, 1 - edge]) if len(known) else (0.0, 1.0)
-        stops = RISING
-    place = (values - low) / max(high - low, 1e-12)
+    if name in NAMES:
+        return _by_name(values.astype(int), names, shown.title)
+    low, high = ends or limits(points, name)
+    stops = SIGNED if shown.signed else RISING
+    place = (values * shown.scale - low) / max(high - low, 1e-12)
     return _between(place, stops), Scale(
-        title=shown.title, unit=shown.unit, low=float(low), high=float(high), stops=stops, names={}
+        title=shown.title,
+        unit=shown.unit,
+        low=low,
+        high=high,
+        stops=stops,
+        names={},
+        signed=shown.signed,
     )
 
 
-def _by_name(labels: np.ndarray, names: Mapping[int, str]) -> tuple[np.ndarray, Scale]:
+def _by_name(labels: np.ndarray, names: Mapping[int, str], title: str) -> tuple[np.ndarray, Scale]:
     distinct, index = np.unique(labels, return_inverse=True)
     colours = [UNKNOWN if n < 0 else NAMED[i % len(NAMED)] for i, n in enumerate(distinct)]
-    titles = [names.get(int(n), f"label {n}") for n in distinct]
+    titles = [names.get(int(n), f"{title} {n}") for n in distinct]
     legend = dict(zip(titles, colours, strict=True))
     return _rgb(colours)[index], Scale(
-        title="label", unit="", low=None, high=None, stops=(), names=legend
+        title=title, unit="", low=None, high=None, stops=(), names=legend
     )
 
 

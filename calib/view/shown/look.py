@@ -1,0 +1,30 @@
+"""What a page shows, as text after the key of its address: a link shows the same again."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from urllib.parse import parse_qsl, quote, urlencode
+
+LONGEST = 2000  # letters: what browsers and mail programs take as a link
+KEYS = ("run", "recording", "stop", "stops", "other", "colour", "scales", "only", "up", "over")
+KEYS += ("below", "camera", "dark")
+
+
+def read(text: str) -> dict[str, str]:
+    """What an address asks for, by `KEYS`; of what cannot be read, nothing."""
+    pairs = parse_qsl(text[:LONGEST], errors="replace")
+    return {key: value for key, value in pairs if key in KEYS}
+
+
+def write(look: Mapping[str, str]) -> str:
+    """The text that `read` reads, percent-encoded; what is empty is left out."""
+    return urlencode({k: look[k] for k in KEYS if look.get(k)}, quote_via=quote, safe=",:")
+
+
+def numbers(text: str, count: int) -> tuple[float, ...] | None:
+    """So many numbers with commas between; None where the text is anything else."""
+    try:
+        values = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        return None
+    return values if len(values) == count and all(abs(v) < 1e9 for v in values) else None

@@ -1,0 +1,56 @@
+"""The workbench in a headless Chromium, for tests to use as a person would."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from calib.view import attend
+from calib.view.bench import Bench
+from calib.view.desk import Desk
+from calib.view.page import Page
+from calib.view.server import serve
+from tests.browser import SOFTWARE_GL, Watched, browser_page
+
+SOON_MS, FIT_MS = 60_000, 300_000
+
+
+@contextmanager
+def shown(*runs: Path, width: int = 1400) -> Iterator[tuple[Watched, Page]]:
+    """The workbench of runs in a browser, its first picture drawn."""
+    served, bench = serve(0), Bench(Desk.of(runs))
+    try:
+        with browser_page(width, 900, *SOFTWARE_GL) as watched:
+            pages = attend(served, bench)
+            watched.page.set_default_timeout(SOON_MS)
+            watched.page.goto(served.address)
+            button(watched, "Add").wait_for()
+            watched.page.get_by_text("drawn; residual").or_(
+                watched.page.get_by_text("is no")
+            ).first.wait_for()
+            (page,) = pages.values()
+            yield watched, page
+            watched.assert_clean()
+    finally:
+        bench.stop()
+        served.stop()
+
+
+def bars(watched: Watched) -> list[float]:
+    """Held-out errors that the ladder shows, mm."""
+    found = watched.page.locator("[data-is=ladder] [data-mm]").all()
+    return [float(bar.get_attribute("data-mm")) for bar in found]
+
+
+def button(watched: Watched, name: str):
+    return watched.page.get_by_role("button", name=name, exact=True)
+
+
+def field(watched: Watched, label: str):
+    """The text field or check box beside a label."""
+    return watched.page.locator(f"xpath=//*[text()='{label}']/following::input[1]")
+
+
+def choose(watched: Watched, label: str, option: str) -> None:
+    """Choose from a menu."""
+    watched.page.get_by_label(label, exact=True).click()
+    watched.page.get_by_role("option", name=option, exact=True).click()
