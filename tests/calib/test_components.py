@@ -96,6 +96,22 @@ def test_values_as_fitted_say_the_same_whatever_held_them():
         np.testing.assert_allclose(again.information, told.information, atol=1e-8)
 
 
+def test_rounding_beside_a_very_wide_spread_is_no_fault():
+    """What is not seen at all stays at zero, however wide; what is seen, at what the rows say."""
+    rng = np.random.default_rng(2)
+    axes, _ = np.linalg.qr(rng.standard_normal((40, 40)))
+    size = np.r_[np.geomspace(1e6, 1e2, 20), np.full(20, -1e-7)]  # as rounding may leave it
+    information = (axes * size) @ axes.T
+    with pytest.raises(np.linalg.LinAlgError):
+        np.linalg.cholesky(np.eye(40) + 1e8 * information)
+    truth = axes[:, :20] @ rng.standard_normal(20)
+    told = Told(information @ truth, information, np.zeros(40, int))
+    values, covariance = told._given(np.full(1, 1e8))
+    np.testing.assert_allclose(axes[:, :20].T @ values, axes[:, :20].T @ truth, atol=0.05)
+    assert np.abs(axes[:, 20:].T @ values).max() < 1.0
+    assert np.linalg.eigvalsh(covariance)[0] > -1e-3
+
+
 def test_the_estimate_and_its_sigma_hold_over_many_worlds():
     found = [Mixed(seed).told() for seed in range(150)]
     sd = np.array([told.spread(np.ones(2)) for told in found])
