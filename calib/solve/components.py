@@ -122,8 +122,8 @@ class Told:
 
 
 def _inverse(inner: np.ndarray) -> np.ndarray:
-    """Of a symmetric matrix that is no less than the identity, whatever rounding makes of it: beside
-    a very wide spread the rounding of what is seen well is more than that."""
+    """Of a symmetric matrix that is no less than the identity, whatever rounding makes of it:
+    beside a very wide spread, rounding of what is seen well is more than that."""
     try:
         return cho_solve(cho_factor(inner), np.eye(len(inner)))
     except np.linalg.LinAlgError:
