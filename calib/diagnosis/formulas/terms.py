@@ -155,9 +155,10 @@ def _ends(term: Term, covariates: Columns) -> np.ndarray:
 
 
 def _wide(term: Term, covariates: Columns) -> np.ndarray:
-    """(c,) the range of the covariate of each constant."""
-    each = [(f.free, np.ptp(covariates[f.covariate])) for f in term.factors]
-    return np.repeat([wide for _, wide in each], [free for free, _ in each])
+    """(c,) the range of the covariate of each constant, of the values that there are."""
+    seen = [covariates[f.covariate] for f in term.factors]
+    wide = [np.nanmax(values) - np.nanmin(values) for values in seen]
+    return np.repeat(wide, [f.free for f in term.factors])
 
 
 def _with(constants: Sequence[float], i: int, value: float) -> list[float]:

@@ -225,6 +225,22 @@ def test_refining_never_explains_less():
         assert after >= before
 
 
+@pytest.mark.parametrize("kind, start", [("decay", (0.05, 0.3)), ("step", (0.47,))])
+def test_holes_in_a_column_are_no_values(kind, start):
+    """Constants are found from the stops that have one, and their slopes are finite."""
+    planted = Factor("humidity", kind, (0.12, 0.3) if kind == "decay" else (0.44,))
+    beams = table(14, stops=30, hidden=lambda c: 6e-3 * planted.columns(c)[:, 0])
+    holes = np.isin(beams.stop, [3, 11, 12])
+    values = np.where(holes, np.nan, beams.covariates["humidity"])
+    residual_m = np.where(holes, beams.residual_m - 6e-3 * planted.columns(beams.covariates)[:, 0],
+                          beams.residual_m)  # fmt: skip
+    beams = replace(
+        beams, covariates={**beams.covariates, "humidity": values}, residual_m=residual_m
+    )
+    term = refine(beams.projection(), Term((Factor("humidity", kind, start),)))
+    assert term.constants == pytest.approx(planted.constants[: len(term.constants)], abs=0.03)
+
+
 def test_a_term_without_constants_stays():
     term = Term((Factor("incidence_rad", "over cosine"),))
     assert refine(table(15, stops=5).projection(), term) is term
