@@ -90,7 +90,8 @@ def hardly_checked(found: Mapping[Group, Reach]) -> list[str]:
     if not far:
         return []
     group, worst = far[0]
-    more = f", and so could {len(far) - 1} others in diagnosis.json" if len(far) > 1 else ""
+    others = f"{len(far) - 1} other{'s' if len(far) > 2 else ''}"
+    more = f", and so could {others} in diagnosis.json" if len(far) > 1 else ""
     return [
         f"A mishap too small to be found ({group}) could move {worst.estimate} by up to "
         f"{worst.sigmas:.1f} of its sigmas{more}: more stops would check it."

@@ -73,3 +73,6 @@ def test_what_could_go_unseen_is_said_of_measurements_not_of_paper():
     assert not hardly_checked({body: near, paper: far})
     (sentence,) = hardly_checked({body: far, paper: far})
     assert "s1: base_markers" in sentence and "lidar.tx by up to 4.0 of its sigmas" in sentence
+    two, three = ({Group("body", f"s{i}", "base_markers"): far for i in range(n)} for n in (2, 3))
+    assert "so could 1 other in" in hardly_checked(two)[0]
+    assert "so could 2 others in" in hardly_checked(three)[0]
