@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import cho_solve, cholesky, solve_triangular
+from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 from scipy.linalg.blas import dsyrk
 from scipy.linalg.lapack import dpstrf
 
@@ -104,3 +104,13 @@ def square_root(matrix: np.ndarray) -> np.ndarray:
     root = np.empty_like(upper)
     root[:, pivot - 1] = upper
     return root * scale
+
+
+def inverse(inner: np.ndarray) -> np.ndarray:
+    """Of a symmetric matrix that is no less than the identity, whatever rounding makes of it:
+    beside a very wide spread, rounding of what is seen well is more than that."""
+    try:
+        return cho_solve(cho_factor(inner), np.eye(len(inner)))
+    except np.linalg.LinAlgError:
+        values, axes = np.linalg.eigh(inner)
+        return (axes / np.maximum(values, 1.0)) @ axes.T

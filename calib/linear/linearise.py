@@ -47,7 +47,8 @@ def linearise(
         beams: False for tracked bodies alone.
         progress: called with how many stops are done, and of how many.
         weighed: how the beams were weighed at another state, where costs are to be compared.
-        slowed: how they were weighed before, if robust scales are to go but half the way on.
+        slowed: how they were weighed before, if robust scales are to go but half the way on, or
+            to stay.
     """
     layout = layout or Layout.of(problem)
     count = len(problem.scans) if beams else 0

@@ -35,10 +35,12 @@ class Weighing:
     Args:
         sigma_m: (N,) single precision: it is kept for every stop while a fit runs.
         scale: how many sigmas wide the bulk was.
+        kept: whether that scale is to stay as it is wherever the state goes.
     """
 
     sigma_m: np.ndarray
     scale: float
+    kept: bool = False
 
     @classmethod
     def of(cls, rows: Rows) -> Weighing:
@@ -94,7 +96,8 @@ class StopRows:
         as of `linearise`."""
         rows = scan.rows(values, association, placed.T[0])
         if slowed is not None:
-            rows = rows.scaled((slowed.scale + rows.scale) / 2)
+            scale = slowed.scale if slowed.kept else (slowed.scale + rows.scale) / 2
+            rows = rows.scaled(scale)
         weight, residual = rows.whitened(newton)
         columns = [layout.columns(list(rows.dense))]
         index = np.empty((len(weight), len(rows.sparse)), np.int32)

@@ -18,6 +18,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize_scalar
 
+from calib.linear.elimination import inverse
 from calib.linear.system import Linearisation, Values
 from calib.problem.places import joints_at
 from calib.problem.problem import Block, Problem, SurfaceCells
@@ -104,7 +105,7 @@ class Told:
         """The values (Q,) and their covariance, given the variances of the groups."""
         root = np.sqrt(variance)[self.group]
         inner = np.eye(len(root)) + root[:, None] * self.information * root
-        covariance = root[:, None] * _inverse(inner) * root
+        covariance = root[:, None] * inverse(inner) * root
         return covariance @ self.score, covariance
 
     def sigma(self, sd: np.ndarray) -> np.ndarray:
@@ -119,16 +120,6 @@ class Told:
         of_variance = np.sqrt(np.maximum(np.diag(inverse), 0.0))
         beyond = np.sqrt(np.square(sd) + of_variance) - sd
         return np.where(of_variance < 2 * np.square(sd), of_variance / (2 * sd), beyond)
-
-
-def _inverse(inner: np.ndarray) -> np.ndarray:
-    """Of a symmetric matrix that is no less than the identity, whatever rounding makes of it:
-    beside a very wide spread, rounding of what is seen well is more than that."""
-    try:
-        return cho_solve(cho_factor(inner), np.eye(len(inner)))
-    except np.linalg.LinAlgError:
-        values, axes = np.linalg.eigh(inner)
-        return (axes / np.maximum(values, 1.0)) @ axes.T
 
 
 def told(some: Sequence[Unknown], values: Mapping[str, np.ndarray], covariance: np.ndarray) -> Told:

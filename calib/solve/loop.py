@@ -22,7 +22,7 @@ from calib.problem.unknowns import Unknown
 from calib.residuals.beams import Association
 from calib.solve.added import begun
 from calib.solve.components import sds, squares, told, wider
-from calib.solve.descent import AT_OPTIMUM, LAST, SLOWED, STEADY, Descent, Progress
+from calib.solve.descent import AT_OPTIMUM, LAST, SLOWED, STEADY, SWAYS, Descent, Progress
 from calib.solve.estimate import DOFS, SEEN, Estimate, Start, started, values_of
 from calib.solve.graph import Graph
 from calib.solve.reweight import SETTLED as SETTLED_WEIGHT
@@ -370,6 +370,11 @@ class Loop(Descent):
             self.take_spread(tolerance)
         self.linearise_here()
         _, fall = self.step()
+        if AT_OPTIMUM <= fall < SWAYS and self.problem.scans and not self.lost:
+            self.keep_scales()
+            any(self.descend(LAST) for _ in range(LOOKS))  # redescending weights have plateaus
+            self.linearise()
+            _, fall = self.step()
         return self.as_it_stands(fall < AT_OPTIMUM and not self.lost, whole=True)
 
     def as_it_stands(self, converged: bool, whole: bool = False) -> Estimate:

@@ -15,7 +15,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from calib.problem import build
 from calib.problem.model import Model, Source
 from calib.runs.calibrate import calibrate
+from calib.solve.descent import LAST
 from calib.solve.fit import solve
+from calib.solve.loop import Loop
 from chains.errors import InputError
 
 from . import rigs, simulated
@@ -303,6 +305,33 @@ def test_curvature_that_misleads_sends_no_fit_round_in_circles(tmp_path):
     source, _ = simulated.made(tmp_path / "rec", "tiny", seed=1)
     estimate = solve(build([source], MODEL))
     assert estimate.converged and estimate.iterations < 25
+
+
+def test_scales_that_are_kept_stay_wherever_the_state_goes_and_each_pass_lowers_the_cost(tmp_path):
+    """At scales that do not follow the state a descent has one cost, which no pass raises; where
+    they follow, the same move changes them."""
+    source, _ = simulated.made(tmp_path / "rec", "tiny", seed=1)
+    loop = Loop(build([source], MODEL), None, lambda what, done, total: None)
+    loop.solve_without_scans()
+    loop.fix_association()
+    loop.linearise()
+    first = [each.scale for each in loop.linear.weighed]
+    step, _ = loop.step()
+    start, there = loop.values, loop.moved(loop.values, step)
+    loop.values = there
+    loop.linearise()
+    assert [each.scale for each in loop.linear.weighed] != first
+    loop.values = start
+    loop.linearise()
+    loop.keep_scales()
+    costs = []
+    for _ in range(12):
+        loop.linearise()
+        assert [each.scale for each in loop.linear.weighed] == first
+        costs.append(loop.cost())
+        if loop.descend(LAST, passes=1):
+            break
+    assert len(costs) > 2 and np.all(np.diff(costs) < 1e-6 * costs[0]), costs
 
 
 class Seen(Exception):
