@@ -152,7 +152,7 @@ class CsvTable:
         """Give every other numeric column; one that is mostly numbers must be so throughout."""
         for name, values in self._columns.items():
             if values.dtype.kind != "f":
-                numeric = [_is_number(cell) for cell in values.tolist() if cell]
+                numeric = [escape.is_number(cell) for cell in values.tolist() if cell]
                 if 2 * sum(numeric) > len(numeric):
                     self._loose(name, "leave a cell empty where the value is unknown")
         return {name: column for name, column in self._columns.items() if column.dtype.kind == "f"}
@@ -163,7 +163,9 @@ class CsvTable:
             raise InputError(f"{self.path}: column {name} is missing; {why}")
         values = self._columns[name]
         if values.dtype.kind != "f":
-            wrong = np.array([bool(cell) and not _is_number(cell) for cell in values.tolist()])
+            wrong = np.array(
+                [bool(cell) and not escape.is_number(cell) for cell in values.tolist()]
+            )
             self.refuse(wrong, lambda row: f"{name} is '{values[row]}', not a number; {why}")
         return self._columns.pop(name)
 
@@ -205,11 +207,3 @@ def _cell(value: Any) -> Any:
     if isinstance(value, str):
         return escape.csv_cell(value)
     return "" if value != value else value
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True

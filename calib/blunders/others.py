@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from calib.blunders.rows import GraphRows, GroupRows
+from calib.blunders.rows import GraphRows, GroupRows, group_rows
 from calib.linear.layout import positions
 from calib.linear.system import Linearisation
+from calib.problem.problem import Problem
 from calib.solve.graph import Graph
 
 # Of I - w H: below this a direction is held by the group alone (rounding of C is some 1e-9 of it).
@@ -45,21 +46,35 @@ class Others:
 
     def against(self, every: Sequence[GroupRows]) -> tuple[np.ndarray, np.ndarray]:
         """H and b of these rows."""
-        A, b = self.spread(every)
+        A = self.spread(every)
+        b = np.concatenate([rows.b for rows in every]) - A @ self.step
         return self.whole.covariance(A, self.kept), b
 
-    def spread(self, every: Sequence[GroupRows]) -> tuple[np.ndarray, np.ndarray]:
-        """The same rows (m, U) over all unknowns, and b."""
+    def spread(self, every: Sequence[GroupRows]) -> np.ndarray:
+        """The same rows (m, U) over all unknowns."""
         ends = np.cumsum([0, *(len(rows.A) for rows in every)])
         A = np.zeros((ends[-1], self.whole.layout.size))
         for rows, start in zip(every, ends, strict=False):
             np.add.at(A[start : start + len(rows.A)].T, rows.columns, rows.A.T)
-        b = np.concatenate([rows.b for rows in every]) - A @ self.step
-        return A, b
+        return A
+
+    def groups(self, problem: Problem) -> Iterator[list[Sequence[GroupRows]]]:
+        """All groups of rows, those of one place in a set; no more sets at once than memory should
+        hold."""
+        sets: dict[tuple[str, str], list[GroupRows]] = {}
+        for rows in group_rows(self.whole, problem, self.graph_rows):
+            sets.setdefault(rows.at, []).append(rows)
+        yield from _batches(sets.values())
 
 
-def batches(sets: Sequence[Sequence[GroupRows]]) -> Iterator[list[Sequence[GroupRows]]]:
-    """Sets of groups, no more at once than memory should hold."""
+def parts(some: Iterable[Sequence[GroupRows]]) -> Iterator[slice]:
+    """Where the rows of each set are among those of all, one set after another."""
+    first = 0
+    for each in some:
+        yield slice(first, first := first + sum(len(rows.A) for rows in each))
+
+
+def _batches(sets: Iterable[Sequence[GroupRows]]) -> Iterator[list[Sequence[GroupRows]]]:
     batch, count = [], 0
     for some in sets:
         batch.append(some)

@@ -18,12 +18,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.blunders.judged import Blunder
-from calib.blunders.others import Others, at_their_sigmas, batches, whitening
-from calib.blunders.rows import GroupRows, group_rows
+from calib.blunders.others import Others, at_their_sigmas, parts, whitening
+from calib.blunders.rows import GroupRows
 from calib.linear.layout import positions
 from calib.linear.system import Linearisation
 from calib.problem.problem import Problem
-from calib.residuals.groups import BEAMS, CAD, Group
+from calib.residuals.groups import CAD, Group
 
 FAR = 3.0  # sigmas: what the diagnosis promises to name; see docs/one_thing_wrong.md
 
@@ -61,20 +61,16 @@ def reaches(
     """
     names, columns = _estimates(whole, problem, sigma)
     others = Others.of(whole)
-    enough = {_key(b.group, b.shift.of_ranges): b.enough for b in blunders}
+    enough = {(b.group, b.shift.of_ranges): b.enough for b in blunders}
     kept = positions(whole.layout.size, whole.layout.kept)[columns]
     towards = whole.followed(others.kept[:, kept])
     wide = np.array([sigma[name] for name in names])
-    sets: dict[tuple[str, str], list[GroupRows]] = {}
-    for rows in group_rows(whole, problem, others.graph_rows):
-        sets.setdefault(rows.at, []).append(rows)
     found: dict[Group, Reach] = {}
-    for some in batches(list(sets.values())):
-        for group, of_ranges, moved in _moved(others, some, towards):
-            key = _key(group, of_ranges)
-            if key not in enough or not len(names):
+    for sets in others.groups(problem) if names else ():
+        for group, of_ranges, moved in _moved(others, sets, towards):
+            if (group, of_ranges) not in enough:
                 continue
-            by = np.sqrt(enough[key]) * moved / wide
+            by = np.sqrt(enough[group, of_ranges]) * moved / wide
             worst = int(np.argmax(by))
             reach = Reach(names[worst], float(by[worst]))
             found[group] = max(found.get(group, reach), reach, key=lambda r: r.sigmas)
@@ -98,10 +94,6 @@ def hardly_checked(found: Mapping[Group, Reach]) -> list[str]:
     ]
 
 
-def _key(group: Group, of_ranges: bool) -> tuple[Group, bool]:
-    return group, of_ranges
-
-
 def _estimates(
     whole: Linearisation, problem: Problem, sigma: Mapping[str, float]
 ) -> tuple[list[str], np.ndarray]:
@@ -122,12 +114,9 @@ def _moved(
     """Groups, whether it is their range zero that is off, and by how much an offset of one squared
     sigma in the test moves each estimate (P,) at most; `towards` (U, P) are these columns of C."""
     every = [rows for some in sets for rows in some]
-    A, _ = others.spread(every)
+    A = others.spread(every)
     H, K = others.whole.covariance(A, others.kept), A @ towards
-    first = 0
-    for some in sets:
-        mine = slice(first, first + sum(len(rows.A) for rows in some))
-        first = mine.stop
+    for some, mine in zip(sets, parts(sets), strict=True):
         left, moved = at_their_sigmas(some, H[mine, mine], K[mine])
         yield from _of_set(some, left, moved)
 
@@ -135,13 +124,10 @@ def _moved(
 def _of_set(
     some: Sequence[GroupRows], H: np.ndarray, K: np.ndarray
 ) -> Iterator[tuple[Group, bool, np.ndarray]]:
-    first = 0
-    for rows in some:
-        here = slice(first, first + len(rows.A))
-        first = here.stop
-        raw = np.eye(len(rows.A)) if rows.information is None else rows.information
+    for rows, here in zip(some, parts([rows] for rows in some), strict=True):
+        raw = rows.own_information
         for group, own in rows.groups.items():
             checked = own.T @ (raw - H[here, here]) @ own
             size = np.sqrt(np.maximum(np.diag(own.T @ raw @ own), 1e-300))
             along = whitening(checked, size).T @ own.T @ K[here]
-            yield group, list(rows.axes) == [BEAMS], np.linalg.norm(along, axis=0)
+            yield group, rows.of_ranges, np.linalg.norm(along, axis=0)

@@ -58,6 +58,16 @@ class GroupRows:
     information: np.ndarray | None = None
 
     @property
+    def of_ranges(self) -> bool:
+        """Whether they are of a range zero, and not of a place."""
+        return list(self.axes) == [BEAMS]
+
+    @property
+    def own_information(self) -> np.ndarray:
+        """(m, m) what they say of an offset, all else being known."""
+        return np.eye(len(self.A)) if self.information is None else self.information
+
+    @property
     def at(self) -> tuple[str, str]:
         """Recording, and stop or target: groups of one place may contradict each other alone."""
         group = next(iter(self.groups))

@@ -22,7 +22,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.linalg import block_diag
 
-from calib.blunders.others import UNCHECKED, Others, at_their_sigmas, batches, whitening
+from calib.blunders.others import UNCHECKED, Others, at_their_sigmas, parts, whitening
 from calib.blunders.rows import GroupRows, group_rows, scan_rows
 from calib.linear.system import Linearisation
 from calib.problem.problem import Problem
@@ -76,11 +76,8 @@ def shifts(whole: Linearisation, problem: Problem) -> Iterator[Shift]:
         problem: of that fit; candidates beside it change nothing.
     """
     others = Others.of(whole)
-    sets: dict[tuple[str, str], list[GroupRows]] = {}
-    for rows in group_rows(whole, problem, others.graph_rows):
-        sets.setdefault(rows.at, []).append(rows)
-    for some in batches(list(sets.values())):
-        yield from _against(others, some)
+    for sets in others.groups(problem):
+        yield from _against(others, sets)
 
 
 def standing_alone(
@@ -103,13 +100,13 @@ def standing_alone(
         key: rows
         for rows in group_rows(whole, problem, others.graph_rows)
         for group in rows.groups
-        if (key := (group, list(rows.axes) == [BEAMS])) in wanted
+        if (key := (group, rows.of_ranges)) in wanted
     }
     order = [shift.group for shift, _ in some]
     every = [mine[shift.group, shift.of_ranges] for shift, _ in some]
     H, b = at_their_sigmas(every, *others.against(every))
     own = block_diag(*(rows.groups[group] for group, rows in zip(order, every, strict=True)))
-    raw = block_diag(*(np.eye(len(r.A)) if r.information is None else r.information for r in every))
+    raw = block_diag(*(rows.own_information for rows in every))
     M, u = own.T @ (raw - H) @ own, own.T @ b
     ends = np.cumsum([0, *(rows.groups[g].shape[1] for g, rows in zip(order, every, strict=True))])
     gone, alone = np.zeros(0, int), []
@@ -140,7 +137,7 @@ def of_poses(whole: Linearisation, problem: Problem, wild: Collection[Group]) ->
     every = [
         rows
         for rows in scan_rows(whole, problem)
-        if list(rows.axes) != [BEAMS] and not set(wild) & set(rows.groups)
+        if not rows.of_ranges and not set(wild) & set(rows.groups)
     ]
     if not every:
         return None
@@ -168,18 +165,12 @@ def _statistic(M: np.ndarray, u: np.ndarray, at: np.ndarray) -> float:
 def _against(others: Others, sets: Sequence[Sequence[GroupRows]]) -> Iterator[Shift]:
     """Groups against all other rows."""
     H, b = others.against([rows for some in sets for rows in some])
-    first = 0
-    for some in sets:
-        mine = slice(first, first + sum(len(rows.A) for rows in some))
-        first = mine.stop
+    for some, mine in zip(sets, parts(sets), strict=True):
         yield from _of_set(some, *at_their_sigmas(some, H[mine, mine], b[mine]))
 
 
 def _of_set(some: Sequence[GroupRows], H: np.ndarray, b: np.ndarray) -> Iterator[Shift]:
-    first = 0
-    for rows in some:
-        here = slice(first, first + len(rows.A))
-        first = here.stop
+    for rows, here in zip(some, parts([rows] for rows in some), strict=True):
         of = _of_rows if rows.information is None else _of_sums
         for group in rows.groups:
             yield of(group, rows, b[here], H[here, here])

@@ -13,14 +13,14 @@ from calib.linear.clusters import Gradients
 from calib.linear.layout import Layout
 from calib.problem import build
 from calib.problem.model import Model, Source
-from calib.residuals.groups import CAD, MESH, Group
+from calib.residuals.groups import CAD, Group
 from calib.simulation import Spec
 from calib.solve.fit import preview
 
 from . import rigs, simulated
 from .linear import cases
 from .linear.dense import Dense
-from .linear.groups import Groups
+from .linear.groups import Groups, by_place
 
 CASES = [name for name in cases.CASES if name != "an earlier estimate"]
 WELL = 1e-3  # of what a group says, checked by others: rows can be left out without loss of digits
@@ -31,11 +31,7 @@ BY_STOP = {"base": {"moves": "stop"}}
 def both(request, tmp_path_factory):
     """A case, and the dense rows of each place with the full weight there."""
     case = cases.made(request.param, tmp_path_factory.mktemp("blunders"))
-    where = {g.where for b in case.start.problem.blocks for g in b.groups}
-    places = {*where, *(s.name for s in case.start.problem.scans), CAD, MESH}
-    if not case.weighted:
-        return case, dict.fromkeys(places, Groups(case.dense))
-    return case, {place: Groups(case.dense, {place}) for place in places}
+    return case, by_place(case)
 
 
 def found(case):

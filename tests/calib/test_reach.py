@@ -6,10 +6,10 @@ import pytest
 from calib.blunders.judged import judge
 from calib.blunders.reach import FAR, Reach, hardly_checked, reaches
 from calib.linear.clusters import Gradients
-from calib.residuals.groups import CAD, MESH, Group
+from calib.residuals.groups import CAD, Group
 
 from .linear import cases
-from .linear.groups import Groups
+from .linear.groups import Groups, by_place
 
 CASES = [name for name in cases.CASES if name != "an earlier estimate"]
 WELL = 1e-4  # of a group's directions, checked by others: those that rounding leaves as they are
@@ -19,11 +19,7 @@ WELL = 1e-4  # of a group's directions, checked by others: those that rounding l
 def both(request, tmp_path_factory):
     """A case, and of each place the dense rows with their full weight there."""
     case = cases.made(request.param, tmp_path_factory.mktemp("reach"))
-    where = {g.where for b in case.start.problem.blocks for g in b.groups}
-    places = {*where, *(s.name for s in case.start.problem.scans), CAD, MESH}
-    if not case.weighted:
-        return case, dict.fromkeys(places, Groups(case.dense))
-    return case, {place: Groups(case.dense, {place}) for place in places}
+    return case, by_place(case)
 
 
 def estimates(there):

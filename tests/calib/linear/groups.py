@@ -14,7 +14,7 @@ import numpy as np
 
 from calib.effects import FrameOffset
 from calib.problem.unknowns import Role
-from calib.residuals.groups import Group
+from calib.residuals.groups import CAD, MESH, Group
 from calib.residuals.targets import HangingTarget
 from calib.residuals.tracker import TrackedBody
 
@@ -41,6 +41,16 @@ class Off:
     dof: int
     offset: np.ndarray
     covariance: np.ndarray
+
+
+def by_place(case: object) -> dict[str, Groups]:
+    """Place -> the dense rows of a case, with their full weight there."""
+    problem = case.start.problem
+    where = {g.where for b in problem.blocks for g in b.groups}
+    places = {*where, *(s.name for s in problem.scans), CAD, MESH}
+    if not case.weighted:
+        return dict.fromkeys(places, Groups(case.dense))
+    return {place: Groups(case.dense, {place}) for place in places}
 
 
 class Groups:
