@@ -47,8 +47,8 @@ class Blunder:
         p_adjusted: the same, all groups looked at being paid for.
         evidence: minus the log of the p-value of independent rows, at the scale of its kind.
         limit: of the statistic, beyond which it is named.
-        enough: of the statistic's noncentrality, to be found with 80 % power.
-        detectable: unit -> size that is so.
+        enough: noncentrality of the statistic at which it is found with 80 % power.
+        detectable: unit -> size of such a blunder.
         looks: how many groups were looked at.
     """
 

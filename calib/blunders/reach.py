@@ -6,8 +6,8 @@ the worst moves estimate j, whose row of C is c, by
 
     sqrt(d) |(I - H)^(-1/2) A c|
 
-(external reliability: Baarda 1968, A testing procedure for use in geodetic networks). Where a group
-is hardly checked by others, this is large however small its rows are against all others.
+(external reliability: Baarda 1968, A testing procedure for use in geodetic networks). Where others
+hardly check a group, this is large.
 """
 
 from __future__ import annotations

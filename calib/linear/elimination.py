@@ -107,8 +107,8 @@ def square_root(matrix: np.ndarray) -> np.ndarray:
 
 
 def inverse(inner: np.ndarray) -> np.ndarray:
-    """Of a symmetric matrix that is no less than the identity, whatever rounding makes of it:
-    beside a very wide spread, rounding of what is seen well is more than that."""
+    """Of a symmetric matrix whose eigenvalues are all at least 1, though rounding errors of the
+    largest may exceed that."""
     try:
         return cho_solve(cho_factor(inner), np.eye(len(inner)))
     except np.linalg.LinAlgError:
