@@ -13,9 +13,9 @@ from calib.simulation import load_spec, simulate
 
 from .programs import ROOT, rigcal, script, started
 
-README, FORMATS, DAY_BY_DAY = (
+README, START, FORMATS, DAY_BY_DAY = (
     (ROOT / name).read_text(encoding="utf-8")
-    for name in ("README.md", "docs/formats.md", "docs/day_by_day.md")
+    for name in ("README.md", "docs/start.md", "docs/formats.md", "docs/day_by_day.md")
 )
 
 
@@ -89,6 +89,22 @@ def test_what_readme_shows_is_what_is_printed(loop):
     (fall,), (found,) = map(set, falls)
     for there, here in zip(fall, found, strict=True):
         assert float(here) == pytest.approx(float(there), rel=0.15)
+
+
+@pytest.mark.slow
+def test_the_first_page_of_the_site_shows_what_is_printed(loop):
+    """Its commands are README's, and more on the same runs."""
+    folder, said = loop
+    here = commands(START)
+    more = [words for words in here if words not in commands()]
+    assert {tuple(words) for words in here if words[1] in ("simulate", "fit", "add")} <= {
+        tuple(words) for words in commands()
+    }
+    said = shape("\n".join([said, *(rigcal(words[1:], folder) for words in more)]))
+    shown = blocks("text", START)
+    assert len(shown) == 2
+    for block in shown:
+        assert shape(block) in said, block
 
 
 def unwrapped(text):

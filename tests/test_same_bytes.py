@@ -47,15 +47,15 @@ WAYS = {  # PYTHONHASHSEED, threads of a BLAS call, threads over stops
     "a": ("1", "1", "1"),
     "b/c": ("20240", "3", "3"),
 }
-LIMIT_S = 270  # of all commands that write: they share a process, as starting takes long
-# Runs its arguments as commands; what they say goes to a file each, which begins with the first.
+LIMIT_S = 270  # of all commands: they share a process, as starting takes long
+# Runs its arguments as commands; what each says goes to a file, by whether it writes, and its name.
 PROGRAM = """
 import contextlib, shlex, sys
 from calib.cli import main
-_, name, *lines = sys.argv
-for k, line in enumerate(lines):
+for k, line in enumerate(sys.argv[1:]):
     sys.argv[1:] = shlex.split(line)
-    with open(f"{name}-{k}.txt", "w") as said, contextlib.redirect_stdout(said):
+    what = "saying" if "--json" in sys.argv else "writing"
+    with open(f"{what}-{k}-{sys.argv[1]}.txt", "w") as said, contextlib.redirect_stdout(said):
         try:
             main()
         except SystemExit as end:
@@ -77,11 +77,10 @@ def made(tmp_path_factory):
         (where.parent / "mine.yaml").write_text(MINE)
         variables = {"PYTHONHASHSEED": seed, "TZ": f"UTC{-int(threads)}"}
         variables |= {f"{x}_NUM_THREADS": threads for x in ("MKL", "OMP", "OPENBLAS")}
-        for name, text in (("writing", COMMANDS), ("saying", SAYING)):
-            lines = text.strip().format(rec=folder / "rec", n=workers).splitlines()
-            command = [sys.executable, "-c", PROGRAM, name, *lines]
-            done = execute(command, where, limit_s=LIMIT_S, **variables)
-            assert done.returncode == 0, done.stderr
+        lines = (COMMANDS + SAYING).format(rec=folder / "rec", n=workers).split("\n")
+        command = [sys.executable, "-c", PROGRAM, *filter(None, lines)]
+        done = execute(command, where, limit_s=LIMIT_S, **variables)
+        assert done.returncode == 0, done.stderr
         found.append(where)
     return found
 
@@ -129,5 +128,6 @@ def test_every_command_is_among_them():
 
 @pytest.mark.slow
 def test_what_is_made_again_is_identical(made):
-    documents = (json.loads((folder / "saying-4.txt").read_text()) for folder in made)
+    said = (next(folder.glob("saying-*-reproduce.txt")) for folder in made)
+    documents = [json.loads(path.read_text()) for path in said]
     assert [each["identical"] for each in documents] == [True, True]

@@ -240,17 +240,6 @@ def test_a_fit_estimates_the_spread_and_each_stop(scattered):
     assert len(estimate.values[name]) == 24
 
 
-@pytest.mark.slow
-def test_it_is_found_said_to_be_chance_and_then_nothing_is_missing(scattered):
-    run = fit([scattered / "rec"], scattered / "run")
-    found = diagnose(run)
-    assert found.verdict == "missing_effect" and found.worth_adding == ["stop_range_scatter"]
-    assert not found.unexplained and not found.blunders
-    (told,) = found.scatter
-    assert told["sd"] == pytest.approx(0.0009, abs=3 * told["sigma"])
-    assert any("Stops scatter by" in sentence for sentence in found.sentences)
-
-
 def test_shift_and_turn_of_the_lidar_have_a_spread_each(tmp_path):
     """0.9 mm and 0.9 mrad at size 3; the spreads come without the other ways to scatter."""
     simulate(SPEC, tmp_path / "rec", 7, {"stop_pose_scatter": 3.0})

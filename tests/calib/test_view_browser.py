@@ -9,14 +9,12 @@ import time
 import numpy as np
 import pytest
 
-from calib.runs.calibrate import calibrate
 from calib.runs.diagnose import diagnose
 from calib.runs.run import Run
-from calib.simulation import simulate
 from calib.view.page import Page
 from calib.view.stage import PANEL_PX, PLOT_PX
 from tests.browser import Watched
-from tests.calib.viewed import blunder, diagnosed, small_run
+from tests.calib.viewed import blunder, diagnosed, hidden_run, small_run
 from tests.calib.workbench import FIT_MS, SOON_MS, bars, button, field, shown
 
 pytestmark = pytest.mark.slow
@@ -35,11 +33,9 @@ def copied(small, tmp_path) -> Run:
 
 
 @pytest.fixture(scope="module")
-def hidden(tmp_path_factory) -> Run:
+def hidden(once) -> Run:
     """A run whose model lacks what was hidden in its recording."""
-    folder = tmp_path_factory.mktemp("hidden")
-    simulate("tiny", folder / "rec", 1, {"incidence_angle_bias": 2.0})
-    run = calibrate([folder / "rec"], folder / "run")
+    run = Run.open(once(hidden_run) / "run")
     diagnose(run, refits=False)
     return run
 

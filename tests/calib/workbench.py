@@ -12,16 +12,26 @@ from calib.view.server import serve
 from tests.browser import SOFTWARE_GL, Watched, browser_page
 
 SOON_MS, FIT_MS = 60_000, 300_000
+# Without a graphics card a core draws, and would be taken by nothing but frames.
+FEWER_FRAMES = """
+const draw = window.requestAnimationFrame.bind(window);
+window.requestAnimationFrame = then => draw(() => setTimeout(() => draw(then), 100));
+"""
 
 
 @contextmanager
 def shown(*runs: Path, width: int = 1400) -> Iterator[tuple[Watched, Page]]:
-    """The workbench of runs in a browser, its first picture drawn."""
+    """The workbench of runs in a browser, its first picture drawn.
+
+    Without the light of surroundings, whose shaders take a core 6 s to compile in each browser.
+    """
     served, bench = serve(0), Bench(Desk.of(runs))
+    served.server.scene.configure_environment_map(hdri=None)
     try:
         with browser_page(width, 900, *SOFTWARE_GL) as watched:
             pages = attend(served, bench)
             watched.page.set_default_timeout(SOON_MS)
+            watched.page.add_init_script(FEWER_FRAMES)
             watched.page.goto(served.address)
             button(watched, "Add").wait_for()
             watched.page.get_by_text("drawn; residual").or_(
