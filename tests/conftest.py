@@ -20,22 +20,28 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, lambda *_: None)
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
-# Heaviest first, by seconds of a core (105 to 25): the last files should be short ones.
+# Heaviest first, by seconds of a core (105 to 20), browsers too: the last files should be short.
 HEAVY = [
     "test_docs",
     "test_damage",
-    "test_components",
-    "test_view_browser",
     "test_examples",
+    "test_view_browser",
+    "test_components",
     "test_same_bytes",
-    "test_outputs_killed",
-    "test_own_effects",
+    "test_arm_geometry",
     "test_linearise",
-    "test_formulas",
-    "test_converged",
-    "test_report_odd",
+    "test_own_effects",
+    "test_view_shown",
     "test_formulas_shown",
+    "test_mishaps",
+    "test_converged",
     "test_readme",
+    "test_formulas",
+    "test_outputs_killed",
+    "test_hidden_effects",
+    "test_report_odd",
+    "test_intervals",
+    "test_torn",
 ]
 LIMIT_S = {"slow": 600, "long": 3600}  # of others: see pyproject.toml
 
