@@ -73,13 +73,19 @@ class Blunder:
     @property
     def possible(self) -> bool:
         """Whether it may be off by so much at all."""
-        angles = [x for x, u in zip(self.shift.offset, self.shift.units, strict=True) if u == "rad"]
-        return self.group.kind != "joints" or bool(np.all(np.abs(angles) < LINEAR_RAD))
+        return self.group.kind != "joints" or self._turned < LINEAR_RAD
 
     @property
     def found(self) -> bool:
-        """Whether it is to be named."""
-        return self.p_adjusted < ALPHA
+        """Whether it is to be named: not where it would be turned by more than half a turn, as
+        where nothing fits at all."""
+        return self.p_adjusted < ALPHA and (self.group.kind == "joints" or self._turned < np.pi)
+
+    @property
+    def _turned(self) -> float:
+        """Its largest angle, rad."""
+        turns = np.array([unit == "rad" for unit in self.shift.units])
+        return float(np.abs(np.asarray(self.shift.offset)[turns]).max(initial=0.0))
 
     def leading(self) -> tuple[float, float, str, str]:
         """Size, its sigma, the unit, and along which axis; empty where it is along no single one.

@@ -171,6 +171,14 @@ def _sentence(left: LeftOut, wrong_sign: str | None) -> str:
     return f"{out}{sign}."
 
 
+def suspect(left: LeftOut) -> str:
+    """Of what is furthest out, where a fit without it has no optimum either."""
+    return (
+        f"Furthest from everything else: {left.blunder.group}. Without it the fit does not "
+        "converge either, so it need not be the cause; look at it first."
+    )
+
+
 def size_told(size: float, sigma: float, unit: str) -> str:
     """A size in m or rad and its sigma, as people read it."""
     name, scale = SHOWN.get(unit, (unit, 1.0))

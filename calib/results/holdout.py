@@ -120,11 +120,21 @@ def held_out(
             progress(f"without fold {number}: {what}", done, total)
 
         trained = problems.build(sources, model, [~left for left in fold])
-        estimate = solve(trained, progress=tell, start=_without_planes(trained, start))
+        estimate = _near(trained, _without_planes(trained, start), tell)
         unseen = problems.build(sources, model, fold, trained.meetings)
         unseen = with_spread(unseen, estimate.start.spread)
         out += predict(unseen, trained, estimate, keep)
     return out
+
+
+def _near(trained: Problem, start: Start | None, progress: Progress) -> Estimate:
+    """The fit of a fold, from that of all stops, which knows how widely things scatter; where that
+    leads to no optimum, from nothing."""
+    if start is not None:
+        estimate = solve(trained, progress=progress, start=start, spread=False)
+        if estimate.converged:
+            return estimate
+    return solve(trained, progress=progress)
 
 
 def _without_planes(trained: Problem, start: Start | None) -> Start | None:

@@ -70,9 +70,13 @@ def _found(
     stand = stand_of(run, progress, candidates)
     rings = dict(_odd_rings(stand))
     harmful = {name: each for name, each in rings.items() if each.what != "reversed"}
-    # Away from an optimum every effect that moves the state towards one looks missing, and beams
-    # are thrown away for no reason of their own.
+    # Away from an optimum every effect that moves the state towards one looks missing, beams are
+    # thrown away for no reason of their own, and groups far out that are not to blame.
     found = search(stand, progress) if run.converged else search(stand, progress, most=0)
+    suspect = []
+    if found.blunders and not found.looks[-1].stand.estimate.converged:
+        suspect = [told.suspect(found.blunders[0])]
+        found = replace(found, looks=found.looks[:1], blunders=())
     rejected = rejects(found.looks[0].stand, progress) if run.converged else None
     falls = {}
     before = run.summary["rms_mm"]["held_out"]
@@ -107,6 +111,7 @@ def _found(
         unseen=unseen,
         sentences=[
             *run.doubts,
+            *suspect,
             *result.sentences,
             *hardly_checked(unseen),
             *map(told.whole, cautions(run)),

@@ -124,20 +124,24 @@ class Loop(Descent):
         return graph.solve(first)[0]
 
     def reweigh(self, beams: bool) -> bool:
-        """Go on with robust weights until these settle, where any group of rows asks for one;
-        whether any did.
+        """Go on with robust weights until these settle, where any group of rows asks for one, or
+        rows stay hopelessly wide; whether any did.
 
         Args:
             beams: False for trackers and targets alone.
         """
         times, settled = REWEIGHTED if self.problem.scans else ALONE
         times = BEFORE_SCANS if self.problem.scans and not beams else times
-        changed = False
-        for _ in range(times):
+        changed, last = False, np.inf
+        for count in range(times):
             before = self.given, self.problem
             if self.lost or not self.take_weights(settled):
                 break
             self.linearise(beams=beams)
+            if count % HOPEFUL == HOPEFUL - 1:
+                if self.rows_hopeless() and self.cost() > last / 2:
+                    break
+                last = self.cost()
             tangent, fall = self.step()
             if fall < max(STILL, AS_GOOD * self.cost()):
                 self.given, self.problem = before

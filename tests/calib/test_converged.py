@@ -2,6 +2,7 @@
 
 import csv
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,10 +14,13 @@ from calib.problem import build
 from calib.problem.model import Model, Source
 from calib.residuals.robust import tukey_cost
 from calib.runs.calibrate import calibrate
+from calib.runs.diagnose import diagnose
 from calib.solve.descent import MAX_PASSES, Descent
-from calib.solve.fit import solve
+from calib.solve.fit import preview, solve
+from calib.solve.loop import HOPEFUL, Loop
 from chains.errors import InputError
 
+from ..mishaps import MISHAPS, Scene
 from ..worlds import World, write
 from . import simulated
 
@@ -213,6 +217,19 @@ def test_bodies_that_no_start_brings_near_are_not_followed_far(damage, tiny, tmp
     assert not found.converged and len(steps) <= MAX_PASSES
 
 
+def test_weights_are_not_sought_for_long_where_rows_stay_hopeless(tmp_path, monkeypatch):
+    """An encoder that is stuck: 24 rounds of weights at most, where 200 are allowed."""
+    source, _ = simulated.made(tmp_path / "rec", "laser-tracker")
+    joints = source.recording.joints.copy()
+    joints[:, 2] = joints[0, 2]
+    wrong = replace(source, recording=replace(source.recording, joints=joints))
+    rounds, weigh = [], Loop.take_weights
+    monkeypatch.setattr(Loop, "take_weights", lambda self, *a: rounds.append(1) or weigh(self, *a))
+    few = np.arange(len(joints)) < 12
+    assert not preview(build([wrong], Model(), [few])).converged
+    assert len(rounds) <= 3 * HOPEFUL
+
+
 def test_a_fit_that_is_not_at_its_optimum_is_not_called_converged(tiny, monkeypatch):
     """Too few passes, and a step left that would lower the cost."""
     problem = build([Source.open(tiny)], Model())
@@ -235,3 +252,17 @@ def test_scales_that_swing_about_the_state_come_to_rest(tmp_path):
     write(World(seed=266072375, stop_scatter_m=3e-3), tmp_path / "rec")
     estimate = solve(build([Source.open(tmp_path / "rec")], Model()))
     assert estimate.converged and estimate.iterations < 100
+
+
+def test_what_is_out_where_nothing_converges_is_a_suspect_and_no_blunder(
+    tiny, tmp_path, monkeypatch
+):
+    """A body that was moved at one stop, and no optimum with or without it."""
+    recording = shutil.copytree(tiny, tmp_path / "rec")
+    scene = Scene(recording, np.random.default_rng(1))
+    (moved,) = MISHAPS["mount body shifted at one stop"].apply(scene, 10).right
+    monkeypatch.setattr("calib.solve.loop.AT_OPTIMUM", -1.0)  # nothing is
+    found = diagnose(calibrate([recording], tmp_path / "run", hold_out="none"))
+    said = " ".join(found.sentences)
+    assert found.verdict == "bad_data" and not found.blunders and not found.command
+    assert "not converged" in said and f"Furthest from everything else: {moved[:6]}" in said

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 from calib import diagnose, fit
+from calib.diagnosis.search import Search
 from calib.diagnosis.stand import Stand
+from calib.diagnosis.verdict import conclude
 from calib.diagnosis.verdict.matters import FALL, SHIFT, Consequences, Matters
 from calib.effects import find
 from calib.problem import build
@@ -79,3 +81,17 @@ def test_what_matters_stands_with_each_finding_and_a_trace_is_said_to_be_one(tmp
     traces = [s for s in found.sentences if s.startswith("A trace of")]
     assert found.verdict == "adequate" and not found.worth_adding
     assert len(traces) == 1 and "none that matters" in found.sentences[0]
+
+
+@pytest.mark.parametrize(("over", "verdict"), [(2.0, "unexplained_structure"), (1.1, "adequate")])
+def test_what_single_beams_show_and_no_test_confirms_is_not_called_adequate(look, over, verdict):
+    """Unless the held-out error is what it should be: then it is chance."""
+    found = Search([look], found=(), blunders=(), unnamed=(), scatter=None)
+    rms_mm = {"held_out": over * 2.0, "fit": 2.0, "noise_floor": 2.0}
+    told = conclude(found, {}, {"rms_mm": rms_mm, "misfit": {}}, [])
+    assert told.verdict == verdict
+    if verdict == "adequate":
+        assert not told.unexplained and "adequate" in told.sentences[0]
+    else:
+        assert told.unexplained[0]["covariates"] and "no test confirms" in told.sentences[0]
+        assert not any("adequate" in each for each in told.sentences)

@@ -1,15 +1,19 @@
 """A fit that starts from the state of another: what it takes over, and that it ends the same."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform
 
 from calib.problem import build
 from calib.problem.model import Model, Source
+from calib.problem.spread import spread_of
 from calib.residuals.surfaces import PlaneSurface
+from calib.results import holdout
 from calib.results.holdout import held_out
 from calib.simulation import Spec
-from calib.solve.estimate import Start
+from calib.solve.estimate import SD, Start
 from calib.solve.fit import solve
 
 from . import rigs, simulated
@@ -133,3 +137,28 @@ def test_held_out_errors_do_not_depend_on_where_their_fit_starts(cold):
 
     assert told(first.start) == pytest.approx(told(None), rel=0.01)
     assert passes[False] < passes[True] or not first.scans
+
+
+@pytest.mark.parametrize("arrives", [True, False])
+def test_a_fold_scatters_as_the_fit_of_all_stops_does(tmp_path, monkeypatch, arrives):
+    """Unless that leads to no optimum: then the fold is fitted from nothing."""
+    source = Source.open(rigs.write(tmp_path / "rec", seed=4))
+    model = Model(("arm_link_length", "stop_range_scatter"))
+    known = {"stop_range_scatter": 7e-3}
+    start = solve(build([source], model)).start
+    start = Start(start.state | {f"{name}{SD}": np.array(sd) for name, sd in known.items()})
+    found = []
+
+    def solved(problem, *prior, **how):
+        estimate = solve(problem, *prior, **how)
+        if prior:
+            return estimate
+        at_first = how.get("start") is not None
+        found.append((at_first, spread_of(estimate.problem)["stop_range_scatter"]))
+        return replace(estimate, converged=arrives or not at_first)
+
+    monkeypatch.setattr(holdout, "solve", solved)
+    held_out([source], model, "stop", 1, lambda *what: None, start)
+    assert found[0] == (True, known["stop_range_scatter"])
+    assert len(found) == (1 if arrives else 2)
+    assert arrives or found[1][1] < 0.8 * known["stop_range_scatter"]

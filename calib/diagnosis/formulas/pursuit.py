@@ -17,6 +17,7 @@ from scipy import special
 
 from calib.blunders.chance import after_looks, at_least, log_tail
 from calib.diagnosis.formulas.factors import Factor, factors
+from calib.diagnosis.formulas.needed import needed
 from calib.diagnosis.formulas.smooths import Bases, Smooth, screen_smooths
 from calib.diagnosis.formulas.table import Projection, Table
 from calib.diagnosis.formulas.terms import Term, refine
@@ -166,9 +167,11 @@ def _step(fitted: Projection, bases: Bases, smooths: Sequence[Smooth], alpha: fl
 
 def _stands_out(fitted: Projection, bases: Bases, smooth: Smooth) -> bool:
     """Whether chance hardly makes so large a smooth function: of others no forms are tried, which
-    takes time."""
-    p = _judged(fitted, bases.of(smooth.covariates)).p_value()
-    return float(after_looks(p, smooth.looks)) < PLAUSIBLE
+    takes time. Where stops tell less of it than it has directions, as of a few walls, nothing
+    confirms it; a form has fewer, and is judged on its own."""
+    judged = _judged(fitted, bases.of(smooth.covariates))
+    p = float(after_looks(judged.p_value(), smooth.looks))
+    return p < PLAUSIBLE or judged.chance.d < judged.chance.nu
 
 
 def _judged(fitted: Projection, columns: np.ndarray) -> Test:
@@ -179,18 +182,30 @@ def _judged(fitted: Projection, columns: np.ndarray) -> Test:
 
 def _by_chance(fitted: Projection, form: Form, smooth: Smooth) -> float:
     """How often chance makes a form of these covariates that explains as much: no more than as
-    many forms do as were tried (Bonferroni); where a smooth function explains it, nor more than
-    such functions do (the S-method of Scheffe 1953). The smaller of both bounds, twice."""
-    found = _judged(fitted, form.term.columns(fitted.table.covariates))
+    many forms do as were tried, whole or with those of its columns alone that are needed
+    (Bonferroni); where a smooth function explains it, nor more than such functions do (the
+    S-method of Scheffe 1953). The smallest of these bounds, as many times."""
+    columns = form.term.columns(fitted.table.covariates)
+    (kept,) = needed(fitted, [form.term], [columns])
+    bounds = [_bound(fitted, columns, form.tried)]
+    if 0 < len(kept) < columns.shape[1]:
+        ways = special.comb(columns.shape[1], len(kept))
+        bounds.append(_bound(fitted, columns[:, kept], form.tried * ways))
+    if smooth.test.statistic > COVERS * form.statistic:
+        bounds.append(_bound(fitted, columns, 1, smooth.test.dof))
+    return at_least(min(1.0, len(bounds) * min(bounds)))
+
+
+def _bound(fitted: Projection, columns: np.ndarray, tried: float, dof: int = 0) -> float:
+    """How often chance explains as much as columns (N, k) do by the best of as many such blocks, or
+    by a function of `dof` parameters, if these are more."""
+    found = _judged(fitted, columns)
     chance = found.chance
     if chance.d <= 0.0:
         return 1.0
-    each = max(chance.trace / found.dof, 1.0)
-    dof = max(smooth.test.dof, found.dof)
-    covers = smooth.test.statistic > COVERS * form.statistic
-    together = special.fdtrc(dof, chance.d, found.statistic / each / dof) if covers else 1.0
-    alone = special.fdtrc(chance.nu, chance.d, found.statistic / each / found.dof)
-    return at_least(min(1.0, 2 * min(together, alone * form.tried)))
+    each = found.statistic / max(chance.trace / found.dof, 1.0)
+    most = max(dof, found.dof) if dof else chance.nu
+    return tried * float(special.fdtrc(most, chance.d, each / max(dof, found.dof)))
 
 
 def form(projection: Projection, term: Term, tried: int) -> Form:

@@ -16,12 +16,12 @@ from calib.diagnosis.candidates import concerned, lacking
 from calib.diagnosis.curves import Curve, curves
 from calib.diagnosis.rejects import Rejects
 from calib.diagnosis.screen import Candidate, Screen
-from calib.diagnosis.search import FEWEST, ODDS, Search
+from calib.diagnosis.search import ALPHA_UNNAMED, FEWEST, ODDS, Search, suspects
 from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import formula, hangs_on
 from calib.diagnosis.verdict.candidates import candidate_documents, explained
 from calib.diagnosis.verdict.matters import weighed
-from calib.diagnosis.verdict.sentences import BAD, UNNAMED, sentences_of, stops_of
+from calib.diagnosis.verdict.sentences import BAD, UNNAMED, sentences_of, stops_of, unconfirmed
 from calib.diagnosis.verdict.unnamed import Unnamed
 from calib.problem.model import labels
 from calib.residuals.groups import Group
@@ -158,12 +158,19 @@ def conclude(
     verdict = BAD if spoilt or found.blunders else _verdict(found, hold, more)
     if verdict == "adequate" and forbids:
         verdict = BAD
+    doubt = _unconfirmed(found, summary["rms_mm"]) if verdict != BAD and not more else None
+    verdict = UNNAMED if verdict == "adequate" and doubt else verdict
     candidates = candidate_documents(heavy, held_out, verdict == UNNAMED, hold)
     untestable = _untestable(first)
     thrown = rejected.unexplained() if rejected and verdict == UNNAMED else []
     unexplained = _structure(found, verdict, formulas, thrown)
+    if doubt and not unexplained:
+        unexplained = [_unexplained(doubt, found.looks[-1].unnamed, ())]
     blunders = [*spoilt, *(told.document(left, _rig(left, first)) for left in found.blunders)]
-    sentences = sentences_of(verdict, heavy, candidates, unexplained, untestable, blunders)
+    said = "missing_effect" if doubt else verdict
+    sentences = sentences_of(said, heavy, candidates, unexplained, untestable, blunders)
+    if doubt:
+        sentences.insert(0, unconfirmed(unexplained[0], summary["rms_mm"]))
     if forbids and verdict == BAD and not blunders:
         sentences.insert(0, f"This run is not to be believed as it stands: {'; '.join(forbids)}.")
     sentences += [formulas.refused] if formulas.refused else []
@@ -185,6 +192,17 @@ def conclude(
         rejected=rejected,
         scatter=[s.document(each.effect.name) for each in found.chance for s in each.spreads],
     )
+
+
+def _unconfirmed(found: Search, rms_mm: Mapping[str, float]) -> Candidate | None:
+    """Structure that single beams show, where the held-out error is larger than chance makes it and
+    nothing is confirmed: so few stops, or walls, see each part of it that they may differ by chance
+    as much."""
+    held_out, floor = rms_mm.get("held_out"), rms_mm["noise_floor"]
+    over = held_out is not None and held_out > BY_CHANCE * floor
+    if not over or found.unnamed or found.found or not found.looks[0].stand.estimate.scans:
+        return None
+    return next(suspects(found.looks[-1].unnamed, ALPHA_UNNAMED), None)
 
 
 def _rig(left: LeftOut, look: Look) -> Rig:

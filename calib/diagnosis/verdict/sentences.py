@@ -66,6 +66,17 @@ def sentences_of(
     return out
 
 
+def unconfirmed(each: Mapping[str, Any], rms_mm: Mapping[str, float]) -> str:
+    """Of structure that too few stops see for any test to confirm it."""
+    what = " and ".join(words(c) for c in each["covariates"])
+    over = rms_mm["held_out"] / rms_mm["noise_floor"]
+    return (
+        f"The held-out error is {over:.1f} times as large as expected, and no test confirms why: "
+        f"single beams show that the residuals depend on {what}, but so few stops or surfaces see "
+        "each part of that that it may be chance. Stops that face other surfaces would tell."
+    )
+
+
 def _first_sentences(verdict: str, look: Look, traces: bool) -> list[str]:
     """That nothing can be said, or that nothing is missing."""
     stops = stops_of(look)
