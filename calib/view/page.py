@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,9 +14,11 @@ from calib.runs.ladder import Rung
 from calib.view import panels
 from calib.view.bench import Bench
 from calib.view.desk import DiagnosisCurve, Findings
-from calib.view.job import Told
+from calib.view.effects import known
+from calib.view.effects.own import OwnFormula, document
+from calib.view.effects.ticks import Ticks
+from calib.view.job import Change, Told
 from calib.view.leave_out import LeaveOut
-from calib.view.own import OwnFormula, document
 from calib.view.picture import NOTHING, Picture
 from calib.view.server import Visitor
 from calib.view.shown import colours, look
@@ -93,13 +95,7 @@ class Page:
         with gui.add_folder("Findings"):
             self._findings = gui.add_html("")
             self._formulas = gui.add_html("")
-            self._effect = self._menu("Effect", [NOTHING], self._choose_curve)
-            self._add = gui.add_button("Add", hint="Refit with this effect, from this run")
-            self._own = OwnFormula(gui, self._guarded, self._on_own)
             self._diagnose = gui.add_button("Diagnose", visible=False)
-            self._bar = gui.add_progress_bar(0.0, visible=False)
-            self._doing = gui.add_html("", visible=False)
-            self._cancel = gui.add_button("Cancel", visible=False, color="gray")
             self._over = self._menu("Curve over", [NOTHING], self._draw_curve)
             self._curve = gui.add_uplot(
                 *_curve(None),
@@ -107,8 +103,13 @@ class Page:
                 bands=({"series": (2, 3), "fill": "rgba(0, 0, 0, 0.08)"},),
                 height=CURVE_PX,
             )
-        self._add.on_click(self._guarded(self._on_add))
-        self._diagnose.on_click(self._guarded(lambda: self._start(self.desk.run.folder)))
+        self._ticks = Ticks(gui, self._guarded, self._on_ticks, self._on_refit)
+        with self._ticks.folder:
+            self._bar = gui.add_progress_bar(0.0, visible=False)
+            self._doing = gui.add_html("", visible=False)
+            self._cancel = gui.add_button("Cancel", visible=False, color="gray")
+            self._own = OwnFormula(gui, self._guarded, self._on_own)
+        self._diagnose.on_click(self._guarded(self._start))
         self._cancel.on_click(self._guarded(self._on_cancel))
 
     def _add_ladder_widgets(self) -> None:
@@ -200,19 +201,18 @@ class Page:
             self._formulas.content = panels.formulas(self.findings)
             self._blunders.show(self.findings.blunders if self.findings else [])
             self._diagnose.visible = self.findings is None
-            self._fill(self._effect, list(self.desk.addable(self.findings)) or [NOTHING])
-            found = self.findings
-            worth = found is not None and bool(found.worth_adding or found.formulas)
-            self._add.color = None if worth else "gray"
-            self._choose_curve()
+            offered = self.desk.addable(self.findings)
+            listed = list(offered)[: panels.SHOWN_CANDIDATES] if self.findings else []
+            self._ticks.show(self.desk.effects, offered, listed)
 
     def _choose_curve(self) -> None:
-        """The curve that shows the chosen effect best."""
+        """The curve that shows best what was ticked last, or what stands out."""
         names = list(self.findings.curves) if self.findings else []
         self._over.visible = self._curve.visible = bool(names)
         self._covariates = {colours.column(n).heading: n for n in names}
         if names:
-            best = colours.column(self.findings.covariate_of(self._effect.value)).heading
+            effect = self._ticks.latest or next(iter(self.desk.addable(self.findings)), NOTHING)
+            best = colours.column(self.findings.covariate_of(effect)).heading
             self._fill(self._over, list(self._covariates), best)
             self._draw_curve()
 
@@ -223,23 +223,25 @@ class Page:
             self.findings.curves[name], self._over.value, scale
         )
 
-    def _on_add(self) -> None:
-        name = self._effect.value
-        what = self.desk.addable(self.findings).get(name)
-        if what is None:
-            raise InputError(f"'{name}' is not an effect that can be added to this run")
-        self._start(self.desk.run.folder, what, self.desk.folder_for(name))
+    def _on_ticks(self, wanted: Mapping[str, Any]) -> str:
+        """Show the curve of what was ticked last; what is known of all that is ticked."""
+        self._choose_curve()
+        others = {name: run for name, run in self.desk.runs.items() if name != self.desk.chosen}
+        return known.told(self.desk.run, wanted, self.findings, others)
+
+    def _on_refit(self, added: Mapping[str, Any], dropped: Sequence[str]) -> None:
+        if not added and not dropped:
+            raise InputError("these are the effects of the run; tick others, or take a tick away")
+        out = self.desk.folder_for(*added, dropped=dropped)
+        self._start(Change(out, tuple(added.values()), tuple(dropped)))
 
     def _on_own(self, text: str, site: str) -> None:
         effect = document(text, site, self.picture.beams(), self.desk.run.effects)
-        self._start(self.desk.run.folder, effect, self.desk.folder_for(effect["name"]))
+        self._start(Change(self.desk.folder_for(effect["name"]), (effect,)))
 
     def _on_leave_out(self, tokens: Sequence[str]) -> None:
-        def leave_out() -> None:
-            run, out = self.desk.run.folder, self.desk.folder_without()
-            self._start(run, out=out, without=tokens)
-
-        self._guarded(leave_out)()
+        change = Change(self.desk.folder_without(), without=tuple(tokens))
+        self._guarded(partial(self._start, change))()
 
     def _on_undo(self) -> None:
         told = self.desk.undo()
@@ -248,9 +250,9 @@ class Page:
 
     # ------------------------------------------------------------------------- in the background
 
-    def _start(self, run: Path, *what: Any, **more: Any) -> None:
+    def _start(self, change: Change | None = None) -> None:
         self._ask()
-        self.bench.start(self, run, *what, **more)
+        self.bench.start(self, self.desk.run.folder, change)
         self._tell("")
         self._show_busy()
 
@@ -268,9 +270,9 @@ class Page:
         busy = self.bench.busy
         self._bar.visible = self._doing.visible = busy
         self._cancel.visible = busy and self.may_change
-        self._add.disabled = self._diagnose.disabled = busy or not self.may_change
-        self._blunders.busy(busy or not self.may_change)
-        self._own.busy(busy or not self.may_change)
+        self._diagnose.disabled = busy or not self.may_change
+        for widget in (self._blunders, self._ticks, self._own):
+            widget.busy(busy or not self.may_change)
         self._bar.value, self._doing.content = 0.0, panels.note("Starting …")
 
     def _hear(self, told: Told, by: Any) -> None:

@@ -163,6 +163,11 @@ def formulas(diagnosed: Findings | None) -> str:
     )
 
 
+def expected(text: str) -> str:
+    """What is known of a set of effects before it is fitted."""
+    return _framed(f'<div data-is="expected">{escape(text)}</div>')
+
+
 def blunders(found: Sequence[Mapping[str, Any]]) -> str:
     """What is wrong in the recording, in the sentences of the diagnosis."""
     lines = "".join(f'<li style="margin:.3em 0">{escape(b["sentence"])}</li>' for b in found)

@@ -232,14 +232,17 @@ def test_each_browser_has_a_view_of_its_own_and_only_the_key_changes_anything(be
             assert mine.picture.stage.points is not None
 
             # Buttons are pressed by messages: those that they do not have, and another's.
-            for press in (other._add, other._diagnose, other._cancel, mine._add, mine._diagnose):
+            refit, refits = other._ticks._button, mine._ticks._button
+            for press in (refit, other._diagnose, other._cancel, refits, mine._diagnose):
                 two(**pressed(press), updates={"value": True})
             until(lambda: "cannot change anything" in other._note.content)
             time.sleep(0.5)
             assert asked == [] and not bench.busy
 
-            one(**pressed(mine._add), updates={"value": True})
+            one(**pressed(mine._ticks._boxes["range_scale"]), updates={"value": True})
+            one(**pressed(refits), updates={"value": True})
             until(lambda: len(asked) == 1)
+            assert asked[0][1].added == ("range_scale",)
             until(lambda: other._doing.visible and mine._doing.visible)
             assert mine._cancel.visible and not other._cancel.visible
             two(**pressed(other._cancel), updates={"value": True})

@@ -9,7 +9,7 @@ import pytest
 from calib.runs.calibrate import calibrate
 from calib.runs.run import Run
 from calib.simulation import simulate
-from calib.view.own import document
+from calib.view.effects.own import document
 from calib.view.scene import Points, Scene
 from calib.view.shown import colours, look, plot
 from calib.view.shown.columns import comparable, gathered, kept
