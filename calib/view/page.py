@@ -21,7 +21,7 @@ from calib.view.job import Change, Told
 from calib.view.leave_out import LeaveOut
 from calib.view.picture import NOTHING, Picture
 from calib.view.server import Visitor
-from calib.view.shown import colours, look
+from calib.view.shown import brush, colours, look
 from calib.view.stage import PANEL_PX
 from chains.errors import InputError
 
@@ -58,6 +58,7 @@ class Page:
         self._note = gui.add_html("", visible=False)
         self._run = self._menu("Run", list(self.desk.runs), self._on_run)
         self.picture = Picture(client, self._guarded, self._asks)
+        visitor.run(brush.SCRIPT)
         self._add_ladder_widgets()
         self._blunders = LeaveOut(gui, self._on_leave_out)
         self._add_findings_widgets()

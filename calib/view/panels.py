@@ -16,11 +16,12 @@ from calib.show import misfit
 from calib.show.headline import moved_sentence
 from calib.view.desk import Findings
 from calib.view.scene import Points
-from calib.view.shown.colours import Scale, column
+from calib.view.shown.colours import Scale, choices, column
 from chains.escape import html as escape
 
 SHOWN_CANDIDATES = 6  # candidates in the table; the menu has all
 LARGE = ((1e6, " million"), (1.0, ""))
+DIGITS = {"m": 3, "mm": 2, "deg": 1, "°C": 2, "s": 1, "of the median": 3}  # that are told
 BAR = "#7fb2d9"
 STRIPED = f"repeating-linear-gradient(45deg,{BAR} 0 6px,#dcebf6 6px 10px)"  # of a rung by a formula
 _FRAME = "padding:0 1.2em .4em .75em;font-size:12px;line-height:1.4"
@@ -59,14 +60,37 @@ def scan(points: Points | None, drawn: int, stop: str, ratios: Mapping[str, floa
     return _framed(_beams(points, drawn, stop) + _misfit(ratios))
 
 
-def plotted(points: Points, rows: np.ndarray, up: str, low: float, high: float) -> str:
-    """What a plot of the beams (n,) shows, and how many of them are off its scale."""
+def plotted(points: Points, rows: np.ndarray, up: str, axes: Mapping[str, Any]) -> str:
+    """What a plot of the beams (n,) shows, how many of them are off its scale, and from where to
+    where it goes along x."""
     values = points.columns[up][rows] * column(up).scale
+    low, high = axes["y"]["range"]
     beyond = int(np.sum((values < low) | (values > high)))
     off = f"; {beyond:,} are beyond the scale" if beyond else ""
+    left, right = axes["x"]["range"]
     return _framed(
-        f'<span data-is="plotted">{len(rows):,} beams{off}. Line: mean of the inliers.</span>'
+        f'<span data-is="plotted" data-low="{left:.6g}" data-high="{right:.6g}">'
+        f"{len(rows):,} beams{off}. Line: mean of the inliers. Drag across the plot to light up "
+        "beams in the room.</span>"
     )
+
+
+def lit(points: Points, kept: np.ndarray, chosen: np.ndarray | None) -> str:
+    """How many beams are lit, of those that are looked at (N,), and how large their residual is."""
+    if chosen is None:
+        return ""
+    some = chosen & kept
+    said = f"{some.sum():,} of {kept.sum():,} beams are lit"
+    return _framed(f'<b data-is="lit">{said}{_residual(points, some & points.inlier)}.</b>')
+
+
+def _residual(points: Points, inliers: np.ndarray) -> str:
+    """How large the residual of some inliers (N,) is."""
+    if not inliers.any():
+        return ", none of which the fit took for an inlier"
+    residual = 1e3 * points.columns["residual_m"][inliers].astype(float)
+    rms = math.sqrt(np.mean(residual**2))
+    return f"; residual of the inliers {rms:.2f} mm rms, {residual.mean():+.2f} mm mean"
 
 
 def moved(run: Run) -> str:
@@ -88,13 +112,7 @@ def _beams(points: Points | None, drawn: int, stop: str) -> str:
         return f"Stop {escape(stop)} has no scan in this fit."
     here = len(points.inlier)
     some = "" if here == points.measured else f", {here:,} of them looked at"
-    if not points.inlier.any():
-        return f"{points.measured:,} beams{some}, none of which the fit took for an inlier."
-    residual = 1e3 * points.columns["residual_m"][points.inlier].astype(float)
-    return (
-        f"{points.measured:,} beams{some}, {drawn:,} drawn; residual of the inliers "
-        f"{math.sqrt(np.mean(residual**2)):.2f} mm rms, {residual.mean():+.2f} mm mean"
-    )
+    return f"{points.measured:,} beams{some}, {drawn:,} drawn{_residual(points, points.inlier)}"
 
 
 def _misfit(ratios: Mapping[str, float]) -> str:
@@ -108,26 +126,33 @@ def _misfit(ratios: Mapping[str, float]) -> str:
     return f'<div data-is="misfit">Residuals over their sigmas: {cells}</div>' if cells else ""
 
 
-def point(points: Points, index: int, label_names: Mapping[int, str]) -> str:
-    """All that is known of one point."""
+def point(points: Points, index: int, names: Mapping[str, Mapping[int, str]]) -> str:
+    """All that is known of one beam: its residual, and every column.
 
-    def told(name: str, digits: int) -> str:
-        shown = column(name)
-        return f"{points.columns[name][index] * shown.scale:.{digits}f} {shown.unit}".strip()
+    Args:
+        points: the beams.
+        index: of the beam.
+        names: what the numbers of columns stand for.
+    """
+
+    def told(name: str) -> str:
+        value, shown = points.columns[name][index], column(name)
+        if name in names:
+            return names[name].get(int(value), f"{shown.title} {int(value)}")
+        value = float(value) * shown.scale
+        digits = DIGITS.get(shown.unit, 4)
+        text = f"{value:.{digits}f}" if shown.unit else f"{value:.6g}"
+        return f"{text} {shown.unit}".strip()
 
     sigma = f"{1e3 * points.columns['sigma_m'][index]:.2f} mm"
     residual = f"{1e3 * points.columns['residual_m'][index]:+.2f} ± {sigma}"
     rows = {
         "residual": residual + ("" if points.inlier[index] else ", outlier"),
-        "range": told("range_m", 3),
-        "ring, column": f"{told('ring', 0)}, {told('column', 0)}",
-        "incidence": told("incidence_rad", 1),
+        "ring, column": f"{told('ring')}, {told('column')}",
     }
-    if "label" in points.columns:
-        number = int(points.columns["label"][index])
-        rows["label"] = label_names.get(number, f"label {number}")
-    if np.isfinite(points.columns.get("intensity", np.array([np.nan]))[0]):
-        rows["intensity"] = told("intensity", 3)
+    rest = [n for n in choices(points) if n not in ("residual_m", "sigma_m", "ring", "column")]
+    known = (n for n in rest if np.isfinite(points.columns[n][index]))
+    rows |= {column(name).title: told(name) for name in known}
     cells = [
         f'<td style="{_QUIET};padding-right:.8em">{escape(name)}</td>'
         f'<td style="padding-right:1.2em">{escape(text)}</td>'

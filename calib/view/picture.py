@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -13,7 +12,7 @@ from calib.runs.run import Run
 from calib.show.misfit import of_stop
 from calib.view import panels
 from calib.view.scene import Points, Scene
-from calib.view.shown import colours, look, plot
+from calib.view.shown import brush, colours, look, plot
 from calib.view.shown.columns import LOCATION, comparable, gathered, kept, location_names
 from calib.view.stage import AXES, NARROW_PX, PLOT_PX, RIG, ROOM, Stage
 from chains.errors import InputError
@@ -42,9 +41,10 @@ class Picture:
         self._client, self._guarded, self._asks = client, guarded, dict(asks)
         self._columns: dict[str, str] = {}  # heading -> column
         self._others: dict[str, Run] = {}
-        self._scales = _read_scales(asks.get("scales", ""))
+        self._scales = look.read_scales(asks.get("scales", ""))
         self._known: tuple[Any, ...] = ()  # what the points were gathered for
         self._kept = np.zeros(0, bool)
+        self._clicked: int | None = None  # index of a beam
         self._add_menus()
         self._add_plot()
         client.scene.on_click()(guarded(self._on_point, with_event=True))
@@ -87,10 +87,14 @@ class Picture:
             self._lock = gui.add_checkbox("Keep scales", locked, hint="Off: as the beams are")
             self._lock.on_update(self._guarded(self._on_lock))
             self._up = self._menu("Plot", self._draw_plot)
-            self._over = self._menu("Over", self._draw_plot)
+            self._over = self._menu("Over", self._on_over)
+            lit = self._asks.get("lit", "")
+            self._light = gui.add_text(brush.LABEL, lit, hint=brush.HINT)
+            self._light.on_update(self._guarded(self._paint))
             self._plot = gui.add_uplot(
                 *plot.EMPTY,
                 scales={"x": {"time": False}},
+                cursor={"drag": {"setScale": False, "x": True}},
                 legend={"show": False},
                 height=PLOT_HEIGHT_PX,
             )
@@ -118,10 +122,11 @@ class Picture:
             "stops": "" if self._stops.value == THIS else self._stops.value,
             "other": self._other.value if self._other.visible else "",
             "colour": column(self._colour.value, ""),
-            "scales": _write_scales(self._scales) if self._lock.value else FREE,
+            "scales": look.write_scales(self._scales) if self._lock.value else FREE,
             "only": self._only.value,
             "up": column(self._up.value, ""),
             "over": column(self._over.value, ""),
+            "lit": self._light.value,
             "below": f"{self._below.value:.2f}",
             "camera": ",".join(f"{x:.6g}" for x in np.round(self.stage.camera(), 3) + 0.0),
         }
@@ -203,6 +208,7 @@ class Picture:
         else:
             points = self.stage.points
         self.stage.show(at, stop, points)
+        self._clicked = None
         for widget in (self._below, self._colour, self._up, self._over, self._plot):
             widget.visible = points is not None
         self._point.content = panels.note(CLICK) if points else ""
@@ -272,22 +278,40 @@ class Picture:
         name = self._columns[self._colour.value]
         ends = None if name in colours.NAMES else self._ends(name)
         colour, scale = colours.coloured(points, name, self._names(name), ends)
-        drawn = self.stage.paint(colour, self._below.value + 0.01, self._kept)
+        lit = self._lit
+        if lit is not None:
+            colour[~lit] = brush.UNLIT
+        drawn = self.stage.paint(colour, self._below.value + 0.01, self._kept, lit)
         self._legend.content = panels.legend(scale)
         self._tell_scan(points, drawn)
         self._colours = colour
         self._draw_plot()
 
+    def _on_over(self) -> None:
+        self._light.value = ""  # a range of another column
+        self._paint()
+
+    @property
+    def _lit(self) -> np.ndarray | None:
+        """Which beams (N,) are lit; None where no range was chosen."""
+        between = brush.ends(self._light.value)
+        if between is None:
+            return None
+        return brush.within(self.stage.points, self._columns[self._over.value], between)
+
     def _draw_plot(self) -> None:
         up, over = (self._columns[menu.value] for menu in (self._up, self._over))
         rows = np.flatnonzero(self._kept)
         low, high = self._ends(up)
-        points = self.stage.points
-        data, series = plot.chart(points, rows, up, over, self._colours)
+        points, lit = self.stage.points, self._lit
+        beside = {"lit": lit, "marked": self._clicked}
+        data, series = plot.chart(points, rows, up, over, self._colours, **beside)
+        axes = plot.axes(data[0], low, high)
         with self._client.atomic():
-            self._plot.scales = plot.axes(data[0], low, high)
+            self._plot.scales = axes
             self._plot.data, self._plot.series = data, series
-        self._told.content = panels.plotted(points, rows, up, low, high)
+        told = panels.plotted(points, rows, up, axes)
+        self._told.content = told + panels.lit(points, self._kept, lit)
 
     def _tell_scan(self, points: Points | None, drawn: int) -> None:
         stop, names = self.stop.value, recording_names(self.stage.scene.sources)
@@ -302,7 +326,10 @@ class Picture:
     def _on_point(self, event: Any) -> None:
         index = self.stage.pick(np.array(event.ray_origin), np.array(event.ray_direction))
         if index is not None:
-            self._point.content = panels.point(self.stage.points, index, self._names("label"))
+            names = {name: self._names(name) for name in colours.NAMES}
+            self._point.content = panels.point(self.stage.points, index, names)
+            self._clicked = index
+            self._draw_plot()
 
     @property
     def _at(self) -> int:
@@ -329,17 +356,3 @@ class Picture:
         menu.value = chosen if chosen in options else options[0]
         if asked in options:
             del self._asks[key]
-
-
-def _read_scales(text: str) -> dict[str, tuple[float, float]]:
-    found = {}
-    for part in text.split(","):
-        name, _, ends = part.partition(":")
-        numbers = look.numbers(ends.replace(":", ","), 2)
-        if re.fullmatch(r"[\w.]+", name) and numbers and numbers[0] < numbers[1]:
-            found[name] = numbers
-    return found
-
-
-def _write_scales(scales: Mapping[str, tuple[float, float]]) -> str:
-    return ",".join(f"{name}:{low:.6g}:{high:.6g}" for name, (low, high) in scales.items())

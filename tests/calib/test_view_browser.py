@@ -156,7 +156,14 @@ def test_a_click_reads_the_point_that_it_meets(small):
             rows, found, off = clicked()
         assert float(rows["range"].split()[0]) == pytest.approx(columns["range_m"][found], abs=1e-3)
         assert rows["residual"].startswith(f"{1e3 * columns['residual_m'][found]:+.2f}")
-        assert set(rows) == {"residual", "ring, column", "range", "incidence", "label", "intensity"}
+        assert {"incidence", "label", "intensity", "temperature", "humidity", "location"} <= set(
+            rows
+        )
+        stop = page.picture.stage.scene.sources[0].recording
+        here = stop.stops.index(page.picture.stop.value)
+        said = float(rows["temperature"].split()[0])
+        assert said == pytest.approx(stop.covariates["temperature_c"][here], abs=0.01)
+        assert page.picture._plot.series[-2]["label"] == "clicked"  # in the plot too
 
 
 def test_stops_and_colours_are_chosen(small):

@@ -1,0 +1,116 @@
+"""What the workbench answers: which beams a part of a plot is of, and which a point is."""
+
+import re
+
+import numpy as np
+import pytest
+
+from calib.runs.run import Run
+from calib.view.scene import Points
+from calib.view.shown import brush, plot
+from sensors.recording import read_table
+from tests.browser import Watched
+from tests.calib.viewed import diagnosed, small_run
+from tests.calib.workbench import choose, field, shown
+
+TABLES = "residuals.parquet"
+
+
+@pytest.fixture(scope="module")
+def run(once) -> Run:
+    run = Run.open(once(small_run) / "run")
+    diagnosed(run.folder)
+    return run
+
+
+def cloud(**columns: np.ndarray) -> Points:
+    count = len(next(iter(columns.values())))
+    return Points(np.zeros((count, 3)), np.zeros(3), {"weight": np.ones(count)} | columns, count)
+
+
+# ----------------------------------------------------------------------------------------- a brush
+
+
+def test_a_range_is_two_numbers_in_any_order_and_nothing_else():
+    for text in ("1.5 to 20", " 20to1.5 ", "20, 1.5", "1.5e0 to +2e1"):
+        assert brush.ends(text) == (1.5, 20.0)
+    assert brush.ends("-3 to -1") == (-3.0, -1.0)
+    for text in ("", "3", "3 to", "2 to 2", "a to b", "1.2.3 to 4", "1 to 2 to 3", "nan to 1"):
+        assert brush.ends(text) is None
+
+
+def test_beams_are_within_a_range_in_the_unit_that_is_shown():
+    points = cloud(incidence_rad=np.radians([10.0, 20.0, 30.0, np.nan]))
+    assert list(brush.within(points, "incidence_rad", (15.0, 30.5))) == [False, True, True, False]
+
+
+def test_dots_that_are_not_lit_are_faint_and_one_has_a_ring():
+    rng = np.random.default_rng(1)
+    points = cloud(range_m=rng.uniform(0, 9, 400), residual_m=rng.normal(0, 1e-3, 400))
+    lit, rows = points.columns["range_m"] < 3, np.arange(1, 400)
+    rgb = np.full((400, 3), 90, np.uint8)
+    beside = {"lit": lit, "marked": 7}
+    (x, *drawn, _), series = plot.chart(points, rows, "residual_m", "range_m", rgb, **beside)
+    faint, bright, ring = ({*x[np.isfinite(each)]} for each in drawn)
+    assert series[1]["points"]["fill"] == plot.FAINT and series[2]["points"]["fill"] == "#5a5a5a"
+    assert faint == {*points.columns["range_m"][rows][~lit[rows]]}
+    assert bright == {*points.columns["range_m"][rows][lit[rows]]}
+    assert ring == {points.columns["range_m"][7]} and series[3]["points"]["stroke"] == plot.RING
+    _, series = plot.chart(points, rows, "residual_m", "range_m", rgb, lit=lit, marked=0)
+    assert len(series) == 4  # the marked beam is not among those that are looked at
+
+
+def dragged(watched: Watched, start: float, end: float) -> None:
+    """Drag across the plot of beams, from one share of its width to another."""
+    box = watched.page.locator(".u-over").first.bounding_box()
+    xs, y = [box["x"] + share * box["width"] for share in (start, end)], box["y"] + 80
+    watched.page.mouse.move(xs[0], y)
+    watched.page.mouse.down()
+    watched.page.mouse.move(xs[1], y, steps=5)
+    watched.page.mouse.up()
+
+
+@pytest.mark.slow
+def test_a_part_of_the_plot_lights_its_beams_in_the_room(run):
+    """By dragging and by writing; how many they are and how far off is told; a link keeps it."""
+    table = read_table(run.folder / TABLES / "L00P00.parquet")
+    with shown(run.folder) as (watched, page):
+        tab, stage = watched.page, page.picture.stage
+        choose(watched, "Over", "ring")
+        tab.wait_for_url(re.compile("over=ring"))
+        dragged(watched, 0.25, 0.6)
+        told = tab.locator("[data-is=lit]")
+        told.wait_for()
+        low, high = brush.ends(field(watched, "Light up").input_value())
+        ring = table["ring"]
+        room = 0.03 * np.ptp(ring)  # to either side of the plot
+        span = np.ptp(ring) + 2 * room
+        assert low == pytest.approx(ring.min() - room + 0.25 * span, abs=0.02 * span)
+        assert high == pytest.approx(ring.min() - room + 0.6 * span, abs=0.02 * span)
+
+        def answer(low: float, high: float) -> str:
+            some = (table["ring"] >= low) & (table["ring"] <= high)
+            residual = 1e3 * table["residual_m"][some & (table["weight"] > 0)].astype(float)
+            rms, mean = np.sqrt(np.mean(residual**2)), residual.mean()
+            return (
+                f"{some.sum():,} of {len(ring):,} beams are lit; residual of the inliers "
+                f"{rms:.2f} mm rms, {mean:+.2f} mm mean."
+            )
+
+        assert told.inner_text() == answer(low, high)
+        field(watched, "Light up").fill("10 to 90")
+        told.get_by_text(answer(10, 90)).wait_for()
+        lit = stage.client.scene.get_handle_by_name("/lit")
+        unlit = stage.client.scene.get_handle_by_name("/points")
+        there = stage.points.columns["ring"][stage.shown]
+        assert len(lit.points) == ((there >= 10) & (there <= 90)).sum()
+        assert len(unlit.points) == len(there) - len(lit.points)
+        assert np.unique(unlit.colors, axis=0).tolist() == [list(brush.UNLIT)]
+        tab.wait_for_url(re.compile("lit=10%20to%2090"))
+        link = tab.url
+        tab.goto("about:blank")
+        tab.goto(link)
+        told.get_by_text(answer(10, 90)).wait_for()
+        choose(watched, "Over", "range, m")  # of which that is no range
+        told.wait_for(state="hidden")
+        assert field(watched, "Light up").input_value() == ""
