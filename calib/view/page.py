@@ -22,6 +22,7 @@ from calib.view.leave_out import LeaveOut
 from calib.view.picture import NOTHING, Picture
 from calib.view.server import Visitor
 from calib.view.shown import brush, colours, look
+from calib.view.shown.moves import parameters
 from calib.view.stage import PANEL_PX
 from chains.errors import InputError
 
@@ -117,6 +118,8 @@ class Page:
         with self.client.gui.add_folder("Ladder"):
             self._ladder = self.client.gui.add_html("")
             self._undo = self.client.gui.add_button("Undo", hint="Back to the run below")
+        with self.client.gui.add_folder("Parameters", expand_by_default=False):
+            self._parameters = self.client.gui.add_html("")
         self._undo.on_click(self._guarded(self._on_undo))
 
     def _menu(self, label: str, options: list[str], use: Callable[[], None]) -> Any:
@@ -174,6 +177,7 @@ class Page:
         self._ladder.content = "".join(
             (panels.moved(desk.run), panels.ladder(desk.rungs()), panels.standing_out(desk.run))
         )
+        self._parameters.content = panels.framed(parameters(desk.run))
         self._undo.disabled = desk.rungs()[-1].below is None
         self._show_findings()
         self._tell(f"Reading the recordings of {desk.chosen} …")

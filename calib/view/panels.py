@@ -17,6 +17,7 @@ from calib.show.headline import moved_sentence
 from calib.view.desk import Findings
 from calib.view.scene import Points
 from calib.view.shown.colours import Scale, choices, column
+from calib.view.shown.moves import Move
 from chains.escape import html as escape
 
 SHOWN_CANDIDATES = 6  # candidates in the table; the menu has all
@@ -37,7 +38,7 @@ def legend(scale: Scale) -> str:
             f'width:.8em;height:.8em;background:{colour}"></span> {escape(name)}</span>'
             for name, colour in scale.names.items()
         )
-        return _framed(items)
+        return framed(items)
     middle, unit = (scale.low + scale.high) / 2, f" {scale.unit}" if scale.unit else ""
     sign = "+" if scale.signed else ""
     ends = [f"{value:{sign if value else ''}.3g}" for value in (scale.low, middle, scale.high)]
@@ -48,7 +49,7 @@ def legend(scale: Scale) -> str:
         ends = [f"{end}{unit}" for end in ends]
     bar = f"height:.9em;background:linear-gradient(to right,{','.join(scale.stops)})"
     texts = "".join(f"<span>{escape(end)}</span>" for end in ends)
-    return _framed(
+    return framed(
         f'<div style="{bar}"></div>'
         f'<div style="display:flex;justify-content:space-between">{texts}</div>'
     )
@@ -57,7 +58,7 @@ def legend(scale: Scale) -> str:
 def scan(points: Points | None, drawn: int, stop: str, ratios: Mapping[str, float]) -> str:
     """What the stop's beams say, all of them, however few are drawn; and how large residuals of all
     that was measured there are, over their sigmas."""
-    return _framed(_beams(points, drawn, stop) + _misfit(ratios))
+    return framed(_beams(points, drawn, stop) + _misfit(ratios))
 
 
 def plotted(points: Points, rows: np.ndarray, up: str, axes: Mapping[str, Any]) -> str:
@@ -68,7 +69,7 @@ def plotted(points: Points, rows: np.ndarray, up: str, axes: Mapping[str, Any]) 
     beyond = int(np.sum((values < low) | (values > high)))
     off = f"; {beyond:,} are beyond the scale" if beyond else ""
     left, right = axes["x"]["range"]
-    return _framed(
+    return framed(
         f'<span data-is="plotted" data-low="{left:.6g}" data-high="{right:.6g}">'
         f"{len(rows):,} beams{off}. Line: mean of the inliers. Drag across the plot to light up "
         "beams in the room.</span>"
@@ -81,7 +82,7 @@ def lit(points: Points, kept: np.ndarray, chosen: np.ndarray | None) -> str:
         return ""
     some = chosen & kept
     said = f"{some.sum():,} of {kept.sum():,} beams are lit"
-    return _framed(f'<b data-is="lit">{said}{_residual(points, some & points.inlier)}.</b>')
+    return framed(f'<b data-is="lit">{said}{_residual(points, some & points.inlier)}.</b>')
 
 
 def _residual(points: Points, inliers: np.ndarray) -> str:
@@ -97,14 +98,14 @@ def moved(run: Run) -> str:
     """What moved since the run that was its prior; nothing where there was none."""
     links = run.summary.get("links")
     told = f"Since the earlier run: {moved_sentence(links)}" if links else ""
-    return _framed(f'<p data-is="moved"><b>{escape(told)}</b></p>') if told else ""
+    return framed(f'<p data-is="moved"><b>{escape(told)}</b></p>') if told else ""
 
 
 def standing_out(run: Run) -> str:
     """What of the run does not fit; nothing where nothing stands out."""
     lines = "".join(f"<li>{escape(line)}</li>" for line in misfit.standing_out(run.summary))
     title = '<b style="color:#b3261e">What does not fit</b>'
-    return _framed(f'{title}<ul data-is="misfits">{lines}</ul>') if lines else ""
+    return framed(f'{title}<ul data-is="misfits">{lines}</ul>') if lines else ""
 
 
 def _beams(points: Points | None, drawn: int, stop: str) -> str:
@@ -159,13 +160,23 @@ def point(points: Points, index: int, names: Mapping[str, Mapping[int, str]]) ->
         for name, text in rows.items()
     ]
     pairs = "".join(f"<tr>{''.join(cells[i : i + 2])}</tr>" for i in range(0, len(cells), 2))
-    return _framed(f'<table data-is="point">{pairs}</table>')
+    return framed(f'<table data-is="point">{pairs}</table>')
+
+
+def moves(found: Sequence[Move]) -> str:
+    """How far every link stands from CAD, those that are hardly chance in bold."""
+    lines = "".join(
+        f'<div style="{"font-weight:600" if move.sure else _QUIET}">{escape(move.text)}</div>'
+        for move in found
+    )
+    said = lines or "No link was estimated against CAD."
+    return framed(f'<div data-is="moves">{said}</div>')
 
 
 def findings(diagnosed: Findings | None) -> str:
     """The verdict in sentences, and the candidates in their order."""
     if diagnosed is None:
-        return _framed("This run has not been diagnosed.")
+        return framed("This run has not been diagnosed.")
     above = {each["sentence"] for each in diagnosed.blunders}  # listed with their buttons
     sentences = "".join(
         f'<p style="margin:.3em 0">{escape(text)}</p>'
@@ -173,13 +184,13 @@ def findings(diagnosed: Findings | None) -> str:
         if text not in above
     )
     verdict = escape(f"Verdict: {diagnosed.heading}")
-    return _framed(f'<b data-is="verdict">{verdict}</b>{sentences}{_candidates(diagnosed)}')
+    return framed(f'<b data-is="verdict">{verdict}</b>{sentences}{_candidates(diagnosed)}')
 
 
 def formulas(diagnosed: Findings | None) -> str:
     """A picture for each formula: what was measured, the formula, and what is left."""
     return "".join(
-        _framed(
+        framed(
             f'<div data-is="formula"><b>{escape(chart.title)}</b>'
             f'<div style="background:#fff">{plots.svg(chart.figure(), chart.id)}</div>'
             f'<div style="{_QUIET}">{escape(chart.reading)}</div></div>'
@@ -190,13 +201,13 @@ def formulas(diagnosed: Findings | None) -> str:
 
 def expected(text: str) -> str:
     """What is known of a set of effects before it is fitted."""
-    return _framed(f'<div data-is="expected">{escape(text)}</div>')
+    return framed(f'<div data-is="expected">{escape(text)}</div>')
 
 
 def blunders(found: Sequence[Mapping[str, Any]]) -> str:
     """What is wrong in the recording, in the sentences of the diagnosis."""
     lines = "".join(f'<li style="margin:.3em 0">{escape(b["sentence"])}</li>' for b in found)
-    return _framed(f'<ul data-is="blunders" style="margin:0;padding-left:1.2em">{lines}</ul>')
+    return framed(f'<ul data-is="blunders" style="margin:0;padding-left:1.2em">{lines}</ul>')
 
 
 def _candidates(diagnosed: Findings) -> str:
@@ -253,7 +264,7 @@ def ladder(rungs: Sequence[Rung]) -> str:
         for sentence in rungs[-1].run.warning
     )
     picture = f'<div data-is="ladder">{rows}</div><div style="{_QUIET}">{said}</div>'
-    return _framed(warning + picture)
+    return framed(warning + picture)
 
 
 def _error(rung: Rung) -> tuple[float, str]:
@@ -298,5 +309,6 @@ def new_run(rung: Rung) -> str:
     return f"{made} Error of stops held out: {below:.2f} → {here:.2f} mm."
 
 
-def _framed(inner: str) -> str:
+def framed(inner: str) -> str:
+    """HTML as it stands in the panel."""
     return f'<div style="{_FRAME}">{inner}</div>'

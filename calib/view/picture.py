@@ -14,7 +14,8 @@ from calib.view import panels
 from calib.view.scene import Points, Scene
 from calib.view.shown import brush, colours, look, plot
 from calib.view.shown.columns import LOCATION, comparable, gathered, kept, location_names
-from calib.view.stage import AXES, NARROW_PX, PLOT_PX, RIG, ROOM, Stage
+from calib.view.shown.moves import SURE, TIMES
+from calib.view.stage import AXES, MOVES, NARROW_PX, PLOT_PX, RIG, ROOM, Stage
 from chains.errors import InputError
 
 NOTHING = "—"
@@ -23,6 +24,10 @@ CLICK = "Click a point to read it. Keys: N next stop, P previous stop."
 ONLY = "A formula, e.g. (range > 3) * (abs(residual) > 0.002); metres, radians. * is and"
 PLOT_HEIGHT_PX = 300
 FREE = "free"
+MOVES_LABEL = f"Moves, {TIMES} times"
+MOVES_HINT = (
+    f"How far each link stands from CAD, {TIMES} times as long; grey: less than {SURE:.0f} sigmas"
+)
 
 
 class Picture:
@@ -47,6 +52,7 @@ class Picture:
         self._clicked: int | None = None  # index of a beam
         self._add_menus()
         self._add_plot()
+        self._on_moves()
         client.scene.on_click()(guarded(self._on_point, with_event=True))
         for key, step, name in (("N", 1, "Next stop"), ("P", -1, "Previous stop")):
             command = client.gui.add_command(name, hotkey=key)
@@ -66,6 +72,9 @@ class Picture:
         self._below.on_update(self._guarded(self._paint))
         self._what = gui.add_button_group("Hide, show", ("room", "rig", "frames"))
         self._what.on_click(self._guarded(self._on_what))
+        self._moves = gui.add_checkbox(MOVES_LABEL, bool(self._asks.get("moves")), hint=MOVES_HINT)
+        self._moves.on_update(self._guarded(self._on_moves))
+        self._moved = gui.add_html("", visible=False)
         self._scan = gui.add_html("")
         self._point = gui.add_html(panels.note(CLICK))
 
@@ -127,6 +136,7 @@ class Picture:
             "up": column(self._up.value, ""),
             "over": column(self._over.value, ""),
             "lit": self._light.value,
+            "moves": "1" if self._moves.value else "",
             "below": f"{self._below.value:.2f}",
             "camera": ",".join(f"{x:.6g}" for x in np.round(self.stage.camera(), 3) + 0.0),
         }
@@ -208,6 +218,7 @@ class Picture:
         else:
             points = self.stage.points
         self.stage.show(at, stop, points)
+        self._moved.content = panels.moves(self.stage.moves)
         self._clicked = None
         for widget in (self._below, self._colour, self._up, self._over, self._plot):
             widget.visible = points is not None
@@ -322,6 +333,11 @@ class Picture:
 
     def _on_what(self) -> None:
         self.stage.toggle({"room": ROOM, "rig": RIG, "frames": AXES}[self._what.value])
+
+    def _on_moves(self) -> None:
+        if self._moves.value == (MOVES in self.stage.hidden):
+            self.stage.toggle(MOVES)
+        self._moved.visible = self._moves.value
 
     def _on_point(self, event: Any) -> None:
         index = self.stage.pick(np.array(event.ray_origin), np.array(event.ray_direction))

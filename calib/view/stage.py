@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from calib.view import scene as scenes
 from calib.view.scene import Points, Scene
+from calib.view.shown.moves import TIMES, Move, moves
 from chains import se3
 
-ROOM, RIG, AXES, POINTS, LIT, PICKED = "/room", "/rig", "/axes", "/points", "/lit", "/picked"
+ROOM, RIG, AXES, MOVES = "/room", "/rig", "/axes", "/moves"
+POINTS, LIT, PICKED = "/points", "/lit", "/picked"
 ARM_COLOUR, MOUNT_COLOUR, ROOM_COLOUR = (60, 70, 85), (150, 155, 165), (236, 236, 232)
+SURE_COLOUR, UNSURE_COLOUR = (200, 30, 120), (150, 155, 165)  # of moves from CAD
+HEAD_M = 0.06  # of an arrow that is long enough
 THICK_M, THIN_M = 0.05, 0.015
 FINEST_M, COARSEST = 0.006, 1 / 350  # of a point: metres, and a share of the room
 LARGER = 1.4  # points that are lit, among others
@@ -36,16 +41,17 @@ class Stage:
         self.scene: Scene | None = None
         self.points: Points | None = None
         self.shown = np.zeros(0, int)
+        self.moves: Sequence[Move] = ()
         self._middle_m = np.zeros(3)
         self._room: tuple[str, str] | None = None
         self._around: np.ndarray | None = None
-        self.hidden: set[str] = set()
+        self.hidden = {MOVES}
         client.scene.configure_default_lights(cast_shadow=False)
 
     def clear(self) -> None:
         """Draw nothing."""
         self.scene, self.points, self._room = None, None, None
-        for name in (ROOM, RIG, AXES, POINTS, LIT, PICKED):
+        for name in (ROOM, RIG, AXES, MOVES, POINTS, LIT, PICKED):
             self.client.scene.remove_by_name(name)
 
     def open(self, scene: Scene, recording: int) -> None:
@@ -77,6 +83,8 @@ class Stage:
         """Draw the rig at a stop, and take these points, which `paint` draws."""
         self.client.scene.remove_by_name(PICKED)
         self._draw_rig(recording, stop)
+        self.moves = moves(self.scene, recording, stop)
+        self._draw_moves()
         self.points = points
         if points is None:
             for name in (POINTS, LIT):
@@ -176,8 +184,33 @@ class Stage:
                 f"{AXES}/{name}/name", name, font_size_mode="scene", font_scene_height=LETTER_M
             )
 
+    def _draw_moves(self) -> None:
+        """An arrow for each link, those that are hardly chance in their colour."""
+        scene = self.client.scene
+        scene.remove_by_name(MOVES)
+        scene.add_frame(MOVES, show_axes=False, visible=MOVES not in self.hidden)
+        for i, move in enumerate(self.moves):
+            arrow = move.arrow_m - self._middle_m
+            head = min(HEAD_M, TIMES * move.length_m / 2)
+            scene.add_arrows(
+                f"{MOVES}/{i}",
+                arrow[None],
+                SURE_COLOUR if move.sure else UNSURE_COLOUR,
+                shaft_radius=head / 6,
+                head_radius=head / 2.5,
+                head_length=head,
+            )
+            if move.sure:  # others are short, and their names would hide each other
+                scene.add_label(
+                    f"{MOVES}/{i}/name",
+                    move.text,
+                    position=arrow[1],
+                    font_size_mode="scene",
+                    font_scene_height=LETTER_M,
+                )
+
     def toggle(self, name: str) -> None:
-        """Hide the room, the rig or its axes; or show it again."""
+        """Hide the room, the rig, its axes or its moves; or show it again."""
         self.hidden ^= {name}
         node = self.client.scene.get_handle_by_name(name)
         if node is not None:

@@ -1,13 +1,16 @@
-"""What the workbench answers: which beams a part of a plot is of, and which a point is."""
+"""What the workbench answers: which beams a part of a plot is of, and how far its links moved."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from calib.runs.run import Run
-from calib.view.scene import Points
+from calib.view import panels
+from calib.view.scene import Points, Scene
 from calib.view.shown import brush, plot
+from calib.view.shown.moves import Move, moves, parameters
 from sensors.recording import read_table
 from tests.browser import Watched
 from tests.calib.viewed import diagnosed, small_run
@@ -114,3 +117,64 @@ def test_a_part_of_the_plot_lights_its_beams_in_the_room(run):
         choose(watched, "Over", "range, m")  # of which that is no range
         told.wait_for(state="hidden")
         assert field(watched, "Light up").input_value() == ""
+
+
+# ---------------------------------------------------------------------------------- moves from CAD
+
+
+def test_an_arrow_leads_from_where_cad_has_a_link_and_its_sigma_is_the_runs(run):
+    """Whatever effects have moved it: where it is, less where CAD has it in its parent."""
+    scene, solution = Scene.of(run), run.solution
+    edges = {edge.name: edge for edge in scene.sources[0].rig.tree.edges}
+    for stop in scene.stops(0):
+        found = {move.link: move for move in moves(scene, 0, stop)}
+        assert {"lidar", "mount", "joint_3"} <= set(found) and "joint_2" not in found
+        for name, move in found.items():
+            parent, T_cad = scene.place(0, stop, edges[name].parent), edges[name].T_parent_child
+            wanted = scene.place(0, stop, edges[name].child)[:3, 3] - (parent @ T_cad)[:3, 3]
+            np.testing.assert_allclose(move.move_m, wanted, atol=1e-12)
+            np.testing.assert_allclose(np.diff(move.arrow_m, axis=0)[0], 100 * wanted, atol=1e-10)
+    # CAD's sigma of this frame is the same along all axes, and the fit's nearly so.
+    sigma_m = solution.shared.frames["lidar"].sigma_m
+    assert sigma_m.min() * 0.999 <= found["lidar"].sigma_m <= sigma_m.max() * 1.001
+    lengths = solution.shared.effects["arm_link_length"]
+    k = lengths.names.index("joint_3")
+    assert found["joint_3"].sigma_m == pytest.approx(lengths.sigma[k])
+    assert found["joint_3"].length_m == pytest.approx(abs(lengths.estimate[k]))
+
+
+def test_a_move_is_told_with_its_sigma_and_whether_it_is_chance():
+    move = Move("a<b", np.zeros(3), np.array([0, 3e-3, 4e-3]), 1e-3)
+    assert move.sure and move.text == "a<b: 5.00 ± 1.00 mm"
+    assert not replace(move, sigma_m=3e-3).sure and not replace(move, sigma_m=np.nan).sure
+    assert replace(move, sigma_m=np.nan).text == "a<b: 5.00 mm"
+    assert "a&lt;b" in panels.moves([move]) and "No link" in panels.moves([])
+
+
+def test_every_parameter_is_listed_with_its_sigma(run):
+    html = parameters(run)
+    cells = re.findall(r"<td[^>]*>(.*?)</td>", html.partition("<b>lidar</b> in mount, from CAD")[2])
+    i = run.solution.names.index("lidar.rx")
+    sigma_rad = np.sqrt(run.solution.covariance[i, i])
+    assert cells[0] == "rx" and cells[1].endswith(f"± {1e3 * sigma_rad:.2f} mrad")
+    assert "<b>faro</b> in opti, no CAD" in html and "128 values" in html
+
+
+@pytest.mark.slow
+def test_arrows_are_drawn_where_they_are_ticked(run):
+    with shown(run.folder) as (watched, page):
+        arrows = page.client.scene.get_handle_by_name("/moves")
+        assert not arrows.visible
+        field(watched, "Moves, 100 times").check(force=True)
+        watched.page.wait_for_url(re.compile("moves=1"))
+        assert arrows.visible
+        found = page.picture.stage.moves
+        told = watched.page.locator("[data-is=moves] div").all_inner_texts()
+        assert told == [move.text for move in found] and len(told) > 5
+        drawn = page.client.scene.get_handle_by_name("/moves/0").points[0]
+        assert np.linalg.norm(drawn[1] - drawn[0]) == pytest.approx(100 * found[0].length_m)
+        watched.page.keyboard.press("n")
+        watched.page.wait_for_url(re.compile("stop=L00P01"))
+        assert page.client.scene.get_handle_by_name("/moves").visible
+        watched.page.reload()
+        watched.page.locator("[data-is=moves]").wait_for()
