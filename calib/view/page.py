@@ -23,11 +23,13 @@ from calib.view.picture import NOTHING, Picture
 from calib.view.server import Visitor
 from calib.view.shown import brush, colours, look
 from calib.view.shown.moves import parameters
+from calib.view.shown.taken import extrinsics_zip
 from calib.view.stage import PANEL_PX
 from chains.errors import InputError
 
 CURVE_PX = 180
 SETTLED_S = 0.4  # the camera rests for so long before the address tells where it is
+TAKE_HINT = "What 'rigcal export' writes of this run, in all formats, as a zip"
 LOOKS = "Opened to look at: this address cannot change anything."
 
 
@@ -120,6 +122,8 @@ class Page:
             self._undo = self.client.gui.add_button("Undo", hint="Back to the run below")
         with self.client.gui.add_folder("Parameters", expand_by_default=False):
             self._parameters = self.client.gui.add_html("")
+        self._take = self.client.gui.add_button("Extrinsics as zip", hint=TAKE_HINT, color="gray")
+        self._take.on_click(self._guarded(self._on_take))
         self._undo.on_click(self._guarded(self._on_undo))
 
     def _menu(self, label: str, options: list[str], use: Callable[[], None]) -> Any:
@@ -247,6 +251,11 @@ class Page:
     def _on_leave_out(self, tokens: Sequence[str]) -> None:
         change = Change(self.desk.folder_without(), without=tuple(tokens))
         self._guarded(partial(self._start, change))()
+
+    def _on_take(self) -> None:
+        run = self.desk.run
+        name = f"{run.folder.name}-extrinsics.zip"
+        self.client.send_file_download(name, extrinsics_zip(run), save_immediately=True)
 
     def _on_undo(self) -> None:
         told = self.desk.undo()

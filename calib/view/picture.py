@@ -15,6 +15,7 @@ from calib.view.scene import Points, Scene
 from calib.view.shown import brush, colours, look, plot
 from calib.view.shown.columns import LOCATION, comparable, gathered, kept, location_names
 from calib.view.shown.moves import SURE, TIMES
+from calib.view.shown.taken import beams_csv
 from calib.view.stage import AXES, MOVES, NARROW_PX, PLOT_PX, RIG, ROOM, Stage
 from chains.errors import InputError
 
@@ -24,7 +25,7 @@ CLICK = "Click a point to read it. Keys: N next stop, P previous stop."
 ONLY = "A formula, e.g. (range > 3) * (abs(residual) > 0.002); metres, radians. * is and"
 PLOT_HEIGHT_PX = 300
 FREE = "free"
-MOVES_LABEL = f"Moves, {TIMES} times"
+MOVES_LABEL = f"Moves x {TIMES}"
 MOVES_HINT = (
     f"How far each link stands from CAD, {TIMES} times as long; grey: less than {SURE:.0f} sigmas"
 )
@@ -108,6 +109,8 @@ class Picture:
                 height=PLOT_HEIGHT_PX,
             )
             self._told = gui.add_html("")
+            self._take = gui.add_button("Plot as CSV", hint="The beams of the plot", color="gray")
+            self._take.on_click(self._guarded(self._on_take))
         panel.dock_left()
         panel.set_width(PLOT_PX)
         if self._client.camera.image_width < NARROW_PX:
@@ -323,6 +326,16 @@ class Picture:
             self._plot.data, self._plot.series = data, series
         told = panels.plotted(points, rows, up, axes)
         self._told.content = told + panels.lit(points, self._kept, lit)
+
+    def _on_take(self) -> None:
+        points, menus = self.stage.points, (self._over, self._up, self._colour)
+        if points is None:
+            raise InputError("there are no beams here, so there is no plot to take away")
+        names = [self._columns[menu.value] for menu in menus]
+        lit = np.ones(len(points.xyz_m), bool) if self._lit is None else self._lit
+        table = beams_csv(points, np.flatnonzero(self._kept), names, lit)
+        name = f"{self.stage.scene.run.folder.name}-{names[1]}-over-{names[0]}.csv"
+        self._client.send_file_download(name, table, save_immediately=True)
 
     def _tell_scan(self, points: Points | None, drawn: int) -> None:
         stop, names = self.stop.value, recording_names(self.stage.scene.sources)

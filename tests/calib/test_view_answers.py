@@ -1,20 +1,26 @@
-"""What the workbench answers: which beams a part of a plot is of, and how far its links moved."""
+"""What the workbench answers: beams of a part of a plot, moves of links, and files of both."""
 
+import csv
+import io
 import re
+import zipfile
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from calib.exporters import export
 from calib.runs.run import Run
 from calib.view import panels
 from calib.view.scene import Points, Scene
 from calib.view.shown import brush, plot
 from calib.view.shown.moves import Move, moves, parameters
+from calib.view.shown.taken import beams_csv, extrinsics_zip
 from sensors.recording import read_table
 from tests.browser import Watched
 from tests.calib.viewed import diagnosed, small_run
-from tests.calib.workbench import choose, field, shown
+from tests.calib.workbench import button, choose, field, shown
 
 TABLES = "residuals.parquet"
 
@@ -160,12 +166,47 @@ def test_every_parameter_is_listed_with_its_sigma(run):
     assert "<b>faro</b> in opti, no CAD" in html and "128 values" in html
 
 
+# --------------------------------------------------------------------------------- taken away
+
+
+def test_a_plot_is_taken_away_with_its_units_and_says_what_is_lit(tmp_path):
+    columns = {"range_m": np.array([1.0, 2.0, np.nan]), "residual_m": np.array([1e-3, 0, -2e-3])}
+    points = cloud(**columns, ring=np.arange(3), **{"=nan()": np.arange(3.0)})
+    points.columns["weight"][1] = 0
+    (tmp_path / "a.csv").write_bytes(
+        beams_csv(
+            points,
+            np.array([0, 1, 2]),
+            ["range_m", "residual_m", "=nan()", "range_m"],
+            np.array([True, True, False]),
+        )
+    )
+    with open(tmp_path / "a.csv", newline="") as file:
+        heading, *rows = csv.reader(file)
+    assert heading == ["ring", "range, m", "residual, mm", "'=nan()", "inlier", "lit"]
+    assert rows == [
+        ["0", "1", "1", "0", "1", "1"],
+        ["1", "2", "0", "1", "0", "1"],
+        ["2", "", "-2", "2", "1", "0"],
+    ]
+
+
+def test_extrinsics_are_what_export_writes_and_the_same_bytes_again(run, tmp_path):
+    packed = extrinsics_zip(run)
+    assert packed == extrinsics_zip(run)
+    wanted = {file.name: file.read_bytes() for file in export(run, tmp_path / "out").files}
+    with zipfile.ZipFile(io.BytesIO(packed)) as archive:
+        found = {Path(name).name: archive.read(name) for name in archive.namelist()}
+        assert {Path(name).parent.as_posix() for name in archive.namelist()} == {"extrinsics"}
+    assert found == wanted and "extrinsics.yaml" in found
+
+
 @pytest.mark.slow
-def test_arrows_are_drawn_where_they_are_ticked(run):
+def test_arrows_are_ticked_and_files_are_taken_away(run):
     with shown(run.folder) as (watched, page):
         arrows = page.client.scene.get_handle_by_name("/moves")
         assert not arrows.visible
-        field(watched, "Moves, 100 times").check(force=True)
+        field(watched, "Moves x 100").check(force=True)
         watched.page.wait_for_url(re.compile("moves=1"))
         assert arrows.visible
         found = page.picture.stage.moves
@@ -176,5 +217,17 @@ def test_arrows_are_drawn_where_they_are_ticked(run):
         watched.page.keyboard.press("n")
         watched.page.wait_for_url(re.compile("stop=L00P01"))
         assert page.client.scene.get_handle_by_name("/moves").visible
+        field(watched, "Only where").fill("ring > 40")
+        watched.page.wait_for_url(re.compile("only=ring"))
+        with watched.page.expect_download() as plot_file:
+            button(watched, "Plot as CSV").click()
+        assert plot_file.value.suggested_filename == "run-residual_m-over-range_m.csv"
+        table = np.genfromtxt(plot_file.value.path(), delimiter=",", skip_header=1)
+        points = page.picture.stage.points  # of L00P01
+        rows = points.columns["ring"] > 40
+        np.testing.assert_allclose(table[:, 4], 1e3 * points.columns["residual_m"][rows], 1e-5)
+        with watched.page.expect_download() as archive:
+            button(watched, "Extrinsics as zip").click()
+        assert zipfile.ZipFile(archive.value.path()).testzip() is None
         watched.page.reload()
         watched.page.locator("[data-is=moves]").wait_for()
