@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -101,6 +101,7 @@ def held_out(
     progress: Progress,
     start: Start | None = None,
     keep: Keep = lambda scan, rows: None,
+    fit: Callable[..., Estimate] = solve,
 ) -> Errors:
     """Residuals of stops left out of the fit, their poses told by tracker and arm alone.
 
@@ -112,6 +113,7 @@ def held_out(
         progress: as of `fit.solve`.
         start: a fit of all stops: each fold's fit is near it, and starts from there.
         keep: shown every stop left out and its rows, where there are scans.
+        fit: `solve`, or `stepped` for what is known from one linearisation.
     """
     out = Errors()
     for number, fold in enumerate(folds(sources, by)[:count], 1):
@@ -120,7 +122,7 @@ def held_out(
             progress(f"without fold {number}: {what}", done, total)
 
         trained = problems.build(sources, model, [~left for left in fold])
-        estimate = solve(trained, progress=tell, start=_without_planes(trained, start))
+        estimate = fit(trained, progress=tell, start=_without_planes(trained, start))
         unseen = problems.build(sources, model, fold, trained.meetings)
         unseen = with_spread(unseen, estimate.start.spread)
         out += predict(unseen, trained, estimate, keep)

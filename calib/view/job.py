@@ -13,11 +13,15 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from calib.effects import Trust
 from chains.errors import InputError
 from sensors.documents import write_yaml
+
+if TYPE_CHECKING:
+    from calib.problem.model import Model
+    from calib.runs.run import Run
 
 PATIENCE_S = 10.0  # for a process that was stopped to clean up
 
@@ -121,7 +125,7 @@ def _work(mouth: Connection, run: Path, change: Change | None, trust: Trust) -> 
 
 
 def _study(mouth: Connection, folder: Path, change: Change | None, trust: Trust) -> None:
-    from calib.runs.calibrate import grow, grown_model
+    from calib.runs.calibrate import grow
     from calib.runs.diagnose import diagnose
     from calib.runs.run import Run
 
@@ -130,12 +134,22 @@ def _study(mouth: Connection, folder: Path, change: Change | None, trust: Trust)
 
     run = Run.open(folder, trust)
     if change is not None:
-        with tempfile.TemporaryDirectory() as scratch:
-            model = grown_model(run, list(_named(change.added, Path(scratch))))
-        model = model.minus(change.dropped).leaving_out(change.without)
-        run = grow(run, model, change.out, progress)
+        run = grow(run, changed(run, change), change.out, progress)
         mouth.send(Told("run", str(run.folder)))
     diagnose(run, progress)
+
+
+def changed(run: Run, change: Change) -> Model:
+    """The model of a run with a change.
+
+    Raises:
+        InputError: an effect is unknown, or is there already, or is not there.
+    """
+    from calib.runs.calibrate import grown_model
+
+    with tempfile.TemporaryDirectory() as scratch:
+        model = grown_model(run, list(_named(change.added, Path(scratch))))
+    return model.minus(change.dropped).leaving_out(change.without)
 
 
 def _named(added: Sequence[str | Mapping[str, Any]], scratch: Path) -> Iterator[str]:

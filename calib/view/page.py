@@ -15,6 +15,7 @@ from calib.view import panels
 from calib.view.bench import Bench
 from calib.view.desk import DiagnosisCurve, Findings
 from calib.view.effects import known
+from calib.view.effects.expected import Asked, Expected
 from calib.view.effects.own import OwnFormula, document
 from calib.view.effects.ticks import Ticks
 from calib.view.job import Change, Told
@@ -30,6 +31,7 @@ from chains.errors import InputError
 CURVE_PX = 180
 SETTLED_S = 0.4  # the camera rests for so long before the address tells where it is
 TAKE_HINT = "What 'rigcal export' writes of this run, in all formats, as a zip"
+WORKED_OUT = "What stops held out make of it is being worked out from the linearisation …"
 LOOKS = "Opened to look at: this address cannot change anything."
 
 
@@ -54,6 +56,10 @@ class Page:
         self._address = ""
         self._covariates: dict[str, str] = {}  # heading -> covariate that has a curve
         self._lock = threading.RLock()
+        self._asked: Asked | None = None
+        self._expected = Expected(
+            self.desk.trust, lambda *told: self._guarded(partial(self._on_expected, *told))()
+        )
         gui = client.gui
         gui.main_panel.dock_right()
         gui.main_panel.set_width(PANEL_PX)
@@ -81,6 +87,7 @@ class Page:
     def close(self) -> None:
         """Its browser has gone."""
         self.bench.forget(self._hear)
+        self._expected.stop()
         if self._settling is not None:
             self._settling.cancel()
 
@@ -236,13 +243,32 @@ class Page:
         """Show the curve of what was ticked last; what is known of all that is ticked."""
         self._choose_curve()
         others = {name: run for name, run in self.desk.runs.items() if name != self.desk.chosen}
-        return known.told(self.desk.run, wanted, self.findings, others)
+        told = known.told(self.desk.run, wanted, self.findings, others)
+        self._asked = None
+        before = self.desk.run.summary["rms_mm"]["held_out"]
+        if told.endswith(known.UNKNOWN) and before is not None and self.may_change:
+            self._asked = (
+                self.desk.run.folder,
+                self._change(*known.changed(self.desk.effects, wanted)),
+            )
+            self._expected.ask(*self._asked)
+            told = told.removesuffix(known.UNKNOWN) + WORKED_OUT
+        return told
+
+    def _on_expected(self, asked: Asked, after: float | None) -> None:
+        """Tell what was worked out of the set that is ticked, if it still is."""
+        if asked == self._asked:
+            before = self.desk.run.summary["rms_mm"]["held_out"]
+            self._ticks.tell(known.linearised(before, after))
+
+    def _change(self, added: Mapping[str, Any], dropped: Sequence[str]) -> Change:
+        out = self.desk.folder_for(*added, dropped=dropped)
+        return Change(out, tuple(added.values()), tuple(dropped))
 
     def _on_refit(self, added: Mapping[str, Any], dropped: Sequence[str]) -> None:
         if not added and not dropped:
             raise InputError("these are the effects of the run; tick others, or take a tick away")
-        out = self.desk.folder_for(*added, dropped=dropped)
-        self._start(Change(out, tuple(added.values()), tuple(dropped)))
+        self._start(self._change(added, dropped))
 
     def _on_own(self, text: str, site: str) -> None:
         effect = document(text, site, self.picture.beams(), self.desk.run.effects)

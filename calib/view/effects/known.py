@@ -1,4 +1,5 @@
-"""What is known of a set of effects before it is fitted: from what was fitted already.
+"""What is known of a set of effects before it is fitted: from what was fitted already, or from one
+linearisation.
 
 A diagnosis fits what it names, one effect after another, to all stops but those held out, and says
 what becomes of the error there. A run on the workbench may have the very set.
@@ -51,6 +52,13 @@ def told(run: Run, wanted: Effects, findings: Findings | None, runs: Mapping[str
         if alone is not None:
             return f"It explains {alone:.2f} mm rms of what this fit left. {UNKNOWN}"
     return UNKNOWN
+
+
+def linearised(before: float, after: float | None) -> str:
+    """What is told of an error that one linearisation leads to; None where there is none."""
+    if after is None:
+        return UNKNOWN
+    return f"{_fall(before, after)}, by one step of the linearised fit."
 
 
 def fitted(findings: Findings, before_mm: float) -> dict[frozenset[str], float]:

@@ -100,7 +100,11 @@ class Ticks:
             self._on_tick(name)
 
     def _tell(self) -> None:
-        self._said.content = panels.expected(self._say(self.wanted))
+        self.tell(self._say(self.wanted))
+
+    def tell(self, text: str) -> None:
+        """Say what is known of the set that is ticked."""
+        self._said.content = panels.expected(text)
 
     def _on_button(self) -> None:
         added, dropped = changed(self._own, self.wanted)
