@@ -2,6 +2,7 @@
 
 import csv
 import io
+import queue
 import re
 import zipfile
 from dataclasses import replace
@@ -11,16 +12,21 @@ import numpy as np
 import pytest
 
 from calib.exporters import export
+from calib.results.holdout import held_out
+from calib.runs.reopen import reopened, start_of
 from calib.runs.run import Run
+from calib.solve.fit import stepped
 from calib.view import panels
+from calib.view.effects.expected import Expected
+from calib.view.job import Change, changed
 from calib.view.scene import Points, Scene
 from calib.view.shown import brush, plot
 from calib.view.shown.moves import Move, moves, parameters
 from calib.view.shown.taken import beams_csv, extrinsics_zip
 from sensors.recording import read_table
 from tests.browser import Watched
-from tests.calib.viewed import diagnosed, small_run
-from tests.calib.workbench import button, choose, field, shown
+from tests.calib.viewed import diagnosed, hidden, small_run
+from tests.calib.workbench import SOON_MS, button, choose, field, shown
 
 TABLES = "residuals.parquet"
 
@@ -164,6 +170,57 @@ def test_every_parameter_is_listed_with_its_sigma(run):
     sigma_rad = np.sqrt(run.solution.covariance[i, i])
     assert cells[0] == "rx" and cells[1].endswith(f"± {1e3 * sigma_rad:.2f} mrad")
     assert "<b>faro</b> in opti, no CAD" in html and "128 values" in html
+
+
+# ------------------------------------------------------------ what is expected of a set of effects
+
+
+@pytest.fixture(scope="module")
+def lacking(once) -> Run:
+    """A run whose model lacks what was hidden in its recording."""
+    return Run.open(once(hidden) / "run")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "added, dropped",
+    [
+        ([], []),
+        (["incidence_angle_bias"], []),
+        (["faro_scale", "range_scale"], []),
+        (["incidence_angle_bias"], ["ring_range_offset"]),
+    ],
+)
+def test_one_step_tells_what_a_fit_finds(lacking, added, dropped):
+    """Of stops held out, within a tenth; the run's own error is far from all but the first."""
+    sources = reopened(lacking)
+    model = changed(lacking, Change(lacking.folder, added, dropped))
+    how = sources, model, "location", 1, lambda *told: None, start_of(lacking, sources)
+    fitted_mm = held_out(*how).rms_mm
+    assert held_out(*how, fit=stepped).rms_mm == pytest.approx(fitted_mm, rel=0.1)
+    before = lacking.summary["rms_mm"]["held_out"]
+    assert (abs(fitted_mm / before - 1) > 0.2) is bool(added or dropped)
+
+
+@pytest.mark.slow
+def test_of_several_questions_the_last_is_answered(lacking):
+    """And one that has no answer does not keep others from theirs."""
+    heard: queue.Queue = queue.Queue()
+    asked = [Change(lacking.folder, [name]) for name in ("no_such", "faro_scale", "range_scale")]
+    expected = Expected({}, lambda *told: heard.put(told))
+    try:
+        for change in asked:
+            expected.ask(lacking.folder, change)
+        found = [heard.get(timeout=SOON_MS / 1e3)]
+        while found[-1][0][1] != asked[-1]:
+            found.append(heard.get(timeout=SOON_MS / 1e3))
+        assert found[-1][1] > 1.0 and asked[1] not in [question for (_, question), _ in found]
+        assert all(mm is None for (_, question), mm in found if question == asked[0])
+    finally:
+        expected.stop()
+    assert not expected._process.is_alive()
+    expected.ask(lacking.folder, asked[1])
+    assert heard.empty()
 
 
 # --------------------------------------------------------------------------------- taken away

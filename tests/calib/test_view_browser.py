@@ -76,11 +76,13 @@ def test_the_first_finding_is_added_and_the_ladder_falls(hidden):
         expected = watched.page.locator("[data-is=expected]")
         expected.get_by_text(f"as {made.folder.name}").wait_for()
         tick(watched, "ring_range_offset", False)
-        expected.get_by_text("is not known before the refit").wait_for()
+        expected.get_by_text("by one step of the linearised fit").wait_for()
+        wanted = float(re.search(r"→ ([\d.]+) mm", expected.inner_text())[1])
         button(watched, "Refit").click()
         watched.page.get_by_text("+ incidence_angle_bias, - ring_range_offset").wait_for(
             timeout=FIT_MS
         )
+        assert page.desk.run.summary["rms_mm"]["held_out"] == pytest.approx(wanted, rel=0.1)
         assert page.desk.run.effects == (*hidden.effects[:2], "incidence_angle_bias")
 
 

@@ -292,7 +292,7 @@ def test_a_run_that_one_browser_makes_is_offered_in_all(bench, monkeypatch, tmp_
         with browser(served.address), browser(served.address):
             until(lambda: len(pages) == len(bench._hearers) == 2)  # once shown, a page listens
             one, two = pages.values()
-            one._on_add()
+            one._on_refit({"range_scale": "range_scale"}, [])
             until(lambda: one.desk.chosen == "made" and "made" in two._run.options)
             assert two.desk.chosen == "run" and str(Run.open(made).folder) in two._note.content
     finally:

@@ -76,10 +76,9 @@ class Ticks:
         self._button.disabled = busy
 
     def _add(self, name: str, ticked: bool = False) -> None:
-        hint = "In the model" if name in self._own else "Not in the model"
         order = self._more.order - 1 + len(self._boxes) / MOST
         with self.folder:
-            box = self._gui.add_checkbox(name, ticked, hint=hint, order=order)
+            box = self._gui.add_checkbox(name, ticked, order=order)
         box.on_update(self._guarded(partial(self._on_tick, name)))
         self._boxes[name] = box
 
