@@ -6,17 +6,15 @@ import shutil
 import numpy as np
 import pytest
 
-from calib.runs.calibrate import calibrate
 from calib.runs.run import Run
-from calib.simulation import simulate
-from calib.view.own import document
+from calib.view.effects.own import document
 from calib.view.scene import Points, Scene
 from calib.view.shown import colours, look, plot
 from calib.view.shown.columns import comparable, gathered, kept
 from chains.errors import InputError
 from sensors.documents import read_yaml, write_yaml
 from sensors.recording import read_table, write_table
-from tests.calib.viewed import diagnosed, small_run
+from tests.calib.viewed import diagnosed, hidden, small_run
 from tests.calib.workbench import FIT_MS, bars, button, choose, field, shown
 
 TABLES = "residuals.parquet"
@@ -274,9 +272,3 @@ def test_a_formula_of_ones_own_is_tried_and_stops_held_out_answer(once, tmp_path
         assert made.effects[-1] == "own_1_maximum_cos_incidence_0_2_1"
         assert made.summary["rms_mm"]["held_out"] == pytest.approx(after, abs=1e-3)
         button(watched, "Cancel").wait_for(state="hidden", timeout=FIT_MS)
-
-
-def hidden(folder) -> None:
-    """A run whose model lacks what was hidden in its recording."""
-    simulate("tiny", folder / "rec", 1, {"incidence_angle_bias": 2.0})
-    calibrate([folder / "rec"], folder / "run")

@@ -24,6 +24,12 @@ def small_run(folder: Path, **changes: object) -> Run:
     return calibrate([folder / "rec"], folder / "run", hold_out="none")
 
 
+def hidden(folder: Path) -> None:
+    """A run whose model lacks what was hidden in its recording, in ``folder/run``."""
+    simulate("tiny", folder / "rec", 1, {"incidence_angle_bias": 2.0})
+    calibrate([folder / "rec"], folder / "run")
+
+
 def grown(run: Run, out: Path, effect: str, held_out_mm: float) -> Run:
     """A copy of a run that says that it grew from that one by an effect."""
     shutil.copytree(run.folder, out)
