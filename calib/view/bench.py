@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from calib.runs.run import Run
 from calib.view.desk import Desk
-from calib.view.job import Job, Told
+from calib.view.job import Change, Job, Told
 from calib.view.scene import Scene
 from chains.errors import InputError
 
@@ -61,14 +61,7 @@ class Bench:
         """Whether a job runs."""
         return self._job is not None
 
-    def start(
-        self,
-        by: Any,
-        run: Path,
-        effect: str | Mapping[str, Any] | None = None,
-        out: Path | None = None,
-        without: Sequence[str] = (),
-    ) -> None:
+    def start(self, by: Any, run: Path, change: Change | None = None) -> None:
         """Begin a job, as `Job` takes it; `by` is told to those who listen.
 
         Raises:
@@ -77,7 +70,7 @@ class Bench:
         with self._lock:
             if self.busy:
                 raise InputError("one fit is running already; wait for it, or cancel it")
-            job = self._job = Job(run, effect, out, without, self._desk.trust)
+            job = self._job = Job(run, change, self._desk.trust)
         threading.Thread(target=self._follow, args=(job, by), daemon=True).start()
 
     def stop(self) -> None:

@@ -18,6 +18,8 @@ from calib.runs.ladder import Rung, ladder
 from calib.runs.run import Run
 from chains.errors import InputError
 
+LONGEST_CHANGE = 80  # letters of it that a folder's name takes up
+
 
 @dataclass(frozen=True)
 class Findings:
@@ -188,9 +190,15 @@ class Desk:
             if name not in self.run.effects and _addable(name, what)
         }
 
-    def folder_for(self, effect: str) -> Path:
-        """Where a run with one more effect goes: beside this one, under a name not yet taken."""
-        return self._beside(f"+{effect}")
+    @property
+    def effects(self) -> dict[str, str | Mapping[str, Any]]:
+        """Those of the run's model: name -> as model.yaml has it."""
+        return dict(zip(self.run.effects, self.run.model["effects"], strict=True))
+
+    def folder_for(self, *added: str, dropped: Sequence[str] = ()) -> Path:
+        """Where a run with other effects goes: beside this one, under a name not yet taken."""
+        change = "".join([*(f"+{name}" for name in added), *(f"-{name}" for name in dropped)])
+        return self._beside(change if len(change) <= LONGEST_CHANGE else "-refit")
 
     def folder_without(self) -> Path:
         """Where a run goes that leaves something out; as `folder_for`."""

@@ -13,10 +13,15 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from calib.effects import Trust
 from chains.errors import InputError
+from sensors.documents import write_yaml
+
+if TYPE_CHECKING:
+    from calib.problem.model import Model
+    from calib.runs.run import Run
 
 PATIENCE_S = 10.0  # for a process that was stopped to clean up
 
@@ -36,34 +41,45 @@ class Told:
     share: float = 0.0
 
 
+@dataclass(frozen=True)
+class Change:
+    """What is to be another in the next run.
+
+    Args:
+        out: folder of the run to make.
+        added: effects, as `Desk.addable` has them: names, or documents of formulas.
+        dropped: names of effects that the model is to have no more.
+        without: what to leave out, as ``--without`` takes it.
+    """
+
+    out: Path
+    added: Sequence[str | Mapping[str, Any]] = ()
+    dropped: Sequence[str] = ()
+    without: Sequence[str] = ()
+
+
 class Job:
-    """An effect added to a run, or something left out, and the result diagnosed; or a run
-    diagnosed, where nothing is to be changed.
+    """A run refitted with a change, and the result diagnosed; or a run diagnosed, where nothing is
+    to be changed.
 
     Args:
         run: folder of the run to start from.
-        effect: as `Desk.addable` has it: a name, or the document of a formula.
-        out: folder of the run to make.
-        without: what to leave out, as ``--without`` takes it.
+        change: what is to be another.
         trust: the Python files of effects that may run.
     """
 
     def __init__(
         self,
         run: Path,
-        effect: str | Mapping[str, Any] | None = None,
-        out: Path | None = None,
-        without: Sequence[str] = (),
+        change: Change | None = None,
         trust: Trust = MappingProxyType({}),
     ) -> None:
         # Spawned: a process with threads and libraries such as these cannot be forked safely.
         context = multiprocessing.get_context("spawn")
         self._ear, mouth = context.Pipe(duplex=False)
         self._stopped = False
-        task = (run, effect, out, without, dict(trust))
-        self._process = context.Process(
-            target=_work, args=(mouth, *task), daemon=True, name="rigcal job"
-        )
+        task = (mouth, run, change, dict(trust))
+        self._process = context.Process(target=_work, args=task, daemon=True, name="rigcal job")
         self._process.start()
         mouth.close()  # so that the pipe ends when the process does
 
@@ -93,19 +109,12 @@ class Job:
             self._process.kill()
 
 
-def _work(
-    mouth: Connection,
-    run: Path,
-    effect: str | Mapping[str, Any] | None,
-    out: Path | None,
-    without: Sequence[str],
-    trust: Trust,
-) -> None:
+def _work(mouth: Connection, run: Path, change: Change | None, trust: Trust) -> None:
     """What the process does."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the page, which ends its jobs
     signal.signal(signal.SIGTERM, _leave)
     try:
-        _study(mouth, run, effect, out, without, trust)
+        _study(mouth, run, change, trust)
         mouth.send(Told("done"))
     except InputError as error:
         mouth.send(Told("failed", str(error)))
@@ -115,33 +124,42 @@ def _work(
         mouth.send(Told("failed", f"internal fault: {type(error).__name__}: {error}"))
 
 
-def _study(
-    mouth: Connection,
-    folder: Path,
-    effect: str | Mapping[str, Any] | None,
-    out: Path | None,
-    without: Sequence[str],
-    trust: Trust,
-) -> None:
-    from calib.runs.calibrate import grow, grown_model
+def _study(mouth: Connection, folder: Path, change: Change | None, trust: Trust) -> None:
+    from calib.runs.calibrate import grow
     from calib.runs.diagnose import diagnose
     from calib.runs.run import Run
-    from sensors.documents import write_yaml
 
     def progress(what: str, done: int, total: int) -> None:
         mouth.send(Told("progress", what, (done + 1) / max(total, 1)))
 
     run = Run.open(folder, trust)
-    if out is not None:
-        with tempfile.TemporaryDirectory() as scratch:
-            if isinstance(effect, Mapping):
-                path = Path(scratch) / "formula.yaml"
-                write_yaml(path, dict(effect))
-                effect = str(path)
-            model = grown_model(run, [effect] if effect else [])
-        run = grow(run, model.leaving_out(without), out, progress)
+    if change is not None:
+        run = grow(run, changed(run, change), change.out, progress)
         mouth.send(Told("run", str(run.folder)))
     diagnose(run, progress)
+
+
+def changed(run: Run, change: Change) -> Model:
+    """The model of a run with a change.
+
+    Raises:
+        InputError: an effect is unknown, or is there already, or is not there.
+    """
+    from calib.runs.calibrate import grown_model
+
+    with tempfile.TemporaryDirectory() as scratch:
+        model = grown_model(run, list(_named(change.added, Path(scratch))))
+    return model.minus(change.dropped).leaving_out(change.without)
+
+
+def _named(added: Sequence[str | Mapping[str, Any]], scratch: Path) -> Iterator[str]:
+    """Effects as ``rigcal add`` takes them: formulas are written to files."""
+    for number, effect in enumerate(added):
+        if isinstance(effect, Mapping):
+            path = scratch / f"{number}.yaml"
+            write_yaml(path, dict(effect))
+            effect = str(path)
+        yield effect
 
 
 def _leave(number: int, frame: object) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,17 +14,24 @@ from calib.runs.ladder import Rung
 from calib.view import panels
 from calib.view.bench import Bench
 from calib.view.desk import DiagnosisCurve, Findings
-from calib.view.job import Told
+from calib.view.effects import known
+from calib.view.effects.expected import Asked, Expected
+from calib.view.effects.own import OwnFormula, document
+from calib.view.effects.ticks import Ticks
+from calib.view.job import Change, Told
 from calib.view.leave_out import LeaveOut
-from calib.view.own import OwnFormula, document
 from calib.view.picture import NOTHING, Picture
 from calib.view.server import Visitor
-from calib.view.shown import colours, look
+from calib.view.shown import brush, colours, look
+from calib.view.shown.moves import parameters
+from calib.view.shown.taken import extrinsics_zip
 from calib.view.stage import PANEL_PX
 from chains.errors import InputError
 
 CURVE_PX = 180
 SETTLED_S = 0.4  # the camera rests for so long before the address tells where it is
+TAKE_HINT = "What 'rigcal export' writes of this run, in all formats, as a zip"
+WORKED_OUT = "What stops held out make of it is being worked out from the linearisation …"
 LOOKS = "Opened to look at: this address cannot change anything."
 
 
@@ -49,6 +56,10 @@ class Page:
         self._address = ""
         self._covariates: dict[str, str] = {}  # heading -> covariate that has a curve
         self._lock = threading.RLock()
+        self._asked: Asked | None = None
+        self._expected = Expected(
+            self.desk.trust, lambda *told: self._guarded(partial(self._on_expected, *told))()
+        )
         gui = client.gui
         gui.main_panel.dock_right()
         gui.main_panel.set_width(PANEL_PX)
@@ -56,6 +67,7 @@ class Page:
         self._note = gui.add_html("", visible=False)
         self._run = self._menu("Run", list(self.desk.runs), self._on_run)
         self.picture = Picture(client, self._guarded, self._asks)
+        visitor.run(brush.SCRIPT)
         self._add_ladder_widgets()
         self._blunders = LeaveOut(gui, self._on_leave_out)
         self._add_findings_widgets()
@@ -75,6 +87,7 @@ class Page:
     def close(self) -> None:
         """Its browser has gone."""
         self.bench.forget(self._hear)
+        self._expected.stop()
         if self._settling is not None:
             self._settling.cancel()
 
@@ -93,13 +106,7 @@ class Page:
         with gui.add_folder("Findings"):
             self._findings = gui.add_html("")
             self._formulas = gui.add_html("")
-            self._effect = self._menu("Effect", [NOTHING], self._choose_curve)
-            self._add = gui.add_button("Add", hint="Refit with this effect, from this run")
-            self._own = OwnFormula(gui, self._guarded, self._on_own)
             self._diagnose = gui.add_button("Diagnose", visible=False)
-            self._bar = gui.add_progress_bar(0.0, visible=False)
-            self._doing = gui.add_html("", visible=False)
-            self._cancel = gui.add_button("Cancel", visible=False, color="gray")
             self._over = self._menu("Curve over", [NOTHING], self._draw_curve)
             self._curve = gui.add_uplot(
                 *_curve(None),
@@ -107,14 +114,23 @@ class Page:
                 bands=({"series": (2, 3), "fill": "rgba(0, 0, 0, 0.08)"},),
                 height=CURVE_PX,
             )
-        self._add.on_click(self._guarded(self._on_add))
-        self._diagnose.on_click(self._guarded(lambda: self._start(self.desk.run.folder)))
+        self._ticks = Ticks(gui, self._guarded, self._on_ticks, self._on_refit)
+        with self._ticks.folder:
+            self._bar = gui.add_progress_bar(0.0, visible=False)
+            self._doing = gui.add_html("", visible=False)
+            self._cancel = gui.add_button("Cancel", visible=False, color="gray")
+            self._own = OwnFormula(gui, self._guarded, self._on_own)
+        self._diagnose.on_click(self._guarded(self._start))
         self._cancel.on_click(self._guarded(self._on_cancel))
 
     def _add_ladder_widgets(self) -> None:
         with self.client.gui.add_folder("Ladder"):
             self._ladder = self.client.gui.add_html("")
             self._undo = self.client.gui.add_button("Undo", hint="Back to the run below")
+        with self.client.gui.add_folder("Parameters", expand_by_default=False):
+            self._parameters = self.client.gui.add_html("")
+        self._take = self.client.gui.add_button("Extrinsics as zip", hint=TAKE_HINT, color="gray")
+        self._take.on_click(self._guarded(self._on_take))
         self._undo.on_click(self._guarded(self._on_undo))
 
     def _menu(self, label: str, options: list[str], use: Callable[[], None]) -> Any:
@@ -172,6 +188,7 @@ class Page:
         self._ladder.content = "".join(
             (panels.moved(desk.run), panels.ladder(desk.rungs()), panels.standing_out(desk.run))
         )
+        self._parameters.content = panels.framed(parameters(desk.run))
         self._undo.disabled = desk.rungs()[-1].below is None
         self._show_findings()
         self._tell(f"Reading the recordings of {desk.chosen} …")
@@ -200,19 +217,18 @@ class Page:
             self._formulas.content = panels.formulas(self.findings)
             self._blunders.show(self.findings.blunders if self.findings else [])
             self._diagnose.visible = self.findings is None
-            self._fill(self._effect, list(self.desk.addable(self.findings)) or [NOTHING])
-            found = self.findings
-            worth = found is not None and bool(found.worth_adding or found.formulas)
-            self._add.color = None if worth else "gray"
-            self._choose_curve()
+            offered = self.desk.addable(self.findings)
+            listed = list(offered)[: panels.SHOWN_CANDIDATES] if self.findings else []
+            self._ticks.show(self.desk.effects, offered, listed)
 
     def _choose_curve(self) -> None:
-        """The curve that shows the chosen effect best."""
+        """The curve that shows best what was ticked last, or what stands out."""
         names = list(self.findings.curves) if self.findings else []
         self._over.visible = self._curve.visible = bool(names)
         self._covariates = {colours.column(n).heading: n for n in names}
         if names:
-            best = colours.column(self.findings.covariate_of(self._effect.value)).heading
+            effect = self._ticks.latest or next(iter(self.desk.addable(self.findings)), NOTHING)
+            best = colours.column(self.findings.covariate_of(effect)).heading
             self._fill(self._over, list(self._covariates), best)
             self._draw_curve()
 
@@ -223,23 +239,49 @@ class Page:
             self.findings.curves[name], self._over.value, scale
         )
 
-    def _on_add(self) -> None:
-        name = self._effect.value
-        what = self.desk.addable(self.findings).get(name)
-        if what is None:
-            raise InputError(f"'{name}' is not an effect that can be added to this run")
-        self._start(self.desk.run.folder, what, self.desk.folder_for(name))
+    def _on_ticks(self, wanted: Mapping[str, Any]) -> str:
+        """Show the curve of what was ticked last; what is known of all that is ticked."""
+        self._choose_curve()
+        others = {name: run for name, run in self.desk.runs.items() if name != self.desk.chosen}
+        told = known.told(self.desk.run, wanted, self.findings, others)
+        self._asked = None
+        before = self.desk.run.summary["rms_mm"]["held_out"]
+        if told.endswith(known.UNKNOWN) and before is not None and self.may_change:
+            self._asked = (
+                self.desk.run.folder,
+                self._change(*known.changed(self.desk.effects, wanted)),
+            )
+            self._expected.ask(*self._asked)
+            told = told.removesuffix(known.UNKNOWN) + WORKED_OUT
+        return told
+
+    def _on_expected(self, asked: Asked, after: float | None) -> None:
+        """Tell what was worked out of the set that is ticked, if it still is."""
+        if asked == self._asked:
+            before = self.desk.run.summary["rms_mm"]["held_out"]
+            self._ticks.tell(known.linearised(before, after))
+
+    def _change(self, added: Mapping[str, Any], dropped: Sequence[str]) -> Change:
+        out = self.desk.folder_for(*added, dropped=dropped)
+        return Change(out, tuple(added.values()), tuple(dropped))
+
+    def _on_refit(self, added: Mapping[str, Any], dropped: Sequence[str]) -> None:
+        if not added and not dropped:
+            raise InputError("these are the effects of the run; tick others, or take a tick away")
+        self._start(self._change(added, dropped))
 
     def _on_own(self, text: str, site: str) -> None:
         effect = document(text, site, self.picture.beams(), self.desk.run.effects)
-        self._start(self.desk.run.folder, effect, self.desk.folder_for(effect["name"]))
+        self._start(Change(self.desk.folder_for(effect["name"]), (effect,)))
 
     def _on_leave_out(self, tokens: Sequence[str]) -> None:
-        def leave_out() -> None:
-            run, out = self.desk.run.folder, self.desk.folder_without()
-            self._start(run, out=out, without=tokens)
+        change = Change(self.desk.folder_without(), without=tuple(tokens))
+        self._guarded(partial(self._start, change))()
 
-        self._guarded(leave_out)()
+    def _on_take(self) -> None:
+        run = self.desk.run
+        name = f"{run.folder.name}-extrinsics.zip"
+        self.client.send_file_download(name, extrinsics_zip(run), save_immediately=True)
 
     def _on_undo(self) -> None:
         told = self.desk.undo()
@@ -248,9 +290,9 @@ class Page:
 
     # ------------------------------------------------------------------------- in the background
 
-    def _start(self, run: Path, *what: Any, **more: Any) -> None:
+    def _start(self, change: Change | None = None) -> None:
         self._ask()
-        self.bench.start(self, run, *what, **more)
+        self.bench.start(self, self.desk.run.folder, change)
         self._tell("")
         self._show_busy()
 
@@ -268,9 +310,9 @@ class Page:
         busy = self.bench.busy
         self._bar.visible = self._doing.visible = busy
         self._cancel.visible = busy and self.may_change
-        self._add.disabled = self._diagnose.disabled = busy or not self.may_change
-        self._blunders.busy(busy or not self.may_change)
-        self._own.busy(busy or not self.may_change)
+        self._diagnose.disabled = busy or not self.may_change
+        for widget in (self._blunders, self._ticks, self._own):
+            widget.busy(busy or not self.may_change)
         self._bar.value, self._doing.content = 0.0, panels.note("Starting …")
 
     def _hear(self, told: Told, by: Any) -> None:

@@ -16,11 +16,13 @@ from calib.show import misfit
 from calib.show.headline import moved_sentence
 from calib.view.desk import Findings
 from calib.view.scene import Points
-from calib.view.shown.colours import Scale, column
+from calib.view.shown.colours import Scale, choices, column
+from calib.view.shown.moves import Move
 from chains.escape import html as escape
 
 SHOWN_CANDIDATES = 6  # candidates in the table; the menu has all
 LARGE = ((1e6, " million"), (1.0, ""))
+DIGITS = {"m": 3, "mm": 2, "deg": 1, "°C": 2, "s": 1, "of the median": 3}  # that are told
 BAR = "#7fb2d9"
 STRIPED = f"repeating-linear-gradient(45deg,{BAR} 0 6px,#dcebf6 6px 10px)"  # of a rung by a formula
 _FRAME = "padding:0 1.2em .4em .75em;font-size:12px;line-height:1.4"
@@ -36,7 +38,7 @@ def legend(scale: Scale) -> str:
             f'width:.8em;height:.8em;background:{colour}"></span> {escape(name)}</span>'
             for name, colour in scale.names.items()
         )
-        return _framed(items)
+        return framed(items)
     middle, unit = (scale.low + scale.high) / 2, f" {scale.unit}" if scale.unit else ""
     sign = "+" if scale.signed else ""
     ends = [f"{value:{sign if value else ''}.3g}" for value in (scale.low, middle, scale.high)]
@@ -47,7 +49,7 @@ def legend(scale: Scale) -> str:
         ends = [f"{end}{unit}" for end in ends]
     bar = f"height:.9em;background:linear-gradient(to right,{','.join(scale.stops)})"
     texts = "".join(f"<span>{escape(end)}</span>" for end in ends)
-    return _framed(
+    return framed(
         f'<div style="{bar}"></div>'
         f'<div style="display:flex;justify-content:space-between">{texts}</div>'
     )
@@ -56,31 +58,54 @@ def legend(scale: Scale) -> str:
 def scan(points: Points | None, drawn: int, stop: str, ratios: Mapping[str, float]) -> str:
     """What the stop's beams say, all of them, however few are drawn; and how large residuals of all
     that was measured there are, over their sigmas."""
-    return _framed(_beams(points, drawn, stop) + _misfit(ratios))
+    return framed(_beams(points, drawn, stop) + _misfit(ratios))
 
 
-def plotted(points: Points, rows: np.ndarray, up: str, low: float, high: float) -> str:
-    """What a plot of the beams (n,) shows, and how many of them are off its scale."""
+def plotted(points: Points, rows: np.ndarray, up: str, axes: Mapping[str, Any]) -> str:
+    """What a plot of the beams (n,) shows, how many of them are off its scale, and from where to
+    where it goes along x."""
     values = points.columns[up][rows] * column(up).scale
+    low, high = axes["y"]["range"]
     beyond = int(np.sum((values < low) | (values > high)))
     off = f"; {beyond:,} are beyond the scale" if beyond else ""
-    return _framed(
-        f'<span data-is="plotted">{len(rows):,} beams{off}. Line: mean of the inliers.</span>'
+    left, right = axes["x"]["range"]
+    return framed(
+        f'<span data-is="plotted" data-low="{left:.6g}" data-high="{right:.6g}">'
+        f"{len(rows):,} beams{off}. Line: mean of the inliers. Drag across the plot to light up "
+        "beams in the room.</span>"
     )
+
+
+def lit(points: Points, kept: np.ndarray, chosen: np.ndarray | None) -> str:
+    """How many beams are lit, of those that are looked at (N,), and how large their residual is."""
+    if chosen is None:
+        return ""
+    some = chosen & kept
+    said = f"{some.sum():,} of {kept.sum():,} beams are lit"
+    return framed(f'<b data-is="lit">{said}{_residual(points, some & points.inlier)}.</b>')
+
+
+def _residual(points: Points, inliers: np.ndarray) -> str:
+    """How large the residual of some inliers (N,) is."""
+    if not inliers.any():
+        return ", none of which the fit took for an inlier"
+    residual = 1e3 * points.columns["residual_m"][inliers].astype(float)
+    rms = math.sqrt(np.mean(residual**2))
+    return f"; residual of the inliers {rms:.2f} mm rms, {residual.mean():+.2f} mm mean"
 
 
 def moved(run: Run) -> str:
     """What moved since the run that was its prior; nothing where there was none."""
     links = run.summary.get("links")
     told = f"Since the earlier run: {moved_sentence(links)}" if links else ""
-    return _framed(f'<p data-is="moved"><b>{escape(told)}</b></p>') if told else ""
+    return framed(f'<p data-is="moved"><b>{escape(told)}</b></p>') if told else ""
 
 
 def standing_out(run: Run) -> str:
     """What of the run does not fit; nothing where nothing stands out."""
     lines = "".join(f"<li>{escape(line)}</li>" for line in misfit.standing_out(run.summary))
     title = '<b style="color:#b3261e">What does not fit</b>'
-    return _framed(f'{title}<ul data-is="misfits">{lines}</ul>') if lines else ""
+    return framed(f'{title}<ul data-is="misfits">{lines}</ul>') if lines else ""
 
 
 def _beams(points: Points | None, drawn: int, stop: str) -> str:
@@ -88,13 +113,7 @@ def _beams(points: Points | None, drawn: int, stop: str) -> str:
         return f"Stop {escape(stop)} has no scan in this fit."
     here = len(points.inlier)
     some = "" if here == points.measured else f", {here:,} of them looked at"
-    if not points.inlier.any():
-        return f"{points.measured:,} beams{some}, none of which the fit took for an inlier."
-    residual = 1e3 * points.columns["residual_m"][points.inlier].astype(float)
-    return (
-        f"{points.measured:,} beams{some}, {drawn:,} drawn; residual of the inliers "
-        f"{math.sqrt(np.mean(residual**2)):.2f} mm rms, {residual.mean():+.2f} mm mean"
-    )
+    return f"{points.measured:,} beams{some}, {drawn:,} drawn{_residual(points, points.inlier)}"
 
 
 def _misfit(ratios: Mapping[str, float]) -> str:
@@ -108,39 +127,56 @@ def _misfit(ratios: Mapping[str, float]) -> str:
     return f'<div data-is="misfit">Residuals over their sigmas: {cells}</div>' if cells else ""
 
 
-def point(points: Points, index: int, label_names: Mapping[int, str]) -> str:
-    """All that is known of one point."""
+def point(points: Points, index: int, names: Mapping[str, Mapping[int, str]]) -> str:
+    """All that is known of one beam: its residual, and every column.
 
-    def told(name: str, digits: int) -> str:
-        shown = column(name)
-        return f"{points.columns[name][index] * shown.scale:.{digits}f} {shown.unit}".strip()
+    Args:
+        points: the beams.
+        index: of the beam.
+        names: what the numbers of columns stand for.
+    """
+
+    def told(name: str) -> str:
+        value, shown = points.columns[name][index], column(name)
+        if name in names:
+            return names[name].get(int(value), f"{shown.title} {int(value)}")
+        value = float(value) * shown.scale
+        digits = DIGITS.get(shown.unit, 4)
+        text = f"{value:.{digits}f}" if shown.unit else f"{value:.6g}"
+        return f"{text} {shown.unit}".strip()
 
     sigma = f"{1e3 * points.columns['sigma_m'][index]:.2f} mm"
     residual = f"{1e3 * points.columns['residual_m'][index]:+.2f} ± {sigma}"
     rows = {
         "residual": residual + ("" if points.inlier[index] else ", outlier"),
-        "range": told("range_m", 3),
-        "ring, column": f"{told('ring', 0)}, {told('column', 0)}",
-        "incidence": told("incidence_rad", 1),
+        "ring, column": f"{told('ring')}, {told('column')}",
     }
-    if "label" in points.columns:
-        number = int(points.columns["label"][index])
-        rows["label"] = label_names.get(number, f"label {number}")
-    if np.isfinite(points.columns.get("intensity", np.array([np.nan]))[0]):
-        rows["intensity"] = told("intensity", 3)
+    rest = [n for n in choices(points) if n not in ("residual_m", "sigma_m", "ring", "column")]
+    known = (n for n in rest if np.isfinite(points.columns[n][index]))
+    rows |= {column(name).title: told(name) for name in known}
     cells = [
         f'<td style="{_QUIET};padding-right:.8em">{escape(name)}</td>'
         f'<td style="padding-right:1.2em">{escape(text)}</td>'
         for name, text in rows.items()
     ]
     pairs = "".join(f"<tr>{''.join(cells[i : i + 2])}</tr>" for i in range(0, len(cells), 2))
-    return _framed(f'<table data-is="point">{pairs}</table>')
+    return framed(f'<table data-is="point">{pairs}</table>')
+
+
+def moves(found: Sequence[Move]) -> str:
+    """How far every link stands from CAD, those that are hardly chance in bold."""
+    lines = "".join(
+        f'<div style="{"font-weight:600" if move.sure else _QUIET}">{escape(move.text)}</div>'
+        for move in found
+    )
+    said = lines or "No link was estimated against CAD."
+    return framed(f'<div data-is="moves">{said}</div>')
 
 
 def findings(diagnosed: Findings | None) -> str:
     """The verdict in sentences, and the candidates in their order."""
     if diagnosed is None:
-        return _framed("This run has not been diagnosed.")
+        return framed("This run has not been diagnosed.")
     above = {each["sentence"] for each in diagnosed.blunders}  # listed with their buttons
     sentences = "".join(
         f'<p style="margin:.3em 0">{escape(text)}</p>'
@@ -148,13 +184,13 @@ def findings(diagnosed: Findings | None) -> str:
         if text not in above
     )
     verdict = escape(f"Verdict: {diagnosed.heading}")
-    return _framed(f'<b data-is="verdict">{verdict}</b>{sentences}{_candidates(diagnosed)}')
+    return framed(f'<b data-is="verdict">{verdict}</b>{sentences}{_candidates(diagnosed)}')
 
 
 def formulas(diagnosed: Findings | None) -> str:
     """A picture for each formula: what was measured, the formula, and what is left."""
     return "".join(
-        _framed(
+        framed(
             f'<div data-is="formula"><b>{escape(chart.title)}</b>'
             f'<div style="background:#fff">{plots.svg(chart.figure(), chart.id)}</div>'
             f'<div style="{_QUIET}">{escape(chart.reading)}</div></div>'
@@ -163,10 +199,15 @@ def formulas(diagnosed: Findings | None) -> str:
     )
 
 
+def expected(text: str) -> str:
+    """What is known of a set of effects before it is fitted."""
+    return framed(f'<div data-is="expected">{escape(text)}</div>')
+
+
 def blunders(found: Sequence[Mapping[str, Any]]) -> str:
     """What is wrong in the recording, in the sentences of the diagnosis."""
     lines = "".join(f'<li style="margin:.3em 0">{escape(b["sentence"])}</li>' for b in found)
-    return _framed(f'<ul data-is="blunders" style="margin:0;padding-left:1.2em">{lines}</ul>')
+    return framed(f'<ul data-is="blunders" style="margin:0;padding-left:1.2em">{lines}</ul>')
 
 
 def _candidates(diagnosed: Findings) -> str:
@@ -223,7 +264,7 @@ def ladder(rungs: Sequence[Rung]) -> str:
         for sentence in rungs[-1].run.warning
     )
     picture = f'<div data-is="ladder">{rows}</div><div style="{_QUIET}">{said}</div>'
-    return _framed(warning + picture)
+    return framed(warning + picture)
 
 
 def _error(rung: Rung) -> tuple[float, str]:
@@ -268,5 +309,6 @@ def new_run(rung: Rung) -> str:
     return f"{made} Error of stops held out: {below:.2f} → {here:.2f} mm."
 
 
-def _framed(inner: str) -> str:
+def framed(inner: str) -> str:
+    """HTML as it stands in the panel."""
     return f'<div style="{_FRAME}">{inner}</div>'

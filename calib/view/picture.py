@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -13,9 +12,11 @@ from calib.runs.run import Run
 from calib.show.misfit import of_stop
 from calib.view import panels
 from calib.view.scene import Points, Scene
-from calib.view.shown import colours, look, plot
+from calib.view.shown import brush, colours, look, plot
 from calib.view.shown.columns import LOCATION, comparable, gathered, kept, location_names
-from calib.view.stage import AXES, NARROW_PX, PLOT_PX, RIG, ROOM, Stage
+from calib.view.shown.moves import SURE, TIMES
+from calib.view.shown.taken import beams_csv
+from calib.view.stage import AXES, MOVES, NARROW_PX, PLOT_PX, RIG, ROOM, Stage
 from chains.errors import InputError
 
 NOTHING = "—"
@@ -24,6 +25,10 @@ CLICK = "Click a point to read it. Keys: N next stop, P previous stop."
 ONLY = "A formula, e.g. (range > 3) * (abs(residual) > 0.002); metres, radians. * is and"
 PLOT_HEIGHT_PX = 300
 FREE = "free"
+MOVES_LABEL = f"Moves x {TIMES}"
+MOVES_HINT = (
+    f"How far each link stands from CAD, {TIMES} times as long; grey: less than {SURE:.0f} sigmas"
+)
 
 
 class Picture:
@@ -42,11 +47,13 @@ class Picture:
         self._client, self._guarded, self._asks = client, guarded, dict(asks)
         self._columns: dict[str, str] = {}  # heading -> column
         self._others: dict[str, Run] = {}
-        self._scales = _read_scales(asks.get("scales", ""))
+        self._scales = look.read_scales(asks.get("scales", ""))
         self._known: tuple[Any, ...] = ()  # what the points were gathered for
         self._kept = np.zeros(0, bool)
+        self._clicked: int | None = None  # index of a beam
         self._add_menus()
         self._add_plot()
+        self._on_moves()
         client.scene.on_click()(guarded(self._on_point, with_event=True))
         for key, step, name in (("N", 1, "Next stop"), ("P", -1, "Previous stop")):
             command = client.gui.add_command(name, hotkey=key)
@@ -66,6 +73,9 @@ class Picture:
         self._below.on_update(self._guarded(self._paint))
         self._what = gui.add_button_group("Hide, show", ("room", "rig", "frames"))
         self._what.on_click(self._guarded(self._on_what))
+        self._moves = gui.add_checkbox(MOVES_LABEL, bool(self._asks.get("moves")), hint=MOVES_HINT)
+        self._moves.on_update(self._guarded(self._on_moves))
+        self._moved = gui.add_html("", visible=False)
         self._scan = gui.add_html("")
         self._point = gui.add_html(panels.note(CLICK))
 
@@ -87,14 +97,20 @@ class Picture:
             self._lock = gui.add_checkbox("Keep scales", locked, hint="Off: as the beams are")
             self._lock.on_update(self._guarded(self._on_lock))
             self._up = self._menu("Plot", self._draw_plot)
-            self._over = self._menu("Over", self._draw_plot)
+            self._over = self._menu("Over", self._on_over)
+            lit = self._asks.get("lit", "")
+            self._light = gui.add_text(brush.LABEL, lit, hint=brush.HINT)
+            self._light.on_update(self._guarded(self._paint))
             self._plot = gui.add_uplot(
                 *plot.EMPTY,
                 scales={"x": {"time": False}},
+                cursor={"drag": {"setScale": False, "x": True}},
                 legend={"show": False},
                 height=PLOT_HEIGHT_PX,
             )
             self._told = gui.add_html("")
+            self._take = gui.add_button("Plot as CSV", hint="The beams of the plot", color="gray")
+            self._take.on_click(self._guarded(self._on_take))
         panel.dock_left()
         panel.set_width(PLOT_PX)
         if self._client.camera.image_width < NARROW_PX:
@@ -118,10 +134,12 @@ class Picture:
             "stops": "" if self._stops.value == THIS else self._stops.value,
             "other": self._other.value if self._other.visible else "",
             "colour": column(self._colour.value, ""),
-            "scales": _write_scales(self._scales) if self._lock.value else FREE,
+            "scales": look.write_scales(self._scales) if self._lock.value else FREE,
             "only": self._only.value,
             "up": column(self._up.value, ""),
             "over": column(self._over.value, ""),
+            "lit": self._light.value,
+            "moves": "1" if self._moves.value else "",
             "below": f"{self._below.value:.2f}",
             "camera": ",".join(f"{x:.6g}" for x in np.round(self.stage.camera(), 3) + 0.0),
         }
@@ -203,6 +221,8 @@ class Picture:
         else:
             points = self.stage.points
         self.stage.show(at, stop, points)
+        self._moved.content = panels.moves(self.stage.moves)
+        self._clicked = None
         for widget in (self._below, self._colour, self._up, self._over, self._plot):
             widget.visible = points is not None
         self._point.content = panels.note(CLICK) if points else ""
@@ -272,22 +292,50 @@ class Picture:
         name = self._columns[self._colour.value]
         ends = None if name in colours.NAMES else self._ends(name)
         colour, scale = colours.coloured(points, name, self._names(name), ends)
-        drawn = self.stage.paint(colour, self._below.value + 0.01, self._kept)
+        lit = self._lit
+        if lit is not None:
+            colour[~lit] = brush.UNLIT
+        drawn = self.stage.paint(colour, self._below.value + 0.01, self._kept, lit)
         self._legend.content = panels.legend(scale)
         self._tell_scan(points, drawn)
         self._colours = colour
         self._draw_plot()
 
+    def _on_over(self) -> None:
+        self._light.value = ""  # a range of another column
+        self._paint()
+
+    @property
+    def _lit(self) -> np.ndarray | None:
+        """Which beams (N,) are lit; None where no range was chosen."""
+        between = brush.ends(self._light.value)
+        if between is None:
+            return None
+        return brush.within(self.stage.points, self._columns[self._over.value], between)
+
     def _draw_plot(self) -> None:
         up, over = (self._columns[menu.value] for menu in (self._up, self._over))
         rows = np.flatnonzero(self._kept)
         low, high = self._ends(up)
-        points = self.stage.points
-        data, series = plot.chart(points, rows, up, over, self._colours)
+        points, lit = self.stage.points, self._lit
+        beside = {"lit": lit, "marked": self._clicked}
+        data, series = plot.chart(points, rows, up, over, self._colours, **beside)
+        axes = plot.axes(data[0], low, high)
         with self._client.atomic():
-            self._plot.scales = plot.axes(data[0], low, high)
+            self._plot.scales = axes
             self._plot.data, self._plot.series = data, series
-        self._told.content = panels.plotted(points, rows, up, low, high)
+        told = panels.plotted(points, rows, up, axes)
+        self._told.content = told + panels.lit(points, self._kept, lit)
+
+    def _on_take(self) -> None:
+        points, menus = self.stage.points, (self._over, self._up, self._colour)
+        if points is None:
+            raise InputError("there are no beams here, so there is no plot to take away")
+        names = [self._columns[menu.value] for menu in menus]
+        lit = np.ones(len(points.xyz_m), bool) if self._lit is None else self._lit
+        table = beams_csv(points, np.flatnonzero(self._kept), names, lit)
+        name = f"{self.stage.scene.run.folder.name}-{names[1]}-over-{names[0]}.csv"
+        self._client.send_file_download(name, table, save_immediately=True)
 
     def _tell_scan(self, points: Points | None, drawn: int) -> None:
         stop, names = self.stop.value, recording_names(self.stage.scene.sources)
@@ -299,10 +347,18 @@ class Picture:
     def _on_what(self) -> None:
         self.stage.toggle({"room": ROOM, "rig": RIG, "frames": AXES}[self._what.value])
 
+    def _on_moves(self) -> None:
+        if self._moves.value == (MOVES in self.stage.hidden):
+            self.stage.toggle(MOVES)
+        self._moved.visible = self._moves.value
+
     def _on_point(self, event: Any) -> None:
         index = self.stage.pick(np.array(event.ray_origin), np.array(event.ray_direction))
         if index is not None:
-            self._point.content = panels.point(self.stage.points, index, self._names("label"))
+            names = {name: self._names(name) for name in colours.NAMES}
+            self._point.content = panels.point(self.stage.points, index, names)
+            self._clicked = index
+            self._draw_plot()
 
     @property
     def _at(self) -> int:
@@ -329,17 +385,3 @@ class Picture:
         menu.value = chosen if chosen in options else options[0]
         if asked in options:
             del self._asks[key]
-
-
-def _read_scales(text: str) -> dict[str, tuple[float, float]]:
-    found = {}
-    for part in text.split(","):
-        name, _, ends = part.partition(":")
-        numbers = look.numbers(ends.replace(":", ","), 2)
-        if re.fullmatch(r"[\w.]+", name) and numbers and numbers[0] < numbers[1]:
-            found[name] = numbers
-    return found
-
-
-def _write_scales(scales: Mapping[str, tuple[float, float]]) -> str:
-    return ",".join(f"{name}:{low:.6g}:{high:.6g}" for name, (low, high) in scales.items())

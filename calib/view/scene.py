@@ -140,11 +140,15 @@ class Scene:
         Raises:
             InputError: nothing was measured at the stop, so nothing says where the rig was.
         """
+        stops, row = self._of_stop(recording, stop)
+        return stops.in_reference(frame, self.state).T[row]
+
+    def _of_stop(self, recording: int, stop: str) -> tuple[Stops, int]:
+        """The geometry that places a stop, and its row there."""
         key = recording, self.sources[recording].recording.stops.index(stop)
         if key not in self._stops:
             raise InputError(f"stop '{stop}' has neither a scan nor a tracked body")
-        stops, row = self._stops[key]
-        return stops.in_reference(frame, self.state).T[row]
+        return self._stops[key]
 
     def frames(self, recording: int, stop: str) -> dict[str, np.ndarray]:
         """Frame -> T_reference_frame (4, 4): the rig's root, its arm's ends, all that CAD names."""
@@ -164,6 +168,30 @@ class Scene:
         arm = [e.name in rig.arm_edges for e in rig.tree.edges]
         long = np.array([np.linalg.norm(b - a) > 1e-6 for a, b in ends], bool)
         return np.reshape(ends, (-1, 2, 3))[long], np.array(arm, bool)[long]
+
+    def twists(self, recording: int, stop: str) -> tuple[np.ndarray, np.ndarray]:
+        """By which twist (E, 6) each edge of the rig differs at a stop from what is drawn, by all
+        effects of the model, and its covariance (E, 6, 6); NaN where an effect has none.
+
+        Raises:
+            InputError: nothing was measured at the stop.
+        """
+        stops, row = self._of_stop(recording, stop)
+        known = {name: i for i, name in enumerate(self.run.solution.names)}
+        edges = len(stops.rig.tree.edges)
+        twists, jacobians, numbers = np.zeros((edges, 6)), [np.zeros((edges, 6, 0))], []
+        for name, bases in stops.edge_bases.items():
+            basis = bases[row if len(bases) > 1 else 0]
+            twists += basis @ self.state[name]
+            jacobians.append(basis)
+            numbers += [known.get(f"{name}.{dof}") for dof in self.problem.variables[name].dofs]
+        lost = np.array([number is None for number in numbers], bool)
+        at = np.array([number or 0 for number in numbers], int)
+        covariance = self.run.solution.covariance[np.ix_(at, at)]
+        J = np.concatenate(jacobians, axis=2)
+        out = J @ np.where(lost | lost[:, None], 0.0, covariance) @ np.swapaxes(J, 1, 2)
+        out[np.any(J[:, :, lost] != 0, axis=(1, 2))] = np.nan
+        return twists, out
 
     def points(self, recording: int, stop: str) -> Points | None:
         """The stop's beams; None where it was not scanned.

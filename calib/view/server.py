@@ -56,10 +56,13 @@ class Visitor:
 
     def readdress(self, asks: str) -> None:
         """Have its address ask for something else, behind the same key, and load nothing."""
+        self.run(READDRESS.replace("ASKS", json.dumps(asks)))
+
+    def run(self, script: str) -> None:
+        """Run a script in it."""
         from viser import _messages  # viser has no public way to do this
 
-        source = READDRESS.replace("ASKS", json.dumps(asks))
-        self.client._websock_connection.queue_message(_messages.RunJavascriptMessage(source))
+        self.client._websock_connection.queue_message(_messages.RunJavascriptMessage(script))
 
 
 class Served:

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from calib.view import scene as scenes
 from calib.view.scene import Points, Scene
+from calib.view.shown.moves import TIMES, Move, moves
 from chains import se3
 
-ROOM, RIG, AXES, POINTS, PICKED = "/room", "/rig", "/axes", "/points", "/picked"
+ROOM, RIG, AXES, MOVES = "/room", "/rig", "/axes", "/moves"
+POINTS, LIT, PICKED = "/points", "/lit", "/picked"
 ARM_COLOUR, MOUNT_COLOUR, ROOM_COLOUR = (60, 70, 85), (150, 155, 165), (236, 236, 232)
+SURE_COLOUR, UNSURE_COLOUR = (200, 30, 120), (150, 155, 165)  # of moves from CAD
+HEAD_M = 0.06  # of an arrow that is long enough
 THICK_M, THIN_M = 0.05, 0.015
 FINEST_M, COARSEST = 0.006, 1 / 350  # of a point: metres, and a share of the room
+LARGER = 1.4  # points that are lit, among others
 BEHIND_M = 0.01  # the room is drawn so far behind its surface
 OVERHEAD = 0.75  # of the way from the LiDAR to the ceiling: points above that hide the rest
 LETTER_M = 0.03  # frames are centimetres apart: their names are read from close by
@@ -35,16 +41,17 @@ class Stage:
         self.scene: Scene | None = None
         self.points: Points | None = None
         self.shown = np.zeros(0, int)
+        self.moves: Sequence[Move] = ()
         self._middle_m = np.zeros(3)
         self._room: tuple[str, str] | None = None
         self._around: np.ndarray | None = None
-        self.hidden: set[str] = set()
+        self.hidden = {MOVES}
         client.scene.configure_default_lights(cast_shadow=False)
 
     def clear(self) -> None:
         """Draw nothing."""
         self.scene, self.points, self._room = None, None, None
-        for name in (ROOM, RIG, AXES, POINTS, PICKED):
+        for name in (ROOM, RIG, AXES, MOVES, POINTS, LIT, PICKED):
             self.client.scene.remove_by_name(name)
 
     def open(self, scene: Scene, recording: int) -> None:
@@ -76,9 +83,12 @@ class Stage:
         """Draw the rig at a stop, and take these points, which `paint` draws."""
         self.client.scene.remove_by_name(PICKED)
         self._draw_rig(recording, stop)
+        self.moves = moves(self.scene, recording, stop)
+        self._draw_moves()
         self.points = points
         if points is None:
-            self.client.scene.remove_by_name(POINTS)
+            for name in (POINTS, LIT):
+                self.client.scene.remove_by_name(name)
         if self._around is None:
             self._around = self._extent(recording, stop) - self._middle_m
             self._aim()
@@ -94,26 +104,33 @@ class Stage:
         eye = self.points.eye_m[2]
         return float(low), float(high), float(eye + OVERHEAD * max(high - eye, 0.0))
 
-    def paint(self, colours: np.ndarray, below_m: float, kept: np.ndarray) -> int:
-        """Draw the points that are kept (N,) in their colours (N, 3) uint8; how many they are."""
+    def paint(
+        self, colours: np.ndarray, below_m: float, kept: np.ndarray, lit: np.ndarray | None = None
+    ) -> int:
+        """Draw the points that are kept (N,) in their colours (N, 3) uint8, those that are lit
+        (N,) larger; how many they are."""
         points = self.points
         self.shown = points.drawn(below_m, among=kept)
-        if not len(self.shown):
-            self.client.scene.remove_by_name(POINTS)
-            return 0
         span = float(np.linalg.norm(np.subtract(*scenes.box(points.xyz_m))))
         size = float(np.clip(span / 2 / np.sqrt(len(self.shown) + 1), FINEST_M, span * COARSEST))
-        xyz = points.xyz_m[self.shown] - self._middle_m
+        large = np.zeros(len(self.shown), bool) if lit is None else lit[self.shown]
+        self._draw_points(POINTS, self.shown[~large], colours, size)
+        self._draw_points(LIT, self.shown[large], colours, size * LARGER)
+        return len(self.shown)
+
+    def _draw_points(self, name: str, some: np.ndarray, colours: np.ndarray, size_m: float) -> None:
+        if not len(some):
+            self.client.scene.remove_by_name(name)
+            return
         self.client.scene.add_point_cloud(
-            POINTS,
-            xyz.astype(np.float32),
-            colours[self.shown],
-            point_size=size,
+            name,
+            (self.points.xyz_m[some] - self._middle_m).astype(np.float32),
+            colours[some],
+            point_size=size_m,
             point_shape="circle",
             point_shading="flat",
             precision="float32",
         )
-        return len(self.shown)
 
     def pick(self, origin_m: np.ndarray, direction: np.ndarray) -> int | None:
         """The point that was clicked, which is marked; None where the click met none."""
@@ -167,8 +184,33 @@ class Stage:
                 f"{AXES}/{name}/name", name, font_size_mode="scene", font_scene_height=LETTER_M
             )
 
+    def _draw_moves(self) -> None:
+        """An arrow for each link, those that are hardly chance in their colour."""
+        scene = self.client.scene
+        scene.remove_by_name(MOVES)
+        scene.add_frame(MOVES, show_axes=False, visible=MOVES not in self.hidden)
+        for i, move in enumerate(self.moves):
+            arrow = move.arrow_m - self._middle_m
+            head = min(HEAD_M, TIMES * move.length_m / 2)
+            scene.add_arrows(
+                f"{MOVES}/{i}",
+                arrow[None],
+                SURE_COLOUR if move.sure else UNSURE_COLOUR,
+                shaft_radius=head / 6,
+                head_radius=head / 2.5,
+                head_length=head,
+            )
+            if move.sure:  # others are short, and their names would hide each other
+                scene.add_label(
+                    f"{MOVES}/{i}/name",
+                    move.text,
+                    position=arrow[1],
+                    font_size_mode="scene",
+                    font_scene_height=LETTER_M,
+                )
+
     def toggle(self, name: str) -> None:
-        """Hide the room, the rig or its axes; or show it again."""
+        """Hide the room, the rig, its axes or its moves; or show it again."""
         self.hidden ^= {name}
         node = self.client.scene.get_handle_by_name(name)
         if node is not None:

@@ -206,7 +206,7 @@ def test_the_workbench_shows_it_and_offers_to_add_it(described):
         box = found.locator("svg").bounding_box()
         assert 300 < box["width"] < 400 and box["height"] > box["width"]
         assert "from 8.21 to 2.86 mm" in found.inner_text()
-        assert watched.page.get_by_label("Effect").input_value() == NAME
+        assert not watched.page.get_by_label(NAME, exact=True).is_checked()
 
 
 def test_names_in_a_picture_cannot_become_markup(described):

@@ -18,7 +18,7 @@ from calib.runs.calibrate import calibrate
 from calib.runs.diagnose import command_without, diagnose
 from calib.runs.run import MODEL, Run
 from calib.view.desk import Desk, Findings
-from calib.view.job import Job
+from calib.view.job import Change, Job
 from chains.errors import InputError
 from sensors.documents import write_yaml
 
@@ -234,11 +234,11 @@ def test_the_workbench_offers_no_file_that_a_diagnosis_names(folder):
 
 def test_the_workbench_runs_what_it_was_told_to_trust(folder, tmp_path):
     run = folder / "run"
-    *_, last = Job(run, "range_scale", tmp_path / "out").listen()
+    *_, last = Job(run, Change(tmp_path / "out", ["range_scale"])).listen()
     assert last.kind == "failed" and "--trust" in last.text and not (folder / "ran").exists()
     trust = {digest(folder / "mine.py"): None}
     assert Desk.of([run], trust).run.trust == trust
-    *_, last = Job(run, "range_scale", tmp_path / "out", trust=trust).listen()
+    *_, last = Job(run, Change(tmp_path / "out", ["range_scale"]), trust).listen()
     assert last.kind == "done" and (folder / "ran").exists()
 
 

@@ -14,8 +14,9 @@ from calib.runs.run import Run
 from calib.view.page import Page
 from calib.view.stage import PANEL_PX, PLOT_PX
 from tests.browser import Watched
-from tests.calib.viewed import blunder, diagnosed, hidden_run, small_run
-from tests.calib.workbench import FIT_MS, SOON_MS, bars, button, field, shown
+from tests.calib.viewed import blunder, diagnosed, small_run
+from tests.calib.viewed import hidden as hidden_run
+from tests.calib.workbench import FIT_MS, SOON_MS, bars, button, field, shown, tick
 
 pytestmark = pytest.mark.slow
 
@@ -36,22 +37,25 @@ def copied(small, tmp_path) -> Run:
 def hidden(once) -> Run:
     """A run whose model lacks what was hidden in its recording."""
     run = Run.open(once(hidden_run) / "run")
-    diagnose(run, refits=False)
+    diagnose(run)
     return run
 
 
 def test_the_first_finding_is_added_and_the_ladder_falls(hidden):
-    with shown(hidden.folder) as (watched, _):
+    with shown(hidden.folder) as (watched, page):
         first = watched.page.locator("[data-is=findings] tr").nth(1).inner_text()
         assert first.startswith("incidence_angle_bias")
-        assert watched.page.get_by_label("Effect").input_value() == "incidence_angle_bias"
         before = bars(watched)
         assert before == [pytest.approx(hidden.summary["rms_mm"]["held_out"], abs=1e-3)]
-        button(watched, "Add").click()
+        tick(watched, "incidence_angle_bias")
+        fall = next(c for c in hidden.diagnosis()["candidates"] if c["step"])["held_out_rms_mm"]
+        watched.page.get_by_text("{before:.2f} → {after:.2f} mm".format(**fall)).last.wait_for()
+        button(watched, "Refit").click()
         button(watched, "Cancel").wait_for()
-        assert button(watched, "Add").is_disabled()
+        assert button(watched, "Refit").is_disabled()
         watched.page.locator("[data-is=ladder] [data-mm]").nth(1).wait_for(timeout=FIT_MS)
         after = bars(watched)
+        assert after == pytest.approx(list(fall.values()), abs=0.01)
         assert after[0] == before[0] and after[-1] < before[0] / 2
         made = Run.open(f"{hidden.folder}+incidence_angle_bias")
         assert made.summary["rms_mm"]["held_out"] == pytest.approx(after[-1], abs=1e-3)
@@ -64,6 +68,19 @@ def test_the_first_finding_is_added_and_the_ladder_falls(hidden):
         button(watched, "Undo").click()
         watched.page.get_by_text("stays on disk").wait_for()
         assert bars(watched) == before and made.folder.is_dir()
+        # What was fitted once is known from then on, and what is taken away can be anything.
+        tick(watched, "incidence_angle_bias")
+        expected = watched.page.locator("[data-is=expected]")
+        expected.get_by_text(f"as {made.folder.name}").wait_for()
+        tick(watched, "ring_range_offset", False)
+        expected.get_by_text("by one step of the linearised fit").wait_for()
+        wanted = float(re.search(r"→ ([\d.]+) mm", expected.inner_text())[1])
+        button(watched, "Refit").click()
+        watched.page.get_by_text("+ incidence_angle_bias, - ring_range_offset").wait_for(
+            timeout=FIT_MS
+        )
+        assert page.desk.run.summary["rms_mm"]["held_out"] == pytest.approx(wanted, rel=0.1)
+        assert page.desk.run.effects == (*hidden.effects[:2], "incidence_angle_bias")
 
 
 def test_a_blunder_is_left_out_by_a_click_and_undone(copied):
@@ -138,7 +155,14 @@ def test_a_click_reads_the_point_that_it_meets(small):
             rows, found, off = clicked()
         assert float(rows["range"].split()[0]) == pytest.approx(columns["range_m"][found], abs=1e-3)
         assert rows["residual"].startswith(f"{1e3 * columns['residual_m'][found]:+.2f}")
-        assert set(rows) == {"residual", "ring, column", "range", "incidence", "label", "intensity"}
+        assert {"incidence", "label", "intensity", "temperature", "humidity", "location"} <= set(
+            rows
+        )
+        stop = page.picture.stage.scene.sources[0].recording
+        here = stop.stops.index(page.picture.stop.value)
+        said = float(rows["temperature"].split()[0])
+        assert said == pytest.approx(stop.covariates["temperature_c"][here], abs=0.01)
+        assert page.picture._plot.series[-2]["label"] == "clicked"  # in the plot too
 
 
 def test_stops_and_colours_are_chosen(small):
@@ -168,7 +192,7 @@ def test_stops_and_colours_are_chosen(small):
 @pytest.mark.parametrize("width", [1400, 700])
 def test_the_page_fits_its_window(small, width):
     with shown(small.folder, width=width) as (watched, _):
-        assert button(watched, "Add").is_visible()
+        assert button(watched, "Refit").is_visible()
         wide = watched.page.evaluate("document.documentElement.scrollWidth")
         assert wide <= width
         for text in ("Run", "Stop", "Ladder", "Findings"):
@@ -190,4 +214,4 @@ def test_a_recording_that_is_gone_is_said_on_the_page(small, tmp_path):
         assert len(bars(watched)) == 1  # the ladder stands all the same
         button(watched, "Diagnose").click()
         watched.page.get_by_text("is no longer there").wait_for()
-        button(watched, "Add").click(trial=True, timeout=FIT_MS)  # enabled again
+        button(watched, "Refit").click(trial=True, timeout=FIT_MS)  # enabled again

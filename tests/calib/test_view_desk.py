@@ -18,7 +18,8 @@ from calib.runs.ladder import Rung
 from calib.runs.run import Run
 from calib.view import panels
 from calib.view.desk import Desk, Findings
-from calib.view.job import Job
+from calib.view.effects.known import told
+from calib.view.job import Change, Job
 from calib.view.server import serve
 from chains.errors import InputError
 from tests.calib.viewed import blunder, candidate, diagnosed, grown, small_run
@@ -66,6 +67,8 @@ def test_new_runs_go_beside_under_a_name_not_taken(first, tmp_path):
     (tmp_path / "run+x").mkdir()
     (tmp_path / "run+x-2").mkdir()
     assert desk.folder_for("x") == tmp_path / "run+x-3"
+    assert desk.folder_for("x", "y", dropped=["z"]) == tmp_path / "run+x+y-z"
+    assert desk.folder_for(*("x" * 30 for _ in range(3))) == tmp_path / "run-refit"
 
 
 def test_a_run_that_leaves_something_out_goes_beside_too(first, tmp_path):
@@ -107,6 +110,62 @@ def test_the_curve_is_the_effects_own_or_that_which_stands_out_most(first):
     assert found.covariate_of("range_scale") == "range_m"
     assert found.covariate_of("empirical_range") == "range_m"
     assert found.curves["incidence_rad"].stands_out == pytest.approx(2.0)
+
+
+# ------------------------------------------------------------------ what is known before a refit
+
+
+def step(name: str, number: int, before: float, after: float) -> dict:
+    return candidate(name, number) | {"held_out_rms_mm": {"before": before, "after": after}}
+
+
+def expected(run: Run, *wanted: str, runs: dict[str, Run] | None = None) -> str:
+    """What is told of these effects beside the run's, or of those after "only"."""
+    chosen = wanted[1:] if wanted[:1] == ("only",) else (*run.effects, *wanted)
+    return told(run, {name: name for name in chosen}, Findings.read(run), runs or {})
+
+
+def test_what_a_diagnosis_fitted_is_expected_and_nothing_else_is(first):
+    """Its steps, one after another, and formulas after them; of all else it fitted nothing."""
+    first.summary["rms_mm"]["held_out"] = 7.71
+    steps = [step("faro_scale", 2, 3.0, 2.0), step("incidence_angle_bias", 1, 7.71, 3.0)]
+    fall = {"before": 2.0, "after": 1.25}
+    formula = {"formula": {"name": "empirical_range"}, "held_out_rms_mm": fall}
+    diagnosed(first.folder, candidates=[candidate("range_scale"), *steps], unexplained=[formula])
+    both = ("incidence_angle_bias", "faro_scale")
+    assert "7.71 → 3.00 mm" in expected(first, "incidence_angle_bias")
+    assert "7.71 → 2.00 mm" in expected(first, *both)
+    assert "7.71 → 1.25 mm" in expected(first, "empirical_range", *both)
+    unfitted = [("faro_scale",), ("empirical_range",), ("range_scale",), ("incidence_angle_bias",)]
+    unfitted[3:] = [(*both, "range_scale"), ("only", *first.effects[1:], both[0])]
+    for wanted in unfitted:
+        assert "not known before" in expected(first, *wanted) and "→" not in expected(
+            first, *wanted
+        )
+    assert "explains 0.44 mm" in expected(first, "range_scale")
+    assert "effects of the run" in expected(first)
+    # A diagnosis that began elsewhere, as without a blunder, tells nothing of this run.
+    first.summary["rms_mm"]["held_out"] = 8.0
+    assert "not known before" in expected(first, "incidence_angle_bias")
+    first.summary["rms_mm"]["held_out"] = None
+    assert "No stop was held out" in expected(first, "incidence_angle_bias")
+
+
+def test_a_run_that_was_fitted_so_is_what_is_expected(first, tmp_path):
+    first.summary["rms_mm"]["held_out"] = 7.71
+    second = grown(first, tmp_path / "second", "faro_scale", 3.0)
+    runs = {"second": second}
+    assert "7.71 → 3.00 mm: so it was fitted, as second" in expected(first, "faro_scale", runs=runs)
+    assert "3.00 → 7.71 mm" in expected(second, "only", *first.effects, runs={"run": first})
+    assert "→" not in expected(first, "faro_scale", "range_scale", runs=runs)
+    second.model["fixed"] = ["lidar.tz"]
+    assert "→" not in expected(first, "faro_scale", runs=runs)
+    second.model["fixed"] = []
+    second.model["effects"] = [*first.effects, {"name": "own", "basis": ["ring"]}]
+    of = {name: name for name in first.effects}
+    for basis, known in (("ring", True), ("ring * 2", False)):
+        wanted = of | {"own": {"name": "own", "basis": [basis]}}
+        assert ("3.00 mm" in told(first, wanted, None, runs)) is known
 
 
 OLD = json.dumps({key: [] for key in ("sentences", "unexplained", "curves", "weak_directions")})
@@ -206,7 +265,7 @@ def test_names_cannot_become_markup(first):
 
 
 def test_a_job_that_cannot_be_done_ends_in_its_sentence(first, tmp_path):
-    *_, last = Job(first.folder, "no_such_effect", tmp_path / "out").listen()
+    *_, last = Job(first.folder, Change(tmp_path / "out", ["no_such_effect"])).listen()
     assert last.kind == "failed" and "not in the catalogue" in last.text
     assert not (tmp_path / "out").exists()
 
@@ -214,7 +273,7 @@ def test_a_job_that_cannot_be_done_ends_in_its_sentence(first, tmp_path):
 @pytest.mark.slow
 def test_a_job_leaves_out_what_rigcal_add_leaves_out(first, tmp_path):
     token = "L01P01:base_markers"
-    job = Job(first.folder, out=tmp_path / "out", without=[token])
+    job = Job(first.folder, Change(tmp_path / "out", without=[token]))
     for each in job.listen():
         if each.kind == "run":
             job.stop()
@@ -231,13 +290,13 @@ def test_a_job_leaves_out_what_rigcal_add_leaves_out(first, tmp_path):
 
 def test_a_job_that_is_stopped_leaves_nothing(first, tmp_path):
     before = sorted(path.name for path in tmp_path.iterdir())
-    job = Job(first.folder, "range_scale", tmp_path / "out")
-    told = job.listen()
-    assert next(told).kind == "progress"
+    job = Job(first.folder, Change(tmp_path / "out", ["range_scale"]))
+    heard = job.listen()
+    assert next(heard).kind == "progress"
     during = {path.name for path in tmp_path.iterdir()} - set(before)
     assert len(during) == 1 and during.pop().startswith(".out.")
     job.stop()
-    assert [each.kind for each in told] == ["stopped"]
+    assert [each.kind for each in heard] == ["stopped"]
     assert sorted(path.name for path in tmp_path.iterdir()) == before
 
 
@@ -246,13 +305,13 @@ def test_a_job_makes_the_run_that_rigcal_add_makes(first, tmp_path):
     from calib.runs.calibrate import grow, grown_model
 
     formula = {"name": "humid", "site": "range", "unit": "1", "sigma": 0.01, "basis": ["range"]}
-    told = []
-    job = Job(first.folder, formula, tmp_path / "out")
+    heard = []
+    job = Job(first.folder, Change(tmp_path / "out", [formula]))
     for each in job.listen():
-        told.append(each)
+        heard.append(each)
         if each.kind == "run":
             job.stop()
-    *progress, made, last = told
+    *progress, made, last = heard
     assert (made.text, last.kind) == (str(tmp_path / "out"), "stopped")
     assert all(0 < each.share <= 1 for each in progress)
     mine = tmp_path / "mine.yaml"

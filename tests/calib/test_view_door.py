@@ -232,14 +232,17 @@ def test_each_browser_has_a_view_of_its_own_and_only_the_key_changes_anything(be
             assert mine.picture.stage.points is not None
 
             # Buttons are pressed by messages: those that they do not have, and another's.
-            for press in (other._add, other._diagnose, other._cancel, mine._add, mine._diagnose):
+            refit, refits = other._ticks._button, mine._ticks._button
+            for press in (refit, other._diagnose, other._cancel, refits, mine._diagnose):
                 two(**pressed(press), updates={"value": True})
             until(lambda: "cannot change anything" in other._note.content)
             time.sleep(0.5)
             assert asked == [] and not bench.busy
 
-            one(**pressed(mine._add), updates={"value": True})
+            one(**pressed(mine._ticks._boxes["range_scale"]), updates={"value": True})
+            one(**pressed(refits), updates={"value": True})
             until(lambda: len(asked) == 1)
+            assert asked[0][1].added == ("range_scale",)
             until(lambda: other._doing.visible and mine._doing.visible)
             assert mine._cancel.visible and not other._cancel.visible
             two(**pressed(other._cancel), updates={"value": True})
@@ -289,7 +292,7 @@ def test_a_run_that_one_browser_makes_is_offered_in_all(bench, monkeypatch, tmp_
         with browser(served.address), browser(served.address):
             until(lambda: len(pages) == len(bench._hearers) == 2)  # once shown, a page listens
             one, two = pages.values()
-            one._on_add()
+            one._on_refit({"range_scale": "range_scale"}, [])
             until(lambda: one.desk.chosen == "made" and "made" in two._run.options)
             assert two.desk.chosen == "run" and str(Run.open(made).folder) in two._note.content
     finally:

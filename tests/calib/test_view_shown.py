@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from calib.runs.run import Run
-from calib.view.own import document
+from calib.view.effects.own import document
 from calib.view.scene import Points, Scene
 from calib.view.shown import colours, look, plot
 from calib.view.shown.columns import comparable, gathered, kept
 from chains.errors import InputError
 from sensors.documents import read_yaml, write_yaml
 from sensors.recording import read_table, write_table
-from tests.calib.viewed import diagnosed, hidden_run, small_run
+from tests.calib.viewed import diagnosed, hidden, small_run
 from tests.calib.workbench import FIT_MS, bars, button, choose, field, shown
 
 TABLES = "residuals.parquet"
@@ -255,7 +255,7 @@ def test_keys_go_from_stop_to_stop_and_a_link_shows_the_same(run, other):
 @pytest.mark.slow
 def test_a_formula_of_ones_own_is_tried_and_stops_held_out_answer(once, tmp_path):
     """What was hidden is written as a formula; a wrong one is told beside its box."""
-    folder = shutil.copytree(once(hidden_run) / "run", tmp_path / "run")
+    folder = shutil.copytree(once(hidden) / "run", tmp_path / "run")
     with shown(folder) as (watched, page):
         field(watched, "Own formula").fill("abs(residual)")
         button(watched, "Try").click()

@@ -24,7 +24,7 @@ def small_run(folder: Path, **changes: object) -> Run:
     return calibrate([folder / "rec"], folder / "run", hold_out="none")
 
 
-def hidden_run(folder: Path) -> None:
+def hidden(folder: Path) -> None:
     """A run whose model lacks what was hidden in its recording, in ``folder/run``."""
     simulate("tiny", folder / "rec", 1, {"incidence_angle_bias": 2.0})
     calibrate([folder / "rec"], folder / "run")

@@ -33,7 +33,7 @@ def shown(*runs: Path, width: int = 1400) -> Iterator[tuple[Watched, Page]]:
             watched.page.set_default_timeout(SOON_MS)
             watched.page.add_init_script(FEWER_FRAMES)
             watched.page.goto(served.address)
-            button(watched, "Add").wait_for()
+            button(watched, "Refit").wait_for()
             watched.page.get_by_text("drawn; residual").or_(
                 watched.page.get_by_text("is no")
             ).first.wait_for()
@@ -64,3 +64,8 @@ def choose(watched: Watched, label: str, option: str) -> None:
     """Choose from a menu."""
     watched.page.get_by_label(label, exact=True).click()
     watched.page.get_by_role("option", name=option, exact=True).click()
+
+
+def tick(watched: Watched, effect: str, on: bool = True) -> None:
+    """Tick an effect in the list, or take its tick away."""
+    watched.page.get_by_label(effect, exact=True).set_checked(on, force=True)

@@ -167,11 +167,11 @@ def _step(fitted: Projection, bases: Bases, smooths: Sequence[Smooth], alpha: fl
 
 def _stands_out(fitted: Projection, bases: Bases, smooth: Smooth) -> bool:
     """Whether chance hardly makes so large a smooth function: of others no forms are tried, which
-    takes time. Where stops tell less of it than it has directions, as of a few walls, nothing
-    confirms it; a form has fewer, and is judged on its own."""
+    takes time. One of as many directions as there are stops, as over a few walls, none of them
+    can confirm; a form has fewer, and is judged on its own."""
     judged = _judged(fitted, bases.of(smooth.covariates))
     p = float(after_looks(judged.p_value(), smooth.looks))
-    return p < PLAUSIBLE or judged.chance.d < judged.chance.nu
+    return p < PLAUSIBLE or judged.dof >= judged.clusters
 
 
 def _judged(fitted: Projection, columns: np.ndarray) -> Test:

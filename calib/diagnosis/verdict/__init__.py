@@ -153,24 +153,19 @@ def conclude(
     found, first = heavy.found, found.looks[0]
     spoilt = [*rings, *(rejected.blunders() if rejected and not found.found else [])]
     hold = believed(found, held_out) and not formulas.instead
-    thrown = bool(heavy.refused) or (rejected is not None and not rejected.explained)
-    more = thrown or bool(formulas.formulas)
-    verdict = BAD if spoilt or found.blunders else _verdict(found, hold, more)
-    if verdict == "adequate" and forbids:
-        verdict = BAD
-    doubt = _unconfirmed(found, summary["rms_mm"]) if verdict != BAD and not more else None
-    verdict = UNNAMED if verdict == "adequate" and doubt else verdict
+    more = bool(heavy.refused or formulas.formulas or (rejected and not rejected.explained))
+    bad = bool(spoilt or found.blunders)
+    doubt = None if bad or more else _unconfirmed(found, summary["rms_mm"])
+    calm = BAD if forbids else UNNAMED if doubt else "adequate"
+    verdict = BAD if bad else _verdict(found, hold, more, calm)
     candidates = candidate_documents(heavy, held_out, verdict == UNNAMED, hold)
     untestable = _untestable(first)
     thrown = rejected.unexplained() if rejected and verdict == UNNAMED else []
-    unexplained = _structure(found, verdict, formulas, thrown)
-    if doubt and not unexplained:
-        unexplained = [_unexplained(doubt, found.looks[-1].unnamed, ())]
+    unexplained = _structure(found, verdict, formulas, thrown, doubt)
     blunders = [*spoilt, *(told.document(left, _rig(left, first)) for left in found.blunders)]
     said = "missing_effect" if doubt else verdict
     sentences = sentences_of(said, heavy, candidates, unexplained, untestable, blunders)
-    if doubt:
-        sentences.insert(0, unconfirmed(unexplained[0], summary["rms_mm"]))
+    sentences[:0] = [unconfirmed(doubt, summary["rms_mm"])] if doubt else []
     if forbids and verdict == BAD and not blunders:
         sentences.insert(0, f"This run is not to be believed as it stands: {'; '.join(forbids)}.")
     sentences += [formulas.refused] if formulas.refused else []
@@ -212,18 +207,19 @@ def _rig(left: LeftOut, look: Look) -> Rig:
     return rigs.get(left.blunder.group.recording) or sources[0].rig
 
 
-def _verdict(found: Search, hold: bool, more: bool) -> str:
+def _verdict(found: Search, hold: bool, more: bool, calm: str) -> str:
     """Of a search without blunders.
 
     Args:
         found: the search.
         hold: whether its names are to be believed.
         more: whether there is something beside all that it found.
+        calm: the verdict where it found nothing.
     """
     if not found.found:
         if found.unnamed or more:
             return UNNAMED
-        return "missing_effect" if found.chance else "adequate"
+        return "missing_effect" if found.chance else calm
     named = hold and (not found.unnamed or _absorbed(found) > ABSORBED)
     return "missing_effect" if named else UNNAMED
 
@@ -284,14 +280,20 @@ def _without_a_name(found: Search, verdict: str) -> list[tuple[Screen, Candidate
 
 
 def _structure(
-    found: Search, verdict: str, formulas: Unnamed, thrown: Sequence[Mapping[str, Any]]
+    found: Search,
+    verdict: str,
+    formulas: Unnamed,
+    thrown: Sequence[Mapping[str, Any]],
+    doubt: Candidate | None,
 ) -> list[Mapping[str, Any]]:
-    """What has no name: formulas, or bins where there are none; and what was `thrown` away."""
+    """What has no name: formulas, or bins where there are none, be they in doubt; and what was
+    `thrown` away."""
     taken = found.looks[0].stand.model.names
     if formulas.formulas:
         drawn = {c for each in formulas.formulas for c in each.covariates}
         return [*formulas.documents(taken), *(t for t in thrown if not drawn >= {*t["covariates"]})]
     left = _without_a_name(found, verdict)
+    left += [(found.looks[-1].unnamed, doubt)] if doubt else []
     return [*thrown, *(_unexplained(c, screen, taken) for screen, c in left)]
 
 

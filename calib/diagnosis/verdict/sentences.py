@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from calib.diagnosis.screen import Candidate
 from calib.diagnosis.search import FEWEST, NamedEffect
 from calib.diagnosis.stand import Look
-from calib.diagnosis.suggest import words
+from calib.diagnosis.suggest import hangs_on, words
 from calib.diagnosis.verdict.matters import FALL, Weighed
 
 UNNAMED, BAD = "unexplained_structure", "bad_data"
@@ -66,9 +67,9 @@ def sentences_of(
     return out
 
 
-def unconfirmed(each: Mapping[str, Any], rms_mm: Mapping[str, float]) -> str:
+def unconfirmed(candidate: Candidate, rms_mm: Mapping[str, float]) -> str:
     """Of structure that too few stops see for any test to confirm it."""
-    what = " and ".join(words(c) for c in each["covariates"])
+    what = " and ".join(words(c) for c in hangs_on(candidate.effect))
     over = rms_mm["held_out"] / rms_mm["noise_floor"]
     return (
         f"The held-out error is {over:.1f} times as large as expected, and no test confirms why: "

@@ -1,1 +1,2 @@
-"""What of the beams a page shows: which stops, which columns, on which scale, in which colours."""
+"""What of a run a page shows: stops and columns, on which scale, in which colours; and how far its
+rig stands from CAD."""

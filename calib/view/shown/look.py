@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from urllib.parse import parse_qsl, quote, urlencode
 
 LONGEST = 2000  # letters: what browsers and mail programs take as a link
 KEYS = ("run", "recording", "stop", "stops", "other", "colour", "scales", "only", "up", "over")
-KEYS += ("below", "camera", "dark")
+KEYS += ("lit", "moves", "below", "camera", "dark")
 
 
 def read(text: str) -> dict[str, str]:
@@ -28,3 +29,19 @@ def numbers(text: str, count: int) -> tuple[float, ...] | None:
     except ValueError:
         return None
     return values if len(values) == count and all(abs(v) < 1e9 for v in values) else None
+
+
+def read_scales(text: str) -> dict[str, tuple[float, float]]:
+    """Ends of scales by column, of those that can be read."""
+    found = {}
+    for part in text.split(","):
+        name, _, ends = part.partition(":")
+        pair = numbers(ends.replace(":", ","), 2)
+        if re.fullmatch(r"[\w.]+", name) and pair and pair[0] < pair[1]:
+            found[name] = pair
+    return found
+
+
+def write_scales(scales: Mapping[str, tuple[float, float]]) -> str:
+    """The text that `read_scales` reads."""
+    return ",".join(f"{name}:{low:.6g}:{high:.6g}" for name, (low, high) in scales.items())

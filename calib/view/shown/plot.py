@@ -13,12 +13,21 @@ from calib.view.shown.colours import column
 MOST_DOTS = 3000  # more would hide each other on a panel of 400 pixels
 BINS, FEWEST = 16, 5  # of the line of means, and beams in one: of fewer a mean says little
 MEAN = "#d6278a"  # apart from all colours of dots, on light and on dark
+FAINT = "rgba(128,128,128,0.3)"  # of dots that are not lit, on light and on dark
+RING = "#13a10e"  # about the beam that was clicked, apart from those
 Chart = tuple[tuple[np.ndarray, ...], tuple[Mapping[str, Any], ...]]
 EMPTY: Chart = ((np.zeros(2), np.full(2, np.nan)), ({"label": ""}, {"label": ""}))
 
 
 def chart(
-    points: Points, rows: np.ndarray, up: str, over: str, colours: np.ndarray, shades: int = 12
+    points: Points,
+    rows: np.ndarray,
+    up: str,
+    over: str,
+    colours: np.ndarray,
+    shades: int = 12,
+    lit: np.ndarray | None = None,
+    marked: int | None = None,
 ) -> Chart:
     """Data and series: dots of some beams, and the mean of all inliers in even bins of `over`.
 
@@ -28,6 +37,8 @@ def chart(
         up, over: columns.
         colours: (N, 3) uint8 of all beams.
         shades: how many colours the dots have at most; the nearest is taken.
+        lit: (N,) bool, beams that have their colours; all of them where None.
+        marked: index of one beam, with a ring about it.
     """
     x, y = (points.columns[n].astype(float) * column(n).scale for n in (over, up))
     rows = rows[np.isfinite(x[rows]) & np.isfinite(y[rows])]
@@ -35,14 +46,20 @@ def chart(
         return EMPTY
     means = binned(x[rows], y[rows], points.inlier[rows])
     thin = np.arange(0, len(rows), max(1, -(-len(rows) // MOST_DOTS)))
+    thin = np.union1d(thin, np.flatnonzero(rows == marked))
     thin = thin[np.argsort(x[rows[thin]], kind="stable")]
     dots = rows[thin]
     palette, group = _palette(colours[dots], shades)
+    if lit is not None:
+        palette, group = [FAINT, *palette], np.where(lit[dots], group + 1, 0)
     series: list[Mapping[str, Any]] = [{"label": column(over).heading}]
     data = [x[dots]]
     for i, colour in enumerate(palette):
         data.append(np.where(group == i, y[dots], np.nan))
         series.append({"label": "beams", **_dots(colour)})
+    if marked in rows:
+        data.append(np.where(dots == marked, y[dots], np.nan))
+        series.append({"label": "clicked", **_dots("rgba(0,0,0,0)", RING, 12)})
     data.append(means[thin])
     series.append({"label": "mean", "stroke": MEAN, "width": 2, "points": {"show": False}})
     return tuple(data), tuple(series)
@@ -73,6 +90,7 @@ def _palette(colours: np.ndarray, shades: int) -> tuple[list[str], np.ndarray]:
     return names, np.argmin(apart, axis=1)
 
 
-def _dots(colour: str) -> dict[str, Any]:
-    points = {"show": True, "size": 4, "fill": colour, "stroke": colour, "width": 0}
+def _dots(colour: str, edge: str = "", size: int = 4) -> dict[str, Any]:
+    points = {"show": True, "size": size, "fill": colour, "stroke": edge or colour}
+    points["width"] = 2 if edge else 0
     return {"stroke": "rgba(0,0,0,0)", "width": 0, "points": points}

@@ -69,6 +69,35 @@ PLANTED = {
 }
 
 
+def two_walls(rng, c):
+    """Azimuths of stops that each look at two walls, 23 degrees of either."""
+    stops = len(np.unique(c["temperature_c"]))
+    ways = rng.uniform(-np.pi, np.pi, (stops, 1, 1)) + np.array([0.0, 1.9])
+    there = ways + rng.uniform(-0.2, 0.2, (stops, len(c["ring"]) // stops // 2, 2))
+    return {"azimuth_rad": (there.reshape(-1) + np.pi) % (2 * np.pi) - np.pi}
+
+
+def test_a_form_is_found_where_too_few_stops_confirm_any_smooth_function():
+    """Of 56 directions, by 12 stops; a form with a product as its own has two."""
+    beams = table(
+        3,
+        stops=12,
+        each=300,
+        hidden=lambda c: 8e-3 * np.sin(3 * c["azimuth_rad"]) * c["elevation_rad"] / 0.27,
+        more=two_walls,
+    )
+    (step,) = pursue(beams, ALPHA, lambda *what: None)
+    assert set(step.form.term.covariates) == {"azimuth_rad", "elevation_rad"}
+    assert "sin(3 * azimuth_rad)" in step.form.term.texts[0]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_chance_is_no_form_where_stops_are_few(seed):
+    """Each stop has a range zero of its own, which bins of azimuth may take on."""
+    beams = table(seed, stops=12, each=300, scatter_m=0.002, more=two_walls)
+    assert not pursue(beams, ALPHA, lambda *what: None)
+
+
 @pytest.fixture(scope="module")
 def found():
     """What is planted, as it is found: made when asked."""
