@@ -191,11 +191,12 @@ def conclude(
 
 def _unconfirmed(found: Search, rms_mm: Mapping[str, float]) -> Candidate | None:
     """Structure that single beams show, where the held-out error is larger than chance makes it and
-    nothing is confirmed: so few stops, or walls, see each part of it that they may differ by chance
-    as much."""
+    nothing is found: so few stops, or walls, see each part of it that they may differ by chance as
+    much. What scatters by chance is in the expected error only once the model has it."""
     held_out, floor = rms_mm.get("held_out"), rms_mm["noise_floor"]
     over = held_out is not None and held_out > BY_CHANCE * floor
-    if not over or found.unnamed or found.found or not found.looks[0].stand.estimate.scans:
+    there = found.unnamed or found.found or found.chance
+    if there or not over or not found.looks[0].stand.estimate.scans:
         return None
     return next(suspects(found.looks[-1].unnamed, ALPHA_UNNAMED), None)
 
