@@ -73,19 +73,19 @@ class Blunder:
     @property
     def possible(self) -> bool:
         """Whether it may be off by so much at all."""
-        return self.group.kind != "joints" or self._turned < LINEAR_RAD
+        return self._turned_rad < (LINEAR_RAD if self.group.kind == "joints" else np.pi)
 
     @property
     def found(self) -> bool:
-        """Whether it is to be named: not where it would be turned by more than half a turn, as
-        where nothing fits at all."""
-        return self.p_adjusted < ALPHA and (self.group.kind == "joints" or self._turned < np.pi)
+        """Whether it is to be named: joints, and others only where they may be off by so much, as
+        where nothing fits they would be turned by more than half a turn."""
+        return self.p_adjusted < ALPHA and (self.group.kind == "joints" or self.possible)
 
     @property
-    def _turned(self) -> float:
-        """Its largest angle, rad."""
-        turns = np.array([unit == "rad" for unit in self.shift.units])
-        return float(np.abs(np.asarray(self.shift.offset)[turns]).max(initial=0.0))
+    def _turned_rad(self) -> float:
+        """Its largest angle."""
+        turns = self.shift.parts.get("rad", np.zeros(0, int))
+        return float(np.abs(self.shift.offset[turns]).max(initial=0.0))
 
     def leading(self) -> tuple[float, float, str, str]:
         """Size, its sigma, the unit, and along which axis; empty where it is along no single one.

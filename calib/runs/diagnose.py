@@ -74,7 +74,8 @@ def _found(
     # thrown away for no reason of their own, and groups far out that are not to blame.
     found = search(stand, progress) if run.converged else search(stand, progress, most=0)
     suspect = []
-    if found.blunders and not found.looks[-1].stand.estimate.converged:
+    unexplained = not run.converged and not found.looks[-1].stand.estimate.converged
+    if found.blunders and unexplained:
         suspect = [told.suspect(found.blunders[0])]
         found = replace(found, looks=found.looks[:1], blunders=())
     rejected = rejects(found.looks[0].stand, progress) if run.converged else None

@@ -45,7 +45,7 @@ BEFORE_SCANS = 2  # times: bodies are then a start for the scans, and no result
 REWEIGHTED, ALONE = (10, SETTLED_WEIGHT), (200, 1e-3)
 # So often is looked what beams meet before it is asked whether that leads anywhere, and so often at
 # most; good recordings, and one with the LiDAR 0.13 m from where CAD has it, take 2 to 6 passes.
-HOPEFUL, LOOKED = 8, 15
+HOPEFUL, LOOKED = 8, 15  # and after so many rounds each, weights that bring nothing are given up
 # How many sigmas wide the residuals of most stops may be by then: in those recordings it is 1 to 4,
 # with scans at wrong stops 85. And so wide may rows of trackers and targets be, as weighed, where
 # a fit has not settled: of the 90 kinds of damage it is 10 at most (a joint scaled, the mesh

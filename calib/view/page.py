@@ -249,7 +249,7 @@ class Page:
         if told.endswith(known.UNKNOWN) and before is not None and self.may_change:
             self._asked = (
                 self.desk.run.folder,
-                self._change(*known.changed(self.desk.effects, wanted)),
+                self._change(*known.difference(self.desk.effects, wanted)),
             )
             self._expected.ask(*self._asked)
             told = told.removesuffix(known.UNKNOWN) + WORKED_OUT

@@ -187,25 +187,24 @@ def _by_chance(fitted: Projection, form: Form, smooth: Smooth) -> float:
     S-method of Scheffe 1953). The smallest of these bounds, as many times."""
     columns = form.term.columns(fitted.table.covariates)
     (kept,) = needed(fitted, [form.term], [columns])
-    bounds = [_bound(fitted, columns, form.tried)]
+    whole = _judged(fitted, columns)
+    bounds = [form.tried * _tail(whole)]
     if 0 < len(kept) < columns.shape[1]:
         ways = special.comb(columns.shape[1], len(kept))
-        bounds.append(_bound(fitted, columns[:, kept], form.tried * ways))
+        bounds.append(form.tried * ways * _tail(_judged(fitted, columns[:, kept])))
     if smooth.test.statistic > COVERS * form.statistic:
-        bounds.append(_bound(fitted, columns, 1, smooth.test.dof))
+        bounds.append(_tail(whole, max(smooth.test.dof, whole.dof)))
     return at_least(min(1.0, len(bounds) * min(bounds)))
 
 
-def _bound(fitted: Projection, columns: np.ndarray, tried: float, dof: int = 0) -> float:
-    """How often chance explains as much as columns (N, k) do by the best of as many such blocks, or
-    by a function of `dof` parameters, if these are more."""
-    found = _judged(fitted, columns)
+def _tail(found: Test, among: int = 0) -> float:
+    """How often chance explains as much as a test found, or, with `among`, as the best function of
+    so many parameters does."""
     chance = found.chance
     if chance.d <= 0.0:
         return 1.0
     each = found.statistic / max(chance.trace / found.dof, 1.0)
-    most = max(dof, found.dof) if dof else chance.nu
-    return tried * float(special.fdtrc(most, chance.d, each / max(dof, found.dof)))
+    return float(special.fdtrc(among or chance.nu, chance.d, each / (among or found.dof)))
 
 
 def form(projection: Projection, term: Term, tried: int) -> Form:

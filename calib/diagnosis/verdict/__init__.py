@@ -163,9 +163,8 @@ def conclude(
     thrown = rejected.unexplained() if rejected and verdict == UNNAMED else []
     unexplained = _structure(found, verdict, formulas, thrown, doubt)
     blunders = [*spoilt, *(told.document(left, _rig(left, first)) for left in found.blunders)]
-    said = "missing_effect" if doubt else verdict
-    sentences = sentences_of(said, heavy, candidates, unexplained, untestable, blunders)
-    sentences[:0] = [unconfirmed(doubt, summary["rms_mm"])] if doubt else []
+    unsure = unconfirmed(doubt, summary["rms_mm"]) if doubt else ""
+    sentences = sentences_of(verdict, heavy, candidates, unexplained, untestable, blunders, unsure)
     if forbids and verdict == BAD and not blunders:
         sentences.insert(0, f"This run is not to be believed as it stands: {'; '.join(forbids)}.")
     sentences += [formulas.refused] if formulas.refused else []

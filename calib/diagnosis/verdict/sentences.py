@@ -23,8 +23,10 @@ def sentences_of(
     unexplained: Sequence[Mapping[str, Any]],
     untestable: Mapping[str, str],
     blunders: Sequence[Mapping[str, Any]],
+    doubt: str = "",
 ) -> list[str]:
-    """The finding in words, the verdict first; arguments as `conclude` has made them."""
+    """The finding in words, the verdict first; arguments as `conclude` has made them, `doubt` being
+    what is said of structure that nothing confirms."""
     found, traces = heavy.found, heavy.traces
     look = found.looks[0]
     residual = _residual(look)
@@ -43,7 +45,9 @@ def sentences_of(
     else:
         out += [each.sentence for each in found.chance]
     out += [*heavy.refused, *traces]
-    if verdict == UNNAMED:
+    if doubt:
+        out = [doubt, *out]
+    elif verdict == UNNAMED:
         beside = any(c["step"] and not c["dressed_up"] for c in candidates)
         what = "Beside what is named here, there" if beside else "There"
         out = [
@@ -72,9 +76,10 @@ def unconfirmed(candidate: Candidate, rms_mm: Mapping[str, float]) -> str:
     what = " and ".join(words(c) for c in hangs_on(candidate.effect))
     over = rms_mm["held_out"] / rms_mm["noise_floor"]
     return (
-        f"The held-out error is {over:.1f} times as large as expected, and no test confirms why: "
-        f"single beams show that the residuals depend on {what}, but so few stops or surfaces see "
-        "each part of that that it may be chance. Stops that face other surfaces would tell."
+        f"The held-out error is {over:.1f} times as large as expected, and no test confirms why. "
+        f"Taken one by one, the beams show residuals that depend on {what}, but too few stops or "
+        "surfaces see each part of that dependence to rule out chance. Stops that face other "
+        "surfaces would tell."
     )
 
 

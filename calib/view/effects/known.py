@@ -32,8 +32,7 @@ def told(run: Run, wanted: Effects, findings: Findings | None, runs: Mapping[str
         findings: of the run; None where it was not diagnosed.
         runs: by name, others that may have been fitted with these effects.
     """
-    added = frozenset(name for name in wanted if name not in run.effects)
-    dropped = [name for name in run.effects if name not in wanted]
+    added, dropped = difference(run.effects, wanted)
     before = run.summary["rms_mm"]["held_out"]
     if not added and not dropped:
         return "These are the effects of the run. Tick others, or take a tick away."
@@ -44,7 +43,7 @@ def told(run: Run, wanted: Effects, findings: Findings | None, runs: Mapping[str
         if after is not None and _is_of(other, run, wanted):
             return f"{_fall(before, after)}: so it was fitted, as {name}."
     if findings is not None and not dropped:
-        after = fitted(findings, before).get(added)
+        after = fitted(findings, before).get(frozenset(added))
         if after is not None:
             return f"{_fall(before, after)}: so the diagnosis fitted it."
         sizes = {c["add"]: c["unabsorbed_rms_mm"] for c in findings.candidates}
@@ -109,7 +108,7 @@ def _fall(before: float, after: float) -> str:
     return f"Expected of stops held out: {before:.2f} → {after:.2f} mm"
 
 
-def changed(own: Collection[str], wanted: Effects) -> tuple[dict[str, Any], list[str]]:
+def difference(own: Collection[str], wanted: Effects) -> tuple[dict[str, Any], list[str]]:
     """What is added to a model's own effects, as `rigcal add` takes it, and what is taken away."""
     added = {name: what for name, what in wanted.items() if name not in own}
     return added, [name for name in own if name not in wanted]

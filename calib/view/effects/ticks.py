@@ -7,7 +7,7 @@ from functools import partial
 from typing import Any
 
 from calib.view import panels
-from calib.view.effects.known import changed
+from calib.view.effects.known import difference
 
 MORE = "another effect …"
 MOST = 1000  # effects in a list: viser puts widgets in the order of numbers, this many to a step
@@ -106,5 +106,5 @@ class Ticks:
         self._said.content = panels.expected(text)
 
     def _on_button(self) -> None:
-        added, dropped = changed(self._own, self.wanted)
+        added, dropped = difference(self._own, self.wanted)
         self._use(added, dropped)
