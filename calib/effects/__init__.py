@@ -15,8 +15,10 @@ from calib.effects.arm import (
     ArmGeometry,
     ArmGravitySag,
     ArmJointEccentricity,
+    ArmJointLag,
     ArmJointOffset,
     ArmJointScale,
+    ArmJointSlip,
     ArmLinkLength,
     ArmThermalGrowth,
 )
@@ -62,7 +64,14 @@ from calib.effects.scatter import (
     TrackerScatter,
 )
 from calib.effects.targets import TargetRodTilt, TargetSphereOffset
-from calib.effects.tracker import BaseSlip, BodySlip, OptitrackDistortion, OptitrackScale
+from calib.effects.tracker import (
+    BaseSlip,
+    BodySlip,
+    OptitrackDistortion,
+    OptitrackScale,
+    TrackerCreep,
+    TrackerSlip,
+)
 from calib.rig import Rig
 from chains.errors import InputError
 
@@ -90,12 +99,14 @@ CATALOGUE: tuple[Effect, ...] = (
     NearRangeAzimuth(),
     ArmLinkLength(),
     ArmJointOffset(),
+    ArmJointSlip(),
     ArmAxisTilt(),
     ArmGeometry(),
     ArmJointScale(),
     ArmJointEccentricity(),
     ArmGravitySag(),
     ArmBacklash(),
+    ArmJointLag(),
     ArmGearError(),
     ArmThermalGrowth(),
     BaseFlex(),
@@ -106,6 +117,8 @@ CATALOGUE: tuple[Effect, ...] = (
     OptitrackDistortion(),
     BodySlip(),
     BaseSlip(),
+    TrackerSlip(),
+    TrackerCreep(),
     TargetRodTilt(),
     TargetSphereOffset(),
     FaroScale(),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from calib.effects.base import Effect, Param, Site, View
-from calib.effects.basis import finite
+from calib.effects.basis import finite, step_times
 from calib.effects.range import AMBIENT_C
 from calib.rig import Rig
 from chains.arm import Mass, gravity_torque
@@ -62,6 +62,29 @@ class ArmJointOffset(Effect):
 
     def basis(self, view: View) -> np.ndarray:
         return np.eye(len(view.rig.joint_names))[None]
+
+
+class ArmJointSlip(ArmJointOffset):
+    """A joint's zero slips once, and stays where it slipped to: a belt, a clutch, or an encoder
+    that was referenced anew."""
+
+    name = "arm_joint_slip"
+    formula = "q_i = reported_i + offset_i where t > t*, t since the first stop"
+    typical = "0.2 to 5 mrad, size assumed"
+    covariates = ("joints", "elapsed_s")
+    confounded_with = ("mount_slip", "base_slip", "arm_joint_offset")
+    source = "size assumed"
+    shape_name, shape = "t_s", 900.0
+
+    def shapes(self, stops: View) -> tuple[float, ...]:
+        return step_times(stops) if stops.rig.joint_names else ()
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        return tuple(Param(joint, unit, 0.001) for joint, unit in _units(rig).items())
+
+    def basis(self, view: View) -> np.ndarray:
+        late = (view["elapsed_s"] > self.shape).astype(float)
+        return late[:, None, None] * super().basis(view)
 
 
 class ArmAxisTilt(Effect):
@@ -229,15 +252,33 @@ class ArmBacklash(Effect):
     formula = "q_i = reported_i + h_i * (sign of joint i's last move)"
     typical = "0.1 to 1 mrad, size assumed"
     covariates = ("joints", "time_s")
-    confounded_with = ("arm_joint_offset", "arm_gear_error")
+    confounded_with = ("arm_joint_lag", "arm_joint_offset", "arm_gear_error")
     source = "size assumed"
+    column = "moved"
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
         return tuple(Param(joint, unit, 0.0005) for joint, unit in _units(rig).items())
 
     def basis(self, view: View) -> np.ndarray:
-        way = np.stack([view[f"moved.{joint}"] for joint in view.rig.joint_names], axis=1)
+        way = np.stack([view[f"{self.column}.{joint}"] for joint in view.rig.joint_names], axis=1)
         return way[:, :, None] * np.eye(way.shape[1])
+
+
+class ArmJointLag(ArmBacklash):
+    """A joint is read before it has arrived: it still lacks a share of the way that it came.
+
+    The share depends on how long the arm rests before it is read; here it is one for each joint.
+    """
+
+    name = "arm_joint_lag"
+    unit = "1"
+    formula = "q_i = reported_i + k_i * (how far joint i went since the stop before)"
+    typical = "0.01 to 0.2 percent of the way, size assumed"
+    confounded_with = ("arm_backlash", "arm_joint_scale")
+    column = "travel"
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        return tuple(Param(joint, "1", 0.0005) for joint in rig.joint_names)
 
 
 class ArmThermalGrowth(Effect):

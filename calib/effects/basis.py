@@ -37,3 +37,13 @@ def place_of(values: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Index of each value among the known ones, which ascend; -1 for one that is not known."""
     at = np.minimum(np.searchsorted(known, values), len(known) - 1)
     return np.where(known[at] == values, at, -1)
+
+
+def step_times(stops: View) -> tuple[float, ...]:
+    """Times midway between stops, three or more of them on either side; 20 at most."""
+    time_s = np.sort(stops["elapsed_s"])
+    between = (0.5 * (time_s[1:] + time_s[:-1]))[2:-2]
+    if not len(between):
+        return ()
+    chosen = np.linspace(0, len(between) - 1, min(len(between), 20)).round().astype(int)
+    return tuple(float(f"{t:.6g}") for t in np.unique(between[chosen]))

@@ -6,6 +6,7 @@ import numpy as np
 
 from calib.effects.arm import masses
 from calib.effects.base import Effect, Param, Site, View
+from calib.effects.basis import step_times
 from calib.rig import Rig
 from chains import se3
 from chains.arm import G
@@ -175,16 +176,6 @@ class MountBending(Effect):
         basis = np.zeros((len(lever), len(tree.edges), 6, 1))
         basis[:, edge, :3, 0] = np.cross(lever, -T_root_mount[:, 2, :3])
         return basis
-
-
-def step_times(stops: View) -> tuple[float, ...]:
-    """Times midway between stops, three or more of them on either side; 20 at most."""
-    time_s = np.sort(stops["elapsed_s"])
-    between = (0.5 * (time_s[1:] + time_s[:-1]))[2:-2]
-    if not len(between):
-        return ()
-    chosen = np.linspace(0, len(between) - 1, min(len(between), 20)).round().astype(int)
-    return tuple(float(f"{t:.6g}") for t in np.unique(between[chosen]))
 
 
 def mount_edges(rig: Rig) -> tuple[int, ...]:

@@ -8,8 +8,10 @@ from dataclasses import replace
 import numpy as np
 
 from calib.effects.base import Effect, Param, Site, View
-from calib.effects.rig import MountSlip, mount_edges, step_times
+from calib.effects.basis import step_times
+from calib.effects.rig import MountCreep, MountSlip, mount_edges
 from calib.rig import Rig
+from chains import se3
 
 VOLUME_M = 3.0  # half the width of a usual volume
 
@@ -110,6 +112,69 @@ class BaseSlip(BodySlip):
     def bodies(self, rig: Rig) -> tuple[str, ...]:
         bodies = rig.tracker.bodies if rig.tracker and rig.arm_edges else ()
         return tuple(body for body in bodies if not rig.joints_to(body))
+
+
+class TrackerSlip(MountSlip):
+    """The tracker is knocked once, or the place where the base stands gives way once. Which of
+    the two moved, these rows cannot tell.
+
+    All bodies are seen to move together. Where the base stands elsewhere at every stop, only a
+    LiDAR in a scanned room shows it.
+    """
+
+    name = "tracker_slip"
+    site = Site.TRACKER
+    unit = "rad, m"
+    formula = "T_opti_body as seen = exp(theta) T_opti_body where t > t*, t since the first stop"
+    typical = "0.2 to 5 mm, 0.2 to 2 mrad, size assumed"
+    covariates = ("elapsed_s", "tracked")
+    confounded_with = ("mount_slip", "base_slip", "tracker_creep")
+    source = "size assumed"
+    of_lidar = False
+
+    def shapes(self, stops: View) -> tuple[float, ...]:
+        return step_times(stops) if self.params(stops.rig) else ()
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        return self.moves() if _world_seen(rig) else ()
+
+    def basis(self, view: View) -> np.ndarray:
+        return _seen_from_elsewhere(view, self.when(view["elapsed_s"]))
+
+
+class TrackerCreep(MountCreep):
+    """The tracker, or the place where the base stands, gives way little by little, evenly in
+    time. Which of the two moves, these rows cannot tell."""
+
+    name = "tracker_creep"
+    site = Site.TRACKER
+    formula = "T_opti_body as seen = exp(theta * t / 1 h) T_opti_body, t since the first stop"
+    typical = "0.05 to 0.5 mm per hour, size assumed; tripods and tyres settle"
+    covariates = ("elapsed_s", "tracked")
+    confounded_with = ("mount_creep", "tracker_slip", "warmup_drift")
+    of_lidar = False
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        return tuple(replace(p, unit=f"{p.unit}/h") for p in self.moves() if _world_seen(rig))
+
+    def basis(self, view: View) -> np.ndarray:
+        return _seen_from_elsewhere(view, self.when(view["elapsed_s"]))
+
+
+def _world_seen(rig: Rig) -> bool:
+    """Whether something other than the tracker tells where the base stands."""
+    return rig.tracker is not None and (rig.moves != "stop" or rig.lidar is not None)
+
+
+def _seen_from_elsewhere(view: View, when: np.ndarray) -> np.ndarray:
+    """The twists (K, B, 6, 6) of bodies, in their axes, of a motion of the tracker's frame.
+
+    Args:
+        view: its column ``tracked`` (K, B, 4, 4) holds the bodies' poses, NaN where not seen.
+        when: (K,) how much of the motion has happened.
+    """
+    T_body_opti = se3.inverse(np.nan_to_num(view["tracked"]))
+    return when[:, None, None, None] * se3.adjoint(T_body_opti)
 
 
 def _in_body(view: View, field: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:

@@ -330,8 +330,9 @@ def stop_columns(rig: Rig, joints: np.ndarray, time_s: np.ndarray) -> dict[str, 
     """What follows from when and how the arm came to each of K stops, (K,) each.
 
     Each joint by its name as reported, rad or m; and, where the times are known: ``time_s``;
-    ``elapsed_s`` since the first stop; ``moved.<joint>``, which way a joint last turned: -1, 0 or
-    1, nothing being known of the first.
+    ``elapsed_s`` since the first stop; ``travel.<joint>``, how far a joint went since the stop
+    before, rad or m; ``moved.<joint>``, which way: -1, 0 or 1. Of the first both are 0: nothing
+    is known of it.
 
     Args:
         rig: whose joints they are.
@@ -342,10 +343,12 @@ def stop_columns(rig: Rig, joints: np.ndarray, time_s: np.ndarray) -> dict[str, 
     if not np.isfinite(time_s).all():
         return columns
     order = np.argsort(time_s, kind="stable")
-    way = np.zeros(np.shape(joints))
-    way[order[1:]] = np.sign(np.diff(joints[order], axis=0))
+    travel = np.zeros(np.shape(joints))
+    travel[order[1:]] = np.diff(joints[order], axis=0)
     columns |= {"time_s": time_s, "elapsed_s": time_s - time_s.min(initial=np.inf)}
-    return columns | {f"moved.{name}": w for name, w in zip(rig.joint_names, way.T, strict=True)}
+    for name, went in zip(rig.joint_names, travel.T, strict=True):
+        columns |= {f"travel.{name}": went, f"moved.{name}": np.sign(went)}
+    return columns
 
 
 def tracked_poses(rig: Rig, recording: Recording) -> np.ndarray:

@@ -75,7 +75,7 @@ UNKNOWN: dict[str, tuple[frozenset[str], dict[str, Any]]] = {
 _NOT_ALONE = {"range_offset", "range_quantisation", *DEFAULT}
 SINGLES = tuple(e.name for e in CATALOGUE if e.site is not Site.NOISE and e.name not in _NOT_ALONE)
 # Their parameters have one unit, so that a size at which they are found means something.
-OF_ONE_UNIT = tuple(n for n in SINGLES if not find(n).shape_name and n != "mount_creep")
+OF_ONE_UNIT = tuple(n for n in SINGLES if not find(n).shape_name and "creep" not in n)
 RIVALS = ("ring_elevation_offset", "ring_range_offset")
 WITHOUT_RINGS = ("arm_link_length", "arm_joint_offset")
 FAMILIES = {

@@ -215,6 +215,43 @@ def test_a_slip_is_a_step_and_creep_goes_with_time(source):
             np.testing.assert_allclose(found[k], expected.as_matrix(), atol=1e-12)
 
 
+def test_a_zero_that_slips_is_another_zero_from_then_on(source):
+    offset = np.array([1e-3, -2e-3, 3e-3, -1e-3, 2e-3, 1e-3])
+    late = source.columns["elapsed_s"] > 300
+    assert 0 < late.sum() < len(late)
+    found = placed(source, "arm_joint_slip@300", offset)
+    zeroed, plain = (placed(source, "arm_joint_offset", x) for x in (offset, 0 * offset))
+    np.testing.assert_allclose(found[late], zeroed[late], atol=1e-12)
+    np.testing.assert_allclose(found[~late], plain[~late], atol=1e-12)
+    assert np.abs(zeroed - plain).max() > 1e-4
+
+
+@pytest.mark.parametrize("name", ["tracker_slip@300", "tracker_creep"])
+def test_a_tracker_that_moves_moves_all_that_it_sees(source, name):
+    """In its own axes: what is seen at ``T_opti_body`` is said to be at ``exp(theta) T``."""
+    tracked = tracked_poses(source.rig, source.recording)
+    stops = stops_of(source, tracked=tracked)
+    elapsed_s = stops["elapsed_s"]
+    share = elapsed_s / 3600 if name.endswith("creep") else elapsed_s > 300
+    twist = np.array([1e-3, -2e-3, 3e-3, 1e-3, 2e-3, -1e-3])
+    found = np.nan_to_num(tracked) @ se3.exp(find(name).basis(stops) @ twist)
+    expected = np.stack([RigidTransform.from_exp_coords(twist * s).as_matrix() for s in share])
+    seen_there = np.isfinite(tracked).all(axis=(2, 3))
+    assert seen_there.sum() > len(elapsed_s)
+    moved = expected[:, None] @ np.nan_to_num(tracked)
+    np.testing.assert_allclose(found[seen_there], moved[seen_there], atol=1e-12)
+
+
+def test_a_tracker_that_moves_needs_another_witness(source):
+    """A base that stands elsewhere at every stop goes with it, unless a LiDAR sees the room."""
+    without = replace(source.rig, lidar=None, lidar_frame=None)
+    for name in ("tracker_slip", "tracker_creep"):
+        assert source.rig.moves == "stop" and len(find(name).params(source.rig)) == 6
+        assert find(name).params(without) == ()
+        assert len(find(name).params(replace(without, moves="never"))) == 6
+        assert find(name).params(replace(source.rig, tracker=None)) == ()
+
+
 def test_links_grow_with_the_temperature(source):
     alpha = 1e-3
     found = placed(source, "arm_thermal_growth", alpha)
@@ -254,10 +291,14 @@ def test_backlash_follows_the_way_each_joint_came(source):
     columns = stop_columns(source.rig, joints, np.array([50.0, 900.0, 400.0]))
     np.testing.assert_array_equal(columns["moved.joint_1"], [0, 1, 1])
     np.testing.assert_array_equal(columns["moved.joint_2"], [0, -1, 1])
+    np.testing.assert_allclose(columns["travel.joint_1"], [0, 0.1, 0.1])
+    np.testing.assert_allclose(columns["travel.joint_2"], [0, -1, 1])
     np.testing.assert_array_equal(columns["elapsed_s"], [0, 850, 350])
     np.testing.assert_array_equal(columns["joint_2"], [1, 1, 2])
     basis = find("arm_backlash").basis(View(source.rig, 3, columns, joints))
     np.testing.assert_array_equal(basis[1], np.diag([1, -1, 0, 0, 0, 0]))
+    basis = find("arm_joint_lag").basis(View(source.rig, 3, columns, joints))
+    np.testing.assert_allclose(basis[1], np.diag([0.1, -1, 0, 0, 0, 0]))
 
 
 # --------------------------------------------------------------------- tracker, targets, reference

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from calib import diagnose, fit
+from calib import add, diagnose, fit
 from calib.diagnosis.search import Search
 from calib.diagnosis.stand import Stand
 from calib.diagnosis.verdict import conclude
@@ -13,6 +13,8 @@ from calib.problem import build
 from calib.problem.model import Model, Source
 from calib.simulation import Spec, simulate
 from calib.solve.fit import solve
+
+from ..worlds import World, write
 
 SPEC = Spec(lidar="hesai_pandarxt32", locations=6, stops_per_location=4, column_step=100)
 
@@ -95,3 +97,17 @@ def test_what_single_beams_show_and_no_test_confirms_is_not_called_adequate(look
     else:
         assert told.unexplained[0]["covariates"] and "no test confirms" in told.sentences[0]
         assert not any("adequate" in each for each in told.sentences)
+
+
+def test_a_joint_whose_zero_slips_is_named_and_not_called_scatter(tmp_path):
+    """By a world of its own code: nothing but one joint, from the middle of the session on."""
+    world = World(seed=1, beams=800, hidden=(("joint_slip", 0.002),))
+    truth = write(world, tmp_path / "rec")
+    run = fit([tmp_path / "rec"], tmp_path / "run")
+    found = diagnose(run)
+    (name,) = found.worth_adding
+    assert name.startswith("arm_joint_slip@")
+    slipped = add(run, [name], tmp_path / "grown").solution.shared.effects[name]
+    joint = slipped.names.index("joint_3")
+    size = truth["params"]["joint_slip"]
+    assert abs(slipped.estimate[joint] - size) < 4 * slipped.sigma[joint] < size

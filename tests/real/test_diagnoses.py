@@ -1,7 +1,9 @@
 """What the diagnosis says of real hardware, where something is missing and nobody knows what."""
 
+import numpy as np
 import pytest
 
+import calib
 from calib.diagnosis.verdict import worth_adding
 from calib.problem.model import Model
 from calib.runs.calibrate import calibrate
@@ -35,6 +37,20 @@ def test_a_ur10_gives_way_and_errs_with_its_gears(shared, once):
     sag = grown.solution.shared.effects[first]
     lift, elbow = (list(sag.names).index(f"{joint}_joint") for joint in ("shoulder_lift", "elbow"))
     assert all(sag.estimate[i] > 10 * sag.sigma[i] for i in (lift, elbow)), "and it droops"
+
+
+def test_a_base_that_creeps_is_what_creeps(shared, tmp_path):
+    """By another program's arm: not its mount, which is free to move in the same way."""
+    run = calibrate([shared / "recordings/arm_base_creeps"], tmp_path / "run")
+    found = diagnose(run)
+    assert found.worth_adding == ["tracker_creep"]
+    grown = calib.add(run, ["tracker_creep"], tmp_path / "grown")
+    crept = grown.solution.shared.effects["tracker_creep"]
+    per_h, sigma = np.linalg.norm(crept.estimate[3:]), np.linalg.norm(crept.sigma[3:])
+    # 0.8 mm in the 299 poses x 20 s of the session.
+    hidden = 0.0008 / (299 * 20 / 3600)
+    assert abs(per_h - hidden) < 3 * sigma and sigma < hidden / 5
+    assert grown.summary["rms_mm"]["held_out"] < 0.5 * run.summary["rms_mm"]["held_out"]
 
 
 @pytest.mark.parametrize("kind", ["qt64", "ouster"])

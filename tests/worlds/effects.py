@@ -12,14 +12,17 @@ EFFECTS = {
     "incidence": "m: range = true + k (1 / cos(incidence) - 1)",
     "warm_up": "m: range = true + k exp(-t / 900 s)",
     "gravity_sag": "rad/(N m): joint = reported + k times gravity's torque about it",
+    "joint_slip": "rad: joint_3 = reported + k in the second half of the stops",
     "ring_by_temperature": "m: range = true + k (T - 24 C) / 4 K (2 ring / last ring - 1)",
 }
 
 
 def of_joints(hidden: tuple[tuple[str, float], ...], reported: np.ndarray) -> np.ndarray:
     """What hidden effects add to reported angles (K, 6) rad."""
-    size = dict(hidden).get("gravity_sag", 0.0)
-    return size * gravity_torque(reported)
+    size = dict(hidden)
+    late = np.arange(len(reported)) >= len(reported) / 2
+    slipped = np.outer(late, [0.0, 0.0, size.get("joint_slip", 0.0), 0.0, 0.0, 0.0])
+    return size.get("gravity_sag", 0.0) * gravity_torque(reported) + slipped
 
 
 def of_range(

@@ -219,12 +219,14 @@ def test_hidden_effects_have_their_formulas():
     found = effects.of_range(hidden, cosine, height, effects.WARM_UP_S, 28.0)
     base = 0.002 / np.e
     assert np.allclose(found, [base - 0.003, base + 0.001 + 0.003])
-    assert {name for name, _ in hidden} | {"gravity_sag"} == set(effects.EFFECTS)
+    assert {name for name, _ in hidden} | {"gravity_sag", "joint_slip"} == set(effects.EFFECTS)
     angles = np.zeros((1, 6))
     angles[0, 1] = 0.5
     turned = effects.of_joints((("gravity_sag", 1e-4),), angles)
     low, high = (arm.along(q)[0, -1, 2, 3] for q in (angles + turned, angles))
     assert low < high  # it droops
+    slipped = effects.of_joints((("joint_slip", 0.002),), np.zeros((4, 6)))
+    assert np.array_equal(slipped, np.outer([0, 0, 0.002, 0.002], np.eye(6)[2]))
 
 
 def test_moved_frames_move_in_the_axes_that_are_said():
