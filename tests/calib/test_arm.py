@@ -63,7 +63,8 @@ def test_it_is_where_the_graph_has_it(source, name, tip):
     part, known, values = found(source, names, rng)
     joints = rng.uniform(-3, 3, (50, 3))
     columns = {c: rng.uniform(10, 30, 50) for c in COLUMNS}
-    columns |= {f"moved.{joint}": rng.choice([-1.0, 1.0], 50) for joint in source.rig.joint_names}
+    for joint, travel in zip(source.rig.joint_names, rng.uniform(-1, 1, (3, 50)), strict=True):
+        columns |= {f"moved.{joint}": np.sign(travel), f"travel.{joint}": travel}
     columns |= {j: q for j, q in zip(source.rig.joint_names, joints.T, strict=True)}
     arm = Arm.as_found(source.rig, part, known, tip)
     there = in_the_graph(source, known, values, joints, columns, arm.base, arm.tip)

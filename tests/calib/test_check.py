@@ -81,7 +81,7 @@ def test_times_that_are_missing_are_said_to_be(rec):
     source = Source.open(rec)
     assert not {"time_s", "elapsed_s", "moved.turn"} & set(source.columns)
     assert "time_s" not in source.recording.to_pandas()
-    for name in ("warmup_drift", "mount_creep", "mount_slip", "arm_backlash"):
+    for name in ("warmup_drift", "mount_creep", "mount_slip", "arm_backlash", "arm_joint_lag"):
         assert lacking(effects.find(name), [source], frozenset(source.columns)), name
 
 

@@ -89,7 +89,7 @@ def test_the_catalogue_says_what_an_effect_is(effect, views):
     # It looks at nothing else.
     columns = {name: view.columns[name] for name in effect.covariates if name != "joints"}
     if "time_s" in columns:
-        columns |= {n: c for n, c in view.columns.items() if n.startswith("moved.")}
+        columns |= {n: c for n, c in view.columns.items() if n.startswith(("moved.", "travel."))}
     # What says which row it is of.
     own = {Site.REFERENCE: "normal", Site.TARGET: "target"}.get(effect.site)
     normal = {own: view.columns[own]} if own else {}
