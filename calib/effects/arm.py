@@ -56,17 +56,18 @@ class ArmJointOffset(Effect):
     covariates = ("joints",)
     confounded_with = ("arm_base", "mount", "arm_joint_eccentricity")
     source = "Mooring, Roth, Driels 1991, Fundamentals of Manipulator Calibration"
+    sigma = 0.005
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
-        return tuple(Param(joint, unit, 0.005) for joint, unit in _units(rig).items())
+        return tuple(Param(joint, unit, self.sigma) for joint, unit in _units(rig).items())
 
     def basis(self, view: View) -> np.ndarray:
         return np.eye(len(view.rig.joint_names))[None]
 
 
 class ArmJointSlip(ArmJointOffset):
-    """A joint's zero slips once, and stays where it slipped to: a belt, a clutch, or an encoder
-    that was referenced anew."""
+    """A joint's zero changes once, and stays changed: a belt jumped, a clutch slipped, or the
+    encoder was referenced anew."""
 
     name = "arm_joint_slip"
     formula = "q_i = reported_i + offset_i where t > t*, t since the first stop"
@@ -75,12 +76,10 @@ class ArmJointSlip(ArmJointOffset):
     confounded_with = ("mount_slip", "base_slip", "arm_joint_offset")
     source = "size assumed"
     shape_name, shape = "t_s", 900.0
+    sigma = 0.001
 
     def shapes(self, stops: View) -> tuple[float, ...]:
-        return step_times(stops) if stops.rig.joint_names else ()
-
-    def params(self, rig: Rig) -> tuple[Param, ...]:
-        return tuple(Param(joint, unit, 0.001) for joint, unit in _units(rig).items())
+        return step_times(stops) if self.params(stops.rig) else ()
 
     def basis(self, view: View) -> np.ndarray:
         late = (view["elapsed_s"] > self.shape).astype(float)
@@ -265,15 +264,16 @@ class ArmBacklash(Effect):
 
 
 class ArmJointLag(ArmBacklash):
-    """A joint is read before it has arrived: it still lacks a share of the way that it came.
+    """A joint is read before it has come to rest. Where it rests is off its reading by a share of
+    the distance that it went.
 
-    The share depends on how long the arm rests before it is read; here it is one for each joint.
+    The share depends on how long the arm waits before it is read; here each joint has one.
     """
 
     name = "arm_joint_lag"
     unit = "1"
     formula = "q_i = reported_i + k_i * (how far joint i went since the stop before)"
-    typical = "0.01 to 0.2 percent of the way, size assumed"
+    typical = "0.01 to 0.2 percent of the distance, size assumed"
     confounded_with = ("arm_backlash", "arm_joint_scale")
     column = "travel"
 

@@ -101,7 +101,7 @@ class MountSlip(Effect):
     sigma = np.repeat([0.001, 0.001], 3)
 
     def shapes(self, stops: View) -> tuple[float, ...]:
-        return step_times(stops) if mount_edges(stops.rig) else ()
+        return step_times(stops) if self.params(stops.rig) else ()
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
         return self.moves() if mount_edges(rig) else ()

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 
 from calib.effects.base import Effect, Param, Site, View
-from calib.effects.basis import step_times
 from calib.effects.rig import MountCreep, MountSlip, mount_edges
 from calib.rig import Rig
 from chains import se3
@@ -76,9 +75,6 @@ class BodySlip(MountSlip):
     confounded_with = ("mount_slip", "mount_creep", "optitrack_distortion")
     source = "size assumed"
 
-    def shapes(self, stops: View) -> tuple[float, ...]:
-        return step_times(stops) if self.bodies(stops.rig) else ()
-
     def bodies(self, rig: Rig) -> tuple[str, ...]:
         """The bodies that it is about."""
         tree, mount = rig.tree, mount_edges(rig)
@@ -115,8 +111,8 @@ class BaseSlip(BodySlip):
 
 
 class TrackerSlip(MountSlip):
-    """The tracker is knocked once, or the place where the base stands gives way once. Which of
-    the two moved, these rows cannot tell.
+    """The tracker is knocked once, or the place where the base stands gives way once. This data
+    cannot tell which of the two moved.
 
     All bodies are seen to move together. Where the base stands elsewhere at every stop, only a
     LiDAR in a scanned room shows it.
@@ -124,57 +120,38 @@ class TrackerSlip(MountSlip):
 
     name = "tracker_slip"
     site = Site.TRACKER
-    unit = "rad, m"
     formula = "T_opti_body as seen = exp(theta) T_opti_body where t > t*, t since the first stop"
     typical = "0.2 to 5 mm, 0.2 to 2 mrad, size assumed"
     covariates = ("elapsed_s", "tracked")
     confounded_with = ("mount_slip", "base_slip", "tracker_creep")
-    source = "size assumed"
     of_lidar = False
 
-    def shapes(self, stops: View) -> tuple[float, ...]:
-        return step_times(stops) if self.params(stops.rig) else ()
-
     def params(self, rig: Rig) -> tuple[Param, ...]:
-        return self.moves() if _world_seen(rig) else ()
+        """None where nothing but the tracker tells where the base stands."""
+        told = rig.moves != "stop" or rig.lidar is not None
+        return self.moves() if rig.tracker and told else ()
 
     def basis(self, view: View) -> np.ndarray:
-        return _seen_from_elsewhere(view, self.when(view["elapsed_s"]))
+        """The tracker's frame moves by the twist, and each body in its own axes.
+
+        Column ``tracked`` (K, B, 4, 4) holds the bodies' poses, NaN where not seen.
+        """
+        T_body_opti = se3.inverse(np.nan_to_num(view["tracked"]))
+        when = self.when(view["elapsed_s"])
+        return when[:, None, None, None] * se3.adjoint(T_body_opti)
 
 
-class TrackerCreep(MountCreep):
+class TrackerCreep(MountCreep, TrackerSlip):
     """The tracker, or the place where the base stands, gives way little by little, evenly in
-    time. Which of the two moves, these rows cannot tell."""
+    time; per hour. This data cannot tell which of the two moves.
+
+    It moves what `TrackerSlip` moves, as `MountCreep` moves it.
+    """
 
     name = "tracker_creep"
-    site = Site.TRACKER
     formula = "T_opti_body as seen = exp(theta * t / 1 h) T_opti_body, t since the first stop"
     typical = "0.05 to 0.5 mm per hour, size assumed; tripods and tyres settle"
-    covariates = ("elapsed_s", "tracked")
     confounded_with = ("mount_creep", "tracker_slip", "warmup_drift")
-    of_lidar = False
-
-    def params(self, rig: Rig) -> tuple[Param, ...]:
-        return tuple(replace(p, unit=f"{p.unit}/h") for p in self.moves() if _world_seen(rig))
-
-    def basis(self, view: View) -> np.ndarray:
-        return _seen_from_elsewhere(view, self.when(view["elapsed_s"]))
-
-
-def _world_seen(rig: Rig) -> bool:
-    """Whether something other than the tracker tells where the base stands."""
-    return rig.tracker is not None and (rig.moves != "stop" or rig.lidar is not None)
-
-
-def _seen_from_elsewhere(view: View, when: np.ndarray) -> np.ndarray:
-    """The twists (K, B, 6, 6) of bodies, in their axes, of a motion of the tracker's frame.
-
-    Args:
-        view: its column ``tracked`` (K, B, 4, 4) holds the bodies' poses, NaN where not seen.
-        when: (K,) how much of the motion has happened.
-    """
-    T_body_opti = se3.inverse(np.nan_to_num(view["tracked"]))
-    return when[:, None, None, None] * se3.adjoint(T_body_opti)
 
 
 def _in_body(view: View, field: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:

@@ -241,8 +241,8 @@ def test_a_tracker_that_moves_moves_all_that_it_sees(source, name):
     np.testing.assert_allclose(found[seen_there], expected[seen_there], atol=1e-12)
 
 
-def test_a_tracker_that_moves_needs_another_witness(source):
-    """A base that stands elsewhere at every stop goes with it, unless a LiDAR sees the room."""
+def test_a_tracker_moves_only_where_something_else_tells_where_the_base_is(source):
+    """It cannot be told from a base that stands elsewhere at every stop, but by a LiDAR."""
     without = replace(source.rig, lidar=None, lidar_frame=None)
     for name in ("tracker_slip", "tracker_creep"):
         assert source.rig.moves == "stop" and len(find(name).params(source.rig)) == 6

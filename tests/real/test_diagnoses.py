@@ -40,7 +40,7 @@ def test_a_ur10_gives_way_and_errs_with_its_gears(shared, once):
 
 
 def test_a_base_that_creeps_is_what_creeps(shared, tmp_path):
-    """By another program's arm: not its mount, which is free to move in the same way."""
+    """Of another program's arm; a mount that creeps explains less."""
     run = calibrate([shared / "recordings/arm_base_creeps"], tmp_path / "run")
     found = diagnose(run)
     assert found.worth_adding == ["tracker_creep"]
