@@ -20,6 +20,10 @@ Measured on 24 units' own tables (Hesai's correction files, Ouster's metadata, H
 files): as they are, every other numbering leaves 1.46 times the misfit or more; numbered from the
 other end, the right one leaves 0.04 of it at most; one too low 0.42, and so one too high but for
 two Ousters, whose own angles lie half a step off: there one too high is not told."""
+_NEIGHBOURS = 9
+"""Rings whose median a ring is compared with, as a unit's own angles differ smoothly from its
+model's: of the same 24 units by 0.94 steps at most from that median, and none is out of order."""
+_LISTED = 3
 _FOREIGN_RAD, _FOREIGN_STEPS = np.radians(2.0), 4.0
 """Beyond both, elevations are of no model known; units are off by 1.2 deg or 2.4 steps at most."""
 
@@ -30,18 +34,21 @@ class RingFinding:
 
     Args:
         what: "reversed"; "shifted", by `shift`; "upside_down", z reversed; "model", those of
-            another, `model`; "unknown", nothing that fits.
-        off_rad: rms of the rings' elevations against the model's table.
+            another, `model`; "exchanged", some rings bear others' numbers; "unknown", nothing that
+            fits.
+        off_rad: rms of the rings' elevations against the model's table; of those alone that bear
+            other rings' numbers, `rings`, if some do, and beside their neighbours'.
         left_rad: the same against the numbering that fits best.
         sentence: for people.
     """
 
-    what: Literal["reversed", "shifted", "upside_down", "model", "unknown"]
+    what: Literal["reversed", "shifted", "upside_down", "model", "exchanged", "unknown"]
     off_rad: float
     left_rad: float
     sentence: str
     shift: int = 0
     model: str | None = None
+    rings: tuple[int, ...] = ()
 
 
 def ring_elevations(sums_rad: ArrayLike, counts: ArrayLike) -> Array:
@@ -78,7 +85,7 @@ def odd_rings(lidar: LidarModel, elevation_rad: ArrayLike) -> RingFinding | None
     step_rad = _step_rad(lidar)
     off_rad = _rms(seen[rings] - lidar.elevation_rad[rings])
     if off_rad < least_off_rad(lidar):
-        return None
+        return _exchanged(lidar, seen, rings)
     others = [
         (_rms(seen[at] - table[at]), words)
         for table, words in _numberings(lidar)
@@ -87,6 +94,9 @@ def odd_rings(lidar: LidarModel, elevation_rad: ArrayLike) -> RingFinding | None
     ]
     left_rad, found = min(others, key=lambda other: round(other[0], 6))  # the first of equals
     if left_rad > _EXPLAINED * off_rad:
+        exchanged = _exchanged(lidar, seen, rings)
+        if exchanged is not None:
+            return exchanged
         if off_rad < max(_FOREIGN_RAD, _FOREIGN_STEPS * step_rad):
             return None
         found = {"what": "unknown", "said": "are those of no model of the catalogue"}
@@ -100,6 +110,37 @@ def odd_rings(lidar: LidarModel, elevation_rad: ArrayLike) -> RingFinding | None
             f"rings of {lidar.name} {found['said']}: their elevations are "
             f"{np.degrees(off_rad):.2g} deg rms off its table, and {np.degrees(left_rad):.2f} deg "
             "off the nearest other one"
+        ),
+    )
+
+
+def _exchanged(lidar: LidarModel, seen: Array, rings: Array) -> RingFinding | None:
+    """Rings that lie where others should, if any: they are not in their table's order."""
+    from scipy.ndimage import median_filter  # late: few rings are out of order
+
+    rings = rings[np.argsort(lidar.elevation_rad[rings])]
+    table, seen = lidar.elevation_rad[rings], seen[rings]
+    if np.all(np.diff(seen) > 0):
+        return None
+    of_unit = table + median_filter(seen - table, _NEIGHBOURS, mode="nearest")
+    off = np.abs(seen[:, None] - of_unit)
+    nearest, own = off.argmin(axis=1), off.diagonal()
+    step_rad = _CLEARLY_OFF * _step_rad(lidar)
+    wrong = np.flatnonzero((own > step_rad) & (off.min(axis=1) < _EXPLAINED * own))
+    if not 0 < len(wrong) <= len(rings) // 2:  # most are needed to tell the unit's own angles
+        return None
+    wrong = wrong[np.argsort(rings[wrong])]
+    said = [f"ring {rings[k]} lies where ring {rings[nearest[k]]} should" for k in wrong[:_LISTED]]
+    more = f", and {len(wrong) - _LISTED} more rings elsewhere" if len(wrong) > _LISTED else ""
+    off_rad, left_rad = _rms(own[wrong]), _rms(off[wrong, nearest[wrong]])
+    return RingFinding(
+        what="exchanged",
+        off_rad=off_rad,
+        left_rad=left_rad,
+        rings=tuple(rings[wrong].tolist()),
+        sentence=(
+            f"rings of {lidar.name} bear other rings' numbers: {', '.join(said)}{more}; their "
+            f"elevations are {np.degrees(off_rad):.2g} deg rms off the table, beside neighbours"
         ),
     )
 

@@ -110,6 +110,7 @@ def test_where_nothing_was_done_nothing_is_named(tmp_path, seed):
             for each in (
                 ("base body taped anew from a stop on", None, "base_slip"),
                 ("rings numbered one off", "rings", None),
+                ("two rings exchanged", "rings", None),
                 ("ranges long at one stop", ":scan", None),
             )
         ),

@@ -48,6 +48,16 @@ def rings_in_the_order_of_firing(scene: Scene, times: float) -> Done:
 
 
 @mishap("lidar")
+def two_rings_exchanged(scene: Scene, times: float) -> Done:
+    """They bear each other's numbers in the driver."""
+    count = _rings(scene)
+    ring = np.arange(count)
+    ring[[count // 4, 3 * count // 4]] = 3 * count // 4, count // 4
+    scene.each_scan(lambda c: c.update(ring=ring[c["ring"].astype(int)]))
+    return done({"rings*", "*:rings"})
+
+
+@mishap("lidar")
 def all_returns_of_ring_zero(scene: Scene, times: float) -> Done:
     scene.each_scan(lambda c: c.update(ring=0 * c["ring"].astype(int)))
     return done({"rings*", "*:rings"})

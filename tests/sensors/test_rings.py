@@ -124,6 +124,23 @@ def test_other_numbers_are_told_from_the_least_size_on(model):
     assert np.isinf(least_off_rad(replace(lidar, elevation_rad=table[:4])))
 
 
+def test_rings_that_bear_each_others_numbers_are_named(unit):
+    """Two far from each other, two neighbours, three in a round: these rings and no others. A lone
+    ring between two others as well."""
+    table, lidar = unit
+    for those in ([3, 12], [6, 7], [2, 9, 14]):
+        seen = table.copy()
+        seen[those] = table[np.roll(those, 1)]
+        found = odd_rings(lidar, seen)
+        assert found.what == "exchanged" and set(found.rings) == set(those)
+        for ring, at in zip(those, np.roll(those, 1), strict=True):
+            assert f"ring {ring} lies where ring {at} should" in found.sentence
+        assert found.left_rad < 0.6 * found.off_rad
+    seen = table.copy()
+    seen[4] = table[11] + 0.1 * (table[12] - table[11])
+    assert odd_rings(lidar, seen).rings == (4,)
+
+
 def test_too_few_rings_tell_nothing():
     lidar = load_lidar("hesai_pandarxt32")
     counts = np.r_[np.ones(5), np.zeros(27)]
