@@ -22,7 +22,8 @@ class Chart:
         reading: how to read it, in a sentence or two.
         draw: makes the figure.
         wide: whether it takes the page's whole width.
-        tail: whether the page folds it away among those that few will need.
+        quiet: whether it shows nothing of note, or what a table says as well: the page has its
+            title alone, which opens it.
     """
 
     id: str
@@ -30,7 +31,7 @@ class Chart:
     reading: str
     draw: Callable[[], Figure]
     wide: bool = False
-    tail: bool = False
+    quiet: bool = False
 
     def figure(self) -> Figure:
         """The figure, drawn in the house style."""

@@ -56,15 +56,16 @@ class Section:
 
     @property
     def shown(self) -> list[Drawn]:
-        return [drawn for drawn in self.charts if not drawn.chart.tail]
+        return [drawn for drawn in self.charts if not drawn.chart.quiet]
 
     @property
     def folded(self) -> list[Drawn]:
-        return [drawn for drawn in self.charts if drawn.chart.tail]
+        return [drawn for drawn in self.charts if drawn.chart.quiet]
 
     def read_as(self, chart: Chart) -> str:
-        """The id of the first chart of the section that is read as this one is; its own, maybe."""
-        return next(d.chart.id for d in self.charts if d.chart.reading == chart.reading)
+        """The id of the first chart on the page that is read as this one is; its own, maybe."""
+        drawn = [*self.shown, *self.folded]
+        return next(d.chart.id for d in drawn if d.chart.reading == chart.reading)
 
 
 def render(
@@ -165,13 +166,13 @@ def _numbers(evidence: Evidence) -> list[tuple[str, str]]:
     return out
 
 
-def _candidates(evidence: Evidence) -> list[dict[str, str]]:
-    """Candidates that are confirmed, or beyond chance, each with its evidence in words."""
+def _candidates(evidence: Evidence) -> dict[str, list[dict[str, Any]]]:
+    """Candidates that are confirmed, and others beyond chance, each with its evidence in words."""
     about = {effect.family: effect_page(effect)["what"] for effect in CATALOGUE}
     candidates = evidence.diagnosis["candidates"] if evidence.diagnosis else []
     own = {c["effect"]: c["document"] for c in candidates if isinstance(c.get("document"), Mapping)}
     about |= {name: str(document.get("what", "")) for name, document in own.items()}
-    return [
+    told = [
         {
             "name": c["add"],
             "what": about.get(c["effect"], ""),
@@ -180,6 +181,8 @@ def _candidates(evidence: Evidence) -> list[dict[str, str]]:
         }
         for c in [c for c in candidates if c["step"] or c["p_adjusted"] < ALPHA][:TOLD_CANDIDATES]
     ]
+    confirmed = [c for c in told if c["confirmed"]]
+    return {"confirmed": confirmed, "others": [c for c in told if c not in confirmed]}
 
 
 def _formulas(evidence: Evidence) -> bool:

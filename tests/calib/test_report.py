@@ -121,8 +121,23 @@ def test_a_browser_shows_every_chart_and_asks_nobody_for_anything(pages, shown):
 def told_below(chart, contents):
     """How it is read, or which figure above it in its section is read so."""
     section = next(charts for charts in contents.sections.values() if chart in charts)
-    first = next(each for each in section if each.reading == chart.reading)
+    shown = sorted(section, key=lambda each: each.quiet)
+    first = next(each for each in shown if each.reading == chart.reading)
     return chart.reading if first is chart else f"Read as {first.id}."
+
+
+def test_figures_without_a_finding_are_their_titles_until_they_are_opened(pages, shown):
+    """Every chart is one or the other; a link to a folded one opens it."""
+    page, charts = shown.page, pages[0].contents.charts
+    for chart in charts:
+        assert page.locator(f"figure[id='{chart.id}']").is_visible() != chart.quiet
+    quiet = [chart for chart in charts if chart.quiet]
+    assert 0 < len(quiet) < len(charts)
+    found = page.locator(".quiet > details:has(figure) > summary").all_inner_texts()
+    assert sorted(found) == sorted(chart.title for chart in quiet)
+    page.goto(f"{pages[0].file.as_uri()}#{quiet[-1].id}")
+    assert page.locator(f"figure[id='{quiet[-1].id}']").is_visible()
+    assert not page.locator(f"figure[id='{quiet[0].id}']").is_visible()
 
 
 def test_nothing_is_wider_than_the_window(shown):

@@ -13,6 +13,7 @@ from calib.report.chart import Absent, Chart
 from calib.report.evidence import Evidence
 from calib.residuals.targets import HangingTarget
 from calib.residuals.tracker import TrackedBody
+from calib.show.misfit import STANDS_OUT
 from calib.show.scale import round_up
 from chains import se3
 
@@ -52,6 +53,7 @@ def tracked(evidence: Evidence) -> Iterator[Chart | Absent]:
         f"them ({worst}); the tracker's noise alone is {sigma_mm:.2f} mm",
         evidence.sources[0].rig.world,
         bodies,
+        sigma_mm,
     )
 
 
@@ -73,6 +75,7 @@ def targets(evidence: Evidence) -> Iterator[Chart | Absent]:
         f"noise is {sigma_mm:.2f} mm",
         evidence.sources[0].rig.reference_frame,
         {"sphere": arrows},
+        sigma_mm,
     )
 
 
@@ -86,7 +89,9 @@ def _seen(blocks: Sequence[TrackedBody], values: Mapping[str, np.ndarray]) -> Ar
     return Arrows(np.concatenate(at), np.concatenate(off))
 
 
-def _chart(name: str, title: str, frame: str, bodies: Mapping[str, Arrows]) -> Chart:
+def _chart(
+    name: str, title: str, frame: str, bodies: Mapping[str, Arrows], sigma_mm: float
+) -> Chart:
     scale = magnification(list(bodies.values()))
     return Chart(
         name,
@@ -96,6 +101,7 @@ def _chart(name: str, title: str, frame: str, bodies: Mapping[str, Arrows]) -> C
         f"axes of '{frame}'. Arrows at random are noise; neighbours that agree are an error.",
         lambda: _draw(bodies, scale, frame),
         wide=True,
+        quiet=all(arrows.rms_mm < STANDS_OUT * sigma_mm for arrows in bodies.values()),
     )
 
 
@@ -108,7 +114,7 @@ def magnification(groups: Sequence[Arrows]) -> float:
 
 
 def _draw(bodies: Mapping[str, Arrows], scale: float, frame: str) -> Figure:
-    figure, grid = plots.axes(plots.WIDE, 3.9, 1, 2)
+    figure, grid = plots.axes(plots.WIDE, 3.2, 1, 2)
     for ax, (i, k), what in zip(grid[0], ((0, 1), (0, 2)), ("above", "the side"), strict=True):
         for (name, arrows), colour in zip(bodies.items(), _colours(len(bodies)), strict=True):
             some = slice(None, None, len(arrows.at_m) // MOST_ARROWS + 1)

@@ -51,6 +51,7 @@ def groups(evidence: Evidence) -> Iterator[Chart | Absent]:
         "here.",
         lambda: _groups(found, loud, stops),
         wide=True,
+        quiet=not loud,
     )
 
 

@@ -118,6 +118,7 @@ def correlation(evidence: Evidence) -> Iterator[Chart | Absent]:
         f"effect with many parameters their mean stands for all.",
         lambda: _correlation(names, matrix),
         wide=True,
+        quiet=True,
     )
 
 

@@ -131,7 +131,7 @@ def chain(evidence: Evidence) -> Iterator[Chart | Absent]:
 
 
 def _chain(links: Sequence[ChainLink]) -> Figure:
-    figure, grid = plots.axes(plots.WIDE, 0.7 + 0.42 * len(links))
+    figure, grid = plots.axes(plots.WIDE, 0.7 + 0.34 * len(links))
     ax = grid[0, 0]
     ax.set_axis_off()
     ax.set_xlim(0, 100)
@@ -200,6 +200,7 @@ def moves(evidence: Evidence) -> Iterator[Chart | Absent]:
         "data said nothing and the number is CAD's.",
         lambda: _moves(rows),
         wide=True,
+        quiet=True,
     )
 
 
@@ -278,7 +279,7 @@ def _many_chart(fitted: VariableEstimate, name: str) -> Chart:
         "The estimate of each parameter, in the order of solution.yaml, with its 95 % band; zero "
         "is what paper says.",
         lambda: _curve(fitted, "parameter"),
-        tail=True,
+        quiet=True,
     )
 
 

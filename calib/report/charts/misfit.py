@@ -51,6 +51,7 @@ def by_stop(evidence: Evidence) -> Iterator[Chart | Absent]:
         f"that stop; a whole row of dots there is a sigma too small, or an effect that is missing.",
         lambda: _by_stop(stops, loud),
         wide=True,
+        quiet=most < STANDS_OUT,
     )
 
 
@@ -99,6 +100,7 @@ def moves_from_cad(evidence: Evidence) -> Iterator[Chart | Absent]:
         f"beyond it the value in rig.yaml or in the URDF is wrong, a sign or a unit say, or the "
         f"estimate is.",
         lambda: _moves(dict(list(found.items())[:MOST_BARS])),
+        quiet=not loud,
     )
 
 

@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from calib.report.plots import Axes, Figure
 
 NO_BEAMS = "there are no scans, so no residuals of beams"
-FRONT = {*FIRST, "stop", "elapsed_s", "recording"}  # what is not folded away, and temperature
+FRONT = {*FIRST, "stop", "elapsed_s", "recording"}  # shown if residuals hang on it; temperature too
+ALWAYS = ("incidence_rad", "range_m")  # shown whatever is left
 AXIS_UNITS = {
     "_rad": ("deg", 180.0 / np.pi),
     "_m": ("m", 1.0),
@@ -43,6 +44,7 @@ def curves(evidence: Evidence) -> Iterator[Chart | Absent]:
         return
     for name, now in evidence.after.curves.items():
         was = evidence.earlier.curves.get(name)
+        front = name in FRONT or "temperature" in name
         yield Chart(
             curve_id(name),
             _title(name, now, was, evidence.before),
@@ -50,7 +52,7 @@ def curves(evidence: Evidence) -> Iterator[Chart | Absent]:
             "residuals scatter. Bands hold the mean with 95 %, stops and surfaces counted, not "
             "points; where one holds zero, nothing is left to explain there.",
             lambda now=now, was=was: _curve(now, was, evidence.before),
-            tail=name not in FRONT and "temperature" not in name,
+            quiet=name not in ALWAYS and not (front and outside(now)[2]),
         )
     for name in FIRST:
         if name not in evidence.after.curves:
@@ -114,7 +116,7 @@ def _curve(now: ResidualCurve, was: ResidualCurve | None, before: str) -> Figure
     names = now.axis.names or ()
     margins = None if len(names) > UPRIGHT_NAMES else MARGINS
     figure, grid = plots.axes(
-        plots.HALF, 4.3, 3, margins=margins, sharex=True, height_ratios=(2.0, 2.0, 1.0)
+        plots.HALF, 3.7, 3, margins=margins, sharex=True, height_ratios=(2.0, 2.0, 1.0)
     )
     top, middle, bottom = grid[:, 0]
     if was is not None:
@@ -236,6 +238,7 @@ def thrown_away(evidence: Evidence) -> Iterator[Chart | Absent]:
         "lies beyond the picture stands at its ends.",
         lambda: _thrown_away(now),
         wide=True,
+        quiet=bool(found.get("explained")),
     )
 
 

@@ -18,7 +18,7 @@ from calib.show.scale import round_up
 if TYPE_CHECKING:
     from calib.report.plots import Figure
 
-MOST_STOPS = 4  # that are drawn, the worst: as many as a screen holds in a row each
+MOST_STOPS = 3  # that are drawn, the worst: as many as a screen holds in a row each
 NAME = 20  # letters of a stop's name that stand along a map
 WITHIN = 0.95  # of the cells of stops held out: those that lie inside the scale
 
@@ -51,7 +51,7 @@ def unseen(evidence: Evidence) -> Iterator[Chart | Absent]:
 
 
 def _unseen(stops: Sequence[StopMaps]) -> Figure:
-    height = 1.2 + 1.5 * len(stops)
+    height = 1.2 + 1.25 * len(stops)
     figure, grid = plots.axes(plots.WIDE, height, len(stops), 3, sharex=True, sharey="row")
     off_mm = np.concatenate([1e3 * np.abs(stop.map_m[-1]).ravel() for stop in stops])
     limit = round_up(float(np.nanquantile(off_mm, WITHIN)))
