@@ -85,7 +85,7 @@ bench-hidden: system $(TESTED)
 
 docs: system
 	@echo "== docs: the site, in build/docs"
-	$(PIP) sphinx myst-parser furo
+	$(PIP) sphinx myst-nb furo ipykernel pandas
 	$(BIN)/python -m sphinx -W --keep-going -q -b html docs build/docs
 
 clean:

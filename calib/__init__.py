@@ -21,11 +21,13 @@ if TYPE_CHECKING:
     from calib.runs.diagnose import diagnose
     from calib.runs.explain import explain
     from calib.runs.run import Run
+    from calib.show.notebook import ProgressLine
     from calib.simulation import simulate
 
 __all__ = [
     "Arm",
     "Model",
+    "ProgressLine",
     "Recording",
     "Run",
     "add",
@@ -43,6 +45,7 @@ __all__ = [
 _HOME = {
     "Arm": "calib.evaluation.arm:Arm",
     "Model": "calib.problem.model:Model",
+    "ProgressLine": "calib.show.notebook:ProgressLine",
     "Recording": "calib.rig.recording:Recording",
     "Run": "calib.runs.run:Run",
     "add": "calib.runs.add:add",

@@ -12,12 +12,16 @@ from calib.effects import CATALOGUE  # noqa: E402
 from calib.show.tables import effect_page  # noqa: E402
 
 project, author, copyright = "rigcal", "the rigcal authors", "the rigcal authors"
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 html_theme = "furo"
 html_title = "rigcal"
 html_copy_source = False
 myst_enable_extensions = ["deflist"]
 myst_heading_anchors = 3
+nb_execution_mode = "cache"  # notebooks are run, again only where they have changed
+nb_execution_timeout = 600
+nb_execution_in_temp = True
+nb_execution_raise_on_error = True
 autodoc_typehints = "none"
 autodoc_preserve_defaults = True
 # Pages link to files beside the site, as they do where the repository shows them.

@@ -28,11 +28,13 @@ _GROUPS = {
 
 
 def _open3d() -> ModuleType:
-    """Open3D, opened late and without its plots for notebooks: these bring a web server along,
-    which is half of the time that it takes to start."""
-    plots = "open3d.visualization.draw_plotly"
+    """Open3D, opened late and without what it has for notebooks: its plots bring a web server
+    along, which is half of the time that it takes to start, and its viewer prints that it is there.
+    """
+    plots, viewer = "open3d.visualization.draw_plotly", "OPEN3D_DISABLE_WEB_VISUALIZER"
     if "open3d" not in sys.modules and plots not in sys.modules:
         sys.modules[plots] = _LaterPlots(plots)
+        os.environ.setdefault(viewer, "true")  # unless somebody has asked for it
         try:
             import open3d
         finally:

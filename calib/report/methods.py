@@ -6,6 +6,7 @@ the first name that has to do with runs.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING
 
 from calib.runs.run import Run
@@ -59,9 +60,11 @@ def plot(run: Run, name: str) -> Figure:
     Raises:
         InputError: there is no such figure, or not of this run, or a recording has changed.
     """
-    from calib.report import Evidence, figure
+    from calib.report import Evidence, figure, plots
 
-    return figure(Evidence.of([run]), name)
+    found = figure(Evidence.of([run]), name)
+    found._repr_png_ = partial(plots.png, found)  # what a notebook shows of it
+    return found
 
 
 def diagnose(run: Run) -> Diagnosis:

@@ -229,6 +229,16 @@ def check_format(path: Path | str) -> str:
     return kind
 
 
+def png(figure: Figure) -> bytes:
+    """The figure as a picture for a screen."""
+    file = io.BytesIO()
+    with styled():
+        figure.set_dpi(MAP_DPI)  # first: letters are as wide as whole dots make them
+        _lay_out(figure)
+        figure.savefig(file, format="png", dpi=MAP_DPI, facecolor="white")
+    return file.getvalue()
+
+
 def save(figure: Figure, path: Path | str) -> None:
     """Write a figure as the end of the path says; `check_format` says what it may be."""
     from matplotlib import rc_context

@@ -90,19 +90,23 @@ def _changes(link: Mapping[str, Any], words: Words) -> Iterator[str]:
 
 
 def closing(run: Run) -> list[str]:
-    """Of a run that has just been fitted: its error beside what is expected, what it is worth, and
-    the next command."""
-    rms, verdict = run.summary["rms_mm"], judge(run, None)
+    """Of a run: its error beside what is expected and what it is worth; until it is diagnosed, the
+    next command as well."""
+    diagnosis = run.diagnosis()
+    rms, verdict = run.summary["rms_mm"], judge(run, diagnosis)
     kind, before = ("held_out", "held_out_") if rms.get("held_out") is not None else ("fit", "")
     what = {"held_out": "held-out error", "fit": "error of the fit, none held out"}[kind]
     error = over_beams(rms[kind], run.summary, before).partition("; ")[0]
+    first = f"{what}: {error}; {rms['noise_floor']:.2f} mm expected if the model is right"
+    if diagnosis:
+        return [first, f"verdict: {verdict.meaning}; {verdict.sentence}"]
     told = "nothing speaks against the model; diagnose has not been asked"
     if reasons := [each for each in verdict.reasons if not each.startswith(UNASKED)]:
-        first, more = reasons[0].partition(": ")[0], len(reasons) - 1
+        why, more = reasons[0].partition(": ")[0], len(reasons) - 1
         others = f" (and {more} more reason{'s' * (more > 1)})" if more else ""
-        told = f"{verdict.meaning}; {first}{others}"
+        told = f"{verdict.meaning}; {why}{others}"
     return [
-        f"{what}: {error}; {rms['noise_floor']:.2f} mm expected if the model is right",
+        first,
         f"verdict so far: {told}",
         f"next: rigcal diagnose {shlex.quote(str(run.folder))}",
     ]

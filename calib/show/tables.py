@@ -208,7 +208,15 @@ class _Terminal(Console):
 def terminal(file: IO[str] | None = None) -> Console:
     """Where people read: at most `WIDTH` columns wide, and as wide where nobody looks; stdout where
     no file is given."""
-    console = _Terminal(file=file, markup=False, highlight=False, emoji=False)
+    # In a notebook rich would colour a text for a file, and show it beside.
+    console = _Terminal(
+        file=file,
+        markup=False,
+        highlight=False,
+        emoji=False,
+        force_jupyter=False,
+        force_terminal=file.isatty() if file else None,
+    )
     console.width = min(console.width, WIDTH) if console.is_terminal else WIDTH
     return console
 

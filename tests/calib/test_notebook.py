@@ -11,7 +11,7 @@ from calib.results.solution import EffectEstimate, FrameEstimate, Part, Solution
 from calib.runs.ladder import Rung
 from calib.runs.run import Run
 from calib.show.blunders import blunder_cells
-from calib.show.notebook import diagnosis_html, run_html, rung_html
+from calib.show.notebook import ProgressLine, diagnosis_html, run_html, rung_html
 from calib.show.tables import print_run
 
 NAMES = ("lidar.rx", "lidar.ry", "lidar.rz", "lidar.tx", "lidar.ty", "lidar.tz")
@@ -76,6 +76,17 @@ def test_a_run_shows_what_the_terminal_shows(run, capsys):
     assert "not told: lidar.tz: no <floor> in sight" in said
 
 
+def test_a_card_begins_with_its_finding_and_folds_the_rest(run):
+    page = parsed(run_html(run))
+    assert page.find("p/b").text.startswith("runs/a&b: held-out error: 1.42 mm")
+    folded = [each.find("summary").text for each in page.iter("details")]
+    assert folded == ["links", "effects", "errors", "not told: 1"]
+    assert not [each for each in page.iter("details") if each.get("open")]
+    assert not [each for each in page if each.tag == "table"]
+    alone = parsed(rung_html(Rung(run, None))).find("details")
+    assert alone.get("open")  # there is nothing else to see
+
+
 def candidate(name):
     """A confirmed candidate of a diagnosis."""
     return {
@@ -128,6 +139,28 @@ def test_a_rung_shows_its_errors(run):
     rows = cells(rung_html(Rung(run, None)))
     assert rows[0] == ["ladder", "model", "held out, mm", "fit, mm", "expected, mm"]
     assert rows[1] == ["a&b", "start", "1.42", "0.86", "1.74"]
+
+
+def test_progress_is_one_line_that_ends_with_the_last_step(capsys, monkeypatch):
+    """Steps that follow each other faster than one reads are left out, the last one never."""
+    now = iter([0.0, 0.01, 0.2, 0.21])
+    monkeypatch.setattr("calib.show.notebook.time.monotonic", lambda: 1.0 + next(now))
+    tell = ProgressLine()
+    for done in range(4):
+        tell("fitting", done, 4)
+    told = capsys.readouterr().err
+    assert "\n" not in told
+    assert [line.strip() for line in told.split("\r") if line] == [
+        "fitting 1/4",
+        "fitting 3/4",
+        "fitting 4/4",
+    ]
+
+
+def test_texts_are_plain_where_the_environment_asks_for_colours(run, monkeypatch):
+    """As a notebook's does."""
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    assert "\x1b" not in str(run) and str(run).startswith("runs/a&b")
 
 
 def test_results_are_shown_by_notebooks(run):
