@@ -24,6 +24,7 @@ from calib.report.statistics import (
     residual_statistics,
     stop_map,
 )
+from calib.report.walls import Box, Ends, Face, faces, yaw_of
 from calib.residuals.scan import ScanStop
 from calib.runs.estimates import VariableEstimate, variable_estimates
 from calib.runs.ladder import Rung, ladder
@@ -212,6 +213,43 @@ class Evidence:
                 maps = [stop_map(each, self.rings, self.azimuths) for each in tables]
                 found.append(StopMaps(path.stem, *zip(*maps, strict=True)))
         return sorted(found, key=lambda stop: -stop.rms_m[-1])
+
+    @cached_property
+    def walls(self) -> list[tuple[float, list[Face]]]:
+        """Of each mesh its sigma, and the residuals on the sides of its room; none of planes."""
+        meshes = [source.reference for source in self.sources]
+        found = []
+        for i, mesh in enumerate(meshes):
+            if mesh is None or any(same_mesh(mesh, other) for other in meshes[:i]):
+                continue
+            scans = [s for s in self.problem.scans if same_mesh(meshes[self._source(s)], mesh)]
+            if not scans:
+                continue
+            chosen = scans[:: -(-len(scans) // SAMPLED)]
+            yaw_rad = yaw_of(mesh.vertices_m, mesh.triangles)
+            ends = [self._ends(scan) for scan in chosen]
+            beams = sum(len(each.weight) for each in ends) * len(scans) // len(chosen)
+            box = Box.of(yaw_rad, ends, beams)
+            found.append((scans[0].reference_sigma_m, faces(box, map(self._ends, scans))))
+        return found
+
+    def _ends(self, scan: ScanStop) -> Ends:
+        """Where a stop's beams end."""
+        columns = self._columns(self.run, scan)
+        azimuth, up, reach = (
+            columns[name].astype(float) for name in ("azimuth_rad", "elevation_rad", "range_m")
+        )
+        ahead = np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros_like(up)], axis=1)
+        left = np.stack([-ahead[:, 1], ahead[:, 0], ahead[:, 2]], axis=1)
+        radial, tangential = scan.lidar.beam_origin_m
+        xyz_m = (radial + reach * np.cos(up))[:, None] * ahead + tangential * left
+        xyz_m[:, 2] += reach * np.sin(up)
+        T = scan.pose(self.values)
+        return Ends(
+            xyz_m @ T[:3, :3].T + T[:3, 3],
+            columns["residual_m"].astype(float),
+            weight=columns["weight"].astype(float),
+        )
 
     def _tables(self, run: Run | None, what: str) -> Iterator[StopResiduals]:
         meshes = [source.reference for source in self.sources]

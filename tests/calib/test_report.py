@@ -40,7 +40,7 @@ ALWAYS = (
     "correlation",
 )
 OF_BEAMS = (
-    *("unseen", "variance", "scatter", "rings", "map", "targets", "findings", "groups"),
+    *("unseen", "variance", "scatter", "rings", "map", "room", "targets", "findings", "groups"),
     *(f"residual-{c}" for c in ("incidence", "range", "ring", "azimuth", "elevation", "intensity")),
     *(f"residual-{c}" for c in ("label", "stop", "elapsed", "temperature", "humidity", "near-ir")),
 )
@@ -153,6 +153,17 @@ def test_no_two_parts_of_the_page_have_one_id(shown):
         const to = e.getAttribute('href') || e.getAttribute('clip-path').slice(4, -1);
         return !document.getElementById(to.slice(1)) }).length"""
     assert shown.page.evaluate(missing) == 0
+
+
+def test_beams_end_on_the_mesh_where_they_are_drawn_on_the_room(grown):
+    """Ends are made from a table's angles and ranges; the mesh is asked, which they never saw."""
+    scan, mesh = grown.problem.scans[1], grown.sources[0].reference
+    ends = grown._ends(scan)
+    off_m = mesh.distance_m(ends.at_m[ends.weight > 0])
+    assert np.median(off_m) < 0.005 and np.quantile(off_m, 0.95) < 0.03
+    ((sigma_m, sides),) = grown.walls
+    assert sigma_m == scan.reference_sigma_m
+    assert sum(np.isfinite(side.mean_m).sum() for side in sides) > 60
 
 
 def test_names_are_text_and_no_markup(shown):

@@ -16,6 +16,7 @@ from calib.report.charts import (
     misfit,
     residuals,
     unseen,
+    walls,
 )
 from calib.report.evidence import Evidence
 
@@ -28,7 +29,7 @@ SECTIONS: Mapping[str, tuple[Charts, ...]] = {
     "The calibration": (links.chain, links.moves, links.effects, knowledge.budget),
     "What is left": (
         unseen.unseen,
-        *(residuals.ring_map, residuals.thrown_away, residuals.curves),
+        *(residuals.ring_map, walls.walls, residuals.thrown_away, residuals.curves),
         *(bodies.tracked, bodies.targets),
     ),
     "What could not be determined": (knowledge.correlation,),
