@@ -22,8 +22,8 @@ other end, the right one leaves 0.04 of it at most; one too low 0.42, and so one
 two Ousters, whose own angles lie half a step off: there one too high is not told."""
 _NEIGHBOURS = 9
 """Rings whose median a ring is compared with, as a unit's own angles differ smoothly from its
-model's: of the 14 units of Hesai and Ouster among these by 0.94 steps at most from that median, and
-the rings of none are out of order."""
+model's: 14 units of Hesai and Ouster among these lie 0.94 steps at most from that median, and none
+has rings out of order."""
 _LISTED = 3
 _FOREIGN_RAD, _FOREIGN_STEPS = np.radians(2.0), 4.0
 """Beyond both, elevations are of no model known; units are off by 1.2 deg or 2.4 steps at most."""
@@ -141,7 +141,7 @@ def _exchanged(lidar: LidarModel, seen: Array, rings: Array) -> RingFinding | No
         rings=tuple(rings[wrong].tolist()),
         sentence=(
             f"rings of {lidar.name} bear other rings' numbers: {', '.join(said)}{more}; their "
-            f"elevations are {np.degrees(off_rad):.2g} deg rms off the table, beside neighbours"
+            f"elevations are {np.degrees(off_rad):.2g} deg rms off what their numbers say"
         ),
     )
 

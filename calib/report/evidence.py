@@ -29,10 +29,11 @@ from calib.residuals.scan import ScanStop
 from calib.runs.estimates import VariableEstimate, variable_estimates
 from calib.runs.ladder import Rung, ladder
 from calib.runs.reopen import problem_of, reopened, start_of, state_of
-from calib.runs.residual_table import UNSEEN, residual_table, table_path
+from calib.runs.residual_table import UNSEEN, beam_ends, residual_table, table_path
 from calib.runs.run import RESIDUALS, SUMMARY, Run
 from calib.solve.estimate import Start, values_of
 from calib.solve.fit import Progress
+from chains import se3
 from chains.errors import InputError
 from sensors.recording import read_table
 
@@ -226,27 +227,18 @@ class Evidence:
             if not scans:
                 continue
             chosen = scans[:: -(-len(scans) // SAMPLED)]
-            yaw_rad = yaw_of(mesh.vertices_m, mesh.triangles)
             ends = [self._ends(scan) for scan in chosen]
             beams = sum(len(each.weight) for each in ends) * len(scans) // len(chosen)
-            box = Box.of(yaw_rad, ends, beams)
+            box = Box.of(yaw_of(mesh), ends, beams)
             found.append((scans[0].reference_sigma_m, faces(box, map(self._ends, scans))))
         return found
 
     def _ends(self, scan: ScanStop) -> Ends:
         """Where a stop's beams end."""
         columns = self._columns(self.run, scan)
-        azimuth, up, reach = (
-            columns[name].astype(float) for name in ("azimuth_rad", "elevation_rad", "range_m")
-        )
-        ahead = np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros_like(up)], axis=1)
-        left = np.stack([-ahead[:, 1], ahead[:, 0], ahead[:, 2]], axis=1)
-        radial, tangential = scan.lidar.beam_origin_m
-        xyz_m = (radial + reach * np.cos(up))[:, None] * ahead + tangential * left
-        xyz_m[:, 2] += reach * np.sin(up)
-        T = scan.pose(self.values)
+        at_m = beam_ends(columns, scan.lidar.beam_origin_m)
         return Ends(
-            xyz_m @ T[:3, :3].T + T[:3, 3],
+            se3.apply(scan.pose(self.values), at_m),
             columns["residual_m"].astype(float),
             weight=columns["weight"].astype(float),
         )

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sensors.reference import Reference
+
 CELL_M, BEAMS = 0.2, 10  # a cell's size, and how many beams end in it: larger where they are few
 DEPTH_M = 0.4  # of what stands before a wall, and is drawn on it: shelves, pipes, doors
 FEWEST = 5  # beams of a cell that is drawn
@@ -77,13 +79,11 @@ class Box:
         return cls(yaw_rad, low_m, high_m, max(CELL_M, round(float(cell_m), 1)))
 
 
-def yaw_of(vertices_m: np.ndarray, triangles: np.ndarray) -> float:
+def yaw_of(mesh: Reference) -> float:
     """By how much the walls of a mesh are turned about z from its axes, rad; within pi / 4."""
-    a, b, c = np.asarray(vertices_m, float)[np.asarray(triangles)].swapaxes(0, 1)
-    normal = np.cross(b - a, c - a)
-    area, level = np.linalg.norm(normal, axis=1), np.hypot(normal[:, 0], normal[:, 1])
-    turns = 4.0 * np.arctan2(normal[:, 1], normal[:, 0])  # all four walls of a room as one
-    walls = area * (level > UPRIGHT * area)
+    x, y = mesh.planes[:-1, :2].T
+    turns = 4.0 * np.arctan2(y, x)  # all four walls of a room as one
+    walls = mesh.area_m2 * (np.hypot(x, y) > UPRIGHT)
     return float(np.angle(np.sum(walls * np.exp(1j * turns)))) / 4.0
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -67,3 +67,19 @@ def residual_table(rows: Rows) -> dict[str, np.ndarray]:
 
 def _compact(column: np.ndarray) -> np.ndarray:
     return column.astype(np.int32 if column.dtype.kind in "iu" else np.float32)
+
+
+def beam_ends(columns: Mapping[str, np.ndarray], beam_origin_m: np.ndarray) -> np.ndarray:
+    """Where beams end (N, 3) m, in the LiDAR's frame: origin + (predicted + residual) direction.
+
+    Args:
+        columns: of a table of residuals.
+        beam_origin_m: (2,) of the LiDAR, as `sensors.lidar.beams` has it.
+    """
+    azimuth, elevation = (columns[n].astype(float) for n in ("azimuth_rad", "elevation_rad"))
+    range_m = columns["range_m"].astype(float) + columns["residual_m"]
+    radial, tangential = beam_origin_m
+    c, s = np.cos(azimuth), np.sin(azimuth)
+    flat = radial + range_m * np.cos(elevation)
+    z = range_m * np.sin(elevation)
+    return np.stack([flat * c - tangential * s, flat * s + tangential * c, z], axis=1)

@@ -26,14 +26,13 @@ from calib.show.diagnosis import (
     unexplained_table,
 )
 from calib.show.headline import closing, moved_sentence
-from calib.show.tables import effects_table, error_table, links_table, outcome, terminal
+from calib.show.tables import WIDTH, effects_table, error_table, links_table, outcome, terminal
 from chains import escape
 
 if TYPE_CHECKING:
     from rich.table import Table
 
 TOLD_EVERY_S = 0.1  # lines follow each other no faster than they can be read
-WIDTH = 78  # of a terminal's line
 
 _PAGE = """\
 <div><p><b>{{ title }}</b></p>
@@ -82,7 +81,7 @@ class ProgressLine:
         self._next_s = now_s + TOLD_EVERY_S
         line = escape.terminal(f"{what} {done + 1}/{total}")
         if "ipykernel" not in sys.modules:
-            print(f"\r{line:<{WIDTH}}", end="", file=sys.stderr, flush=True)
+            print(f"\r{line:<{WIDTH - 1}}", end="", file=sys.stderr, flush=True)
         elif self._cell is None:
             from IPython.display import display
 

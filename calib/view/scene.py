@@ -18,7 +18,7 @@ from calib.problem.model import Source
 from calib.residuals.scan import ScanStop
 from calib.residuals.tracker import TrackedBody
 from calib.runs.reopen import problem_of, reopened, state_of
-from calib.runs.residual_table import table_path
+from calib.runs.residual_table import beam_ends, table_path
 from calib.runs.run import RESIDUALS, Run
 from chains import se3
 from chains.errors import InputError
@@ -204,7 +204,7 @@ class Scene:
             return None
         columns = self._table(self.run, scan)
         T = scan.pose(self.state)
-        xyz_m = se3.apply(T, _beam_ends(columns, scan.lidar.beam_origin_m))
+        xyz_m = se3.apply(T, beam_ends(columns, scan.lidar.beam_origin_m))
         return Points(xyz_m, T[:3, 3], columns, len(xyz_m))
 
     def table(self, recording: int, stop: str, other: Run) -> Mapping[str, np.ndarray] | None:
@@ -267,17 +267,6 @@ class Scene:
         for scan in self.problem.scans:
             placed[number[scan.recording.folder], scan.index] = scan.stops, 0
         return dict(sorted(placed.items(), key=lambda item: item[0]))
-
-
-def _beam_ends(columns: Mapping[str, np.ndarray], beam_origin_m: np.ndarray) -> np.ndarray:
-    """Where beams end (N, 3), in the LiDAR's frame: origin + (predicted + residual) direction."""
-    azimuth, elevation = (columns[n].astype(float) for n in ("azimuth_rad", "elevation_rad"))
-    range_m = columns["range_m"].astype(float) + columns["residual_m"]
-    radial, tangential = beam_origin_m
-    c, s = np.cos(azimuth), np.sin(azimuth)
-    flat = radial + range_m * np.cos(elevation)
-    z = range_m * np.sin(elevation)
-    return np.stack([flat * c - tangential * s, flat * s + tangential * c, z], axis=1)
 
 
 def sunk(vertices_m: np.ndarray, triangles: np.ndarray, depth_m: float) -> np.ndarray:

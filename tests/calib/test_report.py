@@ -156,7 +156,7 @@ def test_no_two_parts_of_the_page_have_one_id(shown):
 
 
 def test_beams_end_on_the_mesh_where_they_are_drawn_on_the_room(grown):
-    """Ends are made from a table's angles and ranges; the mesh is asked, which they never saw."""
+    """Ends are made from a table's angles and ranges; the mesh says how far they are from it."""
     scan, mesh = grown.problem.scans[1], grown.sources[0].reference
     ends = grown._ends(scan)
     off_m = mesh.distance_m(ends.at_m[ends.weight > 0])

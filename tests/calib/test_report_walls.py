@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from calib.report.walls import CELL_M, Box, Ends, faces, repeats_m, yaw_of
+from sensors.reference import Reference
 
 CORNER_M = np.array([3.0, -2.0, 0.5])
 MANY = 1_000_000  # beams: cells are as small as they get
@@ -18,15 +19,16 @@ def turned(at, yaw_rad):
 
 
 def box_mesh(yaw_rad):
-    """Vertices and triangles of a closed box, turned."""
+    """A closed box, turned."""
     corner = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * SIZE_M
     sides = [(0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5)]
     triangles = [t for a, b, c, d in sides for t in ((a, b, c), (a, c, d))]
-    return turned(corner, yaw_rad) + CORNER_M, np.array(triangles)
+    return Reference(turned(corner, yaw_rad) + CORNER_M, np.array(triangles))
 
 
 def stop(rng, yaw_rad, off, noise_m, count=40_000):
-    """Ends on all sides of the box; `off` (side, (N, 2) along it) gives each its residual."""
+    """Ends on all sides of the box; `off` gives each its residual, by the side's axis, which of
+    its two ends, and where on it."""
     k, end = rng.integers(0, 3, count), rng.integers(0, 2, count)
     at = rng.uniform(0, 1, (count, 3)) * SIZE_M
     at[np.arange(count), k] = end * SIZE_M[k]
@@ -37,7 +39,7 @@ def stop(rng, yaw_rad, off, noise_m, count=40_000):
 
 @pytest.mark.parametrize("yaw_rad", [-0.7, 0.0, 0.3])
 def test_the_walls_of_a_mesh_say_how_the_room_is_turned(yaw_rad):
-    assert yaw_of(*box_mesh(yaw_rad)) == pytest.approx(yaw_rad, abs=1e-9)
+    assert yaw_of(box_mesh(yaw_rad)) == pytest.approx(yaw_rad, abs=1e-9)
 
 
 def test_what_is_wrong_on_one_wall_is_seen_there_and_nowhere_else():

@@ -32,8 +32,8 @@ def walls(evidence: Evidence) -> Iterator[Chart | Absent]:
         repeats = repeats_m(sides)
         yield Chart(
             "room" if len(rooms) == 1 else f"room-{i}",
-            f"Of the residuals {1e3 * repeats:.2f} mm rms repeat where they are in the room; the "
-            f"mesh is known to {1e3 * sigma_m:.2f} mm",
+            f"{1e3 * repeats:.2f} mm rms of the residuals repeat from stop to stop at the same "
+            f"place in the room; the mesh is known to {1e3 * sigma_m:.2f} mm",
             f"Mean residual in cells of {sides[0].cell_m:g} m of floor, ceiling and walls, and "
             f"of what stands up to {DEPTH_M:g} m before them; coordinates from a corner of the "
             "room. Orange reads long, purple short, grey was not seen. What repeats is what both "
