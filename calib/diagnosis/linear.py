@@ -18,7 +18,7 @@ from calib.linear.layout import Layout, positions
 from calib.linear.linearise import linearise
 from calib.linear.system import Linearisation
 from calib.problem.problem import Problem
-from calib.solve.clustered import of_beams, of_cells, of_graph, of_stops
+from calib.solve.clustered import Beams, of_cells, of_graph, of_stops
 from calib.solve.estimate import Estimate
 from calib.solve.fit import Progress
 from calib.solve.graph import Graph
@@ -88,7 +88,16 @@ def rows_along(
     layout = Layout.of(wide, unbounded=candidates)
     directions = np.concatenate([away[name] for name in layout.at])
     places, met = Gradients(layout.size), estimate.associations
-    yield from of_beams(wide, layout, values, met, directions, places, progress=progress)
+    beams = Beams(
+        problem=wide,
+        layout=layout,
+        values=values,
+        associations=met,
+        directions=directions,
+        places=places,
+        progress=progress,
+    )
+    yield from beams.rows()
     every = np.arange(directions.shape[1])
     for rows in other_rows(wide, layout, values, places):
         yield rows._replace(A=rows.A @ directions[rows.columns], columns=every)

@@ -32,6 +32,24 @@ class ClusteredRows(NamedTuple):
     place: np.ndarray
 
 
+class CellSums(NamedTuple):
+    """Sums of a stop's whitened rows along P directions, by what they look at.
+
+    Args:
+        stop: number of the stop.
+        place: (G,) numbers of what is looked at.
+        moved: (G, P) derivatives times right side, added up.
+        share: (G, P) squares of the derivatives, added up.
+        products: (P, P) products of the derivatives, all added up.
+    """
+
+    stop: int
+    place: np.ndarray
+    moved: np.ndarray
+    share: np.ndarray
+    products: np.ndarray
+
+
 @dataclass
 class Gradients:
     """``J^T W b`` of clusters of rows: beams of a stop on a surface, bodies at a stop, ...

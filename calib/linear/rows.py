@@ -17,7 +17,7 @@ from calib.forward import Placed
 from calib.linear.elimination import square
 from calib.linear.layout import Layout, key_of
 from calib.residuals.beams import Association, Rows
-from calib.residuals.compiled import cluster_sums, cross_sums, renumber
+from calib.residuals.compiled import cluster_sums, cross_sums, renumber, square_sums
 from calib.residuals.robust import tukey_cost
 from calib.residuals.scan import ScanStop
 
@@ -170,17 +170,26 @@ class StopRows:
         columns = np.concatenate([self.chain_columns, self.columns])
         return np.hstack([found[:, :TWIST] @ self.chain, found[:, TWIST + 1 :]]), columns
 
+    def squares_along(
+        self, directions: np.ndarray, cluster: np.ndarray, clusters: int
+    ) -> np.ndarray:
+        """Weighted squares (clusters, q) of the rows along directions (U, q) in all unknowns, added
+        up by the cluster (N,) of each."""
+        by_dense, by_sparse = _by_column(directions, self)
+        at = self.dense, self.weight, self.index, self.value
+        return square_sums(*at, by_dense, by_sparse, cluster, clusters)
+
     def along(self, directions: np.ndarray) -> np.ndarray:
         """The rows (N, q) along directions (U, q) in all unknowns."""
-        mine, wide = directions[self.columns], self.dense.shape[1] - TWIST - 1
-        twist = self.chain @ directions[self.chain_columns]
-        out = self.dense[:, :TWIST] @ twist + self.dense[:, TWIST + 1 :] @ mine[:wide]
+        by_dense, by_sparse = _by_column(directions, self)
+        derivatives = np.arange(self.dense.shape[1]) != TWIST
+        out = self.dense[:, derivatives] @ by_dense[derivatives]
         if self.sparse:
             rows, each = self.index.shape
             value = np.where(self.index >= 0, self.value, 0.0).ravel()  # index -1: none
             columns = np.maximum(self.index, 0).ravel()
             entries = value, columns, each * np.arange(rows + 1)
-            out += csr_array(entries, shape=(rows, self.sparse)) @ mine[wide:]
+            out += csr_array(entries, shape=(rows, self.sparse)) @ by_sparse
         return out
 
 
@@ -230,6 +239,14 @@ class StopSums:
             columns=np.concatenate([self.chain_columns, self.columns]),
         )
 
+    def along(self, directions: np.ndarray) -> np.ndarray:
+        """Products (q, q) of the rows along directions (U, q) in all unknowns."""
+        by_dense, by_sparse = _by_column(directions, self)
+        between = by_sparse.T @ self.with_dense @ by_dense
+        between += by_sparse[: len(self.with_sparse)].T @ self.with_sparse @ by_sparse
+        own = by_sparse.T @ (self.own[:, None] * by_sparse)
+        return by_dense.T @ self.dense @ by_dense + own + between + between.T
+
     def whole(self) -> np.ndarray:
         """(7 + d + s, same) over [twist | b | d columns | s columns]."""
         both = np.diag(self.own)
@@ -237,6 +254,15 @@ class StopSums:
         both[:count] += self.with_sparse
         both[:, :count] += self.with_sparse.T
         return np.block([[self.dense, self.with_dense.T], [self.with_dense, both]])
+
+
+def _by_column(directions: np.ndarray, of: StopRows | StopSums) -> tuple[np.ndarray, np.ndarray]:
+    """Directions (U, q) in all unknowns: by the dense columns (7 + d, q), with 0 for the right
+    side, and by the sparse ones (s, q)."""
+    mine, wide = directions[of.columns], of.dense.shape[1] - TWIST - 1
+    twist = of.chain @ directions[of.chain_columns]
+    right = np.zeros((1, directions.shape[1]))
+    return np.vstack([twist, right, mine[:wide]]), mine[wide:]
 
 
 @dataclass(frozen=True)

@@ -222,6 +222,48 @@ def cluster_sums(
 
 
 @compiled
+def square_sums(
+    dense: np.ndarray,
+    weight: np.ndarray,
+    index: np.ndarray,
+    value: np.ndarray,
+    by_dense: np.ndarray,
+    by_sparse: np.ndarray,
+    cluster: np.ndarray,
+    clusters: int,
+) -> np.ndarray:
+    """Weighted sums (clusters, P) of squares of rows along P directions.
+
+    Args:
+        dense, weight, index, value: as of `cross_sums`.
+        by_dense: (m, P), by_sparse: (size, P) the directions, in the columns of each kind.
+        cluster: (N,) that each row is in, of so many `clusters`.
+    """
+    count, groups = index.shape
+    width, directions = by_dense.shape
+    out, along = np.zeros((clusters, directions)), np.empty(directions)
+    for i in range(count):
+        w, c = weight[i], cluster[i]
+        if w == 0.0:
+            continue
+        along[:] = 0.0
+        for j in range(width):
+            x = dense[i, j]
+            if x != 0.0:
+                for p in range(directions):
+                    along[p] += x * by_dense[j, p]
+        for g in range(groups):
+            at = index[i, g]
+            if at >= 0:
+                x = value[i, g]
+                for p in range(directions):
+                    along[p] += x * by_sparse[at, p]
+        for p in range(directions):
+            out[c, p] += w * along[p] * along[p]
+    return out
+
+
+@compiled
 def add_at(target: np.ndarray, rows: np.ndarray, columns: np.ndarray, block: np.ndarray) -> None:
     """``target[rows[i], columns[j]] += block[i, j]``; rows and columns of -1 are left out."""
     for i in range(len(rows)):

@@ -35,10 +35,10 @@ import numpy as np
 from scipy import special
 from scipy.linalg import solve_triangular
 
-from calib.linear.clusters import ClusteredRows, Gradients, summed
+from calib.linear.clusters import CellSums, ClusteredRows, Gradients, summed
 from calib.linear.rows import PLACES
 from calib.results.errors import in_cad
-from calib.solve.clustered import of_beams, of_cells, of_graph, of_stops
+from calib.solve.clustered import Beams, of_cells, of_graph, of_stops
 from calib.solve.estimate import Estimate
 from calib.solve.fit import Progress
 from calib.solve.graph import KeptRows
@@ -150,8 +150,20 @@ def intervals(estimate: Estimate, progress: Progress = lambda what, done, total:
     places, stops = Gradients(layout.size), len(layout.stops)
     problem, met = estimate.problem, estimate.associations
     tell = partial(progress, "how far rows err together")
-    for rows in of_beams(problem, layout, values, met, directions, places, PARTS, tell):
-        sums.add(rows)
+    beams = Beams(
+        problem=problem,
+        layout=layout,
+        values=values,
+        associations=met,
+        directions=directions,
+        places=places,
+        kinds=PARTS,
+        progress=tell,
+    )
+    for cells, scatter in beams.cells():
+        sums.add_stop(cells)
+        if scatter is not None:
+            sums.add(scatter)
     others = [*of_stops(layout, values), *_of_cells(estimate, places)]
     frames, paper = in_cad(problem), np.zeros_like(estimate.kept)
     for block, name, rows in of_graph(estimate.graph, layout, values):
@@ -240,10 +252,20 @@ class _Sums:
         self.cells.append(np.stack([stop[first], part[first]]))
         self.moved.append(summed(A * b[:, None], at))
         self.share.append(summed(np.square(A), at))
+        for one in np.unique(stop[stop >= 0]).tolist():
+            mine = A[stop == one]
+            self._add_products(one, mine.T @ mine)
+
+    def add_stop(self, sums: CellSums) -> None:
+        """Add the whitened rows of a stop along the directions of the parameters, as sums."""
+        self.cells.append(np.stack([np.full(len(sums.place), sums.stop), sums.place]))
+        self.moved.append(sums.moved)
+        self.share.append(sums.share)
+        self._add_products(sums.stop, sums.products)
+
+    def _add_products(self, stop: int, products: np.ndarray) -> None:
         if len(self.stops) <= WHOLE:
-            for one in np.unique(stop[stop >= 0]).tolist():
-                mine = A[stop == one]
-                self.stops[one] = self.stops.get(one, 0.0) + mine.T @ mine
+            self.stops[stop] = self.stops.get(stop, 0.0) + products
 
     def wider(self) -> np.ndarray:
         """How many times wider the intervals are than the graph has them (P,)."""

@@ -8,11 +8,13 @@ it there.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_array, diags_array
 
-from calib.linear.clusters import ClusteredRows, Gradients
+from calib.linear.clusters import CellSums, ClusteredRows, Gradients
 from calib.linear.layout import Layout, keys_of
 from calib.linear.linearise import lidars, own_rows, spread_rows
 from calib.linear.parallel import in_order
@@ -25,17 +27,9 @@ from calib.solve.graph import Graph
 Values = Mapping[str, np.ndarray]
 
 
-def of_beams(
-    problem: Problem,
-    layout: Layout,
-    values: Values,
-    associations: Sequence[Association],
-    directions: np.ndarray,
-    places: Gradients,
-    kinds: Sequence[str] = PLACES,
-    progress: Callable[[int, int], None] = lambda done, total: None,
-) -> Iterator[ClusteredRows]:
-    """Rows of beams, weighted; no more than a few stops' in memory.
+@dataclass(frozen=True)
+class Beams:
+    """All beams along some directions; no more than a few stops' in memory.
 
     Args:
         problem: with its scans.
@@ -47,26 +41,76 @@ def of_beams(
         kinds: columns that say what a beam looks at; the first there is.
         progress: called with how many stops are done, and of how many.
     """
-    scans, placed = problem.scans, lidars(problem.scans, values)
-    every = np.arange(directions.shape[1])
 
-    def work(i: int) -> tuple[np.ndarray, np.ndarray, list[ClusteredRows]]:
-        rows = StopRows.of(scans[i], layout, values, placed[i], associations[i])
+    problem: Problem
+    layout: Layout
+    values: Values
+    associations: Sequence[Association]
+    directions: np.ndarray
+    places: Gradients
+    kinds: Sequence[str] = PLACES
+    progress: Callable[[int, int], None] = lambda done, total: None
+
+    def rows(self) -> Iterator[ClusteredRows]:
+        """Each row, weighted."""
+        for (A, b, more, stop, cluster), place in self._each_stop(self._rows_of):
+            at = np.full(len(cluster), stop), place[cluster]
+            yield self._clustered(A, b, *at)
+            if more is not None:
+                yield self._clustered(*more, *at)
+
+    def cells(self) -> Iterator[tuple[CellSums, ClusteredRows | None]]:
+        """Sums of the weighted rows of each stop, by what they look at; and its rows of scatter
+        within holds, where there are any."""
+        for (sums, more, stop, cluster), place in self._each_stop(self._cells_of):
+            found = None
+            if more is not None:
+                found = self._clustered(*more, np.full(len(cluster), stop), place[cluster])
+            yield CellSums(stop, place, *sums), found
+
+    def _rows_of(self, rows: StopRows, cluster: np.ndarray, count: int) -> tuple[Any, ...]:
         root = np.sqrt(rows.weight)
-        parts, cluster = rows.places(kinds)
-        stop = np.full(len(root), rows.stop)
-        A, b = rows.along(directions) * root[:, None], root * rows.b
-        found = [ClusteredRows(A, b, every, stop, cluster)]
-        if rows.rows.spread is not None:
-            more = spread_rows(rows.rows.spread, layout)
-            A, b = more.A @ directions[more.columns], more.b
-            found.append(ClusteredRows(A, b, every, stop, cluster))
-        return parts, cluster, found
+        A = rows.along(self.directions) * root[:, None]
+        return A, root * rows.b, self._scatter(rows), rows.stop, cluster
 
-    for i, (parts, cluster, found) in enumerate(in_order(work, len(scans))):
-        progress(i, len(scans))
-        place = places.numbers(scans[i].room, parts)[cluster]  # here: threads would race for them
-        yield from (rows._replace(place=place) for rows in found)
+    def _cells_of(self, rows: StopRows, cluster: np.ndarray, count: int) -> tuple[Any, ...]:
+        gradient, columns = rows.gradient(cluster, count)
+        sums = (
+            gradient @ self.directions[columns],
+            rows.squares_along(self.directions, cluster, count),
+            rows.sums().along(self.directions),
+        )
+        return sums, self._scatter(rows), rows.stop, cluster
+
+    def _scatter(self, rows: StopRows) -> tuple[np.ndarray, np.ndarray] | None:
+        """Derivatives and right side of the rows of scatter within holds."""
+        if rows.rows.spread is None:
+            return None
+        more = spread_rows(rows.rows.spread, self.layout)
+        return more.A @ self.directions[more.columns], more.b
+
+    def _clustered(
+        self, A: np.ndarray, b: np.ndarray, stop: np.ndarray, place: np.ndarray
+    ) -> ClusteredRows:
+        return ClusteredRows(A, b, np.arange(self.directions.shape[1]), stop, place)
+
+    def _each_stop(
+        self, found: Callable[[StopRows, np.ndarray, int], tuple[Any, ...]]
+    ) -> Iterator[tuple[tuple[Any, ...], np.ndarray]]:
+        """What is found of the rows of each stop, and the numbers of what they meet; the rows
+        come with which of these each meets, and how many there are."""
+        scans, placed = self.problem.scans, lidars(self.problem.scans, self.values)
+
+        def work(i: int) -> tuple[np.ndarray, tuple[Any, ...]]:
+            at = scans[i], self.layout, self.values, placed[i], self.associations[i]
+            rows = StopRows.of(*at)
+            parts, cluster = rows.places(self.kinds)
+            return parts, found(rows, cluster, len(parts))
+
+        for i, (parts, told) in enumerate(in_order(work, len(scans))):
+            self.progress(i, len(scans))
+            # Numbered here: threads would race for them.
+            yield told, self.places.numbers(scans[i].room, parts)
 
 
 def of_stops(layout: Layout, values: Values) -> Iterator[ClusteredRows]:

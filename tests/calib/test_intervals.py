@@ -17,7 +17,7 @@ from calib.linear.clusters import ClusteredRows, Gradients
 from calib.problem.model import Model, Source
 from calib.results.intervals import PARTS, Intervals, _Sums, intervals
 from calib.simulation import Spec
-from calib.solve.clustered import of_beams
+from calib.solve.clustered import Beams
 from calib.solve.fit import solve
 
 from ..worlds import World, write
@@ -194,7 +194,12 @@ def test_the_rows_of_a_fit_are_all_that_is_known_and_lead_nowhere(fitted, monkey
         seen.moved = seen.moved + (rows.A.T @ rows.b)
         seen.share = seen.share + np.square(rows.A).sum(axis=0)
 
+    def add_stop(self, sums):
+        seen.moved = seen.moved + sums.moved.sum(axis=0)
+        seen.share = seen.share + sums.share.sum(axis=0)
+
     monkeypatch.setattr(_Sums, "add", add)
+    monkeypatch.setattr(_Sums, "add_stop", add_stop)
     monkeypatch.setattr(_Sums, "wider", lambda self: np.ones(len(self.priors)))
     intervals(fitted)
     np.testing.assert_allclose(seen.share, 1.0, atol=1e-6)
@@ -208,7 +213,11 @@ def test_priors_of_patches_are_with_their_region_and_each_target_is_a_cluster(fi
         for pair in zip(rows.stop.tolist(), rows.place.tolist(), strict=True):
             cells[pair] = cells.get(pair, 0) + 1
 
+    def add_stop(self, sums):
+        cells.update({(sums.stop, part): 1 for part in sums.place.tolist()})
+
     monkeypatch.setattr(_Sums, "add", add)
+    monkeypatch.setattr(_Sums, "add_stop", add_stop)
     monkeypatch.setattr(_Sums, "wider", lambda self: np.ones(len(self.priors)))
     intervals(fitted)
     beams = {part for stop, part in cells if stop >= 0 and part >= 0}
@@ -236,17 +245,39 @@ def test_a_ring_without_returns_is_as_well_known_as_before(tmp_path):
 
 
 def test_beams_are_told_apart_by_region(fitted):
-    layout, places = fitted.linear.layout, Gradients(fitted.linear.layout.size)
-    directions = np.zeros((layout.size, 1))
-    found = list(
-        of_beams(
-            *(fitted.problem, layout, fitted.values, fitted.associations),
-            *(directions, places, PARTS),
-        )
-    )
+    found = list(beams(fitted, 1).rows())
     regions = {int(p) for a in fitted.associations for p in np.unique(a.patches["region"])}
     assert {int(p) for each in found for p in np.unique(each.place)} == set(range(len(regions)))
     assert len(regions) > 30
+
+
+def beams(estimate, count):
+    """All beams of an estimate along so many directions drawn at random."""
+    layout = estimate.linear.layout
+    directions = np.random.default_rng(0).normal(size=(layout.size, count))
+    return Beams(
+        problem=estimate.problem,
+        layout=layout,
+        values=estimate.values,
+        associations=estimate.associations,
+        directions=directions,
+        places=Gradients(layout.size),
+        kinds=PARTS,
+    )
+
+
+def test_sums_by_cell_are_those_of_the_rows(fitted):
+    """As intervals take them, without a row along the directions, and by the rows themselves."""
+    some = beams(fitted, 5)
+    for (cells, scatter), rows in zip(some.cells(), some.rows(), strict=True):
+        assert scatter is None and set(rows.stop) == {cells.stop}
+        assert len(set(cells.place.tolist())) == len(cells.place) > 3
+        for place, moved, share in zip(cells.place, cells.moved, cells.share, strict=True):
+            A, b = rows.A[rows.place == place], rows.b[rows.place == place]
+            np.testing.assert_allclose(moved, A.T @ b, atol=1e-9 * np.abs(A.T @ A).max())
+            np.testing.assert_allclose(share, np.square(A).sum(axis=0), rtol=1e-9)
+        scale = np.abs(cells.products).max()
+        np.testing.assert_allclose(cells.products, rows.A.T @ rows.A, atol=1e-9 * scale)
 
 
 # ------------------------------------------------------------------ worlds of another simulator

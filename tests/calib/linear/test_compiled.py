@@ -138,6 +138,19 @@ def test_cluster_sums_are_those_of_the_rows_of_each(sizes):
     assert not found[6].any()
 
 
+@pytest.mark.parametrize("sizes", GROUPS)
+def test_square_sums_are_those_of_rows_along_directions(sizes):
+    rng = np.random.default_rng(len(sizes))
+    dense, weight, index, value, full, _ = rows(rng, 300, sizes)
+    cluster = rng.integers(0, 6, 300)
+    directions = rng.normal(size=(dense.shape[1] + full.shape[1], 4))
+    by = directions[: dense.shape[1]], directions[dense.shape[1] :]
+    found = compiled.square_sums(dense, weight, index, value, *by, cluster, 7)
+    pick = (cluster == np.arange(7)[:, None]) * weight
+    close(found, pick @ np.square(np.hstack([dense, full]) @ directions))
+    assert not found[6].any()
+
+
 @pytest.mark.parametrize("fine", ["first", "last", "none"])
 def test_add_sparse_puts_every_product_where_its_columns_stand(fine):
     """Three groups, of which one is that whose block is kept as a diagonal."""
