@@ -318,6 +318,8 @@ class ScanStop:
         with one non-zero per row, parts of surfaces the last."""
         by_site: dict[Site, np.ndarray] = {}
         found = {}
+        usable = seen.surface.usable
+        lost = np.flatnonzero(~usable)
         for name, (site, basis) in seen.bases.items():
             if site is Site.BEAM and not turns_beams(basis):
                 found[name] = range_columns(name, basis, len(t))
@@ -326,15 +328,12 @@ class ScanStop:
                     beam = site is Site.BEAM
                     turn = -T[:3, :3].T
                     by_site[site] = beam_derivative(seen.ray, t, slope) if beam else slope @ turn
+                    by_site[site][lost] = 0.0  # 0 * inf would be NaN
                 found[name] = effect_columns(name, basis, by_site[site])
         dense = {name: c for name, c in found.items() if not isinstance(c, Columns)}
         sparse = [c for c in found.values() if isinstance(c, Columns)]
         sparse += seen.surface.unknown(t)
-        usable = seen.surface.usable
-        lost = np.flatnonzero(~usable)
-        if len(lost):  # 0 * inf would be NaN
-            sparse = [replace(c, value=_without(c.value, lost)) for c in sparse]
-            dense = {name: _without(c, lost) for name, c in dense.items()}
+        sparse = [replace(c, value=_without(c.value, lost)) for c in sparse]
         sparse += [
             Columns(name, np.where(usable, index, -1), 1.0 / cosine, np.arange(size))
             for name, index, size in seen.cells
