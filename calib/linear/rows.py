@@ -23,6 +23,7 @@ from calib.residuals.scan import ScanStop
 
 PLACES = ("surface", "plane")  # beams that meet the same one share its error
 TWIST = 6  # columns of a stop's rows that come first; minus the residual is the next
+BLOCK = 8192  # rows that are weighted at once: bounds the memory
 ZERO = "range_offset"  # the effect that lengthens all ranges alike
 
 
@@ -134,13 +135,12 @@ class StopRows:
 
     def sums(self) -> StopSums:
         """Their Gram matrix, in its parts."""
-        weighted = self.dense * np.sqrt(self.weight)[:, None]
         with_dense, with_sparse, own = cross_sums(
             self.dense, self.weight, self.index, self.value, self.sparse, self.last
         )
         return StopSums(
             stop=self.stop,
-            dense=square(weighted),
+            dense=_gram(self.dense, self.weight),
             with_dense=with_dense,
             with_sparse=with_sparse,
             own=own,
@@ -254,6 +254,13 @@ class StopSums:
         both[:count] += self.with_sparse
         both[:, :count] += self.with_sparse.T
         return np.block([[self.dense, self.with_dense.T], [self.with_dense, both]])
+
+
+def _gram(dense: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Weighted products (m, m) of columns (N, m), so many rows at once."""
+    blocks = range(0, max(len(dense), 1), BLOCK)
+    some = ((dense[at : at + BLOCK], np.sqrt(weight[at : at + BLOCK])) for at in blocks)
+    return sum(square(rows * root[:, None]) for rows, root in some)
 
 
 def _by_column(directions: np.ndarray, of: StopRows | StopSums) -> tuple[np.ndarray, np.ndarray]:

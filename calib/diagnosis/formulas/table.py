@@ -91,40 +91,37 @@ class Table:
         problem, values = beside(estimate.problem, estimate)
         layout, scans = Layout.of(problem), problem.scans
         placed, places = lidars(scans, values), Gradients(layout.size)
-        beams = [int(np.count_nonzero(a.part >= 0)) for a in estimate.associations]
-        share = min(1.0, most / max(sum(beams), 1))
+        beams = sum(int(np.count_nonzero(a.part >= 0)) for a in estimate.associations)
+        share = min(1.0, most / max(beams, 1))
 
         def work(i: int) -> _Drawn:
             rows = StopRows.of(scans[i], layout, values, placed[i], estimate.associations[i])
-            return _Drawn.of(rows, share, i)
+            return _Drawn.of(rows, share, i, TWIST * len(scans), layout.size)
 
-        drawn = []
+        drawn, place = [], []
         for i, each in enumerate(in_order(work, len(scans))):
             progress(i, len(scans))
-            drawn.append(each.numbered(places, scans[i].room))
+            drawn.append(each)
+            # Numbered here: threads would race for them.
+            place.append(places.numbers(scans[i].room, each.surfaces)[each.met])
         names = [n for n in drawn[0].columns if all(n in d.columns for d in drawn)]
         others, b, others_stop, others_place = rows_of_others(problem, layout, values, places)
-        begin, every = TWIST * len(scans), [d.covariates(names) for d in drawn]
-        chains = [_rows_over(d.rows.chain, d.rows.chain_columns, layout.size) for d in drawn]
-        twists = [
-            _twists(d.rows, d.picked, TWIST * i, begin, begin + layout.size)
-            for i, d in enumerate(drawn)
-        ]
+        chains = [*(d.chain for d in drawn), eye_array(layout.size, format="csr")]
         return cls(
-            covariates={n: np.concatenate([columns[n] for columns in every]) for n in names},
+            covariates={n: np.concatenate([d.column(n) for d in drawn]) for n in names},
             by_stop=frozenset(n for n in names if all(len(d.columns[n]) == 1 for d in drawn)),
-            residual_m=np.concatenate([d.rows.rows.residual_m[d.picked] for d in drawn]),
-            sigma_m=np.concatenate([d.rows.rows.sigma_m[d.picked] for d in drawn]),
-            stop=np.concatenate([np.full(len(d.picked), d.rows.stop) for d in drawn]),
-            place=np.concatenate([d.place for d in drawn]),
+            residual_m=np.concatenate([d.residual_m for d in drawn]),
+            sigma_m=np.concatenate([d.sigma_m for d in drawn]),
+            stop=np.concatenate([np.full(len(d.residual_m), d.stop) for d in drawn]),
+            place=np.concatenate(place),
             share=share,
-            twists=csr_array(vstack(twists)),
-            chain=csr_array(vstack([*chains, eye_array(layout.size, format="csr")])),
+            twists=csr_array(vstack([d.twists for d in drawn])),
+            chain=csr_array(vstack(chains)),
             others=others,
             others_b=b,
             others_stop=others_stop,
             others_place=others_place,
-            joints=frozenset(drawn[0].rows.rows.view.rig.joint_names),
+            joints=frozenset(scans[0].stops.rig.joint_names),
         )
 
     def __len__(self) -> int:
@@ -321,44 +318,49 @@ def _explained(score: np.ndarray, whole: np.ndarray, left: np.ndarray) -> tuple[
     return float(np.sum(np.square(along) / values[seen])), int(seen.sum())
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Drawn:
-    """Beams of one stop.
+    """Beams of one stop, and nothing of its others.
 
     Args:
-        rows: all of the stop's.
-        picked: (n,) which of them.
+        stop: its number.
         columns: covariates (n,) of these; (1,) of the stop.
-        met: (n,) what each meets, of the surfaces (G,) that any does.
-        place: (n,) its number among all stops.
+        residual_m, sigma_m, twists, chain: as of `Table`.
+        surfaces: (G,) those that any beam of the stop meets; met: (n,) which of these each does.
     """
 
-    rows: StopRows
-    picked: np.ndarray
+    stop: int
     columns: Mapping[str, np.ndarray]
+    residual_m: np.ndarray
+    sigma_m: np.ndarray
+    twists: csr_array
+    chain: csr_array
     surfaces: np.ndarray
     met: np.ndarray
-    place: np.ndarray | None = None
 
     @classmethod
-    def of(cls, rows: StopRows, share: float, seed: int) -> _Drawn:
-        """A share of a stop's beams."""
+    def of(cls, rows: StopRows, share: float, number: int, begin: int, size: int) -> _Drawn:
+        """A share of a stop's beams; so many columns of unknowns begin after the twists'."""
         usable = np.flatnonzero(rows.rows.usable & np.isfinite(rows.rows.residual_m))
-        drawn = np.random.default_rng(seed).choice(usable, round(share * len(usable)), False)
+        drawn = np.random.default_rng(number).choice(usable, round(share * len(usable)), False)
         picked, columns = np.sort(drawn), {}
         for name, values in covariates_of(rows.rows.view):
             columns[name] = (values[picked] if len(values) > 1 else values).astype(float)
         surfaces, met = rows.places()
-        return cls(rows, picked, columns, surfaces, met=met[picked])
+        return cls(
+            stop=rows.stop,
+            columns=columns,
+            residual_m=rows.rows.residual_m[picked],
+            sigma_m=rows.rows.sigma_m[picked],
+            twists=_twists(rows, picked, TWIST * number, begin, begin + size),
+            chain=_rows_over(rows.chain, rows.chain_columns, size),
+            surfaces=surfaces,
+            met=met[picked],
+        )
 
-    def numbered(self, places: Gradients, room: object) -> _Drawn:
-        """With what its beams meet numbered as in all stops: one after another, as threads would
-        race for numbers."""
-        return replace(self, place=places.numbers(room, self.surfaces)[self.met])
-
-    def covariates(self, names: Sequence[str]) -> dict[str, np.ndarray]:
-        """Some of them (n,)."""
-        return {n: np.broadcast_to(self.columns[n], len(self.picked)) for n in names}
+    def column(self, name: str) -> np.ndarray:
+        """A covariate (n,)."""
+        return np.broadcast_to(self.columns[name], len(self.residual_m))
 
 
 def _twists(rows: StopRows, picked: np.ndarray, first: int, begin: int, size: int) -> csr_array:
