@@ -131,7 +131,7 @@ class Applied:
 @one_blas_thread
 def apply(
     run: Run,
-    clouds: Sequence[Path | str],
+    clouds: outputs.Paths,
     out: Path | str,
     rig: str | None = None,
     progress: Progress = lambda what, done, total: None,
@@ -141,9 +141,9 @@ def apply(
 
     Args:
         run: whose model's effects on beams are taken off, at their estimates.
-        clouds: PCD, PLY or Parquet files with x y z in m in the LiDAR's frame, as its driver gives
-            them; or recording folders. Of the run's own recordings the mesh tells range, incidence
-            and label of what was met.
+        clouds: a PCD, PLY or Parquet file with x y z in m in the LiDAR's frame, as its driver gives
+            them, or a recording folder; or several. Of the run's own recordings the mesh tells
+            range, incidence and label of what was met.
         out: the folder to write to; files keep their names, and earlier clouds there stay.
         rig: whose LiDAR it was, where the run has several.
         progress: called with what is being done, and how far it is.
@@ -154,14 +154,15 @@ def apply(
             or two clouds have one name.
     """
     run.refuse_unconverged(force)
-    out, done, names = Path(out), [], [Path(cloud).resolve().name for cloud in clouds]
+    out, done, clouds = Path(out), [], outputs.each(clouds)
+    names = [cloud.resolve().name for cloud in clouds]
     for name in names:
         if names.count(name) > 1:
             raise InputError(f"{out}: two clouds are called {name}; correct them one by one")
     with outputs.folder(out, outputs.CLOUDS, [*clouds, run.folder, *run.inputs]) as folder:
         (folder / outputs.CLOUDS_MARK).write_text("corrected by rigcal\n", encoding="utf-8")
         correction = Correction.of(run, rig)
-        for i, (cloud, name) in enumerate(zip(map(Path, clouds), names, strict=True)):
+        for i, (cloud, name) in enumerate(zip(clouds, names, strict=True)):
             if cloud.is_dir():
                 one = _apply_recording(run, correction, cloud, folder / name, progress)
             else:

@@ -40,6 +40,8 @@ __all__ = [
     "RUN",
     "SIMULATED",
     "Kind",
+    "Paths",
+    "each",
     "entries",
     "file",
     "folder",
@@ -50,6 +52,13 @@ __all__ = [
 ]
 
 Inputs = Iterable[Path | str]
+Paths = Path | str | Iterable[Path | str]
+
+
+def each(paths: Paths) -> list[Path]:
+    """One path, or several, in a list."""
+    several = [paths] if isinstance(paths, Path | str) else paths
+    return [Path(path) for path in several]
 
 
 @contextmanager

@@ -62,7 +62,7 @@ from sensors.recording import write_table
 
 @one_blas_thread
 def calibrate(
-    recordings: Sequence[Path | str],
+    recordings: outputs.Paths,
     out: Path | str,
     model: Model | None = None,
     hold_out: str = "location",
@@ -73,7 +73,7 @@ def calibrate(
     """Estimate a rig from its recordings and write the run folder.
 
     Args:
-        recordings: folders; what is the same hardware is one variable.
+        recordings: folder, or folders; what is the same hardware is one variable.
         out: the run folder to make; an earlier run there is replaced, anything else is refused.
         model: what is estimated; the default effects where None.
         hold_out: "location", "stop" or "none": what the held-out error leaves out of its fit.
@@ -84,9 +84,10 @@ def calibrate(
     Raises:
         InputError: what is wrong with the input, in one sentence.
     """
+    recordings = outputs.each(recordings)
     inputs = [*recordings, *([prior] if prior else [])]
     with outputs.folder(out, outputs.RUN, inputs) as folder:
-        _refuse_twice([Path(r).resolve() for r in recordings])
+        _refuse_twice([r.resolve() for r in recordings])
         model = model or Model.of(None, (), (), recordings)
         sources = leave_out([Source.open(r) for r in recordings], model.without)
         _fit(sources, model, folder, _Choices(Path(out), hold_out, folds, prior), progress)

@@ -59,7 +59,7 @@ class Explanation:
 
 
 def explain(
-    recordings: Sequence[Path | str],
+    recordings: outputs.Paths,
     out: Path | str,
     model: Model | None = None,
     progress: Progress = lambda what, done, total: None,
@@ -74,7 +74,7 @@ def explain(
     finished are taken up again.
 
     Args:
-        recordings: folders.
+        recordings: folder, or folders.
         out: folder of the runs ``00``, ``01``, …, made if it is not there.
         model: what is estimated at first; the default effects where None.
         progress: as of `fit.solve`.
@@ -83,12 +83,12 @@ def explain(
     Raises:
         InputError: what is wrong with the input, or `out` is something else.
     """
-    out = Path(out)
+    out, recordings = Path(out), outputs.each(recordings)
     with outputs.entries(out, outputs.LADDER, recordings) as entries:
         for number in range(MOST_RUNGS):  # one that is not climbed any more, too
             outputs.settle(out / f"{number:02d}")
         own_effects((), candidates)  # what is wrong with a file is said before the first fit
-        climb = _Climb([Path(r) for r in recordings], out, progress, candidates)
+        climb = _Climb(recordings, out, progress, candidates)
         climb.first(model or Model.of(None, (), (), recordings))
         diagnosis = diagnose(climb.run, climb.tell, False, candidates)
         while len(climb.runs) < MOST_RUNGS and climb.improve(diagnosis):

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from calib import outputs
 from calib.problem.model import Model
 from calib.results.solution import Part
 from calib.runs.calibrate import calibrate, grow
@@ -94,7 +95,7 @@ class Reproduction:
 
 def reproduce(
     run: Run,
-    recordings: Sequence[Path | str] = (),
+    recordings: outputs.Paths = (),
     progress: Progress = lambda what, done, total: None,
 ) -> Reproduction:
     """Fit a run again, and every run that it grew from, and compare.
@@ -108,11 +109,11 @@ def reproduce(
         InputError: a recording or the prior is gone or has changed, or the run does not say by
             which steps it was made; or an effect of it is in a Python file that may not run.
     """
-    stored = run.model["recordings"]
-    if recordings and len(recordings) != len(stored):
-        count = f"{len(recordings)} recordings are given, and {run.folder} was fitted to"
+    stored, moved = run.model["recordings"], outputs.each(recordings)
+    if moved and len(moved) != len(stored):
+        count = f"{len(moved)} recordings are given, and {run.folder} was fitted to"
         raise InputError(f"{count} {len(stored)}; give each of them, in the order of {MODEL}")
-    paths = [Path(path) for path in recordings] or run.recordings
+    paths = moved or run.recordings
     for each, path in zip(stored, paths, strict=True):
         if not path.is_dir():
             raise InputError(

@@ -27,6 +27,7 @@ def bench() -> Iterator[SimpleNamespace]:
         "bench_speed",
         "bench_memory",
         "bench_screen",
+        "bench_scale",
     )
     sys.path.insert(0, str(HERE))
     try:
@@ -114,3 +115,13 @@ def test_the_loop_agrees_with_itself(tmp_path):
     for verb in ("fit", "diagnose", "add", "explain", "report"):
         assert 0.1 < float(lines[verb].split()[4]) < 10, told
     assert "eliminating" in told and "whole / its casts" in told
+
+
+def test_costs_are_of_the_process_and_their_power_is_told(bench):
+    scale = bench.bench_scale
+    spent = [3.0 + 0.002 * size**1.3 for size in (100, 1000, 10_000)]
+    assert scale.exponent((100, 1000, 10_000), spent, 3.0) == pytest.approx(1.3)
+    found = scale.cost(["effects"])
+    assert 20 < found.peak_mb < 2000 and 0 < found.cpu_s < 2 * found.wall_s
+    with pytest.raises(RuntimeError, match="nowhere"):
+        scale.cost(["check", "nowhere"])

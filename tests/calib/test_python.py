@@ -1,11 +1,14 @@
 """What Python asks of a run: tables, residuals, figures, its graph, and what it prints."""
 
+from pathlib import Path
+
 import gtsam
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
 import calib
+from calib import outputs
 from calib.report.charts.graph import graph_rows
 from calib.runs.asked.factors import estimate_of
 from calib.solve.without import kinds_of
@@ -163,3 +166,14 @@ def test_what_moved_is_printed_as_the_command_prints_it(folder, rigcal):
     a, b = (calib.Run.open(folder / name) for name in "ab")
     _, out, _ = rigcal("moved", a.folder, b.folder)
     assert str(calib.moved(a, b)) == "\n".join(line.rstrip() for line in out.rstrip().splitlines())
+
+
+def test_one_folder_is_given_as_well_as_several(folder, tmp_path):
+    """A text is one path, and no list of letters."""
+    assert outputs.each("rec") == outputs.each(Path("rec")) == outputs.each(["rec"])
+    for call in (calib.fit, calib.explain):
+        with pytest.raises(InputError, match=r"nowhere.rig\.yaml does not exist"):
+            call(str(tmp_path / "nowhere"), tmp_path / "out")
+    with pytest.raises(InputError, match=r"nowhere\.pcd"):
+        calib.apply(calib.Run.open(folder / "a"), "nowhere.pcd", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
