@@ -295,20 +295,17 @@ class StopsFirst(Assembly):
     def add(self, sums: StopSums) -> None:
         """Add the beams of a stop, and eliminate what is its own."""
         super().add(sums)
-        layout = self.layout
-        mine = np.unique(np.concatenate([sums.chain_columns, sums.columns, [layout.size]]))
-        at = positions(layout.size + 1, mine)
-        unit = np.append(layout.sigma, 1.0)
-        through = np.zeros((TWIST, len(mine)))
+        mine, at = self._columns(sums.stop, sums.chain_columns, sums.columns)
+        unit = np.append(self.layout.sigma, 1.0)
+        through, beside = np.zeros((2, TWIST, len(mine)))
         through[:, at[sums.chain_columns]] = sums.chain * unit[sums.chain_columns]
-        direct = np.append(layout.size, sums.columns).astype(int)
-        whole, place, scale = sums.whole(), at[direct], unit[direct]
-        out = through.T @ whole[:TWIST, :TWIST] @ through
-        cross = through.T @ (whole[:TWIST, TWIST:] * scale)
-        out[:, place] += cross
-        out[place] += cross.T
-        add_at(out, place, place, whole[TWIST:, TWIST:] * scale * scale[:, None])
-        self._finish(sums.stop, mine, out)
+        direct = np.append(self.layout.size, sums.columns).astype(int)
+        block, place, scale = sums.whole(), at[direct], unit[direct]
+        beside[:, place] = block[:TWIST, TWIST:] * scale
+        half = block[:TWIST, :TWIST] @ through / 2.0 + beside
+        whole = np.vstack([through, half]).T @ np.vstack([half, through])
+        add_at(whole, place, place, block[TWIST:, TWIST:] * scale * scale[:, None])
+        self._finish(sums.stop, mine, at, whole)
 
     def add_kept(self, rows: OwnRows) -> None:
         """Add whitened rows about kept unknowns."""
@@ -317,33 +314,38 @@ class StopsFirst(Assembly):
             self._add_raw([rows])
         rows.add_to(self.total, self.at, self.layout.sigma, len(self.columns) - 1)
 
-    def _finish(self, stop: int, columns: np.ndarray, matrix: np.ndarray) -> None:
-        """Add a stop's own rows to its matrix over some columns, and eliminate what is its own."""
+    def _columns(self, stop: int, *beams: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Columns (m,) that a stop's rows touch, its own first and the right side last, and where
+        among them each of all stands; those of its beams are given."""
+        size, own = self.layout.size, self.layout.own.get(stop, np.zeros(0, int))
+        rows = (each.columns for each in self.waiting.get(stop, ()))
+        touched = np.unique(np.concatenate([*beams, *rows, [size]]).astype(int))
+        mine = np.concatenate([own, np.setdiff1d(touched, own)])
+        return mine, positions(size + 1, mine)
+
+    def _finish(self, stop: int, mine: np.ndarray, at: np.ndarray, whole: np.ndarray) -> None:
+        """Add a stop's own rows to the matrix of its beams over its columns, and eliminate what is
+        its own; the other arguments are those of `_columns`."""
         layout, rows = self.layout, self.waiting.pop(stop, ())
         if self.raw is not None:
-            place = positions(layout.size + 1, layout.kept)
-            add_at(self.raw, place[columns], place[columns], matrix)
+            place = positions(layout.size + 1, layout.kept)[mine]
+            add_at(self.raw, place, place, whole)
             self._add_raw(rows)
-        mine = np.unique(np.concatenate([columns, *(each.columns for each in rows)]))
-        at = positions(layout.size + 1, mine)
-        whole = np.zeros((len(mine), len(mine)))
-        whole[np.ix_(at[columns], at[columns])] = matrix
         for each in rows:
             each.add_to(whole, at, layout.sigma, len(mine) - 1)
-        own = at[layout.own[stop]] if stop in layout.own else np.zeros(0, int)
-        left = np.setdiff1d(np.arange(len(mine)), own)
-        rest = whole[np.ix_(left, left)]
-        if len(own):
-            factor, gain = eliminate(whole[np.ix_(own, own)], whole[np.ix_(own, left)], rest)
-            self.eliminated.append(Eliminated(mine[own], mine[left], factor, gain))
-        to = self.at[mine[left]]
+        count = len(layout.own.get(stop, ()))
+        rest = whole[count:, count:]
+        if count:
+            factor, gain = eliminate(whole[:count, :count], whole[:count, count:], rest)
+            self.eliminated.append(Eliminated(mine[:count], mine[count:], factor, gain))
+        to = self.at[mine[count:]]
         add_at(self.total, to, to, rest)
 
     def done(self, values: Values) -> Linearisation:
         """Eliminate all but the kept."""
-        size = self.layout.size
         for stop in list(self.waiting):
-            self._finish(stop, np.array([size]), np.zeros((1, 1)))
+            mine, at = self._columns(stop)
+            self._finish(stop, mine, at, np.zeros((len(mine), len(mine))))
         count = len(self.cells)
         if not count:
             return self._done(values, self.total)
