@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from scipy.sparse import csr_array, diags_array
@@ -24,7 +24,9 @@ from calib.residuals.beams import Association
 from calib.residuals.tracker import TrackedBody
 from calib.solve.graph import Graph
 
+T = TypeVar("T")
 Values = Mapping[str, np.ndarray]
+Found = Callable[[StopRows, np.ndarray, int, int], T]
 
 
 @dataclass(frozen=True)
@@ -68,12 +70,16 @@ class Beams:
                 found = self._clustered(*more, np.full(len(cluster), stop), place[cluster])
             yield CellSums(stop, place, *sums), found
 
-    def _rows_of(self, rows: StopRows, cluster: np.ndarray, count: int) -> tuple[Any, ...]:
+    def _rows_of(
+        self, rows: StopRows, cluster: np.ndarray, count: int, scan: int
+    ) -> tuple[Any, ...]:
         root = np.sqrt(rows.weight)
         A = rows.along(self.directions) * root[:, None]
         return A, root * rows.b, self._scatter(rows), rows.stop, cluster
 
-    def _cells_of(self, rows: StopRows, cluster: np.ndarray, count: int) -> tuple[Any, ...]:
+    def _cells_of(
+        self, rows: StopRows, cluster: np.ndarray, count: int, scan: int
+    ) -> tuple[Any, ...]:
         gradient, columns = rows.gradient(cluster, count)
         sums = (
             gradient @ self.directions[columns],
@@ -94,23 +100,38 @@ class Beams:
     ) -> ClusteredRows:
         return ClusteredRows(A, b, np.arange(self.directions.shape[1]), stop, place)
 
-    def _each_stop(
-        self, found: Callable[[StopRows, np.ndarray, int], tuple[Any, ...]]
-    ) -> Iterator[tuple[tuple[Any, ...], np.ndarray]]:
-        """What is found of the rows of each stop, and the numbers of what they meet; the rows
-        come with which of these each meets, and how many there are."""
-        scans, placed = self.problem.scans, lidars(self.problem.scans, self.values)
+    def _each_stop(self, found: Found[T]) -> Iterator[tuple[T, np.ndarray]]:
+        state = self.problem, self.layout, self.values, self.associations
+        return each_stop(*state, self.places, found, self.kinds, self.progress)
 
-        def work(i: int) -> tuple[np.ndarray, tuple[Any, ...]]:
-            at = scans[i], self.layout, self.values, placed[i], self.associations[i]
-            rows = StopRows.of(*at)
-            parts, cluster = rows.places(self.kinds)
-            return parts, found(rows, cluster, len(parts))
 
-        for i, (parts, told) in enumerate(in_order(work, len(scans))):
-            self.progress(i, len(scans))
-            # Numbered here: threads would race for them.
-            yield told, self.places.numbers(scans[i].room, parts)
+def each_stop(
+    problem: Problem,
+    layout: Layout,
+    values: Values,
+    associations: Sequence[Association],
+    places: Gradients,
+    found: Found[T],
+    kinds: Sequence[str] = PLACES,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Iterator[tuple[T, np.ndarray]]:
+    """What is found of the rows of each stop, and the numbers of what they meet; arguments as of
+    `Beams`.
+
+    Args:
+        found: called with the rows of a stop, which of what they meet each meets, how many there
+            are, and the number of the scan.
+    """
+    scans, placed = problem.scans, lidars(problem.scans, values)
+
+    def work(i: int) -> tuple[np.ndarray, T]:
+        rows = StopRows.of(scans[i], layout, values, placed[i], associations[i])
+        parts, cluster = rows.places(kinds)
+        return parts, found(rows, cluster, len(parts), i)
+
+    for i, (parts, told) in enumerate(in_order(work, len(scans))):
+        progress(i, len(scans))
+        yield told, places.numbers(scans[i].room, parts)  # here: threads would race for them
 
 
 def of_stops(layout: Layout, values: Values) -> Iterator[ClusteredRows]:

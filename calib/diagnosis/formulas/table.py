@@ -21,11 +21,10 @@ from calib.diagnosis.linear import beside, other_rows
 from calib.diagnosis.score import GAUGE, Scores, Test, test
 from calib.linear.clusters import ClusteredRows, Gradients, summed
 from calib.linear.layout import Layout
-from calib.linear.linearise import lidars
-from calib.linear.parallel import in_order
 from calib.linear.rows import TWIST, StopRows
 from calib.problem import Problem
 from calib.residuals.robust import MAD
+from calib.solve.clustered import each_stop
 from calib.solve.estimate import Estimate
 
 # Beams in the table. What limits a formula is stops and surfaces that err together, not beams: of
@@ -90,20 +89,16 @@ class Table:
         """
         problem, values = beside(estimate.problem, estimate)
         layout, scans = Layout.of(problem), problem.scans
-        placed, places = lidars(scans, values), Gradients(layout.size)
+        places = Gradients(layout.size)
         beams = sum(int(np.count_nonzero(a.part >= 0)) for a in estimate.associations)
         share = min(1.0, most / max(beams, 1))
 
-        def work(i: int) -> _Drawn:
-            rows = StopRows.of(scans[i], layout, values, placed[i], estimate.associations[i])
-            return _Drawn.of(rows, share, i, TWIST * len(scans), layout.size)
+        def found(rows: StopRows, met: np.ndarray, count: int, scan: int) -> _Drawn:
+            return _Drawn.of(rows, met, share, scan, TWIST * len(scans), layout.size)
 
-        drawn, place = [], []
-        for i, each in enumerate(in_order(work, len(scans))):
-            progress(i, len(scans))
-            drawn.append(each)
-            # Numbered here: threads would race for them.
-            place.append(places.numbers(scans[i].room, each.surfaces)[each.met])
+        state = problem, layout, values, estimate.associations
+        every = list(each_stop(*state, places, found, progress=progress))
+        drawn, place = [d for d, _ in every], [numbers[d.met] for d, numbers in every]
         names = [n for n in drawn[0].columns if all(n in d.columns for d in drawn)]
         others, b, others_stop, others_place = rows_of_others(problem, layout, values, places)
         chains = [*(d.chain for d in drawn), eye_array(layout.size, format="csr")]
@@ -326,7 +321,7 @@ class _Drawn:
         stop: its number.
         columns: covariates (n,) of these; (1,) of the stop.
         residual_m, sigma_m, twists, chain: as of `Table`.
-        surfaces: (G,) those that any beam of the stop meets; met: (n,) which of these each does.
+        met: (n,) which of what any beam of the stop meets each does.
     """
 
     stop: int
@@ -335,18 +330,18 @@ class _Drawn:
     sigma_m: np.ndarray
     twists: csr_array
     chain: csr_array
-    surfaces: np.ndarray
     met: np.ndarray
 
     @classmethod
-    def of(cls, rows: StopRows, share: float, number: int, begin: int, size: int) -> _Drawn:
+    def of(
+        cls, rows: StopRows, met: np.ndarray, share: float, number: int, begin: int, size: int
+    ) -> _Drawn:
         """A share of a stop's beams; so many columns of unknowns begin after the twists'."""
         usable = np.flatnonzero(rows.rows.usable & np.isfinite(rows.rows.residual_m))
         drawn = np.random.default_rng(number).choice(usable, round(share * len(usable)), False)
         picked, columns = np.sort(drawn), {}
         for name, values in covariates_of(rows.rows.view):
             columns[name] = (values[picked] if len(values) > 1 else values).astype(float)
-        surfaces, met = rows.places()
         return cls(
             stop=rows.stop,
             columns=columns,
@@ -354,7 +349,6 @@ class _Drawn:
             sigma_m=rows.rows.sigma_m[picked],
             twists=_twists(rows, picked, TWIST * number, begin, begin + size),
             chain=_rows_over(rows.chain, rows.chain_columns, size),
-            surfaces=surfaces,
             met=met[picked],
         )
 
