@@ -34,12 +34,7 @@ POLICY = (
 PAGE = "/"  # all that viser serves but the websocket, whatever stands after the key
 # Of the connection that a message came by; viser's callbacks run in its context.
 _visit_here: ContextVar[Visit | None] = ContextVar("visit", default=None)
-# A menu that was used lets go of the keyboard, whose keys would be letters in it.
-READDRESS = """
-history.replaceState(null, "", "/" + location.pathname.split("/")[1] + "/" + ASKS);
-const used = document.activeElement;
-if (used?.ariaHasPopup === "listbox" && used.ariaExpanded !== "true") used.blur();
-"""
+READDRESS = 'history.replaceState(null, "", "/" + location.pathname.split("/")[1] + "/" + ASKS)'
 NOBODY = Visit(may_change=False)
 
 

@@ -13,13 +13,14 @@ LABEL = "Light up"
 HINT = "Drag across the plot, or write two numbers: 2 to 4.5"
 UNLIT = (211, 213, 217)  # fainter than any colour of a scale, on white walls
 # Plots of viser tell a server nothing of what is dragged across them: the page itself writes the
-# range into the field, as a person would. A box that was ticked with the mouse lets go of the
-# keyboard, whose keys would go to it and not to the next stop.
+# range into the field, as a person would. A menu that was used, and a box that was ticked with the
+# mouse, let go of the keyboard, whose keys would go to them and not to the next stop.
 SCRIPT = """
 if (!window.rigcalBrush) {
   window.rigcalBrush = true;
   document.addEventListener("click", e => {
     if (e.detail && e.target.type === "checkbox") e.target.blur();
+    if (e.target.closest("[role=option]")) document.activeElement.blur();
   });
   document.addEventListener("mouseup", () => setTimeout(() => {
     const told = document.querySelector("[data-is=plotted]");
