@@ -183,7 +183,8 @@ def size_told(size: float, sigma: float, unit: str) -> str:
     """A size in m or rad and its sigma, as people read it."""
     name, scale = SHOWN.get(unit, (unit, 1.0))
     if scale * size >= LARGE:
-        return f"{size:.3g} {unit}"
+        in_deg = f" ({np.degrees(size):.3g} deg)" if unit == "rad" else ""
+        return f"{size:.3g} {unit}{in_deg}"
     return f"{scale * size:.3g} ± {scale * sigma:.2g} {name}"
 
 

@@ -15,7 +15,7 @@ from calib.forward import Values
 from calib.linear.parallel import one_blas_thread
 from calib.problem.model import Model, Source
 from calib.problem.without import ROD, leave_out
-from calib.residuals.groups import SCAN
+from calib.residuals.groups import CAD, SCAN
 from calib.residuals.scan import ScanStop
 from calib.results.reach import Reach, reach
 from calib.results.solution import solution_of
@@ -27,6 +27,8 @@ from calib.rig.suspect import Suspect
 from calib.rig.tracked import odd_bodies
 from calib.solve.estimate import Estimate
 from calib.solve.fit import Progress, preview
+from calib.solve.turned import lidars_turned
+from chains import se3
 from chains.errors import InputError
 from sensors.recording import Recording, read_scan
 from sensors.reference import Reference
@@ -150,13 +152,13 @@ class _Checker:
             found.contents.extend(inventory.of_targets(targets))
         if targets and rig and rig.target:
             self._tell(odd_targets(targets, rig.target))
-        for suspect in found.suspects:
-            suspect["without"] = _token(suspect, rig, recording)
         reference = self._read_mesh(rig)
         if reference and scans.points:
             self._tell(odd_mesh(reference, scans.reach_m))
         if self.graph and rig and recording and (reference or not rig.reference):
             self._try_graph(Source(rig, recording, reference), scans)
+        for suspect in found.suspects:
+            suspect["without"] = _token(suspect, rig, recording)
 
     def _tell(self, odd: Iterable[str | Suspect]) -> None:
         """Note what looks odd, as sentences and, what is likely a mishap, as entries."""
@@ -205,14 +207,19 @@ class _Checker:
         if problem is None:
             return
         readable = [scan for scan in problem.scans if scan.name in scans.points]
-        readable = readable[:: -(-len(readable) // MOST_SCANS) or 1]
-        problem.scans, placed = [], []
-        for i, scan in enumerate(readable):
-            self.progress("placing scans", i, len(readable))
-            at = self._attempt(_place, scan, problem.initial)
+        problem.scans = readable[:: -(-len(readable) // MOST_SCANS) or 1]
+        values = problem.initial
+        if turned := lidars_turned(problem, values):
+            values = {**values, **turned}
+            self._tell([_turned(problem.scans[0], problem.initial, values)])
+        kept, placed = [], []
+        for i, scan in enumerate(problem.scans):
+            self.progress("placing scans", i, len(problem.scans))
+            at = self._attempt(_place, scan, values)
             if at is not None:
-                problem.scans.append(scan)
+                kept.append(scan)
                 placed.append(at)
+        problem.scans = kept
         if placed:
             self.found.contents.extend(inventory.of_beams(placed))
             self.found.odd.extend(inventory.odd_beams(placed))
@@ -227,10 +234,27 @@ class _Checker:
                     self.found.odd.append(reached.warning)
 
 
+def _turned(scan: ScanStop, before: Values, after: Values) -> Suspect:
+    """That the scans want the LiDAR's frame turned, as this one of them has it after."""
+    tree = scan.stops.rig.tree
+    edge = tree.edges[tree.path(scan.stops.rig.lidar_frame)[-1]]
+    turn = se3.inverse(scan.pose(before)) @ scan.pose(after)
+    rpy_rad = np.round(se3.to_rpy(edge.T_parent_child @ turn), 2) + 0.0  # no -0
+    angle = float(np.linalg.norm(se3.so3_log(turn[:3, :3])))
+    return Suspect(
+        kind="frame",
+        name=edge.child,
+        size=angle,
+        unit="rad",
+        sentence=f"the scans fit the mesh with {edge.child} turned by {np.degrees(angle):.0f} deg "
+        f"from CAD; check its rpy_rad in rig.yaml, which would be about {rpy_rad.tolist()}",
+    )
+
+
 def _token(suspect: Mapping[str, Any], rig: Rig | None, recording: Recording | None) -> str | None:
     """How ``--without`` names what a suspect is about, if it has a name for it."""
     kind, stop, name = (suspect[key] for key in ("kind", "stop", "name"))
-    known = {"scan": f"{stop}:{SCAN}", "target": f"{name}:{ROD}"}
+    known = {"scan": f"{stop}:{SCAN}", "target": f"{name}:{ROD}", "frame": f"{CAD}:{name}"}
     token = known.get(kind, f"{stop}:{name}")
     if rig is None or recording is None:
         return None

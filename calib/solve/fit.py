@@ -8,7 +8,7 @@ from calib.solve.added import declared
 from calib.solve.descent import LAST, SLOWED, UPHILL
 from calib.solve.estimate import Estimate, Start, cost_of, values_of
 from calib.solve.loop import CONVERGED, Loop, Progress
-from calib.solve.turned import least_turned, turned_far
+from calib.solve.turned import least_turned, lidars_turned, turned_far
 from chains.errors import InputError
 
 __all__ = ["CONVERGED", "Progress", "preview", "resume", "solve"]
@@ -25,15 +25,14 @@ def solve(
     """Maximum a posteriori estimate of a problem.
 
     Trackers and targets alone are solved first; where bodies are then far from where the chain puts
-    them, also from starts with a joint's zero or a frame turned, and the least cost wins. Then each
-    pass linearises every stop's rows at the present state (robust weights and, until the fit has
-    settled, the surface met included), eliminates what belongs to surfaces and stops, and takes one
-    Gauss-Newton step of the graph of all that is left, as far as it lowers the cost. From an
-    earlier state, what the beams meet is known and a few passes are all there is; the cost does not
-    end above that of the state.
+    them, also from starts with a joint's zero or a frame turned, and the least cost wins. A LiDAR
+    whose beams end far from the mesh is turned as they fit it best. Then each pass linearises every
+    stop's rows at the present state (robust weights and, until the fit has settled, the surface met
+    included), eliminates what belongs to surfaces and stops, and takes one Gauss-Newton step of the
+    graph of all that is left, as far as it lowers the cost. From an earlier state, what beams meet
+    is known and a few passes are all; the cost does not end above that of the state.
 
-    A fit whose bodies, beams, or rows of trackers and targets are hopelessly far off is given up,
-    not converged.
+    A fit whose bodies, beams, or rows of trackers and targets are hopelessly far off is given up.
 
     Args:
         problem: what to estimate.
@@ -68,7 +67,8 @@ def solve(
         loop.reweigh(beams=False)
         loop.lost = loop.bodies_astray()
     if problem.scans:
-        loop.values |= declared(problem, loop.held)  # of which nothing was known without scans
+        # Nothing was known of these without scans.
+        loop.values |= declared(problem, loop.held) | lidars_turned(loop.problem, loop.values)
         loop.lost = loop.lost or not loop.look_around()
         if spread:
             loop.begin_spread()
@@ -124,6 +124,7 @@ def preview(problem: Problem, progress: Progress = lambda what, done, total: Non
     loop.solve_without_scans()
     loop.reweigh(beams=False)
     if problem.scans:
+        loop.values |= lidars_turned(problem, loop.values)
         loop.fix_association()
     return loop.estimate()
 

@@ -20,6 +20,7 @@ from calib.problem.spread import by_chance, widening, with_spread
 from calib.problem.surfaces import well_seen, with_surfaces
 from calib.problem.unknowns import Unknown
 from calib.residuals.beams import Association
+from calib.residuals.surfaces import MeshSurface
 from calib.solve.added import begun
 from calib.solve.components import sds, squares, told, wider
 from calib.solve.descent import AT_OPTIMUM, LAST, SLOWED, STEADY, SWAYS, Descent, Progress
@@ -237,8 +238,8 @@ class Loop(Descent):
 
     def look_around(self) -> bool:
         """Passes that look each time anew what beams meet, until they settle; False where the fit
-        is hopeless. Where bodies contradict each other, scans say which of them is right: as CAD
-        has the LiDAR, and once more where a pass has put it."""
+        is hopeless, as where planes that were found in the scans never do. Where bodies contradict
+        each other, scans say which is right: as CAD has the LiDAR, and where a pass has put it."""
         for count in range(1, LOOKED + 1):
             if count <= ASKED:
                 self._ask_scans()
@@ -252,8 +253,8 @@ class Loop(Descent):
             tangent, _ = self.step()
             self.values = self.moved(self.values, tangent)
             if self.size(tangent) < SETTLED:
-                break
-        return True
+                return True
+        return any(isinstance(scan.meeting, MeshSurface) for scan in self.problem.scans)
 
     def _ask_scans(self) -> None:
         """Set aside the bodies that the scan at their stop shows to be wrong."""

@@ -1,4 +1,4 @@
-"""Other starts: a joint's zero, or a frame, turned by a quarter or half of a turn."""
+"""Other starts: a joint's zero, a frame, or the LiDAR in its frame, turned."""
 
 from __future__ import annotations
 
@@ -6,17 +6,30 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from calib.forward import Placed
 from calib.problem.problem import Problem
+from calib.residuals.scan import ScanStop
+from calib.residuals.surfaces import MeshSurface
 from calib.residuals.tracker import BodiesTogether, TrackedBody
 from chains import se3
 from chains.align import mean_pose
+from sensors.lidar import Beams
 
 TURNS = (np.pi, np.pi / 2, -np.pi / 2)
 KEPT = 3  # starts that are given, of all that are looked at
 TOGETHER = 2  # zeros and frames that may be turned at once
 WIDTH = 5  # of those with one turned, how many have a second one turned
+# Orientations of a LiDAR are looked at on a grid, of turns by up to 0.6 rad about three axes beside
+# each of the 24 that map a cube onto itself, and on finer ones beside the best of these. From
+# 0.3 rad away passes over the scans find the optimum.
+STEP_RAD, FINER_RAD, BEST = 0.3, (0.15, 0.07), 8
+# So many beams of so many scans tell orientations apart; beams are off by no more than this, as
+# what they pass by may be anywhere behind.
+SCANS, BEAMS, FAR_M = 8, 150, 1.0
+NEAR_M = 0.1  # mean error of these beams that asks for no other orientation: good ones have 0.02
+NEARER = 0.5  # share of the mean error by which another orientation must be better
 
 Values = dict[str, np.ndarray]
 
@@ -62,6 +75,93 @@ def turned_far(problem: Problem, values: Mapping[str, np.ndarray]) -> bool:
         for name, i in _angles(problem, problem.bodies)
     )
     return any(abs(now - mean) > np.pi / 4 for mean, now in pairs)
+
+
+def lidars_turned(problem: Problem, values: Mapping[str, np.ndarray]) -> Values:
+    """The frame of each LiDAR turned as its scans fit the mesh best, of orientations all around.
+
+    Args:
+        problem: with scans.
+        values: the state; a LiDAR's origin stays where it has it.
+
+    Returns:
+        The unknowns of the frames to turn, by name: of those LiDARs whose beams are then less than
+        half as far off.
+    """
+    seen: dict[tuple[str, int], list[_Sampled]] = {}
+    for scan in problem.scans:
+        edge = _free_edge(problem, scan)
+        if edge and isinstance(scan.meeting, MeshSurface):
+            seen.setdefault(edge, []).append(_Sampled(scan, scan.pose(values)))
+    return {
+        name: _with_turn(values[name], start, turn)
+        for (name, start), scans in seen.items()
+        if (turn := _best_turn(scans)) is not None
+    }
+
+
+@dataclass(frozen=True)
+class _Sampled:
+    """A scan, and T_reference_lidar (4, 4) as a state has it."""
+
+    scan: ScanStop
+    T: np.ndarray
+
+    def off_m(self, turns: np.ndarray) -> np.ndarray:
+        """Mean error (G,) of some beams with the LiDAR turned (G, 3, 3) about its origin."""
+        _, ray = self.scan.store.read(self.scan.index)
+        some = np.linspace(0, len(ray.range_m) - 1, BEAMS).round().astype(int)
+        origin = (ray.origin_m[some] @ turns.mT).reshape(-1, 3)
+        direction = (ray.direction[some] @ turns.mT).reshape(-1, 3)
+        beams = Beams(origin, direction, np.tile(ray.range_m[some], len(turns)))
+        met = self.scan.meeting.associate(self.T, beams, {}, near_edges=False)
+        surface = self.scan.meeting.meet(self.T, beams, {}, met)
+        off_m = np.where(surface.usable, np.abs(beams.range_m - surface.predicted_m), FAR_M)
+        return np.minimum(off_m, FAR_M).reshape(len(turns), -1).mean(axis=1)
+
+
+def _best_turn(scans: Sequence[_Sampled]) -> np.ndarray | None:
+    """The turn (3, 3) of a LiDAR that makes its beams fit best; None where none is much better."""
+    chosen = np.unique(np.linspace(0, len(scans) - 1, SCANS).round().astype(int))
+
+    def off_m(turns: np.ndarray) -> np.ndarray:
+        return np.mean([scans[i].off_m(turns) for i in chosen], axis=0)
+
+    start_m = float(off_m(np.eye(3)[None])[0])
+    if start_m < NEAR_M:
+        return None
+    turns = _beside(Rotation.create_group("O").as_matrix(), STEP_RAD * np.arange(-2, 3))
+    for step in FINER_RAD:
+        turns = _beside(turns[np.argsort(off_m(turns))[:BEST]], step * np.arange(-1, 2))
+    found_m = off_m(turns)
+    return turns[np.argmin(found_m)] if found_m.min() < NEARER * start_m else None
+
+
+def _beside(turns: np.ndarray, angles: np.ndarray) -> np.ndarray:
+    """Turns (G, 3, 3), each turned further by all combinations of angles about three axes."""
+    further = se3.so3_exp(np.stack(np.meshgrid(*[angles] * 3), axis=-1).reshape(-1, 3))
+    return (turns[:, None] @ further).reshape(-1, 3, 3)
+
+
+def _free_edge(problem: Problem, scan: ScanStop) -> tuple[str, int] | None:
+    """Unknown that may turn the frame of a LiDAR any way, the same at all stops, and where its
+    rotation vector begins; None where there is none."""
+    path = scan.stops.rig.tree.path(scan.stops.rig.lidar_frame)
+    if not path:  # it is the rig's root
+        return None
+    for name, basis in scan.stops.edge_bases.items():
+        turns = np.flatnonzero(np.any(basis[0, path[-1], :3] != 0, axis=0))
+        same = len(basis) == 1 and name in problem.calibration
+        if same and np.array_equal(basis[0, path[-1], :3][:, turns], np.eye(3)):
+            return name, int(turns[0])
+    return None
+
+
+def _with_turn(value: np.ndarray, start: int, turn: np.ndarray) -> np.ndarray:
+    """A frame's offsets with its rotation vector, which begins there, turned."""
+    out, angles = value.copy(), slice(start, start + 3)
+    out[angles] = se3.so3_log(se3.so3_exp(value[angles]) @ turn)
+    return out
 
 
 @dataclass(frozen=True)
