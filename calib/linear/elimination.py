@@ -106,11 +106,14 @@ def square_root(matrix: np.ndarray) -> np.ndarray:
     return root * scale
 
 
-def inverse(inner: np.ndarray) -> np.ndarray:
+def inverse_and_log_det(inner: np.ndarray) -> tuple[np.ndarray, float]:
     """Of a symmetric matrix whose eigenvalues are all at least 1, though rounding errors of the
-    largest may exceed that."""
+    largest may exceed that: the inverse, and the logarithm of the determinant."""
     try:
-        return cho_solve(cho_factor(inner), np.eye(len(inner)))
+        factor = cho_factor(inner)
     except np.linalg.LinAlgError:
         values, axes = np.linalg.eigh(inner)
-        return (axes / np.maximum(values, 1.0)) @ axes.T
+        values = np.maximum(values, 1.0)
+        return (axes / values) @ axes.T, float(np.log(values).sum())
+    log_det = 2.0 * float(np.log(np.diag(factor[0])).sum())
+    return cho_solve(factor, np.eye(len(inner))), log_det

@@ -15,10 +15,9 @@ from functools import reduce
 from operator import add
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
-from scipy.optimize import minimize_scalar
+from scipy.optimize import minimize, minimize_scalar
 
-from calib.linear.elimination import inverse
+from calib.linear.elimination import inverse_and_log_det
 from calib.linear.system import Linearisation, Values
 from calib.problem.places import joints_at
 from calib.problem.problem import Block, Problem, SurfaceCells
@@ -30,8 +29,7 @@ from calib.residuals.targets import PARTS, SIGMAS, HangingTarget
 from calib.residuals.tracker import BodiesTogether, TrackedBody
 from calib.solve.estimate import Estimate
 
-ROUNDS = 500  # of the fixed point; from ten times too large or small 40 were measured
-STEADY = 1e-6  # relative change of a variance that ends them
+PRECISE = {"ftol": 1e-15, "gtol": 1e-7}  # of twice a log-likelihood: sds to some 1e-6 of theirs
 LEAST = 1e-3  # of the sd that a group starts from: what is smaller counts as none
 MOST = 1e6  # times that: far from an optimum scores are of any size, and squares overflow
 SEEN = 1e-9  # of the largest information, below which a direction of values is not seen
@@ -73,20 +71,23 @@ class Told:
         Args:
             start: (G,) sd to start from.
         """
-        count = np.bincount(self.group, minlength=len(start))
-        least, most = np.square(LEAST * start), np.square(MOST * start)
-        variance = np.square(start)
-        for _ in range(ROUNDS):
-            values, covariance = self._given(variance)
-            # A value known no better than by its prior tells nothing of that (MacKay 1992).
-            told = count - np.bincount(self.group, np.diag(covariance)) / variance
-            new = np.bincount(self.group, np.square(values)) / np.maximum(told, 1e-12)
-            new = np.where(told > 1e-9, np.clip(new, least, most), variance)
-            steady = np.all(np.abs(new - variance) < STEADY * variance)
-            variance = new
-            if steady:
-                break
-        return np.sqrt(variance)
+        first = 2.0 * np.log(start)
+        bounds = np.stack([first + 2.0 * np.log(LEAST), first + 2.0 * np.log(MOST)], axis=1)
+        best = minimize(
+            self._unlikely, first, jac=True, method="L-BFGS-B", bounds=bounds, options=PRECISE
+        )
+        return np.exp(best.x / 2.0)
+
+    def _unlikely(self, log_variance: np.ndarray) -> tuple[float, np.ndarray]:
+        """Minus the restricted log-likelihood, twice, and its derivative (G,) by the logs of the
+        variances: nought where the squares of the values are as many variances as all rows tell of
+        (MacKay 1992)."""
+        variance = np.exp(log_variance)
+        values, covariance, log_det = self._given(variance)
+        count = np.bincount(self.group, minlength=len(variance))
+        told = count - np.bincount(self.group, np.diag(covariance)) / variance
+        slope = told - np.bincount(self.group, np.square(values)) / variance
+        return log_det - float(self.score @ values), slope
 
     def of(self, group: int) -> Told:
         """Of one group, all others being 0."""
@@ -95,23 +96,22 @@ class Told:
 
     def statistic(self, sd: np.ndarray) -> float:
         """Twice the log of the likelihood ratio of the sds (G,) against none."""
-        root = sd[self.group]
-        inner = np.eye(len(root)) + root[:, None] * self.information * root
-        whole = cho_factor(inner)
-        scaled = root * self.score
-        return float(scaled @ cho_solve(whole, scaled) - 2 * np.log(np.diag(whole[0])).sum())
+        values, _, log_det = self._given(np.square(sd))
+        return float(self.score @ values) - log_det
 
-    def _given(self, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The values (Q,) and their covariance, given the variances of the groups."""
+    def _given(self, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        """The values (Q,) and their covariance, given the variances of the groups; and by how much
+        the log of the determinant of what is told of them grows."""
         root = np.sqrt(variance)[self.group]
         inner = np.eye(len(root)) + root[:, None] * self.information * root
-        covariance = root[:, None] * inverse(inner) * root
-        return covariance @ self.score, covariance
+        of_inner, log_det = inverse_and_log_det(inner)
+        covariance = root[:, None] * of_inner * root
+        return covariance @ self.score, covariance, log_det
 
     def sigma(self, sd: np.ndarray) -> np.ndarray:
         """Of the sds (G,), from the expected information of the variances: ``tr(P E_i P E_j) / 2``
         with ``P = M - M C M``; of one that is no more than that, the sd of such a variance."""
-        _, covariance = self._given(np.square(sd))
+        _, covariance, _ = self._given(np.square(sd))
         P = self.information - self.information @ covariance @ self.information
         sums = np.zeros((len(sd), len(sd)))
         np.add.at(sums, (self.group[:, None], self.group), np.square(P) / 2)

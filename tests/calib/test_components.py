@@ -106,7 +106,7 @@ def test_rounding_beside_a_very_wide_spread_is_no_fault():
         np.linalg.cholesky(np.eye(40) + 1e8 * information)
     truth = axes[:, :20] @ rng.standard_normal(20)
     told = Told(information @ truth, information, np.zeros(40, int))
-    values, covariance = told._given(np.full(1, 1e8))
+    values, covariance, _ = told._given(np.full(1, 1e8))
     np.testing.assert_allclose(axes[:, :20].T @ values, axes[:, :20].T @ truth, atol=0.05)
     assert np.abs(axes[:, 20:].T @ values).max() < 1.0
     assert np.linalg.eigvalsh(covariance)[0] > -1e-3
@@ -378,3 +378,18 @@ def test_without_a_mesh_the_planes_are_no_bodies(tmp_path):
     assert of == {"base_markers", "mount_markers"}
     (p,) = (c["p_value"] for c in found.candidates if c["effect"] == "tracker_scatter")
     assert p >= 1e-6
+
+
+@pytest.mark.parametrize("size", [1.0, 1e8, 1e16, 1e24])
+def test_spreads_are_found_where_rounding_spoils_the_information(size):
+    """Values that nothing but their sum is told of, to ever more digits than a double has: of such
+    a matrix and 1, rounding makes eigenvalues that are negative."""
+    rng = np.random.default_rng(0)
+    along = rng.normal(size=(30, 2))
+    information = size * along @ along.T
+    information += 1e-15 * size * (noise := rng.normal(size=(30, 30))) + 1e-15 * size * noise.T
+    score = information @ rng.normal(size=30)
+    told = Told(score, information, np.repeat([0, 1], 15))
+    sd = told.spread(np.array([0.1, 0.1]))
+    assert np.isfinite(sd).all() and np.isfinite(told.statistic(sd))
+    assert told.statistic(sd) >= told.statistic(np.array([0.1, 0.1]))
