@@ -152,14 +152,20 @@ def known_effects(
             continue
         if effect.family in model.fixed or lacking(effect, sources, columns):
             continue
-        shapes = {}
-        for source in sources:
-            shapes |= dict.fromkeys(effect.shapes(stops_view(source)))
         if effect.shape_name:
-            found += [effect.at(shape) for shape in shapes]
+            found += [effect.at(shape) for shape in shapes_of(effect, sources)]
         else:
             found.append(effect)
     return found
+
+
+def shapes_of(effect: Effect, sources: Sequence[Source]) -> list[float]:
+    """The shapes worth trying, ascending. Of several recordings, as of times at which something
+    slipped, no more than of the one that has most: evenly among those of all."""
+    each = [effect.shapes(stops_view(source)) for source in sources]
+    every = sorted(set().union(*each))
+    chosen = np.linspace(0, len(every) - 1, max(map(len, each))).round().astype(int)
+    return [every[i] for i in np.unique(chosen)]
 
 
 def concerned(effect: Effect, sources: Sequence[Source]) -> bool:

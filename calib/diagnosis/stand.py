@@ -16,7 +16,7 @@ from calib.diagnosis.candidates import (
     ShapeStep,
     covariates,
     known_effects,
-    stops_view,
+    shapes_of,
     structure,
 )
 from calib.diagnosis.chance import Chance, chances, of_lidar, ranked, rows_by_chance
@@ -155,7 +155,7 @@ class Stand:
         """An effect with its shape chosen more finely than the grid on which it was found."""
         if not effect.shape_name:
             return effect
-        grid = sorted({shape for s in self.sources for shape in effect.shapes(stops_view(s))})
+        grid = shapes_of(effect, self.sources)
         i = grid.index(effect.shape)
         ends = grid[max(0, i - 1)], grid[min(len(grid) - 1, i + 1)]
         spaced = (np.geomspace if ends[0] > 0 else np.linspace)(*ends, FINER)

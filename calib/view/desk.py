@@ -54,7 +54,11 @@ class Findings:
         if document is None:
             return None
         single = (c for c in document["curves"] if len(c["covariates"]) == 1)
-        curves = {c["covariates"][0]: DiagnosisCurve.read(c) for c in single}
+        curves: dict[str, DiagnosisCurve] = {}
+        for each in single:  # of several rigs, whose stands out most
+            covariate, curve = each["covariates"][0], DiagnosisCurve.read(each)
+            if covariate not in curves or curve.stands_out > curves[covariate].stands_out:
+                curves[covariate] = curve
         names = ("sentences", "candidates", "unexplained", "blunders")
         lists = {name: document[name] for name in names}
         charts = charts_of(document, narrow=True)
