@@ -1,9 +1,10 @@
 """Which unknowns are a stop's own, which are cells, and which are kept."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from calib.linear import layout as layouts
 from calib.linear.layout import Layout
 from calib.problem import build
 from calib.problem.model import Model, Source
@@ -138,10 +139,10 @@ def test_what_has_no_prior_is_not_scaled(problem):
     assert layout.unbounded == {"mount"}
 
 
-def test_stops_go_first_where_they_outnumber_cells(problem, monkeypatch):
-    """Of four stops, and some two hundred cells, or none before any are known."""
-    plain = problem(seen=False)
-    layout, with_cells = Layout.of(plain), Layout.of(preview(plain).problem)
-    assert not layout.stops_first and not with_cells.stops_first
-    monkeypatch.setattr(layouts, "ONE_BLOCK", 23)
-    assert layout.stops_first and not with_cells.stops_first
+def test_stops_go_first_where_that_is_less_work(problem):
+    """Not four of them; a thousand do, unless far more unknowns than theirs are kept."""
+    layout = Layout.of(preview(problem(seen=False)).problem)
+    assert not layout.stops_first
+    many = replace(layout, own={stop: np.arange(12) for stop in range(1000)})
+    assert many.stops_first
+    assert not replace(many, kept=np.arange(50_000)).stops_first
