@@ -11,15 +11,17 @@ from calib.diagnosis.search import _adapted
 class ScriptedLook:
     """A look of which it is written what it finds, by how many blunders were left out."""
 
+    converged = True
+
     def __init__(self, script, count=0):
         self.count, self.script = count, script
-        estimate = SimpleNamespace(problem=None, values=None)
+        estimate = SimpleNamespace(problem=None, values=None, converged=self.converged)
         self.stand = SimpleNamespace(estimate=estimate, without=self.without)
         self.checked, self.blunders = set(), []
         self.wild, self.outdone, self.quiet = script[count]
 
     def without(self, groups, progress):
-        after = ScriptedLook(self.script, self.count + len(groups))
+        after = type(self)(self.script, self.count + len(groups))
         return SimpleNamespace(look=lambda progress: after)
 
 
@@ -68,3 +70,10 @@ def test_none_is_left_out_where_something_stands_out_after_all(left_out):
 def test_what_leads_stays_left_out_when_a_trial_after_it_fails(left_out):
     looks = (ONE, False, False), (ONE, True, False), (ONE, True, False), QUIET
     assert left_out(*looks) == 1
+
+
+def test_a_fit_without_optimum_is_mended_in_two_rounds_or_not_at_all(left_out, monkeypatch):
+    looks = [(ONE, False, False)] * 5 + [QUIET]
+    assert left_out(*looks) == 5
+    monkeypatch.setattr(ScriptedLook, "converged", False)
+    assert left_out(*looks) == search.MENDED == 2
