@@ -167,6 +167,15 @@ class Chance:
         return f"{spread.of or 'sd'}.{spread.unit}" if several else "sd"
 
     @property
+    def unsettled(self) -> str:
+        """What is said of it where no fit that has it comes to an optimum."""
+        who = NOUNS.get(self.effect.site, f"{self.effect.per.capitalize()}s scatter")
+        return (
+            f"{who} more than chance allows (p = {self.p_adjusted:.1g}), but no fit with that "
+            f"scatter ({self.effect.name}) comes to an optimum: part of it is systematic."
+        )
+
+    @property
     def sentence(self) -> str:
         """What it says, and what to do about it."""
         each, name = self.effect.per, self.effect.name

@@ -11,6 +11,7 @@ from calib.blunders.chance import after_looks
 from calib.diagnosis.score import Scores, Test, test
 from calib.effects import Effect, Site
 
+ODDS = np.log(20.0)  # of a rival: within these it can stand in for the best
 QUANTILE = 0.05  # of the smallest p-value, at which dependent tests are counted
 
 
@@ -138,3 +139,23 @@ def looked(smallest: np.ndarray) -> float:
     """How many independent tests have so small a smallest p-value, by chance (R,), at 5 %."""
     limit = float(np.quantile(smallest, QUANTILE))
     return max(1.0, float(np.log1p(-QUANTILE) / np.log1p(-min(max(limit, 1e-12), QUANTILE))))
+
+
+def rivals(screen: Screen, best: Candidate, scale: float) -> list[Candidate]:
+    """Candidates that explain nearly as much as the best one, at their price.
+
+    Args:
+        screen: the look at which all of them were missing.
+        best: the leading candidate.
+        scale: how much wider than their sigmas allow rows scatter once it is in the model.
+    """
+    own = best.test.evidence(scale)
+    others = (c for c in screen.candidates if c.effect.family != best.effect.family)
+    return [c for c in others if own - c.test.evidence(scale) < ODDS]
+
+
+def angle_deg(screen: Screen, a: Candidate, b: Candidate) -> float:
+    """Smallest principal angle between what two candidates would do to the residuals."""
+    cross = screen.scores.information[np.ix_(a.test.columns, b.test.columns)]
+    cosine = np.linalg.svd(a.test.whiten.T @ cross @ b.test.whiten, compute_uv=False)[0]
+    return float(np.degrees(np.arccos(min(1.0, cosine))))

@@ -19,7 +19,7 @@ from calib.blunders.shifts import standing_alone
 from calib.diagnosis.chance import Chance
 from calib.diagnosis.score import Test
 from calib.diagnosis.score import test as joint_test
-from calib.diagnosis.screen import Candidate, Screen
+from calib.diagnosis.screen import ODDS, Candidate, Screen, rivals
 from calib.diagnosis.stand import Look, Stand, tried
 from calib.effects import Effect
 from calib.residuals.groups import CAD, JOINTS, MESH
@@ -35,7 +35,6 @@ TRIES = 3  # how many suspects are judged before a look is called quiet
 ADAPTED, MENDED = 8, 2  # rounds of leaving out; of 76 fits without optimum one was mended, in two
 AS_FAR = 0.1  # of the leading blunder's evidence: others at other places are left out with it
 HELD_BACK = 0.1  # of what a test says of an effect: what is fitted with less does not bear it out
-ODDS = np.log(20.0)  # of a rival: within these it can stand in for the best
 
 
 @dataclass(frozen=True)
@@ -81,6 +80,7 @@ class Search:
         at_first: structure that is confirmed before any of them; empty, as not asked for, unless
             the first of them is dressed up.
         chance: what scatters by chance beside all that was found, strongest first.
+        unsettled: what scatters beside that, and with which no fit comes to an optimum.
     """
 
     looks: Sequence[Look]
@@ -90,6 +90,7 @@ class Search:
     scatter: Candidate | None
     at_first: Sequence[Candidate] = ()
     chance: Sequence[Chance] = ()
+    unsettled: Chance | None = None
 
     def dressed_up(self, i: int) -> bool:
         """Whether structure without a name would have explained more than the i-th name did."""
@@ -112,17 +113,20 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NAMES) -> Search:
     """
     looks, found, left = plain = _steps(stand, progress, most)
     chance: list[Chance] = []
+    unsettled: Chance | None = None
     while most and (strongest := next((c for c in looks[-1].chance if c.found), None)):
         others = [c for c in looks[-1].chance if c.found and c is not strongest]
         chance.append(strongest)
-        if strongest.effect.widens:
-            wider = looks[-1].stand.with_effects([strongest.effect], progress)
-            looks = [*looks, wider.look(progress)]
+        widens = strongest.effect.widens
+        base = looks[-1].stand if widens else stand
+        added = [c.effect for c in chance[-1 if widens else 0 :]]
+        beside = tried(base.with_effects, added, progress)
+        if beside is None or not beside.estimate.converged:
+            unsettled = chance.pop()
+            break
+        if widens:
+            looks = [*looks, beside.look(progress)]
         else:
-            beside = tried(stand.with_effects, [c.effect for c in chance], progress)
-            if beside is None or not beside.estimate.converged:  # nothing is known of such a spread
-                chance.pop()
-                break
             looks, found, left = _steps(beside, progress, most)
         tested = {c.effect.name for c in looks[-1].chance}  # with it, and others that still can be
         near = (c for c in others if strongest.statistic - c.statistic < 2 * ODDS)
@@ -138,6 +142,7 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NAMES) -> Search:
         unnamed=structures(last, progress) if most else (),
         scatter=_scatter(last, progress) if most else None,
         chance=[c for c in still if c.found],
+        unsettled=unsettled,
     )
     if done.chance and done.unnamed and structures(plain[0][0], progress):
         if not plain[1] and _chance_leads(plain[0][-1]):
@@ -378,23 +383,3 @@ def _stands_out(candidate: Candidate, alpha: float) -> bool:
         return False
     alone = -log_tail(candidate.test.statistic, candidate.test.dof)
     return candidate.p_adjusted < alpha or alone > np.log(candidate.looks / alpha)
-
-
-def rivals(screen: Screen, best: Candidate, scale: float) -> list[Candidate]:
-    """Candidates that explain nearly as much as the best one, at their price.
-
-    Args:
-        screen: the look at which all of them were missing.
-        best: the leading candidate.
-        scale: how much wider than their sigmas allow rows scatter once it is in the model.
-    """
-    own = best.test.evidence(scale)
-    others = (c for c in screen.candidates if c.effect.family != best.effect.family)
-    return [c for c in others if own - c.test.evidence(scale) < ODDS]
-
-
-def angle_deg(screen: Screen, a: Candidate, b: Candidate) -> float:
-    """Smallest principal angle between what two candidates would do to the residuals."""
-    cross = screen.scores.information[np.ix_(a.test.columns, b.test.columns)]
-    cosine = np.linalg.svd(a.test.whiten.T @ cross @ b.test.whiten, compute_uv=False)[0]
-    return float(np.degrees(np.arccos(min(1.0, cosine))))

@@ -39,7 +39,7 @@ SIZE = {Site.BEAM: 3, Site.REFERENCE: 3, Site.NOISE: 1}
 PRIOR_COUNT = 20.0  # a measured spread of fewer sweeps than this leans on the datasheet
 MET = ("label", "incidence_rad")
 PARTS = ("surface", "region", "patch", "plane")  # of what is met: no column of a user's
-LOCAL_SHARE = 0.05  # of the reference's variance, between neighbouring points of one patch
+LOCAL_SHARE = 0.05  # of the variance of a patch of the reference, between its neighbouring points
 
 
 @dataclass(frozen=True)
@@ -126,6 +126,13 @@ class ScanStop:
         """How far the reference may be off as rig.yaml has it, or the least that planes are."""
         beyond2 = sum(sd**2 for sd in self.reference_scatter_m.values())
         return float(np.sqrt(max(self.reference_sigma_m**2 - beyond2, 0.0)))
+
+    @property
+    def local_sigma_m(self) -> float:
+        """How far neighbouring points of one patch may be off each other: a whole surface that is
+        elsewhere is no rougher for that."""
+        patch_m = self.reference_scatter_m.get("patch", 0.0)
+        return float(np.sqrt(LOCAL_SHARE * (self.stated_sigma_m**2 + patch_m**2)))
 
     def scattering(self, part: str, sd_m: float) -> ScanStop:
         """The scan on a reference whose parts of one kind scatter otherwise beyond that."""
@@ -288,10 +295,10 @@ class ScanStop:
         if error[Site.REFERENCE].any():
             t += np.einsum("ni,ni->n", slope @ T[:3, :3].T, error[Site.REFERENCE])
         residual = np.where(usable, ray.range_m - t - error[Site.BEAM][:, 0], 0.0)
-        reference = self.reference_sigma_m / cosine
+        reference, local = self.reference_sigma_m / cosine, self.local_sigma_m / cosine
         single = self.lidar.range_variance(t, cosine) * np.exp(2.0 * error[Site.NOISE][:, 0])
         variance = self._beam_variance(scan, single, t, cosine, usable)
-        sigma = np.sqrt(variance + LOCAL_SHARE * reference**2)
+        sigma = np.sqrt(variance + local**2)
         z = residual / sigma
         scale = robust_scale(z[usable])
         growth = {
@@ -303,7 +310,7 @@ class ScanStop:
             residual_m=residual,
             sigma_m=sigma,
             weight=np.where(usable, tukey_weight(z, scale), 0.0),
-            reference_sigma_m=reference * np.sqrt(1.0 - LOCAL_SHARE),
+            reference_sigma_m=np.sqrt(reference**2 - local**2),
             scale=scale,
             view=seen.view,
             usable=usable,

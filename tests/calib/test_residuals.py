@@ -111,6 +111,23 @@ def test_sigma_is_that_of_the_data_sheet_the_angle_and_the_reference(on_mesh):
     )
 
 
+def test_a_surface_that_is_elsewhere_is_no_rougher(on_mesh):
+    """Else wide scatter of surfaces would take the weight of all beams on them."""
+    scan = on_mesh.problem.scans[0]
+    place = on_mesh.values, on_mesh.association[0]
+    rows = scan.rows(*place)
+    elsewhere = scan.scattering("surface", 0.02).rows(*place)
+    rougher = scan.scattering("patch", 0.02).rows(*place)
+    np.testing.assert_allclose(elsewhere.sigma_m, rows.sigma_m, rtol=1e-9)
+    assert np.all(rougher.sigma_m[rows.usable] > 2 * rows.sigma_m[rows.usable])
+    for wider in (elsewhere, rougher):
+        grown = (wider.sigma_m**2 + wider.reference_sigma_m**2) - (
+            rows.sigma_m**2 + rows.reference_sigma_m**2
+        )
+        cosine = np.cos(rows.view["incidence_rad"])[rows.usable]
+        np.testing.assert_allclose(grown[rows.usable], (0.02 / cosine) ** 2, rtol=1e-9)
+
+
 def test_a_wild_beam_loses_its_own_weight_and_no_others(on_mesh):
     scan = on_mesh.problem.scans[0]
     rows = scan.rows(on_mesh.values, on_mesh.association[0])

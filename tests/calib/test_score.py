@@ -11,8 +11,7 @@ from calib.blunders.chance import log_tail
 from calib.diagnosis import score
 from calib.diagnosis.jackknife import Shares
 from calib.diagnosis.linear import Linear
-from calib.diagnosis.screen import looked, screen
-from calib.diagnosis.search import rivals
+from calib.diagnosis.screen import looked, rivals, screen
 from calib.effects import Site
 from calib.linear.clusters import ClusteredRows
 

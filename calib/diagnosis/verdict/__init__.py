@@ -15,8 +15,8 @@ from calib.blunders.reach import Reach
 from calib.diagnosis.candidates import concerned, lacking
 from calib.diagnosis.curves import Curve, curves
 from calib.diagnosis.rejects import Rejects
-from calib.diagnosis.screen import Candidate, Screen
-from calib.diagnosis.search import ALPHA_UNNAMED, FEWEST, ODDS, Search, suspects
+from calib.diagnosis.screen import ODDS, Candidate, Screen
+from calib.diagnosis.search import ALPHA_UNNAMED, FEWEST, Search, suspects
 from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import formula, hangs_on
 from calib.diagnosis.verdict.candidates import candidate_documents, explained
@@ -154,6 +154,7 @@ def conclude(
     spoilt = [*rings, *(rejected.blunders() if rejected and not found.found else [])]
     hold = believed(found, held_out) and not formulas.instead
     more = bool(heavy.refused or formulas.formulas or (rejected and not rejected.explained))
+    more |= found.unsettled is not None
     bad = bool(spoilt or found.blunders)
     doubt = None if bad or more else _unconfirmed(found, summary["rms_mm"])
     calm = BAD if forbids else UNNAMED if doubt else "adequate"

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from calib.diagnosis.screen import Candidate
-from calib.diagnosis.search import ALPHA, ALPHA_NOISE, NamedEffect, Search, angle_deg
+from calib.diagnosis.screen import Candidate, angle_deg
+from calib.diagnosis.search import ALPHA, ALPHA_NOISE, NamedEffect, Search
 from calib.diagnosis.suggest import what_separates
 from calib.diagnosis.verdict.matters import Weighed
 from calib.effects import Site

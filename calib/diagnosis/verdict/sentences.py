@@ -44,6 +44,7 @@ def sentences_of(
         out.append(f"Random scatter ({beside}) is judged once that structure is in the model.")
     else:
         out += [each.sentence for each in found.chance]
+    out += [found.unsettled.unsettled] if found.unsettled else []
     out += [*heavy.refused, *traces]
     if doubt:
         out = [doubt, *out]
