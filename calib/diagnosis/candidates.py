@@ -7,12 +7,14 @@ of a pair, and for the arm a smooth function of its joints. It finds what nobody
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import chain, combinations, permutations
 
 import numpy as np
 
 from calib.effects import CATALOGUE, Effect, OneHot, Param, Site, View
 from calib.effects.basis import RANGE
+from calib.effects.rig import MountSlip
 from calib.problem.model import Model, Source
 from calib.rig import Rig
 
@@ -20,6 +22,7 @@ BINS, PAIR_BINS = 12, 6
 AZIMUTH_BINS = 24
 # Of columns of the stops: with more parameters than a fifth of these, tests say nothing.
 STOPS_A_BIN = 5
+WAVES = 4  # of a pose over a column: its quarters, as 12 bins have thirds of those
 STEP = 0.01  # relative, to either side, for the derivative by a shape
 # What a range error may hang on alone, and the pairs that matter; others pair with range.
 POINT = ("range_m", "incidence_rad", "azimuth_rad", "elevation_rad", "intensity")
@@ -105,6 +108,46 @@ class JointShape(Effect):
         out = np.zeros((len(q), view.joints.shape[1], len(waves)))
         out[:, i] = np.stack(waves, axis=1)
         return out
+
+
+class PoseShape(Effect):
+    """Something is moved by a smooth function of a column of the stops; empirical.
+
+    Args:
+        slips: the effect that moves it once: the mount, a tracked body, or the tracker.
+        column: of the stops.
+        seen: its least and largest value.
+        waves: how many cosines there are of each motion.
+    """
+
+    typical = "empirical"
+    formula = "moved by exp(sum over m = 1..M of a_m cos(pi m u)), u = 0 to 1 over the column"
+
+    def __init__(
+        self, slips: MountSlip, column: str, seen: tuple[float, float], waves: int
+    ) -> None:
+        self.slips, self.site, self.of_lidar = slips, slips.site, slips.of_lidar
+        self.column, self.seen, self.waves = column, {column: seen}, waves
+        self.covariates = (column,)
+        self.name = f"structure:{self.what},{column}"
+
+    @property
+    def what(self) -> str:
+        """What is moved: mount, body, base or tracker."""
+        return self.slips.family.removesuffix("_slip")
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        each = self.slips.params(rig)
+        return tuple(
+            replace(move, name=f"{move.name}.{m}") for m in range(self.waves) for move in each
+        )
+
+    def basis(self, view: View) -> np.ndarray:
+        low, high = self.seen[self.column]
+        u = (view[self.column] - low) / (high - low)
+        known = np.isfinite(u)
+        waves = (np.where(known, np.cos(np.pi * m * u), 0.0) for m in range(1, self.waves + 1))
+        return np.concatenate([self.slips.moved(view, wave) for wave in waves], axis=-1)
 
 
 class ShapeStep(Effect):
@@ -226,7 +269,24 @@ def structure(sources: Sequence[Source], sample: Mapping[str, np.ndarray]) -> li
     seen = {name: _ends(np.concatenate(values)) for name, values in joints.items()}
     out += [JointShape(j, j, seen[j]) for j in joints]
     out += [JointShape(i, k, seen[k]) for i, k in permutations(joints, 2)]
-    return out
+    return [*out, *_moved(sources)]
+
+
+def _moved(sources: Sequence[Source]) -> Iterator[PoseShape]:
+    """Mount, tracked bodies and tracker, moved by every column that changes from stop to stop."""
+    stops = sum(len(s.recording.stops) for s in sources)
+    slips = [e for e in CATALOGUE if isinstance(e, MountSlip) and e.shape_name]
+    slips = [e for e in slips if any(e.params(s.rig) for s in sources)]
+    columns = set.intersection(
+        *({"time_s", *s.recording.covariates} & {*s.columns} for s in sources)
+    )
+    for column in sorted(columns):
+        values = np.concatenate([s.columns[column] for s in sources])
+        low, high = _ends(values[np.isfinite(values)])
+        for slip in slips if high > low else ():
+            each = max(len(slip.params(s.rig)) for s in sources)
+            if waves := min(WAVES, stops // (STOPS_A_BIN * each)):
+                yield PoseShape(slip, column, (low, high), waves)
 
 
 def _moving(source: Source) -> Iterator[tuple[str, np.ndarray]]:

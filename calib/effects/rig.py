@@ -113,9 +113,12 @@ class MountSlip(Effect):
         return tuple(Param(dof, unit, float(sigma)) for dof, unit, sigma in each)
 
     def basis(self, view: View) -> np.ndarray:
-        when = self.when(view["elapsed_s"])
-        basis = np.zeros((len(when), len(view.rig.tree.edges), 6, 6))
-        basis[:, mount_edges(view.rig)[0]] = when[:, None, None] * np.eye(6)
+        return self.moved(view, self.when(view["elapsed_s"]))
+
+    def moved(self, view: View, by: np.ndarray) -> np.ndarray:
+        """The basis where so much (K,) of each motion has happened at each stop."""
+        basis = np.zeros((len(by), len(view.rig.tree.edges), 6, 6))
+        basis[:, mount_edges(view.rig)[0]] = by[:, None, None] * np.eye(6)
         return basis
 
     def when(self, elapsed_s: np.ndarray) -> np.ndarray:

@@ -88,13 +88,13 @@ class BodySlip(MountSlip):
             replace(move, name=f"{body}.{move.name}") for body in self.bodies(rig) for move in each
         )
 
-    def basis(self, view: View) -> np.ndarray:
+    def moved(self, view: View, by: np.ndarray) -> np.ndarray:
+        """The basis where so much (K,) of each motion has happened at each stop."""
         bodies = view.rig.tracker.bodies
         own = [bodies.index(body) for body in self.bodies(view.rig)]
-        when = self.when(view["elapsed_s"])
-        basis = np.zeros((len(when), len(bodies), 6, 6 * len(own)))
+        basis = np.zeros((len(by), len(bodies), 6, 6 * len(own)))
         for i, b in enumerate(own):
-            basis[:, b, :, 6 * i : 6 * (i + 1)] = when[:, None, None] * np.eye(6)
+            basis[:, b, :, 6 * i : 6 * (i + 1)] = by[:, None, None] * np.eye(6)
         return basis
 
 
@@ -131,14 +131,13 @@ class TrackerSlip(MountSlip):
         told = rig.moves != "stop" or rig.lidar is not None
         return self.moves() if rig.tracker and told else ()
 
-    def basis(self, view: View) -> np.ndarray:
+    def moved(self, view: View, by: np.ndarray) -> np.ndarray:
         """The tracker's frame moves by the twist, and each body in its own axes.
 
         Column ``tracked`` (K, B, 4, 4) holds the bodies' poses, NaN where not seen.
         """
         T_body_opti = se3.inverse(np.nan_to_num(view["tracked"]))
-        when = self.when(view["elapsed_s"])
-        return when[:, None, None, None] * se3.adjoint(T_body_opti)
+        return by[:, None, None, None] * se3.adjoint(T_body_opti)
 
 
 class TrackerCreep(MountCreep, TrackerSlip):

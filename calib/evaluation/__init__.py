@@ -27,7 +27,8 @@ from calib import outputs
 from calib.evaluation.tally import FLAT_M, Columns, Evaluated, Tally
 from calib.forward import Values
 from calib.linear.parallel import one_blas_thread
-from calib.residuals.scan import Ranges, ScanStop
+from calib.residuals.beams import Ranges
+from calib.residuals.scan import ScanStop
 from calib.residuals.surfaces import Meeting, MeshSurface
 from calib.runs.reopen import problem_of, reopened, state_of
 from calib.runs.run import Run

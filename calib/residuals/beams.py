@@ -21,6 +21,7 @@ from calib.effects import LazyColumn, OneHot, View
 from calib.residuals.robust import tukey_cost, tukey_curvature, tukey_weight
 from calib.residuals.spread import SpreadRows
 from sensors.lidar import Beams
+from sensors.recording import Scan
 
 
 @dataclass(frozen=True)
@@ -207,3 +208,29 @@ def growth_columns(basis: np.ndarray | OneHot, rows: int) -> np.ndarray:
     out = np.zeros((rows, basis.size + 1))  # the last stands for index -1: none
     out[np.arange(rows), basis.index] = basis.values[:, 0]
     return out[:, :-1]
+
+
+@dataclass(frozen=True)
+class Ranges:
+    """What one stop's beams measured, against the surface that they met.
+
+    Args:
+        T_reference_lidar: (4, 4).
+        scan: all N points of the stop.
+        view: columns (N,) of the points, ranges and incidence as predicted for the beams as read.
+        hit: (H,) indices of the points whose beam meets the surface.
+        surface_m: (H, 3) where it does, corrected beams, in the reference's frame.
+        direction, normal: (H, 3) of the corrected beams and of the surface, facing them, unit.
+        raw_m: (H,) measured - predicted range, nothing corrected.
+        corrected_m: (H,) the same, after what the model corrects of beams and surface.
+    """
+
+    T_reference_lidar: np.ndarray
+    scan: Scan
+    view: View
+    hit: np.ndarray
+    surface_m: np.ndarray
+    direction: np.ndarray
+    normal: np.ndarray
+    raw_m: np.ndarray
+    corrected_m: np.ndarray

@@ -15,6 +15,7 @@ from calib.forward import Stops, Term, Values
 from calib.residuals.beams import (
     Association,
     Columns,
+    Ranges,
     Rows,
     Surface,
     beam_derivative,
@@ -40,32 +41,6 @@ PRIOR_COUNT = 20.0  # a measured spread of fewer sweeps than this leans on the d
 MET = ("label", "incidence_rad")
 PARTS = ("surface", "region", "patch", "plane")  # of what is met: no column of a user's
 LOCAL_SHARE = 0.05  # of the variance of a patch of the reference, between its neighbouring points
-
-
-@dataclass(frozen=True)
-class Ranges:
-    """What one stop's beams measured, against the surface that they met.
-
-    Args:
-        T_reference_lidar: (4, 4).
-        scan: all N points of the stop.
-        view: columns (N,) of the points, ranges and incidence as predicted for the beams as read.
-        hit: (H,) indices of the points whose beam meets the surface.
-        surface_m: (H, 3) where it does, corrected beams, in the reference's frame.
-        direction, normal: (H, 3) of the corrected beams and of the surface, facing them, unit.
-        raw_m: (H,) measured - predicted range, nothing corrected.
-        corrected_m: (H,) the same, after what the model corrects of beams and surface.
-    """
-
-    T_reference_lidar: np.ndarray
-    scan: Scan
-    view: View
-    hit: np.ndarray
-    surface_m: np.ndarray
-    direction: np.ndarray
-    normal: np.ndarray
-    raw_m: np.ndarray
-    corrected_m: np.ndarray
 
 
 @dataclass(frozen=True)
