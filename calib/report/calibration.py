@@ -45,7 +45,7 @@ def calibration_tables(evidence: Evidence) -> list[Table]:
     for row in effects:
         if len(row.parameters) > LISTED_PARAMETERS:
             name = f"table-effect-{escape.identifier(row.variable)}"
-            tables.append(_effects(name, row.variable, [row], prior, folded=True))
+            tables.append(_effects(name, row.variable, [row], prior))
     return [table for table in tables if table.rows]
 
 
@@ -54,7 +54,6 @@ def _effects(
     title: str,
     rows: Sequence[VariableEstimate],
     prior: dict[str, float],
-    folded: bool = False,
 ) -> Table:
     return Table(
         id=name,
@@ -62,7 +61,7 @@ def _effects(
         reading="Instruments are corrected by taking the estimate off, geometry by adding it.",
         columns=("effect", "parameter", "estimate", *NUMBERS),
         rows=[[Cell(row.variable), *cells] for row in rows for cells in _numbers(row, prior)],
-        folded=folded,
+        folded=True,
     )
 
 

@@ -26,6 +26,7 @@ from chains import escape
 
 TOLD_CANDIDATES = 8  # candidates whose evidence is told
 LISTED_DIRECTIONS = 12  # weak directions that are told
+LISTED_QUIET = 3  # titles of charts without a finding that a section lists; more are one line
 
 
 @dataclass(frozen=True)
@@ -45,10 +46,17 @@ class Drawn:
 
 @dataclass(frozen=True)
 class Section:
-    """A heading and its charts."""
+    """A heading and its charts.
+
+    Args:
+        title: the heading.
+        charts: in their order.
+        brief: whether only charts that are an `answer` are open.
+    """
 
     title: str
     charts: Sequence[Drawn]
+    brief: bool
 
     @property
     def id(self) -> str:
@@ -56,15 +64,28 @@ class Section:
 
     @property
     def shown(self) -> list[Drawn]:
-        return [drawn for drawn in self.charts if not drawn.chart.quiet]
+        """Charts that are open."""
+        loud = (drawn for drawn in self.charts if not drawn.chart.quiet)
+        return [drawn for drawn in loud if drawn.chart.answer or not self.brief]
 
     @property
-    def folded(self) -> list[Drawn]:
+    def listed(self) -> list[Drawn]:
+        """Charts that a click on their title opens."""
+        rest = [drawn for drawn in self.charts if drawn not in self.shown]
+        return rest if len(self._quiet) <= LISTED_QUIET else [d for d in rest if not d.chart.quiet]
+
+    @property
+    def grouped(self) -> list[Drawn]:
+        """Charts whose titles have to be opened first, as they are many and say nothing of note."""
+        return self._quiet if len(self._quiet) > LISTED_QUIET else []
+
+    @property
+    def _quiet(self) -> list[Drawn]:
         return [drawn for drawn in self.charts if drawn.chart.quiet]
 
     def read_as(self, chart: Chart) -> str:
         """The id of the first chart on the page that is read as this one is; its own, maybe."""
-        drawn = [*self.shown, *self.folded]
+        drawn = [*self.shown, *self.listed, *self.grouped]
         return next(d.chart.id for d in drawn if d.chart.reading == chart.reading)
 
 
@@ -101,6 +122,7 @@ def render(
         numbers=_numbers(evidence),
         sections=sections,
         tables=calibration_tables(evidence),
+        brief=verdict.light != "green",
         absent=absent,
         diagnosis=evidence.diagnosis,
         headings=HEADINGS,

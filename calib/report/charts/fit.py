@@ -46,6 +46,7 @@ def ladder(evidence: Evidence) -> Iterator[Chart | Absent]:
         + (f" A diamond: {FORMULA}." if any(rung.empirical for rung in evidence.rungs) else ""),
         lambda: _ladder(evidence),
         wide=True,
+        answer=True,
     )
 
 

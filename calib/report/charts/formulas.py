@@ -136,6 +136,7 @@ def charts_of(diagnosis: Mapping[str, Any] | None, narrow: bool = False) -> list
             each.reading,
             partial(each.figure, narrow),
             wide=len(each.covariates) > 1,
+            answer=True,
         )
         for i, each in enumerate(found, 1)
     ]

@@ -52,6 +52,7 @@ def groups(evidence: Evidence) -> Iterator[Chart | Absent]:
         lambda: _groups(found, loud, stops),
         wide=True,
         quiet=not loud,
+        answer=True,
     )
 
 

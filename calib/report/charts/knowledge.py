@@ -42,6 +42,7 @@ def findings(evidence: Evidence) -> Iterator[Chart | Absent]:
         "best first, with its p-value after all that was looked at. Blue ones are confirmed; of "
         "the others, many explain the same as a confirmed one, less well.",
         lambda: _findings(candidates[:DRAWN_CANDIDATES]),
+        answer=True,
     )
 
 

@@ -246,6 +246,7 @@ def effects(evidence: Evidence) -> Iterator[Chart | Absent]:
             "A panel per effect, a dot per parameter with its 95 % interval. Zero is what paper "
             "says; instruments are corrected by taking the effect off, geometry by adding it.",
             lambda: _few(few),
+            quiet=True,
         )
     else:
         yield Absent("effects", "the model has no effect of few parameters")
