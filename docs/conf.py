@@ -48,7 +48,7 @@ def write_catalogue() -> None:
     for page in map(effect_page, CATALOGUE):
         sites.setdefault(page["site"], []).append(page["name"])
         _write(folder / f"{page['name']}.md", _effect(page))
-    lines = ["# The catalogue", "", "Every way in which rigcal knows that hardware may lie.", ""]
+    lines = ["# The catalogue", "", "Every effect that rigcal tests, by where it acts.", ""]
     for site, names in sites.items():
         lines += [f"## {SITES.get(site, site.capitalize())}", "", "```{toctree}"]
         lines += [":maxdepth: 1", "", *names, "```", ""]

@@ -19,7 +19,7 @@ KNOTS = 7  # of the piecewise linear function that is suggested for one covariat
 PAIR_KNOTS = 3
 WAVES = 2  # of the harmonics of azimuth
 
-DESCRIBES = "Empirical: it describes and explains nothing, and was seen at"
+DESCRIBES = "Empirical, without a known cause; observed at"
 # Endings of columns -> the unit that people read, and how many of it the column's unit is.
 UNITS = {
     "_m": ("m", 1.0),

@@ -130,6 +130,5 @@ def _stand_in(name: str, effect: Effect, other: Effect) -> dict[str, Any]:
     return {
         "parameters": [name, other.family],
         "sigma_mm": None,
-        "needs": f"{what_separates(effect, other)}: on this data {name} takes on what "
-        f"{other.family} would do",
+        "needs": f"{what_separates(effect, other)}: on these data {name} absorbs {other.family}",
     }

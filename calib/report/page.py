@@ -169,7 +169,7 @@ def _numbers(evidence: Evidence) -> list[tuple[str, str]]:
     summary, (kind, error) = evidence.run.summary, error_mm(evidence.rungs[-1])
     rms = summary["rms_mm"]
     told = {
-        "held-out": "rms error of stops that the fit never saw",
+        "held-out": "rms error of held-out stops",
         "fit": "rms error of the fit; none held out",
     }
     before = "held_out_" if kind == "held-out" else ""
@@ -214,11 +214,11 @@ def _formulas(evidence: Evidence) -> bool:
 
 
 def _told(candidate: dict[str, Any]) -> list[str]:
-    out = [f"{chance(candidate['p_adjusted'])} after all that was looked at"]
+    out = [f"{chance(candidate['p_adjusted'])}, adjusted for multiple testing"]
     if candidate["unabsorbed_rms_mm"] is not None:
         out.append(
-            f"would explain {mm(candidate['unabsorbed_rms_mm'])} mm rms that the model cannot take "
-            f"on, of {mm(candidate['rms_mm'])} mm that it does"
+            f"would explain {mm(candidate['unabsorbed_rms_mm'])} mm rms that the model does not "
+            f"absorb, of its {mm(candidate['rms_mm'])} mm in all"
         )
     before, after = (candidate["held_out_rms_mm"][k] for k in ("before", "after"))
     if before is not None and after is not None:
@@ -231,7 +231,10 @@ def _told(candidate: dict[str, Any]) -> list[str]:
     if candidate["dressed_up"]:
         out.append("rejected: a generic function of other covariates (bins) explains more")
     for rival in candidate["rivals"]:
-        out.append(f"this data cannot tell it from {rival['effect']}, {rival['separate']} would")
+        out.append(
+            f"on these data not distinguishable from {rival['effect']}; {rival['separate']} would "
+            "separate them"
+        )
     return out
 
 

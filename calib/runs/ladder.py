@@ -12,7 +12,7 @@ from calib.runs.run import Run
 from chains.errors import InputError
 
 DESCRIBED = "~"  # before an effect that was added and only describes
-FORMULA = "a formula that describes what was measured, and explains nothing"
+FORMULA = "an empirical formula, without a known cause"
 
 
 @dataclass(frozen=True)

@@ -31,8 +31,8 @@ from chains.errors import InputError
 CURVE_PX = 180
 SETTLED_S = 0.4  # the camera rests for so long before the address tells where it is
 TAKE_HINT = "What 'rigcal export' writes of this run, in all formats, as a zip"
-WORKED_OUT = "What stops held out make of it is being worked out from the linearisation …"
-LOOKS = "Opened to look at: this address cannot change anything."
+WORKED_OUT = "The held-out error is being predicted from the linearisation …"
+LOOKS = "Read-only: this address cannot change anything."
 
 
 class Page:

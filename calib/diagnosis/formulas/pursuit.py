@@ -133,7 +133,9 @@ def pursue(
         columns = [s.form.term.columns(table.covariates) for s in found]
         fitted = table.beside(np.hstack(columns)).projection() if found else table.projection()
         smooths = screen_smooths(
-            fitted, bases, lambda done, total: progress("what residuals hang on", done, total)
+            fitted,
+            bases,
+            lambda done, total: progress("searching covariates of the residuals", done, total),
         )
         step = _step(fitted, bases, smooths, alpha)
         if step is None or step.p_adjusted >= alpha:

@@ -57,8 +57,8 @@ class Reach:
         if not beyond:
             return ""
         return (
-            f"{effect.name} only describes what was measured: it was seen at "
-            f"{' and at '.join(beyond)}; what it says beyond is a guess."
+            f"{effect.name} is empirical: it was observed at "
+            f"{' and at '.join(beyond)}; beyond that it extrapolates."
         )
 
 

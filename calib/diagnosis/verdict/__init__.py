@@ -320,5 +320,5 @@ def _untestable(look: Look) -> dict[str, str]:
         if missing := lacking(effect, look.stand.sources, look.columns):
             found[effect.family] = f"the recordings lack {', '.join(missing)}"
         elif effect.family in gauges:
-            found[effect.family] = "not observable: the model can take on all that it does"
+            found[effect.family] = "not identifiable: absorbed by the model"
     return found

@@ -161,7 +161,7 @@ def weighed(
 
 def _sentence(what: str, candidate: Candidate, screen: Screen, told: Matters) -> str:
     return (
-        f"A trace of {what} is there, {1e3 * screen.rms_m(candidate):.2f} mm rms, too small to "
+        f"{what} is significant, {1e3 * screen.rms_m(candidate):.2f} mm rms, and too small to "
         f"matter: it would change the held-out error by {told.held_out_mm:+.3f} mm, and no value "
         f"of the calibration by more than {told.largest_shift_sigmas:.1f} of its sigmas."
     )

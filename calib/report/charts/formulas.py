@@ -119,7 +119,7 @@ def formulas(evidence: Evidence) -> Iterator[Chart | Absent]:
         yield Absent("formula", f"not diagnosed; 'rigcal diagnose {evidence.run.folder}' does it")
         return
     found = charts_of(evidence.diagnosis)
-    yield from found or [Absent("formula", "the diagnosis found no formula of what has no name")]
+    yield from found or [Absent("formula", "the diagnosis found no formula for residual structure")]
 
 
 def charts_of(diagnosis: Mapping[str, Any] | None, narrow: bool = False) -> list[Chart]:

@@ -63,11 +63,11 @@ def graph(evidence: Evidence) -> Iterator[Chart | Absent]:
     """The factor graph of the run."""
     yield Chart(
         "graph",
-        "The factor graph: what speaks of what, and how much each kind of rows tells",
-        "Left: the unknowns, and of how many numbers each is; below the dotted line those that are "
-        "estimated along and not reported. A line joins an unknown to the rows that speak of it, "
-        "the thicker the more they tell. Right: bits per parameter that would be lost without the "
-        "rows of one kind, and how many all of them tell over CAD. A bit halves a sigma.",
+        "The factor graph: which rows constrain which unknowns, and their information",
+        "Left: the unknowns with their dimensions; below the dotted line those that are "
+        "estimated and not reported. A line joins an unknown to the rows that depend on it, "
+        "thicker for more information. Right: bits per parameter that would be lost without the "
+        "rows of one kind, and the bits that all rows add to CAD. One bit halves a sigma.",
         lambda: _draw(*_found(evidence)),
         wide=True,
     )
