@@ -1,4 +1,4 @@
-"""What every command shares: the app, its options, and how a result or progress is told."""
+"""What every command shares: the app, its options, and how a result or progress is shown."""
 
 from __future__ import annotations
 

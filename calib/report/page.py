@@ -250,7 +250,7 @@ def _detectable(evidence: Evidence) -> list[tuple[str, str]]:
 
 
 def _weak(evidence: Evidence) -> list[tuple[str, str, str]]:
-    """What the data hardly tell: names, how much they may be off, what would determine them."""
+    """What is weakly determined: names, how much they may be off, what would determine them."""
     directions = evidence.diagnosis["weak_directions"] if evidence.diagnosis else []
     return [
         (

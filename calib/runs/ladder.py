@@ -11,7 +11,7 @@ from calib.rig.suspect import listed
 from calib.runs.run import Run
 from chains.errors import InputError
 
-DESCRIBED = "~"  # before an effect that was added and only describes
+DESCRIBED = "~"  # before an effect that was added and is empirical
 FORMULA = "an empirical formula, without a known cause"
 
 

@@ -1,4 +1,4 @@
-"""A formula of what has no name, as people see it: picture, ladder, file, warning."""
+"""A formula of residual structure, as people see it: picture, ladder, file, warning."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""Where an effect that only describes was seen, and whether it is used beyond that."""
+"""Where an empirical effect was observed, and whether it is used beyond that."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ BEYOND = 0.05
 
 
 class Reach:
-    """From where to where the columns go that effects hang on, batch by batch.
+    """From where to where the columns go that effects depend on, batch by batch.
 
     Args:
         effects: those with `Effect.seen` are asked about.

@@ -188,7 +188,7 @@ class Rejects:
         return said + "."
 
     def unexplained(self) -> list[dict[str, Any]]:
-        """Its structure as diagnosis.json lists structure without a name."""
+        """Its structure as diagnosis.json lists residual structure."""
         return [
             {
                 "covariates": [place.covariate],

@@ -93,7 +93,7 @@ class Consequences:
 
     @cached_property
     def _projected(self) -> tuple[np.ndarray, np.ndarray]:
-        """How much (C, Q) of each candidate every value of the calibration takes on, and sigmas."""
+        """How much (C, Q) of each candidate every value of the calibration absorbs, and sigmas."""
         linear = self.look.linear
         _, model, taken = projection(linear, linear.candidates)
         names = [n for n in self.look.stand.problem.calibration if n in linear.at]

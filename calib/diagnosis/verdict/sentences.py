@@ -37,7 +37,7 @@ def sentences_of(
     formulas = [each for each in unexplained if "says" in each]
     for i, step in enumerate(found.found):
         candidate = next(c for c in candidates if c["add"] == step.effect.name)
-        if not (formulas and candidate["dressed_up"]):  # what was tried before helps nobody then
+        if not (formulas and candidate["dressed_up"]):  # what was tried before is of no use then
             out += _step_sentences(step, candidate, found.dressed_up(i))
     if verdict == UNNAMED and found.chance:
         beside = ", ".join(each.effect.name for each in found.chance)
@@ -107,7 +107,7 @@ def _first_sentences(verdict: str, look: Look, traces: bool) -> list[str]:
 
 
 def _structure_sentences(unexplained: Sequence[Mapping[str, Any]], residual: str) -> list[str]:
-    """Of structure without a name."""
+    """Of residual structure."""
     out = []
     for each in unexplained[:2]:
         what = " and ".join(words(c) for c in each["covariates"])
@@ -144,7 +144,7 @@ def _formula_sentences(each: Mapping[str, Any], residual: str) -> list[str]:
 
 
 def _other(form: Mapping[str, Any]) -> str:
-    """Another form: as it is where it is short, else by what it hangs on."""
+    """Another form: as it is where it is short, else by what it depends on."""
     if len(form["says"]) <= SHORT:
         return form["says"]
     return f"another formula, over {' and '.join(words(c) for c in form['covariates'])}"
@@ -165,7 +165,7 @@ def _why_sentences(why: Mapping[str, Any]) -> list[str]:
 
 
 def _step_sentences(step: NamedEffect, candidate: Mapping[str, Any], worn: bool) -> list[str]:
-    """Of a named effect; `worn` where bins without a name explain more than it does."""
+    """Of a named effect; `worn` where bins explain more than it does."""
     before, after = (candidate["held_out_rms_mm"][k] for k in ("before", "after"))
     if candidate["dressed_up"]:
         why = "a generic function of other covariates (bins) explains more"

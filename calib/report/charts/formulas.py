@@ -1,4 +1,4 @@
-"""What has no name: residuals over what they depend on, the formula found, and what it leaves."""
+"""Residual structure: residuals over what they depend on, the formula found, and what it leaves."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def pictures(diagnosis: Mapping[str, Any] | None) -> list[Picture]:
 
 
 def formulas(evidence: Evidence) -> Iterator[Chart | Absent]:
-    """A chart for each formula of what has no name."""
+    """A chart for each formula of residual structure."""
     if evidence.diagnosis is None:
         yield Absent("formula", f"not diagnosed; 'rigcal diagnose {evidence.run.folder}' does it")
         return

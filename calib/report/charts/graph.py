@@ -1,4 +1,4 @@
-"""The factor graph: which rows speak of which unknowns, and how much each kind of them tells."""
+"""The factor graph: which rows depend on which unknowns, and the information of each kind."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Row:
     Args:
         name: as it is drawn.
         dim: of how many numbers.
-        kinds: kinds of rows that speak of it.
+        kinds: kinds of rows that depend on it.
         bits: kind -> bits per parameter that would be lost without it; empty of a group.
         beyond: bits per parameter beyond CAD; None where CAD says nothing, and of a group.
     """

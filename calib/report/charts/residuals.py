@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from calib.report.plots import Axes, Figure
 
 NO_BEAMS = "there are no scans, so no residuals of beams"
-FRONT = {*FIRST, "stop", "elapsed_s", "recording"}  # shown if residuals hang on it; temperature too
+# Shown if residuals depend on it; temperature too.
+FRONT = {*FIRST, "stop", "elapsed_s", "recording"}
 ALWAYS = ("incidence_rad", "range_m")  # shown whatever is left
 AXIS_UNITS = {
     "_rad": ("deg", 180.0 / np.pi),
