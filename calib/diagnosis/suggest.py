@@ -54,8 +54,7 @@ def formula(candidate: Candidate, taken: Collection[str] = ()) -> dict[str, Any]
 
     Piecewise linear over the covariate's bins, products of such for a pair, the strongest harmonics
     of azimuth; for a joint, harmonics of the joint that it depends on. None where there is no
-    formula
-    for it: of labels, or of a column that goes by no name of a formula.
+    formula for it: of labels, or of a column that goes by no name of a formula.
 
     Args:
         candidate: structure that stands out.
