@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import tempfile
 from pathlib import Path
 
 HERE = Path(__file__).parent
@@ -11,10 +10,9 @@ sys.path.insert(0, str(HERE.parent))
 
 from calib.effects import CATALOGUE, Effect  # noqa: E402
 from calib.report import plots  # noqa: E402
-from calib.report.effects import effect_figure  # noqa: E402
-from calib.rig import Rig, load_rig  # noqa: E402
+from calib.report.effects import effect_figure, example_rig  # noqa: E402
+from calib.rig import Rig  # noqa: E402
 from calib.show.tables import effect_page  # noqa: E402
-from calib.simulation import simulate  # noqa: E402
 
 project, author, copyright = "rigcal", "the rigcal authors", "the rigcal authors"
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
@@ -50,9 +48,7 @@ def write_catalogue() -> None:
     folder = HERE / "catalogue"
     folder.mkdir(exist_ok=True)
     sites: dict[str, list[str]] = {}
-    with tempfile.TemporaryDirectory() as made:
-        simulate("tiny", Path(made) / "rec", 1, {})
-        rig = load_rig(Path(made) / "rec")
+    rig = example_rig()
     for effect in CATALOGUE:
         page = effect_page(effect)
         sites.setdefault(page["site"], []).append(page["name"])

@@ -347,6 +347,9 @@ def effects(
             autocompletion=effect_names,
         ),
     ] = None,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="Draw what one does: .png, .svg or .pdf.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """List the catalogue, or show the page of one effect.
@@ -357,6 +360,12 @@ def effects(
     from calib.show.tables import effect_page, print_catalogue
 
     chosen = load_effects((name,)) if name else CATALOGUE
+    if out is not None:
+        if len(chosen) != 1:
+            raise InputError(f"-o {out} draws one effect; name one")
+        from calib.report.effects import draw_effect
+
+        draw_effect(chosen[0], out)
     if as_json:
         print_json([effect_page(e) for e in chosen])
     else:

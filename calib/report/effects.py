@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from calib import outputs
 from calib.effects import Effect, Site
 from calib.effects.base import OneHot, Param, View
 from calib.report import plots
-from calib.rig import Rig
+from calib.rig import Rig, load_rig
+from calib.simulation import simulate
+from chains.errors import InputError
 
 if TYPE_CHECKING:
     from calib.report.plots import Figure
@@ -62,6 +67,27 @@ def effect_figure(effect: Effect, rig: Rig) -> Figure | None:
     drawn = np.argwhere(spans > LEAST * spans.max())[:MOST_CURVES]
     curves = [(part, params[k], error[:, part, k]) for part, k in drawn]
     return _figure(effect.site, rig, over[0], curves) if curves else None
+
+
+def example_rig() -> Rig:
+    """The simulated rig on which the catalogue's pictures are drawn."""
+    with tempfile.TemporaryDirectory() as made:
+        simulate("tiny", Path(made) / "rec", 1, {})
+        return load_rig(Path(made) / "rec")
+
+
+def draw_effect(effect: Effect, out: Path | str) -> None:
+    """Write `effect_figure` on the example rig to a file.
+
+    Raises:
+        InputError: there is no such picture, or the file cannot be written.
+    """
+    plots.check_format(out)
+    figure = effect_figure(effect, example_rig())
+    if figure is None:
+        raise InputError(f"{effect.name} has no picture: it does not depend on one number alone")
+    with outputs.file(out) as file:
+        plots.save(figure, file)
 
 
 def _view(rig: Rig, name: str) -> View:

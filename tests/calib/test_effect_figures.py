@@ -42,6 +42,21 @@ def test_a_joint_s_error_is_drawn_over_its_angle_in_mrad(rig):
     np.testing.assert_allclose(mrad, 1e3 * param.sigma * np.radians(deg), atol=1e-9)
 
 
+def test_the_command_draws_an_effect_or_says_why_not(rigcal, tmp_path):
+    code, out, _ = rigcal("effects", "range_scale", "-o", tmp_path / "a.svg")
+    assert (
+        code == 0 and out.startswith("range_scale") and b"<svg" in (tmp_path / "a.svg").read_bytes()
+    )
+    for words, why in (
+        (("label_range_offset", "-o", tmp_path / "b.svg"), "has no picture"),
+        (("range_scale", "-o", tmp_path / "b.jpg"), ".png, .svg, .pdf"),
+        (("-o", tmp_path / "b.svg"), "draws one effect"),
+    ):
+        code, out, err = rigcal("effects", *words)
+        assert (code, out) == (2, "") and why in err
+    assert [path.name for path in tmp_path.iterdir()] == ["a.svg"]
+
+
 def test_what_depends_on_no_single_number_has_no_picture(rig):
     none = {effect.name for effect in CATALOGUE if effect_figure(effect, rig) is None}
     assert {"range_offset", "label_range_offset", "mount_slip", "stop_range_scatter"} <= none
