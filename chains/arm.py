@@ -1,4 +1,5 @@
-"""An arm as its maker describes it: the chain of joints of a URDF file, and what its links weigh.
+"""An arm as its maker describes it: the chain of joints of a URDF file, what its links weigh, and
+which meshes show them.
 
 URDF: https://wiki.ros.org/urdf/XML/joint. A joint's origin is T_parent_child at zero, its axis
 stands in the child's frame, and what is left out has the defaults given there.
@@ -35,6 +36,18 @@ class Mass:
     frame: str
     kg: float | Array
     centre_m: Array
+
+
+@dataclass(frozen=True)
+class LinkMesh:
+    """A mesh that shows a link: the file's name as the URDF has it, where its origin stands
+    (T_link_mesh (4, 4)), and by what its coordinates are multiplied, per axis (3,), to be metres.
+    """
+
+    link: str
+    file: str
+    T_link_mesh: Array
+    scale: Array
 
 
 def read_arm(urdf_path: str | Path, base: str, tip: str) -> list[Edge]:
@@ -93,6 +106,26 @@ def read_masses(urdf_path: str | Path, base: str, tip: str) -> list[Mass]:
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     return masses
+
+
+def read_meshes(urdf_path: str | Path, links: Sequence[str]) -> dict[str, list[list[LinkMesh]]]:
+    """Return what may show each of ``links`` that has meshes: all that is to be seen of it
+    (``visual``) or else all that is to be collided with (``collision``).
+
+    Boxes, cylinders and spheres are not read. Raises InputError where the file cannot be read, or a
+    mesh's origin or scale is not three numbers.
+    """
+    path = Path(urdf_path)
+    found: dict[str, list[list[LinkMesh]]] = {}
+    try:
+        for link in _parse(path).findall("link"):
+            name = link.get("name", "")
+            either = [_meshes(name, link.findall(kind)) for kind in ("visual", "collision")]
+            if name in links and any(either):
+                found[name] = [meshes for meshes in either if meshes]
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    return found
 
 
 def gravity_torque(tree: FrameTree, masses: Sequence[Mass], joints: Array) -> Array:
@@ -167,6 +200,21 @@ def _origin(joint: Element) -> Array:
     """Return T_parent_child (4, 4) at the joint's zero."""
     xyz, rpy = (_numbers(joint, "origin", part, [0, 0, 0]) for part in ("xyz", "rpy"))
     return se3.from_xyz_rpy(xyz, rpy)
+
+
+def _meshes(link: str, parts: Sequence[Element]) -> list[LinkMesh]:
+    """Return the meshes among the ``visual`` or ``collision`` elements of a link."""
+    meshes = [(part, part.find("geometry/mesh")) for part in parts]
+    return [
+        LinkMesh(
+            link=link,
+            file=mesh.get("filename", ""),
+            T_link_mesh=_origin(part),
+            scale=_numbers(part, "geometry/mesh", "scale", [1, 1, 1]),
+        )
+        for part, mesh in meshes
+        if mesh is not None
+    ]
 
 
 def _motion(joint: Element) -> Joint | None:

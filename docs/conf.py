@@ -8,7 +8,10 @@ from pathlib import Path
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent))
 
-from calib.effects import CATALOGUE  # noqa: E402
+from calib.effects import CATALOGUE, Effect  # noqa: E402
+from calib.report import plots  # noqa: E402
+from calib.report.effects import effect_figure, example_rig  # noqa: E402
+from calib.rig import Rig  # noqa: E402
 from calib.show.tables import effect_page  # noqa: E402
 
 project, author, copyright = "rigcal", "the rigcal authors", "the rigcal authors"
@@ -45,10 +48,12 @@ def write_catalogue() -> None:
     folder = HERE / "catalogue"
     folder.mkdir(exist_ok=True)
     sites: dict[str, list[str]] = {}
-    for page in map(effect_page, CATALOGUE):
+    rig = example_rig()
+    for effect in CATALOGUE:
+        page = effect_page(effect)
         sites.setdefault(page["site"], []).append(page["name"])
-        _write(folder / f"{page['name']}.md", _effect(page))
-    lines = ["# The catalogue", "", "Every way in which rigcal knows that hardware may lie.", ""]
+        _write(folder / f"{page['name']}.md", _effect(page) + _picture(effect, rig, folder))
+    lines = ["# The catalogue", "", "Every effect that rigcal tests, by where it acts.", ""]
     for site, names in sites.items():
         lines += [f"## {SITES.get(site, site.capitalize())}", "", "```{toctree}"]
         lines += [":maxdepth: 1", "", *names, "```", ""]
@@ -68,6 +73,18 @@ def _effect(page: dict) -> str:
         if value:
             rows.append(f"{key.replace('_', ' ').capitalize()}\n: {value}\n")
     return "\n".join([f"# {page['name']}", "", page["what"], "", page["notes"], "", *rows])
+
+
+def _picture(effect: Effect, rig: Rig, folder: Path) -> str:
+    """The picture of what an effect does, and the line that shows it; of some there is none."""
+    figure = effect_figure(effect, rig)
+    if figure is None:
+        return ""
+    _write(folder / f"{effect.name}.svg", plots.svg(figure, effect.name))
+    return (
+        "\nWhat it does, each parameter at the sigma of its prior, and of several shapes one:"
+        f"\n\n![{effect.name} over its covariate]({effect.name}.svg)\n"
+    )
 
 
 def _write(path: Path, text: str) -> None:

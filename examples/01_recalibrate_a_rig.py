@@ -1,8 +1,8 @@
 """A rig was calibrated on Monday. On Friday somebody bumped into its LiDAR. What has moved?
 
 The second fit takes the first as its prior, sigmas and correlations included, and asks of every
-link whether its change is larger than the two fits together allow. What has not moved keeps what
-Monday knew, so what has moved is found far better than either fit alone could tell.
+link whether its change is larger than the two fits together allow. Links that have not moved keep
+Monday's estimates, so that those that moved are determined far better than by either fit alone.
 
     python examples/01_recalibrate_a_rig.py [FOLDER]
 """

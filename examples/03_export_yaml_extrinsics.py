@@ -1,8 +1,9 @@
 """Calibrate, export, and use the files without rigcal: YAML with PyYAML, URDF with yourdfpy.
 
-Neither `mount -> mount_markers` nor `mount -> lidar` can be told alone, as the mount itself is
-never seen: their sigmas are half a millimetre. The two together are told far better, and so is all
-from the base's markers to the LiDAR: `rig.urdf`, the arm's with other origins, and the frames.
+Neither `mount -> mount_markers` nor `mount -> lidar` is identifiable alone, as the mount itself is
+not observed: their sigmas are half a millimetre. Their combination is determined far better, and so
+is all from the base's markers to the LiDAR: `rig.urdf`, the arm's with other origins, and the
+frames.
 
     python examples/03_export_yaml_extrinsics.py [FOLDER]
 """

@@ -1,11 +1,11 @@
 """A fit looks fine and predicts badly. Which physical effect is missing from its model?
 
 The fit itself gives no alarm: its error is below what is expected, as rings, mounts and surfaces of
-the room have bent themselves around what the model does not know. Stops that it never saw tell:
-there the error is several times the floor. The diagnosis tests every effect of the catalogue beside
-the model, names the one that the data ask for, says how sure it is and what else could look alike,
-and what adding it would do to the held-out error. `calib.add` then adds it, starting from the fit
-that there is, and a second diagnosis has nothing left to say.
+the room absorb what the model lacks. Held-out stops show it: there the error is several times the
+expected one. The diagnosis tests every effect of the catalogue beside the model, names the one that
+the data ask for, says how sure it is and what else could look alike, and what adding it would do to
+the held-out error. `calib.add` then adds it, starting from the fit that there is, and a second
+diagnosis has nothing left to say.
 
 In a terminal: `rigcal fit`, `rigcal diagnose`, `rigcal add`, `rigcal compare`; or all of them at
 once, as often as it pays, with `rigcal explain`.

@@ -1,4 +1,4 @@
-"""You suspect something that no catalogue has: say it as a formula, or as a class, and try it.
+"""You suspect an effect that the catalogue lacks: write it as a formula, or as a class, and try it.
 
 Here the range scale goes with the humidity of the air, which `stops.csv` has as a column of its
 own. A formula is arithmetic over the columns of stops and points; it is parsed, never run. A class

@@ -1,4 +1,4 @@
-"""What every command shares: the app, its options, and how a result or progress is told."""
+"""What every command shares: the app, its options, and how a result or progress is shown."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import io
 import re
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TextIO
@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TextIO
 import typer
 import typer.core
 
+from calib.cli.stages import Stage, Staged
 from chains.escape import terminal
 
 if TYPE_CHECKING:
@@ -61,13 +62,16 @@ def _print_version(asked: bool) -> None:
 def manners(
     context: typer.Context,
     verbose: Annotated[
-        bool, typer.Option("-v", "--verbose", help="Tell every step, on stderr, and all reasons.")
+        bool, typer.Option("-v", "--verbose", help="Show every step on stderr, and all reasons.")
     ] = False,
     quiet: Annotated[
-        bool, typer.Option("-q", "--quiet", help="Print nothing but errors, and what --json asks.")
+        bool, typer.Option("-q", "--quiet", help="Print errors and the result of --json only.")
     ] = False,
     version: Annotated[
-        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Which one.")
+        bool,
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Print the version."
+        ),
     ] = False,
 ) -> None:
     """Take down what is said of how much is to be said."""
@@ -95,7 +99,7 @@ def effect_names(incomplete: str) -> list[str]:
 
 Json = Annotated[bool, typer.Option("--json", help="Print the machine-readable result alone.")]
 Out = Annotated[Path, typer.Option("-o", "--out", help="Where to write.")]
-Force = Annotated[bool, typer.Option("--force", help="Even of a run that has not converged.")]
+Force = Annotated[bool, typer.Option("--force", help="Accept a run that has not converged.")]
 Runs = Annotated[list[Path], typer.Argument(metavar="RUN...", help="Run folders.")]
 Trust = Annotated[
     list[str] | None,
@@ -139,10 +143,14 @@ def print_json(document: Any) -> None:
 
 
 @contextmanager
-def progress_bar() -> Iterator[Progress]:
-    """A progress bar on stderr where that is a terminal; else silence, or with -v a line a step."""
+def progress_bar(stages: Sequence[Stage] = ()) -> Iterator[Progress]:
+    """A progress bar on stderr where that is a terminal; else silence, or with -v a line a step.
+
+    Args:
+        stages: that the command goes through.
+    """
     if not sys.stderr.isatty():
-        yield _line_by_line() if _verbose else lambda what, done, total: None
+        yield _line_by_line(Staged(stages)) if _verbose else lambda what, done, total: None
         return
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
@@ -154,19 +162,23 @@ def progress_bar() -> Iterator[Progress]:
         TimeElapsedColumn(),
     )
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("reading", total=None)
+        task, staged = bar.add_task("reading", total=None), Staged(stages)
+        start = time.monotonic()
         yield lambda what, done, total: bar.update(
-            task, description=terminal(what), completed=done + 1, total=total
+            task,
+            description=terminal(staged(what, time.monotonic() - start)),
+            completed=done + 1,
+            total=total,
         )
 
 
-def _line_by_line() -> Progress:
+def _line_by_line(staged: Staged) -> Progress:
     """Progress as lines on stderr: seconds since the start, and what is done next."""
     start = time.monotonic()
 
     def tell(what: str, done: int, total: int) -> None:
         seconds = time.monotonic() - start
-        said = terminal(f"{seconds:8.1f} s  {what} {done + 1}/{total}")
+        said = terminal(f"{seconds:8.1f} s  {staged(what, seconds)} {done + 1}/{total}")
         print(said, file=sys.stderr, flush=True)
 
     return tell

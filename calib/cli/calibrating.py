@@ -23,6 +23,7 @@ from calib.cli.app import (
     say,
     verbose,
 )
+from calib.cli.stages import DIAGNOSE, FIT
 from calib.linear.parallel import workers as threads
 from chains.errors import InputError
 from chains.escape import terminal
@@ -40,17 +41,13 @@ Fix = Annotated[
 CANDIDATES = "Effects of your own that may be missing: files of them, or folders, with commas."
 Without = Annotated[
     list[str] | None,
-    typer.Option(
-        metavar="STOP:BODY", help="Leave out what a mishap spoiled, as 'diagnose' names it."
-    ),
+    typer.Option(metavar="STOP:BODY", help="Leave out a blunder, as 'diagnose' names it."),
 ]
 
 
 @app.command()
 def simulate(
-    spec: Annotated[
-        str, typer.Argument(help="A preset, or a YAML file that says what to simulate.")
-    ],
+    spec: Annotated[str, typer.Argument(help="A preset, or a YAML specification.")],
     out: Out,
     seed: Annotated[int, typer.Option(help="Same seed, same recording.")] = 0,
     hide: Annotated[
@@ -59,7 +56,7 @@ def simulate(
     trust: Trust = None,
     as_json: Json = False,
 ) -> None:
-    """Write a recording, and the truth beside it."""
+    """Simulate a recording, and write the truth beside it."""
     from calib.simulation import simulate as run
 
     with progress_bar() as progress:
@@ -73,7 +70,10 @@ def simulate(
 
 @app.command()
 def check(recording: Path, as_json: Json = False) -> None:
-    """What is in a recording, what is wrong, and what can and cannot be estimated from it."""
+    """List what a recording holds and what it can determine.
+
+    Errors in it are reported, and the parameters that are not identifiable.
+    """
     from calib.results.check import check as run
 
     with progress_bar() as progress:
@@ -103,14 +103,17 @@ def fit(
     workers: Workers = None,
     as_json: Json = False,
 ) -> None:
-    """Estimate the rig jointly; several recordings share what is the same hardware."""
+    """Estimate all parameters of a rig jointly.
+
+    Several recordings share the parameters of the same hardware.
+    """
     if hold_out not in ("location", "stop", "none"):
         raise InputError(f"--hold-out {hold_out}: give location, stop or none")
     from calib.problem.model import Model
     from calib.runs.calibrate import calibrate
 
     chosen = Model.of(effects, fix or [], without or [], recordings)
-    with threads(workers), progress_bar() as progress:
+    with threads(workers), progress_bar(FIT) as progress:
         run = calibrate(recordings, out, chosen, hold_out, folds, prior, progress)
     _tell(run, as_json)
 
@@ -130,14 +133,14 @@ def add(
     workers: Workers = None,
     as_json: Json = False,
 ) -> None:
-    """The model of a run and more effects, refitted from that run to the same recordings."""
+    """Add effects to the model of a run, and refit it."""
     if not effects and not without:
         raise InputError("give an EFFECT to add, or what to leave out with --without")
     from calib.runs.add import add as grow
     from calib.runs.run import Run
 
     grown_from = Run.open(run, trust or ())
-    with threads(workers), progress_bar() as progress:
+    with threads(workers), progress_bar(FIT) as progress:
         _tell(grow(grown_from, effects or [], out, progress, without or []), as_json)
 
 
@@ -145,7 +148,7 @@ def add(
 def diagnose(
     run: Path,
     refits: Annotated[
-        bool, typer.Option("--refits/--no-refits", help="Whether to take the held-out falls.")
+        bool, typer.Option("--refits/--no-refits", help="Whether to refit for held-out errors.")
     ] = True,
     candidates: Annotated[
         str | None, typer.Option("--candidates", "--effects", metavar="FILE", help=CANDIDATES)
@@ -154,12 +157,15 @@ def diagnose(
     workers: Workers = None,
     as_json: Json = False,
 ) -> None:
-    """Where a run's model fails and which effect it lacks; written to RUN/diagnosis.json."""
+    """Test a run's model: missing effects, blunders, scatter.
+
+    The result is written to RUN/diagnosis.json.
+    """
     from calib.runs.diagnose import diagnose as find
     from calib.runs.run import Run
 
     fitted = Run.open(run, trust or ())
-    with threads(workers), progress_bar() as progress:
+    with threads(workers), progress_bar(DIAGNOSE) as progress:
         diagnosis = find(fitted, progress, refits, candidates or ())
     if as_json:
         print_json(diagnosis.document())
@@ -183,7 +189,10 @@ def explain(
     workers: Workers = None,
     as_json: Json = False,
 ) -> None:
-    """Fit, diagnose, add, until nothing worth adding is left; every rung is kept in DIR."""
+    """Fit, diagnose and add until nothing is missing.
+
+    Every rung of the ladder is kept in DIR.
+    """
     from calib.problem.model import Model
     from calib.runs.explain import explain as climb
 
@@ -201,7 +210,10 @@ def explain(
 
 @app.command()
 def compare(runs: Runs, as_json: Json = False) -> None:
-    """Errors and parameters of runs side by side, and the ladder by which they grew."""
+    """Show errors and parameters of runs side by side.
+
+    With the ladder by which they grew.
+    """
     from calib.runs.ladder import ladder
     from calib.runs.run import Run
     from calib.show.comparison import comparison, print_comparison
@@ -220,7 +232,7 @@ def moved(
     second: Annotated[Path, typer.Argument(metavar="RUN_B", help="The later run.")],
     as_json: Json = False,
 ) -> None:
-    """What changed between two runs, in a sentence and a table, with honest sigmas."""
+    """Report what changed between two runs, with sigmas."""
     from calib.runs.asked.moved import moved as compare_two
     from calib.runs.run import Run
     from calib.show.comparison import moved_document, print_moved
@@ -247,7 +259,10 @@ def reproduce(
     trust: Trust = None,
     as_json: Json = False,
 ) -> None:
-    """Fit a run again, with all that it grew from, and say whether every file holds the same."""
+    """Repeat a run and compare every file of it.
+
+    With all runs that it grew from.
+    """
     from calib.runs.reproduce import reproduce as make_again
     from calib.runs.run import Run
 
@@ -282,7 +297,9 @@ def evaluate(
     trust: Trust = None,
     as_json: Json = False,
 ) -> None:
-    """Accuracy and precision of every return, by ring, distance, incidence and label.
+    """Compute accuracy and precision of every return.
+
+    By ring, distance, incidence and label.
 
     With --at, where the arm truly is at poses that need not be measured, and its sigma.
     """
@@ -330,13 +347,25 @@ def effects(
             autocompletion=effect_names,
         ),
     ] = None,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="Draw what one does: .png, .svg or .pdf.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
-    """The catalogue: formula, unit, size, what an effect is confounded with, source."""
+    """List the catalogue, or show the page of one effect.
+
+    Formula, unit, typical size, confounded effects, source.
+    """
     from calib.effects import CATALOGUE, load_effects
     from calib.show.tables import effect_page, print_catalogue
 
     chosen = load_effects((name,)) if name else CATALOGUE
+    if out is not None:
+        if len(chosen) != 1:
+            raise InputError(f"-o {out} draws one effect; name one")
+        from calib.report.effects import draw_effect
+
+        draw_effect(chosen[0], out)
     if as_json:
         print_json([effect_page(e) for e in chosen])
     else:

@@ -26,7 +26,7 @@ def export(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Write the result for others: YAML, URDF, ROS 2, ring tables, pictures, tables."""
+    """Write the result as YAML, URDF, ROS 2, ring tables, ..."""
     from calib.exporters import export as write
     from calib.runs.reopen import effects_that_may_run
     from calib.runs.run import Run
@@ -64,7 +64,7 @@ def apply(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Write corrected clouds: what the run has learnt of its LiDAR is taken off."""
+    """Correct point clouds by the estimated effects of a run."""
     from calib.evaluation.apply import apply as correct
     from calib.runs.run import Run
 

@@ -19,7 +19,7 @@ from calib.cli.app import (
 from calib.linear.parallel import workers as threads
 
 UNTIL = "The fewest stops until sigmas are so small: 'lidar 0.3 mm, rings 1 mm'."
-FOR = "all; frames, effects or parameters to know better, with commas; effects to tell apart."
+FOR = "all; frames, effects or parameters to know better, with commas; effects to separate."
 
 
 @app.command()
@@ -58,7 +58,7 @@ def plan(
     workers: Workers = None,
     as_json: Json = False,
 ) -> None:
-    """The next stops: what to measure to separate what cannot be told apart, and what it gives."""
+    """Plan the next stops, and predict what they determine."""
     from calib.planning import is_rig
     from calib.planning import plan as choose
     from calib.runs.run import Run

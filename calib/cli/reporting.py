@@ -14,7 +14,7 @@ from chains.errors import InputError
 
 @app.command()
 def report(runs: Runs, out: Out, trust: Trust = None, as_json: Json = False) -> None:
-    """One page for a colleague: the verdict, what was found, and how good it is; no network."""
+    """Write a report: one HTML page that needs no network."""
     from calib.report import report as write
     from calib.runs.run import Run
 
@@ -35,7 +35,7 @@ def plot(
     trust: Trust = None,
     as_json: Json = False,
 ) -> None:
-    """One figure of a run's report, for a paper."""
+    """Write one figure of a run's report."""
     from calib.report import Evidence, refuse_figure
     from calib.report import listed as figures
     from calib.report import plot as draw
@@ -71,7 +71,7 @@ def view(
     trust: Trust = None,
     as_json: Json = False,
 ) -> None:
-    """The browser workbench, on this machine alone, until Ctrl-C."""
+    """Open the workbench in a browser, until Ctrl-C."""
     from calib.view import view as serve
 
     def tell(url: str, look_url: str) -> None:

@@ -1,7 +1,7 @@
 """What could be missing: every effect of the catalogue that a model does not have, and structure.
 
 Structure is what no physics is claimed for: an error of its own for every bin of a covariate, or
-of a pair, and for the arm a smooth function of its joints. It finds what nobody has named.
+of a pair, and for the arm a smooth function of its joints. It finds residual structure.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from calib.rig import Rig
 
 BINS, PAIR_BINS = 12, 6
 AZIMUTH_BINS = 24
-# Of columns of the stops: with more parameters than a fifth of these, tests say nothing.
+# Of columns of the stops: with more parameters than a fifth of these, tests have no power.
 STOPS_A_BIN = 5
 WAVES = 4  # of a pose over a column: its quarters, as 12 bins have thirds of those
 STEP = 0.01  # relative, to either side, for the derivative by a shape
-# What a range error may hang on alone, and the pairs that matter; others pair with range.
+# What a range error may depend on alone, and the pairs that matter; others pair with range.
 POINT = ("range_m", "incidence_rad", "azimuth_rad", "elevation_rad", "intensity")
 PAIRS = (*combinations(POINT[:4], 2), ("intensity", "range_m"), ("label", "incidence_rad"))
 
@@ -240,7 +240,7 @@ def stops_view(source: Source) -> View:
 
 
 def covariates() -> set[str]:
-    """Columns that structure may hang on in any recording."""
+    """Columns that structure may depend on in any recording."""
     return {*POINT, "time_s", *chain(*PAIRS)}
 
 

@@ -189,11 +189,15 @@ class Chance:
             told = [s.told for s in self.spreads if s.sd > s.sigma] or [self.spreads[0].told]
             told = " and ".join(told)
             what = f"{each.capitalize()}s scatter by {told} {self.effect.what}"
-        rivals = f"This data cannot tell it from {', '.join(self.rivals)}. " if self.rivals else ""
+        rivals = (
+            f"On these data it is not distinguishable from {', '.join(self.rivals)}. "
+            if self.rivals
+            else ""
+        )
         return (
-            f"{what}; by chance as far as this data tell (p = {self.p_adjusted:.1g}). {rivals}"
-            f"{name} takes that into every sigma; it tells nothing of the next {each}, so no "
-            f"held-out error falls."
+            f"{what}; random as far as these data show (p = {self.p_adjusted:.1g}). {rivals}"
+            f"{name} widens every sigma by that; it predicts nothing at another {each}, so the "
+            "held-out error does not fall."
         )
 
 

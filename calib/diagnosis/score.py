@@ -3,7 +3,7 @@
 One fit serves all candidates: their columns are projected off everything that the model estimates,
 stops' poses and surfaces' errors included, and what is left of the residual along them is the score
 ``s``, with information ``I`` (Rao 1948). The statistic ``s' I^-1 s`` is what the effect would
-explain. How large it gets by chance is told from clusters of rows, not rows: see `jackknife`.
+explain. How large it gets by chance is estimated from clusters of rows, not rows: see `jackknife`.
 """
 
 from __future__ import annotations
@@ -85,8 +85,8 @@ class Scores:
 
 
 def projection(linear: Linear, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Variables, be they candidates or of the model itself, projected off all that the model can
-    take on; other candidates play no part.
+    """Variables, be they candidates or of the model itself, projected off all that the model
+    absorbs; other candidates play no part.
 
     Returns:
         Columns of the variables (Q,) and of the model's unknowns (M,), and how much of each of
@@ -103,7 +103,7 @@ def projection(linear: Linear, names: Sequence[str]) -> tuple[np.ndarray, np.nda
 
 
 def away_from_model(linear: Linear, names: Sequence[str]) -> np.ndarray:
-    """Directions (U, Q) of variables with all that the model can take on of them taken off, stops'
+    """Directions (U, Q) of variables with all that the model absorbs of them taken off, stops'
     poses and surfaces' errors included."""
     theirs, model, taken = projection(linear, names)
     kept = np.zeros((len(linear.information), len(theirs)))

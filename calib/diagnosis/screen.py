@@ -1,4 +1,4 @@
-"""All candidates tested together: by family, adjusted for how many were looked at, and ranked."""
+"""All candidates tested together: by family, adjusted for how many were tested, and ranked."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ class Candidate:
     Args:
         effect: with that shape.
         test: its test.
-        p_value: how often chance alone does as much, the shapes tried paid for; of the screen's
+        p_value: how often chance alone does as much, adjusted for the shapes tried; of the screen's
             test until it is judged, then of that.
-        p_adjusted: how often chance does so in any candidate that was looked at, so no less.
+        p_adjusted: how often chance does so in any candidate that was tested, so no less.
         evidence: see `Test.evidence`.
         looks: by how many independent looks p_adjusted pays.
     """
@@ -54,7 +54,7 @@ class Screen:
     gauges: Sequence[Effect]
 
     def size_m(self, candidate: Candidate) -> float:
-        """Root mean square of what it does to the ranges, all that the model takes on included."""
+        """Root mean square of what it does to the ranges, all that the model absorbs included."""
         theta, columns = candidate.test.estimate(), candidate.test.columns
         whole = self.scores.whole[np.ix_(columns, columns)]
         return float(np.sqrt(theta @ whole @ theta / max(self.scores.weight_m2, 1e-300)))

@@ -93,7 +93,7 @@ class Search:
     unsettled: Chance | None = None
 
     def dressed_up(self, i: int) -> bool:
-        """Whether structure without a name would have explained more than the i-th name did."""
+        """Whether residual structure would have explained more than the i-th name did."""
         common, step = self.looks[-1].named.common, self.found[i]
         bins = (c.test.evidence(common) for c in step.before.unnamed.candidates)
         return step.candidate.test.evidence(common) < max(bins, default=0.0) - ODDS
@@ -284,8 +284,8 @@ def _chance_leads(look: Look) -> bool:
 
 
 def _quiet(look: Look) -> bool:
-    """Whether no effect and no structure stands out: bins, or a name that acts like bins, take on
-    what one stop has alone, but one stop left out does not take an effect away."""
+    """Whether no effect and no structure is significant: bins, or a name that acts like bins, take
+    on what one stop has alone, but one stop left out does not take an effect away."""
     named = any(_stands_out(c, ALPHA) for c in look.named.candidates)
     return not named and not any(_stands_out(c, ALPHA_UNNAMED) for c in look.unnamed.candidates)
 
@@ -367,7 +367,7 @@ def _scatter(look: Look, progress: Progress) -> Candidate | None:
 
 
 def judged(look: Look, candidate: Candidate, progress: Progress) -> tuple[Test, float]:
-    """A candidate's test, its clusters jackknifed, and its p-value once all looks are paid for."""
+    """A candidate's test, its clusters jackknifed, and its p-value adjusted for all tests."""
     found = look.judged(candidate, progress)
     return found, float(after_looks(found.p_value(), candidate.looks))
 

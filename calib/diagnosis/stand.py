@@ -319,7 +319,7 @@ class Look:
         shares = Shares()
 
         def tell(done: int, total: int) -> None:
-            progress("judging what stands out", done, total)
+            progress("fitting the candidates", done, total)
 
         for rows in rows_along(wide, stand.estimate, by_name, tell):
             shares.add(rows)

@@ -19,7 +19,7 @@ KNOTS = 7  # of the piecewise linear function that is suggested for one covariat
 PAIR_KNOTS = 3
 WAVES = 2  # of the harmonics of azimuth
 
-DESCRIBES = "Empirical: it describes and explains nothing, and was seen at"
+DESCRIBES = "Empirical, without a known cause; observed at"
 # Endings of columns -> the unit that people read, and how many of it the column's unit is.
 UNITS = {
     "_m": ("m", 1.0),
@@ -53,8 +53,8 @@ def formula(candidate: Candidate, taken: Collection[str] = ()) -> dict[str, Any]
     """An effect as a formula that the user can add as it stands, empirical as it is.
 
     Piecewise linear over the covariate's bins, products of such for a pair, the strongest harmonics
-    of azimuth; for a joint, harmonics of the joint that it hangs on. None where there is no formula
-    for it: of labels, or of a column that goes by no name of a formula.
+    of azimuth; for a joint, harmonics of the joint that it depends on. None where there is no
+    formula for it: of labels, or of a column that goes by no name of a formula.
 
     Args:
         candidate: structure that stands out.
@@ -140,13 +140,13 @@ def _strongest_waves(candidate: Candidate) -> tuple[int, ...]:
 
 
 def what_separates(a: Effect, b: Effect) -> str:
-    """The measurement that would tell two effects apart, from what they hang on."""
+    """The measurement that would separate two effects, from what they depend on."""
     arm = (Site.EDGE, Site.JOINTS)
     return what_differs(a.covariates, b.covariates, a.site in arm or b.site in arm)
 
 
 def what_differs(a: Collection[str], b: Collection[str], of_arm: bool = False) -> str:
-    """The measurement that would tell what hangs on some covariates from what does on others.
+    """The measurement that would separate what depends on some covariates from what does on others.
 
     Args:
         a, b: the covariates of both.

@@ -16,7 +16,7 @@ from calib.results.solution import Solution
 
 LEANS = 0.5  # of the prior's variance left in a direction that the data hardly determine
 SHARE = 0.2  # of a direction of unit length, in priors' sigmas, for a parameter to be named
-STANDS_IN = 0.97  # of what a candidate does, that an effect of the model can take on
+STANDS_IN = 0.97  # of what a candidate does, that an effect of the model can absorb
 MOST_DIRECTIONS = 8
 
 
@@ -37,7 +37,7 @@ def to_be_told_apart(
 
     Args:
         candidates: of a diagnosis; of those confirmed the first that has rivals counts, though
-            something without a name may be dressed up in it: other stops would say that too.
+            it may stand in for residual structure: other stops would say that too.
         weak: its weak directions; of effects that may stand for each other the first.
     """
     confirmed = (c for c in candidates if c["step"])
@@ -107,7 +107,7 @@ def _needs(names: list[str]) -> str:
 def standing_in(look: Look) -> list[dict[str, Any]]:
     """Effects of the model that could as well be a candidate: on this data they do the same.
 
-    A candidate that the model takes on almost wholly, and would not without one of its effects, may
+    A candidate that the model absorbs almost wholly, and would not without one of its effects, may
     be what that effect's estimate is made of.
     """
     linear, stand = look.linear, look.stand
@@ -130,6 +130,5 @@ def _stand_in(name: str, effect: Effect, other: Effect) -> dict[str, Any]:
     return {
         "parameters": [name, other.family],
         "sigma_mm": None,
-        "needs": f"{what_separates(effect, other)}: on this data {name} takes on what "
-        f"{other.family} would do",
+        "needs": f"{what_separates(effect, other)}: on these data {name} absorbs {other.family}",
     }

@@ -2,7 +2,7 @@
 
 The error is where the arm truly brings a body less where the arm as drawn would, both standing and
 holding it as fitted. Its sigma is that of the true place under the run's covariance, the place of
-the base included where nothing else tells it. It speaks of what is in the model.
+the base included where nothing else tells it. It covers what is in the model.
 """
 
 from __future__ import annotations

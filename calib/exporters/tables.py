@@ -70,10 +70,8 @@ def _tables(rows: list[VariableEstimate]) -> list[_TextTable]:
         for parameter, cell, unit, told in effect_cells(row)
     ]
     tables = [
-        _TextTable("Links", ("link", "x", "y", "z", "unit", "not told alone"), links),
-        _TextTable(
-            "Effects", ("effect", "parameter", "estimate", "unit", "not told alone"), effects
-        ),
+        _TextTable("Links", ("link", "x", "y", "z", "unit", "confounded"), links),
+        _TextTable("Effects", ("effect", "parameter", "estimate", "unit", "confounded"), effects),
     ]
     return [table for table in tables if table.rows]
 

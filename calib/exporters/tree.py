@@ -58,7 +58,7 @@ def write_tree(fit: FittedRig, folder: Path) -> Written:
         _text(svg, LEFT, 28 + LINE * i, line, RED, style=BOLD)
     _text(svg, LEFT, top - 56, f"Frames of {fit.rig.name}", style=BOLD)
     said = "each in the axes of the frame above it, angles as in URDF; sigma of the worst axis"
-    _text(svg, LEFT, top - 36, f"{said}, amber where the data alone do not tell it", PALE)
+    _text(svg, LEFT, top - 36, f"{said}, amber where the data alone do not identify it", PALE)
     for x, title in ((where, "x, y, z, roll, pitch, yaw"), (spread, "one sigma")):
         _text(svg, x, top - 12, title, PALE)
     for i, row in enumerate(rows):

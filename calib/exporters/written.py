@@ -48,7 +48,10 @@ def head(run: Run, rig: str, conventions: Iterable[str], not_held: Iterable[str]
         f"Written by rigcal {version}, from the run {run.folder.resolve().name} of {rig}.",
         *conventions,
         *_listed("Not held here:", not_held),
-        *_listed("Not told by the data alone (why: solution.yaml):", textwrap.wrap(untold, WIDTH)),
+        *_listed(
+            "Not identifiable from the data alone (why: solution.yaml):",
+            textwrap.wrap(untold, WIDTH),
+        ),
     ]
 
 

@@ -153,7 +153,7 @@ def _by_overlap(
     if min(a1, b1) < max(a0, b0):
         raise InputError(
             f"clock {clock} runs from {a0:.3f} to {a1:.3f} s and {main} from {b0:.3f} to {b1:.3f} "
-            f"s; they do not overlap, and no motion tells how they lie: say --clock-offset "
+            f"s; they do not overlap, and no motion determines their offset: say --clock-offset "
             f"{clock}=SECONDS"
         )
     out.odd.append(

@@ -98,7 +98,7 @@ def first_rig(
     frames = [line for mounted in roles.mounted for line in _frame(mounted)]
     odd = list(roles.odd)
     if lidar and (parent := _carrier(gathered, roles, columns)):
-        at = "as if it were there: nothing says where it hangs"
+        at = "as if it were there: its mounting is not known"
         frames += _frame(Mounted("lidar", parent, np.eye(4), at))
         odd.append(f"frame lidar is written as if it coincided with {parent}; write CAD there")
     bodies = [m.body for m in roles.mounted] or (bodies_of(columns) if frames else [])

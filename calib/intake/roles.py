@@ -24,7 +24,8 @@ Ends = dict[str, Array]
 """Base and tip of the arm: T_world_end (K, 4, 4); NaN where what tells it was not seen."""
 
 _TOO_FEW = (
-    "{}: too few stops, or turns about one axis only, do not tell where it hangs on the arm; give "
+    "{}: too few stops, or turns about one axis only, do not determine where it is mounted on "
+    "the arm; give "
     "--rig with its frame from CAD"
 )
 _STRAYS = (

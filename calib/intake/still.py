@@ -55,7 +55,7 @@ def find_holds(
     rates = [rate for rate in rates if rate is not None]
     if not rates:
         raise InputError(
-            "no log tells when the rig stood still; give joints, a tracked body or a gyro, or a "
+            "no log shows when the rig stood still; give joints, a tracked body or a gyro, or a "
             "table with a row for every stop"
         )
     still, said = [], []

@@ -192,7 +192,7 @@ class Model:
 
 
 def default_effects(recordings: Sequence[Path | str]) -> tuple[str, ...]:
-    """The effects that are estimated where nobody chooses any.
+    """The effects that are estimated where none are chosen.
 
     Without the arm's whole geometry the sigmas of its lengths and zeros are too small, so it is
     there wherever the tracked poses can tell it: from ten rows on for each parameter of the arm

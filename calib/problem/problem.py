@@ -1,4 +1,4 @@
-"""A problem: all unknowns of a model on its recordings, and all rows that speak of them."""
+"""A problem: all unknowns of a model on its recordings, and all rows that depend on them."""
 
 from __future__ import annotations
 

@@ -123,7 +123,7 @@ def report(
                 svg = plots.svg(picture, chart.id)
                 drawn.append(Drawn(chart, svg, figure_csv(picture)))
                 done += 1
-            sections.append(Section(title, drawn))
+            sections.append(Section(title, drawn, brief=verdict.light != "green"))
         page = render(evidence, verdict, sections, contents.absent)
         file.write_text(page, encoding="utf-8")
     return WrittenReport(Path(out), verdict, contents)

@@ -6,7 +6,7 @@ came from paper,
 
     uncertain = sqrt(mean over rows of J C J^T),    moved = sqrt(mean over rows of (J theta)^2).
 
-Both speak of one variable alone, all others held. What two of them trade with each other, or with
+Both are of one variable alone, all others held. What two of them trade with each other, or with
 where the rig stands at a stop, counts in each, so the parts may well exceed the error of the whole.
 """
 

@@ -16,7 +16,9 @@ from calib.show.tables import LISTED_PARAMETERS, estimate_texts
 from chains import escape, se3
 
 SIX = ("x, mm", "y, mm", "z, mm", "roll, deg", "pitch, deg", "yaw, deg")
-NUMBERS = ("sigma", "sigma before", "unit", "in its sigmas", "in sigmas before", "told by the data")
+NUMBERS = (
+    *("sigma", "prior sigma", "unit", "estimate/sigma", "estimate/prior sigma", "identifiable"),
+)
 
 
 def calibration_tables(evidence: Evidence) -> list[Table]:
@@ -30,8 +32,8 @@ def calibration_tables(evidence: Evidence) -> list[Table]:
         Table(
             id="table-links",
             title="How far every link is from CAD",
-            reading="Of each link T_cad exp(twist) in the child's own axes: tx ty tz along them, "
-            "rx ry rz about them. Without a difference, no CAD says where it should be.",
+            reading="Per link T_cad exp(twist) in the child's axes: tx ty tz along them, rx ry rz "
+            "about them. A link without a difference has no CAD pose.",
             columns=("link", "in", "parameter", "difference", *NUMBERS),
             rows=[
                 [Cell(row.variable), Cell(row.parent), *cells]
@@ -45,7 +47,7 @@ def calibration_tables(evidence: Evidence) -> list[Table]:
     for row in effects:
         if len(row.parameters) > LISTED_PARAMETERS:
             name = f"table-effect-{escape.identifier(row.variable)}"
-            tables.append(_effects(name, row.variable, [row], prior, folded=True))
+            tables.append(_effects(name, row.variable, [row], prior))
     return [table for table in tables if table.rows]
 
 
@@ -54,7 +56,6 @@ def _effects(
     title: str,
     rows: Sequence[VariableEstimate],
     prior: dict[str, float],
-    folded: bool = False,
 ) -> Table:
     return Table(
         id=name,
@@ -62,7 +63,7 @@ def _effects(
         reading="Instruments are corrected by taking the estimate off, geometry by adding it.",
         columns=("effect", "parameter", "estimate", *NUMBERS),
         rows=[[Cell(row.variable), *cells] for row in rows for cells in _numbers(row, prior)],
-        folded=folded,
+        folded=True,
     )
 
 

@@ -24,6 +24,8 @@ class Chart:
         wide: whether it takes the page's whole width.
         quiet: whether it shows nothing of note, or what a table says as well: the page has its
             title alone, which opens it.
+        answer: whether it says how good the model is, or what is wrong with it: of a run that is
+            not to be used as it stands, the page has all others as titles alone.
     """
 
     id: str
@@ -32,6 +34,7 @@ class Chart:
     draw: Callable[[], Figure]
     wide: bool = False
     quiet: bool = False
+    answer: bool = False
 
     def figure(self) -> Figure:
         """The figure, drawn in the house style."""

@@ -26,6 +26,7 @@ from chains import escape
 
 TOLD_CANDIDATES = 8  # candidates whose evidence is told
 LISTED_DIRECTIONS = 12  # weak directions that are told
+LISTED_QUIET = 3  # titles of charts without a finding that a section lists; more are one line
 
 
 @dataclass(frozen=True)
@@ -45,10 +46,17 @@ class Drawn:
 
 @dataclass(frozen=True)
 class Section:
-    """A heading and its charts."""
+    """A heading and its charts.
+
+    Args:
+        title: the heading.
+        charts: in their order.
+        brief: whether only charts that are an `answer` are open.
+    """
 
     title: str
     charts: Sequence[Drawn]
+    brief: bool
 
     @property
     def id(self) -> str:
@@ -56,15 +64,28 @@ class Section:
 
     @property
     def shown(self) -> list[Drawn]:
-        return [drawn for drawn in self.charts if not drawn.chart.quiet]
+        """Charts that are open."""
+        loud = (drawn for drawn in self.charts if not drawn.chart.quiet)
+        return [drawn for drawn in loud if drawn.chart.answer or not self.brief]
 
     @property
-    def folded(self) -> list[Drawn]:
+    def listed(self) -> list[Drawn]:
+        """Charts that a click on their title opens."""
+        rest = [drawn for drawn in self.charts if drawn not in self.shown]
+        return rest if len(self._quiet) <= LISTED_QUIET else [d for d in rest if not d.chart.quiet]
+
+    @property
+    def grouped(self) -> list[Drawn]:
+        """Charts whose titles have to be opened first, as they are many and say nothing of note."""
+        return self._quiet if len(self._quiet) > LISTED_QUIET else []
+
+    @property
+    def _quiet(self) -> list[Drawn]:
         return [drawn for drawn in self.charts if drawn.chart.quiet]
 
     def read_as(self, chart: Chart) -> str:
         """The id of the first chart on the page that is read as this one is; its own, maybe."""
-        drawn = [*self.shown, *self.folded]
+        drawn = [*self.shown, *self.listed, *self.grouped]
         return next(d.chart.id for d in drawn if d.chart.reading == chart.reading)
 
 
@@ -101,6 +122,7 @@ def render(
         numbers=_numbers(evidence),
         sections=sections,
         tables=calibration_tables(evidence),
+        brief=verdict.light != "green",
         absent=absent,
         diagnosis=evidence.diagnosis,
         headings=HEADINGS,
@@ -147,7 +169,7 @@ def _numbers(evidence: Evidence) -> list[tuple[str, str]]:
     summary, (kind, error) = evidence.run.summary, error_mm(evidence.rungs[-1])
     rms = summary["rms_mm"]
     told = {
-        "held-out": "rms error of stops that the fit never saw",
+        "held-out": "rms error of held-out stops",
         "fit": "rms error of the fit; none held out",
     }
     before = "held_out_" if kind == "held-out" else ""
@@ -192,11 +214,11 @@ def _formulas(evidence: Evidence) -> bool:
 
 
 def _told(candidate: dict[str, Any]) -> list[str]:
-    out = [f"{chance(candidate['p_adjusted'])} after all that was looked at"]
+    out = [f"{chance(candidate['p_adjusted'])}, adjusted for multiple testing"]
     if candidate["unabsorbed_rms_mm"] is not None:
         out.append(
-            f"would explain {mm(candidate['unabsorbed_rms_mm'])} mm rms that the model cannot take "
-            f"on, of {mm(candidate['rms_mm'])} mm that it does"
+            f"would explain {mm(candidate['unabsorbed_rms_mm'])} mm rms that the model does not "
+            f"absorb, of its {mm(candidate['rms_mm'])} mm in all"
         )
     before, after = (candidate["held_out_rms_mm"][k] for k in ("before", "after"))
     if before is not None and after is not None:
@@ -209,7 +231,10 @@ def _told(candidate: dict[str, Any]) -> list[str]:
     if candidate["dressed_up"]:
         out.append("rejected: a generic function of other covariates (bins) explains more")
     for rival in candidate["rivals"]:
-        out.append(f"this data cannot tell it from {rival['effect']}, {rival['separate']} would")
+        out.append(
+            f"on these data not distinguishable from {rival['effect']}; {rival['separate']} would "
+            "separate them"
+        )
     return out
 
 
@@ -225,7 +250,7 @@ def _detectable(evidence: Evidence) -> list[tuple[str, str]]:
 
 
 def _weak(evidence: Evidence) -> list[tuple[str, str, str]]:
-    """What the data hardly tell: names, how much they may be off, what would determine them."""
+    """What is weakly determined: names, how much they may be off, what would determine them."""
     directions = evidence.diagnosis["weak_directions"] if evidence.diagnosis else []
     return [
         (

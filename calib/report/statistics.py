@@ -95,8 +95,8 @@ class ResidualCurve:
 
     @property
     def rms_m(self) -> float:
-        """How much of the residual hangs on this covariate: rms over rows of the bins' means, what
-        their bands would give by chance taken off."""
+        """How much of the residual depends on this covariate: rms over rows of the bins' means,
+        what their bands would give by chance taken off."""
         known = np.isfinite(self.mean_m) & np.isfinite(self.band_m)
         if not known.any():
             return 0.0

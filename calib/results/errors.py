@@ -32,7 +32,7 @@ class Errors:
         count: how many there are, those of weight 0 left out, as from the next three sums.
         total_m, squares_m2: sum [m] and sum of squares [m2].
         expected_m2: sum of the variances [m2] that their sigmas lead one to expect.
-        rejected: how many have weight 0: their beams meet a surface, and nobody believes them.
+        rejected: how many have weight 0: their beams meet a surface, and they were rejected.
         rejected_m2: sum of the squares of those [m2].
     """
 

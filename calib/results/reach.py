@@ -1,7 +1,7 @@
 """How well an arm that a tracker alone has seen is known: where it was, and wherever it can go.
 
 The covariance of the calibration is carried to the position of a tracked body beyond the joints, at
-the poses of the recording and at joints drawn over all that they can turn. It speaks of what is in
+the poses of the recording and at joints drawn over all that they can turn. It covers what is in
 the model: what the arm does elsewhere that no pose shows is in neither number.
 """
 

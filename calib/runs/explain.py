@@ -65,13 +65,13 @@ def explain(
     progress: Progress = lambda what, done, total: None,
     candidates: str | Sequence[str] = (),
 ) -> Explanation:
-    """Grow a model until it is adequate, or what is left has no name; every rung is kept.
+    """Grow a model until it is adequate, or residual structure is left; every rung is kept.
 
     What a mishap spoiled is left out first, as a rung of its own. What is found is added only if
     the held-out error falls, by a hundredth of what it has above the expected one or more, and
-    dropped again if later steps leave it nothing to lower. What has no name is added as a formula,
-    which ``effects/NAME.yaml`` keeps for other recordings. Rungs that an interrupted call has
-    finished are taken up again.
+    dropped again if later steps leave it nothing to lower. Residual structure is added as a
+    formula, which ``effects/NAME.yaml`` keeps for other recordings. Rungs that an interrupted call
+    has finished are taken up again.
 
     Args:
         recordings: folder, or folders.

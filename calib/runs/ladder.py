@@ -11,8 +11,8 @@ from calib.rig.suspect import listed
 from calib.runs.run import Run
 from chains.errors import InputError
 
-DESCRIBED = "~"  # before an effect that was added and only describes
-FORMULA = "a formula that describes what was measured, and explains nothing"
+DESCRIBED = "~"  # before an effect that was added and is empirical
+FORMULA = "an empirical formula, without a known cause"
 
 
 @dataclass(frozen=True)

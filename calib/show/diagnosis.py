@@ -55,9 +55,9 @@ def _print_tables(console: Console, diagnosis: Diagnosis, residual: str) -> None
     rivals = [(c["add"], c["indistinguishable_from"]) for c in diagnosis.candidates]
     tied = [(name, ", ".join(those)) for name, those in rivals if those]
     if tied:
-        print_pairs(console, "what this data cannot tell apart", tied)
+        print_pairs(console, "not distinguishable on these data", tied)
     if diagnosis.plan:
-        print_command(console, diagnosis.plan, "Stops that would tell it apart are planned by:")
+        print_command(console, diagnosis.plan, "Stops that would separate them are planned by:")
     if diagnosis.unexplained:
         console.print(unexplained_table(diagnosis.unexplained[:LEADING], residual))
     if adequate:
@@ -101,7 +101,7 @@ def candidates_table(candidates: Sequence[Mapping[str, Any]], residual: str) -> 
         column.no_wrap = True
     for column in table.columns[2:5]:
         column.justify = "right"
-    table.title = f"what may be missing; p after all looks, mm rms of {residual}"
+    table.title = f"candidate effects; adjusted p, mm rms of {residual}"
     table.title_justify, table.title_style = "left", "bold"
     for each in candidates:
         held_out = each["held_out_rms_mm"]
@@ -119,10 +119,10 @@ def candidates_table(candidates: Sequence[Mapping[str, Any]], residual: str) -> 
 
 def unexplained_table(unexplained: Sequence[Mapping[str, Any]], residual: str) -> Table:
     """Structure that no effect accounts for, strongest first."""
-    table = columns_table("left without a name, over", "p", "mm", "to add it")
+    table = columns_table("residual structure over", "p", "mm", "to add it")
     for column in table.columns[1:3]:
         column.justify = "right"
-    table.title = f"structure; p after all looks, mm rms of {residual}"
+    table.title = f"structure; adjusted p, mm rms of {residual}"
     table.title_justify, table.title_style = "left", "bold"
     for each in unexplained:
         formula = each["formula"]["name"] if each["formula"] else ""
@@ -169,7 +169,7 @@ def _print_weak(console: Console, directions: Sequence[Mapping[str, Any]]) -> No
         sigma = "" if d["sigma_mm"] is None else f" ± {d['sigma_mm']:.2f} mm"
         rows.append((f"{', '.join(d['parameters'])}{sigma}", d["needs"]))
     if rows:
-        print_pairs(console, "what the data hardly tell, and what would", rows)
+        print_pairs(console, "weakly determined, and what would determine it", rows)
 
 
 def _estimate(parameters: Mapping[str, Any]) -> str:

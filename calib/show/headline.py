@@ -32,17 +32,17 @@ class Words(NamedTuple):
 
 MOVED = Words(
     *("moved", "turned", "changed by", "nothing else moved"),
-    none="nothing moved beyond the uncertainty of then and now",
-    silent="of {} the new data say nothing",
+    none="nothing moved significantly",
+    silent="the new data do not determine {}",
     title="moved since the earlier run",
     title_of_none="not moved",
 )
 DIFFERS = Words(  # of one recording: nothing moved, two models tell it otherwise
-    *("differs by", "differs by", "differs by", "no other estimate differs beyond chance"),
-    none="no estimate differs beyond chance",
-    silent="of {} nothing is known",
-    title="differs beyond chance",
-    title_of_none="does not differ beyond chance",
+    *("differs by", "differs by", "differs by", "no other estimate differs significantly"),
+    none="no estimate differs significantly",
+    silent="{} is not known",
+    title="differs significantly",
+    title_of_none="does not differ significantly",
 )
 
 
@@ -100,7 +100,7 @@ def closing(run: Run) -> list[str]:
     first = f"{what}: {error}; {rms['noise_floor']:.2f} mm expected if the model is right"
     if diagnosis:
         return [first, f"verdict: {verdict.meaning}; {verdict.sentence}"]
-    told = "nothing speaks against the model; diagnose has not been asked"
+    told = "no contradiction to the model; not diagnosed yet"
     if reasons := [each for each in verdict.reasons if not each.startswith(UNASKED)]:
         why, more = reasons[0].partition(": ")[0], len(reasons) - 1
         others = f" (and {more} more reason{'s' * (more > 1)})" if more else ""

@@ -97,14 +97,16 @@ def run_html(run: Run) -> str:
     effects = [row for row in rows if row.parent is None]
     tables = {"links": links_table([row for row in rows if row.parent is not None])}
     tables |= {"effects": effects_table(effects)} if effects else {}
-    untold = [f"not told: {each['name']}: {each['why']}" for each in run.solution.not_estimated]
+    untold = [
+        f"not identifiable: {each['name']}: {each['why']}" for each in run.solution.not_estimated
+    ]
     first, *others = closing(run)
     moved = [moved_sentence(run.summary["links"])] if "links" in run.summary else []
     return _html(
         f"{run.folder}: {first}",
         [*moved, *run.warning, *others],
         {**tables, "errors": error_table(run.summary)},
-        folded={f"not told: {len(untold)}": untold} if untold else {},
+        folded={f"not identifiable: {len(untold)}": untold} if untold else {},
     )
 
 

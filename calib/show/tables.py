@@ -88,7 +88,7 @@ def print_run(run: Run, whole: bool = False) -> None:
     if own := [(str(e["name"]), str(e["what"])) for e in formulas if "what" in e]:
         print_pairs(console, "effects of your own", own)
     if whole:
-        _print_reasons(console, "not told by the data", run.solution.not_estimated)
+        _print_reasons(console, "not identifiable", run.solution.not_estimated)
     else:
         _print_untold(console, run.solution.not_estimated)
     console.print(error_table(summary))
@@ -241,7 +241,7 @@ def print_pairs(console: Console, title: str, rows: Iterable[tuple[str, str]]) -
 
 def links_table(rows: Sequence[VariableEstimate]) -> Table:
     """How far every frame lies from CAD, in its own axes, mm and mrad."""
-    table = columns_table("from CAD, own axes", "x", "y", "z", "", "not told")
+    table = columns_table("from CAD, own axes", "x", "y", "z", "", "confounded")
     for row in rows:
         for part, unit in ((slice(3, 6), "m"), (slice(0, 3), "rad")):
             cells = map(estimate_cell, row.estimate[part], row.sigma[part], (unit,) * 3)
@@ -258,7 +258,7 @@ def effects_table(rows: Sequence[VariableEstimate]) -> Table:
     for row in rows:
         name = row.variable
         for parameter, cell, unit, told in effect_cells(row):
-            table.add_row(name, parameter, cell, unit, "" if told else "not told")
+            table.add_row(name, parameter, cell, unit, "" if told else "confounded")
             name = ""
     table.add_row()
     return table
@@ -360,10 +360,10 @@ def _print_untold(console: Console, entries: Sequence[Mapping[str, str]]) -> Non
     """Names of what was not told, those that are tied to others together, whatever to."""
     tied = [entry["name"] for entry in entries if ": " in entry["why"]]
     if tied:
-        why = "determined only together with others; 'rigcal -v fit' says with which"
-        print_pairs(console, f"not told by the data: {why}", [("", ", ".join(tied))])
+        why = "determined only in combination with others; 'rigcal -v fit' names these"
+        print_pairs(console, f"not identifiable: {why}", [("", ", ".join(tied))])
     _print_reasons(
-        console, "not told by the data", [each for each in entries if ": " not in each["why"]]
+        console, "not identifiable", [each for each in entries if ": " not in each["why"]]
     )
 
 

@@ -77,13 +77,13 @@ def _wrong(run: Run, diagnosis: Mapping[str, Any] | None) -> Iterator[str]:
 def _doubtful(run: Run, diagnosis: Mapping[str, Any] | None) -> Iterator[str]:
     rms = run.summary["rms_mm"]
     if diagnosis is None:
-        yield f"{UNASKED}; 'rigcal diagnose {run.folder}' asks what is missing"
+        yield f"{UNASKED}; 'rigcal diagnose {run.folder}' looks for missing effects"
     elif diagnosis["too_few_stops"]:
         yield "the stops are too few to say whether anything is missing"
     elif diagnosis["verdict"] == "unexplained_structure":
         yield "there is structure that no known effect explains"
     if rms.get("held_out") is None:
-        yield "no stops were held out, so nothing says how well it predicts"
+        yield "no stops were held out, so its predictions were not checked"
     if AT_THE_FLOOR < (times := over_floor(run)) <= FAR_OFF:
         yield OVER.format(times)
     yield from cautions(run)

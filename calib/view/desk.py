@@ -29,10 +29,10 @@ class Findings:
         heading: the verdict in words.
         sentences: the finding in words.
         candidates: effects that the model lacks, best first.
-        unexplained: structure without a name.
+        unexplained: residual structure.
         blunders: what is wrong in the recording.
         curves: mean residual against one covariate each, by its name.
-        formulas: a chart for each formula of what has no name.
+        formulas: a chart for each formula of residual structure.
     """
 
     heading: str
@@ -176,7 +176,7 @@ class Desk:
     def addable(self, findings: Findings | None) -> dict[str, str | Mapping[str, Any]]:
         """Effects that the model lacks, those found first: name -> what `rigcal add` takes.
 
-        What has no name is a formula, as a document of an effect's file.
+        Residual structure is a formula, as a document of an effect's file.
         """
         offered: dict[str, str | Mapping[str, Any]] = {}
         if findings is not None:

@@ -31,8 +31,8 @@ from chains.errors import InputError
 CURVE_PX = 180
 SETTLED_S = 0.4  # the camera rests for so long before the address tells where it is
 TAKE_HINT = "What 'rigcal export' writes of this run, in all formats, as a zip"
-WORKED_OUT = "What stops held out make of it is being worked out from the linearisation …"
-LOOKS = "Opened to look at: this address cannot change anything."
+WORKED_OUT = "The held-out error is being predicted from the linearisation …"
+LOOKS = "Read-only: this address cannot change anything."
 
 
 class Page:
@@ -48,6 +48,8 @@ class Page:
 
     def __init__(self, visitor: Visitor, bench: Bench) -> None:
         client = visitor.client
+        # Of the window until the panels are docked, then of what they leave of it.
+        window_px = client.camera.image_width, client.camera.image_height
         self.client, self.bench, self.may_change = client, bench, visitor.may_change
         self.desk = bench.desk()
         self.findings: Findings | None = None
@@ -66,7 +68,7 @@ class Page:
         gui.add_html(panels.note(LOOKS), visible=not self.may_change)
         self._note = gui.add_html("", visible=False)
         self._run = self._menu("Run", list(self.desk.runs), self._on_run)
-        self.picture = Picture(client, self._guarded, self._asks)
+        self.picture = Picture(client, window_px, self._guarded, self._asks)
         visitor.run(brush.SCRIPT)
         self._add_ladder_widgets()
         self._blunders = LeaveOut(gui, self._on_leave_out)

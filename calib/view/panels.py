@@ -88,7 +88,7 @@ def lit(points: Points, kept: np.ndarray, chosen: np.ndarray | None) -> str:
 def _residual(points: Points, inliers: np.ndarray) -> str:
     """How large the residual of some inliers (N,) is."""
     if not inliers.any():
-        return ", none of which the fit took for an inlier"
+        return ", none of them an inlier of the fit"
     residual = 1e3 * points.columns["residual_m"][inliers].astype(float)
     rms = math.sqrt(np.mean(residual**2))
     return f"; residual of the inliers {rms:.2f} mm rms, {residual.mean():+.2f} mm mean"
@@ -306,7 +306,7 @@ def new_run(rung: Rung) -> str:
     here = rung.run.summary["rms_mm"]["held_out"]
     if below is None or here is None:
         return made
-    return f"{made} Error of stops held out: {below:.2f} → {here:.2f} mm."
+    return f"{made} Held-out error: {below:.2f} → {here:.2f} mm."
 
 
 def framed(inner: str) -> str:

@@ -36,14 +36,19 @@ class Picture:
 
     Args:
         client: viser's.
+        window_px: width and height of its window, the panels included.
         guarded: makes a callback of what a widget does.
         asks: what the browser's address asks for, by `look.KEYS`.
     """
 
     def __init__(
-        self, client: Any, guarded: Callable[..., Callable[..., None]], asks: Mapping[str, str]
+        self,
+        client: Any,
+        window_px: tuple[int, int],
+        guarded: Callable[..., Callable[..., None]],
+        asks: Mapping[str, str],
     ) -> None:
-        self.stage = Stage(client, look.numbers(asks.get("camera", ""), 6))
+        self.stage = Stage(client, window_px, look.numbers(asks.get("camera", ""), 6))
         self._client, self._guarded, self._asks = client, guarded, dict(asks)
         self._columns: dict[str, str] = {}  # heading -> column
         self._others: dict[str, Run] = {}
@@ -52,7 +57,7 @@ class Picture:
         self._kept = np.zeros(0, bool)
         self._clicked: int | None = None  # index of a beam
         self._add_menus()
-        self._add_plot()
+        self._add_plot(window_px[0] < NARROW_PX)
         self._on_moves()
         client.scene.on_click()(guarded(self._on_point, with_event=True))
         for key, step, name in (("N", 1, "Next stop"), ("P", -1, "Previous stop")):
@@ -73,13 +78,14 @@ class Picture:
         self._below.on_update(self._guarded(self._paint))
         self._what = gui.add_button_group("Hide, show", ("room", "rig", "frames"))
         self._what.on_click(self._guarded(self._on_what))
+        self._lines_why = gui.add_html("", visible=False)
         self._moves = gui.add_checkbox(MOVES_LABEL, bool(self._asks.get("moves")), hint=MOVES_HINT)
         self._moves.on_update(self._guarded(self._on_moves))
         self._moved = gui.add_html("", visible=False)
         self._scan = gui.add_html("")
         self._point = gui.add_html(panels.note(CLICK))
 
-    def _add_plot(self) -> None:
+    def _add_plot(self, narrow: bool) -> None:
         gui = self._client.gui
         panel = gui.add_panel()
         with panel.add_tab("Beams"):
@@ -113,7 +119,7 @@ class Picture:
             self._take.on_click(self._guarded(self._on_take))
         panel.dock_left()
         panel.set_width(PLOT_PX)
-        if self._client.camera.image_width < NARROW_PX:
+        if narrow:
             panel.minimize()
 
     def _menu(self, label: str, use: Callable[[], None]) -> Any:
@@ -200,6 +206,8 @@ class Picture:
             self.clear()
             raise InputError(f"{name}: nothing was measured at any of its stops")
         self.stage.open(self.stage.scene, self._at)
+        why = self.stage.lines_why
+        self._lines_why.content, self._lines_why.visible = panels.note(why), bool(why)
         self._fill(self.stop, stops, "stop")
         self._on_stop()
 

@@ -6,7 +6,7 @@ by its residual, which is what is left when all that the model knows has been ta
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -160,14 +160,18 @@ class Scene:
         names = dict.fromkeys((rig.tree.root, *ends, *named))
         return {name: self.place(recording, stop, name) for name in names}
 
-    def links(self, recording: int, stop: str) -> tuple[np.ndarray, np.ndarray]:
-        """Segments (n, 2, 3) m from frame to frame, and which of them (n,) are the arm's."""
+    def links(
+        self, recording: int, stop: str, shaped: Collection[str] = ()
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Segments (n, 2, 3) m from frame to frame, and which of them (n,) are the arm's; none
+        between two frames that are `shaped`, as those links are drawn by their meshes."""
         rig = self.sources[recording].rig
         at = {f: self.place(recording, stop, f)[:3, 3] for f in rig.tree.frames}
         ends = [(at[e.parent], at[e.child]) for e in rig.tree.edges]
         arm = [e.name in rig.arm_edges for e in rig.tree.edges]
-        long = np.array([np.linalg.norm(b - a) > 1e-6 for a, b in ends], bool)
-        return np.reshape(ends, (-1, 2, 3))[long], np.array(arm, bool)[long]
+        drawn = np.array([not {e.parent, e.child} <= {*shaped} for e in rig.tree.edges], bool)
+        drawn &= [np.linalg.norm(b - a) > 1e-6 for a, b in ends]
+        return np.reshape(ends, (-1, 2, 3))[drawn], np.array(arm, bool)[drawn]
 
     def twists(self, recording: int, stop: str) -> tuple[np.ndarray, np.ndarray]:
         """By which twist (E, 6) each edge of the rig differs at a stop from what is drawn, by all

@@ -10,11 +10,13 @@ import numpy as np
 from calib.view import scene as scenes
 from calib.view.scene import Points, Scene
 from calib.view.shown.moves import TIMES, Move, moves
+from calib.view.shown.shapes import Shape, arm_shapes
 from chains import se3
 
 ROOM, RIG, AXES, MOVES = "/room", "/rig", "/axes", "/moves"
 POINTS, LIT, PICKED = "/points", "/lit", "/picked"
 ARM_COLOUR, MOUNT_COLOUR, ROOM_COLOUR = (60, 70, 85), (150, 155, 165), (236, 236, 232)
+SHAPE_COLOUR = (196, 201, 208)
 SURE_COLOUR, UNSURE_COLOUR = (200, 30, 120), (150, 155, 165)  # of moves from CAD
 HEAD_M = 0.06  # of an arrow that is long enough
 THICK_M, THIN_M = 0.05, 0.015
@@ -33,16 +35,21 @@ class Stage:
 
     Args:
         client: viser's, of that browser.
+        window_px: width and height of its window, the panels included.
         camera: where the eye stands and what it looks at, as `camera` has it; None: as shows all.
     """
 
-    def __init__(self, client: Any, camera: tuple[float, ...] | None = None) -> None:
-        self.client, self._camera = client, camera
+    def __init__(
+        self, client: Any, window_px: tuple[int, int], camera: tuple[float, ...] | None = None
+    ) -> None:
+        self.client, self._window_px, self._camera = client, window_px, camera
         self.scene: Scene | None = None
         self.points: Points | None = None
         self.shown = np.zeros(0, int)
         self.moves: Sequence[Move] = ()
         self._middle_m = np.zeros(3)
+        self.lines_why = ""
+        self._shapes: Sequence[Shape] = ()
         self._room: tuple[str, str] | None = None
         self._around: np.ndarray | None = None
         self.hidden = {MOVES}
@@ -66,6 +73,7 @@ class Stage:
         first = scene.stops(recording)[0]
         around = room[0] if room else self._extent(recording, first)
         self._middle_m = np.mean(scenes.box(around), axis=0)
+        self._open_shapes(recording)
         if room:
             # Half of every point would be inside the wall that it lies on.
             vertices = scenes.sunk(*room, BEHIND_M) - self._middle_m
@@ -77,6 +85,21 @@ class Stage:
                 side="front",
                 flat_shading=True,
                 visible=ROOM not in self.hidden,
+            )
+
+    def _open_shapes(self, recording: int) -> None:
+        """Send the meshes of the arm's links, which `_draw_rig` puts in their places."""
+        self._shapes, self.lines_why = arm_shapes(self.scene.sources[recording].rig)
+        scene = self.client.scene
+        scene.add_frame(RIG, show_axes=False, visible=RIG not in self.hidden)
+        for i, shape in enumerate(self._shapes):
+            scene.add_mesh_simple(
+                f"{RIG}/shape{i}",
+                shape.vertices_m.astype(np.float32),
+                shape.triangles,
+                color=SHAPE_COLOUR,
+                side="double",
+                flat_shading=True,
             )
 
     def show(self, recording: int, stop: str, points: Points | None) -> None:
@@ -157,10 +180,13 @@ class Stage:
 
     def _draw_rig(self, recording: int, stop: str) -> None:
         scene = self.client.scene
-        scene.remove_by_name(RIG)
         scene.remove_by_name(AXES)
-        scene.add_frame(RIG, show_axes=False, visible=RIG not in self.hidden)
-        links, arm = self.scene.links(recording, stop)
+        for i, shape in enumerate(self._shapes):
+            T = self.scene.place(recording, stop, shape.link)
+            node = scene.get_handle_by_name(f"{RIG}/shape{i}")
+            node.wxyz, node.position = se3.to_quat_wxyz(T), T[:3, 3] - self._middle_m
+        shaped = {shape.link for shape in self._shapes}
+        links, arm = self.scene.links(recording, stop, shaped)
         for part, thick, colour, name in (
             (arm, THICK_M, ARM_COLOUR, "arm"),
             (~arm, THIN_M, MOUNT_COLOUR, "mounts"),
@@ -219,8 +245,8 @@ class Stage:
     def _aim(self) -> None:
         """Let the person at the page look at all of it, from above one corner."""
         client = self.client
-        # What is told is the window: the panels stand beside the picture, or below it on a phone.
-        width, height = client.camera.image_width, client.camera.image_height
+        # The panels stand beside the picture, or below it on a phone.
+        width, height = self._window_px
         width -= PLOT_PX if width >= NARROW_PX else 0
         width -= PANEL_PX if width > 1.5 * PANEL_PX else 0
         wide = min(1.0, width / max(height, 1))  # the angle of view is the height's

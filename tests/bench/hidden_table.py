@@ -126,9 +126,9 @@ def _null(results: Sequence[Result]) -> list[tuple[str, ...]]:
     lines = share("null: adequate", results, lambda r: r["verdict"] == "adequate", ">= 0.95")
     lines += share("null: a named effect", results, lambda r: bool(r["steps"]), "<= 0.05")
     lines += share(
-        "null: range_offset not observable",
+        "null: range_offset not identifiable",
         results,
-        lambda r: r["untestable"].get("range_offset", "").startswith("not observable"),
+        lambda r: r["untestable"].get("range_offset", "").startswith("not identifiable"),
         "1",
     )
     for key, what in (("candidates", "p of named"), ("structure", "p of structure")):

@@ -38,7 +38,7 @@ def small(family: str, number: int = 0, **fields: object) -> Case:
 def test_nothing_is_found_where_nothing_is_hidden(number):
     result = run(small("null", number), baselines=False)
     assert result["verdict"] == "adequate", result["steps"]
-    assert result["untestable"]["range_offset"].startswith("not observable")
+    assert result["untestable"]["range_offset"].startswith("not identifiable")
 
 
 @pytest.mark.slow

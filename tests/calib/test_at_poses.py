@@ -1,4 +1,4 @@
-"""What is predicted of an arm at poses that nobody measured, against worlds of scipy."""
+"""What is predicted of an arm at poses that were not measured, against worlds of scipy."""
 
 import csv
 import json

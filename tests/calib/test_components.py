@@ -287,7 +287,7 @@ def test_on_one_tracked_body_a_mount_that_gives_is_a_tracker_that_scatters(tmp_p
     (added,) = found.worth_adding
     (one,) = (c for c in found.candidates if c["add"] == added)
     assert {added, *one["indistinguishable_from"]} == {"stop_pose_scatter", "tracker_scatter"}
-    assert any("cannot tell it from tracker_scatter" in each for each in found.sentences)
+    assert any("not distinguishable from tracker_scatter" in each for each in found.sentences)
 
 
 def test_two_recordings_share_the_spread_and_nothing_else(scattered, tmp_path):

@@ -174,7 +174,7 @@ def test_candidates_are_ranked_and_none_is_in_the_model(study):
 def test_what_cannot_be_seen_is_not_tested(studies):
     """One range zero for all rings is what the rings' own zeros do together."""
     _, found = studies["null"]
-    assert "not observable" in found.untestable["range_offset"]
+    assert "absorbed by the model" in found.untestable["range_offset"]
 
 
 # ------------------------------------------------------------------------------------------ people
@@ -233,7 +233,7 @@ def test_rivals_and_structure_are_printed(studies, capsys):
     left = {"covariates": ["ring", "azimuth_rad"], "rms_mm": 1.94, "p_adjusted": 3e-5}
     print_diagnosis(replace(found, candidates=[first], unexplained=[{**left, "formula": formula}]))
     lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
-    at = lines.index("what this data cannot tell apart")
+    at = lines.index("not distinguishable on these data")
     assert lines[at + 1] == f"{HIDDEN} faro_scale"
     assert "ring x azimuth_rad 3e-05 1.94 empirical_azimuth" in lines
 

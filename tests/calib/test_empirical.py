@@ -45,8 +45,8 @@ def test_it_is_added_by_the_printed_name_and_the_held_out_error_falls(run, rigca
     code, said, err = rigcal("add", run.folder, name, "-o", tmp_path / "grown")
     assert code == 0, err
     said = " ".join(said.split())
-    assert "describes and explains nothing" in said
-    (ends,) = re.findall(r"seen at incidence from ([\d.]+) to ([\d.]+) degrees", said)
+    assert "without a known cause" in said
+    (ends,) = re.findall(r"observed at incidence from ([\d.]+) to ([\d.]+) degrees", said)
     assert float(ends[0]) < 5 and 60 < float(ends[1]) < 90
     before, after = run.summary["rms_mm"], Run.open(tmp_path / "grown").summary["rms_mm"]
     assert after["held_out"] < 1.05 * after["noise_floor"] < before["held_out"] / 1.2

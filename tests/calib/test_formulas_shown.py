@@ -1,4 +1,4 @@
-"""A formula of what has no name, as people see it: picture, ladder, file, warning."""
+"""A formula of residual structure, as people see it: picture, ladder, file, warning."""
 
 import json
 import re
@@ -275,7 +275,7 @@ def test_what_lies_beyond_is_told_and_a_bins_width_is_not(tmp_path, values, told
         reach.look({"temperature_c": np.array([value]), "other": None})
     (sentence,) = reach.sentences() or [""]
     assert told in sentence and bool(sentence) == bool(told)
-    assert not sentence or sentence.startswith("drift only describes what was measured")
+    assert not sentence or sentence.startswith("drift is empirical")
 
 
 def test_rows_that_do_not_count_are_not_looked_at(tmp_path):

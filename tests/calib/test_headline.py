@@ -27,7 +27,7 @@ def closing_lines(folder="somewhere/run", **summary):
 def test_the_last_lines_are_the_error_what_it_is_worth_and_the_next_command():
     lines = closing_lines()
     assert lines[0] == "held-out error: 3.47 mm; 3.62 mm expected if the model is right"
-    assert lines[1].startswith("verdict so far: nothing speaks against the model")
+    assert lines[1].startswith("verdict so far: no contradiction to the model")
     assert lines[2] == "next: rigcal diagnose somewhere/run"
 
 
@@ -84,7 +84,7 @@ def test_a_move_that_no_axis_shows_alone_is_said_along_the_clearest():
 def test_what_the_new_data_do_not_show_is_not_said_to_stand_still():
     silent = link("mount", False, [0] * 6, [1e-4] * 6) | {"p_value": None}
     assert "nothing else moved" not in moved_sentence([LIDAR, silent])
-    assert moved_sentence([LIDAR, silent]).endswith("of mount the new data say nothing.")
+    assert moved_sentence([LIDAR, silent]).endswith("the new data do not determine mount.")
 
 
 def test_the_workbench_says_what_moved():

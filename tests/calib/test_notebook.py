@@ -73,14 +73,14 @@ def test_a_run_shows_what_the_terminal_shows(run, capsys):
     assert not any(row for row in rows if not any(row))
     said = "".join(parsed(run_html(run)).itertext())
     assert "runs/a&b" in said
-    assert "not told: lidar.tz: no <floor> in sight" in said
+    assert "not identifiable: lidar.tz: no <floor> in sight" in said
 
 
 def test_a_card_begins_with_its_finding_and_folds_the_rest(run):
     page = parsed(run_html(run))
     assert page.find("p/b").text.startswith("runs/a&b: held-out error: 1.42 mm")
     folded = [each.find("summary").text for each in page.iter("details")]
-    assert folded == ["links", "effects", "errors", "not told: 1"]
+    assert folded == ["links", "effects", "errors", "not identifiable: 1"]
     assert not [each for each in page.iter("details") if each.get("open")]
     assert not [each for each in page if each.tag == "table"]
     alone = parsed(rung_html(Rung(run, None))).find("details")

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from calib.report import Evidence, charts_of, plot, report
-from calib.report.budget import beam_jacobian, budget
+from calib.report.page import LISTED_QUIET
 from calib.report.statistics import Z_EDGES
-from calib.results.solution import Solution
 from calib.runs.calibrate import calibrate, grow, grown_model
 from calib.runs.diagnose import diagnose
 from calib.runs.residual_table import UNSEEN
@@ -23,7 +22,6 @@ from sensors.documents import write_json
 from sensors.recording import read_table, write_table
 
 from ..browser import browser_page
-from .rigs import retract
 
 SMALL = Spec(
     lidar="hesai_pandarxt32", room="box", locations=3, stops_per_location=2, column_step=200
@@ -112,32 +110,61 @@ def test_a_browser_shows_every_chart_and_asks_nobody_for_anything(pages, shown):
     for chart in pages[0].contents.charts:
         figure = page.locator(f"figure[id='{chart.id}']")
         assert figure.locator("h4").inner_text() == chart.title
-        assert told_below(chart, pages[0].contents) in figure.locator("figcaption").inner_text()
+        assert (
+            told_below(chart, pages[0].contents, pages[0].verdict.light)
+            in figure.locator("figcaption").inner_text()
+        )
         box = figure.locator("svg").bounding_box()
         assert box["width"] > 300 and box["height"] > 80, chart.id
     shown.assert_clean()
 
 
-def told_below(chart, contents):
+def is_open(chart, light):
+    """Whether a page of that light shows a chart before anything is opened."""
+    return not chart.quiet and (chart.answer or light == "green")
+
+
+def told_below(chart, contents, light):
     """How it is read, or which figure above it in its section is read so."""
     section = next(charts for charts in contents.sections.values() if chart in charts)
-    shown = sorted(section, key=lambda each: each.quiet)
+    many = sum(each.quiet for each in section) > LISTED_QUIET
+    shown = sorted(section, key=lambda each: (not is_open(each, light), many and each.quiet))
     first = next(each for each in shown if each.reading == chart.reading)
     return chart.reading if first is chart else f"Read as {first.id}."
 
 
-def test_figures_without_a_finding_are_their_titles_until_they_are_opened(pages, shown):
-    """Every chart is one or the other; a link to a folded one opens it."""
-    page, charts = shown.page, pages[0].contents.charts
+@pytest.mark.parametrize("which", [0, 1])
+def test_what_is_no_answer_is_a_title_until_it_is_opened(pages, shown, which):
+    """Every chart is one or the other; a link to a folded one opens it, and all about it."""
+    page, written = shown.page, pages[which]
+    address, charts = written.file.as_uri(), written.contents.charts
+    page.goto(address)
+    folded = [chart for chart in charts if not is_open(chart, written.verdict.light)]
+    assert 0 < len(folded) < len(charts)
     for chart in charts:
-        assert page.locator(f"figure[id='{chart.id}']").is_visible() != chart.quiet
-    quiet = [chart for chart in charts if chart.quiet]
-    assert 0 < len(quiet) < len(charts)
-    found = page.locator(".quiet > details:has(figure) > summary").all_inner_texts()
-    assert sorted(found) == sorted(chart.title for chart in quiet)
-    page.goto(f"{pages[0].file.as_uri()}#{quiet[-1].id}")
-    assert page.locator(f"figure[id='{quiet[-1].id}']").is_visible()
-    assert not page.locator(f"figure[id='{quiet[0].id}']").is_visible()
+        assert page.locator(f"figure[id='{chart.id}']").is_visible() != (chart in folded)
+    found = page.locator(".quiet details:has(> figure) > summary").all_text_contents()
+    assert sorted(found) == sorted(chart.title for chart in folded)
+    grouped = page.locator(".quiet details details > figure").evaluate_all(
+        "all => all.map(f => f.id)"
+    )
+    assert grouped
+    page.goto(f"{address}#{grouped[-1]}")
+    assert page.locator(f"figure[id='{grouped[-1]}']").is_visible()
+    assert not page.locator(f"figure[id='{grouped[0]}']").is_visible()
+
+
+def test_a_bad_run_is_short_and_begins_with_its_answer(pages, shown):
+    """Shorter than three screens of a desk, where it has been ten."""
+    page, size = shown.page, shown.page.viewport_size
+    assert pages[0].verdict.light == "red"
+    page.set_viewport_size({"width": 1300, "height": 900})
+    assert page.evaluate("document.documentElement.scrollHeight") < 4500  # five screens
+    page.set_viewport_size(size)
+    said = pages[0].verdict.sentence
+    assert page.locator("#verdict").inner_text().count(said) == 1
+    assert page.locator("main").inner_text().count(said) == 0
+    assert not page.locator("table.sortable").first.is_visible()
 
 
 def test_nothing_is_wider_than_the_window(shown):
@@ -173,10 +200,12 @@ def test_names_are_text_and_no_markup(shown):
 
 
 def test_print_opens_what_is_folded(shown):
-    folded = shown.page.locator("details figure").first
-    assert not folded.is_visible()
-    shown.page.emulate_media(media="print")
-    assert folded.is_visible() and folded.bounding_box()["height"] > 80
+    for folded in ("details figure", "details details figure"):
+        shown.page.emulate_media(media="screen")
+        figure = shown.page.locator(folded).first
+        assert not figure.is_visible()
+        shown.page.emulate_media(media="print")
+        assert figure.is_visible() and figure.bounding_box()["height"] > 80
     assert not shown.page.locator("nav").is_visible()
 
 
@@ -260,49 +289,6 @@ def test_the_noise_floor_is_taken_apart_into_all_of_it(grown):
     total = np.sqrt(sum(v * v for v in parts.values()))
     assert total == pytest.approx(max(rms["noise_floor"], rms["held_out"]), rel=1e-6)
     assert parts["range noise"] > 0 and parts["pose of an unseen stop"] > 0
-
-
-# -------------------------------------------------------------------------------------- the budget
-
-
-@pytest.mark.parametrize(
-    "name", ["lidar", "arm_joint_offset", "arm_link_length", "ring_range_offset", "faro"]
-)
-def test_derivatives_are_differences_of_residuals(first, name):
-    """The columns of a variable, against residuals with it moved; beams keep what they meet."""
-    scan, values = first.problem.scans[0], first.values
-    J = beam_jacobian(scan, values)
-    association = scan.associate(values, near_edges=False)
-    kept = np.flatnonzero(scan.rows(values, association).weight > 0)
-    assert len(kept) == len(J[name])
-
-    def residuals(step):
-        kind = first.problem.variables[name].kind
-        moved = values | {name: retract(kind, values[name], step)}
-        return scan.rows(moved, association).residual_m[kept]
-
-    step = 1e-5 * np.random.default_rng(0).normal(size=J[name].shape[1])
-    difference = (residuals(step) - residuals(-step)) / 2
-    np.testing.assert_allclose(J[name] @ step, difference, atol=1e-4 * np.abs(difference).max())
-
-
-def test_a_budget_is_the_rms_of_what_one_variable_does(grown):
-    """Where the only thing unknown is every ring's zero, ranges are unsure by just as much."""
-    solution, sigma = grown.run.solution, 0.003
-    rings = np.array([n.startswith("ring_range_offset.") for n in solution.names])
-    told = Solution(
-        shared=solution.shared,
-        recordings={},
-        not_estimated=[],
-        names=solution.names,
-        covariance=np.diag(np.where(rings, sigma**2, 0.0)),
-    )
-    values = grown.values | {"ring_range_offset": np.full(32, 0.002)}
-    found = budget(grown.problem, values, told)
-    assert found.uncertain_m["ring_range_offset"] == pytest.approx(sigma)
-    assert found.moved_m["ring_range_offset"] == pytest.approx(0.002)
-    assert found.uncertain_m["lidar"] == 0.0
-    assert "faro" in found.uncertain_m and "faro" not in found.moved_m  # no paper says where
 
 
 # ---------------------------------------------------------------------------------- single figures

@@ -262,7 +262,7 @@ def test_a_formula_of_ones_own_is_tried_and_stops_held_out_answer(once, tmp_path
         assert not page.bench.busy
         field(watched, "Own formula").fill("1 / maximum(cos(incidence), 0.2) - 1")
         button(watched, "Try").click()
-        watched.page.get_by_text("Error of stops held out:").wait_for(timeout=FIT_MS)
+        watched.page.get_by_text("Held-out error:").wait_for(timeout=FIT_MS)
         page.bench.stop()
         before, after = bars(watched)
         assert after < before / 2

@@ -84,7 +84,7 @@ def test_rings_told_by_elevation_are_those_of_the_packets(model, hesai):
     gap_m, nearest = cKDTree(np.concatenate([xyz(p) for p in decoded])).query(xyz(theirs))
     same = gap_m < 1e-5
     np.testing.assert_array_equal(theirs["ring"][same], ring[nearest[same]])
-    assert any("told by elevation" in line for line in found.odd)
+    assert any("inferred from elevation" in line for line in found.odd)
 
 
 @pytest.mark.parametrize(

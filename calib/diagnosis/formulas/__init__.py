@@ -1,4 +1,4 @@
-"""What nobody has named: its formula, from the residuals of a fit."""
+"""Residual structure: its formula, from the residuals of a fit."""
 
 from __future__ import annotations
 

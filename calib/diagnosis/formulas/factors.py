@@ -155,7 +155,8 @@ class Factor:
 
 
 def covariates_of(view: View) -> Iterator[tuple[str, np.ndarray]]:
-    """Names and columns that residuals may hang on: (N,), or (1,) where one value holds for all."""
+    """Names and columns that residuals may depend on: (N,), or (1,) where one value holds for
+    all."""
     for name in view.columns:
         if name in NOT_COVARIATES or name.startswith(("moved.", "travel.")):
             continue

@@ -83,7 +83,7 @@ class Formula:
     Args:
         parts: its terms; amounts are in m, or in rad of a joint.
         steps: how each of them was found.
-        rms_m: of what it changes the residuals by, beyond what the model takes on.
+        rms_m: of what it changes the residuals by, beyond what the model absorbs.
         seen: covariate -> its least and largest value.
         picture: of residuals over two of the covariates, as measured, as the formula has them and
             what is left; see `picture_of`.

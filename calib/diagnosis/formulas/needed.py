@@ -20,7 +20,7 @@ CLEAR = 3.0
 def needed(
     model: Projection, terms: Sequence[Term], columns: Sequence[np.ndarray]
 ) -> list[list[int]]:
-    """Of each term the columns that the data need: not those that the model takes on, nor those
+    """Of each term the columns that the data need: not those that the model absorbs, nor those
     that chance, or other constants, explain."""
     kept = [list(range(c.shape[1])) for c in columns]
     while True:
@@ -98,7 +98,7 @@ def _alone(model: Projection, term: Term, kept: Sequence[int], column: int) -> f
 
 
 def _taken_on(model: Projection, columns: np.ndarray) -> np.ndarray:
-    """Which columns (N, k) the model, or those before, can take on."""
+    """Which columns (N, k) the model, or those before, absorb."""
     kept, _ = model.off(columns)
     root = np.sqrt(model.weight)[:, None]
     size = np.sqrt(np.square(root * columns).sum(axis=0))

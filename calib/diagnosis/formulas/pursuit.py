@@ -3,7 +3,7 @@
 Orthogonal matching pursuit (Pati, Rezaiifar and Krishnaprasad 1993) on the beams' table: of all
 covariates those that a smooth function needs; of all products of their `factors` that which
 explains most, its constants refined; beside it the next, until nothing stands out. Where several
-forms do equally well, stop by stop (Vuong 1989), the simplest is taken and the others are told.
+forms do equally well, stop by stop (Vuong 1989), the simplest is taken and the others are listed.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ RIVALS = 2  # sets of covariates, beside the best one, over which forms are trie
 INSTEAD = 0.8  # of the best set's statistic that another must explain for that
 AS = {"ring": "elevation_rad"}  # what goes along with another covariate
 COVERS = 0.9  # of what a form explains, that a smooth function must for the form to be one of them
-SAME = 1e-6  # of what two forms explain: one is the other and what the model takes on
+SAME = 1e-6  # of what two forms explain: one is the other and what the model absorbs
 AT_ONCE = 400  # columns: bounds the memory
 
 
@@ -133,7 +133,9 @@ def pursue(
         columns = [s.form.term.columns(table.covariates) for s in found]
         fitted = table.beside(np.hstack(columns)).projection() if found else table.projection()
         smooths = screen_smooths(
-            fitted, bases, lambda done, total: progress("what residuals hang on", done, total)
+            fitted,
+            bases,
+            lambda done, total: progress("searching covariates of the residuals", done, total),
         )
         step = _step(fitted, bases, smooths, alpha)
         if step is None or step.p_adjusted >= alpha:

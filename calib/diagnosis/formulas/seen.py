@@ -1,4 +1,4 @@
-"""Where an effect that only describes was seen, and whether it is used beyond that."""
+"""Where an empirical effect was observed, and whether it is used beyond that."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ BEYOND = 0.05
 
 
 class Reach:
-    """From where to where the columns go that effects hang on, batch by batch.
+    """From where to where the columns go that effects depend on, batch by batch.
 
     Args:
         effects: those with `Effect.seen` are asked about.
@@ -57,8 +57,8 @@ class Reach:
         if not beyond:
             return ""
         return (
-            f"{effect.name} only describes what was measured: it was seen at "
-            f"{' and at '.join(beyond)}; what it says beyond is a guess."
+            f"{effect.name} is empirical: it was observed at "
+            f"{' and at '.join(beyond)}; beyond that it extrapolates."
         )
 
 

@@ -1,8 +1,8 @@
-"""What a residual hangs on: smooth functions of one, two or three covariates, tested together.
+"""What a residual depends on: smooth functions of one, two or three covariates, tested together.
 
 Every column that beams or stops have is looked at, alone, in pairs, and with the best pairs a
-third. One price is paid for all looks (Westfall and Young 1993), and stops and surfaces are the
-clusters, as for the catalogue's effects.
+third. The p-value is adjusted for all tests (Westfall and Young 1993), and stops and surfaces are
+the clusters, as for the catalogue's effects.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from calib.diagnosis.screen import by_rank, looked
 # three times over its range; finer things are found alone or as formulas.
 KNOTS = {1: 12, 2: 5, 3: 3}
 TURN_KNOTS = {1: 24, 2: 8, 3: 6}  # of azimuth, evenly round: 4 would not see two waves in a turn
-STOPS_A_KNOT = 5  # of columns of the stops, as of bins: with fewer, tests say nothing
+STOPS_A_KNOT = 5  # of columns of the stops, as of bins: with fewer, tests have no power
 FEW = 8  # values of a column, up to which each is a class of its own
 MOST_THIRDS = 2  # pairs to which a third covariate is tried; also threes, by their product alone
 AT_ONCE = 200  # of threes: bounds the memory

@@ -1,6 +1,6 @@
-"""Some of the beams at a solution, with all that they may hang on: a table to try formulas on.
+"""Some of the beams at a solution, with all that they may depend on: a table to try formulas on.
 
-A formula is a column of the range: what it adds to each beam. What of it the model can take on
+A formula is a column of the range: what it adds to each beam. What of it the model absorbs
 (poses, links, ring zeros, parts of surfaces) is projected off, exactly as for an effect of the
 catalogue; here for so few beams that thousands of columns are tried in seconds.
 """
@@ -227,7 +227,7 @@ class Projection:
 
     def fitted(self, columns_m: np.ndarray) -> tuple[Projection, np.ndarray]:
         """With columns (N, k) fitted beside the model, and what they are multiplied by (k,); 0 of
-        what the model can take on."""
+        what the model absorbs."""
         kept, taken = left = self.off(columns_m)
         theta = self._test(columns_m, left).estimate()
         beside = replace(self, left_m=self.left_m - kept @ theta, step=self.step - taken @ theta)
@@ -235,7 +235,7 @@ class Projection:
 
     def off(self, columns_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """What is left of columns (N, Q) of the range, in the beams (N, Q), and how the model's
-        unknowns (U, Q) take on the rest."""
+        unknowns (U, Q) absorb the rest."""
         table, weighted = self.table, self.weight[:, None] * columns_m
         taken = cho_solve(self.factor, -(table.chain.T @ (table.twists_T @ weighted)))
         return columns_m + table.twists @ (table.chain @ taken), taken

@@ -1,6 +1,6 @@
 """Which mechanisms could be behind a formula: a formula describes, physics explains.
 
-Known effects that hang on the same covariates look like it under other conditions; mechanisms and
+Known effects that depend on the same covariates look like it under other conditions; mechanisms and
 experiments are those of calibration practice.
 """
 
@@ -11,7 +11,7 @@ from typing import Any
 
 from calib.effects import CATALOGUE, Site
 
-# Covariate -> a mechanism by which ranges hang on it, and the experiment that would confirm it.
+# Covariate -> a mechanism by which ranges depend on it, and the experiment that would confirm it.
 # Range, ring, azimuth, incidence and intensity after Lichti 2007 and Glennie and Lichti 2010,
 # temperature after Glennie and Lichti 2011; the others from how the instruments are built.
 MECHANISMS = {
@@ -60,7 +60,7 @@ JOINT = (
     "cables pull on the LiDAR or its supply sags as the arm moves, or the arm bends",
     "the same view reached with other values of this joint",
 )
-# The same of what hangs on an arm's joint: Hollerbach, Khalil and Gautier 2016.
+# The same of what depends on an arm's joint: Hollerbach, Khalil and Gautier 2016.
 OF_ARM = {
     "payload_kg": (
         "gears and links bend under the load",
@@ -96,7 +96,7 @@ def why(
         of_arm: whether the formula is one of a joint.
 
     Returns:
-        ``known``: effects of the catalogue that hang on some of them and on nothing else;
+        ``known``: effects of the catalogue that depend on some of them and on nothing else;
         ``mechanisms``: covariate -> one, and ``experiments``: covariate -> what would confirm it.
     """
     mine = set(covariates)

@@ -115,7 +115,7 @@ class Place:
             "unit": "m",
             "sigma": max(0.01, 2.0 * abs(self.residual_m)),
             "basis": [both],
-            "what": f"Empirical: it describes and explains nothing, in an interval of {name} whose "
+            "what": f"Empirical, without a known cause: an interval of {name} whose "
             "beams were rejected.",
         }
 
@@ -188,7 +188,7 @@ class Rejects:
         return said + "."
 
     def unexplained(self) -> list[dict[str, Any]]:
-        """Its structure as diagnosis.json lists structure without a name."""
+        """Its structure as diagnosis.json lists residual structure."""
         return [
             {
                 "covariates": [place.covariate],

@@ -55,9 +55,9 @@ class Diagnosis:
         misfit: instrument -> how many times larger than their sigmas its residuals are.
         curves: mean residual against covariates.
         too_few: whether the stops are too few to say anything, whatever the verdict.
-        command: what fits the same without the blunders, or adds the formulas of what has no name,
-            ready to be typed; empty without any.
-        plan: what plans stops that tell apart what these cannot, ready to be typed; or empty.
+        command: what fits the same without the blunders, or adds the formulas of residual
+            structure, ready to be typed; empty without any.
+        plan: what plans stops that separate what these do not, ready to be typed; or empty.
         rejected: what the fit threw away; None without scans, or where nobody looked.
         scatter: how widely things scatter by chance, of the model and of what it lacks.
         detectable: of what is no group of rows: name -> unit -> least size of a mishap to be found.
@@ -90,12 +90,13 @@ class Diagnosis:
     @property
     def worth_adding(self) -> list[str]:
         """Names of the effects that were confirmed, in the order in which to add them; not those
-        that something without a name is dressed up in."""
+        that stand in for residual structure."""
         return worth_adding(self.candidates)
 
     @property
     def formulas(self) -> dict[str, Mapping[str, Any]]:
-        """Name -> the effect that draws what has no name; none beside a verdict that needs none."""
+        """Name -> the effect that draws residual structure; none beside a verdict that needs
+        none."""
         found = [u for u in self.unexplained if self.verdict in (UNNAMED, "missing_effect")]
         return {u["formula"]["name"]: u["formula"] for u in found if "says" in u}
 
@@ -147,7 +148,7 @@ def conclude(
         rejected: what the fit threw away.
         forbids: why the run is not to be believed, whatever its model explains; a clause each.
         rings: whose numbers are wrong, as blunders.
-        formulas: of what has no name.
+        formulas: of residual structure.
     """
     heavy = weighed(found, held_out, summary["rms_mm"])
     found, first = heavy.found, found.looks[0]
@@ -246,10 +247,10 @@ def _leave_most(found: Search, held_out: Mapping[str, tuple[float, float, float]
 
 
 def _names_hold(found: Search) -> bool:
-    """Whether the names explain as much as a single structure without a name, each at its price; so
+    """Whether the names explain as much as a single residual structure, each at its price; so
     they do where there are none.
 
-    Something that nobody has named is dressed up by a search in several names, each of which takes
+    A search may describe residual structure by several effects, each of which takes
     a part of it; where a name is right, no bins do better.
     """
     if not found.found:
@@ -274,7 +275,8 @@ def _absorbed(found: Search) -> float:
 
 
 def _without_a_name(found: Search, verdict: str) -> list[tuple[Screen, Candidate]]:
-    """What is left without a name; as it stood at first if the first name is not to be believed."""
+    """The residual structure that is left; as it stood at first if the first name is not to be
+    believed."""
     worn = verdict == UNNAMED and bool(found.found) and found.dressed_up(0)
     left, look = (found.at_first, 0) if worn else (found.unnamed, -1)
     return [(found.looks[look].unnamed, c) for c in left]
@@ -287,7 +289,7 @@ def _structure(
     thrown: Sequence[Mapping[str, Any]],
     doubt: Candidate | None,
 ) -> list[Mapping[str, Any]]:
-    """What has no name: formulas, or bins where there are none, be they in doubt; and what was
+    """Residual structure: formulas, or bins where there are none, be they in doubt; and what was
     `thrown` away."""
     taken = found.looks[0].stand.model.names
     if formulas.formulas:
@@ -321,5 +323,5 @@ def _untestable(look: Look) -> dict[str, str]:
         if missing := lacking(effect, look.stand.sources, look.columns):
             found[effect.family] = f"the recordings lack {', '.join(missing)}"
         elif effect.family in gauges:
-            found[effect.family] = "not observable: the model can take on all that it does"
+            found[effect.family] = "not identifiable: absorbed by the model"
     return found

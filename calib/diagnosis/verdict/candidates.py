@@ -26,7 +26,7 @@ def candidate_documents(
     Args:
         heavy: what of the search matters.
         held_out: as of `conclude`.
-        unnamed: whether something has no name.
+        unnamed: whether residual structure is left.
         hold: whether the names are to be believed nevertheless, where bins do not do better.
     """
     found = heavy.found
@@ -36,7 +36,7 @@ def candidate_documents(
         each["matters"] = told_of.document() if told_of else None
         worn = bool(each["step"]) and (not hold or found.dressed_up(each["step"] - 1))
         each["dressed_up"] = unnamed and worn
-    # What has no name may scatter as chance does: that is judged once it is in the model.
+    # Residual structure may be random scatter: that is judged once it is in the model.
     chance = [
         each.document(None if unnamed else named + i) for i, each in enumerate(found.chance, 1)
     ]

@@ -93,7 +93,7 @@ class Consequences:
 
     @cached_property
     def _projected(self) -> tuple[np.ndarray, np.ndarray]:
-        """How much (C, Q) of each candidate every value of the calibration takes on, and sigmas."""
+        """How much (C, Q) of each candidate every value of the calibration absorbs, and sigmas."""
         linear = self.look.linear
         _, model, taken = projection(linear, linear.candidates)
         names = [n for n in self.look.stand.problem.calibration if n in linear.at]
@@ -161,7 +161,7 @@ def weighed(
 
 def _sentence(what: str, candidate: Candidate, screen: Screen, told: Matters) -> str:
     return (
-        f"A trace of {what} is there, {1e3 * screen.rms_m(candidate):.2f} mm rms, too small to "
+        f"{what} is significant, {1e3 * screen.rms_m(candidate):.2f} mm rms, and too small to "
         f"matter: it would change the held-out error by {told.held_out_mm:+.3f} mm, and no value "
         f"of the calibration by more than {told.largest_shift_sigmas:.1f} of its sigmas."
     )

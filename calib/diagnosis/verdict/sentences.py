@@ -37,7 +37,7 @@ def sentences_of(
     formulas = [each for each in unexplained if "says" in each]
     for i, step in enumerate(found.found):
         candidate = next(c for c in candidates if c["add"] == step.effect.name)
-        if not (formulas and candidate["dressed_up"]):  # what was tried before helps nobody then
+        if not (formulas and candidate["dressed_up"]):  # what was tried before is of no use then
             out += _step_sentences(step, candidate, found.dressed_up(i))
     if verdict == UNNAMED and found.chance:
         beside = ", ".join(each.effect.name for each in found.chance)
@@ -50,9 +50,9 @@ def sentences_of(
         out = [doubt, *out]
     elif verdict == UNNAMED:
         beside = any(c["step"] and not c["dressed_up"] for c in candidates)
-        what = "Beside what is named here, there" if beside else "There"
+        what = "Besides, there" if beside else "There"
         out = [
-            f"{what} is structure in the residuals that no known effect explains.",
+            f"{what} is residual structure that no known effect explains.",
             *(line for each in formulas for line in _formula_sentences(each, residual)),
             *out,
         ]
@@ -80,7 +80,7 @@ def unconfirmed(candidate: Candidate, rms_mm: Mapping[str, float]) -> str:
         f"The held-out error is {over:.1f} times as large as expected, and no test confirms why. "
         f"Taken one by one, the beams show residuals that depend on {what}, but too few stops or "
         "surfaces see each part of that dependence to rule out chance. Stops that face other "
-        "surfaces would tell."
+        "surfaces would decide it."
     )
 
 
@@ -89,24 +89,26 @@ def _first_sentences(verdict: str, look: Look, traces: bool) -> list[str]:
     stops = stops_of(look)
     if stops < FEWEST:
         return [
-            f"Nothing can be said: {stops} stops are too few to name an effect, as all of them may "
-            f"share one error; {FEWEST} are the least, and 20 are better."
+            f"No test is possible: {stops} stops are too few to name an effect, as all of them "
+            f"may share one error; {FEWEST} are the least, and 20 are better."
         ]
     if verdict != "adequate":
         return []
     out = [
         f"The model is adequate: of {len(look.named.candidates)} known effects and "
         f"{len(look.unnamed.candidates)} kinds of structure none "
-        f"{'that matters ' if traces else ''}stands out from chance."
+        f"{'that matters ' if traces else ''}is significant."
     ]
     described = [effect.name for effect in look.stand.model.effects if effect.seen]
     if described:
-        out.append(f"Part of it only describes, and nobody knows why: {', '.join(described)}.")
+        out.append(
+            f"Part of it is an empirical description without a known cause: {', '.join(described)}."
+        )
     return out
 
 
 def _structure_sentences(unexplained: Sequence[Mapping[str, Any]], residual: str) -> list[str]:
-    """Of structure without a name."""
+    """Of residual structure."""
     out = []
     for each in unexplained[:2]:
         what = " and ".join(words(c) for c in each["covariates"])
@@ -136,13 +138,14 @@ def _formula_sentences(each: Mapping[str, Any], residual: str) -> list[str]:
     ]
     for other in each["alike"][:1]:
         out.append(
-            f"This data cannot tell it from {_other(other)}; {other['separate']} would tell."
+            f"On these data it is not distinguishable from {_other(other)}; {other['separate']} "
+            "would separate them."
         )
     return [*out, *_why_sentences(each["why"])]
 
 
 def _other(form: Mapping[str, Any]) -> str:
-    """Another form: as it is where it is short, else by what it hangs on."""
+    """Another form: as it is where it is short, else by what it depends on."""
     if len(form["says"]) <= SHORT:
         return form["says"]
     return f"another formula, over {' and '.join(words(c) for c in form['covariates'])}"
@@ -163,7 +166,7 @@ def _why_sentences(why: Mapping[str, Any]) -> list[str]:
 
 
 def _step_sentences(step: NamedEffect, candidate: Mapping[str, Any], worn: bool) -> list[str]:
-    """Of a named effect; `worn` where bins without a name explain more than it does."""
+    """Of a named effect; `worn` where bins explain more than it does."""
     before, after = (candidate["held_out_rms_mm"][k] for k in ("before", "after"))
     if candidate["dressed_up"]:
         why = "a generic function of other covariates (bins) explains more"
@@ -181,8 +184,9 @@ def _step_sentences(step: NamedEffect, candidate: Mapping[str, Any], worn: bool)
     ]
     for rival in candidate["rivals"][:LISTED]:
         out.append(
-            f"This data cannot tell it from {rival['effect']} (odds {rival['odds']:.1f} to 1); "
-            f"{rival['separate']} would."
+            f"On these data it is not distinguishable from {rival['effect']} (odds "
+            f"{rival['odds']:.1f} to 1); "
+            f"{rival['separate']} would separate them."
         )
     return out
 

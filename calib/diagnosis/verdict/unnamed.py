@@ -17,7 +17,7 @@ from calib.effects.own.formula import FormulaEffect
 from calib.results.errors import Errors
 from calib.solve.fit import Progress
 
-ALIKE = 3  # other forms that are told
+ALIKE = 3  # other forms that are listed
 Falls = Mapping[str, tuple[float, float, float]]
 
 

@@ -41,7 +41,7 @@ class FormulaFile(Document):
         parameters: their names; numbered where there are none.
         start: where a fit begins, a number per parameter; 0 where there are none. Beams that are
             off by more than noise explains are rejected until the effect is about right.
-        seen: of one that only describes what was measured: column -> its least and largest value
+        seen: of an empirical effect: column -> its least and largest value
             there. Where it is used beyond that, a warning says so.
         what, typical, source: for its page.
     """

@@ -46,6 +46,7 @@ def ladder(evidence: Evidence) -> Iterator[Chart | Absent]:
         + (f" A diamond: {FORMULA}." if any(rung.empirical for rung in evidence.rungs) else ""),
         lambda: _ladder(evidence),
         wide=True,
+        answer=True,
     )
 
 
@@ -94,10 +95,10 @@ def variance(evidence: Evidence) -> Iterator[Chart | Absent]:
         if left > floor
         else f"The largest part of what is expected is the {largest}: {parts[largest]:.2f} mm, "
         f"{100 * parts[largest] ** 2 / floor**2:.0f} % of the variance",
-        "Independent parts, which add up in squares. Range and angle noise and the reference are "
-        "what the rows' own sigmas hold; the pose is what is not known of where the LiDAR is at a "
-        "stop that the fit never saw, and chance what each stop draws anew. These make up the "
-        "expected error; what the error has beyond it nothing explains.",
+        "Independent parts, which add in squares. Range noise, angle noise and reference are the "
+        "rows' own sigmas; pose is the uncertainty of the LiDAR's place at a held-out stop; "
+        "chance is scatter from stop to stop. Together they are the expected error; the rest of "
+        "the error is unexplained.",
         lambda: _bars(parts, "contribution to the rms error, mm"),
     )
 
@@ -142,10 +143,10 @@ def scatter(evidence: Evidence) -> Iterator[Chart | Absent]:
     yield Chart(
         "scatter",
         f"Residuals are {says} their sigmas ({width:.2f} of them); {lost:.1f} % were thrown out",
-        "How many beams lie how many sigmas off, on a logarithmic scale, against the bell that "
-        "honest sigmas would give. The reference's errors, which the fit takes on surface by "
-        "surface, are in the sigmas, so a good fit is a little narrower; long tails are mixed "
-        "pixels and moved things.",
+        "Share of beams by residual over sigma, on a logarithmic scale, and the normal "
+        "distribution that correct sigmas would give. The sigmas include the errors of the "
+        "reference, which the fit estimates surface by surface, so a good fit is a little "
+        "narrower; long tails are mixed pixels and moved objects.",
         lambda: _scatter(evidence),
     )
 

@@ -1,4 +1,4 @@
-"""What has no name: residuals over what they depend on, the formula found, and what it leaves."""
+"""Residual structure: residuals over what they depend on, the formula found, and what it leaves."""
 
 from __future__ import annotations
 
@@ -114,12 +114,12 @@ def pictures(diagnosis: Mapping[str, Any] | None) -> list[Picture]:
 
 
 def formulas(evidence: Evidence) -> Iterator[Chart | Absent]:
-    """A chart for each formula of what has no name."""
+    """A chart for each formula of residual structure."""
     if evidence.diagnosis is None:
         yield Absent("formula", f"not diagnosed; 'rigcal diagnose {evidence.run.folder}' does it")
         return
     found = charts_of(evidence.diagnosis)
-    yield from found or [Absent("formula", "the diagnosis found no formula of what has no name")]
+    yield from found or [Absent("formula", "the diagnosis found no formula for residual structure")]
 
 
 def charts_of(diagnosis: Mapping[str, Any] | None, narrow: bool = False) -> list[Chart]:
@@ -136,6 +136,7 @@ def charts_of(diagnosis: Mapping[str, Any] | None, narrow: bool = False) -> list
             each.reading,
             partial(each.figure, narrow),
             wide=len(each.covariates) > 1,
+            answer=True,
         )
         for i, each in enumerate(found, 1)
     ]

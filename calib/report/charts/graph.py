@@ -1,4 +1,4 @@
-"""The factor graph: which rows speak of which unknowns, and how much each kind of them tells."""
+"""The factor graph: which rows depend on which unknowns, and the information of each kind."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Row:
     Args:
         name: as it is drawn.
         dim: of how many numbers.
-        kinds: kinds of rows that speak of it.
+        kinds: kinds of rows that depend on it.
         bits: kind -> bits per parameter that would be lost without it; empty of a group.
         beyond: bits per parameter beyond CAD; None where CAD says nothing, and of a group.
     """
@@ -63,11 +63,11 @@ def graph(evidence: Evidence) -> Iterator[Chart | Absent]:
     """The factor graph of the run."""
     yield Chart(
         "graph",
-        "The factor graph: what speaks of what, and how much each kind of rows tells",
-        "Left: the unknowns, and of how many numbers each is; below the dotted line those that are "
-        "estimated along and not reported. A line joins an unknown to the rows that speak of it, "
-        "the thicker the more they tell. Right: bits per parameter that would be lost without the "
-        "rows of one kind, and how many all of them tell over CAD. A bit halves a sigma.",
+        "The factor graph: which rows constrain which unknowns, and their information",
+        "Left: the unknowns with their dimensions; below the dotted line those that are "
+        "estimated and not reported. A line joins an unknown to the rows that depend on it, "
+        "thicker for more information. Right: bits per parameter that would be lost without the "
+        "rows of one kind, and the bits that all rows add to CAD. One bit halves a sigma.",
         lambda: _draw(*_found(evidence)),
         wide=True,
     )

@@ -43,15 +43,15 @@ def groups(evidence: Evidence) -> Iterator[Chart | Absent]:
         if loud
         else f"Of {len(found)} groups of rows none is further off than chance allows; the furthest "
         f"is {worst}, at {times(found[worst][1])} of it",
-        "How far each group of rows that one mishap would spoil together is off from what all "
-        "others say of it, over the most that chance allows when so many are looked at. What lies "
-        "above the dashed line is something that happened there; what the diagnosis left out is "
-        "drawn as it was before. Small dots: single joints and, after the stops, targets, values "
-        "on paper (cad) and surfaces (mesh). What nothing contradicts cannot be told, and is not "
-        "here.",
+        "How far each group of rows that one blunder would spoil is off from what all other rows "
+        "predict, over the limit of the test, which is adjusted for all groups that are tested. "
+        "Above the dashed line is a blunder; what the diagnosis left out is drawn as it was "
+        "before. Small dots: single joints and, after the stops, targets, nominal values (cad) "
+        "and surfaces (mesh). Groups without redundancy cannot be tested and are not drawn.",
         lambda: _groups(found, loud, stops),
         wide=True,
         quiet=not loud,
+        answer=True,
     )
 
 

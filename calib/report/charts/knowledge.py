@@ -38,10 +38,11 @@ def findings(evidence: Evidence) -> Iterator[Chart | Absent]:
         f"Missing: {', '.join(confirmed)}"
         if confirmed
         else f"Of {len(candidates)} effects that were tested none is confirmed",
-        "How much each effect that the model lacks would explain of what the model cannot take on, "
-        "best first, with its p-value after all that was looked at. Blue ones are confirmed; of "
-        "the others, many explain the same as a confirmed one, less well.",
+        "How much each effect would explain of what the model does not absorb, largest first, "
+        "with its p-value adjusted for multiple testing. Blue: confirmed. Many of the others "
+        "explain part of the same residuals as a confirmed one.",
         lambda: _findings(candidates[:DRAWN_CANDIDATES]),
+        answer=True,
     )
 
 
@@ -72,14 +73,13 @@ def budget(evidence: Evidence) -> Iterator[Chart | Absent]:
         most = max(moved, key=moved.get)
         told = f"What changed {what}s most is {most}: by {1e3 * moved[most]:.2f} mm rms"
     else:
-        told = f"No link or effect came from paper in a way that changes a {what}"
+        told = f"No estimate of a link or an effect changes a {what}"
     yield Chart(
         "budget",
         told,
-        f"Left: by how much each link's or effect's estimate changed a {what} from paper. Right: "
-        f"by how much a {what} may still be off for what is not known of it, all others held. What "
-        f"links trade with each other counts in each, so these may exceed the error of the whole. "
-        f"rms over {looked}.",
+        f"Left: by how much the estimate of each link or effect changed a {what} from its nominal "
+        f"value. Right: how uncertain it leaves a {what}, all others held fixed. Correlated parts "
+        f"count in each, so these may exceed the uncertainty of the whole. rms over {looked}.",
         lambda: _budget(spent, what),
         wide=True,
     )
@@ -89,7 +89,7 @@ def _budget(spent: Budget, what: str) -> Figure:
     sides = (spent.moved_m, spent.uncertain_m)
     names = [n for n in spent.uncertain_m if max(s.get(n, 0.0) for s in sides) > NEGLIGIBLE]
     figure, grid = plots.axes(plots.WIDE, 1.0 + 0.3 * max(len(names), 1), 1, 2, sharey=True)
-    labels = (f"changed the {what} by, mm rms", "leaves it unsure by, mm rms")
+    labels = (f"changed the {what} by, mm rms", "leaves it uncertain by, mm rms")
     for ax, side, label, colour in zip(grid[0], sides, labels, (plots.LINES[5], plots.AFTER),
                                        strict=True):  # fmt: skip
         bars = ax.barh(names, [1e3 * side.get(n, 0.0) for n in names], height=0.6, color=colour)
@@ -112,7 +112,7 @@ def correlation(evidence: Evidence) -> Iterator[Chart | Absent]:
     i, k = np.unravel_index(off.argmax(), off.shape)
     yield Chart(
         "correlation",
-        f"{names[i]} and {names[k]} are the most tied: correlation {matrix[i, k]:+.3f}",
+        f"{names[i]} and {names[k]} are the most correlated: {matrix[i, k]:+.3f}",
         f"Correlation of the estimates that are tied to another by more than {TIED}, or lie in a "
         f"weak direction: near +1 or -1 the data see only a sum or a difference of the two. Of an "
         f"effect with many parameters their mean stands for all.",

@@ -196,8 +196,8 @@ def moves(evidence: Evidence) -> Iterator[Chart | Absent]:
         "moves",
         f"The data halved the uncertainty, or better, of {told} of {free} numbers of the links",
         "A dot per axis of each link: how far from CAD, in sigmas of CAD, with its 95 % interval. "
-        "The grey band is what CAD allows (95 %). An interval as wide as the band means that the "
-        "data said nothing and the number is CAD's.",
+        "The grey band is what CAD allows (95 %). An interval as wide as the band is "
+        "prior-dominated: the data add nothing to CAD.",
         lambda: _moves(rows),
         wide=True,
         quiet=True,
@@ -243,9 +243,10 @@ def effects(evidence: Evidence) -> Iterator[Chart | Absent]:
             "effects",
             f"{clear} of {len(z)} parameters of effects differ clearly from zero; the clearest is "
             f"{max(z, key=z.get)}",
-            "A panel per effect, a dot per parameter with its 95 % interval. Zero is what paper "
-            "says; instruments are corrected by taking the effect off, geometry by adding it.",
+            "A panel per effect, a dot per parameter with its 95 % interval. Zero is the nominal "
+            "value; instruments are corrected by taking the effect off, geometry by adding it.",
             lambda: _few(few),
+            quiet=True,
         )
     else:
         yield Absent("effects", "the model has no effect of few parameters")
@@ -277,7 +278,7 @@ def _many_chart(fitted: VariableEstimate, name: str) -> Chart:
         name,
         f"{fitted.variable}: its parameters differ by {_spread(fitted)}",
         "The estimate of each parameter, in the order of solution.yaml, with its 95 % band; zero "
-        "is what paper says.",
+        "is the nominal value.",
         lambda: _curve(fitted, "parameter"),
         quiet=True,
     )

@@ -95,8 +95,8 @@ def moves_from_cad(evidence: Evidence) -> Iterator[Chart | Absent]:
         f"{loud} of {len(found)} CAD values are not where their sigmas say; the furthest is {told}"
         if loud
         else f"CAD values are where their sigmas say; the furthest is {told}",
-        f"By how many sigmas of what was known before each frame (its parameter that moved most) "
-        f"and each parameter of the geometry moved; the dashed line is {FAR_FROM_CAD:g}. Far "
+        "How far each frame (its parameter that moved most) and each parameter of the geometry "
+        f"moved, in sigmas of its prior; the dashed line is {FAR_FROM_CAD:g}. Far "
         f"beyond it the value in rig.yaml or in the URDF is wrong, a sign or a unit say, or the "
         f"estimate is.",
         lambda: _moves(dict(list(found.items())[:MOST_BARS])),
@@ -116,5 +116,5 @@ def _moves(found: Mapping[str, Mapping[str, Any]]) -> Figure:
     ax.invert_yaxis()
     ax.margins(x=0.2)
     ax.grid(False, axis="y")
-    ax.set_xlabel("moved by, in sigmas of what was known before")
+    ax.set_xlabel("moved by, in sigmas of the prior")
     return figure

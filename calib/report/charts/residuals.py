@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from calib.report.plots import Axes, Figure
 
 NO_BEAMS = "there are no scans, so no residuals of beams"
-FRONT = {*FIRST, "stop", "elapsed_s", "recording"}  # shown if residuals hang on it; temperature too
+# Shown if residuals depend on it; temperature too.
+FRONT = {*FIRST, "stop", "elapsed_s", "recording"}
 ALWAYS = ("incidence_rad", "range_m")  # shown whatever is left
 AXIS_UNITS = {
     "_rad": ("deg", 180.0 / np.pi),
@@ -48,9 +49,9 @@ def curves(evidence: Evidence) -> Iterator[Chart | Absent]:
         yield Chart(
             curve_id(name),
             _title(name, now, was, evidence.before),
-            "Mean of measured less predicted before and now, now alone, and how widely single "
-            "residuals scatter. Bands hold the mean with 95 %, stops and surfaces counted, not "
-            "points; where one holds zero, nothing is left to explain there.",
+            "Mean residual (measured less predicted) before and now, now alone, and the scatter "
+            "of single residuals. Bands are 95 % intervals of the mean, clustered by stop and "
+            "surface; where one contains zero, no significant residual is left.",
             lambda now=now, was=was: _curve(now, was, evidence.before),
             quiet=name not in ALWAYS and not (front and outside(now)[2]),
         )
@@ -109,7 +110,7 @@ def _title(name: str, now: ResidualCurve, was: ResidualCurve | None, before: str
     if hangs:
         return f"The residuals depend on {what}: {1e3 * now.rms_m:.2f} mm rms{earlier}"
     inside = f"{bins - out} of {bins} bins within their band"
-    return f"No clear trace of {what} is left ({inside}{earlier})"
+    return f"No significant dependence on {what} is left ({inside}{earlier})"
 
 
 def _curve(now: ResidualCurve, was: ResidualCurve | None, before: str) -> Figure:
@@ -196,7 +197,7 @@ def ring_map(evidence: Evidence) -> Iterator[Chart | Absent]:
         f"Every cell is the mean residual of all stops in one ring and {360 / now.shape[1]:.3g} "
         "degrees of azimuth: orange reads long, purple short, grey was not seen. Each map has a "
         "scale of its own. Stripes along a ring are range zeros of rings; stripes across rings "
-        "hang on the encoder, or on what is bolted to the LiDAR.",
+        "come from the encoder or the mount.",
         lambda: _ring_map(was, now, evidence.before),
         wide=True,
     )

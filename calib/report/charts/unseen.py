@@ -43,8 +43,8 @@ def unseen(evidence: Evidence) -> Iterator[Chart | Absent]:
         f"{of}: {unseen_mm:.2f} mm rms where the fit did not see it, {seen_mm:.2f} mm where it did",
         "A row per stop, the worst first, and all maps on one scale. Left to right: "
         f"{evidence.before}; in the fit of all stops; in a fit without it. Orange reads long, "
-        "purple short, grey was not seen. An error that shows on the right alone is one that the "
-        "fit hides where it sees the stop.",
+        "purple short, grey was not seen. An error that shows on the right alone is absorbed by "
+        "the fit where it uses the stop.",
         lambda: _unseen(stops[:MOST_STOPS]),
         wide=True,
     )

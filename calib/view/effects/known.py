@@ -18,7 +18,7 @@ from calib.view.shown.columns import comparable
 SAME = 1e-6  # relative: one error, read from two files
 # What two runs must share, beside recordings and effects, for one to tell of the other.
 ASKED = ("fixed", "without", "hold_out", "folds", "prior_sha256")
-UNKNOWN = "What stops held out make of it is not known before the refit."
+UNKNOWN = "The held-out error is not known before the refit."
 Effects = Mapping[str, Any]  # name -> name, or document of a formula
 
 
@@ -105,7 +105,7 @@ def _alike(one: Any, other: Any) -> bool:
 
 
 def _fall(before: float, after: float) -> str:
-    return f"Expected of stops held out: {before:.2f} → {after:.2f} mm"
+    return f"Expected held-out error: {before:.2f} → {after:.2f} mm"
 
 
 def difference(own: Collection[str], wanted: Effects) -> tuple[dict[str, Any], list[str]]:

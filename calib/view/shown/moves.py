@@ -88,7 +88,7 @@ def parameters(run: Run) -> str:
         where = "" if row.parent is None else f" in {row.parent}, {cad}"
         rows.append([f"<b>{escape(row.variable)}</b>{escape(where)}"])
         for name, cell, unit, told in effect_cells(row):
-            texts = [name, f"{cell} {unit}".strip(), "" if told else "not told"]
+            texts = [name, f"{cell} {unit}".strip(), "" if told else "confounded"]
             rows.append(list(map(escape, texts)))
     return f'<table data-is="parameters" style="width:100%">{"".join(map(_row, rows))}</table>'
 

@@ -59,7 +59,7 @@ class Order:
         if place[-1] + 1 != self.rings:
             raise InputError(
                 f"a cloud has {place[-1] + 1} turns of azimuth, one after another, and the first"
-                f" had {self.rings}: rings cannot be told by the order of its points"
+                f" had {self.rings}: rings cannot be inferred from the order of its points"
             )
         return self.rings - 1 - place if self.downwards else place
 
@@ -79,7 +79,7 @@ def ring_order(xyz_m: Array) -> Order | None:
     step = np.diff(middle)
     if not (np.all(step > 0) or np.all(step < 0)):
         return None
-    why = f"rings are told by the order of the points, in {rings} turns, counted from the lowest up"
+    why = f"rings are inferred from the order of the points, in {rings} turns, from the lowest up"
     return Order(rings, bool(step[0] < 0), why)
 
 
@@ -173,14 +173,14 @@ def _number(middle: Array, origin: Array, models: list[str], xyz_m: Array) -> Gr
     alike = {name: rings for name in models if (rings := _rings_of(name, middle)) is not None}
     if alike:
         name, why = _one_of(alike, xyz_m)
-        why = f"rings are told by elevation, whose {len(middle)} groups are those of {why}"
+        why = f"rings are inferred from elevation, whose {len(middle)} groups are those of {why}"
         elevation = load_lidar(name).elevation_rad.copy()  # of rings with next to no points
         elevation[alike[name]] = middle
         order = np.argsort(elevation)
         return Groups(elevation[order], order, origin, why)
     if len(middle) not in RING_COUNTS:
         return None
-    why = f"rings are told by elevation, in {len(middle)} clear groups, counted from the lowest up"
+    why = f"rings are inferred from elevation: {len(middle)} clear groups, counted from the lowest"
     return Groups(middle, np.arange(len(middle)), origin, why)
 
 

@@ -353,7 +353,7 @@ def _stops(
     stops: Columns = {"stop": np.array([f"row{k:05d}" for k in range(rows)])} | table
     order = np.arange(rows)
     if time_s is None:
-        odd = (*odd, f"{path.name}: {words}; what changes with time cannot be told from it")
+        odd = (*odd, f"{path.name}: {words}; what changes with time cannot be determined from it")
     else:
         order = np.argsort(time_s, kind="stable")
         stops["time_s"] = time_s

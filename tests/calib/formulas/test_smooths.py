@@ -1,4 +1,4 @@
-"""What a residual hangs on: the right covariates first, and nothing where nothing is."""
+"""What a residual depends on: the right covariates first, and nothing where nothing is."""
 
 import numpy as np
 import pytest

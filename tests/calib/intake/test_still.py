@@ -103,7 +103,7 @@ def test_nothing_that_stands_still_is_refused():
     wild.values[:, 1] += 0.5 * np.sin(TIME_S)
     with pytest.raises(InputError, match="--still"):
         find_holds([wild], ())
-    with pytest.raises(InputError, match="no log tells"):
+    with pytest.raises(InputError, match="no log shows"):
         find_holds([], ())
 
 

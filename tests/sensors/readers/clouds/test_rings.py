@@ -83,7 +83,7 @@ def test_rows_of_one_elevation_are_rings():
     mixed = cloud(POINTS[order], shape=(16, 180))
     seen = find_format("c", mixed, Options(lidar="velodyne_vlp16"))
     np.testing.assert_array_equal(seen.layout.points(mixed)["ring"], RING[order])
-    assert any("told by elevation" in line for line in seen.odd)
+    assert any("inferred from elevation" in line for line in seen.odd)
 
 
 @pytest.mark.parametrize(
@@ -112,7 +112,7 @@ def test_two_models_with_one_set_of_elevations_are_told_by_azimuth_steps_or_aske
         downwards = name == "hesai_xt16"
         expected = 15 - ring if downwards else ring
         np.testing.assert_array_equal(seen.layout.points(cloud(points))["ring"], expected)
-        (line,) = [line for line in seen.odd if "told by elevation" in line]
+        (line,) = [line for line in seen.odd if "inferred from elevation" in line]
         assert all(other in line for other in names)
     points, ring, _ = box_scan(VLP16.elevation_rad, 1200)
     with pytest.raises(InputError, match=r"hesai_xt16 and of velodyne_vlp16.*1200 .*--lidar"):

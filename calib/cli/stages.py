@@ -1,0 +1,62 @@
+"""Which stage of a command is under way, of how many, and how much time is left."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One of the stages that a command goes through in their order.
+
+    Args:
+        title: what is done.
+        begins: how the texts of progress within it begin.
+        share: of the command's time; of the preset `default`, on two cores.
+    """
+
+    title: str
+    begins: tuple[str, ...]
+    share: float
+
+
+FIT = (
+    Stage("estimate", ("looking for depth edges", "pass "), 0.62),
+    Stage("sigmas", ("errors in common of rows",), 0.11),
+    Stage("held-out error", ("without ",), 0.19),
+    Stage("residuals", ("nominal residuals", "writing residuals"), 0.08),
+)
+DIAGNOSE = (
+    Stage("tests", ("testing", "looking for depth edges", "fitting", "pass "), 0.67),
+    Stage("rejected beams", ("looking at what was thrown away",), 0.02),
+    Stage("held-out error", ("without ",), 0.05),
+    Stage("formulas", ("reading residuals", "searching covariates"), 0.26),
+)
+
+
+class Staged:
+    """Says of each step of a command in which stage it is, and how much time is left.
+
+    Args:
+        stages: in their order; one that does not occur is passed over. Without any, a step is told
+            as it is.
+    """
+
+    def __init__(self, stages: Sequence[Stage] = ()) -> None:
+        self._stages, self._at, self._end_s = stages, 0, 0.0
+
+    def __call__(self, what: str, elapsed_s: float) -> str:
+        """The text of a step, ``elapsed_s`` after the start. The time left is what the later stages
+        took of a measured run, in proportion; in the first stage it is not known, as the number of
+        its passes is not."""
+        if not self._stages:
+            return what
+        later = range(self._at, len(self._stages))
+        at = next((i for i in later if what.startswith(self._stages[i].begins)), self._at)
+        if at > self._at:
+            self._at = at
+            self._end_s = elapsed_s / sum(stage.share for stage in self._stages[:at])
+        left_s = self._end_s - elapsed_s
+        left = f", about {left_s:.0f} s left" if left_s >= 1.0 else ""
+        return f"{at + 1} of {len(self._stages)}, {self._stages[at].title}{left}: {what}"
