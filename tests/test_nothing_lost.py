@@ -24,17 +24,12 @@ FILES = {
     "report": ["report run", "report run again"],
     "plot": ["plot run chain"],
     "plan": ["plan run"],
+    "effects": ["effects incidence_angle_bias"],
 }
 INSIDE = {"diagnose", "evaluate"}  # what they find stands in the run itself
-READ = {
-    "check",
-    "compare",
-    "effects",
-    "moved",
-    "reproduce",
-    "view",
-}  # view makes runs by the same functions as add
-ENDS = {"report": ".html", "plot": ".png", "plan": ".csv"}
+# view makes runs by the same functions as add
+READ = {"check", "compare", "moved", "reproduce", "view"}
+ENDS = {"report": ".html", "plot": ".png", "plan": ".csv", "effects": ".png"}
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +49,7 @@ def made(tmp_path_factory):
     (folder / "mine/thesis.tex").write_text("all of it")
     (folder / "mine/rig.yaml").write_text("name: begun\n")
     (folder / "link").symlink_to("rec", target_is_directory=True)
-    for end in ENDS.values():
+    for end in sorted({*ENDS.values()}):
         (folder / f"link{end}").symlink_to("run/solution.yaml")
         (folder / f"a_folder{end}").mkdir()
     return folder

@@ -30,6 +30,7 @@ report later -o report.html
 plot run rings -o rings.svg
 plot run rings -o rings.pdf
 plot run rings -o rings.png
+effects incidence_angle_bias -o incidence.png
 export deeper/run -o export
 apply run {rec} -o applied
 """

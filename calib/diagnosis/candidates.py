@@ -126,10 +126,14 @@ class PoseShape(Effect):
     def __init__(
         self, slips: MountSlip, column: str, seen: tuple[float, float], waves: int
     ) -> None:
-        self.slips, self.site, self.of_lidar = slips, slips.site, slips.of_lidar
+        self.slips, self.site = slips, slips.site
         self.column, self.seen, self.waves = column, {column: seen}, waves
         self.covariates = (column,)
         self.name = f"structure:{self.what},{column}"
+
+    @property
+    def of_lidar(self) -> bool:
+        return self.slips.of_lidar
 
     @property
     def what(self) -> str:

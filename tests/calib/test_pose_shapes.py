@@ -1,0 +1,72 @@
+"""A tracked body, the mount or the tracker that moves with a column of the stops: no effect of the
+catalogue does so evenly in temperature, and it is told what moves, and with what."""
+
+import csv
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from calib.diagnosis.candidates import PoseShape
+from calib.effects import CATALOGUE
+from calib.effects.base import View
+from calib.rig import load_rig
+from calib.runs.calibrate import calibrate
+from calib.runs.diagnose import diagnose
+from calib.simulation import Spec, simulate
+
+# Six numbers of a motion are seen over a column in 30 stops or more.
+SPEC = Spec(lidar="hesai_pandarxt32", locations=6, stops_per_location=6, column_step=200)
+WHERE = {"base_markers": "before the arm", "mount_markers": "beyond the arm"}
+MOVED_M = 0.002
+SLIPS = {e.name: e for e in CATALOGUE if e.name.endswith("_slip") and hasattr(e, "moved")}
+
+
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("poses")
+    simulate("tiny", folder / "rec", 1)
+    return load_rig(folder / "rec")
+
+
+@pytest.mark.parametrize("name", sorted(SLIPS))
+def test_each_wave_moves_what_the_slip_moves(rig, name):
+    effect = PoseShape(SLIPS[name], "humidity", (0.2, 0.6), 2)
+    humidity = np.array([0.2, 0.3, 0.4, 0.6, np.nan])
+    tracked = np.tile(np.eye(4), (len(humidity), len(WHERE), 1, 1))
+    columns = {"humidity": humidity, "tracked": tracked}
+    view = View(rig, len(humidity), columns, np.zeros((len(humidity), len(rig.joint_names))))
+    basis = effect.basis(view)
+    assert basis.shape[-1] == len(effect.params(rig)) == 12
+    whole = SLIPS[name].moved(view, np.ones(len(humidity)))
+    first, second = np.split(basis, 2, axis=-1)
+    angle = np.pi * np.array([0.0, 0.25, 0.5, 1.0])
+    for wave, m in ((first, 1), (second, 2)):
+        np.testing.assert_allclose(wave[:4].T, whole[:4].T * np.cos(m * angle), atol=1e-12)
+        assert not wave[4].any() and whole[4].any()  # where the column has a hole
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("body", sorted(WHERE))
+def test_a_body_that_moves_with_temperature_is_told(tmp_path, body):
+    simulate(SPEC, tmp_path / "rec", 1)
+    with (tmp_path / "rec/stops.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    temperature = np.array([float(row["temperature_c"]) for row in rows])
+    u = (temperature - temperature.min()) / np.ptp(temperature)
+    for row, far in zip(rows, MOVED_M * np.cos(np.pi * u), strict=True):
+        if row[f"{body}.x"]:  # it was seen
+            turn = Rotation.from_quat([float(row[f"{body}.q{c}"]) for c in "xyzw"])
+            for c, by in zip("xyz", turn.apply([0.0, 0.0, far]), strict=True):
+                row[f"{body}.{c}"] = float(row[f"{body}.{c}"]) + by
+    with (tmp_path / "rec/stops.csv").open("w", newline="") as file:
+        table = csv.DictWriter(file, rows[0])
+        table.writeheader()
+        table.writerows(rows)
+    run = calibrate([tmp_path / "rec"], tmp_path / "run")
+    diagnose(run)
+    found = run.diagnosis()
+    assert found["verdict"] == "unexplained_structure"
+    assert found["unexplained"][0]["covariates"] == ["temperature_c"]
+    said = " ".join(found["sentences"])
+    assert f"depends on temperature, as where the tracked body {WHERE[body]} moves" in said
