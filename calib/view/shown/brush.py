@@ -14,7 +14,8 @@ HINT = "Drag across the plot, or write two numbers: 2 to 4.5"
 UNLIT = (211, 213, 217)  # fainter than any colour of a scale, on white walls
 # Plots of viser tell a server nothing of what is dragged across them: the page itself writes the
 # range into the field, as a person would. A menu that was used, and a box that was ticked with the
-# mouse, let go of the keyboard, whose keys would go to them and not to the next stop.
+# mouse, let go of the keyboard, whose keys would go to them and not to the next stop: at once, and
+# a menu again when its choice is shown, as it may have taken the keyboard back meanwhile.
 SCRIPT = """
 if (!window.rigcalBrush) {
   window.rigcalBrush = true;
@@ -22,6 +23,10 @@ if (!window.rigcalBrush) {
     if (e.detail && e.target.type === "checkbox") e.target.blur();
     if (e.target.closest("[role=option]")) document.activeElement.blur();
   });
+  window.rigcalLetGo = () => {
+    const used = document.activeElement;
+    if (used?.ariaHasPopup === "listbox" && used.ariaExpanded !== "true") used.blur();
+  };
   document.addEventListener("mouseup", () => setTimeout(() => {
     const told = document.querySelector("[data-is=plotted]");
     let panel = told;
