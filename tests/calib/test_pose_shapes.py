@@ -1,7 +1,5 @@
 """A tracked body, the mount or the tracker that moves with a column of the stops: no effect of the
-catalogue does so evenly in temperature, and it is told what moves, and with what."""
-
-import csv
+catalogue does so with temperature, and it is told what moves, and with what."""
 
 import numpy as np
 import pytest
@@ -14,6 +12,9 @@ from calib.rig import load_rig
 from calib.runs.calibrate import calibrate
 from calib.runs.diagnose import diagnose
 from calib.simulation import Spec, simulate
+
+from ..mishaps import Scene
+from ..mishaps.scene import QUAT
 
 # Six numbers of a motion are seen over a column in 30 stops or more.
 SPEC = Spec(lidar="hesai_pandarxt32", locations=6, stops_per_location=6, column_step=200)
@@ -50,23 +51,17 @@ def test_each_wave_moves_what_the_slip_moves(rig, name):
 @pytest.mark.parametrize("body", sorted(WHERE))
 def test_a_body_that_moves_with_temperature_is_told(tmp_path, body):
     simulate(SPEC, tmp_path / "rec", 1)
-    with (tmp_path / "rec/stops.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    temperature = np.array([float(row["temperature_c"]) for row in rows])
-    u = (temperature - temperature.min()) / np.ptp(temperature)
-    for row, far in zip(rows, MOVED_M * np.cos(np.pi * u), strict=True):
-        if row[f"{body}.x"]:  # it was seen
-            turn = Rotation.from_quat([float(row[f"{body}.q{c}"]) for c in "xyzw"])
-            for c, by in zip("xyz", turn.apply([0.0, 0.0, far]), strict=True):
-                row[f"{body}.{c}"] = float(row[f"{body}.{c}"]) + by
-    with (tmp_path / "rec/stops.csv").open("w", newline="") as file:
-        table = csv.DictWriter(file, rows[0])
-        table.writeheader()
-        table.writerows(rows)
+    scene = Scene(tmp_path / "rec", np.random.default_rng())
+    rows = np.flatnonzero(scene.seen(body))
+    (temperature,) = scene.stops.numbers("temperature_c")[rows].T
+    quat = scene.stops.numbers(*(f"{body}.{q}" for q in QUAT))[rows]
+    far = MOVED_M * np.cos(np.pi * (temperature - temperature.min()) / np.ptp(temperature))
+    shift = Rotation.from_quat(quat, scalar_first=True).apply(far[:, None] * [0.0, 0.0, 1.0])
+    scene.move(body, rows, shift, np.zeros(3))
     run = calibrate([tmp_path / "rec"], tmp_path / "run")
     diagnose(run)
     found = run.diagnosis()
     assert found["verdict"] == "unexplained_structure"
     assert found["unexplained"][0]["covariates"] == ["temperature_c"]
     said = " ".join(found["sentences"])
-    assert f"depends on temperature, as where the tracked body {WHERE[body]} moves" in said
+    assert f"depends on temperature, as if the tracked body {WHERE[body]} moved" in said

@@ -13,7 +13,7 @@ from calib.diagnosis.verdict.matters import FALL, Weighed
 
 UNNAMED, BAD = "unexplained_structure", "bad_data"
 LISTED = 6  # untestable effects and rivals that a sentence names
-# What a pose that depends on a column is of.
+# What moves, by what `diagnosis.json` calls it, as a sentence names it.
 MOVED = {
     "mount": "the mount",
     "body": "the tracked body beyond the arm",
@@ -119,7 +119,7 @@ def _structure_sentences(unexplained: Sequence[Mapping[str, Any]], residual: str
     out = []
     for each in unexplained[:2]:
         what = " and ".join(words(c) for c in each["covariates"])
-        moves = f", as where {MOVED[each['moves']]} moves" if each.get("moves") else ""
+        moves = f", as if {MOVED[each['moves']]} moved" if each.get("moves") else ""
         out.append(
             f"The residual structure depends on {what}{moves}: {each['rms_mm']:.2f} mm rms of "
             f"{residual}."

@@ -60,6 +60,7 @@ def unnamed(
     progress: Progress,
 ) -> Unnamed:
     """Look for formulas of what a search left: of the ranges, or of a joint where there are none.
+    Where structure of poses leads, none is sought.
 
     Args:
         found: the search.
@@ -69,7 +70,7 @@ def unnamed(
         progress: as of `fit.solve`.
     """
     leading = next(iter(found.at_first or found.unnamed), None)
-    if leading and isinstance(leading.effect, PoseShape):  # no formula of a beam or joint moves it
+    if leading and isinstance(leading.effect, PoseShape):  # formulas move beams and joints
         return Unnamed()
     first, last = found.looks[0].stand, found.looks[-1].stand
     if found.found and doubtful and unseen is not None:
