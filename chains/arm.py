@@ -128,6 +128,37 @@ def read_meshes(urdf_path: str | Path, links: Sequence[str]) -> dict[str, list[l
     return found
 
 
+def gravity_moment(
+    tree: FrameTree, masses: Sequence[Mass], edges: Sequence[str], joints: Array
+) -> Array:
+    """Return the moment of weights about the origins of edges (K, n, 3), N m.
+
+    Of each edge, of all masses beyond it, in the axes of its origin, which its joint has not turned
+    yet: ``m = R^T sum((c - o) x (0, 0, -G kg))``, with z of the tree's root up.
+    """
+    moment = np.zeros((len(joints), len(edges), 3))
+    origins = [_at(tree, tree.edges[tree.edge_names.index(name)].parent, joints) for name in edges]
+    for mass in masses:
+        T = _at(tree, mass.frame, joints)
+        centre_m = T[:, :3, :3] @ mass.centre_m + T[:, :3, 3]
+        weight = np.reshape(mass.kg, (-1, 1)) * [[0.0, 0.0, -G]]
+        beyond = {tree.edge_names[i] for i in tree.path(mass.frame)}
+        for n, name in enumerate(edges):
+            if name in beyond:
+                edge = tree.edges[tree.edge_names.index(name)]
+                origin = origins[n] @ edge.T_parent_child
+                about = np.cross(centre_m - origin[:, :3, 3], weight)
+                moment[:, n] += np.einsum("kji,kj->ki", origin[:, :3, :3], about)
+    return moment
+
+
+def _at(tree: FrameTree, frame: str, joints: Array) -> Array:
+    """Return T_root_frame (K, 4, 4)."""
+    chain = SerialChain([tree.edges[i] for i in tree.path(frame)])
+    ours = [tree.joint_names.index(name) for name in chain.joint_names]
+    return chain.place(np.asarray(joints)[:, ours])
+
+
 def gravity_torque(tree: FrameTree, masses: Sequence[Mass], joints: Array) -> Array:
     """Return what gravity exerts on every joint (K, J), N m about or N along its axis.
 

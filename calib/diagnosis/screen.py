@@ -63,6 +63,15 @@ class Screen:
         """Root mean square of the range residual that it alone can explain."""
         return float(np.sqrt(candidate.test.statistic / max(self.scores.weight_m2, 1e-300)))
 
+    def taken_up(self, candidate: Candidate, theta: np.ndarray) -> float:
+        """Share of what a test says of a candidate that its parameters (q,) have once it is fitted:
+        little, where it would have to be far larger than it may be."""
+        columns, wanted = candidate.test.columns, candidate.test.estimate()
+        told = self.scores.information[np.ix_(columns, columns)] @ wanted
+        return (
+            float(theta @ told / max(wanted @ told, 1e-300)) if len(theta) == len(wanted) else 1.0
+        )
+
 
 def screen(
     scores: Scores,

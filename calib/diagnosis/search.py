@@ -299,36 +299,46 @@ def likeliest(here: Sequence[Blunder]) -> Blunder:
 
 def _named(look: Look, found: list[NamedEffect], progress: Progress) -> list[NamedEffect]:
     """What was found, and the best candidate that is confirmed, fitted; with it others may have
-    better shapes."""
+    better shapes. Which one is best may change once it is fitted, as rows then scatter less."""
     for candidate in suspects(look.named, ALPHA):
-        test, p = judged(look, candidate, progress)
-        if p < ALPHA:
-            effect = look.stand.finest(candidate.effect, progress)
-            stand = tried(look.stand.with_effects, [effect], progress)
-            theta = stand.theta(effect, whole=False) if stand else 0 * test.estimate()
-            if _taken_up(look.named, candidate, theta) < HELD_BACK:
-                continue
-            stand, swapped = stand.retuned([f.effect.name for f in found], progress)
-            after = stand.look(progress)
-            others = rivals(look.named, candidate, max(after.named.common, test.inflation))
-            step = NamedEffect(
-                candidate=replace(candidate, effect=effect, p_value=test.p_value()),
-                before=look,
-                after=after,
-                judged=test,
-                p_adjusted=p,
-                rivals=others,
-            )
-            return [*(f.with_effect(swapped.get(f.effect.name)) for f in found), step]
+        if more := _fitted(look, candidate, found, progress):
+            likelier = _likelier(more[-1])
+            return (likelier and _fitted(look, likelier, found, progress)) or more
     return found
 
 
-def _taken_up(screen: Screen, candidate: Candidate, theta: np.ndarray) -> float:
-    """Share of what a test says of a candidate that its parameters (q,) have once it is fitted:
-    little, where it would have to be far larger than it may be."""
-    columns, wanted = candidate.test.columns, candidate.test.estimate()
-    told = screen.scores.information[np.ix_(columns, columns)] @ wanted
-    return float(theta @ told / max(wanted @ told, 1e-300)) if len(theta) == len(wanted) else 1.0
+def _fitted(
+    look: Look, candidate: Candidate, found: list[NamedEffect], progress: Progress
+) -> list[NamedEffect]:
+    """What was found, and a candidate, fitted; nothing where it is not confirmed."""
+    test, p = judged(look, candidate, progress)
+    if p >= ALPHA:
+        return []
+    effect = look.stand.finest(candidate.effect, progress)
+    stand = tried(look.stand.with_effects, [effect], progress)
+    theta = stand.theta(effect, whole=False) if stand else 0 * test.estimate()
+    if look.named.taken_up(candidate, theta) < HELD_BACK:
+        return []
+    stand, swapped = stand.retuned([f.effect.name for f in found], progress)
+    after = stand.look(progress)
+    step = NamedEffect(
+        candidate=replace(candidate, effect=effect, p_value=test.p_value()),
+        before=look,
+        after=after,
+        judged=test,
+        p_adjusted=p,
+        rivals=rivals(look.named, candidate, max(after.named.common, test.inflation)),
+    )
+    return [*(f.with_effect(swapped.get(f.effect.name)) for f in found), step]
+
+
+def _likelier(step: NamedEffect) -> Candidate | None:
+    """A rival that explains more than the named effect does, beyond the odds of chance, where rows
+    scatter as they do with that in the model."""
+    scale = max(step.after.named.common, step.judged.inflation)
+    best = max(step.rivals, key=lambda c: c.test.evidence(scale), default=step.candidate)
+    more = best.test.evidence(scale) - step.candidate.test.evidence(scale)
+    return best if more > ODDS else None
 
 
 def structures(look: Look, progress: Progress) -> list[Candidate]:

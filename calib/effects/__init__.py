@@ -13,7 +13,6 @@ from calib.effects.arm import (
     ArmBacklash,
     ArmGearError,
     ArmGeometry,
-    ArmGravitySag,
     ArmJointEccentricity,
     ArmJointLag,
     ArmJointOffset,
@@ -32,6 +31,14 @@ from calib.effects.beams import (
     RingAzimuthOffset,
     RingElevationOffset,
     SpinAxisWobble,
+)
+from calib.effects.elastic import (
+    ArmGravitySag,
+    ArmLinkBending,
+    ArmPayloadSag,
+    ArmTorqueSag,
+    BaseFlex,
+    MountBending,
 )
 from calib.effects.noise import NoiseIncidence, NoiseIntensity, NoiseRange
 from calib.effects.own.files import files_in, from_document, from_file, is_file
@@ -52,7 +59,7 @@ from calib.effects.range import (
     WarmupDrift,
 )
 from calib.effects.reference import FaroScale, MeshShift, MovedSurface
-from calib.effects.rig import BaseFlex, FrameOffset, MountBending, MountCreep, MountSlip
+from calib.effects.rig import FrameOffset, MountCreep, MountSlip
 from calib.effects.scatter import (
     JointScatter,
     LocationRangeScatter,
@@ -105,6 +112,9 @@ CATALOGUE: tuple[Effect, ...] = (
     ArmJointScale(),
     ArmJointEccentricity(),
     ArmGravitySag(),
+    ArmPayloadSag(),
+    ArmTorqueSag(),
+    ArmLinkBending(),
     ArmBacklash(),
     ArmJointLag(),
     ArmGearError(),

@@ -8,7 +8,6 @@ from calib.effects.base import Effect, Param, Site, View
 from calib.effects.basis import finite, step_times
 from calib.effects.range import AMBIENT_C
 from calib.rig import Rig
-from chains.arm import Mass, gravity_torque
 from chains.minimal import Slip, across, own_slips
 
 
@@ -215,33 +214,6 @@ class ArmGearError(ArmJointEccentricity):
         return tuple(map(float, (*range(2, 21), *high))) if stops.rig.joint_names else ()
 
 
-class ArmGravitySag(Effect):
-    """A joint gives way under the arm's weight. It turns by so much per unit of gravity's torque.
-
-    The weights are those of the URDF's links, and `payload_kg` at the arm's tip where stops say
-    it; the root's z axis is taken to point up. ``c > 0`` droops.
-    """
-
-    name = "arm_gravity_sag"
-    site = Site.JOINTS
-    unit = "rad/(N m)"
-    formula = "q_i = reported_i + c_i * torque of gravity about joint i"
-    typical = "0.2 to 2 mrad at full reach: 0.00002 to 0.0002 rad/(N m), size assumed"
-    covariates = ("joints",)
-    confounded_with = ("arm_joint_eccentricity", "base_flex", "arm_joint_offset")
-    source = "stiffness of arms: Klimchik et al.; size assumed"
-
-    def params(self, rig: Rig) -> tuple[Param, ...]:
-        if not rig.masses:
-            return ()
-        units = {"rad": "rad/(N m)", "m": "m/N"}
-        return tuple(Param(joint, units[unit], 2e-4) for joint, unit in _units(rig).items())
-
-    def basis(self, view: View) -> np.ndarray:
-        torque = gravity_torque(view.rig.tree, masses(view), view.joints)
-        return torque[:, :, None] * np.eye(torque.shape[1])
-
-
 class ArmBacklash(Effect):
     """A joint lies half its play behind the way it came: ``true = reported + h * (+1 or -1)``."""
 
@@ -305,16 +277,6 @@ class ArmThermalGrowth(Effect):
             origin_m = T_parent_child[:3, :3].T @ T_parent_child[:3, 3]
             basis[:, e, 3:, 0] = warmer[:, None] * origin_m
         return basis
-
-
-def masses(view: View) -> list[Mass]:
-    """What weighs on the arm at the view's stops: its links, and the payload at its tip."""
-    found = list(view.rig.masses)
-    if "payload_kg" in view.columns:
-        tree = view.rig.tree
-        tip = tree.edges[tree.edge_names.index(view.rig.arm_edges[-1])].child
-        found.append(Mass(tip, finite(view["payload_kg"]), np.zeros(3)))
-    return found
 
 
 def _units(rig: Rig) -> dict[str, str]:

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from calib.effects.arm import masses
 from calib.effects.base import Effect, Param, Site, View
 from calib.effects.basis import step_times
 from calib.rig import Rig
-from chains import se3
-from chains.arm import G
 
 DOF = ("rx", "ry", "rz", "tx", "ty", "tz")
 
@@ -39,46 +36,6 @@ class FrameOffset(Effect):
         tree = view.rig.tree
         basis = np.zeros((1, len(tree.edges), 6, 6))
         basis[0, tree.edge_names.index(self.name)] = np.eye(6)
-        return basis
-
-
-class BaseFlex(Effect):
-    """What carries the arm tilts under it: tyres, a plate, the first link's foot.
-
-    Weights as of `arm_gravity_sag`; the root's z axis is taken to point up.
-    """
-
-    name = "base_flex"
-    site = Site.EDGE
-    unit = "rad/(N m)"
-    formula = "the arm's base turns by (c_x m_x, c_y m_y), m the moment of the arm's weight there"
-    typical = "0.1 to 2 mrad at full reach: 0.00002 to 0.0002 rad/(N m), size assumed"
-    covariates = ("joints",)
-    confounded_with = ("arm_gravity_sag", "arm_joint_offset", "arm_base")
-    source = "size assumed"
-
-    def params(self, rig: Rig) -> tuple[Param, ...]:
-        return tuple(Param(n, "rad/(N m)", 5e-5) for n in "xy") if rig.masses else ()
-
-    def basis(self, view: View) -> np.ndarray:
-        """At the edge that leads to the arm's base; at the arm's first where there is none."""
-        tree = view.rig.tree
-        first = tree.edge_names.index(view.rig.arm_edges[0])
-        base = tree.edges[first].parent
-        T_root_base = tree.place(base, view.joints).Ts_root_frame
-        before = [e for e, edge in enumerate(tree.edges) if edge.child == base]
-        if not before:
-            T_root_base = T_root_base @ tree.edges[first].T_parent_child
-        moment = np.zeros((len(view.joints), 3))
-        for mass in masses(view):
-            at = tree.place(mass.frame, view.joints).Ts_root_frame
-            arm_m = at[:, :3, :3] @ mass.centre_m + at[:, :3, 3] - T_root_base[:, :3, 3]
-            weight = np.reshape(mass.kg, (-1, 1)) * [[0.0, 0.0, -G]]
-            moment += np.cross(arm_m, weight)
-        moment = np.einsum("kji,kj->ki", T_root_base[:, :3, :3], moment)
-        basis = np.zeros((len(moment), len(tree.edges), 6, 2))
-        for axis in (0, 1):
-            basis[:, (before or [first])[0], axis, axis] = moment[:, axis]
         return basis
 
 
@@ -146,39 +103,6 @@ class MountCreep(MountSlip):
     def when(self, elapsed_s: np.ndarray) -> np.ndarray:
         """How much of the motion has happened (K,) at times since the first stop."""
         return elapsed_s / 3600.0
-
-
-class MountBending(Effect):
-    """The mount bends under the LiDAR's weight. It gives way alike to all sides.
-
-    The lever points from the mount to the LiDAR as CAD has it, gravity along -z of the root.
-    """
-
-    name = "mount_bending"
-    site = Site.EDGE
-    unit = "rad"
-    formula = "the mount turns by c * (lever x gravity), both as unit vectors in its axes"
-    typical = "0.05 to 0.5 mrad, size assumed"
-    covariates = ("joints",)
-    confounded_with = ("arm_gravity_sag", "mount")
-    source = "size assumed"
-    of_lidar = True
-
-    def params(self, rig: Rig) -> tuple[Param, ...]:
-        carries = rig.arm_edges and rig.lidar and mount_edges(rig)
-        return (Param("amount", "rad", 0.0005),) if carries else ()
-
-    def basis(self, view: View) -> np.ndarray:
-        tree = view.rig.tree
-        edge = mount_edges(view.rig)[0]
-        T_root_mount = tree.place(tree.edges[edge].child, view.joints).Ts_root_frame
-        T_root_lidar = tree.place(view.rig.lidar_frame, view.joints).Ts_root_frame
-        lever_m = (se3.inverse(T_root_mount) @ T_root_lidar)[:, :3, 3]
-        length_m = np.linalg.norm(lever_m, axis=1, keepdims=True)
-        lever = np.where(length_m > 1e-9, lever_m / np.maximum(length_m, 1e-9), [0.0, 0.0, 1.0])
-        basis = np.zeros((len(lever), len(tree.edges), 6, 1))
-        basis[:, edge, :3, 0] = np.cross(lever, -T_root_mount[:, 2, :3])
-        return basis
 
 
 def mount_edges(rig: Rig) -> tuple[int, ...]:

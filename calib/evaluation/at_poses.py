@@ -140,7 +140,8 @@ def _read(path: Path, source: Source) -> tuple[list[str], np.ndarray, dict[str, 
     table = CsvTable(path, key="stop", text=("location",))
     names = table.names()
     joints, times = table.joints(rig.joint_names), table.times("time_s")
-    return names, joints, {**stop_columns(rig, joints, times), **table.rest()}
+    rest = table.rest()
+    return names, joints, {**stop_columns(rig, joints, times, rest), **rest}
 
 
 def _apart(drawn: np.ndarray, true: np.ndarray) -> np.ndarray:

@@ -290,7 +290,7 @@ class Source:
     def columns(self) -> dict[str, np.ndarray]:
         """Per-stop columns (K, ...) that effects may look at; see `stop_columns`."""
         recording = self.recording
-        columns = stop_columns(self.rig, recording.joints, recording.time_s)
+        columns = stop_columns(self.rig, recording.joints, recording.time_s, recording.covariates)
         columns |= {"stop": np.array(recording.stops), "location": recording.location}
         if self.rig.tracker:
             columns["tracked"] = tracked_poses(self.rig, recording)
@@ -326,10 +326,13 @@ def same_mesh(a: Reference | None, b: Reference | None) -> bool:
     return np.array_equal(a.vertices_m, b.vertices_m) and np.array_equal(a.triangles, b.triangles)
 
 
-def stop_columns(rig: Rig, joints: np.ndarray, time_s: np.ndarray) -> dict[str, np.ndarray]:
+def stop_columns(
+    rig: Rig, joints: np.ndarray, time_s: np.ndarray, recorded: Mapping[str, np.ndarray]
+) -> dict[str, np.ndarray]:
     """What follows from when and how the arm came to each of K stops, (K,) each.
 
-    Each joint by its name as reported, rad or m; and, where the times are known: ``time_s``;
+    Each joint by its name as reported, rad or m; ``torques`` (K, J), N m or N, where any column
+    ``<joint>.torque`` was recorded; and, where the times are known: ``time_s``;
     ``elapsed_s`` since the first stop; ``travel.<joint>``, how far a joint went since the stop
     before, rad or m; ``moved.<joint>``, which way: -1, 0 or 1. Of the first both are 0: nothing
     is known of it.
@@ -338,8 +341,13 @@ def stop_columns(rig: Rig, joints: np.ndarray, time_s: np.ndarray) -> dict[str, 
         rig: whose joints they are.
         joints: (K, J) reported.
         time_s: (K,) of the stops; NaN where nothing says when they were made.
+        recorded: the recording's own columns.
     """
     columns = dict(zip(rig.joint_names, joints.T, strict=True))
+    torques = {name: f"{name}.torque" for name in rig.joint_names}
+    if any(name in recorded for name in torques.values()):
+        unknown = np.full(len(joints), np.nan)
+        columns["torques"] = np.stack([recorded.get(c, unknown) for c in torques.values()], axis=1)
     if not np.isfinite(time_s).all():
         return columns
     order = np.argsort(time_s, kind="stable")

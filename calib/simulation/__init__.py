@@ -15,7 +15,7 @@ from calib.simulation import rig as rig_on_paper
 from calib.simulation.room import Room, build
 from calib.simulation.scan import Scanner
 from calib.simulation.spec import PRESETS, Spec, load_spec
-from calib.simulation.stops import World, plan
+from calib.simulation.stops import World, loads, plan
 from calib.simulation.truth import Truth, draw, stream
 from calib.simulation.write import write_reference, write_stops, write_targets, write_truth
 from chains.errors import InputError
@@ -82,6 +82,8 @@ def _record(
 ) -> None:
     rig = truth.rig
     stops = plan(rig, spec, room.true, stream(seed, "plan"))
+    more = loads(stops, truth, stream(seed, "loads"))
+    stops = replace(stops, columns={**stops.columns, **more})
     world = World.of(truth, stops, spec.noise, stream(seed, "encoders"))
     write_stops(folder / "stops.csv", world, spec, stream(seed, "tracker"))
     if spec.targets:

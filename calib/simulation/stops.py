@@ -9,12 +9,14 @@ from functools import cached_property
 import numpy as np
 
 from calib.effects import Site, View
+from calib.effects.elastic import masses
 from calib.problem.model import stop_columns
 from calib.rig import Rig
 from calib.simulation.room import FLOOR_CENTRE_M
 from calib.simulation.spec import Spec
 from calib.simulation.truth import Truth
 from chains import se3
+from chains.arm import gravity_torque
 from chains.errors import InputError
 from sensors.reference import Reference
 
@@ -23,6 +25,7 @@ CLEAR_M, ABOVE_FLOOR_M, BASE_CLEAR_M = 0.6, 0.5, 0.45
 SETTLE = np.repeat([0.0002, 0.0003], 3)  # rad, m: how the base shifts when the arm moves
 GUESS = np.repeat([np.radians(1.0), 0.02], 3)  # rad, m: error of a guessed base pose
 RATE = 0.25  # rad/s: sd of a joint's speed while the arm moves
+PAYLOAD_KG, FRICTION = 2.5, 0.05  # as small arms carry; a share of the largest torque, assumed
 TRIES = 200
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -47,7 +50,8 @@ class Plan:
     def seen(self, rig: Rig) -> dict[str, np.ndarray]:
         """What effects may look at (K,), by name, as in a fit."""
         known = {"stop": np.array(self.names), "location": np.array(self.location)}
-        return {**stop_columns(rig, self.joints, self.columns["time_s"]), **self.columns, **known}
+        own = stop_columns(rig, self.joints, self.columns["time_s"], self.columns)
+        return {**own, **self.columns, **known}
 
 
 def plan(rig: Rig, spec: Spec, mesh: Reference, rng: np.random.Generator) -> Plan:
@@ -168,6 +172,20 @@ def _columns(location: np.ndarray, rng: np.random.Generator) -> dict[str, np.nda
         "temperature_c": 23.0 + 1.2 * warm + 0.3 * rng.standard_normal(count),
         "humidity": 0.5 + 0.05 * damp + 0.01 * rng.standard_normal(count),
     }
+
+
+def loads(stops: Plan, truth: Truth, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """Columns (K,) of what loads the arm, where an effect of the hardware depends on it: a payload
+    of up to `PAYLOAD_KG`, and the torques of its drives, off by `FRICTION` of the largest."""
+    needed, rig = {c for effect, _ in truth.effects for c in effect.covariates}, truth.rig
+    kg = PAYLOAD_KG * rng.integers(0, 3, len(stops.joints)) / 2
+    found = {"payload_kg": kg} if "payload_kg" in needed else {}
+    if "torques" in needed:
+        view = View(rig, len(kg), found, stops.joints)
+        torques = gravity_torque(rig.tree, masses(view), stops.joints)
+        torques += FRICTION * np.abs(torques).max() * rng.choice([-1.0, 1.0], torques.shape)
+        found |= {f"{j}.torque": t for j, t in zip(rig.joint_names, torques.T, strict=True)}
+    return found
 
 
 @dataclass(frozen=True)

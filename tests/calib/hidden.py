@@ -38,6 +38,12 @@ def hide(folder: Path, name: str, size: float = 1.0, **fields: object) -> tuple[
     return made(folder, changed(FLAWLESS, **fields), **{name: size})
 
 
+def every_column(folder: Path) -> tuple[Source, dict]:
+    """A recording of flawless hardware with all columns that effects may look at, and its truth."""
+    nothing = dict.fromkeys(("range_offset", "arm_payload_sag", "arm_torque_sag"), 0.0)
+    return made(folder, FLAWLESS, **nothing)
+
+
 def at_truth(source: Source, truth: dict, name: str) -> tuple[Problem, dict, np.ndarray]:
     """The problem of one effect, its values where the recording was made, and the effect's own."""
     problem = build([source], Model((effects.find(name),)))

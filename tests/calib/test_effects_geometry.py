@@ -164,6 +164,44 @@ def test_a_payload_weighs_at_the_tip(source):
     np.testing.assert_allclose(more[:, 1, 1], -np.nan_to_num(kg) * 9.80665 * rise, atol=1e-6)
 
 
+def test_joints_give_way_to_the_payload_alone_by_a_coefficient_of_its_own(source):
+    kg = np.linspace(0, 2, len(source.recording.stops))
+    sag = find("arm_gravity_sag")
+    more = sag.basis(stops_of(source, payload_kg=kg)) - sag.basis(stops_of(source))
+    found = find("arm_payload_sag").basis(stops_of(source, payload_kg=kg))
+    np.testing.assert_allclose(found, more, atol=1e-9)
+    assert np.abs(found).max() > 1
+
+
+def test_joints_give_way_to_the_torques_that_were_measured(source):
+    count = len(source.recording.stops)
+    measured = np.linspace(-20, 30, count)
+    measured[0] = np.nan
+    given = {"joint_2.torque": measured}
+    columns = stop_columns(source.rig, source.recording.joints, np.full(count, np.nan), given)
+    found = find("arm_torque_sag").basis(stops_of(source, **columns))
+    np.testing.assert_array_equal(found[:, 1, 1], np.nan_to_num(measured))
+    assert np.count_nonzero(found) == count - 1
+
+
+def test_links_bend_across_the_axes_along_gravity(source):
+    """The moment is the slope of the potential energy, downhill; about the axis there is none."""
+    tree, step = source.rig.tree, 1e-5
+    basis = find("arm_link_bending").basis(stops_of(source))
+    for p, joint in enumerate(source.rig.joint_names):
+        edge = next(e for e in tree.edges if e.joint is not None and e.joint.name == joint)
+        e, slope = tree.edge_names.index(edge.name), np.zeros((len(basis), 3))
+        for axis in range(3):
+            twist = np.zeros((1, len(tree.edges), 6))
+            twist[0, e, axis] = step
+            up, down = (height_energy(source, source.recording.joints, t) for t in (twist, -twist))
+            slope[:, axis] = -(up - down) / (2 * step)
+        slope -= np.outer(slope @ edge.joint.axis, edge.joint.axis)
+        np.testing.assert_allclose(basis[:, e, :3, p], slope, atol=1e-5)
+        basis[:, e, :3, p] = 0
+    assert not basis.any()
+
+
 def test_the_base_tilts_along_gravity(source):
     joints, tree = source.recording.joints, source.rig.tree
     basis = find("base_flex").basis(stops_of(source))
@@ -287,7 +325,7 @@ def test_joint_errors_are_what_their_formulas_say(source, name, error):
 
 def test_backlash_follows_the_way_each_joint_came(source):
     joints = np.array([[0.0, 1, 0, 0, 0, 0], [0.2, 1, 0, 0, 0, 0], [0.1, 2, 0, 0, 0, 0]])
-    columns = stop_columns(source.rig, joints, np.array([50.0, 900.0, 400.0]))
+    columns = stop_columns(source.rig, joints, np.array([50.0, 900.0, 400.0]), {})
     np.testing.assert_array_equal(columns["moved.joint_1"], [0, 1, 1])
     np.testing.assert_array_equal(columns["moved.joint_2"], [0, -1, 1])
     np.testing.assert_allclose(columns["travel.joint_1"], [0, 0.1, 0.1])

@@ -11,7 +11,7 @@ from calib.solve.fit import solve
 from chains.errors import InputError
 
 from . import rigs
-from .hidden import at_truth, hide, residuals
+from .hidden import at_truth, every_column, hide, residuals
 from .simulated import made, off_mesh
 
 # The noise of every LiDAR of the catalogue dithers its rounding away.
@@ -51,7 +51,7 @@ def test_what_is_hidden_is_what_the_rows_explain(tmp_path, name):
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     """A recording with nothing wrong."""
-    return hide(tmp_path_factory.mktemp("whole") / "rec", "range_offset", 0.0)
+    return every_column(tmp_path_factory.mktemp("whole") / "rec")
 
 
 @pytest.mark.parametrize("name", SHOWN)

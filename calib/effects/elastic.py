@@ -1,0 +1,200 @@
+"""What gives way under its load: joints, links, the base, the mount.
+
+The weights are those of the URDF's links, and ``payload_kg`` at the arm's tip where stops have that
+column. The root's z axis is taken to point up.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calib.effects.base import Effect, Param, Site, View
+from calib.effects.basis import finite
+from calib.effects.rig import mount_edges
+from calib.rig import Rig
+from chains import se3
+from chains.arm import Mass, gravity_moment, gravity_torque
+
+PER_TORQUE = {"revolute": "rad/(N m)", "prismatic": "m/N"}
+SOFT = 2e-4  # rad/(N m): a soft gear, as of a small collaborative arm
+
+
+class ArmGravitySag(Effect):
+    """A joint gives way under the arm's weight. It turns by so much per unit of gravity's torque.
+
+    The payload counts as the links do. ``c > 0`` droops.
+    """
+
+    name = "arm_gravity_sag"
+    site = Site.JOINTS
+    unit = "rad/(N m)"
+    formula = "q_i = reported_i + c_i * torque of gravity about joint i"
+    typical = "0.2 to 2 mrad at full reach: 0.00002 to 0.0002 rad/(N m), size assumed"
+    covariates = ("joints",)
+    confounded_with = ("arm_joint_eccentricity", "base_flex", "arm_joint_offset")
+    source = "stiffness of arms: Klimchik et al.; size assumed"
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        return _per_joint(rig) if rig.masses else ()
+
+    def basis(self, view: View) -> np.ndarray:
+        return self.torque(view)[:, :, None] * np.eye(len(view.rig.joint_names))
+
+    def torque(self, view: View) -> np.ndarray:
+        """What each joint (K, J) gives way to, N m or N."""
+        return gravity_torque(view.rig.tree, masses(view), view.joints)
+
+
+class ArmPayloadSag(ArmGravitySag):
+    """A joint gives way under the payload more, or less, than under the arm's own weight.
+
+    So it seems where the payload hangs elsewhere than at the tip, where it weighs other than
+    stated, or where the URDF's masses are wrong.
+    """
+
+    name = "arm_payload_sag"
+    formula = "q_i = reported_i + p_i * torque of the payload, at the tip, about joint i"
+    covariates = ("joints", "payload_kg")
+    confounded_with = ("arm_gravity_sag", "arm_torque_sag")
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        return _per_joint(rig)
+
+    def torque(self, view: View) -> np.ndarray:
+        """What each joint (K, J) gives way to, N m or N."""
+        return gravity_torque(view.rig.tree, [_payload(view)], view.joints)
+
+
+class ArmTorqueSag(ArmGravitySag):
+    """A joint gives way to the torque that its drive measures, friction and all.
+
+    Column ``<joint>.torque`` of a stop is that torque, N m, or a force, N; positive where it turns
+    the joint on. A joint without that column is taken to bear none.
+    """
+
+    name = "arm_torque_sag"
+    formula = "q_i = reported_i + k_i * torque of joint i as measured"
+    covariates = ("joints", "torques")
+    confounded_with = ("arm_gravity_sag", "arm_payload_sag")
+    source = "Albu-Schaeffer, Ott, Hirzinger 2007, Int. J. Robotics Research 26(1): flexible joints"
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        return _per_joint(rig)
+
+    def torque(self, view: View) -> np.ndarray:
+        """What each joint (K, J) gives way to, N m or N."""
+        return finite(view["torques"])
+
+
+class ArmLinkBending(Effect):
+    """Links and bearings give way across the joints' axes, where no encoder sees it.
+
+    At each joint the arm turns with the moment of the weight beyond it, but for the part about the
+    joint's axis: that is `arm_gravity_sag`. It gives way alike to both sides.
+    """
+
+    name = "arm_link_bending"
+    site = Site.EDGE
+    unit = "rad/(N m)"
+    formula = "origin of joint i -> origin * exp(b_i * m_i), m_i the moment across its axis"
+    typical = "a fifth of arm_gravity_sag, as bearings and links are stiffer than gears"
+    covariates = ("joints",)
+    confounded_with = ("arm_gravity_sag", "base_flex", "arm_geometry")
+    source = (
+        "Klimchik et al. 2014, Robotics and Computer-Integrated Manufacturing 30(3); size assumed"
+    )
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        joints = rig.joint_names if rig.masses else ()
+        return tuple(Param(joint, self.unit, SOFT / 5) for joint in joints)
+
+    def basis(self, view: View) -> np.ndarray:
+        tree, joints = view.rig.tree, view.rig.joint_names
+        leading = {e.joint.name: e for e in tree.edges if e.joint is not None and e.joint.leads}
+        edges = [leading[joint] for joint in joints]
+        names = [edge.name for edge in edges]
+        moment = gravity_moment(tree, masses(view), names, view.joints)
+        axes = np.stack([edge.joint.axis for edge in edges])
+        moment -= np.einsum("kni,ni,nj->knj", moment, axes, axes)
+        basis = np.zeros((len(moment), len(tree.edges), 6, len(joints)))
+        for p, name in enumerate(names):
+            basis[:, tree.edge_names.index(name), :3, p] = moment[:, p]
+        return basis
+
+
+class BaseFlex(Effect):
+    """What carries the arm tilts under it: tyres, a plate, the first link's foot."""
+
+    name = "base_flex"
+    site = Site.EDGE
+    unit = "rad/(N m)"
+    formula = "the arm's base turns by (c_x m_x, c_y m_y), m the moment of the arm's weight there"
+    typical = "0.1 to 2 mrad at full reach: 0.00002 to 0.0002 rad/(N m), size assumed"
+    covariates = ("joints",)
+    confounded_with = ("arm_gravity_sag", "arm_joint_offset", "arm_base")
+    source = "size assumed"
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        return tuple(Param(n, "rad/(N m)", 5e-5) for n in "xy") if rig.masses else ()
+
+    def basis(self, view: View) -> np.ndarray:
+        """At the edge that leads to the arm's base; at the arm's first where there is none."""
+        tree = view.rig.tree
+        first = tree.edges[tree.edge_names.index(view.rig.arm_edges[0])]
+        edge = next((edge for edge in tree.edges if edge.child == first.parent), first)
+        moment = gravity_moment(tree, masses(view), [edge.name], view.joints)[:, 0]
+        basis = np.zeros((len(moment), len(tree.edges), 6, 2))
+        for axis in (0, 1):
+            basis[:, tree.edge_names.index(edge.name), axis, axis] = moment[:, axis]
+        return basis
+
+
+class MountBending(Effect):
+    """The mount bends under the LiDAR's weight. It gives way alike to all sides.
+
+    The lever points from the mount to the LiDAR as CAD has it, gravity along -z of the root.
+    """
+
+    name = "mount_bending"
+    site = Site.EDGE
+    unit = "rad"
+    formula = "the mount turns by c * (lever x gravity), both as unit vectors in its axes"
+    typical = "0.05 to 0.5 mrad, size assumed"
+    covariates = ("joints",)
+    confounded_with = ("arm_gravity_sag", "mount")
+    source = "size assumed"
+    of_lidar = True
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        carries = rig.arm_edges and rig.lidar and mount_edges(rig)
+        return (Param("amount", "rad", 0.0005),) if carries else ()
+
+    def basis(self, view: View) -> np.ndarray:
+        tree = view.rig.tree
+        edge = mount_edges(view.rig)[0]
+        T_root_mount = tree.place(tree.edges[edge].child, view.joints).Ts_root_frame
+        T_root_lidar = tree.place(view.rig.lidar_frame, view.joints).Ts_root_frame
+        lever_m = (se3.inverse(T_root_mount) @ T_root_lidar)[:, :3, 3]
+        length_m = np.linalg.norm(lever_m, axis=1, keepdims=True)
+        lever = np.where(length_m > 1e-9, lever_m / np.maximum(length_m, 1e-9), [0.0, 0.0, 1.0])
+        basis = np.zeros((len(lever), len(tree.edges), 6, 1))
+        basis[:, edge, :3, 0] = np.cross(lever, -T_root_mount[:, 2, :3])
+        return basis
+
+
+def masses(view: View) -> list[Mass]:
+    """What weighs on the arm at the view's stops: its links, and the payload at its tip."""
+    payload = [_payload(view)] if "payload_kg" in view.columns else []
+    return [*view.rig.masses, *payload]
+
+
+def _payload(view: View) -> Mass:
+    tree = view.rig.tree
+    tip = tree.edges[tree.edge_names.index(view.rig.arm_edges[-1])].child
+    return Mass(tip, finite(view["payload_kg"]), np.zeros(3))
+
+
+def _per_joint(rig: Rig) -> tuple[Param, ...]:
+    """How much each joint gives way."""
+    each = zip(rig.joint_names, rig.joint_kinds, strict=True)
+    return tuple(Param(joint, PER_TORQUE[kind], SOFT) for joint, kind in each)
