@@ -59,7 +59,7 @@ from calib.effects.range import (
     WarmupDrift,
 )
 from calib.effects.reference import FaroScale, MeshShift, MovedSurface
-from calib.effects.rig import FrameOffset, MountCreep, MountSlip
+from calib.effects.rig import FrameOffset, MountCreep, MountSettle, MountSlip
 from calib.effects.scatter import (
     JointScatter,
     LocationRangeScatter,
@@ -77,6 +77,7 @@ from calib.effects.tracker import (
     OptitrackDistortion,
     OptitrackScale,
     TrackerCreep,
+    TrackerSettle,
     TrackerSlip,
 )
 from calib.rig import Rig
@@ -122,6 +123,7 @@ CATALOGUE: tuple[Effect, ...] = (
     BaseFlex(),
     MountSlip(),
     MountCreep(),
+    MountSettle(),
     MountBending(),
     OptitrackScale(),
     OptitrackDistortion(),
@@ -129,6 +131,7 @@ CATALOGUE: tuple[Effect, ...] = (
     BaseSlip(),
     TrackerSlip(),
     TrackerCreep(),
+    TrackerSettle(),
     TargetRodTilt(),
     TargetSphereOffset(),
     FaroScale(),

@@ -105,6 +105,26 @@ class MountCreep(MountSlip):
         return elapsed_s / 3600.0
 
 
+class MountSettle(MountSlip):
+    """The mount settles: it moves fast at first, then ever more slowly, to where it stays."""
+
+    name = "mount_settle"
+    formula = "T_tip_mount = T_cad exp(theta * (1 - exp(-t / tau))), t since the first stop"
+    typical = "0.1 to 1 mm, 0.1 to 1 mrad, size assumed; printed resin and rubber relax"
+    confounded_with = ("mount_creep", "mount_slip", "warmup_drift")
+    shape_name, shape = "tau_s", 300.0
+
+    def shapes(self, stops: View) -> tuple[float, ...]:
+        """Shares of the time measured in: after a longer one it would look like `mount_creep`."""
+        lasted_s = float(stops["elapsed_s"].max(initial=0.0))
+        known = bool(self.params(stops.rig)) and 0.0 < lasted_s < np.inf
+        return tuple(float(f"{share * lasted_s:.3g}") for share in (0.05, 0.1, 0.2) if known)
+
+    def when(self, elapsed_s: np.ndarray) -> np.ndarray:
+        """How much of the motion has happened (K,) at times since the first stop."""
+        return 1.0 - np.exp(-elapsed_s / self.shape)
+
+
 def mount_edges(rig: Rig) -> tuple[int, ...]:
     """The edges beyond the arm's tip, or beyond the root without an arm, on the way to the LiDAR.
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from calib.effects.base import Effect, Param, Site, View
-from calib.effects.rig import MountCreep, MountSlip, mount_edges
+from calib.effects.rig import MountCreep, MountSettle, MountSlip, mount_edges
 from calib.rig import Rig
 from chains import se3
 
@@ -151,6 +151,19 @@ class TrackerCreep(MountCreep, TrackerSlip):
     formula = "T_opti_body as seen = exp(theta * t / 1 h) T_opti_body, t since the first stop"
     typical = "0.05 to 0.5 mm per hour, size assumed; tripods and tyres settle"
     confounded_with = ("mount_creep", "tracker_slip", "warmup_drift")
+
+
+class TrackerSettle(MountSettle, TrackerSlip):
+    """The tracker, or the place where the base stands, settles: fast at first, then ever more
+    slowly. This data cannot tell which of the two moves.
+
+    It moves what `TrackerSlip` moves, as `MountSettle` moves it.
+    """
+
+    name = "tracker_settle"
+    formula = "T_opti_body as seen = exp(theta * (1 - exp(-t / tau))) T_opti_body"
+    typical = "0.1 to 1 mm, 0.05 to 0.5 mrad, size assumed; tripods and tyres settle"
+    confounded_with = ("tracker_creep", "tracker_slip", "warmup_drift")
 
 
 def _in_body(view: View, field: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:

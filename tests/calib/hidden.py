@@ -6,6 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from calib import effects
+from calib.effects import View, find
+from calib.forward import Term, place
 from calib.problem import Problem, build
 from calib.problem.model import Model, Source
 from calib.rig import Rig
@@ -42,6 +44,19 @@ def every_column(folder: Path) -> tuple[Source, dict]:
     """A recording of flawless hardware with all columns that effects may look at, and its truth."""
     nothing = dict.fromkeys(("range_offset", "arm_payload_sag", "arm_torque_sag"), 0.0)
     return made(folder, FLAWLESS, **nothing)
+
+
+def stops_of(source: Source, **columns: np.ndarray) -> View:
+    count = len(source.recording.stops)
+    return View(source.rig, count, {**source.columns, **columns}, source.recording.joints)
+
+
+def placed(source: Source, name: str, theta: object, frame: str = "lidar") -> np.ndarray:
+    """T_root_frame (K, 4, 4) under one effect."""
+    theta = np.atleast_1d(np.asarray(theta, float))
+    term = Term(find(name), name, np.arange(len(theta)))
+    joints, columns = source.recording.joints, source.columns
+    return place(source.rig, [term], joints, columns, "root", None).in_root(frame, {name: theta}).T
 
 
 def at_truth(source: Source, truth: dict, name: str) -> tuple[Problem, dict, np.ndarray]:

@@ -120,7 +120,7 @@ def test_a_rig_without_what_it_acts_on_has_no_such_effect(effect, bare):
     of_lidar = effect.site in (Site.BEAM, Site.NOISE) and effect.name not in unknown
     assert bool(effect.params(lidar)) == of_lidar
     unknown = {"arm_gravity_sag", "arm_link_bending", "base_flex", "mount_bending"}
-    unknown |= {"mount_slip", "mount_creep"}
+    unknown |= {"mount_slip", "mount_creep", "mount_settle"}
     unknown |= {"stop_pose_scatter"}  # of a LiDAR
     of_arm = effect.site in (Site.JOINTS, Site.EDGE) and effect.name not in unknown
     assert bool(effect.params(arm)) == of_arm

@@ -7,7 +7,6 @@ import pytest
 from scipy.spatial.transform import RigidTransform
 
 from calib.effects import View, find
-from calib.forward import Term, place
 from calib.problem.model import Source, stop_columns, tracked_poses
 from calib.rig import load_rig
 from calib.simulation import PRESETS, simulate
@@ -16,35 +15,13 @@ from chains.errors import InputError
 from sensors.lidar import beams
 
 from . import rigs
-from .hidden import FLAWLESS, coarse, hide
+from .hidden import FLAWLESS, coarse, hide, placed, stops_of
 from .simulated import changed, made, nominal, pose, seen
 
 
 @pytest.fixture(scope="module")
 def source(tmp_path_factory) -> Source:
     return hide(tmp_path_factory.mktemp("geometry") / "rec", "range_offset", 0.0)[0]
-
-
-def stops_of(source: Source, **columns: np.ndarray) -> View:
-    count = len(source.recording.stops)
-    return View(source.rig, count, {**source.columns, **columns}, source.recording.joints)
-
-
-def placed(source: Source, name: str, theta: object, frame: str = "lidar") -> np.ndarray:
-    """T_root_frame (K, 4, 4) under one effect."""
-    theta = np.atleast_1d(np.asarray(theta, float))
-    term = Term(find(name), name, np.arange(len(theta)))
-    joints, columns = source.recording.joints, source.columns
-    return place(source.rig, [term], joints, columns, "root", None).in_root(frame, {name: theta}).T
-
-
-def height_energy(source: Source, joints: np.ndarray, twists: np.ndarray | None = None):
-    """Potential energy (K,) J of what weighs on the arm, by where each link's centre is."""
-    energy = 0.0
-    for mass in source.rig.masses:
-        T = source.rig.tree.place(mass.frame, joints, twists).Ts_root_frame
-        energy = energy + 9.80665 * mass.kg * (T @ np.append(mass.centre_m, 1.0))[:, 2]
-    return energy
 
 
 # ------------------------------------------------------------------------------------------ beams
@@ -141,114 +118,18 @@ def test_beam_errors_are_what_their_formulas_say(source, name, axis, columns, ex
 # -------------------------------------------------------------------------------------------- arm
 
 
-def test_joints_sag_along_gravity(source):
-    """The torque is the slope of the potential energy, downhill."""
-    joints, step = source.recording.joints, 1e-5
-    basis = find("arm_gravity_sag").basis(stops_of(source))
-    for j in range(joints.shape[1]):
-        nudge = step * np.eye(joints.shape[1])[j]
-        slope = height_energy(source, joints + nudge) - height_energy(source, joints - nudge)
-        np.testing.assert_allclose(basis[:, j, j], -slope / (2 * step), atol=1e-6)
-    assert np.abs(basis[:, 1, 1]).max() > 5  # N m, at the shoulder
-    np.testing.assert_allclose(basis[:, 0, 0], 0, atol=1e-9)  # its axis is upright
-
-
-def test_a_payload_weighs_at_the_tip(source):
-    joints, kg = source.recording.joints, np.linspace(0, 2, len(source.recording.stops))
-    kg[0] = np.nan
-    effect = find("arm_gravity_sag")
-    more = effect.basis(stops_of(source, payload_kg=kg)) - effect.basis(stops_of(source))
-    step = 1e-5 * np.eye(6)[1]
-    up, down = (source.rig.tree.place("arm_end", joints + s) for s in (step, -step))
-    rise = (up.Ts_root_frame - down.Ts_root_frame)[:, 2, 3] / 2e-5
-    np.testing.assert_allclose(more[:, 1, 1], -np.nan_to_num(kg) * 9.80665 * rise, atol=1e-6)
-
-
-def test_joints_give_way_to_the_payload_alone_by_a_coefficient_of_its_own(source):
-    kg = np.linspace(0, 2, len(source.recording.stops))
-    sag = find("arm_gravity_sag")
-    more = sag.basis(stops_of(source, payload_kg=kg)) - sag.basis(stops_of(source))
-    found = find("arm_payload_sag").basis(stops_of(source, payload_kg=kg))
-    np.testing.assert_allclose(found, more, atol=1e-9)
-    assert np.abs(found).max() > 1
-
-
-def test_joints_give_way_to_the_torques_that_were_measured(source):
-    count = len(source.recording.stops)
-    measured = np.linspace(-20, 30, count)
-    measured[0] = np.nan
-    given = {"joint_2.torque": measured}
-    columns = stop_columns(source.rig, source.recording.joints, np.full(count, np.nan), given)
-    found = find("arm_torque_sag").basis(stops_of(source, **columns))
-    np.testing.assert_array_equal(found[:, 1, 1], np.nan_to_num(measured))
-    assert np.count_nonzero(found) == count - 1
-
-
-def test_links_bend_across_the_axes_along_gravity(source):
-    """The moment is the slope of the potential energy, downhill; about the axis there is none."""
-    tree, step = source.rig.tree, 1e-5
-    basis = find("arm_link_bending").basis(stops_of(source))
-    for p, joint in enumerate(source.rig.joint_names):
-        edge = next(e for e in tree.edges if e.joint is not None and e.joint.name == joint)
-        e, slope = tree.edge_names.index(edge.name), np.zeros((len(basis), 3))
-        for axis in range(3):
-            twist = np.zeros((1, len(tree.edges), 6))
-            twist[0, e, axis] = step
-            up, down = (height_energy(source, source.recording.joints, t) for t in (twist, -twist))
-            slope[:, axis] = -(up - down) / (2 * step)
-        slope -= np.outer(slope @ edge.joint.axis, edge.joint.axis)
-        np.testing.assert_allclose(basis[:, e, :3, p], slope, atol=1e-5)
-        basis[:, e, :3, p] = 0
-    assert not basis.any()
-
-
-def test_the_base_tilts_along_gravity(source):
-    joints, tree = source.recording.joints, source.rig.tree
-    basis = find("base_flex").basis(stops_of(source))
-    edge = tree.edge_names.index("arm_base")
-    for axis in (0, 1):
-        twist = np.zeros((1, len(tree.edges), 6))
-        twist[0, edge, axis] = 1e-5
-        slope = height_energy(source, joints, twist) - height_energy(source, joints, -twist)
-        np.testing.assert_allclose(basis[:, edge, axis, axis], -slope / 2e-5, atol=1e-5)
-    elsewhere = basis.copy()
-    elsewhere[:, edge, (0, 1), (0, 1)] = 0
-    assert not elsewhere.any() and np.abs(basis).max() > 5
-
-
-def test_without_a_frame_before_it_the_arm_s_first_edge_tilts(source):
-    tree = source.rig.tree
-    below = ("arm_base", "base_markers")
-    inner = type(tree)([e for e in tree.edges if e.name not in below])
-    assert inner.root == "arm_base"
-    rig = replace(source.rig, tree=inner)
-    view = View(rig, len(source.recording.stops), {}, source.recording.joints)
-    found = find("base_flex").basis(view)
-    moved = np.abs(found).max(axis=(0, 2, 3)) > 0
-    assert [e for e, m in zip(inner.edge_names, moved, strict=True) if m] == ["joint_1"]
-
-
-def test_the_mount_bends_down(source):
-    """The LiDAR comes lower wherever its lever does not hang or stand along gravity."""
-    plain, bent = placed(source, "mount_bending", 0.0), placed(source, "mount_bending", 1e-3)
-    mount = source.rig.tree.place("mount", source.recording.joints).Ts_root_frame
-    lever = plain[:, :3, 3] - mount[:, :3, 3]
-    across = np.linalg.norm(lever[:, :2], axis=1)
-    fall = (plain - bent)[:, 2, 3]
-    # By an angle of 1 mrad times the sine between lever and gravity, at arm's length of the lever.
-    np.testing.assert_allclose(fall, 1e-3 * across**2 / np.linalg.norm(lever, axis=1), atol=1e-7)
-    assert fall.max() > 2e-5
-
-
-def test_a_slip_is_a_step_and_creep_goes_with_time(source):
+def test_a_slip_is_a_step_creep_goes_with_time_and_what_settles_comes_to_rest(source):
     twist = np.array([1e-3, -2e-3, 3e-3, 1e-3, 2e-3, -1e-3])
     elapsed_s = source.columns["elapsed_s"]
-    slipped, crept = (placed(source, f"mount_{n}", twist) for n in ("slip@300", "creep"))
+    names = ("slip@300", "creep", "settle@200")
+    slipped, crept, settled = (placed(source, f"mount_{n}", twist) for n in names)
+    rested = 1 - np.exp(-elapsed_s / 200)
     assert 0 < (elapsed_s > 300).sum() < len(elapsed_s)
     for k, joints in enumerate(source.recording.joints):
         mount = nominal(source, "mount", joints)
         beyond = mount.inv() * nominal(source, "lidar", joints)
-        for found, share in ((slipped, elapsed_s[k] > 300), (crept, elapsed_s[k] / 3600)):
+        shares = elapsed_s[k] > 300, elapsed_s[k] / 3600, rested[k]
+        for found, share in zip((slipped, crept, settled), shares, strict=True):
             expected = mount * RigidTransform.from_exp_coords(twist * share) * beyond
             np.testing.assert_allclose(found[k], expected.as_matrix(), atol=1e-12)
 
@@ -264,13 +145,17 @@ def test_a_zero_that_slips_is_another_zero_from_then_on(source):
     assert np.abs(zeroed - plain).max() > 1e-4
 
 
-@pytest.mark.parametrize("name", ["tracker_slip@300", "tracker_creep"])
+@pytest.mark.parametrize("name", ["tracker_slip@300", "tracker_creep", "tracker_settle@200"])
 def test_a_tracker_that_moves_moves_all_that_it_sees(source, name):
     """In its own axes: what is seen at ``T_opti_body`` is said to be at ``exp(theta) T``."""
     tracked = tracked_poses(source.rig, source.recording)
     stops = stops_of(source, tracked=tracked)
     elapsed_s = stops["elapsed_s"]
-    share = elapsed_s / 3600 if name.endswith("creep") else elapsed_s > 300
+    share = {
+        "tracker_slip@300": elapsed_s > 300,
+        "tracker_creep": elapsed_s / 3600,
+        "tracker_settle@200": 1 - np.exp(-elapsed_s / 200),
+    }[name]
     twist = np.array([1e-3, -2e-3, 3e-3, 1e-3, 2e-3, -1e-3])
     found = np.nan_to_num(tracked) @ se3.exp(find(name).basis(stops) @ twist)
     expected = np.stack([RigidTransform.from_exp_coords(twist * s).as_matrix() for s in share])
@@ -282,7 +167,7 @@ def test_a_tracker_that_moves_moves_all_that_it_sees(source, name):
 def test_a_tracker_moves_only_where_something_else_tells_where_the_base_is(source):
     """It cannot be told from a base that stands elsewhere at every stop, but by a LiDAR."""
     without = replace(source.rig, lidar=None, lidar_frame=None)
-    for name in ("tracker_slip", "tracker_creep"):
+    for name in ("tracker_slip", "tracker_creep", "tracker_settle"):
         assert source.rig.moves == "stop" and len(find(name).params(source.rig)) == 6
         assert find(name).params(without) == ()
         assert len(find(name).params(replace(without, moves="never"))) == 6

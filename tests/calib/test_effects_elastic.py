@@ -1,0 +1,124 @@
+"""What gives way under its load, against the slope of the potential energy."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib.effects import View, find
+from calib.problem.model import Source, stop_columns
+
+from .hidden import hide, placed, stops_of
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory) -> Source:
+    return hide(tmp_path_factory.mktemp("elastic") / "rec", "range_offset", 0.0)[0]
+
+
+def height_energy(source: Source, joints: np.ndarray, twists: np.ndarray | None = None):
+    """Potential energy (K,) J of what weighs on the arm, by where each link's centre is."""
+    energy = 0.0
+    for mass in source.rig.masses:
+        T = source.rig.tree.place(mass.frame, joints, twists).Ts_root_frame
+        energy = energy + 9.80665 * mass.kg * (T @ np.append(mass.centre_m, 1.0))[:, 2]
+    return energy
+
+
+def test_joints_sag_along_gravity(source):
+    """The torque is the slope of the potential energy, downhill."""
+    joints, step = source.recording.joints, 1e-5
+    basis = find("arm_gravity_sag").basis(stops_of(source))
+    for j in range(joints.shape[1]):
+        nudge = step * np.eye(joints.shape[1])[j]
+        slope = height_energy(source, joints + nudge) - height_energy(source, joints - nudge)
+        np.testing.assert_allclose(basis[:, j, j], -slope / (2 * step), atol=1e-6)
+    assert np.abs(basis[:, 1, 1]).max() > 5  # N m, at the shoulder
+    np.testing.assert_allclose(basis[:, 0, 0], 0, atol=1e-9)  # its axis is upright
+
+
+def test_a_payload_weighs_at_the_tip(source):
+    joints, kg = source.recording.joints, np.linspace(0, 2, len(source.recording.stops))
+    kg[0] = np.nan
+    effect = find("arm_gravity_sag")
+    more = effect.basis(stops_of(source, payload_kg=kg)) - effect.basis(stops_of(source))
+    step = 1e-5 * np.eye(6)[1]
+    up, down = (source.rig.tree.place("arm_end", joints + s) for s in (step, -step))
+    rise = (up.Ts_root_frame - down.Ts_root_frame)[:, 2, 3] / 2e-5
+    np.testing.assert_allclose(more[:, 1, 1], -np.nan_to_num(kg) * 9.80665 * rise, atol=1e-6)
+
+
+def test_joints_give_way_to_the_payload_alone_by_a_coefficient_of_its_own(source):
+    kg = np.linspace(0, 2, len(source.recording.stops))
+    sag = find("arm_gravity_sag")
+    more = sag.basis(stops_of(source, payload_kg=kg)) - sag.basis(stops_of(source))
+    found = find("arm_payload_sag").basis(stops_of(source, payload_kg=kg))
+    np.testing.assert_allclose(found, more, atol=1e-9)
+    assert np.abs(found).max() > 1
+
+
+def test_joints_give_way_to_the_torques_that_were_measured(source):
+    count = len(source.recording.stops)
+    measured = np.linspace(-20, 30, count)
+    measured[0] = np.nan
+    given = {"joint_2.torque": measured}
+    columns = stop_columns(source.rig, source.recording.joints, np.full(count, np.nan), given)
+    found = find("arm_torque_sag").basis(stops_of(source, **columns))
+    np.testing.assert_array_equal(found[:, 1, 1], np.nan_to_num(measured))
+    assert np.count_nonzero(found) == count - 1
+
+
+def test_links_bend_across_the_axes_along_gravity(source):
+    """The moment is the slope of the potential energy, downhill; about the axis there is none."""
+    tree, step = source.rig.tree, 1e-5
+    basis = find("arm_link_bending").basis(stops_of(source))
+    for p, joint in enumerate(source.rig.joint_names):
+        edge = next(e for e in tree.edges if e.joint is not None and e.joint.name == joint)
+        e, slope = tree.edge_names.index(edge.name), np.zeros((len(basis), 3))
+        for axis in range(3):
+            twist = np.zeros((1, len(tree.edges), 6))
+            twist[0, e, axis] = step
+            up, down = (height_energy(source, source.recording.joints, t) for t in (twist, -twist))
+            slope[:, axis] = -(up - down) / (2 * step)
+        slope -= np.outer(slope @ edge.joint.axis, edge.joint.axis)
+        np.testing.assert_allclose(basis[:, e, :3, p], slope, atol=1e-5)
+        basis[:, e, :3, p] = 0
+    assert not basis.any()
+
+
+def test_the_base_tilts_along_gravity(source):
+    joints, tree = source.recording.joints, source.rig.tree
+    basis = find("base_flex").basis(stops_of(source))
+    edge = tree.edge_names.index("arm_base")
+    for axis in (0, 1):
+        twist = np.zeros((1, len(tree.edges), 6))
+        twist[0, edge, axis] = 1e-5
+        slope = height_energy(source, joints, twist) - height_energy(source, joints, -twist)
+        np.testing.assert_allclose(basis[:, edge, axis, axis], -slope / 2e-5, atol=1e-5)
+    elsewhere = basis.copy()
+    elsewhere[:, edge, (0, 1), (0, 1)] = 0
+    assert not elsewhere.any() and np.abs(basis).max() > 5
+
+
+def test_without_a_frame_before_it_the_arm_s_first_edge_tilts(source):
+    tree = source.rig.tree
+    below = ("arm_base", "base_markers")
+    inner = type(tree)([e for e in tree.edges if e.name not in below])
+    assert inner.root == "arm_base"
+    rig = replace(source.rig, tree=inner)
+    view = View(rig, len(source.recording.stops), {}, source.recording.joints)
+    found = find("base_flex").basis(view)
+    moved = np.abs(found).max(axis=(0, 2, 3)) > 0
+    assert [e for e, m in zip(inner.edge_names, moved, strict=True) if m] == ["joint_1"]
+
+
+def test_the_mount_bends_down(source):
+    """The LiDAR comes lower wherever its lever does not hang or stand along gravity."""
+    plain, bent = placed(source, "mount_bending", 0.0), placed(source, "mount_bending", 1e-3)
+    mount = source.rig.tree.place("mount", source.recording.joints).Ts_root_frame
+    lever = plain[:, :3, 3] - mount[:, :3, 3]
+    across = np.linalg.norm(lever[:, :2], axis=1)
+    fall = (plain - bent)[:, 2, 3]
+    # By an angle of 1 mrad times the sine between lever and gravity, at arm's length of the lever.
+    np.testing.assert_allclose(fall, 1e-3 * across**2 / np.linalg.norm(lever, axis=1), atol=1e-7)
+    assert fall.max() > 2e-5
