@@ -21,18 +21,57 @@ RIVAL = 0.8  # of the best evidence, at another offset: then nobody knows which 
 LOBE_S = 1.0  # within it of the best, a peak is the same one
 LEAST_OVERLAP = 0.3  # of the shorter log
 PARTS = 8  # of the logs, whose own offsets tell the uncertainty
-LEAST_S = 2.0
-DRIFT_S = 0.02  # from the first part to the last
+REACH_S = 0.25  # the offset of a part is sought within it: a clock 100 ppm off needs 40 min for it
+LEAST_S = 2.0  # of a log: less has not one move of an arm in it
+DRIFT_S = (
+    0.02  # from the first part to the last; less is below the time that an arm takes to settle
+)
+
+
+@dataclass(frozen=True)
+class Added:
+    """What is added to a clock's times: one offset, or where clocks drift apart one that changes.
+
+    Args:
+        offset_s: (P,) what is added at each time `at_s`, linear between and beyond; one of each
+            where it is the same always.
+        at_s: (P,) rising, times of that clock.
+    """
+
+    offset_s: Array
+    at_s: Array
+
+    @classmethod
+    def always(cls, offset_s: float) -> Added:
+        """The same offset at all times."""
+        return cls(np.array([offset_s]), np.zeros(1))
+
+    def to(self, time_s: Array) -> Array:
+        """Times on the other clock."""
+        if len(self.at_s) == 1:
+            return time_s + self.offset_s[0]
+        k = np.clip(np.searchsorted(self.at_s, time_s) - 1, 0, len(self.at_s) - 2)
+        slope = np.diff(self.offset_s) / np.diff(self.at_s)
+        return time_s + self.offset_s[k] + slope[k] * (time_s - self.at_s[k])
 
 
 @dataclass(frozen=True)
 class Offset:
-    """What is added to one clock to give another: s, with its sigma, and how alike motions are."""
+    """What is added to one clock to give another: s, with its sigma, and how alike motions are.
+
+    Args:
+        offset_s, sigma_s: of all of both logs together.
+        likeness: correlation of the two motions at that offset.
+        drift_s: by how much the offset changes from the first part of the logs to the last; 0 where
+            it merely scatters.
+        added: what is to be added, that change included.
+    """
 
     offset_s: float
     sigma_s: float
     likeness: float
-    drift_s: float = 0.0
+    drift_s: float
+    added: Added
 
 
 @dataclass(frozen=True)
@@ -68,8 +107,8 @@ def align(
             f"--clock-offset {wrong[0]}: there is no such clock{nearest(wrong[0], spans)}"
         )
     main = _main(tracks, sweeps, spans)
-    known = {main: 0.0} if main is not None else {}
-    known |= {name: float(s) for name, s in given_s.items()}
+    known = {main: Added.always(0.0)} if main is not None else {}
+    known |= {name: Added.always(float(s)) for name, s in given_s.items()}
     out = Aligned([], [], [], [])
     if len(spans) > 1:
         out.understood.append(f"clocks: all times are those of {main}")
@@ -81,10 +120,12 @@ def align(
     for clock in sorted((c for c in spans if c not in known), key=lambda c: c not in moving):
         others = [(c, m) for c in known for m in heard[c]]
         known[clock] = _offset(clock, heard[clock], others, known, spans, main, out)
+    still = Added.always(0.0)
     for track in tracks:
-        out.tracks.append(replace(track, time_s=track.time_s + known.get(track.clock, 0.0)))
+        time_s = known.get(track.clock, still).to(track.time_s)
+        out.tracks.append(replace(track, time_s=time_s))
     for one in sweeps:
-        out.sweeps.append(replace(one, time_s=one.time_s + known.get(one.clock, 0.0)))
+        out.sweeps.append(replace(one, time_s=known.get(one.clock, still).to(one.time_s)))
     return out
 
 
@@ -109,11 +150,13 @@ def _main(
 
 def _offset(
     clock: str, mine: Sequence[Motion], others: Sequence[tuple[str, Motion]],
-    known: Mapping[str, float], spans: Mapping[str, tuple[float, float]], main: str, out: Aligned,
-) -> float:  # fmt: skip
+    known: Mapping[str, Added], spans: Mapping[str, tuple[float, float]], main: str, out: Aligned,
+) -> Added:  # fmt: skip
     """What is added to a clock, from motion where there is some, else from nothing but overlap."""
     pairs = [(c, a, b) for a in mine for c, b in others if {a.kind, b.kind} <= _alike(a.kind)]
-    offsets = [(estimate(a, replace(b, time_s=b.time_s + known[c])), c, a, b) for c, a, b in pairs]
+    offsets = [
+        (estimate(a, replace(b, time_s=known[c].to(b.time_s))), c, a, b) for c, a, b in pairs
+    ]
     told = [entry for entry in offsets if entry[0] is not None]
     if not told:
         return _by_overlap(clock, spans, known, main, out)
@@ -132,12 +175,13 @@ def _offset(
         f"clocks: {clock} {best.offset_s:+.4f} ± {best.sigma_s:.4f} s, from the motion of "
         f"{a.name} and {b.name} (correlation {best.likeness:.2f})"
     )
-    if abs(best.drift_s) > DRIFT_S:
+    if len(best.added.at_s) > 1:
+        shape = "a straight line" if len(best.added.at_s) == 2 else "straight pieces"
         out.odd.append(
-            f"clock {clock} drifts by {best.drift_s:+.3f} s from the beginning to the end; one "
-            "offset was applied"
+            f"clock {clock} drifts by {best.drift_s:+.3f} s from the beginning to the end; its "
+            f"times were corrected along {shape}"
         )
-    return best.offset_s
+    return best.added
 
 
 def _alike(kind: str) -> set[str]:
@@ -146,9 +190,9 @@ def _alike(kind: str) -> set[str]:
 
 
 def _by_overlap(
-    clock: str, spans: Mapping[str, tuple[float, float]], known: Mapping[str, float], main: str,
+    clock: str, spans: Mapping[str, tuple[float, float]], known: Mapping[str, Added], main: str,
     out: Aligned,
-) -> float:  # fmt: skip
+) -> Added:  # fmt: skip
     (a0, a1), (b0, b1) = spans[clock], spans[main]
     if min(a1, b1) < max(a0, b0):
         raise InputError(
@@ -160,7 +204,7 @@ def _by_overlap(
         f"clock {clock} is taken for the same as {main}: their times overlap, and no motion that "
         f"both logged says otherwise; --clock-offset {clock}=SECONDS corrects it"
     )
-    return 0.0
+    return Added.always(0.0)
 
 
 # ------------------------------------------------------------------------------- two motions
@@ -191,10 +235,23 @@ def estimate(mine: Motion, other: Motion) -> Offset | None:
     rival = np.nanmax(evidence, where=far & np.isfinite(evidence), initial=0.0)
     offset_s = float(other.time_s[0] - mine.time_s[0] + peak_s)
     top = float(likeness[best])
+    always = Added.always(offset_s)
     if rival > RIVAL * evidence[best] and top > LEAST_LIKE:
-        return Offset(offset_s, np.nan, top)
-    sigma_s, drift_s = _scatter(a, b, int(lag[best]), step_s)
-    return Offset(offset_s, sigma_s, top, drift_s)
+        return Offset(offset_s, np.nan, top, 0.0, always)
+    at, shift_s = _parts(a, b, int(lag[best]), step_s)
+    drift_s = _drift(shift_s)
+    if abs(drift_s) < DRIFT_S:
+        return Offset(offset_s, _standard_error(shift_s, step_s), top, drift_s, always)
+    first_s = float(other.time_s[0] - mine.time_s[0]) + int(lag[best]) * step_s
+    at_s, off_s = _pieces(mine.time_s[0] + at * step_s, first_s + shift_s)
+    left = first_s + shift_s - np.interp(mine.time_s[0] + at * step_s, at_s, off_s)
+    return Offset(
+        offset_s=offset_s,
+        sigma_s=_standard_error(left, step_s),
+        likeness=top,
+        drift_s=drift_s,
+        added=Added(off_s, at_s),
+    )
 
 
 def _step(motion: Motion) -> float:
@@ -251,29 +308,70 @@ def _vertex(values: Array, k: int) -> float:
     return 0.0 if curve >= 0 else float(np.clip((before - after) / (2 * curve), -1, 1))
 
 
-def _scatter(a: Array, b: Array, lag: int, step_s: float) -> tuple[float, float]:
-    """Standard error of the offset, and how much it changes from the first part to the last."""
+def _parts(a: Array, b: Array, lag: int, step_s: float) -> tuple[Array, Array]:
+    """Of parts of the logs, where each is in the first, in steps, and by how many seconds its own
+    offset differs from that of all; parts that tell nothing are left out.
+
+    Each is sought about the offset of all, then about the line through those found, as clocks that
+    drift leave the reach of the former.
+    """
     start, end = max(0, -lag), min(len(a), len(b) - lag)
-    reach = max(2, round(0.25 / step_s))
-    edges = np.linspace(start, end, PARTS + 1).astype(int)
-    shifts_s = []
-    for low, high in itertools.pairwise(edges):
-        low, high = max(low, reach - lag, 0), min(high, len(b) - lag - reach)
-        if (high - low) * step_s < LEAST_S / 2:
-            continue
-        shifts = np.arange(-reach, reach + 1)
-        like = np.array(
-            [_correlation(a[low:high], b[low + lag + s : high + lag + s]) for s in shifts]
-        )
-        if np.isfinite(like).all() and like.max() > LEAST_LIKE:
-            k = int(like.argmax())
-            shifts_s.append((shifts[k] + _vertex(like, k)) * step_s)
-    if len(shifts_s) < 3:
-        return step_s, 0.0
-    shifts_s = np.array(shifts_s)
-    spread = 1.4826 * np.median(np.abs(shifts_s - np.median(shifts_s)))
+    reach = max(2, round(REACH_S / step_s))
+    parts = list(itertools.pairwise(np.linspace(start, end, PARTS + 1).astype(int)))
+    middle = np.array([(low + high) / 2 for low, high in parts])
+    about, found = np.zeros(len(parts)), np.full(len(parts), np.nan)
+    for _ in range(2):
+        for i, (low, high) in enumerate(parts):
+            found[i] = _own_lag(a, b, (low, high), lag + round(about[i]), reach, step_s) - lag
+        told = np.isfinite(found)
+        if told.sum() < 3:
+            break
+        about = np.polyval(np.polyfit(middle[told], found[told], 1), middle)
+    told = np.isfinite(found)
+    return middle[told], found[told] * step_s
+
+
+def _own_lag(
+    a: Array, b: Array, part: tuple[int, int], lag: int, reach: int, step_s: float
+) -> float:
+    """The lag of a part of a log, within a reach about a lag, to a fraction of a step; NaN where it
+    is too short, moves too little, or is like the other nowhere there."""
+    low, high = max(part[0], reach - lag, 0), min(part[1], len(b) - lag - reach)
+    if (high - low) * step_s < LEAST_S / 2:
+        return np.nan
+    shifts = np.arange(-reach, reach + 1)
+    like = [_correlation(a[low:high], b[low + lag + s : high + lag + s]) for s in shifts]
+    if not np.isfinite(like).all() or max(like) < LEAST_LIKE:
+        return np.nan
+    k = int(np.argmax(like))
+    at_end = k in (0, len(shifts) - 1)
+    return np.nan if at_end else lag + shifts[k] + _vertex(np.array(like), k)
+
+
+def _standard_error(shift_s: Array, step_s: float) -> float:
+    """Of an offset, from how those of parts of the logs scatter."""
+    if len(shift_s) < 3:
+        return step_s
+    spread = 1.4826 * np.median(np.abs(shift_s - np.median(shift_s)))
     least = step_s / 20  # no more is believed of a parabola
-    return max(float(spread / np.sqrt(len(shifts_s))), least), _drift(shifts_s)
+    return max(float(spread / np.sqrt(len(shift_s))), least)
+
+
+def _pieces(at_s: Array, offset_s: Array) -> tuple[Array, Array]:
+    """Ends of straight pieces through offsets that drift: all of them, or a line's two, by which
+    predicts each inner offset from the others better."""
+    inner = range(1, len(at_s) - 1)
+    by_line, by_pieces = [], []
+    for i in inner:
+        others, x = np.delete(np.arange(len(at_s)), i), at_s[i] - at_s[0]
+        line = np.polyfit(at_s[others] - at_s[0], offset_s[others], 1)
+        by_line.append(offset_s[i] - np.polyval(line, x))
+        by_pieces.append(offset_s[i] - np.interp(at_s[i], at_s[others], offset_s[others]))
+    if np.square(by_pieces).sum() < np.square(by_line).sum():
+        return at_s, offset_s
+    line = np.polyfit(at_s - at_s[0], offset_s, 1)
+    ends = at_s[[0, -1]]
+    return ends, np.polyval(line, ends - at_s[0])
 
 
 def _drift(offset_s: Array) -> float:

@@ -5,10 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import calib
 from calib.effects import View, find
 from calib.problem.model import Source, stop_columns
 
 from .hidden import hide, placed, stops_of
+from .simulated import made
 
 
 @pytest.fixture(scope="module")
@@ -122,3 +124,12 @@ def test_the_mount_bends_down(source):
     # By an angle of 1 mrad times the sine between lever and gravity, at arm's length of the lever.
     np.testing.assert_allclose(fall, 1e-3 * across**2 / np.linalg.norm(lever, axis=1), atol=1e-7)
     assert fall.max() > 2e-5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["arm_payload_sag", "arm_torque_sag"])
+def test_a_joint_that_gives_way_is_named_by_what_it_gives_way_to(tmp_path, name):
+    """Gravity alone explains most of a measured torque, and comes first until it is fitted."""
+    made(tmp_path / "rec", "laser-tracker", 2, **{name: 0.5})
+    run = calib.fit(tmp_path / "rec", tmp_path / "run")
+    assert calib.diagnose(run, refits=False).worth_adding == [name]

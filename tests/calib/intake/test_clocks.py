@@ -119,11 +119,22 @@ def test_what_is_given_is_applied_and_not_estimated(edges):
     assert found.tracks[1].time_s[0] == pytest.approx(3.0) and "as given" in found.understood[1]
 
 
-def test_a_clock_that_drifts_is_named(edges):
+@pytest.mark.parametrize("warps", [False, True])
+def test_a_clock_that_drifts_is_corrected(edges, warps):
+    """A clock that is fast, and one whose speed changes, as a crystal's does while it warms up."""
     drifting = cup(0.0, noise=0)
-    drifting = replace(drifting, time_s=drifting.time_s * 1.005)
-    said = align([joints(), drifting], [], edges, {})
-    assert any("drifts" in line for line in said.odd), said.understood
+    true_s = drifting.time_s
+    late_s = 0.004 * true_s if not warps else 0.25 * (true_s / END_S) ** 2
+    said = align([joints(), replace(drifting, time_s=true_s + late_s)], [], edges, {})
+    off_s = said.tracks[1].time_s - true_s
+    assert late_s[-1] > 0.2 and np.abs(off_s).max() < 0.015 and np.abs(off_s).mean() < 0.004
+    (line,) = said.odd
+    assert "drifts by -0.2" in line and ("pieces" if warps else "straight line") in line
+
+
+def test_a_clock_that_keeps_time_is_not_bent(edges):
+    said = align([joints(), cup(0.7, noise=3e-3)], [], edges, {})
+    assert not said.odd and np.ptp(said.tracks[1].time_s - cup(0.0).time_s) < 1e-9
 
 
 def test_motion_that_repeats_is_ambiguous(edges):
