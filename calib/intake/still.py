@@ -13,12 +13,12 @@ from chains.frames import Edge
 from chains.se3 import Array
 from sensors.readers.base import Track
 
-WINDOW_S = 0.25
+WINDOW_S = 0.25  # rates are smoothed over it: an arm takes longer to move
 REST_SHARE = 0.1  # of the time at least, things are taken to be at rest
 FACTOR = 4.0  # above the rate at rest, and it is no noise
 SLOWEST, FASTEST = 0.003, 0.05  # rad/s or m/s between which the threshold lies
 SETTLE_S = 0.3  # cut from both ends of a hold
-MIN_HOLD_S = 1.0
+MIN_HOLD_S = 1.0  # ten turns of a LiDAR, by which its noise averages to a third
 
 
 @dataclass(frozen=True)
@@ -63,11 +63,12 @@ def find_holds(
         limit = threshold if threshold is not None else learned(rate)
         still.append(_spans(time_s, rate < limit, ~np.isfinite(rate)))
         said.append(f"holds: {name} is at rest below {1e3 * limit:.1f} mrad/s or mm/s")
-    spans = still[0]
+    together = still[0]
     for other in still[1:]:
-        spans = _both(spans, other)
-    spans = spans + np.array([SETTLE_S, -SETTLE_S])
-    spans = spans[spans[:, 1] - spans[:, 0] >= min_hold_s - 1e-9]
+        together = _both(together, other)
+    together = together + np.array([SETTLE_S, -SETTLE_S])
+    long = together[:, 1] - together[:, 0] >= min_hold_s - 1e-9
+    spans = together[long]
     if not len(spans):
         raise InputError(
             f"nothing stands still for {min_hold_s:g} s anywhere in the logs; say --still "
@@ -78,7 +79,36 @@ def find_holds(
         f"holds: {len(spans)}, of {lengths.min():.1f} to {lengths.max():.1f} s, over "
         f"{spans[-1, 1] - spans[0, 0]:.0f} s"
     )
+    said += _dropped(together[~long], min_hold_s)
+    for own, (_, _, name) in zip(still, rates, strict=True):
+        said += _broken(own, spans, name, min_hold_s)
     return Holds(spans, said)
+
+
+def _dropped(short: Array, min_hold_s: float) -> list[str]:
+    """What is said of periods (n, 2) too short to be holds; those that merely brush are none."""
+    lengths = short[:, 1] - short[:, 0]
+    lengths = lengths[lengths > 0]
+    if not len(lengths):
+        return []
+    return [
+        f"holds: {len(lengths)} more were dropped, as they last less than {min_hold_s:g} s after "
+        f"{SETTLE_S:g} s to settle at both ends (the longest {lengths.max():.1f} s)"
+    ]
+
+
+def _broken(own: Array, spans: Array, name: str, min_hold_s: float) -> list[str]:
+    """What is said of periods (n, 2) in which one log is at rest and no hold is, as another moves
+    there."""
+    own = own[own[:, 1] - own[:, 0] >= min_hold_s + 2 * SETTLE_S]
+    meets = (own[:, None, 0] < spans[None, :, 1]) & (spans[None, :, 0] < own[:, None, 1])
+    alone = own[~meets.any(axis=1)]
+    if not len(alone):
+        return []
+    return [
+        f"holds: {len(alone)} times {name} is at rest long enough while another log moves, first "
+        f"from {alone[0, 0]:.1f} to {alone[0, 1]:.1f} s"
+    ]
 
 
 def learned(rate: Array) -> float:

@@ -66,6 +66,28 @@ def test_all_that_moves_must_be_still():
     assert not np.any((found[:, 0] < middle) & (found[:, 1] > middle + 0.2))
 
 
+def test_what_is_dropped_is_said_with_the_reason():
+    """The arm rests nine times; the base shakes all through the fourth rest, from end to end."""
+    lengths = np.sort(SPANS[:, 1] - SPANS[:, 0])
+    least_s = float(lengths[1:3].mean()) - 2 * SETTLE_S  # one or two of the nine are shorter
+    found = find_holds([joints()], (), min_hold_s=least_s)
+    (line,) = (line for line in found.understood if "dropped" in line)
+    assert int(line.split()[1]) == len(SPANS) - len(found.spans_s) > 0
+
+    xyz = np.zeros((len(TIME_S), 7))
+    xyz[:, 3] = 1
+    shaken = (SPANS[3, 0] - 0.5 < TIME_S) & (SPANS[3, 1] + 0.5 > TIME_S)
+    xyz[:, 0] = np.where(shaken, 0.05 * np.sin(9 * TIME_S), 0.0)
+    base = Track(name="base", kind="pose", clock="c", time_s=TIME_S, names=POSE, values=xyz)
+    found = find_holds([joints(), base], ())
+    assert len(found.spans_s) == len(SPANS) - 1
+    (line,) = (line for line in found.understood if "while another log moves" in line)
+    assert line.startswith("holds: 1 times log is at rest")
+    said = float(line.split("first from ")[1].split()[0])
+    assert abs(said - SPANS[3, 0]) < SETTLE_S
+    assert not any("dropped" in line for line in find_holds([joints()], ()).understood)
+
+
 def test_a_body_out_of_sight_breaks_no_hold():
     hidden = cup()
     hidden.values[(SPANS[4, 0] + 0.8 < TIME_S) & (SPANS[4, 1] - 0.8 > TIME_S)] = np.nan
