@@ -119,7 +119,7 @@ class Chance:
             return replace(again, rivals=self.rivals) if again else self
         known, found = spreads(estimate), []
         for unknown in by_chance(estimate.problem):
-            if unknown.name.rpartition("/")[2] == self.effect.name:  # before it: of which rig
+            if unknown.owner.effect == self.effect.name:  # of whichever rig
                 rows = told([unknown], estimate.values, estimate.covariance_of([unknown.name]))
                 pairs = zip(units_of(self.effect), spread_keys(unknown), strict=True)
                 each = [Spread("", unit, *known[key]) for unit, key in pairs]

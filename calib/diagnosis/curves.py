@@ -51,11 +51,11 @@ def curves(screen: Screen) -> list[Curve]:
     """The curve of every covariate, and the map of every pair, that was tested for structure; of
     each rig, where there are several."""
     return [
-        _curve(screen, c.effect, at, name.removesuffix(c.effect.name).removesuffix("/"))
+        _curve(screen, c.effect, at, screen.scores.owner[name].rig)
         for c in screen.candidates
         if isinstance(c.effect, Binned)
         for name, at in screen.scores.at.items()
-        if f"/{name}".endswith(f"/{c.effect.name}")
+        if screen.scores.owner[name].effect == c.effect.name
     ]
 
 

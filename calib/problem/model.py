@@ -13,7 +13,7 @@ import numpy as np
 
 from calib import effects
 from calib.effects import Effect, FrameOffset
-from calib.forward import Term
+from calib.forward import Term, named
 from calib.residuals.groups import Group, Kind
 from calib.residuals.store import BeamStore
 from calib.rig import Rig, load_rig
@@ -157,10 +157,8 @@ class Model:
         for effect in chosen:
             free = self._free(effect, rig)
             if len(free):
-                own = several and owned(effect, rig)
-                terms.append(
-                    Term(effect, f"{rig.name}/{effect.name}" if own else effect.name, free)
-                )
+                owner = rig.name if several and owned(effect, rig) else ""
+                terms.append(Term(effect, named(effect.name, owner), free, owner))
         return terms
 
     def _free(self, effect: Effect, rig: Rig) -> np.ndarray:

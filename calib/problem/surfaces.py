@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from calib.problem.problem import Problem, SurfaceCells
-from calib.problem.unknowns import Role, Unknown
+from calib.problem.unknowns import Owner, Role, Unknown, vector_unknown
 from calib.residuals.beams import Association
 from calib.residuals.scan import ScanStop
 from calib.residuals.surfaces import PLANE_PATCHES_M, PlaneSurface
@@ -107,15 +107,13 @@ def well_seen(problem: Problem, associations: Sequence[Association]) -> list[Ass
 
 
 def _unknown(name: str, room: int | str, column: str, parts: np.ndarray, sigma_m: float) -> Unknown:
-    return Unknown(
+    return vector_unknown(
         name,
-        "vector",
-        mean=np.zeros(len(parts)),
-        sigma=np.full(len(parts), sigma_m),
-        dofs=tuple(f"{column}_{part}" for part in parts),
+        np.full(len(parts), sigma_m),
+        dofs=(f"{column}_{part}" for part in parts),
         units=("m",) * len(parts),
         role=Role.SURFACE,
-        owner=room,
+        owner=Owner(room=room),
     )
 
 

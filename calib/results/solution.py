@@ -103,8 +103,7 @@ def solution_of(problem: Problem, estimate: Estimate, told: np.ndarray | None = 
     for source, terms in zip(problem.sources, problem.terms, strict=True):
         rig = source.rig
         for term in terms:
-            own = term.variable != term.effect.name
-            part = recordings.setdefault(rig.name, Part()) if own else shared
+            part = recordings.setdefault(term.rig, Part()) if term.rig else shared
             if term.effect.by_chance:
                 part.effects[term.effect.name] = _spread(term, scatter)
                 continue
