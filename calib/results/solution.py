@@ -12,6 +12,7 @@ from calib.effects import FrameOffset
 from calib.forward import Term
 from calib.problem import Problem
 from calib.problem.model import Source
+from calib.problem.spread import names_of
 from calib.results.observability import not_estimated
 from calib.solve.components import spreads
 from calib.solve.estimate import Estimate
@@ -105,7 +106,7 @@ def solution_of(problem: Problem, estimate: Estimate, told: np.ndarray | None = 
         for term in terms:
             part = recordings.setdefault(term.rig, Part()) if term.rig else shared
             if term.effect.by_chance:
-                part.effects[term.effect.name] = _spread(term, scatter)
+                part.effects[term.effect.name] = _spread(problem, term, scatter)
                 continue
             theta = estimate.values[term.variable]
             covariance = told[at[term.variable], at[term.variable]]
@@ -168,14 +169,14 @@ def _effect(
     return EffectEstimate(unit, tuple(p.name for p in params), estimate, sigma)
 
 
-def _spread(term: Term, told: Mapping[str, tuple[float, float]]) -> EffectEstimate:
+def _spread(
+    problem: Problem, term: Term, told: Mapping[str, tuple[float, float]]
+) -> EffectEstimate:
     """What is known of an effect by chance: how widely it scatters; of several bodies, each."""
-    mine = {key: each for key, each in told.items() if key.startswith(f"{term.variable}.")}
-    mine = mine or {f"{term.variable}.sd": told[term.variable]}
-    names = tuple(key.removeprefix(f"{term.variable}.") for key in mine)
-    units = [name.rpartition(".")[2] if "." in name else term.effect.unit for name in names]
-    sd, sigma = np.array(list(mine.values())).T
-    return EffectEstimate(one_unit(units), names, sd, sigma)
+    names = names_of(problem, term)
+    sd, sigma = np.array([told[key] for key in names]).T
+    unit = one_unit([each.unit for each in names.values()])
+    return EffectEstimate(unit, tuple(each.name for each in names.values()), sd, sigma)
 
 
 def _absent(problem: Problem) -> list[dict[str, str]]:
