@@ -47,14 +47,15 @@ def with_surfaces(
         first = problem.scans[scans[0]]
         if not first.reference_sigma_m:
             continue
+        on_planes = isinstance(first.meeting, PlaneSurface)
         for column, kind in kinds_of(first).items():
-            parts_of = {i: _parts(problem, associations[i], i, column) for i in scans}
-            last = max(int(p.max(initial=-1)) for p in parts_of.values())
-            seen = sum(np.bincount(p + 1, minlength=last + 2) for p in parts_of.values())
+            parts_in = {i: _parts(problem, associations[i], i, column) for i in scans}
+            last = max(int(p.max(initial=-1)) for p in parts_in.values())
+            seen = sum(np.bincount(p + 1, minlength=last + 2) for p in parts_in.values())
             parts = np.flatnonzero(seen[1:])  # counted from -1: nothing is met
             number = np.full(last + 2, -1, np.int32)  # the last stands for -1
             number[parts] = np.arange(len(parts))
-            name = kind if column != kind else f"{room}/reference_{column}"
+            name = kind if on_planes else f"{room}/reference_{column}"
             sigma_m = cell_sigma_m(first, column)
             unknowns.append(_unknown(name, room, column, parts, sigma_m))
             cells[name] = SurfaceCells(
@@ -65,7 +66,7 @@ def with_surfaces(
                 room=room,
             )
             for i in scans:
-                numbered[i][name] = number[parts_of[i]]
+                numbered[i][name] = number[parts_in[i]]
     found = [replace(a, cells=n) for a, n in zip(associations, numbered, strict=True)]
     return problem.with_cells(unknowns, cells), found
 
@@ -74,8 +75,13 @@ def kinds_of(scan: ScanStop) -> dict[str, str]:
     """Column of the parts of what a scan meets -> what those with one spread are called: all meshes
     have one for each column; the planes of a recording have their own."""
     if isinstance(scan.meeting, PlaneSurface):
-        return {column: f"{scan.meeting.variable}/{column}" for column in PLANE_PATCHES_M}
+        return dict(zip(PLANE_PATCHES_M, parts_of(scan.meeting), strict=True))
     return {column: column for column in SURFACE_SHARES}
+
+
+def parts_of(planes: PlaneSurface) -> list[str]:
+    """The unknowns of the parts of planes, one for each kind."""
+    return [f"{planes.variable}/{column}" for column in PLANE_PATCHES_M]
 
 
 def cell_sigma_m(scan: ScanStop, column: str) -> float:
