@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -30,6 +30,18 @@ class Role(Enum):
     PLANE = "plane"  # planes found in the scans
     SURFACE = "surface"  # how far parts of the mesh, or of planes, stand off the room
     SCATTER = "scatter"  # what chance does anew to each stop or location
+
+
+class Key(NamedTuple):
+    """One parameter: its unknown, and its name among those of that. Either may have dots in it."""
+
+    unknown: str
+    dof: str
+
+    @property
+    def name(self) -> str:
+        """As files and people have it."""
+        return f"{self.unknown}.{self.dof}"
 
 
 @dataclass(frozen=True)
@@ -85,6 +97,11 @@ class Unknown:
     @property
     def dim(self) -> int:
         return len(self.sigma)
+
+    @property
+    def keys(self) -> tuple[Key, ...]:
+        """(dim,) of its parameters."""
+        return tuple(Key(self.name, dof) for dof in self.dofs)
 
     @property
     def prior_sigma(self) -> np.ndarray:
