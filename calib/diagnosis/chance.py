@@ -369,7 +369,7 @@ def _of_rows(effect: Scatter, sums: Sums, problem: Problem) -> Chance | None:
         grown = max(at_first.growth(), 0.0)
         sd = float(np.sqrt(grown * variance))
         of_sd = sigma_beyond(sd, variance * at_first.sigma(grown))
-        spreads.append(Spread(whose.text, whose.unit, sd, of_sd, whose.what))
+        spreads.append(Spread(whose.text, whose.unit, sd, of_sd, who=whose.what))
         p.append(float(special.chdtrc(at_first.dof, at_first.scaled)))
         statistic += at_first.statistic(grown)
         if whose.unit == effect.leading:
