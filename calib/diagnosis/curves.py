@@ -10,8 +10,7 @@ import numpy as np
 
 from calib.diagnosis.candidates import Binned
 from calib.diagnosis.screen import Screen
-
-CONFIDENCE = 0.95
+from calib.linear.binned import BinnedMean, TwoWay
 
 
 @dataclass(frozen=True)
@@ -63,19 +62,14 @@ def _curve(screen: Screen, effect: Binned, columns: slice, rig: str) -> Curve:
     scores = screen.scores
     weight = np.diag(scores.whole)[columns]
     weight = np.where(weight > 1e-9 * weight.max(), weight, np.nan)
-    stop, place = np.square(scores.by_stop[:, columns]), np.square(scores.by_place[:, columns])
-    one_way = np.maximum(stop.sum(axis=0), place.sum(axis=0))
-    two_way = stop.sum(axis=0) + place.sum(axis=0) - np.square(scores.both[:, columns]).sum(axis=0)
+    ways = (scores.by_stop, scores.by_place, scores.both)
+    squares = TwoWay.of(*(way[:, columns] for way in ways))
     model = screen.common * np.diag(scores.information)[columns]
-    sigma = np.sqrt(np.maximum(np.maximum(one_way, two_way), model)) / weight
-    scale = np.sqrt(np.maximum(stop.sum(axis=0) + place.sum(axis=0), 1e-300))
-    by_chance = np.abs(scores.draws[:, columns]) / scale
-    width = np.quantile(by_chance[:, np.isfinite(weight)].max(axis=1), CONFIDENCE)
     # A range error of 1 m changes every residual of its bin by as much: mean = score / weight.
-    mean = scores.score[columns] / weight
+    found = BinnedMean.of(scores.score[columns], weight, squares, model)
     return Curve(
         centres=effect.centres,
-        mean_m=mean.reshape(effect.bins),
-        band_m=(width * sigma).reshape(effect.bins),
+        mean_m=found.mean.reshape(effect.bins),
+        band_m=found.together(scores.draws[:, columns], squares).reshape(effect.bins),
         rig=rig,
     )
