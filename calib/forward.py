@@ -24,6 +24,12 @@ ROOT, NOISE = "root of each", "noise of each"
 Derivatives = dict[str, np.ndarray]
 
 
+def named(name: str, rig: str) -> str:
+    """Name of the unknown of a frame or an effect: that of the rig stands before it where it
+    belongs to one of several rigs."""
+    return f"{rig}/{name}" if rig else name
+
+
 @dataclass(frozen=True)
 class Term:
     """An effect as it stands in a model: its variable in the graph, and what of it is free."""
@@ -31,6 +37,7 @@ class Term:
     effect: Effect
     variable: str
     free: np.ndarray  # (n,) indices into the effect's parameters
+    rig: str = ""  # that it belongs to alone, as `named` has it
 
     def basis(self, view: View) -> np.ndarray | OneHot:
         """The effect's basis, of the free parameters only."""

@@ -1,7 +1,7 @@
 """What sources say of themselves: what they import, what they show, how they call."""
 
 import ast
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from graphlib import CycleError, TopologicalSorter
 from importlib.util import resolve_name
 from pathlib import Path
@@ -148,3 +148,15 @@ def _is_set(node: ast.AST) -> bool:
 
 def _called(node: ast.Call) -> str:
     return getattr(node.func, "id", getattr(node.func, "attr", ""))
+
+
+TAKES_APART = {"startswith", "endswith", "removeprefix", "removesuffix"}
+TAKES_APART |= {"partition", "rpartition", "rsplit"}  # no `split`: numpy's takes arrays apart
+
+
+def calls(tree: ast.Module, names: Collection[str]) -> Iterator[int]:
+    """Lines that call a function or method of one of these names."""
+    for node in (n for n in ast.walk(tree) if isinstance(n, ast.Call)):
+        name = getattr(node.func, "attr", getattr(node.func, "id", ""))
+        if name in names:
+            yield node.lineno

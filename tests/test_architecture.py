@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 
 from .sources import (
+    TAKES_APART,
+    calls,
     dataclasses,
     every_argument,
     import_cycle,
@@ -57,6 +59,30 @@ ROOMS = {
         "cli",
     ),
 }
+# Rooms that know unknowns. What one is says its `Unknown`; its name is made, and not taken apart.
+# Beside them what takes other texts apart: what users type, files, sentences, columns and units.
+KNOWING_UNKNOWNS = ("forward", "residuals", "problem", "linear", "solve", "results", "blunders")
+KNOWING_UNKNOWNS += ("diagnosis", "runs", "planning")
+TEXTS = {
+    "calib/blunders/told.py": "directions, in sentences",
+    "calib/diagnosis/candidates.py": "families of effects, for a formula",
+    "calib/diagnosis/formulas/factors.py": "columns",
+    "calib/diagnosis/formulas/found.py": "columns, sites and texts of formulas",
+    "calib/diagnosis/formulas/seen.py": "sentences",
+    "calib/diagnosis/rejects/found.py": "units of columns",
+    "calib/diagnosis/suggest.py": "units of columns",
+    "calib/diagnosis/verdict/sentences.py": "sentences",
+    "calib/planning/purpose.py": "--for",
+    "calib/planning/tolerance.py": "--until",
+    "calib/problem/beams.py": "--without",
+    "calib/problem/model.py": "--fix",
+    "calib/problem/without.py": "--without",
+    "calib/residuals/groups.py": "--without",
+    "calib/runs/calibrate.py": "effects that `add` names",
+    "calib/runs/estimates.py": "solution.yaml",
+    "calib/runs/reopen.py": "state.npz",
+    "calib/runs/run.py": "state.npz",
+}
 AT_THE_ROOT_OF_CALIB = {"__init__", "forward"}
 
 
@@ -103,6 +129,31 @@ def test_the_simulator_shares_nothing_of_the_fit():
             if name.startswith(("calib.residuals", "calib.linear", "calib.solve"))
         ]
     )
+
+
+def test_an_unknown_is_born_among_the_problems():
+    none(
+        [
+            f"{path}:{line}"
+            for path, tree in packages().items()
+            if not path.startswith("calib/problem/")
+            for line in calls(tree, {"Unknown"})
+        ]
+    )
+
+
+def test_no_name_of_an_unknown_is_taken_apart():
+    rooms = {path: path.split("/")[1].removesuffix(".py") for path in packages()}
+    mine = {p: t for p, t in packages().items() if rooms[p] in KNOWING_UNKNOWNS}
+    found = {path: list(calls(tree, TAKES_APART)) for path, tree in mine.items()}
+    none([f"{path}:{line}" for path, some in found.items() if path not in TEXTS for line in some])
+    none([f"{path} takes no text apart" for path in TEXTS if not found[path]])
+
+
+def test_a_name_that_is_taken_apart_would_be_found():
+    bad = ("n.rpartition('.')[0]", "[n for n in x if n.startswith('a')]", "f(n).removesuffix(SD)")
+    assert [list(calls(ast.parse(text), TAKES_APART)) for text in bad] == [[1]] * 3
+    assert list(calls(ast.parse("np.split(a, 2)\nUnknown(x)"), {*TAKES_APART, "Unknown"})) == [2]
 
 
 def test_every_folder_of_code_is_a_package():

@@ -26,6 +26,7 @@ from calib.blunders.others import UNCHECKED, Others, at_their_sigmas, parts, whi
 from calib.blunders.rows import GroupRows, group_rows, scan_rows
 from calib.linear.system import Linearisation
 from calib.problem.problem import Problem
+from calib.problem.spread import Whose
 from calib.residuals.groups import BEAMS, Group
 from calib.solve.components import Sums, Told, squares_beside_bodies
 
@@ -120,7 +121,7 @@ def standing_alone(
 def beside_bodies(
     whole: Linearisation,
     problem: Problem,
-    whose: Collection[tuple[str, str]],
+    whose: Collection[Whose],
     wild: Collection[Group],
 ) -> Sums:
     """What rows that are of no body say of their sigmas; arguments as of

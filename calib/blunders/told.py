@@ -157,7 +157,7 @@ def _sentence(left: LeftOut, wrong_sign: str | None) -> str:
     *size, axis = left.blunder.leading()
     along = f" {axis}" if axis.startswith("about") else f" in {axis}" if axis else ""
     along = f" {axis}" if axis == BEAMS else along
-    along = "" if axis == left.blunder.group.what.rpartition(".")[2] else along
+    along = "" if left.blunder.group.what.endswith(f".{axis}") else along
     sign = f", as if the sign of its {wrong_sign} were wrong" if wrong_sign else ""
     group = str(left.blunder.group)
     group = f"T{group[1:]}" if group.startswith("the ") else group

@@ -25,7 +25,7 @@ from calib.diagnosis.score import Scores
 from calib.effects import CATALOGUE, Scatter, Site
 from calib.linear.system import Linearisation
 from calib.problem import Problem
-from calib.problem.spread import OF_TARGETS, by_chance, rows_at, sigmas, spread_keys
+from calib.problem.spread import SpreadName, Whose, by_chance, rows_at, sigmas, spread_keys
 from calib.results.solution import one_unit
 from calib.solve.components import (
     LEAST,
@@ -60,15 +60,17 @@ class Spread:
     """How widely values scatter, or the rows of one body beyond their sigma.
 
     Args:
-        of: the body; empty where the effect has one spread.
+        of: the body, as files have it; empty where the effect has one spread.
         unit: "m" or "rad".
         sd, sigma: the spread, and its sigma.
+        who: the body, as people read it.
     """
 
     of: str
     unit: str
     sd: float
     sigma: float
+    who: str = ""
 
     @property
     def told(self) -> str:
@@ -119,7 +121,7 @@ class Chance:
             return replace(again, rivals=self.rivals) if again else self
         known, found = spreads(estimate), []
         for unknown in by_chance(estimate.problem):
-            if unknown.name.rpartition("/")[2] == self.effect.name:  # before it: of which rig
+            if unknown.owner.effect == self.effect.name:  # of whichever rig
                 rows = told([unknown], estimate.values, estimate.covariance_of([unknown.name]))
                 pairs = zip(units_of(self.effect), spread_keys(unknown), strict=True)
                 each = [Spread("", unit, *known[key]) for unit, key in pairs]
@@ -163,8 +165,7 @@ class Chance:
 
     def _name(self, spread: Spread) -> str:
         """As solution.yaml has it."""
-        several = spread.of or len(self.spreads) > 1
-        return f"{spread.of or 'sd'}.{spread.unit}" if several else "sd"
+        return SpreadName.made(spread.of, spread.unit, len(self.spreads) > 1).name
 
     @property
     def unsettled(self) -> str:
@@ -182,7 +183,7 @@ class Chance:
         if self.effect.widens:
             sizes: dict[str, list[str]] = {}
             for spread in (s for s in self.spreads if s.sd > s.sigma):
-                sizes.setdefault(spread.of.removeprefix(OF_TARGETS), []).append(spread.told)
+                sizes.setdefault(spread.who, []).append(spread.told)
             told = ", ".join(f"{of} by {' and '.join(some)}" for of, some in sizes.items())
             what = f"{NOUNS[self.effect.site]} more than rig.yaml says: beyond its sigma, {told}"
         else:
@@ -343,11 +344,12 @@ def rows_by_chance(
         whole: all rows, linearised at the fit.
         problem: of the fit.
     """
-    sums: dict[tuple[str, str], Checks] = {}
+    sums: dict[Whose, Checks] = {}
     for shift in (b.shift for b in blunders if not b.found and b.group.kind == "body"):
         for unit, squares_there in shift.squares.items():
-            here, before = Checks.alone(*squares_there), sums.get((shift.group.what, unit))
-            sums[shift.group.what, unit] = here if before is None else before + here
+            body = Whose("body", shift.group.what, unit)
+            here, before = Checks.alone(*squares_there), sums.get(body)
+            sums[body] = here if before is None else before + here
     sites = {effect.site for effect in effects} - {Site.TRACKER}
     if whose := {each for site in sites for each in rows_at(problem, site)}:
         sums |= beside_bodies(whole, problem, whose, [b.group for b in blunders if b.found])
@@ -360,16 +362,17 @@ def _of_rows(effect: Scatter, sums: Sums, problem: Problem) -> Chance | None:
     known, spreads, p, statistic, detectable = sigmas(problem), [], [], 0.0, np.inf
     mine = [whose for whose in rows_at(problem, effect.site) if whose in sums]
     checked = {whose: sums[whose] for whose in mine if sums[whose].left >= FEWEST}
-    for (what, unit), checks in checked.items():
-        sigma, beyond = known[what, unit]
+    for whose, checks in checked.items():
+        sigma, beyond = known[whose]
         variance = sigma**2 - beyond**2
         at_first = checks.had_variance(variance / sigma**2)
         grown = max(at_first.growth(), 0.0)
         sd = float(np.sqrt(grown * variance))
-        spreads.append(Spread(what, unit, sd, sigma_beyond(sd, variance * at_first.sigma(grown))))
+        of_sd = sigma_beyond(sd, variance * at_first.sigma(grown))
+        spreads.append(Spread(whose.text, whose.unit, sd, of_sd, who=whose.what))
         p.append(float(special.chdtrc(at_first.dof, at_first.scaled)))
         statistic += at_first.statistic(grown)
-        if unit == effect.leading:
+        if whose.unit == effect.leading:
             limit = special.chdtri(at_first.dof, ALPHA / LOOKS / len(checked))
             enough = limit / special.chdtri(at_first.dof, POWER) - 1.0
             share = at_first.told / at_first.left

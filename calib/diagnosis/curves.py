@@ -10,8 +10,7 @@ import numpy as np
 
 from calib.diagnosis.candidates import Binned
 from calib.diagnosis.screen import Screen
-
-CONFIDENCE = 0.95
+from calib.linear.binned import BinnedMean, TwoWay
 
 
 @dataclass(frozen=True)
@@ -51,11 +50,11 @@ def curves(screen: Screen) -> list[Curve]:
     """The curve of every covariate, and the map of every pair, that was tested for structure; of
     each rig, where there are several."""
     return [
-        _curve(screen, c.effect, at, name.removesuffix(c.effect.name).removesuffix("/"))
+        _curve(screen, c.effect, at, screen.scores.owner[name].rig)
         for c in screen.candidates
         if isinstance(c.effect, Binned)
         for name, at in screen.scores.at.items()
-        if f"/{name}".endswith(f"/{c.effect.name}")
+        if screen.scores.owner[name].effect == c.effect.name
     ]
 
 
@@ -63,19 +62,14 @@ def _curve(screen: Screen, effect: Binned, columns: slice, rig: str) -> Curve:
     scores = screen.scores
     weight = np.diag(scores.whole)[columns]
     weight = np.where(weight > 1e-9 * weight.max(), weight, np.nan)
-    stop, place = np.square(scores.by_stop[:, columns]), np.square(scores.by_place[:, columns])
-    one_way = np.maximum(stop.sum(axis=0), place.sum(axis=0))
-    two_way = stop.sum(axis=0) + place.sum(axis=0) - np.square(scores.both[:, columns]).sum(axis=0)
+    ways = (scores.by_stop, scores.by_place, scores.both)
+    squares = TwoWay.of(*(way[:, columns] for way in ways))
     model = screen.common * np.diag(scores.information)[columns]
-    sigma = np.sqrt(np.maximum(np.maximum(one_way, two_way), model)) / weight
-    scale = np.sqrt(np.maximum(stop.sum(axis=0) + place.sum(axis=0), 1e-300))
-    by_chance = np.abs(scores.draws[:, columns]) / scale
-    width = np.quantile(by_chance[:, np.isfinite(weight)].max(axis=1), CONFIDENCE)
     # A range error of 1 m changes every residual of its bin by as much: mean = score / weight.
-    mean = scores.score[columns] / weight
+    found = BinnedMean.of(scores.score[columns], weight, squares, model)
     return Curve(
         centres=effect.centres,
-        mean_m=mean.reshape(effect.bins),
-        band_m=(width * sigma).reshape(effect.bins),
+        mean_m=found.mean.reshape(effect.bins),
+        band_m=found.together(scores.draws[:, columns], squares).reshape(effect.bins),
         rig=rig,
     )

@@ -18,6 +18,7 @@ from calib.linear.layout import Layout, positions
 from calib.linear.linearise import linearise
 from calib.linear.system import Linearisation
 from calib.problem.problem import Problem
+from calib.problem.unknowns import Owner
 from calib.solve.clustered import Beams, of_cells, of_graph, of_stops
 from calib.solve.estimate import Estimate
 from calib.solve.fit import Progress
@@ -38,6 +39,7 @@ class Linear:
 
     Args:
         candidates: unknowns that the model does not have; they have no prior.
+        owner: unknown -> whose it is.
         at: unknown -> its columns among the S, of those that were not eliminated.
         columns: unknown -> its columns among the U.
         information: (S, S) of all rows; the priors of the hardware widened.
@@ -53,6 +55,7 @@ class Linear:
     """
 
     candidates: tuple[str, ...]
+    owner: Mapping[str, Owner]
     at: Mapping[str, np.ndarray]
     columns: Mapping[str, slice]
     information: np.ndarray
@@ -148,6 +151,7 @@ def linearise_with(
     table, stop, place = gradients.table()
     return Linear(
         candidates=tuple(candidates),
+        owner={name: unknown.owner for name, unknown in wide.variables.items()},
         at={name: at[np.r_[layout.at[name]]] for name in layout.outer()},
         columns=layout.at,
         information=information / np.outer(unit, unit),

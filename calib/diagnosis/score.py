@@ -20,6 +20,7 @@ from calib.blunders.chance import at_least, log_tail
 from calib.diagnosis.jackknife import ScoreSpread, Shares, by_signs
 from calib.diagnosis.linear import Linear
 from calib.linear.clusters import summed
+from calib.problem.unknowns import Owner
 
 GAUGE = 1e-6  # share of a direction's information that is left, below which there is none
 UNFELT = 1e-9  # of an effect's largest column, below which no row feels a parameter
@@ -33,6 +34,7 @@ class Scores:
 
     Args:
         at: candidate -> its columns.
+        owner: candidate -> whose it is.
         score: (Q,).
         information: (Q, Q) left after projection.
         whole: (Q, Q) before it.
@@ -43,6 +45,7 @@ class Scores:
     """
 
     at: Mapping[str, slice]
+    owner: Mapping[str, Owner]
     score: np.ndarray
     information: np.ndarray
     whole: np.ndarray
@@ -132,6 +135,7 @@ def project(linear: Linear, names: Sequence[str], spent: int = 0) -> Scores:
     cells = linear.gradient[:, own].toarray() + linear.gradient[:, others] @ away[others]
     return Scores(
         at=at,
+        owner={name: linear.owner[name] for name in names},
         score=cells.sum(axis=0),
         information=information_left(linear, names),
         whole=linear.raw[np.ix_(theirs, theirs)],

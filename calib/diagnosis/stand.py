@@ -25,6 +25,7 @@ from calib.diagnosis.linear import Linear, linearise_with, rows_along
 from calib.diagnosis.score import Test, away_from_model, project, test
 from calib.diagnosis.screen import Candidate, Screen, screen
 from calib.effects import CATALOGUE, Effect, Scatter, Site
+from calib.forward import named
 from calib.linear.layout import Layout
 from calib.linear.system import Linearisation
 from calib.problem import Problem
@@ -196,7 +197,7 @@ class Stand:
     def _state_with(self, swapped: Mapping[str, Effect]) -> dict[str, np.ndarray]:
         """The state, for a model in which some effects have other shapes."""
         renamed = {
-            t.variable: t.variable.removesuffix(t.effect.name) + swapped[t.effect.name].name
+            t.variable: named(swapped[t.effect.name].name, t.rig)
             for terms in self.problem.terms
             for t in terms
             if t.effect.name in swapped

@@ -11,6 +11,7 @@ from calib.diagnosis.score import projection
 from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import what_separates
 from calib.effects import Effect
+from calib.problem.unknowns import Key
 from calib.results.observability import UNTOLD, echelon
 from calib.results.solution import Solution
 
@@ -50,26 +51,25 @@ def to_be_told_apart(
 def leaning(solution: Solution, look: Look) -> list[dict[str, Any]]:
     """The weakest directions of a run's solution, in units of what was known before."""
     problem = look.stand.problem
-    prior = {}
-    for name in problem.calibration:
-        variable = problem.variables[name]
-        prior |= {f"{name}.{d}": s for d, s in zip(variable.dofs, variable.sigma, strict=True)}
-    known = np.array([prior.get(name, np.nan) for name in solution.names])
+    prior: dict[Key, float] = {}
+    for variable in (problem.variables[name] for name in problem.calibration):
+        prior |= dict(zip(variable.keys, variable.sigma.tolist(), strict=True))
+    known = np.array([prior.get(key, np.nan) for key in solution.keys])
     usable = np.flatnonzero(np.isfinite(known))
     if not len(usable):
         return []
-    known, names = known[usable], [solution.names[i] for i in usable]
+    known, keys = known[usable], [solution.keys[i] for i in usable]
     graph = solution.covariance if solution.graph is None else solution.graph
-    return hardly_known(names, graph[np.ix_(usable, usable)], known)
+    return hardly_known(keys, graph[np.ix_(usable, usable)], known)
 
 
 def hardly_known(
-    names: Sequence[str], covariance: np.ndarray, known: np.ndarray
+    keys: Sequence[Key], covariance: np.ndarray, known: np.ndarray
 ) -> list[dict[str, Any]]:
     """The directions that data hardly determine, the weakest first.
 
     Args:
-        names: (P,) of the parameters.
+        keys: (P,) of the parameters.
         covariance: (P, P) of them.
         known: (P,) their sigmas before any data.
     """
@@ -89,19 +89,20 @@ def hardly_known(
             moved = np.sqrt(value) * np.abs(axis * known)[named]
             out.append(
                 {
-                    "parameters": [names[i] for i in named],
+                    "parameters": [keys[i].name for i in named],
                     "sigma_mm": float(1e3 * moved.max()),
-                    "needs": _needs([names[i] for i in named]),
+                    "needs": _needs([keys[i] for i in named]),
                 }
             )
     return out
 
 
-def _needs(names: list[str]) -> str:
-    owners = list(dict.fromkeys(name.rpartition(".")[0] for name in names))
+def _needs(keys: Sequence[Key]) -> str:
+    owners = list(dict.fromkeys(key.unknown for key in keys))
     if len(owners) > 1:
         return f"stops at which {' and '.join(owners)} act differently; only their sum is seen"
-    return f"a measurement of {' and '.join(names)} itself, or stops that it moves more"
+    names = " and ".join(key.name for key in keys)
+    return f"a measurement of {names} itself, or stops that it moves more"
 
 
 def standing_in(look: Look) -> list[dict[str, Any]]:

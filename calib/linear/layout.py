@@ -172,7 +172,7 @@ def _cells(unknowns: Mapping[str, Unknown]) -> tuple[list[str], list[str]]:
     finest: dict[int, str] = {}
     found = [n for n, u in unknowns.items() if u.role is Role.SURFACE]
     for name in found:
-        mesh = unknowns[name].owner
+        mesh = unknowns[name].owner.room
         if mesh not in finest or unknowns[name].dim > unknowns[finest[mesh]].dim:
             finest[mesh] = name
     return list(finest.values()), [n for n in found if n not in finest.values()]

@@ -25,6 +25,7 @@ from calib.planning.scene import Scene
 from calib.planning.stops import Poses
 from calib.planning.tolerance import purpose_until
 from calib.planning.worth import Known
+from calib.problem.unknowns import Key
 from calib.results.recalibrate import earlier
 from calib.runs.diagnose import stand_of
 from calib.runs.run import MODEL, Run
@@ -58,7 +59,7 @@ class Plan:
         purpose: what they were chosen for.
         poses: of the stops, in the order in which to drive to them.
         joints: (J,) name and kind, revolute or prismatic, of each.
-        names, units: (P,) of the parameters of the calibration.
+        keys, units: (P,) of the parameters of the calibration.
         now, after: what is known without and with them; sigmas as a run reports them.
         effect_units: of the effects in `Known.smallest`.
         candidates: how many poses they were chosen among.
@@ -70,7 +71,7 @@ class Plan:
     purpose: Purpose
     poses: Poses
     joints: Sequence[tuple[str, str]]
-    names: Sequence[str]
+    keys: Sequence[Key]
     units: Sequence[str]
     now: Known
     after: Known
@@ -78,6 +79,11 @@ class Plan:
     candidates: int
     untold: Sequence[Mapping[str, Any]] = ()
     curve: Sequence[Step] = ()
+
+    @property
+    def names(self) -> list[str]:
+        """(P,) of the parameters of the calibration."""
+        return [key.name for key in self.keys]
 
     @property
     def _names(self) -> list[str]:
@@ -214,7 +220,7 @@ def _planned(planner: Planner, stops: int, candidates: int, seed: int) -> Plan:
         purpose=planner.aim,
         poses=some,
         joints=list(zip(rig.joint_names, rig.joint_kinds, strict=True)),
-        names=planner.names,
+        keys=planner.keys,
         units=planner.units,
         now=planner.now,
         after=planner.after(some),

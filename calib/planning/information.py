@@ -23,14 +23,12 @@ from calib.linear.rows import TWIST, StopRows, StopSums
 from calib.problem import Problem
 from calib.problem.prior import JointPrior
 from calib.problem.surfaces import with_surfaces
-from calib.problem.unknowns import Role, Unknown
+from calib.problem.unknowns import Key, Role, Unknown
 from calib.residuals.beams import Association
 from calib.residuals.compiled import add_at, add_both
 from calib.residuals.tracker import BodiesTogether
 from calib.solve.clustered import of_graph
 from calib.solve.graph import Graph
-
-Key = tuple[str, str]  # of a component: its unknown, and its name among those of that
 
 
 @dataclass(frozen=True)
@@ -73,7 +71,7 @@ class Information:
 
     def believing(self, prior: JointPrior) -> Information:
         """The same where an earlier estimate stands for what paper says of some unknowns."""
-        held = [(v.name, dof) for v in prior.held for dof in v.dofs]
+        held = [key for v in prior.held for key in v.keys]
         at, paper = np.array([self.keys.index(key) for key in held]), self.paper.copy()
         paper[at] = paper[:, at] = 0.0
         whole = inverse(prior.covariance, np.arange(len(at)))
@@ -122,7 +120,7 @@ def of_all(
         into = paper if block is None and name in problem.calibration else data
         place = at[rows.columns]
         into[np.ix_(place, place)] += scaled.T @ scaled
-    keys = tuple((name, dof) for name, unknown in layout.outer().items() for dof in unknown.dofs)
+    keys = tuple(key for unknown in layout.outer().values() for key in unknown.keys)
     return Information(keys, layout.sigma[layout.kept], data, paper)
 
 

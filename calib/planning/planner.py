@@ -17,7 +17,7 @@ from calib.planning.purpose import Purpose
 from calib.planning.scene import Scene
 from calib.planning.stops import Poses
 from calib.planning.worth import Known, criterion
-from calib.problem.unknowns import Role
+from calib.problem.unknowns import Key, Role
 from calib.results.solution import Solution
 from calib.solve.fit import Progress
 from chains.errors import InputError
@@ -116,7 +116,7 @@ class Planner:
         return best.some(range(needed)), [*(curve[n] for n in sorted(curve)), last]
 
     def _step(self, known: Known) -> Step:
-        at = [self.names.index(".".join(key)) for key in self.aim.components]
+        at = [self.keys.index(key) for key in self.aim.components]
         over = known.sigma[at] / np.array(self.aim.tolerance)
         worst = int(np.argmax(over))
         return Step(known.stops, float(over[worst]), self.names[at[worst]])
@@ -133,10 +133,15 @@ class Planner:
         return now.onto(np.array(keep))
 
     @cached_property
-    def names(self) -> list[str]:
+    def keys(self) -> list[Key]:
         """(P,) of the parameters of the calibration."""
         now = self.scene.now
-        return [".".join(now.keys[i]) for i in now.at(self.scene.calibration)]
+        return [now.keys[i] for i in now.at(self.scene.calibration)]
+
+    @property
+    def names(self) -> list[str]:
+        """(P,) of those."""
+        return [key.name for key in self.keys]
 
     @cached_property
     def units(self) -> list[str]:
@@ -162,9 +167,9 @@ class Planner:
         """(P,) how many times wider than the graph has them the run reports its sigmas, as rows of
         a stop err together; they are taken to go on doing so."""
         if self.solution is None:
-            return np.ones(len(self.names))
+            return np.ones(len(self.keys))
         solution = self.solution
-        sigma = dict(zip(solution.names, np.sqrt(np.diag(solution.covariance)), strict=True))
+        sigma = dict(zip(solution.keys, np.sqrt(np.diag(solution.covariance)), strict=True))
         model = self.scene.now.without(self.scene.unbounded)
         graph = model.covariance(model.at(self.scene.calibration))
-        return np.array([sigma[name] for name in self.names]) / np.sqrt(np.diag(graph))
+        return np.array([sigma[key] for key in self.keys]) / np.sqrt(np.diag(graph))

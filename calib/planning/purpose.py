@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 from calib.diagnosis.stand import Stand
 from calib.diagnosis.weak import to_be_told_apart
 from calib.effects import CATALOGUE, Effect, Site, find, split
-from calib.planning.information import Key
+from calib.problem.unknowns import Key, Unknown
 from calib.runs.reopen import proposed
 from calib.runs.run import Run
 from chains.errors import InputError
@@ -76,32 +76,33 @@ def _from_diagnosis(run: Run, stand: Stand) -> Purpose:
         why = "what the diagnosis cannot tell apart"
         return replace(purpose_of(run, stand, ",".join(rivals)), why=why)
     weak = [name for w in document["weak_directions"] for name in w["parameters"]]
-    components = {key: None for name in weak for key in _single(stand, name)}
+    single = _single(stand)
+    components = {single[name]: None for name in weak if name in single}
     if components:
-        names = ",".join(".".join(key) for key in components)
+        names = ",".join(key.name for key in components)
         return Purpose(
             names, "what the diagnosis finds hardly determined", components=tuple(components)
         )
     return Purpose(ALL)
 
 
-def _known(stand: Stand) -> Mapping[str, tuple[str, ...]]:
-    variables = stand.estimate.problem.variables
-    return {name: variables[name].dofs for name in stand.estimate.problem.calibration}
+def calibration(stand: Stand) -> list[Unknown]:
+    """The unknowns of the model that describe the hardware."""
+    problem = stand.estimate.problem
+    return [problem.variables[name] for name in problem.calibration]
 
 
-def _single(stand: Stand, name: str) -> Iterator[Key]:
-    """The component ``variable.dof``, where the model has it."""
-    variable, _, dof = name.rpartition(".")
-    if dof in _known(stand).get(variable, ()):
-        yield variable, dof
+def _single(stand: Stand) -> dict[str, Key]:
+    """Name of every component of the model -> its key."""
+    return {key.name: key for unknown in calibration(stand) for key in unknown.keys}
 
 
 def components(stand: Stand, name: str) -> list[Key]:
-    """The components of the model that go by a name: a frame's or effect's, or one of them."""
-    known = _known(stand)
-    whole = [(v, dof) for v in known if name in (v, v.rpartition("/")[2]) for dof in known[v]]
-    return whole or list(_single(stand, name))
+    """The components of the model that go by a name: a frame's or effect's, of whichever rig, or
+    one of them."""
+    mine = (u for u in calibration(stand) if name in (u.name, u.owner.effect))
+    whole = [key for unknown in mine for key in unknown.keys]
+    return whole or [key for text, key in _single(stand).items() if text == name]
 
 
 def _effects(run: Run | None, stand: Stand, names: Sequence[str]) -> Iterator[Effect]:
@@ -113,7 +114,7 @@ def _effects(run: Run | None, stand: Stand, names: Sequence[str]) -> Iterator[Ef
         try:
             effect = find(name, own)
         except InputError:
-            every = list(dict.fromkeys([*_known(stand), *known, ALL]))
+            every = list(dict.fromkeys([*stand.estimate.problem.calibration, *known, ALL]))
             raise InputError(
                 f"--for {name}: neither in the model nor an effect{nearest(name, every)}; give a "
                 f"frame, effect or parameter of the model, effects to be told apart, or {ALL}"

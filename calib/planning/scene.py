@@ -15,7 +15,7 @@ from calib.forward import Term
 from calib.linear.layout import key_of
 from calib.linear.parallel import in_order
 from calib.planning.brightness import Brightness
-from calib.planning.information import Information, Key, of_all, of_each
+from calib.planning.information import Information, of_all, of_each
 from calib.planning.stops import (
     PlannedScan,
     PlannedStore,
@@ -30,6 +30,7 @@ from calib.problem import Problem, build
 from calib.problem.model import Source
 from calib.problem.prior import JointPrior
 from calib.problem.surfaces import with_surfaces
+from calib.problem.unknowns import Key
 from calib.residuals.beams import Association
 from calib.solve.estimate import started
 from calib.solve.reweight import weighted_as

@@ -9,8 +9,8 @@ import numpy as np
 
 from calib.diagnosis.stand import Stand
 from calib.effects import split
-from calib.planning.information import Key
-from calib.planning.purpose import Purpose, components
+from calib.planning.purpose import Purpose, calibration, components
+from calib.problem.unknowns import Key
 from chains.errors import InputError
 
 # What people write -> the unit of parameters, and how many of it that is.
@@ -74,18 +74,11 @@ def _keys(stand: Stand, item: str, name: str, unit: str) -> list[Key]:
     if not found:
         known = ", ".join(stand.estimate.problem.calibration)
         raise InputError(f"--until '{item}': '{name}' is not in the model; it has {known}")
-    units = {
-        (v, dof): u
-        for v in stand.estimate.problem.calibration
-        for dof, u in zip(*_dofs(stand, v), strict=True)
-    }
+    units: dict[Key, str] = {}
+    for unknown in calibration(stand):
+        units |= dict(zip(unknown.keys, unknown.units, strict=True))
     alike = [key for key in found if units[key] == unit]
     if not alike:
         has = " and ".join(dict.fromkeys(units[key] for key in found))
         raise InputError(f"--until '{item}': parameters of '{name}' are in {has}, not {unit}")
     return alike
-
-
-def _dofs(stand: Stand, name: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    unknown = stand.estimate.problem.variables[name]
-    return unknown.dofs, unknown.units

@@ -57,12 +57,11 @@ class Known:
         model = known.without(scene.unbounded)
         every = model.at(scene.calibration)
         own = model.at([n for n in scene.calibration if n != scene.source.rig.reference_frame])
-        names = [".".join(model.keys[i]) for i in own]
         return cls(
             stops=stops,
             sigma=wider * np.sqrt(np.diag(model.covariance(every))),
             smallest=dict(zip(aim.rivals, _smallest(scene, aim, known), strict=True)),
-            weak=hardly_known(names, model.covariance(own), model.unit[own]),
+            weak=hardly_known([model.keys[i] for i in own], model.covariance(own), model.unit[own]),
             indices=indices(model, every, stops),
         )
 

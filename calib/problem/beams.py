@@ -9,7 +9,7 @@ from calib.problem.model import Source, same_mesh
 from calib.problem.places import Places
 from calib.problem.problem import Problem, SourceStops
 from calib.problem.surfaces import LEAST_BEAMS
-from calib.problem.unknowns import Role, Unknown
+from calib.problem.unknowns import Owner, Role, Unknown, vector_unknown
 from calib.residuals.groups import SCAN, Group
 from calib.residuals.scan import ScanStop
 from calib.residuals.surfaces import PLANE_PATCHES_M, Meeting, MeshSurface, PlaneSurface
@@ -71,7 +71,7 @@ def _meeting(problem: Problem, part: SourceStops, places: Places) -> Meeting:
         )
         problem.meetings[part.number] = found
     if isinstance(found, PlaneSurface):
-        problem.add(_planes_unknown(found))
+        problem.add(_planes_unknown(found, Owner(recording=part.label, room=_room(problem, part))))
     return found
 
 
@@ -80,18 +80,17 @@ def _left_out(source: Source) -> frozenset[int]:
     return frozenset(int(what.removeprefix("surface_")) for _, what in source.lacks("surface"))
 
 
-def _planes_unknown(found: PlaneSurface) -> Unknown:
+def _planes_unknown(found: PlaneSurface, owner: Owner) -> Unknown:
     """The planes' numbers, free within half a radian and a metre."""
     count = len(found.planes.normal)
     kinds = ("tilt_1", "tilt_2", "distance")
-    return Unknown(
+    return vector_unknown(
         found.variable,
-        "vector",
-        mean=np.zeros(3 * count),
-        sigma=np.tile([0.5, 0.5, 1.0], count),
-        dofs=tuple(f"plane_{m}.{kind}" for m in range(count) for kind in kinds),
+        np.tile([0.5, 0.5, 1.0], count),
+        dofs=(f"plane_{m}.{kind}" for m in range(count) for kind in kinds),
         units=("rad", "rad", "m") * count,
         role=Role.PLANE,
+        owner=owner,
     )
 
 

@@ -8,7 +8,7 @@ from calib.effects import Site, View
 from calib.problem import start
 from calib.problem.places import Places
 from calib.problem.problem import Problem, SourceStops
-from calib.problem.unknowns import Role, Unknown
+from calib.problem.unknowns import Owner, Role, Unknown, vector_unknown
 from calib.residuals.groups import Group
 from calib.residuals.targets import PARTS, HangingTarget
 from calib.residuals.tracker import TrackedBody
@@ -84,14 +84,14 @@ def add_targets(problem: Problem, part: SourceStops, places: Places) -> None:
         )
     )
     for m, name in enumerate(targets.names):
-        marker = Unknown(
+        marker = vector_unknown(
             f"{part.prefix}target:{name}",
-            "vector",
-            mean=lower_m[m],
-            sigma=np.full(3, 10.0),  # m: anywhere in the room
+            np.full(3, 10.0),  # m: anywhere in the room
             dofs=("x", "y", "z"),
             units=("m",) * 3,
+            mean=lower_m[m],
             role=Role.TARGET,
+            owner=Owner(recording=part.label, where=name),
         )
         problem.add(marker)
         problem.blocks.append(

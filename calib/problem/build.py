@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from calib.problem.bodies import add_bodies, add_targets
 from calib.problem.model import Model, Source, labels
 from calib.problem.places import Places
 from calib.problem.problem import Problem, SourceStops
-from calib.problem.unknowns import Role, Unknown
+from calib.problem.unknowns import Owner, Role, Unknown, vector_unknown
 from calib.residuals.groups import CAD
 from calib.residuals.surfaces import Meeting
 from calib.rig import Rig
@@ -81,14 +82,13 @@ def effect_unknown(term: Term, source: Source) -> Unknown:
     params = [params[i] for i in term.free]
     lacks, name = source.lacks("frame"), term.effect.name
     free = [not lacks.isdisjoint({(CAD, name), (CAD, f"{name}.{p.name}")}) for p in params]
-    return Unknown(
+    return vector_unknown(
         term.variable,
-        "vector",
-        mean=np.zeros(len(params)),
-        sigma=np.where(free, FREE, [p.sigma for p in params]),
-        dofs=tuple(p.name for p in params),
-        units=tuple(p.unit for p in params),
+        np.where(free, FREE, [p.sigma for p in params]),
+        dofs=(p.name for p in params),
+        units=(p.unit for p in params),
         role=Role.SCATTER if term.effect.by_chance else Role.CALIBRATION,
+        owner=Owner(effect=name, rig=term.rig),
     )
 
 
@@ -106,7 +106,7 @@ def with_members(terms: Sequence[Sequence[Term]], sources: Sequence[Source]) -> 
         if term.variable not in members:
             return term
         effect = term.effect.among(members[term.variable], label)
-        return Term(effect, term.variable, np.arange(len(effect.params(rig))))
+        return replace(term, effect=effect, free=np.arange(len(effect.params(rig))))
 
     rigs = [source.rig for source in sources]
     return [

@@ -13,7 +13,7 @@ import numpy as np
 
 from calib import effects
 from calib.effects import Effect, FrameOffset
-from calib.forward import Term
+from calib.forward import Term, named
 from calib.residuals.groups import Group, Kind
 from calib.residuals.store import BeamStore
 from calib.rig import Rig, load_rig
@@ -128,10 +128,17 @@ class Model:
             if name not in self.names:
                 raise InputError(f"effect '{name}' is not in the model{nearest(name, self.names)}")
         kept = tuple(e for e in self.effects if e.name not in names)
-        # A shape may have a point in it, as what is held has between an effect and a parameter.
-        gone = tuple(f"{name}." for name in names)
-        fixed = (n for n in self.fixed if n not in names and not n.startswith(gone))
+        fixed = (held for held in self.fixed if self._effect_of(held) not in names)
         return Model(kept, tuple(fixed), self.without)
+
+    def _effect_of(self, held: str) -> str:
+        """The effect that a user holds, or of which one parameter; empty where it is a frame.
+
+        A shape may have a point in it, as what is held has between an effect and a parameter: of
+        effects whose names it begins with, the longest is meant.
+        """
+        mine = (n for n in self.names if held == n or held.startswith(f"{n}."))
+        return max(mine, key=len, default="")
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -157,10 +164,8 @@ class Model:
         for effect in chosen:
             free = self._free(effect, rig)
             if len(free):
-                own = several and owned(effect, rig)
-                terms.append(
-                    Term(effect, f"{rig.name}/{effect.name}" if own else effect.name, free)
-                )
+                owner = rig.name if several and owned(effect, rig) else ""
+                terms.append(Term(effect, named(effect.name, owner), free, owner))
         return terms
 
     def _free(self, effect: Effect, rig: Rig) -> np.ndarray:

@@ -10,7 +10,15 @@ from calib.forward import Stops, place
 from calib.problem import start
 from calib.problem.model import Model, labels
 from calib.problem.problem import Problem, SourceStops
-from calib.problem.unknowns import EXACT, UNKNOWN_POSE, UNREAD, Role, Unknown, pose_unknown
+from calib.problem.unknowns import (
+    EXACT,
+    UNKNOWN_POSE,
+    UNREAD,
+    Owner,
+    Role,
+    pose_unknown,
+    vector_unknown,
+)
 from calib.residuals.groups import JOINTS, Group
 from chains import se3
 from chains.errors import InputError
@@ -67,15 +75,18 @@ class Places:
         has_scan = self.part.source.recording.has_scan
         return [(k, self._geometry[root, k]) for root, k in self.stops if k >= 0 and has_scan[k]]
 
-    def _groups(self) -> dict[str, np.ndarray]:
-        """Unknown of the root -> the stops that share it."""
+    def _standing(self) -> np.ndarray:
+        """Label (K,) of each stop: those with one share where the rig stands."""
         recording, moves = self.part.source.recording, self.part.source.rig.moves
-        labels = {
+        return {
             "stop": np.array(recording.stops),
             "location": recording.location,
             "never": np.full(len(recording.stops), "all"),
         }[moves]
-        index = np.flatnonzero(self.part.chosen)
+
+    def _groups(self) -> dict[str, np.ndarray]:
+        """Unknown of the root -> the stops that share it."""
+        labels, index = self._standing(), np.flatnonzero(self.part.chosen)
         names = dict.fromkeys(labels[index])
         return {f"{self.part.prefix}root@{name}": index[labels[index] == name] for name in names}
 
@@ -148,7 +159,8 @@ class Places:
                     f"{source.recording.folder / 'stops.csv'}: '{stop}': nothing tracks the rig"
                     f" and there is no base_guess to start from; add base_guess.x … base_guess.qz"
                 )
-        self.problem.add(pose_unknown(name, T, sigma, Role.PLACE))
+        owner = Owner(recording=self.part.label, where=str(self._standing()[stops[0]]))
+        self.problem.add(pose_unknown(name, T, sigma, Role.PLACE, owner))
 
     def _neighbour(self, stops: np.ndarray) -> np.ndarray | None:
         """T_world_root of another stop at the same location, or of the nearest in time or row."""
@@ -166,18 +178,16 @@ class Places:
         sigma = self._joint_sigma(index)
         if not sigma.any():
             return stops
-        name = _joints(self.part.prefix, source.recording.stops[index[0]])
-        count = len(source.rig.joint_names)
+        stop = source.recording.stops[index[0]]
         units = tuple("rad" if kind == "revolute" else "m" for kind in source.rig.joint_kinds)
-        self.problem.add(
-            Unknown(
-                name,
-                "vector",
-                mean=np.zeros(count),
-                sigma=np.where(sigma > 0, sigma, EXACT),
+        name = self.problem.add(
+            vector_unknown(
+                _joints(self.part.prefix, stop),
+                np.where(sigma > 0, sigma, EXACT),
                 dofs=source.rig.joint_names,
                 units=units,
                 role=Role.JOINTS,
+                owner=Owner(recording=self.part.label, where=stop),
             )
         )
         return stops.with_joint_noise(name)

@@ -11,10 +11,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from calib.effects import Site
+from calib.forward import Term
 from calib.problem.problem import Block, Problem
 from calib.problem.surfaces import SURFACE_SHARES, cell_sigma_m, kinds_of
 from calib.problem.unknowns import Role, Unknown
@@ -24,7 +26,43 @@ from calib.residuals.surfaces import PlaneSurface
 from calib.residuals.targets import SIGMAS, HangingTarget
 from calib.residuals.tracker import TrackedBody
 
-OF_TARGETS = "target/"  # before what of targets a spread is of: no body is called so
+
+class Whose(NamedTuple):
+    """Rows that have one sigma.
+
+    Args:
+        kind: what kind of rows they are.
+        what: the body; `JOINTS`; sphere or marker of targets; of surfaces, the kind of part.
+        unit: of the sigma.
+    """
+
+    kind: Literal["body", "joints", "target", "surface"]
+    what: str
+    unit: str
+
+    @property
+    def text(self) -> str:
+        """Whose they are, as keys and files have it: no body is called as what is of targets."""
+        return f"target/{self.what}" if self.kind == "target" else self.what
+
+
+class SpreadName(NamedTuple):
+    """What files call a spread of an effect by chance.
+
+    Args:
+        name: among the effect's parameters.
+        of: whose it is; empty where it is of the effect's own values.
+        unit: of the spread.
+    """
+
+    name: str
+    of: str
+    unit: str
+
+    @classmethod
+    def made(cls, of: str, unit: str, several: bool) -> SpreadName:
+        """That of one, or of one of several."""
+        return cls(f"{of or 'sd'}.{unit}" if of or several else "sd", of, unit)
 
 
 def by_chance(problem: Problem) -> list[Unknown]:
@@ -42,30 +80,48 @@ def spread_keys(unknown: Unknown) -> dict[str, np.ndarray]:
     return every if len(every) > 1 else {unknown.name: np.arange(len(units))}
 
 
-def widening(problem: Problem) -> dict[str, tuple[str, str]]:
-    """Key of every spread that widens the sigma of rows -> whose, and its unit."""
-    out: dict[str, tuple[str, str]] = {}
+def names_of(problem: Problem, term: Term) -> dict[str, SpreadName]:
+    """Key of every spread of an effect by chance -> what files call it."""
+    if term.effect.widens:
+        mine = _widened_by(problem, term).items()
+        return {key: SpreadName.made(whose.text, whose.unit, True) for key, whose in mine}
+    unknown = problem.variables[term.variable]
+    keys = spread_keys(unknown)
+    units = [unknown.units[at[0]] for at in keys.values()]
+    pairs = zip(keys, units, strict=True)
+    return {key: SpreadName.made("", unit, len(keys) > 1) for key, unit in pairs}
+
+
+def _widened_by(problem: Problem, term: Term) -> dict[str, Whose]:
+    """Key of every spread by which an effect widens the sigma of rows -> whose."""
+    mine = rows_at(problem, term.effect.site)
+    return {f"{term.variable}.{whose.text}.{whose.unit}": whose for whose in mine}
+
+
+def widening(problem: Problem) -> dict[str, Whose]:
+    """Key of every spread that widens the sigma of rows -> whose."""
+    out: dict[str, Whose] = {}
     for term in (t for some in problem.terms for t in some if t.effect.widens):
-        mine = rows_at(problem, term.effect.site)
-        out |= {f"{term.variable}.{what}.{unit}": (what, unit) for what, unit in mine}
+        out |= _widened_by(problem, term)
     planes = (
         kind for scan in problem.scans if _on_planes(scan) for kind in kinds_of(scan).values()
     )
-    return out | {f"{kind}.m": (kind, "m") for kind in planes}
+    return out | {f"{kind}.m": Whose("surface", kind, "m") for kind in planes}
 
 
-def rows_at(problem: Problem, site: Site) -> list[tuple[str, str]]:
-    """Whose rows, and their unit, have a sigma that an effect at a site may widen."""
+def rows_at(problem: Problem, site: Site) -> list[Whose]:
+    """Whose rows have a sigma that an effect at a site may widen."""
     if site is Site.TRACKER:
         bodies = {block.body: block.is_point for block in problem.bodies}
-        return [(b, u) for b, point in bodies.items() for u in (("m",) if point else ("rad", "m"))]
+        units = {body: ("m",) if point else ("rad", "m") for body, point in bodies.items()}
+        return [Whose("body", body, unit) for body, some in units.items() for unit in some]
     if site is Site.JOINTS:
-        return [(JOINTS, unit) for unit in ("rad", "m") if read(problem, unit)]
+        return [Whose("joints", JOINTS, unit) for unit in ("rad", "m") if read(problem, unit)]
     if site is Site.TARGET:
         there = any(isinstance(block, HangingTarget) for block in problem.blocks)
-        return [(f"{OF_TARGETS}{part}", "m") for part in SIGMAS] if there else []
+        return [Whose("target", part, "m") for part in SIGMAS] if there else []
     meshes = any(scan.reference_sigma_m for scan in problem.scans if not _on_planes(scan))
-    return [(part, "m") for part in SURFACE_SHARES] if meshes else []
+    return [Whose("surface", part, "m") for part in SURFACE_SHARES] if meshes else []
 
 
 def read(problem: Problem, unit: str) -> list[Unknown]:
@@ -74,24 +130,25 @@ def read(problem: Problem, unit: str) -> list[Unknown]:
     return [unknown for unknown in every if len(unknown.read(unit))]
 
 
-def sigmas(problem: Problem) -> dict[tuple[str, str], tuple[float, float]]:
-    """Whose rows and unit -> their sigma, and how much of it is beyond what it was at first."""
+def sigmas(problem: Problem) -> dict[Whose, tuple[float, float]]:
+    """Whose rows -> their sigma, and how much of it is beyond what it was at first."""
     out = {
-        (block.body, unit): (getattr(block, f"sigma_{unit}"), block.scatter[unit])
+        Whose("body", block.body, unit): (getattr(block, f"sigma_{unit}"), block.scatter[unit])
         for block in problem.bodies
         for unit in ("rad", "m")
     }
     for unit in ("rad", "m"):
         for unknown in read(problem, unit)[:1]:
             sigma = float(unknown.sigma[unknown.read(unit)[0]])
-            out[JOINTS, unit] = sigma, unknown.scatter.get(unit, 0.0)
+            out[Whose("joints", JOINTS, unit)] = sigma, unknown.scatter.get(unit, 0.0)
     for block in (b for b in problem.blocks if isinstance(b, HangingTarget)):
         for part, beyond in block.scatter.items():
-            out[f"{OF_TARGETS}{part}", "m"] = getattr(block, f"sigma_{part}_m"), beyond
+            sigma = getattr(block, f"sigma_{part}_m")
+            out[Whose("target", part, "m")] = sigma, beyond
     for scan in problem.scans:
         for part, kind in kinds_of(scan).items():
             beyond = scan.reference_scatter_m.get(part, 0.0)
-            out.setdefault((kind, "m"), (cell_sigma_m(scan, part), beyond))
+            out.setdefault(Whose("surface", kind, "m"), (cell_sigma_m(scan, part), beyond))
     return out
 
 
@@ -133,14 +190,14 @@ def with_spread(problem: Problem, spread: Mapping[str, float], settled: float = 
     return problem
 
 
-def _widened(problem: Problem, whose: tuple[str, str], sd: float) -> Problem:
+def _widened(problem: Problem, whose: Whose, sd: float) -> Problem:
     """The problem with another spread of some rows."""
-    what, unit = whose
-    if what == JOINTS:
+    kind, what, unit = whose
+    if kind == "joints":
         joints = {u.name: u.scattering(unit, sd) for u in read(problem, unit)}
         return replace(problem, variables=problem.variables | joints)
-    if what.startswith(OF_TARGETS) or any(block.body == what for block in problem.bodies):
-        blocks = [_block_scattering(block, what, unit, sd) for block in problem.blocks]
+    if kind != "surface":
+        blocks = [_block_scattering(block, whose, sd) for block in problem.blocks]
         return replace(problem, blocks=blocks)
     scans, aside = (
         [_scattering(scan, what, sd) for scan in some] for some in (problem.scans, problem.aside)
@@ -155,12 +212,12 @@ def _widened(problem: Problem, whose: tuple[str, str], sd: float) -> Problem:
     return replace(wider, variables=problem.variables | cells)
 
 
-def _block_scattering(block: Block, what: str, unit: str, sd: float) -> Block:
+def _block_scattering(block: Block, whose: Whose, sd: float) -> Block:
     """The block with another spread, if it is a target, or of the body, whose that is."""
-    if isinstance(block, HangingTarget) and what.startswith(OF_TARGETS):
-        return block.scattering(what.removeprefix(OF_TARGETS), sd)
-    mine = isinstance(block, TrackedBody) and block.body == what
-    return block.scattering(unit, sd) if mine else block
+    if isinstance(block, HangingTarget) and whose.kind == "target":
+        return block.scattering(whose.what, sd)
+    mine = isinstance(block, TrackedBody) and whose[:2] == ("body", block.body)
+    return block.scattering(whose.unit, sd) if mine else block
 
 
 def _scattering(scan: ScanStop, what: str, sd: float) -> ScanStop:

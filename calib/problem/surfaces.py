@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from calib.problem.problem import Problem, SurfaceCells
-from calib.problem.unknowns import Role, Unknown
+from calib.problem.unknowns import Owner, Role, Unknown, vector_unknown
 from calib.residuals.beams import Association
 from calib.residuals.scan import ScanStop
 from calib.residuals.surfaces import PLANE_PATCHES_M, PlaneSurface
@@ -47,14 +47,15 @@ def with_surfaces(
         first = problem.scans[scans[0]]
         if not first.reference_sigma_m:
             continue
+        on_planes = isinstance(first.meeting, PlaneSurface)
         for column, kind in kinds_of(first).items():
-            parts_of = {i: _parts(problem, associations[i], i, column) for i in scans}
-            last = max(int(p.max(initial=-1)) for p in parts_of.values())
-            seen = sum(np.bincount(p + 1, minlength=last + 2) for p in parts_of.values())
+            parts_in = {i: _parts(problem, associations[i], i, column) for i in scans}
+            last = max(int(p.max(initial=-1)) for p in parts_in.values())
+            seen = sum(np.bincount(p + 1, minlength=last + 2) for p in parts_in.values())
             parts = np.flatnonzero(seen[1:])  # counted from -1: nothing is met
             number = np.full(last + 2, -1, np.int32)  # the last stands for -1
             number[parts] = np.arange(len(parts))
-            name = kind if column != kind else f"{room}/reference_{column}"
+            name = kind if on_planes else f"{room}/reference_{column}"
             sigma_m = cell_sigma_m(first, column)
             unknowns.append(_unknown(name, room, column, parts, sigma_m))
             cells[name] = SurfaceCells(
@@ -65,7 +66,7 @@ def with_surfaces(
                 room=room,
             )
             for i in scans:
-                numbered[i][name] = number[parts_of[i]]
+                numbered[i][name] = number[parts_in[i]]
     found = [replace(a, cells=n) for a, n in zip(associations, numbered, strict=True)]
     return problem.with_cells(unknowns, cells), found
 
@@ -74,8 +75,13 @@ def kinds_of(scan: ScanStop) -> dict[str, str]:
     """Column of the parts of what a scan meets -> what those with one spread are called: all meshes
     have one for each column; the planes of a recording have their own."""
     if isinstance(scan.meeting, PlaneSurface):
-        return {column: f"{scan.meeting.variable}/{column}" for column in PLANE_PATCHES_M}
+        return dict(zip(PLANE_PATCHES_M, parts_of(scan.meeting), strict=True))
     return {column: column for column in SURFACE_SHARES}
+
+
+def parts_of(planes: PlaneSurface) -> list[str]:
+    """The unknowns of the parts of planes, one for each kind."""
+    return [f"{planes.variable}/{column}" for column in PLANE_PATCHES_M]
 
 
 def cell_sigma_m(scan: ScanStop, column: str) -> float:
@@ -107,15 +113,13 @@ def well_seen(problem: Problem, associations: Sequence[Association]) -> list[Ass
 
 
 def _unknown(name: str, room: int | str, column: str, parts: np.ndarray, sigma_m: float) -> Unknown:
-    return Unknown(
+    return vector_unknown(
         name,
-        "vector",
-        mean=np.zeros(len(parts)),
-        sigma=np.full(len(parts), sigma_m),
-        dofs=tuple(f"{column}_{part}" for part in parts),
+        np.full(len(parts), sigma_m),
+        dofs=(f"{column}_{part}" for part in parts),
         units=("m",) * len(parts),
         role=Role.SURFACE,
-        owner=room,
+        owner=Owner(room=room),
     )
 
 

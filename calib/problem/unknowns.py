@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -32,6 +32,40 @@ class Role(Enum):
     SCATTER = "scatter"  # what chance does anew to each stop or location
 
 
+class Key(NamedTuple):
+    """One parameter: its unknown, and its name among those of that. Either may have dots in it."""
+
+    unknown: str
+    dof: str
+
+    @property
+    def name(self) -> str:
+        """As files and people have it."""
+        return f"{self.unknown}.{self.dof}"
+
+
+@dataclass(frozen=True)
+class Owner:
+    """Whose an unknown is. What says nothing of it is empty.
+
+    Args:
+        effect: the effect, or the frame, whose parameters it holds.
+        rig: of these, the one rig that they belong to, where there are several.
+        recording: what a stop, a target or planes are of, by its label; see `calib.problem.model`.
+        where: the stop or target; of a pose that several stops share, their location.
+        room: of surfaces, the number of the mesh, or the recording whose planes they are.
+    """
+
+    effect: str = ""
+    rig: str = ""
+    recording: str = ""
+    where: str = ""
+    room: int | str | None = None
+
+
+NOBODY = Owner()  # of what all share
+
+
 @dataclass(frozen=True)
 class Unknown:
     """One unknown of a problem.
@@ -44,8 +78,7 @@ class Unknown:
         dofs: (dim,) a name per tangent direction.
         units: (dim,) "m" or "rad" or another unit, per tangent direction.
         role: what it stands for.
-        owner: of SURFACE, the mesh or the recording whose planes they are: those of one have the
-            same.
+        owner: whose it is.
         weight: robust weight of what was known before, 0 to 1.
         scatter: unit -> how widely it scatters beyond what its sigmas in it were at first.
     """
@@ -57,13 +90,18 @@ class Unknown:
     dofs: tuple[str, ...]
     units: tuple[str, ...]
     role: Role = Role.CALIBRATION
-    owner: int | str = 0
+    owner: Owner = NOBODY
     weight: float = 1.0
     scatter: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def dim(self) -> int:
         return len(self.sigma)
+
+    @property
+    def keys(self) -> tuple[Key, ...]:
+        """(dim,) of its parameters."""
+        return tuple(Key(self.name, dof) for dof in self.dofs)
 
     @property
     def prior_sigma(self) -> np.ndarray:
@@ -91,9 +129,44 @@ class Unknown:
 
 
 def pose_unknown(
-    name: str, mean: np.ndarray, sigma: np.ndarray = UNKNOWN_POSE, role: Role = Role.CALIBRATION
+    name: str,
+    mean: np.ndarray,
+    sigma: np.ndarray = UNKNOWN_POSE,
+    role: Role = Role.CALIBRATION,
+    owner: Owner = NOBODY,
 ) -> Unknown:
     """A pose known to `sigma` about `mean`."""
     return Unknown(
-        name=name, kind="pose", mean=mean, sigma=sigma, dofs=DOF, units=POSE_UNITS, role=role
+        name=name,
+        kind="pose",
+        mean=mean,
+        sigma=sigma,
+        dofs=DOF,
+        units=POSE_UNITS,
+        role=role,
+        owner=owner,
+    )
+
+
+def vector_unknown(
+    name: str,
+    sigma: np.ndarray,
+    dofs: Iterable[str],
+    units: Iterable[str],
+    mean: np.ndarray | float = 0.0,
+    role: Role = Role.CALIBRATION,
+    owner: Owner = NOBODY,
+    weight: float = 1.0,
+) -> Unknown:
+    """Numbers (n,) known to `sigma` (n,) about `mean`."""
+    return Unknown(
+        name=name,
+        kind="vector",
+        mean=np.zeros(len(sigma)) + mean,
+        sigma=sigma,
+        dofs=tuple(dofs),
+        units=tuple(units),
+        role=role,
+        owner=owner,
+        weight=weight,
     )

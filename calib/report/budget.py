@@ -64,10 +64,9 @@ def budget(
         progress: called with what is being done, and how far it is.
         met: what beams are known to have met, as of `Start.met`; of others it is found anew.
     """
-    owner = {f"{v.name}.{dof}": v.name for v in problem.variables.values() for dof in v.dofs}
     at: dict[str, list[int]] = {}
-    for i, name in enumerate(solution.names):
-        at.setdefault(owner[name], []).append(i)
+    for i, key in enumerate(solution.keys):
+        at.setdefault(key.unknown, []).append(i)
     drawn = [n for n in at if problem.variables[n].kind == "vector"]  # a pose has no paper
     uncertain, moved = dict.fromkeys(at, 0.0), dict.fromkeys(drawn, 0.0)
     rows, stops = 0, 0

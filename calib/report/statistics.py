@@ -1,10 +1,7 @@
 """What the residuals of a run do along every covariate: exact sums over all rows, stop by stop.
 
 No more than one stop is in memory. The band of a mean counts clusters, not rows: rows of one stop,
-and rows on one surface, err together. With the weighted residuals about the mean summed within each
-cluster, s_c, the variance of the mean is the two-way one of Cameron, Gelbach and Miller (2011),
-``(sum over stops s^2 + over surfaces s^2 - over stop x surface s^2) / W^2``, never less than any of
-the three alone, each with its ``G / (G - 1)`` for G clusters.
+and rows on one surface, err together; see `calib.linear.binned`.
 """
 
 from __future__ import annotations
@@ -14,9 +11,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy import special
 
-CONFIDENCE = 0.95
+from calib.linear.binned import BinnedSums
+
 BINS, AZIMUTHS = 30, 180  # at most
 Z_EDGES = np.linspace(-5.0, 5.0, 101)
 PLACES = ("surface", "plane", "label")
@@ -106,14 +103,12 @@ class ResidualCurve:
 
 
 class _Sums:
-    """Sums over the rows of each bin of one axis, and over clusters of them."""
+    """Sums over the rows of each bin of one axis."""
 
     def __init__(self, axis: Axis) -> None:
         self.axis = axis
-        self.rows = np.zeros((5, axis.bins))  # count, weight, w r, w r^2, covariate
-        self.by_stop = np.zeros((4, axis.bins))  # clusters, W^2, W R, R^2
-        self.by_both = np.zeros((4, axis.bins))
-        self.places = np.zeros((2, axis.bins, 0))  # W, R of each place
+        self.rows = np.zeros((3, axis.bins))  # count, w r^2, covariate
+        self.binned = BinnedSums(axis.bins)
 
     def add(
         self, x: np.ndarray, residual: np.ndarray, weight: np.ndarray, place: np.ndarray
@@ -124,52 +119,24 @@ class _Sums:
             x, residual, weight, place = (v[known] for v in (x, residual, weight, place))
         bins = self.axis.bins
         b = np.searchsorted(self.axis.edges, x)
-        wr = weight * residual
-        each = (None, weight, wr, wr * residual, x)
+        each = (None, weight * np.square(residual), x)
         self.rows += [np.bincount(b, values, bins) for values in each]
-        theirs, local = np.unique(place, return_inverse=True)
-        flat, size = b * len(theirs) + local, bins * len(theirs)
-        sums = np.stack([np.bincount(flat, v, size).reshape(bins, -1) for v in (weight, wr)])
-        self.by_both += _squares(sums)
-        self.by_stop += _squares(sums.sum(axis=2, keepdims=True))
-        missing = int(theirs.max(initial=-1)) + 1 - self.places.shape[2]
-        if missing > 0:
-            self.places = np.pad(self.places, ((0, 0), (0, 0), (0, missing)))
-        self.places[:, :, theirs] += sums
+        self.binned.add(b, residual, weight, place)
 
     def curve(self) -> ResidualCurve:
         """What the sums say."""
-        count, weight, total, squares, x = self.rows
+        count, squares, x = self.rows
         with np.errstate(invalid="ignore", divide="ignore"):
-            mean, at = total / weight, x / count
-            std = np.sqrt(np.maximum(squares / weight - mean**2, 0.0))
-            band = self._band(mean, weight)
-        return ResidualCurve(
-            axis=self.axis, count=count.astype(int), at=at, mean_m=mean, std_m=std, band_m=band
-        )
-
-    def _band(self, mean: np.ndarray, weight: np.ndarray) -> np.ndarray:
-        clusters = [self.by_stop, _squares(self.places), self.by_both]
-        stop, place, both = (
-            np.maximum(ww * mean**2 - 2 * wr * mean + rr, 0.0) * np.where(g > 1, g / (g - 1), 0.0)
-            for g, ww, wr, rr in clusters
-        )
-        variance = np.maximum.reduce([stop + place - both, stop, place, both])
-        few = np.minimum(*(np.where(g > 1, g, np.inf) for g in (clusters[0][0], clusters[1][0])))
-        many = np.where(np.isfinite(few), few, clusters[2][0])
-        half = (
-            special.stdtrit(np.maximum(many - 1, 1), 0.5 + CONFIDENCE / 2)
-            * np.sqrt(variance)
-            / weight
-        )
-        return np.where(many > 1, half, np.nan)
-
-
-def _squares(sums: np.ndarray) -> np.ndarray:
-    """(4, B) how many clusters have rows, and W^2, W R, R^2 added up, of (2, B, C) W and R."""
-    weight, total = sums
-    parts = ((weight > 0).astype(float), weight * weight, weight * total, total * total)
-    return np.stack([part.sum(axis=1) for part in parts])
+            found, clusters = self.binned.mean()
+            spread = squares / self.binned.weight - found.mean**2
+            return ResidualCurve(
+                axis=self.axis,
+                count=count.astype(int),
+                at=x / count,
+                mean_m=found.mean,
+                std_m=np.sqrt(np.maximum(spread, 0.0)),
+                band_m=found.each(clusters),
+            )
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,12 @@ from calib.problem import Problem
 from calib.problem.model import Model, Source
 from calib.problem.prior import JointPrior
 from calib.problem.problem import Block
-from calib.problem.spread import with_spread
+from calib.problem.spread import spread_of, with_spread
+from calib.problem.surfaces import parts_of
 from calib.residuals.scan import ScanStop
 from calib.residuals.surfaces import PlaneSurface
 from calib.results.errors import Errors, Keep, body_errors, scan_errors
-from calib.solve.estimate import SD, Estimate, Start
+from calib.solve.estimate import Estimate, Start
 from calib.solve.fit import Progress, solve
 
 FOLDS = 5  # a fit leaves out about a fifth of the locations
@@ -134,25 +135,18 @@ def held_out(
         trained = problems.build(sources, model, [~left for left in fold])
         estimate = fit(trained, progress=tell, start=_without_planes(trained, start))
         unseen = problems.build(sources, model, fold, trained.meetings)
-        unseen = with_spread(unseen, estimate.start.spread)
+        unseen = with_spread(unseen, spread_of(estimate.problem))
         out += predict(unseen, trained, estimate, keep)
     return out
 
 
 def _without_planes(trained: Problem, start: Start | None) -> Start | None:
-    """A start less the planes found in the scans: other scans, other planes."""
+    """A start less the planes found in the scans: other scans, other planes. How uneven walls are,
+    others tell as well."""
     found = [m for m in trained.meetings.values() if isinstance(m, PlaneSurface)]
     if start is None or not found:
         return start
-    planes = {meeting.variable for meeting in found}
-    return Start({n: x for n, x in start.state.items() if not _is_of(n, planes)})
-
-
-def _is_of(name: str, planes: set[str]) -> bool:
-    """Whether a value of a state is of planes or of their parts; how uneven walls are, others tell
-    as well."""
-    mine = any(name.startswith(f"{variable}/") for variable in planes)
-    return name in planes or (mine and not name.endswith(SD))
+    return start.without([name for each in found for name in (each.variable, *parts_of(each))])
 
 
 def predict(

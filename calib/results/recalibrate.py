@@ -53,11 +53,11 @@ def earlier(problem: Problem, solution: Solution) -> JointPrior:
     Raises:
         InputError: the two have nothing in common.
     """
-    position = {name: i for i, name in enumerate(solution.names)}
+    position = {key: i for i, key in enumerate(solution.keys)}
     held, means, rows = [], {}, []
     for name in problem.calibration:
         variable = problem.variables[name]
-        index = [position.get(f"{name}.{dof}") for dof in variable.dofs]
+        index = [position.get(key) for key in variable.keys]
         mean = _earlier_value(problem, variable, solution)
         if None not in index and mean is not None:
             held.append(variable)

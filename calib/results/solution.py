@@ -9,9 +9,12 @@ from typing import Any
 import numpy as np
 
 from calib.effects import FrameOffset
-from calib.forward import Term
+from calib.effects.rig import DOF
+from calib.forward import Term, named
 from calib.problem import Problem
 from calib.problem.model import Source
+from calib.problem.spread import names_of
+from calib.problem.unknowns import POSE_UNITS, Key
 from calib.results.observability import not_estimated
 from calib.solve.components import spreads
 from calib.solve.estimate import Estimate
@@ -64,7 +67,7 @@ class Solution:
         shared: what holds for all recordings.
         recordings: rig name -> what belongs to it alone; empty where there is one rig.
         not_estimated: a `name` and a `why` for what the data could not tell.
-        names: (P,) calibration parameters, ``variable.parameter``.
+        keys: (P,) calibration parameters.
         covariance: (P, P) joint covariance, m and rad; see `calib.results.intervals`.
         graph: (P, P) the same as the graph has it; None where that is no other.
     """
@@ -72,9 +75,20 @@ class Solution:
     shared: Part
     recordings: dict[str, Part]
     not_estimated: list[dict[str, str]]
-    names: tuple[str, ...]
+    keys: tuple[Key, ...]
     covariance: np.ndarray
     graph: np.ndarray | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """(P,) of the parameters, ``variable.parameter``."""
+        return tuple(key.name for key in self.keys)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """(P,) of the parameters."""
+        known = units_of(self.shared, self.recordings)
+        return tuple(known[key] for key in self.keys)
 
     def part(self, rig: str | None) -> Part:
         """All frames and effects that hold for one rig."""
@@ -103,10 +117,9 @@ def solution_of(problem: Problem, estimate: Estimate, told: np.ndarray | None = 
     for source, terms in zip(problem.sources, problem.terms, strict=True):
         rig = source.rig
         for term in terms:
-            own = term.variable != term.effect.name
-            part = recordings.setdefault(rig.name, Part()) if own else shared
+            part = recordings.setdefault(term.rig, Part()) if term.rig else shared
             if term.effect.by_chance:
-                part.effects[term.effect.name] = _spread(term, scatter)
+                part.effects[term.effect.name] = _spread(problem, term, scatter)
                 continue
             theta = estimate.values[term.variable]
             covariance = told[at[term.variable], at[term.variable]]
@@ -129,12 +142,11 @@ def solution_of(problem: Problem, estimate: Estimate, told: np.ndarray | None = 
         if not isinstance(t.effect, FrameOffset)
     )
     untold = not_estimated(estimate.variables, estimate.covariance, effects, estimate.touched())
-    names = tuple(f"{v.name}.{dof}" for v in estimate.variables for dof in v.dofs)
     return Solution(
         shared=shared,
         recordings=recordings,
         not_estimated=untold + _absent(problem),
-        names=names,
+        keys=tuple(key for v in estimate.variables for key in v.keys),
         covariance=told,
         graph=estimate.covariance,
     )
@@ -169,14 +181,14 @@ def _effect(
     return EffectEstimate(unit, tuple(p.name for p in params), estimate, sigma)
 
 
-def _spread(term: Term, told: Mapping[str, tuple[float, float]]) -> EffectEstimate:
+def _spread(
+    problem: Problem, term: Term, told: Mapping[str, tuple[float, float]]
+) -> EffectEstimate:
     """What is known of an effect by chance: how widely it scatters; of several bodies, each."""
-    mine = {key: each for key, each in told.items() if key.startswith(f"{term.variable}.")}
-    mine = mine or {f"{term.variable}.sd": told[term.variable]}
-    names = tuple(key.removeprefix(f"{term.variable}.") for key in mine)
-    units = [name.rpartition(".")[2] if "." in name else term.effect.unit for name in names]
-    sd, sigma = np.array(list(mine.values())).T
-    return EffectEstimate(one_unit(units), names, sd, sigma)
+    names = names_of(problem, term)
+    sd, sigma = np.array([told[key] for key in names]).T
+    unit = one_unit([each.unit for each in names.values()])
+    return EffectEstimate(unit, tuple(each.name for each in names.values()), sd, sigma)
 
 
 def _absent(problem: Problem) -> list[dict[str, str]]:
@@ -202,6 +214,18 @@ def _absent(problem: Problem) -> list[dict[str, str]]:
         )
         out.append({"name": "lidar", "why": why})
     return out
+
+
+def units_of(shared: Part, recordings: Mapping[str, Part]) -> dict[Key, str]:
+    """Every parameter of frames and effects -> its unit; arguments as of `Solution`."""
+    found: dict[Key, str] = {}
+    for rig, part in {"": shared, **recordings}.items():
+        each = {frame: (DOF, POSE_UNITS) for frame in part.frames}
+        each |= {name: (effect.names, effect.units) for name, effect in part.effects.items()}
+        for name, (dofs, units) in each.items():
+            unknown = named(name, rig)
+            found |= {Key(unknown, dof): u for dof, u in zip(dofs, units, strict=True)}
+    return found
 
 
 def one_unit(units: Sequence[str]) -> str:

@@ -24,6 +24,7 @@ from calib.effects import own_effects
 from calib.linear.parallel import one_blas_thread
 from calib.problem import build
 from calib.problem.model import default_effects
+from calib.problem.spread import names_of
 from calib.residuals.groups import Group
 from calib.results.errors import Errors
 from calib.results.holdout import held_out
@@ -107,7 +108,7 @@ def _found(
     return replace(
         result,
         plan=command_to_plan(run, apart) if apart else "",
-        scatter=[*_scatter(run), *result.scatter],
+        scatter=[*_scatter(run, stand), *result.scatter],
         detectable=_detectable(stand),
         unseen=unseen,
         sentences=[
@@ -133,15 +134,16 @@ def _command(run: Run, found: Diagnosis) -> str:
     return shlex.join(["rigcal", "add", str(run.folder), *names, "-o", f"{run.folder}-formula"])
 
 
-def _scatter(run: Run) -> Iterator[dict[str, Any]]:
+def _scatter(run: Run, stand: Stand) -> Iterator[dict[str, Any]]:
     """How widely things scatter by chance, as the run's model has it."""
     parts = [run.solution.shared, *run.solution.recordings.values()]
-    for effect in (e for e in model_of(run).effects if e.by_chance):
+    for effect in (e for e in stand.model.effects if e.by_chance):
+        terms = (t for some in stand.problem.terms for t in some if t.effect.name == effect.name)
+        of = {s.name: s.of for t in terms for s in names_of(stand.problem, t).values()}
         for found in (part.effects[effect.name] for part in parts if effect.name in part.effects):
             numbers = zip(found.estimate.tolist(), found.sigma.tolist(), strict=True)
             for name, unit, each in zip(found.names, found.units, numbers, strict=True):
-                of = name.rpartition(".")[0].removeprefix("sd")  # of nothing else, none
-                yield Spread(of, unit, *each).document(effect.name)
+                yield Spread(of[name], unit, *each).document(effect.name)
 
 
 def command_to_plan(run: Run, effects: Sequence[str]) -> str:

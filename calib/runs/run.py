@@ -16,7 +16,7 @@ import numpy as np
 
 from calib import outputs
 from calib.effects import Trust, trusted
-from calib.results.solution import EffectEstimate, FrameEstimate, Part, Solution
+from calib.results.solution import EffectEstimate, FrameEstimate, Part, Solution, units_of
 from calib.runs.stored import AGAIN, read_arrays, read_json, read_model, read_summary
 from chains import se3
 from chains.errors import InputError
@@ -231,11 +231,14 @@ def read_solution(folder: Path) -> Solution:
     if any(x.shape != shape or x.dtype.kind != "f" for x in (covariance, graph)):
         raise InputError(f"{beside} is no covariance of a run; {AGAIN}")
     try:
+        shared = _read_part(data)
+        recordings = {n: _read_part(p) for n, p in data.get("recordings", {}).items()}
+        keys = {key.name: key for key in units_of(shared, recordings)}
         return Solution(
-            shared=_read_part(data),
-            recordings={n: _read_part(p) for n, p in data.get("recordings", {}).items()},
+            shared=shared,
+            recordings=recordings,
             not_estimated=[{"name": e["name"], "why": e["why"]} for e in data["not_estimated"]],
-            names=tuple(names.tolist()),
+            keys=tuple(keys[name] for name in names.tolist()),
             covariance=covariance,
             graph=graph,
         )

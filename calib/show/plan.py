@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from rich.table import Table
 
+from calib.problem.unknowns import Key
 from calib.show.tables import columns_table, print_pairs, shown, terminal
 
 if TYPE_CHECKING:
@@ -34,11 +35,11 @@ def print_plan(plan: Plan) -> None:
     tables = [_stops_table(plan)]
     if document["smallest_detectable"]:
         tables.append(_detectable_table(document["smallest_detectable"]))
-    tables.append(_sigma_table(document["sigma"]))
+    tables.append(_sigma_table(plan))
     for table in tables:
         console.print(table)
         console.print()
-    same = [name for name, _, now, after in _rows(document["sigma"]) if after >= FALLS * now]
+    same = [row for row in _rows(plan) if row.after >= FALLS * row.now]
     if same:
         print_pairs(console, "as well known as before", [("", _together(same))])
     weak = document["weak_directions"]
@@ -97,37 +98,49 @@ def _scale(kind: str) -> float:
     return float(np.degrees(1.0)) if kind == "revolute" else 1e3
 
 
-def _sigma_table(sigma: Mapping[str, Mapping[str, Any]]) -> Table:
+def _sigma_table(plan: Plan) -> Table:
     table = columns_table("expected sigma", "", "now", "after")
-    for name, unit, now, after in _rows(sigma):
-        if after < FALLS * now:
-            factor, unit = shown(unit)
-            table.add_row(name, unit, f"{factor * now:.3g}", f"{factor * after:.3g}")
+    for row in _rows(plan):
+        if row.after < FALLS * row.now:
+            factor, unit = shown(row.unit)
+            table.add_row(row.name, unit, f"{factor * row.now:.3g}", f"{factor * row.after:.3g}")
     return table
 
 
-def _rows(sigma: Mapping[str, Mapping[str, Any]]) -> Iterator[tuple[str, str, float, float]]:
-    """A row a parameter; of an effect with many, their root mean square."""
-    by_variable: dict[str, list[str]] = {}
-    for name in sigma:
-        by_variable.setdefault(name.rpartition(".")[0], []).append(name)
-    for variable, names in by_variable.items():
-        if len(names) < MANY:
-            yield from ((n, *(sigma[n][key] for key in ("unit", "now", "after"))) for n in names)
-            continue
-        both = (
-            float(np.sqrt(np.mean([sigma[n][key] ** 2 for n in names]))) for key in ("now", "after")
-        )
-        yield f"{variable}, rms of {len(names)}", sigma[names[0]]["unit"], *both
+class _Row(NamedTuple):
+    """What is known of some parameters of an unknown: of one, or the root mean square of many."""
+
+    keys: Sequence[Key]
+    unit: str
+    now: float
+    after: float
+
+    @property
+    def name(self) -> str:
+        first, count = self.keys[0], len(self.keys)
+        return first.name if count == 1 else f"{first.unknown}, rms of {count}"
 
 
-def _together(names: list[str]) -> str:
-    """Parameters, those of one variable together."""
-    by_variable: dict[str, list[str]] = {}
-    for name in names:
-        variable, _, dof = name.rpartition(".")
-        by_variable.setdefault(variable or name, []).append(dof)
-    return "; ".join(f"{variable} {', '.join(dofs)}" for variable, dofs in by_variable.items())
+def _rows(plan: Plan) -> Iterator[_Row]:
+    """A row a parameter; of an effect with many in one unit, one for all."""
+    by_unknown: dict[str, list[int]] = {}
+    for i, key in enumerate(plan.keys):
+        by_unknown.setdefault(key.unknown, []).append(i)
+    for at in by_unknown.values():
+        alike = len(at) >= MANY and len({plan.units[i] for i in at}) == 1
+        for some in [at] if alike else [[i] for i in at]:
+            sizes = (float(np.sqrt(np.mean(k.sigma[some] ** 2))) for k in (plan.now, plan.after))
+            yield _Row([plan.keys[i] for i in some], plan.units[some[0]], *sizes)
+
+
+def _together(rows: Sequence[_Row]) -> str:
+    """What rows are of, parameters of one unknown together."""
+    by_unknown: dict[str, list[str]] = {}
+    for row in rows:
+        alone = len(row.keys) == 1
+        some = by_unknown.setdefault(row.keys[0].unknown if alone else row.name, [])
+        some += [row.keys[0].dof] if alone else []
+    return "; ".join(" ".join(filter(None, (n, ", ".join(d)))) for n, d in by_unknown.items())
 
 
 def _detectable_table(smallest: Mapping[str, Mapping[str, Any]]) -> Table:

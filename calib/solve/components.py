@@ -21,10 +21,10 @@ from calib.linear.elimination import inverse_and_log_det
 from calib.linear.system import Linearisation, Values
 from calib.problem.places import joints_at
 from calib.problem.problem import Block, Problem, SurfaceCells
-from calib.problem.spread import OF_TARGETS, by_chance, read, sigmas, spread_keys, widening
+from calib.problem.spread import Whose, by_chance, read, sigmas, spread_keys, widening
 from calib.problem.unknowns import Unknown
 from calib.problem.without import ROD
-from calib.residuals.groups import JOINTS, Group
+from calib.residuals.groups import Group
 from calib.residuals.targets import PARTS, SIGMAS, HangingTarget
 from calib.residuals.tracker import BodiesTogether, TrackedBody
 from calib.solve.estimate import Estimate
@@ -237,27 +237,27 @@ class Checks:
         return Checks(share * self.square / grown**2, share * r / grown, self.count)
 
 
-Sums = Mapping[tuple[str, str], Checks]
+Sums = Mapping[Whose, Checks]
 # A block, the whitened derivative by each unknown, and minus the residuals: see `Graph`.
 GraphRow = tuple[Block | None, Mapping[str, np.ndarray], np.ndarray]
 NOTHING = Checks.alone(0.0, 0.0)
 
 
 def squares(estimate: Estimate) -> Sums:
-    """Whose rows and unit -> what these rows say of their sigma; of those that a spread widens."""
+    """Whose rows -> what these rows say of their sigma; of those that a spread widens."""
     problem = estimate.problem
     whose = frozenset(widening(problem).values())
     rows = estimate.graph.linear_rows(estimate.values)
     out = squares_beside_bodies(
         problem, estimate.values, estimate.linear, estimate.kept, whose, rows
     )
-    bodies = [block for block in problem.bodies if (block.body, "m") in whose]
+    bodies = [b for b in problem.bodies if Whose("body", b.body, "m") in whose]
     return out | _of_bodies(bodies, estimate)
 
 
 def _of_bodies(bodies: Sequence[TrackedBody], estimate: Estimate) -> Sums:
     """Of tracked bodies."""
-    found: dict[tuple[str, str], list[tuple[float, float]]] = {}
+    found: dict[Whose, list[tuple[float, float]]] = {}
     together = BodiesTogether.of(bodies)
     blocks = [block for each in together for block in each.blocks]
     rows = [some for each in together for some in each.evaluate(estimate.values)]
@@ -269,7 +269,7 @@ def _of_bodies(bodies: Sequence[TrackedBody], estimate: Estimate) -> Sums:
         for k, unit in enumerate(("m",) if block.is_point else ("rad", "m")):
             mine = [each.reshape(count, -1, 3)[:, k] for each in (residual, left)]
             sums = float(np.square(mine[0]).sum()), float(mine[1].sum())
-            found.setdefault((block.body, unit), []).append(sums)
+            found.setdefault(Whose("body", block.body, unit), []).append(sums)
     return {key: Checks.alone(*np.sum(sums, axis=0)) for key, sums in found.items()}
 
 
@@ -278,10 +278,10 @@ def squares_beside_bodies(
     values: Values,
     linear: Linearisation,
     kept: np.ndarray,
-    whose: Collection[tuple[str, str]],
+    whose: Collection[Whose],
     graph_rows: Iterable[GraphRow],
     wild: Collection[Group] = (),
-) -> dict[tuple[str, str], Checks]:
+) -> dict[Whose, Checks]:
     """The same of joint readings, of targets, and of what parts of surfaces stand off, by kind.
 
     Args:
@@ -293,14 +293,14 @@ def squares_beside_bodies(
         graph_rows: rows, at the state, of the graph that it is in.
         wild: blunders, of which nothing is told.
     """
-    cells = {name: each for name, each in problem.cells.items() if (each.kind, "m") in whose}
+    cells = {n: c for n, c in problem.cells.items() if Whose("surface", c.kind, "m") in whose}
     out = _of_cells(problem, values, cells, lambda some: linear.variances(some, kept))
-    if any(what.startswith(OF_TARGETS) for what, _ in whose):
+    if any(each.kind == "target" for each in whose):
         out |= _of_targets(linear, kept, graph_rows, wild)
     off = {joints_at(problem, group) for group in wild if group.kind == "joints"}
-    for unit in (unit for what, unit in whose if what == JOINTS):
-        if good := [u for u in read(problem, unit) if u.name not in off]:
-            out[JOINTS, unit] = _of_joints(good, unit, values, linear, kept)
+    for each in (each for each in whose if each.kind == "joints"):
+        if good := [u for u in read(problem, each.unit) if u.name not in off]:
+            out[each] = _of_joints(good, each.unit, values, linear, kept)
     return out
 
 
@@ -330,7 +330,7 @@ def _of_targets(
     kept: np.ndarray,
     graph_rows: Iterable[GraphRow],
     wild: Collection[Group],
-) -> dict[tuple[str, str], Checks]:
+) -> dict[Whose, Checks]:
     """Of spheres and of markers; the upper one counts across its rod alone."""
     rows = [row for row in graph_rows if isinstance(row[0], HangingTarget)]
     variances = linear.variances([by for _, by, _ in rows], kept)
@@ -344,7 +344,8 @@ def _of_targets(
                     here, count = slice(3 * i, 3 * i + 3), 2 if PARTS[i] == "upper" else 3
                     left = count * weight[i] - seen[here].sum()
                     sums.setdefault(of, []).append((np.square(residual[here]).sum(), left))
-    return {(f"{OF_TARGETS}{of}", "m"): Checks.alone(*np.sum(s, axis=0)) for of, s in sums.items()}
+    found = {of: Checks.alone(*np.sum(some, axis=0)) for of, some in sums.items()}
+    return {Whose("target", of, "m"): checks for of, checks in found.items()}
 
 
 def _of_cells(
@@ -352,16 +353,17 @@ def _of_cells(
     values: Values,
     cells: Mapping[str, SurfaceCells],
     variances: Callable[[Sequence[Mapping[str, np.ndarray]]], list[np.ndarray]],
-) -> dict[tuple[str, str], Checks]:
+) -> dict[Whose, Checks]:
     """Of what parts of surfaces stand off, by their kind."""
-    out: dict[tuple[str, str], Checks] = {}
+    out: dict[Whose, Checks] = {}
     each = variances([{n: np.eye(problem.variables[n].dim)} for n in cells])
     for (name, some), seen in zip(cells.items(), each, strict=True):
         sigma = problem.variables[name].sigma
         total = float(np.square(values[name] / sigma).sum())
         found = Checks.alone(total, float(np.sum(1.0 - seen / np.square(sigma))))
-        before = out.get((some.kind, "m"))
-        out[some.kind, "m"] = found if before is None else before + found
+        whose = Whose("surface", some.kind, "m")
+        before = out.get(whose)
+        out[whose] = found if before is None else before + found
     return out
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -37,11 +37,16 @@ class Start:
     met: Mapping[StopKey, np.ndarray] = field(default_factory=dict)
     aside: frozenset[str] = frozenset()
 
-    @property
-    def spread(self) -> dict[str, float]:
-        """How widely things scatter by chance, by the keys of `problem.spread`."""
-        ends = (name for name in self.state if name.endswith(SD))
-        return {name.removesuffix(SD): float(self.state[name]) for name in ends}
+    def spread(self, problem: Problem) -> dict[str, float]:
+        """How widely things scatter by chance in a problem, by the keys of `problem.spread`; of
+        those that the state knows."""
+        known = {key: self.state.get(f"{key}{SD}") for key in spread_of(problem)}
+        return {key: float(sd) for key, sd in known.items() if sd is not None}
+
+    def without(self, names: Collection[str]) -> Start:
+        """The same, with nothing known of some unknowns."""
+        gone = {f"{name}{ending}" for name in names for ending in ("", DOFS, SEEN)}
+        return Start({n: x for n, x in self.state.items() if n not in gone})
 
 
 @dataclass(frozen=True)

@@ -80,7 +80,8 @@ class Loop(Descent):
         start: Start | None = None,
     ) -> None:
         start = start or Start()
-        problem = with_spread(problem.setting_aside(start.aside), start.spread)
+        problem = problem.setting_aside(start.aside)
+        problem = with_spread(problem, start.spread(problem))
         super().__init__(problem, prior, progress, values_of(problem, start.state))
         self.given, self.start = self.problem, start
         self.seen: dict[str, np.ndarray] = {}

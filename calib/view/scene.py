@@ -181,14 +181,14 @@ class Scene:
             InputError: nothing was measured at the stop.
         """
         stops, row = self._of_stop(recording, stop)
-        known = {name: i for i, name in enumerate(self.run.solution.names)}
+        known = {key: i for i, key in enumerate(self.run.solution.keys)}
         edges = len(stops.rig.tree.edges)
         twists, jacobians, numbers = np.zeros((edges, 6)), [np.zeros((edges, 6, 0))], []
         for name, bases in stops.edge_bases.items():
             basis = bases[row if len(bases) > 1 else 0]
             twists += basis @ self.state[name]
             jacobians.append(basis)
-            numbers += [known.get(f"{name}.{dof}") for dof in self.problem.variables[name].dofs]
+            numbers += [known.get(key) for key in self.problem.variables[name].keys]
         lost = np.array([number is None for number in numbers], bool)
         at = np.array([number or 0 for number in numbers], int)
         covariance = self.run.solution.covariance[np.ix_(at, at)]

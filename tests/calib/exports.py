@@ -8,6 +8,7 @@ import numpy as np
 from calib.effects import FrameOffset, trust_in
 from calib.forward import Placed, Term, place
 from calib.problem.model import Model, Source
+from calib.problem.unknowns import Key
 from calib.results.solution import EffectEstimate, FrameEstimate, Part, Solution, one_unit
 from calib.rig import Rig
 from calib.runs.run import Run
@@ -22,7 +23,7 @@ def found_by_chance(
     With several recordings, each rig has everything for itself.
     """
     rng, model = np.random.default_rng(seed), Model(tuple(effects))
-    shared, own, names, sources = Part(), {}, [], [Source.open(folder) for folder in folders]
+    shared, own, keys, sources = Part(), {}, [], [Source.open(folder) for folder in folders]
     for source in sources:
         rig, several = source.rig, len(sources) > 1
         part = own.setdefault(rig.name, Part()) if several else shared
@@ -32,12 +33,12 @@ def found_by_chance(
             if params:
                 theta = size * rng.normal(0, [p.sigma for p in params])
                 sigma = rng.uniform(0.1, 0.5, len(params)) * [p.sigma for p in params]
-                names += [f"{before}{effect.name}.{p.name}" for p in params]
+                keys += [Key(f"{before}{effect.name}", p.name) for p in params]
                 _put(part, rig, effect, theta, sigma)
         if rig.tracker and rig.reference:
             T = se3.exp(rng.normal(size=6))
             part.frames[rig.reference_frame] = FrameEstimate(rig.world, T, *np.full((2, 3), 1e-4))
-    root = rng.normal(0, 1e-4, (len(names), len(names)))
+    root = rng.normal(0, 1e-4, (len(keys), len(keys)))
     documents = [
         {"path": str(folder), "rig": s.rig.name, "sha256": s.recording.digest()}
         for folder, s in zip(folders, sources, strict=True)
@@ -55,7 +56,7 @@ def found_by_chance(
         shared=shared,
         recordings=own,
         not_estimated=untold,
-        names=tuple(names),
+        keys=tuple(keys),
         covariance=root @ root.T,
     )
     trust = trust_in(model.effects)

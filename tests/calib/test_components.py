@@ -325,8 +325,8 @@ def test_rows_that_scatter_beyond_their_sigma_tell_by_how_much(worse, effect, si
         least = 0.7 * sigma if effect == "reference_scatter" else sigma - 3 * of
         assert least < sd < sigma + 3 * of and 0.05 < of / sd < 0.3
     again = squares(estimate)
-    for what, checks in again.items():
-        if f"{what[0]}.{what[1]}" in keys:
+    for whose, checks in again.items():
+        if f"{whose.text}.{whose.unit}" in keys:
             assert checks.total / checks.left == pytest.approx(1.0, abs=0.05)  # they fit
 
 

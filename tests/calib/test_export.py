@@ -56,7 +56,7 @@ def run(tmp_path):
             shared=shared,
             recordings=own,
             not_estimated=untold,
-            names=(),
+            keys=(),
             covariance=np.zeros((0, 0)),
         ),
     )

@@ -16,7 +16,7 @@ SUMMARY = {"residual": "range", "rms_mm": RMS_MM, "converged": True, "misfit": {
 
 def fitted(folder="somewhere/run", **summary):
     part = Part({}, {})
-    solution = Solution(shared=part, recordings={}, not_estimated=[], names=(), covariance=None)
+    solution = Solution(shared=part, recordings={}, not_estimated=[], keys=(), covariance=None)
     return Run(Path(folder), {}, SUMMARY | summary, solution)
 
 

@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import kstest
 
 from calib.problem.prior import JointPrior
-from calib.problem.unknowns import Unknown
+from calib.problem.unknowns import Key, Unknown
 from calib.results.recalibrate import Fitted, let_go
 from calib.runs.asked.moved import _apart, _differences, moved
 from calib.runs.asked.pair import Known, Pair, unknowns_of
@@ -181,8 +181,10 @@ def test_names_of_parameters_may_have_dots(tmp_path):
     }
     (tmp_path / "residuals.parquet").mkdir()
     write_table(tmp_path / "residuals.parquet/_prior.parquet", columns)
-    names = ("arm_geometry.joint_2.tx", "arm_geometry.joint_2.ty", "lidar.tx")
-    run = SimpleNamespace(folder=tmp_path, solution=SimpleNamespace(names=names))
+    arm = [Key("arm_geometry", "joint_2.tx"), Key("arm_geometry", "joint_2.ty")]
+    run = SimpleNamespace(
+        folder=tmp_path, solution=SimpleNamespace(keys=(*arm, Key("lidar", "tx")))
+    )
     found = {unknown.name: (unknown.dofs, theta.tolist()) for unknown, theta in unknowns_of(run)}
     assert found == {
         "arm_geometry": (("joint_2.tx", "joint_2.ty"), [0.1, 0.2]),

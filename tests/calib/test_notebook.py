@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from calib.diagnosis.verdict import Diagnosis
+from calib.effects.rig import DOF
+from calib.problem.unknowns import Key
 from calib.results.solution import EffectEstimate, FrameEstimate, Part, Solution
 from calib.runs.ladder import Rung
 from calib.runs.run import Run
@@ -14,7 +16,7 @@ from calib.show.blunders import blunder_cells
 from calib.show.notebook import ProgressLine, diagnosis_html, run_html, rung_html
 from calib.show.tables import print_run
 
-NAMES = ("lidar.rx", "lidar.ry", "lidar.rz", "lidar.tx", "lidar.ty", "lidar.tz")
+KEYS = tuple(Key("lidar", dof) for dof in DOF)
 
 
 @pytest.fixture
@@ -31,7 +33,7 @@ def run():
         shared=Part({"lidar": frame}, effects),
         recordings={},
         not_estimated=[{"name": "lidar.tz", "why": "no <floor> in sight"}],
-        names=NAMES,
+        keys=KEYS,
         covariance=np.diag(np.full(6, 9e-8)),
     )
     rms = {"fit": 0.86, "held_out": 1.42, "noise_floor": 1.74}

@@ -41,12 +41,12 @@ def test_derivatives_are_differences_of_residuals(evidence, name):
 def test_a_budget_is_the_rms_of_what_one_variable_does(evidence):
     """Where the only thing unknown is every ring's zero, ranges are unsure by just as much."""
     solution, sigma = evidence.run.solution, 0.003
-    rings = np.array([n.startswith("ring_range_offset.") for n in solution.names])
+    rings = np.array([key.unknown == "ring_range_offset" for key in solution.keys])
     told = Solution(
         shared=solution.shared,
         recordings={},
         not_estimated=[],
-        names=solution.names,
+        keys=solution.keys,
         covariance=np.diag(np.where(rings, sigma**2, 0.0)),
     )
     values = evidence.values | {"ring_range_offset": np.full(rings.sum(), 0.002)}

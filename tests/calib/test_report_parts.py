@@ -7,26 +7,30 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from calib.problem.unknowns import Key
 from calib.report.charts.bodies import Arrows, magnification
 from calib.report.charts.groups import groups
 from calib.report.charts.knowledge import tied
-from calib.results.solution import Solution
+from calib.results.solution import EffectEstimate, Part, Solution
 from calib.runs.run import Run
 from calib.show.verdict import judge
 
 
 def test_correlations_are_those_of_the_covariance_and_large_effects_are_summed_up():
-    names = ("a.x", "a.y", "b.z", *(f"rings.ring_{i:03}" for i in range(20)))
+    keys = tuple(map(Key, "aab", "xyz")) + tuple(Key("rings", f"ring_{i:03}") for i in range(20))
     covariance = np.eye(23)
     covariance[0, 1] = covariance[1, 0] = 0.9
     covariance[3:, 3:] += 1.0
     covariance[2, 3:] = covariance[3:, 2] = -0.7
+    names = {"a": ("x", "y"), "b": ("z",), "rings": tuple(key.dof for key in keys[3:])}
+    effects = {n: EffectEstimate("m", some, *np.zeros((2, len(some)))) for n, some in names.items()}
+    shared = Part(effects=effects)
     chosen, matrix = tied(
         Solution(
-            shared=None,
+            shared=shared,
             recordings={},
             not_estimated=[],
-            names=names,
+            keys=keys,
             covariance=covariance,
         ),
         None,
@@ -37,10 +41,10 @@ def test_correlations_are_those_of_the_covariance_and_large_effects_are_summed_u
     weak = {"weak_directions": [{"parameters": ["b.z"]}]}
     alone = tied(
         Solution(
-            shared=None,
+            shared=shared,
             recordings={},
             not_estimated=[],
-            names=names[:3],
+            keys=keys[:3],
             covariance=covariance[:3, :3],
         ),
         weak,

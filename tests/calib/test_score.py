@@ -14,6 +14,7 @@ from calib.diagnosis.linear import Linear
 from calib.diagnosis.screen import looked, rivals, screen
 from calib.effects import Site
 from calib.linear.clusters import ClusteredRows
+from calib.problem.unknowns import Owner
 
 STOPS, PLACES, EACH = 30, 25, 6
 THEIRS = {"one": 1, "twin": 1, "several": 3, "gauge": 1, "rings": 40}
@@ -63,6 +64,7 @@ class World:
         stop, place = np.divmod(np.arange(STOPS * PLACES), PLACES)
         return Linear(
             candidates=tuple(names),
+            owner=dict.fromkeys(columns, Owner()),
             at={name: np.r_[at] for name, at in columns.items()},
             columns=columns,
             information=J.T @ J,

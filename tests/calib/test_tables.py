@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial.transform import RigidTransform
 
 from calib.effects import CATALOGUE
+from calib.problem.unknowns import Key
 from calib.results.solution import EffectEstimate, FrameEstimate, Part, Solution
 from calib.runs.run import Run
 from calib.show import tables
@@ -60,7 +61,7 @@ def run(box, tmp_path):
         ),
         "a_scale": EffectEstimate("1", ("s",), np.array([1.234e-5]), np.array([2e-6])),
     }
-    names = tuple(f"{frame}.{dof}" for frame in frames for dof in DOF)
+    keys = tuple(Key(frame, dof) for frame in frames for dof in DOF)
     untold = [
         {"name": "lidar (rx … rz, ty)", "why": f"tied to mount: {WHY}"},
         {"name": "arm_link_length.turn", "why": f"tied to faro.tz: {WHY}"},
@@ -77,7 +78,7 @@ def run(box, tmp_path):
         shared=Part(frames, effects),
         recordings={},
         not_estimated=untold,
-        names=names,
+        keys=keys,
         covariance=covariance,
     )
     return Run(tmp_path / "first", model, SUMMARY, solution)
@@ -121,8 +122,8 @@ def test_a_recording_that_is_gone_leaves_the_sigmas(run, printed):
 
 def test_what_belongs_to_one_rig_carries_its_name(run, printed):
     own = Part({"lidar": run.solution.shared.frames["lidar"]}, {})
-    names = tuple(f"box/{n}" for n in run.solution.names)
-    solution = replace(run.solution, shared=Part(), recordings={"box": own}, names=names)
+    keys = tuple(Key(f"box/{key.unknown}", key.dof) for key in run.solution.keys)
+    solution = replace(run.solution, shared=Part(), recordings={"box": own}, keys=keys)
     lines = printed(tables.print_run, replace(run, solution=solution))
     assert any(re.match(r"box/lidar \+1.23 ± 0.45", line) for line in lines)
 

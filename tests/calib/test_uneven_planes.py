@@ -93,7 +93,7 @@ def test_ring_zeros_are_as_sure_as_walls_are_flat(fitted):
 def test_a_fit_tells_how_uneven_walls_are(fitted, uneven_m):
     """What is common to a plane is where it lies, and what varies within a patch is not counted."""
     _, estimate = fitted(uneven_m)
-    parts = [sigma for (kind, _), (sigma, _) in sigmas(estimate.problem).items() if "/" in kind]
+    parts = [sigma for whose, (sigma, _) in sigmas(estimate.problem).items() if "/" in whose.what]
     assert len(parts) == 2
     found = np.hypot(*parts)
     assert found < 2e-4 if uneven_m == 0 else 0.6 * uneven_m < found < 1.3 * uneven_m

@@ -111,6 +111,12 @@ def test_what_a_state_does_not_know_starts_at_its_mean(cold):
     assert again.converged and sigmas_apart(first, again) < (0.25 if differ else 0.01)
 
 
+def test_a_start_forgets_what_it_is_told_to_and_nothing_whose_name_begins_alike():
+    kept = {"planes_east": 1, "planes/region.m.sd": 2, "range_cyclic@1.2": 3, "a.planes": 4}
+    gone = {f"planes{ending}": 0 for ending in ("", ".dofs", ".seen")} | {"range_cyclic@1": 0}
+    assert Start(kept | gone).without(["planes", "range_cyclic@1"]).state == kept
+
+
 def test_from_afar_beams_look_anew_what_they_meet(tmp_path):
     """A state of another place is a poor start, and no worse than that."""
     source = Source.open(rigs.write(tmp_path / "box", seed=4))

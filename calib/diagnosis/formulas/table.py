@@ -281,6 +281,7 @@ class Projection:
         cells = summed(np.vstack(shares), cell)
         return Scores(
             at={},
+            owner={},
             score=cells.sum(axis=0),
             information=(information + information.T) / 2,
             whole=weighted.T @ columns_m,

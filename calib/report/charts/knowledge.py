@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from calib.problem.unknowns import Key
 from calib.report import plots
 from calib.report.budget import Budget
 from calib.report.chart import Absent, Chart
@@ -124,7 +125,7 @@ def correlation(evidence: Evidence) -> Iterator[Chart | Absent]:
 
 def tied(solution: Solution, diagnosis: Any) -> tuple[list[str], np.ndarray]:
     """The parameters most tied to others (n,), and their correlations (n, n)."""
-    names, A = _summarised(solution.names)
+    names, A = _summarised(solution.keys, solution.units)
     covariance = A @ solution.covariance @ A.T
     sigma = np.sqrt(np.diag(covariance))
     known = np.flatnonzero(sigma > 0)
@@ -138,19 +139,20 @@ def tied(solution: Solution, diagnosis: Any) -> tuple[list[str], np.ndarray]:
     return [names[i] for i in chosen], matrix[np.ix_(chosen, chosen)]
 
 
-def _summarised(names: Sequence[str]) -> tuple[list[str], np.ndarray]:
-    """Names with those of large effects replaced by their mean, and what makes those of these."""
+def _summarised(keys: Sequence[Key], units: Sequence[str]) -> tuple[list[str], np.ndarray]:
+    """Names of parameters, those of large effects replaced by their mean where they have one unit,
+    and what makes those of these."""
     owners: dict[str, list[int]] = {}
-    for i, name in enumerate(names):
-        owners.setdefault(name.rpartition(".")[0], []).append(i)
+    for i, key in enumerate(keys):
+        owners.setdefault(key.unknown, []).append(i)
     out, rows = [], []
     for owner, at in owners.items():
-        if len(at) > LISTED_PARAMETERS:
+        if len(at) > LISTED_PARAMETERS and len({units[i] for i in at}) == 1:
             out.append(f"mean of {owner}")
-            rows.append(np.isin(np.arange(len(names)), at) / len(at))
+            rows.append(np.isin(np.arange(len(keys)), at) / len(at))
         else:
-            out += [names[i] for i in at]
-            rows += [np.arange(len(names)) == i for i in at]
+            out += [keys[i].name for i in at]
+            rows += [np.arange(len(keys)) == i for i in at]
     return out, np.array(rows, float)
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from calib.forward import named
 from calib.report import plots
 from calib.report.chart import Absent, Chart
 from calib.report.evidence import Evidence
@@ -54,7 +55,8 @@ class ChainLink:
 def _links(evidence: Evidence, rig: Rig) -> list[ChainLink]:
     """The frames of one rig, parents before children, the arm drawn together."""
     fitted = {f.variable: f for f in evidence.estimates if f.parent is not None}
-    fitted |= {n.removeprefix(f"{rig.name}/"): f for n, f in fitted.items()}
+    own = {frame: fitted.get(named(frame, rig.name)) for frame in rig.frame_sigma}
+    fitted |= {frame: f for frame, f in own.items() if f is not None}
     out = [
         ChainLink(rig.world, 0, "the tracker's frame" if rig.tracker else "the reference's frame")
     ]

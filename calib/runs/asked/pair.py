@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from calib.effects.rig import DOF
-from calib.problem.unknowns import Unknown, pose_unknown
+from calib.problem.unknowns import Key, Unknown, pose_unknown, vector_unknown
 from calib.residuals.robust import huber_weight
 from calib.results.solution import EffectEstimate, FrameEstimate, Solution
 from calib.runs.run import RESIDUALS, Run
@@ -52,17 +52,16 @@ class Pair:
         Raises:
             InputError: they have nothing in common, or the second is incomplete.
         """
-        places = [{name: i for i, name in enumerate(r.solution.names)} for r in (a, b)]
+        places = [{key: i for i, key in enumerate(r.solution.keys)} for r in (a, b)]
         earlier, later = _estimates(a.solution), _estimates(b.solution)
         held, then, now, rows, is_frame = [], {}, {}, [], []
         for unknown, theta in unknowns_of(b):
-            names = [f"{unknown.name}.{dof}" for dof in unknown.dofs]
-            if unknown.name not in earlier or not set(names) <= places[0].keys():
+            if unknown.name not in earlier or not set(unknown.keys) <= places[0].keys():
                 continue
             both = earlier[unknown.name], later[unknown.name]
             held.append(unknown)
             then[unknown.name], now[unknown.name] = _values(unknown, theta, *both)
-            rows += [[place[name] for place in places] for name in names]
+            rows += [[place[key] for place in places] for key in unknown.keys]
             is_frame += [isinstance(both[1], FrameEstimate)] * unknown.dim
         if not held:
             raise InputError(
@@ -106,33 +105,30 @@ def unknowns_of(run: Run) -> Iterator[tuple[Unknown, np.ndarray]]:
     if not path.is_file():
         raise InputError(f"{path} is missing; the run is incomplete, fit {run.folder} again")
     table = read_table(path)
-    names = np.char.add(np.char.add(table["unknown"], "."), table["parameter"]).tolist()
-    rows = {name: i for i, name in enumerate(names)}
-    owners: dict[str, list[str]] = {}
-    for name in run.solution.names:  # a parameter's name may have dots, but for those of a pose
-        owner = str(table["unknown"][rows[name]]) if name in rows else name.rpartition(".")[0]
-        owners.setdefault(owner, []).append(name)
-    vectors = {o: [rows[n] for n in own] for o, own in owners.items() if set(own) <= rows.keys()}
+    keys = map(Key, table["unknown"].tolist(), table["parameter"].tolist())
+    rows = {key: i for i, key in enumerate(keys)}
+    owners: dict[str, list[Key]] = {}
+    for key in run.solution.keys:
+        owners.setdefault(key.unknown, []).append(key)
+    vectors = {o: [rows[k] for k in own] for o, own in owners.items() if set(own) <= rows.keys()}
     norms = np.array([np.linalg.norm(table["whitened"][at]) for at in vectors.values()])
     weights = huber_weight(norms, np.array([len(at) for at in vectors.values()]))
     weight = dict(zip(vectors, weights.tolist(), strict=True))
     for name, own in owners.items():
         if name in vectors:
             at = vectors[name]
-            unknown = Unknown(
-                name=name,
-                kind="vector",
-                mean=np.zeros(len(at)),
-                sigma=table["sigma"][at],
-                dofs=tuple(table["parameter"][at].tolist()),
-                units=tuple(table["unit"][at].tolist()),
+            unknown = vector_unknown(
+                name,
+                table["sigma"][at],
+                dofs=table["parameter"][at].tolist(),
+                units=table["unit"][at].tolist(),
                 weight=weight[name],
             )
             yield unknown, table["residual"][at]
         elif name in run.solution.shared.frames and len(own) == len(DOF):
             yield pose_unknown(name, run.solution.shared.frames[name].T_parent_child), np.zeros(6)
         else:
-            raise InputError(f"{path} has no row of {own[0]}; fit {run.folder} again")
+            raise InputError(f"{path} has no row of {own[0].name}; fit {run.folder} again")
 
 
 def _estimates(solution: Solution) -> dict[str, FrameEstimate | EffectEstimate]:
