@@ -62,16 +62,16 @@ class Offset:
     Args:
         offset_s, sigma_s: of all of both logs together.
         likeness: correlation of the two motions at that offset.
+        added: what is to be added, its change included.
         drift_s: by how much the offset changes from the first part of the logs to the last; 0 where
             it merely scatters.
-        added: what is to be added, that change included.
     """
 
     offset_s: float
     sigma_s: float
     likeness: float
-    drift_s: float
     added: Added
+    drift_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -237,11 +237,11 @@ def estimate(mine: Motion, other: Motion) -> Offset | None:
     top = float(likeness[best])
     always = Added.always(offset_s)
     if rival > RIVAL * evidence[best] and top > LEAST_LIKE:
-        return Offset(offset_s, np.nan, top, 0.0, always)
+        return Offset(offset_s, np.nan, top, added=always)
     at, shift_s = _parts(a, b, int(lag[best]), step_s)
     drift_s = _drift(shift_s)
     if abs(drift_s) < DRIFT_S:
-        return Offset(offset_s, _standard_error(shift_s, step_s), top, drift_s, always)
+        return Offset(offset_s, _standard_error(shift_s, step_s), top, added=always)
     first_s = float(other.time_s[0] - mine.time_s[0]) + int(lag[best]) * step_s
     at_s, off_s = _pieces(mine.time_s[0] + at * step_s, first_s + shift_s)
     left = first_s + shift_s - np.interp(mine.time_s[0] + at * step_s, at_s, off_s)
