@@ -144,7 +144,7 @@ def project(linear: Linear, names: Sequence[str], spent: int = 0) -> Scores:
 
 
 @dataclass(frozen=True)
-class Test:
+class ScoreTest:
     """One candidate's test; see the module.
 
     Args:
@@ -181,7 +181,7 @@ class Test:
         """How much wider its score scatters than independent rows of their sigmas would."""
         return self.chance.trace / self.dof
 
-    def judged(self, shares: Shares) -> Test:
+    def judged(self, shares: Shares) -> ScoreTest:
         """The same with its clusters left out one by one."""
         left_out = shares.left_out(self.chances[0].nu, self.spent)
         return replace(self, chances=(*self.chances, left_out))
@@ -232,7 +232,7 @@ class Test:
         return float(np.sqrt(noncentral * scale / nu / each))
 
 
-def test(scores: Scores, columns: np.ndarray) -> Test:
+def score_test(scores: Scores, columns: np.ndarray) -> ScoreTest:
     """Test the candidate of these columns."""
     size = np.sqrt(np.maximum(np.diag(scores.whole)[columns], 0.0))
     size = np.where(size > UNFELT * size.max(initial=0.0), size, np.inf)
@@ -242,7 +242,7 @@ def test(scores: Scores, columns: np.ndarray) -> Test:
     whiten = (axes[:, seen] / np.sqrt(values[seen])) / size[:, None]
     score = scores.score[columns]
     clusters = int((np.abs(scores.by_stop[:, columns] @ whiten).max(axis=1, initial=0.0) > 0).sum())
-    return Test(
+    return ScoreTest(
         columns=columns,
         statistic=float(np.sum(np.square(whiten.T @ score))),
         whiten=whiten,

@@ -17,8 +17,7 @@ from calib.blunders.chance import LEVELS, after_looks, log_tail
 from calib.blunders.judged import Blunder, LeftOut
 from calib.blunders.shifts import standing_alone
 from calib.diagnosis.chance import Chance
-from calib.diagnosis.score import Test
-from calib.diagnosis.score import test as joint_test
+from calib.diagnosis.score import ScoreTest, score_test
 from calib.diagnosis.screen import ODDS, Candidate, Screen, rivals
 from calib.diagnosis.stand import Look, Stand, tried
 from calib.effects import Effect
@@ -52,7 +51,7 @@ class NamedEffect:
     candidate: Candidate
     before: Look
     after: Look
-    judged: Test
+    judged: ScoreTest
     p_adjusted: float
     rivals: Sequence[Candidate]
 
@@ -351,8 +350,8 @@ def _covered(screen: Screen, candidate: Candidate, by: Sequence[Candidate]) -> b
     if not by:
         return False
     columns = np.unique(np.concatenate([c.test.columns for c in by]))
-    there = joint_test(screen.scores, columns)
-    both = joint_test(screen.scores, np.union1d(columns, candidate.test.columns))
+    there = score_test(screen.scores, columns)
+    both = score_test(screen.scores, np.union1d(columns, candidate.test.columns))
     gain = max(both.statistic - there.statistic, 0.0) / max(screen.common, 1.0)
     more = both.dof - there.dof
     return more < 1 or -log_tail(gain, more) < np.log(candidate.looks / ALPHA_UNNAMED)
@@ -366,7 +365,7 @@ def _scatter(look: Look, progress: Progress) -> Candidate | None:
     return None
 
 
-def judged(look: Look, candidate: Candidate, progress: Progress) -> tuple[Test, float]:
+def judged(look: Look, candidate: Candidate, progress: Progress) -> tuple[ScoreTest, float]:
     """A candidate's test, its clusters jackknifed, and its p-value adjusted for all tests."""
     found = look.judged(candidate, progress)
     return found, float(after_looks(found.p_value(), candidate.looks))

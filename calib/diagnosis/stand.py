@@ -22,7 +22,7 @@ from calib.diagnosis.candidates import (
 from calib.diagnosis.chance import Chance, chances, of_lidar, ranked, rows_by_chance
 from calib.diagnosis.jackknife import Shares
 from calib.diagnosis.linear import Linear, linearise_with, rows_along
-from calib.diagnosis.score import Test, away_from_model, project, test
+from calib.diagnosis.score import ScoreTest, away_from_model, project, score_test
 from calib.diagnosis.screen import Candidate, Screen, screen
 from calib.effects import CATALOGUE, Effect, Scatter, Site
 from calib.linear.layout import Layout
@@ -164,7 +164,7 @@ class Stand:
         shaped = [effect.at(float(shape)) for shape in finer]
         linear, at = self.linearise(shaped, progress)
         scores = project(linear, linear.candidates)
-        return max(shaped, key=lambda e: test(scores, at[e.name]).statistic)
+        return max(shaped, key=lambda e: score_test(scores, at[e.name]).statistic)
 
     def retuned(
         self, names: Collection[str], progress: Progress
@@ -182,7 +182,7 @@ class Stand:
         scores = project(linear, linear.candidates)
         swapped = {}
         for effect, step in zip(shaped, steps, strict=True):
-            found = test(scores, at[step.name])
+            found = score_test(scores, at[step.name])
             if found.dof and found.statistic > BETTER_SHAPE:
                 by = np.exp(np.clip(found.estimate()[0], -LARGEST, LARGEST))
                 swapped[effect.name] = effect.at(float(f"{effect.shape * by:.6g}"))
@@ -309,7 +309,7 @@ class Look:
         """Groups of rows that others contradict, or could."""
         return {blunder.group for blunder in self.blunders}
 
-    def judged(self, candidate: Candidate, progress: Progress) -> Test:
+    def judged(self, candidate: Candidate, progress: Progress) -> ScoreTest:
         """A candidate's test with its clusters jackknifed: see `jackknife`."""
         stand, found = self.stand, candidate.test
         wide = stand.problem_of(stand.model.plus((candidate.effect,)))

@@ -23,7 +23,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from calib import problem as problems
-from calib.diagnosis.score import project, test
+from calib.diagnosis.score import project, score_test
 from calib.diagnosis.search import ALPHA, Search, search
 from calib.diagnosis.stand import Stand
 from calib.diagnosis.suggest import hangs_on
@@ -175,7 +175,7 @@ def _estimate(found: Search, effect: Effect, truth: dict[str, Any]) -> dict[str,
     chosen = slice(start, start + len(theta))
     by_fit = np.sqrt(np.diag(stand.estimate.covariance)[chosen])
     scores = project(look.linear, [term.variable])
-    by_test = test(scores, np.arange(len(theta))).sigma(look.named.common)
+    by_test = score_test(scores, np.arange(len(theta))).sigma(look.named.common)
     told = by_fit < LEFT_SIGMA * variable.sigma
     off = (stand.estimate.values[term.variable] - theta)[told]
     return {"by_fit": (off / by_fit[told]).tolist(), "by_test": (off / by_test[told]).tolist()}

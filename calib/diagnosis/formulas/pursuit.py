@@ -21,7 +21,7 @@ from calib.diagnosis.formulas.needed import needed
 from calib.diagnosis.formulas.smooths import Bases, Smooth, screen_smooths
 from calib.diagnosis.formulas.table import Projection, Table
 from calib.diagnosis.formulas.terms import Term, refine
-from calib.diagnosis.score import Test
+from calib.diagnosis.score import ScoreTest
 from calib.solve.fit import Progress
 
 KEPT = 4  # factors of each covariate whose products are tried
@@ -176,7 +176,7 @@ def _stands_out(fitted: Projection, bases: Bases, smooth: Smooth) -> bool:
     return p < PLAUSIBLE or judged.dof >= judged.clusters
 
 
-def _judged(fitted: Projection, columns: np.ndarray) -> Test:
+def _judged(fitted: Projection, columns: np.ndarray) -> ScoreTest:
     """The test of columns (N, k), stops left out one by one, and beams weighed as they are once
     these are known: what is clipped before would seem to differ from stop to stop."""
     return fitted.table.projection(columns).judged(columns)
@@ -199,7 +199,7 @@ def _by_chance(fitted: Projection, form: Form, smooth: Smooth) -> float:
     return at_least(min(1.0, len(bounds) * min(bounds)))
 
 
-def _tail(found: Test, among: int = 0) -> float:
+def _tail(found: ScoreTest, among: int = 0) -> float:
     """How often chance explains as much as a test found, or, with `among`, as the best function of
     so many parameters does."""
     chance = found.chance

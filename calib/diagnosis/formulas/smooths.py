@@ -16,7 +16,7 @@ import numpy as np
 from calib.blunders.chance import log_tail
 from calib.diagnosis.formulas.factors import product_of
 from calib.diagnosis.formulas.table import Projection, Table
-from calib.diagnosis.score import Scores, Test, test
+from calib.diagnosis.score import Scores, ScoreTest, score_test
 from calib.diagnosis.screen import by_rank, looked
 
 # Knots of a function of one covariate, of each of two and of three. A pair of 5 x 5 sees what turns
@@ -39,11 +39,11 @@ class Smooth:
         covariates: their names.
         test: of its columns.
         looks: by how many independent looks a p-value pays.
-        evidence: see `Test.evidence`.
+        evidence: see `ScoreTest.evidence`.
     """
 
     covariates: tuple[str, ...]
-    test: Test
+    test: ScoreTest
     looks: float
     evidence: float
 
@@ -192,22 +192,22 @@ def _tested(
     bases: Bases,
     sets: Sequence[tuple[str, ...]],
     progress: Callable[[int, int], None],
-) -> Iterator[tuple[tuple[str, ...], tuple[Test, np.ndarray]]]:
+) -> Iterator[tuple[tuple[str, ...], tuple[ScoreTest, np.ndarray]]]:
     """Each set's test, and by rank the p-values (R,) of the same on scores by chance."""
     for i, names in enumerate(sets):
         progress(i, len(sets))
         columns = bases.of(names)
         scores = projection.scores(columns)
-        found = test(scores, np.arange(columns.shape[1]))
+        found = score_test(scores, np.arange(columns.shape[1]))
         if found.dof:
             yield names, (found, _by_chance(scores, found, projection.table.signs))
 
 
-def _by_chance(scores: Scores, found: Test, signs: np.ndarray) -> np.ndarray:
+def _by_chance(scores: Scores, found: ScoreTest, signs: np.ndarray) -> np.ndarray:
     # Every set has the same clusters in the same order, so the same draw of signs is one world.
     shares = np.vstack([scores.by_stop, scores.by_place]) @ found.whiten
     return by_rank(np.sum(np.square(signs @ shares), axis=1))
 
 
-def _common(tests: Sequence[Test]) -> float:
+def _common(tests: Sequence[ScoreTest]) -> float:
     return float(np.median([t.inflation for t in tests])) if tests else 1.0

@@ -18,7 +18,7 @@ from scipy.sparse import block_diag, csr_array, eye_array, hstack, vstack
 from calib.diagnosis.formulas.factors import covariates_of
 from calib.diagnosis.jackknife import Shares
 from calib.diagnosis.linear import beside, other_rows
-from calib.diagnosis.score import GAUGE, Scores, Test, test
+from calib.diagnosis.score import GAUGE, Scores, ScoreTest, score_test
 from calib.linear.clusters import ClusteredRows, Gradients, summed
 from calib.linear.layout import Layout
 from calib.linear.rows import TWIST, StopRows
@@ -260,12 +260,12 @@ class Projection:
         """Scores of columns (N, Q) of the range, of one candidate; see `calib.diagnosis.score`."""
         return self._scores(columns_m, self.off(columns_m))
 
-    def test(self, columns_m: np.ndarray) -> Test:
+    def test(self, columns_m: np.ndarray) -> ScoreTest:
         """The test of columns (N, q) together."""
         return self._test(columns_m, self.off(columns_m))
 
-    def _test(self, columns_m: np.ndarray, kept: tuple[np.ndarray, np.ndarray]) -> Test:
-        return test(self._scores(columns_m, kept), np.arange(columns_m.shape[1]))
+    def _test(self, columns_m: np.ndarray, kept: tuple[np.ndarray, np.ndarray]) -> ScoreTest:
+        return score_test(self._scores(columns_m, kept), np.arange(columns_m.shape[1]))
 
     def _scores(self, columns_m: np.ndarray, kept: tuple[np.ndarray, np.ndarray]) -> Scores:
         """As `scores`, with what `off` gives."""
@@ -290,7 +290,7 @@ class Projection:
             weight_m2=self.weight_m2,
         )
 
-    def judged(self, columns_m: np.ndarray) -> Test:
+    def judged(self, columns_m: np.ndarray) -> ScoreTest:
         """The test of columns (N, q) with its clusters left out one by one: see `jackknife`."""
         table, kept = self.table, self.off(columns_m)
         found = self._test(columns_m, kept)

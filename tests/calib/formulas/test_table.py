@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from calib.diagnosis.formulas.table import HUBER, Projection, Table
-from calib.diagnosis.score import test as score_test
+from calib.diagnosis.score import score_test
 from calib.effects import DEFAULT
 from calib.problem import build
 from calib.problem.model import Model
