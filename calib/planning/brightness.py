@@ -53,7 +53,13 @@ class Brightness:
         A[:, -2:] = _logs(range_m[fine], np.cos(incidence[fine]))
         found = np.linalg.lstsq(A, np.log(intensity[fine]), rcond=None)[0]
         level = found[:-2]
-        return cls(labels, level, float(np.median(level)), float(found[-2]), float(found[-1]))
+        return cls(
+            labels=labels,
+            level=level,
+            usual=float(np.median(level)),
+            fall=float(found[-2]),
+            slant=float(found[-1]),
+        )
 
     def at(self, label: np.ndarray, range_m: np.ndarray, cosine: np.ndarray) -> np.ndarray:
         """Intensity (N,) over the median of beams that meet such labels, at ranges and cosines of

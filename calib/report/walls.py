@@ -108,10 +108,10 @@ def faces(box: Box, stops: Iterable[Ends]) -> list[Face]:
             into += np.reshape(every, into.shape)
     return [
         Face(
-            _name(k, end, size_m),
-            tuple("xyz"[i] for i in _along(k)),
-            box.cell_m,
-            *_means(sums[k, end]),
+            name=_name(k, end, size_m),
+            axes=tuple("xyz"[i] for i in _along(k)),
+            cell_m=box.cell_m,
+            **_means(sums[k, end]),
         )
         for k, end in sides
     ]
@@ -124,13 +124,13 @@ def repeats_m(found: Sequence[Face]) -> float:
     return float(np.sqrt(max(seen.mean(), 0.0))) if len(seen) else 0.0
 
 
-def _means(sums: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of sums (2, 3, H, W) the mean over both halves, and those of each."""
+def _means(sums: np.ndarray) -> dict[str, np.ndarray]:
+    """Of sums (2, 3, H, W) the mean over both halves, and those of each; as `Face` has them."""
     every = np.concatenate([sums.sum(axis=0)[None], sums])
     count, weight, total = every.swapaxes(0, 1)
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = np.where(count >= FEWEST, total / weight, np.nan)
-    return mean[0], mean[1:]
+    return {"mean_m": mean[0], "halves_m": mean[1:]}
 
 
 def _turned(at_m: np.ndarray, yaw_rad: float) -> np.ndarray:

@@ -203,7 +203,14 @@ class _Gathered:
             return None
         columns = zip(names, zip(*self.keys, strict=True), strict=True)
         named = {name: np.array(column, np.str_) for name, column in columns}
-        return InstrumentRows(named, np.array(self.units), *np.hstack(self.numbers))
+        sigma, whitened, redundancy = np.hstack(self.numbers)
+        return InstrumentRows(
+            names=named,
+            unit=np.array(self.units),
+            sigma=sigma,
+            whitened=whitened,
+            redundancy=redundancy,
+        )
 
 
 def _stop_names(estimate: Estimate) -> dict[StopKey, tuple[str, str]]:

@@ -116,7 +116,7 @@ class Scanner:
         near, far = lidar.min_range_m, lidar.max_range_m
         back = (hits.range_m > near) & (hits.range_m < far) & (hits.incidence_rad < NO_RETURN_RAD)
         kept = np.flatnonzero(back)
-        return beams[kept], Hits(*(v[kept] for v in vars(hits).values()))
+        return beams[kept], Hits(**{name: v[kept] for name, v in vars(hits).items()})
 
     def _cast(self, T_faro_lidar: np.ndarray, azimuth: np.ndarray, elevation: np.ndarray) -> Hits:
         origin, direction = beam(azimuth, elevation, self.lidar.beam_origin_m)

@@ -30,7 +30,7 @@ SMALL = Spec(lidar="hesai_pandarxt32", locations=4, stops_per_location=3, column
 
 
 def rows(A, b, stop, part):
-    return ClusteredRows(A, b, np.arange(A.shape[1]), stop, part)
+    return ClusteredRows(A=A, b=b, columns=np.arange(A.shape[1]), stop=stop, place=part)
 
 
 def by_hand(moved, share, cluster):

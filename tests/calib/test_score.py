@@ -94,7 +94,8 @@ def judged(world, name):
     left = world.b - world.model @ np.linalg.lstsq(world.model, world.b, rcond=None)[0]
     along, every = away @ found.whiten, np.arange(found.dof)
     shares = Shares()
-    shares.add(ClusteredRows(along, left, every, world.stop, world.place))
+    at = {"stop": world.stop, "place": world.place}
+    shares.add(ClusteredRows(A=along, b=left, columns=every, **at))
     return found.judged(shares)
 
 

@@ -219,7 +219,8 @@ class Projection:
         factor = cho_factor(H)  # upper
         raw = table.residual_m
         step = cho_solve(factor, right - chain.T @ (table.twists_T @ (weight * raw)))
-        return cls(table, weight, raw + T @ (chain @ step), step, factor)
+        left_m = raw + T @ (chain @ step)
+        return cls(table=table, weight=weight, left_m=left_m, step=step, factor=factor)
 
     def beside(self, columns_m: np.ndarray) -> Projection:
         """The projection, at the same weights, of a model that has columns (N, k), too."""
@@ -301,7 +302,7 @@ class Projection:
             (root[:, None] * (kept[0] @ found.whiten), root * self.left_m, table.stop, table.place),
             (table.others @ (kept[1] @ found.whiten), away, table.others_stop, table.others_place),
         ):
-            shares.add(ClusteredRows(A, b, every, stop, place))
+            shares.add(ClusteredRows(A=A, b=b, columns=every, stop=stop, place=place))
         return found.judged(shares)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import numpy as np
@@ -128,11 +128,11 @@ class Rejected:
     @classmethod
     def of(cls, parts: Sequence[Rejected]) -> Rejected:
         """Several together."""
-        columns = zip(*(vars(part).values() for part in parts), strict=True)
-        return cls(*(np.concatenate(column) for column in columns))
+        names = [field.name for field in fields(cls)]
+        return cls(**{n: np.concatenate([getattr(part, n) for part in parts]) for n in names})
 
     def __getitem__(self, rows: np.ndarray) -> Rejected:
-        return Rejected(*(column[rows] for column in vars(self).values()))
+        return Rejected(**{name: column[rows] for name, column in vars(self).items()})
 
     def __len__(self) -> int:
         return len(self.stop)

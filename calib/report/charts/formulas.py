@@ -65,7 +65,7 @@ class Picture:
             names = tuple(map(str, document["covariates"]))
             edges = tuple(np.array(e, float) for e in document["edges"])
             keys = ("measured", "formula", "left")
-            values = [np.array(document[key], float) for key in keys]
+            values = {key: np.array(document[key], float) for key in keys}
             over = tuple(map(str, each["covariates"]))
             held_out = [each["held_out_rms_mm"][key] for key in ("before", "after")]
             what = "Ranges depend" if unit == "mm" else "A joint's angle depends"
@@ -75,10 +75,18 @@ class Picture:
             raise InputError(WRONG) from None
         shape = tuple(len(e) - 1 for e in edges)
         known = all(e.ndim == 1 and len(e) > 1 and (np.diff(e) > 0).all() for e in edges)
-        if not known or len(names) not in (1, 2) or any(v.shape != shape for v in values):
+        if not known or len(names) not in (1, 2) or any(v.shape != shape for v in values.values()):
             raise InputError(WRONG)
         rest = tuple(name for name in over if name not in names)
-        return cls(names, edges, unit, *values, title=title, says=says, averaged=rest)
+        return cls(
+            covariates=names,
+            edges=edges,
+            unit=unit,
+            **values,
+            title=title,
+            says=says,
+            averaged=rest,
+        )
 
     @property
     def limit(self) -> float:
