@@ -87,8 +87,8 @@ class Scan:
 
 
 @dataclass(frozen=True)
-class Recording:
-    """K stops of one rig; `Recording.open` reads one."""
+class RecordedStops:
+    """K stops of one rig; `RecordedStops.open` reads one."""
 
     folder: Path
     stops: list[str]

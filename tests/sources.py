@@ -1,7 +1,7 @@
 """What sources say of themselves: what they import, what they show, how they call."""
 
 import ast
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from graphlib import CycleError, TopologicalSorter
 from importlib.util import resolve_name
 from pathlib import Path
@@ -134,6 +134,33 @@ def every_argument(function: ast.FunctionDef) -> list[ast.arg]:
     given = function.args
     rest = filter(None, (given.vararg, given.kwarg))
     return [*given.posonlyargs, *given.args, *given.kwonlyargs, *rest]
+
+
+def public_classes(tree: ast.Module) -> Iterator[str]:
+    """Names of the classes of a module."""
+    names = (node.name for node in tree.body if isinstance(node, ast.ClassDef))
+    yield from (name for name in names if not name.startswith("_"))
+
+
+def public_constants(tree: ast.Module) -> Iterator[str]:
+    """Names in capitals to which a module itself gives a value; imported ones are others'."""
+    for node in tree.body:
+        if isinstance(node, ast.Assign | ast.AnnAssign):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            names = (each for target in targets for each in ast.walk(target))
+            ids = (each.id for each in names if isinstance(each, ast.Name))
+            yield from (i for i in ids if i.isupper() and len(i) > 1 and not i.startswith("_"))
+
+
+def shared(
+    sources: dict[str, ast.Module], names: Callable[[ast.Module], Iterator[str]]
+) -> Iterator[str]:
+    """A line for each name that more than one of the sources defines."""
+    homes: dict[str, list[str]] = {}
+    for path, tree in sources.items():
+        for name in dict.fromkeys(names(tree)):
+            homes.setdefault(name, []).append(path)
+    yield from (f"{name}: {', '.join(at)}" for name, at in homes.items() if len(at) > 1)
 
 
 ORDERING = {"list", "tuple", "fromkeys", "array", "join", "enumerate", "zip", "iter", "next", "map"}

@@ -16,6 +16,9 @@ from .sources import (
     imports,
     module_name,
     public,
+    public_classes,
+    public_constants,
+    shared,
     upward,
     walks_over_sets,
     wide_calls,
@@ -257,6 +260,22 @@ def test_a_wide_call_would_be_found():
     classes = filled_classes(trees)
     calls = [list(wide_calls(path, tree, classes, 4)) for path, tree in trees.items()]
     assert calls == [["4 A"], ["2 B"], ["2 A"], [], ["6 E"], ["3 F"]]
+
+
+def test_a_name_of_a_class_means_one_thing():
+    none(list(shared(packages(), public_classes)))
+
+
+def test_a_name_of_two_things_would_be_found():
+    sources = {
+        "calib/a.py": "class A: pass\nclass _Own: pass\nMOST = 1\nLEAST, _OWN = 2, 3\nT = T_a = 4",
+        "calib/b.py": "from calib.a import A, MOST\nclass B: pass\nclass _Own: pass\n_OWN = T = 5",
+        "calib/c.py": "class A: pass\nMOST: int = 6\nLEAST = MOST\nLEAST += 1\nT_a = 7",
+    }
+    trees = {path: ast.parse(text) for path, text in sources.items()}
+    assert list(shared(trees, public_classes)) == ["A: calib/a.py, calib/c.py"]
+    twice = ["MOST: calib/a.py, calib/c.py", "LEAST: calib/a.py, calib/c.py"]
+    assert list(shared(trees, public_constants)) == twice
 
 
 def test_nothing_follows_the_order_of_a_set():

@@ -9,7 +9,7 @@ import numpy as np
 
 from calib.blunders.chance import LEAST_P
 from calib.blunders.judged import Blunder, LeftOut
-from calib.blunders.reach import Reach
+from calib.blunders.reach import FurthestMoved
 from calib.residuals.groups import BEAMS, JOINTS, MESH, Group
 from calib.rig import Rig
 from sensors.rings import RingFinding
@@ -22,7 +22,7 @@ SIGN = 0.05  # of twice a value on paper, within which it is off as a wrong sign
 def groups(
     looked_at: Iterable[Blunder],
     others: Mapping[str, Mapping[str, float]],
-    unseen: Mapping[Group, Reach],
+    unseen: Mapping[Group, FurthestMoved],
 ) -> dict[str, Any]:
     """How far out every group that was looked at is, and the size from which a mishap to it, or to
     what is no group of rows, would be found, and how far one that is not would move an estimate, as

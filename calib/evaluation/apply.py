@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from calib import outputs
-from calib.diagnosis.formulas.seen import Reach
+from calib.diagnosis.formulas.seen import ColumnRanges
 from calib.effects import Effect, LazyColumn, Site, View
 from calib.linear.parallel import one_blas_thread
 from calib.problem.model import Source
@@ -35,7 +35,9 @@ from sensors.meshes import read_cloud, write_cloud
 from sensors.recording import read_table, write_table
 
 Columns = dict[str, np.ndarray]
-Known = Callable[[Beams], Mapping[str, np.ndarray]]  # beams of points -> what else is known of them
+KnownOfBeams = Callable[
+    [Beams], Mapping[str, np.ndarray]
+]  # beams of points -> what else is known of them
 NEIGHBOURS = 24  # of a point, through which its plane is laid
 SUPPORT = 200_000  # points among which neighbours are sought
 THICKEST = 0.3  # of a plane's width: what is thicker is none
@@ -175,7 +177,7 @@ def apply(
 def _apply_file(correction: Correction, cloud: Path, target: Path) -> Applied:
     parquet = cloud.suffix.lower() == ".parquet"
     columns = read_table(cloud) if parquet else read_cloud(cloud)
-    reach = Reach(e for e, _ in correction.effects)
+    reach = ColumnRanges(e for e, _ in correction.effects)
     rms_m, left_out = _correct(correction, cloud, columns, reach)
     (write_table if parquet else write_cloud)(target, columns)
     return Applied(target, len(columns["x"]), rms_m, left_out, extrapolated=reach.sentences())
@@ -188,7 +190,7 @@ def _apply_recording(
     met = dict(_met(run, folder))  # but for scans that were left out, or set aside
     stops = (dict(_unmet(Source.open(folder))) | met).items()
     points, squares, left_out = 0, 0.0, {}
-    reach = Reach(e for e, _ in correction.effects)
+    reach = ColumnRanges(e for e, _ in correction.effects)
     shutil.copytree(folder, target)
     for i, (stop, known) in enumerate(stops):
         progress("correcting", i, len(stops))
@@ -202,7 +204,7 @@ def _apply_recording(
     return Applied(target, points, rms_m, left_out, extrapolated=reach.sentences())
 
 
-def _unmet(source: Source) -> list[tuple[str, Known]]:
+def _unmet(source: Source) -> list[tuple[str, KnownOfBeams]]:
     """Stops with a scan, and what is known of all points of each: the columns of the stop."""
     return [
         (stop, lambda ray, k=k: {n: c[[k]] for n, c in source.columns.items() if c.ndim == 1})
@@ -211,7 +213,7 @@ def _unmet(source: Source) -> list[tuple[str, Known]]:
     ]
 
 
-def _met(run: Run, folder: Path) -> list[tuple[str, Known]]:
+def _met(run: Run, folder: Path) -> list[tuple[str, KnownOfBeams]]:
     """The same of a recording that the run was fitted to; and what its beams meet on the mesh."""
     if folder.resolve() not in [path.resolve() for path in run.recordings]:
         return []
@@ -229,8 +231,8 @@ def _correct(
     correction: Correction,
     path: Path,
     columns: Columns,
-    reach: Reach,
-    known: Known = lambda ray: {},
+    reach: ColumnRanges,
+    known: KnownOfBeams = lambda ray: {},
 ) -> tuple[float, dict[str, str]]:
     """Correct a cloud's columns x y z in place, and show `reach` what effects look at; by how much,
     rms in m, and what was left out."""

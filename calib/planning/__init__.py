@@ -21,7 +21,7 @@ from calib.planning.alone import nothing_measured
 from calib.planning.places import in_region, where_it_stood
 from calib.planning.planner import Planner, Step
 from calib.planning.purpose import ALL, Purpose, purpose_of
-from calib.planning.scene import Scene
+from calib.planning.scene import PlanningScene
 from calib.planning.stops import Poses
 from calib.planning.tolerance import purpose_until
 from calib.planning.worth import Known
@@ -248,7 +248,7 @@ def planner_of(
     prior = None
     if fitted and fitted.prior:
         prior = earlier(stand.estimate.problem, Run.open(fitted.prior).solution)
-    scene = Scene(stand, aim.added, prior)
+    scene = PlanningScene(stand, aim.added, prior)
     if stand.estimate.scans and not scene.scanned:
         raise InputError(
             f"{scene.source.recording.folder}: there is no mesh, so nothing says what the beams of "

@@ -14,7 +14,7 @@ from calib.planning.criteria import chosen
 from calib.planning.information import Information
 from calib.planning.poses import in_order_of_path, reachable
 from calib.planning.purpose import Purpose
-from calib.planning.scene import Scene
+from calib.planning.scene import PlanningScene
 from calib.planning.stops import Poses
 from calib.planning.worth import Known, criterion
 from calib.problem.unknowns import Role
@@ -58,7 +58,7 @@ class Planner:
     """
 
     folder: Path
-    scene: Scene
+    scene: PlanningScene
     aim: Purpose
     places: Mapping[str, np.ndarray]
     solution: Solution | None

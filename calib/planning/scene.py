@@ -44,7 +44,7 @@ COMPARED = 6  # stops that were measured, by which it is found how many one of t
 
 
 @dataclass(frozen=True)
-class Scene:
+class PlanningScene:
     """A fit, and effects that it lacks but whose columns are wanted; planned stops are of the first
     of its recordings.
 

@@ -12,7 +12,7 @@ import numpy as np
 from calib.effects.rig import DOF
 from chains import se3
 
-Kind = Literal["vector", "pose", "direction"]
+UnknownKind = Literal["vector", "pose", "direction"]
 # What is known of a pose before any data: the room it is in.
 UNKNOWN_POSE = np.repeat([3.0, 10.0], 3)
 POSE_UNITS = ("rad",) * 3 + ("m",) * 3
@@ -51,7 +51,7 @@ class Unknown:
     """
 
     name: str
-    kind: Kind
+    kind: UnknownKind
     mean: np.ndarray
     sigma: np.ndarray
     dofs: tuple[str, ...]

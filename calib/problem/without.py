@@ -17,7 +17,7 @@ from calib.residuals.groups import CAD, JOINTS, MESH, SCAN, Group
 from calib.residuals.targets import PARTS
 from chains.errors import InputError
 from sensors.documents import nearest
-from sensors.recording import Recording
+from sensors.recording import RecordedStops
 from sensors.stops import Targets
 
 ROD = "rod"  # of a target: all of it
@@ -80,7 +80,7 @@ def of_the_arm() -> list[Effect]:
     return [e for e in map(find, DEFAULT) if e.site in (Site.EDGE, Site.JOINTS)]
 
 
-def _seen(recording: Recording, body: str) -> np.ndarray:
+def _seen(recording: RecordedStops, body: str) -> np.ndarray:
     return np.isfinite(recording.bodies[body][:, :3]).all(axis=1)
 
 

@@ -34,7 +34,7 @@ from calib.residuals.surfaces import Meeting
 from chains import se3
 from chains.errors import InputError
 from sensors.lidar import Beams, LidarModel
-from sensors.recording import Recording, Scan
+from sensors.recording import RecordedStops, Scan
 
 SIZE = {Site.BEAM: 3, Site.REFERENCE: 3, Site.NOISE: 1}
 PRIOR_COUNT = 20.0  # a measured spread of fewer sweeps than this leans on the datasheet
@@ -83,7 +83,7 @@ class ScanStop:
     """
 
     name: str
-    recording: Recording
+    recording: RecordedStops
     index: int
     stops: Stops
     terms: Sequence[Term]

@@ -38,7 +38,7 @@ from scipy.linalg import solve_triangular
 from calib.linear.clusters import CellSums, ClusteredRows, Gradients, summed
 from calib.linear.rows import PLACES
 from calib.results.errors import in_cad
-from calib.solve.clustered import Beams, of_cells, of_graph, of_stops
+from calib.solve.clustered import BeamsAlong, of_cells, of_graph, of_stops
 from calib.solve.estimate import Estimate
 from calib.solve.fit import Progress
 from calib.solve.graph import KeptRows
@@ -150,7 +150,7 @@ def intervals(estimate: Estimate, progress: Progress = lambda what, done, total:
     places, stops = Gradients(layout.size), len(layout.stops)
     problem, met = estimate.problem, estimate.associations
     tell = partial(progress, "errors in common of rows")
-    beams = Beams(
+    beams = BeamsAlong(
         problem=problem,
         layout=layout,
         values=values,

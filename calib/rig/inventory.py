@@ -9,7 +9,7 @@ import numpy as np
 
 from calib.rig import Rig
 from calib.rig.suspect import listed
-from sensors.recording import Recording
+from sensors.recording import RecordedStops
 from sensors.reference import Reference
 from sensors.stops import Targets
 
@@ -55,7 +55,7 @@ def of_rig(rig: Rig) -> Iterator[Line]:
     yield "rig", f"{rig.name}: {', '.join(parts) or 'nothing on it'}"
 
 
-def of_stops(recording: Recording) -> Iterator[Line]:
+def of_stops(recording: RecordedStops) -> Iterator[Line]:
     """Stops, locations, and how often each body is seen."""
     count, locations = len(recording.stops), len(set(recording.location))
     when = f"over {np.ptp(recording.time_s) / 60:.0f} min" if recording.timed else "no times"
@@ -106,7 +106,7 @@ def odd_rig(rig: Rig) -> Iterator[str]:
                 yield f"{section}.{key} is {sigma_m:g} m in rig.yaml; was it meant in millimetres?"
 
 
-def odd_stops(rig: Rig, recording: Recording) -> Iterator[str]:
+def odd_stops(rig: Rig, recording: RecordedStops) -> Iterator[str]:
     """Too few locations, and bodies that are hardly seen."""
     names = np.array(recording.stops)
     if (locations := len(set(recording.location))) < FEW_LOCATIONS:
@@ -122,7 +122,7 @@ def odd_stops(rig: Rig, recording: Recording) -> Iterator[str]:
         yield f"no tracked body is seen at {listed(unseen)}; what they tell rests on their scans"
 
 
-def odd_joints(rig: Rig, recording: Recording) -> Iterator[str]:
+def odd_joints(rig: Rig, recording: RecordedStops) -> Iterator[str]:
     """Joints at rest, or beyond their limits."""
     names = np.array(recording.stops)
     values = dict(zip(rig.joint_names, recording.joints.T, strict=True))
@@ -166,7 +166,7 @@ def counted(n: int, what: str) -> str:
     return f"{n:,} {what}" if n == 1 else f"{n:,} {what}s"
 
 
-def _seen(recording: Recording) -> dict[str, np.ndarray]:
+def _seen(recording: RecordedStops) -> dict[str, np.ndarray]:
     return {body: np.isfinite(pose[:, 0]) for body, pose in recording.bodies.items()}
 
 

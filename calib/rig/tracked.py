@@ -14,7 +14,7 @@ from chains import se3
 from chains.align import hand_eye
 from chains.errors import InputError
 from chains.se3 import Array
-from sensors.recording import Recording
+from sensors.recording import RecordedStops
 
 MOVED = 1e-3  # rad or m by which a joint has moved, if it has
 UNKNOWN = 0.005  # rad and m that arms' joints and links are off by; those measured, by 0.003
@@ -55,7 +55,7 @@ class _Pair:
         return T[0] if len(T) == 1 else se3.inverse(T[0]) @ T[1]
 
 
-def odd_bodies(rig: Rig, recording: Recording) -> Iterator[Suspect]:
+def odd_bodies(rig: Rig, recording: RecordedStops) -> Iterator[Suspect]:
     """What looks wrong with tracked bodies."""
     if rig.tracker is None:
         return
@@ -79,7 +79,7 @@ def odd_bodies(rig: Rig, recording: Recording) -> Iterator[Suspect]:
 # --------------------------------------------------------------------------------- placeholders
 
 
-def _placeholders(rig: Rig, recording: Recording, body: str) -> Iterator[Suspect]:
+def _placeholders(rig: Rig, recording: RecordedStops, body: str) -> Iterator[Suspect]:
     """Poses that trackers write where they have not seen; returns (K,) which these are."""
     pose, names = recording.bodies[body], np.array(recording.stops)
     zero = (pose[:, :3] == 0).all(axis=1)
@@ -98,7 +98,7 @@ def _placeholders(rig: Rig, recording: Recording, body: str) -> Iterator[Suspect
     return zero | level | old
 
 
-def _repeated(rig: Rig, recording: Recording, body: str) -> np.ndarray:
+def _repeated(rig: Rig, recording: RecordedStops, body: str) -> np.ndarray:
     """(K,) stops at which a body beyond the arm repeats an old pose, its joints having moved."""
     same = np.zeros(len(recording.stops), bool)
     joints = [rig.joint_names.index(name) for name in rig.joints_to(body)]
@@ -114,7 +114,7 @@ def _repeated(rig: Rig, recording: Recording, body: str) -> np.ndarray:
 # ------------------------------------------------------------------------------- at all stops
 
 
-def _pairs(rig: Rig, recording: Recording, usable: Mapping[str, np.ndarray]) -> Iterator[_Pair]:
+def _pairs(rig: Rig, recording: RecordedStops, usable: Mapping[str, np.ndarray]) -> Iterator[_Pair]:
     """Each body as the tracker sees it, where the rig's root stands still; else as the body
     nearest to the root does."""
     bodies = sorted((b for b in usable if usable[b].any()), key=lambda b: len(rig.joints_to(b)))

@@ -15,7 +15,7 @@ import numpy as np
 from calib import outputs
 from calib import problem as problems
 from calib.blunders.chance import at_least
-from calib.diagnosis.formulas.seen import Reach
+from calib.diagnosis.formulas.seen import ColumnRanges
 from calib.effects import Effect, is_known, load_effects, split, trust_in
 from calib.linear.parallel import one_blas_thread
 from calib.problem import Problem
@@ -198,7 +198,7 @@ def _fit(
         estimate, known, links = solve_from(problem, earlier(problem, before), progress)
     unseen, by = _held_out(sources, model, estimate, folder / RESIDUALS, choices, progress)
     nominal = _nominal(problem, progress)
-    seen_at = Reach(model.effects)
+    seen_at = ColumnRanges(model.effects)
     by_stop = _write_residuals(problem, estimate, folder / RESIDUALS, progress, seen_at)
     seen = sum(by_stop.values(), Errors())
     if not estimate.scans:
@@ -255,7 +255,7 @@ def _nominal(problem: Problem, progress: Progress) -> Errors:
 
 
 def _write_residuals(
-    problem: Problem, estimate: Estimate, folder: Path, progress: Progress, seen: Reach
+    problem: Problem, estimate: Estimate, folder: Path, progress: Progress, seen: ColumnRanges
 ) -> dict[tuple[str, str], Errors]:
     """Write every beam's residual, stop by stop, and show `seen` what effects look at; sums of
     the residuals, by recording and stop."""

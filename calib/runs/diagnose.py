@@ -12,7 +12,7 @@ import numpy as np
 
 from calib import outputs
 from calib.blunders import told
-from calib.blunders.reach import Reach, hardly_checked, reaches
+from calib.blunders.reach import FurthestMoved, hardly_checked, reaches
 from calib.diagnosis.chance import Spread
 from calib.diagnosis.rejects import rejects
 from calib.diagnosis.search import search
@@ -191,7 +191,7 @@ def _detectable(stand: Stand) -> dict[str, dict[str, float]]:
     return {"rings": {"rad": max(sizes)}} if sizes else {}
 
 
-def _reaches(look: Look, run: Run) -> dict[Group, Reach]:
+def _reaches(look: Look, run: Run) -> dict[Group, FurthestMoved]:
     """How far mishaps that are not found could move what a run reports."""
     sigma = np.sqrt(np.diag(run.solution.covariance)).tolist()
     known = dict(zip(run.solution.names, sigma, strict=True))

@@ -28,7 +28,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True)
-class Plan:
+class SimulatedStops:
     """Where the K stops are and what was written down there.
 
     Args:
@@ -50,7 +50,7 @@ class Plan:
         return {**stop_columns(rig, self.joints, self.columns["time_s"]), **self.columns, **known}
 
 
-def plan(rig: Rig, spec: Spec, mesh: Reference, rng: np.random.Generator) -> Plan:
+def plan(rig: Rig, spec: Spec, mesh: Reference, rng: np.random.Generator) -> SimulatedStops:
     """Random stops within the joints' limits at which the LiDAR is clear of everything.
 
     Raises:
@@ -74,7 +74,7 @@ def plan(rig: Rig, spec: Spec, mesh: Reference, rng: np.random.Generator) -> Pla
     if spec.poses == "moving":
         rates = RATE * rng.standard_normal((len(location), len(rig.joint_names)))
         columns |= {f"rate.{j}": r for j, r in zip(rig.joint_names, rates.T, strict=True)}
-    return Plan(
+    return SimulatedStops(
         names=spec.names["stop"],
         location=spec.names["location"],
         joints=np.concatenate(joints),
@@ -182,12 +182,14 @@ class World:
     """
 
     truth: Truth
-    plan: Plan
+    plan: SimulatedStops
     joints: np.ndarray
     twists: np.ndarray
 
     @classmethod
-    def of(cls, truth: Truth, stops: Plan, noise: float, rng: np.random.Generator) -> World:
+    def of(
+        cls, truth: Truth, stops: SimulatedStops, noise: float, rng: np.random.Generator
+    ) -> World:
         """Bend the rig by its effects: ``true = nominal + effect``, encoders with their noise."""
         rig, view = (
             truth.rig,

@@ -30,7 +30,7 @@ Found = Callable[[StopRows, np.ndarray, int, int], T]
 
 
 @dataclass(frozen=True)
-class Beams:
+class BeamsAlong:
     """All beams along some directions; no more than a few stops' in memory.
 
     Args:
@@ -117,7 +117,7 @@ def each_stop(
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Iterator[tuple[T, np.ndarray]]:
     """What is found of the rows of each stop, and the numbers of what they meet; arguments as of
-    `Beams`.
+    `BeamsAlong`.
 
     Args:
         found: called with the rows of a stop, which of what they meet each meets, how many there

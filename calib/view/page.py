@@ -18,7 +18,7 @@ from calib.view.effects import known
 from calib.view.effects.expected import Asked, Expected
 from calib.view.effects.own import OwnFormula, document
 from calib.view.effects.ticks import Ticks
-from calib.view.job import Change, Told
+from calib.view.job import Change, JobMessage
 from calib.view.leave_out import LeaveOut
 from calib.view.picture import NOTHING, Picture
 from calib.view.server import Visitor
@@ -317,7 +317,7 @@ class Page:
             widget.busy(busy or not self.may_change)
         self._bar.value, self._doing.content = 0.0, panels.note("Starting …")
 
-    def _hear(self, told: Told, by: Any) -> None:
+    def _hear(self, told: JobMessage, by: Any) -> None:
         """Show what a job tells; `by` is the page that started it."""
         if told.kind == "progress":
             if not self._bar.visible:  # another page started it
@@ -339,7 +339,7 @@ class Page:
             self._fill(self._run, list(self.desk.runs), self.desk.chosen)
             self._tell(panels.new_run(Rung(self.desk.runs[self.desk.name_of(folder)], None)))
 
-    def _ended(self, told: Told, here: bool) -> None:
+    def _ended(self, told: JobMessage, here: bool) -> None:
         self._show_busy()
         if told.kind == "done" and self.findings is None:
             self._show_findings()

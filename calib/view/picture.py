@@ -16,7 +16,7 @@ from calib.view.shown import brush, colours, look, plot
 from calib.view.shown.columns import LOCATION, comparable, gathered, kept, location_names
 from calib.view.shown.moves import SURE, TIMES
 from calib.view.shown.taken import beams_csv
-from calib.view.stage import AXES, MOVES, NARROW_PX, PLOT_PX, RIG, ROOM, Stage
+from calib.view.stage import AXES, MOVES, NARROW_PX, PLOT_PX, RIG, ROOM, Drawing
 from chains.errors import InputError
 
 NOTHING = "—"
@@ -48,7 +48,7 @@ class Picture:
         guarded: Callable[..., Callable[..., None]],
         asks: Mapping[str, str],
     ) -> None:
-        self.stage = Stage(client, window_px, look.numbers(asks.get("camera", ""), 6))
+        self.stage = Drawing(client, window_px, look.numbers(asks.get("camera", ""), 6))
         self._client, self._guarded, self._asks = client, guarded, dict(asks)
         self._columns: dict[str, str] = {}  # heading -> column
         self._others: dict[str, Run] = {}

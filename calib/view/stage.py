@@ -30,7 +30,7 @@ NARROW_PX = 1200  # of a window with hardly room for a picture between two panel
 FOV_RAD = np.radians(50.0)
 
 
-class Stage:
+class Drawing:
     """What one browser draws, about the room's middle, as browsers have single precision.
 
     Args:

@@ -79,7 +79,7 @@ class Sweeps:
 
 
 @dataclass(frozen=True)
-class Arm:
+class ArmDescription:
     """An arm: the text of a URDF, and the links between which it moves (None = not known)."""
 
     urdf: str
@@ -134,7 +134,7 @@ class Contents:
     sweeps: tuple[Sweeps, ...] = ()
     stops: Columns | None = None
     lidar: Mapping[str, Any] | None = None
-    arm: Arm | None = None
+    arm: ArmDescription | None = None
     surface: ScannedSurface | None = None
     spheres: Spheres | None = None
     understood: tuple[str, ...] = ()

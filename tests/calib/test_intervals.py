@@ -17,7 +17,7 @@ from calib.linear.clusters import ClusteredRows, Gradients
 from calib.problem.model import Model, Source
 from calib.results.intervals import PARTS, Intervals, _Sums, intervals
 from calib.simulation import Spec
-from calib.solve.clustered import Beams
+from calib.solve.clustered import BeamsAlong
 from calib.solve.fit import solve
 
 from ..worlds import World, write
@@ -255,7 +255,7 @@ def beams(estimate, count):
     """All beams of an estimate along so many directions drawn at random."""
     layout = estimate.linear.layout
     directions = np.random.default_rng(0).normal(size=(layout.size, count))
-    return Beams(
+    return BeamsAlong(
         problem=estimate.problem,
         layout=layout,
         values=estimate.values,

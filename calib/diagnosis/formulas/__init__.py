@@ -9,8 +9,8 @@ import numpy as np
 from calib.blunders.chance import LEVELS
 from calib.diagnosis.formulas.arm import joint_tables
 from calib.diagnosis.formulas.found import JOINT, RANGE, Formula, settled
-from calib.diagnosis.formulas.pursuit import Step, pursue
-from calib.diagnosis.formulas.table import Projection, Table
+from calib.diagnosis.formulas.pursuit import ConfirmedTerm, pursue
+from calib.diagnosis.formulas.table import BeamTable, Projection
 from calib.diagnosis.stand import Stand
 from calib.solve.fit import Progress
 
@@ -26,7 +26,7 @@ def find(stand: Stand, progress: Progress) -> list[Formula]:
         progress: as of `fit.solve`.
     """
     if stand.estimate.scans:
-        table = Table.of(
+        table = BeamTable.of(
             stand.estimate, lambda done, total: progress("reading residuals", done, total)
         )
         steps = pursue(table, LEVELS["structure"], progress)
@@ -42,7 +42,7 @@ def find(stand: Stand, progress: Progress) -> list[Formula]:
     return settled(tables[joint], steps, JOINT + joint)
 
 
-def _left(table: Table, steps: Sequence[Step]) -> float:
+def _left(table: BeamTable, steps: Sequence[ConfirmedTerm]) -> float:
     """Chi-square of all that was measured, beside some terms."""
     columns = np.hstack([step.form.term.columns(table.covariates) for step in steps])
     return Projection.of(table, table.sigma_m**-2.0).fitted(columns)[0].chi2

@@ -38,7 +38,7 @@ NOT_COVARIATES |= {"reference_intensity", "stop", "location", "tracked", "normal
 
 
 @dataclass(frozen=True)
-class Kind:
+class FactorKind:
     """A sort of factor.
 
     Args:
@@ -58,34 +58,36 @@ class Kind:
 
 # The 1 beside a line, a square and a logarithm lets the place of their zero be found.
 KINDS = {
-    "line": Kind(("({x} - {0}) / {1}", "1"), 1.0),
-    "proportional": Kind(("{x} / {0}",), 0.9),
-    "square": Kind(("(({x} - {0}) / {1})**2", "({x} - {0}) / {1}", "1"), 2.5),
-    "logarithm": Kind(("log({x} / {0})", "1"), 1.5),
-    "saturation": Kind(("log(1 + {x} / {0})",), 2.0, free=1, scales=(0,)),
-    "share": Kind(("{x} / ({x} + {0})",), 2.0, free=1, scales=(0,)),
-    "root": Kind(("sqrt({x} / {0})",), 1.5),
-    "power": Kind(("({x} / {0})**{1}",), 1.5),
-    "reciprocal": Kind(("{0} / {x}",), 1.5),
-    "decay": Kind(("exp(-({x} - {1}) / {0})",), 2.0, free=1, scales=(0,)),
-    "growth": Kind(("exp(({x} - {1}) / {0})",), 2.0, free=1, scales=(0,)),
-    "wave": Kind(("sin(2 * pi * {x} / {0})", "cos(2 * pi * {x} / {0})"), 2.5, free=1, scales=(0,)),
-    "harmonic": Kind(("sin({0} * {x})", "cos({0} * {x})"), 2.0),
-    "step": Kind(("{x} > {0}",), 2.0, free=1, edges=True),
-    "window": Kind(("({x} > {0}) * ({x} < {1})",), 2.5, free=2, edges=True),
-    "outside": Kind(("({x} < {0}) + ({x} > {1})",), 2.5, free=2, edges=True),
-    "ramp": Kind(("maximum(0, {x} - {0}) / {1}",), 2.0, free=1),
-    "ramp down": Kind(("maximum(0, {0} - {x}) / {1}",), 2.0, free=1),
-    "bump": Kind(("exp(-(({x} - {0}) / {1})**2)",), 2.5, free=2, scales=(1,)),
-    "over cosine": Kind(("1 / cos({x}) - 1",), 1.0),
-    "tangent": Kind(("tan({x})",), 1.0),
-    "tangent squared": Kind(("tan({x})**2",), 1.5),
-    "sine": Kind(("sin({x})",), 1.0),
-    "cosine": Kind(("cos({x})", "1"), 1.2),
-    "every other": Kind(("where(mod({x}, 2) > 0.5, 1, -1)",), 1.5),
-    "block": Kind(("where(mod(floor({x} / {0}), 2) > 0.5, 1, -1)",), 1.8),
-    "one of": Kind(("mod({x}, {0}) == {1}",), 2.0),
-    "class": Kind(("{x} == {0}",), 1.0),
+    "line": FactorKind(("({x} - {0}) / {1}", "1"), 1.0),
+    "proportional": FactorKind(("{x} / {0}",), 0.9),
+    "square": FactorKind(("(({x} - {0}) / {1})**2", "({x} - {0}) / {1}", "1"), 2.5),
+    "logarithm": FactorKind(("log({x} / {0})", "1"), 1.5),
+    "saturation": FactorKind(("log(1 + {x} / {0})",), 2.0, free=1, scales=(0,)),
+    "share": FactorKind(("{x} / ({x} + {0})",), 2.0, free=1, scales=(0,)),
+    "root": FactorKind(("sqrt({x} / {0})",), 1.5),
+    "power": FactorKind(("({x} / {0})**{1}",), 1.5),
+    "reciprocal": FactorKind(("{0} / {x}",), 1.5),
+    "decay": FactorKind(("exp(-({x} - {1}) / {0})",), 2.0, free=1, scales=(0,)),
+    "growth": FactorKind(("exp(({x} - {1}) / {0})",), 2.0, free=1, scales=(0,)),
+    "wave": FactorKind(
+        ("sin(2 * pi * {x} / {0})", "cos(2 * pi * {x} / {0})"), 2.5, free=1, scales=(0,)
+    ),
+    "harmonic": FactorKind(("sin({0} * {x})", "cos({0} * {x})"), 2.0),
+    "step": FactorKind(("{x} > {0}",), 2.0, free=1, edges=True),
+    "window": FactorKind(("({x} > {0}) * ({x} < {1})",), 2.5, free=2, edges=True),
+    "outside": FactorKind(("({x} < {0}) + ({x} > {1})",), 2.5, free=2, edges=True),
+    "ramp": FactorKind(("maximum(0, {x} - {0}) / {1}",), 2.0, free=1),
+    "ramp down": FactorKind(("maximum(0, {0} - {x}) / {1}",), 2.0, free=1),
+    "bump": FactorKind(("exp(-(({x} - {0}) / {1})**2)",), 2.5, free=2, scales=(1,)),
+    "over cosine": FactorKind(("1 / cos({x}) - 1",), 1.0),
+    "tangent": FactorKind(("tan({x})",), 1.0),
+    "tangent squared": FactorKind(("tan({x})**2",), 1.5),
+    "sine": FactorKind(("sin({x})",), 1.0),
+    "cosine": FactorKind(("cos({x})", "1"), 1.2),
+    "every other": FactorKind(("where(mod({x}, 2) > 0.5, 1, -1)",), 1.5),
+    "block": FactorKind(("where(mod(floor({x} / {0}), 2) > 0.5, 1, -1)",), 1.8),
+    "one of": FactorKind(("mod({x}, {0}) == {1}",), 2.0),
+    "class": FactorKind(("{x} == {0}",), 1.0),
 }
 
 

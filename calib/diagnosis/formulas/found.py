@@ -14,9 +14,9 @@ import numpy as np
 from calib.diagnosis.formulas.factors import columns_of
 from calib.diagnosis.formulas.needed import needed, reduced
 from calib.diagnosis.formulas.picture import picture_of
-from calib.diagnosis.formulas.pursuit import Form, Step
-from calib.diagnosis.formulas.table import Projection, Table
-from calib.diagnosis.formulas.terms import Term, refine, slopes, times
+from calib.diagnosis.formulas.pursuit import ConfirmedTerm, Form
+from calib.diagnosis.formulas.table import BeamTable, Projection
+from calib.diagnosis.formulas.terms import FormulaTerm, refine, slopes, times
 from calib.diagnosis.suggest import outward
 from calib.effects.own.formula import FormulaEffect
 
@@ -30,7 +30,7 @@ LEAST_SIGMA = {"m": 0.01, "rad": 0.003}
 
 
 @dataclass(frozen=True)
-class Part:
+class FittedTerm:
     """One term of a formula, with what its columns are multiplied by.
 
     Args:
@@ -41,7 +41,7 @@ class Part:
         constants_sigma: (c,) of the term's constants.
     """
 
-    term: Term
+    term: FormulaTerm
     at: tuple[int, ...]
     amount: np.ndarray
     covariance: np.ndarray
@@ -91,8 +91,8 @@ class Formula:
         joints: which covariates are joints of the arm.
     """
 
-    parts: Sequence[Part]
-    steps: Sequence[Step]
+    parts: Sequence[FittedTerm]
+    steps: Sequence[ConfirmedTerm]
     rms_m: float
     seen: dict[str, tuple[float, float]]
     picture: dict[str, Any]
@@ -165,7 +165,7 @@ class Formula:
         return columns_of(self.texts, covariates) @ self.amount
 
 
-def settled(table: Table, steps: Sequence[Step], site: str = RANGE) -> list[Formula]:
+def settled(table: BeamTable, steps: Sequence[ConfirmedTerm], site: str = RANGE) -> list[Formula]:
     """All terms fitted together, their constants refined; those over the same covariates are one
     formula of the site."""
     terms = [step.form.term for step in steps]
@@ -184,7 +184,9 @@ def settled(table: Table, steps: Sequence[Step], site: str = RANGE) -> list[Form
     return [replace(f, site=site) for f in _grouped(table, terms, kept, [steps[i] for i in there])]
 
 
-def _refined(table: Table, terms: Sequence[Term], kept: Sequence[Sequence[int]]) -> list[Term]:
+def _refined(
+    table: BeamTable, terms: Sequence[FormulaTerm], kept: Sequence[Sequence[int]]
+) -> list[FormulaTerm]:
     """Terms with the constants that are best for the columns kept of each, beside the others."""
     terms = list(terms)
     columns = [t.columns(table.covariates)[:, k] for t, k in zip(terms, kept, strict=True)]
@@ -197,13 +199,16 @@ def _refined(table: Table, terms: Sequence[Term], kept: Sequence[Sequence[int]])
     return terms
 
 
-def _centred(term: Term, table: Table) -> Term:
+def _centred(term: FormulaTerm, table: BeamTable) -> FormulaTerm:
     """A term with its edges midway between the values that they part."""
     return term.at(term.gaps(table.covariates).mean(axis=1).tolist())
 
 
 def _grouped(
-    table: Table, terms: Sequence[Term], kept: Sequence[Sequence[int]], steps: Sequence[Step]
+    table: BeamTable,
+    terms: Sequence[FormulaTerm],
+    kept: Sequence[Sequence[int]],
+    steps: Sequence[ConfirmedTerm],
 ) -> list[Formula]:
     """Formulas of terms, each with its numbers."""
     columns = [t.columns(table.covariates)[:, k] for t, k in zip(terms, kept, strict=True)]
@@ -234,10 +239,10 @@ def _grouped(
 
 def _parts(
     model: Projection,
-    terms: Sequence[Term],
+    terms: Sequence[FormulaTerm],
     columns: Sequence[np.ndarray],
     kept: Sequence[Sequence[int]],
-) -> list[Part]:
+) -> list[FittedTerm]:
     """Terms with what their columns are multiplied by, and the sigmas of that and of their
     constants, all of them unknown together."""
     beside, amount = model.fitted(np.hstack(columns))
@@ -255,7 +260,7 @@ def _parts(
     gaps = [t.gaps(model.table.covariates) for t in terms]
     others = [np.hypot(o, np.ptp(g, axis=1) / 12**0.5) for o, g in zip(others, gaps, strict=True)]
     return [
-        Part(term=term, at=tuple(k), amount=a, covariance=c, constants_sigma=o)
+        FittedTerm(term=term, at=tuple(k), amount=a, covariance=c, constants_sigma=o)
         for term, k, a, c, o in zip(terms, kept, amounts, blocks, others, strict=True)
     ]
 
@@ -264,7 +269,7 @@ def _ends(values: np.ndarray) -> tuple[float, float]:
     return float(np.nanmin(values)), float(np.nanmax(values))
 
 
-def _said(part: Part, unit: str) -> str:
+def _said(part: FittedTerm, unit: str) -> str:
     """A term as people write it."""
     each = zip(part.rows, part.amount, part.sigma, strict=True)
     says = (
@@ -277,7 +282,7 @@ def _said(part: Part, unit: str) -> str:
     return says.replace("- -", "+ ").replace("+ -", "- ")
 
 
-def _shifted(part: Part, unit: str) -> str:
+def _shifted(part: FittedTerm, unit: str) -> str:
     """Of a line, or lines, whose zero is found too: two columns that differ by one line's text."""
     if len(part.at) != 2:
         return ""
@@ -295,7 +300,7 @@ def _shifted(part: Part, unit: str) -> str:
     return f"{_signed(slope, part.sigma[0])} {unit} * {_product(texts)}"
 
 
-def _turned(part: Part, unit: str) -> str:
+def _turned(part: FittedTerm, unit: str) -> str:
     """Of a sine and a cosine: an amplitude and a phase."""
     texts = [times(row) for row in part.rows]
     if len(texts) != 2 or texts[0].replace(*PHASE) != texts[1] or texts[0].count(PHASE[0]) != 1:

@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from calib.diagnosis.formulas.table import Projection, Table
+from calib.diagnosis.formulas.table import BeamTable, Projection
 
 BINS = {1: 48, 2: 20}  # of one covariate, and of each of two: a few hundred beams in each
 FEWEST = 3  # beams of a bin that is shown
 
 
 def picture_of(
-    table: Table,
+    table: BeamTable,
     covariates: Sequence[str],
     value: np.ndarray,
     fit: Projection,

@@ -19,8 +19,8 @@ from calib.blunders.chance import after_looks, at_least, log_tail
 from calib.diagnosis.formulas.factors import Factor, factors
 from calib.diagnosis.formulas.needed import needed
 from calib.diagnosis.formulas.smooths import Bases, Smooth, screen_smooths
-from calib.diagnosis.formulas.table import Projection, Table
-from calib.diagnosis.formulas.terms import Term, refine
+from calib.diagnosis.formulas.table import BeamTable, Projection
+from calib.diagnosis.formulas.terms import FormulaTerm, refine
 from calib.diagnosis.score import ScoreTest
 from calib.solve.fit import Progress
 
@@ -41,7 +41,7 @@ AT_ONCE = 400  # columns: bounds the memory
 
 
 @dataclass(frozen=True)
-class Step:
+class ConfirmedTerm:
     """A term that is confirmed.
 
     Args:
@@ -69,7 +69,7 @@ class Form:
         tried: of how many it is the best.
     """
 
-    term: Term
+    term: FormulaTerm
     statistic: float
     dof: int
     left: np.ndarray
@@ -103,7 +103,7 @@ def forms(projection: Projection, bases: Bases, covariates: Sequence[str]) -> li
     table = projection.table
     best = [_best_factors(projection, bases, covariates, c) for c in covariates]
     tried = int(np.prod([count for _, count in best]))
-    terms = [Term(each) for each in product(*(some for some, _ in best))]
+    terms = [FormulaTerm(each) for each in product(*(some for some, _ in best))]
     statistic, dof = _explained(projection, [t.columns(table.covariates) for t in terms])
     evidence = np.array([_evidence(s, d) for s, d in zip(statistic, dof, strict=True)])
     first = [terms[i] for i in np.argsort(-evidence, kind="stable")[:REFINED]]
@@ -113,12 +113,12 @@ def forms(projection: Projection, bases: Bases, covariates: Sequence[str]) -> li
 
 
 def pursue(
-    table: Table,
+    table: BeamTable,
     alpha: float,
     progress: Progress,
     most: int = MOST_TERMS,
-    found: Sequence[Step] = (),
-) -> list[Step]:
+    found: Sequence[ConfirmedTerm] = (),
+) -> list[ConfirmedTerm]:
     """Terms that stand out from chance, one beside the other, strongest first.
 
     Args:
@@ -144,7 +144,9 @@ def pursue(
     return found
 
 
-def _step(fitted: Projection, bases: Bases, smooths: Sequence[Smooth], alpha: float) -> Step | None:
+def _step(
+    fitted: Projection, bases: Bases, smooths: Sequence[Smooth], alpha: float
+) -> ConfirmedTerm | None:
     """The best term over the sets of covariates that explain most, judged."""
     likely = (s for s in smooths[:TRIES] if s.evidence > np.log(s.looks / alpha))
     best = next((s for s in likely if _stands_out(fitted, bases, s)), None)
@@ -159,7 +161,7 @@ def _step(fitted: Projection, bases: Bases, smooths: Sequence[Smooth], alpha: fl
         return None
     chosen, alike = simplest(sorted(over, key=lambda f: -f.evidence), len(bases.names()))
     p = _by_chance(fitted, chosen, over[chosen])
-    return Step(
+    return ConfirmedTerm(
         form=chosen,
         alike=alike,
         p_value=p,
@@ -209,7 +211,7 @@ def _tail(found: ScoreTest, among: int = 0) -> float:
     return float(special.fdtrc(among or chance.nu, chance.d, each / (among or found.dof)))
 
 
-def form(projection: Projection, term: Term, tried: int) -> Form:
+def form(projection: Projection, term: FormulaTerm, tried: int) -> Form:
     """A term with what it leaves of each stop."""
     columns = term.columns(projection.table.covariates)
     (statistic,), (dof,) = projection.explained([columns])

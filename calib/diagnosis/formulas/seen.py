@@ -15,7 +15,7 @@ from calib.effects import Effect
 BEYOND = 0.05
 
 
-class Reach:
+class ColumnRanges:
     """From where to where the columns go that effects depend on, batch by batch.
 
     Args:

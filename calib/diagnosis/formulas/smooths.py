@@ -15,7 +15,7 @@ import numpy as np
 
 from calib.blunders.chance import log_tail
 from calib.diagnosis.formulas.factors import product_of
-from calib.diagnosis.formulas.table import Projection, Table
+from calib.diagnosis.formulas.table import BeamTable, Projection
 from calib.diagnosis.score import Scores, ScoreTest, score_test
 from calib.diagnosis.screen import by_rank, looked
 
@@ -57,7 +57,7 @@ class Bases:
         stops: how many there are.
     """
 
-    table: Table
+    table: BeamTable
     stops: int
     _made: dict[tuple[str, int], np.ndarray] = field(default_factory=dict, repr=False)
 

@@ -37,7 +37,7 @@ HUBER = 1.345  # sigmas: 95 % efficiency on normal rows (Huber 1981)
 
 
 @dataclass(frozen=True)
-class Table:
+class BeamTable:
     """N beams, drawn at random from each stop alike.
 
     Args:
@@ -79,7 +79,7 @@ class Table:
         estimate: Estimate,
         progress: Callable[[int, int], None] = lambda done, total: None,
         most: int = MOST_BEAMS,
-    ) -> Table:
+    ) -> BeamTable:
         """The table of a fit with scans, drawn alike whenever it is drawn.
 
         Args:
@@ -149,7 +149,7 @@ class Table:
         found, cell = np.unique((stop + 1) * wide + place + 1, return_inverse=True)
         return found // wide - 1, found % wide - 1, cell
 
-    def beside(self, columns_m: np.ndarray) -> Table:
+    def beside(self, columns_m: np.ndarray) -> BeamTable:
         """The table of a model that has such columns (N, F) of the range, too: its last unknowns,
         of which nothing was known."""
         more = columns_m.shape[1]
@@ -190,7 +190,7 @@ class Projection:
         factor: of its normal equations.
     """
 
-    table: Table
+    table: BeamTable
     weight: np.ndarray
     left_m: np.ndarray
     step: np.ndarray
@@ -208,7 +208,7 @@ class Projection:
         return float(self.weight.sum()) if self.table.weight_m2 is None else self.table.weight_m2
 
     @classmethod
-    def of(cls, table: Table, weight: np.ndarray) -> Projection:
+    def of(cls, table: BeamTable, weight: np.ndarray) -> Projection:
         """Fit the model at these weights (N,)."""
         T, chain = table.twists, table.chain
         gram = table.twists_T @ T.multiply(weight[:, None]).tocsr()
@@ -321,7 +321,7 @@ class _Drawn:
     Args:
         stop: its number.
         columns: covariates (n,) of these; (1,) of the stop.
-        residual_m, sigma_m, twists, chain: as of `Table`.
+        residual_m, sigma_m, twists, chain: as of `BeamTable`.
         met: (n,) which of what any beam of the stop meets each does.
     """
 

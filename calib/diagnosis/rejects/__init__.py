@@ -25,7 +25,7 @@ import numpy as np
 from scipy import special
 
 from calib.blunders.chance import LEAST_P, LEVELS, after_looks
-from calib.diagnosis.rejects.counts import Axis, Counts, Rejected, count
+from calib.diagnosis.rejects.counts import CellAxis, Counts, Rejected, count
 from calib.diagnosis.rejects.found import CLUTTER, Place, Rejects
 from calib.diagnosis.stand import Stand
 from calib.solve.fit import Progress
@@ -93,7 +93,7 @@ class _View:
             (G,) in all of each.
     """
 
-    axis: Axis
+    axis: CellAxis
     rows: np.ndarray
     bin: np.ndarray
     cell: np.ndarray
@@ -115,8 +115,8 @@ def _views(counts: Counts) -> Iterator[_View]:
                 (rejected.place, counts.places[a], counts.of_place),
             ),
         )
-    stops = Axis.of_things("stop", counts.stop_names)
-    surfaces = Axis.of_things("surface", counts.surface_names)
+    stops = CellAxis.of_things("stop", counts.stop_names)
+    surfaces = CellAxis.of_things("surface", counts.surface_names)
     for axis, mine, other, beams in (
         (stops, rejected.stop, rejected.surface, met.T),
         (surfaces, rejected.surface, rejected.stop, met),

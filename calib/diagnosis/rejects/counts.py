@@ -20,7 +20,7 @@ STOPS_A_BIN = 5  # of a covariate of stops: fewer clusters than this tell nothin
 
 
 @dataclass(frozen=True)
-class Axis:
+class CellAxis:
     """A covariate cut into cells, where an interval may end, and bins of these, which are tested.
 
     Args:
@@ -40,7 +40,7 @@ class Axis:
     wraps: bool = False
 
     @classmethod
-    def of(cls, name: str, values: np.ndarray, bins: int = BINS) -> Axis:
+    def of(cls, name: str, values: np.ndarray, bins: int = BINS) -> CellAxis:
         """Cells of about equal count, of equal width for azimuth, one for each of few values."""
         values = values[np.isfinite(values)].astype(float)
         distinct = np.unique(values)
@@ -64,7 +64,7 @@ class Axis:
     @classmethod
     def of_things(
         cls, name: str, names: Sequence[str], numbers: Sequence[int] | None = None
-    ) -> Axis:
+    ) -> CellAxis:
         """A cell, and a bin, for each of some things; of ascending numbers, from 0 if not given."""
         at = np.arange(len(names)) if numbers is None else np.asarray(numbers)
         edges = (at[1:] + at[:-1]) / 2
@@ -169,7 +169,7 @@ class Counts:
         rejected: the rejected ones.
     """
 
-    axes: Sequence[Axis]
+    axes: Sequence[CellAxis]
     stops: Sequence[np.ndarray]
     places: Sequence[np.ndarray]
     cells: Sequence[np.ndarray]
@@ -246,7 +246,7 @@ class _Counted:
     rejected: Rejected
 
 
-def _count_stop(stand: Stand, i: int, axes: Sequence[Axis]) -> _Counted:
+def _count_stop(stand: Stand, i: int, axes: Sequence[CellAxis]) -> _Counted:
     scan, estimate = stand.estimate.scans[i], stand.estimate
     rows = scan.rows(estimate.values, estimate.associations[i])
     used, view = np.flatnonzero(rows.usable), rows.view
@@ -294,25 +294,25 @@ def _numbered(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return found - 1, number[values + 1]
 
 
-def _axes(stand: Stand) -> list[Axis]:
+def _axes(stand: Stand) -> list[CellAxis]:
     """The covariates of points and stops that change, cut into cells and bins."""
     scans = stand.estimate.scans
     _, sample = stand.columns
     rings = max(scan.lidar.rings for scan in scans)
-    out = [Axis.of("ring", np.arange(rings))]
+    out = [CellAxis.of("ring", np.arange(rings))]
     for name, values in sorted(sample.items()):
         told = [scan.columns[name] for scan in scans if name in scan.columns]
         if name == "label":
             out.append(_labels(stand, values))
         elif len(told) == len(scans):  # of stops
             bins = max(2, min(BINS, len(scans) // STOPS_A_BIN))
-            out.append(Axis.of(name, np.concatenate(told), bins))
+            out.append(CellAxis.of(name, np.concatenate(told), bins))
         else:
-            out.append(Axis.of(name, values, 2 * BINS if name == "azimuth_rad" else BINS))
+            out.append(CellAxis.of(name, values, 2 * BINS if name == "azimuth_rad" else BINS))
     return [axis for axis in out if axis.count > 1]
 
 
-def _labels(stand: Stand, values: np.ndarray) -> Axis:
+def _labels(stand: Stand, values: np.ndarray) -> CellAxis:
     names = {n: text for source in stand.sources for n, text in source.rig.labels.items()}
     numbers = sorted({*names, *np.unique(values).astype(int).tolist()})
-    return Axis.of_things("label", [names.get(n, str(n)) for n in numbers], numbers)
+    return CellAxis.of_things("label", [names.get(n, str(n)) for n in numbers], numbers)

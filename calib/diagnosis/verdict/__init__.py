@@ -11,7 +11,7 @@ import numpy as np
 from calib.blunders import told
 from calib.blunders.chance import log_tail
 from calib.blunders.judged import Blunder, LeftOut
-from calib.blunders.reach import Reach
+from calib.blunders.reach import FurthestMoved
 from calib.diagnosis.candidates import PoseShape, concerned, lacking
 from calib.diagnosis.curves import Curve, curves
 from calib.diagnosis.rejects import Rejects
@@ -80,7 +80,7 @@ class Diagnosis:
     rejected: Rejects | None = None
     scatter: Sequence[Mapping[str, Any]] = ()
     detectable: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    unseen: Mapping[Group, Reach] = field(default_factory=dict, repr=False)
+    unseen: Mapping[Group, FurthestMoved] = field(default_factory=dict, repr=False)
 
     @property
     def heading(self) -> str:

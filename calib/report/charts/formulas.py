@@ -29,7 +29,7 @@ WRONG = "diagnosis.json has a picture of another version; diagnose the run again
 
 
 @dataclass(frozen=True)
-class Picture:
+class FormulaPicture:
     """Mean residuals over one or two columns.
 
     Args:
@@ -53,7 +53,7 @@ class Picture:
     averaged: tuple[str, ...]
 
     @classmethod
-    def read(cls, each: Mapping[str, Any]) -> Picture:
+    def read(cls, each: Mapping[str, Any]) -> FormulaPicture:
         """Of a formula as diagnosis.json has it.
 
         Raises:
@@ -111,14 +111,14 @@ class Picture:
         return f"{self.says}. {READING}{over if self.averaged else ''}"
 
 
-def pictures(diagnosis: Mapping[str, Any] | None) -> list[Picture]:
+def pictures(diagnosis: Mapping[str, Any] | None) -> list[FormulaPicture]:
     """Of all formulas of a diagnosis.
 
     Raises:
         InputError: one is of another version.
     """
     found = (diagnosis or {}).get("unexplained", ())
-    return [Picture.read(each) for each in found if "picture" in each]
+    return [FormulaPicture.read(each) for each in found if "picture" in each]
 
 
 def formulas(evidence: Evidence) -> Iterator[Chart | Absent]:
@@ -158,7 +158,7 @@ def _title(what: str, held_out: list[float | None]) -> str:
     return f"{what}; with a formula for it {fall}"
 
 
-def _parts(picture: Picture) -> dict[str, np.ndarray]:
+def _parts(picture: FormulaPicture) -> dict[str, np.ndarray]:
     parts = {
         "measured": picture.measured,
         "formula": picture.formula,
@@ -169,7 +169,7 @@ def _parts(picture: Picture) -> dict[str, np.ndarray]:
     return {f"{name}, {rms[name]:.2f} {picture.unit} rms": values for name, values in parts.items()}
 
 
-def _maps(picture: Picture, narrow: bool) -> Figure:
+def _maps(picture: FormulaPicture, narrow: bool) -> Figure:
     """Three maps on one scale."""
     across, up = (1, 0) if picture.covariates[0] in UPRIGHT else (0, 1)
     names = picture.covariates
@@ -189,7 +189,7 @@ def _maps(picture: Picture, narrow: bool) -> Figure:
     return figure
 
 
-def _curve(picture: Picture) -> Figure:
+def _curve(picture: FormulaPicture) -> Figure:
     """Points and the formula above, what is left below, on one scale."""
     (name,), (edges,) = picture.covariates, picture.edges
     edges = shown_unit(name)[1] * edges

@@ -15,7 +15,7 @@ from calib.report.evidence import Evidence
 from calib.results.recalibrate import blocks_of
 from calib.runs.asked.factors import estimate_of
 from calib.solve.estimate import Estimate
-from calib.solve.without import Kind, kinds_of
+from calib.solve.without import RowsOfKind, kinds_of
 
 if TYPE_CHECKING:
     from calib.report.plots import Axes, Figure
@@ -73,14 +73,14 @@ def graph(evidence: Evidence) -> Iterator[Chart | Absent]:
     )
 
 
-def _found(evidence: Evidence) -> tuple[list[Row], list[Kind]]:
+def _found(evidence: Evidence) -> tuple[list[Row], list[RowsOfKind]]:
     """What is drawn: it takes some passes over the beams."""
     estimate = estimate_of(evidence.run, evidence.progress)
     kinds = kinds_of(estimate)
     return graph_rows(estimate, kinds), kinds
 
 
-def graph_rows(estimate: Estimate, kinds: Sequence[Kind]) -> list[Row]:
+def graph_rows(estimate: Estimate, kinds: Sequence[RowsOfKind]) -> list[Row]:
     """The unknowns of the calibration one by one, and the others by what they stand for."""
     at, C = blocks_of(estimate.variables), estimate.covariance
     out = []
@@ -114,7 +114,7 @@ def _bits(before: np.ndarray, after: np.ndarray) -> float:
     return float((larger - smaller) / (2 * np.log(2) * len(after)))
 
 
-def _draw(rows: Sequence[Row], kinds: Sequence[Kind]) -> Figure:
+def _draw(rows: Sequence[Row], kinds: Sequence[RowsOfKind]) -> Figure:
     rows = rows[:MOST_ROWS]
     height = 1.5 + 0.27 * len(rows)
     figure, grid = plots.axes(plots.WIDE, height, 1, 2, sharey=True, width_ratios=(1.35, 1.0))
@@ -127,7 +127,7 @@ def _draw(rows: Sequence[Row], kinds: Sequence[Kind]) -> Figure:
     return figure
 
 
-def _lines(ax: Axes, rows: Sequence[Row], kinds: Sequence[Kind]) -> None:
+def _lines(ax: Axes, rows: Sequence[Row], kinds: Sequence[RowsOfKind]) -> None:
     """Unknowns on the left, rows on the right, and what joins them."""
     places = np.linspace(0, len(rows) - 1, 2 * len(kinds) + 1)[1::2]
     colours = dict(zip((kind.name for kind in kinds), plots.LINES, strict=False))

@@ -5,7 +5,7 @@ import pytest
 import yaml
 
 from calib.diagnosis.formulas.factors import KINDS, Factor, columns_of, factors
-from calib.diagnosis.formulas.terms import Term
+from calib.diagnosis.formulas.terms import FormulaTerm
 from calib.effects import View
 from calib.effects.own.expression import Expression
 from calib.effects.own.formula import FormulaEffect
@@ -175,7 +175,7 @@ def test_a_rare_class_is_none():
 
 
 def test_columns_of_a_product_are_all_products():
-    term = Term((Factor("x", "line", (1.0, 2.0)), Factor("y", "cosine")))
+    term = FormulaTerm((Factor("x", "line", (1.0, 2.0)), Factor("y", "cosine")))
     x, y = np.linspace(0, 1, 5), np.linspace(0, 3, 5)
     a = (x - 1) / 2
     expected = np.stack([a * np.cos(y), a, np.cos(y), np.ones(5)], axis=1)
