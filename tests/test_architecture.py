@@ -266,6 +266,10 @@ def test_a_name_of_a_class_means_one_thing():
     none(list(shared(packages(), public_classes)))
 
 
+def test_a_name_of_a_constant_means_one_thing():
+    none(list(shared(packages(), public_constants)))
+
+
 def test_a_name_of_two_things_would_be_found():
     sources = {
         "calib/a.py": "class A: pass\nclass _Own: pass\nMOST = 1\nLEAST, _OWN = 2, 3\nT = T_a = 4",

@@ -25,7 +25,7 @@ from calib.linear.system import Linearisation
 from calib.problem.problem import Problem
 from calib.residuals.groups import CAD, Group
 
-FAR = 3.0  # sigmas: what the diagnosis promises to name; see docs/one_thing_wrong.md
+PROMISED_SIGMAS = 3.0  # sigmas: what the diagnosis promises to name; see docs/one_thing_wrong.md
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ def hardly_checked(found: Mapping[Group, FurthestMoved]) -> list[str]:
     anything should; none where none could. Of values on paper that nothing measured checks, the
     weak directions tell."""
     measured = [(group, each) for group, each in found.items() if group.where != CAD]
-    far = sorted((m for m in measured if m[1].sigmas > FAR), key=lambda m: -m[1].sigmas)
+    far = sorted((m for m in measured if m[1].sigmas > PROMISED_SIGMAS), key=lambda m: -m[1].sigmas)
     if not far:
         return []
     group, worst = far[0]

@@ -11,7 +11,7 @@ import numpy as np
 from calib.diagnosis.candidates import Binned
 from calib.diagnosis.screen import Screen
 
-CONFIDENCE = 0.95
+CURVE_CONFIDENCE = 0.95
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def _curve(screen: Screen, effect: Binned, columns: slice, rig: str) -> Curve:
     sigma = np.sqrt(np.maximum(np.maximum(one_way, two_way), model)) / weight
     scale = np.sqrt(np.maximum(stop.sum(axis=0) + place.sum(axis=0), 1e-300))
     by_chance = np.abs(scores.draws[:, columns]) / scale
-    width = np.quantile(by_chance[:, np.isfinite(weight)].max(axis=1), CONFIDENCE)
+    width = np.quantile(by_chance[:, np.isfinite(weight)].max(axis=1), CURVE_CONFIDENCE)
     # A range error of 1 m changes every residual of its bin by as much: mean = score / weight.
     mean = scores.score[columns] / weight
     return Curve(

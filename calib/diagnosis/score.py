@@ -16,15 +16,14 @@ import numpy as np
 from scipy import special
 from scipy.linalg import cho_factor, cho_solve
 
-from calib.blunders.chance import at_least, log_tail
+from calib.blunders.chance import POWER, at_least, log_tail
 from calib.diagnosis.jackknife import ScoreSpread, Shares, by_signs
 from calib.diagnosis.linear import Linear
 from calib.linear.clusters import summed
 
 GAUGE = 1e-6  # share of a direction's information that is left, below which there is none
 UNFELT = 1e-9  # of an effect's largest column, below which no row feels a parameter
-POWER = 0.8  # with which an effect of the smallest detectable size is found
-DRAWS = 1999
+SCORE_DRAWS = 1999
 
 
 @dataclass(frozen=True)
@@ -81,7 +80,7 @@ class Scores:
         """Scores (R, Q) as chance might have dealt them: every cluster's share, times a normal
         number of its own (the multiplier bootstrap)."""
         shares = np.vstack([self.by_stop, self.by_place])
-        return np.random.default_rng(0).standard_normal((DRAWS, len(shares))) @ shares
+        return np.random.default_rng(0).standard_normal((SCORE_DRAWS, len(shares))) @ shares
 
 
 def projection(linear: Linear, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -17,6 +17,7 @@ from calib.blunders.chance import LEVELS, after_looks, log_tail
 from calib.blunders.judged import Blunder, LeftOut
 from calib.blunders.shifts import standing_alone
 from calib.diagnosis.chance import Chance
+from calib.diagnosis.rejects import FEWEST_STOPS
 from calib.diagnosis.score import ScoreTest, score_test
 from calib.diagnosis.screen import ODDS, Candidate, Screen, rivals
 from calib.diagnosis.stand import Look, Stand, tried
@@ -24,13 +25,12 @@ from calib.effects import Effect
 from calib.residuals.groups import CAD, JOINTS, MESH
 from calib.solve.fit import Progress
 
-ALPHA = LEVELS["effect"]
+ALPHA_EFFECT = LEVELS["effect"]
 ALPHA_UNNAMED = LEVELS["structure"]
 ALPHA_NOISE = LEVELS["effect on the scatter"]
-MOST_NAMES = 3  # an explanation that needs more names than this is none
-INSTEAD = 0.5  # of the leading structure's evidence, for another covariate to be named too
-FEWEST = 4  # stops, below which nothing is claimed
-TRIES = 3  # how many suspects are judged before a look is called quiet
+MOST_NEEDED = 3  # an explanation that needs more names than this is none
+ALSO_NAMED = 0.5  # of the leading structure's evidence, for another covariate to be named too
+SUSPECTS_JUDGED = 3  # how many suspects are judged before a look is called quiet
 ADAPTED, MENDED = 8, 2  # rounds of leaving out; of 76 fits without optimum one was mended, in two
 AS_FAR = 0.1  # of the leading blunder's evidence: others at other places are left out with it
 HELD_BACK = 0.1  # of what a test says of an effect: what is fitted with less does not bear it out
@@ -101,7 +101,7 @@ class Search:
 Steps = tuple[list[Look], list[NamedEffect], list[LeftOut]]
 
 
-def search(stand: Stand, progress: Progress, most: int = MOST_NAMES) -> Search:
+def search(stand: Stand, progress: Progress, most: int = MOST_NEEDED) -> Search:
     """Name what is missing, one effect after another, then ask whether that is all.
 
     Args:
@@ -285,7 +285,7 @@ def _chance_leads(look: Look) -> bool:
 def _quiet(look: Look) -> bool:
     """Whether no effect and no structure is significant: bins, or a name that acts like bins, take
     on what one stop has alone, but one stop left out does not take an effect away."""
-    named = any(_stands_out(c, ALPHA) for c in look.named.candidates)
+    named = any(_stands_out(c, ALPHA_EFFECT) for c in look.named.candidates)
     return not named and not any(_stands_out(c, ALPHA_UNNAMED) for c in look.unnamed.candidates)
 
 
@@ -299,9 +299,9 @@ def likeliest(here: Sequence[Blunder]) -> Blunder:
 def _named(look: Look, found: list[NamedEffect], progress: Progress) -> list[NamedEffect]:
     """What was found, and the best candidate that is confirmed, fitted; with it others may have
     better shapes."""
-    for candidate in suspects(look.named, ALPHA):
+    for candidate in suspects(look.named, ALPHA_EFFECT):
         test, p = judged(look, candidate, progress)
-        if p < ALPHA:
+        if p < ALPHA_EFFECT:
             effect = look.stand.finest(candidate.effect, progress)
             stand = tried(look.stand.with_effects, [effect], progress)
             theta = stand.theta(effect, whole=False) if stand else 0 * test.estimate()
@@ -337,7 +337,7 @@ def structures(look: Look, progress: Progress) -> list[Candidate]:
         if not _stands_out(candidate, ALPHA_UNNAMED):
             continue
         instead = out and len(candidate.effect.covariates) == 1
-        instead = instead and candidate.evidence > INSTEAD * out[0].evidence
+        instead = instead and candidate.evidence > ALSO_NAMED * out[0].evidence
         if instead or not _covered(look.unnamed, candidate, out):
             test, p = judged(look, candidate, progress)
             if p < ALPHA_UNNAMED:
@@ -374,11 +374,11 @@ def judged(look: Look, candidate: Candidate, progress: Progress) -> tuple[ScoreT
 def suspects(screen: Screen, alpha: float) -> Iterator[Candidate]:
     """Candidates found if rows were independent, or found by clusters, best first."""
     standing_out = [c for c in screen.candidates if _stands_out(c, alpha)]
-    yield from standing_out[:TRIES]
+    yield from standing_out[:SUSPECTS_JUDGED]
 
 
 def _stands_out(candidate: Candidate, alpha: float) -> bool:
-    if candidate.test.clusters < FEWEST:
+    if candidate.test.clusters < FEWEST_STOPS:
         return False
     alone = -log_tail(candidate.test.statistic, candidate.test.dof)
     return candidate.p_adjusted < alpha or alone > np.log(candidate.looks / alpha)

@@ -39,10 +39,10 @@ from chains.errors import InputError
 
 FINER = 9  # shapes tried between the two beside the best one
 BETTER_SHAPE = 9.0  # squared sigmas by which another shape must fit better
-LARGEST = 0.4  # change of a shape's logarithm at once
-SAMPLED = 8  # scans from which the bins of covariates are taken
+LARGEST_SHAPE_STEP = 0.4  # change of a shape's logarithm at once
+SCANS_SAMPLED = 8  # scans from which the bins of covariates are taken
 # Beams of each of them at most: a quantile of so many beams in all is off by 0.15 % of them.
-DRAWN = 16_384
+BEAMS_DRAWN = 16_384
 
 
 @dataclass(frozen=True)
@@ -184,7 +184,7 @@ class Stand:
         for effect, step in zip(shaped, steps, strict=True):
             found = score_test(scores, at[step.name])
             if found.dof and found.statistic > BETTER_SHAPE:
-                by = np.exp(np.clip(found.estimate()[0], -LARGEST, LARGEST))
+                by = np.exp(np.clip(found.estimate()[0], -LARGEST_SHAPE_STEP, LARGEST_SHAPE_STEP))
                 swapped[effect.name] = effect.at(float(f"{effect.shape * by:.6g}"))
         if not swapped:
             return self, {}
@@ -235,7 +235,7 @@ class Stand:
         """Which columns there are, and the values of covariates at some of the points."""
         columns = {c for s in self.sources for c in s.columns}
         scans = self.estimate.scans
-        chosen = np.unique(np.linspace(0, len(scans) - 1, SAMPLED).round().astype(int))
+        chosen = np.unique(np.linspace(0, len(scans) - 1, SCANS_SAMPLED).round().astype(int))
         found: dict[str, list[np.ndarray]] = {}
         rng = np.random.default_rng(0)
         for i in chosen.tolist() if scans else ():
@@ -246,8 +246,8 @@ class Stand:
             own = _own_columns(scans[i])
             looked_at = {*covariates(), *own}
             some = np.flatnonzero(rows.usable)
-            if len(some) > DRAWN:
-                some = np.sort(rng.choice(some, DRAWN, replace=False))
+            if len(some) > BEAMS_DRAWN:
+                some = np.sort(rng.choice(some, BEAMS_DRAWN, replace=False))
             for name in (n for n in rows.view.columns if n in looked_at):
                 whole = np.broadcast_to(rows.view[name], rows.view.rows)
                 found.setdefault(name, []).append(whole[some])

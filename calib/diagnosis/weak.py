@@ -15,7 +15,7 @@ from calib.results.observability import UNTOLD, echelon
 from calib.results.solution import Solution
 
 LEANS = 0.5  # of the prior's variance left in a direction that the data hardly determine
-SHARE = 0.2  # of a direction of unit length, in priors' sigmas, for a parameter to be named
+NAMED_SHARE = 0.2  # of a direction of unit length, in priors' sigmas, for a parameter to be named
 STANDS_IN = 0.97  # of what a candidate does, that an effect of the model can absorb
 MOST_DIRECTIONS = 8
 
@@ -84,7 +84,7 @@ def hardly_known(
     for value, axis in weak[:MOST_DIRECTIONS]:
         if value < LEANS:
             break
-        named = [int(i) for i in np.argsort(-np.abs(axis)) if abs(axis[i]) > SHARE]
+        named = [int(i) for i in np.argsort(-np.abs(axis)) if abs(axis[i]) > NAMED_SHARE]
         if named:
             moved = np.sqrt(value) * np.abs(axis * known)[named]
             out.append(

@@ -41,8 +41,8 @@ KnownOfBeams = Callable[
 NEIGHBOURS = 24  # of a point, through which its plane is laid
 SUPPORT = 200_000  # points among which neighbours are sought
 THICKEST = 0.3  # of a plane's width: what is thicker is none
-FLATTEST_RAD = np.radians(85.0)  # flatter beams are corrected as these are
-PASSES = (
+FLATTEST_BEAM_RAD = np.radians(85.0)  # flatter beams are corrected as these are
+CORRECTION_PASSES = (
     3  # looks at the range: a correction changes by a millionth of itself from each to the next
 )
 _SEEN = ("range_m", "azimuth_rad", "elevation_rad", "incidence_rad")  # of any cloud
@@ -109,7 +109,7 @@ class Correction:
         error = np.zeros((len(xyz_m), 3))
         if "intensity" in columns:
             columns = {**columns, "intensity": columns["intensity"] / self.median_intensity}
-        for _ in range(PASSES):
+        for _ in range(CORRECTION_PASSES):
             there = {"range_m": ray.range_m - error[:, 0], **_angles(ray), **columns}
             view = View(self.rig, len(xyz_m), there, np.zeros((1, 0)))
             each = (site_error(e.basis(view), theta) for e, theta in self.effects)
@@ -273,7 +273,7 @@ def _incidence(xyz_m: np.ndarray, rig: Rig, met_rad: np.ndarray | None) -> np.nd
         incidence_rad = np.where(np.isnan(met_rad), incidence(xyz_m, rig), met_rad)
     else:
         incidence_rad = met_rad
-    return np.minimum(incidence_rad, FLATTEST_RAD)
+    return np.minimum(incidence_rad, FLATTEST_BEAM_RAD)
 
 
 def incidence(xyz_m: np.ndarray, rig: Rig) -> np.ndarray:

@@ -15,12 +15,12 @@ from chains.se3 import Array
 from sensors.documents import nearest
 from sensors.readers.base import Sweeps, Track
 
-WINDOW_S = 0.2  # rates are smoothed over it before they are compared
+RATE_WINDOW_S = 0.2  # rates are smoothed over it before they are compared
 LEAST_LIKE = 0.75  # correlation below which two motions are not the same
 RIVAL = 0.8  # of the best evidence, at another offset: then nobody knows which is right
 LOBE_S = 1.0  # within it of the best, a peak is the same one
 LEAST_OVERLAP = 0.3  # of the shorter log
-PARTS = 8  # of the logs, whose own offsets tell the uncertainty
+LOG_PARTS = 8  # of the logs, whose own offsets tell the uncertainty
 LEAST_S = 2.0
 DRIFT_S = 0.02  # from the first part to the last
 
@@ -75,7 +75,8 @@ def align(
         out.understood.append(f"clocks: all times are those of {main}")
     out.understood.extend(f"clocks: {n} {s:+.4f} s, as given" for n, s in given_s.items())
     heard = {
-        c: [m for t in tracks if t.clock == c for m in motions(t, edges, WINDOW_S)] for c in spans
+        c: [m for t in tracks if t.clock == c for m in motions(t, edges, RATE_WINDOW_S)]
+        for c in spans
     }
     moving = [c for c in spans if heard[c]]
     for clock in sorted((c for c in spans if c not in known), key=lambda c: c not in moving):
@@ -255,7 +256,7 @@ def _scatter(a: Array, b: Array, lag: int, step_s: float) -> tuple[float, float]
     """Standard error of the offset, and how much it changes from the first part to the last."""
     start, end = max(0, -lag), min(len(a), len(b) - lag)
     reach = max(2, round(0.25 / step_s))
-    edges = np.linspace(start, end, PARTS + 1).astype(int)
+    edges = np.linspace(start, end, LOG_PARTS + 1).astype(int)
     shifts_s = []
     for low, high in itertools.pairwise(edges):
         low, high = max(low, reach - lag, 0), min(high, len(b) - lag - reach)

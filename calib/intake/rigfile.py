@@ -12,12 +12,13 @@ import numpy as np
 
 from calib.intake.gather import Gathered, section
 from calib.intake.roles import Mounted, Roles, find_roles
-from calib.rig.description import FORMAT
+from calib.rig.description import RECORDING_FORMAT
 from chains import escape, se3
 from chains.errors import InputError
 from sensors.documents import nearest, write_atomically
 from sensors.lidar import catalog
-from sensors.readers.base import POSE, Columns
+from sensors.readers.base import Columns
+from sensors.stops import POSE
 
 GUESS_M, GUESS_RAD = 0.1, 0.3
 _PLAIN = re.compile(r"[A-Za-z_][\w./-]*( [\w./-]+)*|\d+")
@@ -86,7 +87,7 @@ def first_rig(
     roles = _roles(gathered, columns)
     lines = [
         "# Written by rigcal import. A guess was found in the data: write there what CAD says.",
-        f"format: {FORMAT.newest}",
+        f"format: {RECORDING_FORMAT.newest}",
         f"name: {name}",
     ]
     lidar = _lidar(gathered, model) if gathered.sweeps else None

@@ -36,8 +36,9 @@ __all__ = ["Plan", "is_rig", "plan", "planner_of"]
 
 # Poses that are looked at. On the page's example 50, 200, 500, 1500 of them bring the smallest sag
 # that is told from its rival to 0.071, 0.062, 0.061, 0.059 mrad/(N m) (mean of two seeds).
-CANDIDATES = 500
-STOPS, MOST = 5, 30  # that are planned where nobody says how many; and until sigmas are small
+CANDIDATE_POSES = 500
+# Stops that are planned where nobody says how many, and until sigmas are small.
+USUAL_STOPS, MOST_PLANNED = 5, 30
 
 
 def _silent(what: str, done: int, total: int) -> None:
@@ -152,7 +153,7 @@ def plan(
     purpose: str | None = None,
     until: str | None = None,
     region: Sequence[float] | None = None,
-    candidates: int = CANDIDATES,
+    candidates: int = CANDIDATE_POSES,
     seed: int = 0,
     out: Path | str | None = None,
     progress: Progress = _silent,
@@ -179,7 +180,7 @@ def plan(
     """
     if until is not None and purpose is not None:
         raise InputError("--until says what the stops are for, so it takes no --for beside it")
-    stops = (MOST if until else STOPS) if stops is None else stops
+    stops = (MOST_PLANNED if until else USUAL_STOPS) if stops is None else stops
     if stops < 1 or candidates < stops:
         raise InputError(
             f"{stops} stops out of {candidates} candidates: give at least 1, and no more"

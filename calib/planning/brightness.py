@@ -14,8 +14,8 @@ import numpy as np
 
 from calib.residuals.beams import Rows
 
-FAINTEST = 1e-6  # of the median: less has no logarithm
-NEAREST_M, FLATTEST = 0.1, 0.05  # range and cosine: logarithms of less would decide the fit
+LEAST_INTENSITY = 1e-6  # of the median: less has no logarithm
+LEAST_RANGE_M, LEAST_COSINE = 0.1, 0.05  # range and cosine: logarithms of less would decide the fit
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Brightness:
             values = [np.broadcast_to(rows.view[name], rows.view.rows) for name in names]
             parts.append(np.stack(values)[:, rows.usable])
         intensity, label, range_m, incidence = np.concatenate(parts, axis=1)
-        fine = np.isfinite(intensity) & (intensity > FAINTEST)
+        fine = np.isfinite(intensity) & (intensity > LEAST_INTENSITY)
         if not fine.any():
             return None
         labels, index = np.unique(label[fine].astype(int), return_inverse=True)
@@ -71,5 +71,5 @@ class Brightness:
 
 
 def _logs(range_m: np.ndarray, cosine: np.ndarray) -> np.ndarray:
-    held = np.maximum(range_m, NEAREST_M), np.maximum(cosine, FLATTEST)
+    held = np.maximum(range_m, LEAST_RANGE_M), np.maximum(cosine, LEAST_COSINE)
     return np.log(np.stack(held, axis=1))

@@ -22,7 +22,8 @@ from calib.results.solution import Solution
 from calib.solve.fit import Progress
 from chains.errors import InputError
 
-AGAIN = 1e4  # times that all candidates are measured for what no number of stops gets beyond
+# Times that all candidates are measured for what no number of stops gets beyond.
+ENDLESS_TIMES = 1e4
 
 
 @dataclass(frozen=True)
@@ -92,7 +93,7 @@ class Planner:
         """What all candidates tell, measured again and again: no stops of the arm tell more. As the
         mesh's errors are taken to differ from stop to stop, even these may not tell as much."""
         base = self.lasting
-        return self._known(replace(base, data=base.data + AGAIN * each.sum(axis=0)), 0)
+        return self._known(replace(base, data=base.data + ENDLESS_TIMES * each.sum(axis=0)), 0)
 
     def enough(self, poses: Poses, each: np.ndarray, most: int) -> tuple[Poses, list[Step]]:
         """The fewest stops, one best after another, with which every tolerance is kept, or `most`

@@ -18,7 +18,7 @@ from calib.residuals.surfaces import Meeting
 from calib.rig import Rig
 from chains.errors import InputError
 
-FREE = 1.0  # m or rad: what is known of a value on paper that is left out, the rig's own size
+FREE_SIGMA = 1.0  # m or rad: what is known of a value on paper that is left out, the rig's own size
 
 
 def build(
@@ -85,7 +85,7 @@ def effect_unknown(term: Term, source: Source) -> Unknown:
         term.variable,
         "vector",
         mean=np.zeros(len(params)),
-        sigma=np.where(free, FREE, [p.sigma for p in params]),
+        sigma=np.where(free, FREE_SIGMA, [p.sigma for p in params]),
         dofs=tuple(p.name for p in params),
         units=tuple(p.unit for p in params),
         role=Role.SCATTER if term.effect.by_chance else Role.CALIBRATION,

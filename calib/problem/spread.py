@@ -21,7 +21,7 @@ from calib.problem.unknowns import Role, Unknown
 from calib.residuals.groups import JOINTS
 from calib.residuals.scan import ScanStop
 from calib.residuals.surfaces import PlaneSurface
-from calib.residuals.targets import SIGMAS, HangingTarget
+from calib.residuals.targets import PARTS_OF_SIGMAS, HangingTarget
 from calib.residuals.tracker import TrackedBody
 
 OF_TARGETS = "target/"  # before what of targets a spread is of: no body is called so
@@ -63,7 +63,7 @@ def rows_at(problem: Problem, site: Site) -> list[tuple[str, str]]:
         return [(JOINTS, unit) for unit in ("rad", "m") if read(problem, unit)]
     if site is Site.TARGET:
         there = any(isinstance(block, HangingTarget) for block in problem.blocks)
-        return [(f"{OF_TARGETS}{part}", "m") for part in SIGMAS] if there else []
+        return [(f"{OF_TARGETS}{part}", "m") for part in PARTS_OF_SIGMAS] if there else []
     meshes = any(scan.reference_sigma_m for scan in problem.scans if not _on_planes(scan))
     return [(part, "m") for part in SURFACE_SHARES] if meshes else []
 

@@ -8,7 +8,7 @@ from typing import Literal
 GroupKind = Literal["body", "joints", "scan", "target", "frame", "rings", "surface"]
 SCAN, JOINTS = "scan", "joints"  # what of a stop, beside its bodies and single joints
 CAD, MESH = "cad", "mesh"  # where, of what belongs to no stop and no target
-BEAMS = "along the beams"  # the direction of a range zero
+ALONG_BEAMS = "along the beams"  # the direction of a range zero
 
 
 @dataclass(frozen=True)

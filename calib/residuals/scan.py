@@ -39,7 +39,7 @@ from sensors.recording import RecordedStops, Scan
 SIZE = {Site.BEAM: 3, Site.REFERENCE: 3, Site.NOISE: 1}
 PRIOR_COUNT = 20.0  # a measured spread of fewer sweeps than this leans on the datasheet
 MET = ("label", "incidence_rad")
-PARTS = ("surface", "region", "patch", "plane")  # of what is met: no column of a user's
+MET_PARTS = ("surface", "region", "patch", "plane")  # of what is met: no column of a user's
 LOCAL_SHARE = 0.05  # of the variance of a patch of the reference, between its neighbouring points
 
 
@@ -248,7 +248,7 @@ class ScanStop:
         return found
 
     def _view(self, scan: Scan, ray: Beams, surface: Surface) -> View:
-        given = {n: c for n, c in {**self.columns, **scan.extra}.items() if n not in PARTS}
+        given = {n: c for n, c in {**self.columns, **scan.extra}.items() if n not in MET_PARTS}
         columns: dict[str, LazyColumn] = {
             **given,
             **surface.columns,

@@ -14,7 +14,7 @@ from sensors.reference import Reference
 from sensors.stops import Targets
 
 FEW_LOCATIONS = 3  # below that no whole location can be held out
-STILL = 0.05  # rad or m that a joint travels: too little to tell its own errors
+JOINT_STILL = 0.05  # rad or m that a joint travels: too little to tell its own errors
 LIMIT_SLACK = 1e-3  # rad or m beyond a joint's limit
 LEVEL_RAD = np.radians(3.0)
 NARROW_RAD = np.radians(30.0)
@@ -126,7 +126,7 @@ def odd_joints(rig: Rig, recording: RecordedStops) -> Iterator[str]:
     """Joints at rest, or beyond their limits."""
     names = np.array(recording.stops)
     values = dict(zip(rig.joint_names, recording.joints.T, strict=True))
-    if still := [name for name, at in values.items() if np.ptp(at) < STILL]:
+    if still := [name for name, at in values.items() if np.ptp(at) < JOINT_STILL]:
         yield f"{listed(still)} hardly moved, too little to tell their own errors; move them"
     for joint in (j for edge in rig.tree.edges if (j := edge.joint) is not None and j.leads):
         at, unit = values[joint.name], "rad" if joint.kind == "revolute" else "m"

@@ -35,7 +35,7 @@ from calib.solve.fit import Progress, resume
 from sensors.documents import write_json
 from sensors.rings import RingFinding, least_off_rad
 
-LOOKED = 3  # scans from which the numbers of rings are checked: each holds all rings
+SCANS_LOOKED_AT = 3  # scans from which the numbers of rings are checked: each holds all rings
 
 
 @one_blas_thread
@@ -174,7 +174,7 @@ def _odd_rings(stand: Stand) -> Iterator[tuple[str, RingFinding]]:
     """LiDARs whose rings are numbered otherwise than their model has it. Those counted from the
     other end are many makers' own; else offsets by ring are of no use."""
     for source in stand.sources:
-        scanned = np.flatnonzero(source.recording.has_scan)[:LOOKED]
+        scanned = np.flatnonzero(source.recording.has_scan)[:SCANS_LOOKED_AT]
         if source.rig.lidar is not None and len(scanned):
             sums = ScanSums(source.rig.lidar)
             for k in scanned.tolist():

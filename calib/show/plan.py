@@ -13,8 +13,8 @@ from calib.show.tables import columns_table, print_pairs, shown, terminal
 if TYPE_CHECKING:
     from calib.planning import Plan
 
-MANY = 12  # parameters of an effect, from which on their sigmas are told together
-LISTED = 4  # directions that are shown
+MANY_PARAMETERS = 12  # parameters of an effect, from which on their sigmas are told together
+DIRECTIONS_SHOWN = 4  # directions that are shown
 WEAK = {
     "now": "hardly determined now",
     "after": "and after these stops",
@@ -43,8 +43,8 @@ def print_plan(plan: Plan) -> None:
         print_pairs(console, "as well known as before", [("", _together(same))])
     weak = document["weak_directions"]
     for when, title in WEAK.items():
-        pairs = [("", " and ".join(each["parameters"])) for each in weak[when][:LISTED]]
-        more = len(weak[when]) - LISTED
+        pairs = [("", " and ".join(each["parameters"])) for each in weak[when][:DIRECTIONS_SHOWN]]
+        more = len(weak[when]) - DIRECTIONS_SHOWN
         pairs += [("", f"and {more} more")] if more > 0 else []
         print_pairs(console, title, pairs or [("", "nothing")])
     now, after = document["observability"]["now"], document["observability"]["after"]
@@ -112,7 +112,7 @@ def _rows(sigma: Mapping[str, Mapping[str, Any]]) -> Iterator[tuple[str, str, fl
     for name in sigma:
         by_variable.setdefault(name.rpartition(".")[0], []).append(name)
     for variable, names in by_variable.items():
-        if len(names) < MANY:
+        if len(names) < MANY_PARAMETERS:
             yield from ((n, *(sigma[n][key] for key in ("unit", "now", "after"))) for n in names)
             continue
         both = (

@@ -17,7 +17,7 @@ from sensors.reference import Hits
 
 NO_RETURN_RAD = np.radians(86.0)
 RETURNED = 0.99  # share of the sweeps in which a direction returns anything
-FAR_OFF_M = 0.1  # sd of a range that is wrong for no visible reason
+STRAY_SD_M = 0.1  # sd of a range that is wrong for no visible reason
 EDGE_STEP_M = 0.05  # two surfaces this far apart along a beam mix
 PROBES_PER_MIXED = 12
 
@@ -187,7 +187,7 @@ class Scanner:
         spoilt = range_m.copy()
         spoilt[probed[edges]] += rng.uniform(0.1, 0.9, len(edges)) * step_m[edges]
         others = order[len(order) - (wanted - len(edges)) :]
-        spoilt[others] += FAR_OFF_M * rng.standard_normal(len(others))
+        spoilt[others] += STRAY_SD_M * rng.standard_normal(len(others))
         return np.maximum(spoilt, self.lidar.min_range_m)
 
     def _average(

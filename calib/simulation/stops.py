@@ -19,11 +19,11 @@ from chains.errors import InputError
 from sensors.reference import Reference
 
 # The LiDAR keeps clear of floor and furniture, the base of furniture.
-CLEAR_M, ABOVE_FLOOR_M, BASE_CLEAR_M = 0.6, 0.5, 0.45
+LIDAR_CLEAR_M, ABOVE_FLOOR_M, BASE_FROM_FURNITURE_M = 0.6, 0.5, 0.45
 SETTLE = np.repeat([0.0002, 0.0003], 3)  # rad, m: how the base shifts when the arm moves
 GUESS = np.repeat([np.radians(1.0), 0.02], 3)  # rad, m: error of a guessed base pose
 RATE = 0.25  # rad/s: sd of a joint's speed while the arm moves
-TRIES = 200
+POSES_TRIED = 200
 UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -93,7 +93,7 @@ def _bases(
     tried = placed = 0
     while True:
         tried += 1
-        if tried > TRIES:
+        if tried > POSES_TRIED:
             raise InputError(f"{n} stops clear of the furniture were not found; ask for fewer")
         joints = _joints(rig, spec, placed, 40 * n, rng)
         if spec.arm:
@@ -127,9 +127,9 @@ def _base(mesh: Reference, rng: np.random.Generator) -> np.ndarray:
     """T_faro_base (4, 4) of a base on the floor, clear of furniture."""
     turn = np.linspace(0, 2 * np.pi, 24, endpoint=False)
     around = np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=1)
-    for _ in range(TRIES):
+    for _ in range(POSES_TRIED):
         xyz = FLOOR_CENTRE_M + rng.uniform((-2.3, -1.5, 0.0), (2.3, 1.5, 0.0))
-        if mesh.cast(xyz + 0.3 * UP, around).range_m.min() > BASE_CLEAR_M:
+        if mesh.cast(xyz + 0.3 * UP, around).range_m.min() > BASE_FROM_FURNITURE_M:
             tilt = 0.003 * rng.standard_normal(2)
             return se3.from_xyz_rpy(xyz, np.append(tilt, rng.uniform(-np.pi, np.pi)))
     raise InputError("no free place for the base was found in this room")
@@ -155,7 +155,9 @@ def _clear(mesh: Reference, Ts_faro_tip: np.ndarray) -> np.ndarray:
     range_m = mesh.cast(origins, np.tile(rays, (len(Ts_faro_tip), 1))).range_m
     range_m = range_m.reshape(len(Ts_faro_tip), -1)
     high = Ts_faro_tip[:, 2, 3] - FLOOR_CENTRE_M[2] > ABOVE_FLOOR_M
-    return np.flatnonzero(high & (range_m.min(axis=1) > CLEAR_M) & np.isfinite(range_m).all(axis=1))
+    return np.flatnonzero(
+        high & (range_m.min(axis=1) > LIDAR_CLEAR_M) & np.isfinite(range_m).all(axis=1)
+    )
 
 
 def _columns(location: np.ndarray, rng: np.random.Generator) -> dict[str, np.ndarray]:

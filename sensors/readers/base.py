@@ -21,8 +21,6 @@ Array = NDArray[np.float64]
 Columns = dict[str, np.ndarray]
 Progress = Callable[[str, int, int], None]
 
-POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
-
 
 @dataclass(frozen=True)
 class Track:
@@ -30,9 +28,9 @@ class Track:
 
     Args:
         name: the body, or where the log comes from: a topic or a file.
-        kind: "pose" has the columns of `POSE`, T_world_body in m and unit quaternions; "point"
-            has x y z in m; "joints" one per joint, rad or m; "gyro" x y z in rad/s; "covariate"
-            anything else.
+        kind: "pose" has the columns of `sensors.stops.POSE`, T_world_body in m and unit
+            quaternions; "point" has x y z in m; "joints" one per joint, rad or m; "gyro" x y z in
+            rad/s; "covariate" anything else.
         clock: what counted the seconds; tracks of one clock share its name.
         time_s: (N,) s, not falling.
         names: (C,) the columns.

@@ -24,7 +24,7 @@ from threadpoolctl import threadpool_limits
 
 from calib import problem as problems
 from calib.diagnosis.score import project, score_test
-from calib.diagnosis.search import ALPHA, Search, search
+from calib.diagnosis.search import ALPHA_EFFECT, Search, search
 from calib.diagnosis.stand import Stand
 from calib.diagnosis.suggest import hangs_on
 from calib.diagnosis.verdict import conclude
@@ -81,7 +81,7 @@ def _at_the_limit(case: Case, folder: Path) -> tuple[Source, dict[str, Any], Hid
     look = fitted(source, case).look(silent).named
     (name,) = case.hidden
     candidate = next(c for c in look.candidates if c.effect.family == name)
-    alpha = -np.expm1(np.log1p(-ALPHA) / candidate.looks)
+    alpha = -np.expm1(np.log1p(-ALPHA_EFFECT) / candidate.looks)
     size = candidate.test.smallest_detectable(look.common, alpha)
     sigma = [p.sigma for p in candidate.effect.params(source.rig) if p.sigma]
     return written(case, folder, {name: size / float(np.sqrt(np.mean(np.square(sigma))))})

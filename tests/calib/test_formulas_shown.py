@@ -19,7 +19,7 @@ from calib.report import Evidence, plot, report
 from calib.report.charts.fit import ladder as ladder_chart
 from calib.report.charts.formulas import charts_of, pictures
 from calib.runs.calibrate import calibrate
-from calib.runs.explain import EXPLANATION, KEPT, explain
+from calib.runs.explain import EXPLANATION, KEPT_EFFECTS, explain
 from calib.runs.ladder import FORMULA, Rung, ladder
 from calib.runs.run import Run
 from calib.show.comparison import ladder_table
@@ -340,7 +340,7 @@ def test_explain_climbs_by_a_formula_and_keeps_it_for_others(tmp_path, rigcal):
     assert name == "empirical_incidence" and found.steps[-1]["added"] == [name]
     assert [rung.empirical for rung in ladder([found.runs[-1]])] == [[], [name]]
     (kept,) = found.kept
-    assert kept == tmp_path / "ladder" / KEPT / f"{name}.yaml"
+    assert kept == tmp_path / "ladder" / KEPT_EFFECTS / f"{name}.yaml"
     written = json.loads((tmp_path / "ladder" / EXPLANATION).read_text())
     assert written["kept"] == [str(kept)] and written["ladder"][-1]["empirical"] == [name]
     document = yaml.safe_load(kept.read_text())

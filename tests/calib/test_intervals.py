@@ -15,7 +15,7 @@ from scipy.linalg import sqrtm
 from calib import problem as problems
 from calib.linear.clusters import ClusteredRows, Gradients
 from calib.problem.model import Model, Source
-from calib.results.intervals import PARTS, Intervals, _Sums, intervals
+from calib.results.intervals import ROOM_PARTS, Intervals, _Sums, intervals
 from calib.simulation import Spec
 from calib.solve.clustered import BeamsAlong
 from calib.solve.fit import solve
@@ -262,7 +262,7 @@ def beams(estimate, count):
         associations=estimate.associations,
         directions=directions,
         places=Gradients(layout.size),
-        kinds=PARTS,
+        kinds=ROOM_PARTS,
     )
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from calib.blunders.chance import LEVELS
 from calib.diagnosis.formulas.arm import joint_tables
-from calib.diagnosis.formulas.found import JOINT, RANGE, Formula, settled
+from calib.diagnosis.formulas.found import JOINT_SITE, RANGE_SITE, Formula, settled
 from calib.diagnosis.formulas.pursuit import ConfirmedTerm, pursue
 from calib.diagnosis.formulas.table import BeamTable, Projection
 from calib.diagnosis.stand import Stand
@@ -30,7 +30,7 @@ def find(stand: Stand, progress: Progress) -> list[Formula]:
             stand.estimate, lambda done, total: progress("reading residuals", done, total)
         )
         steps = pursue(table, LEVELS["structure"], progress)
-        return settled(table, steps, RANGE) if steps else []
+        return settled(table, steps, RANGE_SITE) if steps else []
     tables = dict(joint_tables(stand))
     alpha = LEVELS["structure"] / max(len(tables), 1)
     first = {name: pursue(table, alpha, progress, most=1) for name, table in tables.items()}
@@ -39,7 +39,7 @@ def find(stand: Stand, progress: Progress) -> list[Formula]:
         return []
     joint = min(left, key=left.__getitem__)
     steps = pursue(tables[joint], alpha, progress, found=first[joint])
-    return settled(tables[joint], steps, JOINT + joint)
+    return settled(tables[joint], steps, JOINT_SITE + joint)
 
 
 def _left(table: BeamTable, steps: Sequence[ConfirmedTerm]) -> float:

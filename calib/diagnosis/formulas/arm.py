@@ -23,8 +23,9 @@ from calib.effects.own.formula import FormulaEffect
 from calib.linear.clusters import Gradients
 from calib.linear.layout import Layout
 
-LARGEST = 3000  # unknowns: with more, as where every stop has some of its own, no table is made
-SEEN = 1e-6  # of the largest: a joint whose angle changes less at a pose is not seen there
+# Unknowns: with more, as where every stop has some of its own, no table is made.
+MOST_UNKNOWNS = 3000
+ANGLE_SEEN = 1e-6  # of the largest: a joint whose angle changes less at a pose is not seen there
 
 
 def joint_tables(stand: Stand) -> Iterator[tuple[str, BeamTable]]:
@@ -38,7 +39,7 @@ def joint_tables(stand: Stand) -> Iterator[tuple[str, BeamTable]]:
     )
     turned = variables_of(wide, {effect.name for _, effect in levers})
     layout = Layout.of(wide, unbounded=[*chain(*turned.values())])
-    if layout.size > LARGEST:
+    if layout.size > MOST_UNKNOWNS:
         return
     A, *of_rows = rows_of_others(wide, layout, values, Gradients(layout.size))
     A, covariates = A.toarray(), _covariates(stand, layout)
@@ -74,7 +75,7 @@ def _table(
     it turns."""
     a = np.where(stop >= 0, lever, 0.0)
     size = np.sqrt(np.bincount(np.maximum(stop, 0), np.square(a)))
-    seen = size > SEEN * size.max(initial=0.0)
+    seen = size > ANGLE_SEEN * size.max(initial=0.0)
     if not seen.any():
         return None
     at = np.flatnonzero(stop >= 0)

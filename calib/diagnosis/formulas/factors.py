@@ -19,17 +19,17 @@ from calib.effects.own.expression import Expression
 
 Columns = Mapping[str, np.ndarray]
 
-STEPS = 16  # places at which a step is tried first
+STEP_PLACES = 16  # places at which a step is tried first
 WINDOW = 12  # edges between which a window is tried first
 CENTRES, WIDTHS = 8, (0.06, 0.15)  # of bumps; of the covariate's range
 SCALES = (0.1, 0.25, 0.6)  # of exponentials, of the covariate's range
 PERIODS = tuple(np.geomspace(0.1, 1.5, 24))  # of waves, of the covariate's range
 WIDEST, NARROWEST = 3.0, 0.005  # scales and widths, of the covariate's range
-BLOCKS = (2.0, 4.0, 8.0, 16.0, 32.0)  # rings that a chip, or a bank of chips, has
+RING_BLOCKS = (2.0, 4.0, 8.0, 16.0, 32.0)  # rings that a chip, or a bank of chips, has
 A_PERIOD = 6  # values that a period must have, of those that can be told apart
-ORDERS = 12  # of harmonics of an angle
+HARMONICS = 12  # of harmonics of an angle
 FEWEST_VALUES = 3  # of a covariate that is not a class
-WIDE = 1.5  # largest over smallest value, from which powers differ from a line
+WIDE_ENOUGH = 1.5  # largest over smallest value, from which powers differ from a line
 LEAST_SHARE = 0.005  # of the beams that a class must have
 # Columns that name a part of the room, a beam or a stop, and so are no covariate; the rest of the
 # room is in range, incidence and label.
@@ -57,7 +57,7 @@ class FactorKind:
 
 
 # The 1 beside a line, a square and a logarithm lets the place of their zero be found.
-KINDS = {
+FACTOR_KINDS = {
     "line": FactorKind(("({x} - {0}) / {1}", "1"), 1.0),
     "proportional": FactorKind(("{x} / {0}",), 0.9),
     "square": FactorKind(("(({x} - {0}) / {1})**2", "({x} - {0}) / {1}", "1"), 2.5),
@@ -97,7 +97,7 @@ class Factor:
 
     Args:
         covariate: its name.
-        kind: of `KINDS`.
+        kind: of `FACTOR_KINDS`.
         constants: those that the kind's columns have.
     """
 
@@ -113,17 +113,19 @@ class Factor:
     def written(self, free: Sequence[str]) -> tuple[str, ...]:
         """The same with these in place of its first constants."""
         numbers = [*free, *(f"{c:.6g}" for c in self.constants[len(free) :])]
-        found = (text.format(*numbers, x=self.covariate) for text in KINDS[self.kind].columns)
+        found = (
+            text.format(*numbers, x=self.covariate) for text in FACTOR_KINDS[self.kind].columns
+        )
         return tuple(_plain(text, self.covariate) for text in found)
 
     @property
     def cost(self) -> float:
-        return KINDS[self.kind].cost
+        return FACTOR_KINDS[self.kind].cost
 
     @property
     def free(self) -> int:
         """How many constants, from the first, are to be found."""
-        return KINDS[self.kind].free
+        return FACTOR_KINDS[self.kind].free
 
     def bounds(self, values: np.ndarray) -> np.ndarray:
         """(free, 2) least and largest value of the constants to be found: a place is among the
@@ -131,7 +133,7 @@ class Factor:
         it could not be told from a line, nor so small that it is one value."""
         low, high = float(np.nanmin(values)), float(np.nanmax(values))
         scale = (high - low) * np.array([NARROWEST, WIDEST])
-        kinds = KINDS[self.kind]
+        kinds = FACTOR_KINDS[self.kind]
         found = [scale if i in kinds.scales else (low, high) for i in range(self.free)]
         return np.reshape(found, (self.free, 2))
 
@@ -140,7 +142,7 @@ class Factor:
         of other constants these themselves."""
         found = np.repeat(np.reshape(self.constants[: self.free], (-1, 1)), 2, axis=1)
         known = np.unique(values[np.isfinite(values)])
-        if not KINDS[self.kind].edges or len(known) < 2:
+        if not FACTOR_KINDS[self.kind].edges or len(known) < 2:
             return found
         after = np.clip(np.searchsorted(known, found[:, 0], side="right"), 1, len(known) - 1)
         return np.stack([known[after - 1], known[after]], axis=1)
@@ -184,7 +186,7 @@ def product_of(columns: Sequence[np.ndarray]) -> np.ndarray:
 @cache
 def _expressions(kind: str) -> tuple[Expression, ...]:
     """A kind's columns, of ``x`` and of constants ``c0``, ``c1``: parsed once."""
-    texts = (text.format("c0", "c1", x="x") for text in KINDS[kind].columns)
+    texts = (text.format("c0", "c1", x="x") for text in FACTOR_KINDS[kind].columns)
     return tuple(Expression(text, "a finding") for text in texts)
 
 
@@ -221,7 +223,7 @@ def factors(name: str, values: np.ndarray, levels: int, angle: bool = False) -> 
     out = [*_smooth(name, known, levels, angle), *_sharp(name, known, distinct, levels)]
     if name == "ring":
         out.append(Factor(name, "every other"))
-        out += [Factor(name, "block", (size,)) for size in BLOCKS]
+        out += [Factor(name, "block", (size,)) for size in RING_BLOCKS]
         out += [Factor(name, "one of", (4.0, float(k))) for k in range(4)]
     return out
 
@@ -232,13 +234,13 @@ def _smooth(name: str, known: np.ndarray, levels: int, angle: bool) -> Iterator[
     half = _rounded(wide / 2, wide / 2)
     yield Factor(name, "line", (middle, half))
     yield Factor(name, "square", (middle, half))
-    if low > 0.0 and high > WIDE * low:
+    if low > 0.0 and high > WIDE_ENOUGH * low:
         scale = _rounded(float(np.sqrt(low * high)), wide)
         yield Factor(name, "logarithm", (scale,))
         yield Factor(name, "root", (scale,))
         yield Factor(name, "reciprocal", (scale,))
         yield from (Factor(name, "power", (scale, p)) for p in (2.0, 3.0))
-    if low >= 0.0 and high > WIDE * low:
+    if low >= 0.0 and high > WIDE_ENOUGH * low:
         yield Factor(name, "proportional", (_rounded(high, wide),))
         sorts = ("saturation", "share")
         yield from (Factor(name, sort, (share * wide,)) for sort in sorts for share in SCALES)
@@ -251,7 +253,7 @@ def _smooth(name: str, known: np.ndarray, levels: int, angle: bool) -> Iterator[
     elif name == "elevation_rad":
         yield from (Factor(name, sort) for sort in ("tangent", "sine", "cosine"))
     if angle or name == "azimuth_rad":
-        orders = min(ORDERS, max(1, levels // A_PERIOD))
+        orders = min(HARMONICS, max(1, levels // A_PERIOD))
         yield from (Factor(name, "harmonic", (float(m),)) for m in range(1, orders + 1))
     else:
         slow = (share for share in PERIODS if share * levels > A_PERIOD)
@@ -261,8 +263,8 @@ def _smooth(name: str, known: np.ndarray, levels: int, angle: bool) -> Iterator[
 def _sharp(name: str, known: np.ndarray, distinct: np.ndarray, levels: int) -> Iterator[Factor]:
     low, high = float(known.min()), float(known.max())
     wide = high - low
-    places = np.unique(np.quantile(known, np.arange(1, STEPS + 1) / (STEPS + 1)))
-    if len(distinct) < 4 * STEPS:  # between values: where a step is among them cannot be told
+    places = np.unique(np.quantile(known, np.arange(1, STEP_PLACES + 1) / (STEP_PLACES + 1)))
+    if len(distinct) < 4 * STEP_PLACES:  # between values: where a step is among them cannot be told
         at = np.unique(np.clip(np.searchsorted(distinct, places), 1, len(distinct) - 1))
         places = (distinct[at] + distinct[at - 1]) / 2
     yield from (Factor(name, "step", (float(t),)) for t in places)

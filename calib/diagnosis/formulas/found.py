@@ -21,10 +21,10 @@ from calib.diagnosis.suggest import outward
 from calib.effects.own.formula import FormulaEffect
 
 WIDER = 3.0  # times the largest amplitude: the sigma that the prior of an amplitude has
-PASSES = 2  # of refining every term beside the others
+REFINING_PASSES = 2  # of refining every term beside the others
 PHASE = ("sin(", "cos(")
-RANGE, JOINT = "range", "joint:"  # sites; of the latter the joint's name follows
-UNITS = {"m": "mm", "rad": "mrad"}  # of amounts -> in which they are said
+RANGE_SITE, JOINT_SITE = "range", "joint:"  # sites; of the latter the joint's name follows
+AMOUNT_UNITS = {"m": "mm", "rad": "mrad"}  # of amounts -> in which they are said
 # The prior of an amount is no narrower: errors of ranges and of joints that a rig may have.
 LEAST_SIGMA = {"m": 0.01, "rad": 0.003}
 
@@ -96,7 +96,7 @@ class Formula:
     rms_m: float
     seen: dict[str, tuple[float, float]]
     picture: dict[str, Any]
-    site: str = RANGE
+    site: str = RANGE_SITE
     joints: frozenset[str] = frozenset()
 
     @property
@@ -122,19 +122,23 @@ class Formula:
     @property
     def says(self) -> str:
         """The formula as people write it, each number with the sigma of its last digits."""
-        what = "range = true" if self.site == RANGE else f"{self.site.removeprefix(JOINT)} = read"
-        return " ".join([what, *(_said(part, UNITS[self.unit]) for part in self.parts)])
+        what = (
+            "range = true"
+            if self.site == RANGE_SITE
+            else f"{self.site.removeprefix(JOINT_SITE)} = read"
+        )
+        return " ".join([what, *(_said(part, AMOUNT_UNITS[self.unit]) for part in self.parts)])
 
     @property
     def unit(self) -> str:
         """Of its amounts."""
-        return "m" if self.site == RANGE else "rad"
+        return "m" if self.site == RANGE_SITE else "rad"
 
     def name(self, taken: Collection[str] = ()) -> str:
         """Of its effect; another where that is taken."""
-        joint = self.site.removeprefix(JOINT)
+        joint = self.site.removeprefix(JOINT_SITE)
         bare = (c.removesuffix("_rad").removesuffix("_m") for c in self.covariates if c != joint)
-        of = [] if self.site == RANGE else [re.sub(r"\W", "_", joint, flags=re.ASCII)]
+        of = [] if self.site == RANGE_SITE else [re.sub(r"\W", "_", joint, flags=re.ASCII)]
         name = "_".join(["empirical", *of, *(re.sub(r"\W", "_", c, flags=re.ASCII) for c in bare)])
         every = (name if i == 1 else f"{name}_{i}" for i in count(1))
         return next(each for each in every if each not in taken)
@@ -165,12 +169,14 @@ class Formula:
         return columns_of(self.texts, covariates) @ self.amount
 
 
-def settled(table: BeamTable, steps: Sequence[ConfirmedTerm], site: str = RANGE) -> list[Formula]:
+def settled(
+    table: BeamTable, steps: Sequence[ConfirmedTerm], site: str = RANGE_SITE
+) -> list[Formula]:
     """All terms fitted together, their constants refined; those over the same covariates are one
     formula of the site."""
     terms = [step.form.term for step in steps]
     kept = [list(range(len(term.texts))) for term in terms]
-    for _ in range(PASSES):
+    for _ in range(REFINING_PASSES):
         terms = _refined(table, terms, kept)
     columns = [t.columns(table.covariates) for t in terms]
     kept = needed(table.projection(np.hstack(columns)), terms, columns)
@@ -230,7 +236,7 @@ def _grouped(
                 steps=[steps[i] for i in some],
                 rms_m=float(np.sqrt(model.weight @ np.square(left) / model.weight_m2)),
                 seen={n: _ends(table.covariates[n]) for n in names},
-                picture=picture_of(table, names, value, fit, UNITS[table.unit]),
+                picture=picture_of(table, names, value, fit, AMOUNT_UNITS[table.unit]),
                 joints=table.joints & set(names),
             )
         )

@@ -24,20 +24,20 @@ from calib.diagnosis.formulas.terms import FormulaTerm, refine
 from calib.diagnosis.score import ScoreTest
 from calib.solve.fit import Progress
 
-KEPT = 4  # factors of each covariate whose products are tried
+FACTORS_KEPT = 4  # factors of each covariate whose products are tried
 REFINED = 5  # products whose constants are refined
 # Sigmas by which stops must prefer a form for it to be told from a simpler one; of one that hangs
 # on more, as little likely among as many covariates as those might have been.
-APART = 2.0
+SIGMAS_APART = 2.0
 MOST_TERMS = 4
-TRIES = 3  # smooth functions that are judged before nothing is said to be there
+SMOOTHS_JUDGED = 3  # smooth functions that are judged before nothing is said to be there
 PLAUSIBLE = 0.1  # adjusted p-value of a smooth function, from which forms are tried
 RIVALS = 2  # sets of covariates, beside the best one, over which forms are tried
-INSTEAD = 0.8  # of the best set's statistic that another must explain for that
+EXPLAINS_AS_MUCH = 0.8  # of the best set's statistic that another must explain for that
 AS = {"ring": "elevation_rad"}  # what goes along with another covariate
 COVERS = 0.9  # of what a form explains, that a smooth function must for the form to be one of them
-SAME = 1e-6  # of what two forms explain: one is the other and what the model absorbs
-AT_ONCE = 400  # columns: bounds the memory
+SAME_FORM = 1e-6  # of what two forms explain: one is the other and what the model absorbs
+COLUMNS_AT_ONCE = 400  # columns: bounds the memory
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class Form:
             for each in (self, form)
         )
         more = self.term.cost > form.term.cost and set(form.term.texts) <= set(self.term.texts)
-        alike = abs(self.statistic - form.statistic) < SAME * form.statistic
+        alike = abs(self.statistic - form.statistic) < SAME_FORM * form.statistic
         same = alike and {c for c, _ in mine} == {c for c, _ in its}
         return not (mine == its or more or same)
 
@@ -148,13 +148,13 @@ def _step(
     fitted: Projection, bases: Bases, smooths: Sequence[Smooth], alpha: float
 ) -> ConfirmedTerm | None:
     """The best term over the sets of covariates that explain most, judged."""
-    likely = (s for s in smooths[:TRIES] if s.evidence > np.log(s.looks / alpha))
+    likely = (s for s in smooths[:SMOOTHS_JUDGED] if s.evidence > np.log(s.looks / alpha))
     best = next((s for s in likely if _stands_out(fitted, bases, s)), None)
     if best is None:
         return None
     inside = [s for s in smooths if set(s.covariates) < set(best.covariates)]
     others = [s for s in smooths if not set(s.covariates) >= set(best.covariates)]
-    rivals = [s for s in others if s.test.statistic > INSTEAD * best.test.statistic]
+    rivals = [s for s in others if s.test.statistic > EXPLAINS_AS_MUCH * best.test.statistic]
     sets = list({s.covariates: s for s in (best, *inside[:1], *rivals[:RIVALS])}.values())
     over = {f: s for s in sets for f in forms(fitted, bases, s.covariates)}
     if not over:
@@ -246,7 +246,7 @@ def simplest(found: Sequence[Form], covariates: int) -> tuple[Form, list[Form]]:
 def _told_apart(form: Form, best: Form, covariates: int) -> bool:
     worse = (form.left - best.left)[best.left > 0.0]
     further = len(set(best.term.covariates) - set(form.term.covariates))
-    limit = -float(special.ndtri(special.ndtr(-APART) / max(covariates, 1) ** further))
+    limit = -float(special.ndtri(special.ndtr(-SIGMAS_APART) / max(covariates, 1) ** further))
     if form is best or worse.sum() <= limit**2:
         return False
     scatter = np.sqrt(len(worse) * np.var(worse, ddof=1)) if len(worse) > 1 else np.inf
@@ -274,7 +274,7 @@ def _best_factors(
     kinds: dict[tuple[str, str], int] = {}  # of each kind the best: others become it when refined
     for i in order:
         kinds.setdefault((every[i].covariate, every[i].kind), i)
-    chosen = [every[i] for i in list(kinds.values())[:KEPT]]
+    chosen = [every[i] for i in list(kinds.values())[:FACTORS_KEPT]]
     plain = next((every[i] for i in order if every[i].kind in ("line", "class")), None)
     if plain is not None and plain not in chosen:
         chosen.append(plain)
@@ -287,7 +287,7 @@ def _explained(
     """As `Projection.explained`, some columns at a time."""
     parts: list[list[np.ndarray]] = [[]]
     for block in blocks:
-        if sum(b.shape[1] for b in parts[-1]) + block.shape[1] > AT_ONCE and parts[-1]:
+        if sum(b.shape[1] for b in parts[-1]) + block.shape[1] > COLUMNS_AT_ONCE and parts[-1]:
             parts.append([])
         parts[-1].append(block)
     found = [projection.explained(part) for part in parts]

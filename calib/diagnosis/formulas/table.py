@@ -24,6 +24,7 @@ from calib.linear.layout import Layout
 from calib.linear.rows import TWIST, StopRows
 from calib.problem import Problem
 from calib.residuals.robust import MAD
+from calib.solve.added import HUBER
 from calib.solve.clustered import each_stop
 from calib.solve.estimate import Estimate
 
@@ -31,9 +32,8 @@ from calib.solve.estimate import Estimate
 # `known_ring_by_temperature` the constants of 10,000, 40,000 and all beams agree to 0.3 of their
 # sigma.
 MOST_BEAMS = 20_000
-DRAWS = 499  # scores of chance: 25 of them beyond the quantile that counts looks
-PASSES = 3  # of weighing, after which weights of a gross structure change by less than 1 %
-HUBER = 1.345  # sigmas: 95 % efficiency on normal rows (Huber 1981)
+FORMULA_DRAWS = 499  # scores of chance: 25 of them beyond the quantile that counts looks
+WEIGHING_PASSES = 3  # of weighing, after which weights of a gross structure change by less than 1 %
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,9 @@ class BeamTable:
         """(R, C) what the clusters' shares of a score are multiplied by to make one of chance; see
         `Scores.draws`."""
         stop, place, _ = self.cells
-        return np.random.default_rng(0).standard_normal((DRAWS, stop.max() + place.max() + 2))
+        return np.random.default_rng(0).standard_normal(
+            (FORMULA_DRAWS, stop.max() + place.max() + 2)
+        )
 
     @cached_property
     def of_others(self) -> tuple[np.ndarray, np.ndarray]:
@@ -169,7 +171,7 @@ class BeamTable:
             The model alone, at the weights of that fit.
         """
         z = self.residual_m / self.sigma_m
-        for _ in range(PASSES):
+        for _ in range(WEIGHING_PASSES):
             scale = max(1.0, MAD * float(np.median(np.abs(z))))
             weight = np.minimum(1.0, HUBER * scale / np.maximum(np.abs(z), 1e-300))
             out = Projection.of(self, weight / self.sigma_m**2 / self.share)

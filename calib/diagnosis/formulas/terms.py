@@ -12,10 +12,10 @@ from calib.diagnosis.formulas.factors import Columns, Factor, product_of
 from calib.diagnosis.formulas.table import Projection
 
 CLOSER = (0.04, 0.04, 0.01, 0.0025)  # of a covariate's range, between places that are tried
-BESIDE = (0, -4, -3, -2, -1, 1, 2, 3, 4)  # which of them; where none is better, it stays
+PLACES_BESIDE = (0, -4, -3, -2, -1, 1, 2, 3, 4)  # which of them; where none is better, it stays
 NUDGE = 0.01  # of a covariate's range, for the derivative by a constant
-STEPS = 6  # of Gauss-Newton; two or three are enough from where the places are
-PARTS = (1.0, 0.5, 0.25)  # of a step that are tried
+GAUSS_NEWTON_STEPS = 6  # of Gauss-Newton; two or three are enough from where the places are
+STEP_PARTS = (1.0, 0.5, 0.25)  # of a step that are tried
 ENOUGH = 1e-4  # of what is explained: steps that gain less are the last
 
 
@@ -85,7 +85,7 @@ def refine(projection: Projection, term: FormulaTerm, kept: Sequence[int] = ()) 
     ends, wide = _ends(term, covariates), _wide(term, covariates)
     for size in CLOSER:
         for i in range(len(wide)):
-            places = np.clip(term.constants[i] + size * wide[i] * np.array(BESIDE), *ends[i])
+            places = np.clip(term.constants[i] + size * wide[i] * np.array(PLACES_BESIDE), *ends[i])
             tried = [term.at(_with(term.constants, i, place)) for place in places.tolist()]
             columns = _changed(term, tried, covariates)
             explained, _ = projection.explained([each[:, kept] for each in columns])
@@ -127,13 +127,13 @@ def _descended(
         return projection.explained([each[:, kept] for each in columns])[0]
 
     (best,) = explained([term])
-    for _ in range(STEPS):
+    for _ in range(GAUSS_NEWTON_STEPS):
         columns = term.columns(covariates)[:, kept]
         _, amount = projection.fitted(columns)
         along = slopes(covariates, term, kept, amount)
         _, both = projection.fitted(np.hstack([columns, along]))
         now, step = np.array(term.constants), both[len(kept) :]
-        tried = [term.at(np.clip(now + part * step, *ends.T).tolist()) for part in PARTS]
+        tried = [term.at(np.clip(now + part * step, *ends.T).tolist()) for part in STEP_PARTS]
         found = explained(tried)
         gain = found.max() - best
         if gain > 0.0:

@@ -30,10 +30,15 @@ from calib.diagnosis.rejects.found import CLUTTER, Place, Rejects
 from calib.diagnosis.stand import Stand
 from calib.solve.fit import Progress
 
-ALPHA = LEVELS["structure of what was rejected"]
+ALPHA_REJECTED = LEVELS["structure of what was rejected"]
 MOST_PLACES = 4  # places that are told apart
-FEWEST = 4  # stops, below which nothing is claimed
-KINDS = {"all": (-1, 1), "long": (1,), "short": (-1,)}  # signs of the residuals that are counted
+FEWEST_STOPS = 4  # stops, below which nothing is claimed
+# Signs of the residuals that are counted.
+SIGNS_COUNTED = {
+    "all": (-1, 1),
+    "long": (1,),
+    "short": (-1,),
+}
 
 
 def rejects(stand: Stand, progress: Progress = lambda what, done, total: None) -> Rejects | None:
@@ -52,7 +57,7 @@ def rejects(stand: Stand, progress: Progress = lambda what, done, total: None) -
     left = np.ones(len(counts.rejected), bool)
     places: list[Place] = []
     least = 1.0
-    while len(places) < MOST_PLACES and len(counts.stop_names) >= FEWEST:
+    while len(places) < MOST_PLACES and len(counts.stop_names) >= FEWEST_STOPS:
         found, p = _most(counts, left)
         least = min(least, p)
         if found is None:
@@ -129,17 +134,17 @@ def _most(counts: Counts, left: np.ndarray) -> tuple[tuple[np.ndarray, Place] | 
     """The place that explains most of the rejected that are left, with which of these it holds;
     and the smallest p-value, after all looks."""
     views = list(_views(counts))
-    looks = len(KINDS) * sum(view.axis.count for view in views)
+    looks = len(SIGNS_COUNTED) * sum(view.axis.count for view in views)
     sign = np.sign(counts.rejected.residual_m)
     best, most, least = None, 0.0, 1.0
     for view in views:
-        for signs in KINDS.values():
+        for signs in SIGNS_COUNTED.values():
             mine = left & np.isin(sign, signs) & (view.bin < view.axis.count)
             p = after_looks(_p_values(view, mine), looks)
             least = min(least, float(p.min()))
-            if p.min() >= ALPHA:
+            if p.min() >= ALPHA_REJECTED:
                 continue
-            cells, gain = _extent(view, mine, p < ALPHA)
+            cells, gain = _extent(view, mine, p < ALPHA_REJECTED)
             if gain > most:
                 most, best = gain, (view, cells, float(p.min()))
     if best is None:

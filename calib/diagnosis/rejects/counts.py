@@ -8,15 +8,15 @@ from functools import cached_property
 
 import numpy as np
 
+from calib.diagnosis.candidates import STOPS_A_BIN
 from calib.diagnosis.stand import Stand
 from calib.linear.parallel import in_order
 from calib.linear.rows import PLACES
 from calib.residuals.robust import TUKEY
 from calib.solve.fit import Progress
 
-CELLS, BINS = 240, 12  # of a covariate: where an interval may end, and what is tested
+CELLS, REJECT_BINS = 240, 12  # of a covariate: where an interval may end, and what is tested
 AGREES = 0.5  # share of rejected beams that agree on a size, from which they are coherent
-STOPS_A_BIN = 5  # of a covariate of stops: fewer clusters than this tell nothing
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class CellAxis:
     wraps: bool = False
 
     @classmethod
-    def of(cls, name: str, values: np.ndarray, bins: int = BINS) -> CellAxis:
+    def of(cls, name: str, values: np.ndarray, bins: int = REJECT_BINS) -> CellAxis:
         """Cells of about equal count, of equal width for azimuth, one for each of few values."""
         values = values[np.isfinite(values)].astype(float)
         distinct = np.unique(values)
@@ -305,10 +305,12 @@ def _axes(stand: Stand) -> list[CellAxis]:
         if name == "label":
             out.append(_labels(stand, values))
         elif len(told) == len(scans):  # of stops
-            bins = max(2, min(BINS, len(scans) // STOPS_A_BIN))
+            bins = max(2, min(REJECT_BINS, len(scans) // STOPS_A_BIN))
             out.append(CellAxis.of(name, np.concatenate(told), bins))
         else:
-            out.append(CellAxis.of(name, values, 2 * BINS if name == "azimuth_rad" else BINS))
+            out.append(
+                CellAxis.of(name, values, 2 * REJECT_BINS if name == "azimuth_rad" else REJECT_BINS)
+            )
     return [axis for axis in out if axis.count > 1]
 
 

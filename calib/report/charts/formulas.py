@@ -19,8 +19,8 @@ from chains.errors import InputError
 if TYPE_CHECKING:
     from calib.report.plots import Figure
 
-UPRIGHT = ("ring", "elevation_rad")  # what goes up where there are two
-WITHIN = 0.98  # of the bins: what the scale shows
+UPRIGHT_COLUMNS = ("ring", "elevation_rad")  # what goes up where there are two
+BINS_IN_SCALE = 0.98  # of the bins: what the scale shows
 READING = (
     "Means in bins, on one scale: what the model leaves without the formula, the formula, and what "
     "is left with it."
@@ -93,7 +93,7 @@ class FormulaPicture:
         """The end of the scale, the same for all three."""
         sizes = np.abs(np.concatenate([v.ravel() for v in (self.measured, self.formula)]))
         known = sizes[np.isfinite(sizes)]
-        return round_up(float(np.quantile(known, WITHIN))) if len(known) else 1.0
+        return round_up(float(np.quantile(known, BINS_IN_SCALE))) if len(known) else 1.0
 
     @property
     def label(self) -> str:
@@ -171,10 +171,10 @@ def _parts(picture: FormulaPicture) -> dict[str, np.ndarray]:
 
 def _maps(picture: FormulaPicture, narrow: bool) -> Figure:
     """Three maps on one scale."""
-    across, up = (1, 0) if picture.covariates[0] in UPRIGHT else (0, 1)
+    across, up = (1, 0) if picture.covariates[0] in UPRIGHT_COLUMNS else (0, 1)
     names = picture.covariates
     x, y = (shown_unit(names[i])[1] * picture.edges[i] for i in (across, up))
-    size = (plots.NARROW, 5.4, 3, 1) if narrow else (plots.WIDE, 3.0, 1, 3)
+    size = (plots.NARROW, 5.4, 3, 1) if narrow else (plots.WIDE_IN, 3.0, 1, 3)
     figure, grid = plots.axes(*size, sharex=True, sharey=True)
     for ax, (title, values) in zip(grid.flat, _parts(picture).items(), strict=True):
         rows = values.T if up == 1 else values
@@ -194,7 +194,7 @@ def _curve(picture: FormulaPicture) -> Figure:
     (name,), (edges,) = picture.covariates, picture.edges
     edges = shown_unit(name)[1] * edges
     x = (edges[1:] + edges[:-1]) / 2
-    figure, grid = plots.axes(plots.HALF, 3.6, 2, sharex=True, sharey=True)
+    figure, grid = plots.axes(plots.HALF_IN, 3.6, 2, sharex=True, sharey=True)
     top, bottom = grid[:, 0]
     top.plot(x, picture.measured, "o", ms=3.5, color=plots.BEFORE, label="measured")
     top.stairs(picture.formula, edges, baseline=None, lw=1.5, color=plots.INK, label="formula")

@@ -20,13 +20,13 @@ from calib.solve.without import RowsOfKind, kinds_of
 if TYPE_CHECKING:
     from calib.report.plots import Axes, Figure
 
-NAMES = {
+BLOCK_NAMES = {
     "beams": "{rows} beams\nof {blocks} scans",
     "tracker": "{rows} numbers\nof the tracker",
     "target": "{rows} numbers\nof {blocks} targets",
     "prior": "the earlier run,\n{rows} numbers",
 }
-SHORT = {"target": "targets", "prior": "earlier"}
+SHORT_NAMES = {"target": "targets", "prior": "earlier"}
 GROUPS = {
     Role.PLACE: "places of the rig",
     Role.JOINTS: "joint readings",
@@ -117,7 +117,7 @@ def _bits(before: np.ndarray, after: np.ndarray) -> float:
 def _draw(rows: Sequence[Row], kinds: Sequence[RowsOfKind]) -> Figure:
     rows = rows[:MOST_ROWS]
     height = 1.5 + 0.27 * len(rows)
-    figure, grid = plots.axes(plots.WIDE, height, 1, 2, sharey=True, width_ratios=(1.35, 1.0))
+    figure, grid = plots.axes(plots.WIDE_IN, height, 1, 2, sharey=True, width_ratios=(1.35, 1.0))
     _lines(grid[0, 0], rows, kinds)
     _cells(figure, grid[0, 1], rows, [kind.name for kind in kinds])
     grid[0, 0].set_yticks(
@@ -138,7 +138,7 @@ def _lines(ax: Axes, rows: Sequence[Row], kinds: Sequence[RowsOfKind]) -> None:
                 colour = colours[kind.name] if row.bits else plots.PALE
                 ax.plot([0, 1], [i, y], color=colour, linewidth=width, alpha=0.75, zorder=1)
         ax.plot(1, y, "s", color=colours[kind.name], markersize=11, zorder=3)
-        text = NAMES.get(kind.name, kind.name).format(rows=kind.rows, blocks=kind.blocks)
+        text = BLOCK_NAMES.get(kind.name, kind.name).format(rows=kind.rows, blocks=kind.blocks)
         ax.text(1.06, y, text, va="center", fontsize=8.5)
     ax.plot(np.zeros(len(rows)), range(len(rows)), "o", color=plots.INK, markersize=5, zorder=3)
     last = sum(bool(row.bits) for row in rows) - 0.5
@@ -165,7 +165,7 @@ def _cells(figure: Figure, ax: Axes, rows: Sequence[Row], kinds: Sequence[str]) 
         text = f"{values[i, k]:.1f}" if values[i, k] >= LEAST_BITS else "0"
         colour = "white" if dark else plots.INK
         ax.text(k, i, text, ha="center", va="center", fontsize=8, color=colour)
-    labels = [f"without\n{SHORT.get(kind, kind)}" for kind in kinds]
+    labels = [f"without\n{SHORT_NAMES.get(kind, kind)}" for kind in kinds]
     ax.set_xticks(range(len(kinds) + 1), [*labels, "by all,\nover CAD"], fontsize=8)
     ax.axvline(len(kinds) - 0.5, color=plots.PALE, linewidth=0.8)
     ax.grid(False)

@@ -30,7 +30,7 @@ from calib.runs.run import Run, solution_digest
 from calib.solve.descent import LAST
 from chains.errors import InputError
 
-PRIOR, APART, SHARED = "prior", "independent", "shared"  # how two runs go together
+PRIOR, INDEPENDENT, SHARED = "prior", "independent", "shared"  # how two runs go together
 # A fit ends where a step would lower half the chi-square by less than LAST: by so much of its
 # variance may an estimate be off, and so by twice as much the difference of two.
 UNSETTLED = 4 * LAST
@@ -99,7 +99,7 @@ def moved(a: Run, b: Run) -> Moved:
         )
     told = "Different recordings: their errors are independent, and CAD counts once"
     links = _documents(_apart(Pair.of(a, b), b))
-    return Moved((a, b), APART, links, bounds=(), remarks=(told, *differ))
+    return Moved((a, b), INDEPENDENT, links, bounds=(), remarks=(told, *differ))
 
 
 def _documents(links: Sequence[Link]) -> list[dict[str, Any]]:

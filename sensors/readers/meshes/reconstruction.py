@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 FINEST_VOXEL_M = 0.002
-MOST_POINTS = 1_500_000
+MOST_MESHED_POINTS = 1_500_000
 _DEPTHS = (5, 11)
 # Poisson's equation needs a few points in each of its cells.
 _SPACINGS_PER_CELL = 3.0
@@ -39,7 +39,7 @@ class Thinner:
     of eight of half the size, so sums of sums are exact.
     """
 
-    def __init__(self, voxel_m: float = FINEST_VOXEL_M, most: int = MOST_POINTS) -> None:
+    def __init__(self, voxel_m: float = FINEST_VOXEL_M, most: int = MOST_MESHED_POINTS) -> None:
         self.voxel_m = voxel_m
         self.most = most
         self.count = 0

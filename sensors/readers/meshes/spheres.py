@@ -13,7 +13,7 @@ from chains.errors import InputError
 from sensors.meshes import surface_normals
 from sensors.readers.base import Array, Contents, Options, Progress, Spheres
 from sensors.readers.meshes.placing import find_placing
-from sensors.readers.meshes.survey import SUFFIXES as CLOUDS
+from sensors.readers.meshes.survey import SURVEY_SUFFIXES as CLOUDS
 from sensors.readers.meshes.survey import read_blocks
 from sensors.readers.tables.sheets import LENGTHS, Sheet, is_number, open_sheet, split_unit
 

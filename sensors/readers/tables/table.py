@@ -18,7 +18,7 @@ import numpy as np
 from chains.errors import InputError
 from sensors.documents import nearest
 from sensors.readers import conventions
-from sensors.readers.base import POSE, Array, Columns, Contents, Options, Progress, Track
+from sensors.readers.base import Array, Columns, Contents, Options, Progress, Track
 from sensors.readers.tables.sheets import (
     ANGLES,
     LENGTHS,
@@ -28,6 +28,7 @@ from sensors.readers.tables.sheets import (
     seconds,
     split_unit,
 )  # fmt: skip
+from sensors.stops import POSE
 
 EULER = ("rx", "ry", "rz")
 TEXT = ("stop", "location")

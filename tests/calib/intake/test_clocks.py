@@ -11,7 +11,8 @@ from calib.intake.gather import chain
 from calib.intake.motion import motions
 from chains.errors import InputError
 from chains.readers.dh import DhRow, to_urdf
-from sensors.readers.base import POSE, ArmDescription, Sweeps, Track
+from sensors.readers.base import ArmDescription, Sweeps, Track
+from sensors.stops import POSE
 
 from .moving import DH, JOINTS, T_TIP_CUP, T_WORLD_BASE, logged, plan, tip
 
