@@ -18,6 +18,8 @@ from calib.effects.rig import MountSlip
 from calib.problem.model import Model, Source
 from calib.rig import Rig
 
+# Bins of a covariate, of each of two, and of azimuth, whose harmonics turn several times about. A
+# choice: what has half the period of three bins is seen, and looks are few; `formulas` sees finer.
 COVARIATE_BINS, PAIR_BINS = 12, 6
 AZIMUTH_BINS = 24
 # Of columns of the stops: with more parameters than a fifth of these, tests have no power.

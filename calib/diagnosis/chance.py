@@ -44,7 +44,7 @@ ALPHA_SCATTER = LEVELS["scatter by chance"]
 # Members, or checks of a body's rows, below which nothing is said of their spread.
 FEWEST_MEMBERS = 4
 SCATTER_LOOKS = sum(effect.by_chance for effect in CATALOGUE)  # effects that are looked at
-SCATTER_DRAWS = 2000
+SCATTER_DRAWS = 2000  # of chance: their mean, from which p-values follow, is known to some 5 %
 # Of wider rows: who scatters.
 NOUNS = {
     Site.TRACKER: "The tracker scatters",

@@ -11,7 +11,7 @@ import numpy as np
 from calib.diagnosis.candidates import Binned
 from calib.diagnosis.screen import Screen
 
-CURVE_CONFIDENCE = 0.95
+CURVE_CONFIDENCE = 0.95  # that the band holds the whole curve: by convention
 
 
 @dataclass(frozen=True)

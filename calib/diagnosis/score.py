@@ -23,7 +23,7 @@ from calib.linear.clusters import summed
 
 GAUGE = 1e-6  # share of a direction's information that is left, below which there is none
 UNFELT = 1e-9  # of an effect's largest column, below which no row feels a parameter
-SCORE_DRAWS = 1999
+SCORE_DRAWS = 1999  # of chance: 100 of them are beyond 5 %, where looks are counted, so to 10 %
 
 
 @dataclass(frozen=True)

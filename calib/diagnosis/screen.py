@@ -11,8 +11,12 @@ from calib.blunders.chance import after_looks
 from calib.diagnosis.score import Scores, ScoreTest, score_test
 from calib.effects import Effect, Site
 
-ODDS = np.log(20.0)  # of a rival: within these it can stand in for the best
-QUANTILE = 0.05  # of the smallest p-value, at which dependent tests are counted
+# Of a rival, within which it can stand in for the best: from 20 to 1 on, evidence is called strong
+# (Kass and Raftery 1995, JASA 90).
+ODDS = np.log(20.0)
+# Of the smallest p-value, at which dependent tests are counted: by convention, and near the level
+# at which claims are made.
+QUANTILE = 0.05
 
 
 @dataclass(frozen=True)

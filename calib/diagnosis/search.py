@@ -28,12 +28,20 @@ from calib.solve.fit import Progress
 ALPHA_EFFECT = LEVELS["effect"]
 ALPHA_UNNAMED = LEVELS["structure"]
 ALPHA_NOISE = LEVELS["effect on the scatter"]
-MOST_NEEDED = 3  # an explanation that needs more names than this is none
-ALSO_NAMED = 0.5  # of the leading structure's evidence, for another covariate to be named too
-SUSPECTS_JUDGED = 3  # how many suspects are judged before a look is called quiet
+MOST_NEEDED = 3  # an explanation that needs more names than this is none: a choice
+# Of the leading structure's evidence, for another covariate to be named too: a choice, as what has
+# half of it may be the cause where covariates go together.
+ALSO_NAMED = 0.5
+# How many suspects are judged before a look is called quiet: a choice. They come in the order of
+# their evidence, and each costs a jackknife.
+SUSPECTS_JUDGED = 3
 ADAPTED, MENDED = 8, 2  # rounds of leaving out; of 76 fits without optimum one was mended, in two
-AS_FAR = 0.1  # of the leading blunder's evidence: others at other places are left out with it
-HELD_BACK = 0.1  # of what a test says of an effect: what is fitted with less does not bear it out
+# Of the leading blunder's evidence, from which others at other places are left out with it: a
+# choice; what is left over is found by the next look.
+AS_FAR = 0.1
+# Of what a test says of an effect, below which a fit does not bear it out: a choice, far below the
+# whole that it takes up where the test is right.
+HELD_BACK = 0.1
 
 
 @dataclass(frozen=True)

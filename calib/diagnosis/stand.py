@@ -38,8 +38,12 @@ from calib.solve.fit import Progress, solve
 from chains.errors import InputError
 
 FINER = 9  # shapes tried between the two beside the best one
-BETTER_SHAPE = 9.0  # squared sigmas by which another shape must fit better
-LARGEST_SHAPE_STEP = 0.4  # change of a shape's logarithm at once
+# Squared sigmas by which another shape must fit better: three sigmas of one parameter, 0.3 % by
+# chance.
+BETTER_SHAPE = 9.0
+# Change of a shape's logarithm at once: a choice, half as much again; the derivative holds no
+# further.
+LARGEST_SHAPE_STEP = 0.4
 SCANS_SAMPLED = 8  # scans from which the bins of covariates are taken
 # Beams of each of them at most: a quantile of so many beams in all is off by 0.15 % of them.
 BEAMS_DRAWN = 16_384

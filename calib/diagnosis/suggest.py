@@ -15,9 +15,11 @@ from calib.effects import Effect, Site
 from calib.effects.own.formula import FormulaEffect
 from chains.errors import InputError
 
-SUGGESTED_KNOTS = 7  # of the piecewise linear function that is suggested for one covariate
-PAIR_KNOTS = 3
-AZIMUTH_WAVES = 2  # of the harmonics of azimuth
+# Of the piecewise linear function that is suggested for one covariate, and of each of two; and of
+# the harmonics of azimuth. A choice: with half as many knots as bins each has two bins to be fitted
+# by, and a pair has 9 parameters.
+SUGGESTED_KNOTS, PAIR_KNOTS = 7, 3
+AZIMUTH_WAVES = 2
 
 DESCRIBES = "Empirical, without a known cause; observed at"
 # Endings of columns -> the unit that people read, and how many of it the column's unit is.

@@ -21,7 +21,7 @@ RIVAL = 0.8  # of the best evidence, at another offset: then nobody knows which 
 LOBE_S = 1.0  # within it of the best, a peak is the same one
 LEAST_OVERLAP = 0.3  # of the shorter log
 LOG_PARTS = 8  # of the logs, whose own offsets tell the uncertainty
-LEAST_S = 2.0
+LEAST_S = 2.0  # of a log, a choice: a motion and a hold take as long; of less any lag fits
 DRIFT_S = 0.02  # from the first part to the last
 
 

@@ -20,6 +20,8 @@ from sensors.lidar import catalog
 from sensors.readers.base import Columns
 from sensors.stops import POSE
 
+# Sigmas of a mounting that is worked out from the recording: a choice, so wide that they decide
+# nothing.
 GUESS_M, GUESS_RAD = 0.1, 0.3
 _PLAIN = re.compile(r"[A-Za-z_][\w./-]*( [\w./-]+)*|\d+")
 _TRACKER = "sigma_m: 0.0002, sigma_rad: 0.0003"

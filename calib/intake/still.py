@@ -13,12 +13,12 @@ from chains.frames import Edge
 from chains.se3 import Array
 from sensors.readers.base import Track
 
-STILL_WINDOW_S = 0.25
+STILL_WINDOW_S = 0.25  # over which rates are taken, a choice: shorter than what settles takes
 REST_SHARE = 0.1  # of the time at least, things are taken to be at rest
 FACTOR = 4.0  # above the rate at rest, and it is no noise
 SLOWEST, FASTEST = 0.003, 0.05  # rad/s or m/s between which the threshold lies
 SETTLE_S = 0.3  # cut from both ends of a hold
-MIN_HOLD_S = 1.0
+MIN_HOLD_S = 1.0  # a choice: ten sweeps of a LiDAR at 10 Hz; `--min-hold` says otherwise
 
 
 @dataclass(frozen=True)

@@ -32,8 +32,8 @@ SPANS = {
     "elevation_rad": (-0.4, 0.4, 180.0 / np.pi, "elevation, deg"),
     "joints": (-np.pi, np.pi, 180.0 / np.pi, "angle of {}, deg"),
 }
-CURVE_POINTS = 400
-MOST_CURVES = 4
+CURVE_POINTS = 400  # a choice: finer than a column of the page is drawn
+MOST_CURVES = 4  # a choice: more hide each other
 LEAST_ERROR = 0.02  # of the largest error: one that is smaller is not drawn
 LIFTING_JOINT = 1  # the second, which lifts the arm: what gravity does shows at it
 ERRORS_OF_SITES = {

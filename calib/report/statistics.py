@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 from scipy import special
 
-CONFIDENCE = 0.95
-MOST_BINS, AZIMUTHS = 30, 180  # at most
-Z_EDGES = np.linspace(-5.0, 5.0, 101)
+CONFIDENCE = 0.95  # of a band: by convention
+MOST_BINS, AZIMUTHS = 30, 180  # at most, of a covariate and of azimuth (2 deg): a choice
+Z_EDGES = np.linspace(-5.0, 5.0, 101)  # sigmas: beyond 5 of them a histogram shows nothing
 PLACE_COLUMNS = ("surface", "plane", "label")
 
 

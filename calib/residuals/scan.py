@@ -37,10 +37,14 @@ from sensors.lidar import Beams, LidarModel
 from sensors.recording import RecordedStops, Scan
 
 SIZE = {Site.BEAM: 3, Site.REFERENCE: 3, Site.NOISE: 1}
-PRIOR_COUNT = 20.0  # a measured spread of fewer sweeps than this leans on the datasheet
+# A measured spread of fewer sweeps than this leans on the datasheet: a choice; of so many, a sigma
+# is known to a sixth.
+PRIOR_COUNT = 20.0
 MET = ("label", "incidence_rad")
 MET_PARTS = ("surface", "region", "patch", "plane")  # of what is met: no column of a user's
-LOCAL_SHARE = 0.05  # of the variance of a patch of the reference, between its neighbouring points
+# Of the variance of a patch of the reference, between its neighbouring points: a choice, as errors
+# of scans and planes are smooth.
+LOCAL_SHARE = 0.05
 
 
 @dataclass(frozen=True)

@@ -20,10 +20,10 @@ from sensors.planes import Cells, Planes
 from sensors.reference import Reference
 from sensors.surfaces import SurfaceGrid, transverse
 
-FLATTEST_FITTED_RAD = np.deg2rad(
-    80.0
-)  # a fit keeps no beam that meets its surface flatter than this
-PARALLEL_RAD = np.deg2rad(89.0)
+# A fit keeps no beam that meets its surface flatter than this: a choice; a millimetre of the
+# surface is 6 mm of range there.
+FLATTEST_FITTED_RAD = np.deg2rad(80.0)
+PARALLEL_RAD = np.deg2rad(89.0)  # a choice: where it is 57 mm of range, nothing is measured
 # Widths of the cells that surfaces are divided into, in a room whose box has 200 m2 of walls; in
 # larger ones the cells grow alike, so that there are never many more of them. Patches of planes are
 # as wide as the cells that planes are found in: within patches of 0.5 m the walls of the simulated

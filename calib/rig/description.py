@@ -19,7 +19,7 @@ from sensors.lidar import LidarFile, LidarModel, Size, load_lidar
 Sigma = Annotated[Number, pydantic.Field(gt=0)]
 
 RECORDING_FORMAT = Format(kind="recording", newest=1)
-LARGEST_FRAME_M = 10.0
+LARGEST_FRAME_M = 10.0  # a choice: no rig is larger, and in millimetres no frame is so small
 
 
 @dataclass(frozen=True)

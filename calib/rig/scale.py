@@ -15,8 +15,9 @@ from chains.errors import InputError
 from sensors.reference import Reference
 from sensors.stops import Targets
 
+# A choice: the end of a rod of 0.2 m is then 10 mm off, where markers are known to tenths of one.
 ASKEW_RAD = np.radians(3.0)
-APART_M = 0.01
+APART_M = 0.01  # a choice: tracker and scanner place spheres to better than a tenth of that
 SIGNIFICANT = 5.0  # sigmas of a ratio of lengths
 # In a metre.
 LENGTH_UNITS = {

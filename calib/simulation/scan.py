@@ -15,10 +15,12 @@ from chains import se3
 from sensors.lidar import LidarModel
 from sensors.reference import Hits
 
-NO_RETURN_RAD = np.radians(86.0)
+NO_RETURN_RAD = np.radians(86.0)  # a choice: flatter beams glance off
 RETURNED = 0.99  # share of the sweeps in which a direction returns anything
 STRAY_SD_M = 0.1  # sd of a range that is wrong for no visible reason
 EDGE_STEP_M = 0.05  # two surfaces this far apart along a beam mix
+# Beams that are looked at for an edge, for each that is to be mixed: each costs a ray. In the
+# preset `default` 1.9 % find one, so that a fifth of the mixed pixels lie at edges.
 PROBES_PER_MIXED = 12
 
 

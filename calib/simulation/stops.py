@@ -23,7 +23,7 @@ LIDAR_CLEAR_M, ABOVE_FLOOR_M, BASE_FROM_FURNITURE_M = 0.6, 0.5, 0.45
 SETTLE = np.repeat([0.0002, 0.0003], 3)  # rad, m: how the base shifts when the arm moves
 GUESS = np.repeat([np.radians(1.0), 0.02], 3)  # rad, m: error of a guessed base pose
 RATE = 0.25  # rad/s: sd of a joint's speed while the arm moves
-POSES_TRIED = 200
+POSES_TRIED = 200  # before a room is said to be too full; the presets take the first
 UP = np.array([0.0, 0.0, 1.0])
 
 

@@ -17,7 +17,7 @@ from calib.problem.problem import Problem
 from calib.residuals.beams import Association, Columns, Rows
 
 HUBER = 1.345  # sigmas: 95 % efficiency on normal rows (Holland and Welsch 1977)
-MOST_PASSES = 5
+MOST_PASSES = 5  # a choice: the cost is convex, and it is but where the fit begins
 SETTLED_SIGMAS = 0.1  # sigmas of an unknown: Tukey's steps do the rest
 
 

@@ -18,7 +18,7 @@ from calib.solve.graph import Graph, KeptRows
 from calib.solve.torn import astray
 
 Progress = Callable[[str, int, int], None]
-MAX_PASSES = 40
+MAX_PASSES = 40  # a choice: four times what good recordings take (see `SLOWED`)
 # Passes over trackers and targets alone to their optimum, on good recordings (12 stops of a world
 # with an arm, CAD off by its sigmas).
 USUAL_PASSES = 4

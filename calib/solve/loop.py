@@ -30,10 +30,12 @@ from calib.solve.reweight import SETTLED_WEIGHT, reweighted
 from calib.solve.torn import CONTRADICTS, borne_out, doubted, torn
 from chains import se3
 
-SETTLED_STEP = 1e-4  # m and rad: after that, which triangle a beam meets is kept
+SETTLED_STEP = 1e-4  # m and rad: then triangles that beams meet are kept; a choice, 1 mm at 10 m
 CONVERGED = 1e-6  # m and rad: a tenth of the smallest sigmas, and the next step is smaller still
-STRAYED = 3e-3  # m and rad: a scan that has moved further looks anew what its beams meet
-DESCENTS = 3  # how often, before a fit is given up
+# m and rad: a scan that has moved further looks anew what its beams meet. A choice: a tenth of the
+# narrowest patch, at 10 m.
+STRAYED = 3e-3
+DESCENTS = 3  # how often a descent is tried before a fit is given up: a choice
 # By how much new weights may still lower half the chi-square, and of it: a hundredth of what an
 # optimum allows, as each round may go but a tenth of the way; where nothing fits, it never ends.
 STILL_FALL, AS_GOOD = AT_OPTIMUM / 100, 1e-8
@@ -56,8 +58,6 @@ HOPELESS = 30.0
 # worth doing again, as 50 members tell it no better.
 SETTLED_SPREAD, NEAR_SPREAD = 0.01, 0.1
 SPREAD = 8  # times: where rows do not scatter, each halves what they were thought to
-
-
 TIMES_ASKED = 2  # times: the first pass brings the LiDAR to where it is, near enough
 SCANS_OF_PLACE = 3  # scans of a place, for most of them to tell where the rig stood
 

@@ -17,6 +17,7 @@ from chains import se3
 from chains.align import mean_pose
 from sensors.lidar import Beams
 
+# What mistakes about axes and mounts turn by: brackets and flanges have holes at right angles.
 TURNS = (np.pi, np.pi / 2, -np.pi / 2)
 STARTS_KEPT = 3  # starts that are given, of all that are looked at
 TURNED_TOGETHER = 2  # zeros and frames that may be turned at once
@@ -29,7 +30,9 @@ STEP_RAD, FINER_RAD, BEST = 0.3, (0.15, 0.07), 8
 # what they pass by may be anywhere behind.
 SCANS_ASKED, BEAMS_A_SCAN, FARTHEST_OFF_M = 8, 150, 1.0
 NEAR_M = 0.1  # mean error of these beams that asks for no other orientation: good ones have 0.02
-NEARER = 0.5  # share of the mean error by which another orientation must be better
+# Of the mean error, what another orientation may have at most: a choice, between good ones' 0.02 m
+# and the 0.1 m from which one is asked for.
+NEARER = 0.5
 
 Values = dict[str, np.ndarray]
 

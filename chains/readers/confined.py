@@ -22,7 +22,7 @@ from chains.xml import parse_xml
 
 MOST_ELEMENTS = 20_000  # that are looked at: 3 s; writing out a Husky with its arm takes 700
 LARGEST_FILE = 10_000_000  # bytes of one file
-LARGEST_ROBOT_YAML = 1_000_000
+LARGEST_ROBOT_YAML = 1_000_000  # bytes, as a robot's own YAML is a few pages and slow to read
 _ALIAS = re.compile(r"(?m)(^|[\s\[{,:-])[&*][^\s\]},]")
 _WANTED = "a xacro file"
 

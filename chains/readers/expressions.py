@@ -16,7 +16,7 @@ from typing import Any
 
 LONGEST_VALUE = 100_000  # characters or items of a value: more than a whole robot's file has
 _BITS = 4096  # of a whole number
-_DEEPEST = 100
+_DEEPEST = 100  # a choice: people nest a few; Python's own limit of 1000 calls is far
 _METHODS = {
     str: {"split", "lower", "upper", "strip", "replace", "startswith", "endswith", "join"},
     dict: {"get", "keys", "values", "items"},

@@ -29,13 +29,18 @@ REFINED = 5  # products whose constants are refined
 # Sigmas by which stops must prefer a form for it to be told from a simpler one; of one that hangs
 # on more, as little likely among as many covariates as those might have been.
 SIGMAS_APART = 2.0
-MOST_TERMS = 4
-SMOOTHS_JUDGED = 3  # smooth functions that are judged before nothing is said to be there
-PLAUSIBLE = 0.1  # adjusted p-value of a smooth function, from which forms are tried
-RIVALS = 2  # sets of covariates, beside the best one, over which forms are tried
-EXPLAINS_AS_MUCH = 0.8  # of the best set's statistic that another must explain for that
+MOST_TERMS = 4  # a choice: bounds the time, as each has a whole search; more are read by nobody
+# Smooth functions that are judged before nothing is said to be there, and the sets of covariates,
+# beside the best one, over which forms are tried. Choices: each costs a jackknife, or a search.
+SMOOTHS_JUDGED, RIVALS = 3, 2
+# Adjusted p-value of a smooth function, from which forms are tried: a choice, ten times the level
+# of a structure, as a form of fewer parameters stands out further than a smooth function.
+PLAUSIBLE = 0.1
+EXPLAINS_AS_MUCH = 0.8  # of the best set's statistic, that another must for that: a choice
 AS = {"ring": "elevation_rad"}  # what goes along with another covariate
-COVERS = 0.9  # of what a form explains, that a smooth function must for the form to be one of them
+# Of what a form explains, that a smooth function must for the form to be one of them: a choice, as
+# knots are few.
+COVERS = 0.9
 SAME_FORM = 1e-6  # of what two forms explain: one is the other and what the model absorbs
 COLUMNS_AT_ONCE = 400  # columns: bounds the memory
 

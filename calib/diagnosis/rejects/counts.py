@@ -16,7 +16,9 @@ from calib.residuals.robust import TUKEY
 from calib.solve.fit import Progress
 
 CELLS, REJECT_BINS = 240, 12  # of a covariate: where an interval may end, and what is tested
-AGREES = 0.5  # share of rejected beams that agree on a size, from which they are coherent
+# Share of rejected beams that agree on a size, beyond those that agree with its negative, from
+# which they are coherent: a choice, most of them.
+AGREES = 0.5
 
 
 @dataclass(frozen=True)

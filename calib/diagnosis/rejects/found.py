@@ -12,7 +12,9 @@ from calib.blunders import told
 from calib.diagnosis.suggest import words
 
 MOST_NAMED = 6  # stops or surfaces that a sentence names
-STRUCTURED_SHARE = 0.5  # share of beams that makes a place structured, whatever their residuals do
+# Share of beams that makes a place structured, whatever their residuals do: a choice, ten times
+# what mixed pixels reach.
+STRUCTURED_SHARE = 0.5
 # Share that mixed pixels may explain, in all or at one place. They are 0.3 to 0.4 % in recordings
 # of two simulators, 1 % at grazing incidence, and 4 % where the simulator does as a paper's rooms.
 CLUTTER = 0.05

@@ -51,6 +51,8 @@ OPERATORS: dict[type, Callable] = {
     ast.Eq: np.equal,
     ast.NotEq: np.not_equal,
 }
+# Characters, and brackets within each other. A choice: more than anybody reads, far less than what
+# Python's own parser bears.
 LONGEST_FORMULA, DEEPEST_FORMULA = 2000, 50
 
 

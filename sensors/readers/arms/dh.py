@@ -24,7 +24,7 @@ _CONVENTIONS = ("standard", "modified")
 _LENGTHS, _ANGLES = ("a", "d"), ("alpha", "theta")
 _SAME = {"joint": "name", "offset": "theta", "theta_offset": "theta", "convention": "convention"}
 _KEYS = ("name", *_LENGTHS, *_ANGLES, "type", "lower", "upper", "mass_kg", "centre_m", "convention")
-_LONGEST_M = 10.0
+_LONGEST_M = 10.0  # a choice: no link is longer, and one of 10 mm or more in millimetres is found
 
 
 def read_dh(files: Sequence[Path], options: Options, progress: Progress) -> Contents:

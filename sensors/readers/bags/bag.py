@@ -38,6 +38,8 @@ _HESAI = (
     "hesai_ros_driver/msg/UdpFrame",
 )
 _TEXT = "std_msgs/msg/String"
+# A choice: messages arrive within a second of their stamps, and clocks that nobody has set are
+# minutes to decades off.
 _SAME_CLOCK_S = 1.0
 
 

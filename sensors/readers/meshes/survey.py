@@ -15,7 +15,7 @@ from sensors.readers.meshes.pts import PointBlock, read_pts, read_ptx
 from sensors.readers.meshes.reconstruction import Rebuilt, Thinner, rebuild
 
 SURVEY_SUFFIXES = (".e57", ".pts", ".ptx", ".xyz", ".ply", ".pcd")
-_COARSE_M = 0.03
+_COARSE_M = 0.03  # a choice: edges are rounded as far, a footprint of a LiDAR a few metres away
 
 
 def read_survey(paths: Sequence[Path], options: Options, progress: Progress) -> Contents:

@@ -20,7 +20,7 @@ import numpy as np
 from chains.errors import InputError
 from sensors.readers.base import Array
 
-SAMPLE_LINES = 200
+SAMPLE_LINES = 200  # of a file, from which its form is told: headers have some ten
 LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 ANGLES = {"rad": 1.0, "deg": np.pi / 180}
 TIME_UNITS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}

@@ -32,6 +32,7 @@ from sensors.stops import POSE
 
 EULER = ("rx", "ry", "rz")
 TEXT = ("stop", "location")
+# From row to row, a choice: logs have 5 Hz and more, arms take seconds; between them is asked.
 LOG_BELOW_S, STOPS_ABOVE_S = 0.2, 1.5
 _TIMES = ("time_s", "time", "timestamp", "stamp", "t", "sec", "secs", "seconds")
 _POSITIONS = {"position", "pos", "q", "actual", "joint_states", "joint", ""}
