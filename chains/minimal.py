@@ -21,7 +21,7 @@ from chains.se3 import Array
 # tests/chains/arms.py shares are 0.014 and more or below 1e-9; in a URDF of calibrated values,
 # 1 mm and 1 mrad from such drawings, those below 1e-9 become up to 0.01.
 NEW = 0.01
-POSES = 40  # drawn: 240 rows for some seventy columns
+RANDOM_POSES = 40  # drawn: 240 rows for some seventy columns
 
 
 @dataclass(frozen=True)
@@ -94,16 +94,16 @@ def _columns(
     length_m = sum(float(np.linalg.norm(edge.T_parent_child[:3, 3])) for edge in edges) or 1.0
     turns = {e.joint.name: e.joint.kind == "revolute" for e in edges if e.joint is not None}
     reach = np.array([np.pi if turns.get(name, True) else length_m for name in tree.joint_names])
-    drawn = np.random.default_rng(0).uniform(-reach, reach, (POSES, len(reach)))
+    drawn = np.random.default_rng(0).uniform(-reach, reach, (RANDOM_POSES, len(reach)))
     placed = tree.place(edges[-1].child, drawn)
     unit = np.repeat([1.0, 1.0 / length_m], 3)
 
     def rows(motion: Array) -> Array:
-        return (unit[:, None] * motion).reshape(6 * POSES, -1)
+        return (unit[:, None] * motion).reshape(6 * RANDOM_POSES, -1)
 
     by_twist = [rows(placed.d_twist[:, :, tree.edge_names.index(name)]) for name in arm]
     own = [tree.joint_names.index(name) for name in turns]
-    by_tool = rows(np.broadcast_to(np.eye(6), (POSES, 6, 6)))
+    by_tool = rows(np.broadcast_to(np.eye(6), (RANDOM_POSES, 6, 6)))
     return by_twist, rows(placed.d_joint[:, :, own]), by_tool
 
 

@@ -10,14 +10,14 @@ from chains.errors import InputError
 
 FREELY = 1 << 28
 """Bytes that any file may unpack to: 256 MB, more than a scan or a run's state has."""
-TIMES = 100
+TIMES_STORED = 100
 """How much larger than itself a larger file may be unpacked; of the files in shared/data the most
 are 16 times (the labels of a mesh, which are alike in long rows)."""
 
 
 def most(stored: int) -> int:
     """The most bytes that `stored` bytes of a file may unpack to."""
-    return max(FREELY, TIMES * stored)
+    return max(FREELY, TIMES_STORED * stored)
 
 
 def check_claim(path: Path, claimed: int, what: str) -> None:

@@ -14,7 +14,7 @@ from xml.parsers import expat
 from chains.errors import InputError
 
 LONGEST_ENTITY = 1000  # characters; what a person writes instead of writing it twice
-DEEPEST = 100  # elements within each other; a URDF has about 6, an E57 file about 15
+DEEPEST_XML = 100  # elements within each other; a URDF has about 6, an E57 file about 15
 
 
 def parse_xml(text: str | bytes, where: object, wanted: str) -> Element:
@@ -53,8 +53,8 @@ def _look_through(text: str | bytes, where: object) -> None:
 
     def start(tag: str, _: dict[str, str]) -> None:
         depths.append(depths[-1] + 1)
-        if depths[-1] > DEEPEST:
-            raise InputError(f"{where} has elements nested more than {DEEPEST} deep")
+        if depths[-1] > DEEPEST_XML:
+            raise InputError(f"{where} has elements nested more than {DEEPEST_XML} deep")
 
     parser.EntityDeclHandler = entity
     parser.StartElementHandler = start

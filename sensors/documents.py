@@ -28,7 +28,7 @@ from chains.errors import InputError, nearest
 
 LARGEST_TEXT = 500_000_000  # bytes: a log of a million rows has 200 MB
 LARGEST_YAML = 10_000_000  # bytes: read at about 150 kB a second; no calibration has 1 MB
-DEEPEST = 50  # lists and mappings within each other; a run's files have 6
+DEEPEST_YAML = 50  # lists and mappings within each other; a run's files have 6
 LONGEST_WHOLE = 300  # digits; a float holds 308
 FEW_NODES = 10_000  # values that aliases may always stand for
 
@@ -73,10 +73,10 @@ class _StrictLoader(yaml.SafeLoader):
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node:
         self._depth += 1
-        if self._depth > DEEPEST:
+        if self._depth > DEEPEST_YAML:
             mark = self.peek_event().start_mark
             raise yaml.MarkedYAMLError(
-                problem=f"nested more than {DEEPEST} deep", problem_mark=mark
+                problem=f"nested more than {DEEPEST_YAML} deep", problem_mark=mark
             )
         node = super().compose_node(parent, index)
         self._depth -= 1

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 Columns = dict[str, NDArray]
 Read = Callable[[Sequence[str]], Iterator[Columns]]
 
-SIGMAS = 4 * 1.4826
+OUTLYING_MADS = 4 * 1.4826
 """Four standard deviations, from the median absolute deviation of a normal distribution."""
 FLOOR_M = 0.012
 """Three range steps of the coarsest sensor: below this nothing is an outlier."""
@@ -86,7 +86,7 @@ def _bounds(read: Read, keys: NDArray, sweeps: NDArray) -> tuple[NDArray, NDArra
         ranges[i[seen], j[seen]] = range_m[seen]
     median_m = _median(ranges)
     np.abs(ranges - median_m[:, None], out=ranges)
-    return median_m.astype(np.float64), np.maximum(SIGMAS * _median(ranges), FLOOR_M)
+    return median_m.astype(np.float64), np.maximum(OUTLYING_MADS * _median(ranges), FLOOR_M)
 
 
 def _median(values: NDArray[np.float32]) -> NDArray[np.float32]:

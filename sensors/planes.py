@@ -25,7 +25,7 @@ MIN_CELL_POINTS = 12
 SAME_NORMAL_RAD = np.radians(6.0)
 # What a sensor sees flatter than this is no plane: the points of a few rings, which fan out about
 # it, lie in one through the sensor itself.
-FLATTEST_RAD = np.radians(80.0)
+FLATTEST_PLANE_RAD = np.radians(80.0)
 # How many of the nearest cells are looked at: enough for a corner, where several planes meet.
 NEAREST_CELLS = 8
 
@@ -170,7 +170,7 @@ class PlaneFinder:
             (cells.count >= MIN_CELL_POINTS)
             & (thick_m < 1.5 * self.noise_m)
             & (narrow_m > np.maximum(3 * thick_m, self.cell_m / 10))
-            & (facing > np.cos(FLATTEST_RAD) * np.linalg.norm(away_m, axis=1))
+            & (facing > np.cos(FLATTEST_PLANE_RAD) * np.linalg.norm(away_m, axis=1))
         )
         same = self._same_place(cells)
         known = len(self._cells.count)

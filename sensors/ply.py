@@ -27,8 +27,8 @@ _TYPES = {
 }  # fmt: skip
 _NAMES = {kind: name for name, kind in reversed(_TYPES.items())}
 _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
-_LONGEST_HEADER = 1 << 16
-_BLOCK_ROWS = 1 << 20
+_LONGEST_HEADER = 1 << 16  # bytes: a choice; headers have a line of some 20 for each property
+_BLOCK_ROWS = 1 << 20  # rows read at once: bounds the memory to some 50 MB
 
 
 @dataclass

@@ -20,7 +20,7 @@ from sensors.surfaces import SurfaceGrid, connected_surfaces, transverse, triang
 # A probe that lands further than this from the plane of the hit has crossed a depth edge.
 DEPTH_STEP_M = 0.02
 # A mesh wider than this is in millimetres.
-WIDEST_M = 1000.0
+WIDEST_MESH_M = 1000.0
 
 
 @dataclass(frozen=True)
@@ -306,7 +306,7 @@ def _check_mesh(vertices_m: np.ndarray, triangles: np.ndarray) -> None:
         row = int(np.flatnonzero(~np.isfinite(vertices_m).all(axis=1))[0])
         raise InputError(f"vertex {row} of the mesh is not finite.")
     size_m = np.ptp(vertices_m, axis=0).max()
-    if size_m > WIDEST_M:
+    if size_m > WIDEST_MESH_M:
         raise InputError(
             f"the mesh is {size_m:.0f} m wide, which looks like millimetres; give metres."
         )

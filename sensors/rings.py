@@ -10,7 +10,9 @@ from numpy.typing import ArrayLike
 from sensors.lidar import Array, LidarModel, catalog, load_lidar
 
 _LEAST_RINGS = 8
+"""A choice: of fewer, a unit's own angles explain a misfit as well as another numbering."""
 _FARTHEST_SHIFT = 4
+"""A choice: files count from 0 or 1, and leave out a few rings at an end."""
 _CLEARLY_OFF = 0.5
 """Of the usual step between rings: by less than that, no ring is taken for its neighbour."""
 _EXPLAINED = 0.6
@@ -25,6 +27,7 @@ _NEIGHBOURS = 9
 model's: 14 units of Hesai and Ouster among these lie 0.94 steps at most from that median, and none
 has rings out of order."""
 _LISTED = 3
+"""Exchanged rings that a sentence names: a choice."""
 _FOREIGN_RAD, _FOREIGN_STEPS = np.radians(2.0), 4.0
 """Beyond both, elevations are of no model known; units are off by 1.2 deg or 2.4 steps at most."""
 

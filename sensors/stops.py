@@ -18,8 +18,8 @@ from sensors.numbers import read_csv
 Array = NDArray[np.float64]
 
 POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
-_FARTHEST_M = 1000.0
-_LARGEST_JOINT = 4 * math.pi
+_FARTHEST_M = 1000.0  # a choice: no tracker sees so far; in millimetres, what is a metre away is
+_LARGEST_JOINT = 4 * math.pi  # rad or m, a choice: wrists turn twice about at most
 
 
 @dataclass(frozen=True)

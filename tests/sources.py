@@ -1,7 +1,7 @@
 """What sources say of themselves: what they import, what they show, how they call."""
 
 import ast
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from graphlib import CycleError, TopologicalSorter
 from importlib.util import resolve_name
 from pathlib import Path
@@ -63,32 +63,53 @@ def upward(sources: dict[str, ast.AST], order: Mapping[str, Sequence[str]]) -> I
                     yield f"{room} imports {above}"
 
 
-def dataclasses(sources: dict[str, ast.AST]) -> set[str]:
-    """Dotted names of the dataclasses of the sources."""
+def filled_classes(sources: dict[str, ast.AST]) -> dict[str, int]:
+    """Dotted names of the dataclasses and named tuples of the sources, and how many fields each
+    states."""
     return {
-        f"{module_name(path)}.{node.name}"
+        f"{module_name(path)}.{node.name}": sum(isinstance(n, ast.AnnAssign) for n in node.body)
         for path, tree in sources.items()
         for node in ast.walk(tree)
-        if isinstance(node, ast.ClassDef)
-        if any("dataclass" in ast.unparse(decorator) for decorator in node.decorator_list)
+        if isinstance(node, ast.ClassDef) and _is_filled(node)
     }
 
 
-def wide_calls(path: str, tree: ast.AST, classes: set[str], most: int) -> Iterator[str]:
-    """Line and class of each call of a dataclass with more than `most` fields by position."""
+def _is_filled(node: ast.ClassDef) -> bool:
+    """Whether a class gets its fields from its call: a dataclass or a named tuple."""
+    decorated = any("dataclass" in ast.unparse(each) for each in node.decorator_list)
+    return decorated or any(ast.unparse(base).endswith("NamedTuple") for base in node.bases)
+
+
+def wide_calls(path: str, tree: ast.AST, classes: Mapping[str, int], most: int) -> Iterator[str]:
+    """Line and class of each call of a dataclass or a named tuple with more than `most` fields by
+    position; ``cls`` is the class around it, and a starred argument may fill all that are left."""
     module = module_name(path)
     homes = {name.rpartition(".")[2]: module for name in classes}
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom):
             (home, *_) = imports(path, iter([node]), set())
             homes |= {alias.asname or alias.name: f"{home} {alias.name}" for alias in node.names}
-    for node in ast.walk(tree):
+    for called, node in _calls(tree):
+        home, _, name = homes.get(called, "").partition(" ")
+        ends = f".{name or called}"  # a package may hand on what a module of it defines
+        ours = [c for c in classes if home and c.startswith(f"{home}.") and c.endswith(ends)]
+        if ours and _by_position(node, max(map(classes.__getitem__, ours))) > most:
+            yield f"{node.lineno} {called}"
+
+
+def _calls(body: ast.AST, around: str = "cls") -> Iterator[tuple[str, ast.Call]]:
+    """Calls of names, and the names; of ``cls``, that of the class around them."""
+    for node in ast.iter_child_nodes(body):
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
-            home, _, name = homes.get(node.func.id, "").partition(" ")
-            ends = f".{name or node.func.id}"  # a package may hand on what a module of it defines
-            ours = home and any(c.startswith(f"{home}.") and c.endswith(ends) for c in classes)
-            if ours and len(node.args) > most:
-                yield f"{node.lineno} {node.func.id}"
+            yield (around if node.func.id == "cls" else node.func.id), node
+        yield from _calls(node, node.name if isinstance(node, ast.ClassDef) else around)
+
+
+def _by_position(call: ast.Call, fields: int) -> int:
+    """How many of a class's fields a call may fill by position."""
+    if not any(isinstance(each, ast.Starred) for each in call.args):
+        return len(call.args)
+    return max(len(call.args), fields - len(call.keywords))
 
 
 def is_property(node: ast.AST) -> bool:
@@ -113,6 +134,33 @@ def every_argument(function: ast.FunctionDef) -> list[ast.arg]:
     given = function.args
     rest = filter(None, (given.vararg, given.kwarg))
     return [*given.posonlyargs, *given.args, *given.kwonlyargs, *rest]
+
+
+def public_classes(tree: ast.Module) -> Iterator[str]:
+    """Names of the classes of a module."""
+    names = (node.name for node in tree.body if isinstance(node, ast.ClassDef))
+    yield from (name for name in names if not name.startswith("_"))
+
+
+def public_constants(tree: ast.Module) -> Iterator[str]:
+    """Names in capitals to which a module itself gives a value; imported ones are others'."""
+    for node in tree.body:
+        if isinstance(node, ast.Assign | ast.AnnAssign):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            names = (each for target in targets for each in ast.walk(target))
+            ids = (each.id for each in names if isinstance(each, ast.Name))
+            yield from (i for i in ids if i.isupper() and len(i) > 1 and not i.startswith("_"))
+
+
+def shared(
+    sources: dict[str, ast.Module], names: Callable[[ast.Module], Iterator[str]]
+) -> Iterator[str]:
+    """A line for each name that more than one of the sources defines."""
+    homes: dict[str, list[str]] = {}
+    for path, tree in sources.items():
+        for name in dict.fromkeys(names(tree)):
+            homes.setdefault(name, []).append(path)
+    yield from (f"{name}: {', '.join(at)}" for name, at in homes.items() if len(at) > 1)
 
 
 ORDERING = {"list", "tuple", "fromkeys", "array", "join", "enumerate", "zip", "iter", "next", "map"}

@@ -12,12 +12,15 @@ import pytest
 from .sources import (
     TAKES_APART,
     calls,
-    dataclasses,
     every_argument,
+    filled_classes,
     import_cycle,
     imports,
     module_name,
     public,
+    public_classes,
+    public_constants,
+    shared,
     upward,
     walks_over_sets,
     wide_calls,
@@ -268,38 +271,65 @@ def test_functions_are_short():
 
 
 def test_functions_take_few_parameters():
-    """But for a command: each parameter of it is an option, which its caller gives by name."""
+    """Commands, too: those with more options take the fields of a dataclass."""
     none(
         [
             f"{path}:{node.lineno} {node.name}: {count} parameters"
             for path, tree in sources().items()
             for node in ast.walk(tree)
             if isinstance(node, ast.FunctionDef)
-            if not any("app.command(" in ast.unparse(each) for each in node.decorator_list)
             if (count := len(every_argument(node))) > MOST_PARAMETERS
         ]
     )
 
 
-def test_dataclasses_are_filled_by_keyword():
+def test_fields_are_filled_by_keyword():
     """Where there are more than a few fields, a position says too little."""
-    classes = dataclasses(sources())
-    wide = {
-        p for p, tree in sources().items() if any(wide_calls(p, tree, classes, MOST_POSITIONAL))
-    }
-    none(sorted(wide))
+    classes = filled_classes(sources())
+    none(
+        [
+            f"{path}:{line}"
+            for path, tree in sources().items()
+            for line in wide_calls(path, tree, classes, MOST_POSITIONAL)
+        ]
+    )
 
 
 def test_a_wide_call_would_be_found():
+    made = "    @classmethod\n    def of(cls):\n        return cls(1, 2, 3, 4, 5)"
+    fields = "; ".join(f"{name}: int" for name in "vwxyz")
     sources = {
         "calib/a.py": "@dataclass(frozen=True)\nclass A:\n    x: int\nA(1, 2, 3, 4, 5)",
         "calib/b.py": "from calib.a import A as B\nB(1, 2, 3, 4, *five)\nB(1, 2, 3, 4, e=5)",
         "calib/c.py": "from calib import A\nA(1, 2, 3, 4, 5)",
         "calib/d.py": "from elsewhere import A\nA(1, 2, 3, 4, 5)",
+        "calib/e.py": f"@dataclass\nclass E:\n    x: int\n{made}\nclass Other:\n{made}",
+        "calib/f.py": f"class F(NamedTuple):\n    {fields}\nF(1, *four)\nF(1, *three, z=1)\nF(1)",
     }
     trees = {path: ast.parse(text) for path, text in sources.items()}
-    calls = [list(wide_calls(path, tree, dataclasses(trees), 4)) for path, tree in trees.items()]
-    assert calls == [["4 A"], ["2 B"], ["2 A"], []]
+    classes = filled_classes(trees)
+    calls = [list(wide_calls(path, tree, classes, 4)) for path, tree in trees.items()]
+    assert calls == [["4 A"], ["2 B"], ["2 A"], [], ["6 E"], ["3 F"]]
+
+
+def test_a_name_of_a_class_means_one_thing():
+    none(list(shared(packages(), public_classes)))
+
+
+def test_a_name_of_a_constant_means_one_thing():
+    none(list(shared(packages(), public_constants)))
+
+
+def test_a_name_of_two_things_would_be_found():
+    sources = {
+        "calib/a.py": "class A: pass\nclass _Own: pass\nMOST = 1\nLEAST, _OWN = 2, 3\nT = T_a = 4",
+        "calib/b.py": "from calib.a import A, MOST\nclass B: pass\nclass _Own: pass\n_OWN = T = 5",
+        "calib/c.py": "class A: pass\nMOST: int = 6\nLEAST = MOST\nLEAST += 1\nT_a = 7",
+    }
+    trees = {path: ast.parse(text) for path, text in sources.items()}
+    assert list(shared(trees, public_classes)) == ["A: calib/a.py, calib/c.py"]
+    twice = ["MOST: calib/a.py, calib/c.py", "LEAST: calib/a.py, calib/c.py"]
+    assert list(shared(trees, public_constants)) == twice
 
 
 def test_nothing_follows_the_order_of_a_set():

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import yaml
 
-from calib.diagnosis.formulas.factors import KINDS
+from calib.diagnosis.formulas.factors import FACTOR_KINDS
 from calib.diagnosis.verdict import worth_adding
 from calib.effects import CATALOGUE
 from calib.effects.own.formula import FormulaEffect
@@ -190,7 +190,9 @@ def test_the_page_about_formulas_has_every_term():
     text = (ROOT / "docs/formulas.md").read_text(encoding="utf-8")
     table = re.search(r"\| term \| formula \|\n\|---\|---\|\n(.*?)\n\n", text, flags=re.S)[1]
     listed = set(re.findall(r"`([^`]+)`", table))
-    columns = {text.format("a", "b", x="x") for kind in KINDS.values() for text in kind.columns}
+    columns = {
+        text.format("a", "b", x="x") for kind in FACTOR_KINDS.values() for text in kind.columns
+    }
     assert listed == columns - {"1"}
 
 

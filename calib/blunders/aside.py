@@ -10,13 +10,14 @@ from calib.blunders.chance import after_looks, at_least, log_tail
 from calib.blunders.judged import Blunder, LeftOut
 from calib.blunders.shifts import Shift
 from calib.problem.problem import Problem
-from calib.residuals.groups import BEAMS, JOINTS, Group
+from calib.residuals.groups import ALONG_BEAMS, JOINTS, Group
 from calib.residuals.robust import MAD
 from calib.residuals.scan import ScanStop
 from calib.solve.torn import CONTRADICTS
 from chains.errors import InputError
 
-ALIKE = 0.1  # of a scan's misfit where it is said to be: at another stop's place it belongs there
+# Of a scan's misfit where it is said to be: at another stop's place it belongs there.
+BELONGS_THERE = 0.1
 
 
 def stray_scans(
@@ -38,7 +39,7 @@ def stray_scans(
         others = [other for other in problem.aside if other is not scan]
         there = [_off_there(scan, values, other) for other in others]
         best = int(np.argmin(there)) if there else -1
-        fits = bool(there) and there[best] < ALIKE * off_m
+        fits = bool(there) and there[best] < BELONGS_THERE * off_m
         chance = log_tail((off_m / sigma_m) ** 2, 1.0)
         p = at_least(np.exp(chance))
         blunder = Blunder(
@@ -73,7 +74,7 @@ def _distance(group: Group, off_m: float, sigma_m: float) -> Shift:
         offset=np.array([off_m]),
         covariance=np.array([[sigma_m**2]]),
         information=np.array([[sigma_m**-2]]),
-        axes=(BEAMS,),
+        axes=(ALONG_BEAMS,),
         units=("m",),
     )
 

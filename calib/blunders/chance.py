@@ -16,6 +16,9 @@ LEVELS = {
     "blunder": 0.005,
     "structure of what was rejected": 0.005,
 }
+# Power with which an effect, a spread or a blunder of the smallest detectable size is found: by
+# convention (Cohen 1988).
+POWER = 0.8
 LEAST_P = 1e-6  # nobody knows a tail further out: no p-value is said to be smaller
 
 

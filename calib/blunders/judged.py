@@ -14,17 +14,16 @@ from functools import cache
 import numpy as np
 from scipy import special
 
-from calib.blunders.chance import LEVELS, after_looks, at_least, log_tail
+from calib.blunders.chance import LEVELS, POWER, after_looks, at_least, log_tail
 from calib.blunders.shifts import Shift, shifts
 from calib.linear.system import Linearisation
 from calib.problem.problem import Problem
 from calib.residuals.groups import JOINTS, Group
 
-ALPHA = LEVELS["blunder"]
-POWER = 0.8  # with which a blunder of the smallest detectable size is found
+ALPHA_BLUNDER = LEVELS["blunder"]
 # How much the median of squares tells of their scale, against their mean, for Gaussian rows.
 MEDIAN = 0.37
-BULK = 4  # groups of a kind, below which these are taken at their sigmas
+FEWEST_OF_KIND = 4  # groups of a kind, below which these are taken at their sigmas
 KNOWN = 1e6  # degrees of freedom of a scale that is taken as known
 # Degrees of freedom of a sigma that somebody states: a half over the square of its relative
 # uncertainty, a quarter (GUM G.4.2). Where groups are few, it tells more of their scale than they.
@@ -79,7 +78,7 @@ class Blunder:
     def found(self) -> bool:
         """Whether it is to be named: joints, and others only where they may be off by so much, as
         where nothing fits they would be turned by more than half a turn."""
-        return self.p_adjusted < ALPHA and (self.group.kind == "joints" or self.possible)
+        return self.p_adjusted < ALPHA_BLUNDER and (self.group.kind == "joints" or self.possible)
 
     @property
     def _turned_rad(self) -> float:
@@ -148,13 +147,15 @@ def _judged(some: Sequence[Shift], looks: int) -> Iterator[Blunder]:
     wholes = [shift for shift in some if _whole(shift.group)]
     dof = np.array([shift.dof for shift in wholes])
     ratio = np.array([shift.statistic for shift in wholes]) / special.chdtri(dof, 0.5)
-    bulk = max(1.0, float(np.median(ratio))) if len(wholes) >= BULK else 1.0
+    bulk = max(1.0, float(np.median(ratio))) if len(wholes) >= FEWEST_OF_KIND else 1.0
 
     @cache
     def bounds(own: int) -> tuple[float, float, float]:
         """Of groups of so many dofs: those of the bulk, the limit of F, and its noncentrality."""
-        known = STATED + MEDIAN * max(dof.sum() - own, 1) if len(wholes) >= BULK else KNOWN
-        limit = special.fdtri(own, known, (1.0 - ALPHA) ** (1.0 / looks))
+        known = (
+            STATED + MEDIAN * max(dof.sum() - own, 1) if len(wholes) >= FEWEST_OF_KIND else KNOWN
+        )
+        limit = special.fdtri(own, known, (1.0 - ALPHA_BLUNDER) ** (1.0 / looks))
         return known, limit, special.ncfdtrinc(own, known, 1.0 - POWER, limit)
 
     for shift in some:

@@ -15,8 +15,8 @@ from calib.problem.problem import Problem
 from calib.solve.graph import Graph
 
 # Of I - w H: below this a direction is held by the group alone (rounding of C is some 1e-9 of it).
-UNCHECKED = 1e-6
-TOGETHER = 400  # rows whose covariance is computed at once: bounds the memory
+HELD_ALONE = 1e-6
+ROWS_TOGETHER = 400  # rows whose covariance is computed at once: bounds the memory
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ def _batches(sets: Iterable[Sequence[GroupRows]]) -> Iterator[list[Sequence[Grou
     for some in sets:
         batch.append(some)
         count += sum(len(rows.A) for rows in some)
-        if count > TOGETHER:
+        if count > ROWS_TOGETHER:
             yield batch
             batch, count = [], 0
     if batch:
@@ -106,7 +106,7 @@ def whitening(M: np.ndarray, size: np.ndarray) -> np.ndarray:
     """What takes a score (r,) of information M (r, r) to independent ones (dof,) of unit variance,
     in the directions that anything contradicts, in units of `size` (r,)."""
     values, axes = np.linalg.eigh(M / np.outer(size, size))
-    seen = values > UNCHECKED
+    seen = values > HELD_ALONE
     return axes[:, seen] / np.sqrt(values[seen]) / size[:, None]
 
 

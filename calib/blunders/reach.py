@@ -25,11 +25,11 @@ from calib.linear.system import Linearisation
 from calib.problem.problem import Problem
 from calib.residuals.groups import CAD, Group
 
-FAR = 3.0  # sigmas: what the diagnosis promises to name; see docs/one_thing_wrong.md
+PROMISED_SIGMAS = 3.0  # sigmas: what the diagnosis promises to name; see docs/one_thing_wrong.md
 
 
 @dataclass(frozen=True)
-class Reach:
+class FurthestMoved:
     """The estimate that a mishap could move furthest, unseen.
 
     Args:
@@ -50,7 +50,7 @@ def reaches(
     problem: Problem,
     blunders: Sequence[Blunder],
     sigma: Mapping[str, float],
-) -> dict[Group, Reach]:
+) -> dict[Group, FurthestMoved]:
     """Group -> how far a mishap to it could move an estimate, unseen; of a scan, its
     place or its range zero, whichever is further.
 
@@ -65,24 +65,24 @@ def reaches(
     kept = positions(whole.layout.size, whole.layout.kept)[columns]
     towards = whole.followed(others.kept[:, kept])
     wide = np.array([sigma[name] for name in names])
-    found: dict[Group, Reach] = {}
+    found: dict[Group, FurthestMoved] = {}
     for sets in others.groups(problem) if names else ():
         for group, of_ranges, moved in _moved(others, sets, towards):
             if (group, of_ranges) not in enough:
                 continue
             by = np.sqrt(enough[group, of_ranges]) * moved / wide
             worst = int(np.argmax(by))
-            reach = Reach(names[worst], float(by[worst]))
+            reach = FurthestMoved(names[worst], float(by[worst]))
             found[group] = max(found.get(group, reach), reach, key=lambda r: r.sigmas)
     return found
 
 
-def hardly_checked(found: Mapping[Group, Reach]) -> list[str]:
+def hardly_checked(found: Mapping[Group, FurthestMoved]) -> list[str]:
     """In a sentence, which measurements could be wrong, unseen, and move an estimate further than
     anything should; none where none could. Of values on paper that nothing measured checks, the
     weak directions tell."""
     measured = [(group, each) for group, each in found.items() if group.where != CAD]
-    far = sorted((m for m in measured if m[1].sigmas > FAR), key=lambda m: -m[1].sigmas)
+    far = sorted((m for m in measured if m[1].sigmas > PROMISED_SIGMAS), key=lambda m: -m[1].sigmas)
     if not far:
         return []
     group, worst = far[0]

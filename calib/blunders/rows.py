@@ -15,16 +15,16 @@ from calib.problem.model import labels
 from calib.problem.problem import Block, Problem
 from calib.problem.unknowns import Role
 from calib.problem.without import ROD, of_the_arm
-from calib.residuals.groups import BEAMS, CAD, JOINTS, MESH, Group
+from calib.residuals.groups import ALONG_BEAMS, CAD, JOINTS, MESH, Group
 from calib.residuals.scan import ScanStop
 from calib.residuals.targets import HangingTarget
 from calib.residuals.tracker import BodiesTogether, TrackedBody
 from calib.rig import Rig
 from calib.solve.reweight import unweighted
 
-POSE = ("about x", "about y", "about z", "x", "y", "z")
-SHIFT = (*POSE, BEAMS)  # of a scan
-SEVERAL = 3  # scans, for most of them to say that the range zero of one is not theirs
+TWIST_NAMES = ("about x", "about y", "about z", "x", "y", "z")
+SCAN_SHIFT = (*TWIST_NAMES, ALONG_BEAMS)  # of a scan
+SEVERAL_SCANS = 3  # scans, for most of them to say that the range zero of one is not theirs
 # Block (none for a prior), whitened derivative by each unknown, and right side: see `Graph`.
 GraphRows = Sequence[tuple[Block | None, Mapping[str, np.ndarray], np.ndarray]]
 
@@ -60,7 +60,7 @@ class GroupRows:
     @property
     def of_ranges(self) -> bool:
         """Whether they are of a range zero, and not of a place."""
-        return list(self.axes) == [BEAMS]
+        return list(self.axes) == [ALONG_BEAMS]
 
     @property
     def own_information(self) -> np.ndarray:
@@ -115,7 +115,7 @@ def _bodies(whole: Linearisation) -> Iterator[GroupRows]:
                     b=-residual[here],
                     weight=np.full(per, weights[k]),
                     sigma=np.repeat([block.sigma_rad, block.sigma_m], 3)[-per:],
-                    axes=POSE[-per:],
+                    axes=TWIST_NAMES[-per:],
                     units=("rad",) * (per - 3) + ("m",) * 3,
                     groups={group: np.eye(per)},
                     turn=turn[-per:, -per:],
@@ -229,7 +229,7 @@ def scan_rows(whole: Linearisation, problem: Problem) -> Iterator[GroupRows]:
     for scan in problem.scans:
         sums = whole.scans[whole.layout.stops[key_of(scan)]]
         count = len(sums.score)
-        for at in (np.arange(6), np.arange(6, count if len(problem.scans) >= SEVERAL else 6)):
+        for at in (np.arange(6), np.arange(6, count if len(problem.scans) >= SEVERAL_SCANS else 6)):
             if len(at):
                 yield GroupRows(
                     A=sums.cross[at],
@@ -237,7 +237,7 @@ def scan_rows(whole: Linearisation, problem: Problem) -> Iterator[GroupRows]:
                     b=sums.score[at],
                     weight=np.ones(len(at)),
                     sigma=np.ones(len(at)),
-                    axes=[SHIFT[i] for i in at],
+                    axes=[SCAN_SHIFT[i] for i in at],
                     units=["rad" if i < 3 else "m" for i in at],
                     groups={scan.group: np.eye(len(at))},
                     information=sums.information[np.ix_(at, at)],

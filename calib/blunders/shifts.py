@@ -22,12 +22,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.linalg import block_diag
 
-from calib.blunders.others import UNCHECKED, Others, at_their_sigmas, parts, whitening
+from calib.blunders.others import HELD_ALONE, Others, at_their_sigmas, parts, whitening
 from calib.blunders.rows import GroupRows, group_rows, scan_rows
 from calib.linear.system import Linearisation
 from calib.problem.problem import Problem
 from calib.problem.spread import Whose
-from calib.residuals.groups import BEAMS, Group
+from calib.residuals.groups import ALONG_BEAMS, Group
 from calib.solve.components import Sums, Told, squares_beside_bodies
 
 
@@ -60,7 +60,7 @@ class Shift:
     @property
     def of_ranges(self) -> bool:
         """Whether it is a range zero, and not a place."""
-        return list(self.axes) == [BEAMS]
+        return list(self.axes) == [ALONG_BEAMS]
 
     @property
     def parts(self) -> dict[str, np.ndarray]:
@@ -146,8 +146,8 @@ def of_poses(whole: Linearisation, problem: Problem, wild: Collection[Group]) ->
     raw = block_diag(*(rows.information for rows in every))
     size = np.sqrt(np.maximum(np.diag(raw), 1e-300))
     values, axes = np.linalg.eigh((raw - H) / np.outer(size, size))
-    axes = axes[:, values > UNCHECKED]
-    told, along = size[:, None] * axes * values[values > UNCHECKED], size[:, None] * axes
+    axes = axes[:, values > HELD_ALONE]
+    told, along = size[:, None] * axes * values[values > HELD_ALONE], size[:, None] * axes
     return Told(
         score=along @ (axes.T @ (b / size)),
         information=told @ along.T,
@@ -201,7 +201,7 @@ def _of_rows(group: Group, rows: GroupRows, b: np.ndarray, H: np.ndarray) -> Shi
     """The residual of a group under the fit without it; see the module."""
     own = rows.groups[group]
     values, axes = np.linalg.eigh(own.T @ (np.eye(len(H)) - H) @ own)
-    seen = values > UNCHECKED
+    seen = values > HELD_ALONE
     values, basis = values[seen], own @ axes[:, seen]
     along = (basis.T @ b) / values
     at = np.flatnonzero(np.any(own != 0, axis=1))

@@ -9,20 +9,20 @@ import numpy as np
 
 from calib.blunders.chance import LEAST_P
 from calib.blunders.judged import Blunder, LeftOut
-from calib.blunders.reach import Reach
-from calib.residuals.groups import BEAMS, JOINTS, MESH, Group
+from calib.blunders.reach import FurthestMoved
+from calib.residuals.groups import ALONG_BEAMS, JOINTS, MESH, Group
 from calib.rig import Rig
 from sensors.rings import RingFinding
 
 SHOWN = {"m": ("mm", 1e3), "rad": ("mrad", 1e3)}
-LARGE = 1000.0  # mm or mrad, from which on metres and radians are read more easily
+LARGE_SIZE = 1000.0  # mm or mrad, from which on metres and radians are read more easily
 SIGN = 0.05  # of twice a value on paper, within which it is off as a wrong sign would have it
 
 
 def groups(
     looked_at: Iterable[Blunder],
     others: Mapping[str, Mapping[str, float]],
-    unseen: Mapping[Group, Reach],
+    unseen: Mapping[Group, FurthestMoved],
 ) -> dict[str, Any]:
     """How far out every group that was looked at is, and the size from which a mishap to it, or to
     what is no group of rows, would be found, and how far one that is not would move an estimate, as
@@ -114,7 +114,7 @@ def of_surface(name: str, off_m: float, sigma_m: float, p: float) -> dict[str, A
         "size": abs(off_m),
         "unit": "m",
         "sigma": sigma_m,
-        "axis": BEAMS,
+        "axis": ALONG_BEAMS,
         "p_value": p,
         "p_adjusted": p,
         "without": group.token,
@@ -156,7 +156,7 @@ def tokens(blunders: Iterable[Mapping[str, Any]]) -> list[str]:
 def _sentence(left: LeftOut, wrong_sign: str | None) -> str:
     *size, axis = left.blunder.leading()
     along = f" {axis}" if axis.startswith("about") else f" in {axis}" if axis else ""
-    along = f" {axis}" if axis == BEAMS else along
+    along = f" {axis}" if axis == ALONG_BEAMS else along
     along = "" if left.blunder.group.what.endswith(f".{axis}") else along
     sign = f", as if the sign of its {wrong_sign} were wrong" if wrong_sign else ""
     group = str(left.blunder.group)
@@ -182,7 +182,7 @@ def suspect(left: LeftOut) -> str:
 def size_told(size: float, sigma: float, unit: str) -> str:
     """A size in m or rad and its sigma, as people read it."""
     name, scale = SHOWN.get(unit, (unit, 1.0))
-    if scale * size >= LARGE:
+    if scale * size >= LARGE_SIZE:
         in_deg = f" ({np.degrees(size):.3g} deg)" if unit == "rad" else ""
         return f"{size:.3g} {unit}{in_deg}"
     return f"{scale * size:.3g} ± {scale * sigma:.2g} {name}"

@@ -9,8 +9,10 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
+from dataclasses import MISSING, fields
+from inspect import Parameter, Signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TextIO
+from typing import TYPE_CHECKING, Annotated, Any, TextIO, TypeVar, get_type_hints
 
 import typer
 import typer.core
@@ -23,6 +25,7 @@ if TYPE_CHECKING:
 
 NOT_TO_BE_USED = 3  # exit code: done, but not to be used as it stands
 Progress = Callable[[str, int, int], None]
+T = TypeVar("T")
 
 # As people meet them; `rigcal --help` lists them so.
 ORDER = (
@@ -118,6 +121,29 @@ Workers = Annotated[
         show_default=False,
     ),
 ]
+
+
+def takes_fields_of(asked: type[T]) -> Callable[[Callable[[T], None]], Callable[..., None]]:
+    """A command whose arguments and options are the fields of a dataclass, of which it gets one."""
+    hints = get_type_hints(asked, include_extras=True)
+    signature = Signature(
+        Parameter(
+            field.name,
+            Parameter.KEYWORD_ONLY,
+            default=Parameter.empty if field.default is MISSING else field.default,
+            annotation=hints[field.name],
+        )
+        for field in fields(asked)
+    )
+
+    def of_fields(command: Callable[[T], None]) -> Callable[..., None]:
+        def run(**given: Any) -> None:
+            command(asked(**given))
+
+        run.__name__, run.__doc__, run.__signature__ = command.__name__, command.__doc__, signature
+        return run
+
+    return of_fields
 
 
 def say(document: dict[str, Any], text: str, as_json: bool) -> None:

@@ -38,7 +38,7 @@ Effects = Annotated[
 Fix = Annotated[
     list[str] | None, typer.Option(metavar="NAME", help="Hold a frame, effect or parameter.")
 ]
-CANDIDATES = "Effects of your own that may be missing: files of them, or folders, with commas."
+CANDIDATES_HELP = "Effects of your own that may be missing: files of them, or folders, with commas."
 Without = Annotated[
     list[str] | None,
     typer.Option(metavar="STOP:BODY", help="Leave out a blunder, as 'diagnose' names it."),
@@ -151,7 +151,7 @@ def diagnose(
         bool, typer.Option("--refits/--no-refits", help="Whether to refit for held-out errors.")
     ] = True,
     candidates: Annotated[
-        str | None, typer.Option("--candidates", "--effects", metavar="FILE", help=CANDIDATES)
+        str | None, typer.Option("--candidates", "--effects", metavar="FILE", help=CANDIDATES_HELP)
     ] = None,
     trust: Trust = None,
     workers: Workers = None,
@@ -184,7 +184,7 @@ def explain(
     fix: Fix = None,
     without: Without = None,
     candidates: Annotated[
-        str | None, typer.Option("--candidates", metavar="FILE", help=CANDIDATES)
+        str | None, typer.Option("--candidates", metavar="FILE", help=CANDIDATES_HELP)
     ] = None,
     workers: Workers = None,
     as_json: Json = False,

@@ -18,12 +18,14 @@ from calib.effects.rig import MountSlip
 from calib.problem.model import Model, Source
 from calib.rig import Rig
 
-BINS, PAIR_BINS = 12, 6
+# Bins of a covariate, of each of two, and of azimuth, whose harmonics turn several times about. A
+# choice: what has half the period of three bins is seen, and looks are few; `formulas` sees finer.
+COVARIATE_BINS, PAIR_BINS = 12, 6
 AZIMUTH_BINS = 24
 # Of columns of the stops: with more parameters than a fifth of these, tests have no power.
 STOPS_A_BIN = 5
-WAVES = 4  # of a pose over a column: its quarters, as 12 bins have thirds of those
-STEP = 0.01  # relative, to either side, for the derivative by a shape
+POSE_WAVES = 4  # of a pose over a column: its quarters, as 12 bins have thirds of those
+SHAPE_STEP = 0.01  # relative, to either side, for the derivative by a shape
 # What a range error may depend on alone, and the pairs that matter; others pair with range.
 POINT = ("range_m", "incidence_rad", "azimuth_rad", "elevation_rad", "intensity")
 PAIRS = (*combinations(POINT[:4], 2), ("intensity", "range_m"), ("label", "incidence_rad"))
@@ -173,9 +175,11 @@ class ShapeStep(Effect):
         return (Param("log", "1", 1.0),) if self.effect.params(rig) else ()
 
     def basis(self, view: View) -> np.ndarray:
-        sides = (self.effect.at(self.effect.shape * f) for f in (1 + STEP, 1 / (1 + STEP)))
+        sides = (
+            self.effect.at(self.effect.shape * f) for f in (1 + SHAPE_STEP, 1 / (1 + SHAPE_STEP))
+        )
         larger, smaller = (side.basis(view) @ self.theta for side in sides)
-        return (larger - smaller)[..., None] / (2 * np.log1p(STEP))
+        return (larger - smaller)[..., None] / (2 * np.log1p(SHAPE_STEP))
 
 
 def known_effects(
@@ -289,7 +293,7 @@ def _moved(sources: Sequence[Source]) -> Iterator[PoseShape]:
         low, high = _ends(values[np.isfinite(values)])
         for slip in slips if high > low else ():
             each = max(len(slip.params(s.rig)) for s in sources)
-            if waves := min(WAVES, stops // (STOPS_A_BIN * each)):
+            if waves := min(POSE_WAVES, stops // (STOPS_A_BIN * each)):
                 yield PoseShape(slip, column, (low, high), waves)
 
 
@@ -309,7 +313,7 @@ def _ends(values: np.ndarray) -> tuple[float, float]:
 def _bins(covariate: str, together: int, stops: int) -> int:
     """How many bins of a covariate, alone or of a pair; where one of them is the same for all beams
     of a stop, no more than that many stops can tell."""
-    usual = PAIR_BINS if together > 1 else BINS
+    usual = PAIR_BINS if together > 1 else COVARIATE_BINS
     if stops:
         return max(2, min(usual, round((stops / STOPS_A_BIN) ** (1.0 / together))))
     return AZIMUTH_BINS if covariate == "azimuth_rad" and together == 1 else usual

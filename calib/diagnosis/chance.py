@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from scipy import special
 
-from calib.blunders.chance import LEVELS, after_looks, at_least
+from calib.blunders.chance import LEVELS, POWER, after_looks, at_least
 from calib.blunders.judged import Blunder
 from calib.blunders.shifts import beside_bodies, of_poses
 from calib.diagnosis.score import Scores
@@ -28,8 +28,8 @@ from calib.problem import Problem
 from calib.problem.spread import SpreadName, Whose, by_chance, rows_at, sigmas, spread_keys
 from calib.results.solution import one_unit
 from calib.solve.components import (
-    LEAST,
-    SEEN,
+    DIRECTION_SEEN,
+    LEAST_SD,
     Checks,
     Sums,
     Told,
@@ -40,11 +40,11 @@ from calib.solve.components import (
 )
 from calib.solve.estimate import Estimate
 
-ALPHA = LEVELS["scatter by chance"]
-POWER = 0.8  # with which one of the smallest detectable spread is found
-FEWEST = 4  # members, or checks of a body's rows, below which nothing is said of their spread
-LOOKS = sum(effect.by_chance for effect in CATALOGUE)  # effects that are looked at
-DRAWS = 2000
+ALPHA_SCATTER = LEVELS["scatter by chance"]
+# Members, or checks of a body's rows, below which nothing is said of their spread.
+FEWEST_MEMBERS = 4
+SCATTER_LOOKS = sum(effect.by_chance for effect in CATALOGUE)  # effects that are looked at
+SCATTER_DRAWS = 2000  # of chance: their mean, from which p-values follow, is known to some 5 %
 # Of wider rows: who scatters.
 NOUNS = {
     Site.TRACKER: "The tracker scatters",
@@ -107,12 +107,12 @@ class Chance:
     @property
     def p_adjusted(self) -> float:
         """Its p-value, all effects by chance being looked at."""
-        return float(after_looks(self.p_value, LOOKS))
+        return float(after_looks(self.p_value, SCATTER_LOOKS))
 
     @property
     def found(self) -> bool:
         """Whether it is to be named."""
-        return self.p_adjusted < ALPHA
+        return self.p_adjusted < ALPHA_SCATTER
 
     def beside(self, estimate: Estimate) -> Chance:
         """The same as a fit has it that it is part of, tested beside all else in that."""
@@ -124,7 +124,10 @@ class Chance:
             if unknown.owner.effect == self.effect.name:  # of whichever rig
                 rows = told([unknown], estimate.values, estimate.covariance_of([unknown.name]))
                 pairs = zip(units_of(self.effect), spread_keys(unknown), strict=True)
-                each = [Spread("", unit, *known[key]) for unit, key in pairs]
+                each = [
+                    Spread(of="", unit=unit, sd=known[key][0], sigma=known[key][1])
+                    for unit, key in pairs
+                ]
                 again = _of_values(self.effect, rows) or self
                 found.append(replace(again, spreads=each, rivals=self.rivals))
         return max(found, key=lambda chance: chance.statistic)
@@ -211,7 +214,7 @@ class AtZero:
 
     def __init__(self, told: Told) -> None:
         values, axes = np.linalg.eigh(told.information)
-        seen = values > SEEN * max(values[-1], 0.0)
+        seen = values > DIRECTION_SEEN * max(values[-1], 0.0)
         self.l = values[seen]
         self.w = np.square(axes[:, seen].T @ told.score) / self.l
         self.d = GRID / np.mean(self.l) if len(self.l) else GRID
@@ -237,8 +240,8 @@ class AtZero:
         return self.w @ (1.0 - 1.0 / grown) - np.log(grown).sum()
 
     def drawn(self, d: float = 0.0) -> np.ndarray:
-        """The statistic (DRAWS,) of draws at a variance."""
-        normal = np.random.default_rng(0).standard_normal((DRAWS, len(self.l)))
+        """The statistic (SCATTER_DRAWS,) of draws at a variance."""
+        normal = np.random.default_rng(0).standard_normal((SCATTER_DRAWS, len(self.l)))
         return self.statistic(np.square(normal) * (1.0 + d * self.l))
 
     @cached_property
@@ -307,21 +310,27 @@ def _of_values(effect: Scatter, rows: Told) -> Chance | None:
     """The test of values, each spread against none; None where too few are told of."""
     units = units_of(effect)
     tests = [AtZero(rows.of(group)) for group in range(len(units))]
-    if any(test.members < FEWEST for test in tests):
+    if any(test.members < FEWEST_MEMBERS for test in tests):
         return None
     statistic, p_value = max((test.p_value() for test in tests), key=lambda each: -each[1])
     p_value = float(after_looks(p_value, len(tests)))
     sd = np.array([test.spread() for test in tests])
-    if len(tests) == 1 or after_looks(p_value, LOOKS) < ALPHA:  # the others are worth no effort
+    if (
+        len(tests) == 1 or after_looks(p_value, SCATTER_LOOKS) < ALPHA_SCATTER
+    ):  # the others are worth no effort
         sd = rows.spread(np.full(len(tests), effect.sigma))
         statistic = max(rows.statistic(sd), statistic)
-    pairs = zip(units, sd.tolist(), rows.sigma(np.maximum(sd, LEAST * effect.sigma)), strict=True)
+    pairs = zip(
+        units, sd.tolist(), rows.sigma(np.maximum(sd, LEAST_SD * effect.sigma)), strict=True
+    )
     return Chance(
         effect,
         spreads=[Spread("", unit, each, float(sigma)) for unit, each, sigma in pairs],
         statistic=statistic,
         p_value=p_value,
-        detectable=tests[units.index(effect.leading)].detectable(ALPHA / LOOKS / len(tests)),
+        detectable=tests[units.index(effect.leading)].detectable(
+            ALPHA_SCATTER / SCATTER_LOOKS / len(tests)
+        ),
     )
 
 
@@ -361,7 +370,7 @@ def _of_rows(effect: Scatter, sums: Sums, problem: Problem) -> Chance | None:
     """The test that rows have the variance that is stated, as `Checks` have it."""
     known, spreads, p, statistic, detectable = sigmas(problem), [], [], 0.0, np.inf
     mine = [whose for whose in rows_at(problem, effect.site) if whose in sums]
-    checked = {whose: sums[whose] for whose in mine if sums[whose].left >= FEWEST}
+    checked = {whose: sums[whose] for whose in mine if sums[whose].left >= FEWEST_MEMBERS}
     for whose, checks in checked.items():
         sigma, beyond = known[whose]
         variance = sigma**2 - beyond**2
@@ -373,7 +382,7 @@ def _of_rows(effect: Scatter, sums: Sums, problem: Problem) -> Chance | None:
         p.append(float(special.chdtrc(at_first.dof, at_first.scaled)))
         statistic += at_first.statistic(grown)
         if whose.unit == effect.leading:
-            limit = special.chdtri(at_first.dof, ALPHA / LOOKS / len(checked))
+            limit = special.chdtri(at_first.dof, ALPHA_SCATTER / SCATTER_LOOKS / len(checked))
             enough = limit / special.chdtri(at_first.dof, POWER) - 1.0
             share = at_first.told / at_first.left
             detectable = min(detectable, float(np.sqrt(variance * enough / share)))

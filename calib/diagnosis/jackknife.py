@@ -60,13 +60,13 @@ import numpy as np
 from scipy import special
 
 from calib.linear.clusters import ClusteredRows
+from calib.results.intervals import ALONE
 
-ALONE = 0.999  # of a direction's information: a cluster that has more of it is alone with it
-UNKNOWN = 1e12  # variance, of a whitened score, where nothing tells it
+UNKNOWN_VARIANCE = 1e12  # variance, of a whitened score, where nothing tells it
 # Least stops, or surfaces, for each parameter that one of these tells as one. Measured in the
 # benchmark: with fewer, 0.1 to 1.0 of empty worlds where stops err show something; else below 0.1.
 PER_PARAMETER = 2
-SLIGHT = 0.05  # of a direction's information: the others predict a cluster with less to 5 %
+SLIGHT_SHARE = 0.05  # of a direction's information: the others predict a cluster with less to 5 %
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,7 @@ def _evenly(shares: np.ndarray) -> np.ndarray:
     """Covariance (r, r) of the sum of shares (c, r), an even part of it taken off each."""
     count, total = len(shares), shares.sum(axis=0)
     if count < 2:
-        return UNKNOWN * np.eye(len(total))
+        return UNKNOWN_VARIANCE * np.eye(len(total))
     return (shares.T @ shares - np.outer(total, total) / count) * count / (count - 1)
 
 
@@ -217,11 +217,11 @@ class Clusters:
     def of(cls, information: np.ndarray, count: int) -> Clusters:
         """Of clusters that hold so much of the information, (c, r, r)."""
         apart, alone = {}, np.zeros_like(information[0])
-        for c in np.flatnonzero(np.linalg.norm(information, axis=(1, 2)) > SLIGHT).tolist():
+        for c in np.flatnonzero(np.linalg.norm(information, axis=(1, 2)) > SLIGHT_SHARE).tolist():
             values, axes = np.linalg.eigh(information[c])
             apart[c] = (axes / (1.0 - np.clip(values, 0.0, ALONE))) @ axes.T
             lonely = axes[:, values > ALONE]
-            alone += UNKNOWN * lonely @ lonely.T
+            alone += UNKNOWN_VARIANCE * lonely @ lonely.T
         return cls(information, count, apart, alone)
 
     @cached_property
@@ -256,7 +256,7 @@ def by_leaving_out(
     spent so many unknowns on stops alone."""
     by_stop, by_place, both = (w.covariance(s) for w, s in zip(ways, scores, strict=True))
     if ways[0].crowded or ways[1].crowded:
-        by_stop = UNKNOWN * np.eye(len(by_stop))
+        by_stop = UNKNOWN_VARIANCE * np.eye(len(by_stop))
     more = _beyond(by_place, both)
     by_stop = by_stop * _widened(ways[0].count, spent)
     parts, of_stops = np.array([np.trace(by_stop), np.trace(more)]), max(ways[0].d - spent, 1.0)

@@ -19,7 +19,7 @@ from calib.linear.linearise import linearise
 from calib.linear.system import Linearisation
 from calib.problem.problem import Problem
 from calib.problem.unknowns import Owner
-from calib.solve.clustered import Beams, of_cells, of_graph, of_stops
+from calib.solve.clustered import BeamsAlong, of_cells, of_graph, of_stops
 from calib.solve.estimate import Estimate
 from calib.solve.fit import Progress
 from calib.solve.graph import Graph
@@ -91,7 +91,7 @@ def rows_along(
     layout = Layout.of(wide, unbounded=candidates)
     directions = np.concatenate([away[name] for name in layout.at])
     places, met = Gradients(layout.size), estimate.associations
-    beams = Beams(
+    beams = BeamsAlong(
         problem=wide,
         layout=layout,
         values=values,

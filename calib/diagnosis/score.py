@@ -16,7 +16,7 @@ import numpy as np
 from scipy import special
 from scipy.linalg import cho_factor, cho_solve
 
-from calib.blunders.chance import at_least, log_tail
+from calib.blunders.chance import POWER, at_least, log_tail
 from calib.diagnosis.jackknife import ScoreSpread, Shares, by_signs
 from calib.diagnosis.linear import Linear
 from calib.linear.clusters import summed
@@ -24,8 +24,7 @@ from calib.problem.unknowns import Owner
 
 GAUGE = 1e-6  # share of a direction's information that is left, below which there is none
 UNFELT = 1e-9  # of an effect's largest column, below which no row feels a parameter
-POWER = 0.8  # with which an effect of the smallest detectable size is found
-DRAWS = 1999
+SCORE_DRAWS = 1999  # of chance: 100 of them are beyond 5 %, where looks are counted, so to 10 %
 
 
 @dataclass(frozen=True)
@@ -84,7 +83,7 @@ class Scores:
         """Scores (R, Q) as chance might have dealt them: every cluster's share, times a normal
         number of its own (the multiplier bootstrap)."""
         shares = np.vstack([self.by_stop, self.by_place])
-        return np.random.default_rng(0).standard_normal((DRAWS, len(shares))) @ shares
+        return np.random.default_rng(0).standard_normal((SCORE_DRAWS, len(shares))) @ shares
 
 
 def projection(linear: Linear, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -148,7 +147,7 @@ def project(linear: Linear, names: Sequence[str], spent: int = 0) -> Scores:
 
 
 @dataclass(frozen=True)
-class Test:
+class ScoreTest:
     """One candidate's test; see the module.
 
     Args:
@@ -185,7 +184,7 @@ class Test:
         """How much wider its score scatters than independent rows of their sigmas would."""
         return self.chance.trace / self.dof
 
-    def judged(self, shares: Shares) -> Test:
+    def judged(self, shares: Shares) -> ScoreTest:
         """The same with its clusters left out one by one."""
         left_out = shares.left_out(self.chances[0].nu, self.spent)
         return replace(self, chances=(*self.chances, left_out))
@@ -236,7 +235,7 @@ class Test:
         return float(np.sqrt(noncentral * scale / nu / each))
 
 
-def test(scores: Scores, columns: np.ndarray) -> Test:
+def score_test(scores: Scores, columns: np.ndarray) -> ScoreTest:
     """Test the candidate of these columns."""
     size = np.sqrt(np.maximum(np.diag(scores.whole)[columns], 0.0))
     size = np.where(size > UNFELT * size.max(initial=0.0), size, np.inf)
@@ -246,7 +245,7 @@ def test(scores: Scores, columns: np.ndarray) -> Test:
     whiten = (axes[:, seen] / np.sqrt(values[seen])) / size[:, None]
     score = scores.score[columns]
     clusters = int((np.abs(scores.by_stop[:, columns] @ whiten).max(axis=1, initial=0.0) > 0).sum())
-    return Test(
+    return ScoreTest(
         columns=columns,
         statistic=float(np.sum(np.square(whiten.T @ score))),
         whiten=whiten,

@@ -8,11 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.blunders.chance import after_looks
-from calib.diagnosis.score import Scores, Test, test
+from calib.diagnosis.score import Scores, ScoreTest, score_test
 from calib.effects import Effect, Site
 
-ODDS = np.log(20.0)  # of a rival: within these it can stand in for the best
-QUANTILE = 0.05  # of the smallest p-value, at which dependent tests are counted
+# Of a rival, within which it can stand in for the best: from 20 to 1 on, evidence is called strong
+# (Kass and Raftery 1995, JASA 90).
+ODDS = np.log(20.0)
+# Of the smallest p-value, at which dependent tests are counted: by convention, and near the level
+# at which claims are made.
+QUANTILE = 0.05
 
 
 @dataclass(frozen=True)
@@ -25,12 +29,12 @@ class Candidate:
         p_value: how often chance alone does as much, adjusted for the shapes tried; of the screen's
             test until it is judged, then of that.
         p_adjusted: how often chance does so in any candidate that was tested, so no less.
-        evidence: see `Test.evidence`.
+        evidence: see `ScoreTest.evidence`.
         looks: by how many independent looks p_adjusted pays.
     """
 
     effect: Effect
-    test: Test
+    test: ScoreTest
     p_value: float
     p_adjusted: float
     evidence: float
@@ -87,7 +91,7 @@ def screen(
         columns: effect's name -> its columns among the scores.
         common: inflation from elsewhere, if not from these effects.
     """
-    tests = {e.name: test(scores, columns[e.name]) for e in effects if e.name in columns}
+    tests = {e.name: score_test(scores, columns[e.name]) for e in effects if e.name in columns}
     gauges = [e for e in effects if e.name not in tests or not tests[e.name].dof]
     tests = {name: t for name, t in tests.items() if t.dof}
     families: dict[str, list[Effect]] = {}
@@ -120,7 +124,7 @@ def screen(
     return Screen(scores, common, sorted(candidates, key=lambda c: -c.evidence), gauges)
 
 
-def _common(tests: Sequence[tuple[Effect, Test]]) -> float:
+def _common(tests: Sequence[tuple[Effect, ScoreTest]]) -> float:
     """The median inflation; of what beams tell, where they tell anything: their rows share errors
     of surfaces, of which those of trackers and targets know nothing."""
     of_beams = [t.inflation for e, t in tests if e.site not in (Site.TRACKER, Site.TARGET)]
@@ -128,7 +132,7 @@ def _common(tests: Sequence[tuple[Effect, Test]]) -> float:
     return float(np.median(every)) if every else 1.0
 
 
-def _by_chance(scores: Scores, tests: Mapping[str, Test]) -> dict[str, np.ndarray]:
+def _by_chance(scores: Scores, tests: Mapping[str, ScoreTest]) -> dict[str, np.ndarray]:
     """p-values (R,) of every test on scores that are nothing but chance: each by its rank."""
     drawn = scores.draws
     return {

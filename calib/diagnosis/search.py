@@ -17,24 +17,29 @@ from calib.blunders.chance import LEVELS, after_looks, log_tail
 from calib.blunders.judged import Blunder, LeftOut
 from calib.blunders.shifts import standing_alone
 from calib.diagnosis.chance import Chance
-from calib.diagnosis.score import Test
-from calib.diagnosis.score import test as joint_test
+from calib.diagnosis.rejects import FEWEST_STOPS
+from calib.diagnosis.score import ScoreTest, score_test
 from calib.diagnosis.screen import ODDS, Candidate, Screen, rivals
 from calib.diagnosis.stand import Look, Stand, tried
 from calib.effects import Effect
 from calib.residuals.groups import CAD, JOINTS, MESH
 from calib.solve.fit import Progress
 
-ALPHA = LEVELS["effect"]
+ALPHA_EFFECT = LEVELS["effect"]
 ALPHA_UNNAMED = LEVELS["structure"]
 ALPHA_NOISE = LEVELS["effect on the scatter"]
-MOST_NAMES = 3  # an explanation that needs more names than this is none
-INSTEAD = 0.5  # of the leading structure's evidence, for another covariate to be named too
-FEWEST = 4  # stops, below which nothing is claimed
-TRIES = 3  # how many suspects are judged before a look is called quiet
+MOST_NEEDED = 3  # an explanation that needs more names than this is none: a choice
+# Of the leading structure's evidence, for another covariate to be named too: a choice, as what has
+# half of it may be the cause where covariates go together.
+ALSO_NAMED = 0.5
+SUSPECTS_JUDGED = 3  # of most evidence, before a look is called quiet: each costs a jackknife
 ADAPTED, MENDED = 8, 2  # rounds of leaving out; of 76 fits without optimum one was mended, in two
-AS_FAR = 0.1  # of the leading blunder's evidence: others at other places are left out with it
-HELD_BACK = 0.1  # of what a test says of an effect: what is fitted with less does not bear it out
+# Of the leading blunder's evidence, from which others at other places are left out with it: a
+# choice; what is left over is found by the next look.
+AS_FAR = 0.1
+# Of what a test says of an effect, below which a fit does not bear it out: a choice, far below the
+# whole that it takes up where the test is right.
+HELD_BACK = 0.1
 
 
 @dataclass(frozen=True)
@@ -52,7 +57,7 @@ class NamedEffect:
     candidate: Candidate
     before: Look
     after: Look
-    judged: Test
+    judged: ScoreTest
     p_adjusted: float
     rivals: Sequence[Candidate]
 
@@ -102,7 +107,7 @@ class Search:
 Steps = tuple[list[Look], list[NamedEffect], list[LeftOut]]
 
 
-def search(stand: Stand, progress: Progress, most: int = MOST_NAMES) -> Search:
+def search(stand: Stand, progress: Progress, most: int = MOST_NEEDED) -> Search:
     """Name what is missing, one effect after another, then ask whether that is all.
 
     Args:
@@ -286,7 +291,7 @@ def _chance_leads(look: Look) -> bool:
 def _quiet(look: Look) -> bool:
     """Whether no effect and no structure is significant: bins, or a name that acts like bins, take
     on what one stop has alone, but one stop left out does not take an effect away."""
-    named = any(_stands_out(c, ALPHA) for c in look.named.candidates)
+    named = any(_stands_out(c, ALPHA_EFFECT) for c in look.named.candidates)
     return not named and not any(_stands_out(c, ALPHA_UNNAMED) for c in look.unnamed.candidates)
 
 
@@ -300,7 +305,7 @@ def likeliest(here: Sequence[Blunder]) -> Blunder:
 def _named(look: Look, found: list[NamedEffect], progress: Progress) -> list[NamedEffect]:
     """What was found, and the best candidate that is confirmed, fitted; with it others may have
     better shapes. Which one is best may change once it is fitted, as rows then scatter less."""
-    for candidate in suspects(look.named, ALPHA):
+    for candidate in suspects(look.named, ALPHA_EFFECT):
         if more := _fitted(look, candidate, found, progress):
             likelier = _likelier(more[-1])
             return (likelier and _fitted(look, likelier, found, progress)) or more
@@ -312,7 +317,7 @@ def _fitted(
 ) -> list[NamedEffect]:
     """What was found, and a candidate, fitted; nothing where it is not confirmed."""
     test, p = judged(look, candidate, progress)
-    if p >= ALPHA:
+    if p >= ALPHA_EFFECT:
         return []
     effect = look.stand.finest(candidate.effect, progress)
     stand = tried(look.stand.with_effects, [effect], progress)
@@ -348,7 +353,7 @@ def structures(look: Look, progress: Progress) -> list[Candidate]:
         if not _stands_out(candidate, ALPHA_UNNAMED):
             continue
         instead = out and len(candidate.effect.covariates) == 1
-        instead = instead and candidate.evidence > INSTEAD * out[0].evidence
+        instead = instead and candidate.evidence > ALSO_NAMED * out[0].evidence
         if instead or not _covered(look.unnamed, candidate, out):
             test, p = judged(look, candidate, progress)
             if p < ALPHA_UNNAMED:
@@ -361,8 +366,8 @@ def _covered(screen: Screen, candidate: Candidate, by: Sequence[Candidate]) -> b
     if not by:
         return False
     columns = np.unique(np.concatenate([c.test.columns for c in by]))
-    there = joint_test(screen.scores, columns)
-    both = joint_test(screen.scores, np.union1d(columns, candidate.test.columns))
+    there = score_test(screen.scores, columns)
+    both = score_test(screen.scores, np.union1d(columns, candidate.test.columns))
     gain = max(both.statistic - there.statistic, 0.0) / max(screen.common, 1.0)
     more = both.dof - there.dof
     return more < 1 or -log_tail(gain, more) < np.log(candidate.looks / ALPHA_UNNAMED)
@@ -376,7 +381,7 @@ def _scatter(look: Look, progress: Progress) -> Candidate | None:
     return None
 
 
-def judged(look: Look, candidate: Candidate, progress: Progress) -> tuple[Test, float]:
+def judged(look: Look, candidate: Candidate, progress: Progress) -> tuple[ScoreTest, float]:
     """A candidate's test, its clusters jackknifed, and its p-value adjusted for all tests."""
     found = look.judged(candidate, progress)
     return found, float(after_looks(found.p_value(), candidate.looks))
@@ -385,11 +390,11 @@ def judged(look: Look, candidate: Candidate, progress: Progress) -> tuple[Test, 
 def suspects(screen: Screen, alpha: float) -> Iterator[Candidate]:
     """Candidates found if rows were independent, or found by clusters, best first."""
     standing_out = [c for c in screen.candidates if _stands_out(c, alpha)]
-    yield from standing_out[:TRIES]
+    yield from standing_out[:SUSPECTS_JUDGED]
 
 
 def _stands_out(candidate: Candidate, alpha: float) -> bool:
-    if candidate.test.clusters < FEWEST:
+    if candidate.test.clusters < FEWEST_STOPS:
         return False
     alone = -log_tail(candidate.test.statistic, candidate.test.dof)
     return candidate.p_adjusted < alpha or alone > np.log(candidate.looks / alpha)

@@ -22,7 +22,7 @@ from calib.diagnosis.candidates import (
 from calib.diagnosis.chance import Chance, chances, of_lidar, ranked, rows_by_chance
 from calib.diagnosis.jackknife import Shares
 from calib.diagnosis.linear import Linear, linearise_with, rows_along
-from calib.diagnosis.score import Test, away_from_model, project, test
+from calib.diagnosis.score import ScoreTest, away_from_model, project, score_test
 from calib.diagnosis.screen import Candidate, Screen, screen
 from calib.effects import CATALOGUE, Effect, Scatter, Site
 from calib.forward import named
@@ -39,11 +39,15 @@ from calib.solve.fit import Progress, solve
 from chains.errors import InputError
 
 FINER = 9  # shapes tried between the two beside the best one
-BETTER_SHAPE = 9.0  # squared sigmas by which another shape must fit better
-LARGEST = 0.4  # change of a shape's logarithm at once
-SAMPLED = 8  # scans from which the bins of covariates are taken
+# Squared sigmas by which another shape must fit better: three sigmas of one parameter, 0.3 % by
+# chance.
+BETTER_SHAPE = 9.0
+# Change of a shape's logarithm at once: a choice, half as much again; the derivative holds no
+# further.
+LARGEST_SHAPE_STEP = 0.4
+SCANS_SAMPLED = 8  # scans from which the bins of covariates are taken
 # Beams of each of them at most: a quantile of so many beams in all is off by 0.15 % of them.
-DRAWN = 16_384
+BEAMS_DRAWN = 16_384
 
 
 @dataclass(frozen=True)
@@ -165,7 +169,7 @@ class Stand:
         shaped = [effect.at(float(shape)) for shape in finer]
         linear, at = self.linearise(shaped, progress)
         scores = project(linear, linear.candidates)
-        return max(shaped, key=lambda e: test(scores, at[e.name]).statistic)
+        return max(shaped, key=lambda e: score_test(scores, at[e.name]).statistic)
 
     def retuned(
         self, names: Collection[str], progress: Progress
@@ -183,9 +187,9 @@ class Stand:
         scores = project(linear, linear.candidates)
         swapped = {}
         for effect, step in zip(shaped, steps, strict=True):
-            found = test(scores, at[step.name])
+            found = score_test(scores, at[step.name])
             if found.dof and found.statistic > BETTER_SHAPE:
-                by = np.exp(np.clip(found.estimate()[0], -LARGEST, LARGEST))
+                by = np.exp(np.clip(found.estimate()[0], -LARGEST_SHAPE_STEP, LARGEST_SHAPE_STEP))
                 swapped[effect.name] = effect.at(float(f"{effect.shape * by:.6g}"))
         if not swapped:
             return self, {}
@@ -236,7 +240,7 @@ class Stand:
         """Which columns there are, and the values of covariates at some of the points."""
         columns = {c for s in self.sources for c in s.columns}
         scans = self.estimate.scans
-        chosen = np.unique(np.linspace(0, len(scans) - 1, SAMPLED).round().astype(int))
+        chosen = np.unique(np.linspace(0, len(scans) - 1, SCANS_SAMPLED).round().astype(int))
         found: dict[str, list[np.ndarray]] = {}
         rng = np.random.default_rng(0)
         for i in chosen.tolist() if scans else ():
@@ -247,8 +251,8 @@ class Stand:
             own = _own_columns(scans[i])
             looked_at = {*covariates(), *own}
             some = np.flatnonzero(rows.usable)
-            if len(some) > DRAWN:
-                some = np.sort(rng.choice(some, DRAWN, replace=False))
+            if len(some) > BEAMS_DRAWN:
+                some = np.sort(rng.choice(some, BEAMS_DRAWN, replace=False))
             for name in (n for n in rows.view.columns if n in looked_at):
                 whole = np.broadcast_to(rows.view[name], rows.view.rows)
                 found.setdefault(name, []).append(whole[some])
@@ -310,7 +314,7 @@ class Look:
         """Groups of rows that others contradict, or could."""
         return {blunder.group for blunder in self.blunders}
 
-    def judged(self, candidate: Candidate, progress: Progress) -> Test:
+    def judged(self, candidate: Candidate, progress: Progress) -> ScoreTest:
         """A candidate's test with its clusters jackknifed: see `jackknife`."""
         stand, found = self.stand, candidate.test
         wide = stand.problem_of(stand.model.plus((candidate.effect,)))

@@ -15,20 +15,22 @@ from calib.effects import Effect, Site
 from calib.effects.own.formula import FormulaEffect
 from chains.errors import InputError
 
-KNOTS = 7  # of the piecewise linear function that is suggested for one covariate
-PAIR_KNOTS = 3
-WAVES = 2  # of the harmonics of azimuth
+# Of the piecewise linear function that is suggested for one covariate, and of each of two; and of
+# the harmonics of azimuth. A choice: with half as many knots as bins each has two bins to be fitted
+# by, and a pair has 9 parameters.
+SUGGESTED_KNOTS, PAIR_KNOTS = 7, 3
+AZIMUTH_WAVES = 2
 
 DESCRIBES = "Empirical, without a known cause; observed at"
 # Endings of columns -> the unit that people read, and how many of it the column's unit is.
-UNITS = {
+COLUMN_UNITS = {
     "_m": ("m", 1.0),
     "_rad": ("degrees", float(np.degrees(1.0))),
     "_s": ("s", 1.0),
     "_c": ("degrees C", 1.0),
     "_kg": ("kg", 1.0),
 }
-WORDS = {
+COLUMN_WORDS = {
     "range_m": "range",
     "incidence_rad": "incidence",
     "azimuth_rad": "azimuth",
@@ -46,7 +48,7 @@ WORDS = {
 
 def words(covariate: str) -> str:
     """A covariate in a roboticist's words."""
-    return WORDS.get(covariate, covariate)
+    return COLUMN_WORDS.get(covariate, covariate)
 
 
 def formula(candidate: Candidate, taken: Collection[str] = ()) -> dict[str, Any] | None:
@@ -93,7 +95,7 @@ def seen(effect: Binned | JointShape) -> str:
 
 def span(name: str, low: float, high: float, suffix: str = "") -> str:
     """From where to where a column goes, in words; `suffix` where its name says no unit."""
-    unit, scale = UNITS.get(suffix or f"_{name.rpartition('_')[2]}", ("", 1.0))
+    unit, scale = COLUMN_UNITS.get(suffix or f"_{name.rpartition('_')[2]}", ("", 1.0))
     ends = (f"{scale * x:.0f}" if abs(x) > 1e4 else f"{scale * x:.3g}" for x in (low, high))
     return f"{words(name)} from {' to '.join(ends)} {unit}".rstrip()
 
@@ -119,7 +121,7 @@ def _shapes(covariate: str, effect: Binned, candidate: Candidate) -> Iterator[st
         waves = _strongest_waves(candidate) if len(effect.covariates) == 1 else (1, 2)
         yield from (f"{f}({m} * azimuth_rad)" for m in waves for f in ("sin", "cos"))
         return
-    most = KNOTS if len(effect.covariates) == 1 else PAIR_KNOTS
+    most = SUGGESTED_KNOTS if len(effect.covariates) == 1 else PAIR_KNOTS
     at = np.unique(np.quantile(effect.centres[covariate], np.linspace(0, 1, most)))
     gaps = [b - a for a, b in pairwise(at)]
     for i, knot in enumerate(at):
@@ -136,7 +138,7 @@ def _strongest_waves(candidate: Candidate) -> tuple[int, ...]:
     wanted = candidate.test.estimate()
     orders = range(1, len(centres) // 3 + 1)
     power = [np.abs(np.sum(wanted * np.exp(1j * m * centres))) for m in orders]
-    return tuple(sorted(int(m) + 1 for m in np.argsort(power)[::-1][:WAVES]))
+    return tuple(sorted(int(m) + 1 for m in np.argsort(power)[::-1][:AZIMUTH_WAVES]))
 
 
 def what_separates(a: Effect, b: Effect) -> str:

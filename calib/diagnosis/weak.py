@@ -15,10 +15,16 @@ from calib.problem.unknowns import Key
 from calib.results.observability import UNTOLD, echelon
 from calib.results.solution import Solution
 
-LEANS = 0.5  # of the prior's variance left in a direction that the data hardly determine
-SHARE = 0.2  # of a direction of unit length, in priors' sigmas, for a parameter to be named
-STANDS_IN = 0.97  # of what a candidate does, that an effect of the model can absorb
-MOST_DIRECTIONS = 8
+# Of the prior's variance left in a direction that the data hardly determine: they say less of it
+# than the prior.
+LEANS = 0.5
+# Of a direction of unit length, in priors' sigmas, for a parameter to be named: a choice; one that
+# is left out holds 4 % of its square at most.
+NAMED_SHARE = 0.2
+# Of what a candidate does, that an effect of the model can absorb: a choice; its sigma is then 5.8
+# times as large beside the other.
+STANDS_IN = 0.97
+MOST_DIRECTIONS = 8  # that are told, the weakest: a choice, as nobody reads more
 
 
 def weak_directions(solution: Solution, look: Look) -> list[dict[str, Any]]:
@@ -84,7 +90,7 @@ def hardly_known(
     for value, axis in weak[:MOST_DIRECTIONS]:
         if value < LEANS:
             break
-        named = [int(i) for i in np.argsort(-np.abs(axis)) if abs(axis[i]) > SHARE]
+        named = [int(i) for i in np.argsort(-np.abs(axis)) if abs(axis[i]) > NAMED_SHARE]
         if named:
             moved = np.sqrt(value) * np.abs(axis * known)[named]
             out.append(

@@ -10,7 +10,7 @@ from calib.rig import Rig
 
 STUDY = "Pushing the Limits of LiDAR: Accurate Performance Analysis of Indoor 3D LiDARs"
 FAINTEST = 0.01  # of the median intensity: about 1 count of 8 bits, where a room's median is 100
-AMBIENT_C = 20.0
+AMBIENT_C = 20.0  # where the error is zero by definition: the usual reference (ISO 1)
 
 
 class RangeEffect(Effect):

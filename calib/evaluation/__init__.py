@@ -38,8 +38,8 @@ from chains.errors import InputError
 from sensors.documents import write_json, write_yaml
 from sensors.recording import write_table
 
-EVALUATION, POINTS, MEANING = "evaluation.json", "points.parquet", "_columns.yaml"
-COLUMNS = {
+EVALUATION_FILE, POINTS_FILE, MEANING_FILE = "evaluation.json", "points.parquet", "_columns.yaml"
+POINT_COLUMNS = {
     "x_m y_m z_m": "mean return of the direction, in the reference's frame, corrected",
     "ring column": "of the direction, from 0",
     "count": "returns of the hold that the other columns are means of",
@@ -52,7 +52,8 @@ COLUMNS = {
     "raw_signed_error_m raw_accuracy_m": "the same, before correction",
 }
 _APART = re.compile(r"[%/\\=]")  # what would end a part of a path, or its key
-NEAREST = 1024  # points of a stop whose nearest point of the mesh is sought: each costs many rays
+# Points of a stop whose nearest point of the mesh is sought: each costs many rays.
+NEAREST_SOUGHT = 1024
 
 
 def _part(name: str) -> str:
@@ -63,7 +64,7 @@ def _part(name: str) -> str:
 def evaluate_stop(scan: ScanStop, values: Values) -> Evaluated:
     """Evaluate one stop, its rig standing where a state says."""
     ranges = scan.ranges(values)
-    some = np.linspace(0, len(ranges.hit) - 1, min(NEAREST, len(ranges.hit))).astype(int)
+    some = np.linspace(0, len(ranges.hit) - 1, min(NEAREST_SOUGHT, len(ranges.hit))).astype(int)
     rig = scan.stops.rig
     return Evaluated(
         rig=rig.name,
@@ -210,10 +211,10 @@ def write_evaluation(
     Returns:
         What evaluation.json holds.
     """
-    points = folder / POINTS
+    points = folder / POINTS_FILE
     points.mkdir(parents=True)
     tally = Tally(raw)
-    write_yaml(points / MEANING, COLUMNS)
+    write_yaml(points / MEANING_FILE, POINT_COLUMNS)
     for done in stops:
         tally.add(done)
         names = {"sensor": done.sensor, "location": done.location, "stop": done.stop}
@@ -221,5 +222,5 @@ def write_evaluation(
         place.mkdir(parents=True, exist_ok=True)
         write_table(place / f"{done.rig}.parquet", done.points)
     document = tally.document(labels)
-    write_json(folder / EVALUATION, document)
+    write_json(folder / EVALUATION_FILE, document)
     return document

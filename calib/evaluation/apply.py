@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from calib import outputs
-from calib.diagnosis.formulas.seen import Reach
+from calib.diagnosis.formulas.seen import ColumnRanges
 from calib.effects import Effect, LazyColumn, Site, View
 from calib.linear.parallel import one_blas_thread
 from calib.problem.model import Source
@@ -35,12 +35,14 @@ from sensors.meshes import read_cloud, write_cloud
 from sensors.recording import read_table, write_table
 
 Columns = dict[str, np.ndarray]
-Known = Callable[[Beams], Mapping[str, np.ndarray]]  # beams of points -> what else is known of them
+KnownOfBeams = Callable[
+    [Beams], Mapping[str, np.ndarray]
+]  # beams of points -> what else is known of them
 NEIGHBOURS = 24  # of a point, through which its plane is laid
 SUPPORT = 200_000  # points among which neighbours are sought
 THICKEST = 0.3  # of a plane's width: what is thicker is none
-FLATTEST_RAD = np.radians(85.0)  # flatter beams are corrected as these are
-PASSES = (
+FLATTEST_BEAM_RAD = np.radians(85.0)  # flatter beams are corrected as these are
+CORRECTION_PASSES = (
     3  # looks at the range: a correction changes by a millionth of itself from each to the next
 )
 _SEEN = ("range_m", "azimuth_rad", "elevation_rad", "incidence_rad")  # of any cloud
@@ -107,7 +109,7 @@ class Correction:
         error = np.zeros((len(xyz_m), 3))
         if "intensity" in columns:
             columns = {**columns, "intensity": columns["intensity"] / self.median_intensity}
-        for _ in range(PASSES):
+        for _ in range(CORRECTION_PASSES):
             there = {"range_m": ray.range_m - error[:, 0], **_angles(ray), **columns}
             view = View(self.rig, len(xyz_m), there, np.zeros((1, 0)))
             each = (site_error(e.basis(view), theta) for e, theta in self.effects)
@@ -175,7 +177,7 @@ def apply(
 def _apply_file(correction: Correction, cloud: Path, target: Path) -> Applied:
     parquet = cloud.suffix.lower() == ".parquet"
     columns = read_table(cloud) if parquet else read_cloud(cloud)
-    reach = Reach(e for e, _ in correction.effects)
+    reach = ColumnRanges(e for e, _ in correction.effects)
     rms_m, left_out = _correct(correction, cloud, columns, reach)
     (write_table if parquet else write_cloud)(target, columns)
     return Applied(target, len(columns["x"]), rms_m, left_out, extrapolated=reach.sentences())
@@ -188,7 +190,7 @@ def _apply_recording(
     met = dict(_met(run, folder))  # but for scans that were left out, or set aside
     stops = (dict(_unmet(Source.open(folder))) | met).items()
     points, squares, left_out = 0, 0.0, {}
-    reach = Reach(e for e, _ in correction.effects)
+    reach = ColumnRanges(e for e, _ in correction.effects)
     shutil.copytree(folder, target)
     for i, (stop, known) in enumerate(stops):
         progress("correcting", i, len(stops))
@@ -202,7 +204,7 @@ def _apply_recording(
     return Applied(target, points, rms_m, left_out, extrapolated=reach.sentences())
 
 
-def _unmet(source: Source) -> list[tuple[str, Known]]:
+def _unmet(source: Source) -> list[tuple[str, KnownOfBeams]]:
     """Stops with a scan, and what is known of all points of each: the columns of the stop."""
     return [
         (stop, lambda ray, k=k: {n: c[[k]] for n, c in source.columns.items() if c.ndim == 1})
@@ -211,7 +213,7 @@ def _unmet(source: Source) -> list[tuple[str, Known]]:
     ]
 
 
-def _met(run: Run, folder: Path) -> list[tuple[str, Known]]:
+def _met(run: Run, folder: Path) -> list[tuple[str, KnownOfBeams]]:
     """The same of a recording that the run was fitted to; and what its beams meet on the mesh."""
     if folder.resolve() not in [path.resolve() for path in run.recordings]:
         return []
@@ -229,8 +231,8 @@ def _correct(
     correction: Correction,
     path: Path,
     columns: Columns,
-    reach: Reach,
-    known: Known = lambda ray: {},
+    reach: ColumnRanges,
+    known: KnownOfBeams = lambda ray: {},
 ) -> tuple[float, dict[str, str]]:
     """Correct a cloud's columns x y z in place, and show `reach` what effects look at; by how much,
     rms in m, and what was left out."""
@@ -271,7 +273,7 @@ def _incidence(xyz_m: np.ndarray, rig: Rig, met_rad: np.ndarray | None) -> np.nd
         incidence_rad = np.where(np.isnan(met_rad), incidence(xyz_m, rig), met_rad)
     else:
         incidence_rad = met_rad
-    return np.minimum(incidence_rad, FLATTEST_RAD)
+    return np.minimum(incidence_rad, FLATTEST_BEAM_RAD)
 
 
 def incidence(xyz_m: np.ndarray, rig: Rig) -> np.ndarray:

@@ -23,7 +23,8 @@ from chains.errors import InputError
 from chains.serial import CHUNK, SerialChain
 
 Columns = Mapping[str, np.ndarray]
-USUAL, STEPS = 3, 30  # of the inverse, where the arm is not stretched and where it is
+# Steps of the inverse, where the arm is not stretched and where it is.
+USUAL_STEPS, STRETCHED_STEPS = 3, 30
 REACHED = 1e-8  # of the arm's length, and rad: no more steps
 # Least damping of a step, of squares of the arm's length; beyond it half the squared error, which
 # keeps steps short where an arm is stretched (Sugihara 2011, IEEE Trans. Robotics 27(5)).
@@ -147,9 +148,9 @@ class Arm:
         off = np.empty((len(command), 6))
         for first in range(0, len(command), CHUNK):
             some = np.arange(first, min(first + CHUNK, len(command)))
-            self._solve(Ts_base_tip, columns, command, off, some, USUAL)
+            self._solve(Ts_base_tip, columns, command, off, some, USUAL_STEPS)
         far = np.abs(off).max(axis=1, initial=0.0) > REACHED * self._length_m
-        self._solve(Ts_base_tip, columns, command, off, np.flatnonzero(far), STEPS)
+        self._solve(Ts_base_tip, columns, command, off, np.flatnonzero(far), STRETCHED_STEPS)
         turned, shifted = np.linalg.norm(off.reshape(-1, 2, 3), axis=2).T
         return Command(joints=command, off_m=shifted, off_rad=turned / self._length_m)
 

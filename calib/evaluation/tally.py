@@ -11,7 +11,7 @@ import numpy as np
 Columns = dict[str, np.ndarray]
 
 # Width of a bin, in the unit of its name, and how to get there from the points' column.
-BINS = {
+BIN_WIDTHS = {
     "ring": ("ring", 1.0, 1.0),
     "incidence_deg": ("incidence_rad", 5.0, np.degrees(1.0)),
     "distance_m": ("distance_m", 0.5, 1.0),
@@ -61,7 +61,7 @@ class Tally:
         self.prefix = "raw_" if raw else ""
         self._whole = np.zeros(6)
         self._nearest = np.zeros(6)
-        self._by: dict[str, np.ndarray] = {name: np.zeros((0, 6)) for name in BINS}
+        self._by: dict[str, np.ndarray] = {name: np.zeros((0, 6)) for name in BIN_WIDTHS}
         self._errors = np.zeros(2 * round(REACH_M / STEP_M))
         self._spreads = np.zeros(round(REACH_M / STEP_M))
         self._planes: dict[str, dict[int, np.ndarray]] = {}
@@ -76,7 +76,7 @@ class Tally:
         count, spread_m = points["count"].astype(float), points["precision_m"].astype(float)
         sums = _sums(count, error_m, accuracy_m, spread_m)
         self._whole += sums.sum(axis=0)
-        for name, (column, width, scale) in BINS.items():
+        for name, (column, width, scale) in BIN_WIDTHS.items():
             at = np.floor(points[column].astype(float) * (scale / width)).astype(int)
             self._by[name] = _added(self._by[name], _by_bin(at, sums))
         self._errors += _histogram(error_m + REACH_M, len(self._errors))
@@ -130,7 +130,7 @@ class Tally:
             "accuracy_mm": whole["accuracy_mm"],
             "precision_mm": whole["precision_mm"],
             "cloud_to_mesh_mm": {"mean": nearest["mean_mm"], "std": nearest["std_mm"]},
-            "by": {name: self._rows(name, labels) for name in BINS},
+            "by": {name: self._rows(name, labels) for name in BIN_WIDTHS},
             "histograms": {
                 "signed_error_mm": _counts(self._errors, -REACH_M),
                 "precision_mm": _counts(self._spreads, 0.0),
@@ -139,7 +139,7 @@ class Tally:
         }
 
     def _rows(self, name: str, labels: Mapping[int, str]) -> list[dict[str, Any]]:
-        width = BINS[name][1]
+        width = BIN_WIDTHS[name][1]
         filled = [(k, row) for k, row in enumerate(self._by[name]) if row[0]]
         if name == "label":
             return [{"value": k, "name": labels.get(k, ""), **_row(row)} for k, row in filled]

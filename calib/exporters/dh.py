@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 
 from calib.exporters.fitted import FittedRig, for_every_rig
-from calib.exporters.written import SIGMAS, Unheld, Written, commented, write_text
+from calib.exporters.written import NO_PLACE_FOR_SIGMAS, Unheld, Written, commented, write_text
 from chains import se3
 from chains.frames import Edge
 from chains.readers.dh_out import table_of
 from sensors.documents import yaml_text
 
-CONVENTIONS = (
+DH_CONVENTIONS = (
     "T_base_tip = base * link 1 * ... * last joint * tip. A link is the matrix product",
     "Rz(theta + q) Tz(d) Tx(a) Rx(alpha) Ry(beta) of a joint that turns; one that slides has its q",
     "in d. The last joint is Rz(q) or Tz(q). q is as the encoder reports it: offsets are in theta.",
@@ -41,9 +41,9 @@ def write_dh(fit: FittedRig, folder: Path) -> Written:
         raise Unheld("a joint follows another, and such a table has no place for it")
     edges = [replace(edge, T_parent_child=fit.origins[edge.name]) for edge in drawn]
     document = {"calibrated": _document(edges, drawn), "drawn": _document(drawn, drawn)}
-    not_held = [SIGMAS, *fit.not_held(fit.fixed)]
+    not_held = [NO_PLACE_FOR_SIGMAS, *fit.not_held(fit.fixed)]
     path = fit.file(folder, "dh.yaml")
-    write_text(path, commented(fit.head(CONVENTIONS, not_held)) + yaml_text(document))
+    write_text(path, commented(fit.head(DH_CONVENTIONS, not_held)) + yaml_text(document))
     return Written([path], not_held)
 
 

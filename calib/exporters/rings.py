@@ -13,16 +13,16 @@ import numpy as np
 
 from calib.effects.beams import BeamOriginOffset
 from calib.exporters.fitted import FittedRig, for_every_rig
-from calib.exporters.written import SIGMAS, Unheld, Written, commented, write_text
+from calib.exporters.written import NO_PLACE_FOR_SIGMAS, Unheld, Written, commented, write_text
 from sensors.documents import json_text
 
-COLUMNS = (("range", "m"), ("azimuth", "rad"), ("elevation", "rad"))
-CONVENTIONS = (
+RING_OFFSETS = (("range", "m"), ("azimuth", "rad"), ("elevation", "rad"))
+RING_CONVENTIONS = (
     "A row per ring, from 0 as the driver counts. measured = true + offset, so subtract offsets.",
     "range_m is along the beam, from where it starts; azimuth_rad counter-clockwise from x, seen",
     "from +z; elevation_rad up from the x-y plane; all in the LiDAR's own frame.",
 )
-OUSTER = {
+OUSTER_ANGLES = {
     "angles": "degrees; altitude up, azimuth clockwise seen from above, as Ouster has them",
     "corrected": "table = that of the LiDAR model in rig.yaml - offset, measured = true + offset",
     "lidar_to_sensor_transform": "half a turn about z, no shift: points come in the frame 'lidar'"
@@ -40,12 +40,12 @@ def write_rings(fit: FittedRig, folder: Path) -> Written:
     """
     offset, sigma = _ring_errors(fit)
     table = {"ring": np.arange(len(offset))}
-    for axis, (name, unit) in enumerate(COLUMNS):
+    for axis, (name, unit) in enumerate(RING_OFFSETS):
         if any(basis[:, axis].any() for basis in fit.by_ring.values()):
             table[f"{name}_offset_{unit}"] = offset[:, axis]
             table[f"{name}_sigma_{unit}"] = sigma[:, axis]
     not_held = fit.not_held(fit.by_ring)
-    conventions = (*CONVENTIONS, f"The sum of {', '.join(fit.by_ring)}; sigma is its own.")
+    conventions = (*RING_CONVENTIONS, f"The sum of {', '.join(fit.by_ring)}; sigma is its own.")
     rows = zip(*(column.tolist() for column in table.values()), strict=True)
     lines = [",".join(table), *(",".join(map(repr, row)) for row in rows), ""]
     path = fit.file(folder, "rings.csv")
@@ -108,7 +108,7 @@ def write_ouster(fit: FittedRig, folder: Path) -> Written:
         not_held.append(f"beams start {1e3 * tangential_m:.3f} mm to the left: no place for it")
     told = fit.head((), not_held)
     path = fit.file(folder, "ouster_metadata.json")
-    write_text(path, json_text(metadata | {"rigcal": {"about": told, **OUSTER}}) + "\n")
+    write_text(path, json_text(metadata | {"rigcal": {"about": told, **OUSTER_ANGLES}}) + "\n")
     return Written([path], not_held)
 
 
@@ -156,4 +156,4 @@ def _not_in_a_table(fit: FittedRig, held: list[str]) -> list[str]:
     """What an angle table leaves out: sigmas, ranges, and all other effects."""
     both = [name for name in held if name in fit.by_ring and fit.by_ring[name][:, 0].any()]
     ranges = [f"{name}: its part of range" for name in both]
-    return [SIGMAS, *ranges, *fit.not_held(held)]
+    return [NO_PLACE_FOR_SIGMAS, *ranges, *fit.not_held(held)]

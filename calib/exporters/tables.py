@@ -14,7 +14,7 @@ from calib.show.scale import shown
 from calib.show.tables import LISTED_PARAMETERS, effect_cells, estimate_cell
 from chains import escape
 
-CONVENTIONS = (
+TABLE_CONVENTIONS = (
     "Links: how far T_parent_child lies from CAD, T_cad exp(twist), in the child's own axes; where",
     "no CAD says, sigma alone. Effects: geometry, true = nominal + effect; instruments,",
     "measured = true + effect. The number after the sign is one standard deviation.",
@@ -53,7 +53,8 @@ def _write(
     ]
     rigs = ", ".join(recording["rig"] for recording in fitted.run.model["recordings"])
     text = "".join(
-        line.format(escape.line(each)) for each in head(fitted.run, rigs, CONVENTIONS, not_held)
+        line.format(escape.line(each))
+        for each in head(fitted.run, rigs, TABLE_CONVENTIONS, not_held)
     )
     for table in _tables(rows):
         text += "\n" + "\n".join(render(table)) + "\n"

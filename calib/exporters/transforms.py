@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from calib.exporters.fitted import FittedRig, for_every_rig
-from calib.exporters.written import SIGMAS, Unheld, Written, commented, write_text
+from calib.exporters.written import NO_PLACE_FOR_SIGMAS, Unheld, Written, commented, write_text
 from calib.results.solution import FrameEstimate
 from chains import se3
 from sensors.documents import yaml_text
@@ -65,7 +65,7 @@ def write_ros2(fit: FittedRig, folder: Path) -> Written:
     Raises:
         Unheld: the rig has no frames.
     """
-    frames, not_held = _frames(fit), [SIGMAS, *_effects_not_held(fit)]
+    frames, not_held = _frames(fit), [NO_PLACE_FOR_SIGMAS, *_effects_not_held(fit)]
     comment = commented(fit.head(ROS, not_held))
     rows = [
         f"    ({', '.join(map(repr, (frame.parent, name, *_numbers(frame))))}),"
@@ -95,7 +95,7 @@ def write_autoware(fit: FittedRig, folder: Path) -> Written:
     on_kit = {name: frame for name, frame in frames.items() if frame.parent == kit}
     not_held = [
         *(f"{name}: it stands on {f.parent}" for name, f in frames.items() if name not in on_kit),
-        SIGMAS,
+        NO_PLACE_FOR_SIGMAS,
         *_effects_not_held(fit),
     ]
     conventions = [*AUTOWARE, f"sensor_kit_base_link stands for the rig's frame {kit}."]
@@ -122,7 +122,7 @@ def write_kalibr(fit: FittedRig, folder: Path) -> Written:
     Raises:
         Unheld: the rig has no frames.
     """
-    not_held = [SIGMAS, *_effects_not_held(fit)]
+    not_held = [NO_PLACE_FOR_SIGMAS, *_effects_not_held(fit)]
     values = {
         name: {
             "parent": frame.parent,

@@ -16,11 +16,11 @@ from calib.results.solution import FrameEstimate
 from calib.runs.estimates import variable_estimates
 from chains import escape, se3
 
-ROW, STEP, LEFT, TOP, LINE = 30, 26, 24, 84, 20
+ROW_PX, STEP_PX, LEFT_PX, TOP_PX, LINE_PX = 30, 26, 24, 84, 20
 FONT = "font-family:system-ui,sans-serif;font-size:13px"
-BOLD, NUMBERS = "font-weight:600", "font-family:ui-monospace,monospace;font-size:12px"
-INK, PALE, AMBER, RED = "#1f2933", "#9aa5b1", "#b7791f", "#b00020"
-MOVES = {
+BOLD_STYLE, NUMBERS_STYLE = "font-weight:600", "font-family:ui-monospace,monospace;font-size:12px"
+SVG_INK, SVG_PALE, SVG_AMBER, SVG_RED = "#1f2933", "#9aa5b1", "#b7791f", "#b00020"
+BASE_STANDS = {
     "stop": "stands anew at every stop",
     "location": "stands anew at every location",
     "never": "stands still",
@@ -46,31 +46,35 @@ class _Row:
 def write_tree(fit: FittedRig, folder: Path) -> Written:
     """Write tree.svg; effects are not in it."""
     rows = list(_rows(fit))
-    names = max(LEFT + STEP * row.depth + _CHARACTER * len(row.frame) for row in rows)
+    names = max(LEFT_PX + STEP_PX * row.depth + _CHARACTER * len(row.frame) for row in rows)
     where, spread = names + 40, names + 490
     warning = warnings(fit.run)
-    top = TOP + LINE * len(warning)
-    size = {"width": f"{spread + 240:.0f}", "height": f"{top + ROW * len(rows) + 16}"}
+    top = TOP_PX + LINE_PX * len(warning)
+    size = {"width": f"{spread + 240:.0f}", "height": f"{top + ROW_PX * len(rows) + 16}"}
     svg = Element("svg", size, xmlns="http://www.w3.org/2000/svg", style=FONT)
     SubElement(svg, "title").text = escape.line(f"Frames of {fit.rig.name}")
     SubElement(svg, "rect", width="100%", height="100%", fill="white")
     for i, line in enumerate(warning):
-        _text(svg, LEFT, 28 + LINE * i, line, RED, style=BOLD)
-    _text(svg, LEFT, top - 56, f"Frames of {fit.rig.name}", style=BOLD)
+        _text(svg, LEFT_PX, 28 + LINE_PX * i, line, SVG_RED, style=BOLD_STYLE)
+    _text(svg, LEFT_PX, top - 56, f"Frames of {fit.rig.name}", style=BOLD_STYLE)
     said = "each in the axes of the frame above it, angles as in URDF; sigma of the worst axis"
-    _text(svg, LEFT, top - 36, f"{said}, amber where the data alone do not identify it", PALE)
+    _text(
+        svg, LEFT_PX, top - 36, f"{said}, amber where the data alone do not identify it", SVG_PALE
+    )
     for x, title in ((where, "x, y, z, roll, pitch, yaw"), (spread, "one sigma")):
-        _text(svg, x, top - 12, title, PALE)
+        _text(svg, x, top - 12, title, SVG_PALE)
     for i, row in enumerate(rows):
-        x, y = LEFT + STEP * row.depth, top + ROW * i + 12
+        x, y = LEFT_PX + STEP_PX * row.depth, top + ROW_PX * i + 12
         if row.above is not None:
-            up, left = top + ROW * row.above + 20, x - STEP + 6
+            up, left = top + ROW_PX * row.above + 20, x - STEP_PX + 6
             dashed = {"stroke-dasharray": "4 3"} if row.loose else {}
-            line = {"d": f"M{left},{up}V{y}H{x - 4}", "fill": "none", "stroke": PALE} | dashed
+            line = {"d": f"M{left},{up}V{y}H{x - 4}", "fill": "none", "stroke": SVG_PALE} | dashed
             SubElement(svg, "path", line)
-        _text(svg, x, y + 5, row.frame, style=BOLD)
-        _text(svg, where, y + 5, row.place, PALE if row.loose else INK, style=NUMBERS)
-        _text(svg, spread, y + 5, row.sigma, INK if row.told else AMBER, style=NUMBERS)
+        _text(svg, x, y + 5, row.frame, style=BOLD_STYLE)
+        _text(svg, where, y + 5, row.place, SVG_PALE if row.loose else SVG_INK, style=NUMBERS_STYLE)
+        _text(
+            svg, spread, y + 5, row.sigma, SVG_INK if row.told else SVG_AMBER, style=NUMBERS_STYLE
+        )
     ElementTree.indent(svg)
     path = fit.file(folder, "tree.svg")
     write_text(path, ElementTree.tostring(svg, "unicode") + "\n")
@@ -96,7 +100,7 @@ def _rows(fit: FittedRig) -> Iterator[_Row]:
         edge, estimate = edges.get(frame), frames.get(frame)
         place, loose = "", False
         if frame == tree.root:
-            place, loose = MOVES[rig.moves], True
+            place, loose = BASE_STANDS[rig.moves], True
         elif estimate is not None:
             place = _place(estimate.T_parent_child)
         elif edge is not None:
@@ -129,6 +133,6 @@ def _sigma(estimate: FrameEstimate | None) -> str:
     return f"± {mm:.3f} mm  ± {mrad:.3f} mrad" if mm or mrad else "held"
 
 
-def _text(svg: Element, x: float, y: float, text: str, fill: str = INK, **more: str) -> None:
+def _text(svg: Element, x: float, y: float, text: str, fill: str = SVG_INK, **more: str) -> None:
     place = {"x": f"{x:.0f}", "y": f"{y:.0f}", "fill": fill, "xml:space": "preserve"}
     SubElement(svg, "text", place, **more).text = escape.line(text)

@@ -9,11 +9,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from calib.exporters.fitted import FittedRig, for_every_rig
-from calib.exporters.written import SIGMAS, Unheld, Written, write_text
+from calib.exporters.written import NO_PLACE_FOR_SIGMAS, Unheld, Written, write_text
 from chains.frames import Edge
 from chains.readers.urdf_out import empty_robot, with_comment, with_frames, with_origins
 
-CONVENTIONS = (
+URDF_CONVENTIONS = (
     "A joint's origin is T_parent_child at a reported joint of 0: xyz in m, in the parent's axes;",
     "rpy in rad about the parent's fixed x, then y, then z. Lengths, tilts and offsets of joints",
     "are in the origins, so joints are given as the encoders report them. Limits are the maker's.",
@@ -30,12 +30,12 @@ def write_urdf(fit: FittedRig, folder: Path) -> Written:
     tree = fit.rig.tree
     if not tree.edges:
         raise Unheld("the rig has neither an arm nor frames")
-    not_held = [SIGMAS, *fit.not_held(fit.fixed)]
+    not_held = [NO_PLACE_FOR_SIGMAS, *fit.not_held(fit.fixed)]
     files, where = [], fit.rig.arm_urdf or "rig.urdf"
     if fit.rig.arm_urdf:
         arm = with_origins(fit.rig.arm_urdf.read_bytes(), fit.origins, where)
         files.append(fit.file(folder, "arm.urdf"))
-        lines = fit.head(CONVENTIONS, not_held)
+        lines = fit.head(URDF_CONVENTIONS, not_held)
         write_text(files[-1], with_comment(arm, lines, where))
     else:
         arm = empty_robot(fit.rig.name, tree.root)
@@ -45,5 +45,5 @@ def write_urdf(fit: FittedRig, folder: Path) -> Written:
     whole, left = with_frames(arm, fixed, where)
     not_held += [f"{name}: nothing fixed ties it to the rest of the URDF's tree" for name in left]
     files.append(fit.file(folder, "rig.urdf"))
-    write_text(files[-1], with_comment(whole, fit.head(CONVENTIONS, not_held), where))
+    write_text(files[-1], with_comment(whole, fit.head(URDF_CONVENTIONS, not_held), where))
     return Written(files, not_held)

@@ -12,8 +12,8 @@ from chains import escape
 from chains.errors import InputError
 from sensors.documents import write_atomically
 
-WIDTH = 90
-SIGMAS = "sigmas: this format has no place for them; extrinsics.yaml has"
+LINE_WIDTH = 90
+NO_PLACE_FOR_SIGMAS = "sigmas: this format has no place for them; extrinsics.yaml has"
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ def write_text(path: Path, text: str | bytes) -> None:
 
 def warnings(run: Run) -> list[str]:
     """What stands above everything that is written of a run, in short lines."""
-    return [line for sentence in run.warning for line in textwrap.wrap(sentence, WIDTH)]
+    return [line for sentence in run.warning for line in textwrap.wrap(sentence, LINE_WIDTH)]
 
 
 def head(run: Run, rig: str, conventions: Iterable[str], not_held: Iterable[str]) -> list[str]:
@@ -50,7 +50,7 @@ def head(run: Run, rig: str, conventions: Iterable[str], not_held: Iterable[str]
         *_listed("Not held here:", not_held),
         *_listed(
             "Not identifiable from the data alone (why: solution.yaml):",
-            textwrap.wrap(untold, WIDTH),
+            textwrap.wrap(untold, LINE_WIDTH),
         ),
     ]
 

@@ -18,15 +18,19 @@ from calib.results.solution import (
     frame_document,
 )
 from calib.runs.reopen import effects_that_may_run
-from calib.runs.run import RING, Run
+from calib.runs.run import RING_NAME, Run
 from chains import se3
 from chains.errors import InputError
 from sensors.documents import Document, Marks, Number, read_yaml, validate, yaml_text
 
 FILE = "extrinsics.yaml"
-FORMAT = "rigcal extrinsics 1"
-UNITS = {"length": "m", "angle": "rad", "suffixes": "a key ending in _m is in m, in _rad in rad"}
-CONVENTIONS = {
+EXTRINSICS_FORMAT = "rigcal extrinsics 1"
+EXTRINSICS_UNITS = {
+    "length": "m",
+    "angle": "rad",
+    "suffixes": "a key ending in _m is in m, in _rad in rad",
+}
+EXTRINSICS_CONVENTIONS = {
     "T_parent_child": ["p_parent = T_parent_child p_child", "4 x 4, row by row"],
     "one_pose": ["T_parent_child", "xyz_m with quat_wxyz", "xyz_m with rpy_rad"],
     "xyz_m": "origin of the child, in the parent's axes",
@@ -46,9 +50,9 @@ def write_extrinsics(fitted: Fitted, folder: Path) -> Written:
     solution = run.solution
     formulas = {effect.name: effect.formula for effect in effects_that_may_run(run)[0]}
     data = {
-        "format": FORMAT,
-        "units": UNITS,
-        "conventions": CONVENTIONS,
+        "format": EXTRINSICS_FORMAT,
+        "units": EXTRINSICS_UNITS,
+        "conventions": EXTRINSICS_CONVENTIONS,
         "provenance": _provenance(run),
         **_part_document(solution.shared, formulas),
         "not_estimated": solution.not_estimated,
@@ -67,8 +71,10 @@ def read_extrinsics(path: Path | str) -> tuple[Part, dict[str, Part]]:
         InputError: the file is missing or none of its kind, or a frame's notations disagree.
     """
     data, marks = read_yaml(path)
-    if not isinstance(data, dict) or data.get("format") != FORMAT:
-        raise InputError(f"{path}: 'format: {FORMAT}' is missing, so this is no export of rigcal")
+    if not isinstance(data, dict) or data.get("format") != EXTRINSICS_FORMAT:
+        raise InputError(
+            f"{path}: 'format: {EXTRINSICS_FORMAT}' is missing, so this is no export of rigcal"
+        )
     file = validate(_File, data, path, marks)
     shared = _read_part(file, path, marks, ())
     recordings = {
@@ -94,7 +100,7 @@ def _provenance(run: Run) -> dict[str, Any]:
 
 
 def _part_document(part: Part, formulas: Mapping[str, str]) -> dict[str, Any]:
-    by_ring = {name for name, e in part.effects.items() if all(map(RING.fullmatch, e.names))}
+    by_ring = {name for name, e in part.effects.items() if all(map(RING_NAME.fullmatch, e.names))}
     return {
         "frames": {name: _frame_document(frame) for name, frame in part.frames.items()},
         "effects": {
@@ -118,7 +124,7 @@ def _frame_document(frame: FrameEstimate) -> dict[str, Any]:
 def _ring_document(effect: EffectEstimate) -> dict[str, Any]:
     offset, sigma = _ring_columns(effect.unit)
     rows = zip(effect.names, effect.estimate, effect.sigma, strict=True)
-    table = [{"ring": int(RING.fullmatch(n)[1]), offset: e, sigma: s} for n, e, s in rows]
+    table = [{"ring": int(RING_NAME.fullmatch(n)[1]), offset: e, sigma: s} for n, e, s in rows]
     return {"unit": effect.unit, "table": table}
 
 
@@ -163,7 +169,7 @@ class _Part(Document):
 
 
 class _File(_Part):
-    format: Literal[FORMAT]
+    format: Literal[EXTRINSICS_FORMAT]
     units: dict[str, str]
     conventions: dict[str, Any]
     provenance: dict[str, Any]

@@ -15,12 +15,12 @@ from chains.se3 import Array
 from sensors.documents import nearest
 from sensors.readers.base import Sweeps, Track
 
-WINDOW_S = 0.2  # rates are smoothed over it before they are compared
+RATE_WINDOW_S = 0.2  # rates are smoothed over it before they are compared
 LEAST_LIKE = 0.75  # correlation below which two motions are not the same
 RIVAL = 0.8  # of the best evidence, at another offset: then nobody knows which is right
 LOBE_S = 1.0  # within it of the best, a peak is the same one
 LEAST_OVERLAP = 0.3  # of the shorter log
-PARTS = 8  # of the logs, whose own offsets tell the uncertainty
+LOG_PARTS = 8  # of the logs, whose own offsets tell the uncertainty
 REACH_S = 0.25  # the offset of a part is sought within it: a clock 100 ppm off needs 40 min for it
 LEAST_S = 2.0  # of a log: less has not one move of an arm in it
 DRIFT_S = (
@@ -114,7 +114,8 @@ def align(
         out.understood.append(f"clocks: all times are those of {main}")
     out.understood.extend(f"clocks: {n} {s:+.4f} s, as given" for n, s in given_s.items())
     heard = {
-        c: [m for t in tracks if t.clock == c for m in motions(t, edges, WINDOW_S)] for c in spans
+        c: [m for t in tracks if t.clock == c for m in motions(t, edges, RATE_WINDOW_S)]
+        for c in spans
     }
     moving = [c for c in spans if heard[c]]
     for clock in sorted((c for c in spans if c not in known), key=lambda c: c not in moving):
@@ -317,7 +318,7 @@ def _parts(a: Array, b: Array, lag: int, step_s: float) -> tuple[Array, Array]:
     """
     start, end = max(0, -lag), min(len(a), len(b) - lag)
     reach = max(2, round(REACH_S / step_s))
-    parts = list(itertools.pairwise(np.linspace(start, end, PARTS + 1).astype(int)))
+    parts = list(itertools.pairwise(np.linspace(start, end, LOG_PARTS + 1).astype(int)))
     middle = np.array([(low + high) / 2 for low, high in parts])
     about, found = np.zeros(len(parts)), np.full(len(parts), np.nan)
     for _ in range(2):

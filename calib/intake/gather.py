@@ -18,7 +18,7 @@ from sensors.lidar import catalog
 from sensors.readers import READERS
 from sensors.readers.arms.urdf import with_ends
 from sensors.readers.base import (
-    Arm,
+    ArmDescription,
     Columns,
     Contents,
     Options,
@@ -46,7 +46,7 @@ class Gathered:
     sweeps: list[Sweeps]
     stops: Columns | None
     lidar: Mapping[str, Any] | None
-    arm: Arm | None
+    arm: ArmDescription | None
     edges: list[Edge]
     surface: ScannedSurface | None
     spheres: Spheres | None
@@ -139,7 +139,7 @@ def _read(kind: str, files: Sequence[Path], options: Options, progress: Progress
     return READERS[kind].read(files, options, progress)
 
 
-def chain(arm: Arm | None) -> list[Edge]:
+def chain(arm: ArmDescription | None) -> list[Edge]:
     """The edges of an arm from its base to its tip; none of no arm."""
     if arm is None:
         return []
@@ -205,13 +205,13 @@ def _told_by_rig(rig: Path, options: Options) -> Options:
     )
 
 
-def _arm_beside(rig: Path) -> Arm | None:
+def _arm_beside(rig: Path) -> ArmDescription | None:
     """The arm that a rig.yaml names, where its URDF lies beside it."""
     arm = _arm_of(rig)
     path = rig.parent / arm["urdf"] if arm else None
     if path is None or not path.is_file():
         return None
-    return Arm(read_text(path), arm["base"], arm["tip"])
+    return ArmDescription(read_text(path), arm["base"], arm["tip"])
 
 
 def _only(those: Sequence[Any], what: str, kinds: Sequence[str]) -> Any:

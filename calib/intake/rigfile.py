@@ -12,13 +12,16 @@ import numpy as np
 
 from calib.intake.gather import Gathered, section
 from calib.intake.roles import Mounted, Roles, find_roles
-from calib.rig.description import FORMAT
+from calib.rig.description import RECORDING_FORMAT
 from chains import escape, se3
 from chains.errors import InputError
 from sensors.documents import nearest, write_atomically
 from sensors.lidar import catalog
-from sensors.readers.base import POSE, Columns
+from sensors.readers.base import Columns
+from sensors.stops import POSE
 
+# Sigmas of a mounting that is worked out from the recording: a choice, so wide that they decide
+# nothing.
 GUESS_M, GUESS_RAD = 0.1, 0.3
 _PLAIN = re.compile(r"[A-Za-z_][\w./-]*( [\w./-]+)*|\d+")
 _TRACKER = "sigma_m: 0.0002, sigma_rad: 0.0003"
@@ -86,7 +89,7 @@ def first_rig(
     roles = _roles(gathered, columns)
     lines = [
         "# Written by rigcal import. A guess was found in the data: write there what CAD says.",
-        f"format: {FORMAT.newest}",
+        f"format: {RECORDING_FORMAT.newest}",
         f"name: {name}",
     ]
     lidar = _lidar(gathered, model) if gathered.sweeps else None

@@ -14,11 +14,13 @@ from chains.align import align_points, hand_eye, mean_pose
 from chains.errors import InputError
 from chains.frames import Edge
 from chains.se3 import Array
-from sensors.readers.base import POSE, Columns
+from sensors.readers.base import Columns
+from sensors.stops import POSE
 
-FITS_M, FITS_RAD = 0.05, 0.05  # rms that a guess may leave: arms and trackers are better than that
-LEAST = 4  # stops at which a body must be seen
-OUTLIER = 5.0  # times the median error
+# Rms that a guess may leave: arms and trackers are better than that.
+GUESS_FITS_M, GUESS_FITS_RAD = 0.05, 0.05
+FEWEST_SEEN = 4  # stops at which a body must be seen
+OUTLIER_TIMES = 5.0  # times the median error
 
 Ends = dict[str, Array]
 """Base and tip of the arm: T_world_end (K, 4, 4); NaN where what tells it was not seen."""
@@ -108,12 +110,12 @@ def _place_pose(
             against = seen[body] if on_base is None else se3.inverse(seen[on_base]) @ seen[body]
             fit = _fit(against, T_base_tip)
             if fit is not None:
-                fits.append((fit[2] / FITS_M + fit[3] / FITS_RAD, body, on_base, fit))
+                fits.append((fit[2] / GUESS_FITS_M + fit[3] / GUESS_FITS_RAD, body, on_base, fit))
     if not fits:
         raise InputError(_TOO_FEW.format(", ".join(seen)))
     _, body, on_base, (X, Z, rms_m, rms_rad) = min(fits, key=lambda fit: fit[0])
     why = f"{1e3 * rms_m:.1f} mm and {np.degrees(rms_rad):.2f} deg rms over {len(T_base_tip)} stops"
-    if rms_m > FITS_M or rms_rad > FITS_RAD:
+    if rms_m > GUESS_FITS_M or rms_rad > GUESS_FITS_RAD:
         raise InputError(_misfit(body, seen[body], on_base, T_base_tip, why))
     mounted, T_world_base = [Mounted(body, tip, X, why)], np.broadcast_to(Z, T_base_tip.shape)
     if on_base is not None:
@@ -133,20 +135,20 @@ def _place_point(
             start, _ = align_points(seen[at], T_base_tip[at, :3, 3])
         except InputError:
             continue
-        if np.count_nonzero(at) < LEAST or np.ptp(seen[at], axis=0).max() < FITS_M:
+        if np.count_nonzero(at) < FEWEST_SEEN or np.ptp(seen[at], axis=0).max() < GUESS_FITS_M:
             continue
 
         def off(v: Array, T: Array = start, world: Array = seen[at], arm: Array = T_base_tip[at]):
             return (world - se3.apply(T @ se3.exp(v[:6]) @ arm, v[None, 6:])[:, 0]).ravel()
 
-        found = least_squares(off, np.zeros(9), loss="soft_l1", f_scale=FITS_M)
+        found = least_squares(off, np.zeros(9), loss="soft_l1", f_scale=GUESS_FITS_M)
         rms_m = float(np.sqrt(3 * np.median(np.square(found.fun))))
         fits.append((rms_m, name, start @ se3.exp(found.x[:6]), found.x[6:]))
     if not fits:
         raise InputError(_TOO_FEW.format(", ".join(points)))
     rms_m, name, Z, x = min(fits, key=lambda fit: fit[0])
     why = f"{1e3 * rms_m:.1f} mm over {len(T_base_tip)} stops"
-    if rms_m > FITS_M:
+    if rms_m > GUESS_FITS_M:
         raise InputError(_STRAYS.format(name, why))
     ends = {tip: Z @ T_base_tip, base: np.broadcast_to(Z, T_base_tip.shape)}
     return [Mounted(name, tip, se3.from_xyz_rpy(x, np.zeros(3)), why, point=True)], ends
@@ -157,12 +159,12 @@ def _fit(T_world_body: Array, T_base_tip: Array) -> tuple[Array, Array, float, f
     index = np.flatnonzero(np.isfinite(T_world_body).all(axis=(1, 2)))
     try:
         for _ in range(2):
-            if len(index) < LEAST:
+            if len(index) < FEWEST_SEEN:
                 return None
             X, Z = hand_eye(T_world_body[index], T_base_tip[index])
             gap = se3.log(se3.inverse(Z @ T_base_tip[index] @ X) @ T_world_body[index])
             size = np.linalg.norm(gap[:, :3], axis=1), np.linalg.norm(gap[:, 3:], axis=1)
-            kept = np.all([s <= OUTLIER * max(np.median(s), 1e-9) for s in size], axis=0)
+            kept = np.all([s <= OUTLIER_TIMES * max(np.median(s), 1e-9) for s in size], axis=0)
             rms = [float(np.sqrt(np.mean(s[kept] ** 2))) for s in size]
             index = index[kept]
     except InputError:
@@ -174,7 +176,12 @@ def _misfit(body: str, seen: Array, on_base: str | None, T_base_tip: Array, why:
     """Why joints do not explain how a body moves: mirrored axes, or no one knows."""
     mirror = np.diag([1.0, 1.0, -1.0, 1.0])
     other = _fit(mirror @ seen @ mirror, T_base_tip)
-    if on_base is None and other is not None and other[2] < FITS_M and other[3] < FITS_RAD:
+    if (
+        on_base is None
+        and other is not None
+        and other[2] < GUESS_FITS_M
+        and other[3] < GUESS_FITS_RAD
+    ):
         return (
             f"{body}: its poses are those of left-handed axes: with z reversed they fit the arm; "
             "export them right-handed"
@@ -196,7 +203,7 @@ def _others(
                 at_m = se3.apply(inward, points[body][:, None])[:, 0]
                 between = se3.from_xyz_rpy(at_m, np.zeros_like(at_m))
             between = between[np.isfinite(between).all(axis=(1, 2))]
-            if len(between) and np.ptp(between[:, :3, 3], axis=0).max() < FITS_M:
+            if len(between) and np.ptp(between[:, :3, 3], axis=0).max() < GUESS_FITS_M:
                 why = f"it moves with {parent}"
                 more.append(Mounted(body, parent, mean_pose(between), why, point=body in points))
                 break

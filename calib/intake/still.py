@@ -13,7 +13,7 @@ from chains.frames import Edge
 from chains.se3 import Array
 from sensors.readers.base import Track
 
-WINDOW_S = 0.25  # rates are smoothed over it: an arm takes longer to move
+STILL_WINDOW_S = 0.25  # rates are smoothed over it: an arm takes longer to move
 REST_SHARE = 0.1  # of the time at least, things are taken to be at rest
 FACTOR = 4.0  # above the rate at rest, and it is no noise
 SLOWEST, FASTEST = 0.003, 0.05  # rad/s or m/s between which the threshold lies
@@ -119,7 +119,7 @@ def learned(rate: Array) -> float:
 
 def _fastest(track: Track, edges: Sequence[Edge]) -> tuple[Array, Array, str] | None:
     """Times and the size of all rates of a track, a metre counting for a radian."""
-    moves = motions(track, edges if track.kind != "joints" else (), WINDOW_S)
+    moves = motions(track, edges if track.kind != "joints" else (), STILL_WINDOW_S)
     if not moves:
         return None
     rate = np.concatenate([_unbiased(motion) for motion in moves], axis=1)

@@ -8,9 +8,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from chains.se3 import Array
-from sensors.readers.base import POSE, Columns, Track
+from sensors.readers.base import Columns, Track
+from sensors.stops import POSE
 
-APART_M, APART_RAD = 0.05, 0.05  # how far the base moves between locations at least
+BASE_MOVED_M, BASE_MOVED_RAD = 0.05, 0.05  # how far the base moves between locations at least
 CREEP = 0.002  # rad or m from the beginning of a hold to its end
 
 
@@ -123,8 +124,8 @@ def _places(pose: Array) -> Array:
             location[k] = location[k - 1] if k else 0
             continue
         near = [
-            np.linalg.norm(row[:3] - at[:3]) < APART_M
-            and 2 * np.arccos(min(1.0, abs(row[3:] @ at[3:]))) < APART_RAD
+            np.linalg.norm(row[:3] - at[:3]) < BASE_MOVED_M
+            and 2 * np.arccos(min(1.0, abs(row[3:] @ at[3:]))) < BASE_MOVED_RAD
             for at in places
         ]
         if not any(near):

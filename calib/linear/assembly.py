@@ -14,6 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
+from calib.linear.clusters import ClusteredRows
 from calib.linear.elimination import BY_TWIST, Eliminated, eliminate, square
 from calib.linear.layout import Layout, positions
 from calib.linear.rows import TWIST, OwnSums, StopSums
@@ -40,6 +41,12 @@ class OwnRows:
     b: np.ndarray
     columns: np.ndarray
     measured: bool
+
+    def of_stop(self, stop: int, place: np.ndarray | None = None) -> ClusteredRows:
+        """The same as rows of a stop, each of a place (m,); -1 for none, as without it."""
+        at, none = np.full(len(self.b), stop), np.full(len(self.b), -1)
+        place = none if place is None else place
+        return ClusteredRows(A=self.A, b=self.b, columns=self.columns, stop=at, place=place)
 
     def add_to(self, target: np.ndarray, at: np.ndarray, sigma: np.ndarray, b: int = -1) -> None:
         """Add their Gram matrix to another.

@@ -9,7 +9,7 @@ import numpy as np
 
 from calib.forward import Placed, place_each
 from calib.linear.assembly import CellsFirst, OwnRows, StopsFirst
-from calib.linear.clusters import ClusteredRows, Gradients
+from calib.linear.clusters import Gradients
 from calib.linear.layout import Layout
 from calib.linear.parallel import in_order
 from calib.linear.rows import StopRows, StopSums, Weighing
@@ -78,8 +78,7 @@ def linearise(
             rows = spread_rows(spread, layout)
             assembly.add_kept(rows)
             if places is not None:
-                at = np.full(len(rows.b), sums.stop), places
-                gradients.add_rows(ClusteredRows(rows.A, rows.b, rows.columns, *at))
+                gradients.add_rows(rows.of_stop(sums.stop, places))
     cost, before = (sum(each[k] for each in found) for k in (1, 2))
     told = {"weighed": [each for each, _, _ in found], "beams_cost": cost}
     return replace(assembly.done(values), cost_before=before if weighed else None, **told)

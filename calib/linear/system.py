@@ -16,7 +16,7 @@ from calib.linear.layout import Layout, positions
 from calib.linear.rows import OwnSums, Weighing
 
 Values = Mapping[str, np.ndarray]
-AT_ONCE = 1024  # rows whose variances are computed at once: bounds the memory
+ROWS_AT_ONCE = 1024  # rows whose variances are computed at once: bounds the memory
 
 
 @dataclass(frozen=True)
@@ -170,8 +170,8 @@ class Linearisation:
             tables.append(csr_array((mine.data, columns, mine.indptr), shape=shape))
         rows = csr_array(vstack(tables))
         found = np.zeros(rows.shape[0])
-        for first in range(0, len(found), AT_ONCE):
-            here = slice(first, first + AT_ONCE)
+        for first in range(0, len(found), ROWS_AT_ONCE):
+            here = slice(first, first + ROWS_AT_ONCE)
             for at, mine, known in self._shares(rows[here].toarray(), kept):
                 found[here][at] += np.einsum("ij,ji->i", mine, known)
         return np.split(found, np.cumsum([table.shape[0] for table in tables[1:]]))[:-1]

@@ -23,7 +23,7 @@ from calib.outputs.kinds import (
     RECORDING,
     RUN,
     SIMULATED,
-    Kind,
+    FolderKind,
     is_exported,
     refuse,
 )
@@ -39,7 +39,7 @@ __all__ = [
     "RECORDING",
     "RUN",
     "SIMULATED",
-    "Kind",
+    "FolderKind",
     "Paths",
     "each",
     "entries",
@@ -63,12 +63,12 @@ def each(paths: Paths) -> list[Path]:
 
 @contextmanager
 def folder(
-    path: Path | str, kind: Kind, inputs: Inputs = (), beside: Iterable[str] = ()
+    path: Path | str, kind: FolderKind, inputs: Inputs = (), beside: Iterable[str] = ()
 ) -> Iterator[Path]:
     """Give an empty folder to fill, which becomes `path` when all went well.
 
     A folder already there is replaced if it is empty or of that kind; what somebody else has put
-    into it stays (see `Kind.parts`).
+    into it stays (see `FolderKind.parts`).
 
     Args:
         path: the folder to make.
@@ -114,7 +114,7 @@ def file(path: Path | str, inputs: Inputs = ()) -> Iterator[Path]:
 
 
 @contextmanager
-def entries(path: Path | str, kind: Kind, inputs: Inputs = ()) -> Iterator[Path]:
+def entries(path: Path | str, kind: FolderKind, inputs: Inputs = ()) -> Iterator[Path]:
     """Give an empty folder; what is in it at the end goes into `path`, all of it or nothing.
 
     Args:
@@ -150,7 +150,7 @@ def _is_fixed(path: Path) -> bool:
         return False
 
 
-def _take_over(old: Path, new: Path, kind: Kind) -> None:
+def _take_over(old: Path, new: Path, kind: FolderKind) -> None:
     """Give a new folder what the old one has beyond its kind's parts, and who may read it."""
     shutil.copymode(old, new)
     for entry in old.iterdir():

@@ -17,7 +17,7 @@ _EXPORTED = (b"rigcal", b"<title>Frames of ", b"Channel,Elevation,Azimuth\n")
 
 
 @dataclass(frozen=True)
-class Kind:
+class FolderKind:
     """A kind of folder that rigcal makes.
 
     Args:
@@ -110,14 +110,14 @@ def is_exported(path: Path) -> bool:
     return any(words in head for words in _EXPORTED)
 
 
-RECORDING = Kind(
+RECORDING = FolderKind(
     "recording",
     _without("rig.yaml", "stops.csv"),
     ("rig.yaml", "stops.csv", "targets.csv", "scans", "reference", "*.urdf"),
 )
 # A measured recording cost a week: no simulation takes its place.
-SIMULATED = Kind("recording of a simulation", _lacks_simulated, RECORDING.parts)
-RUN = Kind(
+SIMULATED = FolderKind("recording of a simulation", _lacks_simulated, RECORDING.parts)
+RUN = FolderKind(
     "run",
     _lacks_run,
     (
@@ -125,15 +125,15 @@ RUN = Kind(
         *("residuals.parquet", "diagnosis.json", "evaluation.json", "points.parquet"),
     ),
 )
-EVALUATION = Kind("evaluation", _lacks_evaluation, ("evaluation.json", "points.parquet"))
-EXPORT = Kind("export", _lacks_export)
-CLOUDS = Kind("folder of corrected clouds", _without(CLOUDS_MARK))
-LADDER = Kind("ladder of runs", _lacks_ladder)
+EVALUATION = FolderKind("evaluation", _lacks_evaluation, ("evaluation.json", "points.parquet"))
+EXPORT = FolderKind("export", _lacks_export)
+CLOUDS = FolderKind("folder of corrected clouds", _without(CLOUDS_MARK))
+LADDER = FolderKind("ladder of runs", _lacks_ladder)
 
 
 def refuse(
     path: Path | str,
-    kind: Kind | None,
+    kind: FolderKind | None,
     inputs: Iterable[Path | str] = (),
     anywhere: bool = False,
 ) -> Path:
@@ -195,7 +195,7 @@ def _inside(path: Path, folder: Path) -> bool:
     return any(above.exists() and above.samefile(folder) for above in path.parents)
 
 
-def _refuse_other(path: Path | str, target: Path, kind: Kind | None) -> None:
+def _refuse_other(path: Path | str, target: Path, kind: FolderKind | None) -> None:
     if not target.exists():
         return
     if kind is None:

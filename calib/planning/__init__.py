@@ -21,7 +21,7 @@ from calib.planning.alone import nothing_measured
 from calib.planning.places import in_region, where_it_stood
 from calib.planning.planner import Planner, Step
 from calib.planning.purpose import ALL, Purpose, purpose_of
-from calib.planning.scene import Scene
+from calib.planning.scene import PlanningScene
 from calib.planning.stops import Poses
 from calib.planning.tolerance import purpose_until
 from calib.planning.worth import Known
@@ -37,8 +37,9 @@ __all__ = ["Plan", "is_rig", "plan", "planner_of"]
 
 # Poses that are looked at. On the page's example 50, 200, 500, 1500 of them bring the smallest sag
 # that is told from its rival to 0.071, 0.062, 0.061, 0.059 mrad/(N m) (mean of two seeds).
-CANDIDATES = 500
-STOPS, MOST = 5, 30  # that are planned where nobody says how many; and until sigmas are small
+CANDIDATE_POSES = 500
+# Stops that are planned where nobody says how many, and until sigmas are small.
+USUAL_STOPS, MOST_PLANNED = 5, 30
 
 
 def _silent(what: str, done: int, total: int) -> None:
@@ -158,7 +159,7 @@ def plan(
     purpose: str | None = None,
     until: str | None = None,
     region: Sequence[float] | None = None,
-    candidates: int = CANDIDATES,
+    candidates: int = CANDIDATE_POSES,
     seed: int = 0,
     out: Path | str | None = None,
     progress: Progress = _silent,
@@ -185,7 +186,7 @@ def plan(
     """
     if until is not None and purpose is not None:
         raise InputError("--until says what the stops are for, so it takes no --for beside it")
-    stops = (MOST if until else STOPS) if stops is None else stops
+    stops = (MOST_PLANNED if until else USUAL_STOPS) if stops is None else stops
     if stops < 1 or candidates < stops:
         raise InputError(
             f"{stops} stops out of {candidates} candidates: give at least 1, and no more"
@@ -254,7 +255,7 @@ def planner_of(
     prior = None
     if fitted and fitted.prior:
         prior = earlier(stand.estimate.problem, Run.open(fitted.prior).solution)
-    scene = Scene(stand, aim.added, prior)
+    scene = PlanningScene(stand, aim.added, prior)
     if stand.estimate.scans and not scene.scanned:
         raise InputError(
             f"{scene.source.recording.folder}: there is no mesh, so nothing says what the beams of "

@@ -13,7 +13,7 @@ from calib.problem.unknowns import pose_unknown
 from calib.rig import load_rig
 from calib.solve.estimate import Estimate
 from chains.errors import InputError
-from sensors.recording import Recording
+from sensors.recording import RecordedStops
 from sensors.reference import Reference
 from sensors.stops import read_targets
 
@@ -36,7 +36,7 @@ def nothing_measured(folder: Path | str) -> Stand:
     spec = rig.reference
     mesh = Reference.read(spec.mesh, spec.faces, spec.labels) if spec and spec.mesh else None
     none = np.zeros(0)
-    recording = Recording(
+    recording = RecordedStops(
         folder=folder,
         stops=[],
         location=none.astype(str),

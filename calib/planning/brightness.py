@@ -14,8 +14,8 @@ import numpy as np
 
 from calib.residuals.beams import Rows
 
-FAINTEST = 1e-6  # of the median: less has no logarithm
-NEAREST_M, FLATTEST = 0.1, 0.05  # range and cosine: logarithms of less would decide the fit
+LEAST_INTENSITY = 1e-6  # of the median: less has no logarithm
+LEAST_RANGE_M, LEAST_COSINE = 0.1, 0.05  # range and cosine: logarithms of less would decide the fit
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Brightness:
             values = [np.broadcast_to(rows.view[name], rows.view.rows) for name in names]
             parts.append(np.stack(values)[:, rows.usable])
         intensity, label, range_m, incidence = np.concatenate(parts, axis=1)
-        fine = np.isfinite(intensity) & (intensity > FAINTEST)
+        fine = np.isfinite(intensity) & (intensity > LEAST_INTENSITY)
         if not fine.any():
             return None
         labels, index = np.unique(label[fine].astype(int), return_inverse=True)
@@ -53,7 +53,13 @@ class Brightness:
         A[:, -2:] = _logs(range_m[fine], np.cos(incidence[fine]))
         found = np.linalg.lstsq(A, np.log(intensity[fine]), rcond=None)[0]
         level = found[:-2]
-        return cls(labels, level, float(np.median(level)), float(found[-2]), float(found[-1]))
+        return cls(
+            labels=labels,
+            level=level,
+            usual=float(np.median(level)),
+            fall=float(found[-2]),
+            slant=float(found[-1]),
+        )
 
     def at(self, label: np.ndarray, range_m: np.ndarray, cosine: np.ndarray) -> np.ndarray:
         """Intensity (N,) over the median of beams that meet such labels, at ranges and cosines of
@@ -65,5 +71,5 @@ class Brightness:
 
 
 def _logs(range_m: np.ndarray, cosine: np.ndarray) -> np.ndarray:
-    held = np.maximum(range_m, NEAREST_M), np.maximum(cosine, FLATTEST)
+    held = np.maximum(range_m, LEAST_RANGE_M), np.maximum(cosine, LEAST_COSINE)
     return np.log(np.stack(held, axis=1))

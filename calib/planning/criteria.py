@@ -17,13 +17,13 @@ from scipy import special
 
 from calib.diagnosis.linear import WIDENED
 from calib.diagnosis.score import POWER
-from calib.diagnosis.search import ALPHA
+from calib.diagnosis.search import ALPHA_EFFECT
 from calib.linear.parallel import in_order
 from calib.planning.information import Information, inverse
 
-AT_ONCE = 32  # designs whose matrices are held at once
-ROUNDING = 1e-13  # of a component's information
-LEAST = 1e-9  # information, in squared sigmas: less is none
+DESIGNS_AT_ONCE = 32  # designs whose matrices are held at once
+INFORMATION_ROUNDING = 1e-13  # of a component's information
+LEAST_INFORMATION = 1e-9  # information, in squared sigmas: less is none
 
 
 class Criterion:
@@ -41,9 +41,13 @@ class Criterion:
 
     def each(self, base: np.ndarray, more: np.ndarray) -> np.ndarray:
         """Of designs (n,) that add one stop each, (n, S, S), to the same others (S, S)."""
-        cuts = range(0, len(more), AT_ONCE)
+        cuts = range(0, len(more), DESIGNS_AT_ONCE)
         return np.concatenate(
-            list(in_order(lambda i: self.of(base + more[cuts[i] : cuts[i] + AT_ONCE]), len(cuts)))
+            list(
+                in_order(
+                    lambda i: self.of(base + more[cuts[i] : cuts[i] + DESIGNS_AT_ONCE]), len(cuts)
+                )
+            )
         )
 
 
@@ -90,7 +94,9 @@ class Apart(Criterion):
         out = []
         for at, size in self.effects:
             left = information_left(M, at)
-            out.append(np.log(np.maximum(np.einsum("kij,i,j->k", left, size, size), LEAST)))
+            out.append(
+                np.log(np.maximum(np.einsum("kij,i,j->k", left, size, size), LEAST_INFORMATION))
+            )
         return np.mean(out, axis=0)
 
 
@@ -111,7 +117,9 @@ def information_left(
     block = block * scale[:, :, None] * scale[:, None]
     # As in `calib.diagnosis.score`: a direction that rows leave open must not stop the elimination,
     # nor a component that no row feels.
-    block += np.einsum("ni,ij->nij", np.where(scale > 0, ROUNDING, 1.0), np.eye(len(others)))
+    block += np.einsum(
+        "ni,ij->nij", np.where(scale > 0, INFORMATION_ROUNDING, 1.0), np.eye(len(others))
+    )
     cross = cross * scale[:, :, None]
     left = M[:, at[:, None], at] - cross.mT @ np.linalg.solve(block, cross)
     return (left + left.mT) / 2
@@ -132,7 +140,7 @@ def smallest(left: np.ndarray, whole: np.ndarray) -> float:
     dof = int((values > 1e-6).sum())
     if not dof:
         return float("inf")
-    limit = special.chdtri(dof, ALPHA)
+    limit = special.chdtri(dof, ALPHA_EFFECT)
     noncentral = special.chndtrinc(limit, dof, 1.0 - POWER)
     return float(np.sqrt(noncentral / (np.trace(left) / len(left))))
 

@@ -12,7 +12,7 @@ from chains import se3
 from chains.errors import InputError
 from sensors.reference import Reference
 
-PLACES = 6  # that are drawn in a region: a recording of a day has about as many
+PLACES_A_REGION = 6  # that are drawn in a region: a recording of a day has about as many
 TRIED = 50  # times as many are tried
 # A base keeps so far from what is as high as itself: half the diagonal of a Husky, 0.99 by 0.67 m.
 BASE_CLEAR_M, BASE_HEIGHT_M = 0.6, 0.3
@@ -68,9 +68,9 @@ def in_region(
     mesh, T_reference_world = source.reference, se3.inverse(T_world_reference)
     were = np.array([(T_reference_world @ T)[:3, 3] for T in stood.values()]).reshape(-1, 3)
     above_m = np.nan_to_num(np.median(were[:, 2] - _floor(mesh, were[:, :2]))) if len(were) else 0.0
-    xy = rng.uniform(low, high, (TRIED * PLACES, 2))
+    xy = rng.uniform(low, high, (TRIED * PLACES_A_REGION, 2))
     at = np.column_stack([xy, _floor(mesh, xy) + above_m])
-    free = at[_free(mesh, at)][:PLACES]
+    free = at[_free(mesh, at)][:PLACES_A_REGION]
     if not len(free):
         raise InputError(
             f"--region {' '.join(f'{x:g}' for x in region)}: no place in it has a floor and is "

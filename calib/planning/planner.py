@@ -14,7 +14,7 @@ from calib.planning.criteria import chosen
 from calib.planning.information import Information
 from calib.planning.poses import in_order_of_path, reachable
 from calib.planning.purpose import Purpose
-from calib.planning.scene import Scene
+from calib.planning.scene import PlanningScene
 from calib.planning.stops import Poses
 from calib.planning.worth import Known, criterion
 from calib.problem.unknowns import Key, Role
@@ -22,7 +22,8 @@ from calib.results.solution import Solution
 from calib.solve.fit import Progress
 from chains.errors import InputError
 
-AGAIN = 1e4  # times that all candidates are measured for what no number of stops gets beyond
+# Times that all candidates are measured for what no number of stops gets beyond.
+ENDLESS_TIMES = 1e4
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,7 @@ class Planner:
     """
 
     folder: Path
-    scene: Scene
+    scene: PlanningScene
     aim: Purpose
     places: Mapping[str, np.ndarray]
     solution: Solution | None
@@ -92,7 +93,7 @@ class Planner:
         """What all candidates tell, measured again and again: no stops of the arm tell more. As the
         mesh's errors are taken to differ from stop to stop, even these may not tell as much."""
         base = self.lasting
-        return self._known(replace(base, data=base.data + AGAIN * each.sum(axis=0)), 0)
+        return self._known(replace(base, data=base.data + ENDLESS_TIMES * each.sum(axis=0)), 0)
 
     def enough(self, poses: Poses, each: np.ndarray, most: int) -> tuple[Poses, list[Step]]:
         """The fewest stops, one best after another, with which every tolerance is kept, or `most`

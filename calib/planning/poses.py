@@ -16,9 +16,10 @@ from calib.results.reach import joint_range
 from chains import se3
 from chains.errors import InputError
 
-CLEAR_M = 0.1  # between parts of the arm, and to the room: about the width of arms' tubes, assumed
-SAMPLED = 4  # points of each tube that are held against the others
-DRAWN = 20  # times as many poses as are wanted are drawn at most
+# Between parts of the arm, and to the room: about the width of arms' tubes, assumed.
+ARM_CLEAR_M = 0.1
+TUBE_POINTS = 4  # points of each tube that are held against the others
+TIMES_DRAWN = 20  # times as many poses as are wanted are drawn at most
 
 
 def reachable(
@@ -51,7 +52,7 @@ def reachable(
     low, high = joint_range(rig, measured)
     clear = _Clear.of(source, places, T_world_reference)
     found: list[tuple[np.ndarray, np.ndarray]] = []
-    for _ in range(DRAWN):
+    for _ in range(TIMES_DRAWN):
         joints = rng.uniform(low, high, (count, len(low)))
         at = rng.integers(len(names), size=count)
         free = clear.of_poses(joints, se3.inverse(T_world_reference) @ Ts[at])
@@ -61,8 +62,8 @@ def reachable(
     joints, at = (np.concatenate(parts)[:count] for parts in zip(*found, strict=True))
     if not len(joints):
         raise InputError(
-            f"{rig.folder}: none of {DRAWN * count} random poses of the arm is clear of itself and "
-            "of the mesh where its base was"
+            f"{rig.folder}: none of {TIMES_DRAWN * count} random poses of the arm is clear of "
+            "itself and of the mesh where its base was"
         )
     return Poses(np.array(names)[at], joints, Ts[at])
 
@@ -83,17 +84,17 @@ class _Clear:
         self.first = moving[0] + 1 if moving else 1  # of the frames that the joints move
         zero = np.zeros((1, len(tree.joint_names)))
         length = np.linalg.norm(np.diff(self._points(zero), axis=1), axis=2)[0]
-        self.tubes = np.flatnonzero(length > CLEAR_M)
+        self.tubes = np.flatnonzero(length > ARM_CLEAR_M)
         gap = np.concatenate([[0.0], np.cumsum(length)])
         pairs = [
             (a, b)
             for a in self.tubes.tolist()
             for b in self.tubes.tolist()
-            if gap[b] - gap[a + 1] > CLEAR_M  # those next to each other always touch
+            if gap[b] - gap[a + 1] > ARM_CLEAR_M  # those next to each other always touch
         ]
         self.pairs = np.array(pairs, int).reshape(-1, 2)
-        self.least_m = np.full(len(self.pairs), CLEAR_M)
-        self.room_m = np.full(len(self.frames) - self.first, CLEAR_M)
+        self.least_m = np.full(len(self.pairs), ARM_CLEAR_M)
+        self.room_m = np.full(len(self.frames) - self.first, ARM_CLEAR_M)
 
     @classmethod
     def of(
@@ -126,7 +127,7 @@ class _Clear:
         """How far tubes are from each other (n, P), and moved frames from the mesh (n, F), m;
         negative outside of the mesh's box."""
         points = self._points(joints)
-        share = np.linspace(0.0, 1.0, SAMPLED)[:, None]
+        share = np.linspace(0.0, 1.0, TUBE_POINTS)[:, None]
         along = [
             points[:, i, None] * (1 - share) + points[:, i + 1, None] * share
             for i in range(points.shape[1] - 1)

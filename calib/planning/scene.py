@@ -40,12 +40,12 @@ from sensors.recording import Scan
 # How many beams of a candidate stop are looked at; they stand for all. Of the 8,192 of an OS0-128,
 # with 300, 600, 1200 the gains of 40 stops have ranks that are correlated by 0.92, 0.96, 0.99 with
 # those of all, and sigmas after five stops are at most 6, 3, 1 % off; 16, 17, 25 ms each, all 51.
-BEAMS = 600
+BEAMS_A_STOP = 600
 COMPARED = 6  # stops that were measured, by which it is found how many one of them is worth
 
 
 @dataclass(frozen=True)
-class Scene:
+class PlanningScene:
     """A fit, and effects that it lacks but whose columns are wanted; planned stops are of the first
     of its recordings.
 
@@ -176,7 +176,7 @@ class Scene:
 
     def planned_alone(self, poses: Poses) -> tuple[Problem, dict[str, np.ndarray]]:
         """The problem of some planned stops, each a visit of its own, and where all of it lies."""
-        patterns = thinned(self._pattern[:2], BEAMS) if self.scanned else []
+        patterns = thinned(self._pattern[:2], BEAMS_A_STOP) if self.scanned else []
         return self._with(poses, patterns, apart=True, alone=True)
 
     def after(self, poses: Poses) -> Information:

@@ -25,8 +25,9 @@ from sensors.lidar import Beams, LidarModel, beams
 from sensors.recording import Scan
 
 SWEEPS = 20.0  # of a stop, where no recording says how many: 2 s at 10 Hz
-SCANS = 8  # of a recording, from which the directions of its beams are taken
-NEAREST = 0.01  # of recorded beams are shorter than those of planned stops that are counted on
+SCANS_FOR_BEAMS = 8  # of a recording, from which the directions of its beams are taken
+# Share of recorded beams that are shorter than those of planned stops that are counted on.
+SHORTER_BEAMS = 0.01
 MARK = "~"  # after the name of a location that is visited again: the base stands elsewhere by then
 
 
@@ -138,7 +139,7 @@ def pattern(source: Source) -> tuple[Scan, Beams, float]:
     Sweeps, and columns of the maker's own, are as they are in the median.
     """
     scanned = np.flatnonzero(source.recording.has_scan)
-    some = scanned[np.unique(np.linspace(0, len(scanned) - 1, SCANS).round().astype(int))]
+    some = scanned[np.unique(np.linspace(0, len(scanned) - 1, SCANS_FOR_BEAMS).round().astype(int))]
     read = [source.store.read(k) for k in some.tolist()]
     ring, column, count = (
         np.concatenate([getattr(scan, name) for scan, _ in read])
@@ -154,7 +155,9 @@ def pattern(source: Source) -> tuple[Scan, Beams, float]:
         for name in read[0][0].extra
         if all(name in scan.extra for scan, _ in read)
     }
-    nearest_m = float(np.quantile(np.concatenate([rays.range_m for _, rays in read]), NEAREST))
+    nearest_m = float(
+        np.quantile(np.concatenate([rays.range_m for _, rays in read]), SHORTER_BEAMS)
+    )
     found = _scan(origin, direction, ring[first], column[first], float(np.median(count)), extra)
     return *found, nearest_m
 

@@ -14,7 +14,7 @@ from calib.problem.unknowns import Key
 from chains.errors import InputError
 
 # What people write -> the unit of parameters, and how many of it that is.
-UNITS: Mapping[str, tuple[str, float]] = {
+TOLERANCE_UNITS: Mapping[str, tuple[str, float]] = {
     "mm": ("m", 1e-3),
     "m": ("m", 1.0),
     "mrad": ("rad", 1e-3),
@@ -32,8 +32,8 @@ def purpose_until(stand: Stand, text: str) -> Purpose:
     Args:
         stand: the fit of a run.
         text: items with commas, each a frame, an effect of the model or one parameter, or `RINGS`,
-            a number, and a unit of `UNITS`: sigmas of all its parameters in such a unit are to be
-            that small.
+            a number, and a unit of `TOLERANCE_UNITS`: sigmas of all its parameters in such a unit
+            are to be that small.
 
     Raises:
         InputError: an item is none, or what it names is not in the model, or has another unit.
@@ -61,9 +61,11 @@ def _size(item: str, number: str, unit: str) -> tuple[str, float]:
         size = float("nan")
     if not 0 < size < float("inf"):
         raise InputError(f"--until '{item}': '{number}' is no number above 0")
-    if base not in UNITS:
-        raise InputError(f"--until '{item}': unit '{unit}' is unknown; give {', '.join(UNITS)}")
-    of, scale = UNITS[base]
+    if base not in TOLERANCE_UNITS:
+        raise InputError(
+            f"--until '{item}': unit '{unit}' is unknown; give {', '.join(TOLERANCE_UNITS)}"
+        )
+    of, scale = TOLERANCE_UNITS[base]
     return f"{of}{per}{rest}", size * scale
 
 

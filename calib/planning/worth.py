@@ -20,7 +20,7 @@ from calib.planning.criteria import (
 )
 from calib.planning.information import Information
 from calib.planning.purpose import Purpose
-from calib.planning.scene import Scene
+from calib.planning.scene import PlanningScene
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Known:
 
     @classmethod
     def of(
-        cls, scene: Scene, aim: Purpose, known: Information, stops: int, wider: np.ndarray
+        cls, scene: PlanningScene, aim: Purpose, known: Information, stops: int, wider: np.ndarray
     ) -> Known:
         """As the information of all stops has it.
 
@@ -66,7 +66,7 @@ class Known:
         )
 
 
-def criterion(scene: Scene, aim: Purpose, known: Information) -> Criterion:
+def criterion(scene: PlanningScene, aim: Purpose, known: Information) -> Criterion:
     """By what stops are chosen: D of all, A of some components, T of rivals."""
     if aim.rivals:
         return Apart(known, [_rival(scene, known, name) for name in aim.rivals])
@@ -77,7 +77,7 @@ def criterion(scene: Scene, aim: Purpose, known: Information) -> Criterion:
     return Variance(known, at, wanted)
 
 
-def _rival(scene: Scene, known: Information, name: str) -> tuple[np.ndarray, np.ndarray]:
+def _rival(scene: PlanningScene, known: Information, name: str) -> tuple[np.ndarray, np.ndarray]:
     """Where the components (q,) of an effect stand, and of what size they are taken to be."""
     variables = [term.variable for term in scene.terms_of(name)]
     size = np.concatenate([scene.problem.variables[v].sigma for v in variables])
@@ -85,7 +85,7 @@ def _rival(scene: Scene, known: Information, name: str) -> tuple[np.ndarray, np.
     return at, size / known.unit[at]
 
 
-def _smallest(scene: Scene, aim: Purpose, known: Information) -> list[tuple[float, float]]:
+def _smallest(scene: PlanningScene, aim: Purpose, known: Information) -> list[tuple[float, float]]:
     """Of each effect the size from which it is found; see `Known`."""
     out, rows = [], Apart(known, []).start
     for name in aim.rivals:

@@ -10,7 +10,7 @@ from calib.problem.places import Places
 from calib.problem.problem import Problem, SourceStops
 from calib.problem.unknowns import Owner, Role, Unknown, vector_unknown
 from calib.residuals.groups import Group
-from calib.residuals.targets import PARTS, HangingTarget
+from calib.residuals.targets import TARGET_PARTS, HangingTarget
 from calib.residuals.tracker import TrackedBody
 
 
@@ -108,7 +108,7 @@ def add_targets(problem: Problem, part: SourceStops, places: Places) -> None:
                 sigma_marker_m=spec.sigma_marker_m,
                 shift={v: b[m] for v, b in shifts.items()},
                 scanned={v: b[m] for v, b in scanned.items()},
-                groups=tuple(Group("target", name, what, part.label) for what in PARTS),
+                groups=tuple(Group("target", name, what, part.label) for what in TARGET_PARTS),
                 weight=None if whole[m].all() else whole[m].astype(float),
             )
         )

@@ -19,7 +19,7 @@ from calib.residuals.surfaces import Meeting
 from calib.rig import Rig
 from chains.errors import InputError
 
-FREE = 1.0  # m or rad: what is known of a value on paper that is left out, the rig's own size
+FREE_SIGMA = 1.0  # m or rad: what is known of a value on paper that is left out, the rig's own size
 
 
 def build(
@@ -84,7 +84,7 @@ def effect_unknown(term: Term, source: Source) -> Unknown:
     free = [not lacks.isdisjoint({(CAD, name), (CAD, f"{name}.{p.name}")}) for p in params]
     return vector_unknown(
         term.variable,
-        np.where(free, FREE, [p.sigma for p in params]),
+        np.where(free, FREE_SIGMA, [p.sigma for p in params]),
         dofs=(p.name for p in params),
         units=(p.unit for p in params),
         role=Role.SCATTER if term.effect.by_chance else Role.CALIBRATION,

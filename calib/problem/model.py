@@ -14,14 +14,14 @@ import numpy as np
 from calib import effects
 from calib.effects import Effect, FrameOffset
 from calib.forward import Term, named
-from calib.residuals.groups import Group, Kind
+from calib.residuals.groups import Group, GroupKind
 from calib.residuals.store import BeamStore
 from calib.rig import Rig, load_rig
 from chains import se3
 from chains.align import align_points
 from chains.errors import InputError
 from sensors.documents import nearest
-from sensors.recording import Recording
+from sensors.recording import RecordedStops
 from sensors.reference import Reference
 
 ROWS_A_PARAMETER = 10  # of an arm, for its whole geometry to be estimated; see `default_effects`
@@ -212,7 +212,7 @@ def default_effects(recordings: Sequence[Path | str]) -> tuple[str, ...]:
             continue  # what it is instead, the fit says
         rig = load_rig(folder)
         if rig.tracker and rig.joint_names:
-            recording = Recording.open(folder, rig.joint_names, rig.tracker.bodies)
+            recording = RecordedStops.open(folder, rig.joint_names, rig.tracker.bodies)
             for body in filter(rig.joints_to, rig.tracker.bodies):
                 pose = np.isfinite(recording.bodies[body])
                 rows += 3 * int(pose[:, :3].all(axis=1).sum() + pose.all(axis=1).sum())
@@ -248,10 +248,10 @@ class Source:
     """
 
     rig: Rig
-    recording: Recording
+    recording: RecordedStops
     reference: Reference | None
     without: tuple[Group, ...] = ()
-    given: Recording | None = None
+    given: RecordedStops | None = None
 
     @classmethod
     def open(cls, folder: Path | str) -> Source:
@@ -263,12 +263,12 @@ class Source:
         rig = load_rig(folder)
         rings = rig.lidar.rings if rig.lidar else None
         bodies = rig.tracker.bodies if rig.tracker else ()
-        recording = Recording.open(folder, rig.joint_names, bodies, rings)
+        recording = RecordedStops.open(folder, rig.joint_names, bodies, rings)
         spec = rig.reference
         mesh = Reference.read(spec.mesh, spec.faces, spec.labels) if spec and spec.mesh else None
         return cls(rig, recording, mesh)
 
-    def changed(self, recording: Recording, without: Group) -> Source:
+    def changed(self, recording: RecordedStops, without: Group) -> Source:
         """The same with a changed recording, something being left out; what scans were read stay
         read."""
         given = self.given or self.recording
@@ -282,7 +282,7 @@ class Source:
         """The same with nothing left out."""
         return replace(self, recording=self.given or self.recording, without=(), given=None)
 
-    def lacks(self, kind: Kind) -> set[tuple[str, str]]:
+    def lacks(self, kind: GroupKind) -> set[tuple[str, str]]:
         """Where and what of one kind is left out."""
         return {(group.where, group.what) for group in self.without if group.kind == kind}
 
@@ -364,7 +364,7 @@ def stop_columns(
     return columns
 
 
-def tracked_poses(rig: Rig, recording: Recording) -> np.ndarray:
+def tracked_poses(rig: Rig, recording: RecordedStops) -> np.ndarray:
     """T_world_body (K, B, 4, 4) of the tracked bodies as measured, NaN where not known.
 
     Bodies seen as points are turned as CAD says, the rig lying as three or more points say.

@@ -23,7 +23,7 @@ from calib.problem.unknowns import Role, Unknown
 from calib.residuals.groups import JOINTS
 from calib.residuals.scan import ScanStop
 from calib.residuals.surfaces import PlaneSurface
-from calib.residuals.targets import SIGMAS, HangingTarget
+from calib.residuals.targets import PARTS_OF_SIGMAS, HangingTarget
 from calib.residuals.tracker import TrackedBody
 
 
@@ -119,7 +119,7 @@ def rows_at(problem: Problem, site: Site) -> list[Whose]:
         return [Whose("joints", JOINTS, unit) for unit in ("rad", "m") if read(problem, unit)]
     if site is Site.TARGET:
         there = any(isinstance(block, HangingTarget) for block in problem.blocks)
-        return [Whose("target", part, "m") for part in SIGMAS] if there else []
+        return [Whose("target", part, "m") for part in PARTS_OF_SIGMAS] if there else []
     meshes = any(scan.reference_sigma_m for scan in problem.scans if not _on_planes(scan))
     return [Whose("surface", part, "m") for part in SURFACE_SHARES] if meshes else []
 

@@ -12,7 +12,7 @@ from chains.align import align_points, mean_pose
 from chains.errors import InputError
 from sensors.stops import Targets
 
-FEWEST = 3  # spheres that fix a pose
+FEWEST_SPHERES = 3  # spheres that fix a pose
 
 
 def root_pose(source: Source, stops: Sequence[int]) -> np.ndarray | None:
@@ -61,7 +61,7 @@ def reference_from_targets(source: Source) -> np.ndarray | None:
         return None
     sphere = lower_markers(targets) + spec.sphere_below_lower_marker_m * gravity(source)
     known = np.isfinite(targets.faro_m).all(axis=1)
-    if known.sum() < FEWEST and source.given is not None:
+    if known.sum() < FEWEST_SPHERES and source.given is not None:
         return None
     try:
         return align_points(sphere[known], targets.faro_m[known])[0]

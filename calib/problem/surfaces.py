@@ -20,7 +20,7 @@ from calib.residuals.scan import ScanStop
 from calib.residuals.surfaces import PLANE_PATCHES_M, PlaneSurface
 
 LEAST_BEAMS = 100  # on a plane: three numbers of it, known ten times better than by a single beam
-LOST = 0.5  # of these, below which a plane that was found has lost its beams
+LOST_BEAMS = 0.5  # of these, below which a plane that was found has lost its beams
 # Variance of the displacements, as shares of the reference's. They add up to more than 1: an error
 # that is smooth over metres has slopes, for which steps between cells must stand. Chosen by how
 # often intervals of ring zeros hold in simulated worlds: with cells of 0.7 m alone, their sigmas
@@ -106,7 +106,7 @@ def well_seen(problem: Problem, associations: Sequence[Association]) -> list[Ass
     for scans in rooms.values():
         count = len(problem.scans[scans[0]].meeting.planes.normal)
         beams = sum(np.bincount(found[i].part + 1, minlength=count + 1)[1:] for i in scans)
-        few = np.append(beams < LOST * LEAST_BEAMS, False)  # the last stands for -1
+        few = np.append(beams < LOST_BEAMS * LEAST_BEAMS, False)  # the last stands for -1
         for i in scans:
             found[i] = replace(found[i], part=np.where(few[found[i].part], -1, found[i].part))
     return found

@@ -12,7 +12,7 @@ import numpy as np
 from calib.effects.rig import DOF
 from chains import se3
 
-Kind = Literal["vector", "pose", "direction"]
+UnknownKind = Literal["vector", "pose", "direction"]
 # What is known of a pose before any data: the room it is in.
 UNKNOWN_POSE = np.repeat([3.0, 10.0], 3)
 POSE_UNITS = ("rad",) * 3 + ("m",) * 3
@@ -63,7 +63,7 @@ class Owner:
     room: int | str | None = None
 
 
-NOBODY = Owner()  # of what all share
+OF_ALL = Owner()  # of what all share
 
 
 @dataclass(frozen=True)
@@ -84,13 +84,13 @@ class Unknown:
     """
 
     name: str
-    kind: Kind
+    kind: UnknownKind
     mean: np.ndarray
     sigma: np.ndarray
     dofs: tuple[str, ...]
     units: tuple[str, ...]
     role: Role = Role.CALIBRATION
-    owner: Owner = NOBODY
+    owner: Owner = OF_ALL
     weight: float = 1.0
     scatter: Mapping[str, float] = field(default_factory=dict)
 
@@ -133,7 +133,7 @@ def pose_unknown(
     mean: np.ndarray,
     sigma: np.ndarray = UNKNOWN_POSE,
     role: Role = Role.CALIBRATION,
-    owner: Owner = NOBODY,
+    owner: Owner = OF_ALL,
 ) -> Unknown:
     """A pose known to `sigma` about `mean`."""
     return Unknown(
@@ -155,7 +155,7 @@ def vector_unknown(
     units: Iterable[str],
     mean: np.ndarray | float = 0.0,
     role: Role = Role.CALIBRATION,
-    owner: Owner = NOBODY,
+    owner: Owner = OF_ALL,
     weight: float = 1.0,
 ) -> Unknown:
     """Numbers (n,) known to `sigma` (n,) about `mean`."""

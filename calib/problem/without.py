@@ -14,10 +14,10 @@ import numpy as np
 from calib.effects import DEFAULT, Effect, Site, find
 from calib.problem.model import Source, labels
 from calib.residuals.groups import CAD, JOINTS, MESH, SCAN, Group
-from calib.residuals.targets import PARTS
+from calib.residuals.targets import TARGET_PARTS
 from chains.errors import InputError
 from sensors.documents import nearest
-from sensors.recording import Recording
+from sensors.recording import RecordedStops
 from sensors.stops import Targets
 
 ROD = "rod"  # of a target: all of it
@@ -61,7 +61,7 @@ def _groups(source: Source, label: str = "") -> list[Group]:
         if rig.joint_names:
             out += [Group("joints", stop, what, label) for what in (JOINTS, *rig.joint_names)]
     for target in recording.targets.names if recording.targets else ():
-        out += [Group("target", target, what, label) for what in (*PARTS, ROD)]
+        out += [Group("target", target, what, label) for what in (*TARGET_PARTS, ROD)]
     out += [Group("frame", CAD, frame) for frame in rig.frame_sigma]
     out += [Group("frame", CAD, f"{e}.{p}") for e, p in on_paper(source)]
     if source.reference is not None:
@@ -80,7 +80,7 @@ def of_the_arm() -> list[Effect]:
     return [e for e in map(find, DEFAULT) if e.site in (Site.EDGE, Site.JOINTS)]
 
 
-def _seen(recording: Recording, body: str) -> np.ndarray:
+def _seen(recording: RecordedStops, body: str) -> np.ndarray:
     return np.isfinite(recording.bodies[body][:, :3]).all(axis=1)
 
 

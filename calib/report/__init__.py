@@ -12,7 +12,7 @@ from calib import outputs
 from calib.linear.parallel import one_blas_thread
 from calib.report import plots
 from calib.report.chart import Absent, Chart
-from calib.report.charts import ALONE, SECTIONS
+from calib.report.charts import ON_REQUEST, SECTIONS
 from calib.report.evidence import Evidence
 from calib.report.numbers import figure_csv
 from calib.report.page import Drawn, Section, render
@@ -87,7 +87,7 @@ def charts_of(evidence: Evidence) -> ReportContents:
 @one_blas_thread
 def listed(evidence: Evidence) -> list[Chart]:
     """Every figure that can be asked for by name; errors as of `charts_of`."""
-    alone = (each for make in ALONE for each in make(evidence))
+    alone = (each for make in ON_REQUEST for each in make(evidence))
     return [*charts_of(evidence).charts, *(each for each in alone if isinstance(each, Chart))]
 
 
@@ -167,7 +167,7 @@ def _inputs(runs: Sequence[Run]) -> list[Path]:
 def _find(evidence: Evidence, name: str) -> Chart:
     """The figure of that name; none behind it is looked at."""
     known = []
-    for make in chain(*SECTIONS.values(), ALONE):
+    for make in chain(*SECTIONS.values(), ON_REQUEST):
         for each in make(evidence):
             if each.id == name and isinstance(each, Chart):
                 return each

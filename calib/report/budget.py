@@ -26,7 +26,7 @@ from calib.residuals.tracker import TrackedBody
 from calib.results.solution import Solution
 from calib.solve.fit import Progress
 
-STOPS, ROWS = 24, 2000  # of each stop that is looked at, no more rows than that
+BUDGET_STOPS, BUDGET_ROWS = 24, 2000  # of each stop that is looked at, no more rows than that
 
 Jacobian = dict[str, np.ndarray]
 
@@ -94,7 +94,7 @@ def _jacobians(
     """Per stop, variable -> (n, dim) derivative of what is measured there, m per unit; and how many
     measurements that is."""
     if problem.scans:
-        chosen = np.linspace(0, len(problem.scans) - 1, STOPS).round().astype(int)
+        chosen = np.linspace(0, len(problem.scans) - 1, BUDGET_STOPS).round().astype(int)
         for k, i in enumerate(np.unique(chosen).tolist()):
             progress("derivatives", k, len(chosen))
             scan = problem.scans[i]
@@ -118,13 +118,13 @@ def beam_jacobian(
     """Variable -> (n, dim) derivative of the range residuals of a stop's beams, m per unit.
 
     Args:
-        scan: the stop; of its beams that the fit keeps, at most `ROWS` are taken, evenly.
+        scan: the stop; of its beams that the fit keeps, at most `BUDGET_ROWS` are taken, evenly.
         values: the state.
         association: what its beams meet; found anew where None.
     """
     rows = scan.rows(values, association)
     kept = np.flatnonzero(rows.weight > 0)
-    some = kept[np.unique(np.linspace(0, len(kept) - 1, ROWS).round().astype(int))]
+    some = kept[np.unique(np.linspace(0, len(kept) - 1, BUDGET_ROWS).round().astype(int))]
     placed = scan.stops.in_reference(scan.stops.rig.lidar_frame, values)
     out = {name: rows.by_twist[some] @ d[0] for name, d in placed.d.items()}
     out |= {name: columns[some] for name, columns in rows.dense.items()}

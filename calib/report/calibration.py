@@ -16,7 +16,7 @@ from calib.show.tables import LISTED_PARAMETERS, estimate_texts
 from chains import escape, se3
 
 SIX = ("x, mm", "y, mm", "z, mm", "roll, deg", "pitch, deg", "yaw, deg")
-NUMBERS = (
+NUMBER_COLUMNS = (
     *("sigma", "prior sigma", "unit", "estimate/sigma", "estimate/prior sigma", "identifiable"),
 )
 
@@ -34,7 +34,7 @@ def calibration_tables(evidence: Evidence) -> list[Table]:
             title="How far every link is from CAD",
             reading="Per link T_cad exp(twist) in the child's axes: tx ty tz along them, rx ry rz "
             "about them. A link without a difference has no CAD pose.",
-            columns=("link", "in", "parameter", "difference", *NUMBERS),
+            columns=("link", "in", "parameter", "difference", *NUMBER_COLUMNS),
             rows=[
                 [Cell(row.variable), Cell(row.parent), *cells]
                 for row in links
@@ -61,7 +61,7 @@ def _effects(
         id=name,
         title=title,
         reading="Instruments are corrected by taking the estimate off, geometry by adding it.",
-        columns=("effect", "parameter", "estimate", *NUMBERS),
+        columns=("effect", "parameter", "estimate", *NUMBER_COLUMNS),
         rows=[[Cell(row.variable), *cells] for row in rows for cells in _numbers(row, prior)],
         folded=True,
     )
@@ -70,7 +70,7 @@ def _effects(
 def _numbers(
     row: VariableEstimate, prior: dict[str, float], order: Sequence[int] | None = None
 ) -> Iterator[list[Cell]]:
-    """Cells of each number of a variable that was not held: its name, itself, and `NUMBERS`."""
+    """Cells of each number of a variable that was not held: its name, itself, `NUMBER_COLUMNS`."""
     for k in range(len(row.parameters)) if order is None else order:
         estimate, sigma = float(row.estimate[k]), float(row.sigma[k])
         if sigma == 0.0:

@@ -10,7 +10,7 @@ from urllib.parse import quote
 
 from chains import escape
 
-DIGITS = 9  # significant digits of a number in CSV: more than any instrument of a rig has
+CSV_DIGITS = 9  # significant digits of a number in CSV: more than any instrument of a rig has
 UNQUOTED = ",:;"  # signs that stand for themselves in the address of a link, beside letters
 
 
@@ -29,7 +29,7 @@ class Cell:
     @property
     def exact(self) -> str:
         """As CSV has it."""
-        return self.text if self.value is None else f"{self.value:z.{DIGITS}g}"
+        return self.text if self.value is None else f"{self.value:z.{CSV_DIGITS}g}"
 
 
 @dataclass(frozen=True)

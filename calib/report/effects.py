@@ -32,11 +32,11 @@ SPANS = {
     "elevation_rad": (-0.4, 0.4, 180.0 / np.pi, "elevation, deg"),
     "joints": (-np.pi, np.pi, 180.0 / np.pi, "angle of {}, deg"),
 }
-POINTS = 400
-MOST_CURVES = 4
-LEAST = 0.02  # of the largest error: one that is smaller is not drawn
-JOINT = 1  # the second, which lifts the arm: what gravity does shows at it
-ERRORS = {
+CURVE_POINTS = 400  # a choice: finer than a column of the page is drawn
+MOST_CURVES = 4  # a choice: more hide each other
+LEAST_ERROR = 0.02  # of the largest error: one that is smaller is not drawn
+LIFTING_JOINT = 1  # the second, which lifts the arm: what gravity does shows at it
+ERRORS_OF_SITES = {
     Site.BEAM: (("range", 1e3, "mm"), ("azimuth", 1e3, "mrad"), ("elevation", 1e3, "mrad")),
     Site.NOISE: (("log of sigma", 1.0, ""),),
 }
@@ -52,7 +52,11 @@ def effect_figure(effect: Effect, rig: Rig) -> Figure | None:
         rig: on which it acts.
     """
     over = [name for name in effect.covariates if name in SPANS]
-    if effect.site not in (*ERRORS, Site.JOINTS) or len(over) != 1 or len(effect.covariates) != 1:
+    if (
+        effect.site not in (*ERRORS_OF_SITES, Site.JOINTS)
+        or len(over) != 1
+        or len(effect.covariates) != 1
+    ):
         return None
     view = _view(rig, over[0])
     shapes = effect.shapes(view)
@@ -60,11 +64,11 @@ def effect_figure(effect: Effect, rig: Rig) -> Figure | None:
         effect = effect.at(shapes[len(shapes) // 2])
     basis = effect.basis(view)
     params = effect.params(rig)
-    if isinstance(basis, OneHot) or len(basis) != POINTS or not params:
+    if isinstance(basis, OneHot) or len(basis) != CURVE_POINTS or not params:
         return None
     error = basis * np.array([param.sigma for param in params])
     spans = np.ptp(error, axis=0)
-    drawn = np.argwhere(spans > LEAST * spans.max())[:MOST_CURVES]
+    drawn = np.argwhere(spans > LEAST_ERROR * spans.max())[:MOST_CURVES]
     curves = [(part, params[k], error[:, part, k]) for part, k in drawn]
     return _figure(effect.site, rig, over[0], curves) if curves else None
 
@@ -95,12 +99,12 @@ def draw_effect(effect: Effect, out: Path | str) -> None:
 def _view(rig: Rig, name: str) -> View:
     """Rows along which one column goes from end to end, and the second joint with it."""
     low, high, _, _ = SPANS[name]
-    column = np.linspace(low, high, POINTS)
+    column = np.linspace(low, high, CURVE_POINTS)
     joints = np.zeros((1, len(rig.joint_names)))
     if name == "joints":
-        joints = np.zeros((POINTS, len(rig.joint_names)))
-        joints[:, JOINT] = column
-    return View(rig, POINTS, {name: column}, joints)
+        joints = np.zeros((CURVE_POINTS, len(rig.joint_names)))
+        joints[:, LIFTING_JOINT] = column
+    return View(rig, CURVE_POINTS, {name: column}, joints)
 
 
 def _figure(
@@ -108,13 +112,13 @@ def _figure(
 ) -> Figure:
     low, high, times, label = SPANS[name]
     with plots.styled():
-        figure, grid = plots.axes(plots.HALF, 2.6)
-        ax, x = grid[0, 0], times * np.linspace(low, high, POINTS)
+        figure, grid = plots.axes(plots.HALF_IN, 2.6)
+        ax, x = grid[0, 0], times * np.linspace(low, high, CURVE_POINTS)
         for (part, param, error), colour in zip(curves, plots.LINES, strict=False):
             what, scale, unit = _error(site, rig, part)
             amount = f"{param.sigma:g} {param.unit}".removesuffix(" 1")
             ax.plot(x, scale * error, color=colour, label=f"{what}: {param.name} = {amount}")
-        ax.set_xlabel(label.format(rig.joint_names[JOINT]))
+        ax.set_xlabel(label.format(rig.joint_names[LIFTING_JOINT]))
         ax.set_ylabel(f"error, {unit}" if unit else "error")
         figure.legend(loc="outside upper left", ncols=2)
         return plots.with_plain_text(figure)
@@ -125,4 +129,4 @@ def _error(site: Site, rig: Rig, part: int) -> tuple[str, float, str]:
     if site is Site.JOINTS:
         turns = rig.joint_kinds[part] == "revolute"
         return rig.joint_names[part], 1e3, "mrad" if turns else "mm"
-    return ERRORS[site][part]
+    return ERRORS_OF_SITES[site][part]

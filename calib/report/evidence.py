@@ -15,8 +15,8 @@ from calib.problem.model import Source, same_mesh
 from calib.report.budget import Budget, budget
 from calib.report.statistics import (
     AZIMUTHS,
-    BINS,
-    PLACES,
+    MOST_BINS,
+    PLACE_COLUMNS,
     Axis,
     Statistics,
     StopMaps,
@@ -29,7 +29,7 @@ from calib.residuals.scan import ScanStop
 from calib.runs.estimates import VariableEstimate, variable_estimates
 from calib.runs.ladder import Rung, ladder
 from calib.runs.reopen import problem_of, reopened, start_of, state_of
-from calib.runs.residual_table import UNSEEN, beam_ends, residual_table, table_path
+from calib.runs.residual_table import UNSEEN_FOLDER, beam_ends, residual_table, table_path
 from calib.runs.run import RESIDUALS, SUMMARY, Run
 from calib.solve.estimate import Start, values_of
 from calib.solve.fit import Progress
@@ -38,9 +38,9 @@ from chains.errors import InputError
 from sensors.recording import read_table
 
 FEWEST_BINS = 4  # bins of a stop's covariate, at least
-SAMPLED = 8  # tables from which the bins of covariates are taken
+TABLES_SAMPLED = 8  # tables from which the bins of covariates are taken
 # Columns of a table that are no covariate: they name a place, or are what is explained.
-NOT_COVARIATES = {*PLACES, "region", "patch", "column", "residual_m", "sigma_m", "weight"}
+NOT_OF_TABLES = {*PLACE_COLUMNS, "region", "patch", "column", "residual_m", "sigma_m", "weight"}
 NEEDED = {"ring", "column", "azimuth_rad", "range_m", "incidence_rad"}
 SUMMARY_KEYS = {"rms_mm", "misfit", "misfit_by", "converged", "residual", "stops", "points"}
 NEEDED |= {"residual_m", "sigma_m", "weight"}
@@ -145,11 +145,11 @@ class Evidence:
     def axes(self) -> list[Axis]:
         """The covariates of points and stops, those of the catalogue first, cut into bins."""
         scans = self.problem.scans
-        chosen = np.unique(np.linspace(0, len(scans) - 1, SAMPLED).round().astype(int))
+        chosen = np.unique(np.linspace(0, len(scans) - 1, TABLES_SAMPLED).round().astype(int))
         sample: dict[str, list[np.ndarray]] = {}
         for i in chosen.tolist():
             for name, column in self._columns(self.run, scans[i]).items():
-                if name not in NOT_COVARIATES - {"label"}:
+                if name not in NOT_OF_TABLES - {"label"}:
                     sample.setdefault(name, []).append(column)
         points = {name: np.concatenate(parts) for name, parts in sample.items()}
         stops = [self._stop(scan, k) for k, scan in enumerate(scans)]
@@ -173,7 +173,7 @@ class Evidence:
             numbers = sorted({*known, *np.unique(values).astype(int).tolist()})
             return Axis.of_things(name, numbers, [known.get(n, str(n)) for n in numbers])
         if len(values) == len(self.problem.scans):  # a value per stop: several stops in each bin
-            return Axis.of_values(name, values, min(BINS, max(FEWEST_BINS, len(values) // 3)))
+            return Axis.of_values(name, values, min(MOST_BINS, max(FEWEST_BINS, len(values) // 3)))
         return Axis.of_values(name, values)
 
     @property
@@ -207,7 +207,7 @@ class Evidence:
         """Stops that were held out, the one furthest off first; none where none were."""
         found = []
         for scan in self.problem.scans:
-            path = table_path(self.run.folder / RESIDUALS / UNSEEN, scan, self.sources)
+            path = table_path(self.run.folder / RESIDUALS / UNSEEN_FOLDER, scan, self.sources)
             if path.is_file():
                 tables = [self._columns(r, scan) for r in (self.below, self.run)]
                 tables.append(_checked(path))
@@ -226,7 +226,7 @@ class Evidence:
             scans = [s for s in self.problem.scans if same_mesh(meshes[self._source(s)], mesh)]
             if not scans:
                 continue
-            chosen = scans[:: -(-len(scans) // SAMPLED)]
+            chosen = scans[:: -(-len(scans) // TABLES_SAMPLED)]
             ends = [self._ends(scan) for scan in chosen]
             beams = sum(len(each.weight) for each in ends) * len(scans) // len(chosen)
             box = Box.of(yaw_of(mesh), ends, beams)

@@ -18,9 +18,13 @@ from chains import escape
 if TYPE_CHECKING:
     from calib.report.plots import Axes, Figure
 
-DIGITS = 5  # significant ones of a number that is drawn: more than a picture shows
+DRAWN_DIGITS = 5  # significant ones of a number that is drawn: more than a picture shows
 COLOUR_BAR = "<colorbar>"  # what matplotlib calls the axes of one
-NAMED = {"FuncFormatter", "StrCategoryFormatter"}  # of axes whose ticks are given as texts
+# Of axes whose ticks are given as texts.
+TEXT_FORMATTERS = {
+    "FuncFormatter",
+    "StrCategoryFormatter",
+}
 Series = tuple[str, np.ndarray, np.ndarray, np.ndarray]
 Rows = list[list[str]]
 
@@ -171,7 +175,7 @@ def _name(artist: Any) -> str:
 def _texts(axis: Any, at: np.ndarray) -> list[str]:
     """Places along an axis: numbers, or where its ticks are names the name of the tick nearby."""
     form = axis.get_major_formatter()
-    if type(form).__name__ in NAMED:
+    if type(form).__name__ in TEXT_FORMATTERS:
         ticks = np.asarray(axis.get_majorticklocs(), float)
         names = [form(tick, k).replace("\n", ", ") for k, tick in enumerate(ticks)]
         if len(ticks) and not all(map(escape.is_number, names)):
@@ -182,4 +186,4 @@ def _texts(axis: Any, at: np.ndarray) -> list[str]:
 
 
 def _text(value: float) -> str:
-    return f"{value:z.{DIGITS}g}" if np.isfinite(value) else ""
+    return f"{value:z.{DRAWN_DIGITS}g}" if np.isfinite(value) else ""

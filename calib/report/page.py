@@ -9,14 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from calib.diagnosis.search import ALPHA
+from calib.diagnosis.search import ALPHA_EFFECT
 from calib.diagnosis.verdict.sentences import UNNAMED
 from calib.effects import CATALOGUE
 from calib.report.calibration import calibration_tables
 from calib.report.chart import Absent, Chart
 from calib.report.charts.fit import error_mm
 from calib.report.evidence import Evidence, folder_name
-from calib.show.blunders import HEADINGS, blunder_cells
+from calib.show.blunders import BLUNDER_HEADINGS, blunder_cells
 from calib.show.headline import moved_sentence
 from calib.show.misfit import over_beams
 from calib.show.scale import shown
@@ -125,7 +125,7 @@ def render(
         brief=verdict.light != "green",
         absent=absent,
         diagnosis=evidence.diagnosis,
-        headings=HEADINGS,
+        headings=BLUNDER_HEADINGS,
         blunders=[blunder_cells(b) for b in (evidence.diagnosis or {}).get("blunders", ())],
         candidates=_candidates(evidence),
         formulas=_formulas(evidence),
@@ -201,7 +201,9 @@ def _candidates(evidence: Evidence) -> dict[str, list[dict[str, Any]]]:
             "confirmed": bool(c["step"]) and not c["dressed_up"],
             "told": "; ".join(_told(c)),
         }
-        for c in [c for c in candidates if c["step"] or c["p_adjusted"] < ALPHA][:TOLD_CANDIDATES]
+        for c in [c for c in candidates if c["step"] or c["p_adjusted"] < ALPHA_EFFECT][
+            :TOLD_CANDIDATES
+        ]
     ]
     confirmed = [c for c in told if c["confirmed"]]
     return {"confirmed": confirmed, "others": [c for c in told if c not in confirmed]}

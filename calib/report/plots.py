@@ -25,12 +25,12 @@ if TYPE_CHECKING:
 
 AFTER, BEFORE, FLOOR, INK, PALE = "#0072b2", "#d55e00", "#009e73", "#333333", "#999999"
 LINES = (AFTER, BEFORE, FLOOR, "#cc79a7", "#e69f00", "#56b4e9")
-SIGNED, UNSIGNED = "PuOr_r", "cividis"
-HALF, WIDE = 5.6, 8.0  # inches: of a column of the page, and of both
+SIGNED_MAP, UNSIGNED_MAP = "PuOr_r", "cividis"
+HALF_IN, WIDE_IN = 5.6, 8.0  # inches: of a column of the page, and of both
 NARROW = 4.2  # of the workbench's panel
-FORMATS = ("png", "svg", "pdf")
+IMAGE_FORMATS = ("png", "svg", "pdf")
 PAPER_DPI, MAP_DPI = 300, 110
-LONGEST_NAME = {"x": 24, "y": 44}  # letters along an axis: longer ones leave no room for the rest
+LONGEST_TICK = {"x": 24, "y": 44}  # letters along an axis: longer ones leave no room for the rest
 LABEL_IN = 0.22  # of axes' labels from the left and from below, where margins are given
 POSITION_DIGITS = 9  # of a position of axes, as a share of the figure: far below what is seen
 _STYLE = {
@@ -58,7 +58,7 @@ _STYLE = {
 
 
 def axes(
-    width: float = HALF,
+    width: float = HALF_IN,
     height: float = 3.0,
     rows: int = 1,
     columns: int = 1,
@@ -120,7 +120,7 @@ def log_axis(ax: Axes, least: float, most: float, name: str = "x") -> None:
 
 
 def signed_map(
-    ax: Axes, values: np.ndarray, extent: Sequence[float], limit: float, scale: str = SIGNED
+    ax: Axes, values: np.ndarray, extent: Sequence[float], limit: float, scale: str = SIGNED_MAP
 ) -> Any:
     """A map (rows, columns) about zero, drawn as one picture; grey where it is NaN.
 
@@ -142,7 +142,7 @@ def signed_cells(ax: Axes, x: np.ndarray, y: np.ndarray, values: np.ndarray, lim
     ax.set_facecolor("#d8d8d8")
     ax.grid(False)
     known = np.ma.masked_invalid(values)
-    return ax.pcolormesh(x, y, known, cmap=SIGNED, vmin=-limit, vmax=limit, rasterized=True)
+    return ax.pcolormesh(x, y, known, cmap=SIGNED_MAP, vmin=-limit, vmax=limit, rasterized=True)
 
 
 def share_map(ax: Axes, values: np.ndarray, extent: Sequence[float], most: float) -> Any:
@@ -150,7 +150,7 @@ def share_map(ax: Axes, values: np.ndarray, extent: Sequence[float], most: float
     ax.set_facecolor("#d8d8d8")
     ax.grid(False)
     options = {"aspect": "auto", "origin": "lower", "interpolation": "nearest"}
-    return ax.imshow(values, UNSIGNED, vmin=0.0, vmax=most, extent=extent, **options)
+    return ax.imshow(values, UNSIGNED_MAP, vmin=0.0, vmax=most, extent=extent, **options)
 
 
 def with_plain_text(figure: Figure) -> Figure:
@@ -162,7 +162,7 @@ def with_plain_text(figure: Figure) -> Figure:
         text.set_text(escape.terminal(text.get_text()))
     for ax in figure.axes:
         for axis in (ax.xaxis, ax.yaxis):
-            names, most = axis.get_major_formatter(), LONGEST_NAME[axis.axis_name]
+            names, most = axis.get_major_formatter(), LONGEST_TICK[axis.axis_name]
             names.format_ticks = partial(_plain_ticks, names.format_ticks, most)
     return figure
 
@@ -223,8 +223,8 @@ def check_format(path: Path | str) -> str:
         InputError: it is none of .png, .svg and .pdf.
     """
     kind = Path(path).suffix.lower().removeprefix(".")
-    if kind not in FORMATS:
-        ends = ", ".join(f".{f}" for f in FORMATS)
+    if kind not in IMAGE_FORMATS:
+        ends = ", ".join(f".{f}" for f in IMAGE_FORMATS)
         raise InputError(f"{path}: a figure is written as one of {ends}; name the file so")
     return kind
 

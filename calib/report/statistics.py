@@ -14,9 +14,9 @@ import numpy as np
 
 from calib.linear.binned import BinnedSums
 
-BINS, AZIMUTHS = 30, 180  # at most
+MOST_BINS, AZIMUTHS = 30, 180  # at most
 Z_EDGES = np.linspace(-5.0, 5.0, 101)
-PLACES = ("surface", "plane", "label")
+PLACE_COLUMNS = ("surface", "plane", "label")
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Axis:
     names: tuple[str, ...] = ()
 
     @classmethod
-    def of_values(cls, name: str, values: np.ndarray, bins: int = BINS) -> Axis:
+    def of_values(cls, name: str, values: np.ndarray, bins: int = MOST_BINS) -> Axis:
         """Bins of about equal count; a bin for each value where they are few."""
         values = values[np.isfinite(values)]
         distinct = np.unique(values)
@@ -245,7 +245,7 @@ def _cell(columns: Mapping[str, np.ndarray], rings: int, azimuths: int) -> np.nd
 
 def _numbered(columns: Mapping[str, np.ndarray], room: int, among: dict[Any, int]) -> np.ndarray:
     """(N,) which place each row looks at, numbered among those of all stops."""
-    kind = next(name for name in PLACES if name in columns)
+    kind = next(name for name in PLACE_COLUMNS if name in columns)
     distinct, local = np.unique(columns[kind], return_inverse=True)
     numbers = [among.setdefault((room, p), len(among)) for p in distinct.tolist()]
     return np.array(numbers, int)[local]

@@ -13,11 +13,12 @@ import numpy as np
 
 from sensors.reference import Reference
 
-CELL_M, BEAMS = 0.2, 10  # a cell's size, and how many beams end in it: larger where they are few
+# A cell's size, and how many beams end in it: larger where they are few.
+WALL_CELL_M, BEAMS_A_CELL = 0.2, 10
 DEPTH_M = 0.4  # of what stands before a wall, and is drawn on it: shelves, pipes, doors
-FEWEST = 5  # beams of a cell that is drawn
+FEWEST_IN_CELL = 5  # beams of a cell that is drawn
 BOX = 0.005, 0.995  # quantiles of where beams end: what is seen through a door is not the room
-UPRIGHT = 0.9  # of a triangle's normal, how much is level: it is of a wall
+LEVEL_NORMAL = 0.9  # of a triangle's normal, how much is level: it is of a wall
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,7 @@ class Face:
         axes: names of the two directions along it, right and up.
         cell_m: size of its cells.
         mean_m: (H, W) mean residual of its cells, from the room's corner; NaN where fewer than
-            `FEWEST` beams ended.
+            `FEWEST_IN_CELL` beams ended.
         halves_m: (2, H, W) the same of each half of the stops.
     """
 
@@ -75,15 +76,15 @@ class Box:
         at_m = _turned(np.concatenate([each.at_m for each in ends]), yaw_rad)
         low_m, high_m = np.quantile(at_m, BOX, axis=0)
         x, y, z = high_m - low_m
-        cell_m = np.sqrt(2 * (x * y + y * z + z * x) * BEAMS / max(beams, 1))
-        return cls(yaw_rad, low_m, high_m, max(CELL_M, round(float(cell_m), 1)))
+        cell_m = np.sqrt(2 * (x * y + y * z + z * x) * BEAMS_A_CELL / max(beams, 1))
+        return cls(yaw_rad, low_m, high_m, max(WALL_CELL_M, round(float(cell_m), 1)))
 
 
 def yaw_of(mesh: Reference) -> float:
     """By how much the walls of a mesh are turned about z from its axes, rad; within pi / 4."""
     x, y = mesh.planes[:-1, :2].T
     turns = 4.0 * np.arctan2(y, x)  # all four walls of a room as one
-    walls = mesh.area_m2 * (np.hypot(x, y) > UPRIGHT)
+    walls = mesh.area_m2 * (np.hypot(x, y) > LEVEL_NORMAL)
     return float(np.angle(np.sum(walls * np.exp(1j * turns)))) / 4.0
 
 
@@ -108,10 +109,10 @@ def faces(box: Box, stops: Iterable[Ends]) -> list[Face]:
             into += np.reshape(every, into.shape)
     return [
         Face(
-            _name(k, end, size_m),
-            tuple("xyz"[i] for i in _along(k)),
-            box.cell_m,
-            *_means(sums[k, end]),
+            name=_name(k, end, size_m),
+            axes=tuple("xyz"[i] for i in _along(k)),
+            cell_m=box.cell_m,
+            **_means(sums[k, end]),
         )
         for k, end in sides
     ]
@@ -124,13 +125,13 @@ def repeats_m(found: Sequence[Face]) -> float:
     return float(np.sqrt(max(seen.mean(), 0.0))) if len(seen) else 0.0
 
 
-def _means(sums: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of sums (2, 3, H, W) the mean over both halves, and those of each."""
+def _means(sums: np.ndarray) -> dict[str, np.ndarray]:
+    """Of sums (2, 3, H, W) the mean over both halves, and those of each; as `Face` has them."""
     every = np.concatenate([sums.sum(axis=0)[None], sums])
     count, weight, total = every.swapaxes(0, 1)
     with np.errstate(invalid="ignore", divide="ignore"):
-        mean = np.where(count >= FEWEST, total / weight, np.nan)
-    return mean[0], mean[1:]
+        mean = np.where(count >= FEWEST_IN_CELL, total / weight, np.nan)
+    return {"mean_m": mean[0], "halves_m": mean[1:]}
 
 
 def _turned(at_m: np.ndarray, yaw_rad: float) -> np.ndarray:

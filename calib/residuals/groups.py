@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-Kind = Literal["body", "joints", "scan", "target", "frame", "rings", "surface"]
+GroupKind = Literal["body", "joints", "scan", "target", "frame", "rings", "surface"]
 SCAN, JOINTS = "scan", "joints"  # what of a stop, beside its bodies and single joints
 CAD, MESH = "cad", "mesh"  # where, of what belongs to no stop and no target
-BEAMS = "along the beams"  # the direction of a range zero
+ALONG_BEAMS = "along the beams"  # the direction of a range zero
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Group:
         recording: name of its folder, where there are several recordings.
     """
 
-    kind: Kind
+    kind: GroupKind
     where: str
     what: str
     recording: str = ""

@@ -9,7 +9,7 @@ MAD = 1.4826  # of normal residuals, from the median of their size to their sigm
 TUKEY = 4.685  # 95 % efficiency on normal rows (Holland and Welsch 1977)
 # Chance that a group of good rows lies further out than where Huber's weights begin: of a recording
 # with a hundred groups, one in a hundred has any weight below 1.
-BEYOND = 1e-4
+CHANCE_BEYOND = 1e-4
 BULK = 4  # groups, below which their median is no measure of their bulk: half could be wild
 
 
@@ -61,4 +61,4 @@ def huber_weight(norm: np.ndarray, dof: np.ndarray) -> np.ndarray:
     bulk = (
         max(1.0, float(np.median(norm / np.sqrt(chdtri(dof, 0.5))))) if len(norm) >= BULK else 1.0
     )
-    return np.minimum(1.0, bulk * np.sqrt(chdtri(dof, BEYOND)) / np.maximum(norm, 1e-300))
+    return np.minimum(1.0, bulk * np.sqrt(chdtri(dof, CHANCE_BEYOND)) / np.maximum(norm, 1e-300))

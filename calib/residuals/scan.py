@@ -34,13 +34,17 @@ from calib.residuals.surfaces import Meeting
 from chains import se3
 from chains.errors import InputError
 from sensors.lidar import Beams, LidarModel
-from sensors.recording import Recording, Scan
+from sensors.recording import RecordedStops, Scan
 
 SIZE = {Site.BEAM: 3, Site.REFERENCE: 3, Site.NOISE: 1}
-PRIOR_COUNT = 20.0  # a measured spread of fewer sweeps than this leans on the datasheet
+# A measured spread of fewer sweeps than this leans on the datasheet: a choice; of so many, a sigma
+# is known to a sixth.
+PRIOR_COUNT = 20.0
 MET = ("label", "incidence_rad")
-PARTS = ("surface", "region", "patch", "plane")  # of what is met: no column of a user's
-LOCAL_SHARE = 0.05  # of the variance of a patch of the reference, between its neighbouring points
+MET_PARTS = ("surface", "region", "patch", "plane")  # of what is met: no column of a user's
+# Of the variance of a patch of the reference, between its neighbouring points: a choice, as errors
+# of scans and planes are smooth.
+LOCAL_SHARE = 0.05
 
 
 @dataclass(frozen=True)
@@ -83,7 +87,7 @@ class ScanStop:
     """
 
     name: str
-    recording: Recording
+    recording: RecordedStops
     index: int
     stops: Stops
     terms: Sequence[Term]
@@ -248,7 +252,7 @@ class ScanStop:
         return found
 
     def _view(self, scan: Scan, ray: Beams, surface: Surface) -> View:
-        given = {n: c for n, c in {**self.columns, **scan.extra}.items() if n not in PARTS}
+        given = {n: c for n, c in {**self.columns, **scan.extra}.items() if n not in MET_PARTS}
         columns: dict[str, LazyColumn] = {
             **given,
             **surface.columns,

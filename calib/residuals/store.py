@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from sensors.lidar import Beams, beams
-from sensors.recording import Recording, Scan
+from sensors.recording import RecordedStops, Scan
 
 KEPT_BYTES = 256e6  # of scans and beams of one recording; what is beyond is read again each time
 
@@ -25,7 +25,7 @@ class BeamStore:
         beam_origin_m: (2,) of its LiDAR, radial and tangential.
     """
 
-    recording: Recording
+    recording: RecordedStops
     beam_origin_m: tuple[float, float]
     _kept: dict[int, tuple[Scan, Beams]] = field(default_factory=dict, repr=False)
     _bytes: float = 0.0

@@ -20,8 +20,10 @@ from sensors.planes import Cells, Planes
 from sensors.reference import Reference
 from sensors.surfaces import SurfaceGrid, transverse
 
-GRAZING_RAD = np.deg2rad(80.0)  # a fit keeps no beam that meets its surface flatter than this
-PARALLEL_RAD = np.deg2rad(89.0)
+# A fit keeps no beam that meets its surface flatter than this: a choice; a millimetre of the
+# surface is 6 mm of range there.
+FLATTEST_FITTED_RAD = np.deg2rad(80.0)
+PARALLEL_RAD = np.deg2rad(89.0)  # a choice: where it is 57 mm of range, nothing is measured
 # Widths of the cells that surfaces are divided into, in a room whose box has 200 m2 of walls; in
 # larger ones the cells grow alike, so that there are never many more of them. Patches of planes are
 # as wide as the cells that planes are found in: within patches of 0.5 m the walls of the simulated
@@ -97,7 +99,7 @@ class MeshSurface:
         if not near_edges:
             return Association(triangle)
         hits = self.reference.hits(triangle, origins, directions)
-        spoilt = hits.incidence_rad > GRAZING_RAD
+        spoilt = hits.incidence_rad > FLATTEST_FITTED_RAD
         spoilt |= self.reference.near_edge(origins, directions, hits, self.footprint_rad)
         return self.divided(T, beams, np.where(spoilt, -1, hits.triangle).astype(np.int32))
 

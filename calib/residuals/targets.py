@@ -10,8 +10,8 @@ import numpy as np
 from calib.forward import Derivatives, Values
 from calib.residuals.groups import Group
 
-PARTS = ("lower", "upper", "sphere")  # of a target, three rows each
-SIGMAS = {"sphere": ("sphere",), "marker": ("lower", "upper")}  # of which parts
+TARGET_PARTS = ("lower", "upper", "sphere")  # of a target, three rows each, in their order
+PARTS_OF_SIGMAS = {"sphere": ("sphere",), "marker": ("lower", "upper")}  # of which parts
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class HangingTarget:
         sigma_sphere_m, sigma_marker_m: per axis.
         shift: (3, P) per variable: where the sphere truly sits beyond that, world frame.
         scanned: (3, P) per variable: where it truly sits beyond where it was scanned, faro frame.
-        groups: (3,) the names of the rows of each of `PARTS`.
+        groups: (3,) the names of the rows of each of `TARGET_PARTS`.
         weight: (3,) of the rows of each, robust, and 0 for a part that was left out; 1 where None.
         scatter: "sphere" or "marker" -> how widely it scatters beyond what its sigma was at first.
     """
@@ -51,7 +51,9 @@ class HangingTarget:
     scanned: Mapping[str, np.ndarray] = field(default_factory=dict)
     groups: tuple[Group, ...] = ()
     weight: np.ndarray | None = None
-    scatter: Mapping[str, float] = field(default_factory=lambda: dict.fromkeys(SIGMAS, 0.0))
+    scatter: Mapping[str, float] = field(
+        default_factory=lambda: dict.fromkeys(PARTS_OF_SIGMAS, 0.0)
+    )
 
     kind = "target"
     rows = 9

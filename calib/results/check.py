@@ -30,7 +30,7 @@ from calib.solve.fit import Progress, preview
 from calib.solve.turned import lidars_turned
 from chains import se3
 from chains.errors import InputError
-from sensors.recording import Recording, read_scan
+from sensors.recording import RecordedStops, read_scan
 from sensors.reference import Reference
 from sensors.stops import read_targets
 
@@ -251,7 +251,9 @@ def _turned(scan: ScanStop, before: Values, after: Values) -> Suspect:
     )
 
 
-def _token(suspect: Mapping[str, Any], rig: Rig | None, recording: Recording | None) -> str | None:
+def _token(
+    suspect: Mapping[str, Any], rig: Rig | None, recording: RecordedStops | None
+) -> str | None:
     """How ``--without`` names what a suspect is about, if it has a name for it."""
     kind, stop, name = (suspect[key] for key in ("kind", "stop", "name"))
     known = {"scan": f"{stop}:{SCAN}", "target": f"{name}:{ROD}", "frame": f"{CAD}:{name}"}
@@ -265,12 +267,14 @@ def _token(suspect: Mapping[str, Any], rig: Rig | None, recording: Recording | N
     return token
 
 
-def _open(folder: Path, rig: Rig | None) -> Recording:
+def _open(folder: Path, rig: Rig | None) -> RecordedStops:
     """The recording, its joints and bodies included where the rig says which they are."""
     if rig is None:
-        return Recording.open(folder, (), ())
+        return RecordedStops.open(folder, (), ())
     bodies = rig.tracker.bodies if rig.tracker else ()
-    return Recording.open(folder, rig.joint_names, bodies, rig.lidar.rings if rig.lidar else None)
+    return RecordedStops.open(
+        folder, rig.joint_names, bodies, rig.lidar.rings if rig.lidar else None
+    )
 
 
 def _place(scan: ScanStop, values: Values) -> PlacedScan:

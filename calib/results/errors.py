@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -44,8 +44,7 @@ class Errors:
     rejected_m2: float = 0.0
 
     def __add__(self, other: Errors) -> Errors:
-        pairs = zip(astuple(self), astuple(other), strict=True)
-        return Errors(*(mine + its for mine, its in pairs))
+        return Errors(**{name: mine + getattr(other, name) for name, mine in vars(self).items()})
 
     @property
     def rms_mm(self) -> float | None:
@@ -118,8 +117,14 @@ def row_errors(rows: Rows, predicted_m2: np.ndarray | float = 0.0) -> Errors:
     inlier, lost = rows.weight > 0, rows.usable & (rows.weight == 0)
     expected = np.square(rows.sigma_m) + np.square(rows.reference_sigma_m) + predicted_m2
     r, out = rows.residual_m[inlier], rows.residual_m[lost]
-    sums = (float(r.sum()), float(r @ r), float(expected[inlier].sum()))
-    return Errors(len(r), *sums, len(out), float(out @ out))
+    return Errors(
+        count=len(r),
+        total_m=float(r.sum()),
+        squares_m2=float(r @ r),
+        expected_m2=float(expected[inlier].sum()),
+        rejected=len(out),
+        rejected_m2=float(out @ out),
+    )
 
 
 def _predicted_variance(

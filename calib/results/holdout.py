@@ -20,7 +20,7 @@ from calib.solve.estimate import Estimate, Start
 from calib.solve.fit import Progress, solve
 
 FOLDS = 5  # a fit leaves out about a fifth of the locations
-BLOCKS = 3 * FOLDS  # of poses: a fold leaves out three, far from each other
+POSE_BLOCKS = 3 * FOLDS  # of poses: a fold leaves out three, far from each other
 
 
 def folds(sources: Sequence[Source], by: str) -> list[list[np.ndarray]]:
@@ -77,7 +77,7 @@ def pose_blocks(source: Source) -> np.ndarray:
     at = np.where(np.isfinite(at), at, np.nanmean(at, axis=0))
     middles: list[int] = []
     away = np.linalg.norm(at - at.mean(axis=0), axis=1)
-    while len(middles) < BLOCKS and away.max(initial=0.0) > 0:
+    while len(middles) < POSE_BLOCKS and away.max(initial=0.0) > 0:
         middles.append(int(np.argmax(away)))
         away = np.linalg.norm(at[:, None] - at[middles], axis=2).min(axis=1)
     if not middles:

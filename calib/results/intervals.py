@@ -12,10 +12,10 @@ of a parameter's variance in C its variance is
 
 with p the share of rows that belong to no cluster, priors of the hardware above all; targets are
 clusters beside the stops, "both" are the cells of stop and region (Cameron, Gelbach and Miller
-2011). Regions are many and each holds little, so there, and where stops are more than `WHOLE`, each
-parameter is taken by itself: ``u = t / sqrt(1 - h)``, h the cluster's share of its information. The
-h also give the degrees of freedom of each sum (Bell and McCaffrey), and Satterthwaite's formula
-those of v. No interval is narrower than by C.
+2011). Regions are many and each holds little, so there, and where stops are more than
+`MOST_WHOLE_STOPS`, each parameter is taken by itself: ``u = t / sqrt(1 - h)``, h the cluster's
+share of its information. The h also give the degrees of freedom of each sum (Bell and McCaffrey),
+and Satterthwaite's formula those of v. No interval is narrower than by C.
 
 Where stops err together 0.92 to 0.95 of 95 % intervals hold, with 4 to 30 stops and 1 to 12
 parameters that differ by stop (the worlds of `tests/calib/test_intervals.py`, 600 draws each);
@@ -38,23 +38,26 @@ from scipy.linalg import solve_triangular
 from calib.linear.clusters import CellSums, ClusteredRows, Gradients, summed
 from calib.linear.rows import PLACES
 from calib.results.errors import in_cad
-from calib.solve.clustered import Beams, of_cells, of_graph, of_stops
+from calib.solve.clustered import BeamsAlong, of_cells, of_graph, of_stops
 from calib.solve.estimate import Estimate
 from calib.solve.fit import Progress
 from calib.solve.graph import KeptRows
 
 REGION = "region"
-PARTS = (REGION, *PLACES)  # of the room, whose beams share the error of the mesh or plane there
+# Parts of the room, whose beams share the error of the mesh or plane there.
+ROOM_PARTS = (REGION, *PLACES)
 # Degrees of freedom that t has at least. With fewer it grows without bound (12.7 with 1): such an
 # interval would speak of the clusters, not of the estimate. With 4 stops 0.94 hold with it.
-FEWEST = 2.5
-MANY = 1e6  # degrees of freedom at which t is normal
-# Of what is known of a parameter: a cluster with more leaves nothing to compare it with.
+FEWEST_DOF = 2.5
+NORMAL_DOF = 1e6  # degrees of freedom at which t is normal
+# Of what is known of a parameter, or of a direction: a cluster with more of it is alone with it and
+# leaves nothing to compare it with.
 ALONE = 0.999
-SLIGHT = 1e-9  # of the same: what clusters hold of it is rounding
-ROUNDING = 1e-12  # of correlations: unknowns that priors tie to each other make them near singular
+ROUNDED_SHARE = 1e-9  # of the same: what clusters hold of it is rounding
+# Of correlations: unknowns that priors tie to each other make them near singular.
+CORRELATION_ROUNDING = 1e-12
 # Stops, up to which each is taken for all parameters at once; of more each holds next to nothing.
-WHOLE = 200
+MOST_WHOLE_STOPS = 200
 LEVEL = 0.975  # the quantile at which a 95 % interval ends
 NORMAL = float(special.ndtri(LEVEL))
 
@@ -89,7 +92,9 @@ class Intervals:
         much larger as CAD is worse than it says."""
         share = np.diag(self.data) / np.diag(self.graph)
         more = np.maximum(np.square(self.wider) - self.least**2, 0.0)
-        root = np.sqrt(np.where(share > SLIGHT, more / np.maximum(share, SLIGHT), 0.0))
+        root = np.sqrt(
+            np.where(share > ROUNDED_SHARE, more / np.maximum(share, ROUNDED_SHARE), 0.0)
+        )
         paper = max(self.cad**2 - self.least**2, 0.0) * self.paper
         return self.least**2 * self.graph + np.outer(root, root) * self.data + paper
 
@@ -150,14 +155,14 @@ def intervals(estimate: Estimate, progress: Progress = lambda what, done, total:
     places, stops = Gradients(layout.size), len(layout.stops)
     problem, met = estimate.problem, estimate.associations
     tell = partial(progress, "errors in common of rows")
-    beams = Beams(
+    beams = BeamsAlong(
         problem=problem,
         layout=layout,
         values=values,
         associations=met,
         directions=directions,
         places=places,
-        kinds=PARTS,
+        kinds=ROOM_PARTS,
         progress=tell,
     )
     for cells, scatter in beams.cells():
@@ -237,7 +242,7 @@ class _Sums:
     @classmethod
     def over(cls, correlation: np.ndarray) -> _Sums:
         """With no rows yet."""
-        safe = correlation + ROUNDING * np.eye(len(correlation))
+        safe = correlation + CORRELATION_ROUNDING * np.eye(len(correlation))
         return cls(np.linalg.cholesky(safe), np.zeros_like(correlation))
 
     def add(self, rows: ClusteredRows) -> None:
@@ -264,7 +269,7 @@ class _Sums:
         self._add_products(sums.stop, sums.products)
 
     def _add_products(self, stop: int, products: np.ndarray) -> None:
-        if len(self.stops) <= WHOLE:
+        if len(self.stops) <= MOST_WHOLE_STOPS:
             self.stops[stop] = self.stops.get(stop, 0.0) + products
 
     def wider(self) -> np.ndarray:
@@ -281,14 +286,16 @@ class _Sums:
         beyond = np.maximum(by_part - by_both, 0.0)
         variance = np.diag(self.priors) + by_stop + beyond
         d = np.square(variance) / np.maximum(by_stop**2 / d_stop + beyond**2 / d_part, 1e-300)
-        wider = np.sqrt(variance) * special.stdtrit(np.clip(d, FEWEST, MANY), LEVEL) / NORMAL
-        return np.where(share.sum(axis=0) > SLIGHT, np.maximum(1.0, wider), 1.0)
+        wider = (
+            np.sqrt(variance) * special.stdtrit(np.clip(d, FEWEST_DOF, NORMAL_DOF), LEVEL) / NORMAL
+        )
+        return np.where(share.sum(axis=0) > ROUNDED_SHARE, np.maximum(1.0, wider), 1.0)
 
     def _of_stops(self, moved: np.ndarray, number: np.ndarray) -> dict[int, np.ndarray]:
         """Stop -> u (P,) of all parameters at once, where stops are few; from what cells (C, P)
         add, and the number (C,) of the cluster of each."""
         found = {}
-        for stop, products in self.stops.items() if len(self.stops) <= WHOLE else ():
+        for stop, products in self.stops.items() if len(self.stops) <= MOST_WHOLE_STOPS else ():
             half = solve_triangular(self.root, products, lower=True)
             values, axes = np.linalg.eigh(solve_triangular(self.root, half.T, lower=True))
             t = moved[number == stop].sum(axis=0)

@@ -19,7 +19,7 @@ from calib.effects.rig import DOF
 from calib.linear.layout import StopKey, key_of
 from calib.problem.model import Source, recording_names
 from calib.problem.unknowns import POSE_UNITS, Role, Unknown
-from calib.residuals.targets import HangingTarget
+from calib.residuals.targets import TARGET_PARTS, HangingTarget
 from calib.residuals.tracker import TrackedBody
 from calib.results.errors import Errors
 from calib.solve.estimate import Estimate
@@ -29,8 +29,8 @@ from calib.solve.reweight import unweighted
 # below 0.01 observations are "not checkable").
 UNCHECKED = 0.01
 XYZ = ("x", "y", "z")
-PARTS = ("lower", "upper", "sphere")  # of a target, in the order of its rows
-GEOMETRY = (Site.EDGE, Site.JOINTS, Site.TARGET, Site.REFERENCE)  # what says how the rig is built
+# What says how the rig is built.
+GEOMETRY_SITES = Site.EDGE, Site.JOINTS, Site.TARGET, Site.REFERENCE
 
 
 @dataclass(frozen=True)
@@ -98,11 +98,11 @@ def target_rows(estimate: Estimate) -> InstrumentRows | None:
     out = _Gathered()
     for block, by, right in estimate.graph.linear_rows(estimate.values):
         if id(block) in whose:
-            weight = np.ones(len(PARTS)) if block.weight is None else block.weight
+            weight = np.ones(len(TARGET_PARTS)) if block.weight is None else block.weight
             root = np.repeat(np.sqrt(np.where(weight > 0, weight, np.inf)), 3)  # a part left out: 0
             (seen,), right = estimate.variances([by]), right / root
             left = np.where(np.isfinite(root), 1.0 - seen / np.square(root), 0.0)
-            each = [(*whose[id(block)], part, axis) for part in PARTS for axis in XYZ]
+            each = [(*whose[id(block)], part, axis) for part in TARGET_PARTS for axis in XYZ]
             marker, sphere = block.sigma_marker_m, block.sigma_sphere_m
             out.add(each, ["m"] * 9, np.repeat([marker, marker, sphere], 3), -right, left)
     return out.rows(("recording", "target", "part", "axis"))
@@ -203,7 +203,14 @@ class _Gathered:
             return None
         columns = zip(names, zip(*self.keys, strict=True), strict=True)
         named = {name: np.array(column, np.str_) for name, column in columns}
-        return InstrumentRows(named, np.array(self.units), *np.hstack(self.numbers))
+        sigma, whitened, redundancy = np.hstack(self.numbers)
+        return InstrumentRows(
+            names=named,
+            unit=np.array(self.units),
+            sigma=sigma,
+            whitened=whitened,
+            redundancy=redundancy,
+        )
 
 
 def _stop_names(estimate: Estimate) -> dict[StopKey, tuple[str, str]]:
@@ -254,7 +261,7 @@ def _moves(estimate: Estimate) -> Iterator[tuple[str, dict[str, Any]]]:
     terms = {t.variable: t.effect for terms in estimate.problem.terms for t in terms}
     for unknown in estimate.variables:
         effect = terms.get(unknown.name)
-        if effect is None or effect.site not in GEOMETRY:
+        if effect is None or effect.site not in GEOMETRY_SITES:
             continue
         moved = _moved(unknown, estimate)
         whole = isinstance(effect, FrameOffset)

@@ -22,12 +22,12 @@ from calib.rig import Rig
 from calib.solve.estimate import Estimate
 from chains import se3
 
-POSES = 1000  # that are drawn: the quantile then stands to 1.4 % (measured, over ten seeds)
-ERRORS = 400  # of the calibration that are drawn, the same for every pose
+DRAWN_POSES = 1000  # that are drawn: the quantile then stands to 1.4 % (measured, over ten seeds)
+DRAWN_ERRORS = 400  # of the calibration that are drawn, the same for every pose
 # From how many times worse elsewhere it is a warning. Measured on an arm of six joints: 300 poses
 # all over the workspace are at 1.4; 40 of them in a box of 0.5 m at 2.1, 20 in one of 0.3 m at 2.6.
 FAR_WORSE = 2.0
-SHARE = 0.95  # of errors that lie below what is told
+TOLD_SHARE = 0.95  # of errors that lie below what is told
 
 
 @dataclass(frozen=True)
@@ -101,9 +101,11 @@ def reach(problem: Problem, estimate: Estimate, known: Intervals | None = None) 
     body, root, base = beyond.body, beyond.root, beyond.base
     stops = beyond.stops
     rng, range_ = np.random.default_rng(0), joint_range(rig, source.recording.joints[stops])
-    at_stop = rng.choice(stops, POSES)
+    at_stop = rng.choice(stops, DRAWN_POSES)
     here = _stops(problem, stops, source.recording.joints[stops], root)
-    there = _stops(problem, at_stop, rng.uniform(*range_, (POSES, len(rig.joint_names))), root)
+    there = _stops(
+        problem, at_stop, rng.uniform(*range_, (DRAWN_POSES, len(rig.joint_names))), root
+    )
     seen, drawn = (placed(each, body, base, estimate.values) for each in (here, there))
     names = list(seen.d)
     covariance = known.over(estimate, names) if known else estimate.covariance_of(names)
@@ -188,11 +190,11 @@ def _errors(covariance: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Errors (P, n) of parameters with this covariance."""
     values, vectors = np.linalg.eigh(covariance)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
-    return root @ rng.normal(size=(len(covariance), ERRORS))
+    return root @ rng.normal(size=(len(covariance), DRAWN_ERRORS))
 
 
 def _error(placed: Placed, names: Sequence[str], errors: np.ndarray) -> float:
     """The length, m, below which 95 % of the errors of position lie."""
     d = np.concatenate([np.broadcast_to(placed.d[n], (len(placed.T), *placed.d[n].shape[1:]))
                         for n in names], axis=2)[:, 3:]  # fmt: skip
-    return float(np.quantile(np.linalg.norm(d @ errors, axis=1), SHARE))
+    return float(np.quantile(np.linalg.norm(d @ errors, axis=1), TOLD_SHARE))

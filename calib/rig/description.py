@@ -18,8 +18,8 @@ from sensors.lidar import LidarFile, LidarModel, Size, load_lidar
 
 Sigma = Annotated[Number, pydantic.Field(gt=0)]
 
-FORMAT = Format(kind="recording", newest=1)
-LARGEST_FRAME_M = 10.0
+RECORDING_FORMAT = Format(kind="recording", newest=1)
+LARGEST_FRAME_M = 10.0  # a choice: no rig is larger, and in millimetres no frame is so small
 
 
 @dataclass(frozen=True)
@@ -213,7 +213,7 @@ class _Reference(Document):
 
 
 class _RigFile(Document):
-    format: int = FORMAT.newest
+    format: int = RECORDING_FORMAT.newest
     name: Annotated[str, pydantic.AfterValidator(_file_name)]
     lidar: _Lidar | None = None
     arm: _Arm | None = None
@@ -239,7 +239,7 @@ def load_rig(folder: str | Path) -> Rig:
     if not path.is_file():
         raise InputError(f"{path} does not exist; a recording is a folder that holds one")
     data, marks = read_yaml(path)
-    FORMAT.check(data, path)
+    RECORDING_FORMAT.check(data, path)
     file = validate(_RigFile, data, path, marks)
     where = _Where(path, marks)
     arm, masses = _read_arm(file.arm, folder, where)

@@ -9,14 +9,18 @@ import numpy as np
 
 from calib.rig import Rig
 from calib.rig.suspect import listed
-from sensors.recording import Recording
+from sensors.recording import RecordedStops
 from sensors.reference import Reference
 from sensors.stops import Targets
 
 FEW_LOCATIONS = 3  # below that no whole location can be held out
-STILL = 0.05  # rad or m that a joint travels: too little to tell its own errors
+JOINT_STILL = 0.05  # rad or m that a joint travels: too little to tell its own errors
 LIMIT_SLACK = 1e-3  # rad or m beyond a joint's limit
+# Between spin axes, below which they are all one. A choice: the sine of 3 deg is 0.05, so of a
+# shift of the LiDAR by 10 mm along its axis 0.5 mm differ from a shift of the room.
 LEVEL_RAD = np.radians(3.0)
+# Of incidence, nine tenths of it, below which what depends on it is hardly told: a choice; from 0
+# to 30 deg its cosine falls by an eighth.
 NARROW_RAD = np.radians(30.0)
 COARSE_M = 0.05  # no instrument here is as bad as that
 FAR_OFF_M = 0.3  # median residual at the start: more than CAD is wrong by
@@ -55,7 +59,7 @@ def of_rig(rig: Rig) -> Iterator[Line]:
     yield "rig", f"{rig.name}: {', '.join(parts) or 'nothing on it'}"
 
 
-def of_stops(recording: Recording) -> Iterator[Line]:
+def of_stops(recording: RecordedStops) -> Iterator[Line]:
     """Stops, locations, and how often each body is seen."""
     count, locations = len(recording.stops), len(set(recording.location))
     when = f"over {np.ptp(recording.time_s) / 60:.0f} min" if recording.timed else "no times"
@@ -106,7 +110,7 @@ def odd_rig(rig: Rig) -> Iterator[str]:
                 yield f"{section}.{key} is {sigma_m:g} m in rig.yaml; was it meant in millimetres?"
 
 
-def odd_stops(rig: Rig, recording: Recording) -> Iterator[str]:
+def odd_stops(rig: Rig, recording: RecordedStops) -> Iterator[str]:
     """Too few locations, and bodies that are hardly seen."""
     names = np.array(recording.stops)
     if (locations := len(set(recording.location))) < FEW_LOCATIONS:
@@ -122,11 +126,11 @@ def odd_stops(rig: Rig, recording: Recording) -> Iterator[str]:
         yield f"no tracked body is seen at {listed(unseen)}; what they tell rests on their scans"
 
 
-def odd_joints(rig: Rig, recording: Recording) -> Iterator[str]:
+def odd_joints(rig: Rig, recording: RecordedStops) -> Iterator[str]:
     """Joints at rest, or beyond their limits."""
     names = np.array(recording.stops)
     values = dict(zip(rig.joint_names, recording.joints.T, strict=True))
-    if still := [name for name, at in values.items() if np.ptp(at) < STILL]:
+    if still := [name for name, at in values.items() if np.ptp(at) < JOINT_STILL]:
         yield f"{listed(still)} hardly moved, too little to tell their own errors; move them"
     for joint in (j for edge in rig.tree.edges if (j := edge.joint) is not None and j.leads):
         at, unit = values[joint.name], "rad" if joint.kind == "revolute" else "m"
@@ -166,7 +170,7 @@ def counted(n: int, what: str) -> str:
     return f"{n:,} {what}" if n == 1 else f"{n:,} {what}s"
 
 
-def _seen(recording: Recording) -> dict[str, np.ndarray]:
+def _seen(recording: RecordedStops) -> dict[str, np.ndarray]:
     return {body: np.isfinite(pose[:, 0]) for body, pose in recording.bodies.items()}
 
 

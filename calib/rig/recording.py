@@ -10,7 +10,7 @@ from calib.rig.description import load_rig
 from sensors import recording
 
 
-class Recording(recording.Recording):
+class Recording(recording.RecordedStops):
     """K stops of the rig that the folder's rig.yaml describes; `Recording.open` reads one."""
 
     @classmethod

@@ -15,13 +15,20 @@ from chains.errors import InputError
 from sensors.reference import Reference
 from sensors.stops import Targets
 
+# A choice: the end of a rod of 0.2 m is then 10 mm off, where markers are known to tenths of one.
 ASKEW_RAD = np.radians(3.0)
-APART_M = 0.01
+APART_M = 0.01  # a choice: tracker and scanner place spheres to better than a tenth of that
 SIGNIFICANT = 5.0  # sigmas of a ratio of lengths
-UNITS = {1000.0: "millimetres", 100.0: "centimetres", 39.37: "inches", 3.281: "feet"}  # in a metre
+# In a metre.
+LENGTH_UNITS = {
+    1000.0: "millimetres",
+    100.0: "centimetres",
+    39.37: "inches",
+    3.281: "feet",
+}
 NEAR_A_UNIT = 0.03  # of a factor, by which a ratio may miss it
 FARTHER = 30.0  # rooms are at most so many times as large as what is seen of them
-ROOM = 2.5  # times the distance of their walls, rooms are across from corner to corner
+ROOM_ACROSS = 2.5  # times the distance of their walls, rooms are across from corner to corner
 
 
 def odd_targets(targets: Targets, spec: TargetSpec) -> Iterator[str | Suspect]:
@@ -74,7 +81,7 @@ def _ratio(tracked_m: np.ndarray, scanned_m: np.ndarray, spec: TargetSpec) -> Su
         f"distances between targets are {ratio:.6g} times as long by the tracker as by the scanner,"
         f" +- {sigma:.1g}"
     )
-    for factor, unit in UNITS.items():
+    for factor, unit in LENGTH_UNITS.items():
         for part, value in (("faro", 1 / ratio), ("upper and lower", ratio)):
             if abs(value / factor - 1) < NEAR_A_UNIT:
                 return Suspect("target", "scale", f"{said}; is {part} in {unit}?", size=ratio - 1)
@@ -93,8 +100,10 @@ def odd_mesh(reference: Reference, reach_m: float) -> Iterator[Suspect]:
     ratio = size_m / reach_m
     if 1 / FARTHER < ratio < FARTHER:
         return
-    factor = min(UNITS, key=lambda f: abs(np.log(max(ratio / ROOM, ROOM / ratio) / f)))
-    unit = UNITS[factor] if ratio > 1 else f"metres divided by {factor:g}"
+    factor = min(
+        LENGTH_UNITS, key=lambda f: abs(np.log(max(ratio / ROOM_ACROSS, ROOM_ACROSS / ratio) / f))
+    )
+    unit = LENGTH_UNITS[factor] if ratio > 1 else f"metres divided by {factor:g}"
     said = (
         f"the mesh is {size_m:.3g} m across, and nineteen in twenty returns come from within "
         f"{reach_m:.3g} m; is it in {unit}?"

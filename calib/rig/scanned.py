@@ -11,7 +11,7 @@ import numpy as np
 from calib.rig import Rig
 from calib.rig.suspect import Suspect, listed
 from sensors.lidar import LARGEST_REFLECTANCE, LidarModel, beams
-from sensors.recording import Recording, Scan
+from sensors.recording import RecordedStops, Scan
 from sensors.rings import RingFinding, odd_rings, ring_elevations
 
 FULL_SCALES = {LARGEST_REFLECTANCE: ", a reflectance", 255.0: " of 255", 65535.0: " of 65535"}
@@ -94,7 +94,7 @@ def of_scans(scans: ScanSums) -> Iterator[tuple[str, str]]:
         yield "per-point covariates", ", ".join(scans.columns)
 
 
-def odd_scans(rig: Rig, recording: Recording, scans: ScanSums) -> Iterator[str | Suspect]:
+def odd_scans(rig: Rig, recording: RecordedStops, scans: ScanSums) -> Iterator[str | Suspect]:
     """Scans without stop, stops without scan, rings without points or with wrong numbers, scans
     or columns that are there twice, and intensities of no known unit."""
     if stray := sorted(scans.points.keys() - set(recording.stops)):
@@ -122,7 +122,7 @@ def numbering(scans: ScanSums) -> RingFinding | None:
     return odd_rings(scans.lidar, ring_elevations(scans.elevation_rad, scans.rings))
 
 
-def _at_once(recording: Recording) -> Iterator[Suspect]:
+def _at_once(recording: RecordedStops) -> Iterator[Suspect]:
     """Stops with scans at one and the same time."""
     at = np.flatnonzero(recording.has_scan & recording.timed)
     _, same, count = np.unique(recording.time_s[at], return_inverse=True, return_counts=True)

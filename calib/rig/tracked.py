@@ -14,19 +14,21 @@ from chains import se3
 from chains.align import hand_eye
 from chains.errors import InputError
 from chains.se3 import Array
-from sensors.recording import Recording
+from sensors.recording import RecordedStops
 
-MOVED = 1e-3  # rad or m by which a joint has moved, if it has
-UNKNOWN = 0.005  # rad and m that arms' joints and links are off by; those measured, by 0.003
+JOINT_MOVED = 1e-3  # rad or m by which a joint has moved, if it has
+ARM_OFF_BY = 0.005  # rad and m that arms' joints and links are off by; those measured, by 0.003
 JITTER = 1e-4  # rad by which joints scatter at least, as of industrial arms
-OUTLIER = 8.0  # sigmas; of 21 sound recordings 3.7 at most, 7.4 where a load changes how joints sag
-LOST = 0.05  # m and rad left by all that CAD and the arm may be off by: not this arm, or not so
+# Sigmas; of 21 sound recordings 3.7 at most, 7.4 where a load changes how joints sag.
+OUTLIER_SIGMAS = 8.0
+# Left by all that CAD and the arm may be off by, m and rad: not this arm, or not so.
+NOT_THIS_ARM = 0.05
 TURNED_RAD, FITS_RAD = 0.1, 0.03  # turns that are not the arm's, and turns that are
 MOST_TAKEN = 0.5  # of the rows by what is unknown: more, and what is left of the others says little
 SWAPPED = 0.2  # of the misfit, left where two bodies are exchanged
 MOST_COMPARED = 100  # stops, each with each
 MOST_FITTED = 1000  # stops, to which what is unknown is fitted; all are held against it
-ORDERS = {"qx, qy, qz, qw": (3, 0, 1, 2), "qz, qw, qx, qy": (1, 2, 3, 0)}
+QUATERNION_ORDERS = {"qx, qy, qz, qw": (3, 0, 1, 2), "qz, qw, qx, qy": (1, 2, 3, 0)}
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,7 @@ class _Pair:
         return T[0] if len(T) == 1 else se3.inverse(T[0]) @ T[1]
 
 
-def odd_bodies(rig: Rig, recording: Recording) -> Iterator[Suspect]:
+def odd_bodies(rig: Rig, recording: RecordedStops) -> Iterator[Suspect]:
     """What looks wrong with tracked bodies."""
     if rig.tracker is None:
         return
@@ -79,7 +81,7 @@ def odd_bodies(rig: Rig, recording: Recording) -> Iterator[Suspect]:
 # --------------------------------------------------------------------------------- placeholders
 
 
-def _placeholders(rig: Rig, recording: Recording, body: str) -> Iterator[Suspect]:
+def _placeholders(rig: Rig, recording: RecordedStops, body: str) -> Iterator[Suspect]:
     """Poses that trackers write where they have not seen; returns (K,) which these are."""
     pose, names = recording.bodies[body], np.array(recording.stops)
     zero = (pose[:, :3] == 0).all(axis=1)
@@ -98,7 +100,7 @@ def _placeholders(rig: Rig, recording: Recording, body: str) -> Iterator[Suspect
     return zero | level | old
 
 
-def _repeated(rig: Rig, recording: Recording, body: str) -> np.ndarray:
+def _repeated(rig: Rig, recording: RecordedStops, body: str) -> np.ndarray:
     """(K,) stops at which a body beyond the arm repeats an old pose, its joints having moved."""
     same = np.zeros(len(recording.stops), bool)
     joints = [rig.joint_names.index(name) for name in rig.joints_to(body)]
@@ -107,14 +109,14 @@ def _repeated(rig: Rig, recording: Recording, body: str) -> np.ndarray:
         return same
     pose, at = np.nan_to_num(recording.bodies[body][seen]), recording.joints[seen][:, joints]
     _, first, inverse = np.unique(pose, axis=0, return_index=True, return_inverse=True)
-    same[seen] = np.abs(at - at[first[inverse.ravel()]]).max(axis=1) > MOVED
+    same[seen] = np.abs(at - at[first[inverse.ravel()]]).max(axis=1) > JOINT_MOVED
     return same
 
 
 # ------------------------------------------------------------------------------- at all stops
 
 
-def _pairs(rig: Rig, recording: Recording, usable: Mapping[str, np.ndarray]) -> Iterator[_Pair]:
+def _pairs(rig: Rig, recording: RecordedStops, usable: Mapping[str, np.ndarray]) -> Iterator[_Pair]:
     """Each body as the tracker sees it, where the rig's root stands still; else as the body
     nearest to the root does."""
     bodies = sorted((b for b in usable if usable[b].any()), key=lambda b: len(rig.joints_to(b)))
@@ -155,7 +157,7 @@ def _at_all_stops(pair: _Pair) -> Suspect | None:
             return Suspect("body", names, said)
     if _turns(pair, seen)[0] < TURNED_RAD:
         return None
-    orders = {order: _turns(pair, pair.seen(index)) for order, index in ORDERS.items()}
+    orders = {order: _turns(pair, pair.seen(index)) for order, index in QUATERNION_ORDERS.items()}
     fitting = [order for order, (left, _) in orders.items() if left < FITS_RAD]
     if not fitting:
         return None
@@ -202,14 +204,14 @@ def _outliers(rig: Rig, pair: _Pair) -> Iterator[tuple[int, Array, bool]]:
     columns = [pair.d_twist, *(d_place * (pair.place == p)[:, None, None]
                for p in np.unique(pair.place[pair.place >= 0]))]  # fmt: skip
     A = np.concatenate(columns, axis=2) / noise[:, None]
-    prior = np.full(A.shape[2], LOST)
+    prior = np.full(A.shape[2], NOT_THIS_ARM)
     prior[: pair.d_twist.shape[2]] = _edge_sigmas(rig)
     left, taken = _robust(A * prior, gap / noise)
     size = np.array([np.linalg.norm(left[:, s], axis=1) for s in _HALVES]).T
     spread = np.median(size, axis=0) / 1.538 / np.sqrt(1.0 - min(taken, 0.99))
-    if taken > MOST_TAKEN or (spread * noise[[0, 3]] > LOST).any():
+    if taken > MOST_TAKEN or (spread * noise[[0, 3]] > NOT_THIS_ARM).any():
         return
-    for k in np.flatnonzero((size > OUTLIER * np.maximum(spread, 1.0)).any(axis=1)):
+    for k in np.flatnonzero((size > OUTLIER_SIGMAS * np.maximum(spread, 1.0)).any(axis=1)):
         exchanged = len(pair.names) == 2 and (
             _size(_gap(nominal[k], se3.inverse(seen[k]))) < SWAPPED * _size(gap[k])
         )
@@ -222,7 +224,9 @@ _HALVES = (slice(0, 3), slice(3, 6))  # of a twist: turn and shift; 1.538 is the
 def _edge_sigmas(rig: Rig) -> Array:
     """(6 E,) how far each edge may be off: CAD's sigma of a frame, or what an arm's may be."""
     sigma = [
-        np.maximum(rig.frame_sigma[name], 1e-6) if name in rig.frame_sigma else np.full(6, UNKNOWN)
+        np.maximum(rig.frame_sigma[name], 1e-6)
+        if name in rig.frame_sigma
+        else np.full(6, ARM_OFF_BY)
         for name in rig.tree.edge_names
     ]
     return 3.0 * np.concatenate(sigma)  # one in a hundred lies beyond

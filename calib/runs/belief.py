@@ -5,7 +5,9 @@ from __future__ import annotations
 from calib.residuals.groups import CAD
 from calib.runs.run import Run
 
-FAR_OFF = 3.0  # times its sigmas, or what is expected: residuals that something large is behind
+# Times its sigmas, or what is expected: residuals that something large is behind. A choice: sigmas
+# of data sheets are wrong by a factor of two at times, and then widened.
+FAR_OFF = 3.0
 # Residuals so much larger than their sigmas are no accident: the result's sigmas are widened.
 TOLERATED = 1.2
 # Of frames few moves from CAD are checked by anything: beyond this chance puts 6 of them in one rig

@@ -15,7 +15,7 @@ import numpy as np
 from calib import outputs
 from calib import problem as problems
 from calib.blunders.chance import at_least
-from calib.diagnosis.formulas.seen import Reach
+from calib.diagnosis.formulas.seen import ColumnRanges
 from calib.effects import Effect, is_known, load_effects, split, trust_in
 from calib.linear.parallel import one_blas_thread
 from calib.problem import Problem
@@ -34,7 +34,7 @@ from calib.results.solution import solution_of
 from calib.runs.belief import TOLERATED
 from calib.runs.reopen import model_of, proposed, reopened, start_of, stored_met
 from calib.runs.residual_table import (
-    UNSEEN,
+    UNSEEN_FOLDER,
     recording_of,
     residual_table,
     table_path,
@@ -52,7 +52,7 @@ from calib.runs.run import (
     versions,
     write_state,
 )
-from calib.runs.stored import FORMAT
+from calib.runs.stored import RUN_FORMAT
 from calib.solve.estimate import Estimate, Start
 from calib.solve.fit import Progress, solve
 from chains.errors import InputError
@@ -198,7 +198,7 @@ def _fit(
         estimate, known, links = solve_from(problem, earlier(problem, before), progress)
     unseen, by = _held_out(sources, model, estimate, folder / RESIDUALS, choices, progress)
     nominal = _nominal(problem, progress)
-    seen_at = Reach(model.effects)
+    seen_at = ColumnRanges(model.effects)
     by_stop = _write_residuals(problem, estimate, folder / RESIDUALS, progress, seen_at)
     seen = sum(by_stop.values(), Errors())
     if not estimate.scans:
@@ -255,7 +255,7 @@ def _nominal(problem: Problem, progress: Progress) -> Errors:
 
 
 def _write_residuals(
-    problem: Problem, estimate: Estimate, folder: Path, progress: Progress, seen: Reach
+    problem: Problem, estimate: Estimate, folder: Path, progress: Progress, seen: ColumnRanges
 ) -> dict[tuple[str, str], Errors]:
     """Write every beam's residual, stop by stop, and show `seen` what effects look at; sums of
     the residuals, by recording and stop."""
@@ -284,7 +284,7 @@ def _held_out(
     a fit that did not converge, none."""
     if choices.hold_out == "none" or not estimate.converged:
         return Errors(), None
-    keep = partial(_write_unseen, sources, folder / UNSEEN)
+    keep = partial(_write_unseen, sources, folder / UNSEEN_FOLDER)
     how = (choices.hold_out, choices.folds, progress, estimate.start, keep)
     unseen = held_out(sources, model, *how)
     return unseen, unit_of(sources, choices.hold_out) if unseen.count else None
@@ -345,7 +345,7 @@ def recordings_document(sources: Sequence[Source]) -> list[dict[str, str]]:
 def _model_document(sources: Sequence[Source], model: Model, choices: _Choices) -> dict[str, Any]:
     below = choices.grown_from
     return {
-        "format": FORMAT.newest,
+        "format": RUN_FORMAT.newest,
         "recordings": recordings_document(sources),
         **model.document(),
         "hold_out": choices.hold_out,

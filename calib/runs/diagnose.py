@@ -12,7 +12,7 @@ import numpy as np
 
 from calib import outputs
 from calib.blunders import told
-from calib.blunders.reach import Reach, hardly_checked, reaches
+from calib.blunders.reach import FurthestMoved, hardly_checked, reaches
 from calib.diagnosis.chance import Spread
 from calib.diagnosis.rejects import rejects
 from calib.diagnosis.search import search
@@ -36,7 +36,7 @@ from calib.solve.fit import Progress, resume
 from sensors.documents import write_json
 from sensors.rings import RingFinding, least_off_rad
 
-LOOKED = 3  # scans from which the numbers of rings are checked: each holds all rings
+SCANS_LOOKED_AT = 3  # scans from which the numbers of rings are checked: each holds all rings
 
 
 @one_blas_thread
@@ -143,7 +143,9 @@ def _scatter(run: Run, stand: Stand) -> Iterator[dict[str, Any]]:
         for found in (part.effects[effect.name] for part in parts if effect.name in part.effects):
             numbers = zip(found.estimate.tolist(), found.sigma.tolist(), strict=True)
             for name, unit, each in zip(found.names, found.units, numbers, strict=True):
-                yield Spread(of[name], unit, *each).document(effect.name)
+                sd, sigma = each
+                spread = Spread(of=of[name], unit=unit, sd=sd, sigma=sigma)
+                yield spread.document(effect.name)
 
 
 def command_to_plan(run: Run, effects: Sequence[str]) -> str:
@@ -176,7 +178,7 @@ def _odd_rings(stand: Stand) -> Iterator[tuple[str, RingFinding]]:
     """LiDARs whose rings are numbered otherwise than their model has it. Those counted from the
     other end are many makers' own; else offsets by ring are of no use."""
     for source in stand.sources:
-        scanned = np.flatnonzero(source.recording.has_scan)[:LOOKED]
+        scanned = np.flatnonzero(source.recording.has_scan)[:SCANS_LOOKED_AT]
         if source.rig.lidar is not None and len(scanned):
             sums = ScanSums(source.rig.lidar)
             for k in scanned.tolist():
@@ -193,7 +195,7 @@ def _detectable(stand: Stand) -> dict[str, dict[str, float]]:
     return {"rings": {"rad": max(sizes)}} if sizes else {}
 
 
-def _reaches(look: Look, run: Run) -> dict[Group, Reach]:
+def _reaches(look: Look, run: Run) -> dict[Group, FurthestMoved]:
     """How far mishaps that are not found could move what a run reports."""
     sigma = np.sqrt(np.diag(run.solution.covariance)).tolist()
     known = dict(zip(run.solution.names, sigma, strict=True))

@@ -22,11 +22,11 @@ from calib.solve.fit import Progress
 from chains.errors import InputError
 from sensors.documents import plain, write_json, write_yaml
 
-EXPLANATION, KEPT = "explanation.json", "effects"
-MOST_RUNGS = 8
-LEAST_FALL = (
-    0.01  # of what the held-out error has above the expected one: what an effect must take away
-)
+EXPLANATION, KEPT_EFFECTS = "explanation.json", "effects"
+MOST_RUNGS = 8  # a choice: ends a ladder that does not end by itself
+# Of what the held-out error has above the expected one, what an effect must take away: a choice, as
+# little as `FALL_MATTERS` of the diagnosis; what takes less is a rung that nobody needs.
+LEAST_FALL = 0.01
 
 
 @dataclass(frozen=True)
@@ -95,11 +95,11 @@ def explain(
             diagnosis = diagnose(climb.run, climb.tell, False, candidates)
         climb.clear_above()
         kept = _keep_formulas(climb.run, entries)
-        files = [out / KEPT / path.name for path in kept]
+        files = [out / KEPT_EFFECTS / path.name for path in kept]
         result = Explanation(climb.runs, climb.steps, climb.refused, diagnosis, kept=files)
         write_json(entries / EXPLANATION, result.document())
-        if not kept and (out / KEPT).is_dir():
-            outputs.remove(out / KEPT)
+        if not kept and (out / KEPT_EFFECTS).is_dir():
+            outputs.remove(out / KEPT_EFFECTS)
     return result
 
 
@@ -108,14 +108,14 @@ def _keep_formulas(run: Run, entries: Path) -> list[Path]:
     begin with what the run found."""
     written = []
     for effect in (e for e in model_of(run).effects if e.seen):
-        (entries / KEPT).mkdir(exist_ok=True)
+        (entries / KEPT_EFFECTS).mkdir(exist_ok=True)
         parts = (run.solution.shared, *run.solution.recordings.values())
         found = next(part.effects[effect.name] for part in parts if effect.name in part.effects)
         document = effect.document() | {
             "start": [float(f"{x:.4g}") for x in found.estimate],
             "source": f"found by 'rigcal explain' in {', '.join(r.name for r in run.recordings)}",
         }
-        written.append(entries / KEPT / f"{effect.name}.yaml")
+        written.append(entries / KEPT_EFFECTS / f"{effect.name}.yaml")
         write_yaml(written[-1], document)
     return written
 

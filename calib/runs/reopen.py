@@ -14,7 +14,7 @@ from calib.problem.model import Model, Source
 from calib.problem.without import leave_out
 from calib.rig import load_rig
 from calib.runs.run import DIAGNOSIS, MODEL, STATE, Run
-from calib.runs.stored import AGAIN
+from calib.runs.stored import FIT_AGAIN
 from calib.solve.estimate import DOFS, Start
 from chains.errors import InputError
 from sensors.recording import digest
@@ -107,7 +107,7 @@ def start_of(run: Run, sources: Sequence[Source]) -> Start:
         known = number.isdecimal() and stop.isdecimal() and int(number) < len(sources)
         mesh = sources[int(number)].reference if known else None
         if mesh is None or not _are_of(mesh, part):
-            raise InputError(f"{run.folder / STATE}: {name} is no list of triangles; {AGAIN}")
+            raise InputError(f"{run.folder / STATE}: {name} is no list of triangles; {FIT_AGAIN}")
         met[folders[int(number)], int(stop)] = part
     return Start(run.state(), met, frozenset(run.set_aside))
 
@@ -127,7 +127,7 @@ def state_of(run: Run, problem: Problem) -> dict[str, np.ndarray]:
         elif whole:
             whole = found.shape == dofs.shape and set(unknown.dofs) <= set(dofs.tolist())
         if not whole:
-            raise InputError(f"{run.folder / STATE}: its state lacks '{name}'; {AGAIN}")
+            raise InputError(f"{run.folder / STATE}: its state lacks '{name}'; {FIT_AGAIN}")
     return state
 
 

@@ -14,7 +14,7 @@ from calib.results.misfit import InstrumentRows
 from sensors.recording import write_table
 
 _FIRST = ("ring", "column", "range_m", "incidence_rad", "azimuth_rad", "elevation_rad", "intensity")
-UNSEEN = "_held_out"  # folder of those stops as a fit without them predicts them
+UNSEEN_FOLDER = "_held_out"  # folder of those stops as a fit without them predicts them
 _PLACES = ("label", "surface", "region", "patch", "plane")
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from calib import outputs
 from calib.effects import Trust, trusted
 from calib.results.solution import EffectEstimate, FrameEstimate, Part, Solution, units_of
-from calib.runs.stored import AGAIN, read_arrays, read_json, read_model, read_summary
+from calib.runs.stored import FIT_AGAIN, read_arrays, read_json, read_model, read_summary
 from chains import se3
 from chains.errors import InputError
 from sensors.documents import read_yaml
@@ -36,7 +36,7 @@ _OF_DIAGNOSIS |= {"unexplained", "weak_directions", "curves", "blunders", "group
 _OF_CANDIDATE = {"effect", "add", "p_adjusted", "step", "dressed_up", "held_out_rms_mm"}
 _OF_CANDIDATE |= {"unabsorbed_rms_mm"}
 _OF_CURVE = {"covariates", "centres", "mean_mm", "band_mm"}
-RING = re.compile(r"ring_(\d+)")  # a parameter of a ring
+RING_NAME = re.compile(r"ring_(\d+)")  # a parameter of a ring
 _OF_STATE, _OF_MET = "state/", "met/"  # before every name in that file: numpy reserves a few
 NOT_CONVERGED = "NOT CONVERGED: the fit did not end at an optimum; its numbers are not to be used"
 
@@ -229,7 +229,7 @@ def read_solution(folder: Path) -> Solution:
     graph = stored.get("graph", covariance)
     shape = 2 * names.shape if names.ndim == 1 else None
     if any(x.shape != shape or x.dtype.kind != "f" for x in (covariance, graph)):
-        raise InputError(f"{beside} is no covariance of a run; {AGAIN}")
+        raise InputError(f"{beside} is no covariance of a run; {FIT_AGAIN}")
     try:
         shared = _read_part(data)
         recordings = {n: _read_part(p) for n, p in data.get("recordings", {}).items()}
@@ -244,7 +244,7 @@ def read_solution(folder: Path) -> Solution:
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(
-            f"{path} is no solution of this version of rigcal, or was edited ({error}); {AGAIN}"
+            f"{path} is no solution of this version of rigcal, or was edited ({error}); {FIT_AGAIN}"
         ) from None
 
 

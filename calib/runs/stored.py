@@ -15,8 +15,8 @@ from chains.errors import InputError
 from sensors import documents, numbers
 from sensors.documents import Document, Format, Number, read_yaml, validate
 
-AGAIN = "fit the run again"
-FORMAT = Format(
+FIT_AGAIN = "fit the run again"
+RUN_FORMAT = Format(
     kind="run",
     newest=2,  # 1: without a number, steps, and the hash of a prior; ways are absolute
 )
@@ -85,7 +85,7 @@ def read_model(path: Path) -> dict[str, Any]:
     """
     data, marks = read_yaml(path)
     known = data.get("versions") if isinstance(data, dict) else None
-    FORMAT.check(data, path, str(known.get("rigcal", "")) if isinstance(known, dict) else "")
+    RUN_FORMAT.check(data, path, str(known.get("rigcal", "")) if isinstance(known, dict) else "")
     return _checked(_Model, data, path, marks)
 
 
@@ -103,7 +103,7 @@ def read_json(path: Path) -> Any:
     try:
         return documents.read_json(path)
     except InputError as error:
-        raise InputError(f"{error}; {AGAIN}") from None
+        raise InputError(f"{error}; {FIT_AGAIN}") from None
 
 
 def _checked(model: type[_Part], data: Any, path: Path, marks: dict) -> dict[str, Any]:
@@ -111,7 +111,7 @@ def _checked(model: type[_Part], data: Any, path: Path, marks: dict) -> dict[str
         validate(model, data, path, marks)
     except InputError as error:
         raise InputError(
-            f"{error}; it was written by another version of rigcal, or edited: {AGAIN}"
+            f"{error}; it was written by another version of rigcal, or edited: {FIT_AGAIN}"
         ) from None
     return data
 
@@ -129,4 +129,4 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
         why = f"{path} is one array, where arrays with names are wanted"
     except InputError as error:
         why = str(error)
-    raise InputError(f"{why}; {AGAIN}")
+    raise InputError(f"{why}; {FIT_AGAIN}")

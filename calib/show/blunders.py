@@ -11,7 +11,7 @@ from calib.show.tables import columns_table
 if TYPE_CHECKING:
     from rich.table import Table
 
-HEADINGS = ("what", "off by", "or else")
+BLUNDER_HEADINGS = ("what", "off by", "or else")
 
 
 def blunder_cells(blunder: Mapping[str, Any]) -> tuple[str, str, str]:
@@ -34,7 +34,7 @@ def blunder_cells(blunder: Mapping[str, Any]) -> tuple[str, str, str]:
 
 def blunders_table(blunders: Sequence[Mapping[str, Any]]) -> Table:
     """All of them, in the order in which they were found."""
-    table = columns_table(*HEADINGS)
+    table = columns_table(*BLUNDER_HEADINGS)
     table.title = "what is wrong in the recording"
     table.title_justify, table.title_style = "left", "bold"
     for each in blunders:

@@ -11,7 +11,7 @@ import numpy as np
 from calib.runs.asked.moved import SHARED, Moved
 from calib.runs.estimates import comparison
 from calib.runs.ladder import DESCRIBED, FORMULA, Rung, ladder
-from calib.show.headline import DIFFERS, MOVED, Words, moved_sentence
+from calib.show.headline import DIFFERS, MOVED_WORDS, Words, moved_sentence
 from calib.show.misfit import worst_of
 from calib.show.scale import shown
 from calib.show.tables import (
@@ -70,7 +70,7 @@ def print_moved(found: Moved, console: Console | None = None) -> None:
 
 
 def _words(found: Moved) -> Words:
-    return DIFFERS if found.relation == SHARED else MOVED
+    return DIFFERS if found.relation == SHARED else MOVED_WORDS
 
 
 def ladder_table(rungs: Sequence[Rung]) -> Table:

@@ -10,7 +10,7 @@ from rich.table import Table
 
 from calib.show.tables import columns_table, mm, terminal
 
-HEADINGS = {
+BIN_HEADINGS = {
     "incidence_deg": "incidence, degrees",
     "distance_m": "distance, m",
     "label": "material",
@@ -80,7 +80,7 @@ def print_evaluation(evaluation: Mapping[str, Any]) -> None:
     console.print(table)
     if evaluation["planes"]:
         console.print(_planes(evaluation["planes"]))
-    for name, heading in HEADINGS.items():
+    for name, heading in BIN_HEADINGS.items():
         rows = evaluation["by"][name]
         if len(rows) > 1 and (name != "ring" or len(rows) <= LISTED_RINGS):
             console.print(_by(heading, rows))

@@ -30,7 +30,7 @@ class Words(NamedTuple):
     title_of_none: str
 
 
-MOVED = Words(
+MOVED_WORDS = Words(
     *("moved", "turned", "changed by", "nothing else moved"),
     none="nothing moved significantly",
     silent="the new data do not determine {}",
@@ -46,7 +46,7 @@ DIFFERS = Words(  # of one recording: nothing moved, two models tell it otherwis
 )
 
 
-def moved_sentence(links: Sequence[Mapping[str, Any]], words: Words = MOVED) -> str:
+def moved_sentence(links: Sequence[Mapping[str, Any]], words: Words = MOVED_WORDS) -> str:
     """What moved since the run that was the prior, and that nothing else did.
 
     Args:

@@ -21,7 +21,7 @@ FAR_FROM_CAD = 4.0
 # Times what single rows would give, from which it is told how much wider intervals are (median): in
 # 24 worlds of another simulator with nothing to find and 8 or 30 stops it was 1.00; in 12 where
 # stops scatter by 1 mm, 1.35 at least.
-TOGETHER = 1.2
+WIDER_TOGETHER = 1.2
 TOLD = 6  # of what stands out, the worst; of the others, how many there are
 
 
@@ -42,7 +42,7 @@ def over_beams(rms_mm: float, summary: Mapping[str, Any], before: str = "") -> s
 def together_told(summary: Mapping[str, Any]) -> list[str]:
     """That rows err together more than the model has it, where intervals are much wider for it."""
     wider = summary.get("intervals_wider_by") or {"median": 1.0}
-    if wider["median"] <= max(TOGETHER, summary.get("sigmas_widened_by", 1.0)):
+    if wider["median"] <= max(WIDER_TOGETHER, summary.get("sigmas_widened_by", 1.0)):
         return []
     return [
         f"rows of one stop, or of one part of the room, have errors in common that the model does "

@@ -26,7 +26,14 @@ from calib.show.diagnosis import (
     unexplained_table,
 )
 from calib.show.headline import closing, moved_sentence
-from calib.show.tables import WIDTH, effects_table, error_table, links_table, outcome, terminal
+from calib.show.tables import (
+    TABLE_WIDTH,
+    effects_table,
+    error_table,
+    links_table,
+    outcome,
+    terminal,
+)
 from chains import escape
 
 if TYPE_CHECKING:
@@ -81,7 +88,7 @@ class ProgressLine:
         self._next_s = now_s + TOLD_EVERY_S
         line = escape.terminal(f"{what} {done + 1}/{total}")
         if "ipykernel" not in sys.modules:
-            print(f"\r{line:<{WIDTH - 1}}", end="", file=sys.stderr, flush=True)
+            print(f"\r{line:<{TABLE_WIDTH - 1}}", end="", file=sys.stderr, flush=True)
         elif self._cell is None:
             from IPython.display import display
 

@@ -14,8 +14,8 @@ from calib.show.tables import columns_table, print_pairs, shown, terminal
 if TYPE_CHECKING:
     from calib.planning import Plan
 
-MANY = 12  # parameters of an effect, from which on their sigmas are told together
-LISTED = 4  # directions that are shown
+MANY_PARAMETERS = 12  # parameters of an effect, from which on their sigmas are told together
+DIRECTIONS_SHOWN = 4  # directions that are shown
 WEAK = {
     "now": "hardly determined now",
     "after": "and after these stops",
@@ -44,8 +44,8 @@ def print_plan(plan: Plan) -> None:
         print_pairs(console, "as well known as before", [("", _together(same))])
     weak = document["weak_directions"]
     for when, title in WEAK.items():
-        pairs = [("", " and ".join(each["parameters"])) for each in weak[when][:LISTED]]
-        more = len(weak[when]) - LISTED
+        pairs = [("", " and ".join(each["parameters"])) for each in weak[when][:DIRECTIONS_SHOWN]]
+        more = len(weak[when]) - DIRECTIONS_SHOWN
         pairs += [("", f"and {more} more")] if more > 0 else []
         print_pairs(console, title, pairs or [("", "nothing")])
     now, after = document["observability"]["now"], document["observability"]["after"]
@@ -127,7 +127,7 @@ def _rows(plan: Plan) -> Iterator[_Row]:
     for i, key in enumerate(plan.keys):
         by_unknown.setdefault(key.unknown, []).append(i)
     for at in by_unknown.values():
-        alike = len(at) >= MANY and len({plan.units[i] for i in at}) == 1
+        alike = len(at) >= MANY_PARAMETERS and len({plan.units[i] for i in at}) == 1
         for some in [at] if alike else [[i] for i in at]:
             sizes = (float(np.sqrt(np.mean(k.sigma[some] ** 2))) for k in (plan.now, plan.after))
             yield _Row([plan.keys[i] for i in some], plan.units[some[0]], *sizes)

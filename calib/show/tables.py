@@ -18,7 +18,7 @@ from calib.diagnosis.suggest import span
 from calib.residuals.groups import CAD
 from calib.runs.belief import TOLERATED_OF_CAD, misfit_sentence
 from calib.runs.estimates import VariableEstimate, variable_estimates
-from calib.show.headline import MOVED, Words, closing, moved_sentence
+from calib.show.headline import MOVED_WORDS, Words, closing, moved_sentence
 from calib.show.misfit import beams_told, standing_out, together_told
 from calib.show.scale import shown
 from chains import escape
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from calib.results.check import Check
     from calib.runs.run import Run
 
-WIDTH = 80
+TABLE_WIDTH = 80
 LISTED_PARAMETERS = 12  # an effect of more parameters than these is summarised
 ERROR_LABELS = {
     "nominal": "all as in CAD",
@@ -206,8 +206,8 @@ class _Terminal(Console):
 
 
 def terminal(file: IO[str] | None = None) -> Console:
-    """Where people read: at most `WIDTH` columns wide, and as wide where nobody looks; stdout where
-    no file is given."""
+    """Where people read: at most `TABLE_WIDTH` columns wide, and as wide where nobody looks; stdout
+    where no file is given."""
     # In a notebook rich would colour a text for a file, and show it beside.
     console = _Terminal(
         file=file,
@@ -217,7 +217,7 @@ def terminal(file: IO[str] | None = None) -> Console:
         force_jupyter=False,
         force_terminal=file.isatty() if file else None,
     )
-    console.width = min(console.width, WIDTH) if console.is_terminal else WIDTH
+    console.width = min(console.width, TABLE_WIDTH) if console.is_terminal else TABLE_WIDTH
     return console
 
 
@@ -304,7 +304,9 @@ def error_table(summary: Mapping[str, Any]) -> Table:
     return table
 
 
-def print_links(console: Console, links: Sequence[Mapping[str, Any]], words: Words = MOVED) -> None:
+def print_links(
+    console: Console, links: Sequence[Mapping[str, Any]], words: Words = MOVED_WORDS
+) -> None:
     """Print what has moved since an earlier run, and what has not."""
     console.print(moved_sentence(links, words), style="bold")
     console.print()

@@ -12,7 +12,7 @@ from calib.show.misfit import standing_out, together_told
 
 AT_THE_FLOOR = 1.25  # times what is expected: a held-out error as good as that
 UNASKED = "not diagnosed"
-MEANING = {"green": "use it", "amber": "use it with care", "red": "do not use it yet"}
+LIGHT_MEANS = {"green": "use it", "amber": "use it with care", "red": "do not use it yet"}
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Verdict:
     @property
     def meaning(self) -> str:
         """What the light asks of the reader."""
-        return MEANING[self.light]
+        return LIGHT_MEANS[self.light]
 
 
 def judge(run: Run, diagnosis: Mapping[str, Any] | None) -> Verdict:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.rig.description import FORMAT
+from calib.rig.description import RECORDING_FORMAT
 from calib.simulation.spec import Spec
 
 # name, origin xyz (m), origin rpy (rad), axis z, limit (degrees), mass of the link behind it (kg),
@@ -20,7 +20,7 @@ _ARM = (
     ("joint_6", (0, 0, 0), (-np.pi / 2, 0, 0), 1, 170, 0.8, (0, 0, 0.03)),
 )
 _TIP_M = (0, 0, 0.075)
-POINTS = ("tip_1", "tip_2", "tip_3")
+TIP_POINTS = ("tip_1", "tip_2", "tip_3")
 # Laser-tracker nests on the mount, well apart and off any line.
 _POINTS_M = ((0.12, 0.0, 0.05), (-0.07, 0.1, 0.04), (-0.05, -0.11, 0.11))
 
@@ -57,7 +57,7 @@ def _text(values: tuple[float, ...]) -> str:
 def bodies(spec: Spec) -> list[str]:
     """What the tracker sees of the rig."""
     if spec.tracker == "points":
-        return list(POINTS)
+        return list(TIP_POINTS)
     base = ["base_markers"] if spec.arm else []
     return [*base, "mount_markers"] if spec.tracker else []
 
@@ -66,7 +66,7 @@ def document(spec: Spec) -> dict[str, Any]:
     """What rig.yaml says of the rig that the spec asks for."""
     carrier = "husky-lwa4p" if spec.arm else "handheld"
     name = f"{carrier}-{spec.lidar or 'no-lidar'}"
-    rig: dict[str, Any] = {"format": FORMAT.newest, "name": name}
+    rig: dict[str, Any] = {"format": RECORDING_FORMAT.newest, "name": name}
     if spec.lidar:
         rig["lidar"] = {"model": spec.lidar, "frame": "lidar"}
     if spec.arm:
@@ -113,7 +113,7 @@ def _frames(spec: Spec) -> dict[str, Any]:
     if "mount_markers" in bodies(spec):
         frames["mount_markers"] = _frame("mount", (0.03, 0.02, 0.05), (0, 0, 0), 0.0008, 0.002)
     if spec.tracker == "points":
-        for name, xyz_m in zip(POINTS, _POINTS_M, strict=True):
+        for name, xyz_m in zip(TIP_POINTS, _POINTS_M, strict=True):
             frames[name] = _frame("mount", xyz_m, (0, 0, 0), 0.0008, 0)
     if spec.lidar:
         frames["lidar"] = _frame("mount", (0, 0, 0.085), (0, 0, -0.7), 0.001, 0.003)

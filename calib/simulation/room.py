@@ -10,12 +10,12 @@ import numpy as np
 from chains import se3
 from sensors.reference import Reference
 
-SIZE_M = np.array([8.0, 6.0, 3.0])
+SIZE_M = np.array([8.0, 6.0, 3.0])  # a choice: a laboratory
 # The FARO's frame: level, its origin at the scanner's head; the room's middle lies elsewhere.
 FLOOR_CENTRE_M = np.array([0.6, -0.4, -1.2])
 X, Y, Z = np.eye(3)
-CELL_M = 0.22
-CORRELATION_M = 1.0
+CELL_M = 0.22  # of the mesh, a choice: finer than errors of walls, and no even part of a wall
+CORRELATION_M = 1.0  # over which walls are uneven alike: a choice
 
 Triple = tuple[float, float, float]
 

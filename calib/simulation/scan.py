@@ -15,10 +15,12 @@ from chains import se3
 from sensors.lidar import LidarModel
 from sensors.reference import Hits
 
-NO_RETURN_RAD = np.radians(86.0)
+NO_RETURN_RAD = np.radians(86.0)  # a choice: flatter beams glance off
 RETURNED = 0.99  # share of the sweeps in which a direction returns anything
-FAR_OFF_M = 0.1  # sd of a range that is wrong for no visible reason
+STRAY_SD_M = 0.1  # sd of a range that is wrong for no visible reason
 EDGE_STEP_M = 0.05  # two surfaces this far apart along a beam mix
+# Beams that are looked at for an edge, for each that is to be mixed: each costs a ray. In the
+# preset `default` 1.9 % find one, so that a fifth of the mixed pixels lie at edges.
 PROBES_PER_MIXED = 12
 
 
@@ -116,7 +118,7 @@ class Scanner:
         near, far = lidar.min_range_m, lidar.max_range_m
         back = (hits.range_m > near) & (hits.range_m < far) & (hits.incidence_rad < NO_RETURN_RAD)
         kept = np.flatnonzero(back)
-        return beams[kept], Hits(*(v[kept] for v in vars(hits).values()))
+        return beams[kept], Hits(**{name: v[kept] for name, v in vars(hits).items()})
 
     def _cast(self, T_faro_lidar: np.ndarray, azimuth: np.ndarray, elevation: np.ndarray) -> Hits:
         origin, direction = beam(azimuth, elevation, self.lidar.beam_origin_m)
@@ -187,7 +189,7 @@ class Scanner:
         spoilt = range_m.copy()
         spoilt[probed[edges]] += rng.uniform(0.1, 0.9, len(edges)) * step_m[edges]
         others = order[len(order) - (wanted - len(edges)) :]
-        spoilt[others] += FAR_OFF_M * rng.standard_normal(len(others))
+        spoilt[others] += STRAY_SD_M * rng.standard_normal(len(others))
         return np.maximum(spoilt, self.lidar.min_range_m)
 
     def _average(

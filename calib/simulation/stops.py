@@ -21,17 +21,17 @@ from chains.errors import InputError
 from sensors.reference import Reference
 
 # The LiDAR keeps clear of floor and furniture, the base of furniture.
-CLEAR_M, ABOVE_FLOOR_M, BASE_CLEAR_M = 0.6, 0.5, 0.45
+LIDAR_CLEAR_M, ABOVE_FLOOR_M, BASE_FROM_FURNITURE_M = 0.6, 0.5, 0.45
 SETTLE = np.repeat([0.0002, 0.0003], 3)  # rad, m: how the base shifts when the arm moves
 GUESS = np.repeat([np.radians(1.0), 0.02], 3)  # rad, m: error of a guessed base pose
 RATE = 0.25  # rad/s: sd of a joint's speed while the arm moves
 PAYLOAD_KG, FRICTION = 2.5, 0.05  # as small arms carry; a share of the largest torque, assumed
-TRIES = 200
+POSES_TRIED = 200
 UP = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True)
-class Plan:
+class SimulatedStops:
     """Where the K stops are and what was written down there.
 
     Args:
@@ -54,7 +54,7 @@ class Plan:
         return {**own, **self.columns, **known}
 
 
-def plan(rig: Rig, spec: Spec, mesh: Reference, rng: np.random.Generator) -> Plan:
+def plan(rig: Rig, spec: Spec, mesh: Reference, rng: np.random.Generator) -> SimulatedStops:
     """Random stops within the joints' limits at which the LiDAR is clear of everything.
 
     Raises:
@@ -78,7 +78,7 @@ def plan(rig: Rig, spec: Spec, mesh: Reference, rng: np.random.Generator) -> Pla
     if spec.poses == "moving":
         rates = RATE * rng.standard_normal((len(location), len(rig.joint_names)))
         columns |= {f"rate.{j}": r for j, r in zip(rig.joint_names, rates.T, strict=True)}
-    return Plan(
+    return SimulatedStops(
         names=spec.names["stop"],
         location=spec.names["location"],
         joints=np.concatenate(joints),
@@ -97,7 +97,7 @@ def _bases(
     tried = placed = 0
     while True:
         tried += 1
-        if tried > TRIES:
+        if tried > POSES_TRIED:
             raise InputError(f"{n} stops clear of the furniture were not found; ask for fewer")
         joints = _joints(rig, spec, placed, 40 * n, rng)
         if spec.arm:
@@ -131,9 +131,9 @@ def _base(mesh: Reference, rng: np.random.Generator) -> np.ndarray:
     """T_faro_base (4, 4) of a base on the floor, clear of furniture."""
     turn = np.linspace(0, 2 * np.pi, 24, endpoint=False)
     around = np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=1)
-    for _ in range(TRIES):
+    for _ in range(POSES_TRIED):
         xyz = FLOOR_CENTRE_M + rng.uniform((-2.3, -1.5, 0.0), (2.3, 1.5, 0.0))
-        if mesh.cast(xyz + 0.3 * UP, around).range_m.min() > BASE_CLEAR_M:
+        if mesh.cast(xyz + 0.3 * UP, around).range_m.min() > BASE_FROM_FURNITURE_M:
             tilt = 0.003 * rng.standard_normal(2)
             return se3.from_xyz_rpy(xyz, np.append(tilt, rng.uniform(-np.pi, np.pi)))
     raise InputError("no free place for the base was found in this room")
@@ -159,7 +159,9 @@ def _clear(mesh: Reference, Ts_faro_tip: np.ndarray) -> np.ndarray:
     range_m = mesh.cast(origins, np.tile(rays, (len(Ts_faro_tip), 1))).range_m
     range_m = range_m.reshape(len(Ts_faro_tip), -1)
     high = Ts_faro_tip[:, 2, 3] - FLOOR_CENTRE_M[2] > ABOVE_FLOOR_M
-    return np.flatnonzero(high & (range_m.min(axis=1) > CLEAR_M) & np.isfinite(range_m).all(axis=1))
+    return np.flatnonzero(
+        high & (range_m.min(axis=1) > LIDAR_CLEAR_M) & np.isfinite(range_m).all(axis=1)
+    )
 
 
 def _columns(location: np.ndarray, rng: np.random.Generator) -> dict[str, np.ndarray]:
@@ -174,7 +176,7 @@ def _columns(location: np.ndarray, rng: np.random.Generator) -> dict[str, np.nda
     }
 
 
-def loads(stops: Plan, truth: Truth, rng: np.random.Generator) -> dict[str, np.ndarray]:
+def loads(stops: SimulatedStops, truth: Truth, rng: np.random.Generator) -> dict[str, np.ndarray]:
     """Columns (K,) of what loads the arm, where an effect of the hardware depends on it: a payload
     of up to `PAYLOAD_KG`, and the torques of its drives, off by `FRICTION` of the largest."""
     needed, rig = {c for effect, _ in truth.effects for c in effect.covariates}, truth.rig
@@ -200,12 +202,14 @@ class World:
     """
 
     truth: Truth
-    plan: Plan
+    plan: SimulatedStops
     joints: np.ndarray
     twists: np.ndarray
 
     @classmethod
-    def of(cls, truth: Truth, stops: Plan, noise: float, rng: np.random.Generator) -> World:
+    def of(
+        cls, truth: Truth, stops: SimulatedStops, noise: float, rng: np.random.Generator
+    ) -> World:
         """Bend the rig by its effects: ``true = nominal + effect``, encoders with their noise."""
         rig, view = (
             truth.rig,

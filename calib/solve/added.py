@@ -16,9 +16,9 @@ from calib.linear.parallel import in_order
 from calib.problem.problem import Problem
 from calib.residuals.beams import Association, Columns, Rows
 
-HUBER = 1.345  # 95 % efficiency on normal rows (Holland and Welsch 1977)
-MOST_PASSES = 5
-SETTLED = 0.1  # sigmas of an unknown: Tukey's steps do the rest
+HUBER = 1.345  # sigmas: 95 % efficiency on normal rows (Holland and Welsch 1977)
+MOST_PASSES = 5  # a choice: the cost is convex, and it is but where the fit begins
+SETTLED_SIGMAS = 0.1  # sigmas of an unknown: Tukey's steps do the rest
 
 
 def begun(
@@ -65,7 +65,7 @@ def begun(
         first = cost if first is None else first
         step = np.linalg.solve(information, right)
         theta = theta + step
-        if np.all(np.abs(step) < SETTLED / np.sqrt(np.diag(information))):
+        if np.all(np.abs(step) < SETTLED_SIGMAS / np.sqrt(np.diag(information))):
             break
     lower = sums(theta)[2] < first
     return {name: theta[i] for name, i in at.items()} if lower else {}

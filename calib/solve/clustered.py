@@ -30,7 +30,7 @@ Found = Callable[[StopRows, np.ndarray, int, int], T]
 
 
 @dataclass(frozen=True)
-class Beams:
+class BeamsAlong:
     """All beams along some directions; no more than a few stops' in memory.
 
     Args:
@@ -68,7 +68,7 @@ class Beams:
             found = None
             if more is not None:
                 found = self._clustered(*more, np.full(len(cluster), stop), place[cluster])
-            yield CellSums(stop, place, *sums), found
+            yield CellSums(stop=stop, place=place, **sums), found
 
     def _rows_of(
         self, rows: StopRows, cluster: np.ndarray, count: int, scan: int
@@ -81,11 +81,11 @@ class Beams:
         self, rows: StopRows, cluster: np.ndarray, count: int, scan: int
     ) -> tuple[Any, ...]:
         gradient, columns = rows.gradient(cluster, count)
-        sums = (
-            gradient @ self.directions[columns],
-            rows.squares_along(self.directions, cluster, count),
-            rows.sums().along(self.directions),
-        )
+        sums = {
+            "moved": gradient @ self.directions[columns],
+            "share": rows.squares_along(self.directions, cluster, count),
+            "products": rows.sums().along(self.directions),
+        }
         return sums, self._scatter(rows), rows.stop, cluster
 
     def _scatter(self, rows: StopRows) -> tuple[np.ndarray, np.ndarray] | None:
@@ -98,7 +98,8 @@ class Beams:
     def _clustered(
         self, A: np.ndarray, b: np.ndarray, stop: np.ndarray, place: np.ndarray
     ) -> ClusteredRows:
-        return ClusteredRows(A, b, np.arange(self.directions.shape[1]), stop, place)
+        along = np.arange(self.directions.shape[1])
+        return ClusteredRows(A=A, b=b, columns=along, stop=stop, place=place)
 
     def _each_stop(self, found: Found[T]) -> Iterator[tuple[T, np.ndarray]]:
         state = self.problem, self.layout, self.values, self.associations
@@ -116,7 +117,7 @@ def each_stop(
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Iterator[tuple[T, np.ndarray]]:
     """What is found of the rows of each stop, and the numbers of what they meet; arguments as of
-    `Beams`.
+    `BeamsAlong`.
 
     Args:
         found: called with the rows of a stop, which of what they meet each meets, how many there
@@ -138,8 +139,7 @@ def of_stops(layout: Layout, values: Values) -> Iterator[ClusteredRows]:
     """Rows about what stops alone have: tracked bodies, and priors."""
     for stop, found in own_rows(layout, values).items():
         for rows in found.values():
-            every = np.full(len(rows.b), stop), np.full(len(rows.b), -1)
-            yield ClusteredRows(rows.A, rows.b, rows.columns, *every)
+            yield rows.of_stop(stop)
 
 
 def of_cells(
@@ -151,7 +151,8 @@ def of_cells(
         sigma = problem.variables[name].sigma
         A, b = csr_array(diags_array(1.0 / sigma)), -values[name] / sigma
         nowhere = np.full(len(b), -1)
-        yield cells, ClusteredRows(A, b, np.r_[layout.at[name]], nowhere, nowhere)
+        columns = np.r_[layout.at[name]]
+        yield cells, ClusteredRows(A=A, b=b, columns=columns, stop=nowhere, place=nowhere)
 
 
 def of_graph(
@@ -169,4 +170,5 @@ def of_graph(
             # The prior of an unknown that one stop alone touches belongs to that stop.
             known = layout.touched.get(name, frozenset())
             stop = np.full(len(b), *known) if len(known) == 1 else nowhere
-        yield block, name, ClusteredRows(A, b, columns, stop, nowhere)
+        rows = ClusteredRows(A=A, b=b, columns=columns, stop=stop, place=nowhere)
+        yield block, name, rows

@@ -25,18 +25,18 @@ from calib.problem.spread import Whose, by_chance, read, sigmas, spread_keys, wi
 from calib.problem.unknowns import Unknown
 from calib.problem.without import ROD
 from calib.residuals.groups import Group
-from calib.residuals.targets import PARTS, SIGMAS, HangingTarget
+from calib.residuals.targets import PARTS_OF_SIGMAS, TARGET_PARTS, HangingTarget
 from calib.residuals.tracker import BodiesTogether, TrackedBody
 from calib.solve.estimate import Estimate
 
 PRECISE = {"ftol": 1e-15, "gtol": 1e-7}  # of twice a log-likelihood: sds to some 1e-6 of theirs
-LEAST = 1e-3  # of the sd that a group starts from: what is smaller counts as none
-MOST = 1e6  # times that: far from an optimum scores are of any size, and squares overflow
-SEEN = 1e-9  # of the largest information, below which a direction of values is not seen
+LEAST_SD = 1e-3  # of the sd that a group starts from: what is smaller counts as none
+LARGEST_SD = 1e6  # times that: far from an optimum scores are of any size, and squares overflow
+DIRECTION_SEEN = 1e-9  # of the largest information, below which a direction of values is not seen
 GROWN = np.geomspace(1e-3, 1e4, 50) - 1.0  # of a variance: no less and no more is found at once
-UNSEEN = 1e-6  # of a redundancy: rounding of a covariance is some 1e-9 of it
-UNTOLD = 1e-6  # rows: what fewer tell of a variance is nothing
-TOGETHER = 400  # joint readings whose covariance is computed at once: bounds the memory
+UNSEEN_REDUNDANCY = 1e-6  # of a redundancy: rounding of a covariance is some 1e-9 of it
+UNTOLD_ROWS = 1e-6  # rows: what fewer tell of a variance is nothing
+READINGS_TOGETHER = 400  # joint readings whose covariance is computed at once: bounds the memory
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,8 @@ class Told:
             start: (G,) sd to start from.
         """
         first = 2.0 * np.log(start)
-        bounds = np.stack([first + 2.0 * np.log(LEAST), first + 2.0 * np.log(MOST)], axis=1)
+        ends = [first + 2.0 * np.log(times) for times in (LEAST_SD, LARGEST_SD)]
+        bounds = np.stack(ends, axis=1)
         best = minimize(
             self._unlikely, first, jac=True, method="L-BFGS-B", bounds=bounds, options=PRECISE
         )
@@ -176,7 +177,7 @@ class Checks:
     def of(cls, residual: np.ndarray, redundancy: np.ndarray) -> Checks:
         """Of residuals (m,) whose covariance is the redundancy (m, m), where sigmas are right."""
         values, axes = np.linalg.eigh(redundancy)
-        seen = values > UNSEEN  # in the others nothing checks the rows, and residuals are 0
+        seen = values > UNSEEN_REDUNDANCY  # in the others nothing checks the rows: residuals are 0
         square = np.square(axes[:, seen].T @ residual)
         return cls(square, np.minimum(values[seen], 1.0), np.ones(int(seen.sum())))
 
@@ -223,7 +224,7 @@ class Checks:
     def sigma(self, d: float) -> float:
         """Sigma of `growth` where that is d."""
         weight = self.count @ np.square(self.redundancy / (1.0 + d * self.redundancy))
-        return float(np.sqrt(2.0 / max(weight, UNTOLD)))
+        return float(np.sqrt(2.0 / max(weight, UNTOLD_ROWS)))
 
     def statistic(self, d: float) -> float:
         """Twice the log of the likelihood ratio of d against none."""
@@ -238,9 +239,8 @@ class Checks:
 
 
 Sums = Mapping[Whose, Checks]
-# A block, the whitened derivative by each unknown, and minus the residuals: see `Graph`.
-GraphRow = tuple[Block | None, Mapping[str, np.ndarray], np.ndarray]
-NOTHING = Checks.alone(0.0, 0.0)
+GraphRow = tuple[Block | None, Mapping[str, np.ndarray], np.ndarray]  # as of `Graph`
+NO_CHECKS = Checks.alone(0.0, 0.0)
 
 
 def squares(estimate: Estimate) -> Sums:
@@ -322,7 +322,7 @@ def _of_joints(
 
 
 def _batches(rows: np.ndarray) -> list[np.ndarray]:
-    return np.array_split(rows, -(-len(rows) // TOGETHER))
+    return np.array_split(rows, -(-len(rows) // READINGS_TOGETHER))
 
 
 def _of_targets(
@@ -336,12 +336,12 @@ def _of_targets(
     variances = linear.variances([by for _, by, _ in rows], kept)
     sums: dict[str, list[tuple[float, float]]] = {}
     for (block, _, residual), seen in zip(rows, variances, strict=True):
-        weight = np.ones(len(PARTS)) if block.weight is None else block.weight
+        weight = np.ones(len(TARGET_PARTS)) if block.weight is None else block.weight
         whole = replace(block.groups[0], what=ROD) in wild
-        for of, parts in SIGMAS.items():
-            for i in (PARTS.index(part) for part in parts):
+        for of, parts in PARTS_OF_SIGMAS.items():
+            for i in (TARGET_PARTS.index(part) for part in parts):
                 if not whole and block.groups[i] not in wild:
-                    here, count = slice(3 * i, 3 * i + 3), 2 if PARTS[i] == "upper" else 3
+                    here, count = slice(3 * i, 3 * i + 3), 2 if TARGET_PARTS[i] == "upper" else 3
                     left = count * weight[i] - seen[here].sum()
                     sums.setdefault(of, []).append((np.square(residual[here]).sum(), left))
     found = {of: Checks.alone(*np.sum(some, axis=0)) for of, some in sums.items()}
@@ -372,7 +372,7 @@ def wider(problem: Problem, sums: Sums) -> dict[str, float]:
     out, known = {}, sigmas(problem)
     for key, whose in widening(problem).items():
         sigma, beyond = known[whose]
-        grown = sums.get(whose, NOTHING).growth()
+        grown = sums.get(whose, NO_CHECKS).growth()
         out[key] = float(np.sqrt(max(grown * sigma**2 + beyond**2, 0.0)))
     return out
 
@@ -390,7 +390,7 @@ def spreads(estimate: Estimate) -> dict[str, tuple[float, float]]:
         sums, known = squares(estimate), sigmas(estimate.problem)
         for key, whose in keys.items():
             sigma, beyond = known[whose]
-            checks = sums.get(whose, NOTHING)
+            checks = sums.get(whose, NO_CHECKS)
             out[key] = beyond, sigma_beyond(beyond, sigma**2 * checks.sigma(0.0))
     return out
 

@@ -18,10 +18,10 @@ from calib.solve.graph import Graph, KeptRows
 from calib.solve.torn import astray
 
 Progress = Callable[[str, int, int], None]
-MAX_PASSES = 40
+MAX_PASSES = 40  # a choice: four times what good recordings take (see `SLOWED`)
 # Passes over trackers and targets alone to their optimum, on good recordings (12 stops of a world
 # with an arm, CAD off by its sigmas).
-USUAL = 4
+USUAL_PASSES = 4
 # Passes of a descent, from which robust scales go half the way: they follow the state, and where
 # residuals are far from normal state and scales can swing about each other for ever (stops that
 # scatter by three times a beam's sigma: steps of 0.1 sigma without end). In 24 worlds of another
@@ -41,9 +41,9 @@ ROUGHLY = 0.01
 # times that. Scales are then kept, as by MM-estimates (Yohai 1987, Annals of Statistics 15).
 SWAYS = 0.1
 STEADY = 1e-9  # the same, of trackers and targets alone, whose steps cost little
-DIGITS = 1e-14  # of a cost: what is less is rounding
+COST_ROUNDING = 1e-14  # of a cost: what is less is rounding
 UPHILL = 1e-9  # of a cost: a step that raises it by more is shortened
-SHORTEST, LONGEST = 1e-3, 2.0  # of a step: how much of it may be taken
+SHORTEST_STEP, LONGEST_STEP = 1e-3, 2.0  # of a step: how much of it may be taken
 
 
 class Descent:
@@ -115,8 +115,10 @@ class Descent:
                 lowest = _lowest(part, fall, fell)
                 if fell < -UPHILL * cost - STEADY:
                     part = min(lowest, part / 2)
-                    self.values = self.moved(before, tangent, part) if part > SHORTEST else before
-                    if part <= SHORTEST:
+                    self.values = (
+                        self.moved(before, tangent, part) if part > SHORTEST_STEP else before
+                    )
+                    if part <= SHORTEST_STEP:
                         self.linearise(beams=beams)
                         return False
                     continue
@@ -126,7 +128,7 @@ class Descent:
             swings = abs(cost - self._cost_before()) > fall
             length = self.size(tangent)
             self.values = self.moved(before, tangent, part)
-            if length < size and fall < max(least, DIGITS * cost):
+            if length < size and fall < max(least, COST_ROUNDING * cost):
                 return True
             # Where a row's curvature misleads, steps grow; its weight never does. It is tried again
             # after twice as many passes each time, lest the steps go round in circles.
@@ -149,7 +151,7 @@ class Descent:
         """
         before = np.inf
         for _ in range(MAX_PASSES):
-            if self.descend(least, beams=False, passes=USUAL):
+            if self.descend(least, beams=False, passes=USUAL_PASSES):
                 return True
             if self.cost() > before / 2:
                 break
@@ -259,4 +261,6 @@ def _lowest(part: float, fall: float, fell: float) -> float:
         fell: by how much that part did.
     """
     bend = 2 * fall * part - fell
-    return float(np.clip(fall * part**2 / bend, part / 10, LONGEST)) if bend > 0 else LONGEST
+    return (
+        float(np.clip(fall * part**2 / bend, part / 10, LONGEST_STEP)) if bend > 0 else LONGEST_STEP
+    )

@@ -20,7 +20,7 @@ from calib.linear.elimination import square_root
 from calib.linear.layout import positions
 from calib.linear.system import Linearisation
 from calib.problem.problem import Block
-from calib.problem.unknowns import Kind, Unknown
+from calib.problem.unknowns import Unknown, UnknownKind
 
 Values = Mapping[str, np.ndarray]
 
@@ -298,7 +298,7 @@ def _check_finite(block: Block, values: np.ndarray, what: str) -> None:
         raise FloatingPointError(f"block '{block.name}' has a {what} that is not finite")
 
 
-def _wrap(kind: Kind, value: np.ndarray) -> np.ndarray | gtsam.Pose3 | gtsam.Unit3:
+def _wrap(kind: UnknownKind, value: np.ndarray) -> np.ndarray | gtsam.Pose3 | gtsam.Unit3:
     if kind == "vector":
         return np.asarray(value, float)
     if kind == "direction":
@@ -307,7 +307,7 @@ def _wrap(kind: Kind, value: np.ndarray) -> np.ndarray | gtsam.Pose3 | gtsam.Uni
     return gtsam.Pose3(gtsam.Rot3.ClosestTo(value[:3, :3]), value[:3, 3])
 
 
-def _read(kind: Kind, values: gtsam.Values, key: int) -> np.ndarray:
+def _read(kind: UnknownKind, values: gtsam.Values, key: int) -> np.ndarray:
     if kind == "vector":
         return values.atVector(key)
     if kind == "direction":

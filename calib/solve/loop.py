@@ -26,27 +26,29 @@ from calib.solve.components import sds, squares, told, wider
 from calib.solve.descent import AT_OPTIMUM, LAST, SLOWED, STEADY, SWAYS, Descent, Progress
 from calib.solve.estimate import DOFS, SEEN, Estimate, Start, started, values_of
 from calib.solve.graph import Graph
-from calib.solve.reweight import SETTLED as SETTLED_WEIGHT
-from calib.solve.reweight import reweighted
+from calib.solve.reweight import SETTLED_WEIGHT, reweighted
 from calib.solve.torn import CONTRADICTS, borne_out, doubted, torn
 from chains import se3
 
-SETTLED = 1e-4  # m and rad: after that, which triangle a beam meets is kept
+SETTLED_STEP = 1e-4  # m and rad: then triangles that beams meet are kept; a choice, 1 mm at 10 m
 CONVERGED = 1e-6  # m and rad: a tenth of the smallest sigmas, and the next step is smaller still
-STRAYED = 3e-3  # m and rad: a scan that has moved further looks anew what its beams meet
-LOOKS = 3  # how often, before a fit is given up
+# m and rad: a scan that has moved further looks anew what its beams meet. A choice: a tenth of the
+# narrowest patch, at 10 m.
+STRAYED = 3e-3
+DESCENTS = 3  # how often a descent is tried before a fit is given up: a choice
+# By how much new weights may still lower half the chi-square, and of it: a hundredth of what an
+# optimum allows, as each round may go but a tenth of the way; where nothing fits, it never ends.
+STILL_FALL, AS_GOOD = AT_OPTIMUM / 100, 1e-8
+BEFORE_SCANS = 2  # times: bodies are then a start for the scans, and no result
 # How often weights are taken anew, and the relative change of one that is none: with scans, and of
 # trackers and targets alone, whose passes cost little and where few rows check each other. A change
 # can be nine tenths of the one before there (four rods, one off: 0.7 sigma from the optimum after
 # ten times, 0.03 once changes are below a thousandth).
-# By how much new weights may still lower half the chi-square, and of it: a hundredth of what an
-# optimum allows, as each round may go but a tenth of the way; where nothing fits, it never ends.
-STILL, AS_GOOD = AT_OPTIMUM / 100, 1e-8
-BEFORE_SCANS = 2  # times: bodies are then a start for the scans, and no result
-REWEIGHTED, ALONE = (10, SETTLED_WEIGHT), (200, 1e-3)
+REWEIGHTED, REWEIGHTED_ALONE = (10, SETTLED_WEIGHT), (200, 1e-3)
 # So often is looked what beams meet before it is asked whether that leads anywhere, and so often at
 # most; good recordings, and one with the LiDAR 0.13 m from where CAD has it, take 2 to 6 passes.
-HOPEFUL, LOOKED = 8, 15  # and after so many rounds each, weights that bring nothing are given up
+# After so many rounds each, weights that bring nothing are given up.
+HOPEFUL, MOST_PASSES_LOOKED = 8, 15
 # How many sigmas wide the residuals of most stops may be by then: in those recordings it is 1 to 4,
 # with scans at wrong stops 85. And so wide may rows of trackers and targets be, as weighed, where
 # a fit has not settled: of the 90 kinds of damage it is 10 at most (a joint scaled, the mesh
@@ -56,10 +58,8 @@ HOPELESS = 30.0
 # worth doing again, as 50 members tell it no better.
 SETTLED_SPREAD, NEAR_SPREAD = 0.01, 0.1
 SPREAD = 8  # times: where rows do not scatter, each halves what they were thought to
-
-
-ASKED = 2  # times: the first pass brings the LiDAR to where it is, near enough
-SEVERAL = 3  # scans of a place, for most of them to tell where the rig stood
+TIMES_ASKED = 2  # times: the first pass brings the LiDAR to where it is, near enough
+SCANS_OF_PLACE = 3  # scans of a place, for most of them to tell where the rig stood
 
 
 class Loop(Descent):
@@ -132,7 +132,7 @@ class Loop(Descent):
         Args:
             beams: False for trackers and targets alone.
         """
-        times, settled = REWEIGHTED if self.problem.scans else ALONE
+        times, settled = REWEIGHTED if self.problem.scans else REWEIGHTED_ALONE
         times = BEFORE_SCANS if self.problem.scans and not beams else times
         changed, last = False, np.inf
         for count in range(times):
@@ -145,7 +145,7 @@ class Loop(Descent):
                     break
                 last = self.cost()
             tangent, fall = self.step()
-            if fall < max(STILL, AS_GOOD * self.cost()):
+            if fall < max(STILL_FALL, AS_GOOD * self.cost()):
                 self.given, self.problem = before
                 self.lay_out()
                 break
@@ -241,19 +241,19 @@ class Loop(Descent):
         """Passes that look each time anew what beams meet, until they settle; False where the fit
         is hopeless, as where planes that were found in the scans never do. Where bodies contradict
         each other, scans say which is right: as CAD has the LiDAR, and where a pass has put it."""
-        for count in range(1, LOOKED + 1):
-            if count <= ASKED:
+        for count in range(1, MOST_PASSES_LOOKED + 1):
+            if count <= TIMES_ASKED:
                 self._ask_scans()
             self.linearise(associate=True)
             self.passes += 1
             scale = np.array([each.scale for each in self.linear.weighed])
-            if count <= ASKED and self._set_aside(scale, count == ASKED):
+            if count <= TIMES_ASKED and self._set_aside(scale, count == TIMES_ASKED):
                 continue
             if count > HOPEFUL and np.median(scale) > HOPELESS:
                 return False
             tangent, _ = self.step()
             self.values = self.moved(self.values, tangent)
-            if self.size(tangent) < SETTLED:
+            if self.size(tangent) < SETTLED_STEP:
                 return True
         return any(isinstance(scan.meeting, MeshSurface) for scan in self.problem.scans)
 
@@ -275,7 +275,7 @@ class Loop(Descent):
         """
         stood = Counter(scan.stops.root for scan in self.problem.scans)
         told = {b.stops.root for b in self.problem.bodies}
-        told |= {root for root, count in stood.items() if count >= SEVERAL}
+        told |= {root for root, count in stood.items() if count >= SCANS_OF_PLACE}
         far = scale > CONTRADICTS * np.median(scale)
         pairs = zip(self.problem.scans, far, strict=True)
         gone = {s.group.token for s, is_far in pairs if is_far and s.stops.root in told}
@@ -295,7 +295,7 @@ class Loop(Descent):
             tolerance: largest step of the last pass, m and rad.
             seen, met: as of `fix_association`.
         """
-        for _ in range(LOOKS):
+        for _ in range(DESCENTS):
             self.fix_association(seen, met)
             if self.lost:
                 return
@@ -378,7 +378,7 @@ class Loop(Descent):
         _, fall = self.step()
         if AT_OPTIMUM <= fall < SWAYS and self.problem.scans and not self.lost:
             self.keep_scales()
-            any(self.descend(LAST) for _ in range(LOOKS))  # redescending weights have plateaus
+            any(self.descend(LAST) for _ in range(DESCENTS))  # redescending weights have plateaus
             self.linearise()
             _, fall = self.step()
         return self.as_it_stands(fall < AT_OPTIMUM and not self.lost, whole=True)

@@ -18,10 +18,10 @@ from calib.problem.problem import Block, Problem
 from calib.problem.spread import spread_of, with_spread
 from calib.problem.unknowns import Role, Unknown
 from calib.residuals.robust import huber_weight
-from calib.residuals.targets import PARTS, HangingTarget
+from calib.residuals.targets import TARGET_PARTS, HangingTarget
 from calib.residuals.tracker import BodiesTogether, TrackedBody
 
-SETTLED = 0.01  # relative change of a weight, and so of how hard a group pulls
+SETTLED_WEIGHT = 0.01  # relative change of a weight, and so of how hard a group pulls
 
 
 class _Norms(NamedTuple):
@@ -37,7 +37,7 @@ def reweighted(
     problem: Problem,
     values: Mapping[str, np.ndarray],
     held: frozenset[str],
-    settled: float = SETTLED,
+    settled: float = SETTLED_WEIGHT,
 ) -> Problem:
     """The problem with the weights that its residuals at a state ask for; itself, where these are
     what it has.
@@ -94,8 +94,10 @@ def _of_blocks(blocks: Sequence[Block], values: Mapping[str, np.ndarray]) -> Ite
     plain = {id(b): unweighted(b) for b in blocks}
     for block in blocks:
         if isinstance(block, HangingTarget):
-            rows = plain[id(block)].evaluate(values, False)[0].reshape(len(PARTS), -1)
-            dof = np.where(np.arange(len(PARTS)) == PARTS.index("upper"), 2, 3)  # across its rod
+            rows = plain[id(block)].evaluate(values, False)[0].reshape(len(TARGET_PARTS), -1)
+            dof = np.where(
+                np.arange(len(TARGET_PARTS)) == TARGET_PARTS.index("upper"), 2, 3
+            )  # across its rod
             yield _Norms("target", block, np.linalg.norm(rows, axis=1), dof)
     bodies = [b for b in blocks if isinstance(b, TrackedBody)]
     owner = {id(plain[id(b)]): b for b in bodies}

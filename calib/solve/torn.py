@@ -32,8 +32,8 @@ ASTRAY = 0.05
 # the LiDAR, was not taken there. On the recordings of the independent simulator it is 1.8 at most,
 # and 206 and 208 of two scans that were exchanged. So it is of a body, against most stops of it.
 CONTRADICTS = 10.0
-ALIKE = 2.0  # and by less than this scans differ that were taken where they are said to be
-MOST = 0.9  # of a scan's beams; a tenth and more meet the walls across any axis of a room
+SCANS_ALIKE = 2.0  # and by less than this scans differ that were taken where they are said to be
+MOST_OF_BEAMS = 0.9  # of a scan's beams; a tenth and more meet the walls across any axis of a room
 DOUBTED = 1e-6  # weight: a body a metre off then pulls as hard as one a millimetre off
 
 Values = Mapping[str, np.ndarray]
@@ -99,7 +99,7 @@ def borne_out(problem: Problem, values: Values) -> tuple[set[str], dict[str, np.
     for scan in asked:
         tried = [(_width(scan, values, T), g, T) for g, T in _stands(problem, scan, values)]
         first, *others = sorted(tried, key=lambda each: each[0])
-        if others and first[0] < ALIKE * usual and ALIKE * first[0] < others[0][0]:
+        if others and first[0] < SCANS_ALIKE * usual and SCANS_ALIKE * first[0] < others[0][0]:
             wrong |= {group.token for _, group, _ in others}
             stood[scan.stops.root] = first[2]
     return wrong, stood
@@ -146,4 +146,8 @@ def _width(scan: ScanStop, values: Values, T_world_root: np.ndarray) -> float:
     except InputError:  # no beam meets anything there
         return np.inf
     size = np.abs(rows.residual_m / rows.sigma_m)[rows.usable]
-    return float(np.quantile(size, MOST)) / ndtri((1 + MOST) / 2) if len(size) else np.inf
+    return (
+        float(np.quantile(size, MOST_OF_BEAMS)) / ndtri((1 + MOST_OF_BEAMS) / 2)
+        if len(size)
+        else np.inf
+    )

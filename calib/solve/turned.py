@@ -17,19 +17,22 @@ from chains import se3
 from chains.align import mean_pose
 from sensors.lidar import Beams
 
+# What mistakes about axes and mounts turn by: brackets and flanges have holes at right angles.
 TURNS = (np.pi, np.pi / 2, -np.pi / 2)
-KEPT = 3  # starts that are given, of all that are looked at
-TOGETHER = 2  # zeros and frames that may be turned at once
-WIDTH = 5  # of those with one turned, how many have a second one turned
+STARTS_KEPT = 3  # starts that are given, of all that are looked at
+TURNED_TOGETHER = 2  # zeros and frames that may be turned at once
+TURNED_AGAIN = 5  # of those with one turned, how many have a second one turned
 # Orientations of a LiDAR are looked at on a grid, of turns by up to 0.6 rad about three axes beside
 # each of the 24 that map a cube onto itself, and on finer ones beside the best of these. From
 # 0.3 rad away passes over the scans find the optimum.
 STEP_RAD, FINER_RAD, BEST = 0.3, (0.15, 0.07), 8
 # So many beams of so many scans tell orientations apart; beams are off by no more than this, as
 # what they pass by may be anywhere behind.
-SCANS, BEAMS, FAR_M = 8, 150, 1.0
+SCANS_ASKED, BEAMS_A_SCAN, FARTHEST_OFF_M = 8, 150, 1.0
 NEAR_M = 0.1  # mean error of these beams that asks for no other orientation: good ones have 0.02
-NEARER = 0.5  # share of the mean error by which another orientation must be better
+# Of the mean error, what another orientation may have at most: a choice, between good ones' 0.02 m
+# and the 0.1 m from which one is asked for.
+NEARER = 0.5
 
 Values = dict[str, np.ndarray]
 
@@ -55,8 +58,8 @@ def least_turned(problem: Problem) -> list[tuple[float, Values]]:
         return []
     found: list[tuple[float, Values, Sequence[np.ndarray]]] = []
     start = np.inf, first, [group.place(first) for group in groups]
-    for _ in range(TOGETHER):
-        for _, values, placed in found[:WIDTH] or [start]:
+    for _ in range(TURNED_TOGETHER):
+        for _, values, placed in found[:TURNED_AGAIN] or [start]:
             for name, turned in _turned(values, angles):
                 at = [
                     group.place(turned) if name in group.felt else Ts
@@ -65,7 +68,7 @@ def least_turned(problem: Problem) -> list[tuple[float, Values]]:
                 cost, stood = _stood(turned, groups, at)
                 found.append((cost + _prior(problem, turned, angles), stood, at))
         found.sort(key=lambda each: each[0])
-    return [(cost, values) for cost, values, _ in found[:KEPT]]
+    return [(cost, values) for cost, values, _ in found[:STARTS_KEPT]]
 
 
 def turned_far(problem: Problem, values: Mapping[str, np.ndarray]) -> bool:
@@ -110,19 +113,21 @@ class _Sampled:
     def off_m(self, turns: np.ndarray) -> np.ndarray:
         """Mean error (G,) of some beams with the LiDAR turned (G, 3, 3) about its origin."""
         _, ray = self.scan.store.read(self.scan.index)
-        some = np.linspace(0, len(ray.range_m) - 1, BEAMS).round().astype(int)
+        some = np.linspace(0, len(ray.range_m) - 1, BEAMS_A_SCAN).round().astype(int)
         origin = (ray.origin_m[some] @ turns.mT).reshape(-1, 3)
         direction = (ray.direction[some] @ turns.mT).reshape(-1, 3)
         beams = Beams(origin, direction, np.tile(ray.range_m[some], len(turns)))
         met = self.scan.meeting.associate(self.T, beams, {}, near_edges=False)
         surface = self.scan.meeting.meet(self.T, beams, {}, met)
-        off_m = np.where(surface.usable, np.abs(beams.range_m - surface.predicted_m), FAR_M)
-        return np.minimum(off_m, FAR_M).reshape(len(turns), -1).mean(axis=1)
+        off_m = np.where(
+            surface.usable, np.abs(beams.range_m - surface.predicted_m), FARTHEST_OFF_M
+        )
+        return np.minimum(off_m, FARTHEST_OFF_M).reshape(len(turns), -1).mean(axis=1)
 
 
 def _best_turn(scans: Sequence[_Sampled]) -> np.ndarray | None:
     """The turn (3, 3) of a LiDAR that makes its beams fit best; None where none is much better."""
-    chosen = np.unique(np.linspace(0, len(scans) - 1, SCANS).round().astype(int))
+    chosen = np.unique(np.linspace(0, len(scans) - 1, SCANS_ASKED).round().astype(int))
 
     def off_m(turns: np.ndarray) -> np.ndarray:
         return np.mean([scans[i].off_m(turns) for i in chosen], axis=0)

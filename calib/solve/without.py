@@ -16,7 +16,7 @@ BEAMS = KeptRows.kind
 
 
 @dataclass(frozen=True)
-class Kind:
+class RowsOfKind:
     """All rows of one kind in an estimate.
 
     Args:
@@ -34,7 +34,7 @@ class Kind:
     covariance: np.ndarray
 
 
-def kinds_of(estimate: Estimate) -> list[Kind]:
+def kinds_of(estimate: Estimate) -> list[RowsOfKind]:
     """Every kind of rows of an estimate that has its graph, but for what is known of each unknown
     by itself."""
     problem, out = estimate.problem, []
@@ -42,12 +42,12 @@ def kinds_of(estimate: Estimate) -> list[Kind]:
         rows = sum(int((met.part >= 0).sum()) for met in estimate.associations)
         covariance = _without(estimate, BEAMS)
         touched = _of_beams(estimate)
-        out.append(Kind(BEAMS, len(estimate.scans), rows, touched, covariance=covariance))
+        out.append(RowsOfKind(BEAMS, len(estimate.scans), rows, touched, covariance=covariance))
     blocks = [*problem.blocks, *_priors(estimate)]
     for name in dict.fromkeys(block.kind for block in blocks):
         mine = [block for block in blocks if block.kind == name]
         out.append(
-            Kind(
+            RowsOfKind(
                 name=name,
                 blocks=len(mine),
                 rows=sum(block.rows for block in mine),

@@ -9,7 +9,7 @@ from typing import Any
 
 from calib.runs.run import Run
 from calib.view.desk import Desk
-from calib.view.job import Change, Job, Told
+from calib.view.job import Change, Job, JobMessage
 from calib.view.scene import Scene
 from chains.errors import InputError
 
@@ -26,7 +26,7 @@ class Bench:
     def __init__(self, desk: Desk) -> None:
         self._desk = desk
         self._scenes: dict[Path, tuple[Run, Scene]] = {}
-        self._hearers: set[Callable[[Told, Any], None]] = set()
+        self._hearers: set[Callable[[JobMessage, Any], None]] = set()
         self._lock = threading.RLock()
         self._job: Job | None = None
 
@@ -48,11 +48,11 @@ class Bench:
                 self._scenes.pop(next(iter(self._scenes)))
             return scene
 
-    def listen(self, hear: Callable[[Told, Any], None]) -> None:
+    def listen(self, hear: Callable[[JobMessage, Any], None]) -> None:
         """Have all that jobs say told to `hear`, with who started them."""
         self._hearers.add(hear)
 
-    def forget(self, hear: Callable[[Told, Any], None]) -> None:
+    def forget(self, hear: Callable[[JobMessage, Any], None]) -> None:
         """Tell it no more."""
         self._hearers.discard(hear)
 

@@ -27,7 +27,7 @@ PATIENCE_S = 10.0  # for a process that was stopped to clean up
 
 
 @dataclass(frozen=True)
-class Told:
+class JobMessage:
     """What a job says of itself.
 
     Args:
@@ -83,9 +83,9 @@ class Job:
         self._process.start()
         mouth.close()  # so that the pipe ends when the process does
 
-    def listen(self) -> Iterator[Told]:
+    def listen(self) -> Iterator[JobMessage]:
         """All that the job says until it is over; the last is "done", "failed" or "stopped"."""
-        last = Told("progress")
+        last = JobMessage("progress")
         while last.kind not in ("done", "failed"):
             try:
                 last = self._ear.recv()
@@ -95,10 +95,12 @@ class Job:
                 yield last
         self._process.join(PATIENCE_S)
         if self._stopped:
-            yield Told("stopped")
+            yield JobMessage("stopped")
         elif last.kind not in ("done", "failed"):
             code = self._process.exitcode
-            yield Told("failed", f"the process ended with code {code}; is there enough memory?")
+            yield JobMessage(
+                "failed", f"the process ended with code {code}; is there enough memory?"
+            )
 
     def stop(self) -> None:
         """End the process; a run that is not whole by then leaves nothing."""
@@ -115,13 +117,13 @@ def _work(mouth: Connection, run: Path, change: Change | None, trust: Trust) -> 
     signal.signal(signal.SIGTERM, _leave)
     try:
         _study(mouth, run, change, trust)
-        mouth.send(Told("done"))
+        mouth.send(JobMessage("done"))
     except InputError as error:
-        mouth.send(Told("failed", str(error)))
+        mouth.send(JobMessage("failed", str(error)))
     except BrokenPipeError:
         pass  # the page is gone
     except Exception as error:
-        mouth.send(Told("failed", f"internal fault: {type(error).__name__}: {error}"))
+        mouth.send(JobMessage("failed", f"internal fault: {type(error).__name__}: {error}"))
 
 
 def _study(mouth: Connection, folder: Path, change: Change | None, trust: Trust) -> None:
@@ -130,12 +132,12 @@ def _study(mouth: Connection, folder: Path, change: Change | None, trust: Trust)
     from calib.runs.run import Run
 
     def progress(what: str, done: int, total: int) -> None:
-        mouth.send(Told("progress", what, (done + 1) / max(total, 1)))
+        mouth.send(JobMessage("progress", what, (done + 1) / max(total, 1)))
 
     run = Run.open(folder, trust)
     if change is not None:
         run = grow(run, changed(run, change), change.out, progress)
-        mouth.send(Told("run", str(run.folder)))
+        mouth.send(JobMessage("run", str(run.folder)))
     diagnose(run, progress)
 
 

@@ -18,9 +18,9 @@ from calib.view.effects import known
 from calib.view.effects.expected import Asked, Expected
 from calib.view.effects.own import OwnFormula, document
 from calib.view.effects.ticks import Ticks
-from calib.view.job import Change, Told
+from calib.view.job import Change, JobMessage
 from calib.view.leave_out import LeaveOut
-from calib.view.picture import NOTHING, Picture
+from calib.view.picture import NO_VALUE, Picture
 from calib.view.server import Visitor
 from calib.view.shown import brush, colours, look
 from calib.view.shown.moves import parameters
@@ -32,7 +32,7 @@ CURVE_PX = 180
 SETTLED_S = 0.4  # the camera rests for so long before the address tells where it is
 TAKE_HINT = "What 'rigcal export' writes of this run, in all formats, as a zip"
 WORKED_OUT = "The held-out error is being predicted from the linearisation …"
-LOOKS = "Read-only: this address cannot change anything."
+READ_ONLY = "Read-only: this address cannot change anything."
 
 
 class Page:
@@ -65,7 +65,7 @@ class Page:
         gui = client.gui
         gui.main_panel.dock_right()
         gui.main_panel.set_width(PANEL_PX)
-        gui.add_html(panels.note(LOOKS), visible=not self.may_change)
+        gui.add_html(panels.note(READ_ONLY), visible=not self.may_change)
         self._note = gui.add_html("", visible=False)
         self._run = self._menu("Run", list(self.desk.runs), self._on_run)
         self.picture = Picture(client, window_px, self._guarded, self._asks)
@@ -109,7 +109,7 @@ class Page:
             self._findings = gui.add_html("")
             self._formulas = gui.add_html("")
             self._diagnose = gui.add_button("Diagnose", visible=False)
-            self._over = self._menu("Curve over", [NOTHING], self._draw_curve)
+            self._over = self._menu("Curve over", [NO_VALUE], self._draw_curve)
             self._curve = gui.add_uplot(
                 *_curve(None),
                 scales={"x": {"time": False}},
@@ -229,7 +229,7 @@ class Page:
         self._over.visible = self._curve.visible = bool(names)
         self._covariates = {colours.column(n).heading: n for n in names}
         if names:
-            effect = self._ticks.latest or next(iter(self.desk.addable(self.findings)), NOTHING)
+            effect = self._ticks.latest or next(iter(self.desk.addable(self.findings)), NO_VALUE)
             best = colours.column(self.findings.covariate_of(effect)).heading
             self._fill(self._over, list(self._covariates), best)
             self._draw_curve()
@@ -248,13 +248,13 @@ class Page:
         told = known.told(self.desk.run, wanted, self.findings, others)
         self._asked = None
         before = self.desk.run.summary["rms_mm"]["held_out"]
-        if told.endswith(known.UNKNOWN) and before is not None and self.may_change:
+        if told.endswith(known.NOT_KNOWN_YET) and before is not None and self.may_change:
             self._asked = (
                 self.desk.run.folder,
                 self._change(*known.difference(self.desk.effects, wanted)),
             )
             self._expected.ask(*self._asked)
-            told = told.removesuffix(known.UNKNOWN) + WORKED_OUT
+            told = told.removesuffix(known.NOT_KNOWN_YET) + WORKED_OUT
         return told
 
     def _on_expected(self, asked: Asked, after: float | None) -> None:
@@ -305,7 +305,7 @@ class Page:
     def _ask(self) -> None:
         """Whoever may only look has no buttons; this is for one who sends messages without."""
         if not self.may_change:
-            raise InputError(LOOKS)
+            raise InputError(READ_ONLY)
 
     def _show_busy(self) -> None:
         """Whether a job runs."""
@@ -317,7 +317,7 @@ class Page:
             widget.busy(busy or not self.may_change)
         self._bar.value, self._doing.content = 0.0, panels.note("Starting …")
 
-    def _hear(self, told: Told, by: Any) -> None:
+    def _hear(self, told: JobMessage, by: Any) -> None:
         """Show what a job tells; `by` is the page that started it."""
         if told.kind == "progress":
             if not self._bar.visible:  # another page started it
@@ -339,7 +339,7 @@ class Page:
             self._fill(self._run, list(self.desk.runs), self.desk.chosen)
             self._tell(panels.new_run(Rung(self.desk.runs[self.desk.name_of(folder)], None)))
 
-    def _ended(self, told: Told, here: bool) -> None:
+    def _ended(self, told: JobMessage, here: bool) -> None:
         self._show_busy()
         if told.kind == "done" and self.findings is None:
             self._show_findings()

@@ -21,8 +21,8 @@ from calib.view.shown.moves import Move
 from chains.escape import html as escape
 
 SHOWN_CANDIDATES = 6  # candidates in the table; the menu has all
-LARGE = ((1e6, " million"), (1.0, ""))
-DIGITS = {"m": 3, "mm": 2, "deg": 1, "°C": 2, "s": 1, "of the median": 3}  # that are told
+LARGE_NUMBERS = ((1e6, " million"), (1.0, ""))
+SHOWN_DIGITS = {"m": 3, "mm": 2, "deg": 1, "°C": 2, "s": 1, "of the median": 3}  # that are told
 BAR = "#7fb2d9"
 STRIPED = f"repeating-linear-gradient(45deg,{BAR} 0 6px,#dcebf6 6px 10px)"  # of a rung by a formula
 _FRAME = "padding:0 1.2em .4em .75em;font-size:12px;line-height:1.4"
@@ -141,7 +141,7 @@ def point(points: Points, index: int, names: Mapping[str, Mapping[int, str]]) ->
         if name in names:
             return names[name].get(int(value), f"{shown.title} {int(value)}")
         value = float(value) * shown.scale
-        digits = DIGITS.get(shown.unit, 4)
+        digits = SHOWN_DIGITS.get(shown.unit, 4)
         text = f"{value:.{digits}f}" if shown.unit else f"{value:.6g}"
         return f"{text} {shown.unit}".strip()
 
@@ -244,7 +244,7 @@ def by_chance(p: float | None) -> str:
     if p <= LEAST_P:
         return "1 in over a million"
     odds = float(f"{1 / p:.1g}")
-    size, word = next(each for each in LARGE if odds >= each[0])
+    size, word = next(each for each in LARGE_NUMBERS if odds >= each[0])
     return f"1 in {odds / size:,.0f}{word}"
 
 

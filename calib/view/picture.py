@@ -14,20 +14,21 @@ from calib.view import panels
 from calib.view.scene import Points, Scene
 from calib.view.shown import brush, colours, look, plot
 from calib.view.shown.columns import LOCATION, comparable, gathered, kept, location_names
-from calib.view.shown.moves import SURE, TIMES
+from calib.view.shown.moves import SURE, TIMES_AS_LONG
 from calib.view.shown.taken import beams_csv
-from calib.view.stage import AXES, MOVES, NARROW_PX, PLOT_PX, RIG, ROOM, Stage
+from calib.view.stage import AXES_PATH, MOVES_PATH, NARROW_PX, PLOT_PX, RIG_PATH, ROOM_PATH, Drawing
 from chains.errors import InputError
 
-NOTHING = "—"
-THIS, HERE, ALL = "this stop", "its location", "all stops"
+NO_VALUE = "—"
+THIS, HERE, ALL_STOPS = "this stop", "its location", "all stops"
 CLICK = "Click a point to read it. Keys: N next stop, P previous stop."
 ONLY = "A formula, e.g. (range > 3) * (abs(residual) > 0.002); metres, radians. * is and"
 PLOT_HEIGHT_PX = 300
-FREE = "free"
-MOVES_LABEL = f"Moves x {TIMES}"
+FREE_SCALES = "free"
+MOVES_LABEL = f"Moves x {TIMES_AS_LONG}"
 MOVES_HINT = (
-    f"How far each link stands from CAD, {TIMES} times as long; grey: less than {SURE:.0f} sigmas"
+    f"How far each link stands from CAD, {TIMES_AS_LONG} times as long; "
+    f"grey: less than {SURE:.0f} sigmas"
 )
 
 
@@ -48,7 +49,7 @@ class Picture:
         guarded: Callable[..., Callable[..., None]],
         asks: Mapping[str, str],
     ) -> None:
-        self.stage = Stage(client, window_px, look.numbers(asks.get("camera", ""), 6))
+        self.stage = Drawing(client, window_px, look.numbers(asks.get("camera", ""), 6))
         self._client, self._guarded, self._asks = client, guarded, dict(asks)
         self._columns: dict[str, str] = {}  # heading -> column
         self._others: dict[str, Run] = {}
@@ -90,7 +91,7 @@ class Picture:
         panel = gui.add_panel()
         with panel.add_tab("Beams"):
             stops = self._asks.get("stops")
-            menu = (THIS, HERE, ALL)
+            menu = (THIS, HERE, ALL_STOPS)
             self._stops = gui.add_dropdown(
                 "Beams of", menu, initial_value=stops if stops in menu else THIS
             )
@@ -99,13 +100,13 @@ class Picture:
             self._only = gui.add_text("Only where", self._asks.get("only", ""), hint=ONLY)
             self._only.on_update(self._guarded(self._on_only))
             self._wrong = gui.add_html("", visible=False)
-            locked = self._asks.get("scales") != FREE
+            locked = self._asks.get("scales") != FREE_SCALES
             self._lock = gui.add_checkbox("Keep scales", locked, hint="Off: as the beams are")
             self._lock.on_update(self._guarded(self._on_lock))
             self._up = self._menu("Plot", self._draw_plot)
             self._over = self._menu("Over", self._on_over)
             lit = self._asks.get("lit", "")
-            self._light = gui.add_text(brush.LABEL, lit, hint=brush.HINT)
+            self._light = gui.add_text(brush.LABEL, lit, hint=brush.BRUSH_HINT)
             self._light.on_update(self._guarded(self._paint))
             self._plot = gui.add_uplot(
                 *plot.EMPTY,
@@ -123,7 +124,7 @@ class Picture:
             panel.minimize()
 
     def _menu(self, label: str, use: Callable[[], None]) -> Any:
-        menu = self._client.gui.add_dropdown(label, [NOTHING])
+        menu = self._client.gui.add_dropdown(label, [NO_VALUE])
         menu.on_update(self._guarded(use))
         return menu
 
@@ -140,7 +141,7 @@ class Picture:
             "stops": "" if self._stops.value == THIS else self._stops.value,
             "other": self._other.value if self._other.visible else "",
             "colour": column(self._colour.value, ""),
-            "scales": look.write_scales(self._scales) if self._lock.value else FREE,
+            "scales": look.write_scales(self._scales) if self._lock.value else FREE_SCALES,
             "only": self._only.value,
             "up": column(self._up.value, ""),
             "over": column(self._over.value, ""),
@@ -166,8 +167,8 @@ class Picture:
         self._others = {n: run for n, run in others.items() if comparable(scene.run, run)}
         self._known = ()
         self._other.visible = bool(self._others)
-        self._other.value = below if below in self._others else NOTHING
-        self._fill(self._other, [NOTHING, *self._others], "other")
+        self._other.value = below if below in self._others else NO_VALUE
+        self._fill(self._other, [NO_VALUE, *self._others], "other")
         self.stage.scene = scene
         self._on_recording()
         asked = {"recording": "recording", "stop": "stop", "other": "other run"}
@@ -194,7 +195,7 @@ class Picture:
         self.stage.clear()
         self._below.visible = False
         for menu in (self.recording, self.stop, self._colour, self._up, self._over):
-            self._fill(menu, [NOTHING])
+            self._fill(menu, [NO_VALUE])
         for html in (self._legend, self._scan, self._point, self._told):
             html.content = ""
         self._plot.visible = False
@@ -250,7 +251,7 @@ class Picture:
         if self._stops.value == THIS:
             return [self.stop.value]
         stops, recording = self.stage.scene.stops(self._at), self._source.recording
-        if self._stops.value == ALL:
+        if self._stops.value == ALL_STOPS:
             return stops
         place = dict(zip(recording.stops, recording.location, strict=True))
         return [name for name in stops if place[name] == place[self.stop.value]]
@@ -258,7 +259,7 @@ class Picture:
     def _offer_columns(self, points: Points) -> None:
         offered = colours.choices(points)
         self._columns = {colours.column(n).heading: n for n in offered}
-        numbers = [h for h, n in self._columns.items() if n not in colours.NAMES]
+        numbers = [h for h, n in self._columns.items() if n not in colours.NAME_COLUMNS]
         for menu, key, options, default in (
             (self._colour, "colour", list(self._columns), None),
             (self._up, "up", numbers, None),
@@ -266,7 +267,7 @@ class Picture:
         ):
             asked = self._asks.pop(key, None)
             first = colours.column(asked).heading if asked in offered else default
-            if menu.value in (NOTHING, None) or asked:
+            if menu.value in (NO_VALUE, None) or asked:
                 menu.options, menu.value = options, first if first in options else options[0]
             self._fill(menu, options)
 
@@ -298,7 +299,7 @@ class Picture:
         if points is None:
             return
         name = self._columns[self._colour.value]
-        ends = None if name in colours.NAMES else self._ends(name)
+        ends = None if name in colours.NAME_COLUMNS else self._ends(name)
         colour, scale = colours.coloured(points, name, self._names(name), ends)
         lit = self._lit
         if lit is not None:
@@ -353,17 +354,19 @@ class Picture:
         self._scan.content = panels.scan(points, drawn, stop, of_stop(found))
 
     def _on_what(self) -> None:
-        self.stage.toggle({"room": ROOM, "rig": RIG, "frames": AXES}[self._what.value])
+        self.stage.toggle(
+            {"room": ROOM_PATH, "rig": RIG_PATH, "frames": AXES_PATH}[self._what.value]
+        )
 
     def _on_moves(self) -> None:
-        if self._moves.value == (MOVES in self.stage.hidden):
-            self.stage.toggle(MOVES)
+        if self._moves.value == (MOVES_PATH in self.stage.hidden):
+            self.stage.toggle(MOVES_PATH)
         self._moved.visible = self._moves.value
 
     def _on_point(self, event: Any) -> None:
         index = self.stage.pick(np.array(event.ray_origin), np.array(event.ray_direction))
         if index is not None:
-            names = {name: self._names(name) for name in colours.NAMES}
+            names = {name: self._names(name) for name in colours.NAME_COLUMNS}
             self._point.content = panels.point(self.stage.points, index, names)
             self._clicked = index
             self._draw_plot()

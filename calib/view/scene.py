@@ -24,8 +24,8 @@ from chains import se3
 from chains.errors import InputError
 from sensors.recording import read_table
 
-MOST_POINTS = 150_000  # more than a screen can tell apart
-MOST_TRIANGLES = 300_000
+MOST_SHOWN_POINTS = 150_000  # more than a screen can tell apart
+MOST_TRIANGLES = 300_000  # of a room, and of a whole arm
 CLICK_REACH = 0.01  # of its distance from the eye: what a click may miss a point by
 _NEEDED = ("ring", "column", "range_m", "incidence_rad", "azimuth_rad", "elevation_rad")
 _NEEDED += ("residual_m", "sigma_m", "weight")
@@ -53,7 +53,10 @@ class Points:
         return self.columns["weight"] > 0
 
     def drawn(
-        self, below_m: float = np.inf, most: int = MOST_POINTS, among: np.ndarray | bool = True
+        self,
+        below_m: float = np.inf,
+        most: int = MOST_SHOWN_POINTS,
+        among: np.ndarray | bool = True,
     ) -> np.ndarray:
         """Indices (n,) of those to draw: lower than `below_m`, every so many of them.
 

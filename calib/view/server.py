@@ -22,7 +22,7 @@ from calib.view.keys import Keys, Visit
 from chains.errors import InputError
 
 HOST = "127.0.0.1"  # this machine alone
-PATIENCE_S = 10.0
+ANSWER_WITHIN_S = 10.0  # a choice: a server of the same machine answers at once, or is none
 REFUSED = "Open the workbench by the whole address that `rigcal view` printed: it holds a key.\n"
 # viser's page is one file, whose scripts and styles lie in it and are unpacked there. It may talk
 # to this server and to nobody else.
@@ -188,7 +188,7 @@ def _restrict(headers: Any, host: str) -> None:
 
 def _refuses(port: int) -> bool:
     """Whether a request without a key is refused."""
-    connection = http.client.HTTPConnection(HOST, port, timeout=PATIENCE_S)
+    connection = http.client.HTTPConnection(HOST, port, timeout=ANSWER_WITHIN_S)
     try:
         connection.request("GET", "/")
         return connection.getresponse().status == http.HTTPStatus.FORBIDDEN

@@ -9,12 +9,12 @@ import numpy as np
 
 from calib.view import scene as scenes
 from calib.view.scene import Points, Scene
-from calib.view.shown.moves import TIMES, Move, moves
+from calib.view.shown.moves import TIMES_AS_LONG, Move, moves
 from calib.view.shown.shapes import Shape, arm_shapes
 from chains import se3
 
-ROOM, RIG, AXES, MOVES = "/room", "/rig", "/axes", "/moves"
-POINTS, LIT, PICKED = "/points", "/lit", "/picked"
+ROOM_PATH, RIG_PATH, AXES_PATH, MOVES_PATH = "/room", "/rig", "/axes", "/moves"
+POINTS_PATH, LIT_PATH, PICKED_PATH = "/points", "/lit", "/picked"
 ARM_COLOUR, MOUNT_COLOUR, ROOM_COLOUR = (60, 70, 85), (150, 155, 165), (236, 236, 232)
 SHAPE_COLOUR = (196, 201, 208)
 SURE_COLOUR, UNSURE_COLOUR = (200, 30, 120), (150, 155, 165)  # of moves from CAD
@@ -30,7 +30,7 @@ NARROW_PX = 1200  # of a window with hardly room for a picture between two panel
 FOV_RAD = np.radians(50.0)
 
 
-class Stage:
+class Drawing:
     """What one browser draws, about the room's middle, as browsers have single precision.
 
     Args:
@@ -52,13 +52,21 @@ class Stage:
         self._shapes: Sequence[Shape] = ()
         self._room: tuple[str, str] | None = None
         self._around: np.ndarray | None = None
-        self.hidden = {MOVES}
+        self.hidden = {MOVES_PATH}
         client.scene.configure_default_lights(cast_shadow=False)
 
     def clear(self) -> None:
         """Draw nothing."""
         self.scene, self.points, self._room = None, None, None
-        for name in (ROOM, RIG, AXES, MOVES, POINTS, LIT, PICKED):
+        for name in (
+            ROOM_PATH,
+            RIG_PATH,
+            AXES_PATH,
+            MOVES_PATH,
+            POINTS_PATH,
+            LIT_PATH,
+            PICKED_PATH,
+        ):
             self.client.scene.remove_by_name(name)
 
     def open(self, scene: Scene, recording: int) -> None:
@@ -78,23 +86,23 @@ class Stage:
             # Half of every point would be inside the wall that it lies on.
             vertices = scenes.sunk(*room, BEHIND_M) - self._middle_m
             self.client.scene.add_mesh_simple(
-                ROOM,
+                ROOM_PATH,
                 vertices,
                 room[1],
                 color=ROOM_COLOUR,
                 side="front",
                 flat_shading=True,
-                visible=ROOM not in self.hidden,
+                visible=ROOM_PATH not in self.hidden,
             )
 
     def _open_shapes(self, recording: int) -> None:
         """Send the meshes of the arm's links, which `_draw_rig` puts in their places."""
         self._shapes, self.lines_why = arm_shapes(self.scene.sources[recording].rig)
         scene = self.client.scene
-        scene.add_frame(RIG, show_axes=False, visible=RIG not in self.hidden)
+        scene.add_frame(RIG_PATH, show_axes=False, visible=RIG_PATH not in self.hidden)
         for i, shape in enumerate(self._shapes):
             scene.add_mesh_simple(
-                f"{RIG}/shape{i}",
+                f"{RIG_PATH}/shape{i}",
                 shape.vertices_m.astype(np.float32),
                 shape.triangles,
                 color=SHAPE_COLOUR,
@@ -104,13 +112,13 @@ class Stage:
 
     def show(self, recording: int, stop: str, points: Points | None) -> None:
         """Draw the rig at a stop, and take these points, which `paint` draws."""
-        self.client.scene.remove_by_name(PICKED)
+        self.client.scene.remove_by_name(PICKED_PATH)
         self._draw_rig(recording, stop)
         self.moves = moves(self.scene, recording, stop)
         self._draw_moves()
         self.points = points
         if points is None:
-            for name in (POINTS, LIT):
+            for name in (POINTS_PATH, LIT_PATH):
                 self.client.scene.remove_by_name(name)
         if self._around is None:
             self._around = self._extent(recording, stop) - self._middle_m
@@ -137,8 +145,8 @@ class Stage:
         span = float(np.linalg.norm(np.subtract(*scenes.box(points.xyz_m))))
         size = float(np.clip(span / 2 / np.sqrt(len(self.shown) + 1), FINEST_M, span * COARSEST))
         large = np.zeros(len(self.shown), bool) if lit is None else lit[self.shown]
-        self._draw_points(POINTS, self.shown[~large], colours, size)
-        self._draw_points(LIT, self.shown[large], colours, size * LARGER)
+        self._draw_points(POINTS_PATH, self.shown[~large], colours, size)
+        self._draw_points(LIT_PATH, self.shown[large], colours, size * LARGER)
         return len(self.shown)
 
     def _draw_points(self, name: str, some: np.ndarray, colours: np.ndarray, size_m: float) -> None:
@@ -161,12 +169,12 @@ class Stage:
             return None
         index = self.points.picked(self.shown, origin_m + self._middle_m, direction)
         if index is None:
-            self.client.scene.remove_by_name(PICKED)
+            self.client.scene.remove_by_name(PICKED_PATH)
         else:
             at = self.points.xyz_m[index] - self._middle_m
             distance = np.linalg.norm(at - origin_m)
             self.client.scene.add_icosphere(
-                PICKED, radius=0.006 * distance, color=(0, 0, 0), position=at
+                PICKED_PATH, radius=0.006 * distance, color=(0, 0, 0), position=at
             )
         return index
 
@@ -180,10 +188,10 @@ class Stage:
 
     def _draw_rig(self, recording: int, stop: str) -> None:
         scene = self.client.scene
-        scene.remove_by_name(AXES)
+        scene.remove_by_name(AXES_PATH)
         for i, shape in enumerate(self._shapes):
             T = self.scene.place(recording, stop, shape.link)
-            node = scene.get_handle_by_name(f"{RIG}/shape{i}")
+            node = scene.get_handle_by_name(f"{RIG_PATH}/shape{i}")
             node.wxyz, node.position = se3.to_quat_wxyz(T), T[:3, 3] - self._middle_m
         shaped = {shape.link for shape in self._shapes}
         links, arm = self.scene.links(recording, stop, shaped)
@@ -193,33 +201,33 @@ class Stage:
         ):
             if part.any():
                 ends = links[part] - self._middle_m
-                scene.add_line_segments(f"{RIG}/{name}", ends, colour, thickness=thick)
+                scene.add_line_segments(f"{RIG_PATH}/{name}", ends, colour, thickness=thick)
         for i, end in enumerate(links[arm].reshape(-1, 3)[1::2] - self._middle_m):
-            scene.add_icosphere(f"{RIG}/joint{i}", THICK_M * 0.75, ARM_COLOUR, position=end)
-        scene.add_frame(AXES, show_axes=False, visible=AXES not in self.hidden)
+            scene.add_icosphere(f"{RIG_PATH}/joint{i}", THICK_M * 0.75, ARM_COLOUR, position=end)
+        scene.add_frame(AXES_PATH, show_axes=False, visible=AXES_PATH not in self.hidden)
         for name, T in self.scene.frames(recording, stop).items():
             at = T[:3, 3] - self._middle_m
             scene.add_frame(
-                f"{AXES}/{name}",
+                f"{AXES_PATH}/{name}",
                 axes_length=0.12,
                 axes_radius=0.006,
                 wxyz=se3.to_quat_wxyz(T),
                 position=at,
             )
             scene.add_label(
-                f"{AXES}/{name}/name", name, font_size_mode="scene", font_scene_height=LETTER_M
+                f"{AXES_PATH}/{name}/name", name, font_size_mode="scene", font_scene_height=LETTER_M
             )
 
     def _draw_moves(self) -> None:
         """An arrow for each link, those that are hardly chance in their colour."""
         scene = self.client.scene
-        scene.remove_by_name(MOVES)
-        scene.add_frame(MOVES, show_axes=False, visible=MOVES not in self.hidden)
+        scene.remove_by_name(MOVES_PATH)
+        scene.add_frame(MOVES_PATH, show_axes=False, visible=MOVES_PATH not in self.hidden)
         for i, move in enumerate(self.moves):
             arrow = move.arrow_m - self._middle_m
-            head = min(HEAD_M, TIMES * move.length_m / 2)
+            head = min(HEAD_M, TIMES_AS_LONG * move.length_m / 2)
             scene.add_arrows(
-                f"{MOVES}/{i}",
+                f"{MOVES_PATH}/{i}",
                 arrow[None],
                 SURE_COLOUR if move.sure else UNSURE_COLOUR,
                 shaft_radius=head / 6,
@@ -228,7 +236,7 @@ class Stage:
             )
             if move.sure:  # others are short, and their names would hide each other
                 scene.add_label(
-                    f"{MOVES}/{i}/name",
+                    f"{MOVES_PATH}/{i}/name",
                     move.text,
                     position=arrow[1],
                     font_size_mode="scene",

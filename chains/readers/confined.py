@@ -17,12 +17,12 @@ from typing import Any
 from xml.dom import minidom
 
 from chains.errors import InputError
-from chains.readers.expressions import LONGEST, evaluate
+from chains.readers.expressions import LONGEST_VALUE, evaluate
 from chains.xml import parse_xml
 
 MOST_ELEMENTS = 20_000  # that are looked at: 3 s; writing out a Husky with its arm takes 700
-LARGEST = 10_000_000  # bytes of one file
-LARGEST_YAML = 1_000_000
+LARGEST_FILE = 10_000_000  # bytes of one file
+LARGEST_ROBOT_YAML = 1_000_000  # bytes, as a robot's own YAML is a few pages and slow to read
 _ALIAS = re.compile(r"(?m)(^|[\s\[{,:-])[&*][^\s\]},]")
 _WANTED = "a xacro file"
 
@@ -36,8 +36,10 @@ def read_document(path: Path) -> minidom.Document:
     try:
         if not path.is_file():
             raise InputError(f"{path} is no file; {_WANTED} is wanted")
-        if path.stat().st_size > LARGEST:
-            raise InputError(f"{path} has more than {LARGEST / 1e6:.0f} MB; no robot's file has")
+        if path.stat().st_size > LARGEST_FILE:
+            raise InputError(
+                f"{path} has more than {LARGEST_FILE / 1e6:.0f} MB; no robot's file has"
+            )
         text = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path} cannot be read ({error.strerror}); name a file") from None
@@ -104,7 +106,7 @@ class _Guard:
         """The data of a YAML file of the robot."""
         file = self.allowed(name)
         text = file.read_text(encoding="utf-8") if file.is_file() else ""
-        if len(text) > LARGEST_YAML or _ALIAS.search(text):
+        if len(text) > LARGEST_ROBOT_YAML or _ALIAS.search(text):
             raise ValueError(f"{name} is too large, or has aliases, which are not read here")
         return self.read_yaml(str(file))
 
@@ -130,8 +132,8 @@ def _short(function: Callable[..., Any]) -> Callable[..., Any]:
 
     def short(*arguments: Any) -> Any:
         value = function(*arguments)
-        if isinstance(value, str) and len(value) > LONGEST:
-            raise ValueError(f"a text has more than {LONGEST} characters")
+        if isinstance(value, str) and len(value) > LONGEST_VALUE:
+            raise ValueError(f"a text has more than {LONGEST_VALUE} characters")
         return value
 
     return short

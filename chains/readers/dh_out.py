@@ -77,29 +77,41 @@ def table_of(edges: Sequence[Edge], drawn: Sequence[Edge]) -> DhTable:
         here = se3.inverse(T) @ to
         point = here[:3, 3] if following.kind == "revolute" else np.zeros(3)
         step = _parallel(here[:3, 2], point) if level else _skew(here[:3, 2], point)
-        links.append(DhLink(joint.name, joint.kind, *step))
+        links.append(DhLink(joint=joint.name, kind=joint.kind, **step))
         T = T @ links[-1].matrix()
     return DhTable(axes[0], links, se3.inverse(T) @ T_tip)
 
 
-def _skew(z: Array, point: Array) -> tuple[float, float, float, float, float]:
+def _skew(z: Array, point: Array) -> dict[str, float]:
     """Return theta, d, a, alpha, beta of a row to an axis of this direction through this point, in
     the frame of the row's own axis: feet of their common normal."""
     x = np.array([-z[1], z[0], 0.0]) / np.hypot(z[0], z[1])  # z_i cross z
     theta, a = np.arctan2(x[1], x[0]), float(point @ x)
     # The foot on the next axis lies a x above (0, 0, d).
     along = (point - a * x) @ np.array([x[1], -x[0], 0.0]) / (z @ np.array([x[1], -x[0], 0.0]))
-    return theta, float(point[2] - along * z[2]), a, float(np.arctan2(np.hypot(*z[:2]), z[2])), 0.0
+    return {
+        "theta_rad": theta,
+        "d_m": float(point[2] - along * z[2]),
+        "a_m": a,
+        "alpha_rad": float(np.arctan2(np.hypot(*z[:2]), z[2])),
+        "beta_rad": 0.0,
+    }
 
 
-def _parallel(z: Array, point: Array) -> tuple[float, float, float, float, float]:
+def _parallel(z: Array, point: Array) -> dict[str, float]:
     """As `_skew`, to an axis that is nearly parallel: where it meets the plane of x and y."""
     foot = point - point[2] / z[2] * z
     theta, a = np.arctan2(foot[1], foot[0]), float(np.hypot(foot[0], foot[1]))
     if a < 1e-9:
         theta, a = 0.0, 0.0
     turned = se3.from_xyz_rpy([0, 0, 0], [0, 0, theta])[:3, :3].T @ z
-    return theta, 0.0, a, float(np.arctan2(-turned[1], turned[2])), float(np.arcsin(turned[0]))
+    return {
+        "theta_rad": theta,
+        "d_m": 0.0,
+        "a_m": a,
+        "alpha_rad": float(np.arctan2(-turned[1], turned[2])),
+        "beta_rad": float(np.arcsin(turned[0])),
+    }
 
 
 def _axes(edges: Sequence[Edge]) -> tuple[list[Array], Array]:

@@ -14,9 +14,9 @@ import re
 from collections.abc import Callable, Mapping
 from typing import Any
 
-LONGEST = 100_000  # characters or items of a value: more than a whole robot's file has
+LONGEST_VALUE = 100_000  # characters or items of a value: more than a whole robot's file has
 _BITS = 4096  # of a whole number
-_DEEPEST = 100
+_DEEPEST = 100  # a choice: people nest a few; Python's own limit of 1000 calls is far
 _METHODS = {
     str: {"split", "lower", "upper", "strip", "replace", "startswith", "endswith", "join"},
     dict: {"get", "keys", "values", "items"},
@@ -53,7 +53,7 @@ def evaluate(text: str, names: Mapping[str, Any], *_: object) -> Any:
         ValueError: it holds what is not calculated here, or its value is too large.
         NameError: it names what there is not.
     """
-    if len(text) > LONGEST:
+    if len(text) > LONGEST_VALUE:
         raise ValueError("an expression is too long")
     return _value(ast.parse(text.strip(), mode="eval").body, names, 0)
 
@@ -121,8 +121,8 @@ def _binary(op: ast.operator, left: Any, right: Any) -> Any:
     if isinstance(op, ast.Mult):
         sizes = [len(each) for each in (left, right) if isinstance(each, str | list | tuple)]
         times = [each for each in (left, right) if isinstance(each, int)]
-        if sizes and times and sizes[0] * times[0] > LONGEST:
-            raise ValueError(f"a value has more than {LONGEST} parts")
+        if sizes and times and sizes[0] * times[0] > LONGEST_VALUE:
+            raise ValueError(f"a value has more than {LONGEST_VALUE} parts")
     return _bounded(_BINARY[type(op)](left, right))
 
 
@@ -147,10 +147,13 @@ def _called(function: Any, arguments: list[Any]) -> Any:
         raise ValueError(f"{name or 'that'}() is not called here; write it out with xacro")
     if name in ("replace", "join", "split"):
         _bounded("".join(map(str, arguments)))
-    if name == "replace" and len(owner) * len(str(arguments[-1])) > LONGEST:
-        raise ValueError(f"a value has more than {LONGEST} parts")
-    if name == "join" and sum(map(len, arguments[0])) + len(owner) * len(arguments[0]) > LONGEST:
-        raise ValueError(f"a value has more than {LONGEST} parts")
+    if name == "replace" and len(owner) * len(str(arguments[-1])) > LONGEST_VALUE:
+        raise ValueError(f"a value has more than {LONGEST_VALUE} parts")
+    if (
+        name == "join"
+        and sum(map(len, arguments[0])) + len(owner) * len(arguments[0]) > LONGEST_VALUE
+    ):
+        raise ValueError(f"a value has more than {LONGEST_VALUE} parts")
     return _bounded(function(*arguments))
 
 
@@ -164,6 +167,6 @@ def _bounded(value: Any) -> Any:
     """The value, unless it is larger than any file of a robot needs."""
     if isinstance(value, int) and value.bit_length() > _BITS:
         raise ValueError(f"a whole number has more than {_BITS} bits")
-    if isinstance(value, str | list | tuple | dict | range) and len(value) > LONGEST:
-        raise ValueError(f"a value has more than {LONGEST} parts")
+    if isinstance(value, str | list | tuple | dict | range) and len(value) > LONGEST_VALUE:
+        raise ValueError(f"a value has more than {LONGEST_VALUE} parts")
     return value

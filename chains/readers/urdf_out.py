@@ -20,7 +20,7 @@ from chains.se3 import Array
 
 _TAG = re.compile(rb"""<[^\s/>]+(?:[^>"']|"[^"]*"|'[^']*')*>""")
 _ATTRIBUTE = re.compile(rb"""\s([^\s=]+)\s*=\s*("[^"]*"|'[^']*')""")
-_UNCHANGED = 1e-15
+_UNCHANGED = 1e-15  # m, and of a rotation's entries: a few roundings of double precision
 _Edit = tuple[int, int, bytes]  # start and end in the text, and what comes there
 
 

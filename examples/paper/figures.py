@@ -123,7 +123,7 @@ def _colours(points: Points) -> list[tuple[str, Columns, str]]:
 
 
 def _histograms(points: Points) -> Figure:
-    figure, ((left, right),) = plots.axes(plots.WIDE, 3.0, 1, 2)
+    figure, ((left, right),) = plots.axes(plots.WIDE_IN, 3.0, 1, 2)
     for sensor, table, colour in _colours(points):
         for ax, column, edges in (
             (left, "precision_m", np.arange(0, 25.25, 0.25)),
@@ -140,7 +140,7 @@ def _histograms(points: Points) -> Figure:
 
 
 def _incidence(points: Points) -> Figure:
-    figure, (axes,) = plots.axes(plots.WIDE, 2.9, 1, 3)
+    figure, (axes,) = plots.axes(plots.WIDE_IN, 2.9, 1, 3)
     for sensor, table, colour in _colours(points):
         x, y = by_incidence(table, "raw_signed_error_m", "median")
         axes[0].plot(x, 1e3 * y, color=colour, label=sensor)
@@ -154,7 +154,7 @@ def _incidence(points: Points) -> Figure:
 
 
 def _distance(points: Points) -> Figure:
-    figure, ((ax,),) = plots.axes(plots.HALF, 3.0)
+    figure, ((ax,),) = plots.axes(plots.HALF_IN, 3.0)
     for sensor, table, colour in _colours(points):
         x, y = by_distance(table)
         ax.plot(x, 1e3 * y, color=colour, label=sensor)
@@ -164,7 +164,7 @@ def _distance(points: Points) -> Figure:
 
 
 def _labels(points: Points, labels: Mapping[int, str]) -> Figure:
-    figure, ((upper,), (lower,)) = plots.axes(plots.WIDE, 5.0, 2, 1, sharex=True)
+    figure, ((upper,), (lower,)) = plots.axes(plots.WIDE_IN, 5.0, 2, 1, sharex=True)
     first = next(iter(points.values()))
     faro = {n: np.mean(first["reference_intensity"][first["label"] == n]) for n in labels}
     order = sorted((n for n in labels if np.isfinite(faro[n])), key=faro.get)
@@ -186,7 +186,7 @@ def _mean(values: np.ndarray, scale: float) -> float:
 
 
 def _rings(points: Points, rings: Mapping[str, Mapping[str, np.ndarray]]) -> Figure:
-    figure, (axes,) = plots.axes(plots.WIDE, 3.0, 1, len(points))
+    figure, (axes,) = plots.axes(plots.WIDE_IN, 3.0, 1, len(points))
     styles = ((plots.PALE, 2.5), (plots.AFTER, 1.0))
     for (sensor, table, _), ax in zip(_colours(points), axes, strict=True):
         for (who, offset_m), (colour, width) in zip(rings[sensor].items(), styles, strict=False):

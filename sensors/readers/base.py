@@ -21,8 +21,6 @@ Array = NDArray[np.float64]
 Columns = dict[str, np.ndarray]
 Progress = Callable[[str, int, int], None]
 
-POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
-
 
 @dataclass(frozen=True)
 class Track:
@@ -30,9 +28,9 @@ class Track:
 
     Args:
         name: the body, or where the log comes from: a topic or a file.
-        kind: "pose" has the columns of `POSE`, T_world_body in m and unit quaternions; "point"
-            has x y z in m; "joints" one per joint, rad or m; "gyro" x y z in rad/s; "covariate"
-            anything else.
+        kind: "pose" has the columns of `sensors.stops.POSE`, T_world_body in m and unit
+            quaternions; "point" has x y z in m; "joints" one per joint, rad or m; "gyro" x y z in
+            rad/s; "covariate" anything else.
         clock: what counted the seconds; tracks of one clock share its name.
         time_s: (N,) s, not falling.
         names: (C,) the columns.
@@ -79,7 +77,7 @@ class Sweeps:
 
 
 @dataclass(frozen=True)
-class Arm:
+class ArmDescription:
     """An arm: the text of a URDF, and the links between which it moves (None = not known)."""
 
     urdf: str
@@ -134,7 +132,7 @@ class Contents:
     sweeps: tuple[Sweeps, ...] = ()
     stops: Columns | None = None
     lidar: Mapping[str, Any] | None = None
-    arm: Arm | None = None
+    arm: ArmDescription | None = None
     surface: ScannedSurface | None = None
     spheres: Spheres | None = None
     understood: tuple[str, ...] = ()

@@ -25,7 +25,7 @@ from calib.runs.calibrate import calibrate
 from calib.runs.run import MODEL, RESIDUALS, Run
 from calib.simulation import Spec, simulate
 from sensors.documents import read_yaml, write_yaml
-from sensors.recording import Recording, read_table, write_table
+from sensors.recording import RecordedStops, read_table, write_table
 
 COLUMN_STEP = 64  # 16 columns of 128 rings: what is truly fitted
 SHAKEN = {"x": 1e-3, "y": 1e-3, "z": 1e-3, "residual_m": 5e-4, "azimuth_rad": 0.1, "range_m": 0.01}
@@ -56,7 +56,7 @@ def large_run(folder: Path, stops: int, rows: int) -> tuple[Path, Path]:
         grown(path, rows, rng)
     model, _ = read_yaml(run / MODEL)
     names = Run.open(run).recordings
-    model["recordings"][0]["sha256"] = Recording.open(names[0], (), ()).digest()
+    model["recordings"][0]["sha256"] = RecordedStops.open(names[0], (), ()).digest()
     write_yaml(run / MODEL, model)
     return recording, run
 

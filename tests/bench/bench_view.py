@@ -26,7 +26,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from calib.runs.run import Run
 from calib.view.scene import Scene
 from sensors.documents import read_yaml, write_yaml
-from sensors.recording import Recording, read_table, write_table
+from sensors.recording import RecordedStops, read_table, write_table
 from tests.browser import SOFTWARE_GL, browser_page
 from tests.calib.viewed import small_run
 
@@ -59,7 +59,7 @@ def tiled(folder: Path, stops: int, beams: int) -> Path:
         for old in by_name:
             (path / f"{old}.parquet").unlink()
     model = read_yaml(run.folder / "model.yaml")[0]
-    model["recordings"][0]["sha256"] = Recording.open(recording, (), ()).digest()
+    model["recordings"][0]["sha256"] = RecordedStops.open(recording, (), ()).digest()
     write_yaml(run.folder / "model.yaml", model)
     return run.folder
 

@@ -16,7 +16,7 @@ from scipy import stats
 from scipy.sparse import csr_array
 
 from calib.diagnosis.candidates import known_effects
-from calib.diagnosis.score import GAUGE, Scores, project, test
+from calib.diagnosis.score import GAUGE, Scores, project, score_test
 from calib.diagnosis.stand import Look, Stand
 from calib.effects import Effect
 
@@ -34,7 +34,7 @@ def answers(look: Look) -> dict[str, list[str]]:
     scores, stand = look.named.scores, look.stand
     known = known_effects(stand.model, stand.sources, look.columns)
     at = {e: np.r_[scores.at[e.name]] for e in known if e.name in scores.at}
-    at = {e: columns for e, columns in at.items() if test(scores, columns).dof}
+    at = {e: columns for e, columns in at.items() if score_test(scores, columns).dof}
     rows = sum(len(a.part) for a in stand.estimate.associations)
     naive = without_mesh_errors(stand, list(at))
     bare = {e: np.r_[naive.at[e.name]] for e in at}
@@ -74,7 +74,7 @@ def forward(scores: Scores, at: Columns, rows: int) -> list[str]:
         for effect, own in at.items():
             if effect.family in chosen:
                 continue
-            found = test(scores, np.concatenate([columns, own]))
+            found = score_test(scores, np.concatenate([columns, own]))
             net = found.statistic - before - len(own) * np.log(rows)
             if net > gain:
                 best, gain = effect, net
@@ -82,7 +82,7 @@ def forward(scores: Scores, at: Columns, rows: int) -> list[str]:
             break
         chosen.append(best.family)
         columns = np.concatenate([columns, at[best]])
-        before = test(scores, columns).statistic
+        before = score_test(scores, columns).statistic
     return chosen
 
 
@@ -90,7 +90,7 @@ def stop_clustered(scores: Scores, at: Columns) -> list[str]:
     """Wald's test with stops as the clusters, Bonferroni over all; most significant first."""
     found: dict[str, float] = {}
     for effect, columns in at.items():
-        whiten = test(scores, columns).whiten
+        whiten = score_test(scores, columns).whiten
         share = scores.by_stop[:, columns] @ whiten
         clusters = int((np.abs(share).max(axis=1) > 0).sum())
         q = whiten.shape[1]
@@ -115,7 +115,7 @@ def leave_location_out(scores: Scores, at: Columns, look: Look) -> list[str]:
     places = np.unique(location)
     gains: dict[str, float] = {}
     for effect, columns in at.items():
-        share = scores.by_stop[: len(scans), columns] @ test(scores, columns).whiten
+        share = scores.by_stop[: len(scans), columns] @ score_test(scores, columns).whiten
         by_place = np.stack([share[location == p].sum(axis=0) for p in places])
         n = len(places)
         theta = (by_place.sum(axis=0) - by_place) * n / (n - 1)

@@ -23,8 +23,8 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from calib import problem as problems
-from calib.diagnosis.score import project, test
-from calib.diagnosis.search import ALPHA, Search, search
+from calib.diagnosis.score import project, score_test
+from calib.diagnosis.search import ALPHA_EFFECT, Search, search
 from calib.diagnosis.stand import Stand
 from calib.diagnosis.suggest import hangs_on
 from calib.diagnosis.verdict import conclude
@@ -81,7 +81,7 @@ def _at_the_limit(case: Case, folder: Path) -> tuple[Source, dict[str, Any], Hid
     look = fitted(source, case).look(silent).named
     (name,) = case.hidden
     candidate = next(c for c in look.candidates if c.effect.family == name)
-    alpha = -np.expm1(np.log1p(-ALPHA) / candidate.looks)
+    alpha = -np.expm1(np.log1p(-ALPHA_EFFECT) / candidate.looks)
     size = candidate.test.smallest_detectable(look.common, alpha)
     sigma = [p.sigma for p in candidate.effect.params(source.rig) if p.sigma]
     return written(case, folder, {name: size / float(np.sqrt(np.mean(np.square(sigma))))})
@@ -175,7 +175,7 @@ def _estimate(found: Search, effect: Effect, truth: dict[str, Any]) -> dict[str,
     chosen = slice(start, start + len(theta))
     by_fit = np.sqrt(np.diag(stand.estimate.covariance)[chosen])
     scores = project(look.linear, [term.variable])
-    by_test = test(scores, np.arange(len(theta))).sigma(look.named.common)
+    by_test = score_test(scores, np.arange(len(theta))).sigma(look.named.common)
     told = by_fit < LEFT_SIGMA * variable.sigma
     off = (stand.estimate.values[term.variable] - theta)[told]
     return {"by_fit": (off / by_fit[told]).tolist(), "by_test": (off / by_test[told]).tolist()}

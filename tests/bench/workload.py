@@ -23,7 +23,7 @@ from calib.residuals.beams import Association
 from calib.simulation import Spec, room, simulate
 from calib.solve.fit import preview
 from calib.solve.graph import Graph, KeptRows
-from sensors.recording import Recording, Scan
+from sensors.recording import RecordedStops, Scan
 from sensors.reference import Reference
 
 Values = dict[str, np.ndarray]
@@ -33,7 +33,7 @@ CELL_M = 0.106  # of the mesh: 50,000 triangles
 
 
 @dataclass(frozen=True)
-class Held(Recording):
+class Held(RecordedStops):
     """A recording whose scans stay in memory."""
 
     scans: dict[int, Scan] = field(default_factory=dict)

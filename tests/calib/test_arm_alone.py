@@ -13,7 +13,7 @@ from calib.effects import CATALOGUE
 from calib.problem import build
 from calib.problem.model import Model, Source
 from calib.results.check import check
-from calib.results.holdout import BLOCKS, FOLDS, folds, pose_blocks, unit_of
+from calib.results.holdout import FOLDS, POSE_BLOCKS, folds, pose_blocks, unit_of
 from calib.results.intervals import intervals
 from calib.results.reach import Reach, joint_range, reach
 from calib.results.solution import solution_of
@@ -67,7 +67,7 @@ def test_folds_are_blocks_of_neighbours_all_over_the_workspace(source):
     many = bent(source, at)
     assert unit_of([many], "location") == "poses" and unit_of([many], "stop") == "stop"
     block = pose_blocks(many)
-    assert len(set(block)) == BLOCKS and np.array_equal(block, pose_blocks(many))
+    assert len(set(block)) == POSE_BLOCKS and np.array_equal(block, pose_blocks(many))
     left = [fold[0] for fold in folds([many], "location")]
     assert len(left) == FOLDS and np.array_equal(np.sum(left, axis=0), np.ones(300))
     for fold in left:

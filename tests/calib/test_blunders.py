@@ -312,7 +312,7 @@ def test_a_stated_sigma_counts_beside_a_few_groups(drawn, monkeypatch):
         limits[stated] = drawn.judged({}, monkeypatch)
     for group in frames:
         alone, both = (limits[stated][group] for stated in (0.0, 8.0))
-        taken = stats.chi2(both.shift.dof).isf(judged.ALPHA / both.looks)
+        taken = stats.chi2(both.shift.dof).isf(judged.ALPHA_BLUNDER / both.looks)
         assert taken < both.limit < 0.8 * alone.limit, "beyond chance, were the sigma known"
 
 

@@ -17,7 +17,7 @@ from calib.runs.run import Run
 from calib.show.diagnosis import print_diagnosis
 from calib.simulation import Spec, simulate
 from chains.errors import InputError
-from sensors.recording import Recording
+from sensors.recording import RecordedStops
 
 HIDDEN = "incidence_angle_bias"
 SMALL = Spec(
@@ -268,7 +268,7 @@ def test_a_column_of_ones_own_is_a_covariate_that_structure_may_hang_on(copied, 
     draughts = np.linspace(0, 1, len(rows))
     rows = [f"{row},{value}" for row, value in zip(rows, draughts, strict=True)]
     path.write_text("\n".join([f"{head},draught", *rows, ""]))
-    assert Recording.open(copied.recordings[0], (), (), 32).covariates
+    assert RecordedStops.open(copied.recordings[0], (), (), 32).covariates
     run = calibrate([copied.recordings[0]], tmp_path / "draughty")
     found = diagnose(run)
     assert found.verdict == "adequate"

@@ -10,8 +10,7 @@ from calib import effects
 from calib import problem as problems
 from calib.diagnosis.jackknife import Shares
 from calib.diagnosis.linear import rows_along
-from calib.diagnosis.score import away_from_model, project
-from calib.diagnosis.score import test as score_test
+from calib.diagnosis.score import away_from_model, project, score_test
 from calib.diagnosis.stand import Stand
 from calib.linear.layout import Layout
 from calib.linear.parallel import workers

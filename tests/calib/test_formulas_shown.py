@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from calib.diagnosis.formulas.picture import picture_of
-from calib.diagnosis.formulas.seen import Reach
+from calib.diagnosis.formulas.seen import ColumnRanges
 from calib.diagnosis.suggest import outward
 from calib.effects import load_effects
 from calib.evaluation.apply import apply
@@ -19,7 +19,7 @@ from calib.report import Evidence, plot, report
 from calib.report.charts.fit import ladder as ladder_chart
 from calib.report.charts.formulas import charts_of, pictures
 from calib.runs.calibrate import calibrate
-from calib.runs.explain import EXPLANATION, KEPT, explain
+from calib.runs.explain import EXPLANATION, KEPT_EFFECTS, explain
 from calib.runs.ladder import FORMULA, Rung, ladder
 from calib.runs.run import Run
 from calib.show.comparison import ladder_table
@@ -270,7 +270,7 @@ def effect(tmp_path, **seen):
 )
 def test_what_lies_beyond_is_told_and_a_bins_width_is_not(tmp_path, values, told):
     (drift,) = load_effects(str(effect(tmp_path, temperature=[20, 30])))
-    reach = Reach([drift])
+    reach = ColumnRanges([drift])
     for value in values:
         reach.look({"temperature_c": np.array([value]), "other": None})
     (sentence,) = reach.sentences() or [""]
@@ -280,7 +280,7 @@ def test_what_lies_beyond_is_told_and_a_bins_width_is_not(tmp_path, values, told
 
 def test_rows_that_do_not_count_are_not_looked_at(tmp_path):
     (drift,) = load_effects(str(effect(tmp_path, ring=[0, 10])))
-    reach, rings = Reach([drift]), np.array([0, 5, 99])
+    reach, rings = ColumnRanges([drift]), np.array([0, 5, 99])
     reach.look({"ring": lambda: rings}, rings < 50)
     assert reach.sentences() == []
     reach.look({"ring": lambda: rings}, rings > 50)
@@ -340,7 +340,7 @@ def test_explain_climbs_by_a_formula_and_keeps_it_for_others(tmp_path, rigcal):
     assert name == "empirical_incidence" and found.steps[-1]["added"] == [name]
     assert [rung.empirical for rung in ladder([found.runs[-1]])] == [[], [name]]
     (kept,) = found.kept
-    assert kept == tmp_path / "ladder" / KEPT / f"{name}.yaml"
+    assert kept == tmp_path / "ladder" / KEPT_EFFECTS / f"{name}.yaml"
     written = json.loads((tmp_path / "ladder" / EXPLANATION).read_text())
     assert written["kept"] == [str(kept)] and written["ladder"][-1]["empirical"] == [name]
     document = yaml.safe_load(kept.read_text())

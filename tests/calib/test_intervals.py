@@ -15,9 +15,9 @@ from scipy.linalg import sqrtm
 from calib import problem as problems
 from calib.linear.clusters import ClusteredRows, Gradients
 from calib.problem.model import Model, Source
-from calib.results.intervals import PARTS, Intervals, _Sums, intervals
+from calib.results.intervals import ROOM_PARTS, Intervals, _Sums, intervals
 from calib.simulation import Spec
-from calib.solve.clustered import Beams
+from calib.solve.clustered import BeamsAlong
 from calib.solve.fit import solve
 
 from ..worlds import World, write
@@ -30,7 +30,7 @@ SMALL = Spec(lidar="hesai_pandarxt32", locations=4, stops_per_location=3, column
 
 
 def rows(A, b, stop, part):
-    return ClusteredRows(A, b, np.arange(A.shape[1]), stop, part)
+    return ClusteredRows(A=A, b=b, columns=np.arange(A.shape[1]), stop=stop, place=part)
 
 
 def by_hand(moved, share, cluster):
@@ -255,14 +255,14 @@ def beams(estimate, count):
     """All beams of an estimate along so many directions drawn at random."""
     layout = estimate.linear.layout
     directions = np.random.default_rng(0).normal(size=(layout.size, count))
-    return Beams(
+    return BeamsAlong(
         problem=estimate.problem,
         layout=layout,
         values=estimate.values,
         associations=estimate.associations,
         directions=directions,
         places=Gradients(layout.size),
-        kinds=PARTS,
+        kinds=ROOM_PARTS,
     )
 
 

@@ -7,7 +7,7 @@ from calib import add, diagnose, fit
 from calib.diagnosis.search import Search
 from calib.diagnosis.stand import Stand
 from calib.diagnosis.verdict import conclude
-from calib.diagnosis.verdict.matters import FALL, SHIFT, Consequences, Matters
+from calib.diagnosis.verdict.matters import FALL_MATTERS, SHIFT_MATTERS, Consequences, Matters
 from calib.effects import find
 from calib.problem import build
 from calib.problem.model import Model, Source
@@ -63,10 +63,10 @@ def test_the_error_falls_by_what_is_explained(look):
 @pytest.mark.parametrize(
     ("fall_mm", "shift", "enough"),
     [
-        (-1.1 * FALL * 2.0, 0.0, True),
-        (-0.9 * FALL * 2.0, 0.0, False),
-        (0.0, 1.1 * SHIFT, True),
-        (+1.0, 0.9 * SHIFT, False),
+        (-1.1 * FALL_MATTERS * 2.0, 0.0, True),
+        (-0.9 * FALL_MATTERS * 2.0, 0.0, False),
+        (0.0, 1.1 * SHIFT_MATTERS, True),
+        (+1.0, 0.9 * SHIFT_MATTERS, False),
     ],
 )
 def test_either_of_them_is_enough(fall_mm, shift, enough):
@@ -79,7 +79,7 @@ def test_what_matters_stands_with_each_finding_and_a_trace_is_said_to_be_one(tmp
     simulate(SPEC, tmp_path / "rec", 4, {"azimuth_range_harmonic": 0.03})
     found = diagnose(fit([tmp_path / "rec"], tmp_path / "run"))
     (told,) = (c["matters"] for c in found.candidates if c["effect"] == "azimuth_range_harmonic")
-    assert -0.01 < told["held_out_mm"] < 0 < told["largest_shift_sigmas"] < SHIFT
+    assert -0.01 < told["held_out_mm"] < 0 < told["largest_shift_sigmas"] < SHIFT_MATTERS
     traces = [s for s in found.sentences if "too small to matter" in s]
     assert found.verdict == "adequate" and not found.worth_adding
     assert len(traces) == 1 and "none that matters" in found.sentences[0]

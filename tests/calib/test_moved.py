@@ -10,9 +10,9 @@ from scipy.stats import kstest
 
 from calib.problem.prior import JointPrior
 from calib.problem.unknowns import Key, Unknown
-from calib.results.recalibrate import Fitted, let_go
+from calib.results.recalibrate import RefittedPrior, let_go
 from calib.runs.asked.moved import _apart, _differences, moved
-from calib.runs.asked.pair import Known, Pair, unknowns_of
+from calib.runs.asked.pair import Covariances, Pair, unknowns_of
 from calib.runs.run import Run
 from calib.show.comparison import moved_document
 from chains.errors import InputError
@@ -52,8 +52,8 @@ def pair(first, second):
         held=unknowns(),
         then=values(first[0]),
         now=values(second[0]),
-        first=Known(*first[1:]),
-        second=Known(*second[1:]),
+        first=Covariances(*first[1:]),
+        second=Covariances(*second[1:]),
         is_frame=np.ones(SIZE, bool),
     )
 
@@ -99,7 +99,7 @@ def test_it_is_what_a_fit_from_the_first_finds(world, size):
     def from_the_rows(prior):
         weight = np.linalg.inv(prior.covariance)
         known = np.linalg.inv(weight + J.T @ J)
-        return Fitted(known @ (weight @ x + J.T @ y) - x, known, known)
+        return RefittedPrior(known @ (weight @ x + J.T @ y) - x, known, known)
 
     links = {
         link.name: link

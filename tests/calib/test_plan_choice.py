@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from calib.diagnosis.search import ALPHA
+from calib.diagnosis.search import ALPHA_EFFECT
 from calib.planning.criteria import (
     Apart,
     Variance,
@@ -81,7 +81,7 @@ def test_an_effect_of_the_smallest_size_is_found_four_times_of_five():
     size = smallest(information, information)
     rng = np.random.default_rng(0)
     z = np.sqrt(40.0) * size + rng.standard_normal(20_000)
-    found = stats.chi2.sf(z**2, 1) < ALPHA
+    found = stats.chi2.sf(z**2, 1) < ALPHA_EFFECT
     assert found.mean() == pytest.approx(0.8, abs=0.01)
     assert smallest(0 * information, information) == np.inf
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from calib.blunders.judged import judge
-from calib.blunders.reach import FAR, Reach, hardly_checked, reaches
+from calib.blunders.reach import PROMISED_SIGMAS, FurthestMoved, hardly_checked, reaches
 from calib.linear.clusters import Gradients
 from calib.residuals.groups import CAD, Group
 
@@ -65,7 +65,10 @@ def test_no_unseen_mishap_moves_an_estimate_further_and_one_goes_so_far(both):
 
 def test_what_could_go_unseen_is_said_of_measurements_not_of_paper():
     body, paper = Group("body", "s1", "base_markers"), Group("frame", CAD, "mount")
-    far, near = Reach("lidar.tx", FAR + 1.0), Reach("lidar.tx", FAR - 1.0)
+    far, near = (
+        FurthestMoved("lidar.tx", PROMISED_SIGMAS + 1.0),
+        FurthestMoved("lidar.tx", PROMISED_SIGMAS - 1.0),
+    )
     assert not hardly_checked({body: near, paper: far})
     (sentence,) = hardly_checked({body: far, paper: far})
     assert "s1: base_markers" in sentence and "lidar.tx by up to 4.0 of its sigmas" in sentence

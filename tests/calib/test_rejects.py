@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from calib.diagnosis.rejects import _p_values, _View, rejects
-from calib.diagnosis.rejects.counts import Axis
+from calib.diagnosis.rejects.counts import CellAxis
 from calib.runs.calibrate import calibrate
 from calib.runs.diagnose import diagnose, stand_of
 from calib.simulation import Spec, simulate
@@ -140,7 +140,7 @@ def test_p_values_hold_their_level_where_beams_of_one_place_err_together():
             (stop, n.sum(axis=1), n.sum(axis=(1, 2))),
             (place, n.sum(axis=0), n.sum(axis=(0, 2))),
         )
-        axis = Axis.of("ring", np.arange(bins))
+        axis = CellAxis.of("ring", np.arange(bins))
         view = _View(axis=axis, rows=n.sum(axis=(0, 1)), bin=at, cell=at, ways=ways)
         small.append(_p_values(view, np.ones(len(at), bool)))
     assert (np.array(small) < 0.05).mean() < 0.05

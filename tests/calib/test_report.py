@@ -14,7 +14,7 @@ from calib.report.page import LISTED_QUIET
 from calib.report.statistics import Z_EDGES
 from calib.runs.calibrate import calibrate, grow, grown_model
 from calib.runs.diagnose import diagnose
-from calib.runs.residual_table import UNSEEN
+from calib.runs.residual_table import UNSEEN_FOLDER
 from calib.runs.run import RESIDUALS, SUMMARY, Run
 from calib.simulation import Spec, simulate
 from chains.errors import InputError
@@ -261,7 +261,9 @@ def test_residuals_before_are_those_of_the_run_below_and_else_of_cad(first, grow
 
 
 def test_stops_held_out_are_those_of_the_summary_and_the_worst_is_first(grown):
-    tables = {p.stem: read_table(p) for p in (grown.run.folder / RESIDUALS / UNSEEN).iterdir()}
+    tables = {
+        p.stem: read_table(p) for p in (grown.run.folder / RESIDUALS / UNSEEN_FOLDER).iterdir()
+    }
     left_out = {name[:3] for name in tables}
     assert len(left_out) == 1 and len(tables) == 2  # one location of the three, whole
     kept = {n: t["residual_m"][t["weight"] > 0].astype(float) for n, t in tables.items()}

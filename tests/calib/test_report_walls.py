@@ -5,7 +5,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from calib.report.walls import CELL_M, Box, Ends, faces, repeats_m, yaw_of
+from calib.report.walls import WALL_CELL_M, Box, Ends, faces, repeats_m, yaw_of
 from sensors.reference import Reference
 
 CORNER_M = np.array([3.0, -2.0, 0.5])
@@ -59,7 +59,7 @@ def test_what_is_wrong_on_one_wall_is_seen_there_and_nowhere_else():
     ]
     wall = found.pop("wall at y = 4.0 m")
     assert wall.axes == ("x", "z") and wall.mean_m.shape == (13, 30)
-    middle = round(3.0 / CELL_M)
+    middle = round(3.0 / WALL_CELL_M)
     assert np.nanmean(wall.mean_m[:, middle + 1 :]) == pytest.approx(2e-3, abs=1e-4)
     assert np.nanmean(wall.mean_m[:, : middle - 1]) == pytest.approx(0.0, abs=1e-4)
     for other in found.values():

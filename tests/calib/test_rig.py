@@ -250,7 +250,7 @@ def test_an_older_recording_that_is_no_longer_read_names_the_version_that_does(
     tmp_path, monkeypatch
 ):
     now = Format(kind="recording", newest=3, former={1: "0.4.2"})
-    monkeypatch.setattr("calib.rig.description.FORMAT", now)
+    monkeypatch.setattr("calib.rig.description.RECORDING_FORMAT", now)
     with pytest.raises(
         InputError, match=r"is of format 1, which is read by rigcal 0\.4\.2 and ear"
     ):

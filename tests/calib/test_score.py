@@ -85,7 +85,7 @@ def scores(world):
 
 def trial(world, name):
     found = scores(world)
-    return score.test(found, np.r_[found.at[name]])
+    return score.score_test(found, np.r_[found.at[name]])
 
 
 def judged(world, name):
@@ -96,7 +96,8 @@ def judged(world, name):
     left = world.b - world.model @ np.linalg.lstsq(world.model, world.b, rcond=None)[0]
     along, every = away @ found.whiten, np.arange(found.dof)
     shares = Shares()
-    shares.add(ClusteredRows(along, left, every, world.stop, world.place))
+    at = {"stop": world.stop, "place": world.place}
+    shares.add(ClusteredRows(A=along, b=left, columns=every, **at))
     return found.judged(shares)
 
 
@@ -136,7 +137,7 @@ def null_p_values(count, **kind):
     for seed in range(count):
         found = scores(World(seed, **kind))
         for name in out:
-            t = score.test(found, np.r_[found.at[name]])
+            t = score.score_test(found, np.r_[found.at[name]])
             out[name].append(t.p_value())
     return {name: np.array(p) for name, p in out.items()}
 
@@ -169,7 +170,7 @@ def test_the_order_of_rows_and_candidates_does_not_matter():
     forward = score.project(linear, linear.candidates)
     backward = score.project(linear, linear.candidates[::-1])
     for name in ("one", "several", "rings"):
-        a, b = (score.test(s, np.r_[s.at[name]]) for s in (forward, backward))
+        a, b = (score.score_test(s, np.r_[s.at[name]]) for s in (forward, backward))
         np.testing.assert_allclose(a.statistic, b.statistic, rtol=1e-8)
         np.testing.assert_allclose(a.p_value(), b.p_value(), rtol=1e-6)
 

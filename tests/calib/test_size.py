@@ -11,7 +11,7 @@ import pytest
 from scipy import stats
 
 from calib.blunders.chance import LEAST_P, after_looks, at_least
-from calib.diagnosis.jackknife import UNKNOWN, Clusters, by_signs
+from calib.diagnosis.jackknife import UNKNOWN_VARIANCE, Clusters, by_signs
 
 BENCH = Path(__file__).parents[1] / "bench"
 DRAWS = 800
@@ -71,7 +71,7 @@ def test_one_stop_that_alone_shows_an_effect_proves_nothing():
     assert by_signs(lone, 3).p_value(49.9**2) > 0.1
     assert by_signs([lone[0], lone[1], lone[2]], 1).p_value(1e6) == 1.0
     holds = np.array([0.9995, 0.0003, 0.0002])[:, None, None]
-    assert Clusters.of(holds, 3).covariance(lone[0])[0, 0] > 0.99 * UNKNOWN
+    assert Clusters.of(holds, 3).covariance(lone[0])[0, 0] > 0.99 * UNKNOWN_VARIANCE
 
 
 def test_no_p_value_is_told_below_the_least_nor_adjusted_below_itself():

@@ -70,7 +70,9 @@ def test_dots_that_are_not_lit_are_faint_and_one_has_a_ring():
     assert series[1]["points"]["fill"] == plot.FAINT and series[2]["points"]["fill"] == "#5a5a5a"
     assert faint == {*points.columns["range_m"][rows][~lit[rows]]}
     assert bright == {*points.columns["range_m"][rows][lit[rows]]}
-    assert ring == {points.columns["range_m"][7]} and series[3]["points"]["stroke"] == plot.RING
+    assert (
+        ring == {points.columns["range_m"][7]} and series[3]["points"]["stroke"] == plot.RING_COLOUR
+    )
     _, series = plot.chart(points, rows, "residual_m", "range_m", rgb, lit=lit, marked=0)
     assert len(series) == 4  # the marked beam is not among those that are looked at
 

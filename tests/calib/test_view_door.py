@@ -263,12 +263,12 @@ class _Job:
         self._over = False
 
     def listen(self):
-        from calib.view.job import Told
+        from calib.view.job import JobMessage
 
-        yield Told("progress", "fit", 0.5)
+        yield JobMessage("progress", "fit", 0.5)
         while not self._over:
             time.sleep(0.02)
-        yield Told("stopped")
+        yield JobMessage("stopped")
 
     def stop(self) -> None:
         self._over = True
@@ -279,11 +279,11 @@ def test_a_run_that_one_browser_makes_is_offered_in_all(bench, monkeypatch, tmp_
 
     class Making(_Job):
         def listen(self):
-            from calib.view.job import Told
+            from calib.view.job import JobMessage
 
             shutil.copytree(tmp_path / "run", made)
-            yield Told("run", str(made))
-            yield Told("done")
+            yield JobMessage("run", str(made))
+            yield JobMessage("done")
 
     monkeypatch.setattr("calib.view.bench.Job", lambda *job: Making())
     served = serve(0)

@@ -9,7 +9,7 @@ from calib.rig import Rig, load_rig
 from calib.runs.run import Run
 from calib.view.scene import Scene
 from calib.view.shown.shapes import PACKAGE, arm_shapes
-from calib.view.stage import RIG
+from calib.view.stage import RIG_PATH
 from tests.calib.viewed import small_run
 from tests.calib.workbench import shown
 
@@ -132,8 +132,8 @@ def test_shapes_are_drawn_in_the_place_of_lines(run, rig, tmp_path, monkeypatch)
         stage, stop = page.picture.stage, scene.stops(0)[1]
         page.picture._step(1)
         for i, shape in enumerate(stage._shapes):
-            node = stage.client.scene.get_handle_by_name(f"{RIG}/shape{i}")
+            node = stage.client.scene.get_handle_by_name(f"{RIG_PATH}/shape{i}")
             at_m = scene.place(0, stop, shape.link)[:3, 3] - stage._middle_m
             np.testing.assert_allclose(node.position, at_m, atol=1e-6)
-        assert stage.client.scene.get_handle_by_name(f"{RIG}/arm") is None
+        assert stage.client.scene.get_handle_by_name(f"{RIG_PATH}/arm") is None
         assert watched.page.get_by_text("Drawn as lines").count() == 0

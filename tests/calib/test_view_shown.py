@@ -146,7 +146,7 @@ def test_a_plot_has_every_beam_once_in_its_colour_and_means_of_inliers():
         assert side.all() if about["points"]["fill"] == "#0000ff" else not side.any()
     inlier = rows[points.columns["weight"][rows] > 0]
     bins = np.minimum(
-        (points.columns["range_m"] - x[0]) / (x[-1] - x[0]) * plot.BINS, plot.BINS - 1
+        (points.columns["range_m"] - x[0]) / (x[-1] - x[0]) * plot.LINE_BINS, plot.LINE_BINS - 1
     ).astype(int)
     first = inlier[bins[inlier] == 0]
     assert mean[0] == pytest.approx(1e3 * points.columns["residual_m"][first].mean())

@@ -12,7 +12,7 @@ from calib.problem.model import Model, Source
 from calib.problem.unknowns import Role
 from calib.problem.without import leave_out
 from calib.report import report
-from calib.residuals.targets import PARTS
+from calib.residuals.targets import TARGET_PARTS
 from calib.runs.add import add
 from calib.runs.calibrate import calibrate, grow
 from calib.runs.diagnose import command_without
@@ -34,7 +34,7 @@ TOKENS = {  # token: which rows are gone (blocks, scans), zero, or free
     "t1:sphere": {"zero": ["target t1 sphere"]},
     "t1:upper": {"zero": ["target t1 upper"]},
     "t1:lower": {"zero": ["target t1 lower"]},
-    "t1:rod": {"gone": [f"target t1 {part}" for part in PARTS]},
+    "t1:rod": {"gone": [f"target t1 {part}" for part in TARGET_PARTS]},
     "s3:joints": {"free": ["joints@s3 turn", "joints@s3 lift", "joints@s3 slide"]},
     "s3:lift": {"free": ["joints@s3 lift"]},
     "cad:lidar": {"free": [f"lidar {dof}" for dof in ("rx", "ry", "rz", "tx", "ty", "tz")]},

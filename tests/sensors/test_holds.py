@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sensors.holds import average_hold
-from sensors.recording import Recording, write_table
+from sensors.recording import RecordedStops, write_table
 
 
 def average(hold):
@@ -71,7 +71,7 @@ def test_a_raw_hold_is_averaged_as_defined(tmp_path, monkeypatch, batch_rows):
     write_table(tmp_path / "scans/a.parquet", hold)
     (tmp_path / "stops.csv").write_text("stop,location,time_s\na,L0,0\n")
     monkeypatch.setattr("sensors.recording._BATCH_ROWS", batch_rows)
-    scan = Recording.open(tmp_path, [], []).scan(0)
+    scan = RecordedStops.open(tmp_path, [], []).scan(0)
     expected = averaged_plainly(hold)
     assert expected[:, -1].sum() > 50 and expected[:, -3].min() == 1
     assert (scan.ring.tolist(), scan.column.tolist()) == (

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from chains.errors import InputError
-from sensors.recording import Recording, read_table, write_table
+from sensors.recording import RecordedStops, read_table, write_table
 
 JOINTS = ("shoulder", "slide")
 HEADER = "stop,location,time_s,shoulder,slide,cart.x,cart.y,cart.z,cart.qw,cart.qx,cart.qy,cart.qz"
@@ -54,7 +54,7 @@ def write(tmp_path):
 
 def open_cart(folder, **changes):
     """Open a recording of the cart that the tests write."""
-    return Recording.open(
+    return RecordedStops.open(
         folder, **({"joint_names": JOINTS, "bodies": ["cart"], "rings": 4} | changes)
     )
 
@@ -85,7 +85,7 @@ def test_stops_are_read_as_written(write):
 
 
 def test_a_body_without_quaternion_is_a_point_and_an_arm_is_optional(write):
-    recording = Recording.open(
+    recording = RecordedStops.open(
         write("stop,location,time_s,nest.x,nest.y,nest.z", ["a,L,0,1,2,3", "b,L,1,,,"], None),
         [],
         ["nest"],
@@ -284,7 +284,7 @@ def test_recordings_by_an_independent_simulator_open_without_their_scans(shared,
     bodies = ["base_markers", "mount_markers"]
     folder = shared / "recordings/known_nothing_hidden"
     with patch("sensors.recording.read_table", side_effect=AssertionError("a scan was read")):
-        recording = Recording.open(folder, names, bodies, rings=128)
+        recording = RecordedStops.open(folder, names, bodies, rings=128)
     assert recording.joints.shape == (30, 6) and recording.has_scan.all()
     assert len(recording.targets.names) == 5 and list(recording.covariates) == [
         "temperature_c",
@@ -301,4 +301,4 @@ def test_recordings_by_an_independent_simulator_open_without_their_scans(shared,
             folder / part, tmp_path / part
         )
     shutil.rmtree(tmp_path / "scans")
-    assert not Recording.open(tmp_path, names, bodies).has_scan.any()
+    assert not RecordedStops.open(tmp_path, names, bodies).has_scan.any()

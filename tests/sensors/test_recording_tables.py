@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from chains.errors import InputError
-from sensors.recording import Recording, read_scan, write_table
+from sensors.recording import RecordedStops, read_scan, write_table
 
 STOPS = """stop,location,time_s,elbow,hand.x,hand.y,hand.z,hand.qw,hand.qx,hand.qy,hand.qz,\
 tip.x,tip.y,tip.z,temperature_c
@@ -24,7 +24,7 @@ def recording(tmp_path):
     columns |= {"ring": np.arange(5, dtype=np.uint16), "column": np.arange(5, dtype=np.uint16) * 3}
     columns |= {"intensity": np.linspace(0, 1, 5), "humidity": np.full(5, 0.4)}
     write_table(tmp_path / "scans" / "s1.parquet", columns)
-    return Recording.open(tmp_path, ["elbow"], ["hand", "tip"], rings=8)
+    return RecordedStops.open(tmp_path, ["elbow"], ["hand", "tip"], rings=8)
 
 
 def test_stops_are_a_data_frame_with_the_columns_of_their_file(recording):

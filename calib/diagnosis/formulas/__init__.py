@@ -8,9 +8,9 @@ import numpy as np
 
 from calib.blunders.chance import LEVELS
 from calib.diagnosis.formulas.arm import joint_tables
-from calib.diagnosis.formulas.found import JOINT, RANGE, Formula, settled
-from calib.diagnosis.formulas.pursuit import Step, pursue
-from calib.diagnosis.formulas.table import Projection, Table
+from calib.diagnosis.formulas.found import JOINT_SITE, RANGE_SITE, Formula, settled
+from calib.diagnosis.formulas.pursuit import ConfirmedTerm, pursue
+from calib.diagnosis.formulas.table import BeamTable, Projection
 from calib.diagnosis.stand import Stand
 from calib.solve.fit import Progress
 
@@ -26,11 +26,11 @@ def find(stand: Stand, progress: Progress) -> list[Formula]:
         progress: as of `fit.solve`.
     """
     if stand.estimate.scans:
-        table = Table.of(
+        table = BeamTable.of(
             stand.estimate, lambda done, total: progress("reading residuals", done, total)
         )
         steps = pursue(table, LEVELS["structure"], progress)
-        return settled(table, steps, RANGE) if steps else []
+        return settled(table, steps, RANGE_SITE) if steps else []
     tables = dict(joint_tables(stand))
     alpha = LEVELS["structure"] / max(len(tables), 1)
     first = {name: pursue(table, alpha, progress, most=1) for name, table in tables.items()}
@@ -39,10 +39,10 @@ def find(stand: Stand, progress: Progress) -> list[Formula]:
         return []
     joint = min(left, key=left.__getitem__)
     steps = pursue(tables[joint], alpha, progress, found=first[joint])
-    return settled(tables[joint], steps, JOINT + joint)
+    return settled(tables[joint], steps, JOINT_SITE + joint)
 
 
-def _left(table: Table, steps: Sequence[Step]) -> float:
+def _left(table: BeamTable, steps: Sequence[ConfirmedTerm]) -> float:
     """Chi-square of all that was measured, beside some terms."""
     columns = np.hstack([step.form.term.columns(table.covariates) for step in steps])
     return Projection.of(table, table.sigma_m**-2.0).fitted(columns)[0].chi2

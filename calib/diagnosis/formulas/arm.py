@@ -16,18 +16,19 @@ from scipy.sparse import csr_array, eye_array
 
 from calib.diagnosis.candidates import stops_view
 from calib.diagnosis.formulas.factors import covariates_of
-from calib.diagnosis.formulas.table import Table, rows_of_others
+from calib.diagnosis.formulas.table import BeamTable, rows_of_others
 from calib.diagnosis.linear import beside
 from calib.diagnosis.stand import Stand, variables_of
 from calib.effects.own.formula import FormulaEffect
 from calib.linear.clusters import Gradients
 from calib.linear.layout import Layout
 
-LARGEST = 3000  # unknowns: with more, as where every stop has some of its own, no table is made
-SEEN = 1e-6  # of the largest: a joint whose angle changes less at a pose is not seen there
+# Unknowns: with more, as where every stop has some of its own, no table is made.
+MOST_UNKNOWNS = 3000
+ANGLE_SEEN = 1e-6  # of the largest: a joint whose angle changes less at a pose is not seen there
 
 
-def joint_tables(stand: Stand) -> Iterator[tuple[str, Table]]:
+def joint_tables(stand: Stand) -> Iterator[tuple[str, BeamTable]]:
     """Each revolute joint that the trackers see, and its table in rad: `residual_m` is how much
     further it is turned than it says, `sigma_m` how well one pose tells."""
     rig = stand.sources[0].rig
@@ -38,7 +39,7 @@ def joint_tables(stand: Stand) -> Iterator[tuple[str, Table]]:
     )
     turned = variables_of(wide, {effect.name for _, effect in levers})
     layout = Layout.of(wide, unbounded=[*chain(*turned.values())])
-    if layout.size > LARGEST:
+    if layout.size > MOST_UNKNOWNS:
         return
     A, *of_rows = rows_of_others(wide, layout, values, Gradients(layout.size))
     A, covariates = A.toarray(), _covariates(stand, layout)
@@ -69,12 +70,12 @@ def _table(
     stop: np.ndarray,
     place: np.ndarray,
     covariates: dict[str, np.ndarray],
-) -> Table | None:
+) -> BeamTable | None:
     """The table of one joint, of whitened rows A (R, U), b (R,); `lever` (R,) is how they change as
     it turns."""
     a = np.where(stop >= 0, lever, 0.0)
     size = np.sqrt(np.bincount(np.maximum(stop, 0), np.square(a)))
-    seen = size > SEEN * size.max(initial=0.0)
+    seen = size > ANGLE_SEEN * size.max(initial=0.0)
     if not seen.any():
         return None
     at = np.flatnonzero(stop >= 0)
@@ -92,7 +93,7 @@ def _table(
     sign = np.where(a[first] < 0, 1.0, -1.0)
     scale = sign / size[stop[first]]
     rest = np.setdiff1d(np.arange(len(b)), first)
-    return Table(
+    return BeamTable(
         covariates={n: c[stop[first]] for n, c in covariates.items()},
         by_stop=frozenset(covariates),
         residual_m=full[first, -1] * scale,

@@ -19,17 +19,17 @@ from calib.effects.own.expression import Expression
 
 Columns = Mapping[str, np.ndarray]
 
-STEPS = 16  # places at which a step is tried first
+STEP_PLACES = 16  # places at which a step is tried first
 WINDOW = 12  # edges between which a window is tried first
 CENTRES, WIDTHS = 8, (0.06, 0.15)  # of bumps; of the covariate's range
 SCALES = (0.1, 0.25, 0.6)  # of exponentials, of the covariate's range
 PERIODS = tuple(np.geomspace(0.1, 1.5, 24))  # of waves, of the covariate's range
 WIDEST, NARROWEST = 3.0, 0.005  # scales and widths, of the covariate's range
-BLOCKS = (2.0, 4.0, 8.0, 16.0, 32.0)  # rings that a chip, or a bank of chips, has
+RING_BLOCKS = (2.0, 4.0, 8.0, 16.0, 32.0)  # rings that a chip, or a bank of chips, has
 A_PERIOD = 6  # values that a period must have, of those that can be told apart
-ORDERS = 12  # of harmonics of an angle
+HARMONICS = 12  # of harmonics of an angle
 FEWEST_VALUES = 3  # of a covariate that is not a class
-WIDE = 1.5  # largest over smallest value, from which powers differ from a line
+WIDE_ENOUGH = 1.5  # largest over smallest value, from which powers differ from a line
 LEAST_SHARE = 0.005  # of the beams that a class must have
 # Columns that name a part of the room, a beam or a stop, and so are no covariate; the rest of the
 # room is in range, incidence and label.
@@ -38,7 +38,7 @@ NOT_COVARIATES |= {"reference_intensity", "stop", "location", "tracked", "normal
 
 
 @dataclass(frozen=True)
-class Kind:
+class FactorKind:
     """A sort of factor.
 
     Args:
@@ -57,35 +57,37 @@ class Kind:
 
 
 # The 1 beside a line, a square and a logarithm lets the place of their zero be found.
-KINDS = {
-    "line": Kind(("({x} - {0}) / {1}", "1"), 1.0),
-    "proportional": Kind(("{x} / {0}",), 0.9),
-    "square": Kind(("(({x} - {0}) / {1})**2", "({x} - {0}) / {1}", "1"), 2.5),
-    "logarithm": Kind(("log({x} / {0})", "1"), 1.5),
-    "saturation": Kind(("log(1 + {x} / {0})",), 2.0, free=1, scales=(0,)),
-    "share": Kind(("{x} / ({x} + {0})",), 2.0, free=1, scales=(0,)),
-    "root": Kind(("sqrt({x} / {0})",), 1.5),
-    "power": Kind(("({x} / {0})**{1}",), 1.5),
-    "reciprocal": Kind(("{0} / {x}",), 1.5),
-    "decay": Kind(("exp(-({x} - {1}) / {0})",), 2.0, free=1, scales=(0,)),
-    "growth": Kind(("exp(({x} - {1}) / {0})",), 2.0, free=1, scales=(0,)),
-    "wave": Kind(("sin(2 * pi * {x} / {0})", "cos(2 * pi * {x} / {0})"), 2.5, free=1, scales=(0,)),
-    "harmonic": Kind(("sin({0} * {x})", "cos({0} * {x})"), 2.0),
-    "step": Kind(("{x} > {0}",), 2.0, free=1, edges=True),
-    "window": Kind(("({x} > {0}) * ({x} < {1})",), 2.5, free=2, edges=True),
-    "outside": Kind(("({x} < {0}) + ({x} > {1})",), 2.5, free=2, edges=True),
-    "ramp": Kind(("maximum(0, {x} - {0}) / {1}",), 2.0, free=1),
-    "ramp down": Kind(("maximum(0, {0} - {x}) / {1}",), 2.0, free=1),
-    "bump": Kind(("exp(-(({x} - {0}) / {1})**2)",), 2.5, free=2, scales=(1,)),
-    "over cosine": Kind(("1 / cos({x}) - 1",), 1.0),
-    "tangent": Kind(("tan({x})",), 1.0),
-    "tangent squared": Kind(("tan({x})**2",), 1.5),
-    "sine": Kind(("sin({x})",), 1.0),
-    "cosine": Kind(("cos({x})", "1"), 1.2),
-    "every other": Kind(("where(mod({x}, 2) > 0.5, 1, -1)",), 1.5),
-    "block": Kind(("where(mod(floor({x} / {0}), 2) > 0.5, 1, -1)",), 1.8),
-    "one of": Kind(("mod({x}, {0}) == {1}",), 2.0),
-    "class": Kind(("{x} == {0}",), 1.0),
+FACTOR_KINDS = {
+    "line": FactorKind(("({x} - {0}) / {1}", "1"), 1.0),
+    "proportional": FactorKind(("{x} / {0}",), 0.9),
+    "square": FactorKind(("(({x} - {0}) / {1})**2", "({x} - {0}) / {1}", "1"), 2.5),
+    "logarithm": FactorKind(("log({x} / {0})", "1"), 1.5),
+    "saturation": FactorKind(("log(1 + {x} / {0})",), 2.0, free=1, scales=(0,)),
+    "share": FactorKind(("{x} / ({x} + {0})",), 2.0, free=1, scales=(0,)),
+    "root": FactorKind(("sqrt({x} / {0})",), 1.5),
+    "power": FactorKind(("({x} / {0})**{1}",), 1.5),
+    "reciprocal": FactorKind(("{0} / {x}",), 1.5),
+    "decay": FactorKind(("exp(-({x} - {1}) / {0})",), 2.0, free=1, scales=(0,)),
+    "growth": FactorKind(("exp(({x} - {1}) / {0})",), 2.0, free=1, scales=(0,)),
+    "wave": FactorKind(
+        ("sin(2 * pi * {x} / {0})", "cos(2 * pi * {x} / {0})"), 2.5, free=1, scales=(0,)
+    ),
+    "harmonic": FactorKind(("sin({0} * {x})", "cos({0} * {x})"), 2.0),
+    "step": FactorKind(("{x} > {0}",), 2.0, free=1, edges=True),
+    "window": FactorKind(("({x} > {0}) * ({x} < {1})",), 2.5, free=2, edges=True),
+    "outside": FactorKind(("({x} < {0}) + ({x} > {1})",), 2.5, free=2, edges=True),
+    "ramp": FactorKind(("maximum(0, {x} - {0}) / {1}",), 2.0, free=1),
+    "ramp down": FactorKind(("maximum(0, {0} - {x}) / {1}",), 2.0, free=1),
+    "bump": FactorKind(("exp(-(({x} - {0}) / {1})**2)",), 2.5, free=2, scales=(1,)),
+    "over cosine": FactorKind(("1 / cos({x}) - 1",), 1.0),
+    "tangent": FactorKind(("tan({x})",), 1.0),
+    "tangent squared": FactorKind(("tan({x})**2",), 1.5),
+    "sine": FactorKind(("sin({x})",), 1.0),
+    "cosine": FactorKind(("cos({x})", "1"), 1.2),
+    "every other": FactorKind(("where(mod({x}, 2) > 0.5, 1, -1)",), 1.5),
+    "block": FactorKind(("where(mod(floor({x} / {0}), 2) > 0.5, 1, -1)",), 1.8),
+    "one of": FactorKind(("mod({x}, {0}) == {1}",), 2.0),
+    "class": FactorKind(("{x} == {0}",), 1.0),
 }
 
 
@@ -95,7 +97,7 @@ class Factor:
 
     Args:
         covariate: its name.
-        kind: of `KINDS`.
+        kind: of `FACTOR_KINDS`.
         constants: those that the kind's columns have.
     """
 
@@ -111,17 +113,19 @@ class Factor:
     def written(self, free: Sequence[str]) -> tuple[str, ...]:
         """The same with these in place of its first constants."""
         numbers = [*free, *(f"{c:.6g}" for c in self.constants[len(free) :])]
-        found = (text.format(*numbers, x=self.covariate) for text in KINDS[self.kind].columns)
+        found = (
+            text.format(*numbers, x=self.covariate) for text in FACTOR_KINDS[self.kind].columns
+        )
         return tuple(_plain(text, self.covariate) for text in found)
 
     @property
     def cost(self) -> float:
-        return KINDS[self.kind].cost
+        return FACTOR_KINDS[self.kind].cost
 
     @property
     def free(self) -> int:
         """How many constants, from the first, are to be found."""
-        return KINDS[self.kind].free
+        return FACTOR_KINDS[self.kind].free
 
     def bounds(self, values: np.ndarray) -> np.ndarray:
         """(free, 2) least and largest value of the constants to be found: a place is among the
@@ -129,7 +133,7 @@ class Factor:
         it could not be told from a line, nor so small that it is one value."""
         low, high = float(np.nanmin(values)), float(np.nanmax(values))
         scale = (high - low) * np.array([NARROWEST, WIDEST])
-        kinds = KINDS[self.kind]
+        kinds = FACTOR_KINDS[self.kind]
         found = [scale if i in kinds.scales else (low, high) for i in range(self.free)]
         return np.reshape(found, (self.free, 2))
 
@@ -138,7 +142,7 @@ class Factor:
         of other constants these themselves."""
         found = np.repeat(np.reshape(self.constants[: self.free], (-1, 1)), 2, axis=1)
         known = np.unique(values[np.isfinite(values)])
-        if not KINDS[self.kind].edges or len(known) < 2:
+        if not FACTOR_KINDS[self.kind].edges or len(known) < 2:
             return found
         after = np.clip(np.searchsorted(known, found[:, 0], side="right"), 1, len(known) - 1)
         return np.stack([known[after - 1], known[after]], axis=1)
@@ -182,7 +186,7 @@ def product_of(columns: Sequence[np.ndarray]) -> np.ndarray:
 @cache
 def _expressions(kind: str) -> tuple[Expression, ...]:
     """A kind's columns, of ``x`` and of constants ``c0``, ``c1``: parsed once."""
-    texts = (text.format("c0", "c1", x="x") for text in KINDS[kind].columns)
+    texts = (text.format("c0", "c1", x="x") for text in FACTOR_KINDS[kind].columns)
     return tuple(Expression(text, "a finding") for text in texts)
 
 
@@ -219,7 +223,7 @@ def factors(name: str, values: np.ndarray, levels: int, angle: bool = False) -> 
     out = [*_smooth(name, known, levels, angle), *_sharp(name, known, distinct, levels)]
     if name == "ring":
         out.append(Factor(name, "every other"))
-        out += [Factor(name, "block", (size,)) for size in BLOCKS]
+        out += [Factor(name, "block", (size,)) for size in RING_BLOCKS]
         out += [Factor(name, "one of", (4.0, float(k))) for k in range(4)]
     return out
 
@@ -230,13 +234,13 @@ def _smooth(name: str, known: np.ndarray, levels: int, angle: bool) -> Iterator[
     half = _rounded(wide / 2, wide / 2)
     yield Factor(name, "line", (middle, half))
     yield Factor(name, "square", (middle, half))
-    if low > 0.0 and high > WIDE * low:
+    if low > 0.0 and high > WIDE_ENOUGH * low:
         scale = _rounded(float(np.sqrt(low * high)), wide)
         yield Factor(name, "logarithm", (scale,))
         yield Factor(name, "root", (scale,))
         yield Factor(name, "reciprocal", (scale,))
         yield from (Factor(name, "power", (scale, p)) for p in (2.0, 3.0))
-    if low >= 0.0 and high > WIDE * low:
+    if low >= 0.0 and high > WIDE_ENOUGH * low:
         yield Factor(name, "proportional", (_rounded(high, wide),))
         sorts = ("saturation", "share")
         yield from (Factor(name, sort, (share * wide,)) for sort in sorts for share in SCALES)
@@ -249,7 +253,7 @@ def _smooth(name: str, known: np.ndarray, levels: int, angle: bool) -> Iterator[
     elif name == "elevation_rad":
         yield from (Factor(name, sort) for sort in ("tangent", "sine", "cosine"))
     if angle or name == "azimuth_rad":
-        orders = min(ORDERS, max(1, levels // A_PERIOD))
+        orders = min(HARMONICS, max(1, levels // A_PERIOD))
         yield from (Factor(name, "harmonic", (float(m),)) for m in range(1, orders + 1))
     else:
         slow = (share for share in PERIODS if share * levels > A_PERIOD)
@@ -259,8 +263,8 @@ def _smooth(name: str, known: np.ndarray, levels: int, angle: bool) -> Iterator[
 def _sharp(name: str, known: np.ndarray, distinct: np.ndarray, levels: int) -> Iterator[Factor]:
     low, high = float(known.min()), float(known.max())
     wide = high - low
-    places = np.unique(np.quantile(known, np.arange(1, STEPS + 1) / (STEPS + 1)))
-    if len(distinct) < 4 * STEPS:  # between values: where a step is among them cannot be told
+    places = np.unique(np.quantile(known, np.arange(1, STEP_PLACES + 1) / (STEP_PLACES + 1)))
+    if len(distinct) < 4 * STEP_PLACES:  # between values: where a step is among them cannot be told
         at = np.unique(np.clip(np.searchsorted(distinct, places), 1, len(distinct) - 1))
         places = (distinct[at] + distinct[at - 1]) / 2
     yield from (Factor(name, "step", (float(t),)) for t in places)

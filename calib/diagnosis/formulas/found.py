@@ -14,23 +14,23 @@ import numpy as np
 from calib.diagnosis.formulas.factors import columns_of
 from calib.diagnosis.formulas.needed import needed, reduced
 from calib.diagnosis.formulas.picture import picture_of
-from calib.diagnosis.formulas.pursuit import Form, Step
-from calib.diagnosis.formulas.table import Projection, Table
-from calib.diagnosis.formulas.terms import Term, refine, slopes, times
+from calib.diagnosis.formulas.pursuit import ConfirmedTerm, Form
+from calib.diagnosis.formulas.table import BeamTable, Projection
+from calib.diagnosis.formulas.terms import FormulaTerm, refine, slopes, times
 from calib.diagnosis.suggest import outward
 from calib.effects.own.formula import FormulaEffect
 
 WIDER = 3.0  # times the largest amplitude: the sigma that the prior of an amplitude has
-PASSES = 2  # of refining every term beside the others
+REFINING_PASSES = 2  # of refining every term beside the others
 PHASE = ("sin(", "cos(")
-RANGE, JOINT = "range", "joint:"  # sites; of the latter the joint's name follows
-UNITS = {"m": "mm", "rad": "mrad"}  # of amounts -> in which they are said
+RANGE_SITE, JOINT_SITE = "range", "joint:"  # sites; of the latter the joint's name follows
+AMOUNT_UNITS = {"m": "mm", "rad": "mrad"}  # of amounts -> in which they are said
 # The prior of an amount is no narrower: errors of ranges and of joints that a rig may have.
 LEAST_SIGMA = {"m": 0.01, "rad": 0.003}
 
 
 @dataclass(frozen=True)
-class Part:
+class FittedTerm:
     """One term of a formula, with what its columns are multiplied by.
 
     Args:
@@ -41,7 +41,7 @@ class Part:
         constants_sigma: (c,) of the term's constants.
     """
 
-    term: Term
+    term: FormulaTerm
     at: tuple[int, ...]
     amount: np.ndarray
     covariance: np.ndarray
@@ -91,12 +91,12 @@ class Formula:
         joints: which covariates are joints of the arm.
     """
 
-    parts: Sequence[Part]
-    steps: Sequence[Step]
+    parts: Sequence[FittedTerm]
+    steps: Sequence[ConfirmedTerm]
     rms_m: float
     seen: dict[str, tuple[float, float]]
     picture: dict[str, Any]
-    site: str = RANGE
+    site: str = RANGE_SITE
     joints: frozenset[str] = frozenset()
 
     @property
@@ -122,19 +122,23 @@ class Formula:
     @property
     def says(self) -> str:
         """The formula as people write it, each number with the sigma of its last digits."""
-        what = "range = true" if self.site == RANGE else f"{self.site.removeprefix(JOINT)} = read"
-        return " ".join([what, *(_said(part, UNITS[self.unit]) for part in self.parts)])
+        what = (
+            "range = true"
+            if self.site == RANGE_SITE
+            else f"{self.site.removeprefix(JOINT_SITE)} = read"
+        )
+        return " ".join([what, *(_said(part, AMOUNT_UNITS[self.unit]) for part in self.parts)])
 
     @property
     def unit(self) -> str:
         """Of its amounts."""
-        return "m" if self.site == RANGE else "rad"
+        return "m" if self.site == RANGE_SITE else "rad"
 
     def name(self, taken: Collection[str] = ()) -> str:
         """Of its effect; another where that is taken."""
-        joint = self.site.removeprefix(JOINT)
+        joint = self.site.removeprefix(JOINT_SITE)
         bare = (c.removesuffix("_rad").removesuffix("_m") for c in self.covariates if c != joint)
-        of = [] if self.site == RANGE else [re.sub(r"\W", "_", joint, flags=re.ASCII)]
+        of = [] if self.site == RANGE_SITE else [re.sub(r"\W", "_", joint, flags=re.ASCII)]
         name = "_".join(["empirical", *of, *(re.sub(r"\W", "_", c, flags=re.ASCII) for c in bare)])
         every = (name if i == 1 else f"{name}_{i}" for i in count(1))
         return next(each for each in every if each not in taken)
@@ -165,12 +169,14 @@ class Formula:
         return columns_of(self.texts, covariates) @ self.amount
 
 
-def settled(table: Table, steps: Sequence[Step], site: str = RANGE) -> list[Formula]:
+def settled(
+    table: BeamTable, steps: Sequence[ConfirmedTerm], site: str = RANGE_SITE
+) -> list[Formula]:
     """All terms fitted together, their constants refined; those over the same covariates are one
     formula of the site."""
     terms = [step.form.term for step in steps]
     kept = [list(range(len(term.texts))) for term in terms]
-    for _ in range(PASSES):
+    for _ in range(REFINING_PASSES):
         terms = _refined(table, terms, kept)
     columns = [t.columns(table.covariates) for t in terms]
     kept = needed(table.projection(np.hstack(columns)), terms, columns)
@@ -184,7 +190,9 @@ def settled(table: Table, steps: Sequence[Step], site: str = RANGE) -> list[Form
     return [replace(f, site=site) for f in _grouped(table, terms, kept, [steps[i] for i in there])]
 
 
-def _refined(table: Table, terms: Sequence[Term], kept: Sequence[Sequence[int]]) -> list[Term]:
+def _refined(
+    table: BeamTable, terms: Sequence[FormulaTerm], kept: Sequence[Sequence[int]]
+) -> list[FormulaTerm]:
     """Terms with the constants that are best for the columns kept of each, beside the others."""
     terms = list(terms)
     columns = [t.columns(table.covariates)[:, k] for t, k in zip(terms, kept, strict=True)]
@@ -197,13 +205,16 @@ def _refined(table: Table, terms: Sequence[Term], kept: Sequence[Sequence[int]])
     return terms
 
 
-def _centred(term: Term, table: Table) -> Term:
+def _centred(term: FormulaTerm, table: BeamTable) -> FormulaTerm:
     """A term with its edges midway between the values that they part."""
     return term.at(term.gaps(table.covariates).mean(axis=1).tolist())
 
 
 def _grouped(
-    table: Table, terms: Sequence[Term], kept: Sequence[Sequence[int]], steps: Sequence[Step]
+    table: BeamTable,
+    terms: Sequence[FormulaTerm],
+    kept: Sequence[Sequence[int]],
+    steps: Sequence[ConfirmedTerm],
 ) -> list[Formula]:
     """Formulas of terms, each with its numbers."""
     columns = [t.columns(table.covariates)[:, k] for t, k in zip(terms, kept, strict=True)]
@@ -225,7 +236,7 @@ def _grouped(
                 steps=[steps[i] for i in some],
                 rms_m=float(np.sqrt(model.weight @ np.square(left) / model.weight_m2)),
                 seen={n: _ends(table.covariates[n]) for n in names},
-                picture=picture_of(table, names, value, fit, UNITS[table.unit]),
+                picture=picture_of(table, names, value, fit, AMOUNT_UNITS[table.unit]),
                 joints=table.joints & set(names),
             )
         )
@@ -234,10 +245,10 @@ def _grouped(
 
 def _parts(
     model: Projection,
-    terms: Sequence[Term],
+    terms: Sequence[FormulaTerm],
     columns: Sequence[np.ndarray],
     kept: Sequence[Sequence[int]],
-) -> list[Part]:
+) -> list[FittedTerm]:
     """Terms with what their columns are multiplied by, and the sigmas of that and of their
     constants, all of them unknown together."""
     beside, amount = model.fitted(np.hstack(columns))
@@ -255,7 +266,7 @@ def _parts(
     gaps = [t.gaps(model.table.covariates) for t in terms]
     others = [np.hypot(o, np.ptp(g, axis=1) / 12**0.5) for o, g in zip(others, gaps, strict=True)]
     return [
-        Part(term=term, at=tuple(k), amount=a, covariance=c, constants_sigma=o)
+        FittedTerm(term=term, at=tuple(k), amount=a, covariance=c, constants_sigma=o)
         for term, k, a, c, o in zip(terms, kept, amounts, blocks, others, strict=True)
     ]
 
@@ -264,7 +275,7 @@ def _ends(values: np.ndarray) -> tuple[float, float]:
     return float(np.nanmin(values)), float(np.nanmax(values))
 
 
-def _said(part: Part, unit: str) -> str:
+def _said(part: FittedTerm, unit: str) -> str:
     """A term as people write it."""
     each = zip(part.rows, part.amount, part.sigma, strict=True)
     says = (
@@ -277,7 +288,7 @@ def _said(part: Part, unit: str) -> str:
     return says.replace("- -", "+ ").replace("+ -", "- ")
 
 
-def _shifted(part: Part, unit: str) -> str:
+def _shifted(part: FittedTerm, unit: str) -> str:
     """Of a line, or lines, whose zero is found too: two columns that differ by one line's text."""
     if len(part.at) != 2:
         return ""
@@ -295,7 +306,7 @@ def _shifted(part: Part, unit: str) -> str:
     return f"{_signed(slope, part.sigma[0])} {unit} * {_product(texts)}"
 
 
-def _turned(part: Part, unit: str) -> str:
+def _turned(part: FittedTerm, unit: str) -> str:
     """Of a sine and a cosine: an amplitude and a phase."""
     texts = [times(row) for row in part.rows]
     if len(texts) != 2 or texts[0].replace(*PHASE) != texts[1] or texts[0].count(PHASE[0]) != 1:

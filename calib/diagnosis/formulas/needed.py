@@ -9,7 +9,7 @@ import numpy as np
 
 from calib.diagnosis.formulas.factors import Factor
 from calib.diagnosis.formulas.table import Projection
-from calib.diagnosis.formulas.terms import Term, refine, slopes
+from calib.diagnosis.formulas.terms import FormulaTerm, refine, slopes
 from calib.diagnosis.score import GAUGE
 
 # Sigmas from zero, below which a column of a term is left out again: of ten columns that are not
@@ -18,7 +18,7 @@ CLEAR = 3.0
 
 
 def needed(
-    model: Projection, terms: Sequence[Term], columns: Sequence[np.ndarray]
+    model: Projection, terms: Sequence[FormulaTerm], columns: Sequence[np.ndarray]
 ) -> list[list[int]]:
     """Of each term the columns that the data need: not those that the model absorbs, nor those
     that chance, or other constants, explain."""
@@ -45,7 +45,7 @@ def needed(
             return kept
 
 
-def reduced(term: Term, kept: Sequence[int]) -> tuple[Term, list[int]]:
+def reduced(term: FormulaTerm, kept: Sequence[int]) -> tuple[FormulaTerm, list[int]]:
     """A term without factors that none of its kept columns has, squares of which but the line is
     kept as lines; and which columns of it are kept."""
     rows = [list(product(*(f.texts for f in term.factors)))[i] for i in kept]
@@ -61,12 +61,12 @@ def reduced(term: Term, kept: Sequence[int]) -> tuple[Term, list[int]]:
     if not factors:
         return term, list(kept)
     every = list(product(*(f.texts for f in factors)))
-    return Term(tuple(factors)), [every.index(tuple(row[i] for i in at)) for row in rows]
+    return FormulaTerm(tuple(factors)), [every.index(tuple(row[i] for i in at)) for row in rows]
 
 
 def _clear(
     model: Projection,
-    terms: Sequence[Term],
+    terms: Sequence[FormulaTerm],
     kept: Sequence[Sequence[int]],
     columns: Sequence[np.ndarray],
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -85,7 +85,7 @@ def _clear(
     return out[0], out[1]
 
 
-def _alone(model: Projection, term: Term, kept: Sequence[int], column: int) -> float:
+def _alone(model: Projection, term: FormulaTerm, kept: Sequence[int], column: int) -> float:
     """What share of what a column of a term explains no other constants do (root)."""
     covariates = model.table.covariates
     left = [c for c in kept if c != column]

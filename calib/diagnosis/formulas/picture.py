@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from calib.diagnosis.formulas.table import Projection, Table
+from calib.diagnosis.formulas.table import BeamTable, Projection
 
-BINS = {1: 48, 2: 20}  # of one covariate, and of each of two: a few hundred beams in each
-FEWEST = 3  # beams of a bin that is shown
+PICTURE_BINS = {1: 48, 2: 20}  # of one covariate, and of each of two: a few hundred beams in each
+FEWEST_BEAMS = 3  # beams of a bin that is shown
 
 
 def picture_of(
-    table: Table,
+    table: BeamTable,
     covariates: Sequence[str],
     value: np.ndarray,
     fit: Projection,
@@ -35,7 +35,7 @@ def picture_of(
         beams are.
     """
     names = list(covariates[:2])
-    edges = [_edges(table.covariates[n], BINS[len(names)]) for n in names]
+    edges = [_edges(table.covariates[n], PICTURE_BINS[len(names)]) for n in names]
     index = np.zeros(len(table), int)
     for name, ends in zip(names, edges, strict=True):
         at = np.searchsorted(ends[1:-1], table.covariates[name], side="right")
@@ -48,7 +48,7 @@ def picture_of(
         total = np.bincount(index, weight * of, size)
         count = np.bincount(index, minlength=size)
         means = 1e3 * total / np.maximum(np.bincount(index, weight, size), 1e-300)
-        return np.where(count >= FEWEST, means, np.nan).reshape(shape).tolist()
+        return np.where(count >= FEWEST_BEAMS, means, np.nan).reshape(shape).tolist()
 
     return {
         "unit": unit,

@@ -19,29 +19,34 @@ from calib.blunders.chance import after_looks, at_least, log_tail
 from calib.diagnosis.formulas.factors import Factor, factors
 from calib.diagnosis.formulas.needed import needed
 from calib.diagnosis.formulas.smooths import Bases, Smooth, screen_smooths
-from calib.diagnosis.formulas.table import Projection, Table
-from calib.diagnosis.formulas.terms import Term, refine
-from calib.diagnosis.score import Test
+from calib.diagnosis.formulas.table import BeamTable, Projection
+from calib.diagnosis.formulas.terms import FormulaTerm, refine
+from calib.diagnosis.score import ScoreTest
 from calib.solve.fit import Progress
 
-KEPT = 4  # factors of each covariate whose products are tried
+FACTORS_KEPT = 4  # factors of each covariate whose products are tried
 REFINED = 5  # products whose constants are refined
 # Sigmas by which stops must prefer a form for it to be told from a simpler one; of one that hangs
 # on more, as little likely among as many covariates as those might have been.
-APART = 2.0
-MOST_TERMS = 4
-TRIES = 3  # smooth functions that are judged before nothing is said to be there
-PLAUSIBLE = 0.1  # adjusted p-value of a smooth function, from which forms are tried
-RIVALS = 2  # sets of covariates, beside the best one, over which forms are tried
-INSTEAD = 0.8  # of the best set's statistic that another must explain for that
+SIGMAS_APART = 2.0
+MOST_TERMS = 4  # a choice: bounds the time, as each has a whole search; more are read by nobody
+# Smooth functions that are judged before nothing is said to be there, and the sets of covariates,
+# beside the best one, over which forms are tried. Choices: each costs a jackknife, or a search.
+SMOOTHS_JUDGED, RIVALS = 3, 2
+# Adjusted p-value of a smooth function, from which forms are tried: a choice, ten times the level
+# of a structure, as a form of fewer parameters stands out further than a smooth function.
+PLAUSIBLE = 0.1
+EXPLAINS_AS_MUCH = 0.8  # of the best set's statistic, that another must for that: a choice
 AS = {"ring": "elevation_rad"}  # what goes along with another covariate
-COVERS = 0.9  # of what a form explains, that a smooth function must for the form to be one of them
-SAME = 1e-6  # of what two forms explain: one is the other and what the model absorbs
-AT_ONCE = 400  # columns: bounds the memory
+# Of what a form explains, that a smooth function must for the form to be one of them: a choice, as
+# knots are few.
+COVERS = 0.9
+SAME_FORM = 1e-6  # of what two forms explain: one is the other and what the model absorbs
+COLUMNS_AT_ONCE = 400  # columns: bounds the memory
 
 
 @dataclass(frozen=True)
-class Step:
+class ConfirmedTerm:
     """A term that is confirmed.
 
     Args:
@@ -69,7 +74,7 @@ class Form:
         tried: of how many it is the best.
     """
 
-    term: Term
+    term: FormulaTerm
     statistic: float
     dof: int
     left: np.ndarray
@@ -83,7 +88,7 @@ class Form:
             for each in (self, form)
         )
         more = self.term.cost > form.term.cost and set(form.term.texts) <= set(self.term.texts)
-        alike = abs(self.statistic - form.statistic) < SAME * form.statistic
+        alike = abs(self.statistic - form.statistic) < SAME_FORM * form.statistic
         same = alike and {c for c, _ in mine} == {c for c, _ in its}
         return not (mine == its or more or same)
 
@@ -103,7 +108,7 @@ def forms(projection: Projection, bases: Bases, covariates: Sequence[str]) -> li
     table = projection.table
     best = [_best_factors(projection, bases, covariates, c) for c in covariates]
     tried = int(np.prod([count for _, count in best]))
-    terms = [Term(each) for each in product(*(some for some, _ in best))]
+    terms = [FormulaTerm(each) for each in product(*(some for some, _ in best))]
     statistic, dof = _explained(projection, [t.columns(table.covariates) for t in terms])
     evidence = np.array([_evidence(s, d) for s, d in zip(statistic, dof, strict=True)])
     first = [terms[i] for i in np.argsort(-evidence, kind="stable")[:REFINED]]
@@ -113,12 +118,12 @@ def forms(projection: Projection, bases: Bases, covariates: Sequence[str]) -> li
 
 
 def pursue(
-    table: Table,
+    table: BeamTable,
     alpha: float,
     progress: Progress,
     most: int = MOST_TERMS,
-    found: Sequence[Step] = (),
-) -> list[Step]:
+    found: Sequence[ConfirmedTerm] = (),
+) -> list[ConfirmedTerm]:
     """Terms that stand out from chance, one beside the other, strongest first.
 
     Args:
@@ -144,22 +149,24 @@ def pursue(
     return found
 
 
-def _step(fitted: Projection, bases: Bases, smooths: Sequence[Smooth], alpha: float) -> Step | None:
+def _step(
+    fitted: Projection, bases: Bases, smooths: Sequence[Smooth], alpha: float
+) -> ConfirmedTerm | None:
     """The best term over the sets of covariates that explain most, judged."""
-    likely = (s for s in smooths[:TRIES] if s.evidence > np.log(s.looks / alpha))
+    likely = (s for s in smooths[:SMOOTHS_JUDGED] if s.evidence > np.log(s.looks / alpha))
     best = next((s for s in likely if _stands_out(fitted, bases, s)), None)
     if best is None:
         return None
     inside = [s for s in smooths if set(s.covariates) < set(best.covariates)]
     others = [s for s in smooths if not set(s.covariates) >= set(best.covariates)]
-    rivals = [s for s in others if s.test.statistic > INSTEAD * best.test.statistic]
+    rivals = [s for s in others if s.test.statistic > EXPLAINS_AS_MUCH * best.test.statistic]
     sets = list({s.covariates: s for s in (best, *inside[:1], *rivals[:RIVALS])}.values())
     over = {f: s for s in sets for f in forms(fitted, bases, s.covariates)}
     if not over:
         return None
     chosen, alike = simplest(sorted(over, key=lambda f: -f.evidence), len(bases.names()))
     p = _by_chance(fitted, chosen, over[chosen])
-    return Step(
+    return ConfirmedTerm(
         form=chosen,
         alike=alike,
         p_value=p,
@@ -176,7 +183,7 @@ def _stands_out(fitted: Projection, bases: Bases, smooth: Smooth) -> bool:
     return p < PLAUSIBLE or judged.dof >= judged.clusters
 
 
-def _judged(fitted: Projection, columns: np.ndarray) -> Test:
+def _judged(fitted: Projection, columns: np.ndarray) -> ScoreTest:
     """The test of columns (N, k), stops left out one by one, and beams weighed as they are once
     these are known: what is clipped before would seem to differ from stop to stop."""
     return fitted.table.projection(columns).judged(columns)
@@ -199,7 +206,7 @@ def _by_chance(fitted: Projection, form: Form, smooth: Smooth) -> float:
     return at_least(min(1.0, len(bounds) * min(bounds)))
 
 
-def _tail(found: Test, among: int = 0) -> float:
+def _tail(found: ScoreTest, among: int = 0) -> float:
     """How often chance explains as much as a test found, or, with `among`, as the best function of
     so many parameters does."""
     chance = found.chance
@@ -209,7 +216,7 @@ def _tail(found: Test, among: int = 0) -> float:
     return float(special.fdtrc(among or chance.nu, chance.d, each / (among or found.dof)))
 
 
-def form(projection: Projection, term: Term, tried: int) -> Form:
+def form(projection: Projection, term: FormulaTerm, tried: int) -> Form:
     """A term with what it leaves of each stop."""
     columns = term.columns(projection.table.covariates)
     (statistic,), (dof,) = projection.explained([columns])
@@ -244,7 +251,7 @@ def simplest(found: Sequence[Form], covariates: int) -> tuple[Form, list[Form]]:
 def _told_apart(form: Form, best: Form, covariates: int) -> bool:
     worse = (form.left - best.left)[best.left > 0.0]
     further = len(set(best.term.covariates) - set(form.term.covariates))
-    limit = -float(special.ndtri(special.ndtr(-APART) / max(covariates, 1) ** further))
+    limit = -float(special.ndtri(special.ndtr(-SIGMAS_APART) / max(covariates, 1) ** further))
     if form is best or worse.sum() <= limit**2:
         return False
     scatter = np.sqrt(len(worse) * np.var(worse, ddof=1)) if len(worse) > 1 else np.inf
@@ -272,7 +279,7 @@ def _best_factors(
     kinds: dict[tuple[str, str], int] = {}  # of each kind the best: others become it when refined
     for i in order:
         kinds.setdefault((every[i].covariate, every[i].kind), i)
-    chosen = [every[i] for i in list(kinds.values())[:KEPT]]
+    chosen = [every[i] for i in list(kinds.values())[:FACTORS_KEPT]]
     plain = next((every[i] for i in order if every[i].kind in ("line", "class")), None)
     if plain is not None and plain not in chosen:
         chosen.append(plain)
@@ -285,7 +292,7 @@ def _explained(
     """As `Projection.explained`, some columns at a time."""
     parts: list[list[np.ndarray]] = [[]]
     for block in blocks:
-        if sum(b.shape[1] for b in parts[-1]) + block.shape[1] > AT_ONCE and parts[-1]:
+        if sum(b.shape[1] for b in parts[-1]) + block.shape[1] > COLUMNS_AT_ONCE and parts[-1]:
             parts.append([])
         parts[-1].append(block)
     found = [projection.explained(part) for part in parts]

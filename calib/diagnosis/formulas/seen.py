@@ -11,11 +11,11 @@ from calib.diagnosis.suggest import span
 from calib.effects import Effect
 
 # Of what lies between the least and largest value: a formula is judged in bins of that width; see
-# `calib.diagnosis.formulas.picture.BINS`.
-BEYOND = 0.05
+# `calib.diagnosis.formulas.picture.PICTURE_BINS`.
+BEYOND_SEEN = 0.05
 
 
-class Reach:
+class ColumnRanges:
     """From where to where the columns go that effects depend on, batch by batch.
 
     Args:
@@ -51,7 +51,7 @@ class Reach:
         beyond = []
         for name, (low, high) in effect.seen.items():
             here = self._ends.get(name, (low, high))
-            slack = BEYOND * (high - low)
+            slack = BEYOND_SEEN * (high - low)
             if here[0] < low - slack or here[1] > high + slack:
                 beyond.append(f"{span(name, low, high)}, and here goes {_ends_of(name, *here)}")
         if not beyond:

@@ -15,18 +15,18 @@ import numpy as np
 
 from calib.blunders.chance import log_tail
 from calib.diagnosis.formulas.factors import product_of
-from calib.diagnosis.formulas.table import Projection, Table
-from calib.diagnosis.score import Scores, Test, test
+from calib.diagnosis.formulas.table import BeamTable, Projection
+from calib.diagnosis.score import Scores, ScoreTest, score_test
 from calib.diagnosis.screen import by_rank, looked
 
 # Knots of a function of one covariate, of each of two and of three. A pair of 5 x 5 sees what turns
 # three times over its range; finer things are found alone or as formulas.
-KNOTS = {1: 12, 2: 5, 3: 3}
+SMOOTH_KNOTS = {1: 12, 2: 5, 3: 3}
 TURN_KNOTS = {1: 24, 2: 8, 3: 6}  # of azimuth, evenly round: 4 would not see two waves in a turn
 STOPS_A_KNOT = 5  # of columns of the stops, as of bins: with fewer, tests have no power
 FEW = 8  # values of a column, up to which each is a class of its own
 MOST_THIRDS = 2  # pairs to which a third covariate is tried; also threes, by their product alone
-AT_ONCE = 200  # of threes: bounds the memory
+THREES_AT_ONCE = 200  # of threes: bounds the memory
 MOST_CLASSES = 6  # of a label, those of most beams
 PATTERN = 4  # rings after which electronics repeat: chips of 4, 8 and 16 channels
 
@@ -39,11 +39,11 @@ class Smooth:
         covariates: their names.
         test: of its columns.
         looks: by how many independent looks a p-value pays.
-        evidence: see `Test.evidence`.
+        evidence: see `ScoreTest.evidence`.
     """
 
     covariates: tuple[str, ...]
-    test: Test
+    test: ScoreTest
     looks: float
     evidence: float
 
@@ -57,7 +57,7 @@ class Bases:
         stops: how many there are.
     """
 
-    table: Table
+    table: BeamTable
     stops: int
     _made: dict[tuple[str, int], np.ndarray] = field(default_factory=dict, repr=False)
 
@@ -77,7 +77,7 @@ class Bases:
         """(N, K) columns of one covariate beside others."""
         values = self.table.covariates[name]
         distinct = np.unique(values[np.isfinite(values)])
-        usual = KNOTS[together]
+        usual = SMOOTH_KNOTS[together]
         if name in self.table.by_stop:
             usual = max(2, min(usual, round((self.stops / STOPS_A_KNOT) ** (1 / together))))
         if name == "label" or len(distinct) <= min(FEW, usual):
@@ -169,8 +169,8 @@ def _threes(
         return [], 0
     lines = {n: _lines(n, bases.table.covariates[n]) for n in plain}
     explained = []
-    for i in range(0, len(sets), AT_ONCE):
-        some = [product_of([lines[n] for n in s]) for s in sets[i : i + AT_ONCE]]
+    for i in range(0, len(sets), THREES_AT_ONCE):
+        some = [product_of([lines[n] for n in s]) for s in sets[i : i + THREES_AT_ONCE]]
         statistic, dof = projection.explained(some)
         explained += [-log_tail(x, d) if d else 0.0 for x, d in zip(statistic, dof, strict=True)]
     best = np.argsort(-np.array(explained), kind="stable")[:MOST_THIRDS]
@@ -192,22 +192,22 @@ def _tested(
     bases: Bases,
     sets: Sequence[tuple[str, ...]],
     progress: Callable[[int, int], None],
-) -> Iterator[tuple[tuple[str, ...], tuple[Test, np.ndarray]]]:
+) -> Iterator[tuple[tuple[str, ...], tuple[ScoreTest, np.ndarray]]]:
     """Each set's test, and by rank the p-values (R,) of the same on scores by chance."""
     for i, names in enumerate(sets):
         progress(i, len(sets))
         columns = bases.of(names)
         scores = projection.scores(columns)
-        found = test(scores, np.arange(columns.shape[1]))
+        found = score_test(scores, np.arange(columns.shape[1]))
         if found.dof:
             yield names, (found, _by_chance(scores, found, projection.table.signs))
 
 
-def _by_chance(scores: Scores, found: Test, signs: np.ndarray) -> np.ndarray:
+def _by_chance(scores: Scores, found: ScoreTest, signs: np.ndarray) -> np.ndarray:
     # Every set has the same clusters in the same order, so the same draw of signs is one world.
     shares = np.vstack([scores.by_stop, scores.by_place]) @ found.whiten
     return by_rank(np.sum(np.square(signs @ shares), axis=1))
 
 
-def _common(tests: Sequence[Test]) -> float:
+def _common(tests: Sequence[ScoreTest]) -> float:
     return float(np.median([t.inflation for t in tests])) if tests else 1.0

@@ -18,12 +18,13 @@ from scipy.sparse import block_diag, csr_array, eye_array, hstack, vstack
 from calib.diagnosis.formulas.factors import covariates_of
 from calib.diagnosis.jackknife import Shares
 from calib.diagnosis.linear import beside, other_rows
-from calib.diagnosis.score import GAUGE, Scores, Test, test
+from calib.diagnosis.score import GAUGE, Scores, ScoreTest, score_test
 from calib.linear.clusters import ClusteredRows, Gradients, summed
 from calib.linear.layout import Layout
 from calib.linear.rows import TWIST, StopRows
 from calib.problem import Problem
 from calib.residuals.robust import MAD
+from calib.solve.added import HUBER
 from calib.solve.clustered import each_stop
 from calib.solve.estimate import Estimate
 
@@ -31,13 +32,12 @@ from calib.solve.estimate import Estimate
 # `known_ring_by_temperature` the constants of 10,000, 40,000 and all beams agree to 0.3 of their
 # sigma.
 MOST_BEAMS = 20_000
-DRAWS = 499  # scores of chance: 25 of them beyond the quantile that counts looks
-PASSES = 3  # of weighing, after which weights of a gross structure change by less than 1 %
-HUBER = 1.345  # sigmas: 95 % efficiency on normal rows (Huber 1981)
+FORMULA_DRAWS = 499  # scores of chance: 25 of them beyond the quantile that counts looks
+WEIGHING_PASSES = 3  # of weighing, after which weights of a gross structure change by less than 1 %
 
 
 @dataclass(frozen=True)
-class Table:
+class BeamTable:
     """N beams, drawn at random from each stop alike.
 
     Args:
@@ -79,7 +79,7 @@ class Table:
         estimate: Estimate,
         progress: Callable[[int, int], None] = lambda done, total: None,
         most: int = MOST_BEAMS,
-    ) -> Table:
+    ) -> BeamTable:
         """The table of a fit with scans, drawn alike whenever it is drawn.
 
         Args:
@@ -132,7 +132,9 @@ class Table:
         """(R, C) what the clusters' shares of a score are multiplied by to make one of chance; see
         `Scores.draws`."""
         stop, place, _ = self.cells
-        return np.random.default_rng(0).standard_normal((DRAWS, stop.max() + place.max() + 2))
+        return np.random.default_rng(0).standard_normal(
+            (FORMULA_DRAWS, stop.max() + place.max() + 2)
+        )
 
     @cached_property
     def of_others(self) -> tuple[np.ndarray, np.ndarray]:
@@ -149,7 +151,7 @@ class Table:
         found, cell = np.unique((stop + 1) * wide + place + 1, return_inverse=True)
         return found // wide - 1, found % wide - 1, cell
 
-    def beside(self, columns_m: np.ndarray) -> Table:
+    def beside(self, columns_m: np.ndarray) -> BeamTable:
         """The table of a model that has such columns (N, F) of the range, too: its last unknowns,
         of which nothing was known."""
         more = columns_m.shape[1]
@@ -169,7 +171,7 @@ class Table:
             The model alone, at the weights of that fit.
         """
         z = self.residual_m / self.sigma_m
-        for _ in range(PASSES):
+        for _ in range(WEIGHING_PASSES):
             scale = max(1.0, MAD * float(np.median(np.abs(z))))
             weight = np.minimum(1.0, HUBER * scale / np.maximum(np.abs(z), 1e-300))
             out = Projection.of(self, weight / self.sigma_m**2 / self.share)
@@ -190,7 +192,7 @@ class Projection:
         factor: of its normal equations.
     """
 
-    table: Table
+    table: BeamTable
     weight: np.ndarray
     left_m: np.ndarray
     step: np.ndarray
@@ -208,7 +210,7 @@ class Projection:
         return float(self.weight.sum()) if self.table.weight_m2 is None else self.table.weight_m2
 
     @classmethod
-    def of(cls, table: Table, weight: np.ndarray) -> Projection:
+    def of(cls, table: BeamTable, weight: np.ndarray) -> Projection:
         """Fit the model at these weights (N,)."""
         T, chain = table.twists, table.chain
         gram = table.twists_T @ T.multiply(weight[:, None]).tocsr()
@@ -219,7 +221,8 @@ class Projection:
         factor = cho_factor(H)  # upper
         raw = table.residual_m
         step = cho_solve(factor, right - chain.T @ (table.twists_T @ (weight * raw)))
-        return cls(table, weight, raw + T @ (chain @ step), step, factor)
+        left_m = raw + T @ (chain @ step)
+        return cls(table=table, weight=weight, left_m=left_m, step=step, factor=factor)
 
     def beside(self, columns_m: np.ndarray) -> Projection:
         """The projection, at the same weights, of a model that has columns (N, k), too."""
@@ -260,12 +263,12 @@ class Projection:
         """Scores of columns (N, Q) of the range, of one candidate; see `calib.diagnosis.score`."""
         return self._scores(columns_m, self.off(columns_m))
 
-    def test(self, columns_m: np.ndarray) -> Test:
+    def test(self, columns_m: np.ndarray) -> ScoreTest:
         """The test of columns (N, q) together."""
         return self._test(columns_m, self.off(columns_m))
 
-    def _test(self, columns_m: np.ndarray, kept: tuple[np.ndarray, np.ndarray]) -> Test:
-        return test(self._scores(columns_m, kept), np.arange(columns_m.shape[1]))
+    def _test(self, columns_m: np.ndarray, kept: tuple[np.ndarray, np.ndarray]) -> ScoreTest:
+        return score_test(self._scores(columns_m, kept), np.arange(columns_m.shape[1]))
 
     def _scores(self, columns_m: np.ndarray, kept: tuple[np.ndarray, np.ndarray]) -> Scores:
         """As `scores`, with what `off` gives."""
@@ -291,7 +294,7 @@ class Projection:
             weight_m2=self.weight_m2,
         )
 
-    def judged(self, columns_m: np.ndarray) -> Test:
+    def judged(self, columns_m: np.ndarray) -> ScoreTest:
         """The test of columns (N, q) with its clusters left out one by one: see `jackknife`."""
         table, kept = self.table, self.off(columns_m)
         found = self._test(columns_m, kept)
@@ -302,7 +305,7 @@ class Projection:
             (root[:, None] * (kept[0] @ found.whiten), root * self.left_m, table.stop, table.place),
             (table.others @ (kept[1] @ found.whiten), away, table.others_stop, table.others_place),
         ):
-            shares.add(ClusteredRows(A, b, every, stop, place))
+            shares.add(ClusteredRows(A=A, b=b, columns=every, stop=stop, place=place))
         return found.judged(shares)
 
 
@@ -321,7 +324,7 @@ class _Drawn:
     Args:
         stop: its number.
         columns: covariates (n,) of these; (1,) of the stop.
-        residual_m, sigma_m, twists, chain: as of `Table`.
+        residual_m, sigma_m, twists, chain: as of `BeamTable`.
         met: (n,) which of what any beam of the stop meets each does.
     """
 

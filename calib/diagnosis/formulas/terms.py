@@ -12,15 +12,15 @@ from calib.diagnosis.formulas.factors import Columns, Factor, product_of
 from calib.diagnosis.formulas.table import Projection
 
 CLOSER = (0.04, 0.04, 0.01, 0.0025)  # of a covariate's range, between places that are tried
-BESIDE = (0, -4, -3, -2, -1, 1, 2, 3, 4)  # which of them; where none is better, it stays
+PLACES_BESIDE = (0, -4, -3, -2, -1, 1, 2, 3, 4)  # which of them; where none is better, it stays
 NUDGE = 0.01  # of a covariate's range, for the derivative by a constant
-STEPS = 6  # of Gauss-Newton; two or three are enough from where the places are
-PARTS = (1.0, 0.5, 0.25)  # of a step that are tried
+GAUSS_NEWTON_STEPS = 6  # of Gauss-Newton; two or three are enough from where the places are
+STEP_PARTS = (1.0, 0.5, 0.25)  # of a step that are tried
 ENOUGH = 1e-4  # of what is explained: steps that gain less are the last
 
 
 @dataclass(frozen=True)
-class Term:
+class FormulaTerm:
     """A product of functions of different covariates; its columns are all products of theirs.
 
     Args:
@@ -48,13 +48,13 @@ class Term:
         """Those that are to be found."""
         return tuple(c for f in self.factors for c in f.constants[: f.free])
 
-    def at(self, constants: Sequence[float]) -> Term:
+    def at(self, constants: Sequence[float]) -> FormulaTerm:
         """The same with other constants."""
         left, out = list(constants), []
         for f in self.factors:
             out.append(f.at(tuple(left[: f.free])))
             del left[: f.free]
-        return Term(tuple(out))
+        return FormulaTerm(tuple(out))
 
     def columns(self, covariates: Columns) -> np.ndarray:
         """(N, k)."""
@@ -69,7 +69,7 @@ class Term:
         return np.vstack([f.gaps(covariates[f.covariate][at]) for f, at in pairs])
 
 
-def refine(projection: Projection, term: Term, kept: Sequence[int] = ()) -> Term:
+def refine(projection: Projection, term: FormulaTerm, kept: Sequence[int] = ()) -> FormulaTerm:
     """A term with those constants that explain most, from where they are: places beside each are
     tried, ever closer, as where an edge is has no slope; then all go together (Gauss-Newton).
 
@@ -85,7 +85,7 @@ def refine(projection: Projection, term: Term, kept: Sequence[int] = ()) -> Term
     ends, wide = _ends(term, covariates), _wide(term, covariates)
     for size in CLOSER:
         for i in range(len(wide)):
-            places = np.clip(term.constants[i] + size * wide[i] * np.array(BESIDE), *ends[i])
+            places = np.clip(term.constants[i] + size * wide[i] * np.array(PLACES_BESIDE), *ends[i])
             tried = [term.at(_with(term.constants, i, place)) for place in places.tolist()]
             columns = _changed(term, tried, covariates)
             explained, _ = projection.explained([each[:, kept] for each in columns])
@@ -93,7 +93,9 @@ def refine(projection: Projection, term: Term, kept: Sequence[int] = ()) -> Term
     return _descended(projection, term, kept, ends)
 
 
-def slopes(covariates: Columns, term: Term, kept: Sequence[int], amount: np.ndarray) -> np.ndarray:
+def slopes(
+    covariates: Columns, term: FormulaTerm, kept: Sequence[int], amount: np.ndarray
+) -> np.ndarray:
     """Derivative (N, c) by its constants of a term whose columns `kept` have amounts (k,)."""
     ends, out = _ends(term, covariates), []
     for i, by in enumerate(NUDGE * _wide(term, covariates)):
@@ -114,22 +116,24 @@ def times(texts: Sequence[str]) -> str:
     return " * ".join(f"({text})" for text in some)
 
 
-def _descended(projection: Projection, term: Term, kept: Sequence[int], ends: np.ndarray) -> Term:
+def _descended(
+    projection: Projection, term: FormulaTerm, kept: Sequence[int], ends: np.ndarray
+) -> FormulaTerm:
     """A term after steps of all its constants together, each of which explains more."""
     covariates = projection.table.covariates
 
-    def explained(some: Sequence[Term]) -> np.ndarray:
+    def explained(some: Sequence[FormulaTerm]) -> np.ndarray:
         columns = _changed(term, some, covariates)
         return projection.explained([each[:, kept] for each in columns])[0]
 
     (best,) = explained([term])
-    for _ in range(STEPS):
+    for _ in range(GAUSS_NEWTON_STEPS):
         columns = term.columns(covariates)[:, kept]
         _, amount = projection.fitted(columns)
         along = slopes(covariates, term, kept, amount)
         _, both = projection.fitted(np.hstack([columns, along]))
         now, step = np.array(term.constants), both[len(kept) :]
-        tried = [term.at(np.clip(now + part * step, *ends.T).tolist()) for part in PARTS]
+        tried = [term.at(np.clip(now + part * step, *ends.T).tolist()) for part in STEP_PARTS]
         found = explained(tried)
         gain = found.max() - best
         if gain > 0.0:
@@ -139,7 +143,9 @@ def _descended(projection: Projection, term: Term, kept: Sequence[int], ends: np
     return term
 
 
-def _changed(term: Term, some: Sequence[Term], covariates: Columns) -> list[np.ndarray]:
+def _changed(
+    term: FormulaTerm, some: Sequence[FormulaTerm], covariates: Columns
+) -> list[np.ndarray]:
     """Columns (N, k) of terms that have most of their factors in common with another."""
     made = {f: f.columns(covariates) for f in term.factors}
     return [product_of([_made(f, made, covariates) for f in each.factors]) for each in some]
@@ -149,12 +155,12 @@ def _made(factor: Factor, made: dict[Factor, np.ndarray], covariates: Columns) -
     return made[factor] if factor in made else factor.columns(covariates)
 
 
-def _ends(term: Term, covariates: Columns) -> np.ndarray:
+def _ends(term: FormulaTerm, covariates: Columns) -> np.ndarray:
     """(c, 2) of each constant the least and largest value."""
     return np.concatenate([f.bounds(covariates[f.covariate]) for f in term.factors])
 
 
-def _wide(term: Term, covariates: Columns) -> np.ndarray:
+def _wide(term: FormulaTerm, covariates: Columns) -> np.ndarray:
     """(c,) the range of the covariate of each constant, of the values that there are."""
     seen = [covariates[f.covariate] for f in term.factors]
     wide = [np.nanmax(values) - np.nanmin(values) for values in seen]

@@ -56,7 +56,7 @@ MECHANISMS = {
         "one pose in dry and in moist air at one temperature",
     ),
 }
-JOINT = (
+WHY_JOINT = (
     "cables pull on the LiDAR or its supply sags as the arm moves, or the arm bends",
     "the same view reached with other values of this joint",
 )
@@ -79,7 +79,7 @@ ARM_JOINT = (
     "encoders and gears err by parts of a turn, and gears and links bend under the arm's weight",
     "this joint alone moved through its range, up and down, with the arm stretched and folded",
 )
-OTHER = (
+WHY_OTHER = (
     "no mechanism is known for this column; it may stand in for another that changes along with it",
     "this column changed on purpose while nothing else does",
 )
@@ -107,8 +107,8 @@ def why(
         and e.covariates
         and (mine | {"joints"} if of_arm and joints else mine).issuperset(e.covariates)
     }
-    by_name, of_joint = (OF_ARM, ARM_JOINT) if of_arm else (MECHANISMS, JOINT)
-    found = {n: of_joint if n in joints else by_name.get(n, OTHER) for n in covariates}
+    by_name, of_joint = (OF_ARM, ARM_JOINT) if of_arm else (MECHANISMS, WHY_JOINT)
+    found = {n: of_joint if n in joints else by_name.get(n, WHY_OTHER) for n in covariates}
     return {
         "known": sorted(known),
         "mechanisms": {name: mechanism for name, (mechanism, _) in found.items()},

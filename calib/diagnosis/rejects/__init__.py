@@ -25,15 +25,20 @@ import numpy as np
 from scipy import special
 
 from calib.blunders.chance import LEAST_P, LEVELS, after_looks
-from calib.diagnosis.rejects.counts import Axis, Counts, Rejected, count
+from calib.diagnosis.rejects.counts import CellAxis, Counts, Rejected, count
 from calib.diagnosis.rejects.found import CLUTTER, Place, Rejects
 from calib.diagnosis.stand import Stand
 from calib.solve.fit import Progress
 
-ALPHA = LEVELS["structure of what was rejected"]
+ALPHA_REJECTED = LEVELS["structure of what was rejected"]
 MOST_PLACES = 4  # places that are told apart
-FEWEST = 4  # stops, below which nothing is claimed
-KINDS = {"all": (-1, 1), "long": (1,), "short": (-1,)}  # signs of the residuals that are counted
+FEWEST_STOPS = 4  # stops, below which nothing is claimed
+# Signs of the residuals that are counted.
+SIGNS_COUNTED = {
+    "all": (-1, 1),
+    "long": (1,),
+    "short": (-1,),
+}
 
 
 def rejects(stand: Stand, progress: Progress = lambda what, done, total: None) -> Rejects | None:
@@ -52,7 +57,7 @@ def rejects(stand: Stand, progress: Progress = lambda what, done, total: None) -
     left = np.ones(len(counts.rejected), bool)
     places: list[Place] = []
     least = 1.0
-    while len(places) < MOST_PLACES and len(counts.stop_names) >= FEWEST:
+    while len(places) < MOST_PLACES and len(counts.stop_names) >= FEWEST_STOPS:
         found, p = _most(counts, left)
         least = min(least, p)
         if found is None:
@@ -93,7 +98,7 @@ class _View:
             (G,) in all of each.
     """
 
-    axis: Axis
+    axis: CellAxis
     rows: np.ndarray
     bin: np.ndarray
     cell: np.ndarray
@@ -115,8 +120,8 @@ def _views(counts: Counts) -> Iterator[_View]:
                 (rejected.place, counts.places[a], counts.of_place),
             ),
         )
-    stops = Axis.of_things("stop", counts.stop_names)
-    surfaces = Axis.of_things("surface", counts.surface_names)
+    stops = CellAxis.of_things("stop", counts.stop_names)
+    surfaces = CellAxis.of_things("surface", counts.surface_names)
     for axis, mine, other, beams in (
         (stops, rejected.stop, rejected.surface, met.T),
         (surfaces, rejected.surface, rejected.stop, met),
@@ -129,17 +134,17 @@ def _most(counts: Counts, left: np.ndarray) -> tuple[tuple[np.ndarray, Place] | 
     """The place that explains most of the rejected that are left, with which of these it holds;
     and the smallest p-value, after all looks."""
     views = list(_views(counts))
-    looks = len(KINDS) * sum(view.axis.count for view in views)
+    looks = len(SIGNS_COUNTED) * sum(view.axis.count for view in views)
     sign = np.sign(counts.rejected.residual_m)
     best, most, least = None, 0.0, 1.0
     for view in views:
-        for signs in KINDS.values():
+        for signs in SIGNS_COUNTED.values():
             mine = left & np.isin(sign, signs) & (view.bin < view.axis.count)
             p = after_looks(_p_values(view, mine), looks)
             least = min(least, float(p.min()))
-            if p.min() >= ALPHA:
+            if p.min() >= ALPHA_REJECTED:
                 continue
-            cells, gain = _extent(view, mine, p < ALPHA)
+            cells, gain = _extent(view, mine, p < ALPHA_REJECTED)
             if gain > most:
                 most, best = gain, (view, cells, float(p.min()))
     if best is None:

@@ -3,24 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import numpy as np
 
+from calib.diagnosis.candidates import STOPS_A_BIN
 from calib.diagnosis.stand import Stand
 from calib.linear.parallel import in_order
 from calib.linear.rows import PLACES
 from calib.residuals.robust import TUKEY
 from calib.solve.fit import Progress
 
-CELLS, BINS = 240, 12  # of a covariate: where an interval may end, and what is tested
-AGREES = 0.5  # share of rejected beams that agree on a size, from which they are coherent
-STOPS_A_BIN = 5  # of a covariate of stops: fewer clusters than this tell nothing
+CELLS, REJECT_BINS = 240, 12  # of a covariate: where an interval may end, and what is tested
+# Share of rejected beams that agree on a size, beyond those that agree with its negative, from
+# which they are coherent: a choice, most of them.
+AGREES = 0.5
 
 
 @dataclass(frozen=True)
-class Axis:
+class CellAxis:
     """A covariate cut into cells, where an interval may end, and bins of these, which are tested.
 
     Args:
@@ -40,7 +42,7 @@ class Axis:
     wraps: bool = False
 
     @classmethod
-    def of(cls, name: str, values: np.ndarray, bins: int = BINS) -> Axis:
+    def of(cls, name: str, values: np.ndarray, bins: int = REJECT_BINS) -> CellAxis:
         """Cells of about equal count, of equal width for azimuth, one for each of few values."""
         values = values[np.isfinite(values)].astype(float)
         distinct = np.unique(values)
@@ -64,7 +66,7 @@ class Axis:
     @classmethod
     def of_things(
         cls, name: str, names: Sequence[str], numbers: Sequence[int] | None = None
-    ) -> Axis:
+    ) -> CellAxis:
         """A cell, and a bin, for each of some things; of ascending numbers, from 0 if not given."""
         at = np.arange(len(names)) if numbers is None else np.asarray(numbers)
         edges = (at[1:] + at[:-1]) / 2
@@ -128,11 +130,11 @@ class Rejected:
     @classmethod
     def of(cls, parts: Sequence[Rejected]) -> Rejected:
         """Several together."""
-        columns = zip(*(vars(part).values() for part in parts), strict=True)
-        return cls(*(np.concatenate(column) for column in columns))
+        names = [field.name for field in fields(cls)]
+        return cls(**{n: np.concatenate([getattr(part, n) for part in parts]) for n in names})
 
     def __getitem__(self, rows: np.ndarray) -> Rejected:
-        return Rejected(*(column[rows] for column in vars(self).values()))
+        return Rejected(**{name: column[rows] for name, column in vars(self).items()})
 
     def __len__(self) -> int:
         return len(self.stop)
@@ -169,7 +171,7 @@ class Counts:
         rejected: the rejected ones.
     """
 
-    axes: Sequence[Axis]
+    axes: Sequence[CellAxis]
     stops: Sequence[np.ndarray]
     places: Sequence[np.ndarray]
     cells: Sequence[np.ndarray]
@@ -246,7 +248,7 @@ class _Counted:
     rejected: Rejected
 
 
-def _count_stop(stand: Stand, i: int, axes: Sequence[Axis]) -> _Counted:
+def _count_stop(stand: Stand, i: int, axes: Sequence[CellAxis]) -> _Counted:
     scan, estimate = stand.estimate.scans[i], stand.estimate
     rows = scan.rows(estimate.values, estimate.associations[i])
     used, view = np.flatnonzero(rows.usable), rows.view
@@ -294,25 +296,27 @@ def _numbered(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return found - 1, number[values + 1]
 
 
-def _axes(stand: Stand) -> list[Axis]:
+def _axes(stand: Stand) -> list[CellAxis]:
     """The covariates of points and stops that change, cut into cells and bins."""
     scans = stand.estimate.scans
     _, sample = stand.columns
     rings = max(scan.lidar.rings for scan in scans)
-    out = [Axis.of("ring", np.arange(rings))]
+    out = [CellAxis.of("ring", np.arange(rings))]
     for name, values in sorted(sample.items()):
         told = [scan.columns[name] for scan in scans if name in scan.columns]
         if name == "label":
             out.append(_labels(stand, values))
         elif len(told) == len(scans):  # of stops
-            bins = max(2, min(BINS, len(scans) // STOPS_A_BIN))
-            out.append(Axis.of(name, np.concatenate(told), bins))
+            bins = max(2, min(REJECT_BINS, len(scans) // STOPS_A_BIN))
+            out.append(CellAxis.of(name, np.concatenate(told), bins))
         else:
-            out.append(Axis.of(name, values, 2 * BINS if name == "azimuth_rad" else BINS))
+            out.append(
+                CellAxis.of(name, values, 2 * REJECT_BINS if name == "azimuth_rad" else REJECT_BINS)
+            )
     return [axis for axis in out if axis.count > 1]
 
 
-def _labels(stand: Stand, values: np.ndarray) -> Axis:
+def _labels(stand: Stand, values: np.ndarray) -> CellAxis:
     names = {n: text for source in stand.sources for n, text in source.rig.labels.items()}
     numbers = sorted({*names, *np.unique(values).astype(int).tolist()})
-    return Axis.of_things("label", [names.get(n, str(n)) for n in numbers], numbers)
+    return CellAxis.of_things("label", [names.get(n, str(n)) for n in numbers], numbers)

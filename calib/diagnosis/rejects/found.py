@@ -11,13 +11,20 @@ import numpy as np
 from calib.blunders import told
 from calib.diagnosis.suggest import words
 
-NAMED = 6  # stops or surfaces that a sentence names
-MOST = 0.5  # share of beams that makes a place structured, whatever their residuals do
+MOST_NAMED = 6  # stops or surfaces that a sentence names
+# Share of beams that makes a place structured, whatever their residuals do: a choice, ten times
+# what mixed pixels reach.
+STRUCTURED_SHARE = 0.5
 # Share that mixed pixels may explain, in all or at one place. They are 0.3 to 0.4 % in recordings
 # of two simulators, 1 % at grazing incidence, and 4 % where the simulator does as a paper's rooms.
 CLUTTER = 0.05
-UNITS = {"_rad": ("rad", "deg", 180.0 / np.pi), "_m": ("m", "m", 1.0), "_s": ("s", "s", 1.0)}
-UNITS |= {"_c": ("degC", "°C", 1.0)}  # of a column: its own, the one that people are shown, factor
+# Ending of a column -> its own unit, the one that people are shown, and the factor between.
+INTERVAL_UNITS = {
+    "_rad": ("rad", "deg", 180.0 / np.pi),
+    "_m": ("m", "m", 1.0),
+    "_s": ("s", "s", 1.0),
+    "_c": ("degC", "°C", 1.0),
+}
 
 
 @dataclass(frozen=True)
@@ -55,7 +62,7 @@ class Place:
     @property
     def structured(self) -> bool:
         """Whether neither mixed pixels nor things that stand in the way explain it."""
-        odd = self.coherent or (self.share > MOST and not self.in_the_way)
+        odd = self.coherent or (self.share > STRUCTURED_SHARE and not self.in_the_way)
         return odd and self.share > CLUTTER
 
     @property
@@ -217,13 +224,13 @@ class Rejects:
 
 def unit_of(covariate: str) -> tuple[str, str, float]:
     """Unit of a column, the unit in which people are shown it, and the factor between the two."""
-    return next((u for end, u in UNITS.items() if covariate.endswith(end)), ("", "", 1.0))
+    return next((u for end, u in INTERVAL_UNITS.items() if covariate.endswith(end)), ("", "", 1.0))
 
 
 def listed(names: Sequence[str]) -> str:
     """Names with commas, no more than a sentence bears."""
-    more = len(names) - NAMED
-    return ", ".join(names[:NAMED]) + (f" and {more} more" if more > 0 else "")
+    more = len(names) - MOST_NAMED
+    return ", ".join(names[:MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
 def percent(share: float) -> str:

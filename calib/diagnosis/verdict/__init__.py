@@ -11,12 +11,12 @@ import numpy as np
 from calib.blunders import told
 from calib.blunders.chance import log_tail
 from calib.blunders.judged import Blunder, LeftOut
-from calib.blunders.reach import Reach
+from calib.blunders.reach import FurthestMoved
 from calib.diagnosis.candidates import PoseShape, concerned, lacking
 from calib.diagnosis.curves import Curve, curves
 from calib.diagnosis.rejects import Rejects
 from calib.diagnosis.screen import ODDS, Candidate, Screen
-from calib.diagnosis.search import ALPHA_UNNAMED, FEWEST, Search, suspects
+from calib.diagnosis.search import ALPHA_UNNAMED, FEWEST_STOPS, Search, suspects
 from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import formula, hangs_on
 from calib.diagnosis.verdict.candidates import candidate_documents, explained
@@ -35,8 +35,10 @@ VERDICTS = {
 }
 # The held-out error of models that lack nothing, over its floor: of 30 by another simulator, with 6
 # to 30 stops, the largest was 1.23.
-BY_CHANCE = 1.25
-ABSORBED = 0.7  # share of structure, or held-out error, that names must explain to be the answer
+HELD_OUT_BY_CHANCE = 1.25
+# Share of structure, or held-out error, that names must explain to be the answer: a choice. Of the
+# rms more than half is left by an answer that explains less than that of the squares.
+ABSORBED = 0.7
 
 
 @dataclass(frozen=True)
@@ -80,7 +82,7 @@ class Diagnosis:
     rejected: Rejects | None = None
     scatter: Sequence[Mapping[str, Any]] = ()
     detectable: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    unseen: Mapping[Group, Reach] = field(default_factory=dict, repr=False)
+    unseen: Mapping[Group, FurthestMoved] = field(default_factory=dict, repr=False)
 
     @property
     def heading(self) -> str:
@@ -184,7 +186,7 @@ def conclude(
         groups=[*(left.blunder for left in found.blunders), *first.blunders],
         misfit=summary["misfit"],
         curves=curves(first.unnamed),
-        too_few=stops_of(first) < FEWEST,
+        too_few=stops_of(first) < FEWEST_STOPS,
         rejected=rejected,
         scatter=[s.document(each.effect.name) for each in found.chance for s in each.spreads],
     )
@@ -195,7 +197,7 @@ def _unconfirmed(found: Search, rms_mm: Mapping[str, float]) -> Candidate | None
     nothing is found: so few stops, or walls, see each part of it that they may differ by chance as
     much. What scatters by chance is in the expected error only once the model has it."""
     held_out, floor = rms_mm.get("held_out"), rms_mm["noise_floor"]
-    over = held_out is not None and held_out > BY_CHANCE * floor
+    over = held_out is not None and held_out > HELD_OUT_BY_CHANCE * floor
     there = found.unnamed or found.found or found.chance
     if there or not over or not found.looks[0].stand.estimate.scans:
         return None
@@ -243,7 +245,7 @@ def _leave_most(found: Search, held_out: Mapping[str, tuple[float, float, float]
     if not falls or not found.looks[0].stand.estimate.scans:
         return False
     after, floor = falls[-1][1:]
-    return after > BY_CHANCE * floor and explained(falls[0][0], after, floor) < ABSORBED
+    return after > HELD_OUT_BY_CHANCE * floor and explained(falls[0][0], after, floor) < ABSORBED
 
 
 def _names_hold(found: Search) -> bool:

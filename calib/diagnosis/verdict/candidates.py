@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from calib.diagnosis.screen import Candidate, angle_deg
-from calib.diagnosis.search import ALPHA, ALPHA_NOISE, NamedEffect, Search
+from calib.diagnosis.search import ALPHA_EFFECT, ALPHA_NOISE, NamedEffect, Search
 from calib.diagnosis.suggest import what_separates
 from calib.diagnosis.verdict.matters import Weighed
 from calib.effects import Site
@@ -75,7 +75,7 @@ def _candidate(
     if step:
         estimate = found.looks[-1].stand.theta(effect, whole=False)
         sigma = found.looks[-1].stand.sigma(effect)
-    level = ALPHA_NOISE if noise else ALPHA
+    level = ALPHA_NOISE if noise else ALPHA_EFFECT
     alpha = -np.expm1(np.log1p(-level) / candidate.looks)
     document = effect.document()
     return {

@@ -22,7 +22,7 @@ from calib.diagnosis.suggest import hangs_on, words
 
 # Where neither is reached a user would decide nothing otherwise: a hundredth of an error is less
 # than two folds of one recording differ by, and half a sigma widens an interval by a tenth.
-FALL, SHIFT = 0.01, 0.5
+FALL_MATTERS, SHIFT_MATTERS = 0.01, 0.5
 
 
 @dataclass(frozen=True)
@@ -42,12 +42,15 @@ class Matters:
     @property
     def worse(self) -> bool:
         """Whether stops that were held out are predicted worse with it."""
-        return self.held_out_mm > FALL * self.floor_mm
+        return self.held_out_mm > FALL_MATTERS * self.floor_mm
 
     @property
     def enough(self) -> bool:
         """Whether it is more than a trace."""
-        return -self.held_out_mm > FALL * self.floor_mm or self.largest_shift_sigmas > SHIFT
+        return (
+            -self.held_out_mm > FALL_MATTERS * self.floor_mm
+            or self.largest_shift_sigmas > SHIFT_MATTERS
+        )
 
     def document(self) -> dict[str, Any]:
         """As the contract has it."""

@@ -6,21 +6,21 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from calib.diagnosis.screen import Candidate
-from calib.diagnosis.search import FEWEST, NamedEffect
+from calib.diagnosis.search import FEWEST_STOPS, NamedEffect
 from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import hangs_on, words
-from calib.diagnosis.verdict.matters import FALL, Weighed
+from calib.diagnosis.verdict.matters import FALL_MATTERS, Weighed
 
 UNNAMED, BAD = "unexplained_structure", "bad_data"
-LISTED = 6  # untestable effects and rivals that a sentence names
+MOST_LISTED = 6  # untestable effects and rivals that a sentence names
 # What moves, by what `diagnosis.json` calls it, as a sentence names it.
-MOVED = {
+WHAT_MOVES = {
     "mount": "the mount",
     "body": "the tracked body beyond the arm",
     "base": "the tracked body before the arm",
     "tracker": "the tracker, or the place where the base stands,",
 }
-SHORT = 60  # letters of another form that a sentence has
+LONGEST_FORM = 60  # letters of another form that a sentence has
 
 
 def sentences_of(
@@ -38,9 +38,9 @@ def sentences_of(
     look = found.looks[0]
     residual = _residual(look)
     out = _first_sentences(verdict, look, bool(traces))
-    out += [each["sentence"] for each in blunders[:LISTED]]
-    if len(blunders) > LISTED:
-        out.append(f"And {len(blunders) - LISTED} more, in diagnosis.json.")
+    out += [each["sentence"] for each in blunders[:MOST_LISTED]]
+    if len(blunders) > MOST_LISTED:
+        out.append(f"And {len(blunders) - MOST_LISTED} more, in diagnosis.json.")
     formulas = [each for each in unexplained if "says" in each]
     for i, step in enumerate(found.found):
         candidate = next(c for c in candidates if c["add"] == step.effect.name)
@@ -74,8 +74,10 @@ def sentences_of(
         )
     gone = [name for name, why in untestable.items() if why.startswith("the recordings")]
     if gone:
-        more = f" and {len(gone) - LISTED} more" if len(gone) > LISTED else ""
-        out.append(f"Could not be tested on these recordings: {', '.join(gone[:LISTED])}{more}.")
+        more = f" and {len(gone) - MOST_LISTED} more" if len(gone) > MOST_LISTED else ""
+        out.append(
+            f"Could not be tested on these recordings: {', '.join(gone[:MOST_LISTED])}{more}."
+        )
     return out
 
 
@@ -94,10 +96,10 @@ def unconfirmed(candidate: Candidate, rms_mm: Mapping[str, float]) -> str:
 def _first_sentences(verdict: str, look: Look, traces: bool) -> list[str]:
     """That nothing can be said, or that nothing is missing."""
     stops = stops_of(look)
-    if stops < FEWEST:
+    if stops < FEWEST_STOPS:
         return [
             f"No test is possible: {stops} stops are too few to name an effect, as all of them "
-            f"may share one error; {FEWEST} are the least, and 20 are better."
+            f"may share one error; {FEWEST_STOPS} are the least, and 20 are better."
         ]
     if verdict != "adequate":
         return []
@@ -119,7 +121,7 @@ def _structure_sentences(unexplained: Sequence[Mapping[str, Any]], residual: str
     out = []
     for each in unexplained[:2]:
         what = " and ".join(words(c) for c in each["covariates"])
-        moves = f", as if {MOVED[each['moves']]} moved" if each.get("moves") else ""
+        moves = f", as if {WHAT_MOVES[each['moves']]} moved" if each.get("moves") else ""
         out.append(
             f"The residual structure depends on {what}{moves}: {each['rms_mm']:.2f} mm rms of "
             f"{residual}."
@@ -137,7 +139,7 @@ def _formula_sentences(each: Mapping[str, Any], residual: str) -> list[str]:
     before, after = (each["held_out_rms_mm"][k] for k in ("before", "after"))
     fall = f" The held-out error goes from {before:.2f} to {after:.2f} mm." if after else ""
     was, now = (each["rejected_share"][k] for k in ("before", "after"))
-    if None not in (was, now) and was - now > FALL:
+    if None not in (was, now) and was - now > FALL_MATTERS:
         fall += f" Beams thrown away go from {100 * was:.1f} to {100 * now:.1f} %."
     out = [
         f"Its formula: {each['says']}.",
@@ -155,7 +157,7 @@ def _formula_sentences(each: Mapping[str, Any], residual: str) -> list[str]:
 
 def _other(form: Mapping[str, Any]) -> str:
     """Another form: as it is where it is short, else by what it depends on."""
-    if len(form["says"]) <= SHORT:
+    if len(form["says"]) <= LONGEST_FORM:
         return form["says"]
     return f"another formula, over {' and '.join(words(c) for c in form['covariates'])}"
 
@@ -169,7 +171,7 @@ def _why_sentences(why: Mapping[str, Any]) -> list[str]:
     if why["known"]:
         out.append(
             f"Known effects of the same columns may look like it on other recordings: "
-            f"{', '.join(why['known'][:LISTED])}."
+            f"{', '.join(why['known'][:MOST_LISTED])}."
         )
     return out
 
@@ -191,7 +193,7 @@ def _step_sentences(step: NamedEffect, candidate: Mapping[str, Any], worn: bool)
         f"{candidate['rms_mm']:.2f} mm rms, of which {candidate['unabsorbed_rms_mm']:.2f} mm is "
         f"not absorbed by the model (adjusted p = {step.p_adjusted:.1g}){fall}."
     ]
-    for rival in candidate["rivals"][:LISTED]:
+    for rival in candidate["rivals"][:MOST_LISTED]:
         out.append(
             f"On these data it is not distinguishable from {rival['effect']} (odds "
             f"{rival['odds']:.1f} to 1); "

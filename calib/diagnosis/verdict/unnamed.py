@@ -13,12 +13,12 @@ from calib.diagnosis.formulas.why import why
 from calib.diagnosis.search import Search
 from calib.diagnosis.stand import Stand
 from calib.diagnosis.suggest import DESCRIBES, span, what_differs, words
-from calib.diagnosis.verdict.matters import FALL
+from calib.diagnosis.verdict.matters import FALL_MATTERS
 from calib.effects.own.formula import FormulaEffect
 from calib.results.errors import Errors
 from calib.solve.fit import Progress
 
-ALIKE = 3  # other forms that are listed
+MOST_ALIKE = 3  # other forms that are listed
 Falls = Mapping[str, tuple[float, float, float]]
 
 
@@ -79,7 +79,7 @@ def unnamed(
             after = unseen(_with(first, formulas, progress)).rms_mm
             before, _, _ = falls[found.found[0].effect.name]
             named = falls[found.found[-1].effect.name][1]
-            if after < named - FALL * before:
+            if after < named - FALL_MATTERS * before:
                 return Unnamed(formulas, True, (before, after))
     # Values by chance take in most of a structure that differs from stop to stop.
     there = set(last.model.names)
@@ -91,8 +91,8 @@ def unnamed(
     before, after = unseen(last), unseen(_with(last, formulas, progress))
     fall_mm = before.rms_mm, after.rms_mm
     # A gross structure is rejected, not fitted: what falls then is the share of such beams.
-    fewer = (before.rejected_share or 0.0) - (after.rejected_share or 0.0) > FALL
-    if fewer or fall_mm[0] - fall_mm[1] > FALL * after.floor_mm:
+    fewer = (before.rejected_share or 0.0) - (after.rejected_share or 0.0) > FALL_MATTERS
+    if fewer or fall_mm[0] - fall_mm[1] > FALL_MATTERS * after.floor_mm:
         return Unnamed(formulas, False, fall_mm, (before.rejected_share, after.rejected_share))
     over = " and ".join(words(c) for c in formulas[0].covariates)
     return Unnamed(
@@ -135,7 +135,7 @@ def _document(found: Formula, taken: Sequence[str]) -> dict[str, Any]:
                 "covariates": list(form.term.covariates),
                 "separate": what_differs(found.covariates, form.term.covariates, of_arm),
             }
-            for form in found.alike[:ALIKE]
+            for form in found.alike[:MOST_ALIKE]
         ],
         "why": why(found.covariates, found.joints, of_arm),
         "formula": found.effect(taken, what),

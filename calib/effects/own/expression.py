@@ -51,7 +51,9 @@ OPERATORS: dict[type, Callable] = {
     ast.Eq: np.equal,
     ast.NotEq: np.not_equal,
 }
-LONGEST, DEEPEST = 2000, 50
+# Characters, and brackets within each other. A choice: more than anybody reads, far less than what
+# Python's own parser bears.
+LONGEST_FORMULA, DEEPEST_FORMULA = 2000, 50
 
 
 @dataclass(frozen=True)
@@ -95,8 +97,10 @@ class Expression:
 
     @cached_property
     def _tree(self) -> ast.expr:
-        if len(self.text) > LONGEST:
-            raise InputError(f"a formula of {self.owner} is longer than {LONGEST} characters")
+        if len(self.text) > LONGEST_FORMULA:
+            raise InputError(
+                f"a formula of {self.owner} is longer than {LONGEST_FORMULA} characters"
+            )
         try:
             return ast.parse(self.text.strip(), mode="eval").body
         except SyntaxError as error:
@@ -109,8 +113,8 @@ class Expression:
             raise self.wrong("is no arithmetic that can be read") from None
 
     def _check(self, node: ast.expr, depth: int) -> None:
-        if depth > DEEPEST:
-            raise self.wrong(f"is nested more than {DEEPEST} deep", node)
+        if depth > DEEPEST_FORMULA:
+            raise self.wrong(f"is nested more than {DEEPEST_FORMULA} deep", node)
         match node:
             case ast.Constant(value=bool() | str() | bytes() | complex() | None):
                 raise self.wrong(f"{node.value!r} is no number", node)

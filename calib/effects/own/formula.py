@@ -17,9 +17,13 @@ from calib.rig import Rig
 from chains.errors import InputError
 from sensors.documents import Document, Marks, Number, nearest, plain, validate
 
-AXES = {"range": 0, "azimuth": 1, "elevation": 2}
+BEAM_AXES = {"range": 0, "azimuth": 1, "elevation": 2}
 OF_TARGET = {"target.x": 0, "target.y": 1, "target.z": 2}
-WORDS = {"noise": Site.NOISE, "reference": Site.REFERENCE, **dict.fromkeys(OF_TARGET, Site.TARGET)}
+SITE_WORDS = {
+    "noise": Site.NOISE,
+    "reference": Site.REFERENCE,
+    **dict.fromkeys(OF_TARGET, Site.TARGET),
+}
 TRACKER = "tracker:"  # before a body's name, as frames go by the same
 Text = Annotated[str, pydantic.Field(min_length=1)]
 Sigma = Annotated[Number, pydantic.Field(gt=0)]
@@ -158,7 +162,7 @@ class FormulaEffect(Effect):
             basis[:, OF_TARGET[self.file.site]] = columns
         else:
             basis = np.zeros((rows, 3, count))
-            basis[:, AXES[self.file.site]] = columns
+            basis[:, BEAM_AXES[self.file.site]] = columns
         return basis
 
     def _value(self, expression: Expression, view: View) -> np.ndarray:
@@ -177,10 +181,10 @@ class FormulaEffect(Effect):
         return expression.value(column)
 
     def _site(self) -> Site:
-        if self.file.site in AXES:
+        if self.file.site in BEAM_AXES:
             return Site.BEAM
-        if self.file.site in WORDS:
-            return WORDS[self.file.site]
+        if self.file.site in SITE_WORDS:
+            return SITE_WORDS[self.file.site]
         if self.file.site.startswith(TRACKER):
             return Site.TRACKER
         return Site.EDGE if self.file.site.rpartition(".")[2] in DOF else Site.JOINTS
@@ -191,7 +195,7 @@ class FormulaEffect(Effect):
         if name not in rig.joint_names:
             frames = [f"{edge}.tz" for edge in rig.tree.edge_names]
             bodies = [f"{TRACKER}{body}.tz" for body in (rig.tracker.bodies if rig.tracker else ())]
-            raise self._no_site([*AXES, *WORDS, *rig.joint_names, *frames, *bodies])
+            raise self._no_site([*BEAM_AXES, *SITE_WORDS, *rig.joint_names, *frames, *bodies])
         return rig.joint_names.index(name)
 
     def _edge(self, rig: Rig) -> tuple[int, int]:

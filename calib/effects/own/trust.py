@@ -19,7 +19,7 @@ from chains.errors import InputError
 Trust = Mapping[str, Path | None]
 """sha256 of a Python file that may run -> where it is; None: where the document says."""
 
-LARGEST = 10_000_000  # bytes of a Python file: far more than anybody writes
+LARGEST_PYTHON = 10_000_000  # bytes of a Python file: far more than anybody writes
 _HASH = re.compile(r"[0-9a-fA-F]{64}")
 
 
@@ -46,9 +46,11 @@ class Code:
         try:
             if path.is_file():
                 with path.open("rb") as file:
-                    source = file.read(LARGEST + 1)
-                if len(source) > LARGEST:
-                    raise InputError(f"{path} has more than {LARGEST / 1e6:.0f} MB: no Python file")
+                    source = file.read(LARGEST_PYTHON + 1)
+                if len(source) > LARGEST_PYTHON:
+                    raise InputError(
+                        f"{path} has more than {LARGEST_PYTHON / 1e6:.0f} MB: no Python file"
+                    )
                 return cls(path.resolve(), source)
         except (OSError, ValueError) as error:
             raise InputError(f"{path} cannot be read: {error}") from None

@@ -34,4 +34,4 @@ SECTIONS: Mapping[str, tuple[Charts, ...]] = {
     ),
     "What could not be determined": (knowledge.correlation,),
 }
-ALONE: tuple[Charts, ...] = (graph.graph,)  # figures that no report has: ask for them by name
+ON_REQUEST: tuple[Charts, ...] = (graph.graph,)  # figures that no report has: ask for them by name

@@ -114,7 +114,7 @@ def magnification(groups: Sequence[Arrows]) -> float:
 
 
 def _draw(bodies: Mapping[str, Arrows], scale: float, frame: str) -> Figure:
-    figure, grid = plots.axes(plots.WIDE, 3.2, 1, 2)
+    figure, grid = plots.axes(plots.WIDE_IN, 3.2, 1, 2)
     for ax, (i, k), what in zip(grid[0], ((0, 1), (0, 2)), ("above", "the side"), strict=True):
         for (name, arrows), colour in zip(bodies.items(), _colours(len(bodies)), strict=True):
             some = slice(None, None, len(arrows.at_m) // MOST_ARROWS + 1)

@@ -54,7 +54,7 @@ def _ladder(evidence: Evidence) -> Figure:
     rungs = evidence.rungs
     names = [f"{folder_name(r.run.folder)}\n{r.step}" for r in rungs]
     rms = [r.run.summary["rms_mm"] for r in rungs]
-    figure, grid = plots.axes(plots.WIDE, 1.3 + 0.55 * (len(rungs) + 1))
+    figure, grid = plots.axes(plots.WIDE_IN, 1.3 + 0.55 * (len(rungs) + 1))
     ax, y = grid[0, 0], np.arange(1, len(rungs) + 1)
     ax.plot(rms[0]["nominal"], 0, "s", color=plots.BEFORE, label="nothing fitted")
     ax.plot([r["fit"] for r in rms], y, "o", mfc="white", color=plots.PALE, label="stops seen")
@@ -120,7 +120,7 @@ def variance_mm(evidence: Evidence) -> dict[str, float]:
 
 
 def _bars(parts: dict[str, float], label: str) -> Figure:
-    figure, grid = plots.axes(plots.HALF, 0.9 + 0.32 * len(parts))
+    figure, grid = plots.axes(plots.HALF_IN, 0.9 + 0.32 * len(parts))
     ax = grid[0, 0]
     colours = [plots.BEFORE if name == "unexplained" else plots.AFTER for name in parts]
     bars = ax.barh(list(parts), list(parts.values()), color=colours, height=0.6)
@@ -158,7 +158,7 @@ def _width(z: np.ndarray) -> float:
 
 
 def _scatter(evidence: Evidence) -> Figure:
-    figure, grid = plots.axes(plots.HALF, 2.6)
+    figure, grid = plots.axes(plots.HALF_IN, 2.6)
     ax, middle = grid[0, 0], (Z_EDGES[1:] + Z_EDGES[:-1]) / 2
     step = Z_EDGES[1] - Z_EDGES[0]
     bell = np.exp(-0.5 * middle**2) / np.sqrt(2 * np.pi)

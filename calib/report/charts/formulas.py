@@ -19,8 +19,8 @@ from chains.errors import InputError
 if TYPE_CHECKING:
     from calib.report.plots import Figure
 
-UPRIGHT = ("ring", "elevation_rad")  # what goes up where there are two
-WITHIN = 0.98  # of the bins: what the scale shows
+UPRIGHT_COLUMNS = ("ring", "elevation_rad")  # what goes up where there are two
+BINS_IN_SCALE = 0.98  # of the bins: what the scale shows
 READING = (
     "Means in bins, on one scale: what the model leaves without the formula, the formula, and what "
     "is left with it."
@@ -29,7 +29,7 @@ WRONG = "diagnosis.json has a picture of another version; diagnose the run again
 
 
 @dataclass(frozen=True)
-class Picture:
+class FormulaPicture:
     """Mean residuals over one or two columns.
 
     Args:
@@ -53,7 +53,7 @@ class Picture:
     averaged: tuple[str, ...]
 
     @classmethod
-    def read(cls, each: Mapping[str, Any]) -> Picture:
+    def read(cls, each: Mapping[str, Any]) -> FormulaPicture:
         """Of a formula as diagnosis.json has it.
 
         Raises:
@@ -65,7 +65,7 @@ class Picture:
             names = tuple(map(str, document["covariates"]))
             edges = tuple(np.array(e, float) for e in document["edges"])
             keys = ("measured", "formula", "left")
-            values = [np.array(document[key], float) for key in keys]
+            values = {key: np.array(document[key], float) for key in keys}
             over = tuple(map(str, each["covariates"]))
             held_out = [each["held_out_rms_mm"][key] for key in ("before", "after")]
             what = "Ranges depend" if unit == "mm" else "A joint's angle depends"
@@ -75,17 +75,25 @@ class Picture:
             raise InputError(WRONG) from None
         shape = tuple(len(e) - 1 for e in edges)
         known = all(e.ndim == 1 and len(e) > 1 and (np.diff(e) > 0).all() for e in edges)
-        if not known or len(names) not in (1, 2) or any(v.shape != shape for v in values):
+        if not known or len(names) not in (1, 2) or any(v.shape != shape for v in values.values()):
             raise InputError(WRONG)
         rest = tuple(name for name in over if name not in names)
-        return cls(names, edges, unit, *values, title=title, says=says, averaged=rest)
+        return cls(
+            covariates=names,
+            edges=edges,
+            unit=unit,
+            **values,
+            title=title,
+            says=says,
+            averaged=rest,
+        )
 
     @property
     def limit(self) -> float:
         """The end of the scale, the same for all three."""
         sizes = np.abs(np.concatenate([v.ravel() for v in (self.measured, self.formula)]))
         known = sizes[np.isfinite(sizes)]
-        return round_up(float(np.quantile(known, WITHIN))) if len(known) else 1.0
+        return round_up(float(np.quantile(known, BINS_IN_SCALE))) if len(known) else 1.0
 
     @property
     def label(self) -> str:
@@ -103,14 +111,14 @@ class Picture:
         return f"{self.says}. {READING}{over if self.averaged else ''}"
 
 
-def pictures(diagnosis: Mapping[str, Any] | None) -> list[Picture]:
+def pictures(diagnosis: Mapping[str, Any] | None) -> list[FormulaPicture]:
     """Of all formulas of a diagnosis.
 
     Raises:
         InputError: one is of another version.
     """
     found = (diagnosis or {}).get("unexplained", ())
-    return [Picture.read(each) for each in found if "picture" in each]
+    return [FormulaPicture.read(each) for each in found if "picture" in each]
 
 
 def formulas(evidence: Evidence) -> Iterator[Chart | Absent]:
@@ -150,7 +158,7 @@ def _title(what: str, held_out: list[float | None]) -> str:
     return f"{what}; with a formula for it {fall}"
 
 
-def _parts(picture: Picture) -> dict[str, np.ndarray]:
+def _parts(picture: FormulaPicture) -> dict[str, np.ndarray]:
     parts = {
         "measured": picture.measured,
         "formula": picture.formula,
@@ -161,12 +169,12 @@ def _parts(picture: Picture) -> dict[str, np.ndarray]:
     return {f"{name}, {rms[name]:.2f} {picture.unit} rms": values for name, values in parts.items()}
 
 
-def _maps(picture: Picture, narrow: bool) -> Figure:
+def _maps(picture: FormulaPicture, narrow: bool) -> Figure:
     """Three maps on one scale."""
-    across, up = (1, 0) if picture.covariates[0] in UPRIGHT else (0, 1)
+    across, up = (1, 0) if picture.covariates[0] in UPRIGHT_COLUMNS else (0, 1)
     names = picture.covariates
     x, y = (shown_unit(names[i])[1] * picture.edges[i] for i in (across, up))
-    size = (plots.NARROW, 5.4, 3, 1) if narrow else (plots.WIDE, 3.0, 1, 3)
+    size = (plots.NARROW, 5.4, 3, 1) if narrow else (plots.WIDE_IN, 3.0, 1, 3)
     figure, grid = plots.axes(*size, sharex=True, sharey=True)
     for ax, (title, values) in zip(grid.flat, _parts(picture).items(), strict=True):
         rows = values.T if up == 1 else values
@@ -181,12 +189,12 @@ def _maps(picture: Picture, narrow: bool) -> Figure:
     return figure
 
 
-def _curve(picture: Picture) -> Figure:
+def _curve(picture: FormulaPicture) -> Figure:
     """Points and the formula above, what is left below, on one scale."""
     (name,), (edges,) = picture.covariates, picture.edges
     edges = shown_unit(name)[1] * edges
     x = (edges[1:] + edges[:-1]) / 2
-    figure, grid = plots.axes(plots.HALF, 3.6, 2, sharex=True, sharey=True)
+    figure, grid = plots.axes(plots.HALF_IN, 3.6, 2, sharex=True, sharey=True)
     top, bottom = grid[:, 0]
     top.plot(x, picture.measured, "o", ms=3.5, color=plots.BEFORE, label="measured")
     top.stairs(picture.formula, edges, baseline=None, lw=1.5, color=plots.INK, label="formula")

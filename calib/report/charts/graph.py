@@ -15,18 +15,18 @@ from calib.report.evidence import Evidence
 from calib.results.recalibrate import blocks_of
 from calib.runs.asked.factors import estimate_of
 from calib.solve.estimate import Estimate
-from calib.solve.without import Kind, kinds_of
+from calib.solve.without import RowsOfKind, kinds_of
 
 if TYPE_CHECKING:
     from calib.report.plots import Axes, Figure
 
-NAMES = {
+BLOCK_NAMES = {
     "beams": "{rows} beams\nof {blocks} scans",
     "tracker": "{rows} numbers\nof the tracker",
     "target": "{rows} numbers\nof {blocks} targets",
     "prior": "the earlier run,\n{rows} numbers",
 }
-SHORT = {"target": "targets", "prior": "earlier"}
+SHORT_NAMES = {"target": "targets", "prior": "earlier"}
 GROUPS = {
     Role.PLACE: "places of the rig",
     Role.JOINTS: "joint readings",
@@ -73,14 +73,14 @@ def graph(evidence: Evidence) -> Iterator[Chart | Absent]:
     )
 
 
-def _found(evidence: Evidence) -> tuple[list[Row], list[Kind]]:
+def _found(evidence: Evidence) -> tuple[list[Row], list[RowsOfKind]]:
     """What is drawn: it takes some passes over the beams."""
     estimate = estimate_of(evidence.run, evidence.progress)
     kinds = kinds_of(estimate)
     return graph_rows(estimate, kinds), kinds
 
 
-def graph_rows(estimate: Estimate, kinds: Sequence[Kind]) -> list[Row]:
+def graph_rows(estimate: Estimate, kinds: Sequence[RowsOfKind]) -> list[Row]:
     """The unknowns of the calibration one by one, and the others by what they stand for."""
     at, C = blocks_of(estimate.variables), estimate.covariance
     out = []
@@ -114,10 +114,10 @@ def _bits(before: np.ndarray, after: np.ndarray) -> float:
     return float((larger - smaller) / (2 * np.log(2) * len(after)))
 
 
-def _draw(rows: Sequence[Row], kinds: Sequence[Kind]) -> Figure:
+def _draw(rows: Sequence[Row], kinds: Sequence[RowsOfKind]) -> Figure:
     rows = rows[:MOST_ROWS]
     height = 1.5 + 0.27 * len(rows)
-    figure, grid = plots.axes(plots.WIDE, height, 1, 2, sharey=True, width_ratios=(1.35, 1.0))
+    figure, grid = plots.axes(plots.WIDE_IN, height, 1, 2, sharey=True, width_ratios=(1.35, 1.0))
     _lines(grid[0, 0], rows, kinds)
     _cells(figure, grid[0, 1], rows, [kind.name for kind in kinds])
     grid[0, 0].set_yticks(
@@ -127,7 +127,7 @@ def _draw(rows: Sequence[Row], kinds: Sequence[Kind]) -> Figure:
     return figure
 
 
-def _lines(ax: Axes, rows: Sequence[Row], kinds: Sequence[Kind]) -> None:
+def _lines(ax: Axes, rows: Sequence[Row], kinds: Sequence[RowsOfKind]) -> None:
     """Unknowns on the left, rows on the right, and what joins them."""
     places = np.linspace(0, len(rows) - 1, 2 * len(kinds) + 1)[1::2]
     colours = dict(zip((kind.name for kind in kinds), plots.LINES, strict=False))
@@ -138,7 +138,7 @@ def _lines(ax: Axes, rows: Sequence[Row], kinds: Sequence[Kind]) -> None:
                 colour = colours[kind.name] if row.bits else plots.PALE
                 ax.plot([0, 1], [i, y], color=colour, linewidth=width, alpha=0.75, zorder=1)
         ax.plot(1, y, "s", color=colours[kind.name], markersize=11, zorder=3)
-        text = NAMES.get(kind.name, kind.name).format(rows=kind.rows, blocks=kind.blocks)
+        text = BLOCK_NAMES.get(kind.name, kind.name).format(rows=kind.rows, blocks=kind.blocks)
         ax.text(1.06, y, text, va="center", fontsize=8.5)
     ax.plot(np.zeros(len(rows)), range(len(rows)), "o", color=plots.INK, markersize=5, zorder=3)
     last = sum(bool(row.bits) for row in rows) - 0.5
@@ -165,7 +165,7 @@ def _cells(figure: Figure, ax: Axes, rows: Sequence[Row], kinds: Sequence[str]) 
         text = f"{values[i, k]:.1f}" if values[i, k] >= LEAST_BITS else "0"
         colour = "white" if dark else plots.INK
         ax.text(k, i, text, ha="center", va="center", fontsize=8, color=colour)
-    labels = [f"without\n{SHORT.get(kind, kind)}" for kind in kinds]
+    labels = [f"without\n{SHORT_NAMES.get(kind, kind)}" for kind in kinds]
     ax.set_xticks(range(len(kinds) + 1), [*labels, "by all,\nover CAD"], fontsize=8)
     ax.axvline(len(kinds) - 0.5, color=plots.PALE, linewidth=0.8)
     ax.grid(False)

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from calib.report.plots import Figure
 
 AT_STOPS = ("body", "joints", "scan")  # kinds that a stop has; others have columns of their own
-LEAST = 0.1  # of what chance allows: what is less is drawn there
-MOST_NAMES = 5  # groups that are named in the picture: more would hide each other
+LEAST_DRAWN = 0.1  # of what chance allows: what is less is drawn there
+MOST_NAMES = 5  # groups or stops that are named in a picture: more would hide each other
 MOST_TICKS = 40  # stops whose names are written below
 ONE_JOINT = "a single joint"
 OTHERS = "others"
@@ -64,11 +64,12 @@ def _groups(
     found: Mapping[str, tuple[str, float]], loud: Sequence[str], stops: Mapping[str, int]
 ) -> Figure:
     column, series = _columns(found, stops), _series(found)
-    figure, grid = plots.axes(plots.WIDE, 3.4)
+    figure, grid = plots.axes(plots.WIDE_IN, 3.4)
     ax = grid[0, 0]
     for i, (name, tokens) in enumerate(series.items()):
         minor = name in (ONE_JOINT, OTHERS)
-        ax.plot([column[_place(t)] for t in tokens], [max(found[t][1], LEAST) for t in tokens],
+        x = [column[_place(t)] for t in tokens]
+        ax.plot(x, [max(found[t][1], LEAST_DRAWN) for t in tokens],
                 "." if minor else "osD^v"[i % 5], ms=4 if minor else 5.5, alpha=0.85, label=name,
                 color=plots.PALE if minor else COLOURS[i % len(COLOURS)],
                 zorder=1 if minor else 2)  # fmt: skip
@@ -79,8 +80,8 @@ def _groups(
                     textcoords="offset points", ha="right" if right else "left",
                     color=plots.BEFORE, fontweight="bold")  # fmt: skip
     high = max(2.0, 1.6 * max(x for _, x in found.values()))
-    plots.log_axis(ax, LEAST, high, "y")
-    ax.set_ylim(0.8 * LEAST, high)
+    plots.log_axis(ax, LEAST_DRAWN, high, "y")
+    ax.set_ylim(0.8 * LEAST_DRAWN, high)
     ax.axhline(1.0, color=plots.INK, linestyle="--", linewidth=0.8)
     names, step = list(column), -(-len(column) // MOST_TICKS)
     ax.set_xticks(range(0, len(names), step), names[::step], rotation=90, fontsize=8)

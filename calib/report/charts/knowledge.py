@@ -48,7 +48,7 @@ def findings(evidence: Evidence) -> Iterator[Chart | Absent]:
 
 
 def _findings(candidates: Sequence[dict[str, Any]]) -> Figure:
-    figure, grid = plots.axes(plots.HALF, 0.9 + 0.3 * len(candidates))
+    figure, grid = plots.axes(plots.HALF_IN, 0.9 + 0.3 * len(candidates))
     ax = grid[0, 0]
     sizes = [c["unabsorbed_rms_mm"] for c in candidates]
     sure = [c["step"] and not c["dressed_up"] for c in candidates]
@@ -89,7 +89,7 @@ def budget(evidence: Evidence) -> Iterator[Chart | Absent]:
 def _budget(spent: Budget, what: str) -> Figure:
     sides = (spent.moved_m, spent.uncertain_m)
     names = [n for n in spent.uncertain_m if max(s.get(n, 0.0) for s in sides) > NEGLIGIBLE]
-    figure, grid = plots.axes(plots.WIDE, 1.0 + 0.3 * max(len(names), 1), 1, 2, sharey=True)
+    figure, grid = plots.axes(plots.WIDE_IN, 1.0 + 0.3 * max(len(names), 1), 1, 2, sharey=True)
     labels = (f"changed the {what} by, mm rms", "leaves it uncertain by, mm rms")
     for ax, side, label, colour in zip(grid[0], sides, labels, (plots.LINES[5], plots.AFTER),
                                        strict=True):  # fmt: skip
@@ -157,7 +157,7 @@ def _summarised(keys: Sequence[Key], units: Sequence[str]) -> tuple[list[str], n
 
 
 def _correlation(names: Sequence[str], matrix: np.ndarray) -> Figure:
-    side = min(plots.WIDE, 2.6 + 0.2 * len(names))
+    side = min(plots.WIDE_IN, 2.6 + 0.2 * len(names))
     figure, grid = plots.axes(side + 0.4, side)
     ax, n = grid[0, 0], len(names)
     picture = plots.signed_map(ax, matrix[::-1], (-0.5, n - 0.5, -0.5, n - 0.5), 1.0)

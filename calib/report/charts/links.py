@@ -14,15 +14,15 @@ from calib.report.chart import Absent, Chart
 from calib.report.evidence import Evidence
 from calib.rig import Rig
 from calib.runs.estimates import VariableEstimate
-from calib.runs.run import RING
+from calib.runs.run import RING_NAME
 from calib.show.scale import shown
 from calib.show.tables import LISTED_PARAMETERS
 
 if TYPE_CHECKING:
     from calib.report.plots import Axes, Figure
 
-FAR = 3.0  # sigmas of CAD
-SHIFT, TURN = slice(3, 6), slice(0, 3)
+BEYOND_CAD = 3.0  # sigmas of CAD
+SHIFT_PART, TURN_PART = slice(3, 6), slice(0, 3)
 
 
 @dataclass(frozen=True)
@@ -63,12 +63,12 @@ def _links(evidence: Evidence, rig: Rig) -> list[ChainLink]:
     if rig.reference_frame in fitted and rig.reference_frame != rig.world:
         far = fitted[rig.reference_frame]
         out.append(ChainLink(rig.reference_frame, 1, "the scanned mesh and the targets", far))
-    out.append(ChainLink(rig.tree.root, 1, f"stands elsewhere {MOVES[rig.moves]}"))
+    out.append(ChainLink(rig.tree.root, 1, f"stands elsewhere {BASE_MOVES[rig.moves]}"))
     _children(rig, rig.tree.root, 2, fitted, evidence.prior_sigma, out)
     return out
 
 
-MOVES = {"stop": "at every stop", "location": "at every location", "never": "at no stop"}
+BASE_MOVES = {"stop": "at every stop", "location": "at every location", "never": "at no stop"}
 
 
 def _children(
@@ -113,13 +113,13 @@ def chain(evidence: Evidence) -> Iterator[Chart | Absent]:
         title = "No link of the chain was estimated against CAD"
         if moved:
             worst = max(moved, key=moved.get)
-            count = sum(z > FAR for z in moved.values())
+            count = sum(z > BEYOND_CAD for z in moved.values())
             title = (
-                f"No link is more than {FAR:.0f} sigmas from CAD; the furthest is {worst}, "
+                f"No link is more than {BEYOND_CAD:.0f} sigmas from CAD; the furthest is {worst}, "
                 f"{moved[worst]:.1f} sigmas"
                 if not count
-                else f"{count} of {len(moved)} links lie more than {FAR:.0f} sigmas from CAD: "
-                f"{worst} by {moved[worst]:.1f}"
+                else f"{count} of {len(moved)} links lie more than {BEYOND_CAD:.0f} sigmas from "
+                f"CAD: {worst} by {moved[worst]:.1f}"
             )
         yield Chart(
             "chain" if len(rigs) == 1 else f"chain-{i}",
@@ -133,7 +133,7 @@ def chain(evidence: Evidence) -> Iterator[Chart | Absent]:
 
 
 def _chain(links: Sequence[ChainLink]) -> Figure:
-    figure, grid = plots.axes(plots.WIDE, 0.7 + 0.34 * len(links))
+    figure, grid = plots.axes(plots.WIDE_IN, 0.7 + 0.34 * len(links))
     ax = grid[0, 0]
     ax.set_axis_off()
     ax.set_xlim(0, 100)
@@ -146,7 +146,7 @@ def _chain(links: Sequence[ChainLink]) -> Figure:
         if link.depth:
             ax.plot([x - 3, x - 3, x], [trunk[link.depth - 1], row, row], color=plots.PALE, lw=1.2)
         trunk[link.depth] = row
-        far = (link.moved or 0.0) > FAR
+        far = (link.moved or 0.0) > BEYOND_CAD
         box = {"boxstyle": "round,pad=0.35", "facecolor": "#f5f7fa", "edgecolor": "#777777"}
         if far:
             box |= {"edgecolor": plots.BEFORE, "linewidth": 1.6}
@@ -159,11 +159,13 @@ def _estimate(ax: Axes, row: int, link: ChainLink, far: bool) -> None:
     if link.fitted is None or np.isnan(link.fitted.estimate).any():
         ax.text(47, row, link.what, va="center", style="italic", color="#555555")
         if link.fitted is not None:
-            sizes = (1e3 * np.linalg.norm(link.fitted.sigma[part]) for part in (SHIFT, TURN))
+            sizes = (
+                1e3 * np.linalg.norm(link.fitted.sigma[part]) for part in (SHIFT_PART, TURN_PART)
+            )
             text = "known to {:.2f} mm, {:.2f} mrad".format(*sizes)
             ax.text(84, row, text, va="center", fontsize=8, ha="left", color="#555555")
         return
-    for x, part in ((47, SHIFT), (66, TURN)):
+    for x, part in ((47, SHIFT_PART), (66, TURN_PART)):
         length, sigma = _length(link.fitted.estimate[part], link.fitted.sigma[part])
         ax.text(x, row, f"{length:.2f} ± {sigma:.2f}", va="center")
     if link.moved is not None:
@@ -207,9 +209,9 @@ def moves(evidence: Evidence) -> Iterator[Chart | Absent]:
 
 
 def _moves(rows: Sequence[tuple[VariableEstimate, np.ndarray]]) -> Figure:
-    figure, grid = plots.axes(plots.WIDE, 0.8 + 0.5 * len(rows), 1, 2, sharey=True, sharex=True)
+    figure, grid = plots.axes(plots.WIDE_IN, 0.8 + 0.5 * len(rows), 1, 2, sharey=True, sharex=True)
     names, shades = [f.variable for f, _ in rows], (plots.AFTER, plots.LINES[4], plots.FLOOR)
-    for ax, part, what in zip(grid[0], (SHIFT, TURN), ("origin", "axes"), strict=True):
+    for ax, part, what in zip(grid[0], (SHIFT_PART, TURN_PART), ("origin", "axes"), strict=True):
         ax.axvspan(-1.96, 1.96, color="#eeeeee", zorder=0)
         ax.axvline(0, color=plots.PALE, linewidth=1)
         for k, axis in enumerate("xyz"):
@@ -240,7 +242,7 @@ def effects(evidence: Evidence) -> Iterator[Chart | Absent]:
             for p, e, s in zip(f.parameters, f.estimate, f.sigma, strict=True)
             if s > 0
         }
-        clear = sum(v > FAR for v in z.values())
+        clear = sum(v > BEYOND_CAD for v in z.values())
         yield Chart(
             "effects",
             f"{clear} of {len(z)} parameters of effects differ clearly from zero; the clearest is "
@@ -262,7 +264,7 @@ def effects(evidence: Evidence) -> Iterator[Chart | Absent]:
 
 
 def _per_ring(fitted: VariableEstimate) -> bool:
-    return all(map(RING.fullmatch, fitted.parameters))
+    return all(map(RING_NAME.fullmatch, fitted.parameters))
 
 
 def _rings_chart(fitted: VariableEstimate, name: str) -> Chart:
@@ -295,7 +297,7 @@ def _spread(fitted: VariableEstimate) -> str:
 
 
 def _curve(fitted: VariableEstimate, along: str) -> Figure:
-    figure, grid = plots.axes(plots.HALF, 2.7)
+    figure, grid = plots.axes(plots.HALF_IN, 2.7)
     ax, (scale, unit) = grid[0, 0], shown(fitted.units[0])
     x = np.arange(len(fitted.parameters))
     value, half = scale * fitted.estimate, 1.96 * scale * fitted.sigma
@@ -311,7 +313,7 @@ def _few(drawn: Sequence[VariableEstimate]) -> Figure:
     count = sum(int((f.sigma > 0).sum()) for f in drawn)
     heights = [max(1, int((f.sigma > 0).sum())) for f in drawn]
     figure, grid = plots.axes(
-        plots.HALF, 0.6 * len(drawn) + 0.22 * count, len(drawn), height_ratios=heights
+        plots.HALF_IN, 0.6 * len(drawn) + 0.22 * count, len(drawn), height_ratios=heights
     )
     for ax, f in zip(grid[:, 0], drawn, strict=True):
         free = f.sigma > 0

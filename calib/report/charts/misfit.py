@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from calib.report import plots
 from calib.report.chart import Absent, Chart
+from calib.report.charts.groups import MOST_NAMES, MOST_TICKS
 from calib.report.evidence import Evidence
 from calib.show.misfit import (
     FAR_FROM_CAD,
@@ -24,9 +25,7 @@ if TYPE_CHECKING:
     from calib.report.plots import Figure
 
 MOST_BARS = 24  # moves that are drawn, the furthest
-MOST_NAMES = 5  # dots that bear their stop's name: more would hide each other
 SHOWN_AT_LEAST = 0.2  # misfit: smaller ones are no news
-MOST_TICKS = 40  # stops whose names are written below
 
 
 def by_stop(evidence: Evidence) -> Iterator[Chart | Absent]:
@@ -56,7 +55,7 @@ def by_stop(evidence: Evidence) -> Iterator[Chart | Absent]:
 
 
 def _by_stop(stops: Mapping[str, Mapping[str, float]], loud: Mapping[str, float]) -> Figure:
-    figure, grid = plots.axes(plots.WIDE, 3.2)
+    figure, grid = plots.axes(plots.WIDE_IN, 3.2)
     ax, names = grid[0, 0], list(stops)
     series = dict.fromkeys(name for found in stops.values() for name in found)
     for i, name in enumerate(series):
@@ -105,7 +104,7 @@ def moves_from_cad(evidence: Evidence) -> Iterator[Chart | Absent]:
 
 
 def _moves(found: Mapping[str, Mapping[str, Any]]) -> Figure:
-    figure, grid = plots.axes(plots.HALF, 0.9 + 0.26 * len(found))
+    figure, grid = plots.axes(plots.HALF_IN, 0.9 + 0.26 * len(found))
     ax, sizes = grid[0, 0], [move["move_sigmas"] for move in found.values()]
     colours = [plots.BEFORE if x > FAR_FROM_CAD else plots.AFTER for x in sizes]
     bars = ax.barh(list(found), sizes, height=0.6, color=colours)

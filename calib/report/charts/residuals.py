@@ -29,11 +29,11 @@ AXIS_UNITS = {
     "_s": ("min", 1 / 60),
     "_c": ("°C", 1.0),
 }
-BY_CHANCE = 0.02  # how seldom so many bins may lie outside their bands by chance
+BINS_OUT_BY_CHANCE = 0.02  # how seldom so many bins may lie outside their bands by chance
 SELDOM = 0.01  # of the rows: things seen less decide no scale
 FEWEST_THROWN = 0.05  # share at the end of the map's scale, at least
-WITHIN = 0.9  # of the beams thrown away: what the histogram shows
-MOST_NAMES = 40  # names of things along an axis
+BEAMS_IN_HISTOGRAM = 0.9  # of the beams thrown away: what the histogram shows
+MOST_AXIS_NAMES = 40  # names of things along an axis
 UPRIGHT_NAMES = 6  # of these; more are turned
 MARGINS = (0.72, 0.1, 0.5, 0.32)  # inches, for labels of four digits and a sign
 
@@ -95,7 +95,7 @@ def outside(curve: ResidualCurve) -> tuple[int, int, bool]:
 
     known = np.isfinite(curve.band_m)
     out = int((np.abs(curve.mean_m[known]) > curve.band_m[known]).sum())
-    return out, int(known.sum()), bool(bdtrc(out - 1, known.sum(), 0.05) < BY_CHANCE)
+    return out, int(known.sum()), bool(bdtrc(out - 1, known.sum(), 0.05) < BINS_OUT_BY_CHANCE)
 
 
 def _title(name: str, now: ResidualCurve, was: ResidualCurve | None, before: str) -> str:
@@ -117,7 +117,7 @@ def _curve(now: ResidualCurve, was: ResidualCurve | None, before: str) -> Figure
     names = now.axis.names or ()
     margins = None if len(names) > UPRIGHT_NAMES else MARGINS
     figure, grid = plots.axes(
-        plots.HALF, 3.7, 3, margins=margins, sharex=True, height_ratios=(2.0, 2.0, 1.0)
+        plots.HALF_IN, 3.7, 3, margins=margins, sharex=True, height_ratios=(2.0, 2.0, 1.0)
     )
     top, middle, bottom = grid[:, 0]
     if was is not None:
@@ -176,7 +176,7 @@ def _line(ax: Axes, curve: ResidualCurve, values_m: np.ndarray, colour: str) -> 
 def _name_bins(ax: Axes, curve: ResidualCurve) -> None:
     ax.set_xlabel(axis_label(curve.axis.name))
     names = curve.axis.names
-    if names and len(names) <= MOST_NAMES:
+    if names and len(names) <= MOST_AXIS_NAMES:
         ax.set_xticks(range(len(names)), names, rotation=45 if len(names) > UPRIGHT_NAMES else 0,
                       ha="right" if len(names) > UPRIGHT_NAMES else "center",
                       rotation_mode="anchor",
@@ -208,7 +208,7 @@ def _map_mm(statistics: Statistics) -> np.ndarray:
 
 
 def _ring_map(was: np.ndarray, now: np.ndarray, before: str) -> Figure:
-    figure, grid = plots.axes(plots.WIDE, 3.4, 1, 2, sharey=True)
+    figure, grid = plots.axes(plots.WIDE_IN, 3.4, 1, 2, sharey=True)
     for ax, values, title in zip(grid[0], (was, now), (before, "now"), strict=True):
         limit = round_up(float(np.nanquantile(np.abs(values), 0.98)))
         picture = plots.signed_map(ax, values, (-180, 180, -0.5, len(values) - 0.5), limit)
@@ -244,7 +244,7 @@ def thrown_away(evidence: Evidence) -> Iterator[Chart | Absent]:
 
 
 def _thrown_away(now: Statistics) -> Figure:
-    figure, grid = plots.axes(plots.WIDE, 3.2, 1, 2, width_ratios=(1.6, 1.0))
+    figure, grid = plots.axes(plots.WIDE_IN, 3.2, 1, 2, width_ratios=(1.6, 1.0))
     left, right = grid[0]
     extent = (-180, 180, -0.5, len(now.thrown) - 0.5)
     most = max(FEWEST_THROWN, float(np.nanmax(now.thrown)))
@@ -253,7 +253,7 @@ def _thrown_away(now: Statistics) -> Figure:
     left.set(xlabel="azimuth, deg", ylabel="ring", xticks=range(-180, 181, 90))
     sizes_mm = 1e3 * now.thrown_m
     if len(sizes_mm):
-        reach = round_up(float(np.quantile(np.abs(sizes_mm), WITHIN)))
+        reach = round_up(float(np.quantile(np.abs(sizes_mm), BEAMS_IN_HISTOGRAM)))
         right.hist(np.clip(sizes_mm, -reach, reach), np.linspace(-reach, reach, 81),
                    color=plots.BEFORE)  # fmt: skip
     right.set(xlabel="measured less predicted, mm", ylabel="beams")

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 MOST_STOPS = 3  # that are drawn, the worst: as many as a screen holds in a row each
 NAME = 20  # letters of a stop's name that stand along a map
-WITHIN = 0.95  # of the cells of stops held out: those that lie inside the scale
+UNSEEN_IN_SCALE = 0.95  # of the cells of stops held out: those that lie inside the scale
 
 
 def unseen(evidence: Evidence) -> Iterator[Chart | Absent]:
@@ -52,9 +52,9 @@ def unseen(evidence: Evidence) -> Iterator[Chart | Absent]:
 
 def _unseen(stops: Sequence[StopMaps]) -> Figure:
     height = 1.2 + 1.25 * len(stops)
-    figure, grid = plots.axes(plots.WIDE, height, len(stops), 3, sharex=True, sharey="row")
+    figure, grid = plots.axes(plots.WIDE_IN, height, len(stops), 3, sharex=True, sharey="row")
     off_mm = np.concatenate([1e3 * np.abs(stop.map_m[-1]).ravel() for stop in stops])
-    limit = round_up(float(np.nanquantile(off_mm, WITHIN)))
+    limit = round_up(float(np.nanquantile(off_mm, UNSEEN_IN_SCALE)))
     for row, stop in zip(grid, stops, strict=True):
         told = zip(row, stop.map_m, stop.rms_m, ("before", "seen", "held out"), strict=True)
         for ax, map_m, rms_m, what in told:

@@ -17,7 +17,7 @@ from calib.show.scale import round_up
 if TYPE_CHECKING:
     from calib.report.plots import Figure
 
-WITHIN = 0.98  # of the cells: those that lie inside the scale
+CELLS_IN_SCALE = 0.98  # of the cells: those that lie inside the scale
 
 
 def walls(evidence: Evidence) -> Iterator[Chart | Absent]:
@@ -46,10 +46,10 @@ def walls(evidence: Evidence) -> Iterator[Chart | Absent]:
 
 def _walls(sides: Sequence[Face]) -> Figure:
     widths = [max(side.mean_m.shape[1] for side in sides[k::3]) for k in range(3)]
-    figure, grid = plots.axes(plots.WIDE, 4.4, 2, 3, width_ratios=widths)
+    figure, grid = plots.axes(plots.WIDE_IN, 4.4, 2, 3, width_ratios=widths)
     seen = np.abs(np.concatenate([side.mean_m.ravel() for side in sides]))
     seen = seen[np.isfinite(seen)]
-    limit = round_up(1e3 * float(np.quantile(seen, WITHIN))) if len(seen) else 1.0
+    limit = round_up(1e3 * float(np.quantile(seen, CELLS_IN_SCALE))) if len(seen) else 1.0
     for ax, side in zip(grid.flat, sides, strict=True):
         rows, columns = side.mean_m.shape
         extent = (0.0, side.cell_m * columns, 0.0, side.cell_m * rows)

@@ -23,14 +23,14 @@ import numpy as np
 from scipy.special import chdtrc
 
 from calib.problem.prior import JointPrior
-from calib.results.recalibrate import ALARM, Fitted, Link, blocks_of, let_go
-from calib.runs.asked.pair import Known, Pair
+from calib.results.recalibrate import ALARM, Link, RefittedPrior, blocks_of, let_go
+from calib.runs.asked.pair import Covariances, Pair
 from calib.runs.calibrate import link_document
 from calib.runs.run import Run, solution_digest
 from calib.solve.descent import LAST
 from chains.errors import InputError
 
-PRIOR, APART, SHARED = "prior", "independent", "shared"  # how two runs go together
+PRIOR, INDEPENDENT, SHARED = "prior", "independent", "shared"  # how two runs go together
 # A fit ends where a step would lower half the chi-square by less than LAST: by so much of its
 # variance may an estimate be off, and so by twice as much the difference of two.
 UNSETTLED = 4 * LAST
@@ -99,7 +99,7 @@ def moved(a: Run, b: Run) -> Moved:
         )
     told = "Different recordings: their errors are independent, and CAD counts once"
     links = _documents(_apart(Pair.of(a, b), b))
-    return Moved((a, b), APART, links, bounds=(), remarks=(told, *differ))
+    return Moved((a, b), INDEPENDENT, links, bounds=(), remarks=(told, *differ))
 
 
 def _documents(links: Sequence[Link]) -> list[dict[str, Any]]:
@@ -197,10 +197,10 @@ def _apart(pair: Pair, b: Run) -> list[Link]:
     of_cad = cad * (least**2 - 1.0 + max(wider**2 - least**2, 0.0) * pair.is_frame)
     beyond = _nowhere_negative(weight @ (reported - graph) @ weight - np.diag(of_cad))
 
-    def fit(prior: JointPrior) -> Fitted:
+    def fit(prior: JointPrior) -> RefittedPrior:
         known = np.linalg.inv(np.linalg.inv(prior.covariance / scale) + information)
         wide = known + known @ beyond @ known
-        return Fitted(sigma * (known @ force), scale * known, scale * wide)
+        return RefittedPrior(sigma * (known @ force), scale * known, scale * wide)
 
     return let_go(JointPrior(pair.held, pair.then, pair.first.reported), fit)
 
@@ -219,7 +219,9 @@ def _differences(pair: Pair, efficient: int | None) -> tuple[list[Link], tuple[s
     links, bounds, blocks = [], [], blocks_of(pair.held)
     for unknown in pair.held:
         k = blocks[unknown.name]
-        first, second = (Known(*(m[k, k] for m in each)) for each in (pair.first, pair.second))
+        first, second = (
+            Covariances(*(m[k, k] for m in each)) for each in (pair.first, pair.second)
+        )
         V = None if efficient is None else _hausman(*((first, second), (second, first))[efficient])
         if V is None:
             V = 2.0 * (first.reported + second.reported)
@@ -240,7 +242,7 @@ def _differences(pair: Pair, efficient: int | None) -> tuple[list[Link], tuple[s
     return links, tuple(bounds)
 
 
-def _hausman(efficient: Known, other: Known) -> np.ndarray | None:
+def _hausman(efficient: Covariances, other: Covariances) -> np.ndarray | None:
     """Covariance of the difference of two estimates, as much wider as those of the estimates are;
     None where it would be negative somewhere."""
     scale = np.sqrt(np.diag(other.graph))

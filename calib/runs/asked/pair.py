@@ -20,7 +20,7 @@ from sensors.recording import read_table
 PRIORS = "_prior.parquet"
 
 
-class Known(NamedTuple):
+class Covariances(NamedTuple):
     """Covariances (P, P) of what both estimate: of rows that err alone, and as reported."""
 
     graph: np.ndarray
@@ -41,8 +41,8 @@ class Pair:
     held: list[Unknown]
     then: dict[str, np.ndarray]
     now: dict[str, np.ndarray]
-    first: Known
-    second: Known
+    first: Covariances
+    second: Covariances
     is_frame: np.ndarray
 
     @classmethod
@@ -69,7 +69,7 @@ class Pair:
                 "the same rig"
             )
         known = [
-            Known(
+            Covariances(
                 *(
                     matrix[np.ix_(at, at)]
                     for matrix in (run.solution.graph, run.solution.covariance)

@@ -13,7 +13,7 @@ from chains.errors import InputError
 from sensors.documents import nearest
 from sensors.recording import read_table
 
-BEAMS, INSTRUMENTS = "beams", ("tracker", "target", "prior")
+BEAM_RESIDUALS, INSTRUMENTS = "beams", ("tracker", "target", "prior")
 
 
 def parameters(run: Run) -> dict[str, np.ndarray]:
@@ -57,7 +57,7 @@ def parameters(run: Run) -> dict[str, np.ndarray]:
     return out
 
 
-def residuals(run: Run, kind: str = BEAMS) -> dict[str, np.ndarray]:
+def residuals(run: Run, kind: str = BEAM_RESIDUALS) -> dict[str, np.ndarray]:
     """Residuals, measured minus predicted, with their sigmas, as columns (N,) with units in names.
 
     Args:
@@ -69,12 +69,12 @@ def residuals(run: Run, kind: str = BEAMS) -> dict[str, np.ndarray]:
     Raises:
         InputError: the run has none of that kind.
     """
-    if kind not in (BEAMS, *INSTRUMENTS):
+    if kind not in (BEAM_RESIDUALS, *INSTRUMENTS):
         raise InputError(
-            f"there are no residuals of '{kind}'{nearest(kind, [BEAMS, *INSTRUMENTS])}"
+            f"there are no residuals of '{kind}'{nearest(kind, [BEAM_RESIDUALS, *INSTRUMENTS])}"
         )
     folder = run.folder / RESIDUALS
-    if kind == BEAMS:
+    if kind == BEAM_RESIDUALS:
         return _of_beams(run, sorted(folder.glob("[!_]*.parquet")))
     path = folder / f"_{kind}.parquet"
     if not path.is_file():

@@ -15,10 +15,10 @@ from calib.runs.run import Run
 from calib.view.desk import Findings
 from calib.view.shown.columns import comparable
 
-SAME = 1e-6  # relative: one error, read from two files
+SAME_ERROR = 1e-6  # relative: one error, read from two files
 # What two runs must share, beside recordings and effects, for one to tell of the other.
-ASKED = ("fixed", "without", "hold_out", "folds", "prior_sha256")
-UNKNOWN = "The held-out error is not known before the refit."
+MUST_AGREE = ("fixed", "without", "hold_out", "folds", "prior_sha256")
+NOT_KNOWN_YET = "The held-out error is not known before the refit."
 Effects = Mapping[str, Any]  # name -> name, or document of a formula
 
 
@@ -49,14 +49,14 @@ def told(run: Run, wanted: Effects, findings: Findings | None, runs: Mapping[str
         sizes = {c["add"]: c["unabsorbed_rms_mm"] for c in findings.candidates}
         alone = sizes.get(next(iter(added))) if len(added) == 1 else None
         if alone is not None:
-            return f"It explains {alone:.2f} mm rms of what this fit left. {UNKNOWN}"
-    return UNKNOWN
+            return f"It explains {alone:.2f} mm rms of what this fit left. {NOT_KNOWN_YET}"
+    return NOT_KNOWN_YET
 
 
 def linearised(before: float, after: float | None) -> str:
     """What is told of an error that one linearisation leads to; None where there is none."""
     if after is None:
-        return UNKNOWN
+        return NOT_KNOWN_YET
     return f"{_fall(before, after)}, by one step of the linearised fit."
 
 
@@ -77,7 +77,9 @@ def fitted(findings: Findings, before_mm: float) -> dict[frozenset[str], float]:
     for names, fall in added:
         start, after = fall.get("before"), fall.get("after")
         if start is not None and after is not None:
-            under = [some for some, mm in known.items() if math.isclose(mm, start, rel_tol=SAME)]
+            under = [
+                some for some, mm in known.items() if math.isclose(mm, start, rel_tol=SAME_ERROR)
+            ]
             known |= {some | names: after for some in under[-1:]}
     del known[frozenset()]
     return known
@@ -91,7 +93,7 @@ def _is_of(other: Run, run: Run, wanted: Effects) -> bool:
     """Whether a run is what another would be with these effects."""
     if not comparable(run, other) or set(other.effects) != set(wanted):
         return False
-    if any(other.model.get(key) != run.model.get(key) for key in ASKED):
+    if any(other.model.get(key) != run.model.get(key) for key in MUST_AGREE):
         return False
     theirs = dict(zip(other.effects, other.model["effects"], strict=True))
     return all(_alike(theirs[name], what) for name, what in wanted.items())

@@ -17,9 +17,9 @@ from calib.view.shown.columns import DIFFERENCE, OTHER, value_of
 from chains.errors import InputError
 
 SITES = {"range": "m", "azimuth": "rad", "elevation": "rad"}  # what it adds to -> in which unit
-LEFT = ("residual_m", "sigma_m", "weight", OTHER, DIFFERENCE)  # columns that a fit makes
-LONGEST_NAME = 40  # letters of it that a folder's name takes up
-HINT = "Of range, incidence, ring, ... and columns of stops, e.g. (humidity - 0.45) * range"
+MADE_BY_FITS = ("residual_m", "sigma_m", "weight", OTHER, DIFFERENCE)  # columns that a fit makes
+LONGEST_IN_FOLDER = 40  # letters of it that a folder's name takes up
+FORMULA_HINT = "Of range, incidence, ring, ... and columns of stops, e.g. (humidity - 0.45) * range"
 
 
 class OwnFormula:
@@ -35,7 +35,7 @@ class OwnFormula:
         self, gui: Any, guarded: Callable[..., Any], use: Callable[[str, str], None]
     ) -> None:
         self._use = use
-        self._text = gui.add_text("Own formula", "", hint=HINT)
+        self._text = gui.add_text("Own formula", "", hint=FORMULA_HINT)
         self._site = gui.add_dropdown("Adds to", tuple(SITES), initial_value="range")
         self._button = gui.add_button("Try", hint="Refit with it times a number to be found")
         self._wrong = gui.add_html("", visible=False)
@@ -70,16 +70,16 @@ def document(text: str, site: str, points: Points, taken: Collection[str]) -> di
         InputError: it is no formula of what is known of a beam before a fit.
     """
     if not text.strip():
-        raise InputError(f"write a formula first. {HINT}")
+        raise InputError(f"write a formula first. {FORMULA_HINT}")
     expression = Expression(text.strip(), "yours")
-    made = [n for n in LEFT if {n, n.removesuffix("_m")} & set(expression.names)]
+    made = [n for n in MADE_BY_FITS if {n, n.removesuffix("_m")} & set(expression.names)]
     if made:
         raise expression.wrong(f"{made[0]} is what a fit leaves; an effect cannot look at it")
     values = value_of(points, expression)
     size = float(np.sqrt(np.mean(np.square(values))))
     if not 0 < size < np.inf:
         raise expression.wrong("it is 0 at every beam here, or no number at some")
-    name = "own_" + "_".join(re.findall(r"[A-Za-z0-9]+", text))[:LONGEST_NAME].strip("_")
+    name = "own_" + "_".join(re.findall(r"[A-Za-z0-9]+", text))[:LONGEST_IN_FOLDER].strip("_")
     found = {
         "name": next(n for n in (name, *(f"{name}_{i}" for i in range(2, 1000))) if n not in taken),
         "site": site,

@@ -10,7 +10,7 @@ from calib.view.scene import Points
 from calib.view.shown.colours import column
 
 LABEL = "Light up"
-HINT = "Drag across the plot, or write two numbers: 2 to 4.5"
+BRUSH_HINT = "Drag across the plot, or write two numbers: 2 to 4.5"
 UNLIT = (211, 213, 217)  # fainter than any colour of a scale, on white walls
 # Plots of viser tell a server nothing of what is dragged across them: the page itself writes the
 # range into the field, as a person would. A menu that was used, and a box that was ticked with the

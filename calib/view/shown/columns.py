@@ -9,11 +9,11 @@ import numpy as np
 
 from calib.effects.own.expression import ALIASES, Expression
 from calib.runs.run import Run
-from calib.view.scene import MOST_POINTS, Points, Scene
+from calib.view.scene import MOST_SHOWN_POINTS, Points, Scene
 from sensors.documents import nearest
 
 OTHER, DIFFERENCE, STOP, LOCATION = "other_m", "difference_m", "stop", "location"
-UNITS = ("_m", "_rad", "_s", "_c")  # what a column's name may be written without
+UNIT_ENDINGS = ("_m", "_rad", "_s", "_c")  # what a column's name may be written without
 _BEAM = ("ring", "column", "scan", "azimuth_rad", "elevation_rad")  # the same in every run
 _ODD = np.uint64(0x9E3779B97F4A7C15)  # 2**64 over the golden ratio: Knuth's multiplicative hashing
 
@@ -29,7 +29,7 @@ def gathered(
     recording: int,
     stops: Sequence[str],
     other: Run | None = None,
-    most: int = MOST_POINTS,
+    most: int = MOST_SHOWN_POINTS,
 ) -> Points | None:
     """The beams of these stops; None where none of them was scanned.
 
@@ -88,7 +88,9 @@ def value_of(points: Points, expression: Expression) -> np.ndarray:
     """
 
     def column(name: str) -> np.ndarray:
-        found = next((n for n in (name, *(name + u for u in UNITS)) if n in points.columns), None)
+        found = next(
+            (n for n in (name, *(name + u for u in UNIT_ENDINGS)) if n in points.columns), None
+        )
         if found is None:
             shown = {full: short for short, full in ALIASES.items()}
             known = [shown.get(n, n.removesuffix("_m")) for n in points.columns]

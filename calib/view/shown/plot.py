@@ -11,10 +11,11 @@ from calib.view.scene import Points
 from calib.view.shown.colours import column
 
 MOST_DOTS = 3000  # more would hide each other on a panel of 400 pixels
-BINS, FEWEST = 16, 5  # of the line of means, and beams in one: of fewer a mean says little
+# Bins of the line of means, and beams in one: of fewer a mean says little.
+LINE_BINS, FEWEST_IN_BIN = 16, 5
 MEAN = "#d6278a"  # apart from all colours of dots, on light and on dark
 FAINT = "rgba(128,128,128,0.3)"  # of dots that are not lit, on light and on dark
-RING = "#13a10e"  # about the beam that was clicked, apart from those
+RING_COLOUR = "#13a10e"  # about the beam that was clicked, apart from those
 Chart = tuple[tuple[np.ndarray, ...], tuple[Mapping[str, Any], ...]]
 EMPTY: Chart = ((np.zeros(2), np.full(2, np.nan)), ({"label": ""}, {"label": ""}))
 
@@ -59,7 +60,7 @@ def chart(
         series.append({"label": "beams", **_dots(colour)})
     if marked in rows:
         data.append(np.where(dots == marked, y[dots], np.nan))
-        series.append({"label": "clicked", **_dots("rgba(0,0,0,0)", RING, 12)})
+        series.append({"label": "clicked", **_dots("rgba(0,0,0,0)", RING_COLOUR, 12)})
     data.append(means[thin])
     series.append({"label": "mean", "stroke": MEAN, "width": 2, "points": {"show": False}})
     return tuple(data), tuple(series)
@@ -75,10 +76,10 @@ def axes(x: np.ndarray, low: float, high: float) -> dict[str, Any]:
 def binned(x: np.ndarray, y: np.ndarray, inlier: np.ndarray) -> np.ndarray:
     """At each of N beams the mean y of the inliers in its bin of x; NaN where they are few."""
     low, high = x.min(), x.max()
-    place = np.minimum((x - low) / max(high - low, 1e-12) * BINS, BINS - 1).astype(int)
-    count = np.bincount(place[inlier], minlength=BINS)
-    total = np.bincount(place[inlier], weights=y[inlier], minlength=BINS)
-    return np.where(count < FEWEST, np.nan, total / np.maximum(count, 1))[place]
+    place = np.minimum((x - low) / max(high - low, 1e-12) * LINE_BINS, LINE_BINS - 1).astype(int)
+    count = np.bincount(place[inlier], minlength=LINE_BINS)
+    total = np.bincount(place[inlier], weights=y[inlier], minlength=LINE_BINS)
+    return np.where(count < FEWEST_IN_BIN, np.nan, total / np.maximum(count, 1))[place]
 
 
 def _palette(colours: np.ndarray, shades: int) -> tuple[list[str], np.ndarray]:

@@ -9,12 +9,12 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from calib.rig import Rig
+from calib.view.scene import MOST_TRIANGLES
 from chains import se3
 from chains.arm import LinkMesh, read_meshes
 from chains.errors import InputError, shortened
 from sensors.readers.meshes.mesh_files import read_mesh_file
 
-MOST_TRIANGLES = 300_000  # of a whole arm: as many as of a room
 PACKAGE = "package://"
 
 

@@ -17,14 +17,14 @@ import numpy as np
 from chains.errors import InputError
 from chains.readers.dh import DhRow, to_urdf
 from sensors.documents import nearest, read_yaml
-from sensors.readers.base import Arm, Contents, Options, Progress
+from sensors.readers.base import ArmDescription, Contents, Options, Progress
 from sensors.readers.tables.sheets import ANGLES, LENGTHS, is_number, open_sheet, split_unit
 
 _CONVENTIONS = ("standard", "modified")
 _LENGTHS, _ANGLES = ("a", "d"), ("alpha", "theta")
 _SAME = {"joint": "name", "offset": "theta", "theta_offset": "theta", "convention": "convention"}
 _KEYS = ("name", *_LENGTHS, *_ANGLES, "type", "lower", "upper", "mass_kg", "centre_m", "convention")
-_LONGEST_M = 10.0
+_LONGEST_M = 10.0  # a choice: no link is longer, and one of 10 mm or more in millimetres is found
 
 
 def read_dh(files: Sequence[Path], options: Options, progress: Progress) -> Contents:
@@ -53,7 +53,7 @@ def read_dh(files: Sequence[Path], options: Options, progress: Progress) -> Cont
     base, tip = options.base or "arm_base", options.tip or "arm_end"
     line = f"{path.name}: an arm of {len(rows)} joints, {convention} Denavit-Hartenberg: "
     return Contents(
-        arm=Arm(to_urdf(name, rows, convention == "modified", base, tip), base, tip),
+        arm=ArmDescription(to_urdf(name, rows, convention == "modified", base, tip), base, tip),
         understood=(line + ", ".join(row.name for row in rows),),
     )
 

@@ -14,7 +14,7 @@ from chains.errors import InputError
 from chains.readers import xacro
 from chains.readers.urdf import apply_note, arm_ends, group_ends, joint_names, parse_robot
 from sensors.documents import read_text, read_yaml
-from sensors.readers.base import Arm, Contents, Options, Progress
+from sensors.readers.base import ArmDescription, Contents, Options, Progress
 
 _MACROS = re.compile(r"<\s*xacro:|[$][{(]")  # an expanded file may still name the namespace
 
@@ -51,10 +51,10 @@ def read_urdf(files: Sequence[Path], options: Options, progress: Progress) -> Co
     )
     if notes:
         text = ElementTree.tostring(robot, encoding="unicode")
-    return Contents(arm=Arm(text, base, tip), understood=tuple(said), odd=odd)
+    return Contents(arm=ArmDescription(text, base, tip), understood=tuple(said), odd=odd)
 
 
-def with_ends(where: str, arm: Arm, options: Options) -> Arm:
+def with_ends(where: str, arm: ArmDescription, options: Options) -> ArmDescription:
     """The arm with its base and tip, found where its source does not say them.
 
     Raises:
@@ -64,7 +64,7 @@ def with_ends(where: str, arm: Arm, options: Options) -> Arm:
         return arm
     robot = parse_robot(Path(where), arm.urdf)
     base, tip, _ = arm_ends(Path(where), robot, options.base or arm.base, options.tip or arm.tip)
-    return Arm(arm.urdf, base, tip)
+    return ArmDescription(arm.urdf, base, tip)
 
 
 def _text(path: Path, options: Options) -> tuple[str, tuple[str, ...]]:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from chains.errors import InputError
 from sensors.documents import read_text
 from sensors.readers.bags.messages import LOGS, Channel, cloud_of, payloads_of
-from sensors.readers.bags.ros import OUSTER, Message, Topic, bag_files, messages, topics_of
+from sensors.readers.bags.ros import OUSTER_TYPES, Message, Topic, bag_files, messages, topics_of
 from sensors.readers.base import Array, Contents, Options, Progress, Sweep, Sweeps, Track, together
 from sensors.readers.clouds.fields import Cloud
 from sensors.readers.clouds.rings import find_format
@@ -38,6 +38,8 @@ _HESAI = (
     "hesai_ros_driver/msg/UdpFrame",
 )
 _TEXT = "std_msgs/msg/String"
+# A choice: messages arrive within a second of their stamps, and clocks that nobody has set are
+# minutes to decades off.
 _SAME_CLOCK_S = 1.0
 
 
@@ -115,7 +117,7 @@ def _choose(name: str, topics: list[Topic], options: Options) -> tuple[Topic | N
         raise InputError(f"{name} has no topic {wanted} among its topics {listed}{likely}")
     full = [topic for topic in topics if topic.count]
     lidars = [t for t in full if t.kind in (_CLOUD, *_HESAI)]
-    lidars += [t for t in full if t.kind in OUSTER and "imu" not in t.name]
+    lidars += [t for t in full if t.kind in OUSTER_TYPES and "imu" not in t.name]
     lidars = [t for t in lidars if t.name in options.topics] or lidars
     if len(lidars) > 1:
         raise InputError(
@@ -148,7 +150,7 @@ def _pass(
     of_use = list(logs)
     if lidar and lidar.kind == _CLOUD:
         of_use.append(lidar)
-    elif lidar and lidar.kind in OUSTER:
+    elif lidar and lidar.kind in OUSTER_TYPES:
         of_use += [t for t in topics if t.kind == _TEXT]
     total = sum(t.count for t in of_use)
     log = _Log()

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from chains.errors import InputError
-from sensors.readers.base import POSE
 from sensors.readers.clouds.fields import Cloud
+from sensors.stops import POSE
 
 # sensor_msgs/PointField: datatype -> numpy
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}

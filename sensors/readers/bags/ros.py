@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
     from rosbags.typesys.store import Typestore
 
-OUSTER = (
+OUSTER_TYPES = (
     "ouster_msgs/msg/PacketMsg",
     "ouster_ros/msg/PacketMsg",
     "ouster_sensor_msgs/msg/PacketMsg",
@@ -38,7 +38,7 @@ _DEFINITIONS = {
     "pandar_msgs/msg/PandarScan": "std_msgs/Header header\npandar_msgs/PandarPacket[] packets\n",
     "nebula_msgs/msg/NebulaPacket": f"{_TIME} stamp\nuint8[] data\n",
     "nebula_msgs/msg/NebulaPackets": "std_msgs/Header header\nnebula_msgs/NebulaPacket[] packets\n",
-    **dict.fromkeys(OUSTER, "uint8[] buf\n"),
+    **dict.fromkeys(OUSTER_TYPES, "uint8[] buf\n"),
 }
 
 

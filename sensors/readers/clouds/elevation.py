@@ -18,6 +18,7 @@ _CLEAR = 3.0
 _LEAST_POINTS = 3
 """Fewer points with one elevation are stray and no ring."""
 _MOST_POINTS = 300_000
+"""Points from which groups are found: of 128 rings some 2,000 each. A choice: bounds the time."""
 _SAME_STEPS = 0.03
 """How far a turn's number of azimuth steps may be off a model's, of itself."""
 _SPEEDS = (0.5, 1.0, 2.0)

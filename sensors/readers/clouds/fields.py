@@ -28,6 +28,8 @@ _USELESS = {
 }
 _AVERAGED = {"count", "range_std_m"}  # of holds, where a file has both
 _UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+# Median range: a choice. Half of a room's or a street's points are nearer, and in millimetres those
+# of a room are beyond 1000.
 _FARTHEST_M = 200.0
 
 

@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 from sensors.readers.base import Array
 
 _LEAST_POINTS = 50
+"""Of a ring: a choice; a line through so many is known to a seventh of their scatter."""
 _LEAST_RINGS = 6
+"""A choice: three times the two numbers that are fitted over them."""
 _MOST_RINGS = 256
 """What has more rows is a scanner that nods, whose rows are no cones about the axis it turns on."""
 

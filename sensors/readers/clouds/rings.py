@@ -31,7 +31,7 @@ from sensors.readers.clouds.origin import BeamOrigin, fit_beam_origin
 
 
 @dataclass(frozen=True)
-class Layout:
+class CloudLayout:
     """How the clouds of one source are read."""
 
     fields: Mapping[str, str]
@@ -80,7 +80,7 @@ class Layout:
 class CloudFormat:
     """What the first cloud of a source tells: how to read all, and what to say."""
 
-    layout: Layout
+    layout: CloudLayout
     lidar: Mapping[str, Any]
     understood: tuple[str, ...]
     odd: tuple[str, ...]
@@ -100,7 +100,7 @@ def find_format(name: str, cloud: Cloud, options: Options) -> CloudFormat:
     odd: list[str] = []
     how, first_ring, groups, rows = _rings(name, cloud, fields, xyz_m, seen, options, odd)
     columns = _columns(cloud, fields, rows, xyz_m, options)
-    layout = Layout(
+    layout = CloudLayout(
         fields=fields, scale=scale, first_ring=first_ring, groups=groups, rows=rows, columns=columns
     )
     ring = layout.points(cloud)["ring"].astype(np.int64)
@@ -205,7 +205,7 @@ def _lidar(
     name: str,
     xyz_m: Array,
     ring: NDArray[np.int64],
-    layout: Layout,
+    layout: CloudLayout,
     origin: BeamOrigin | None,
     options: Options,
     odd: list[str],

@@ -14,12 +14,14 @@ from sensors.numbers import read_csv
 
 # Colours this near each other are one: what a JPEG makes of one colour scatters by a few steps.
 _SAME_COLOUR = 24.0
+# Of a mesh with labels most colours lie so near one of few; photographs have all between. Half of
+# the above; the share, and how many labels people name, are a choice.
 _NEAR_COLOUR = 12.0
 _MOST_COLOURS = 64
 _SHARE_NEAR = 0.9
 # A colour further than this from every one of a palette is none of them.
 _FARTHEST_COLOUR = 60.0
-_MOST_LABELS = 1 << 16
+_MOST_LABELS = 1 << 16  # as a recording's faces have labels in two bytes
 
 
 @dataclass(frozen=True)

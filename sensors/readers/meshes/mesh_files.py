@@ -16,7 +16,7 @@ import numpy as np
 from chains.errors import InputError
 from sensors.ply import Columns, fans, read_ply
 
-SUFFIXES = (".ply", ".obj", ".stl", ".glb", ".gltf", ".off")
+MESH_SUFFIXES = (".ply", ".obj", ".stl", ".glb", ".gltf", ".off")
 # Where a triangle's texture is looked at: its middle, and half-way from there to each corner.
 _SAMPLES = (np.eye(4, 3, -1) + 1 / 3) / np.array([[1], [2], [2], [2]])
 
@@ -53,9 +53,9 @@ def read_mesh_file(path: Path) -> Mesh:
     triangle whose vertex does not exist or is not finite.
     """
     suffix = path.suffix.lower()
-    if suffix not in SUFFIXES:
+    if suffix not in MESH_SUFFIXES:
         cloud = "; a scanner's cloud is a `survey`" if suffix in (".e57", ".pts", ".ptx") else ""
-        known = ", ".join(SUFFIXES)
+        known = ", ".join(MESH_SUFFIXES)
         raise InputError(f"{path}: a mesh is read from {known}, not {suffix!r}{cloud}")
     if not path.is_file():
         raise InputError(f"{path} does not exist; name a mesh")

@@ -12,9 +12,10 @@ from sensors.readers.base import Array, Options
 from sensors.readers.conventions import Z_FROM_Y
 from sensors.readers.tables.sheets import LENGTHS
 
-WIDEST_M = 200.0
-FAR_M = 1000.0
-COARSEST_M = 1e-4
+# A choice: rooms are narrower, and in millimetres a room of 0.2 m and more is wider.
+WIDEST_ROOM_M = 200.0
+FAR_M = 1000.0  # from the origin, as surveys are: told, and no harm
+COARSEST_M = 1e-4  # a sixth of a scanner's usual sigma of 0.6 mm: coarser coordinates would show
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,7 @@ def find_placing(
         raise InputError(f"--length-unit is m, cm or mm and --up is y or z, not {unit} and {axis}")
     low, high = np.nanmin(values, axis=0), np.nanmax(values, axis=0)
     metres, size = LENGTHS[unit], float((high - low).max())
-    if options.length_unit is None and size > WIDEST_M:
+    if options.length_unit is None and size > WIDEST_ROOM_M:
         raise InputError(
             f"{path} is {size:.0f} units wide: if they are millimetres, give --length-unit mm,"
             " if they are metres, --length-unit m"

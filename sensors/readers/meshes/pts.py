@@ -20,7 +20,7 @@ from chains.errors import InputError
 from sensors.numbers import parse_numbers
 from sensors.readers.base import Array
 
-BLOCK_LINES = 1 << 18
+BLOCK_LINES = 1 << 18  # read at once: bounds the memory to some 20 MB
 
 
 @dataclass(frozen=True)

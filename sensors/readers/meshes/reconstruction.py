@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-FINEST_VOXEL_M = 0.002
-MOST_POINTS = 1_500_000
-_DEPTHS = (5, 11)
+FINEST_VOXEL_M = 0.002  # about a scanner's range noise: finer points say nothing new. A choice
+MOST_MESHED_POINTS = 1_500_000  # a choice: bounds memory and time of meshing
+_DEPTHS = (5, 11)  # of the octree, a choice: a room of 8 m has cells of 0.3 m to 4 mm
 # Poisson's equation needs a few points in each of its cells.
 _SPACINGS_PER_CELL = 3.0
 # Surface further from every point than that one is from its eighth neighbour has been invented:
@@ -27,9 +27,9 @@ _SPACINGS_PER_CELL = 3.0
 _CELLS_BEYOND = 3.0
 # As has surface on points thinner than the median's by this many halvings of the distance.
 _LEVELS_BELOW = 3.0
-_NEIGHBOURS = 16
-_ALIKE = np.cos(np.radians(30.0))
-_HALF_KEY = 1 << 20
+_NEIGHBOURS = 16  # points that pull at a vertex, a choice: two rings about it on an even surface
+_ALIKE = np.cos(np.radians(30.0))  # a choice: between noise of normals and a room's right angles
+_HALF_KEY = 1 << 20  # three numbers of 21 bits fill a key of 63
 
 
 class Thinner:
@@ -39,7 +39,7 @@ class Thinner:
     of eight of half the size, so sums of sums are exact.
     """
 
-    def __init__(self, voxel_m: float = FINEST_VOXEL_M, most: int = MOST_POINTS) -> None:
+    def __init__(self, voxel_m: float = FINEST_VOXEL_M, most: int = MOST_MESHED_POINTS) -> None:
         self.voxel_m = voxel_m
         self.most = most
         self.count = 0

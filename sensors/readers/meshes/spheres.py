@@ -13,13 +13,13 @@ from chains.errors import InputError
 from sensors.meshes import surface_normals
 from sensors.readers.base import Array, Contents, Options, Progress, Spheres
 from sensors.readers.meshes.placing import find_placing
-from sensors.readers.meshes.survey import SUFFIXES as CLOUDS
+from sensors.readers.meshes.survey import SURVEY_SUFFIXES as CLOUDS
 from sensors.readers.meshes.survey import read_blocks
 from sensors.readers.tables.sheets import LENGTHS, Sheet, is_number, open_sheet, split_unit
 
-_LARGEST_RMS_M = 0.005
-_LEAST_SHARE = 0.6
-_FEWEST_POINTS = 50
+_LARGEST_RMS_M = 0.005  # a choice: scanners have 1 to 3 mm of noise, what is no sphere has more
+_LEAST_SHARE = 0.6  # of a cloud that is said to be one: a choice, rod and background being the rest
+_FEWEST_POINTS = 50  # with 2 mm of noise the centre of a cap is then 0.9 mm off, rms (300 draws)
 _SEEN_CAP = 0.25  # of the half that faces the scanner, what must be there to be a sphere
 _AXIS = re.compile(r"(?:.*[ _.])?([xyz])(?:[ _-]?(?:coord.*|pos.*|value))?$", re.IGNORECASE)
 

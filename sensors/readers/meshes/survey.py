@@ -10,12 +10,12 @@ import numpy as np
 from chains.errors import InputError
 from sensors.meshes import read_cloud
 from sensors.readers.base import Array, Contents, Options, Progress, ScannedSurface
-from sensors.readers.meshes.placing import WIDEST_M, Placing, find_placing
+from sensors.readers.meshes.placing import WIDEST_ROOM_M, Placing, find_placing
 from sensors.readers.meshes.pts import PointBlock, read_pts, read_ptx
 from sensors.readers.meshes.reconstruction import Rebuilt, Thinner, rebuild
 
-SUFFIXES = (".e57", ".pts", ".ptx", ".xyz", ".ply", ".pcd")
-_COARSE_M = 0.03
+SURVEY_SUFFIXES = (".e57", ".pts", ".ptx", ".xyz", ".ply", ".pcd")
+_COARSE_M = 0.03  # a choice: edges are rounded as far, a footprint of a LiDAR a few metres away
 
 
 def read_survey(paths: Sequence[Path], options: Options, progress: Progress) -> Contents:
@@ -28,7 +28,7 @@ def read_survey(paths: Sequence[Path], options: Options, progress: Progress) -> 
     for n, path in enumerate(paths):
         clouds.read(path, options, lambda what, n=n: progress(what, n, len(paths)))
     scan, points_m, columns = clouds.thinner.means()
-    if np.ptp(points_m, axis=0).max() > WIDEST_M and options.length_unit is None:
+    if np.ptp(points_m, axis=0).max() > WIDEST_ROOM_M and options.length_unit is None:
         raise InputError(
             f"{paths[0]}: its points are {np.ptp(points_m, axis=0).max():.0f} m apart; if they are"
             " metres, give --length-unit m"
@@ -125,8 +125,10 @@ def read_blocks(path: Path) -> Iterator[PointBlock]:
     Raises InputError for a file that is missing, broken or of no kind known here.
     """
     suffix = path.suffix.lower()
-    if suffix not in SUFFIXES:
-        raise InputError(f"{path}: a cloud is read from {', '.join(SUFFIXES)}, not {suffix!r}")
+    if suffix not in SURVEY_SUFFIXES:
+        raise InputError(
+            f"{path}: a cloud is read from {', '.join(SURVEY_SUFFIXES)}, not {suffix!r}"
+        )
     if suffix in (".pts", ".xyz"):
         yield from read_pts(path)
     elif suffix == ".ptx":

@@ -34,7 +34,7 @@ _PCAPNG = b"\x0a\x0d\x0d\x0a"
 # Length of the link's own header, and where in it the type of what follows stands.
 _LINKS = {1: (14, 12), 113: (16, 14), 276: (20, 0)}
 _RAW_IP = {0: 4, 101: 0, 228: 0, 229: 0}
-_LARGEST = 1 << 20
+_LARGEST = 1 << 20  # bytes of a packet: a choice, four times what capture programs ever keep
 _LARGEST_DATAGRAM = 1 << 17  # twice what IPv4 can carry
 
 

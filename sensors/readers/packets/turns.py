@@ -24,6 +24,7 @@ Packets = Callable[[], Iterator[tuple[float, bytes]]]
 Bytes = NDArray[np.uint8]
 
 _CHUNK = 2048
+"""Packets decoded at once: bounds the memory, of the largest to some 50 MB."""
 _PAUSE_S = 0.3
 """No packet for longer than this: what comes next belongs to another turn."""
 

@@ -16,8 +16,9 @@ import numpy as np
 from chains.errors import InputError
 from sensors.documents import read_yaml
 from sensors.readers import conventions
-from sensors.readers.base import POSE, Columns, Contents, Options, Progress
+from sensors.readers.base import Columns, Contents, Options, Progress
 from sensors.readers.tables.sheets import seconds
+from sensors.stops import POSE
 
 
 def read_industrial_calibration(

@@ -15,8 +15,9 @@ import numpy as np
 
 from chains.errors import InputError
 from sensors.readers import conventions
-from sensors.readers.base import POSE, Array, Contents, Options, Progress, Track, together
+from sensors.readers.base import Array, Contents, Options, Progress, Track, together
 from sensors.readers.tables.sheets import Sheet, open_sheet, quoted
+from sensors.stops import POSE
 
 _LENGTHS = {"meters": 1.0, "centimeters": 1e-2, "millimeters": 1e-3, "inches": 0.0254}
 _BODY = 11  # cells of a body in format 1.1: its number, x y z, qx qy qz qw, yaw pitch roll

@@ -13,8 +13,9 @@ import numpy as np
 
 from chains.errors import InputError
 from sensors.readers import conventions
-from sensors.readers.base import POSE, Array, Contents, Options, Progress, Track, together
+from sensors.readers.base import Array, Contents, Options, Progress, Track, together
 from sensors.readers.tables.sheets import LENGTHS, is_number, open_sheet, seconds
+from sensors.stops import POSE
 
 _GYRO = "w_RS_S_x"
 

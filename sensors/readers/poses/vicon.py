@@ -16,8 +16,9 @@ from scipy.spatial.transform import Rotation
 
 from chains.errors import InputError
 from sensors.readers import conventions
-from sensors.readers.base import POSE, Array, Contents, Options, Progress, Track, together
+from sensors.readers.base import Array, Contents, Options, Progress, Track, together
 from sensors.readers.tables.sheets import ANGLES, LENGTHS, Sheet, open_sheet
+from sensors.stops import POSE
 
 _BODIES = ("segments", "objects")
 _TITLES = (*_BODIES, "trajectories")

@@ -20,10 +20,10 @@ import numpy as np
 from chains.errors import InputError
 from sensors.readers.base import Array
 
-SAMPLE_LINES = 200
+SAMPLE_LINES = 200  # of a file, from which its form is told: headers have some ten
 LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 ANGLES = {"rad": 1.0, "deg": np.pi / 180}
-TIMES = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+TIME_UNITS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _BOMS = (
     (codecs.BOM_UTF8, "utf-8-sig"),
     (codecs.BOM_UTF16_LE, "utf-16"),
@@ -141,7 +141,7 @@ def split_unit(header: str) -> tuple[str, str | None]:
         return header.strip(), None
     name, unit = (match[1], match[2]) if match[2] else (match[3], match[4])
     unit = {"degree": "deg", "degrees": "deg", "meters": "m"}.get(unit.lower(), unit.lower())
-    known = unit in LENGTHS or unit in ANGLES or unit in TIMES
+    known = unit in LENGTHS or unit in ANGLES or unit in TIME_UNITS
     return (name.strip(), unit) if known else (header.strip(), None)
 
 
@@ -152,14 +152,14 @@ def seconds(values: Array, unit: str | None) -> tuple[Array, str]:
     too large for seconds since 1970 are milli-, micro- or nanoseconds.
     """
     size = np.nanmedian(np.abs(values)) if np.isfinite(values).any() else 0.0
-    if unit in TIMES:
-        return values * TIMES[unit], f"times in {unit}"
+    if unit in TIME_UNITS:
+        return values * TIME_UNITS[unit], f"times in {unit}"
     if 1.9e13 < size < 2.2e13 and (dates := _dates(values)) is not None:
         return dates, "times as dates, YYYYMMDDhhmmss"
     factor = next((factor for least, factor in _EPOCH if size > least), 1.0)
     return (
         values * factor,
-        f"times in {dict((f, u) for u, f in TIMES.items() if u != 'sec')[factor]}",
+        f"times in {dict((f, u) for u, f in TIME_UNITS.items() if u != 'sec')[factor]}",
     )
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from chains.errors import InputError
 from sensors.documents import nearest
 from sensors.readers import conventions
-from sensors.readers.base import POSE, Array, Columns, Contents, Options, Progress, Track
+from sensors.readers.base import Array, Columns, Contents, Options, Progress, Track
 from sensors.readers.tables.sheets import (
     ANGLES,
     LENGTHS,
@@ -28,9 +28,11 @@ from sensors.readers.tables.sheets import (
     seconds,
     split_unit,
 )  # fmt: skip
+from sensors.stops import POSE
 
 EULER = ("rx", "ry", "rz")
 TEXT = ("stop", "location")
+# From row to row, a choice: logs have 5 Hz and more, arms take seconds; between them is asked.
 LOG_BELOW_S, STOPS_ABOVE_S = 0.2, 1.5
 _TIMES = ("time_s", "time", "timestamp", "stamp", "t", "sec", "secs", "seconds")
 _POSITIONS = {"position", "pos", "q", "actual", "joint_states", "joint", ""}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.sparse import csr_array, vstack
 
-from calib.diagnosis.formulas.table import Table
+from calib.diagnosis.formulas.table import BeamTable
 
 SURFACES, RINGS = 12, 32
 SIGMA = 0.002  # of a beam, m
@@ -32,7 +32,7 @@ def derivative(
     columns: dict[str, np.ndarray], stop: np.ndarray, place: np.ndarray, rng: np.random.Generator
 ) -> csr_array:
     """(N, 6 K + U) of the residual by the twists of K stops, and by the unknowns: the poses of
-    these, a range zero, rings and surfaces; see `Table`."""
+    these, a range zero, rings and surfaces; see `BeamTable`."""
     rows, begin = len(stop), 6 * (int(stop.max()) + 1)
     azimuth, elevation = columns["azimuth_rad"], columns["elevation_rad"]
     flat = np.cos(elevation)
@@ -55,7 +55,7 @@ def table(
     outliers: float = 0.0,
     more: object = None,
     share: float = 1.0,
-) -> Table:
+) -> BeamTable:
     """Beams of a model of stops' poses (tracked), a range zero, and offsets of rings and surfaces.
 
     Args:
@@ -63,7 +63,7 @@ def table(
         scatter_m: sd of a range zero that each stop has of its own.
         outliers: share of the beams that are off by 50 mm.
         more: a function of the generator and the covariates: columns beside these.
-        share: as of `Table`.
+        share: as of `BeamTable`.
     """
     rng = np.random.default_rng(seed)
     columns = covariates(rng, stops, each)
@@ -82,7 +82,7 @@ def table(
     true = 0.1 * rng.standard_normal(unknowns) / priors  # a fit has been here
     true[begin:] *= 0.01
     residual = noise - twists @ np.concatenate([poses @ true, true])
-    return Table(
+    return BeamTable(
         covariates=columns,
         by_stop=frozenset({"temperature_c", "humidity", "time_s"} & set(columns)),
         residual_m=residual + (hidden(columns) if hidden else 0.0),
@@ -99,7 +99,9 @@ def table(
     )
 
 
-def dense(table: Table, weight: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def dense(
+    table: BeamTable, weight: np.ndarray, columns: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """All rows of a table with columns (N, k) beside its model, whitened: (N + R, U + k) their
     derivative by the unknowns, and (N + R,) what each is off by where these are zero."""
     root = np.sqrt(weight)[:, None]

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import yaml
 
-from calib.diagnosis.formulas.factors import KINDS, Factor, columns_of, factors
-from calib.diagnosis.formulas.terms import Term
+from calib.diagnosis.formulas.factors import FACTOR_KINDS, Factor, columns_of, factors
+from calib.diagnosis.formulas.terms import FormulaTerm
 from calib.effects import View
 from calib.effects.own.expression import Expression
 from calib.effects.own.formula import FormulaEffect
@@ -67,10 +67,10 @@ def stacked(columns: list, rows: int) -> np.ndarray:
 
 
 def test_every_kind_is_here():
-    assert {*FORMS, *FORMS_OF_RINGS} >= set(KINDS)
+    assert {*FORMS, *FORMS_OF_RINGS} >= set(FACTOR_KINDS)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", FACTOR_KINDS)
 @pytest.mark.parametrize("as_file", [False, True])
 def test_a_kind_is_its_closed_form(kind, as_file):
     at = X if kind in FORMS else WHOLE
@@ -86,7 +86,7 @@ def test_a_kind_is_its_closed_form(kind, as_file):
     assert found == pytest.approx(stacked(columns(at, *constants), len(at)), abs=1e-12)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", FACTOR_KINDS)
 def test_free_constants_come_first_and_are_moved_alone(kind):
     constants, _ = {**FORMS, **FORMS_OF_RINGS}[kind]
     factor = Factor("column", kind, constants)
@@ -175,7 +175,7 @@ def test_a_rare_class_is_none():
 
 
 def test_columns_of_a_product_are_all_products():
-    term = Term((Factor("x", "line", (1.0, 2.0)), Factor("y", "cosine")))
+    term = FormulaTerm((Factor("x", "line", (1.0, 2.0)), Factor("y", "cosine")))
     x, y = np.linspace(0, 1, 5), np.linspace(0, 3, 5)
     a = (x - 1) / 2
     expected = np.stack([a * np.cos(y), a, np.cos(y), np.ones(5)], axis=1)

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from calib.diagnosis.formulas.factors import Factor
-from calib.diagnosis.formulas.found import Formula, Part, settled, with_sigma
+from calib.diagnosis.formulas.found import FittedTerm, Formula, settled, with_sigma
 from calib.diagnosis.formulas.picture import picture_of
-from calib.diagnosis.formulas.pursuit import Step, form
-from calib.diagnosis.formulas.terms import Term
+from calib.diagnosis.formulas.pursuit import ConfirmedTerm, form
+from calib.diagnosis.formulas.terms import FormulaTerm
 from calib.effects import View
 from calib.effects.own.expression import Expression
 from calib.effects.own.formula import FormulaEffect
@@ -59,15 +59,15 @@ def test_what_is_written_is_the_number_within_a_fraction_of_its_sigma():
 # The sentence -------------------------------------------------------------------------------------
 
 
-def formula(*parts: Part) -> Formula:
+def formula(*parts: FittedTerm) -> Formula:
     return Formula(parts=parts, steps=[], rms_m=1e-3, seen={}, picture={})
 
 
-def part(factors, at, amounts, relative=EXACT) -> Part:
-    term = Term(tuple(factors))
+def part(factors, at, amounts, relative=EXACT) -> FittedTerm:
+    term = FormulaTerm(tuple(factors))
     amount = 1e-3 * np.array(amounts)
     constants = np.abs(np.array(term.constants)) * relative
-    return Part(
+    return FittedTerm(
         term=term,
         at=tuple(at),
         amount=amount,
@@ -181,10 +181,10 @@ def test_its_name_is_of_its_covariates_and_not_taken():
 # Settled ------------------------------------------------------------------------------------------
 
 
-def steps_of(beams, *terms: Term) -> list[Step]:
+def steps_of(beams, *terms: FormulaTerm) -> list[ConfirmedTerm]:
     model = beams.projection()
     forms = [form(model, term, 1) for term in terms]
-    return [Step(form=f, alike=[], p_value=1e-6, p_adjusted=1e-6) for f in forms]
+    return [ConfirmedTerm(form=f, alike=[], p_value=1e-6, p_adjusted=1e-6) for f in forms]
 
 
 def test_terms_over_the_same_covariates_are_one_formula():
@@ -194,9 +194,9 @@ def test_terms_over_the_same_covariates_are_one_formula():
         )
 
     beams = table(1, stops=10, each=100, hidden=hidden)
-    one = Term((Factor("range_m", "harmonic", (1.0,)),))
-    two = Term((Factor("range_m", "step", (6.0,)),))
-    other = Term((Factor("intensity", "step", (0.5,)),))
+    one = FormulaTerm((Factor("range_m", "harmonic", (1.0,)),))
+    two = FormulaTerm((Factor("range_m", "step", (6.0,)),))
+    other = FormulaTerm((Factor("intensity", "step", (0.5,)),))
     formulas = settled(beams, steps_of(beams, one, two, other))
     assert [len(f.parts) for f in formulas] == [2, 1]
     values = beams.covariates["range_m"]
@@ -205,7 +205,9 @@ def test_terms_over_the_same_covariates_are_one_formula():
 
 def test_columns_that_chance_explains_are_left_out():
     beams = table(2, stops=15, each=100, hidden=lambda c: 3e-3 * np.cos(2 * c["azimuth_rad"]))
-    (found,) = settled(beams, steps_of(beams, Term((Factor("azimuth_rad", "harmonic", (2.0,)),))))
+    (found,) = settled(
+        beams, steps_of(beams, FormulaTerm((Factor("azimuth_rad", "harmonic", (2.0,)),)))
+    )
     assert found.texts == ("cos(2 * azimuth_rad)",)
     assert abs(found.amount[0] - 3e-3) < 4 * found.parts[0].sigma[0] < 1.5e-3
 
@@ -213,7 +215,9 @@ def test_columns_that_chance_explains_are_left_out():
 def test_what_the_model_takes_on_is_left_out():
     """Of a line over range the constant is the range zero that is estimated anyway."""
     beams = table(3, stops=15, each=100, hidden=lambda c: 3e-3 * (c["range_m"] - 4) / 5)
-    (found,) = settled(beams, steps_of(beams, Term((Factor("range_m", "line", (6.0, 5.0)),))))
+    (found,) = settled(
+        beams, steps_of(beams, FormulaTerm((Factor("range_m", "line", (6.0, 5.0)),)))
+    )
     assert found.texts == ("(range_m - 6) / 5",)
     assert found.rms_m == pytest.approx(3e-3 * np.std(beams.covariates["range_m"]) / 5, rel=0.1)
 
@@ -223,9 +227,9 @@ def test_amplitude_and_phase_are_as_well_known_as_sine_and_cosine_together(corre
     """By drawing these: to half of the last digit that is written, and 5 %."""
     amount, sigma = np.array([8e-3, 3e-3]), np.array([4e-4, 2e-4])
     covariance = np.outer(sigma, sigma) * np.array([[1.0, correlation], [correlation, 1.0]])
-    wave = Term((Factor("azimuth_rad", "harmonic", (2.0,)),))
+    wave = FormulaTerm((Factor("azimuth_rad", "harmonic", (2.0,)),))
     none = np.zeros(0)
-    told = formula(Part(wave, (0, 1), amount, covariance, constants_sigma=none)).says
+    told = formula(FittedTerm(wave, (0, 1), amount, covariance, constants_sigma=none)).says
     drawn = np.random.default_rng(0).multivariate_normal(amount, covariance, 4000)
     wanted = 1e3 * np.std(np.hypot(*drawn.T)), np.std(np.arctan2(*drawn.T[::-1]))
     written = re.findall(r"\.(\d+)\((\d+)\)", told)
@@ -244,7 +248,7 @@ def test_sigmas_cover():
         return 4e-3 * np.sin(2 * np.pi * c["incidence_rad"] / 0.8 + 0.8) * c["intensity"]
 
     line = Factor("intensity", "power", (1.0, 1.0))
-    start = Term((Factor("incidence_rad", "wave", (0.85,)), line))
+    start = FormulaTerm((Factor("incidence_rad", "wave", (0.85,)), line))
     turned = np.array([np.cos(0.8), np.sin(0.8)])
     z = []
     for seed in range(40):
@@ -262,7 +266,9 @@ def test_sigmas_cover():
 def test_an_edge_is_told_no_closer_than_the_values_beside_it():
     """Errors of a window's edges in their sigmas, of 30 worlds; a ring's edge lies midway."""
     edges, z = np.array([-1.0, 0.5]), []
-    start = Term((Factor("azimuth_rad", "window", (-1.2, 0.6)), Factor("ring", "step", (14.2,))))
+    start = FormulaTerm(
+        (Factor("azimuth_rad", "window", (-1.2, 0.6)), Factor("ring", "step", (14.2,)))
+    )
 
     def hidden(c):
         inside = (c["azimuth_rad"] > edges[0]) & (c["azimuth_rad"] < edges[1])
@@ -286,7 +292,9 @@ def test_an_edge_is_told_no_closer_than_the_values_beside_it():
 
 @pytest.fixture(scope="module")
 def pictured():
-    term = Term((Factor("azimuth_rad", "window", (0.0, 1.5)), Factor("ring", "step", (15.5,))))
+    term = FormulaTerm(
+        (Factor("azimuth_rad", "window", (0.0, 1.5)), Factor("ring", "step", (15.5,)))
+    )
     beams = table(6, stops=20, each=400, hidden=lambda c: 6e-3 * term.columns(c)[:, 0])
     fit, theta = beams.projection(term.columns(beams.covariates)).fitted(
         term.columns(beams.covariates)

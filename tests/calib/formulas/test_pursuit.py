@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from calib.diagnosis.formulas.factors import Factor
-from calib.diagnosis.formulas.found import Formula, Part, settled
-from calib.diagnosis.formulas.pursuit import Form, Step, form, pursue, simplest
-from calib.diagnosis.formulas.terms import Term, refine, slopes
+from calib.diagnosis.formulas.found import FittedTerm, Formula, settled
+from calib.diagnosis.formulas.pursuit import ConfirmedTerm, Form, form, pursue, simplest
+from calib.diagnosis.formulas.terms import FormulaTerm, refine, slopes
 
 from .made import table
 
@@ -218,7 +218,7 @@ def test_slopes_are_derivatives_also_where_a_scale_is_at_its_end(share):
     beams = table(17, stops=5)
     x = beams.covariates["range_m"]
     low, scale = x.min(), share * np.ptp(x)
-    term = Term((Factor("range_m", "decay", (scale, low)),))
+    term = FormulaTerm((Factor("range_m", "decay", (scale, low)),))
     (slope,) = slopes(beams.covariates, term, [0], np.array([2.0])).T
     true = 2.0 * np.exp(-(x - low) / scale) * (x - low) / scale**2
     assert np.isfinite(slope).all()
@@ -240,7 +240,7 @@ def test_slopes_are_derivatives_also_where_a_scale_is_at_its_end(share):
 def test_refining_moves_constants_to_where_they_are(kind, start, true):
     planted = Factor("azimuth_rad", kind, true)
     beams = table(14, hidden=lambda c: 4e-3 * planted.columns(c)[:, 0])
-    term = refine(beams.projection(), Term((Factor("azimuth_rad", kind, start),)))
+    term = refine(beams.projection(), FormulaTerm((Factor("azimuth_rad", kind, start),)))
     assert term.constants == pytest.approx(true, abs=0.05)
 
 
@@ -248,7 +248,7 @@ def test_refining_never_explains_less():
     beams = table(15)
     model = beams.projection()
     for kind, start in (("wave", (3.0,)), ("decay", (2.0, 1.0)), ("window", (3.0, 6.0))):
-        term = Term((Factor("range_m", kind, start),))
+        term = FormulaTerm((Factor("range_m", kind, start),))
         better = refine(model, term)
         before, after = (form(model, t, 1).statistic for t in (term, better))
         assert after >= before
@@ -266,20 +266,20 @@ def test_holes_in_a_column_are_no_values(kind, start):
     beams = replace(
         beams, covariates={**beams.covariates, "humidity": values}, residual_m=residual_m
     )
-    term = refine(beams.projection(), Term((Factor("humidity", kind, start),)))
+    term = refine(beams.projection(), FormulaTerm((Factor("humidity", kind, start),)))
     assert term.constants == pytest.approx(planted.constants[: len(term.constants)], abs=0.03)
 
 
 def test_a_term_without_constants_stays():
-    term = Term((Factor("incidence_rad", "over cosine"),))
+    term = FormulaTerm((Factor("incidence_rad", "over cosine"),))
     assert refine(table(15, stops=5).projection(), term) is term
 
 
 # What takes the place of what ---------------------------------------------------------------------
 
 LINE, WAVE = (
-    Term((Factor("range_m", "line", (6.0, 5.0)),)),
-    Term((Factor("range_m", "wave", (4.0,)),)),
+    FormulaTerm((Factor("range_m", "line", (6.0, 5.0)),)),
+    FormulaTerm((Factor("range_m", "wave", (4.0,)),)),
 )
 
 
@@ -324,7 +324,7 @@ def test_what_hangs_on_more_is_told_by_more(covariates, taken):
     more = np.random.default_rng(0).normal(0.0, 1.0, 30)
     more = 2.0 + (more - more.mean()) * 2.0 * np.sqrt(30) / 2.4 / more.std(ddof=1)
     best, line = rivals(more)
-    product = Term((*LINE.factors, Factor("humidity", "line", (0.45, 0.1))))
+    product = FormulaTerm((*LINE.factors, Factor("humidity", "line", (0.45, 0.1))))
     further = replace(best, term=product)
     assert (simplest([further, line], covariates)[0] is further) is taken
     assert simplest([best, line], MANY)[0] is best
@@ -335,7 +335,9 @@ def test_the_best_of_other_covariates_does_not_shelter_a_poor_form():
     others: the wave is taken, though the line is simpler."""
     rng = np.random.default_rng(0)
     wave, line = rivals(rng.normal(1.0, 1.0, 30) * 3)
-    others = Term((Factor("humidity", "line", (0.4, 0.1)), Factor("intensity", "line", (0.5, 0.5))))
+    others = FormulaTerm(
+        (Factor("humidity", "line", (0.4, 0.1)), Factor("intensity", "line", (0.5, 0.5)))
+    )
     best = Form(others, 400.0, 1, wave.left - rng.normal(3.0, 12.0, 30))
     chosen, alike = simplest([best, wave, line], MANY)
     assert line not in (chosen, *alike) and wave in (chosen, *alike)
@@ -344,7 +346,7 @@ def test_the_best_of_other_covariates_does_not_shelter_a_poor_form():
 def test_what_a_form_leaves_of_stops_is_what_it_does_not_explain():
     beams = table(16, stops=10, each=100, hidden=lambda c: 3e-3 * np.sin(c["range_m"]))
     model = beams.projection()
-    found = form(model, Term((Factor("range_m", "harmonic", (1.0,)),)), 1)
+    found = form(model, FormulaTerm((Factor("range_m", "harmonic", (1.0,)),)), 1)
     alone = model.weight @ np.square(model.left_m)
     _, theta = model.fitted(found.term.columns(beams.covariates))
     assert theta[0] == pytest.approx(3e-3, abs=5e-4)
@@ -354,14 +356,16 @@ def test_what_a_form_leaves_of_stops_is_what_it_does_not_explain():
 
 
 def test_the_same_function_of_a_covariate_that_goes_along_says_nothing_else():
-    ring = Term((Factor("ring", "line", (15.5, 15.5)),))
-    height = Term((Factor("elevation_rad", "line", (0.0, 0.3)),))
-    square = Term((Factor("ring", "square", (15.5, 15.5)),))
+    ring = FormulaTerm((Factor("ring", "line", (15.5, 15.5)),))
+    height = FormulaTerm((Factor("elevation_rad", "line", (0.0, 0.3)),))
+    square = FormulaTerm((Factor("ring", "square", (15.5, 15.5)),))
     chosen = Form(ring, 9.0, 1, np.ones(3))
     others = [Form(term, 8.0, 1, np.ones(3)) for term in (height, square, WAVE)]
-    step = Step(form=chosen, alike=others, p_value=1e-6, p_adjusted=1e-6)
+    step = ConfirmedTerm(form=chosen, alike=others, p_value=1e-6, p_adjusted=1e-6)
     none = np.zeros(0)
-    part = Part(term=ring, at=(0,), amount=none, covariance=np.zeros((0, 0)), constants_sigma=none)
+    part = FittedTerm(
+        term=ring, at=(0,), amount=none, covariance=np.zeros((0, 0)), constants_sigma=none
+    )
     found = Formula(parts=[part], steps=[step], rms_m=0.0, seen={}, picture={})
     # The square only adds a column.
     assert [f.term for f in found.alike] == [WAVE]

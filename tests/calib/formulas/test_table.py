@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from calib.diagnosis.formulas.table import HUBER, Projection, Table
-from calib.diagnosis.score import test as score_test
+from calib.diagnosis.formulas.table import HUBER, BeamTable, Projection
+from calib.diagnosis.score import score_test
 from calib.effects import DEFAULT
 from calib.problem import build
 from calib.problem.model import Model
@@ -17,12 +17,12 @@ from .made import SIGMA, dense, solved, table
 SMALL = {"stops": 8, "each": 60}
 
 
-def some_columns(beams: Table) -> np.ndarray:
+def some_columns(beams: BeamTable) -> np.ndarray:
     c = beams.covariates
     return np.column_stack([c["range_m"] * c["humidity"], np.sin(3 * c["azimuth_rad"])])
 
 
-def weighted(beams: Table) -> np.ndarray:
+def weighted(beams: BeamTable) -> np.ndarray:
     """Weights that differ from row to row."""
     rng = np.random.default_rng(5)
     return rng.uniform(0.2, 1.0, len(beams)) / beams.sigma_m**2
@@ -96,7 +96,7 @@ def test_what_the_model_can_take_on_explains_nothing(case):
     assert free.fitted(np.hstack([zero, ring]))[1].tolist() == [0.0, 0.0]
 
 
-def vars_of(beams: Table) -> dict:
+def vars_of(beams: BeamTable) -> dict:
     return {name: getattr(beams, name) for name in beams.__dataclass_fields__}
 
 
@@ -159,14 +159,14 @@ def estimate(tmp_path_factory):
 
 
 def test_the_same_beams_are_drawn_each_time(estimate):
-    one, two = (Table.of(estimate, most=1000) for _ in range(2))
+    one, two = (BeamTable.of(estimate, most=1000) for _ in range(2))
     assert np.array_equal(one.residual_m, two.residual_m)
     assert all(np.array_equal(v, two.covariates[n]) for n, v in one.covariates.items())
     assert (one.twists != two.twists).nnz == 0
 
 
 def test_a_share_of_each_stop_is_drawn(estimate):
-    every, some = Table.of(estimate), Table.of(estimate, most=1000)
+    every, some = BeamTable.of(estimate), BeamTable.of(estimate, most=1000)
     assert every.share == 1.0
     assert len(some) == pytest.approx(1000, abs=len(np.unique(some.stop)))
     assert some.share == pytest.approx(1000 / len(every), rel=0.02)
@@ -175,7 +175,7 @@ def test_a_share_of_each_stop_is_drawn(estimate):
 
 
 def test_columns_of_stops_are_told_from_those_of_beams(estimate):
-    beams = Table.of(estimate, most=2000)
+    beams = BeamTable.of(estimate, most=2000)
     assert {"range_m", "incidence_rad", "azimuth_rad", "ring"} <= set(beams.covariates)
     assert "temperature_c" in beams.by_stop
     for name, values in beams.covariates.items():

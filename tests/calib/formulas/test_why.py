@@ -6,7 +6,7 @@ import pytest
 
 from calib.diagnosis.candidates import PoseShape
 from calib.diagnosis.formulas.factors import NOT_COVARIATES
-from calib.diagnosis.formulas.why import ARM_JOINT, JOINT, MECHANISMS, OF_ARM, OTHER, why
+from calib.diagnosis.formulas.why import ARM_JOINT, MECHANISMS, OF_ARM, WHY_JOINT, WHY_OTHER, why
 from calib.diagnosis.verdict import unnamed as module
 from calib.diagnosis.verdict.unnamed import unnamed
 from calib.effects import CATALOGUE, Site
@@ -17,16 +17,20 @@ KNOWN = sorted({c for e in CATALOGUE if e.site is Site.BEAM for c in e.covariate
 @pytest.mark.parametrize("name", sorted({*KNOWN, *MECHANISMS} - NOT_COVARIATES))
 def test_each_covariate_of_the_catalogue_has_a_mechanism_and_an_experiment(name):
     found = why([name])
-    assert found["mechanisms"][name] not in ("", OTHER[0])
-    assert found["experiments"][name] not in ("", OTHER[1])
+    assert found["mechanisms"][name] not in ("", WHY_OTHER[0])
+    assert found["experiments"][name] not in ("", WHY_OTHER[1])
 
 
 def test_a_joint_and_a_column_of_the_users_own_have_theirs():
     found = why(["elbow", "wind"], {"elbow"})
-    assert found["mechanisms"] == {"elbow": JOINT[0], "wind": OTHER[0]}
+    assert found["mechanisms"] == {"elbow": WHY_JOINT[0], "wind": WHY_OTHER[0]}
     of_arm = why(["elbow", "wind", "payload_kg"], {"elbow"}, of_arm=True)
     payload = OF_ARM["payload_kg"][0]
-    assert of_arm["mechanisms"] == {"elbow": ARM_JOINT[0], "wind": OTHER[0], "payload_kg": payload}
+    assert of_arm["mechanisms"] == {
+        "elbow": ARM_JOINT[0],
+        "wind": WHY_OTHER[0],
+        "payload_kg": payload,
+    }
     sites = {e.family: e.site for e in CATALOGUE}
     assert of_arm["known"] and {sites[name] for name in of_arm["known"]} == {Site.JOINTS}
 

@@ -11,7 +11,8 @@ from calib.intake.gather import chain
 from calib.intake.motion import motions
 from chains.errors import InputError
 from chains.readers.dh import DhRow, to_urdf
-from sensors.readers.base import POSE, Arm, Sweeps, Track
+from sensors.readers.base import ArmDescription, Sweeps, Track
+from sensors.stops import POSE
 
 from .moving import DH, JOINTS, T_TIP_CUP, T_WORLD_BASE, logged, plan, tip
 
@@ -23,7 +24,7 @@ END_S = float(SPANS[-1, 1])
 @pytest.fixture(scope="module")
 def edges():
     rows = [DhRow(n, a, alpha, d) for n, (a, alpha, d) in zip(JOINTS, DH, strict=True)]
-    return chain(Arm(to_urdf("arm", rows, False), "arm_base", "arm_end"))
+    return chain(ArmDescription(to_urdf("arm", rows, False), "arm_base", "arm_end"))
 
 
 def joints(offset_s=0.0, clock="joints", rate_hz=50):

@@ -10,7 +10,7 @@ from calib.intake import import_files
 from calib.rig import load_rig
 from calib.runs.calibrate import calibrate
 from chains.errors import InputError
-from sensors.readers.base import POSE
+from sensors.stops import POSE
 
 from .moving import JOINTS, T_BASE_FOOT, T_TIP_CUP, T_WORLD_BASE, dh, tip
 

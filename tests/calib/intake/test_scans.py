@@ -5,8 +5,9 @@ import pytest
 
 from calib.intake import scans, targets
 from chains.errors import InputError
-from sensors.readers.base import POSE, Spheres, Sweep, Sweeps, Track
+from sensors.readers.base import Spheres, Sweep, Sweeps, Track
 from sensors.recording import read_table
+from sensors.stops import POSE
 
 STOPS = ("a", "b", "c")
 SPANS = np.array([[0.0, 1.0], [2.0, 3.0], [5.0, 6.0]])

@@ -9,7 +9,8 @@ from calib.intake.rigfile import _without
 from calib.intake.still import SETTLE_S, find_holds
 from calib.intake.stops import locations, table
 from chains.errors import InputError
-from sensors.readers.base import POSE, Track
+from sensors.readers.base import Track
+from sensors.stops import POSE
 
 from .moving import JOINTS, T_TIP_CUP, T_WORLD_BASE, logged, plan, tip
 

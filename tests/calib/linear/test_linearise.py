@@ -161,7 +161,7 @@ def test_variances_of_sets_of_rows_are_the_diagonals_of_their_covariances(case, 
         {n: rng.normal(size=(k, linear.layout.unknowns[n].dim)) for n in by}
         for k, by in enumerate(some, 2)
     ]
-    monkeypatch.setattr("calib.linear.system.AT_ONCE", 4)
+    monkeypatch.setattr("calib.linear.system.ROWS_AT_ONCE", 4)
     assert linear.variances([], kept) == []
     for by, found in zip(sets, linear.variances(sets, kept), strict=True):
         rows = np.zeros((len(found), linear.layout.size))

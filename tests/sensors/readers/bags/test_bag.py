@@ -12,7 +12,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from chains.errors import InputError
 from sensors.lidar import load_lidar
 from sensors.readers.bags.bag import read_bag
-from sensors.readers.base import POSE, Options
+from sensors.readers.base import Options
+from sensors.stops import POSE
 
 from ..room import box_scan
 

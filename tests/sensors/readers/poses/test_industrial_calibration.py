@@ -5,8 +5,9 @@ import pytest
 import yaml
 
 from chains.errors import InputError
-from sensors.readers.base import POSE, Options
+from sensors.readers.base import Options
 from sensors.readers.poses.industrial_calibration import read_industrial_calibration
+from sensors.stops import POSE
 
 POSES = [dict(zip(POSE, [0.1, 0.2, 0.3 + k, 0.5, 0.5, -0.5, 0.5], strict=True)) for k in range(3)]
 ROWS = {

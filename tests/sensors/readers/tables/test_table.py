@@ -6,8 +6,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from chains.errors import InputError
-from sensors.readers.base import POSE, Options
+from sensors.readers.base import Options
 from sensors.readers.tables.table import read_table
+from sensors.stops import POSE
 
 RNG = np.random.default_rng(4)
 TURN = Rotation.random(20, rng=4)
