@@ -22,6 +22,10 @@ LEVEL_RAD = np.radians(3.0)
 # Of incidence, nine tenths of it, below which what depends on it is hardly told: a choice; from 0
 # to 30 deg its cosine falls by an eighth.
 NARROW_RAD = np.radians(30.0)
+# Mass over the cube of an arm's length, kg/m3: of arms for sale 13 (UR10, 29 kg, 1.3 m) to 143 (a
+# KR 1000, 4,700 kg, 3.2 m). Ten times less or more is no arm's, but in grams or tonnes it would be.
+LIGHTEST, HEAVIEST = 1.3, 1430.0
+ALL_ALIKE = 3  # links of one and the same mass: no maker's, but what is written until one is known
 COARSE_M = 0.05  # no instrument here is as bad as that
 FAR_OFF_M = 0.3  # median residual at the start: more than CAD is wrong by
 
@@ -54,7 +58,9 @@ class PlacedScan:
 def of_rig(rig: Rig) -> Iterator[Line]:
     """The rig's instruments."""
     parts = [f"{rig.lidar.name} with {rig.lidar.rings} rings"] if rig.lidar else []
-    parts += [f"arm of {counted(len(rig.joint_names), 'joint')}"] if rig.joint_names else []
+    kg = sum(float(mass.kg) for mass in rig.masses)
+    weight = f"{kg:.3g} kg" if kg else "without masses"
+    parts += [f"arm of {counted(len(rig.joint_names), 'joint')} ({weight})"] * bool(rig.joint_names)
     parts += [f"{counted(len(rig.frame_sigma), 'frame')} from CAD"] if rig.frame_sigma else []
     yield "rig", f"{rig.name}: {', '.join(parts) or 'nothing on it'}"
 
@@ -108,6 +114,23 @@ def odd_rig(rig: Rig) -> Iterator[str]:
             sigma_m = getattr(getattr(rig, section), key, 0.0)
             if sigma_m > COARSE_M:
                 yield f"{section}.{key} is {sigma_m:g} m in rig.yaml; was it meant in millimetres?"
+    yield from _odd_masses(rig)
+
+
+def _odd_masses(rig: Rig) -> Iterator[str]:
+    """Links that weigh all the same, or more or less than any arm's."""
+    kg = [float(mass.kg) for mass in rig.masses]
+    if not kg:
+        return
+    if len(kg) >= ALL_ALIKE and len(set(kg)) == 1:
+        yield f"all {len(kg)} links with a mass weigh {kg[0]:g} kg in the URDF; are these measured?"
+    edges = (rig.tree.edges[rig.tree.edge_names.index(name)] for name in rig.arm_edges)
+    length_m = sum(float(np.linalg.norm(edge.T_parent_child[:3, 3])) for edge in edges)
+    if not LIGHTEST * length_m**3 < sum(kg) < HEAVIEST * length_m**3:
+        yield (
+            f"the arm's links weigh {sum(kg):g} kg in the URDF, at a length of {length_m:.2f} m; "
+            "inertial/mass is in kg"
+        )
 
 
 def odd_stops(rig: Rig, recording: RecordedStops) -> Iterator[str]:

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,9 +13,12 @@ from calib.diagnosis.candidates import lacking
 from calib.problem.model import Model, Source
 from calib.results.check import check
 from calib.results.solution import solution_of
-from calib.rig.inventory import PlacedScan, odd_beams
+from calib.rig.inventory import PlacedScan, odd_beams, odd_rig
 from calib.solve.fit import solve
+from chains import se3
+from chains.arm import Mass
 from chains.errors import InputError
+from chains.frames import Edge, FrameTree
 from sensors.recording import read_table
 
 from . import broken, rigs
@@ -57,7 +61,7 @@ def test_every_part_is_described(found):
     assert len(contents) == len(found.contents), "a name is there twice"
     incidence = contents.pop("beams")
     assert contents == {
-        "rig": "box: velodyne_vlp16 with 16 rings, arm of 3 joints, 5 frames from CAD",
+        "rig": "box: velodyne_vlp16 with 16 rings, arm of 3 joints (without masses), 5 frames from CAD",
         "stops": "4 at 2 locations, over 3 min",
         "base_markers": "seen at 4 of 4 stops",
         "mount_markers": "seen at 4 of 4 stops",
@@ -301,3 +305,35 @@ def test_views_that_differ_are_not_odd():
 def test_views_that_are_alike_or_beside_the_room(change, sentence):
     (line,) = odd_beams(placed(**{"roll_rad": [0.0, 0.3, 0.1, 0.0], **change}))
     assert sentence in line
+
+
+def weighing(*kg: float, length_m: float = 0.4):
+    """A rig of nothing but an arm, each link as long and of its mass."""
+    edges = [
+        Edge(f"j{i}", f"l{i}", f"l{i + 1}", se3.from_xyz_rpy([0, 0, length_m], [0, 0, 0]))
+        for i in range(len(kg))
+    ]
+    masses = tuple(Mass(f"l{i + 1}", each, np.zeros(3)) for i, each in enumerate(kg) if each)
+    return SimpleNamespace(
+        tracker=None,
+        target=None,
+        reference=None,
+        arm_edges=tuple(edge.name for edge in edges),
+        tree=FrameTree(edges),
+        masses=masses,
+    )
+
+
+@pytest.mark.parametrize(
+    ("kg", "said"),
+    [
+        ((7.8, 12.9, 3.9, 2.0), None),  # 26.6 kg at 1.6 m
+        ((0.0, 0.0, 0.0), None),
+        ((1.0, 1.0, 1.0), "all 3 links with a mass weigh 1 kg"),
+        ((7800.0, 12900.0, 3900.0), "weigh 24600 kg in the URDF, at a length of 1.20 m"),
+        ((0.0078, 0.0129, 0.0039), "weigh 0.0246 kg"),
+    ],
+)
+def test_masses_that_no_arm_has_are_said(kg, said):
+    assert [line for line in odd_rig(weighing(*kg)) if said is None or said not in line] == []
+    assert len(list(odd_rig(weighing(*kg)))) == (said is not None)
