@@ -61,7 +61,8 @@ def test_every_part_is_described(found):
     assert len(contents) == len(found.contents), "a name is there twice"
     incidence = contents.pop("beams")
     assert contents == {
-        "rig": "box: velodyne_vlp16 with 16 rings, arm of 3 joints (without masses), 5 frames from CAD",
+        "rig": "box: velodyne_vlp16 with 16 rings, arm of 3 joints (without masses), "
+        "5 frames from CAD",
         "stops": "4 at 2 locations, over 3 min",
         "base_markers": "seen at 4 of 4 stops",
         "mount_markers": "seen at 4 of 4 stops",
