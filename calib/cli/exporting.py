@@ -27,6 +27,7 @@ def export(
     as_json: Json = False,
 ) -> None:
     """Write the result as YAML, URDF, ROS 2, ring tables, ..."""
+    from calib.blunders.told import whole
     from calib.exporters import export as write
     from calib.runs.reopen import effects_that_may_run
     from calib.runs.run import Run
@@ -38,7 +39,8 @@ def export(
         "not_held": done.not_held,
         "left_out": done.left_out,
     }
-    lines = [*opened.warning, *(f"wrote {file}" for file in done.files)]
+    lines = [*opened.warning, *map(whole, opened.odd_rings)]
+    lines += [f"wrote {file}" for file in done.files]
     if missing := effects_that_may_run(opened)[1]:
         lines.append(missing)
     for name, why in done.left_out.items():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from calib.residuals.groups import CAD
+from calib.results.rings import harmful
 from calib.runs.run import Run
 
 FAR_OFF = 3.0  # times its sigmas, or what is expected: residuals that something large is behind
@@ -32,6 +33,12 @@ def _misfit(run: Run, kind: str, times: float) -> str:
     return f"{said}, {worst} by {frames[worst]['move_sigmas']:.1f} of them"
 
 
+def _rings(run: Run, bad: bool) -> list[str]:
+    """How rings are numbered otherwise than their LiDAR's model has it."""
+    found = run.summary.get("rings", ())
+    return [each["sentence"] for each in found if harmful(each["what"]) == bad]
+
+
 def over_floor(run: Run) -> float:
     """The held-out error over the expected one; 0 where nothing was held out."""
     rms = run.summary["rms_mm"]
@@ -39,10 +46,11 @@ def over_floor(run: Run) -> float:
 
 
 def cautions(run: Run) -> list[str]:
-    """Which residuals are larger than they should be, and not so large as to forbid belief."""
+    """What is to be looked at before a run is used, and does not forbid belief; a clause each."""
     misfit = run.summary["misfit"].items()
     least = {kind: TOLERATED_OF_CAD if kind == CAD else TOLERATED for kind, _ in misfit}
-    return [_misfit(run, kind, x) for kind, x in misfit if least[kind] < x <= FAR_OFF]
+    out = [_misfit(run, kind, x) for kind, x in misfit if least[kind] < x <= FAR_OFF]
+    return [*out, *_rings(run, bad=False)]
 
 
 def forbids(run: Run) -> list[str]:
@@ -54,4 +62,4 @@ def forbids(run: Run) -> list[str]:
     out += [_misfit(run, kind, times) for kind, times in misfit if times > FAR_OFF]
     if (times := over_floor(run)) > FAR_OFF:
         out.append(OVER.format(times))
-    return out
+    return [*out, *_rings(run, bad=True)]

@@ -30,6 +30,7 @@ from calib.results.intervals import intervals
 from calib.results.misfit import misfit_by, prior_rows, target_rows, tracker_rows
 from calib.results.reach import reach
 from calib.results.recalibrate import Link, earlier, solve_from
+from calib.results.rings import documents as odd_rings
 from calib.results.solution import solution_of
 from calib.runs.belief import TOLERATED
 from calib.runs.reopen import model_of, proposed, reopened, start_of, stored_met
@@ -229,6 +230,7 @@ def _fit(
     summary |= {"sigmas_widened_by": widened, "cad_widened_by": cad, "held_out_by": by}
     summary |= {"without": list(model.without), "extrapolated": seen_at.sentences()}
     summary["intervals_wider_by"] = calibration.document(solution.names)
+    summary["rings"] = odd_rings(sources)
     summary["set_aside"] = sorted(estimate.problem.set_aside)
     summary["predicted_mm"] = reached.document() if reached else None
     summary["seconds"] = time.monotonic() - began

@@ -27,15 +27,13 @@ from calib.problem.model import default_effects
 from calib.residuals.groups import Group
 from calib.results.errors import Errors
 from calib.results.holdout import held_out
-from calib.rig.scanned import ScanSums, numbering
+from calib.results.rings import harmful, odd_rings
 from calib.runs.belief import cautions, forbids
 from calib.runs.reopen import model_of, reopened, start_of, state_of
 from calib.runs.run import DIAGNOSIS, Run
 from calib.solve.fit import Progress, resume
 from sensors.documents import write_json
-from sensors.rings import RingFinding, least_off_rad
-
-LOOKED = 3  # scans from which the numbers of rings are checked: each holds all rings
+from sensors.rings import least_off_rad
 
 
 @one_blas_thread
@@ -68,8 +66,7 @@ def _found(
 ) -> Diagnosis:
     """As `diagnose`, and nothing is written."""
     stand = stand_of(run, progress, candidates)
-    rings = dict(_odd_rings(stand))
-    harmful = {name: each for name, each in rings.items() if each.what != "reversed"}
+    rings = ((s.rig.lidar.name, each) for s, each in odd_rings(stand.sources))
     # Away from an optimum every effect that moves the state towards one looks missing, beams are
     # thrown away for no reason of their own, and groups far out that are not to blame.
     found = search(stand, progress) if run.converged else search(stand, progress, most=0)
@@ -99,7 +96,7 @@ def _found(
         weak_directions(run.solution, found.looks[0]),
         rejected,
         forbids(run),
-        [told.of_rings(lidar, each) for lidar, each in harmful.items()],
+        [told.of_rings(lidar, each) for lidar, each in rings if harmful(each.what)],
         formulas,
     )
     unseen = _reaches(found.looks[0], run) if run.converged else {}
@@ -117,7 +114,6 @@ def _found(
             *hardly_checked(unseen),
             *map(told.whole, cautions(run)),
             *run.omissions,
-            *(told.whole(each.sentence) for each in rings.values() if each not in harmful.values()),
         ],
         command=_command(run, result),
     )
@@ -168,20 +164,6 @@ def command_without(run: Run, tokens: Sequence[str]) -> str:
             chosen += [f"--{key.replace('_', '-')}", str(run.model[key])]
     chosen += ["--prior", str(run.prior)] if run.prior else []
     return shlex.join(["rigcal", "fit", *map(str, run.recordings), *out, *chosen, *without])
-
-
-def _odd_rings(stand: Stand) -> Iterator[tuple[str, RingFinding]]:
-    """LiDARs whose rings are numbered otherwise than their model has it. Those counted from the
-    other end are many makers' own; else offsets by ring are of no use."""
-    for source in stand.sources:
-        scanned = np.flatnonzero(source.recording.has_scan)[:LOOKED]
-        if source.rig.lidar is not None and len(scanned):
-            sums = ScanSums(source.rig.lidar)
-            for k in scanned.tolist():
-                sums.add(source.recording.stops[k], source.store.read(k)[0])
-            found = numbering(sums)
-            if found is not None:
-                yield source.rig.lidar.name, found
 
 
 def _detectable(stand: Stand) -> dict[str, dict[str, float]]:
