@@ -35,6 +35,7 @@ def export(
     opened = Run.open(run, trust or ())
     done = write(opened, out, formats or [], force)
     document = {
+        "warnings": opened.warning,
         "files": [str(file) for file in done.files],
         "not_held": done.not_held,
         "left_out": done.left_out,
@@ -74,13 +75,14 @@ def apply(
     with progress_bar() as progress:
         done = correct(opened, clouds, out, rig, progress, force)
     document = {
+        "warnings": opened.warning,
         "clouds": [
             {"file": str(a.path), "points": a.points, "moved_rms_mm": 1e3 * a.rms_m}
             | {"not_corrected": a.left_out, "extrapolated": list(a.extrapolated)}
             for a in done
-        ]
+        ],
     }
-    lines = []
+    lines = [*opened.doubts, *opened.omissions]
     for a in done:
         lines += a.extrapolated
         lines.append(f"wrote {a.path}: {a.points} points, moved by {1e3 * a.rms_m:.2f} mm rms")

@@ -217,11 +217,11 @@ def _fit(
     known = known.at_least(widened, cad)
     calibration = known.of([variable.name for variable in estimate.variables])
     solution = solution_of(problem, estimate, calibration.covariance)
-    write_yaml(folder / SOLUTION, solution.document())
     arrays = {"covariance": solution.covariance, "graph": solution.graph}
     np.savez(folder / COVARIANCE, names=np.array(solution.names), **arrays)
     write_state(folder, estimate.state, stored_met(estimate.start, sources))
-    write_yaml(folder / MODEL, _model_document(sources, model, choices))
+    document = _model_document(sources, model, choices)
+    write_yaml(folder / MODEL, document)
     summary = _summary(problem, estimate, nominal, seen, unseen)
     rows = tracker_rows(estimate), target_rows(estimate), prior_rows(estimate)
     write_rows(folder / RESIDUALS, *rows)
@@ -237,6 +237,8 @@ def _fit(
     if links is not None:
         summary["links"] = [link_document(link) for link in links]
     write_json(folder / SUMMARY, summary)
+    run = Run(folder, document, summary, solution)
+    write_yaml(folder / SOLUTION, solution.document(), run.warning)
 
 
 def _refuse_twice(recordings: Sequence[Path]) -> None:
