@@ -125,7 +125,7 @@ def evaluate_at(
         frame=beyond.base or rig.world,
         names=names,
         error=_apart(drawn.T, true.T),
-        covariance=_covariance(true, known.over(estimate, list(true.d))),
+        covariance=_covariance(true, known.together(estimate, list(true.d))),
         warnings=run.warning,
     )
     if out is not None:
