@@ -1,8 +1,16 @@
-"""What forbids to believe a run, whatever its model explains: one list for diagnosis and report."""
+"""What forbids to believe a run, whatever its model explains, and what asks for care: one list of
+each for fit, diagnosis and report."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from calib.blunders.judged import limit_of
+from calib.diagnosis.verdict import BY_CHANCE
 from calib.residuals.groups import CAD
+from calib.results.outstanding import standing_out, together_told
 from calib.results.rings import harmful
 from calib.runs.run import Run
 
@@ -50,7 +58,12 @@ def cautions(run: Run) -> list[str]:
     misfit = run.summary["misfit"].items()
     least = {kind: TOLERATED_OF_CAD if kind == CAD else TOLERATED for kind, _ in misfit}
     out = [_misfit(run, kind, x) for kind, x in misfit if least[kind] < x <= FAR_OFF]
-    return [*out, *_rings(run, bad=False)]
+    if run.summary["rms_mm"].get("held_out") is None:
+        out.append("no stops were held out, so its predictions were not checked")
+    if BY_CHANCE < (times := over_floor(run)) <= FAR_OFF:
+        out.append(OVER.format(times))
+    told = [*together_told(run.summary), *standing_out(run.summary)]
+    return [*out, *_rings(run, bad=False), *told]
 
 
 def forbids(run: Run) -> list[str]:
@@ -63,3 +76,18 @@ def forbids(run: Run) -> list[str]:
     if (times := over_floor(run)) > FAR_OFF:
         out.append(OVER.format(times))
     return [*out, *_rings(run, bad=True)]
+
+
+def limits(redundancies: Mapping[str, Sequence[float]]) -> dict[str, float]:
+    """How many times larger than their sigmas chance makes the residuals of one of all groups at
+    most, by kind, as it is for a diagnosis.
+
+    Args:
+        redundancies: kind -> that of each of its groups.
+    """
+    looks, out = sum(map(len, redundancies.values())), {}
+    for kind, some in redundancies.items():
+        if some:
+            own = max(1.0, float(np.median(some)))
+            out[kind] = float(np.sqrt(limit_of(own, sum(some) - own, len(some), looks)[1]))
+    return out

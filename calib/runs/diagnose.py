@@ -112,11 +112,17 @@ def _found(
             *suspect,
             *result.sentences,
             *hardly_checked(unseen),
-            *map(told.whole, cautions(run)),
+            *map(told.whole, _cautions(run, result)),
             *run.omissions,
         ],
         command=_command(run, result),
     )
+
+
+def _cautions(run: Run, found: Diagnosis) -> list[str]:
+    """What is to be looked at besides, without what was found to be wrong."""
+    named = tuple(f"{each['where']}, {each['name']}:" for each in found.blunders)
+    return [each for each in cautions(run) if not each.startswith(named)]
 
 
 def _command(run: Run, found: Diagnosis) -> str:
