@@ -21,10 +21,11 @@ from calib.diagnosis.verdict import Diagnosis, believed, conclude
 from calib.diagnosis.verdict.unnamed import Unnamed, unnamed
 from calib.diagnosis.weak import to_be_told_apart, weak_directions
 from calib.effects import own_effects
+from calib.effects.reference import FaroScale
 from calib.linear.parallel import one_blas_thread
 from calib.problem import build
 from calib.problem.model import default_effects
-from calib.residuals.groups import Group
+from calib.residuals.groups import MESH, Group
 from calib.results.errors import Errors
 from calib.results.holdout import held_out
 from calib.results.rings import harmful, odd_rings
@@ -105,7 +106,7 @@ def _found(
         result,
         plan=command_to_plan(run, apart) if apart else "",
         scatter=[*_scatter(run), *result.scatter],
-        detectable=_detectable(stand),
+        detectable={**_detectable(stand), **_scale_detectable(result)},
         unseen=unseen,
         sentences=[
             *run.doubts,
@@ -177,6 +178,14 @@ def _detectable(stand: Stand) -> dict[str, dict[str, float]]:
     lidars = [s.rig.lidar for s in stand.sources if s.rig.lidar and s.recording.has_scan.any()]
     sizes = [size for size in map(least_off_rad, lidars) if np.isfinite(size)]
     return {"rings": {"rad": max(sizes)}} if sizes else {}
+
+
+def _scale_detectable(found: Diagnosis) -> dict[str, dict[str, float]]:
+    """From which size a wrong scale of the mesh is found, where the model does not have it: as the
+    effect that it is."""
+    sizes = {c["effect"]: c["smallest_detectable"] for c in found.candidates}
+    size = sizes.get(FaroScale.name)
+    return {f"{MESH}:scale": {FaroScale.unit: size}} if size and np.isfinite(size) else {}
 
 
 def _reaches(look: Look, run: Run) -> dict[Group, Reach]:
