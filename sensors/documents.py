@@ -12,7 +12,7 @@ import stat
 import sys
 import typing
 import uuid
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -353,10 +353,12 @@ class _Dumper(yaml.SafeDumper):
 _Dumper.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, list("-+.0123456789"))
 
 
-def write_yaml(path: str | Path, data: Any) -> None:
-    """Write a YAML document as `yaml_text` gives it, whole or not at all."""
+def write_yaml(path: str | Path, data: Any, head: Iterable[str] = ()) -> None:
+    """Write a YAML document as `yaml_text` gives it, below the lines of `head` as comments; whole
+    or not at all."""
+    comments = "".join(f"# {escape.line(line)}\n" for line in head)
     with write_atomically(path) as temporary:
-        temporary.write_text(yaml_text(data), encoding="utf-8")
+        temporary.write_text(comments + yaml_text(data), encoding="utf-8")
 
 
 def yaml_text(data: Any) -> str:

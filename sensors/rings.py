@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from sensors.lidar import Array, LidarModel, catalog, load_lidar
 
+REVERSED = "reversed"
 _LEAST_RINGS = 8
 """A choice: of fewer, a unit's own angles explain a misfit as well as another numbering."""
 _FARTHEST_SHIFT = 4
@@ -152,7 +153,7 @@ def _exchanged(lidar: LidarModel, seen: Array, rings: Array) -> RingFinding | No
 def _numberings(lidar: LidarModel) -> Iterator[tuple[Array, dict]]:
     """Other elevations (R,) by ring, NaN where there is none, and what they would mean."""
     table = lidar.elevation_rad
-    yield table[::-1], {"what": "reversed", "said": "are numbered from the other end"}
+    yield table[::-1], {"what": REVERSED, "said": "are numbered from the other end"}
     yield -table, {"what": "upside_down", "said": "point down where they should point up"}
     for shift in sorted(set(range(-_FARTHEST_SHIFT, _FARTHEST_SHIFT + 1)) - {0}, key=abs):
         ring = np.arange(len(table)) - shift

@@ -142,6 +142,19 @@ def _whole(group: Group) -> bool:
     return group.kind != "joints" or group.what == JOINTS
 
 
+def limit_of(own: float, others: float, groups: int, looks: int) -> tuple[float, float]:
+    """Degrees of freedom of how far out the bulk of a kind is; and how far beyond that chance puts
+    a group at most, in mean squares (F).
+
+    Args:
+        own, others: degrees of freedom of the group, and of all others of its kind.
+        groups: of its kind.
+        looks: groups that are looked at.
+    """
+    known = STATED + MEDIAN * max(others, 1.0) if groups >= FEWEST_OF_KIND else KNOWN
+    return known, special.fdtri(own, known, (1.0 - ALPHA_BLUNDER) ** (1.0 / looks))
+
+
 def _judged(some: Sequence[Shift], looks: int) -> Iterator[Blunder]:
     """Groups of one kind: in units of how far out their bulk is."""
     wholes = [shift for shift in some if _whole(shift.group)]
@@ -152,10 +165,7 @@ def _judged(some: Sequence[Shift], looks: int) -> Iterator[Blunder]:
     @cache
     def bounds(own: int) -> tuple[float, float, float]:
         """Of groups of so many dofs: those of the bulk, the limit of F, and its noncentrality."""
-        known = (
-            STATED + MEDIAN * max(dof.sum() - own, 1) if len(wholes) >= FEWEST_OF_KIND else KNOWN
-        )
-        limit = special.fdtri(own, known, (1.0 - ALPHA_BLUNDER) ** (1.0 / looks))
+        known, limit = limit_of(own, dof.sum() - own, len(wholes), looks)
         return known, limit, special.ncfdtrinc(own, known, 1.0 - POWER, limit)
 
     for shift in some:

@@ -15,7 +15,14 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
 # Each of these registers its commands.
-from calib.cli import calibrating, exporting, importing, planning, reporting  # noqa: E402, F401
+from calib.cli import (  # noqa: E402
+    calibrating,  # noqa: F401
+    evaluating,  # noqa: F401
+    exporting,  # noqa: F401
+    importing,  # noqa: F401
+    planning,  # noqa: F401
+    reporting,  # noqa: F401
+)
 from calib.cli.app import app  # noqa: E402
 from chains.errors import InputError  # noqa: E402
 from chains.escape import terminal  # noqa: E402

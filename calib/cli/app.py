@@ -154,10 +154,21 @@ def say(document: dict[str, Any], text: str, as_json: bool) -> None:
         print(terminal(text))
 
 
-def end_unless_converged(run: Run) -> None:
-    """End with exit code 3, and the sentence on stderr, where a run has not converged."""
-    if not run.converged:
+def warn(runs: Sequence[Run], as_json: bool) -> None:
+    """Print what is to stand above everything that is shown of runs; on stderr where stdout is for
+    the machine-readable result alone."""
+    for run in runs:
+        for sentence in run.warning:
+            said = f"{run.folder}: {sentence}" if len(runs) > 1 else sentence
+            print(terminal(said), file=sys.stderr if as_json else sys.stdout)
+
+
+def end_unless_converged(*runs: Run) -> None:
+    """End with exit code 3, and a sentence on stderr for each, where runs have not converged."""
+    loose = [run for run in runs if not run.converged]
+    for run in loose:
         print(terminal(f"rigcal: {run.folder}: {run.warning[0]}"), file=sys.stderr)
+    if loose:
         raise SystemExit(NOT_TO_BE_USED)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -26,7 +25,6 @@ from calib.cli.app import (
 from calib.cli.stages import DIAGNOSE, FIT
 from calib.linear.parallel import workers as threads
 from chains.errors import InputError
-from chains.escape import terminal
 
 if TYPE_CHECKING:
     from calib.runs.run import Run
@@ -224,6 +222,7 @@ def compare(runs: Runs, as_json: Json = False) -> None:
         print_json(comparison(opened) | {"ladder": rungs})
     else:
         print_comparison(opened)
+    end_unless_converged(*opened)
 
 
 @app.command()
@@ -242,8 +241,7 @@ def moved(
         print_json(moved_document(found))
     else:
         print_moved(found)
-    for run in found.runs:
-        end_unless_converged(run)
+    end_unless_converged(*found.runs)
 
 
 @app.command()
@@ -276,65 +274,6 @@ def reproduce(
         print_reproduction(found)
     if not found.identical:
         raise SystemExit(NOT_TO_BE_USED)
-
-
-@app.command()
-def evaluate(
-    runs: Runs,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "-o", "--out", help="Where to write, of several runs in a folder each; else the run."
-        ),
-    ] = None,
-    raw: Annotated[bool, typer.Option("--raw", help="Of the returns before correction.")] = False,
-    at: Annotated[
-        Path | None,
-        typer.Option(
-            "--at", metavar="FILE.csv", help="Poses (stop, joints) to predict the arm's error at."
-        ),
-    ] = None,
-    trust: Trust = None,
-    as_json: Json = False,
-) -> None:
-    """Compute accuracy and precision of every return.
-
-    By ring, distance, incidence and label.
-
-    With --at, where the arm truly is at poses that need not be measured, and its sigma.
-    """
-    from calib.evaluation import evaluate_all
-    from calib.runs.run import Run
-
-    opened = [Run.open(run, trust or ()) for run in runs]
-    if at is not None:
-        _predict(opened, at, out, raw, as_json)
-        return
-    for sentence in dict.fromkeys(each for run in opened for each in run.extrapolated):
-        print(terminal(sentence), file=sys.stderr)
-    with progress_bar() as progress:
-        evaluations = evaluate_all(opened, out, raw, progress)
-    if as_json:
-        print_json(evaluations if len(evaluations) > 1 else next(iter(evaluations.values())))
-    else:
-        from calib.show.evaluation import print_evaluations
-
-        print_evaluations(evaluations)
-
-
-def _predict(runs: list[Run], at: Path, out: Path | None, raw: bool, as_json: bool) -> None:
-    if len(runs) > 1 or raw:
-        raise InputError("evaluate --at is of one run, and without --raw")
-    from calib.evaluation.at_poses import evaluate_at
-
-    with progress_bar() as progress:
-        found = evaluate_at(runs[0], at, out, progress)
-    if as_json:
-        print_json(found.document())
-    else:
-        from calib.show.evaluation import print_predicted
-
-        print_predicted(found.document(), out)
 
 
 @app.command()

@@ -27,6 +27,7 @@ def export(
     as_json: Json = False,
 ) -> None:
     """Write the result as YAML, URDF, ROS 2, ring tables, ..."""
+    from calib.blunders.told import whole
     from calib.exporters import export as write
     from calib.runs.reopen import effects_that_may_run
     from calib.runs.run import Run
@@ -34,11 +35,13 @@ def export(
     opened = Run.open(run, trust or ())
     done = write(opened, out, formats or [], force)
     document = {
+        "warnings": opened.warning,
         "files": [str(file) for file in done.files],
         "not_held": done.not_held,
         "left_out": done.left_out,
     }
-    lines = [*opened.warning, *(f"wrote {file}" for file in done.files)]
+    lines = [*opened.warning, *map(whole, opened.odd_rings)]
+    lines += [f"wrote {file}" for file in done.files]
     if missing := effects_that_may_run(opened)[1]:
         lines.append(missing)
     for name, why in done.left_out.items():
@@ -72,13 +75,14 @@ def apply(
     with progress_bar() as progress:
         done = correct(opened, clouds, out, rig, progress, force)
     document = {
+        "warnings": opened.warning,
         "clouds": [
             {"file": str(a.path), "points": a.points, "moved_rms_mm": 1e3 * a.rms_m}
             | {"not_corrected": a.left_out, "extrapolated": list(a.extrapolated)}
             for a in done
-        ]
+        ],
     }
-    lines = []
+    lines = [*opened.doubts, *opened.omissions]
     for a in done:
         lines += a.extrapolated
         lines.append(f"wrote {a.path}: {a.points} points, moved by {1e3 * a.rms_m:.2f} mm rms")

@@ -15,6 +15,7 @@ from calib.cli.app import (
     end_unless_converged,
     print_json,
     progress_bar,
+    warn,
 )
 from calib.linear.parallel import workers as threads
 
@@ -66,11 +67,12 @@ def plan(
     opened = run if is_rig(run) else Run.open(run, trust or ())
     with threads(workers), progress_bar() as progress:
         found = choose(opened, stops, purpose, until, region, candidates, seed, out, progress)
+    of = [opened] if isinstance(opened, Run) else []
+    warn(of, as_json)
     if as_json:
         print_json(found.document())
     else:
         from calib.show.plan import print_plan
 
         print_plan(found)
-    if isinstance(opened, Run):
-        end_unless_converged(opened)
+    end_unless_converged(*of)

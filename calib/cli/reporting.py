@@ -8,7 +8,17 @@ from typing import Annotated
 
 import typer
 
-from calib.cli.app import Json, Out, Runs, Trust, app, progress_bar, say
+from calib.cli.app import (
+    Json,
+    Out,
+    Runs,
+    Trust,
+    app,
+    end_unless_converged,
+    progress_bar,
+    say,
+    warn,
+)
 from chains.errors import InputError
 
 
@@ -21,7 +31,9 @@ def report(runs: Runs, out: Out, trust: Trust = None, as_json: Json = False) -> 
     opened = [Run.open(run, trust or ()) for run in runs]
     with progress_bar() as progress:
         written = write(opened, out, progress)
+    warn(opened, as_json)
     say(written.document(), f"wrote {out}: {written.summary}", as_json)
+    end_unless_converged(*opened)
 
 
 @app.command()
@@ -56,7 +68,9 @@ def plot(
         raise InputError("give a figure's NAME and -o FILE.png, .svg or .pdf; --list names them")
     with progress_bar() as progress:
         chart = draw(evidence, name, out)
+    warn([opened], as_json)
     say(chart.document() | {"file": str(out)}, f"wrote {out}: {chart.title}", as_json)
+    end_unless_converged(opened)
 
 
 @app.command()

@@ -169,7 +169,7 @@ def evaluate(
                 f"{run.folder}: its recordings hold no scans, so there is no LiDAR to evaluate"
             )
         stops = _each(problem.scans, values_of(problem, state_of(run, problem)), progress)
-        return write_evaluation(stops, folder, raw, sources[0].rig.labels)
+        return write_evaluation(stops, folder, raw, sources[0].rig.labels, run.warning)
 
 
 def evaluate_all(
@@ -198,7 +198,11 @@ def evaluate_all(
 
 
 def write_evaluation(
-    stops: Iterable[Evaluated], folder: Path, raw: bool, labels: Mapping[int, str]
+    stops: Iterable[Evaluated],
+    folder: Path,
+    raw: bool,
+    labels: Mapping[int, str],
+    warnings: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Write evaluated stops as they come, and sum them up; one is in memory at a time.
 
@@ -207,6 +211,7 @@ def write_evaluation(
         folder: where evaluation.json and points.parquet/ go; neither is there yet.
         raw: as of `evaluate`.
         labels: their names, where they have any.
+        warnings: what is to stand above everything that is shown of the run.
 
     Returns:
         What evaluation.json holds.
@@ -221,6 +226,6 @@ def write_evaluation(
         place = points / "/".join(f"{key}={_part(name)}" for key, name in names.items())
         place.mkdir(parents=True, exist_ok=True)
         write_table(place / f"{done.rig}.parquet", done.points)
-    document = tally.document(labels)
+    document = {"warnings": list(warnings), **tally.document(labels)}
     write_json(folder / EVALUATION_FILE, document)
     return document

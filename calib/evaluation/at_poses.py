@@ -41,6 +41,7 @@ class Predicted:
         names: of the poses.
         error: (K, 6) rotation rad, then m: true less drawn.
         covariance: (K, 6, 6) of the true place.
+        warnings: what is to stand above everything that is shown of the run.
     """
 
     body: str
@@ -48,6 +49,7 @@ class Predicted:
     names: Sequence[str]
     error: np.ndarray
     covariance: np.ndarray
+    warnings: Sequence[str] = ()
 
     @property
     def sigma_m(self) -> np.ndarray:
@@ -69,6 +71,7 @@ class Predicted:
         """In short, as ``--json`` prints it."""
         told = {"error_mm": np.linalg.norm(self.error[:, 3:], axis=1), "sigma_mm": self.sigma_m}
         return {
+            "warnings": list(self.warnings),
             "body": self.body,
             "frame": self.frame,
             "poses": len(self.names),
@@ -122,7 +125,8 @@ def evaluate_at(
         frame=beyond.base or rig.world,
         names=names,
         error=_apart(drawn.T, true.T),
-        covariance=_covariance(true, known.over(estimate, list(true.d))),
+        covariance=_covariance(true, known.together(estimate, list(true.d))),
+        warnings=run.warning,
     )
     if out is not None:
         if Path(out).suffix != ".csv":

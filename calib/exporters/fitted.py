@@ -11,12 +11,14 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from calib.effects import Effect, OneHot, Site, View
 from calib.exporters.written import Unheld, Written, head
 from calib.problem.model import owned
+from calib.results.rings import harmful
 from calib.results.solution import FrameEstimate, Part
 from calib.rig import Rig
 from calib.runs.reopen import effects_that_may_run, reopened
@@ -104,6 +106,22 @@ class FittedRig:
                 origins[edge.name] = T
         return origins
 
+    @property
+    def odd_rings(self) -> Mapping[str, Any] | None:
+        """How its rings are numbered otherwise than its LiDAR's model has them, as summary.json
+        holds it; None where they are not."""
+        found = self.run.summary.get("rings", ())
+        return next((each for each in found if each["rig"] == self.rig.name), None)
+
+    @property
+    def channels(self) -> np.ndarray:
+        """(R,) of every ring, as the recording counts, its row in the table of the LiDAR's model.
+
+        Rings may be counted from the other end; the table's order is that of the maker's channels.
+        """
+        channels, odd = np.arange(self.rig.lidar.rings), self.odd_rings
+        return channels[::-1] if odd and not harmful(odd["what"]) else channels
+
     @cached_property
     def by_ring(self) -> dict[str, np.ndarray]:
         """Effects that shift every ring for good: basis (R, 3, P), of range, azimuth, elevation."""
@@ -112,7 +130,7 @@ class FittedRig:
         rings, bases = self.rig.lidar.rings, {}
         columns = {
             "ring": np.tile(np.arange(rings), 2),
-            "elevation_rad": np.tile(self.rig.lidar.elevation_rad, 2),
+            "elevation_rad": np.tile(self.rig.lidar.elevation_rad[self.channels], 2),
         }
         for name, effect in self.effects.items():
             if effect.site is Site.BEAM:

@@ -14,6 +14,7 @@ import numpy as np
 from calib.effects.beams import BeamOriginOffset
 from calib.exporters.fitted import FittedRig, for_every_rig
 from calib.exporters.written import NO_PLACE_FOR_SIGMAS, Unheld, Written, commented, write_text
+from calib.results.rings import harmful
 from sensors.documents import json_text
 
 RING_OFFSETS = (("range", "m"), ("azimuth", "rad"), ("elevation", "rad"))
@@ -22,6 +23,11 @@ RING_CONVENTIONS = (
     "range_m is along the beam, from where it starts; azimuth_rad counter-clockwise from x, seen",
     "from +z; elevation_rad up from the x-y plane; all in the LiDAR's own frame.",
 )
+HESAI = (
+    "Channel counts from 1; Elevation is up, Azimuth clockwise seen from above, in degrees.",
+    "table = that of the LiDAR model in rig.yaml - offset, measured = true + offset.",
+)
+FROM_THE_OTHER_END = "from the other end than the recording, whose ring 0 is its last channel"
 OUSTER_ANGLES = {
     "angles": "degrees; altitude up, azimuth clockwise seen from above, as Ouster has them",
     "corrected": "table = that of the LiDAR model in rig.yaml - offset, measured = true + offset",
@@ -46,6 +52,7 @@ def write_rings(fit: FittedRig, folder: Path) -> Written:
             table[f"{name}_sigma_{unit}"] = sigma[:, axis]
     not_held = fit.not_held(fit.by_ring)
     conventions = (*RING_CONVENTIONS, f"The sum of {', '.join(fit.by_ring)}; sigma is its own.")
+    conventions += (f"Mind that {fit.odd_rings['sentence']}.",) if fit.odd_rings else ()
     rows = zip(*(column.tolist() for column in table.values()), strict=True)
     lines = [",".join(table), *(",".join(map(repr, row)) for row in rows), ""]
     path = fit.file(folder, "rings.csv")
@@ -55,14 +62,14 @@ def write_rings(fit: FittedRig, folder: Path) -> Written:
 
 @for_every_rig
 def write_hesai(fit: FittedRig, folder: Path) -> Written:
-    """Write hesai_angle_correction.csv as Hesai's drivers read it; it has no place for comments.
-
-    Channel counts from 1, Elevation is up and Azimuth clockwise seen from above, in degrees.
+    """Write hesai_angle_correction.csv as Hesai's drivers read it. It has no place for comments:
+    these stand beside it, in hesai_angle_correction.txt.
 
     Raises:
         Unheld: the LiDAR is not a Hesai, or the model has no angles by ring.
     """
     _refuse_other_maker(fit, "Hesai")
+    _refuse_odd_rings(fit)
     if not _turning(fit):
         raise Unheld(
             "it holds the angles of rings, and the model has none; what it has of ranges by ring "
@@ -73,9 +80,11 @@ def write_hesai(fit: FittedRig, folder: Path) -> Written:
     rows = [f"{ring},{up!r},{aside!r}" for ring, (up, aside) in enumerate(angles, 1)]
     path = fit.file(folder, "hesai_angle_correction.csv")
     write_text(path, "\n".join(["Channel,Elevation,Azimuth", *rows, ""]))
-    warning = f"warnings: {'. '.join(fit.run.warning)}"
     not_held = [_table(fit), *_not_in_a_table(fit, _turning(fit))]
-    return Written([path], [warning, *not_held] if fit.run.warning else not_held)
+    beside = fit.file(folder, "hesai_angle_correction.txt")
+    write_text(beside, "\n".join([*fit.head((f"Of {path.name}:", *HESAI), not_held), ""]))
+    warning = f"warnings: {'. '.join(fit.run.warning)}"
+    return Written([path, beside], [warning, *not_held] if fit.run.warning else not_held)
 
 
 @for_every_rig
@@ -86,6 +95,7 @@ def write_ouster(fit: FittedRig, folder: Path) -> Written:
         Unheld: the LiDAR is not an Ouster.
     """
     _refuse_other_maker(fit, "Ouster")
+    _refuse_odd_rings(fit)
     lidar = fit.rig.lidar
     origins = [name for name, e in fit.effects.items() if isinstance(e, BeamOriginOffset)]
     moved = [fit.part.effects[name].estimate for name in origins]
@@ -127,18 +137,26 @@ def _refuse_other_maker(fit: FittedRig, maker: str) -> None:
         raise Unheld(f"the LiDAR {fit.rig.lidar.name} is by {fit.rig.lidar.maker}, not {maker}")
 
 
+def _refuse_odd_rings(fit: FittedRig) -> None:
+    """A table by channel needs to know which ring is which channel."""
+    if fit.odd_rings and harmful(fit.odd_rings["what"]):
+        raise Unheld(f"it counts channels as the LiDAR does, and {fit.odd_rings['sentence']}")
+
+
 def _turning(fit: FittedRig) -> list[str]:
     """Effects that turn rings for good."""
     return [name for name, basis in fit.by_ring.items() if basis[:, 1:].any()]
 
 
 def _angles_deg(fit: FittedRig) -> tuple[list[float], list[float]]:
-    """Elevation, up, and azimuth, clockwise, of every ring as the fit has them, in degrees.
+    """Elevation, up, and azimuth, clockwise, of every channel as the fit has them, in degrees.
 
-    The model's table less the error: ``measured = true + error``.
+    The model's table less the error: ``measured = true + error``. Makers' drivers look a beam up by
+    its channel, as the model's table counts them, however a recording numbers the rings.
     """
-    lidar = fit.rig.lidar
-    error = fit.ring_errors()[0] if fit.by_ring else np.zeros((lidar.rings, 3))
+    lidar, error = fit.rig.lidar, np.zeros((fit.rig.lidar.rings, 3))
+    if fit.by_ring:
+        error[fit.channels] = fit.ring_errors()[0]
     azimuth_rad = lidar.azimuth_offset_rad - error[:, 1]
     elevation_rad = lidar.elevation_rad - error[:, 2]
     return np.degrees(elevation_rad).tolist(), (0.0 - np.degrees(azimuth_rad)).tolist()
@@ -156,4 +174,5 @@ def _not_in_a_table(fit: FittedRig, held: list[str]) -> list[str]:
     """What an angle table leaves out: sigmas, ranges, and all other effects."""
     both = [name for name in held if name in fit.by_ring and fit.by_ring[name][:, 0].any()]
     ranges = [f"{name}: its part of range" for name in both]
-    return [NO_PLACE_FOR_SIGMAS, *ranges, *fit.not_held(held)]
+    counted = ["the numbers of rings: it counts channels as the LiDAR does, " + FROM_THE_OTHER_END]
+    return [*(counted if fit.odd_rings else []), NO_PLACE_FOR_SIGMAS, *ranges, *fit.not_held(held)]

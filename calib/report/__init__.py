@@ -132,7 +132,7 @@ def report(
 @one_blas_thread
 def figure(evidence: Evidence, name: str) -> Figure:
     """One figure, for matplotlib; arguments and errors as of `plot`."""
-    return _find(evidence, name).figure()
+    return plots.warned(_find(evidence, name).figure(), evidence.run.warning)
 
 
 @one_blas_thread
@@ -150,7 +150,7 @@ def plot(evidence: Evidence, name: str, out: Path | str) -> Chart:
     refuse_figure([evidence.run], out)
     with outputs.file(out) as file:
         chart = _find(evidence, name)
-        plots.save(chart.figure(), file)
+        plots.save(chart.figure(), file, evidence.run.warning)
     return chart
 
 

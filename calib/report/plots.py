@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import re
+import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -24,10 +25,12 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 AFTER, BEFORE, FLOOR, INK, PALE = "#0072b2", "#d55e00", "#009e73", "#333333", "#999999"
+RED = "#b00020"
 LINES = (AFTER, BEFORE, FLOOR, "#cc79a7", "#e69f00", "#56b4e9")
 SIGNED_MAP, UNSIGNED_MAP = "PuOr_r", "cividis"
 HALF_IN, WIDE_IN = 5.6, 8.0  # inches: of a column of the page, and of both
 NARROW = 4.2  # of the workbench's panel
+LETTERS_PER_INCH = 13  # of the lines of a warning
 IMAGE_FORMATS = ("png", "svg", "pdf")
 PAPER_DPI, MAP_DPI = 300, 110
 LONGEST_TICK = {"x": 24, "y": 44}  # letters along an axis: longer ones leave no room for the rest
@@ -239,13 +242,29 @@ def png(figure: Figure) -> bytes:
     return file.getvalue()
 
 
-def save(figure: Figure, path: Path | str) -> None:
-    """Write a figure as the end of the path says; `check_format` says what it may be."""
+def warned(figure: Figure, warning: Sequence[str]) -> Figure:
+    """The figure, and above it what is to stand above everything that is shown of a run."""
+    wide = int(LETTERS_PER_INCH * figure.get_figwidth())
+    lines = [line for each in warning for line in textwrap.wrap(escape.terminal(each), wide)]
+    if lines:
+        figure.text(0.0, 1.0, "\n".join(lines), color=RED, va="bottom", weight="bold", fontsize=9)
+    return figure
+
+
+def save(figure: Figure, path: Path | str, warning: Sequence[str] = ()) -> None:
+    """Write a figure as the end of the path says; `check_format` says what it may be. A warning
+    stands above it, and in what the file says of itself."""
     from matplotlib import rc_context
 
     kind = check_format(path)
-    undated = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(kind)
+    undated = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(kind, {})
+    more = {}
+    if warning:
+        undated["Subject" if kind == "pdf" else "Description"] = escape.line(" ".join(warning))
+        more["bbox_inches"] = "tight"  # as large as it is with the lines above
     # A paper is read where our letters may not be there: they are drawn.
     with styled(), rc_context({"svg.fonttype": "path"}):
         _lay_out(figure)
-        figure.savefig(path, format=kind, dpi=PAPER_DPI, facecolor="white", metadata=undated)
+        warned(figure, warning)
+        options = {"dpi": PAPER_DPI, "facecolor": "white", "metadata": undated, **more}
+        figure.savefig(path, format=kind, **options)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from calib.effects import FrameOffset
-from calib.problem.problem import Problem
+from calib.problem.problem import Block, Problem
 from calib.problem.unknowns import Role, Unknown
 from calib.residuals.beams import Association, Rows
 from calib.residuals.groups import CAD
@@ -181,24 +181,18 @@ def misfit(estimate: Estimate, beams: Errors, weighted: bool = False) -> dict[st
     Args:
         estimate: the solution.
         beams: of all scans, as fitted.
-        weighted: whether rows count with their robust weights, as they did in the fit.
+        weighted: whether groups of rows that are further off than chance puts one, and whose pull
+            is bounded by a robust weight, are left out: what is left tells how right sigmas are. Of
+            CAD, which has few, they count with their weight.
     """
     values, unknowns = estimate.values, estimate.problem.variables
     out = {}
     for kind in ("tracker", "target"):
         blocks = [b for b in estimate.problem.blocks if b.kind == kind]
         if blocks:
-            counted = blocks if weighted else map(unweighted, blocks)
-            rows = (b.evaluate(values, False)[0] for b in counted)
-            chi2 = sum(float(r @ r) for r in rows)
-            seen = [unknowns[n] for n in {n: None for b in blocks for n in b.variables}]
             # Beams, where there are any, hold where the rig stands.
             own = {Role.TARGET} if kind == "tracker" and beams.count else {Role.TARGET, Role.PLACE}
-            free = sum(u.dim for u in seen if u.role in own)
-            joints = (u for u in seen if u.role is Role.JOINTS)
-            chi2 += sum(_prior_cost(u, values[u.name]) for u in joints)
-            dof = max(1, sum(b.rows for b in blocks) - free)
-            out[kind] = float(np.sqrt(chi2 / dof))
+            out[kind] = _of_blocks(estimate, blocks, own, weighted)
     if beams.count and estimate.scans:
         out["beams"] = beams.misfit
     surfaces = [u for u in unknowns.values() if u.role is Role.SURFACE]
@@ -206,6 +200,43 @@ def misfit(estimate: Estimate, beams: Errors, weighted: bool = False) -> dict[st
         worst = max(_prior_cost(u, values[u.name]) / u.dim for u in surfaces)
         out["reference"] = float(np.sqrt(worst))
     return out | _of_cad(estimate, weighted)
+
+
+def _of_blocks(
+    estimate: Estimate, blocks: Sequence[Block], own: Container[Role], weighted: bool
+) -> float:
+    """Of trackers or targets; see `misfit`.
+
+    Args:
+        estimate: the solution.
+        blocks: of one kind.
+        own: roles of the unknowns that are these rows' own.
+        weighted: as of `misfit`. Where most groups would be left out, nothing tells which are good,
+            and all count with their weights.
+    """
+    values, unknowns = estimate.values, estimate.problem.variables
+    counted = blocks if weighted else map(unweighted, blocks)
+    rows = [(b, b.evaluate(values, False)[0], _bulk(b)) for b in counted]
+    if weighted:
+        told = sum(int(bulk.sum()) for *_, bulk in rows)
+        if 2 * told > sum(b.rows for b in blocks):
+            rows = [(b, r[bulk], bulk[bulk]) for b, r, bulk in rows if bulk.any()]
+    seen = [unknowns[n] for n in {n: None for b, *_ in rows for n in b.variables}]
+    joints = [u for u in seen if u.role is Role.JOINTS]
+    free = sum(u.dim for u in seen if u.role in own)
+    if weighted:
+        free += sum(u.dim for u in joints if u.weight < 1.0)
+        joints = [u for u in joints if u.weight >= 1.0]
+    chi2 = sum(float(r @ r) for _, r, _ in rows)
+    chi2 += sum(_prior_cost(u, values[u.name]) for u in joints)
+    return float(np.sqrt(chi2 / max(1, sum(len(r) for _, r, _ in rows) - free)))
+
+
+def _bulk(block: Block) -> np.ndarray:
+    """Which rows (N,) of a block have their full weight."""
+    if block.weight is None:
+        return np.ones(block.rows, bool)
+    return np.repeat(block.weight >= 1.0, block.rows // len(block.weight))
 
 
 def in_cad(problem: Problem) -> frozenset[str]:

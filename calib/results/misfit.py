@@ -60,16 +60,26 @@ class InstrumentRows:
     def misfit(self, *by: str) -> dict[tuple[str, ...], float | None]:
         """Per group of equal names, how many times larger than expected its residuals are: the
         root of their squares' sum over that of their redundancies; None for what nothing checks."""
+        groups, of = self._groups(by)
+        squares, expected = np.bincount(of, np.square(self.whitened)), self.expected(*by)
+        return {
+            key: float(np.sqrt(square / expected[key])) if key in expected else None
+            for key, square in zip(groups, squares, strict=True)
+        }
+
+    def expected(self, *by: str) -> dict[tuple[str, ...], float]:
+        """Per group of equal names, the sum of its redundancies; without those that nothing
+        checks."""
+        groups, of = self._groups(by)
+        sums = zip(groups, np.bincount(of, self.redundancy), np.bincount(of), strict=True)
+        return {key: float(sum_) for key, sum_, count in sums if sum_ >= UNCHECKED * count}
+
+    def _groups(self, by: Sequence[str]) -> tuple[list[tuple[str, ...]], np.ndarray]:
+        """Groups of equal names, and the number (N,) of that of each row."""
         keys = list(zip(*(self.names[name].tolist() for name in by), strict=True))
         groups = list(dict.fromkeys(keys))
         number = {key: i for i, key in enumerate(groups)}
-        of = np.array([number[key] for key in keys], int)
-        count = np.bincount(of)
-        squares = np.bincount(of, np.square(self.whitened))
-        expected = np.bincount(of, self.redundancy)
-        told = expected >= UNCHECKED * count
-        ratio = np.sqrt(squares / np.where(told, expected, 1.0))
-        return {k: float(r) if t else None for k, r, t in zip(groups, ratio, told, strict=True)}
+        return groups, np.array([number[key] for key in keys], int)
 
 
 def tracker_rows(estimate: Estimate) -> InstrumentRows | None:
@@ -176,6 +186,22 @@ def misfit_by(
         "target": {label(*key): times for key, times in targets.items()},
         "prior": dict(_moves(estimate)),
     }
+
+
+def redundancies(
+    tracker: InstrumentRows | None, target: InstrumentRows | None, prior: InstrumentRows | None
+) -> dict[str, list[float]]:
+    """The redundancy of each group that `misfit_by` tells of, by kind: a body's name, "joints" or
+    "target"; arguments as there."""
+    found: dict[str, list[float]] = {}
+    for (*_, body), x in (tracker.expected("recording", "stop", "body") if tracker else {}).items():
+        found.setdefault(body, []).append(x)
+    for (_, stop), x in (prior.expected("recording", "stop") if prior else {}).items():
+        if stop:
+            found.setdefault("joints", []).append(x)
+    if target:
+        found["target"] = list(target.expected("recording", "target").values())
+    return found
 
 
 @dataclass

@@ -108,7 +108,7 @@ def reach(problem: Problem, estimate: Estimate, known: Intervals | None = None) 
     )
     seen, drawn = (placed(each, body, base, estimate.values) for each in (here, there))
     names = list(seen.d)
-    covariance = known.over(estimate, names) if known else estimate.covariance_of(names)
+    covariance = known.together(estimate, names) if known else estimate.covariance_of(names)
     errors = _errors(covariance, rng)
     low, high = seen.T[:, :3, 3].min(axis=0), seen.T[:, :3, 3].max(axis=0)
     at = drawn.T[:, :3, 3]
@@ -189,7 +189,7 @@ def placed(stops: Stops, body: str, base: str | None, values: Mapping[str, np.nd
 def _errors(covariance: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Errors (P, n) of parameters with this covariance."""
     values, vectors = np.linalg.eigh(covariance)
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    root = vectors * np.sqrt(np.maximum(values, 0.0)) @ vectors.T  # of like ones, alike
     return root @ rng.normal(size=(len(covariance), DRAWN_ERRORS))
 
 

@@ -1,8 +1,17 @@
-"""What forbids to believe a run, whatever its model explains: one list for diagnosis and report."""
+"""What forbids to believe a run, whatever its model explains, and what asks for care: one list of
+each for fit, diagnosis and report."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from calib.blunders.judged import limit_of
+from calib.diagnosis.verdict import HELD_OUT_BY_CHANCE
 from calib.residuals.groups import CAD
+from calib.results.outstanding import standing_out, together_told
+from calib.results.rings import harmful
 from calib.runs.run import Run
 
 # Times its sigmas, or what is expected: residuals that something large is behind. A choice: sigmas
@@ -34,6 +43,12 @@ def _misfit(run: Run, kind: str, times: float) -> str:
     return f"{said}, {worst} by {frames[worst]['move_sigmas']:.1f} of them"
 
 
+def _rings(run: Run, bad: bool) -> list[str]:
+    """How rings are numbered otherwise than their LiDAR's model has it."""
+    found = run.summary.get("rings", ())
+    return [each["sentence"] for each in found if harmful(each["what"]) == bad]
+
+
 def over_floor(run: Run) -> float:
     """The held-out error over the expected one; 0 where nothing was held out."""
     rms = run.summary["rms_mm"]
@@ -41,10 +56,16 @@ def over_floor(run: Run) -> float:
 
 
 def cautions(run: Run) -> list[str]:
-    """Which residuals are larger than they should be, and not so large as to forbid belief."""
+    """What is to be looked at before a run is used, and does not forbid belief; a clause each."""
     misfit = run.summary["misfit"].items()
     least = {kind: TOLERATED_OF_CAD if kind == CAD else TOLERATED for kind, _ in misfit}
-    return [_misfit(run, kind, x) for kind, x in misfit if least[kind] < x <= FAR_OFF]
+    out = [_misfit(run, kind, x) for kind, x in misfit if least[kind] < x <= FAR_OFF]
+    if run.summary["rms_mm"].get("held_out") is None:
+        out.append("no stops were held out, so its predictions were not checked")
+    if HELD_OUT_BY_CHANCE < (times := over_floor(run)) <= FAR_OFF:
+        out.append(OVER.format(times))
+    told = [*together_told(run.summary), *standing_out(run.summary)]
+    return [*out, *_rings(run, bad=False), *told]
 
 
 def forbids(run: Run) -> list[str]:
@@ -56,4 +77,19 @@ def forbids(run: Run) -> list[str]:
     out += [_misfit(run, kind, times) for kind, times in misfit if times > FAR_OFF]
     if (times := over_floor(run)) > FAR_OFF:
         out.append(OVER.format(times))
+    return [*out, *_rings(run, bad=True)]
+
+
+def limits(redundancies: Mapping[str, Sequence[float]]) -> dict[str, float]:
+    """How many times larger than their sigmas chance makes the residuals of one of all groups at
+    most, by kind, as it is for a diagnosis.
+
+    Args:
+        redundancies: kind -> that of each of its groups.
+    """
+    looks, out = sum(map(len, redundancies.values())), {}
+    for kind, some in redundancies.items():
+        if some:
+            own = max(1.0, float(np.median(some)))
+            out[kind] = float(np.sqrt(limit_of(own, sum(some) - own, len(some), looks)[1]))
     return out

@@ -27,11 +27,18 @@ from calib.residuals.scan import ScanStop
 from calib.results.errors import Errors, body_errors, misfit, row_errors, scan_errors
 from calib.results.holdout import held_out, unit_of
 from calib.results.intervals import intervals
-from calib.results.misfit import misfit_by, prior_rows, target_rows, tracker_rows
+from calib.results.misfit import (
+    misfit_by,
+    prior_rows,
+    redundancies,
+    target_rows,
+    tracker_rows,
+)
 from calib.results.reach import reach
 from calib.results.recalibrate import Link, earlier, solve_from
+from calib.results.rings import documents as odd_rings
 from calib.results.solution import solution_of
-from calib.runs.belief import TOLERATED
+from calib.runs.belief import TOLERATED, limits
 from calib.runs.reopen import model_of, proposed, reopened, start_of, stored_met
 from calib.runs.residual_table import (
     UNSEEN_FOLDER,
@@ -196,7 +203,7 @@ def _fit(
         known = intervals(estimate, progress)
     else:
         estimate, known, links = solve_from(problem, earlier(problem, before), progress)
-    unseen, by = _held_out(sources, model, estimate, folder / RESIDUALS, choices, progress)
+    unseen, unit = _held_out(sources, model, estimate, folder / RESIDUALS, choices, progress)
     nominal = _nominal(problem, progress)
     seen_at = ColumnRanges(model.effects)
     by_stop = _write_residuals(problem, estimate, folder / RESIDUALS, progress, seen_at)
@@ -208,33 +215,36 @@ def _fit(
             f"{sources[0].recording.folder}: no beam meets a surface and no tracked body was seen, "
             "so there is nothing to fit to; 'rigcal check' says what is missing"
         )
-    worse = misfit(estimate, seen)
     bulk = misfit(estimate, seen, weighted=True)  # one wild row widens no sigma
     large = {kind: times for kind, times in bulk.items() if times > TOLERATED}
     cad = large.pop(CAD, 1.0) if before is None else 1.0  # an earlier run stands in place of CAD
     widened = max([1.0, *large.values()])
     known = known.at_least(widened, cad)
-    calibration = known.of([variable.name for variable in estimate.variables])
+    calibration = known.of([v.name for v in estimate.variables])
     solution = solution_of(problem, estimate, calibration.covariance)
-    write_yaml(folder / SOLUTION, solution.document())
     arrays = {"covariance": solution.covariance, "graph": solution.graph}
     np.savez(folder / COVARIANCE, names=np.array(solution.names), **arrays)
     write_state(folder, estimate.state, stored_met(estimate.start, sources))
-    write_yaml(folder / MODEL, _model_document(sources, model, choices))
+    document = _model_document(sources, model, choices)
+    write_yaml(folder / MODEL, document)
     summary = _summary(problem, estimate, nominal, seen, unseen)
     rows = tracker_rows(estimate), target_rows(estimate), prior_rows(estimate)
     write_rows(folder / RESIDUALS, *rows)
-    summary |= {"misfit": worse, "misfit_by": misfit_by(estimate, *rows, by_stop)}
+    by = {**misfit_by(estimate, *rows, by_stop), "limit": limits(redundancies(*rows))}
+    summary |= {"misfit": misfit(estimate, seen), "misfit_by": by}
     reached = reach(problem, estimate, known)
-    summary |= {"sigmas_widened_by": widened, "cad_widened_by": cad, "held_out_by": by}
+    summary |= {"sigmas_widened_by": widened, "cad_widened_by": cad, "held_out_by": unit}
     summary |= {"without": list(model.without), "extrapolated": seen_at.sentences()}
-    summary["intervals_wider_by"] = calibration.document(solution.names)
+    summary |= {"intervals_wider_by": calibration.document(solution.names)}
+    summary["rings"] = odd_rings(sources)
     summary["set_aside"] = sorted(estimate.problem.set_aside)
     summary["predicted_mm"] = reached.document() if reached else None
     summary["seconds"] = time.monotonic() - began
     if links is not None:
         summary["links"] = [link_document(link) for link in links]
     write_json(folder / SUMMARY, summary)
+    warning = Run(folder, document, summary, solution).warning
+    write_yaml(folder / SOLUTION, solution.document(), warning)
 
 
 def _refuse_twice(recordings: Sequence[Path]) -> None:

@@ -21,22 +21,21 @@ from calib.diagnosis.verdict import Diagnosis, believed, conclude
 from calib.diagnosis.verdict.unnamed import Unnamed, unnamed
 from calib.diagnosis.weak import to_be_told_apart, weak_directions
 from calib.effects import own_effects
+from calib.effects.reference import FaroScale
 from calib.linear.parallel import one_blas_thread
 from calib.problem import build
 from calib.problem.model import default_effects
 from calib.problem.spread import names_of
-from calib.residuals.groups import Group
+from calib.residuals.groups import MESH, Group
 from calib.results.errors import Errors
 from calib.results.holdout import held_out
-from calib.rig.scanned import ScanSums, numbering
+from calib.results.rings import harmful, odd_rings
 from calib.runs.belief import cautions, forbids
 from calib.runs.reopen import model_of, reopened, start_of, state_of
 from calib.runs.run import DIAGNOSIS, Run
 from calib.solve.fit import Progress, resume
 from sensors.documents import write_json
-from sensors.rings import RingFinding, least_off_rad
-
-SCANS_LOOKED_AT = 3  # scans from which the numbers of rings are checked: each holds all rings
+from sensors.rings import least_off_rad
 
 
 @one_blas_thread
@@ -69,8 +68,7 @@ def _found(
 ) -> Diagnosis:
     """As `diagnose`, and nothing is written."""
     stand = stand_of(run, progress, candidates)
-    rings = dict(_odd_rings(stand))
-    harmful = {name: each for name, each in rings.items() if each.what != "reversed"}
+    rings = ((s.rig.lidar.name, each) for s, each in odd_rings(stand.sources))
     # Away from an optimum every effect that moves the state towards one looks missing, beams are
     # thrown away for no reason of their own, and groups far out that are not to blame.
     found = search(stand, progress) if run.converged else search(stand, progress, most=0)
@@ -100,7 +98,7 @@ def _found(
         weak_directions(run.solution, found.looks[0]),
         rejected,
         forbids(run),
-        [told.of_rings(lidar, each) for lidar, each in harmful.items()],
+        [told.of_rings(lidar, each) for lidar, each in rings if harmful(each.what)],
         formulas,
     )
     unseen = _reaches(found.looks[0], run) if run.converged else {}
@@ -109,19 +107,24 @@ def _found(
         result,
         plan=command_to_plan(run, apart) if apart else "",
         scatter=[*_scatter(run, stand), *result.scatter],
-        detectable=_detectable(stand),
+        detectable={**_detectable(stand), **_scale_detectable(result)},
         unseen=unseen,
         sentences=[
             *run.doubts,
             *suspect,
             *result.sentences,
             *hardly_checked(unseen),
-            *map(told.whole, cautions(run)),
+            *map(told.whole, _cautions(run, result)),
             *run.omissions,
-            *(told.whole(each.sentence) for each in rings.values() if each not in harmful.values()),
         ],
         command=_command(run, result),
     )
+
+
+def _cautions(run: Run, found: Diagnosis) -> list[str]:
+    """What is to be looked at besides, without what was found to be wrong."""
+    named = tuple(f"{each['where']}, {each['name']}:" for each in found.blunders)
+    return [each for each in cautions(run) if not each.startswith(named)]
 
 
 def _command(run: Run, found: Diagnosis) -> str:
@@ -174,25 +177,19 @@ def command_without(run: Run, tokens: Sequence[str]) -> str:
     return shlex.join(["rigcal", "fit", *map(str, run.recordings), *out, *chosen, *without])
 
 
-def _odd_rings(stand: Stand) -> Iterator[tuple[str, RingFinding]]:
-    """LiDARs whose rings are numbered otherwise than their model has it. Those counted from the
-    other end are many makers' own; else offsets by ring are of no use."""
-    for source in stand.sources:
-        scanned = np.flatnonzero(source.recording.has_scan)[:SCANS_LOOKED_AT]
-        if source.rig.lidar is not None and len(scanned):
-            sums = ScanSums(source.rig.lidar)
-            for k in scanned.tolist():
-                sums.add(source.recording.stops[k], source.store.read(k)[0])
-            found = numbering(sums)
-            if found is not None:
-                yield source.rig.lidar.name, found
-
-
 def _detectable(stand: Stand) -> dict[str, dict[str, float]]:
     """From which rms of elevations other numbers of rings are told, of all LiDARs."""
     lidars = [s.rig.lidar for s in stand.sources if s.rig.lidar and s.recording.has_scan.any()]
     sizes = [size for size in map(least_off_rad, lidars) if np.isfinite(size)]
     return {"rings": {"rad": max(sizes)}} if sizes else {}
+
+
+def _scale_detectable(found: Diagnosis) -> dict[str, dict[str, float]]:
+    """From which size a wrong scale of the mesh is found, where the model does not have it: as the
+    effect that it is."""
+    sizes = {c["effect"]: c["smallest_detectable"] for c in found.candidates}
+    size = sizes.get(FaroScale.name)
+    return {f"{MESH}:scale": {FaroScale.unit: size}} if size and np.isfinite(size) else {}
 
 
 def _reaches(look: Look, run: Run) -> dict[Group, FurthestMoved]:

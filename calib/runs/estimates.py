@@ -87,6 +87,7 @@ def comparison(runs: Sequence[Run]) -> dict[str, Any]:
             kind: [run.summary.get("misfit", {}).get(kind) for run in runs]
             for kind in _kinds(runs, "misfit")
         },
+        "converged": [run.converged for run in runs],
         "left_out": [run.left_out for run in runs],
         "set_aside": [run.set_aside for run in runs],
         "misfit_by": [run.summary.get("misfit_by") for run in runs],

@@ -152,6 +152,11 @@ class Run:
         return list(self.summary.get("extrapolated", ()))
 
     @property
+    def odd_rings(self) -> list[str]:
+        """Rings that are numbered otherwise than the table of their LiDAR; a clause each."""
+        return [each["sentence"] for each in self.summary.get("rings", ())]
+
+    @property
     def set_aside(self) -> list[str]:
         """Scans, and bodies at stops, that the fit could not use."""
         return list(self.summary.get("set_aside", ()))

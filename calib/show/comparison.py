@@ -99,6 +99,9 @@ def _comparison_table(runs: Sequence[Run]) -> Table:
             if any(value is not None for value in values):
                 cells = (mm(value, "+" if error == "mean_mm" else "") for value in values)
                 table.add_row(f"{error[:-3]} {label}", "mm", *cells)
+    if not all(compared["converged"]):
+        how = {True: "converged", False: "NOT CONVERGED"}
+        table.add_row("the fit has", "", *(how[each] for each in compared["converged"]))
     for key in ("left_out", "set_aside"):
         if any(compared[key]):
             table.add_row(key.replace("_", " "), "", *map(_stacked, compared[key]))

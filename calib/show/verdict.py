@@ -6,11 +6,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from calib.runs.belief import FAR_OFF, OVER, cautions, forbids, over_floor
+from calib.runs.belief import FAR_OFF, cautions, forbids
 from calib.runs.run import Run
-from calib.show.misfit import standing_out, together_told
 
-AT_THE_FLOOR = 1.25  # times what is expected: a held-out error as good as that
 UNASKED = "not diagnosed"
 LIGHT_MEANS = {"green": "use it", "amber": "use it with care", "red": "do not use it yet"}
 
@@ -82,13 +80,7 @@ def _doubtful(run: Run, diagnosis: Mapping[str, Any] | None) -> Iterator[str]:
         yield "the stops are too few to say whether anything is missing"
     elif diagnosis["verdict"] == "unexplained_structure":
         yield "there is structure that no known effect explains"
-    if rms.get("held_out") is None:
-        yield "no stops were held out, so its predictions were not checked"
-    if AT_THE_FLOOR < (times := over_floor(run)) <= FAR_OFF:
-        yield OVER.format(times)
     yield from cautions(run)
-    yield from together_told(run.summary)
-    yield from standing_out(run.summary)
     for weak in (diagnosis or {}).get("weak_directions", ()):
         if (weak["sigma_mm"] or 0.0) > FAR_OFF * rms["noise_floor"]:
             names = " and ".join(weak["parameters"])

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from calib.linear.linearise import beams_cost
 from calib.problem.problem import Block, Problem
 from calib.solve.added import declared
-from calib.solve.descent import LAST, SLOWED, UPHILL
+from calib.solve.descent import AT_OPTIMUM, LAST, SLOWED, STEADY, UPHILL
 from calib.solve.estimate import Estimate, Start, cost_of, values_of
 from calib.solve.loop import CONVERGED, Loop, Progress
 from calib.solve.turned import least_turned, lidars_turned, turned_far
 from chains.errors import InputError
+
+ROUNDED = 1e-6  # of a cost: how far apart a fit's end and a look at it may be
 
 __all__ = ["CONVERGED", "Progress", "preview", "resume", "solve"]
 
@@ -48,13 +52,10 @@ def solve(
     if not problem.calibration:
         raise InputError("nothing is left to estimate: fix fewer names, or choose an effect")
     loop = Loop(problem, prior, progress, start)
-    if loop.start.state:
-        loop.take_weights()
-    else:
-        loop.doubt_bodies()
+    (loop.take_weights if loop.start.state else loop.doubt_bodies)()
     if loop.start.state and problem.scans:
         _go_on(loop, tolerance)
-        return loop.estimate(tolerance if spread else None)
+        return _not_raised(loop, loop.estimate(tolerance if spread else None))
     loop.solve_without_scans()
     astray = prior is None and loop.bodies_astray()
     if not astray:
@@ -73,7 +74,9 @@ def solve(
         if spread:
             loop.begin_spread()
         _arrive(loop, tolerance)
-    return loop.estimate(tolerance if spread else None)
+    elif loop.start.state:
+        _stay_below(loop, lambda: loop.descend(STEADY, beams=False))
+    return _not_raised(loop, loop.estimate(tolerance if spread else None))
 
 
 def _arrive(loop: Loop, tolerance: float) -> None:
@@ -100,21 +103,42 @@ def _go_on(loop: Loop, tolerance: float) -> None:
     loop.descend_roughly()
     loop.reweigh(beams=True)
     loop.settle_on(tolerance)
-    if not _raised(loop):
-        return
-    loop.values = values_of(loop.problem, loop.start.state)
-    loop.descend(LAST, tolerance, hasten=False)
-    if _raised(loop):
+    _stay_below(loop, lambda: loop.descend(LAST, tolerance, hasten=False))
+
+
+def _stay_below(loop: Loop, descend: Callable[[], bool]) -> None:
+    """Go back to the start where the cost is above that of it, and down from there with the weights
+    as they are; and where that ends above it as well, stay."""
+    for again in (descend, lambda: None):
+        if not _raised(loop):
+            return
         loop.values = values_of(loop.problem, loop.start.state)
+        again()
 
 
-def _raised(loop: Loop) -> bool:
-    """Whether the cost is above that of the start, all beams weighed as they are here."""
+def _raised(loop: Loop, more: float = UPHILL, least: float = 0.0) -> bool:
+    """Whether the cost is above that of the start, all rows weighed as they are here.
+
+    Args:
+        loop: the fit.
+        more, least: by how much it may be above it: of it, and at any rate.
+    """
     loop.linearise_here()
     first, cost = values_of(loop.problem, loop.start.state), loop.cost()
     linear, graph = loop.linearised(first, beams=False)
     beams = beams_cost(loop.problem, first, loop.associations, loop.linear.weighed)
-    return cost > (cost_of(linear, graph, first) + beams) * (1 + UPHILL)
+    return cost > (cost_of(linear, graph, first) + beams) * (1 + more) + least
+
+
+def _not_raised(loop: Loop, estimate: Estimate) -> Estimate:
+    """The estimate of a fit that went on from an earlier one: more unknowns never cost more.
+
+    Raises:
+        RuntimeError: they do, which is a fault of the program.
+    """
+    if loop.start.state and estimate.converged and _raised(loop, ROUNDED, AT_OPTIMUM):
+        raise RuntimeError("a fit ended above the cost of the one that it went on from")
+    return estimate
 
 
 def preview(problem: Problem, progress: Progress = lambda what, done, total: None) -> Estimate:

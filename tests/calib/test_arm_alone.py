@@ -1,5 +1,6 @@
 """Arms under a tracker alone: what is held out, what is predicted elsewhere, what is said."""
 
+import csv
 import json
 import shutil
 from dataclasses import replace
@@ -190,6 +191,46 @@ def test_a_box_is_small_where_the_prediction_outside_is_much_worse():
     assert not of(1.9e-4).is_small and of(2.1e-4).is_small
     assert "1.00 x 0.50 x 0.25 m, which holds 40 %" in of(2.1e-4).warning
     assert "0.1 mm, anywhere in the joints' range to 0.21 mm (95 %)" in of(2.1e-4).sentence
+
+
+def nearest_poses(folder, to, count):
+    """A copy of a recording of an arm, of whose poses those nearest to the first are left."""
+    shutil.copytree(folder, to, copy_function=shutil.copyfile)
+    with (to / "stops.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    at = np.array([[float(row[f"tool.{axis}"]) for axis in "xyz"] for row in rows])
+    near = np.argsort(np.linalg.norm(at - at[0], axis=1))[:count]
+    with (to / "stops.csv").open("w", newline="") as file:
+        table = csv.DictWriter(file, rows[0])
+        table.writeheader()
+        table.writerows(rows[k] for k in sorted(near))
+    return to
+
+
+def test_a_small_box_is_warned_of_however_much_wider_intervals_are(shared, tmp_path):
+    """An effect is missing, so that rows err together and every sigma is widened: each parameter's
+    own factor took from 4.5 to 1.6 how much worse the place is known elsewhere."""
+    folder = nearest_poses(shared / "recordings/arm_payload", tmp_path / "rec", 20)
+    (checked,) = check(folder).predicted
+    run = calibrate([folder], tmp_path / "run", hold_out="none")
+    told = run.summary["predicted_mm"]
+    assert checked.is_small and checked.box_share < 0.05 and run.summary["sigmas_widened_by"] > 2
+    assert len(told["told"]) == 2 and "add poses out there" in told["told"][1]
+    before = checked.anywhere_m / checked.at_poses_m
+    assert told["anywhere"] / told["at_poses"] == pytest.approx(before, rel=0.1)
+
+
+def test_wider_sigmas_never_make_a_place_better_known(shared, tmp_path):
+    folder = nearest_poses(shared / "recordings/arm_payload", tmp_path / "rec", 20)
+    problem = build([Source.open(folder)], Model())
+    estimate = solve(problem)
+    known, plain = intervals(estimate), reach(problem, estimate)
+    found = [reach(problem, estimate, known.at_least(least)) for least in (1.0, 2.0, 4.0, 8.0)]
+    for at in ("at_poses_m", "anywhere_m"):
+        sizes = [getattr(each, at) for each in found]
+        assert np.all(np.diff(sizes) > -1e-3 * sizes[0]), at  # of a sample
+        assert sizes[0] > getattr(plain, at), at
+        assert sizes[-1] == pytest.approx(8.0 * getattr(plain, at), rel=1e-6), at
 
 
 # -------------------------------------------------------------------------------- what is not there

@@ -266,3 +266,40 @@ def test_what_is_out_where_nothing_converges_is_a_suspect_and_no_blunder(
     said = " ".join(found.sentences)
     assert found.verdict == "bad_data" and not found.blunders and not found.command
     assert "not converged" in said and f"Furthest from everything else: {moved[:6]}" in said
+
+
+@pytest.fixture(scope="module")
+def of_arm(tmp_path_factory):
+    """An arm under a tracker alone, its fit, and the problem with one effect more."""
+    source, _ = simulated.made(tmp_path_factory.mktemp("arm") / "rec", "laser-tracker")
+    small = solve(build([source], Model()))
+    return small, build([source], Model().plus((find("arm_gravity_sag"),)))
+
+
+def led_astray(monkeypatch):
+    """Weights that leave the optimum: joint zeros are off by 2 mrad."""
+
+    def reweigh(self, beams):
+        moved = self.values["arm_joint_offset"] + 2e-3
+        self.values = {**self.values, "arm_joint_offset": moved}
+        return True
+
+    monkeypatch.setattr(Loop, "reweigh", reweigh)
+
+
+def test_a_fit_of_an_arm_that_is_led_astray_goes_back_to_where_it_began(of_arm, monkeypatch):
+    small, wide = of_arm
+    alone = solve(wide, start=small.start)
+    led_astray(monkeypatch)
+    found = solve(wide, start=small.start)
+    assert found.converged and found.cost == pytest.approx(alone.cost, abs=1e-3)
+    assert found.cost <= small.cost + 1e-9
+
+
+def test_a_cost_that_an_effect_has_raised_is_a_fault(of_arm, monkeypatch):
+    small, wide = of_arm
+    led_astray(monkeypatch)
+    monkeypatch.setattr("calib.solve.fit._stay_below", lambda loop, descend: None)
+    monkeypatch.setattr("calib.solve.loop.AT_OPTIMUM", np.inf)  # or it is not called converged
+    with pytest.raises(RuntimeError, match="above the cost"):
+        solve(wide, start=small.start)

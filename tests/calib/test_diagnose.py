@@ -218,12 +218,13 @@ def test_every_kind_of_mishap_has_a_size_from_which_it_is_found(studies):
     document = found.document()
     sizes, kinds = document["detectable"], {g["token"]: g["kind"] for g in document["groups"]}
     assert {"body", "joints", "scan", "target", "frame"} <= set(kinds.values())
-    assert sizes.keys() == {*kinds, "rings"}
+    assert sizes.keys() == {*kinds, "rings", "mesh:scale"}
     # None where one direction is checked by nothing, as a turn of a scan that meets a floor alone.
     assert {kinds[token] for token in kinds if not sizes[token]} <= {"scan"}
     assert 0 < sizes["rings"]["rad"] < 0.1
     scale = next(c for c in found.candidates if c["effect"] == "faro_scale")
     assert 0 < scale["smallest_detectable"] < 0.01
+    assert sizes["mesh:scale"] == {"1": scale["smallest_detectable"]}
 
 
 def test_rivals_and_structure_are_printed(studies, capsys):

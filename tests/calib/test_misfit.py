@@ -1,12 +1,14 @@
 """Where a model does not fit: the rows of trackers, targets and priors, one by one and by group."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
 import pyarrow.dataset
 import pyarrow.parquet as pq
 import pytest
+import yaml
 
 from calib.problem import build
 from calib.problem.model import Model, Source
@@ -83,6 +85,20 @@ def test_a_wrong_cad_value_moves_its_frame_by_many_of_its_sigmas(tmp_path):
     assert lidar["worst"] == "tz" and lidar["unit"] == "m" and lidar["move_sigmas"] > 50
     assert 0.1 < lidar["change"] < 0.17  # the mount's CAD takes the rest
     assert lidar["move_sigmas"] == pytest.approx(abs(lidar["change"]) / lidar["sigma"])
+
+
+def test_one_wild_row_widens_no_sigma_and_a_wrong_sigma_all_of_them(tmp_path, shared):
+    """Of 1,495 poses one is 0.5 m off: it is told, and no other is less well known for it."""
+    folder = tmp_path / "rec"
+    shutil.copytree(shared / "recordings/arm_one_wild_row", folder, copy_function=shutil.copyfile)
+    run = calibrate([folder], tmp_path / "run", hold_out="none")
+    assert run.summary["misfit"]["tracker"] > 100 and run.summary["sigmas_widened_by"] == 1.0
+    rig = yaml.safe_load((folder / "rig.yaml").read_text())
+    for name in ("sigma_m", "sigma_rad"):
+        rig["tracker"][name] = float(rig["tracker"][name]) / 5
+    (folder / "rig.yaml").write_text(yaml.safe_dump(rig))
+    run = calibrate([folder], tmp_path / "again", hold_out="none")
+    assert 2 < run.summary["sigmas_widened_by"] < 6
 
 
 def of_cad(run):

@@ -169,8 +169,8 @@ def conclude(
     blunders = [*spoilt, *(told.document(left, _rig(left, first)) for left in found.blunders)]
     unsure = unconfirmed(doubt, summary["rms_mm"]) if doubt else ""
     sentences = sentences_of(verdict, heavy, candidates, unexplained, untestable, blunders, unsure)
-    if forbids and verdict == BAD and not blunders:
-        sentences.insert(0, f"This run is not to be believed as it stands: {'; '.join(forbids)}.")
+    if forbids and verdict in (BAD, UNNAMED) and not blunders:
+        sentences.insert(0 if verdict == BAD else len(sentences), _disbelief(forbids))
     sentences += [formulas.refused] if formulas.refused else []
     if rejected:
         first_of_all = not formulas.formulas and verdict == UNNAMED and not rejected.explained
@@ -190,6 +190,10 @@ def conclude(
         rejected=rejected,
         scatter=[s.document(each.effect.name) for each in found.chance for s in each.spreads],
     )
+
+
+def _disbelief(forbids: Sequence[str]) -> str:
+    return f"This run is not to be believed as it stands: {'; '.join(forbids)}."
 
 
 def _unconfirmed(found: Search, rms_mm: Mapping[str, float]) -> Candidate | None:

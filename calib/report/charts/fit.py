@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from calib.diagnosis.verdict import HELD_OUT_BY_CHANCE
 from calib.report import plots
 from calib.report.chart import Absent, Chart
 from calib.report.evidence import Evidence, folder_name
 from calib.report.statistics import Z_EDGES
 from calib.runs.ladder import FORMULA, Rung
-from calib.show.verdict import AT_THE_FLOOR
 
 if TYPE_CHECKING:
     from calib.report.plots import Figure
@@ -33,7 +33,7 @@ def ladder(evidence: Evidence) -> Iterator[Chart | Absent]:
     floor = evidence.run.summary["rms_mm"]["noise_floor"]
     first = error_mm(evidence.rungs[0])[1]
     way = f" from {first:.2f}" if len(evidence.rungs) > 1 else ""
-    near = "down to" if last <= AT_THE_FLOOR * floor else "still above"
+    near = "down to" if last <= HELD_OUT_BY_CHANCE * floor else "still above"
     near = "below" if last > first and last <= floor else near
     yield Chart(
         "ladder",

@@ -1,0 +1,42 @@
+"""Whether the rings of a recording are numbered as the table of its LiDAR's model has them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from calib.problem.model import Source
+from calib.rig.scanned import ScanSums, numbering
+from sensors.rings import REVERSED, RingFinding
+
+LOOKED = 3  # scans of a recording from which the numbers are checked: each holds all rings
+
+
+def odd_rings(sources: Iterable[Source]) -> Iterator[tuple[Source, RingFinding]]:
+    """Recordings whose rings are numbered otherwise than their LiDAR's model has them."""
+    for source in sources:
+        scanned = np.flatnonzero(source.recording.has_scan)[:LOOKED]
+        if source.rig.lidar is not None and len(scanned):
+            sums = ScanSums(source.rig.lidar)
+            for k in scanned.tolist():
+                sums.add(source.recording.stops[k], source.store.read(k)[0])
+            found = numbering(sums)
+            if found is not None:
+                yield source, found
+
+
+def harmful(what: str) -> bool:
+    """Whether offsets by ring are of no use; where rings are counted from the other end, as many
+    drivers do, they are right, and only a table by the LiDAR's own channels has another order."""
+    return what != REVERSED
+
+
+def documents(sources: Iterable[Source]) -> list[dict[str, Any]]:
+    """The same as summary.json holds it: of which rig and LiDAR, and what was found."""
+    return [
+        {"rig": source.rig.name, "lidar": source.rig.lidar.name, **asdict(found)}
+        for source, found in odd_rings(sources)
+    ]

@@ -1,0 +1,90 @@
+"""A run that has not converged, or lacks what was left out, says so wherever it is shown."""
+
+import json
+from unittest.mock import patch
+
+import pytest
+
+from calib.problem.model import Model
+from calib.runs.calibrate import calibrate
+from calib.runs.run import Run
+from calib.simulation import Spec, simulate
+from calib.solve.descent import AT_OPTIMUM
+from sensors.documents import read_yaml
+
+SPEC = Spec(lidar="hesai_pandarxt32", locations=2, stops_per_location=3, column_step=250)
+LEFT = "L01P02:mount_markers"
+SAID = "NOT CONVERGED"
+
+
+def _run(folder, *without, fall=AT_OPTIMUM):
+    simulate(SPEC, folder / "rec", 1)
+    model = Model.of(None, (), without, [folder / "rec"])
+    with patch("calib.solve.loop.AT_OPTIMUM", fall):
+        calibrate(folder / "rec", folder / "run", model, hold_out="none")
+
+
+def _stopped_early(folder):
+    _run(folder, fall=-1.0)  # nothing is
+
+
+def _less(folder):
+    _run(folder, LEFT)
+
+
+@pytest.fixture
+def loose(once):
+    return once(_stopped_early)
+
+
+@pytest.fixture
+def less(once):
+    return once(_less)
+
+
+def _commands(home):
+    """Every command that shows a run, and the file that it writes, if it is of text."""
+    run, rec, out = home / "run", home / "rec", home / "out"
+    yield ("evaluate", run), run / "evaluation.json"
+    yield ("evaluate", run, "--at", rec / "stops.csv", "-o", home / "at.csv"), None
+    yield ("plot", run, "misfit", "-o", home / "misfit.svg"), home / "misfit.svg"
+    yield ("plan", run, "--stops", 1, "--candidates", 5), None
+    yield ("report", run, "-o", home / "report.html"), home / "report.html"
+    yield ("compare", run), None
+    yield ("apply", run, rec, "-o", out, "--force"), None
+
+
+def test_no_command_shows_it_in_silence(loose, rigcal):
+    for words, file in _commands(loose):
+        code, out, err = rigcal(*words)
+        assert code == (0 if "--force" in words else 3), (words, err)
+        assert SAID in out, words
+        assert file is None or SAID in file.read_text(), words
+        assert "--force" in words or SAID in err, words
+
+
+def test_what_was_left_out_is_told_by_all_of_them(less, rigcal):
+    for words, file in _commands(less):
+        code, out, err = rigcal(*words)
+        assert code == 0, (words, err)
+        assert LEFT in out and SAID not in out, words
+        assert file is None or LEFT in file.read_text(), words
+
+
+def test_machines_are_told_as_well(loose, rigcal):
+    run = loose / "run"
+    for words in (("evaluate", run), ("evaluate", run, "--at", loose / "rec/stops.csv"),
+                  ("apply", run, loose / "rec", "-o", loose / "out", "--force")):  # fmt: skip
+        _, out, _ = rigcal(*words, "--json")
+        assert SAID in json.loads(out)["warnings"][0], words
+    assert json.loads(rigcal("compare", run, "--json")[1])["converged"] == [False]
+
+
+def test_the_solution_says_it_to_whoever_reads_only_that(loose, less):
+    head = (loose / "run/solution.yaml").read_text().splitlines()[0]
+    assert head.startswith(f"# {SAID}: ")
+    assert (less / "run/solution.yaml").read_text().startswith(f"# Left out: {LEFT}\n")
+    for home in (loose, less):
+        found = Run.open(home / "run").solution.shared
+        data, _ = read_yaml(home / "run/solution.yaml")
+        assert data["frames"].keys() == found.frames.keys()
