@@ -277,14 +277,14 @@ def test_arrows_are_ticked_and_files_are_taken_away(run):
         field(watched, "Only where").fill("ring > 40")
         watched.page.wait_for_url(re.compile("only=ring"))
         with watched.page.expect_download() as plot_file:
-            button(watched, "Plot as CSV").click()
+            button(watched, "CSV").click()
         assert plot_file.value.suggested_filename == "run-residual_m-over-range_m.csv"
         table = np.genfromtxt(plot_file.value.path(), delimiter=",", skip_header=1)
         points = page.picture.stage.points  # of L00P01
         rows = points.columns["ring"] > 40
         np.testing.assert_allclose(table[:, 4], 1e3 * points.columns["residual_m"][rows], 1e-5)
         with watched.page.expect_download() as archive:
-            button(watched, "Extrinsics as zip").click()
+            button(watched, "Exports").click()
         assert zipfile.ZipFile(archive.value.path()).testzip() is None
         watched.page.reload()
         watched.page.locator("[data-is=moves]").wait_for()

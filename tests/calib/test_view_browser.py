@@ -159,21 +159,21 @@ def test_a_click_reads_the_point_that_it_meets(small):
             rows
         )
         stop = page.picture.stage.scene.sources[0].recording
-        here = stop.stops.index(page.picture.stop.value)
+        here = stop.stops.index(page.picture.menu.stop.value)
         said = float(rows["temperature"].split()[0])
         assert said == pytest.approx(stop.covariates["temperature_c"][here], abs=0.01)
-        assert page.picture._plot.series[-2]["label"] == "clicked"  # in the plot too
+        assert page.picture.panel.plot.series[-2]["label"] == "clicked"  # in the plot too
 
 
 def test_stops_and_colours_are_chosen(small):
     with shown(small.folder) as (watched, page):
         watched.page.get_by_text("mm, short").wait_for()
-        assert page.picture.stop.value == "L00P00"
+        assert page.picture.menu.stop.value == "L00P00"
         for label, option in (("Stop", "L01P01"), ("Colour", "incidence, deg")):
             watched.page.get_by_label(label, exact=True).click()
             watched.page.get_by_role("option", name=option, exact=True).click()
         watched.page.get_by_text("mm, short").wait_for(state="hidden")
-        assert page.picture.stop.value == "L01P01"
+        assert page.picture.menu.stop.value == "L01P01"
         count = len(page.picture.stage.scene.points(0, "L01P01").inlier)
         watched.page.get_by_text(f"{count:,} beams,").wait_for()
 

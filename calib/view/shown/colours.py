@@ -9,7 +9,8 @@ import numpy as np
 
 from calib.show.scale import round_up
 from calib.view.scene import Points
-from calib.view.shown.columns import DIFFERENCE, LOCATION, OTHER, STOP
+from calib.view.shown import columns
+from calib.view.shown.columns import LOCATION, STOP
 
 # Blue to vermilion about a grey that shows on white walls: told apart by every kind of sight.
 SIGNED = ("#08306b", "#2171b5", "#6baed6", "#b9bdc1", "#fd8d3c", "#d94801", "#7f2704")
@@ -38,10 +39,19 @@ class Column:
         return f"{self.title}, {self.unit}" if self.unit else self.title
 
 
+def _residual(title: str, than: str = "") -> Column:
+    """A residual, or a difference of two."""
+    return Column(title, "mm", 1e3, (f"short{than}", f"long{than}"))
+
+
 COLUMNS = {
-    "residual_m": Column("residual", "mm", 1e3, ("short", "long")),
-    OTHER: Column("residual in the other run", "mm", 1e3, ("short", "long")),
-    DIFFERENCE: Column("difference to the other run", "mm", 1e3, ("shorter", "longer")),
+    "residual_m": _residual("residual"),
+    columns.HELD_OUT: _residual("residual held out"),
+    columns.ABSORBED: _residual("held out less fitted", "er"),
+    columns.OTHER: _residual("residual in the other run"),
+    columns.DIFFERENCE: _residual("difference to the other run", "er"),
+    columns.OTHER_HELD_OUT: _residual("held out in the other run"),
+    columns.HELD_OUT_DIFFERENCE: _residual("held out, difference to the other run", "er"),
     "range_m": Column("range", "m"),
     "incidence_rad": Column("incidence", "deg", 180 / np.pi),
     "ring": Column("ring"),

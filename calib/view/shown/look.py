@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from urllib.parse import parse_qsl, quote, urlencode
 
 LONGEST = 2000  # letters: what browsers and mail programs take as a link
-KEYS = ("run", "recording", "stop", "stops", "other", "colour", "scales", "only", "up", "over")
-KEYS += ("lit", "moves", "below", "camera", "dark")
+KEYS = ("run", "recording", "stop", "stops", "other", "beside", "colour", "size", "scales", "only")
+KEYS += ("up", "over", "lit", "area", "moves", "below", "camera", "dark")
 
 
 def read(text: str) -> dict[str, str]:
