@@ -167,9 +167,9 @@ def colour_bar(
 
 
 def dot_key(
-    figure: Figure, dots: Mapping[str, tuple[str, float]], title: str, side: str = "left"
+    figure: Figure, dots: Mapping[str, tuple[str, float]], title: str, place: str = "lower left"
 ) -> None:
-    """Say below axes, on one side, what dots mean: text -> their colour and their size, points."""
+    """Say outside axes what dots mean: text -> their colour and their size, points."""
     from matplotlib.lines import Line2D
 
     look = {"linestyle": "none", "marker": "o", "markeredgewidth": 0}
@@ -177,8 +177,8 @@ def dot_key(
         Line2D([], [], label=text, color=colour, markersize=size, **look)
         for text, (colour, size) in dots.items()
     ]
-    place = {"loc": f"outside lower {side}", "ncols": 4, "fontsize": 8, "alignment": "left"}
-    figure.legend(handles=handles, title=title, title_fontsize=8, columnspacing=1, **place)
+    where = {"loc": f"outside {place}", "ncols": 4, "fontsize": 8, "alignment": "left"}
+    figure.legend(handles=handles, title=title, title_fontsize=8, columnspacing=1, **where)
 
 
 def with_plain_text(figure: Figure) -> Figure:

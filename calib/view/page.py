@@ -203,15 +203,11 @@ class Page:
 
     def _show_run(self) -> None:
         """Everything anew, for the chosen run."""
+        with self.client.atomic():  # nothing of another run stands beside what is of this one
+            self._show_numbers()
+            self._show_findings()
+            self._tell(f"Reading the recordings of {self.desk.chosen} …")
         desk = self.desk
-        fill(self._run, list(desk.runs), desk.chosen)
-        self._ladder.content = "".join(
-            (panels.moved(desk.run), panels.ladder(desk.rungs()), panels.standing_out(desk.run))
-        )
-        self._parameters.content = panels.framed(parameters(desk.run))
-        self._undo.disabled = desk.rungs()[-1].below is None
-        self._show_findings()
-        self._tell(f"Reading the recordings of {desk.chosen} …")
         try:
             scene = self.bench.scene(desk.run)
         except InputError:
@@ -221,6 +217,15 @@ class Page:
         below = desk.rungs()[-1].below
         self.picture.show(scene, others, desk.name_of(below.folder) if below else None)
         self._tell("")
+
+    def _show_numbers(self) -> None:
+        desk = self.desk
+        fill(self._run, list(desk.runs), desk.chosen)
+        self._ladder.content = "".join(
+            (panels.moved(desk.run), panels.ladder(desk.rungs()), panels.standing_out(desk.run))
+        )
+        self._parameters.content = panels.framed(parameters(desk.run))
+        self._undo.disabled = desk.rungs()[-1].below is None
 
     def _on_run(self) -> None:
         self.desk.choose(self._run.value)
@@ -358,11 +363,12 @@ class Page:
             self._tell(panels.new_run(Rung(self.desk.runs[self.desk.name_of(folder)], None)))
 
     def _ended(self, told: Told, here: bool) -> None:
-        self._show_busy()
+        with self.client.atomic():
+            self._show_busy()
+            if told.kind == "done" and self.findings is None:
+                self._show_findings()
         if here:
             self._send_report(told.kind == "done")
-        if told.kind == "done" and self.findings is None:
-            self._show_findings()
         if told.kind == "stopped" and here:
             self._tell("Cancelled; what was not finished left nothing behind.")
         if told.kind == "failed" and here:

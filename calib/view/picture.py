@@ -249,10 +249,8 @@ class Picture:
             (self.panel.over, "over", numbers, colours.column("range_m").heading),
         ):
             asked = self._asks.pop(key, None)
-            first = colours.column(asked).heading if asked in offered else default
-            if menu.value in (NOTHING, None) or asked:
-                menu.options, menu.value = options, first if first in options else options[0]
-            self._fill(menu, options)
+            wanted = colours.column(asked).heading if asked in offered else None
+            fill(menu, options, wanted or (default if menu.value == NOTHING else None))
 
     # -------------------------------------------------------------------------- columns and scales
 

@@ -64,6 +64,7 @@ def fill(menu: Any, options: Sequence[str], asked: str | None = None) -> bool:
     """Give a menu other options; chosen is what was asked for, or what was, or the first. Whether
     what was asked for is there."""
     chosen = asked if asked in options else menu.value
-    menu.options = tuple(options)
+    if tuple(options) != tuple(menu.options):  # it may be open
+        menu.options = tuple(options)
     menu.value = chosen if chosen in options else options[0]
     return asked in options

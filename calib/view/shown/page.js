@@ -31,15 +31,16 @@ if (!window.rigcalPage) {
     if (e.key === "Enter" && used?.matches("input")) {
       if (isMenu(used)) chosen = used;
       else used.blur(); // what was written is done
-    } else if (e.key.startsWith("Arrow") && used === chosen) {
-      chosen = null; // its options are shown again
+    } else if (e.key === "Tab" || (e.key.startsWith("Arrow") && used === chosen)) {
+      chosen = null; // options are shown again
     }
     const plain = !(e.ctrlKey || e.metaKey || e.altKey || e.shiftKey);
     if (e.rigcal || !plain || !/^[np]$/i.test(e.key) || takesText(used)) return;
     e.preventDefault();
     e.stopImmediatePropagation();
     if (e.repeat) return;
-    const again = new KeyboardEvent("keydown", { key: e.key.toLowerCase(), code: e.code, bubbles: true });
+    const key = e.key.toLowerCase();
+    const again = new KeyboardEvent("keydown", { key, code: e.code, bubbles: true });
     again.rigcal = true;
     setTimeout(() => document.documentElement.dispatchEvent(again), AFTER_WIDGETS_MS);
   }, true);

@@ -92,7 +92,7 @@ def _explain(figure: Figure, grid: np.ndarray, scale: Scale, chosen: Chosen) -> 
         of, steps = sizes.key(chosen.size, chosen.size_ends)
         each = zip(steps, sizes.FACTORS, strict=True)
         dots = {text: (plots.PALE, 0.75 * DOT * factor) for text, factor in each}
-        plots.dot_key(figure, dots, of, "right")
+        plots.dot_key(figure, dots, of, "upper right")
 
 
 def _draw(ax: Axes, data: Sequence[np.ndarray], series: Sequence[Mapping[str, Any]]) -> None:
