@@ -102,11 +102,12 @@ class Picture:
         if self.stage.scene is None:
             return {}
         column, panel = self._columns.get, self.panel
+        told = self._others or panel.other.value != NOTHING  # of several, none may be chosen
         return {
             "recording": self.menu.recording.value if self.menu.recording.visible else "",
             "stop": self.menu.stop.value,
             "stops": "" if panel.stops.value == THIS else panel.stops.value,
-            "other": panel.other.value if panel.other.visible else "",
+            "other": panel.other.value if panel.other.visible and told else "",
             "beside": ",".join(f"{x:.3f}" for x in self._sides.shift_m),
             "colour": column(self.menu.colour.value, ""),
             "size": column(self.menu.size.value, ""),
