@@ -23,6 +23,7 @@ from chains.escape import html as escape
 
 SHOWN_CANDIDATES = 6  # candidates in the table; the menu has all
 DIGITS = {"m": 3, "mm": 2, "deg": 1, "°C": 2, "s": 1, "of the median": 3}  # that are told
+MANY = 0.05  # of the beams: so many beyond a scale are worth another scale
 KEY_EM = 0.4  # of a dot of the usual size, in the key of sizes
 BAR = "#7fb2d9"
 STRIPED = f"repeating-linear-gradient(45deg,{BAR} 0 6px,#dcebf6 6px 10px)"  # of a rung by a formula
@@ -85,6 +86,7 @@ def plotted(points: Points, rows: np.ndarray, up: str, axes: Mapping[str, Any]) 
     low, high = axes["y"]["range"]
     beyond = int(np.sum((values < low) | (values > high)))
     off = f"; {beyond:,} are beyond the scale" if beyond else ""
+    off += ", which is wider without 'Keep scales'" if beyond > MANY * len(rows) else ""
     left, right = axes["x"]["range"]
     return framed(
         f'<span data-is="plotted" data-low="{left:.6g}" data-high="{right:.6g}">'
