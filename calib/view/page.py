@@ -74,7 +74,7 @@ class Page:
         gui.main_panel.dock_right()
         gui.main_panel.set_width(PANEL_PX)
         gui.add_html(panels.note(LOOKS), visible=not self.may_change)
-        self._note = gui.add_html("", visible=False)
+        self._note, self._wrong = gui.add_html("", visible=False), False
         self._run = gui.add_dropdown("Run", list(self.desk.runs))
         self._run.on_update(self._heard(self._on_run))
         self.picture = Picture(client, window_px, self._heard, self._asks, bench.scene)
@@ -155,10 +155,17 @@ class Page:
             if event.client is None:
                 return  # the page itself changed the widget
             told = () if of is None else (of(event),)
+            step = self._guarded(partial(self._do, use, *told))
             with contextlib.suppress(RuntimeError):  # the page is being closed
-                self._worker.submit(self._guarded(partial(use, *told)))
+                self._worker.submit(step)
 
         return heard
+
+    def _do(self, use: Callable[..., None], *told: Any) -> None:
+        """What a widget does; what was wrong before is told no more."""
+        if self._wrong:
+            self._tell("")
+        use(*told)
 
     def _guarded(self, use: Callable[[], None]) -> Callable[[], None]:
         """Do it while nothing else is done; what goes wrong is told on the page."""
@@ -198,6 +205,7 @@ class Page:
     def _tell(self, text: str, bad: bool = False) -> None:
         """Put a sentence above everything else; an empty one takes it away."""
         self._note.content, self._note.visible = panels.note(text, bad), bool(text)
+        self._wrong = bad
 
     # ------------------------------------------------------------------------------- what is shown
 

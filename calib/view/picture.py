@@ -177,13 +177,15 @@ class Picture:
     # ---------------------------------------------------------------------------- runs and stops
 
     def _on_recording(self) -> None:
-        scene, run = self.stage.scene, self.stage.scene.run
+        scene, run, room = self.stage.scene, self.stage.scene.run, self.stage.room
         try:
             self._sides.first.open(scene, run.folder.name, self._number(scene))
         except InputError:
             self.clear()
             raise
         self.menu.lines_why(self.stage.lines_why)
+        if room not in (None, self.stage.room):
+            self.panel.area = None  # it is of another room
         self._fill(self.menu.stop, scene.stops(self._sides.first.at), "stop")
         shift_m = look.numbers(self._asks.pop("beside", ""), 3)
         if shift_m is not None:
@@ -211,10 +213,8 @@ class Picture:
     def _on_stop(self) -> None:
         stop, stops, chosen = self.menu.stop.value, self._chosen_stops(), self.panel.other.value
         other = AS_IN_CAD if chosen == AS_IN_CAD else self._others.get(chosen)
-        first, second = self._sides.first, self._sides.second
-        points = first.go(stop, stops, other)
-        if second is not None:
-            second.go(stop, stops, first.scene.run)
+        points = self._sides.first.go(stop, stops, other)
+        wrong = self._sides.follow(stop, stops)
         self.menu.moved.content = panels.moves(self.stage.moves)
         self.menu.show(points is not None)
         self.panel.show(points is not None)
@@ -228,6 +228,8 @@ class Picture:
         asked = look.numbers(self._asks.pop("below", ""), 1)
         below.value = float(np.clip(asked[0] if asked else free, below.min, below.max))
         self._on_only()
+        if wrong:
+            raise InputError(wrong)
 
     def _chosen_stops(self) -> list[str]:
         here, wanted = self._sides.first, self.panel.stops.value

@@ -199,6 +199,17 @@ class Sides:
         for side in self:
             side.stage.call(side.name)
 
+    def follow(self, stop: str, stops: Sequence[str]) -> str:
+        """Have the second run stand where the first does; why it cannot."""
+        if self.second is None:
+            return ""
+        try:
+            self.second.go(stop, stops, self.first.scene.run)
+        except InputError as error:
+            self.second.stage.show_no_points()
+            return f"{self.second.name}: {error}"
+        return ""
+
     def close_second(self) -> None:
         """Show the first alone."""
         if self.second is not None:

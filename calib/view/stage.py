@@ -71,6 +71,11 @@ class Stage:
         self.hidden = {MOVES}
         client.scene.configure_default_lights(cast_shadow=False)
 
+    @property
+    def room(self) -> tuple[str, str] | None:
+        """Of which recording the room is drawn; None where none is."""
+        return self._room
+
     def clear(self) -> None:
         """Draw nothing."""
         self.scene, self.points, self._room = None, None, None
@@ -154,11 +159,16 @@ class Stage:
         self._draw_moves()
         self.points = points
         if points is None:
-            for name in (*self._clouds(POINTS), *self._clouds(LIT)):
-                self._remove(name)
+            self.show_no_points()
         if self._around is None and not self._root:
             self._around = self._extent(recording, stop) - self._middle_m
             self._aim()
+
+    def show_no_points(self) -> None:
+        """Draw the room and the rig alone."""
+        self.points = None
+        for name in (*self._clouds(POINTS), *self._clouds(LIT)):
+            self._remove(name)
 
     def camera(self) -> tuple[float, ...]:
         """Where the eye stands (3), and what it looks at (3), m from the room's middle."""

@@ -222,6 +222,15 @@ def test_two_runs_stand_side_by_side(runs):
         tab.wait_for_url(re.compile("stop=L00P01"))
         next_one = by_beam(runs / "better" / TABLES / "L00P01.parquet")
         assert len(second.points.xyz_m) == len(next_one)
+        gone = runs / "better" / TABLES / "L01P00.parquet"
+        gone.rename(gone.with_suffix(".gone"))
+        choose(watched, "Stop", "L01P00")  # the first is shown all the same
+        tab.get_by_text("the run is incomplete").wait_for()
+        assert second.points is None and len(first.points.xyz_m) > 100
+        gone.with_suffix(".gone").rename(gone)
+        choose(watched, "Stop", "L00P01")
+        tab.wait_for_url(re.compile("stop=L00P01"))
+        tab.get_by_text("the run is incomplete").wait_for(state="hidden")
         link = tab.url
         tab.goto("about:blank")
         tab.goto(link)
