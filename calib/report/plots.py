@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 import re
 import textwrap
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -154,6 +154,34 @@ def share_map(ax: Axes, values: np.ndarray, extent: Sequence[float], most: float
     ax.grid(False)
     options = {"aspect": "auto", "origin": "lower", "interpolation": "nearest"}
     return ax.imshow(values, UNSIGNED_MAP, vmin=0.0, vmax=most, extent=extent, **options)
+
+
+def colour_bar(
+    figure: Figure, grid: np.ndarray, colours: Sequence[str], ends: tuple[float, float], label: str
+) -> None:
+    """Say beside axes what colours at even steps between two values mean."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import LinearSegmentedColormap, Normalize
+
+    scale = ScalarMappable(Normalize(*ends), LinearSegmentedColormap.from_list("", list(colours)))
+    bar = figure.colorbar(scale, ax=list(grid.flat), aspect=30)
+    bar.outline.set_visible(False)
+    bar.set_label(label)
+
+
+def dot_key(
+    figure: Figure, dots: Mapping[str, tuple[str, float]], title: str, place: str = "lower left"
+) -> None:
+    """Say outside axes what dots mean: text -> their colour and their size, points."""
+    from matplotlib.lines import Line2D
+
+    look = {"linestyle": "none", "marker": "o", "markeredgewidth": 0}
+    handles = [
+        Line2D([], [], label=text, color=colour, markersize=size, **look)
+        for text, (colour, size) in dots.items()
+    ]
+    where = {"loc": f"outside {place}", "ncols": 4, "fontsize": 8, "alignment": "left"}
+    figure.legend(handles=handles, title=title, title_fontsize=8, columnspacing=1, **where)
 
 
 def with_plain_text(figure: Figure) -> Figure:

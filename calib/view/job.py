@@ -58,20 +58,31 @@ class Change:
     without: Sequence[str] = ()
 
 
+@dataclass(frozen=True)
+class Report:
+    """A report to be written.
+
+    Args:
+        out: the file.
+    """
+
+    out: Path
+
+
 class Job:
-    """A run refitted with a change, and the result diagnosed; or a run diagnosed, where nothing is
-    to be changed.
+    """A run refitted with a change, and the result diagnosed; a run diagnosed, where nothing is to
+    be changed; or its report written.
 
     Args:
         run: folder of the run to start from.
-        change: what is to be another.
+        change: what is to be another, or the report.
         trust: the Python files of effects that may run.
     """
 
     def __init__(
         self,
         run: Path,
-        change: Change | None = None,
+        change: Change | Report | None = None,
         trust: Trust = MappingProxyType({}),
     ) -> None:
         # Spawned: a process with threads and libraries such as these cannot be forked safely.
@@ -111,7 +122,7 @@ class Job:
             self._process.kill()
 
 
-def _work(mouth: Connection, run: Path, change: Change | None, trust: Trust) -> None:
+def _work(mouth: Connection, run: Path, change: Change | Report | None, trust: Trust) -> None:
     """What the process does."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the page, which ends its jobs
     signal.signal(signal.SIGTERM, _leave)
@@ -126,7 +137,7 @@ def _work(mouth: Connection, run: Path, change: Change | None, trust: Trust) -> 
         mouth.send(JobMessage("failed", f"internal fault: {type(error).__name__}: {error}"))
 
 
-def _study(mouth: Connection, folder: Path, change: Change | None, trust: Trust) -> None:
+def _study(mouth: Connection, folder: Path, change: Change | Report | None, trust: Trust) -> None:
     from calib.runs.calibrate import grow
     from calib.runs.diagnose import diagnose
     from calib.runs.run import Run
@@ -135,6 +146,11 @@ def _study(mouth: Connection, folder: Path, change: Change | None, trust: Trust)
         mouth.send(JobMessage("progress", what, (done + 1) / max(total, 1)))
 
     run = Run.open(folder, trust)
+    if isinstance(change, Report):
+        from calib.report import report
+
+        report([run], change.out, progress)
+        return
     if change is not None:
         run = grow(run, changed(run, change), change.out, progress)
         mouth.send(JobMessage("run", str(run.folder)))

@@ -17,11 +17,14 @@ class LeaveOut:
 
     Args:
         gui: viser's.
+        guarded: makes a callback of what a widget does.
         use: called with what ``--without`` takes, when a button is clicked.
     """
 
-    def __init__(self, gui: Any, use: Callable[[Sequence[str]], None]) -> None:
-        self._gui, self._use = gui, use
+    def __init__(
+        self, gui: Any, guarded: Callable[..., Any], use: Callable[[Sequence[str]], None]
+    ) -> None:
+        self._gui, self._guarded, self._use = gui, guarded, use
         self._folder = gui.add_folder("Wrong in the recording", visible=False)
         with self._folder:
             self._listed = gui.add_html("")
@@ -50,8 +53,5 @@ class LeaveOut:
     def _offer(self, label: str, tokens: Sequence[str]) -> None:
         hint = "Refit without this, from this run"
         button = self._gui.add_button(label, hint=hint, disabled=self._busy)
-        button.on_click(partial(self._clicked, tokens))
+        button.on_click(self._guarded(partial(self._use, tokens)))
         self._buttons.append(button)
-
-    def _clicked(self, tokens: Sequence[str], _: Any) -> None:
-        self._use(tokens)

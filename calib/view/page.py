@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -13,26 +16,30 @@ import numpy as np
 from calib.runs.ladder import Rung
 from calib.view import panels
 from calib.view.bench import Bench
-from calib.view.desk import DiagnosisCurve, Findings
+from calib.view.desk import Findings
 from calib.view.effects import known
+from calib.view.effects.curve import CurveOver
 from calib.view.effects.expected import Asked, Expected
 from calib.view.effects.own import OwnFormula, document
 from calib.view.effects.ticks import Ticks
-from calib.view.job import Change, JobMessage
+from calib.view.job import Change, JobMessage, Report
 from calib.view.leave_out import LeaveOut
-from calib.view.picture import NO_VALUE, Picture
+from calib.view.picture import Picture
 from calib.view.server import Visitor
-from calib.view.shown import brush, colours, look
+from calib.view.shown import brush, look
+from calib.view.shown.menu import NOTHING, fill
 from calib.view.shown.moves import parameters
-from calib.view.shown.taken import extrinsics_zip
+from calib.view.shown.taken import extrinsics_zip, run_zip
 from calib.view.stage import PANEL_PX
 from chains.errors import InputError
 
-CURVE_PX = 180
 SETTLED_S = 0.4  # the camera rests for so long before the address tells where it is
-TAKE_HINT = "What 'rigcal export' writes of this run, in all formats, as a zip"
+EXPORTS, REPORT, FOLDER = "Exports", "Report", "Run folder"
+TAKE_HINT = (
+    "What 'rigcal export' writes, in all formats; what 'rigcal report' writes; all of the run"
+)
 WORKED_OUT = "The held-out error is being predicted from the linearisation …"
-READ_ONLY = "Read-only: this address cannot change anything."
+LOOKS = "Read-only: this address cannot change anything."
 
 
 class Page:
@@ -56,8 +63,9 @@ class Page:
         self._visitor, self._asks = visitor, look.read(visitor.asks)
         self._settling: threading.Timer | None = None
         self._address = ""
-        self._covariates: dict[str, str] = {}  # heading -> covariate that has a curve
         self._lock = threading.RLock()
+        self._worker = ThreadPoolExecutor(1, "rigcal page")  # what was used first is done first
+        self._written: TemporaryDirectory | None = None  # where a report is being written
         self._asked: Asked | None = None
         self._expected = Expected(
             self.desk.trust, lambda *told: self._guarded(partial(self._on_expected, *told))()
@@ -65,16 +73,17 @@ class Page:
         gui = client.gui
         gui.main_panel.dock_right()
         gui.main_panel.set_width(PANEL_PX)
-        gui.add_html(panels.note(READ_ONLY), visible=not self.may_change)
-        self._note = gui.add_html("", visible=False)
-        self._run = self._menu("Run", list(self.desk.runs), self._on_run)
-        self.picture = Picture(client, window_px, self._guarded, self._asks)
-        visitor.run(brush.SCRIPT)
+        gui.add_html(panels.note(LOOKS), visible=not self.may_change)
+        self._note, self._wrong = gui.add_html("", visible=False), False
+        self._run = gui.add_dropdown("Run", list(self.desk.runs))
+        self._run.on_update(self._heard(self._on_run))
+        self.picture = Picture(client, window_px, self._heard, self._asks, bench.scene)
+        visitor.run(brush.SCRIPT.read_text(encoding="utf-8"))
         self._add_ladder_widgets()
-        self._blunders = LeaveOut(gui, self._on_leave_out)
+        self._blunders = LeaveOut(gui, self._heard, self._on_leave_out)
         self._add_findings_widgets()
         self._dark = gui.add_checkbox("Dark", bool(self._asks.get("dark")))
-        self._dark.on_update(self._guarded(self._paint_page))
+        self._dark.on_update(self._heard(self._paint_page))
         self._paint_page()
         client.camera.on_update(self._on_camera)
 
@@ -90,6 +99,7 @@ class Page:
         """Its browser has gone."""
         self.bench.forget(self._hear)
         self._expected.stop()
+        self._worker.shutdown(wait=False, cancel_futures=True)
         if self._settling is not None:
             self._settling.cancel()
 
@@ -109,21 +119,15 @@ class Page:
             self._findings = gui.add_html("")
             self._formulas = gui.add_html("")
             self._diagnose = gui.add_button("Diagnose", visible=False)
-            self._over = self._menu("Curve over", [NO_VALUE], self._draw_curve)
-            self._curve = gui.add_uplot(
-                *_curve(None),
-                scales={"x": {"time": False}},
-                bands=({"series": (2, 3), "fill": "rgba(0, 0, 0, 0.08)"},),
-                height=CURVE_PX,
-            )
-        self._ticks = Ticks(gui, self._guarded, self._on_ticks, self._on_refit)
+            self._curve = CurveOver(gui, self._heard)
+        self._ticks = Ticks(gui, self._heard, self._on_ticks, self._on_refit)
         with self._ticks.folder:
             self._bar = gui.add_progress_bar(0.0, visible=False)
             self._doing = gui.add_html("", visible=False)
             self._cancel = gui.add_button("Cancel", visible=False, color="gray")
-            self._own = OwnFormula(gui, self._guarded, self._on_own)
-        self._diagnose.on_click(self._guarded(self._start))
-        self._cancel.on_click(self._guarded(self._on_cancel))
+            self._own = OwnFormula(gui, self._heard, self._on_own)
+        self._diagnose.on_click(self._heard(self._start))
+        self._cancel.on_click(self._heard(self._on_cancel))
 
     def _add_ladder_widgets(self) -> None:
         with self.client.gui.add_folder("Ladder"):
@@ -131,24 +135,45 @@ class Page:
             self._undo = self.client.gui.add_button("Undo", hint="Back to the run below")
         with self.client.gui.add_folder("Parameters", expand_by_default=False):
             self._parameters = self.client.gui.add_html("")
-        self._take = self.client.gui.add_button("Extrinsics as zip", hint=TAKE_HINT, color="gray")
-        self._take.on_click(self._guarded(self._on_take))
-        self._undo.on_click(self._guarded(self._on_undo))
+        files = (EXPORTS, REPORT, FOLDER)
+        take = self.client.gui.add_button_group("Download", files, hint=TAKE_HINT)
+        take.on_click(self._heard(self._on_take, of=lambda event: event.target.value))
+        self._undo.on_click(self._heard(self._on_undo))
 
-    def _menu(self, label: str, options: list[str], use: Callable[[], None]) -> Any:
-        menu = self.client.gui.add_dropdown(label, options)
-        menu.on_update(self._guarded(use))
-        return menu
+    def _heard(
+        self, use: Callable[..., None], of: Callable[[Any], Any] | None = None
+    ) -> Callable[[Any], Any]:
+        """A callback of a widget. What a person does is done in its order, however long each step
+        takes.
 
-    def _guarded(self, use: Callable[..., None], with_event: bool = False) -> Callable[..., None]:
-        """A callback: one at a time, and what goes wrong is told on the page."""
+        Args:
+            use: what the widget does.
+            of: what of the event it is called with; nothing where None.
+        """
 
-        def call(event: Any = None) -> None:
-            if event is not None and event.client is None:
+        async def heard(event: Any) -> None:
+            if event.client is None:
                 return  # the page itself changed the widget
+            told = () if of is None else (of(event),)
+            step = self._guarded(partial(self._do, use, *told))
+            with contextlib.suppress(RuntimeError):  # the page is being closed
+                self._worker.submit(step)
+
+        return heard
+
+    def _do(self, use: Callable[..., None], *told: Any) -> None:
+        """What a widget does; what was wrong before is told no more."""
+        if self._wrong:
+            self._tell("")
+        use(*told)
+
+    def _guarded(self, use: Callable[[], None]) -> Callable[[], None]:
+        """Do it while nothing else is done; what goes wrong is told on the page."""
+
+        def call() -> None:
             with self._lock:
                 try:
-                    use(event) if with_event else use()
+                    use()
                 except InputError as error:
                     self._tell(str(error), bad=True)
                 except Exception as error:
@@ -180,20 +205,17 @@ class Page:
     def _tell(self, text: str, bad: bool = False) -> None:
         """Put a sentence above everything else; an empty one takes it away."""
         self._note.content, self._note.visible = panels.note(text, bad), bool(text)
+        self._wrong = bad
 
     # ------------------------------------------------------------------------------- what is shown
 
     def _show_run(self) -> None:
         """Everything anew, for the chosen run."""
+        with self.client.atomic():  # nothing of another run stands beside what is of this one
+            self._show_numbers()
+            self._show_findings()
+            self._tell(f"Reading the recordings of {self.desk.chosen} …")
         desk = self.desk
-        self._fill(self._run, list(desk.runs), desk.chosen)
-        self._ladder.content = "".join(
-            (panels.moved(desk.run), panels.ladder(desk.rungs()), panels.standing_out(desk.run))
-        )
-        self._parameters.content = panels.framed(parameters(desk.run))
-        self._undo.disabled = desk.rungs()[-1].below is None
-        self._show_findings()
-        self._tell(f"Reading the recordings of {desk.chosen} …")
         try:
             scene = self.bench.scene(desk.run)
         except InputError:
@@ -203,6 +225,15 @@ class Page:
         below = desk.rungs()[-1].below
         self.picture.show(scene, others, desk.name_of(below.folder) if below else None)
         self._tell("")
+
+    def _show_numbers(self) -> None:
+        desk = self.desk
+        fill(self._run, list(desk.runs), desk.chosen)
+        self._ladder.content = "".join(
+            (panels.moved(desk.run), panels.ladder(desk.rungs()), panels.standing_out(desk.run))
+        )
+        self._parameters.content = panels.framed(parameters(desk.run))
+        self._undo.disabled = desk.rungs()[-1].below is None
 
     def _on_run(self) -> None:
         self.desk.choose(self._run.value)
@@ -223,27 +254,10 @@ class Page:
             listed = list(offered)[: panels.SHOWN_CANDIDATES] if self.findings else []
             self._ticks.show(self.desk.effects, offered, listed)
 
-    def _choose_curve(self) -> None:
-        """The curve that shows best what was ticked last, or what stands out."""
-        names = list(self.findings.curves) if self.findings else []
-        self._over.visible = self._curve.visible = bool(names)
-        self._covariates = {colours.column(n).heading: n for n in names}
-        if names:
-            effect = self._ticks.latest or next(iter(self.desk.addable(self.findings)), NO_VALUE)
-            best = colours.column(self.findings.covariate_of(effect)).heading
-            self._fill(self._over, list(self._covariates), best)
-            self._draw_curve()
-
-    def _draw_curve(self) -> None:
-        name = self._covariates[self._over.value]
-        scale = colours.column(name).scale
-        self._curve.data, self._curve.series = _curve(
-            self.findings.curves[name], self._over.value, scale
-        )
-
     def _on_ticks(self, wanted: Mapping[str, Any]) -> str:
         """Show the curve of what was ticked last; what is known of all that is ticked."""
-        self._choose_curve()
+        first = next(iter(self.desk.addable(self.findings)), NOTHING) if self.findings else ""
+        self._curve.show(self.findings, self._ticks.latest or first)
         others = {name: run for name, run in self.desk.runs.items() if name != self.desk.chosen}
         told = known.told(self.desk.run, wanted, self.findings, others)
         self._asked = None
@@ -277,13 +291,30 @@ class Page:
         self._start(Change(self.desk.folder_for(effect["name"]), (effect,)))
 
     def _on_leave_out(self, tokens: Sequence[str]) -> None:
-        change = Change(self.desk.folder_without(), without=tuple(tokens))
-        self._guarded(partial(self._start, change))()
+        self._start(Change(self.desk.folder_without(), without=tuple(tokens)))
 
-    def _on_take(self) -> None:
-        run = self.desk.run
-        name = f"{run.folder.name}-extrinsics.zip"
-        self.client.send_file_download(name, extrinsics_zip(run), save_immediately=True)
+    def _on_take(self, what: str) -> None:
+        name = self.desk.run.folder.name
+        if what == REPORT:
+            self._ask()
+            written = TemporaryDirectory(prefix="rigcal-report-")
+            self._start(Report(Path(written.name) / f"{name}.html"))
+            self._written = written
+        elif what == FOLDER:
+            self._send(f"{name}.zip", run_zip(self.desk.run))
+        else:
+            self._send(f"{name}-extrinsics.zip", extrinsics_zip(self.desk.run))
+
+    def _send(self, name: str, content: bytes) -> None:
+        self.client.send_file_download(name, content, save_immediately=True)
+
+    def _send_report(self, done: bool) -> None:
+        """Give the report to who asked for it, and leave nothing of it here."""
+        written, self._written = self._written, None
+        if written is not None:
+            with written as folder:
+                for file in Path(folder).glob("*.html") if done else ():
+                    self._send(file.name, file.read_bytes())
 
     def _on_undo(self) -> None:
         told = self.desk.undo()
@@ -292,7 +323,7 @@ class Page:
 
     # ------------------------------------------------------------------------- in the background
 
-    def _start(self, change: Change | None = None) -> None:
+    def _start(self, change: Change | Report | None = None) -> None:
         self._ask()
         self.bench.start(self, self.desk.run.folder, change)
         self._tell("")
@@ -305,7 +336,7 @@ class Page:
     def _ask(self) -> None:
         """Whoever may only look has no buttons; this is for one who sends messages without."""
         if not self.may_change:
-            raise InputError(READ_ONLY)
+            raise InputError(LOOKS)
 
     def _show_busy(self) -> None:
         """Whether a job runs."""
@@ -336,34 +367,17 @@ class Page:
             self._show_run()
             self._tell(panels.new_run(self.desk.rungs()[-1]))
         else:
-            self._fill(self._run, list(self.desk.runs), self.desk.chosen)
+            fill(self._run, list(self.desk.runs), self.desk.chosen)
             self._tell(panels.new_run(Rung(self.desk.runs[self.desk.name_of(folder)], None)))
 
     def _ended(self, told: JobMessage, here: bool) -> None:
-        self._show_busy()
-        if told.kind == "done" and self.findings is None:
-            self._show_findings()
+        with self.client.atomic():
+            self._show_busy()
+            if told.kind == "done" and self.findings is None:
+                self._show_findings()
+        if here:
+            self._send_report(told.kind == "done")
         if told.kind == "stopped" and here:
             self._tell("Cancelled; what was not finished left nothing behind.")
         if told.kind == "failed" and here:
             raise InputError(told.text)
-
-    def _fill(self, menu: Any, options: list[str], chosen: str | None = None) -> None:
-        """Give a menu other options, and choose one of them: the first where `chosen` is none."""
-        menu.options = options
-        menu.value = chosen if chosen in options else options[0]
-
-
-def _curve(curve: DiagnosisCurve | None, over: str = "", scale: float = 1.0) -> tuple[Any, Any]:
-    """Data and series of a curve with its band; of none, two points."""
-    if curve is None:
-        curve = DiagnosisCurve(*(np.zeros(2),) * 3)
-    data = (curve.centres * scale, curve.mean_mm, curve.band_mm, -curve.band_mm)
-    edge = {"stroke": "#888888", "width": 1, "dash": (4, 4), "points": {"show": False}}
-    series = (
-        {"label": over},
-        {"label": "mean residual, mm", "stroke": "#0072b2", "width": 2},
-        {"label": "chance", **edge},
-        {"label": "to", **edge},
-    )
-    return data, series

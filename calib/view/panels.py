@@ -8,21 +8,23 @@ from typing import Any
 
 import numpy as np
 
-from calib.blunders.chance import LEAST_P
 from calib.report import plots
 from calib.runs.ladder import FORMULA, Rung
 from calib.runs.run import Run
 from calib.show import misfit
 from calib.show.headline import moved_sentence
+from calib.show.tables import small
 from calib.view.desk import Findings
 from calib.view.scene import Points
+from calib.view.shown import sizes
 from calib.view.shown.colours import Scale, choices, column
 from calib.view.shown.moves import Move
 from chains.escape import html as escape
 
 SHOWN_CANDIDATES = 6  # candidates in the table; the menu has all
-LARGE_NUMBERS = ((1e6, " million"), (1.0, ""))
-SHOWN_DIGITS = {"m": 3, "mm": 2, "deg": 1, "°C": 2, "s": 1, "of the median": 3}  # that are told
+DIGITS = {"m": 3, "mm": 2, "deg": 1, "°C": 2, "s": 1, "of the median": 3}  # that are told
+MANY = 0.05  # of the beams: so many beyond a scale are worth another scale
+KEY_EM = 0.4  # of a dot of the usual size, in the key of sizes
 BAR = "#7fb2d9"
 STRIPED = f"repeating-linear-gradient(45deg,{BAR} 0 6px,#dcebf6 6px 10px)"  # of a rung by a formula
 _FRAME = "padding:0 1.2em .4em .75em;font-size:12px;line-height:1.4"
@@ -55,6 +57,22 @@ def legend(scale: Scale) -> str:
     )
 
 
+def size_key(of: str, steps: Sequence[str]) -> str:
+    """What sizes of dots mean, as `sizes.key` has it."""
+    dots = "".join(
+        f'<span style="margin-right:.9em;white-space:nowrap"><span style="display:inline-block;'
+        f"width:{factor * KEY_EM:.2f}em;height:{factor * KEY_EM:.2f}em;border-radius:50%;"
+        f'background:currentColor;vertical-align:middle"></span> {escape(text)}</span>'
+        for factor, text in zip(sizes.FACTORS, steps, strict=True)
+    )
+    return framed(f'<div data-is="sizes">{escape(of)}:<br>{dots}</div>')
+
+
+def run_name(name: str) -> str:
+    """Whose plot stands below."""
+    return f'<b data-is="side">{escape(name)}</b>'
+
+
 def scan(points: Points | None, drawn: int, stop: str, ratios: Mapping[str, float]) -> str:
     """What the stop's beams say, all of them, however few are drawn; and how large residuals of all
     that was measured there are, over their sigmas."""
@@ -68,21 +86,29 @@ def plotted(points: Points, rows: np.ndarray, up: str, axes: Mapping[str, Any]) 
     low, high = axes["y"]["range"]
     beyond = int(np.sum((values < low) | (values > high)))
     off = f"; {beyond:,} are beyond the scale" if beyond else ""
+    off += ", which is wider without 'Keep scales'" if beyond > MANY * len(rows) else ""
     left, right = axes["x"]["range"]
     return framed(
         f'<span data-is="plotted" data-low="{left:.6g}" data-high="{right:.6g}">'
-        f"{len(rows):,} beams{off}. Line: mean of the inliers. Drag across the plot to light up "
-        "beams in the room.</span>"
+        f"{len(rows):,} beams{off}. Line: mean of the inliers.</span>"
     )
 
 
-def lit(points: Points, kept: np.ndarray, chosen: np.ndarray | None) -> str:
-    """How many beams are lit, of those that are looked at (N,), and how large their residual is."""
+def lit(points: Points, kept: np.ndarray, chosen: np.ndarray | None, up: str) -> str:
+    """How many beams are lit, of those that are looked at (N,), how large their residual is, and
+    their mean of what the plot shows."""
     if chosen is None:
         return ""
     some = chosen & kept
     said = f"{some.sum():,} of {kept.sum():,} beams are lit"
-    return framed(f'<b data-is="lit">{said}{_residual(points, some & points.inlier)}.</b>')
+    inliers, mean = some & points.inlier, ""
+    if up != "residual_m" and inliers.any():
+        shown = column(up)
+        value = shown.scale * float(np.nanmean(points.columns[up][inliers].astype(float)))
+        mean = (
+            f"; mean {shown.title} {value:{'+' if shown.signed else ''}.4g} {shown.unit}".rstrip()
+        )
+    return framed(f'<b data-is="lit">{escape(said + _residual(points, inliers) + mean)}.</b>')
 
 
 def _residual(points: Points, inliers: np.ndarray) -> str:
@@ -141,7 +167,7 @@ def point(points: Points, index: int, names: Mapping[str, Mapping[int, str]]) ->
         if name in names:
             return names[name].get(int(value), f"{shown.title} {int(value)}")
         value = float(value) * shown.scale
-        digits = SHOWN_DIGITS.get(shown.unit, 4)
+        digits = DIGITS.get(shown.unit, 4)
         text = f"{value:.{digits}f}" if shown.unit else f"{value:.6g}"
         return f"{text} {shown.unit}".strip()
 
@@ -215,7 +241,7 @@ def _candidates(diagnosed: Findings) -> str:
         return ""  # where a formula is the answer, what was tried before is in the menu
     head = "".join(
         f'<th style="text-align:{side};font-weight:600;padding-right:.6em">{text}</th>'
-        for text, side in (("effect", "left"), ("mm", "right"), ("by chance", "left"))
+        for text, side in (("effect", "left"), ("mm", "right"), ("adjusted p", "left"))
     )
     head += '<th style="text-align:left;font-weight:600">held out</th>'
     rows = "".join(_candidate(each, diagnosed) for each in diagnosed.candidates[:SHOWN_CANDIDATES])
@@ -226,26 +252,14 @@ def _candidate(each: Mapping[str, Any], diagnosed: Findings) -> str:
     size = each["unabsorbed_rms_mm"]
     held = [each["held_out_rms_mm"][k] for k in ("before", "after")]
     held_out = f"{held[0]:.2f} → {held[1]:.2f}" if None not in held else ""
+    p = "" if each["p_adjusted"] is None else small(each["p_adjusted"])
     worth = "" if each["add"] in diagnosed.worth_adding else _QUIET
     return (
         f'<tr style="{worth}"><td>{escape(each["add"]).replace("_", "_<wbr>")}</td>'
         f'<td style="text-align:right;padding-right:.6em">{"" if size is None else f"{size:.2f}"}'
-        f'</td><td style="white-space:nowrap">{by_chance(each["p_adjusted"])}</td>'
+        f'</td><td style="white-space:nowrap">{escape(p)}</td>'
         f'<td style="white-space:nowrap">{held_out}</td></tr>'
     )
-
-
-def by_chance(p: float | None) -> str:
-    """How often chance alone does as much, in words; nothing where that is not known."""
-    if p is None:
-        return ""
-    if p > 0.1:
-        return "often"
-    if p <= LEAST_P:
-        return "1 in over a million"
-    odds = float(f"{1 / p:.1g}")
-    size, word = next(each for each in LARGE_NUMBERS if odds >= each[0])
-    return f"1 in {odds / size:,.0f}{word}"
 
 
 def ladder(rungs: Sequence[Rung]) -> str:
@@ -297,6 +311,11 @@ def note(text: str, bad: bool = False) -> str:
         f'<div role="status" style="margin:0 1.2em .4em .75em;padding:.4em .6em;'
         f'background:{colour};font-size:12px;color:#222;overflow-wrap:anywhere">{escape(text)}</div>'
     )
+
+
+def hint(text: str) -> str:
+    """How something is used."""
+    return framed(f'<div style="{_QUIET}">{escape(text)}</div>')
 
 
 def new_run(rung: Rung) -> str:

@@ -12,24 +12,15 @@ from calib.runs.run import Run
 from calib.show.misfit import of_stop
 from calib.view import panels
 from calib.view.scene import Points, Scene
-from calib.view.shown import brush, colours, look, plot
-from calib.view.shown.columns import LOCATION, comparable, gathered, kept, location_names
-from calib.view.shown.moves import SURE, TIMES_AS_LONG
-from calib.view.shown.taken import beams_csv
-from calib.view.stage import AXES_PATH, MOVES_PATH, NARROW_PX, PLOT_PX, RIG_PATH, ROOM_PATH, Drawing
+from calib.view.shown import brush, colours, look, plot, sizes, taken
+from calib.view.shown.columns import AS_IN_CAD, comparable, gathered
+from calib.view.shown.menu import NOTHING, RoomMenu, fill
+from calib.view.shown.panel import ALL_STOPS, THIS, PlotPanel
+from calib.view.side import Chosen, Ends, Sides
+from calib.view.stage import AXES_PATH, MOVES_PATH, NARROW_PX, RIG_PATH, ROOM_PATH, Drawing
 from chains.errors import InputError
 
-NO_VALUE = "—"
-THIS, HERE, ALL_STOPS = "this stop", "its location", "all stops"
-CLICK = "Click a point to read it. Keys: N next stop, P previous stop."
-ONLY = "A formula, e.g. (range > 3) * (abs(residual) > 0.002); metres, radians. * is and"
-PLOT_HEIGHT_PX = 300
-FREE_SCALES = "free"
-MOVES_LABEL = f"Moves x {TIMES_AS_LONG}"
-MOVES_HINT = (
-    f"How far each link stands from CAD, {TIMES_AS_LONG} times as long; "
-    f"grey: less than {SURE:.0f} sigmas"
-)
+FREE = "free"
 
 
 class Picture:
@@ -40,93 +31,69 @@ class Picture:
         window_px: width and height of its window, the panels included.
         guarded: makes a callback of what a widget does.
         asks: what the browser's address asks for, by `look.KEYS`.
+        scene_of: what a run shows.
     """
 
     def __init__(
         self,
         client: Any,
         window_px: tuple[int, int],
-        guarded: Callable[..., Callable[..., None]],
+        guarded: Callable[..., Callable[..., Any]],
         asks: Mapping[str, str],
+        scene_of: Callable[[Run], Scene],
     ) -> None:
-        self.stage = Drawing(client, window_px, look.numbers(asks.get("camera", ""), 6))
+        camera = look.numbers(asks.get("camera", ""), 6)
+        self._sides = Sides(client, window_px, camera)
         self._client, self._guarded, self._asks = client, guarded, dict(asks)
+        self._scene_of = scene_of
         self._columns: dict[str, str] = {}  # heading -> column
         self._others: dict[str, Run] = {}
         self._scales = look.read_scales(asks.get("scales", ""))
-        self._known: tuple[Any, ...] = ()  # what the points were gathered for
-        self._kept = np.zeros(0, bool)
-        self._clicked: int | None = None  # index of a beam
-        self._add_menus()
-        self._add_plot(window_px[0] < NARROW_PX)
+        self.menu = RoomMenu(client.gui, asks)
+        locked = asks.get("scales") != FREE
+        self.panel = PlotPanel(client.gui, asks, locked, window_px[0] < NARROW_PX)
+        self._wire()
         self._on_moves()
-        client.scene.on_click()(guarded(self._on_point, with_event=True))
+        client.scene.on_click()(guarded(self._on_point, of=lambda event: event))
+        client.scene.on_rect_select(modifier="shift")(
+            guarded(self._on_area, of=lambda event: (event.screen_min, event.screen_max))
+        )
         for key, step, name in (("N", 1, "Next stop"), ("P", -1, "Previous stop")):
             command = client.gui.add_command(name, hotkey=key)
             command.on_trigger(guarded(lambda step=step: self._step(step)))
 
+    @property
+    def stage(self) -> Drawing:
+        """Where the room of the run is drawn that is looked at."""
+        return self._sides.first.stage
+
     # ------------------------------------------------------------------------------------ widgets
 
-    def _add_menus(self) -> None:
-        gui = self._client.gui
-        self.recording = self._menu("Recording", self._on_recording)
-        self.stop = self._menu("Stop", self._on_stop)
-        self._go = gui.add_button_group("Go to", ("previous", "next"), hint="Keys: P and N")
-        self._go.on_click(self._guarded(lambda: self._step(1 if self._go.value == "next" else -1)))
-        self._colour = self._menu("Colour", self._paint)
-        self._legend = gui.add_html("")
-        self._below = gui.add_slider("Show up to, m", 0.0, 1.0, 0.01, 1.0, visible=False)
-        self._below.on_update(self._guarded(self._paint))
-        self._what = gui.add_button_group("Hide, show", ("room", "rig", "frames"))
-        self._what.on_click(self._guarded(self._on_what))
-        self._lines_why = gui.add_html("", visible=False)
-        self._moves = gui.add_checkbox(MOVES_LABEL, bool(self._asks.get("moves")), hint=MOVES_HINT)
-        self._moves.on_update(self._guarded(self._on_moves))
-        self._moved = gui.add_html("", visible=False)
-        self._scan = gui.add_html("")
-        self._point = gui.add_html(panels.note(CLICK))
-
-    def _add_plot(self, narrow: bool) -> None:
-        gui = self._client.gui
-        panel = gui.add_panel()
-        with panel.add_tab("Beams"):
-            stops = self._asks.get("stops")
-            menu = (THIS, HERE, ALL_STOPS)
-            self._stops = gui.add_dropdown(
-                "Beams of", menu, initial_value=stops if stops in menu else THIS
-            )
-            self._stops.on_update(self._guarded(self._on_stop))
-            self._other = self._menu("Other run", self._on_stop)
-            self._only = gui.add_text("Only where", self._asks.get("only", ""), hint=ONLY)
-            self._only.on_update(self._guarded(self._on_only))
-            self._wrong = gui.add_html("", visible=False)
-            locked = self._asks.get("scales") != FREE_SCALES
-            self._lock = gui.add_checkbox("Keep scales", locked, hint="Off: as the beams are")
-            self._lock.on_update(self._guarded(self._on_lock))
-            self._up = self._menu("Plot", self._draw_plot)
-            self._over = self._menu("Over", self._on_over)
-            lit = self._asks.get("lit", "")
-            self._light = gui.add_text(brush.LABEL, lit, hint=brush.BRUSH_HINT)
-            self._light.on_update(self._guarded(self._paint))
-            self._plot = gui.add_uplot(
-                *plot.EMPTY,
-                scales={"x": {"time": False}},
-                cursor={"drag": {"setScale": False, "x": True}},
-                legend={"show": False},
-                height=PLOT_HEIGHT_PX,
-            )
-            self._told = gui.add_html("")
-            self._take = gui.add_button("Plot as CSV", hint="The beams of the plot", color="gray")
-            self._take.on_click(self._guarded(self._on_take))
-        panel.dock_left()
-        panel.set_width(PLOT_PX)
-        if narrow:
-            panel.minimize()
-
-    def _menu(self, label: str, use: Callable[[], None]) -> Any:
-        menu = self._client.gui.add_dropdown(label, [NO_VALUE])
-        menu.on_update(self._guarded(use))
-        return menu
+    def _wire(self) -> None:
+        """Have every widget call what it is used for."""
+        menu, panel, value = self.menu, self.panel, {"of": lambda event: event.target.value}
+        for widget, use in (
+            (menu.recording, self._on_recording),
+            (menu.stop, self._on_stop),
+            (menu.colour, self._paint),
+            (menu.size, self._paint),
+            (menu.below, self._paint),
+            (menu.moves, self._on_moves),
+            (panel.stops, self._on_stop),
+            (panel.other, self._on_other),
+            (panel.beside, self._on_other),
+            (panel.only, self._on_only),
+            (panel.lock, self._on_lock),
+            (panel.up, self._draw_plot),
+            (panel.over, self._on_over),
+            (panel.light, self._on_light),
+        ):
+            widget.on_update(self._guarded(use))
+        panel.dark.on_click(self._guarded(self._on_dark))
+        panel.take.on_click(self._guarded(self._on_take, **value))
+        menu.what.on_click(self._guarded(self._on_what, **value))
+        go = {"next": 1, "previous": -1}
+        menu.go.on_click(self._guarded(lambda way: self._step(go[way]), **value))
 
     # ------------------------------------------------------------------------------ what is shown
 
@@ -134,20 +101,24 @@ class Picture:
         """What is shown now, by `look.KEYS`, but for the run."""
         if self.stage.scene is None:
             return {}
-        column = self._columns.get
+        column, panel = self._columns.get, self.panel
+        told = self._others or panel.other.value != NOTHING  # of several, none may be chosen
         return {
-            "recording": self.recording.value if self.recording.visible else "",
-            "stop": self.stop.value,
-            "stops": "" if self._stops.value == THIS else self._stops.value,
-            "other": self._other.value if self._other.visible else "",
-            "colour": column(self._colour.value, ""),
-            "scales": look.write_scales(self._scales) if self._lock.value else FREE_SCALES,
-            "only": self._only.value,
-            "up": column(self._up.value, ""),
-            "over": column(self._over.value, ""),
-            "lit": self._light.value,
-            "moves": "1" if self._moves.value else "",
-            "below": f"{self._below.value:.2f}",
+            "recording": self.menu.recording.value if self.menu.recording.visible else "",
+            "stop": self.menu.stop.value,
+            "stops": "" if panel.stops.value == THIS else panel.stops.value,
+            "other": panel.other.value if panel.other.visible and told else "",
+            "beside": ",".join(f"{x:.3f}" for x in self._sides.shift_m),
+            "colour": column(self.menu.colour.value, ""),
+            "size": column(self.menu.size.value, ""),
+            "scales": look.write_scales(self._scales) if panel.lock.value else FREE,
+            "only": panel.only.value,
+            "up": column(panel.up.value, ""),
+            "over": column(panel.over.value, ""),
+            "lit": panel.light.value,
+            "area": panel.area.write() if panel.area else "",
+            "moves": "1" if self.menu.moves.value else "",
+            "below": f"{self.menu.below.value:.2f}",
             "camera": ",".join(f"{x:.6g}" for x in np.round(self.stage.camera(), 3) + 0.0),
         }
 
@@ -162,13 +133,15 @@ class Picture:
         Raises:
             InputError: nothing can be shown, or the address asks for what is not here.
         """
-        self._fill(self.recording, scene.names, "recording")
-        self.recording.visible = len(scene.names) > 1
+        self._fill(self.menu.recording, scene.names, "recording")
+        self.menu.recording.visible = len(scene.names) > 1
         self._others = {n: run for n, run in others.items() if comparable(scene.run, run)}
-        self._known = ()
-        self._other.visible = bool(self._others)
-        self._other.value = below if below in self._others else NO_VALUE
-        self._fill(self._other, [NO_VALUE, *self._others], "other")
+        other, at = self.panel.other, self._number(scene)
+        meshed = scene.sources[at].reference is not None and bool(scene.run.summary["points"])
+        first = [NOTHING, AS_IN_CAD] if meshed else [NOTHING]
+        other.visible = meshed or bool(self._others)
+        other.value = below if below in self._others else NOTHING
+        self._fill(other, [*first, *self._others], "other")
         self.stage.scene = scene
         self._on_recording()
         asked = {"recording": "recording", "stop": "stop", "other": "other run"}
@@ -185,214 +158,232 @@ class Picture:
         """
         if self.stage.scene is None:
             raise InputError("nothing of this run can be shown, so nothing can be tried")
-        points = gathered(self.stage.scene, self._at, self.stage.scene.stops(self._at))
+        at = self._number(self.stage.scene)
+        points = gathered(self.stage.scene, at, self.stage.scene.stops(at))
         if points is None:
             raise InputError("this run has no beams, which is what a formula here acts on")
         return points
 
     def clear(self) -> None:
         """Show nothing."""
+        self._sides.close_second()
         self.stage.clear()
-        self._below.visible = False
-        for menu in (self.recording, self.stop, self._colour, self._up, self._over):
-            self._fill(menu, [NO_VALUE])
-        for html in (self._legend, self._scan, self._point, self._told):
-            html.content = ""
-        self._plot.visible = False
+        for menu in (self.menu.recording, self.menu.stop, self.menu.colour, self.menu.size):
+            fill(menu, [NOTHING])
+        self.menu.scan.content = ""
+        self.menu.show(False)
+        self.panel.show(False)
+
+    # ---------------------------------------------------------------------------- runs and stops
 
     def _on_recording(self) -> None:
-        stops = self.stage.scene.stops(self._at)
-        if not stops:
-            name = self.recording.value
+        scene, run, room = self.stage.scene, self.stage.scene.run, self.stage.room
+        try:
+            self._sides.first.open(scene, run.folder.name, self._number(scene))
+        except InputError:
             self.clear()
-            raise InputError(f"{name}: nothing was measured at any of its stops")
-        self.stage.open(self.stage.scene, self._at)
-        why = self.stage.lines_why
-        self._lines_why.content, self._lines_why.visible = panels.note(why), bool(why)
-        self._fill(self.stop, stops, "stop")
+            raise
+        self.menu.lines_why(self.stage.lines_why)
+        if room not in (None, self.stage.room):
+            self.panel.area = None  # it is of another room
+        self._fill(self.menu.stop, scene.stops(self._sides.first.at), "stop")
+        shift_m = look.numbers(self._asks.pop("beside", ""), 3)
+        if shift_m is not None:
+            self.panel.beside.value = True
+        self._on_other(shift_m or ())
+
+    def _on_other(self, shift_m: Sequence[float] = ()) -> None:
+        """Compare with another run, in a room beside this one where that is ticked."""
+        run = self._others.get(self.panel.other.value)
+        self.panel.beside.visible = run is not None
+        if run is None or not self.panel.beside.value:
+            self._sides.close_second()
+        else:
+            scene = self._scene_of(run)
+            name, at = self.panel.other.value, self._number(scene)
+            self._sides.open_second(scene, name, at, shift_m)
         self._on_stop()
 
     def _step(self, step: int) -> None:
         """Go to the next stop, or one back; after the last comes the first."""
-        stops = list(self.stop.options)
-        self.stop.value = stops[(stops.index(self.stop.value) + step) % len(stops)]
+        stops = list(self.menu.stop.options)
+        self.menu.stop.value = stops[(stops.index(self.menu.stop.value) + step) % len(stops)]
         self._on_stop()
 
     def _on_stop(self) -> None:
-        scene, at, stop = self.stage.scene, self._at, self.stop.value
-        stops = self._chosen_stops()
-        known = (scene.run.folder, at, tuple(stops), self._other.value)
-        if known != self._known:
-            other = self._others.get(self._other.value)
-            self._known = ()
-            points = gathered(scene, at, stops, other)
-            self._known = known
-        else:
-            points = self.stage.points
-        self.stage.show(at, stop, points)
-        self._moved.content = panels.moves(self.stage.moves)
-        self._clicked = None
-        for widget in (self._below, self._colour, self._up, self._over, self._plot):
-            widget.visible = points is not None
-        self._point.content = panels.note(CLICK) if points else ""
+        stop, stops, chosen = self.menu.stop.value, self._chosen_stops(), self.panel.other.value
+        other = AS_IN_CAD if chosen == AS_IN_CAD else self._others.get(chosen)
+        points = self._sides.first.go(stop, stops, other)
+        wrong = self._sides.follow(stop, stops)
+        self.menu.moved.content = panels.moves(self.stage.moves)
+        self.menu.show(points is not None)
+        self.panel.show(points is not None)
         if points is None:
-            self._legend.content = self._told.content = ""
-            self._tell_scan(None, 0)
+            self._tell_scan()
             return
         self._offer_columns(points)
         low, high, free = self.stage.ceiling_m()
-        self._below.min, self._below.max = np.floor(low * 100) / 100, np.ceil(high * 100) / 100
+        below = self.menu.below
+        below.min, below.max = np.floor(low * 100) / 100, np.ceil(high * 100) / 100
         asked = look.numbers(self._asks.pop("below", ""), 1)
-        below = asked[0] if asked else free
-        self._below.value = float(np.clip(below, self._below.min, self._below.max))
+        below.value = float(np.clip(asked[0] if asked else free, below.min, below.max))
         self._on_only()
+        if wrong:
+            raise InputError(wrong)
 
     def _chosen_stops(self) -> list[str]:
-        if self._stops.value == THIS:
-            return [self.stop.value]
-        stops, recording = self.stage.scene.stops(self._at), self._source.recording
-        if self._stops.value == ALL_STOPS:
+        here, wanted = self._sides.first, self.panel.stops.value
+        if wanted == THIS:
+            return [self.menu.stop.value]
+        stops, recording = here.scene.stops(here.at), here.scene.sources[here.at].recording
+        if wanted == ALL_STOPS:
             return stops
         place = dict(zip(recording.stops, recording.location, strict=True))
-        return [name for name in stops if place[name] == place[self.stop.value]]
+        return [name for name in stops if place[name] == place[self.menu.stop.value]]
 
     def _offer_columns(self, points: Points) -> None:
         offered = colours.choices(points)
         self._columns = {colours.column(n).heading: n for n in offered}
-        numbers = [h for h, n in self._columns.items() if n not in colours.NAME_COLUMNS]
+        numbers = [colours.column(n).heading for n in sizes.choices(offered)]
         for menu, key, options, default in (
-            (self._colour, "colour", list(self._columns), None),
-            (self._up, "up", numbers, None),
-            (self._over, "over", numbers, colours.column("range_m").heading),
+            (self.menu.colour, "colour", list(self._columns), None),
+            (self.menu.size, "size", [NOTHING, *numbers], NOTHING),
+            (self.panel.up, "up", numbers, None),
+            (self.panel.over, "over", numbers, colours.column("range_m").heading),
         ):
             asked = self._asks.pop(key, None)
-            first = colours.column(asked).heading if asked in offered else default
-            if menu.value in (NO_VALUE, None) or asked:
-                menu.options, menu.value = options, first if first in options else options[0]
-            self._fill(menu, options)
+            wanted = colours.column(asked).heading if asked in offered else None
+            fill(menu, options, wanted or (default if menu.value == NOTHING else None))
+
+    # -------------------------------------------------------------------------- columns and scales
 
     def _on_only(self) -> None:
         """Keep the beams that the formula keeps; one that is wrong is told of, and keeps all."""
-        points = self.stage.points
-        if points is None:
-            return
-        try:
-            self._kept, wrong = kept(points, self._only.value), ""
-        except InputError as error:
-            self._kept, wrong = kept(points, ""), str(error)
-        self._wrong.content, self._wrong.visible = panels.note(wrong, bad=True), bool(wrong)
+        wrong = ""
+        for side in reversed(self._sides.with_beams):
+            wrong = side.keep(self.panel.only.value)
+        said = self.panel.wrong
+        said.content, said.visible = panels.note(wrong, bad=True), bool(wrong)
         self._paint()
 
     def _on_lock(self) -> None:
         self._scales = {}
         self._paint()
 
-    def _ends(self, name: str) -> tuple[float, float]:
+    def _ends(self, name: str) -> Ends:
         """Ends of a column's scale: as they were, where scales are kept."""
         ends = colours.limits(self.stage.points, name)
-        if not self._lock.value:
+        if not self.panel.lock.value:
             return ends
         return self._scales.setdefault(colours.scale_key(name), ends)
 
-    def _paint(self) -> None:
-        points = self.stage.points
-        if points is None:
-            return
-        name = self._columns[self._colour.value]
-        ends = None if name in colours.NAME_COLUMNS else self._ends(name)
-        colour, scale = colours.coloured(points, name, self._names(name), ends)
-        lit = self._lit
-        if lit is not None:
-            colour[~lit] = brush.UNLIT
-        drawn = self.stage.paint(colour, self._below.value + 0.01, self._kept, lit)
-        self._legend.content = panels.legend(scale)
-        self._tell_scan(points, drawn)
-        self._colours = colour
-        self._draw_plot()
-
-    def _on_over(self) -> None:
-        self._light.value = ""  # a range of another column
-        self._paint()
-
-    @property
-    def _lit(self) -> np.ndarray | None:
-        """Which beams (N,) are lit; None where no range was chosen."""
-        between = brush.ends(self._light.value)
-        if between is None:
-            return None
-        return brush.within(self.stage.points, self._columns[self._over.value], between)
-
-    def _draw_plot(self) -> None:
-        up, over = (self._columns[menu.value] for menu in (self._up, self._over))
-        rows = np.flatnonzero(self._kept)
-        low, high = self._ends(up)
-        points, lit = self.stage.points, self._lit
-        beside = {"lit": lit, "marked": self._clicked}
-        data, series = plot.chart(points, rows, up, over, self._colours, **beside)
-        axes = plot.axes(data[0], low, high)
-        with self._client.atomic():
-            self._plot.scales = axes
-            self._plot.data, self._plot.series = data, series
-        told = panels.plotted(points, rows, up, axes)
-        self._told.content = told + panels.lit(points, self._kept, lit)
-
-    def _on_take(self) -> None:
-        points, menus = self.stage.points, (self._over, self._up, self._colour)
-        if points is None:
-            raise InputError("there are no beams here, so there is no plot to take away")
-        names = [self._columns[menu.value] for menu in menus]
-        lit = np.ones(len(points.xyz_m), bool) if self._lit is None else self._lit
-        table = beams_csv(points, np.flatnonzero(self._kept), names, lit)
-        name = f"{self.stage.scene.run.folder.name}-{names[1]}-over-{names[0]}.csv"
-        self._client.send_file_download(name, table, save_immediately=True)
-
-    def _tell_scan(self, points: Points | None, drawn: int) -> None:
-        stop, names = self.stop.value, recording_names(self.stage.scene.sources)
-        label = f"{names[self._at]}.{stop}" if len(names) > 1 else stop
-        run = self.stage.scene.run
-        found = run.summary.get("misfit_by", {"stop": {}})["stop"].get(label, {})
-        self._scan.content = panels.scan(points, drawn, stop, of_stop(found))
-
-    def _on_what(self) -> None:
-        self.stage.toggle(
-            {"room": ROOM_PATH, "rig": RIG_PATH, "frames": AXES_PATH}[self._what.value]
+    def _chosen(self) -> Chosen:
+        column, panel = self._columns, self.panel
+        colour, size = column[self.menu.colour.value], column.get(self.menu.size.value)
+        return Chosen(
+            colour=colour,
+            up=column[panel.up.value],
+            over=column[panel.over.value],
+            size=size,
+            colour_ends=None if colour in colours.NAMES else self._ends(colour),
+            size_ends=self._ends(size) if size else None,
+            below_m=self.menu.below.value + 0.01,
+            between=brush.ends(panel.light.value),
+            area=panel.area,
         )
 
+    def _paint(self) -> None:
+        sides = self._sides.with_beams
+        if not sides:
+            return
+        chosen = self._chosen()
+        for side in sides:
+            side.paint(chosen)
+        size = panels.size_key(*sizes.key(chosen.size, chosen.size_ends)) if chosen.size else ""
+        self.menu.explain(panels.legend(self._sides.first.scale), size)
+        self._tell_scan()
+        self._draw_plot()
+
+    def _draw_plot(self) -> None:
+        sides = self._sides.with_beams
+        if not sides:
+            return
+        chosen = self._chosen()
+        charts, axes = self._charts(chosen)
+        said = []
+        for side in sides:
+            told = panels.plotted(side.points, np.flatnonzero(side.kept), chosen.up, axes)
+            said.append(told + panels.lit(side.points, side.kept, side.lit(chosen), up=chosen.up))
+        with self._client.atomic():
+            names = [side.name for side in sides]
+            self.panel.draw(list(zip(names, charts, said, strict=True)), axes)
+            self.panel.dark.visible = chosen.lights
+
+    def _charts(self, chosen: Chosen) -> tuple[list[plot.Chart], dict[str, Any]]:
+        """The plots of all sides, and the axes that they share."""
+        charts = [side.chart(chosen) for side in self._sides.with_beams]
+        known = [chart[0][0] for chart in charts if chart is not plot.EMPTY]
+        return charts, plot.axes(known, *self._ends(chosen.up))
+
+    # ------------------------------------------------------------------------ what is lit and told
+
+    def _on_over(self) -> None:
+        if self.panel.lit_over != self._columns[self.panel.over.value]:
+            self.panel.light.value = ""  # a range of another column
+        self._paint()
+
+    def _on_light(self) -> None:
+        """Light up a range of the plot, in the place of a part of the room."""
+        self.panel.area, self.panel.lit_over = None, self._columns.get(self.panel.over.value, "")
+        self._paint()
+
+    def _on_area(self, corners: Sequence[Sequence[float]]) -> None:
+        """Light up a part of the room, in the place of a range of the plot."""
+        if self._sides.with_beams:
+            self.panel.area, self.panel.light.value = self._sides.area(corners), ""
+            self._paint()
+
+    def _on_dark(self) -> None:
+        self.panel.area, self.panel.light.value = None, ""
+        self._paint()
+
+    def _on_take(self, kind: str) -> None:
+        sides = self._sides.with_beams
+        if not sides:
+            raise InputError("there are no beams here, so there is no plot to take away")
+        chosen, run = self._chosen(), self.stage.scene.run
+        content = taken.plot_file(sides, chosen, *self._charts(chosen), kind)
+        name = f"{run.folder.name}-{chosen.up}-over-{chosen.over}.{kind.lower()}"
+        self._client.send_file_download(name, content, save_immediately=True)
+
+    def _tell_scan(self) -> None:
+        side, stop = self._sides.first, self.menu.stop.value
+        names = recording_names(side.scene.sources)
+        label = f"{names[side.at]}.{stop}" if len(names) > 1 else stop
+        found = side.scene.run.summary.get("misfit_by", {"stop": {}})["stop"].get(label, {})
+        self.menu.scan.content = panels.scan(side.points, side.drawn, stop, of_stop(found))
+
+    def _on_what(self, part: str) -> None:
+        self._sides.toggle({"room": ROOM_PATH, "rig": RIG_PATH, "frames": AXES_PATH}[part])
+
     def _on_moves(self) -> None:
-        if self._moves.value == (MOVES_PATH in self.stage.hidden):
-            self.stage.toggle(MOVES_PATH)
-        self._moved.visible = self._moves.value
+        if self.menu.moves.value == (MOVES_PATH in self.stage.hidden):
+            self._sides.toggle(MOVES_PATH)
+        self.menu.moved.visible = self.menu.moves.value
 
     def _on_point(self, event: Any) -> None:
-        index = self.stage.pick(np.array(event.ray_origin), np.array(event.ray_direction))
-        if index is not None:
-            names = {name: self._names(name) for name in colours.NAME_COLUMNS}
-            self._point.content = panels.point(self.stage.points, index, names)
-            self._clicked = index
+        side = self._sides.picked(np.array(event.ray_origin), np.array(event.ray_direction))
+        if side is not None:
+            names = {name: side.names(name) for name in colours.NAMES}
+            self.menu.point.content = panels.point(side.points, side.clicked, names)
             self._draw_plot()
 
-    @property
-    def _at(self) -> int:
+    def _number(self, scene: Scene) -> int:
         """Number of the chosen recording."""
-        return self.stage.scene.names.index(self.recording.value)
-
-    @property
-    def _source(self) -> Any:
-        return self.stage.scene.sources[self._at]
-
-    def _names(self, column: str) -> dict[int, str]:
-        """What the numbers of a column stand for."""
-        if column == LOCATION:
-            return location_names(self.stage.scene, self._at)
-        mesh = self._source.reference
-        return mesh.label_names if mesh and column == "label" else {}
+        return scene.names.index(self.menu.recording.value)
 
     def _fill(self, menu: Any, options: Sequence[str], key: str = "") -> None:
         """Give a menu other options; chosen is what the address asks for, or what was, or the
         first."""
-        asked = self._asks.get(key)
-        chosen = asked if asked in options else menu.value
-        menu.options = tuple(options)
-        menu.value = chosen if chosen in options else options[0]
-        if asked in options:
+        if fill(menu, options, self._asks.get(key)):
             del self._asks[key]

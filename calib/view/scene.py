@@ -18,13 +18,13 @@ from calib.problem.model import Source
 from calib.residuals.scan import ScanStop
 from calib.residuals.tracker import TrackedBody
 from calib.runs.reopen import problem_of, reopened, state_of
-from calib.runs.residual_table import beam_ends, table_path
+from calib.runs.residual_table import UNSEEN_FOLDER, beam_ends, residual_table, table_path
 from calib.runs.run import RESIDUALS, Run
 from chains import se3
 from chains.errors import InputError
 from sensors.recording import read_table
 
-MOST_SHOWN_POINTS = 150_000  # more than a screen can tell apart
+MOST_POINTS = 150_000  # more than a screen can tell apart
 MOST_TRIANGLES = 300_000  # of a room, and of a whole arm
 CLICK_REACH = 0.01  # of its distance from the eye: what a click may miss a point by
 _NEEDED = ("ring", "column", "range_m", "incidence_rad", "azimuth_rad", "elevation_rad")
@@ -53,10 +53,7 @@ class Points:
         return self.columns["weight"] > 0
 
     def drawn(
-        self,
-        below_m: float = np.inf,
-        most: int = MOST_SHOWN_POINTS,
-        among: np.ndarray | bool = True,
+        self, below_m: float = np.inf, most: int = MOST_POINTS, among: np.ndarray | bool = True
     ) -> np.ndarray:
         """Indices (n,) of those to draw: lower than `below_m`, every so many of them.
 
@@ -116,7 +113,8 @@ class Scene:
         """
         sources = reopened(run)
         # Poses need no surface, and planes would have to be looked for in every scan.
-        nothing = dict.fromkeys(range(len(sources)), object())
+        flat = [i for i, source in enumerate(sources) if source.reference is None]
+        nothing = dict.fromkeys(flat, object())
         problem = problem_of(run, sources, nothing)
         scene = cls(run, sources, problem, state_of(run, problem))
         for stops, _ in scene._stops.values():
@@ -214,19 +212,38 @@ class Scene:
         xyz_m = se3.apply(T, beam_ends(columns, scan.lidar.beam_origin_m))
         return Points(xyz_m, T[:3, 3], columns, len(xyz_m))
 
-    def table(self, recording: int, stop: str, other: Run) -> Mapping[str, np.ndarray] | None:
-        """What another run of the same recordings left of the stop's beams, as in its residual
-        table; None where it left out the stop's scan.
+    def table(
+        self, recording: int, stop: str, other: Run, unseen: bool = False
+    ) -> Mapping[str, np.ndarray] | None:
+        """What a run of the same recordings left of the stop's beams, as in its residual table;
+        None where it has none of the stop.
+
+        Args:
+            recording: its number.
+            stop: its name.
+            other: the run, this one or another.
+            unseen: as a fit without the stop predicts its beams, where the stop was held out.
 
         Raises:
             InputError: the table is of another version.
         """
-        scan = self._scans[recording, stop]
-        gone = not table_path(other.folder / RESIDUALS, scan, self.sources).is_file()
-        return None if gone else self._table(other, scan)
+        scan, folder = self._scans[recording, stop], UNSEEN_FOLDER if unseen else "."
+        gone = not table_path(other.folder / RESIDUALS / folder, scan, self.sources).is_file()
+        return None if gone else self._table(other, scan, folder)
 
-    def _table(self, run: Run, scan: ScanStop) -> Mapping[str, np.ndarray]:
-        path = table_path(run.folder / RESIDUALS, scan, self.sources)
+    def nominal(self, recording: int, stop: str) -> Mapping[str, np.ndarray] | None:
+        """The residual table of a stop with every frame and effect as in CAD, the rig where it then
+        seems to be; None where there is no mesh, as planes would have to be looked for anew."""
+        scan = self._scans[recording, stop]
+        if self.sources[recording].reference is None:
+            return None
+        key = recording, stop
+        if key not in self._nominal:
+            self._nominal[key] = residual_table(scan.rows(self.problem.initial))
+        return self._nominal[key]
+
+    def _table(self, run: Run, scan: ScanStop, folder: str = ".") -> Mapping[str, np.ndarray]:
+        path = table_path(run.folder / RESIDUALS / folder, scan, self.sources)
         try:
             columns = read_table(path)
         except InputError as error:
@@ -256,6 +273,11 @@ class Scene:
             away = np.einsum("ni,ni->n", np.cross(b - a, c - a), eye - a) < 0
             triangles[away] = triangles[away][:, ::-1]
         return mesh.vertices_m, triangles
+
+    @cached_property
+    def _nominal(self) -> dict[tuple[int, str], Mapping[str, np.ndarray]]:
+        """Tables that `nominal` has made."""
+        return {}
 
     @cached_property
     def _scans(self) -> dict[tuple[int, str], ScanStop]:

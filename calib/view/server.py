@@ -34,10 +34,7 @@ POLICY = (
 PAGE = "/"  # all that viser serves but the websocket, whatever stands after the key
 # Of the connection that a message came by; viser's callbacks run in its context.
 _visit_here: ContextVar[Visit | None] = ContextVar("visit", default=None)
-READDRESS = """
-history.replaceState(null, "", "/" + location.pathname.split("/")[1] + "/" + ASKS);
-window.rigcalLetGo?.();
-"""
+READDRESS = 'history.replaceState(null, "", "/" + location.pathname.split("/")[1] + "/" + ASKS)'
 NOBODY = Visit(may_change=False)
 
 

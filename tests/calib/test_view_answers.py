@@ -26,7 +26,17 @@ from calib.view.shown.taken import beams_csv, extrinsics_zip
 from sensors.recording import read_table
 from tests.browser import Watched
 from tests.calib.viewed import diagnosed, hidden, small_run
-from tests.calib.workbench import SOON_MS, button, choose, field, shown
+from tests.calib.workbench import (
+    SOON_MS,
+    button,
+    check,
+    choose,
+    drag,
+    shown,
+    until,
+    value,
+    write,
+)
 
 TABLES = "residuals.parquet"
 
@@ -70,9 +80,7 @@ def test_dots_that_are_not_lit_are_faint_and_one_has_a_ring():
     assert series[1]["points"]["fill"] == plot.FAINT and series[2]["points"]["fill"] == "#5a5a5a"
     assert faint == {*points.columns["range_m"][rows][~lit[rows]]}
     assert bright == {*points.columns["range_m"][rows][lit[rows]]}
-    assert (
-        ring == {points.columns["range_m"][7]} and series[3]["points"]["stroke"] == plot.RING_COLOUR
-    )
+    assert ring == {points.columns["range_m"][7]} and series[3]["points"]["stroke"] == plot.RING
     _, series = plot.chart(points, rows, "residual_m", "range_m", rgb, lit=lit, marked=0)
     assert len(series) == 4  # the marked beam is not among those that are looked at
 
@@ -80,11 +88,8 @@ def test_dots_that_are_not_lit_are_faint_and_one_has_a_ring():
 def dragged(watched: Watched, start: float, end: float) -> None:
     """Drag across the plot of beams, from one share of its width to another."""
     box = watched.page.locator(".u-over").first.bounding_box()
-    xs, y = [box["x"] + share * box["width"] for share in (start, end)], box["y"] + 80
-    watched.page.mouse.move(xs[0], y)
-    watched.page.mouse.down()
-    watched.page.mouse.move(xs[1], y, steps=5)
-    watched.page.mouse.up()
+    (left, right), y = (box["x"] + share * box["width"] for share in (start, end)), box["y"] + 80
+    drag(watched, (left, y), (right, y))
 
 
 @pytest.mark.slow
@@ -95,13 +100,15 @@ def test_a_part_of_the_plot_lights_its_beams_in_the_room(run):
         tab, stage = watched.page, page.picture.stage
         choose(watched, "Over", "ring")
         tab.wait_for_url(re.compile("over=ring"))
-        dragged(watched, 0.25, 0.6)
-        told = tab.locator("[data-is=lit]")
-        told.wait_for()
-        low, high = brush.ends(field(watched, "Light up").input_value())
         ring = table["ring"]
         room = 0.03 * np.ptp(ring)  # to either side of the plot
         span = np.ptp(ring) + 2 * room
+        plotted, last = tab.locator("[data-is=plotted]").first, f"{ring.max() + room:.6g}"
+        until(watched, lambda: plotted.get_attribute("data-high"), last)
+        dragged(watched, 0.25, 0.6)
+        told = tab.locator("[data-is=lit]")
+        told.wait_for()
+        low, high = brush.ends(value(watched, "Light up"))
         assert low == pytest.approx(ring.min() - room + 0.25 * span, abs=0.02 * span)
         assert high == pytest.approx(ring.min() - room + 0.6 * span, abs=0.02 * span)
 
@@ -114,8 +121,8 @@ def test_a_part_of_the_plot_lights_its_beams_in_the_room(run):
                 f"{rms:.2f} mm rms, {mean:+.2f} mm mean."
             )
 
-        assert told.inner_text() == answer(low, high)
-        field(watched, "Light up").fill("10 to 90")
+        until(watched, told.inner_text, answer(low, high))
+        write(watched, "Light up", "10 to 90")
         told.get_by_text(answer(10, 90)).wait_for()
         lit = stage.client.scene.get_handle_by_name("/lit")
         unlit = stage.client.scene.get_handle_by_name("/points")
@@ -130,7 +137,7 @@ def test_a_part_of_the_plot_lights_its_beams_in_the_room(run):
         told.get_by_text(answer(10, 90)).wait_for()
         choose(watched, "Over", "range, m")  # of which that is no range
         told.wait_for(state="hidden")
-        assert field(watched, "Light up").input_value() == ""
+        until(watched, lambda: value(watched, "Light up"), "")
 
 
 # ---------------------------------------------------------------------------------- moves from CAD
@@ -265,28 +272,29 @@ def test_arrows_are_ticked_and_files_are_taken_away(run):
     with shown(run.folder) as (watched, page):
         arrows = page.client.scene.get_handle_by_name("/moves")
         assert not arrows.visible
-        field(watched, "Moves x 100").check(force=True)
+        check(watched, "Moves x 100")
         watched.page.wait_for_url(re.compile("moves=1"))
         assert arrows.visible
         found = page.picture.stage.moves
-        told = watched.page.locator("[data-is=moves] div").all_inner_texts()
-        assert told == [move.text for move in found] and len(told) > 5
+        told = watched.page.locator("[data-is=moves] div")
+        until(watched, told.all_inner_texts, [move.text for move in found])
+        assert len(found) > 5
         drawn = page.client.scene.get_handle_by_name("/moves/0").points[0]
         assert np.linalg.norm(drawn[1] - drawn[0]) == pytest.approx(100 * found[0].length_m)
         watched.page.keyboard.press("n")
         watched.page.wait_for_url(re.compile("stop=L00P01"))
         assert page.client.scene.get_handle_by_name("/moves").visible
-        field(watched, "Only where").fill("ring > 40")
+        write(watched, "Only where", "ring > 40")
         watched.page.wait_for_url(re.compile("only=ring"))
         with watched.page.expect_download() as plot_file:
-            button(watched, "Plot as CSV").click()
+            button(watched, "CSV").click()
         assert plot_file.value.suggested_filename == "run-residual_m-over-range_m.csv"
         table = np.genfromtxt(plot_file.value.path(), delimiter=",", skip_header=1)
         points = page.picture.stage.points  # of L00P01
         rows = points.columns["ring"] > 40
         np.testing.assert_allclose(table[:, 4], 1e3 * points.columns["residual_m"][rows], 1e-5)
         with watched.page.expect_download() as archive:
-            button(watched, "Extrinsics as zip").click()
+            button(watched, "Exports").click()
         assert zipfile.ZipFile(archive.value.path()).testzip() is None
         watched.page.reload()
         watched.page.locator("[data-is=moves]").wait_for()

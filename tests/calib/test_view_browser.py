@@ -16,7 +16,17 @@ from calib.view.stage import PANEL_PX, PLOT_PX
 from tests.browser import Watched
 from tests.calib.viewed import blunder, diagnosed, small_run
 from tests.calib.viewed import hidden as hidden_run
-from tests.calib.workbench import FIT_MS, SOON_MS, bars, button, field, shown, tick
+from tests.calib.workbench import (
+    FIT_MS,
+    SOON_MS,
+    bars,
+    button,
+    check,
+    choose,
+    shown,
+    tick,
+    until,
+)
 
 pytestmark = pytest.mark.slow
 
@@ -52,7 +62,7 @@ def test_the_first_finding_is_added_and_the_ladder_falls(hidden):
         watched.page.get_by_text("{before:.2f} → {after:.2f} mm".format(**fall)).last.wait_for()
         button(watched, "Refit").click()
         button(watched, "Cancel").wait_for()
-        assert button(watched, "Refit").is_disabled()
+        until(watched, button(watched, "Refit").is_disabled)
         watched.page.locator("[data-is=ladder] [data-mm]").nth(1).wait_for(timeout=FIT_MS)
         after = bars(watched)
         assert after == pytest.approx(list(fall.values()), abs=0.01)
@@ -60,14 +70,13 @@ def test_the_first_finding_is_added_and_the_ladder_falls(hidden):
         made = Run.open(f"{hidden.folder}+incidence_angle_bias")
         assert made.summary["rms_mm"]["held_out"] == pytest.approx(after[-1], abs=1e-3)
         button(watched, "Cancel").wait_for(state="hidden", timeout=FIT_MS)
-        assert (
-            watched.page.locator("[data-is=verdict]").inner_text()
-            == "Verdict: the model is adequate"
-        )
+        told = watched.page.locator("[data-is=verdict]")
+        until(watched, told.inner_text, "Verdict: the model is adequate")
         assert (made.folder / "diagnosis.json").is_file()
         button(watched, "Undo").click()
         watched.page.get_by_text("stays on disk").wait_for()
-        assert bars(watched) == before and made.folder.is_dir()
+        until(watched, lambda: bars(watched), before)
+        assert made.folder.is_dir()
         # What was fitted once is known from then on, and what is taken away can be anything.
         tick(watched, "incidence_angle_bias")
         expected = watched.page.locator("[data-is=expected]")
@@ -90,19 +99,19 @@ def test_a_blunder_is_left_out_by_a_click_and_undone(copied):
     with shown(copied.folder) as (watched, page):
         for name in (*(f"Leave out {token}" for token in tokens), "Leave all out"):
             button(watched, name).wait_for()
-        assert watched.page.locator("[data-is=blunders] li").count() == 2
+        until(watched, watched.page.locator("[data-is=blunders] li").count, 2)
         button(watched, f"Leave out {tokens[1]}").click()
         watched.page.get_by_text(f"Left out: {tokens[1]}").first.wait_for(timeout=FIT_MS)
         made = page.desk.run
         assert made.left_out == tokens[1:]
         assert made.grown_from == copied.folder.resolve()
         watched.page.locator("[data-is=verdict]").wait_for(timeout=FIT_MS)
-        assert not button(watched, "Leave all out").is_visible()
+        until(watched, button(watched, "Leave all out").is_hidden)
         button(watched, "Undo").click()
         watched.page.get_by_text("stays on disk").wait_for()
         button(watched, "Leave all out").wait_for()
         assert page.desk.run.folder == copied.folder
-        assert not watched.page.get_by_text("Left out:").first.is_visible()
+        until(watched, watched.page.get_by_text("Left out:").first.is_hidden)
 
 
 def on_screen(watched: Watched, page: Page) -> np.ndarray:
@@ -159,34 +168,35 @@ def test_a_click_reads_the_point_that_it_meets(small):
             rows
         )
         stop = page.picture.stage.scene.sources[0].recording
-        here = stop.stops.index(page.picture.stop.value)
+        here = stop.stops.index(page.picture.menu.stop.value)
         said = float(rows["temperature"].split()[0])
         assert said == pytest.approx(stop.covariates["temperature_c"][here], abs=0.01)
-        assert page.picture._plot.series[-2]["label"] == "clicked"  # in the plot too
+        assert page.picture.panel.plot.series[-2]["label"] == "clicked"  # in the plot too
 
 
 def test_stops_and_colours_are_chosen(small):
     with shown(small.folder) as (watched, page):
         watched.page.get_by_text("mm, short").wait_for()
-        assert page.picture.stop.value == "L00P00"
-        for label, option in (("Stop", "L01P01"), ("Colour", "incidence, deg")):
-            watched.page.get_by_label(label, exact=True).click()
-            watched.page.get_by_role("option", name=option, exact=True).click()
+        assert page.picture.menu.stop.value == "L00P00"
+        choose(watched, "Stop", "L01P01")
+        choose(watched, "Colour", "incidence, deg")
         watched.page.get_by_text("mm, short").wait_for(state="hidden")
-        assert page.picture.stop.value == "L01P01"
+        assert page.picture.menu.stop.value == "L01P01"
         count = len(page.picture.stage.scene.points(0, "L01P01").inlier)
         watched.page.get_by_text(f"{count:,} beams,").wait_for()
 
         def legend() -> list[str]:
             return watched.page.get_by_text(re.compile(r"^[\d.]+ deg$")).all_inner_texts()
 
-        kept = legend()
+        until(watched, lambda: len(legend()), 3)
+        kept, count = legend(), len(page.picture.stage.scene.points(0, "L00P00").inlier)
         watched.page.keyboard.press("n")
         watched.page.wait_for_url(re.compile("stop=L00P00&"))
-        assert legend() == kept and len(kept) == 3
-        field(watched, "Keep scales").uncheck(force=True)
+        watched.page.get_by_text(f"{count:,} beams,").wait_for()
+        assert legend() == kept
+        check(watched, "Keep scales", False)
         watched.page.wait_for_url(re.compile("scales=free"))
-        assert legend() != kept
+        until(watched, lambda: legend() != kept)
 
 
 @pytest.mark.parametrize("width", [1400, 700])
@@ -211,7 +221,7 @@ def test_a_recording_that_is_gone_is_said_on_the_page(small, tmp_path):
         (tmp_path / "run" / "diagnosis.json").unlink()
         page.open()
         watched.page.get_by_text("is no longer there; put it back").wait_for()
-        assert len(bars(watched)) == 1  # the ladder stands all the same
+        until(watched, lambda: len(bars(watched)), 1)  # the ladder stands all the same
         button(watched, "Diagnose").click()
         watched.page.get_by_text("is no longer there").wait_for()
         button(watched, "Refit").click(trial=True, timeout=FIT_MS)  # enabled again

@@ -222,19 +222,13 @@ def test_a_stop_says_what_of_it_does_not_fit():
     assert "sigmas" not in Text(panels.scan(None, 0, "a", {})).text
 
 
-@pytest.mark.parametrize(
-    "p, words",
-    [
-        (0.5, "often"),
-        (0.02, "1 in 50"),
-        (3.3e-5, "1 in 30,000"),
-        (1.2e-6, "1 in 800,000"),
-        (1e-6, "1 in over a million"),
-        (3e-36, "1 in over a million"),
-    ],
-)
-def test_chance_is_told_in_words(p, words):
-    assert panels.by_chance(p) == words
+def test_an_adjusted_p_value_is_told_as_a_number(first):
+    """As elsewhere: two digits, and no number below what is known of a tail."""
+    each = [candidate(f"range_scale@{i}") | {"p_adjusted": p} for i, p in enumerate((0.26, 1e-6))]
+    diagnosed(first.folder, candidates=[*each, candidate("faro_scale") | {"p_adjusted": None}])
+    said = panels.findings(Findings.read(first))
+    cells = re.findall(r"<td[^>]*>([^<]*)</td>", said.partition("adjusted p</th>")[2])
+    assert cells[1::3] == ["0.26", "&lt; 1e-06", ""]
 
 
 def test_the_ladder_draws_every_rung_and_the_floor_to_scale(first, tmp_path):

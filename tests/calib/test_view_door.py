@@ -225,10 +225,10 @@ def test_each_browser_has_a_view_of_its_own_and_only_the_key_changes_anything(be
             assert mine.desk.chosen == other.desk.chosen == "run"
 
             # What is chosen in one browser does not change another's view.
-            two(**pressed(other.picture.stop), updates={"value": "L01P01"})
+            two(**pressed(other.picture.menu.stop), updates={"value": "L01P01"})
             one(**pressed(mine._run), updates={"value": "other"})
-            until(lambda: other.picture.stop.value == "L01P01" and mine.desk.chosen == "other")
-            assert mine.picture.stop.value == "L00P00" and other.desk.chosen == "run"
+            until(lambda: other.picture.menu.stop.value == "L01P01" and mine.desk.chosen == "other")
+            assert mine.picture.menu.stop.value == "L00P00" and other.desk.chosen == "run"
             assert mine.picture.stage.points is not None
 
             # Buttons are pressed by messages: those that they do not have, and another's.

@@ -10,7 +10,7 @@ from calib.runs.run import Run
 from calib.show.scale import round_up
 from calib.view.scene import Points, Scene, camera, sunk
 from calib.view.shown import colours
-from calib.view.shown.colours import RISING, SIGNED_COLOURS, coloured
+from calib.view.shown.colours import RISING, SIGNED, coloured
 from chains.errors import InputError
 from sensors.recording import read_table, write_table
 from tests.calib import rigs
@@ -220,8 +220,8 @@ def test_residuals_are_coloured_symmetrically_about_grey():
     assert (scale.low, scale.high, scale.unit) == (-50.0, 50.0, "mm")
     assert np.ptp(colour[2].astype(int)) < 20  # grey
     assert colour[0][2] > colour[0][0] and colour[4][0] > colour[4][2]  # blue and red
-    assert tuple(colour[0]) == tuple(bytes.fromhex(SIGNED_COLOURS[0][1:]))
-    assert tuple(colour[4]) == tuple(bytes.fromhex(SIGNED_COLOURS[-1][1:]))
+    assert tuple(colour[0]) == tuple(bytes.fromhex(SIGNED[0][1:]))
+    assert tuple(colour[4]) == tuple(bytes.fromhex(SIGNED[-1][1:]))
 
 
 def test_other_numbers_grow_brighter():

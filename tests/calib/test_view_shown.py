@@ -15,7 +15,16 @@ from chains.errors import InputError
 from sensors.documents import read_yaml, write_yaml
 from sensors.recording import read_table, write_table
 from tests.calib.viewed import diagnosed, hidden, small_run
-from tests.calib.workbench import FIT_MS, bars, button, choose, field, shown
+from tests.calib.workbench import (
+    FIT_MS,
+    bars,
+    button,
+    check,
+    choose,
+    shown,
+    until,
+    write,
+)
 
 TABLES = "residuals.parquet"
 
@@ -146,7 +155,7 @@ def test_a_plot_has_every_beam_once_in_its_colour_and_means_of_inliers():
         assert side.all() if about["points"]["fill"] == "#0000ff" else not side.any()
     inlier = rows[points.columns["weight"][rows] > 0]
     bins = np.minimum(
-        (points.columns["range_m"] - x[0]) / (x[-1] - x[0]) * plot.LINE_BINS, plot.LINE_BINS - 1
+        (points.columns["range_m"] - x[0]) / (x[-1] - x[0]) * plot.BINS, plot.BINS - 1
     ).astype(int)
     first = inlier[bins[inlier] == 0]
     assert mean[0] == pytest.approx(1e3 * points.columns["residual_m"][first].mean())
@@ -218,8 +227,8 @@ def test_keys_go_from_stop_to_stop_and_a_link_shows_the_same(run, other):
             ("Over", "temperature, °C"),
         ):
             choose(watched, label, option)
-        field(watched, "Dark").check(force=True)
-        field(watched, "Only where").fill("ring > 40")
+        check(watched, "Dark")
+        write(watched, "Only where", "ring > 40")
         tab.wait_for_url(re.compile("only=ring.*over=temperature.*dark=1"))
         tables = (read_table(run.folder / TABLES / f"L01P0{i}.parquet") for i in range(2))
         count = sum(int((table["ring"] > 40).sum()) for table in tables)
@@ -232,7 +241,7 @@ def test_keys_go_from_stop_to_stop_and_a_link_shows_the_same(run, other):
         tab.goto("about:blank")
         tab.goto(link)
         tab.locator("[data-is=plotted]", has_text=f"{count:,} beams").wait_for()
-        for label, value in (
+        for label, wanted in (
             ("Run", "run"),
             ("Other run", "other"),
             ("Stop", "L01P00"),
@@ -241,9 +250,11 @@ def test_keys_go_from_stop_to_stop_and_a_link_shows_the_same(run, other):
             ("Over", "temperature, °C"),
             ("Beams of", "its location"),
         ):
-            assert tab.get_by_label(label, exact=True).input_value() == value
-        assert tab.get_by_text("mm, shorter").inner_text() == legend.replace("short", "shorter")
-        assert tab.locator("html").get_attribute("data-mantine-color-scheme") == "dark"
+            until(watched, tab.get_by_label(label, exact=True).input_value, wanted)
+        shorter = legend.replace("short", "shorter")
+        until(watched, tab.get_by_text("mm, shorter").inner_text, shorter)
+        scheme = tab.locator("html")
+        until(watched, lambda: scheme.get_attribute("data-mantine-color-scheme"), "dark")
         tab.wait_for_url(lambda url: near(url, link))
         tab.goto("about:blank")
         tab.goto(link.replace("stop=L01P00", "stop=gone"))
@@ -256,14 +267,15 @@ def test_a_formula_of_ones_own_is_tried_and_stops_held_out_answer(once, tmp_path
     """What was hidden is written as a formula; a wrong one is told beside its box."""
     folder = shutil.copytree(once(hidden) / "run", tmp_path / "run")
     with shown(folder) as (watched, page):
-        field(watched, "Own formula").fill("abs(residual)")
+        write(watched, "Own formula", "abs(residual)")
         button(watched, "Try").click()
         watched.page.get_by_text("residual_m is what a fit leaves").wait_for()
         assert not page.bench.busy
-        field(watched, "Own formula").fill("1 / maximum(cos(incidence), 0.2) - 1")
+        write(watched, "Own formula", "1 / maximum(cos(incidence), 0.2) - 1")
         button(watched, "Try").click()
         watched.page.get_by_text("Held-out error:").wait_for(timeout=FIT_MS)
         page.bench.stop()
+        until(watched, lambda: len(bars(watched)), 2)
         before, after = bars(watched)
         assert after < before / 2
         made = page.desk.run

@@ -1,6 +1,7 @@
 """The workbench in a headless Chromium, for tests to use as a person would."""
 
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -45,10 +46,22 @@ def shown(*runs: Path, width: int = 1400) -> Iterator[tuple[Watched, Page]]:
         served.stop()
 
 
+def until(watched: Watched, what: Callable[[], object], wanted: object = True) -> None:
+    """Wait until something is as it should be: in the page, or in the server that it talks to.
+
+    What is asked for is told to the page in steps, and drawn when the browser comes to it.
+    """
+    end, found = time.monotonic() + SOON_MS / 1e3, None
+    while (found := what()) != wanted:
+        assert time.monotonic() < end, f"{found!r} is not {wanted!r}"
+        watched.page.wait_for_timeout(50)
+
+
 def bars(watched: Watched) -> list[float]:
     """Held-out errors that the ladder shows, mm."""
-    found = watched.page.locator("[data-is=ladder] [data-mm]").all()
-    return [float(bar.get_attribute("data-mm")) for bar in found]
+    return watched.page.locator("[data-is=ladder] [data-mm]").evaluate_all(
+        "bars => bars.map(bar => +bar.dataset.mm)"
+    )
 
 
 def button(watched: Watched, name: str):
@@ -60,12 +73,45 @@ def field(watched: Watched, label: str):
     return watched.page.locator(f"xpath=//*[text()='{label}']/following::input[1]")
 
 
+def _told(watched: Watched) -> None:
+    """Wait until the server is told: of widgets used within 50 ms, viser tells of the first and of
+    the last alone. No person is as fast."""
+    watched.page.wait_for_timeout(60)
+
+
 def choose(watched: Watched, label: str, option: str) -> None:
     """Choose from a menu."""
     watched.page.get_by_label(label, exact=True).click()
     watched.page.get_by_role("option", name=option, exact=True).click()
+    _told(watched)
+
+
+def value(watched: Watched, label: str) -> str:
+    """What is chosen in a menu, or written in a field."""
+    return field(watched, label).input_value()
+
+
+def write(watched: Watched, label: str, text: str) -> None:
+    """Write into a text field."""
+    field(watched, label).fill(text)
+    _told(watched)
+
+
+def check(watched: Watched, label: str, on: bool = True) -> None:
+    """Tick a box that stands after its label, or take its tick away."""
+    field(watched, label).set_checked(on, force=True)
+    _told(watched)
 
 
 def tick(watched: Watched, effect: str, on: bool = True) -> None:
     """Tick an effect in the list, or take its tick away."""
     watched.page.get_by_label(effect, exact=True).set_checked(on, force=True)
+    _told(watched)
+
+
+def drag(watched: Watched, start: tuple[float, float], end: tuple[float, float]) -> None:
+    """Drag from one place of the window to another, px."""
+    watched.page.mouse.move(*start)
+    watched.page.mouse.down()
+    watched.page.mouse.move(*end, steps=5)
+    watched.page.mouse.up()

@@ -15,9 +15,9 @@ from calib.runs.run import Run
 from calib.view.desk import Findings
 from calib.view.shown.columns import comparable
 
-SAME_ERROR = 1e-6  # relative: one error, read from two files
+SAME = 1e-6  # relative: one error, read from two files
 # What two runs must share, beside recordings and effects, for one to tell of the other.
-MUST_AGREE = ("fixed", "without", "hold_out", "folds", "prior_sha256")
+ASKED = ("fixed", "without", "hold_out", "folds", "prior_sha256")
 NOT_KNOWN_YET = "The held-out error is not known before the refit."
 Effects = Mapping[str, Any]  # name -> name, or document of a formula
 
@@ -77,9 +77,7 @@ def fitted(findings: Findings, before_mm: float) -> dict[frozenset[str], float]:
     for names, fall in added:
         start, after = fall.get("before"), fall.get("after")
         if start is not None and after is not None:
-            under = [
-                some for some, mm in known.items() if math.isclose(mm, start, rel_tol=SAME_ERROR)
-            ]
+            under = [some for some, mm in known.items() if math.isclose(mm, start, rel_tol=SAME)]
             known |= {some | names: after for some in under[-1:]}
     del known[frozenset()]
     return known
@@ -93,7 +91,7 @@ def _is_of(other: Run, run: Run, wanted: Effects) -> bool:
     """Whether a run is what another would be with these effects."""
     if not comparable(run, other) or set(other.effects) != set(wanted):
         return False
-    if any(other.model.get(key) != run.model.get(key) for key in MUST_AGREE):
+    if any(other.model.get(key) != run.model.get(key) for key in ASKED):
         return False
     theirs = dict(zip(other.effects, other.model["effects"], strict=True))
     return all(_alike(theirs[name], what) for name, what in wanted.items())

@@ -13,11 +13,11 @@ from calib.effects.own.expression import Expression
 from calib.effects.own.formula import FormulaEffect
 from calib.view import panels
 from calib.view.scene import Points
-from calib.view.shown.columns import DIFFERENCE, OTHER, value_of
+from calib.view.shown.columns import COMPARED_COLUMNS, value_of
 from chains.errors import InputError
 
 SITES = {"range": "m", "azimuth": "rad", "elevation": "rad"}  # what it adds to -> in which unit
-MADE_BY_FITS = ("residual_m", "sigma_m", "weight", OTHER, DIFFERENCE)  # columns that a fit makes
+MADE_BY_FITS = ("residual_m", "sigma_m", "weight", *COMPARED_COLUMNS)  # columns that a fit makes
 LONGEST_IN_FOLDER = 40  # letters of it that a folder's name takes up
 FORMULA_HINT = "Of range, incidence, ring, ... and columns of stops, e.g. (humidity - 0.45) * range"
 

@@ -10,8 +10,7 @@ from calib.view import panels
 from calib.view.effects.known import difference
 
 MORE = "another effect …"
-# Effects in a list: viser puts widgets in the order of numbers, this many to a step.
-MOST_EFFECTS = 1000
+MOST = 1000  # effects in a list: viser puts widgets in the order of numbers, this many to a step
 
 
 class Ticks:
@@ -77,7 +76,7 @@ class Ticks:
         self._button.disabled = busy
 
     def _add(self, name: str, ticked: bool = False) -> None:
-        order = self._more.order - 1 + len(self._boxes) / MOST_EFFECTS
+        order = self._more.order - 1 + len(self._boxes) / MOST
         with self.folder:
             box = self._gui.add_checkbox(name, ticked, order=order)
         box.on_update(self._guarded(partial(self._on_tick, name)))

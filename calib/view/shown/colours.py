@@ -9,35 +9,18 @@ import numpy as np
 
 from calib.show.scale import round_up
 from calib.view.scene import Points
-from calib.view.shown.columns import DIFFERENCE, LOCATION, OTHER, STOP
+from calib.view.shown import columns
+from calib.view.shown.columns import LOCATION, STOP
 
 # Blue to vermilion about a grey that shows on white walls: told apart by every kind of sight.
-SIGNED_COLOURS = ("#08306b", "#2171b5", "#6baed6", "#b9bdc1", "#fd8d3c", "#d94801", "#7f2704")
+SIGNED = ("#08306b", "#2171b5", "#6baed6", "#b9bdc1", "#fd8d3c", "#d94801", "#7f2704")
 # Dark to bright, evenly: matplotlib's viridis.
 RISING = ("#440154", "#472d7b", "#3b528b", "#2c728e", "#21918c", "#28ae80", "#5ec962", "#addc30")
 # For names: Okabe and Ito's, then darker and paler ones of the same hues.
-NAME_COLOURS = (
-    "#0072b2",
-    "#e69f00",
-    "#009e73",
-    "#cc79a7",
-    "#56b4e9",
-    "#d55e00",
-    "#f0e442",
-    "#555555",
-)
-NAME_COLOURS += (
-    "#003a5c",
-    "#7a5400",
-    "#004d38",
-    "#7d3560",
-    "#b8def5",
-    "#7a3600",
-    "#8f8700",
-    "#d9c4a0",
-)
+NAMED = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#f0e442", "#555555")
+NAMED += ("#003a5c", "#7a5400", "#004d38", "#7d3560", "#b8def5", "#7a3600", "#8f8700", "#d9c4a0")
 UNKNOWN_COLOUR = "#999999"
-SHARE_IN_SCALE = 0.98  # of the points lie within the scale
+SHARE = 0.98  # of the points lie within the scale
 
 
 @dataclass(frozen=True)
@@ -56,10 +39,19 @@ class Column:
         return f"{self.title}, {self.unit}" if self.unit else self.title
 
 
-COLOUR_COLUMNS = {
-    "residual_m": Column("residual", "mm", 1e3, ("short", "long")),
-    OTHER: Column("residual in the other run", "mm", 1e3, ("short", "long")),
-    DIFFERENCE: Column("difference to the other run", "mm", 1e3, ("shorter", "longer")),
+def _residual(title: str, than: str = "") -> Column:
+    """A residual, or a difference of two."""
+    return Column(title, "mm", 1e3, (f"short{than}", f"long{than}"))
+
+
+COLUMNS = {
+    "residual_m": _residual("residual"),
+    columns.HELD_OUT: _residual("residual held out"),
+    columns.LESS_FITTED: _residual("held out less fitted", "er"),
+    columns.OTHER: _residual("residual in the other run"),
+    columns.DIFFERENCE: _residual("difference to the other run", "er"),
+    columns.OTHER_HELD_OUT: _residual("held out in the other run"),
+    columns.HELD_OUT_DIFFERENCE: _residual("held out, difference to the other run", "er"),
     "range_m": Column("range", "m"),
     "incidence_rad": Column("incidence", "deg", 180 / np.pi),
     "ring": Column("ring"),
@@ -75,7 +67,7 @@ COLOUR_COLUMNS = {
     STOP: Column("number of the stop"),
     LOCATION: Column("location"),
 }
-NAME_COLUMNS = ("label", LOCATION)  # numbers that stand for names
+NAMES = ("label", LOCATION)  # numbers that stand for names
 HIDDEN = {"surface", "region", "patch", "plane"}  # numbers that mean nothing to people
 
 
@@ -103,13 +95,13 @@ class Scale:
 
 def column(name: str) -> Column:
     """How a column is shown; one that the recording's maker added, under its own name."""
-    return COLOUR_COLUMNS.get(name) or Column(name)
+    return COLUMNS.get(name) or Column(name)
 
 
 def choices(points: Points) -> list[str]:
     """Columns that the points can be coloured by, the residual first."""
-    known = [name for name in COLOUR_COLUMNS if name in points.columns]
-    own = [n for n in points.columns if n not in COLOUR_COLUMNS and n not in HIDDEN]
+    known = [name for name in COLUMNS if name in points.columns]
+    own = [n for n in points.columns if n not in COLUMNS and n not in HIDDEN]
     return [n for n in (*known, *own) if np.isfinite(points.columns[n]).any()]
 
 
@@ -124,9 +116,9 @@ def limits(points: Points, name: str) -> tuple[float, float]:
     known = points.columns[name] * shown.scale
     known = known[np.isfinite(known)]
     if shown.signed:
-        high = round_up(float(np.quantile(np.abs(known), SHARE_IN_SCALE)) if len(known) else 0.0)
+        high = round_up(float(np.quantile(np.abs(known), SHARE)) if len(known) else 0.0)
         return -high, high
-    edge = (1 - SHARE_IN_SCALE) / 2
+    edge = (1 - SHARE) / 2
     low, high = np.quantile(known, [edge, 1 - edge]) if len(known) else (0.0, 1.0)
     return float(low), float(high)
 
@@ -142,14 +134,14 @@ def coloured(
     Args:
         points: of a stop.
         name: the column.
-        names: what its numbers stand for, of one of `NAME_COLUMNS`.
+        names: what its numbers stand for, of one of `NAMES`.
         ends: of the scale; `limits` where there are none.
     """
     shown, values = column(name), points.columns[name]
-    if name in NAME_COLUMNS:
+    if name in NAMES:
         return _by_name(values.astype(int), names, shown.title)
     low, high = ends or limits(points, name)
-    stops = SIGNED_COLOURS if shown.signed else RISING
+    stops = SIGNED if shown.signed else RISING
     place = (values * shown.scale - low) / max(high - low, 1e-12)
     return _between(place, stops), Scale(
         title=shown.title,
@@ -164,10 +156,7 @@ def coloured(
 
 def _by_name(labels: np.ndarray, names: Mapping[int, str], title: str) -> tuple[np.ndarray, Scale]:
     distinct, index = np.unique(labels, return_inverse=True)
-    colours = [
-        UNKNOWN_COLOUR if n < 0 else NAME_COLOURS[i % len(NAME_COLOURS)]
-        for i, n in enumerate(distinct)
-    ]
+    colours = [UNKNOWN_COLOUR if n < 0 else NAMED[i % len(NAMED)] for i, n in enumerate(distinct)]
     titles = [names.get(int(n), f"{title} {n}") for n in distinct]
     legend = dict(zip(titles, colours, strict=True))
     return _rgb(colours)[index], Scale(

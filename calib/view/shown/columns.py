@@ -1,19 +1,25 @@
 """The beams of a stop or of several, with all that is known of each: what its point says, what its
-stop says, and what another run left of its range."""
+stop says, what a fit without its stop left of its range, and what another run left."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Literal
 
 import numpy as np
 
 from calib.effects.own.expression import ALIASES, Expression
 from calib.runs.run import Run
-from calib.view.scene import MOST_SHOWN_POINTS, Points, Scene
+from calib.view.scene import MOST_POINTS, Points, Scene
 from sensors.documents import nearest
 
-OTHER, DIFFERENCE, STOP, LOCATION = "other_m", "difference_m", "stop", "location"
-UNIT_ENDINGS = ("_m", "_rad", "_s", "_c")  # what a column's name may be written without
+HELD_OUT, LESS_FITTED = "held_out_m", "held_out_less_fitted_m"
+OTHER, DIFFERENCE = "other_m", "difference_m"
+OTHER_HELD_OUT, HELD_OUT_DIFFERENCE = "other_held_out_m", "held_out_difference_m"
+COMPARED_COLUMNS = (HELD_OUT, LESS_FITTED, OTHER, DIFFERENCE, OTHER_HELD_OUT, HELD_OUT_DIFFERENCE)
+STOP, LOCATION = "stop", "location"
+AS_IN_CAD = "as in CAD"  # in the place of another run
+UNITS = ("_m", "_rad", "_s", "_c")  # what a column's name may be written without
 _BEAM = ("ring", "column", "scan", "azimuth_rad", "elevation_rad")  # the same in every run
 _ODD = np.uint64(0x9E3779B97F4A7C15)  # 2**64 over the golden ratio: Knuth's multiplicative hashing
 
@@ -28,8 +34,8 @@ def gathered(
     scene: Scene,
     recording: int,
     stops: Sequence[str],
-    other: Run | None = None,
-    most: int = MOST_SHOWN_POINTS,
+    other: Run | Literal["as in CAD"] | None = None,
+    most: int = MOST_POINTS,
 ) -> Points | None:
     """The beams of these stops; None where none of them was scanned.
 
@@ -40,8 +46,8 @@ def gathered(
         scene: of the run.
         recording: its number.
         stops: by name.
-        other: a run of the same recordings, for `OTHER`, its residual of each beam, and
-            `DIFFERENCE`, by how much this run's is larger; NaN where it has not that beam.
+        other: a run of the same recordings, or `AS_IN_CAD`, for `OTHER`, its residual of each beam,
+            and `DIFFERENCE`, by how much this run's is larger; NaN where it has not that beam.
         most: beams.
 
     Raises:
@@ -54,8 +60,7 @@ def gathered(
             many = 1 if len(stops) == 1 else max(1, -(-len(points.xyz_m) * len(stops) // most))
             rows = slice(None, None, many)
             columns = dict(points.columns)
-            if other is not None:
-                columns |= _against(columns, scene.table(recording, stop, other))
+            columns |= _compared(scene, recording, stop, columns, other)
             columns = {name: values[rows] for name, values in columns.items()}
             columns |= _of_stop(scene, recording, stop, columns)
             parts.append(Points(points.xyz_m[rows], points.eye_m, columns, len(points.xyz_m)))
@@ -88,9 +93,7 @@ def value_of(points: Points, expression: Expression) -> np.ndarray:
     """
 
     def column(name: str) -> np.ndarray:
-        found = next(
-            (n for n in (name, *(name + u for u in UNIT_ENDINGS)) if n in points.columns), None
-        )
+        found = next((n for n in (name, *(name + u for u in UNITS)) if n in points.columns), None)
         if found is None:
             shown = {full: short for short, full in ALIASES.items()}
             known = [shown.get(n, n.removesuffix("_m")) for n in points.columns]
@@ -115,11 +118,31 @@ def _of_stop(
     return {name: np.full(count, value) for name, value in values.items()}
 
 
-def _against(
-    columns: Mapping[str, np.ndarray], other: Mapping[str, np.ndarray] | None
+def _compared(
+    scene: Scene,
+    recording: int,
+    stop: str,
+    columns: Mapping[str, np.ndarray],
+    other: Run | str | None,
 ) -> dict[str, np.ndarray]:
-    """Residuals of the same beams in another table, and the differences to them; NaN throughout
-    where there is none."""
+    """Residuals of the same beams held out and in another run, and their differences."""
+    seen, at = columns["residual_m"].astype(float), (recording, stop)
+    unseen = _of_same(columns, scene.table(*at, scene.run, unseen=True))
+    out = {HELD_OUT: unseen, LESS_FITTED: unseen - seen}
+    if other == AS_IN_CAD:
+        there = _of_same(columns, scene.nominal(*at))
+        return out | {OTHER: there, DIFFERENCE: seen - there}
+    if other is not None:
+        there, held_out = (_of_same(columns, scene.table(*at, other, u)) for u in (False, True))
+        out |= {OTHER: there, DIFFERENCE: seen - there}
+        out |= {OTHER_HELD_OUT: held_out, HELD_OUT_DIFFERENCE: unseen - held_out}
+    return out
+
+
+def _of_same(
+    columns: Mapping[str, np.ndarray], other: Mapping[str, np.ndarray] | None
+) -> np.ndarray:
+    """Residuals (N,) of the same beams in another table; NaN throughout where there is none."""
     there = np.full(len(columns["ring"]), np.nan)
     if other is not None and len(other["ring"]):
         names = [name for name in _BEAM if name in columns and name in other]
@@ -130,7 +153,7 @@ def _against(
         # Two beams that nothing tells apart are left out.
         same = np.flatnonzero((distinct[at] == mine) & (count[at] == 1))
         there[same] = other["residual_m"][first[at[same]]]
-    return {OTHER: there, DIFFERENCE: columns["residual_m"] - there}
+    return there
 
 
 def _keys(columns: Sequence[np.ndarray]) -> np.ndarray:

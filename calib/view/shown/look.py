@@ -6,14 +6,14 @@ import re
 from collections.abc import Mapping
 from urllib.parse import parse_qsl, quote, urlencode
 
-LONGEST_LINK = 2000  # letters: what browsers and mail programs take as a link
-KEYS = ("run", "recording", "stop", "stops", "other", "colour", "scales", "only", "up", "over")
-KEYS += ("lit", "moves", "below", "camera", "dark")
+LONGEST = 2000  # letters: what browsers and mail programs take as a link
+KEYS = ("run", "recording", "stop", "stops", "other", "beside", "colour", "size", "scales", "only")
+KEYS += ("up", "over", "lit", "area", "moves", "below", "camera", "dark")
 
 
 def read(text: str) -> dict[str, str]:
     """What an address asks for, by `KEYS`; of what cannot be read, nothing."""
-    pairs = parse_qsl(text[:LONGEST_LINK], errors="replace")
+    pairs = parse_qsl(text[:LONGEST], errors="replace")
     return {key: value for key, value in pairs if key in KEYS}
 
 

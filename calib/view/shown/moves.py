@@ -14,7 +14,7 @@ from calib.view.scene import Scene
 from chains import se3
 from chains.escape import html as escape
 
-TIMES_AS_LONG = 100  # as long as the move: a millimetre is a decimetre, on a rig of a metre or two
+TIMES = 100  # as long as the move: a millimetre is a decimetre, on a rig of a metre or two
 LEAST_M = 1e-7  # a move of less would be no arrow
 SURE = 2.0  # sigmas, from which a move is hardly chance
 
@@ -53,8 +53,8 @@ class Move:
 
     @property
     def arrow_m(self) -> np.ndarray:
-        """(2, 3) from the link's origin, `TIMES_AS_LONG` as long as the move."""
-        return np.stack([self.at_m, self.at_m + TIMES_AS_LONG * self.move_m])
+        """(2, 3) from the link's origin, `TIMES` as long as the move."""
+        return np.stack([self.at_m, self.at_m + TIMES * self.move_m])
 
 
 def moves(scene: Scene, recording: int, stop: str) -> list[Move]:
