@@ -14,7 +14,7 @@ from calib.report import plots
 from calib.report.chart import Absent, Chart
 from calib.report.charts import ALONE, SECTIONS
 from calib.report.evidence import Evidence
-from calib.report.numbers import figure_csv
+from calib.report.numbers import blocks_of, figure_csv, figure_places
 from calib.report.page import Drawn, Section, render
 from calib.runs.run import Run
 from calib.show.verdict import Verdict, judge
@@ -121,7 +121,8 @@ def report(
                 progress("drawing", done, total)
                 picture = chart.figure()
                 svg = plots.svg(picture, chart.id)
-                drawn.append(Drawn(chart, svg, figure_csv(picture)))
+                blocks = blocks_of(picture)
+                drawn.append(Drawn(chart, svg, figure_csv(blocks), figure_places(blocks)))
                 done += 1
             sections.append(Section(title, drawn, brief=verdict.light != "green"))
         page = render(evidence, verdict, sections, contents.absent)
