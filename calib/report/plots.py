@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 AFTER, BEFORE, FLOOR, INK, PALE = "#0072b2", "#d55e00", "#009e73", "#333333", "#999999"
+HELD_OUT = "#b8568f"  # of stops held out, beside AFTER and BEFORE
 LINES = (AFTER, BEFORE, FLOOR, "#cc79a7", "#e69f00", "#56b4e9")
 SIGNED, UNSIGNED = "PuOr_r", "cividis"
 HALF, WIDE = 5.6, 8.0  # inches: of a column of the page, and of both
@@ -104,8 +105,9 @@ def styled() -> Iterator[None]:
 
 
 def band(ax: Axes, x: np.ndarray, mean: np.ndarray, half: np.ndarray, colour: str) -> None:
-    """A shaded band about a line."""
-    ax.fill_between(x, mean - half, mean + half, color=colour, alpha=0.25, linewidth=0)
+    """A shaded band about a line; that of stops held out, which is wide, hides no other."""
+    alpha = 0.1 if colour == HELD_OUT else 0.25
+    ax.fill_between(x, mean - half, mean + half, color=colour, alpha=alpha, linewidth=0)
 
 
 def log_axis(ax: Axes, least: float, most: float, name: str = "x") -> None:
