@@ -31,6 +31,7 @@ from calib.results.misfit import misfit_by, prior_rows, target_rows, tracker_row
 from calib.results.reach import reach
 from calib.results.recalibrate import Link, earlier, solve_from
 from calib.results.solution import solution_of
+from calib.results.stages import FIT, staged
 from calib.runs.belief import TOLERATED
 from calib.runs.reopen import model_of, proposed, reopened, start_of, stored_met
 from calib.runs.residual_table import (
@@ -187,7 +188,7 @@ def _fit(
     start: Start | None = None,
 ) -> None:
     """Estimate, judge by what was held out, and write the run."""
-    began = time.monotonic()
+    began, progress = time.monotonic(), staged(progress, FIT)
     before = Run.open(choices.prior).solution if choices.prior else None
     problem = problems.build(sources, model)
     links: list[Link] | None = None

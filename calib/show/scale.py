@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-DISPLAY_UNITS = {"m": (1e3, "mm"), "rad": (1e3, "mrad"), "1": (1.0, "")}
+DISPLAY_UNITS = {"m": (1e3, "mm"), "rad": (1e3, "mrad"), "1": (1.0, "(no unit)")}
 
 
 def round_up(value: float) -> float:
