@@ -82,8 +82,8 @@ def _picture(effect: Effect, rig: Rig, folder: Path) -> str:
         return ""
     _write(folder / f"{effect.name}.svg", plots.svg(figure, effect.name))
     return (
-        "\nWhat it does, each parameter at the sigma of its prior, and of several shapes one; where "
-        "every ring, material or stop has a parameter, a draw from their priors:"
+        "\nWhat it does, each parameter at the sigma of its prior, and of several shapes one; "
+        "where every ring, material or stop has a parameter, a draw from their priors:"
         f"\n\n![What {effect.name} does]({effect.name}.svg)\n"
     )
 
