@@ -15,7 +15,8 @@ from calib.rig import Rig  # noqa: E402
 from calib.show.tables import effect_page  # noqa: E402
 
 project, author, copyright = "rigcal", "the rigcal authors", "the rigcal authors"
-extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+# githubpages: .nojekyll, without which Pages leaves out folders that begin with _.
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.githubpages", "sphinx.ext.napoleon"]
 html_theme = "furo"
 html_title = "rigcal"
 html_copy_source = False
