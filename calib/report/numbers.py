@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from calib.report.plots import Axes, Figure
 
 DIGITS = 5  # significant ones of a number that is drawn: more than a picture shows
+CELL_DIGITS = 3  # of a cell of a map, which is a colour; a page has many
 COLOUR_BAR = "<colorbar>"  # what matplotlib calls the axes of one
 GIVEN = "numbers of the diagram"  # attribute of axes
 NAMED = {"FuncFormatter", "StrCategoryFormatter"}  # of axes whose ticks are given as texts
@@ -215,7 +216,7 @@ def _map(ax: Axes, image: Any, x: np.ndarray, y: np.ndarray) -> Block:
     at, up_at = (x[1:] + x[:-1]) / 2, (y[1:] + y[:-1]) / 2
     head = [f"{what}; {up} down, {across} to the right".removeprefix("; "), *_texts(ax.xaxis, at)]
     lines = zip(_texts(ax.yaxis, up_at), cells, strict=True)
-    rows = [head, *([place, *map(_text, row)] for place, row in lines)]
+    rows = [head, *([place, *(_text(cell, CELL_DIGITS) for cell in row)] for place, row in lines)]
     told = [_title(ax, ""), across, up, bar_label or _title(ax, "")]
     return Block(ax, rows, [{"what": told, "x": x, "y": y}])
 
@@ -267,5 +268,5 @@ def _texts(axis: Any, at: np.ndarray) -> list[str]:
     return list(map(_text, at))
 
 
-def _text(value: float) -> str:
-    return f"{value:z.{DIGITS}g}" if np.isfinite(value) else ""
+def _text(value: float, digits: int = DIGITS) -> str:
+    return f"{value:z.{digits}g}" if np.isfinite(value) else ""

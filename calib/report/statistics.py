@@ -18,7 +18,7 @@ from scipy import special
 
 CONFIDENCE = 0.95
 BINS, AZIMUTHS = 30, 180  # at most
-COARSE, COARSE_RINGS = 60, 32  # parts of a turn, and groups of rings, of a small map of one stop
+COARSE, COARSE_RINGS = 48, 32  # parts of a turn, and groups of rings, of a small map of one stop
 Z_EDGES = np.linspace(-5.0, 5.0, 101)
 PLACES = ("surface", "plane", "label")
 

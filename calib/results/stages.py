@@ -37,13 +37,13 @@ DIAGNOSE = (
     Stage("formulas", ("reading residuals", "searching covariates"), 0.26),
 )
 PLAN = (
-    Stage("what is known", ("looking for depth edges", "pass "), 0.40),
-    Stage("candidates", ("looking at candidates",), 0.35),
-    Stage("choice", ("choosing", "how many are enough"), 0.25),
+    Stage("what is known", ("looking for depth edges", "pass "), 0.08),
+    Stage("candidates", ("looking at candidates",), 0.85),
+    Stage("choice", ("choosing", "how many are enough"), 0.07),
 )
 REPORT = (
-    Stage("residuals", ("residuals", "derivatives", "stop by stop", "held-out residuals"), 0.30),
-    Stage("figures", ("drawing",), 0.70),
+    Stage("residuals", ("residuals", "derivatives", "stop by stop", "held-out residuals"), 0.22),
+    Stage("figures", ("drawing",), 0.78),
 )
 
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 MOST_STOPS = 3  # that are drawn, the worst: as many as a screen holds in a row each
 ABREAST = 4  # small maps in a row
 FIRST_MAPS, PAGE_MAPS = 8, 24  # small maps that are shown, and in each figure that is folded
-MOST_MAPS = 200  # small maps in all: more would make the page too heavy
+MOST_MAPS = 104  # small maps in all: more would make the page too heavy
 NAME = 16  # letters of a stop's name that stand above a map
 WITHIN = 0.95  # of the cells of stops held out: those that lie inside the scale
 
