@@ -59,8 +59,11 @@ demo: system
 	$(BIN)/rigcal compare demo/run demo/grown
 	@echo "== demo: the result for other programs, in demo/export"
 	$(BIN)/rigcal export demo/grown -o demo/export
-	@echo "== demo: the result for people; open demo/report.html, or type $(BIN)/rigcal view demo/grown"
+	@echo "== demo: the result for people"
 	$(BIN)/rigcal report demo/grown -o demo/report.html
+	@echo "== demo: what was found"
+	@$(BIN)/python -c 'import calib; print(calib.Run.open("demo/run").diagnosis()["sentences"][0])'
+	@echo "The report is demo/report.html; $(BIN)/rigcal view demo/grown opens the workbench."
 
 test: system browser $(TESTED)
 	@echo "== test: style"

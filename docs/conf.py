@@ -15,7 +15,8 @@ from calib.rig import Rig  # noqa: E402
 from calib.show.tables import effect_page  # noqa: E402
 
 project, author, copyright = "rigcal", "the rigcal authors", "the rigcal authors"
-extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+# githubpages: .nojekyll, without which Pages leaves out folders that begin with _.
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.githubpages", "sphinx.ext.napoleon"]
 html_theme = "furo"
 html_title = "rigcal"
 html_copy_source = False
@@ -82,8 +83,9 @@ def _picture(effect: Effect, rig: Rig, folder: Path) -> str:
         return ""
     _write(folder / f"{effect.name}.svg", plots.svg(figure, effect.name))
     return (
-        "\nWhat it does, each parameter at the sigma of its prior, and of several shapes one:"
-        f"\n\n![{effect.name} over its covariate]({effect.name}.svg)\n"
+        "\nWhat it does, each parameter at the sigma of its prior, and of several shapes one; "
+        "where every ring, material or stop has a parameter, a draw from their priors:"
+        f"\n\n![What {effect.name} does]({effect.name}.svg)\n"
     )
 
 

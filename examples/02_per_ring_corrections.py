@@ -33,7 +33,7 @@ def range_errors(
 
 
 out = Path(sys.argv[1] if len(sys.argv) > 1 else tempfile.mkdtemp(prefix="rigcal-"))
-spec = load_spec("tiny").model_copy(update={"lidar": "hesai_pandarqt64"})
+spec = load_spec("tiny").model_copy(update={"lidar": "ouster_os0_128_rev6"})
 calib.simulate(spec, out / "recording", seed=3)
 run = calib.fit([out / "recording"], out / "run", hold_out="none")
 
@@ -41,7 +41,7 @@ truth = json.loads((out / "recording.truth.json").read_text())
 offsets = run.solution.shared.effects["ring_range_offset"]
 true_m = truth["effects"]["ring_range_offset"]
 print("ring  offset mm      truth mm")
-for ring in range(0, 64, 8):
+for ring in range(0, 128, 16):
     estimate = f"{1e3 * offsets.estimate[ring]:+6.2f} ± {1e3 * offsets.sigma[ring]:.2f}"
     print(f"{ring:4}  {estimate}  {1e3 * true_m[ring]:+6.2f}")
 

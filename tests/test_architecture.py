@@ -82,6 +82,7 @@ TEXTS = {
     "calib/problem/without.py": "--without",
     "calib/residuals/groups.py": "--without",
     "calib/results/outstanding.py": "keys of summary.json",
+    "calib/results/stages.py": "what progress says",
     "calib/runs/calibrate.py": "effects that `add` names",
     "calib/runs/diagnose.py": "sentences",
     "calib/runs/estimates.py": "solution.yaml",

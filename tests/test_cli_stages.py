@@ -4,12 +4,12 @@ import re
 
 import pytest
 
-from calib.cli.stages import DIAGNOSE, FIT, Staged
+from calib.results.stages import DIAGNOSE, FIT, PLAN, REPORT, Staged, staged
 
 HIDE = ("--seed", 1, "--hide", "incidence_angle_bias=2")
 
 
-@pytest.mark.parametrize("stages", [FIT, DIAGNOSE])
+@pytest.mark.parametrize("stages", [FIT, DIAGNOSE, PLAN, REPORT])
 def test_shares_are_of_the_whole(stages):
     assert sum(stage.share for stage in stages) == pytest.approx(1.0)
 
@@ -37,21 +37,52 @@ def test_stages_are_passed_over_and_never_gone_back_to():
     assert "left" not in staged("writing residuals", 99.0)
 
 
-def test_without_stages_a_step_is_told_as_it_is():
-    assert Staged()("drawing", 3.0) == "drawing"
+def test_a_step_before_the_first_stage_is_told_as_of_it():
     assert Staged(FIT)("reading", 0.0) == "1 of 4, estimate: reading"
 
 
-def test_every_step_of_a_fit_and_a_diagnosis_has_its_stage(rigcal, tmp_path):
+def test_steps_are_passed_on_with_their_stage():
+    heard = []
+    tell = staged(lambda *step: heard.append(step), REPORT)
+    tell("residuals before", 1, 7)
+    tell("drawing", 2, 9)
+    assert heard[0] == ("1 of 2, residuals: residuals before", 1, 7)
+    assert heard[1][0].startswith("2 of 2, figures") and heard[1][1:] == (2, 9)
+
+
+def stages_told(lines: str, stages) -> list[str]:
+    """Titles of the stages that lines of progress tell, each once; their numbers never fall."""
+    numbers = [int(n) for n in re.findall(rf" ([0-9]) of {len(stages)}, ", lines)]
+    assert numbers == sorted(numbers) and numbers[0] == 1
+    return [stages[n - 1].title for n in dict.fromkeys(numbers)]
+
+
+def test_every_step_of_what_takes_long_has_its_stage(rigcal, tmp_path):
     """Each stage is reached, in order, by what the commands say themselves."""
     assert rigcal("simulate", "tiny", "-o", tmp_path / "rec", *HIDE)[0] == 0
+    run = tmp_path / "run"
     for command, stages in (
-        (("fit", tmp_path / "rec", "-o", tmp_path / "run"), FIT),
-        (("diagnose", tmp_path / "run"), DIAGNOSE),
+        (("fit", tmp_path / "rec", "-o", run), FIT),
+        (("diagnose", run), DIAGNOSE),
+        (("plan", run, "--stops", 1, "--candidates", 20), PLAN),
+        (("report", run, "-o", tmp_path / "run.html"), REPORT),
     ):
         code, _, err = rigcal("-v", *command)
-        numbers = [int(n) for n in re.findall(rf" ([0-9]) of {len(stages)}, ", err)]
-        assert code == 0 and numbers == sorted(numbers) and numbers[0] == 1
-        titles = [stages[n - 1].title for n in dict.fromkeys(numbers)]
         wanted = [stage.title for stage in stages if stage.title != "formulas"]
-        assert [title for title in titles if title != "formulas"] == wanted
+        titles = stages_told(err, stages)
+        assert code == 0 and [title for title in titles if title != "formulas"] == wanted
+        assert len(re.findall(r" \d of \d, ", err)) == len(err.splitlines())  # of every step
+
+
+@pytest.mark.slow
+def test_an_explanation_tells_the_stages_of_each_rung(rigcal, tmp_path):
+    assert rigcal("simulate", "tiny", "-o", tmp_path / "rec", *HIDE)[0] == 0
+    code, out, err = rigcal("-v", "explain", tmp_path / "rec", "-o", tmp_path / "study")
+    assert code == 0
+    rungs = {label: [x for x in err.splitlines() if f" {label}: " in x] for label in ("00", "01")}
+    assert stages_told("\n".join(rungs["00"]), FIT) == [stage.title for stage in FIT]
+    fitted = [x for x in rungs["01"] if f" of {len(FIT)}, {FIT[2].title}" in x]
+    assert fitted and "1 of 4, tests" in rungs["01"][0]
+    held_out, verdict = out.splitlines()[-2:]
+    assert re.match(r"held-out error: [0-9.]+ -> [0-9.]+ mm; ", held_out)
+    assert verdict == "verdict: the model is adequate"

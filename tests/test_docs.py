@@ -94,6 +94,9 @@ def test_the_site_is_built_without_a_warning(tmp_path):
 
     assert "(1 / cos(incidence) - 1)" in text("catalogue/incidence_angle_bias.html")
     assert "calib.fit" in text("api.html")
+    assert (tmp_path / ".nojekyll").is_file()
+    pictures = {path.stem for path in (tmp_path / "_images").glob("*.svg")}
+    assert len(pictures & {effect.name for effect in CATALOGUE}) > 55
 
 
 @pytest.mark.slow
@@ -103,6 +106,10 @@ def test_the_page_about_python_runs_and_shows_what_is_printed(tmp_path):
     said = shape(session.said)
     for block in re.findall(r"^```text\n(.*?)^```", session.text, flags=re.M | re.S):
         assert shape(block) in said, block
+    errors = r"held-out error: (\S+) mm .*? (\S+) mm expected"
+    there, here = (re.search(errors, text)[0] for text in (session.text, session.said))
+    numbers = ([float(x) for x in re.search(errors, text).groups()] for text in (there, here))
+    assert next(numbers) == pytest.approx(next(numbers), rel=0.15)
     assert "the recordings are the same" in " ".join(session.said.split()).lower()
     found = re.search(r"moves by (\S+) mm, and is known to (\S+) mm", session.said).groups()
     solution = Run.open(tmp_path / "grown").solution

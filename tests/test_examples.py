@@ -99,6 +99,10 @@ def test_a_ur10_lacks_what_its_example_says(once, shared):
         rows = re.findall(r"(\S+) mm held out, (\S+) mm in series", series)
         own, others = np.array(rows, float).T
         assert len(rows) == 4 and own[-1] < 0.72 * own[0] and others[-1] < 0.85 * others[0]
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    table = np.array(re.findall(r"^\| [^|]+ \| (0\.\d+) \| (0\.\d+) \|$", readme, re.M), float)
+    found = np.array(re.findall(r"(\S+) mm held out, (\S+) mm in series D", A), float)
+    np.testing.assert_allclose(table, found[[0, 1, 3]], rtol=0.05)
 
 
 @pytest.mark.slow

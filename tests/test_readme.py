@@ -65,6 +65,18 @@ def test_make_targets_exist():
 
 
 @pytest.mark.slow
+def test_the_demo_ends_with_what_was_found_and_where_the_report_is(loop, monkeypatch, capsys):
+    """Its last program, on the runs of README's loop, which hide the same effect."""
+    recipe = re.search(r"^demo:.*?\n\n", (ROOT / "Makefile").read_text(), re.M | re.S)[0]
+    *_, finding, last = recipe.strip().splitlines()
+    assert "The report is demo/report.html" in last
+    program = shlex.split(finding.strip().removeprefix("@"))[-1]
+    monkeypatch.chdir(loop[0])
+    exec(program.replace("demo/run", "run"))
+    assert re.match(r"incidence_angle_bias is missing: .* mm\.\n$", capsys.readouterr().out)
+
+
+@pytest.mark.slow
 def test_the_loop_runs_and_leaves_what_it_names(loop):
     folder, said = loop
     names = {path.name for path in folder.iterdir()}

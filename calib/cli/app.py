@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Annotated, Any, TextIO, TypeVar, get_type_hint
 import typer
 import typer.core
 
-from calib.cli.stages import Stage, Staged
 from chains.escape import terminal
 
 if TYPE_CHECKING:
@@ -180,14 +179,10 @@ def print_json(document: Any) -> None:
 
 
 @contextmanager
-def progress_bar(stages: Sequence[Stage] = ()) -> Iterator[Progress]:
-    """A progress bar on stderr where that is a terminal; else silence, or with -v a line a step.
-
-    Args:
-        stages: that the command goes through.
-    """
+def progress_bar() -> Iterator[Progress]:
+    """A progress bar on stderr where that is a terminal; else silence, or with -v a line a step."""
     if not sys.stderr.isatty():
-        yield _line_by_line(Staged(stages)) if _verbose else lambda what, done, total: None
+        yield _line_by_line() if _verbose else lambda what, done, total: None
         return
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
@@ -199,23 +194,19 @@ def progress_bar(stages: Sequence[Stage] = ()) -> Iterator[Progress]:
         TimeElapsedColumn(),
     )
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task, staged = bar.add_task("reading", total=None), Staged(stages)
-        start = time.monotonic()
+        task = bar.add_task("reading", total=None)
         yield lambda what, done, total: bar.update(
-            task,
-            description=terminal(staged(what, time.monotonic() - start)),
-            completed=done + 1,
-            total=total,
+            task, description=terminal(what), completed=done + 1, total=total
         )
 
 
-def _line_by_line(staged: Staged) -> Progress:
+def _line_by_line() -> Progress:
     """Progress as lines on stderr: seconds since the start, and what is done next."""
     start = time.monotonic()
 
     def tell(what: str, done: int, total: int) -> None:
         seconds = time.monotonic() - start
-        said = terminal(f"{seconds:8.1f} s  {staged(what, seconds)} {done + 1}/{total}")
+        said = terminal(f"{seconds:8.1f} s  {what} {done + 1}/{total}")
         print(said, file=sys.stderr, flush=True)
 
     return tell

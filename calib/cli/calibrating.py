@@ -22,7 +22,6 @@ from calib.cli.app import (
     say,
     verbose,
 )
-from calib.cli.stages import DIAGNOSE, FIT
 from calib.linear.parallel import workers as threads
 from chains.errors import InputError
 
@@ -81,7 +80,7 @@ def check(recording: Path, as_json: Json = False) -> None:
     else:
         from calib.show.tables import print_check
 
-        print_check(checked)
+        print_check(checked, whole=verbose())
     if checked.problems:
         raise SystemExit(2)
 
@@ -111,7 +110,7 @@ def fit(
     from calib.runs.calibrate import calibrate
 
     chosen = Model.of(effects, fix or [], without or [], recordings)
-    with threads(workers), progress_bar(FIT) as progress:
+    with threads(workers), progress_bar() as progress:
         run = calibrate(recordings, out, chosen, hold_out, folds, prior, progress)
     _tell(run, as_json)
 
@@ -138,7 +137,7 @@ def add(
     from calib.runs.run import Run
 
     grown_from = Run.open(run, trust or ())
-    with threads(workers), progress_bar(FIT) as progress:
+    with threads(workers), progress_bar() as progress:
         _tell(grow(grown_from, effects or [], out, progress, without or []), as_json)
 
 
@@ -163,7 +162,7 @@ def diagnose(
     from calib.runs.run import Run
 
     fitted = Run.open(run, trust or ())
-    with threads(workers), progress_bar(DIAGNOSE) as progress:
+    with threads(workers), progress_bar() as progress:
         diagnosis = find(fitted, progress, refits, candidates or ())
     if as_json:
         print_json(diagnosis.document())

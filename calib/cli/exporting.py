@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from calib.cli.app import Force, Json, Out, Trust, app, progress_bar, say
+from calib.cli.app import Force, Json, Out, Trust, app, print_json, progress_bar, say
 
 
 @app.command()
@@ -40,17 +40,27 @@ def export(
         "not_held": done.not_held,
         "left_out": done.left_out,
     }
-    lines = [*opened.warning, *map(whole, opened.odd_rings)]
-    lines += [f"wrote {file}" for file in done.files]
+    if as_json:
+        print_json(document)
+        return
+    from calib.show.tables import print_pairs, terminal
+
+    console = terminal()
+    for sentence in (*opened.warning, *map(whole, opened.odd_rings)):
+        console.print(sentence)
+    for file in done.files:
+        console.print(f"wrote {file}", soft_wrap=True)
     if missing := effects_that_may_run(opened)[1]:
-        lines.append(missing)
-    for name, why in done.left_out.items():
-        lines.append(f"left out {name}: {why}")
-    for name, sentences in done.not_held.items():
-        if what := ", ".join(sentence.partition(":")[0] for sentence in sentences):
-            lines.append(f"{name} does not hold {what}")
-    lines.append("Why, in whole sentences: --json, and the head of each file that has comments.")
-    say(document, "\n".join(lines), as_json)
+        console.print(missing)
+    if done.left_out:
+        print_pairs(console, "left out", done.left_out.items())
+    lacks = {
+        name: ", ".join(sentence.partition(":")[0] for sentence in sentences)
+        for name, sentences in done.not_held.items()
+    }
+    if rows := [(name, what) for name, what in lacks.items() if what]:
+        print_pairs(console, "what files do not hold", rows)
+    console.print("Why, in whole sentences: --json, and the head of each file that has comments.")
 
 
 @app.command()

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 import typer
 import typer.core
 
-from calib.cli.app import Json, Out, app, print_json, progress_bar, takes_fields_of
+from calib.cli.app import Json, Out, app, print_json, progress_bar, takes_fields_of, verbose
 from chains.errors import InputError
 
 if TYPE_CHECKING:
@@ -176,6 +176,6 @@ def _tell(done: Imported, as_json: bool) -> None:
         print_pairs(console, "what looked odd", [("", line) for line in done.odd])
     console.print(f"wrote {done.folder}\n", style="bold", soft_wrap=True)
     if done.check.can or done.check.cannot:
-        print_check(done.check)
+        print_check(done.check, whole=verbose())
     else:
         console.print(f"rigcal check {done.folder} tells what can be estimated from it")

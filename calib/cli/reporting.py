@@ -15,6 +15,7 @@ from calib.cli.app import (
     Trust,
     app,
     end_unless_converged,
+    print_json,
     progress_bar,
     say,
     warn,
@@ -61,8 +62,13 @@ def plot(
         if listed:
             charts = [chart.document() for chart in figures(evidence)]
     if listed:
-        text = "\n".join(f"{chart['id']:24}  {chart['title']}" for chart in charts)
-        say({"charts": charts}, text, as_json)
+        if as_json:
+            print_json({"charts": charts})
+        else:
+            from calib.show.tables import print_pairs, terminal
+
+            names = [(chart["id"], chart["title"]) for chart in charts]
+            print_pairs(terminal(), f"figures of {run}", names)
         return
     if name is None or out is None:
         raise InputError("give a figure's NAME and -o FILE.png, .svg or .pdf; --list names them")

@@ -143,8 +143,8 @@ class StopPoseScatter(Scatter):
 
 
 class TrackerScatter(Scatter):
-    """The tracker scatters more than rig.yaml says, from stop to stop, in turn or in place: glints,
-    cameras that were bumped, markers that are hidden one by one."""
+    """The tracker scatters more than rig.yaml says: from stop to stop, in turn or in place, by
+    glints, cameras that were bumped, markers that are hidden one by one."""
 
     name = "tracker_scatter"
     site = Site.TRACKER
@@ -214,8 +214,8 @@ class TargetScatter(Scatter):
 
 
 class ReferenceScatter(Scatter):
-    """The mesh lies further off its surfaces than rig.yaml says, each surface by its own: scans
-    that were registered badly, meshes that were made too coarse."""
+    """The mesh is less exact than rig.yaml says: each surface is off by an amount of its own, where
+    scans were registered badly or a mesh was made too coarse."""
 
     name = "reference_scatter"
     site = Site.REFERENCE

@@ -111,8 +111,8 @@ class BaseSlip(BodySlip):
 
 
 class TrackerSlip(MountSlip):
-    """The tracker is knocked once, or the place where the base stands gives way once. This data
-    cannot tell which of the two moved.
+    """The tracker, or what the base stands on, moves once. These data cannot tell which of the two
+    moved.
 
     All bodies are seen to move together. Where the base stands elsewhere at every stop, only a
     LiDAR in a scanned room shows it.
@@ -141,8 +141,8 @@ class TrackerSlip(MountSlip):
 
 
 class TrackerCreep(MountCreep, TrackerSlip):
-    """The tracker, or the place where the base stands, gives way little by little, evenly in
-    time; per hour. This data cannot tell which of the two moves.
+    """The tracker, or what the base stands on, creeps: evenly in time, per hour. These data cannot
+    tell which of the two moves.
 
     It moves what `TrackerSlip` moves, as `MountCreep` moves it.
     """

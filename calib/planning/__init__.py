@@ -27,6 +27,8 @@ from calib.planning.tolerance import purpose_until
 from calib.planning.worth import Known
 from calib.problem.unknowns import Key
 from calib.results.recalibrate import earlier
+from calib.results.stages import PLAN as STAGES
+from calib.results.stages import staged
 from calib.runs.diagnose import stand_of
 from calib.runs.run import MODEL, Run
 from calib.solve.fit import Progress
@@ -187,6 +189,7 @@ def plan(
     if until is not None and purpose is not None:
         raise InputError("--until says what the stops are for, so it takes no --for beside it")
     stops = (MOST_PLANNED if until else USUAL_STOPS) if stops is None else stops
+    progress = staged(progress, STAGES)
     if stops < 1 or candidates < stops:
         raise InputError(
             f"{stops} stops out of {candidates} candidates: give at least 1, and no more"

@@ -14,8 +14,9 @@ from calib.report import plots
 from calib.report.chart import Absent, Chart
 from calib.report.charts import ON_REQUEST, SECTIONS
 from calib.report.evidence import Evidence
-from calib.report.numbers import figure_csv
+from calib.report.numbers import blocks_of, figure_csv, figure_places
 from calib.report.page import Drawn, Section, render
+from calib.results.stages import REPORT, staged
 from calib.runs.run import Run
 from calib.show.verdict import Verdict, judge
 from calib.solve.fit import Progress
@@ -111,6 +112,7 @@ def report(
     if Path(out).suffix.lower() not in PAGES:
         raise InputError(f"{out}: a report is a page of HTML; name the file so, {PAGES[0]}")
     with outputs.file(out, _inputs(runs)) as file:
+        progress = staged(progress, REPORT)
         evidence = Evidence.of(runs, progress)
         contents = charts_of(evidence)
         verdict = judge(evidence.run, evidence.diagnosis)
@@ -121,7 +123,8 @@ def report(
                 progress("drawing", done, total)
                 picture = chart.figure()
                 svg = plots.svg(picture, chart.id)
-                drawn.append(Drawn(chart, svg, figure_csv(picture)))
+                blocks = blocks_of(picture)
+                drawn.append(Drawn(chart, svg, figure_csv(blocks), figure_places(blocks)))
                 done += 1
             sections.append(Section(title, drawn, brief=verdict.light != "green"))
         page = render(evidence, verdict, sections, contents.absent)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -15,12 +15,15 @@ from calib.problem.model import Source, same_mesh
 from calib.report.budget import Budget, budget
 from calib.report.statistics import (
     AZIMUTHS,
+    COARSE,
     MOST_BINS,
     PLACE_COLUMNS,
     Axis,
     Statistics,
+    StopMap,
     StopMaps,
     StopResiduals,
+    coarse_map,
     residual_statistics,
     stop_map,
 )
@@ -176,6 +179,19 @@ class Evidence:
             return Axis.of_values(name, values, min(MOST_BINS, max(FEWEST_BINS, len(values) // 3)))
         return Axis.of_values(name, values)
 
+    @cached_property
+    def joint_units(self) -> dict[str, tuple[str, float]]:
+        """Joint -> the unit in which its angle or length is shown, and by what it is multiplied."""
+        kinds = {
+            joint: kind
+            for source in self.sources
+            for joint, kind in zip(source.rig.joint_names, source.rig.joint_kinds, strict=True)
+        }
+        return {
+            joint: ("deg", 180.0 / np.pi) if kind == "revolute" else ("mm", 1e3)
+            for joint, kind in kinds.items()
+        }
+
     @property
     def rings(self) -> int:
         """How many rings the LiDARs have at most."""
@@ -203,17 +219,50 @@ class Evidence:
         )
 
     @cached_property
+    def held_out(self) -> Statistics | None:
+        """The residuals of stops that were held out, in a fit without them; None where none were
+        kept."""
+        scans = [scan for scan in self.problem.scans if self._unseen(scan).is_file()]
+        if not scans:
+            return None
+        tables = self._tables(self.run, "held-out residuals", scans, self._unseen)
+        return residual_statistics(tables, self.axes, self.rings, self.azimuths)
+
+    @cached_property
     def unseen(self) -> list[StopMaps]:
         """Stops that were held out, the one furthest off first; none where none were."""
         found = []
         for scan in self.problem.scans:
-            path = table_path(self.run.folder / RESIDUALS / UNSEEN_FOLDER, scan, self.sources)
+            path = self._unseen(scan)
             if path.is_file():
                 tables = [self._columns(r, scan) for r in (self.below, self.run)]
                 tables.append(_checked(path))
                 maps = [stop_map(each, self.rings, self.azimuths) for each in tables]
                 found.append(StopMaps(path.stem, *zip(*maps, strict=True)))
         return sorted(found, key=lambda stop: -stop.rms_m[-1])
+
+    @cached_property
+    def stops(self) -> list[StopMap]:
+        """Every stop in the fit, and beside it as held out where it was, the one furthest off
+        first."""
+        rings, azimuths = self.rings, min(self.azimuths, COARSE)
+        pairs = []
+        for k, scan in enumerate(self.problem.scans):
+            self.progress("stop by stop", k, len(self.problem.scans))
+            unseen = self._unseen(scan)
+            tables = {True: _checked(unseen)} if unseen.is_file() else {}
+            tables[False] = self._columns(self.run, scan)
+            pair = [
+                StopMap(unseen.stem, *coarse_map(table, rings, azimuths), held_out=held_out)
+                for held_out, table in tables.items()
+            ]
+            pairs.append(pair)
+        pairs.sort(key=lambda pair: -pair[0].rms_m)
+        return [each for pair in pairs for each in pair]
+
+    def _unseen(self, scan: ScanStop) -> Path:
+        """Where a stop's residuals are kept that a fit without it left."""
+        return table_path(self.run.folder / RESIDUALS / UNSEEN_FOLDER, scan, self.sources)
 
     @cached_property
     def walls(self) -> list[tuple[float, list[Face]]]:
@@ -243,15 +292,22 @@ class Evidence:
             weight=columns["weight"].astype(float),
         )
 
-    def _tables(self, run: Run | None, what: str) -> Iterator[StopResiduals]:
+    def _tables(
+        self,
+        run: Run | None,
+        what: str,
+        scans: Sequence[ScanStop] | None = None,
+        kept: Callable[[ScanStop], Path] | None = None,
+    ) -> Iterator[StopResiduals]:
+        """Tables of some scans, all if none are given: those of a run, or those that are kept."""
         meshes = [source.reference for source in self.sources]
         rooms = [next(i for i, m in enumerate(meshes) if same_mesh(m, mesh)) for mesh in meshes]
-        scans = self.problem.scans
+        scans = self.problem.scans if scans is None else scans
         for k, scan in enumerate(scans):
             self.progress(what, k, len(scans))
             yield StopResiduals(
-                columns=self._columns(run, scan),
-                stop=self._stop(scan, k),
+                columns=_checked(kept(scan)) if kept else self._columns(run, scan),
+                stop=self._stop(scan, self.problem.scans.index(scan)),
                 room=rooms[self._source(scan)],
                 sigma_angle_rad=scan.lidar.sigma_angle_rad,
                 sigma_reference_m=scan.reference_sigma_m,

@@ -37,11 +37,13 @@ class Drawn:
         chart: what it says.
         svg: its picture.
         csv: the address of its numbers, as of `csv_link`; empty where it has none.
+        places: where in the picture they are, as of `figure_places`.
     """
 
     chart: Chart
     svg: str
     csv: str
+    places: str
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 AFTER, BEFORE, FLOOR, INK, PALE = "#0072b2", "#d55e00", "#009e73", "#333333", "#999999"
 RED = "#b00020"
+HELD_OUT_COLOUR = "#b8568f"  # of stops held out, beside AFTER and BEFORE
 LINES = (AFTER, BEFORE, FLOOR, "#cc79a7", "#e69f00", "#56b4e9")
 SIGNED_MAP, UNSIGNED_MAP = "PuOr_r", "cividis"
 HALF_IN, WIDE_IN = 5.6, 8.0  # inches: of a column of the page, and of both
@@ -107,8 +108,9 @@ def styled() -> Iterator[None]:
 
 
 def band(ax: Axes, x: np.ndarray, mean: np.ndarray, half: np.ndarray, colour: str) -> None:
-    """A shaded band about a line."""
-    ax.fill_between(x, mean - half, mean + half, color=colour, alpha=0.25, linewidth=0)
+    """A shaded band about a line; that of stops held out, which is wide, hides no other."""
+    alpha = 0.1 if colour == HELD_OUT_COLOUR else 0.25
+    ax.fill_between(x, mean - half, mean + half, color=colour, alpha=alpha, linewidth=0)
 
 
 def log_axis(ax: Axes, least: float, most: float, name: str = "x") -> None:

@@ -15,6 +15,7 @@ import numpy as np
 from calib.linear.binned import BinnedSums
 
 MOST_BINS, AZIMUTHS = 30, 180  # at most
+COARSE, COARSE_RINGS = 48, 32  # parts of a turn, and groups of rings, of a small map of one stop
 Z_EDGES = np.linspace(-5.0, 5.0, 101)
 PLACE_COLUMNS = ("surface", "plane", "label")
 
@@ -235,6 +236,32 @@ def stop_map(
         mean, count = (np.bincount(cell, v, rings * azimuths) for v in (residual, None))
         shown = (mean / count).reshape(rings, azimuths)
     return shown, float(np.sqrt(np.mean(np.square(residual)))) if len(residual) else 0.0
+
+
+@dataclass(frozen=True)
+class StopMap:
+    """One stop, coarsely.
+
+    Args:
+        name: of the stop.
+        map_m: (rings or groups of rings, azimuths) mean residual; NaN where no beam went.
+        rms_m: rms over its beams that were not thrown out.
+        held_out: whether of a fit without it.
+    """
+
+    name: str
+    map_m: np.ndarray
+    rms_m: float
+    held_out: bool
+
+
+def coarse_map(
+    columns: Mapping[str, np.ndarray], rings: int, azimuths: int
+) -> tuple[np.ndarray, float]:
+    """As `stop_map`, neighbouring rings together where they are more than `COARSE_RINGS`."""
+    together = -(-rings // COARSE_RINGS)
+    grouped = dict(columns) | {"ring": columns["ring"] // together}
+    return stop_map(grouped, -(-rings // together), azimuths)
 
 
 def _cell(columns: Mapping[str, np.ndarray], rings: int, azimuths: int) -> np.ndarray:

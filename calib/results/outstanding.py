@@ -21,7 +21,7 @@ FAR_FROM_CAD = 4.0
 # stops scatter by 1 mm, 1.35 at least.
 TOGETHER = 1.2
 TOLD = 6  # of what stands out, the worst; of the others, how many there are
-DISPLAY_UNITS = {"m": (1e3, "mm"), "rad": (1e3, "mrad"), "1": (1.0, "")}
+DISPLAY_UNITS = {"m": (1e3, "mm"), "rad": (1e3, "mrad"), "1": (1.0, "(no unit)")}
 
 
 def shown(unit: str) -> tuple[float, str]:

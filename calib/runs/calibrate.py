@@ -38,6 +38,7 @@ from calib.results.reach import reach
 from calib.results.recalibrate import Link, earlier, solve_from
 from calib.results.rings import documents as odd_rings
 from calib.results.solution import solution_of
+from calib.results.stages import FIT, staged
 from calib.runs.belief import TOLERATED, limits
 from calib.runs.reopen import model_of, proposed, reopened, start_of, stored_met
 from calib.runs.residual_table import (
@@ -194,7 +195,7 @@ def _fit(
     start: Start | None = None,
 ) -> None:
     """Estimate, judge by what was held out, and write the run."""
-    began = time.monotonic()
+    began, progress = time.monotonic(), staged(progress, FIT)
     before = Run.open(choices.prior).solution if choices.prior else None
     problem = problems.build(sources, model)
     links: list[Link] | None = None

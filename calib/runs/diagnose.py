@@ -30,6 +30,8 @@ from calib.residuals.groups import MESH, Group
 from calib.results.errors import Errors
 from calib.results.holdout import held_out
 from calib.results.rings import harmful, odd_rings
+from calib.results.stages import DIAGNOSE as DIAGNOSE_STAGES
+from calib.results.stages import staged
 from calib.runs.belief import cautions, forbids
 from calib.runs.reopen import model_of, reopened, start_of, state_of
 from calib.runs.run import DIAGNOSIS, Run
@@ -58,7 +60,7 @@ def diagnose(
         InputError: the recordings are not what they were, or a file of effects is wrong.
     """
     with outputs.entries(run.folder, outputs.RUN) as entries:
-        result = _found(run, progress, refits, candidates)
+        result = _found(run, staged(progress, DIAGNOSE_STAGES), refits, candidates)
         write_json(entries / DIAGNOSIS, result.document())
     return result
 

@@ -36,20 +36,19 @@ STACKED = 4  # names in a cell
 
 
 def print_comparison(runs: Sequence[Run]) -> None:
-    """Print errors and parameters of runs side by side, and the ladder of a study."""
+    """Print the ladder of a study, and errors and parameters of runs side by side."""
     console = terminal()
     for run in runs:
         console.print(str(run.folder), style="bold", soft_wrap=True)
         for sentence in run.warning:
             console.print(sentence, style="bold red")
         console.print(f"{_model(run)}; {outcome(run.summary)}")
+    if rungs := ladder(runs):
+        console.print()
+        console.print(ladder_table(rungs))
     for start in range(0, len(runs), ABREAST):
         console.print()
         console.print(_comparison_table(runs[start : start + ABREAST]))
-    rungs = ladder(runs)
-    if rungs:
-        console.print()
-        console.print(ladder_table(rungs))
 
 
 def moved_document(found: Moved) -> dict[str, Any]:

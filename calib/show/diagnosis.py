@@ -67,7 +67,8 @@ def _print_tables(console: Console, diagnosis: Diagnosis, residual: str) -> None
 
 
 def print_explanation(explanation: Explanation) -> None:
-    """Print the rungs of a ladder, what was not worth adding, and what is left."""
+    """Print the rungs of a ladder, what was not worth adding and what is left; last, how far the
+    ladder went and the verdict."""
     console, runs = terminal(), explanation.runs
     for run in runs:
         console.print(str(run.folder), style="bold", soft_wrap=True)
@@ -75,17 +76,29 @@ def print_explanation(explanation: Explanation) -> None:
             console.print(sentence, style="bold red")
     console.print()
     console.print(ladder_table(ladder(runs) or [Rung(runs[0], None)]))
-    console.print()
     if explanation.refused:
         names = ", ".join(dict.fromkeys(explanation.refused))
         console.print(f"Found, and not added, as the held-out error did not fall: {names}.")
     for path in explanation.kept:
         console.print(f"Kept for other recordings ('rigcal fit --effects'): {path}")
-    _say_verdict(console, explanation.diagnosis)
+    console.print()
+    _say_found(console, explanation.diagnosis)
+    first, last = (run.summary["rms_mm"] for run in (runs[0], runs[-1]))
+    kind = "held_out" if last.get("held_out") is not None else "fit"
+    what = {"held_out": "held-out error", "fit": "error of the fit, none held out"}[kind]
+    way = f"{first[kind]:.2f} -> {last[kind]:.2f}" if runs[1:] else f"{last[kind]:.2f}"
+    expected = f"{last['noise_floor']:.2f} mm expected if the model is right"
+    console.print(f"{what}: {way} mm; {expected}", style="bold")
+    console.print(f"verdict: {explanation.diagnosis.heading}", style="bold")
 
 
 def _say_verdict(console: Console, diagnosis: Diagnosis) -> None:
     console.print(f"verdict: {diagnosis.heading}", style="bold")
+    _say_found(console, diagnosis)
+
+
+def _say_found(console: Console, diagnosis: Diagnosis) -> None:
+    """What a diagnosis found, and the command that it leads to."""
     for sentence in diagnosis.sentences:
         console.print(sentence)
     console.print()

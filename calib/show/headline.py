@@ -99,7 +99,7 @@ def closing(run: Run) -> list[str]:
     error = over_beams(rms[kind], run.summary, before).partition("; ")[0]
     first = f"{what}: {error}; {rms['noise_floor']:.2f} mm expected if the model is right"
     if diagnosis:
-        return [first, f"verdict: {verdict.meaning}; {verdict.sentence}"]
+        return [first, f"verdict: {verdict.meaning}. {verdict.sentence}"]
     told = "no contradiction to the model; not diagnosed yet"
     if reasons := [each for each in verdict.reasons if not each.startswith(UNASKED)]:
         why, more = reasons[0].partition(": ")[0], len(reasons) - 1

@@ -25,10 +25,11 @@ FALLS = 0.99  # of a sigma: one that falls by less is told together with all suc
 
 
 def print_plan(plan: Plan) -> None:
-    """Print a plan: what it is for, the stops, and what they are worth."""
+    """Print a plan: what it is for and what it achieves, the stops, and all that they are worth."""
     console, document = terminal(), plan.document()
-    console.print(f"{len(plan.stops)} stops {_aim(document)}", style="bold", soft_wrap=True)
-    for sentence in _reached(plan):
+    stops = f"{len(plan.stops)} stop{'s' * (len(plan.stops) != 1)}"
+    console.print(f"{stops} {_aim(document)}", style="bold", soft_wrap=True)
+    for sentence in (*_achieved(document), *_reached(plan)):
         console.print(sentence)
     console.print()
     console.print("Joints in degrees or mm; in the order of a short way that nothing has checked.")
@@ -53,6 +54,28 @@ def print_plan(plan: Plan) -> None:
     for name, row in (("now", now), ("after", after)):
         table.add_row(name, *(f"{value:.3g}" for value in row.values()))
     console.print(table)
+
+
+def _achieved(document: Mapping[str, Any]) -> Iterator[str]:
+    """What the stops are worth, in a sentence or two."""
+    for name, each in document["smallest_detectable"].items():
+        now, after = (each["beside_rivals"][when] for when in ("now", "after"))
+        factor, unit = shown(each["unit"])
+        if after is not None:
+            before = "never" if now is None else f"from {factor * now:.3g} {unit}"
+            found = f"found from {factor * after:.3g} {unit}"
+            yield f"With them {name} is {found}, told from its rivals; now {before}."
+    rows = list(_rows(document["sigma"]))
+    fall = [row for row in rows if row[3] < FALLS * row[2]]
+    if not fall:
+        yield f"None of {len(rows)} expected sigmas falls by more than {100 * (1 - FALLS):.0f} %."
+        return
+    name, unit, now, after = min(fall, key=lambda row: row[3] / row[2])
+    factor, unit = shown(unit)
+    yield (
+        f"With them {len(fall)} of {len(rows)} sigmas fall; most of all that of {name}, from "
+        f"{factor * now:.3g} to {factor * after:.3g} {unit}."
+    )
 
 
 def _reached(plan: Plan) -> Iterator[str]:

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from calib.runs.run import Run
 
 TABLE_WIDTH = 80
+MOST_DIGITS = 6  # after the point
 LISTED_PARAMETERS = 12  # an effect of more parameters than these is summarised
 ERROR_LABELS = {
     "nominal": "all as in CAD",
@@ -38,8 +39,13 @@ ERROR_LABELS = {
 }
 
 
-def print_check(check: Check) -> None:
-    """Print what a recording holds, what is wrong, and what can be estimated from it."""
+def print_check(check: Check, whole: bool = False) -> None:
+    """Print what a recording holds, what is wrong, and what can be estimated from it.
+
+    Args:
+        check: of a recording.
+        whole: also what each parameter that is not identifiable is tied to.
+    """
     console = terminal()
     print_pairs(console, "what is there", check.contents)
     if check.problems:
@@ -52,7 +58,10 @@ def print_check(check: Check) -> None:
     if check.command:
         print_command(console, check.command)
     print_pairs(console, "what can be estimated", [("", line) for line in check.can or ["nothing"]])
-    _print_reasons(console, "what cannot", check.cannot)
+    if whole:
+        _print_reasons(console, "what cannot", check.cannot)
+    else:
+        _print_untold(console, "what cannot", check.cannot, "check")
 
 
 def print_command(
@@ -90,7 +99,7 @@ def print_run(run: Run, whole: bool = False) -> None:
     if whole:
         _print_reasons(console, "not identifiable", run.solution.not_estimated)
     else:
-        _print_untold(console, run.solution.not_estimated)
+        _print_untold(console, "not identifiable", run.solution.not_estimated, "fit")
     console.print(error_table(summary))
     if told := beams_told(summary):
         print_pairs(console, "of how many beams", [("", line) for line in told])
@@ -158,8 +167,10 @@ def print_catalogue(effects: Sequence[Effect], whole: bool) -> None:
             print_pairs(
                 console, name, [(k.replace("_", " "), text) for k, text in page.items() if text]
             )
+            print_command(console, f"rigcal effects {name} -o {name}.svg", "A picture of it:")
         return
     table = columns_table("effect", "what")
+    table.columns[1].no_wrap, table.columns[1].overflow = True, "ellipsis"
     for page in pages:
         table.add_row(page["name"], re.split("[:;.]( |$)", page["what"])[0])
     console.print(table)
@@ -178,15 +189,17 @@ def estimate_cell(estimate: float, sigma: float, unit: str) -> str:
 
 
 def estimate_texts(estimate: float, sigma: float, unit: str) -> tuple[str, str]:
-    """An estimate and its sigma in the unit shown, to as many digits as the sigma lets matter; an
-    estimate of NaN is no text."""
+    """An estimate and its sigma in the unit shown, both to as many digits as the sigma lets matter;
+    an estimate of NaN is no text."""
     scale, _ = shown(unit)
     sigma = scale * sigma
-    if scale == 1.0 or "/" in unit:
-        spread, value = f"{sigma:.2g}", f"{scale * estimate:+.4g}"
-    else:
-        digits = 2 if sigma >= 0.095 else 3
+    digits = 2 if sigma >= 0.095 else 3
+    if scale == 1.0 or "/" in unit:  # of any size: two digits of the sigma
+        digits = max(1 - int(np.floor(np.log10(sigma))), 0) if 0.0 < sigma < np.inf else 2
+    if digits <= MOST_DIGITS:
         spread, value = f"{sigma:.{digits}f}", f"{scale * estimate:+z.{digits}f}"
+    else:
+        spread, value = f"{sigma:.1e}", f"{round(scale * estimate, digits):+.3g}"
     return "" if np.isnan(estimate) else value, spread
 
 
@@ -358,15 +371,15 @@ def _print_reasons(console: Console, title: str, entries: Sequence[Mapping[str, 
         print_pairs(console, f"{title}: {why}", rows)
 
 
-def _print_untold(console: Console, entries: Sequence[Mapping[str, str]]) -> None:
+def _print_untold(
+    console: Console, title: str, entries: Sequence[Mapping[str, str]], command: str
+) -> None:
     """Names of what was not told, those that are tied to others together, whatever to."""
     tied = [entry["name"] for entry in entries if ": " in entry["why"]]
     if tied:
-        why = "determined only in combination with others; 'rigcal -v fit' names these"
-        print_pairs(console, f"not identifiable: {why}", [("", ", ".join(tied))])
-    _print_reasons(
-        console, "not identifiable", [each for each in entries if ": " not in each["why"]]
-    )
+        why = f"determined only in combination with others; 'rigcal -v {command}' names these"
+        print_pairs(console, f"{title}: {why}", [("", ", ".join(tied))])
+    _print_reasons(console, title, [each for each in entries if ": " not in each["why"]])
 
 
 def outcome(summary: Mapping[str, Any]) -> str:

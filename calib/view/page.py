@@ -34,7 +34,7 @@ from calib.view.stage import PANEL_PX
 from chains.errors import InputError
 
 SETTLED_S = 0.4  # the camera rests for so long before the address tells where it is
-EXPORTS, REPORT, FOLDER = "Exports", "Report", "Run folder"
+EXPORTS, REPORT_FILE, FOLDER = "Exports", "Report", "Run folder"
 TAKE_HINT = (
     "What 'rigcal export' writes, in all formats; what 'rigcal report' writes; all of the run"
 )
@@ -135,7 +135,7 @@ class Page:
             self._undo = self.client.gui.add_button("Undo", hint="Back to the run below")
         with self.client.gui.add_folder("Parameters", expand_by_default=False):
             self._parameters = self.client.gui.add_html("")
-        files = (EXPORTS, REPORT, FOLDER)
+        files = (EXPORTS, REPORT_FILE, FOLDER)
         take = self.client.gui.add_button_group("Download", files, hint=TAKE_HINT)
         take.on_click(self._heard(self._on_take, of=lambda event: event.target.value))
         self._undo.on_click(self._heard(self._on_undo))
@@ -295,7 +295,7 @@ class Page:
 
     def _on_take(self, what: str) -> None:
         name = self.desk.run.folder.name
-        if what == REPORT:
+        if what == REPORT_FILE:
             self._ask()
             written = TemporaryDirectory(prefix="rigcal-report-")
             self._start(Report(Path(written.name) / f"{name}.html"))

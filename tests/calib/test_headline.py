@@ -48,7 +48,7 @@ def test_what_speaks_against_a_run_stands_in_its_last_lines(summary, light, reas
 def test_of_a_diagnosed_run_the_last_line_is_the_verdict_and_there_is_nothing_to_ask(monkeypatch):
     found = {"verdict": "missing_effect", "sentences": ["x is missing."], "too_few_stops": False}
     monkeypatch.setattr(Run, "diagnosis", lambda run: found)
-    assert closing_lines()[1:] == ["verdict: do not use it yet; x is missing."]
+    assert closing_lines()[1:] == ["verdict: do not use it yet. x is missing."]
 
 
 def test_a_folder_with_a_blank_is_ready_to_be_pasted():

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from calib.report import report
 from calib.report.data import csv_link
-from calib.report.numbers import figure_csv
+from calib.report.numbers import blocks_of, figure_csv
 from sensors.documents import read_yaml
 
 from ..browser import browser_page
@@ -238,7 +238,13 @@ def test_without_scripts_all_is_there(made, window):
 def test_every_figure_of_numbers_gives_them(made, page):
     ids = page.eval_on_selector_all("figure", "all => all.map(f => f.id)")
     given = page.eval_on_selector_all("figure a.csv", "all => all.map(a => a.download)")
-    assert [f"{name}.csv" for name in ids if name != "chain"] == given
+    assert [f"{name}.csv" for name in ids] == given
+    links = downloaded(page, "chain")
+    found = {row[0]: row[1] for row in links[1:]}
+    frames = read_yaml(made / "run" / "solution.yaml")[0]["frames"]
+    assert {name: frame["parent"] for name, frame in frames.items()}.items() <= found.items()
+    moved = np.array([float(row[2]) for row in links[1:] if row[2]])
+    assert links[0][2] == "origin moved, mm" and len(moved) > 3 and (moved > 0).all()
     assert "unseen: no stops were held out" in page.locator("main").inner_text()
     told = read_yaml(made / "run" / "solution.yaml")[0]["effects"]["ring_range_offset"]
     rows = downloaded(page, "rings")
@@ -262,7 +268,7 @@ def test_numbers_are_those_that_were_drawn():
     dots.errorbar([1.0, 2.0], [0.0, 1.0], xerr=[0.25, 0.5], fmt="o", color="#0072b2")
     dots.set_yticks([0, 1], ["zero\nth", "first"])
     figure.canvas.draw()
-    assert rows_of(figure_csv(figure)) == [
+    assert rows_of(figure_csv(blocks_of(figure))) == [
         ["series", "range, m", "mean, mm", "from", "to"],
         ["now", "1", "2", "0", "3"],
         ["now", "2", "3", "1", "4"],
@@ -280,7 +286,7 @@ def test_numbers_are_those_that_were_drawn():
         ["now", "1", "zero, th", "0.75", "1.25"],
         ["now", "2", "first", "1.5", "2.5"],
     ]
-    assert figure_csv(Figure()) == ""
+    assert figure_csv(blocks_of(Figure())) == ""
 
 
 def test_a_link_holds_any_text():

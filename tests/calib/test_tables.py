@@ -132,9 +132,9 @@ def test_effects_are_listed_or_summed_up(run, printed):
     lines = printed(tables.print_run, run)
     assert "arm_link_length turn +2.11 ± 0.98 mm confounded" in lines
     assert not any("lift" in line for line in lines)  # held
-    assert "a_scale s +1.234e-05 ± 2e-06" in lines
+    assert "a_scale s +1.23e-05 ± 2.0e-06 (no unit)" in lines
     text = " ".join(after(lines, "ring_range_offset"))
-    assert "16 values mean +1.00, -7.00 to +9.00, each ±" in text and "0.31" in text
+    assert "16 values mean +1.00, -7.00 to +9.00, mm" in text and "each ± 0.31" in text
 
 
 def test_the_errors_before_and_after_stand_together(run, printed):
@@ -324,7 +324,7 @@ def test_a_check_is_printed(printed):
         can=["lidar: 0.6 mm"],
         cannot=[{"name": "mount.tz", "why": f"tied to lidar.tz: {WHY}"}],
     )
-    text = " ".join(printed(tables.print_check, check))
+    text = " ".join(printed(tables.print_check, check, True))
     assert "stops 12 at 4 locations" in text
     assert "stops.csv:3: no such thing [red]" in text
     assert "joint_1 hardly moves" in text

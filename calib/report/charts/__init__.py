@@ -28,7 +28,7 @@ SECTIONS: Mapping[str, tuple[Charts, ...]] = {
     "What was found": (formulas.formulas, knowledge.findings),
     "The calibration": (links.chain, links.moves, links.effects, knowledge.budget),
     "What is left": (
-        unseen.unseen,
+        *(unseen.unseen, unseen.every_stop),
         *(residuals.ring_map, walls.walls, residuals.thrown_away, residuals.curves),
         *(bodies.tracked, bodies.targets),
     ),

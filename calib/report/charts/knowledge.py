@@ -39,7 +39,7 @@ def findings(evidence: Evidence) -> Iterator[Chart | Absent]:
         f"Missing: {', '.join(confirmed)}"
         if confirmed
         else f"Of {len(candidates)} effects that were tested none is confirmed",
-        "How much each effect would explain of what the model does not absorb, largest first, "
+        "How much each effect would explain of what the model does not absorb, as they rank, "
         "with its p-value adjusted for multiple testing. Blue: confirmed. Many of the others "
         "explain part of the same residuals as a confirmed one.",
         lambda: _findings(candidates[:DRAWN_CANDIDATES]),
@@ -58,6 +58,7 @@ def _findings(candidates: Sequence[dict[str, Any]]) -> Figure:
     ax.invert_yaxis()
     ax.margins(x=0.22)
     ax.grid(False, axis="y")
+    ax.locator_params(axis="x", nbins=5)
     ax.set_xlabel("would explain, mm rms")
     return figure
 

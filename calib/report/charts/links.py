@@ -12,6 +12,7 @@ from calib.forward import named
 from calib.report import plots
 from calib.report.chart import Absent, Chart
 from calib.report.evidence import Evidence
+from calib.report.numbers import give
 from calib.rig import Rig
 from calib.runs.estimates import VariableEstimate
 from calib.runs.run import RING_NAME
@@ -23,6 +24,10 @@ if TYPE_CHECKING:
 
 BEYOND_CAD = 3.0  # sigmas of CAD
 SHIFT_PART, TURN_PART = slice(3, 6), slice(0, 3)
+CHAIN_COLUMNS = (
+    *("frame", "hangs from", "origin moved, mm", "its sigma, mm", "turned, mrad"),
+    *("its sigma, mrad", "sigmas of CAD", "note"),
+)
 
 
 @dataclass(frozen=True)
@@ -32,6 +37,7 @@ class ChainLink:
     Args:
         name: of the frame.
         depth: how many links it hangs below the world.
+        parent: what it hangs from; empty of the world.
         what: what ties it to its parent, where no estimate does.
         fitted: the estimate; None where the link was not estimated.
         cad_sigma: (6,) how sure CAD was; NaN where it says nothing, 0 where it is exact.
@@ -39,6 +45,7 @@ class ChainLink:
 
     name: str
     depth: int
+    parent: str = ""
     what: str = ""
     fitted: VariableEstimate | None = None
     cad_sigma: np.ndarray | None = None
@@ -58,12 +65,16 @@ def _links(evidence: Evidence, rig: Rig) -> list[ChainLink]:
     own = {frame: fitted.get(named(frame, rig.name)) for frame in rig.frame_sigma}
     fitted |= {frame: f for frame, f in own.items() if f is not None}
     out = [
-        ChainLink(rig.world, 0, "the tracker's frame" if rig.tracker else "the reference's frame")
+        ChainLink(
+            rig.world, 0, what="the tracker's frame" if rig.tracker else "the reference's frame"
+        )
     ]
     if rig.reference_frame in fitted and rig.reference_frame != rig.world:
         far = fitted[rig.reference_frame]
-        out.append(ChainLink(rig.reference_frame, 1, "the scanned mesh and the targets", far))
-    out.append(ChainLink(rig.tree.root, 1, f"stands elsewhere {BASE_MOVES[rig.moves]}"))
+        what = "the scanned mesh and the targets"
+        out.append(ChainLink(rig.reference_frame, 1, parent=rig.world, what=what, fitted=far))
+    stands = f"stands elsewhere {BASE_MOVES[rig.moves]}"
+    out.append(ChainLink(rig.tree.root, 1, parent=rig.world, what=stands))
     _children(rig, rig.tree.root, 2, fitted, evidence.prior_sigma, out)
     return out
 
@@ -82,7 +93,8 @@ def _children(
     arm = [edge for edge in rig.tree.edges if edge.name in rig.arm_edges]
     if arm and arm[0].parent == parent:
         joints = len(rig.joint_names)
-        out.append(ChainLink(arm[-1].child, depth, f"the arm: {joints} joints, from its URDF"))
+        what = f"the arm: {joints} joints, from its URDF"
+        out.append(ChainLink(arm[-1].child, depth, parent=parent, what=what))
         _children(rig, arm[-1].child, depth + 1, fitted, prior, out)
     for edge in rig.tree.edges:
         if edge.parent == parent and edge.name in rig.frame_sigma:
@@ -96,6 +108,7 @@ def _children(
                 ChainLink(
                     name=edge.child,
                     depth=depth,
+                    parent=parent,
                     what="held as in CAD",
                     fitted=None if held else mine,
                     cad_sigma=sigma,
@@ -152,7 +165,22 @@ def _chain(links: Sequence[ChainLink]) -> Figure:
             box |= {"edgecolor": plots.BEFORE, "linewidth": 1.6}
         ax.text(x, row, link.name, va="center", weight="bold", bbox=box)
         _estimate(ax, row, link, far)
+    give(ax, CHAIN_COLUMNS, [_numbers(link) for link in links])
     return figure
+
+
+def _numbers(link: ChainLink) -> list[str]:
+    """A link as the CSV of the diagram has it, by `CHAIN_COLUMNS`."""
+    fitted = link.fitted
+    if fitted is None:
+        return [link.name, link.parent, *[""] * 5, link.what]
+    if np.isnan(fitted.estimate).any():  # CAD says nothing of it
+        sizes = (1e3 * np.linalg.norm(fitted.sigma[part]) for part in (SHIFT_PART, TURN_PART))
+        shift, turn = (f"{size:.5g}" for size in sizes)
+        return [link.name, link.parent, "", shift, "", turn, "", link.what]
+    told = (_length(fitted.estimate[part], fitted.sigma[part]) for part in (SHIFT_PART, TURN_PART))
+    moved = "" if link.moved is None else f"{link.moved:.5g}"
+    return [link.name, link.parent, *(f"{x:.5g}" for pair in told for x in pair), moved, ""]
 
 
 def _estimate(ax: Axes, row: int, link: ChainLink, far: bool) -> None:

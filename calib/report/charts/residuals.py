@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -33,6 +34,7 @@ BINS_OUT_BY_CHANCE = 0.02  # how seldom so many bins may lie outside their bands
 SELDOM = 0.01  # of the rows: things seen less decide no scale
 FEWEST_THROWN = 0.05  # share at the end of the map's scale, at least
 BEAMS_IN_HISTOGRAM = 0.9  # of the beams thrown away: what the histogram shows
+BEFORE_BEYOND = 5.0  # by how much what was before may lie beyond the scale of what is left
 MOST_AXIS_NAMES = 40  # names of things along an axis
 UPRIGHT_NAMES = 6  # of these; more are turned
 MARGINS = (0.72, 0.1, 0.5, 0.32)  # inches, for labels of four digits and a sign
@@ -49,10 +51,11 @@ def curves(evidence: Evidence) -> Iterator[Chart | Absent]:
         yield Chart(
             curve_id(name),
             _title(name, now, was, evidence.before),
-            "Mean residual (measured less predicted) before and now, now alone, and the scatter "
-            "of single residuals. Bands are 95 % intervals of the mean, clustered by stop and "
-            "surface; where one contains zero, no significant residual is left.",
-            lambda now=now, was=was: _curve(now, was, evidence.before),
+            "Mean residual (measured less predicted) before, now and of stops held out; now "
+            "alone; and the scatter of single residuals. Bands are 95 % intervals of the mean, "
+            "clustered by stop and surface; where one contains zero, no significant residual is "
+            "left.",
+            partial(_curve, evidence, name),
             quiet=name not in ALWAYS and not (front and outside(now)[2]),
         )
     for name in FIRST:
@@ -113,51 +116,60 @@ def _title(name: str, now: ResidualCurve, was: ResidualCurve | None, before: str
     return f"No significant dependence on {what} is left ({inside}{earlier})"
 
 
-def _curve(now: ResidualCurve, was: ResidualCurve | None, before: str) -> Figure:
+def _curve(evidence: Evidence, name: str) -> Figure:
+    now, was = evidence.after.curves[name], evidence.earlier.curves.get(name)
+    unseen = evidence.held_out.curves.get(name) if evidence.held_out else None
+    unit = evidence.joint_units.get(name) or shown_unit(name)
     names = now.axis.names or ()
     margins = None if len(names) > UPRIGHT_NAMES else MARGINS
     figure, grid = plots.axes(
         plots.HALF_IN, 3.7, 3, margins=margins, sharex=True, height_ratios=(2.0, 2.0, 1.0)
     )
     top, middle, bottom = grid[:, 0]
-    if was is not None:
-        _draw(top, was, plots.BEFORE, before)
-        _line(bottom, was, was.std_m, plots.BEFORE)
-    _draw(top, now, plots.AFTER, "now")
-    _draw(middle, now, plots.AFTER, None)
-    _line(bottom, now, now.std_m, plots.AFTER)
+    series = [(was, plots.BEFORE, evidence.before), (now, plots.AFTER, "now")]
+    series += [(unseen, plots.HELD_OUT_COLOUR, "held out")]
+    for curve, colour, label in series:
+        if curve is not None:
+            _draw(top, curve, colour, label, unit[1])
+            _line(bottom, curve, colour, unit[1])
+    _draw(middle, now, plots.AFTER, None, unit[1])
+    bottom.margins(y=0.15)
     bottom.set_ylim(bottom=0)
     for ax, label in ((top, "mean, mm"), (middle, "now, mm"), (bottom, "sd, mm")):
         ax.set_ylabel(label)
-    for ax in (top, middle):
+    for ax, drawn in ((top, (was, now)), (middle, (now,))):
         ax.axhline(0, color=plots.PALE, linewidth=1, zorder=1)
-    if now.axis.names:
-        for ax, drawn in ((top, [now, was or now]), (middle, [now])):
-            limit = max(map(_reach, drawn))
+        limit = max(_reach(curve, 1.0) for curve in drawn if curve is not None)
+        if ax is top and unseen is not None:  # of few stops, so its band may leave the picture
+            limit = max(limit, _reach(unseen, 0.0))
+        if limit > 0:
             ax.set_ylim(-limit, limit)
-    _name_bins(bottom, now)
+    _name_bins(bottom, now, unit[0])
     if margins is None:
         figure.align_ylabels()
-    figure.legend(loc="upper left" if margins else "outside upper left", ncols=2)
+    figure.legend(loc="upper left" if margins else "outside upper left", ncols=3)
     return figure
 
 
-def _reach(curve: ResidualCurve) -> float:
-    """How far, in mm, means and bands reach of things that are seen often; seldom ones may leave
-    the picture."""
-    often = np.isfinite(curve.mean_m) & (curve.count >= SELDOM * curve.count.sum())
-    return 1.15e3 * float((np.abs(curve.mean_m) + np.nan_to_num(curve.band_m))[often].max())
+def _reach(curve: ResidualCurve, bands: float) -> float:
+    """How far, in mm, means and this part of their bands reach of things that are seen often;
+    seldom ones may leave the picture."""
+    known = np.isfinite(curve.mean_m)
+    often = known & (curve.count >= SELDOM * curve.count.sum())
+    size = np.abs(curve.mean_m) + bands * np.nan_to_num(curve.band_m)
+    return 1.15e3 * float(size[often if often.any() else known].max(initial=0.0))
 
 
-def _x(curve: ResidualCurve) -> np.ndarray:
+def _x(curve: ResidualCurve, times: float) -> np.ndarray:
+    """Where its bins are drawn."""
     if curve.axis.names:
         return np.arange(curve.axis.bins, dtype=float)
-    return shown_unit(curve.axis.name)[1] * curve.at
+    return times * curve.at
 
 
-def _draw(ax: Axes, curve: ResidualCurve, colour: str, label: str | None) -> None:
+def _draw(ax: Axes, curve: ResidualCurve, colour: str, label: str | None, times: float) -> None:
     """Means with their bands: a line, or dots where bins are things."""
-    x, mean, half = _x(curve), 1e3 * curve.mean_m, 1e3 * curve.band_m
+    x, mean, half = _x(curve, times), 1e3 * curve.mean_m, 1e3 * curve.band_m
     if curve.axis.names:
         ax.errorbar(x, mean, np.nan_to_num(half), fmt="o", ms=4, lw=1.2, color=colour, label=label)
         return
@@ -167,14 +179,15 @@ def _draw(ax: Axes, curve: ResidualCurve, colour: str, label: str | None) -> Non
     ax.plot(x[order], mean[order], ".-", ms=4, color=colour, label=label)
 
 
-def _line(ax: Axes, curve: ResidualCurve, values_m: np.ndarray, colour: str) -> None:
-    known = np.isfinite(values_m)
+def _line(ax: Axes, curve: ResidualCurve, colour: str, times: float) -> None:
+    known = np.isfinite(curve.std_m)
     style = "o" if curve.axis.names else "-"
-    ax.plot(_x(curve)[known], 1e3 * values_m[known], style, ms=4, lw=1.2, color=colour)
+    ax.plot(_x(curve, times)[known], 1e3 * curve.std_m[known], style, ms=4, lw=1.2, color=colour)
 
 
-def _name_bins(ax: Axes, curve: ResidualCurve) -> None:
-    ax.set_xlabel(axis_label(curve.axis.name))
+def _name_bins(ax: Axes, curve: ResidualCurve, unit: str) -> None:
+    what = spoken(curve.axis.name)
+    ax.set_xlabel(f"{what}, {unit}" if unit else what)
     names = curve.axis.names
     if names and len(names) <= MOST_AXIS_NAMES:
         ax.set_xticks(range(len(names)), names, rotation=45 if len(names) > UPRIGHT_NAMES else 0,
@@ -184,39 +197,45 @@ def _name_bins(ax: Axes, curve: ResidualCurve) -> None:
 
 
 def ring_map(evidence: Evidence) -> Iterator[Chart | Absent]:
-    """Mean residual over ring and azimuth, before and after."""
+    """Mean residual over ring and azimuth: before, now, and of stops held out."""
     if not evidence.has_beams:
         yield Absent("map", NO_BEAMS)
         return
-    was, now = (_map_mm(s) for s in (evidence.earlier, evidence.after))
-    sizes = [float(np.sqrt(np.nanmean(np.square(m)))) for m in (was, now)]
+    maps = {evidence.before: 1e3 * evidence.earlier.map_m, "now": 1e3 * evidence.after.map_m}
+    was, now = (float(np.sqrt(np.nanmean(np.square(m)))) for m in maps.values())
+    if evidence.held_out:
+        maps["held out"] = 1e3 * evidence.held_out.map_m
     yield Chart(
         "map",
-        f"Over ring and azimuth the mean residual is {sizes[1]:.2f} mm rms; {evidence.before}: "
-        f"{sizes[0]:.2f} mm",
-        f"Every cell is the mean residual of all stops in one ring and {360 / now.shape[1]:.3g} "
-        "degrees of azimuth: orange reads long, purple short, grey was not seen. Each map has a "
-        "scale of its own. Stripes along a ring are range zeros of rings; stripes across rings "
-        "come from the encoder or the mount.",
-        lambda: _ring_map(was, now, evidence.before),
+        f"Over ring and azimuth the mean residual is {now:.2f} mm rms; {evidence.before}: "
+        f"{was:.2f} mm",
+        f"Every cell is the mean residual of all stops in one ring and "
+        f"{360 / evidence.azimuths:.3g} degrees of azimuth: orange reads long, purple short, grey "
+        "was not seen. All maps have one scale; what lies beyond it has the colour of its end. "
+        "Stops held out are as a fit without them predicts them. Stripes along a ring are range "
+        "zeros of rings; stripes across rings come from the encoder or the mount.",
+        lambda: _ring_map(maps),
         wide=True,
     )
 
 
-def _map_mm(statistics: Statistics) -> np.ndarray:
-    return 1e3 * statistics.map_m
+def map_limit(maps: Sequence[np.ndarray]) -> float:
+    """The end of the one scale of some maps, of which the first is before: what is left now shows,
+    though before may lie beyond it."""
+    ends = [float(np.nanquantile(np.abs(each), 0.98)) for each in maps]
+    return round_up(max(*ends[1:], ends[0] / BEFORE_BEYOND))
 
 
-def _ring_map(was: np.ndarray, now: np.ndarray, before: str) -> Figure:
-    figure, grid = plots.axes(plots.WIDE_IN, 3.4, 1, 2, sharey=True)
-    for ax, values, title in zip(grid[0], (was, now), (before, "now"), strict=True):
-        limit = round_up(float(np.nanquantile(np.abs(values), 0.98)))
+def _ring_map(maps: Mapping[str, np.ndarray]) -> Figure:
+    figure, grid = plots.axes(plots.WIDE_IN, 3.4, 1, len(maps), sharey=True)
+    limit = map_limit(list(maps.values()))
+    for ax, (title, values) in zip(grid[0], maps.items(), strict=True):
         picture = plots.signed_map(ax, values, (-180, 180, -0.5, len(values) - 0.5), limit)
-        bar = figure.colorbar(picture, ax=ax, orientation="horizontal", aspect=35, extend="both")
-        bar.set_label("mean residual, mm")
         ax.set_title(title)
         ax.set_xlabel("azimuth, deg")
         ax.set_xticks(range(-180, 181, 90))
+    bar = figure.colorbar(picture, ax=grid, orientation="horizontal", aspect=60, extend="both")
+    bar.set_label("mean residual, mm")
     grid[0, 0].set_ylabel("ring")
     return figure
 

@@ -1,10 +1,11 @@
-"""Stops that the fit never saw, beam by beam, beside what the fit made of them when it did."""
+"""Stops over ring and azimuth: those held out, beside what the fit left of them; and all."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from textwrap import wrap
-from typing import TYPE_CHECKING
+from functools import partial
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,14 +13,17 @@ from calib.report import plots
 from calib.report.chart import Absent, Chart
 from calib.report.charts.residuals import NO_BEAMS
 from calib.report.evidence import Evidence
-from calib.report.statistics import StopMaps
+from calib.report.statistics import StopMap, StopMaps
 from calib.show.scale import round_up
 
 if TYPE_CHECKING:
     from calib.report.plots import Figure
 
 MOST_STOPS = 3  # that are drawn, the worst: as many as a screen holds in a row each
-NAME = 20  # letters of a stop's name that stand along a map
+MAPS_IN_ROW = 4  # small maps in a row
+FIRST_MAPS, PAGE_MAPS = 8, 24  # small maps that are shown, and in each figure that is folded
+MOST_MAPS = 104  # small maps in all: more would make the page too heavy
+NAME = 16  # letters of a stop's name that stand above a map
 UNSEEN_IN_SCALE = 0.95  # of the cells of stops held out: those that lie inside the scale
 
 
@@ -60,11 +64,73 @@ def _unseen(stops: Sequence[StopMaps]) -> Figure:
         for ax, map_m, rms_m, what in told:
             extent = (-180, 180, -0.5, len(map_m) - 0.5)
             picture = plots.signed_map(ax, 1e3 * map_m, extent, limit)
-            ax.set_title(f"{what}: {1e3 * rms_m:.2f} mm")
+            ax.set_title(f"{_short(stop.name)} {what}: {1e3 * rms_m:.2f} mm")
             ax.set_xticks(range(-180, 181, 90))
-        row[0].set_ylabel("\n".join([*wrap(stop.name, NAME), "ring"]), fontsize=8)
+        row[0].set_ylabel("ring")
+    _finish(figure, grid, picture)
+    return figure
+
+
+def every_stop(evidence: Evidence) -> Iterator[Chart | Absent]:
+    """Mean residual over ring and azimuth of every stop, small: as fitted, and as held out."""
+    if not evidence.has_beams:
+        yield Absent("stops", NO_BEAMS)
+        return
+    maps = evidence.stops
+    shown = maps[:MOST_MAPS]
+    off_mm = np.concatenate([1e3 * np.abs(each.map_m).ravel() for each in shown])
+    limit = round_up(float(np.nanquantile(off_mm, UNSEEN_IN_SCALE)))
+    worst, best = maps[0], maps[-1]
+    stops = len({each.name for each in maps})
+    what = "held out" if worst.held_out else "in the fit"
+    told = f"Stop by stop, the worst first: {worst.name}, {1e3 * worst.rms_m:.2f} mm rms {what}"
+    cuts = [0, *range(FIRST_MAPS, len(shown), PAGE_MAPS), len(shown)]
+    for k, (begin, end) in enumerate(pairwise(dict.fromkeys(cuts))):
+        some = shown[begin:end]
+        yield Chart(
+            f"stops-{k + 1}" if k else "stops",
+            f"{told}; of {stops} stops the best has {1e3 * best.rms_m:.2f} mm"
+            if not k
+            else f"More stops: {some[0].name} to {some[-1].name}, from {1e3 * some[0].rms_m:.2f} "
+            "mm rms",
+            "A map per stop as the fit of all stops left it, after one as a fit without it "
+            "predicts it where it was held out; all maps on one scale. Orange reads long, purple "
+            "short, grey was not seen. A map unlike the others is something that happened at "
+            "that stop; what all share is missing from the model."
+            + (f" The {MOST_MAPS} worst maps of {len(maps)}." if len(maps) > MOST_MAPS else ""),
+            partial(_small, some, evidence.rings, limit),
+            wide=True,
+            quiet=k > 0,
+        )
+
+
+def _small(maps: Sequence[StopMap], rings: int, limit: float) -> Figure:
+    """Small maps, a few abreast, on a scale that ends at `limit` mm."""
+    rows = -(-len(maps) // MAPS_IN_ROW)
+    size = (plots.WIDE_IN, 1.2 + 1.15 * rows, rows, MAPS_IN_ROW)
+    figure, grid = plots.axes(*size, sharex=True, sharey=True)
+    for ax, each in zip(grid.flat, maps, strict=False):
+        extent = (-180, 180, -0.5, rings - 0.5)
+        picture = plots.signed_map(ax, 1e3 * each.map_m, extent, limit)
+        what = " held out" if each.held_out else ""
+        ax.set_title(f"{_short(each.name)}{what}: {1e3 * each.rms_m:.2f} mm", fontsize=8)
+        ax.set_xticks(range(-180, 181, 90))
+    for ax in grid.flat[len(maps) :]:
+        ax.set_axis_off()
+    for ax in grid[:, 0]:
+        ax.set_ylabel("ring")
+    _finish(figure, grid, picture)
+    return figure
+
+
+def _short(name: str) -> str:
+    """A stop's name as long as fits above a map."""
+    return name if len(name) <= NAME else f"{name[: NAME - 1]}…"
+
+
+def _finish(figure: Figure, grid: np.ndarray, picture: Any) -> None:
+    """Say what lies across the maps, and what their colours are."""
     for ax in grid[-1]:
         ax.set_xlabel("azimuth, deg")
     bar = figure.colorbar(picture, ax=grid, orientation="horizontal", aspect=60, extend="both")
     bar.set_label("mean residual, mm")
-    return figure

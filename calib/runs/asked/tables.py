@@ -21,9 +21,9 @@ def parameters(run: Run) -> dict[str, np.ndarray]:
 
     ``variable``, ``parameter``, ``unit``; ``estimate`` and ``sigma`` in that unit; ``cad_sigma``,
     how well it was known before, NaN where it was not; ``cad_sigmas``, how many of these it is from
-    there; ``told``, whether the data could tell; and of a run that was fitted from another one
-    ``moved``, whether its frame or effect has moved since. A frame's estimate is how far it is from
-    CAD, as a twist in its own axes, NaN where no CAD says where it should be.
+    there; ``identifiable``, whether the data determine it; and of a run that was fitted from
+    another one ``moved``, whether its frame or effect has moved since. A frame's estimate is how
+    far it is from CAD, as a twist in its own axes, NaN where no CAD says where it should be.
 
     Raises:
         InputError: the run is incomplete.
@@ -39,7 +39,9 @@ def parameters(run: Run) -> dict[str, np.ndarray]:
         for row in variable_estimates(run)
         for each in zip(row.parameters, row.units, row.estimate, row.sigma, row.told, strict=True)
     ]
-    variable, parameter, unit, estimate, sigma, told = map(np.array, zip(*rows, strict=True))
+    variable, parameter, unit, estimate, sigma, identifiable = map(
+        np.array, zip(*rows, strict=True)
+    )
     known = np.array([before.get((row[0], row[1]), np.nan) for row in rows])
     out = {
         "variable": variable,
@@ -49,7 +51,7 @@ def parameters(run: Run) -> dict[str, np.ndarray]:
         "sigma": sigma,
         "cad_sigma": known,
         "cad_sigmas": estimate / known,
-        "told": told,
+        "identifiable": identifiable,
     }
     if "links" in run.summary:
         moved = {link["name"] for link in run.summary["links"] if link["moved"]}

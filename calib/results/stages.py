@@ -1,19 +1,22 @@
-"""Which stage of a command is under way, of how many, and how much time is left."""
+"""Which stage of what takes long is under way, of how many, and how much time is left."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+
+from calib.solve.fit import Progress
 
 
 @dataclass(frozen=True)
 class Stage:
-    """One of the stages that a command goes through in their order.
+    """One of the stages that something goes through in their order.
 
     Args:
         title: what is done.
         begins: how the texts of progress within it begin.
-        share: of the command's time; of the preset `default`, on two cores.
+        share: of the time of all; of the preset `default`, on two cores.
     """
 
     title: str
@@ -33,25 +36,37 @@ DIAGNOSE = (
     Stage("held-out error", ("without ",), 0.05),
     Stage("formulas", ("reading residuals", "searching covariates"), 0.26),
 )
+PLAN = (
+    Stage("what is known", ("looking for depth edges", "pass "), 0.08),
+    Stage("candidates", ("looking at candidates",), 0.85),
+    Stage("choice", ("choosing", "how many are enough"), 0.07),
+)
+REPORT = (
+    Stage("residuals", ("residuals", "derivatives", "stop by stop", "held-out residuals"), 0.22),
+    Stage("figures", ("drawing",), 0.78),
+)
+
+
+def staged(progress: Progress, stages: Sequence[Stage]) -> Progress:
+    """Tells `progress` with each step its stage and how much time is left, counted from now."""
+    told, start_s = Staged(stages), time.monotonic()
+    return lambda what, done, total: progress(told(what, time.monotonic() - start_s), done, total)
 
 
 class Staged:
-    """Says of each step of a command in which stage it is, and how much time is left.
+    """Says of each step in which stage it is, and how much time is left.
 
     Args:
-        stages: in their order; one that does not occur is passed over. Without any, a step is told
-            as it is.
+        stages: in their order; one that does not occur is passed over.
     """
 
-    def __init__(self, stages: Sequence[Stage] = ()) -> None:
+    def __init__(self, stages: Sequence[Stage]) -> None:
         self._stages, self._at, self._end_s = stages, 0, 0.0
 
     def __call__(self, what: str, elapsed_s: float) -> str:
         """The text of a step, ``elapsed_s`` after the start. The time left is what the later stages
         took of a measured run, in proportion; in the first stage it is not known, as the number of
         its passes is not."""
-        if not self._stages:
-            return what
         later = range(self._at, len(self._stages))
         at = next((i for i in later if what.startswith(self._stages[i].begins)), self._at)
         if at > self._at:
