@@ -89,7 +89,7 @@ class Picture:
             (panel.light, self._on_light),
         ):
             widget.on_update(self._guarded(use))
-        panel.dark.on_click(self._guarded(self._on_dark))
+        panel.light_all.on_click(self._guarded(self._on_light_all))
         panel.take.on_click(self._guarded(self._on_take, **value))
         menu.what.on_click(self._guarded(self._on_what, **value))
         go = {"next": 1, "previous": -1}
@@ -317,7 +317,7 @@ class Picture:
         with self._client.atomic():
             names = [side.name for side in sides]
             self.panel.draw(list(zip(names, charts, said, strict=True)), axes)
-            self.panel.dark.visible = chosen.lights
+            self.panel.light_all.visible = chosen.lights
 
     def _charts(self, chosen: Chosen) -> tuple[list[plot.Chart], dict[str, Any]]:
         """The plots of all sides, and the axes that they share."""
@@ -343,7 +343,7 @@ class Picture:
             self.panel.area, self.panel.light.value = self._sides.area(corners), ""
             self._paint()
 
-    def _on_dark(self) -> None:
+    def _on_light_all(self) -> None:
         self.panel.area, self.panel.light.value = None, ""
         self._paint()
 

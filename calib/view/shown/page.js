@@ -28,6 +28,7 @@ if (!window.rigcalPage) {
 
   window.addEventListener("keydown", (e) => {
     const used = document.activeElement;
+    if (!e.key) return; // a browser that fills in a field presses no key
     if (e.key === "Enter" && used?.matches("input")) {
       if (isMenu(used)) chosen = used;
       else used.blur(); // what was written is done

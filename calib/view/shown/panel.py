@@ -44,7 +44,7 @@ class PlotPanel:
             self.light = gui.add_text(brush.LABEL, asks.get("lit", ""), hint=brush.BRUSH_HINT)
             self.lit_over = asks.get("over", "")  # the column whose range is lit
             self.area = area.Area.read(asks.get("area", ""))
-            self.dark = gui.add_button("Light up all", visible=False, color="gray")
+            self.light_all = gui.add_button("Light up all", visible=False, color="gray")
             self._plots = [self._add_plot(gui, visible) for visible in (True, False)]
             gui.add_html(panels.hint(area.HOW))
             self.take = gui.add_button_group("Plot as", FILES, hint=TAKE)
