@@ -345,6 +345,7 @@ def test_what_does_not_fit_is_told_the_worst_first(run, printed):
     assert "lidar.tz: -133 mm from CAD, 100 of its sigmas" in text
     compared = " ".join(printed(print_comparison, [run, spoilt]))
     assert "s7, base 10.1" in compared and "lidar 100" in compared
+    assert "over sigma, target t 2.90" in compared and "its sigmas, lidar 100.20" in compared
     assert "what does not fit" not in " ".join(printed(tables.print_run, run))
 
 
