@@ -46,7 +46,8 @@ BEFORE_SCANS = 2  # times: bodies are then a start for the scans, and no result
 REWEIGHTED, ALONE = (10, SETTLED_WEIGHT), (200, 1e-3)
 # So often is looked what beams meet before it is asked whether that leads anywhere, and so often at
 # most; good recordings, and one with the LiDAR 0.13 m from where CAD has it, take 2 to 6 passes.
-HOPEFUL, LOOKED = 8, 15  # and after so many rounds each, weights that bring nothing are given up
+# After so many, looks that leave MUCH of the cost, and weights that bring nothing, are given up.
+HOPEFUL, LOOKED, MUCH = 8, 15, 0.9
 # How many sigmas wide the residuals of most stops may be by then: in those recordings it is 1 to 4,
 # with scans at wrong stops 85. And so wide may rows of trackers and targets be, as weighed, where
 # a fit has not settled: of the 90 kinds of damage it is 10 at most (a joint scaled, the mesh
@@ -56,8 +57,6 @@ HOPELESS = 30.0
 # worth doing again, as 50 members tell it no better.
 SETTLED_SPREAD, NEAR_SPREAD = 0.01, 0.1
 SPREAD = 8  # times: where rows do not scatter, each halves what they were thought to
-
-
 ASKED = 2  # times: the first pass brings the LiDAR to where it is, near enough
 SEVERAL = 3  # scans of a place, for most of them to tell where the rig stood
 
@@ -163,8 +162,7 @@ class Loop(Descent):
         given = reweighted(self.given, self.values, self.held, settled)
         if given is self.given:
             return False
-        self.given = given
-        variables = self.problem.variables | given.variables
+        self.given, variables = given, self.problem.variables | given.variables
         self.problem = replace(self.problem, blocks=given.blocks, variables=variables)
         self.lay_out()
         return True
@@ -240,6 +238,7 @@ class Loop(Descent):
         """Passes that look each time anew what beams meet, until they settle; False where the fit
         is hopeless, as where planes that were found in the scans never do. Where bodies contradict
         each other, scans say which is right: as CAD has the LiDAR, and where a pass has put it."""
+        meshes, cost = any(isinstance(s.meeting, MeshSurface) for s in self.problem.scans), np.inf
         for count in range(1, LOOKED + 1):
             if count <= ASKED:
                 self._ask_scans()
@@ -254,7 +253,10 @@ class Loop(Descent):
             self.values = self.moved(self.values, tangent)
             if self.size(tangent) < SETTLED:
                 return True
-        return any(isinstance(scan.meeting, MeshSurface) for scan in self.problem.scans)
+            if meshes and count >= HOPEFUL and self.cost() > MUCH * cost:
+                return bool(np.median(scale) <= HOPELESS)
+            cost = self.cost()
+        return meshes
 
     def _ask_scans(self) -> None:
         """Set aside the bodies that the scan at their stop shows to be wrong."""
@@ -314,8 +316,7 @@ class Loop(Descent):
         return any(np.abs(se3.log(se3.inverse(a) @ b)).max() >= STRAYED for a, b in pairs)
 
     def rows_hopeless(self) -> bool:
-        """Whether rows of trackers and targets, as weighed, were hopelessly wide before the last
-        step."""
+        """Whether rows of trackers and targets, as weighed, were hopelessly wide a step ago."""
         rows = sum(block.rows for block in self.problem.blocks)
         return 0 < rows * HOPELESS**2 < 2 * (self.cost() - self.linear.beams_cost)
 
