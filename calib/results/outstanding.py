@@ -68,6 +68,14 @@ def groups(summary: Mapping[str, Any]) -> dict[str, float]:
     return dict(sorted(out.items(), key=lambda pair: -pair[1]))
 
 
+def things(summary: Mapping[str, Any]) -> dict[str, float]:
+    """Misfit of every tracked body and target over all stops, the worst first."""
+    found = summary.get("misfit_by", {"body": {}, "target": {}})
+    out = {**found["body"], **{f"target {name}": x for name, x in found["target"].items()}}
+    known = {name: ratio for name, ratio in out.items() if ratio is not None}
+    return dict(sorted(known.items(), key=lambda pair: -pair[1]))
+
+
 def outstanding(summary: Mapping[str, Any]) -> dict[str, float]:
     """Those groups that stand out from their like, the worst first.
 

@@ -12,7 +12,7 @@ from calib.runs.asked.moved import SHARED, Moved
 from calib.runs.estimates import comparison
 from calib.runs.ladder import DESCRIBED, FORMULA, Rung, ladder
 from calib.show.headline import DIFFERS, MOVED_WORDS, Words, moved_sentence
-from calib.show.misfit import worst_of
+from calib.show.misfit import moves, things, worst_of
 from calib.show.scale import shown
 from calib.show.tables import (
     ERROR_LABELS,
@@ -136,6 +136,25 @@ def _add_misfit(table: Table, runs: Sequence[Run], compared: Mapping[str, Any]) 
     for label, cells in zip(labels, zip(*map(worst_of, runs), strict=True), strict=True):
         if any(cells):
             table.add_row(label, "", *cells)
+    _add_worst(table, "residuals over sigma, {}", [things(run.summary) for run in runs])
+    frames = [
+        {name: move["move_sigmas"] for name, move in moves(run.summary).items() if "." not in name}
+        for run in runs
+    ]
+    _add_worst(table, "from CAD in its sigmas, {}", frames)
+
+
+def _add_worst(table: Table, label: str, found: Sequence[Mapping[str, float]]) -> None:
+    """A row for each name, those first that are worst in any run; of many the worst."""
+    most: dict[str, float] = {}
+    for each in found:
+        most |= {name: max(x, most.get(name, 0.0)) for name, x in each.items()}
+    ranked = sorted(most, key=lambda name: -most[name])
+    for name in ranked[:LISTED_PARAMETERS]:
+        cells = (f"{each[name]:.2f}" if name in each else "" for each in found)
+        table.add_row(label.format(name), "", *cells)
+    if (more := len(ranked) - LISTED_PARAMETERS) > 0:
+        table.add_row(f"and {more} more that are less", "", *("" for _ in found))
 
 
 def _add_spread(table: Table, variable: str, entries: Sequence[Mapping[str, Any]]) -> None:

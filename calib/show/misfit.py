@@ -14,6 +14,7 @@ from calib.results.outstanding import (
     of_stop,
     outstanding,
     standing_out,
+    things,
     times,
     together_told,
 )
@@ -33,6 +34,7 @@ __all__ = [
     "outstanding",
     "over_beams",
     "standing_out",
+    "things",
     "times",
     "together_told",
     "worst_of",

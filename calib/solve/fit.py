@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
+
 from calib.linear.linearise import beams_cost
 from calib.problem.problem import Block, Problem
 from calib.solve.added import declared
 from calib.solve.descent import AT_OPTIMUM, LAST, SLOWED, STEADY, UPHILL
 from calib.solve.estimate import Estimate, Start, cost_of, values_of
-from calib.solve.loop import CONVERGED, Loop, Progress
+from calib.solve.loop import CONVERGED, HOPELESS, Loop, Progress
+from calib.solve.reweight import reweighted
 from calib.solve.turned import least_turned, lidars_turned, turned_far
 from chains.errors import InputError
 
@@ -83,17 +86,26 @@ def _arrive(loop: Loop, tolerance: float) -> None:
     """From where it is known what beams meet to the optimum, robust weights included.
 
     A fit that is not there in as many passes as good ones take is asked for weights at once; where
-    trackers and targets are then still hopelessly far off, it is given up.
+    trackers and targets are with them hopelessly far off, it is given up.
     """
     loop.fix_association()
     settled = loop.lost or loop.descend(LAST, tolerance, passes=SLOWED)
     if settled and loop.strayed():
         loop.settle(tolerance)
+    loop.lost = loop.lost or not (settled or _near(loop))
     changed = loop.reweigh(beams=True)
     if not settled:
         loop.lost = loop.rows_hopeless()
     if changed or not settled:
         loop.settle_on(tolerance)
+
+
+def _near(loop: Loop) -> bool:
+    """Whether robust weights, as they would be here, leave trackers and targets with rows that are
+    not hopelessly wide."""
+    blocks = reweighted(loop.given, loop.values, loop.held).blocks
+    rows = np.concatenate([np.zeros(1), *(b.evaluate(loop.values, False)[0] for b in blocks)])
+    return rows @ rows < len(rows) * HOPELESS**2
 
 
 def _go_on(loop: Loop, tolerance: float) -> None:

@@ -32,9 +32,7 @@ from chains import se3
 
 SETTLED_STEP = 1e-4  # m and rad: then triangles that beams meet are kept; a choice, 1 mm at 10 m
 CONVERGED = 1e-6  # m and rad: a tenth of the smallest sigmas, and the next step is smaller still
-# m and rad: a scan that has moved further looks anew what its beams meet. A choice: a tenth of the
-# narrowest patch, at 10 m.
-STRAYED = 3e-3
+STRAYED = 3e-3  # m and rad: a scan that moved further looks anew what its beams meet; a choice
 DESCENTS = 3  # how often a descent is tried before a fit is given up: a choice
 # By how much new weights may still lower half the chi-square, and of it: a hundredth of what an
 # optimum allows, as each round may go but a tenth of the way; where nothing fits, it never ends.
@@ -47,8 +45,8 @@ BEFORE_SCANS = 2  # times: bodies are then a start for the scans, and no result
 REWEIGHTED, REWEIGHTED_ALONE = (10, SETTLED_WEIGHT), (200, 1e-3)
 # So often is looked what beams meet before it is asked whether that leads anywhere, and so often at
 # most; good recordings, and one with the LiDAR 0.13 m from where CAD has it, take 2 to 6 passes.
-# After so many rounds each, weights that bring nothing are given up.
-HOPEFUL, MOST_PASSES_LOOKED = 8, 15
+# After so many, looks that leave MUCH of the cost, and weights that bring nothing, are given up.
+HOPEFUL, MOST_PASSES_LOOKED, MUCH = 8, 15, 0.9
 # How many sigmas wide the residuals of most stops may be by then: in those recordings it is 1 to 4,
 # with scans at wrong stops 85. And so wide may rows of trackers and targets be, as weighed, where
 # a fit has not settled: of the 90 kinds of damage it is 10 at most (a joint scaled, the mesh
@@ -164,8 +162,7 @@ class Loop(Descent):
         given = reweighted(self.given, self.values, self.held, settled)
         if given is self.given:
             return False
-        self.given = given
-        variables = self.problem.variables | given.variables
+        self.given, variables = given, self.problem.variables | given.variables
         self.problem = replace(self.problem, blocks=given.blocks, variables=variables)
         self.lay_out()
         return True
@@ -241,6 +238,7 @@ class Loop(Descent):
         """Passes that look each time anew what beams meet, until they settle; False where the fit
         is hopeless, as where planes that were found in the scans never do. Where bodies contradict
         each other, scans say which is right: as CAD has the LiDAR, and where a pass has put it."""
+        meshes, cost = any(isinstance(s.meeting, MeshSurface) for s in self.problem.scans), np.inf
         for count in range(1, MOST_PASSES_LOOKED + 1):
             if count <= TIMES_ASKED:
                 self._ask_scans()
@@ -255,7 +253,10 @@ class Loop(Descent):
             self.values = self.moved(self.values, tangent)
             if self.size(tangent) < SETTLED_STEP:
                 return True
-        return any(isinstance(scan.meeting, MeshSurface) for scan in self.problem.scans)
+            if meshes and count >= HOPEFUL and self.cost() > MUCH * cost:
+                return bool(np.median(scale) <= HOPELESS)
+            cost = self.cost()
+        return meshes
 
     def _ask_scans(self) -> None:
         """Set aside the bodies that the scan at their stop shows to be wrong."""
@@ -315,8 +316,7 @@ class Loop(Descent):
         return any(np.abs(se3.log(se3.inverse(a) @ b)).max() >= STRAYED for a, b in pairs)
 
     def rows_hopeless(self) -> bool:
-        """Whether rows of trackers and targets, as weighed, were hopelessly wide before the last
-        step."""
+        """Whether rows of trackers and targets, as weighed, were hopelessly wide a step ago."""
         rows = sum(block.rows for block in self.problem.blocks)
         return 0 < rows * HOPELESS**2 < 2 * (self.cost() - self.linear.beams_cost)
 

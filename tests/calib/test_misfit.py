@@ -15,6 +15,7 @@ from calib.problem.model import Model, Source
 from calib.results.errors import Errors
 from calib.results.misfit import InstrumentRows, misfit_by, prior_rows, target_rows, tracker_rows
 from calib.runs.calibrate import calibrate
+from calib.show.comparison import print_comparison
 from calib.solve.fit import solve
 
 from . import broken, rigs
@@ -255,3 +256,13 @@ def test_nothing_tracked_and_no_targets_leaves_what_is_known_of_beams(tmp_path):
     prior, beams = prior_rows(estimate), {("box", "s1"): Errors(4, 0.0, 4.0, 1.0)}
     found = misfit_by(estimate, None, None, prior, beams)
     assert found["stop"]["s1"]["beams"] == 2 and found["body"] == found["target"] == {}
+
+
+def test_bodies_and_targets_are_compared_the_worst_first(good, capsys):
+    targets = {f"t{k:02d}": 1.0 + k for k in range(20)}
+    found = good.summary["misfit_by"] | {"target": targets, "body": {"tool": 0.5}}
+    print_comparison([good, replace(good, summary=good.summary | {"misfit_by": found})])
+    compared = " ".join(capsys.readouterr().out.split())
+    assert compared.index("target t19 20.00") < compared.index("target t08 9.00")
+    assert "target t07" not in compared and "over sigma, tool" not in compared
+    assert "more that are less" in compared and "in its sigmas, lidar" in compared

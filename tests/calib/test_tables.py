@@ -340,12 +340,12 @@ def test_what_does_not_fit_is_told_the_worst_first(run, printed):
     spoilt = replace(run, summary=run.summary | {"misfit_by": found})
     text = " ".join(printed(tables.print_run, spoilt))
     assert text.index("s7, base: residuals 10.1 times larger") < text.index("s6, base")
-    assert "s2, base" in text and "s1, base" not in text and "and 2 more" in text
+    assert "s2, base" in text and "and 2 more" in text and "s1, base" not in text
     assert "t0, base" not in text
-    assert "target" not in text.partition("what does not fit")[2].partition("not identifiable")[0]
+    assert "target" not in text.partition("what does not fit")[2].partition("not identifi")[0]
     assert "lidar.tz: -133 mm from CAD, 100 of its sigmas" in text
     compared = " ".join(printed(print_comparison, [run, spoilt]))
-    assert "s7, base 10.1" in compared and "lidar 100" in compared
+    assert all(t in compared for t in ("s7, base 10.1", "sigma, target t 2.90", "lidar 100.20"))
     assert "what does not fit" not in " ".join(printed(tables.print_run, run))
 
 
@@ -385,8 +385,8 @@ def test_cad_that_is_not_as_good_as_it_says_is_told(run, capsys):
     told = " ".join(capsys.readouterr().out.split())
     assert "frames are 2.2 times further from CAD than its sigmas allow: a value of CAD is" in told
     assert "larger than their sigmas" not in told
-    slight = {"misfit": {"beams": 0.9, "cad": 1.4}, "cad_widened_by": 1.4}  # as chance may have it
-    tables.print_run(replace(run, summary=run.summary | slight))
+    misfit = {"misfit": {"beams": 0.9, "cad": 1.4}, "cad_widened_by": 1.4}  # as chance may have it
+    tables.print_run(replace(run, summary=run.summary | misfit))
     assert "further from CAD" not in " ".join(capsys.readouterr().out.split())
 
 
@@ -395,6 +395,6 @@ def test_rows_that_err_together_are_told(run, capsys):
     tables.print_run(replace(run, summary=run.summary | {"intervals_wider_by": wider}))
     told = " ".join(capsys.readouterr().out.split())
     assert "sigmas are 1.9 times what single rows would give (median; 2.4 for ring_range" in told
-    slight = {"intervals_wider_by": wider | {"median": 1.1}}
-    tables.print_run(replace(run, summary=run.summary | slight))
+    wider["median"] = 1.1
+    tables.print_run(replace(run, summary=run.summary | {"intervals_wider_by": wider}))
     assert "single rows" not in capsys.readouterr().out

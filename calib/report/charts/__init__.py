@@ -24,7 +24,9 @@ Charts = Callable[[Evidence], Iterator[Chart | Absent]]
 
 SECTIONS: Mapping[str, tuple[Charts, ...]] = {
     "How good it is": (fit.ladder, fit.variance, fit.scatter),
-    "What does not fit": (groups.groups, misfit.by_stop, misfit.moves_from_cad),
+    "What does not fit": (
+        *(groups.groups, misfit.by_stop, misfit.by_thing, misfit.moves_from_cad),
+    ),
     "What was found": (formulas.formulas, knowledge.findings),
     "The calibration": (links.chain, links.moves, links.effects, knowledge.budget),
     "What is left": (

@@ -18,6 +18,7 @@ from calib.show.misfit import (
     moves,
     of_stop,
     outstanding,
+    things,
     times,
 )
 
@@ -77,6 +78,39 @@ def _by_stop(stops: Mapping[str, Mapping[str, float]], loud: Mapping[str, float]
     ax.set_xticks(range(0, len(names), step), names[::step], rotation=90, fontsize=8)
     ax.set_ylabel("residuals over their sigmas")
     figure.legend(loc="outside upper left", ncols=5)
+    return figure
+
+
+def by_thing(evidence: Evidence) -> Iterator[Chart | Absent]:
+    """Residuals over their sigmas of every body and target, all of its rows together."""
+    found, loud = things(evidence.run.summary), outstanding(evidence.run.summary)
+    if not found:
+        yield Absent("misfit-by", "nothing checks the rows of a body or a target")
+        return
+    worst, most = next(iter(found.items()))
+    yield Chart(
+        "misfit-by",
+        f"Of bodies and targets {worst} has the largest residuals, {times(most)} times their "
+        f"sigmas",
+        "How many times larger than their sigmas allow the residuals are, of all stops together: "
+        "about 1 (dashed) when all is well. Far beyond it, a body was not where rig.yaml says, or "
+        "its sigma is too small.",
+        lambda: _by_thing(dict(list(found.items())[:MOST_BARS])),
+        quiet=most < STANDS_OUT and not loud,
+    )
+
+
+def _by_thing(found: Mapping[str, float]) -> Figure:
+    figure, grid = plots.axes(plots.HALF_IN, 0.9 + 0.26 * len(found))
+    ax = grid[0, 0]
+    colours = [plots.BEFORE if x > STANDS_OUT else plots.AFTER for x in found.values()]
+    bars = ax.barh(list(found), list(found.values()), height=0.6, color=colours)
+    ax.bar_label(bars, [times(x) for x in found.values()], padding=3, fontsize=8)
+    ax.axvline(1.0, color=plots.INK, linestyle="--", linewidth=0.8)
+    ax.invert_yaxis()
+    ax.margins(x=0.2)
+    ax.grid(False, axis="y")
+    ax.set_xlabel("residuals over their sigmas")
     return figure
 
 
