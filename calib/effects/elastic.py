@@ -46,10 +46,11 @@ class ArmGravitySag(Effect):
 
 
 class ArmPayloadSag(ArmGravitySag):
-    """A joint gives way under the payload more, or less, than under the arm's own weight.
+    """A joint gives way under the payload.
 
-    So it seems where the payload hangs elsewhere than at the tip, where it weighs other than
-    stated, or where the URDF's masses are wrong.
+    It gives way more, or less, than under the arm's own weight. So it seems where the payload hangs
+    elsewhere than at the tip, where it weighs other than stated, or where the URDF's masses are
+    wrong.
     """
 
     name = "arm_payload_sag"
@@ -66,10 +67,10 @@ class ArmPayloadSag(ArmGravitySag):
 
 
 class ArmTorqueSag(ArmGravitySag):
-    """A joint gives way to the torque that its drive measures, friction and all.
+    """A joint gives way to its measured torque.
 
-    Column ``<joint>.torque`` of a stop is that torque, N m, or a force, N; positive where it turns
-    the joint on. A joint without that column is taken to bear none.
+    Friction is part of it. Column ``<joint>.torque`` of a stop is that torque, N m, or a force, N;
+    positive where it turns the joint on. A joint without that column is taken to bear none.
     """
 
     name = "arm_torque_sag"
@@ -87,10 +88,11 @@ class ArmTorqueSag(ArmGravitySag):
 
 
 class ArmLinkBending(Effect):
-    """Links and bearings give way across the joints' axes, where no encoder sees it.
+    """Links bend across the joints' axes.
 
-    At each joint the arm turns with the moment of the weight beyond it, but for the part about the
-    joint's axis: that is `arm_gravity_sag`. It gives way alike to both sides.
+    Links and bearings give way there, where no encoder sees it. At each joint the arm turns with
+    the moment of the weight beyond it, but for the part about the joint's axis, which is
+    `arm_gravity_sag`. It gives way alike to both sides.
     """
 
     name = "arm_link_bending"
@@ -100,9 +102,7 @@ class ArmLinkBending(Effect):
     typical = "a fifth of arm_gravity_sag, as bearings and links are stiffer than gears"
     covariates = ("joints",)
     confounded_with = ("arm_gravity_sag", "base_flex", "arm_geometry")
-    source = (
-        "Klimchik et al. 2014, Robotics and Computer-Integrated Manufacturing 30(3); size assumed"
-    )
+    source = "stiffness of arms: Klimchik et al.; size assumed"
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
         joints = rig.joint_names if rig.masses else ()

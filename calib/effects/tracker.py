@@ -154,8 +154,8 @@ class TrackerCreep(MountCreep, TrackerSlip):
 
 
 class TrackerSettle(MountSettle, TrackerSlip):
-    """The tracker, or the place where the base stands, settles: fast at first, then ever more
-    slowly. This data cannot tell which of the two moves.
+    """The tracker, or what the base stands on, settles: fast at first, then ever more slowly. These
+    data cannot tell which of the two moves.
 
     It moves what `TrackerSlip` moves, as `MountSettle` moves it.
     """
