@@ -29,7 +29,7 @@ def print_plan(plan: Plan) -> None:
     console, document = terminal(), plan.document()
     stops = f"{len(plan.stops)} stop{'s' * (len(plan.stops) != 1)}"
     console.print(f"{stops} {_aim(document)}", style="bold", soft_wrap=True)
-    for sentence in (*_achieved(document), *_reached(plan)):
+    for sentence in (*_achieved(plan, document), *_reached(plan)):
         console.print(sentence)
     console.print()
     console.print("Joints in degrees or mm; in the order of a short way that nothing has checked.")
@@ -56,7 +56,7 @@ def print_plan(plan: Plan) -> None:
     console.print(table)
 
 
-def _achieved(document: Mapping[str, Any]) -> Iterator[str]:
+def _achieved(plan: Plan, document: Mapping[str, Any]) -> Iterator[str]:
     """What the stops are worth, in a sentence or two."""
     for name, each in document["smallest_detectable"].items():
         now, after = (each["beside_rivals"][when] for when in ("now", "after"))
@@ -65,16 +65,16 @@ def _achieved(document: Mapping[str, Any]) -> Iterator[str]:
             before = "never" if now is None else f"from {factor * now:.3g} {unit}"
             found = f"found from {factor * after:.3g} {unit}"
             yield f"With them {name} is {found}, told from its rivals; now {before}."
-    rows = list(_rows(document["sigma"]))
-    fall = [row for row in rows if row[3] < FALLS * row[2]]
+    rows = list(_rows(plan))
+    fall = [row for row in rows if row.after < FALLS * row.now]
     if not fall:
         yield f"None of {len(rows)} expected sigmas falls by more than {100 * (1 - FALLS):.0f} %."
         return
-    name, unit, now, after = min(fall, key=lambda row: row[3] / row[2])
-    factor, unit = shown(unit)
+    most = min(fall, key=lambda row: row.after / row.now)
+    factor, unit = shown(most.unit)
     yield (
-        f"With them {len(fall)} of {len(rows)} sigmas fall; most of all that of {name}, from "
-        f"{factor * now:.3g} to {factor * after:.3g} {unit}."
+        f"With them {len(fall)} of {len(rows)} sigmas fall; most of all that of {most.name}, from "
+        f"{factor * most.now:.3g} to {factor * most.after:.3g} {unit}."
     )
 
 

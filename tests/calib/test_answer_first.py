@@ -3,9 +3,11 @@
 import re
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from calib.effects import CATALOGUE
+from calib.problem.unknowns import Key
 from calib.results.check import Check
 from calib.runs.run import Run
 from calib.show.comparison import print_comparison
@@ -122,8 +124,20 @@ def plan_of(sigma, smallest=None):
         "weak_directions": {"now": [], "after": [], "with_any_number": []},
         "observability": {"now": {"lambda": 1.0}, "after": {"lambda": 2.0}},
     }
-    stops = [{"location": "L00"}]
-    return SimpleNamespace(stops=stops, joints=[], curve=None, document=lambda: document)
+    now, after = (
+        SimpleNamespace(sigma=np.array([each[when] for each in sigma.values()]))
+        for when in ("now", "after")
+    )
+    return SimpleNamespace(
+        stops=[{"location": "L00"}],
+        joints=[],
+        curve=None,
+        keys=[Key(*name.rsplit(".", 1)) for name in sigma],
+        units=[each["unit"] for each in sigma.values()],
+        now=now,
+        after=after,
+        document=lambda: document,
+    )
 
 
 def test_a_plan_begins_with_what_it_achieves(capsys):
