@@ -273,7 +273,8 @@ def test_every_group_stands_in_the_diagnosis_and_one_is_wild(session):
     found = Run.open(session.folder / "run").diagnosis()
     wild = [g["token"] for g in found["groups"] if g["statistic"] > g["limit"]]
     assert wild == [TOKEN] and found["groups"][0]["token"] == TOKEN
-    assert {"rings", *(g["token"] for g in found["groups"])} == found["detectable"].keys()
+    others = {"rings", "mesh:scale"}
+    assert {*others, *(g["token"] for g in found["groups"])} == found["detectable"].keys()
     assert {g["kind"] for g in found["groups"]} >= {"body", "scan", "joints", "target", "frame"}
     assert all(0 <= g["p_value"] <= 1 and g["dof"] > 0 for g in found["groups"])
     mended = Run.open(session.folder / "without").diagnosis()

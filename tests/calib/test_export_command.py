@@ -31,7 +31,7 @@ def test_json_says_what_was_written_and_what_was_not(rigcal, folder):
     code, out, err = rigcal("export", "run", "-o", "all", "--json")
     assert (code, err) == (0, "")
     told = json.loads(out)
-    assert told.keys() == {"files", "not_held", "left_out"}
+    assert told.keys() == {"warnings", "files", "not_held", "left_out"}
     assert {folder / file for file in told["files"]} == set((folder / "all").iterdir())
     assert told["left_out"].keys() == {"hesai", "ouster"} - told["not_held"].keys()
     assert told["left_out"].keys() | told["not_held"].keys() == set(FORMATS)
