@@ -54,7 +54,7 @@ def main() -> None:
     except InputError as error:
         _fail(str(error), 2)
     except MemoryError:
-        _fail("there is not enough memory for this; look with 'rigcal check' at how much it is", 2)
+        _fail("there is not enough memory; 'rigcal check' shows how large the recording is", 2)
     except KeyboardInterrupt:
         code = INTERRUPTED
     except Exception as error:

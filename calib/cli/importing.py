@@ -82,7 +82,9 @@ class Asked:
     sphere_radius: Annotated[
         float | None, _flag("sphere-radius", "Of spheres in clouds.", "METRES")
     ] = None
-    still: Annotated[float | None, _flag("still", "What is slower is at rest.", "RAD_PER_S")] = None
+    still: Annotated[
+        float | None, _flag("still", "Below it, things count as at rest.", "RAD_PER_S")
+    ] = None
     min_hold: Annotated[float, _flag("min-hold", "What is shorter is no hold.", "SECONDS")] = 1.0
     locations: Annotated[
         int | None, _flag("locations", "Locations are so many blocks of time.", "N")

@@ -188,8 +188,8 @@ def _steps(stand: Stand, progress: Progress, most: int, chance_leads: bool = Tru
 
 def _adapted(look: Look, left: list[LeftOut], progress: Progress, named: bool) -> Look:
     """A look without the blunders that explain more than any effect or structure would, or leave
-    these nothing to explain; they are added to those left out. Once an effect was `named`, paper is
-    none: a name that is wrong trades with lengths, and would put the blame on them.
+    these nothing to explain; they are added to those left out. Once an effect was `named`, no value
+    of CAD is left out: lengths absorb part of an effect whose name is wrong.
 
     Several blunders at once may look like an effect: where one of them that an effect outdoes is
     left out, and the next then outdoes it, they are left out together if nothing stands out after.

@@ -187,7 +187,9 @@ def plan(
             rig has no arm, or scans without a mesh; or there are fewer poses than stops.
     """
     if until is not None and purpose is not None:
-        raise InputError("--until says what the stops are for, so it takes no --for beside it")
+        raise InputError(
+            "give --until or --for, not both: --until already says what the stops are for"
+        )
     stops = (MOST_PLANNED if until else USUAL_STOPS) if stops is None else stops
     progress = staged(progress, STAGES)
     if stops < 1 or candidates < stops:

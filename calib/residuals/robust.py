@@ -47,7 +47,7 @@ def robust_scale(z: np.ndarray) -> float:
 def huber_weight(norm: np.ndarray, dof: np.ndarray) -> np.ndarray:
     """Weight of each group of whitened rows under Huber's loss of its norm: ``min(1, k / norm)``.
 
-    A group's influence is bounded, and none is thrown away: where two groups contradict each other
+    A group's influence is bounded, and none is rejected: where two groups contradict each other
     and nothing else speaks, neither is taken to be right (Huber 1964). A group begins to lose
     weight at a norm k that chance exceeds with a probability of 1e-4, times how much wider than
     their sigmas the bulk of groups of its kind is.

@@ -32,7 +32,7 @@ FIT = (
 )
 DIAGNOSE = (
     Stage("tests", ("testing", "looking for depth edges", "fitting", "pass "), 0.67),
-    Stage("rejected beams", ("looking at what was thrown away",), 0.02),
+    Stage("rejected beams", ("looking at what was rejected",), 0.02),
     Stage("held-out error", ("without ",), 0.05),
     Stage("formulas", ("reading residuals", "searching covariates"), 0.26),
 )

@@ -72,7 +72,7 @@ def _found(
     stand = stand_of(run, progress, candidates)
     rings = ((s.rig.lidar.name, each) for s, each in odd_rings(stand.sources))
     # Away from an optimum every effect that moves the state towards one looks missing, beams are
-    # thrown away for no reason of their own, and groups far out that are not to blame.
+    # rejected for no reason of their own, and groups far out that are not to blame.
     found = search(stand, progress) if run.converged else search(stand, progress, most=0)
     suspect = []
     unexplained = not run.converged and not found.looks[-1].stand.estimate.converged

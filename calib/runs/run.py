@@ -171,7 +171,7 @@ class Run:
         if not (self.converged or force):
             raise InputError(
                 f"{self.folder} has NOT CONVERGED, so its numbers are not to be used; "
-                f"'rigcal diagnose {self.folder}' looks for what is wrong, --force takes them still"
+                f"'rigcal diagnose {self.folder}' looks for what is wrong, --force uses them anyway"
             )
 
     def diagnosis(self) -> dict[str, Any] | None:

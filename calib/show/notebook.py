@@ -167,7 +167,7 @@ def diagnosis_html(diagnosis: Diagnosis) -> str:
     if diagnosis.verdict == "adequate" and not diagnosis.too_few:
         tables["what would have been found"] = detectable_table(diagnosis.candidates)
     wrong = bool(diagnosis.blunders)
-    lead = "Mend it in the recording; or leave it out:" if wrong else "Add it to the model:"
+    lead = "Correct the recording, or leave this out:" if wrong else "Add it to the model:"
     return _html(
         f"verdict: {diagnosis.heading}",
         diagnosis.sentences[:1],

@@ -32,7 +32,9 @@ def print_plan(plan: Plan) -> None:
     for sentence in (*_achieved(plan, document), *_reached(plan)):
         console.print(sentence)
     console.print()
-    console.print("Joints in degrees or mm; in the order of a short way that nothing has checked.")
+    console.print(
+        "Joints in degrees or mm, in the order of a short path; collisions are not checked for."
+    )
     tables = [_stops_table(plan)]
     if document["smallest_detectable"]:
         tables.append(_detectable_table(document["smallest_detectable"]))

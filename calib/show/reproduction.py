@@ -28,7 +28,7 @@ def print_reproduction(found: Reproduction) -> None:
 def sentences(found: Reproduction) -> Iterator[str]:
     """The result in words."""
     if found.identical:
-        yield f"identical: made again, all {found.files} files hold the same."
+        yield f"identical: of the repeated run all {found.files} files hold the same."
         return
     differ = f"{len(found.differences)} of {found.files} files"
     yield f"differs: made again, {differ} hold something else."

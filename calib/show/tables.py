@@ -65,7 +65,7 @@ def print_check(check: Check, whole: bool = False) -> None:
 
 
 def print_command(
-    console: Console, command: str, what: str = "Mend it in the recording; or leave it out:"
+    console: Console, command: str, what: str = "Correct the recording, or leave this out:"
 ) -> None:
     """Print a command in one line, ready to be pasted, and what it does."""
     console.print(what)

@@ -68,7 +68,7 @@ def _wrong(run: Run, diagnosis: Mapping[str, Any] | None) -> Iterator[str]:
     if diagnosis and diagnosis["verdict"] == "missing_effect":
         yield "an effect is missing that is worth adding"
     elif diagnosis and diagnosis["verdict"] == "bad_data":
-        yield "something in the recording is wrong, which is to be mended or left out"
+        yield "something in the recording is wrong, which has to be corrected or left out"
     yield from forbids(run)
 
 

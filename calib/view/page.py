@@ -283,7 +283,7 @@ class Page:
 
     def _on_refit(self, added: Mapping[str, Any], dropped: Sequence[str]) -> None:
         if not added and not dropped:
-            raise InputError("these are the effects of the run; tick others, or take a tick away")
+            raise InputError("these are the effects of the run; tick others, or untick some")
         self._start(self._change(added, dropped))
 
     def _on_own(self, text: str, site: str) -> None:

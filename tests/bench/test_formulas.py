@@ -284,7 +284,7 @@ def test_a_case_is_run_from_the_world_to_the_count(rig, most, tmp_path):
     case = replace(SMALL, formulas=(sector,), rig=rig)
     result = formulas.run(case, tmp_path, most)
     assert json.loads(json.dumps(result)) == result
-    # Without it the window is thrown away, or stays: either is told from the floor.
+    # Without it the window is rejected, or stays: either is told from the floor.
     first = {k: result[k][0] for k in ("held_out_mm", "floor_mm", "rejected")}
     assert not at_floor(first, result["oracle"]) and at_floor(result["oracle"], result["oracle"])
     assert len(result["verdicts"]) == len(result["search_s"]) == most

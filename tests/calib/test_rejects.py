@@ -84,7 +84,7 @@ def test_a_sector_is_no_adequate_model_and_its_formula_takes_it_up(studied, tmp_
     assert diagnosis.verdict == "unexplained_structure"
     (size,) = re.findall(r"^Its formula: range = true \+ ([\d.]+)", diagnosis.sentences[1])
     assert float(size) == pytest.approx(25.0, abs=0.1)
-    told = next(each for each in diagnosis.sentences if "thrown away; of the beams" in each)
+    told = next(each for each in diagnosis.sentences if "rejected; of the beams" in each)
     assert "azimuth 21 to 51 deg" in told and "25.0 ±" in told
     document = json.loads((run.folder / "diagnosis.json").read_text())
     assert document["rejected"]["covariates"] == ["azimuth_rad"]

@@ -164,8 +164,8 @@ class BeamTable:
     def projection(self, columns_m: np.ndarray | None = None) -> Projection:
         """The model fitted to the table, with columns (N, k) of the ranges beside it or none.
 
-        Beams are weighed as Huber has it: those far out are held in bounds and none is thrown
-        away, as what is thrown away may be what is missing.
+        Beams are weighed as Huber has it: those far out are bounded and none is rejected, as what
+        is rejected may be what is missing.
 
         Returns:
             The model alone, at the weights of that fit.

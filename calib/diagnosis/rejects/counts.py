@@ -191,7 +191,7 @@ def count(stand: Stand, progress: Progress) -> Counts:
     cells = [np.zeros(len(axis.bins), int) for axis in axes]
     met, of_place = np.zeros((len(scans), 0), int), np.zeros((0, 1), int)
     for i, found in enumerate(in_order(lambda i: _count_stop(stand, i, axes), len(scans))):
-        progress("looking at what was thrown away", i, len(scans))
+        progress("looking at what was rejected", i, len(scans))
         place, surface = (
             numbers.of(scans[i].room, parts)
             for numbers, parts in ((places, found.places), (surfaces, found.surfaces))

@@ -140,7 +140,7 @@ class Rejects:
         meshed: whether surfaces are those of a mesh, and not planes found in the scans.
         clutter: share of all beams that hit something that is not in the mesh; clutter_stops: the
             stops of these.
-        beyond: whether more is thrown away elsewhere than mixed pixels may explain; beyond_m: the
+        beyond: whether more is rejected elsewhere than mixed pixels may explain; beyond_m: the
             median residual of that, where it agrees on one.
     """
 
@@ -175,13 +175,13 @@ class Rejects:
 
     @property
     def explained(self) -> bool:
-        """Whether all that was thrown away is what mixed pixels and clutter explain."""
+        """Whether all that was rejected is what mixed pixels and clutter explain."""
         return not self.structured and not self.beyond
 
     @property
     def sentence(self) -> str:
-        """What was thrown away, in words."""
-        said = f"{percent(self.share)} % of the beams that meet a surface were thrown away"
+        """What was rejected, in words."""
+        said = f"{percent(self.share)} % of the beams that meet a surface were rejected"
         if self.beyond:
             said += f", more than the {100 * CLUTTER:.0f} % that mixed pixels may explain"
             said += f", by {1e3 * self.beyond_m:+.1f} mm" if self.beyond_m else ""

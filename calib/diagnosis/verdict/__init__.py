@@ -193,7 +193,7 @@ def conclude(
 
 
 def _disbelief(forbids: Sequence[str]) -> str:
-    return f"This run is not to be believed as it stands: {'; '.join(forbids)}."
+    return f"This run should not be used as it stands: {'; '.join(forbids)}."
 
 
 def _unconfirmed(found: Search, rms_mm: Mapping[str, float]) -> Candidate | None:

@@ -70,7 +70,8 @@ def sentences_of(
         what = " and ".join(words(c) for c in found.scatter.effect.covariates)
         out.append(
             f"The noise depends on {what} otherwise than the LiDAR's noise model says: "
-            f"{found.scatter.effect.name} would give the rows better weights; it changes no mean."
+            f"{found.scatter.effect.name} would improve the weights of the rows; it does not "
+            "change the mean."
         )
     gone = [name for name, why in untestable.items() if why.startswith("the recordings")]
     if gone:
@@ -140,10 +141,10 @@ def _formula_sentences(each: Mapping[str, Any], residual: str) -> list[str]:
     fall = f" The held-out error goes from {before:.2f} to {after:.2f} mm." if after else ""
     was, now = (each["rejected_share"][k] for k in ("before", "after"))
     if None not in (was, now) and was - now > FALL_MATTERS:
-        fall += f" Beams thrown away go from {100 * was:.1f} to {100 * now:.1f} %."
+        fall += f" Rejected beams go from {100 * was:.1f} to {100 * now:.1f} %."
     out = [
         f"Its formula: {each['says']}.",
-        f"The model does not absorb {each['rms_mm']:.2f} mm rms of what it does to {residual} "
+        f"Of its effect on {residual}, {each['rms_mm']:.2f} mm rms is not absorbed by the model "
         f"(adjusted p = {each['p_adjusted']:.1g}).{fall}",
         f"It can be added by its name, '{each['formula']['name']}'. {each['formula']['what']}",
     ]

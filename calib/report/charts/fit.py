@@ -42,7 +42,7 @@ def ladder(evidence: Evidence) -> Iterator[Chart | Absent]:
         else f"The {kind} error is {last:.2f} mm, {near} the {floor:.2f} mm expected",
         "A row per run, each named by what it added to the one above. Blue: rms error of stops "
         "that its fit never saw; hollow: of those it saw; green: what would be left if the model "
-        "were right. Further left is better; an error at the green mark cannot be told from noise."
+        "were right. An error at the green mark is as small as the noise allows."
         + (f" A diamond: {FORMULA}." if any(rung.empirical for rung in evidence.rungs) else ""),
         lambda: _ladder(evidence),
         wide=True,

@@ -300,7 +300,7 @@ def _rings_chart(fitted: VariableEstimate, name: str) -> Chart:
         name,
         f"{fitted.variable}: rings differ by {_spread(fitted)}",
         "The estimate of each ring with its 95 % band. Where the band holds zero, no correction is "
-        "called for; elsewhere take the value off what the ring measures.",
+        "called for; elsewhere subtract the value from the ring's ranges.",
         lambda: _curve(fitted, "ring"),
     )
 

@@ -125,9 +125,10 @@ def moves_from_cad(evidence: Evidence) -> Iterator[Chart | Absent]:
     told = move_told(name, furthest)
     yield Chart(
         "moved",
-        f"{loud} of {len(found)} CAD values are not where their sigmas say; the furthest is {told}"
+        f"{loud} of {len(found)} CAD values are further off than their sigmas allow, the furthest "
+        f"{told}"
         if loud
-        else f"CAD values are where their sigmas say; the furthest is {told}",
+        else f"CAD values agree with their sigmas; the furthest is {told}",
         "How far each frame (its parameter that moved most) and each parameter of the geometry "
         f"moved, in sigmas of its prior; the dashed line is {FAR_FROM_CAD:g}. Far "
         f"beyond it the value in rig.yaml or in the URDF is wrong, a sign or a unit say, or the "

@@ -33,7 +33,7 @@ AXIS_UNITS = {
 BINS_OUT_BY_CHANCE = 0.02  # how seldom so many bins may lie outside their bands by chance
 SELDOM = 0.01  # of the rows: things seen less decide no scale
 FEWEST_THROWN = 0.05  # share at the end of the map's scale, at least
-BEAMS_IN_HISTOGRAM = 0.9  # of the beams thrown away: what the histogram shows
+BEAMS_IN_HISTOGRAM = 0.9  # of the beams rejected: what the histogram shows
 BEFORE_BEYOND = 5.0  # by how much what was before may lie beyond the scale of what is left
 MOST_AXIS_NAMES = 40  # names of things along an axis
 UPRIGHT_NAMES = 6  # of these; more are turned
@@ -248,7 +248,7 @@ def thrown_away(evidence: Evidence) -> Iterator[Chart | Absent]:
     now = evidence.after
     found = (evidence.diagnosis or {}).get("rejected") or {}
     share = 100 * (1 - now.kept / max(now.rows, 1))
-    told = f"{share:.2g} % of the beams that meet a surface were thrown away"
+    told = f"{share:.2g} % of the beams that meet a surface were rejected"
     yield Chart(
         "rejected",
         found.get("sentence", "").rstrip(".") or told,

@@ -35,7 +35,7 @@ def told(run: Run, wanted: Effects, findings: Findings | None, runs: Mapping[str
     added, dropped = difference(run.effects, wanted)
     before = run.summary["rms_mm"]["held_out"]
     if not added and not dropped:
-        return "These are the effects of the run. Tick others, or take a tick away."
+        return "These are the effects of the run. Tick others, or untick some."
     if before is None:
         return "No stop was held out of this run, so no error is expected."
     for name, other in runs.items():

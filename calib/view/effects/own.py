@@ -74,7 +74,7 @@ def document(text: str, site: str, points: Points, taken: Collection[str]) -> di
     expression = Expression(text.strip(), "yours")
     made = [n for n in MADE_BY_FITS if {n, n.removesuffix("_m")} & set(expression.names)]
     if made:
-        raise expression.wrong(f"{made[0]} is what a fit leaves; an effect cannot look at it")
+        raise expression.wrong(f"{made[0]} is a result of the fit; an effect cannot depend on it")
     values = value_of(points, expression)
     size = float(np.sqrt(np.mean(np.square(values))))
     if not 0 < size < np.inf:
