@@ -23,7 +23,10 @@ SPANS = {
     "azimuth_rad": (-np.pi, np.pi, 180.0 / np.pi, "azimuth, deg"),
     "elevation_rad": (-0.4, 0.4, 180.0 / np.pi, "elevation, deg"),
     "joints": (-np.pi, np.pi, 180.0 / np.pi, "angle of {}, deg"),
+    "payload_kg": (0.0, 5.0, 1.0, "payload, kg"),
+    "torques": (-40.0, 40.0, 1.0, "torque of every joint, N m"),
 }
+LOADS = {"payload_kg", "torques"}
 # A place goes along x, the others of its coordinates standing at these.
 TRACKED, ROOM_POINT = (-3.0, 3.0, (0.5, 1.0)), (0.0, 8.0, (2.0, 1.0))
 CURVE_POINTS, STOPS, STOPS_PER_LOCATION, MAP_CELLS = 400, 12, 3, 60
@@ -51,6 +54,8 @@ class Walk:
 def walk_of(effect: Effect, rig: Rig) -> Walk | None:
     """The rows over which an effect is drawn; None where it depends on what no room has."""
     over = [name for name in effect.covariates if name != "time_s"]
+    if set(over) & LOADS:  # of an arm that stands still
+        over.remove("joints")
     if effect.by_chance or set(over) & {"ring", "label", "stop", "location", "surface", "target"}:
         return _things(effect, rig)
     if "time_s" in effect.covariates:
@@ -70,7 +75,7 @@ def walk_of(effect: Effect, rig: Rig) -> Walk | None:
 def grid_of(effect: Effect, rig: Rig) -> tuple[View, list[str]] | None:
     """Cells over two covariates, the second going fastest, and their names; else None."""
     names = list(effect.covariates)
-    if len(names) != 2 or not set(names) <= SPANS.keys() - {"joints"}:
+    if len(names) != 2 or not set(names) <= SPANS.keys() - {"joints", *LOADS}:
         return None
     edges = (np.linspace(*SPANS[name][:2], MAP_CELLS + 1) for name in names)
     middles = ((edge[1:] + edge[:-1]) / 2 for edge in edges)
@@ -86,6 +91,7 @@ def _view(
 ) -> View:
     """Rows at which all stands still but these columns."""
     still = {name: np.full(rows, 0.5 * sum(span[:2])) for name, span in SPANS.items()}
+    still = {name: column for name, column in still.items() if name not in LOADS}
     still["normal"] = np.tile([0.0, 0.0, 1.0], (rows, 1))
     if joints is None:
         joints = np.full((rows, len(rig.joint_names)), REST)
@@ -99,6 +105,9 @@ def _along(rig: Rig, name: str) -> Walk:
     """Along one column, from end to end; of the joints along the second."""
     low, high, times, label = SPANS[name]
     column = np.linspace(low, high, CURVE_POINTS)
+    if name == "torques":
+        torques = np.tile(column[:, None], len(rig.joint_names))
+        return Walk(_view(rig, CURVE_POINTS, {name: torques}), label, times * column)
     if name != "joints":
         return Walk(_view(rig, CURVE_POINTS, {name: column}), label, times * column)
     joints = np.zeros((CURVE_POINTS, len(rig.joint_names)))
