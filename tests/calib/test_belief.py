@@ -85,7 +85,7 @@ def test_what_forbids_belief_takes_the_verdict_along(run, searched, monkeypatch,
     assert any(said in each for each in forbids(spoilt)) and not forbids(run)
     found = diagnosed(spoilt, searched, monkeypatch)
     assert found.verdict == "bad_data"
-    assert any("not to be believed" in each and said in each for each in found.sentences)
+    assert any("should not be used" in each and said in each for each in found.sentences)
     verdict = judge(spoilt, found.document())
     assert verdict.light == "red" and any(said in each for each in verdict.reasons)
 

@@ -221,7 +221,7 @@ def test_a_rig_that_nobody_measured_is_promised_what_a_recording_gives(narrow, t
         ("--for lidar.tq", "--for lidar.tq: neither in the model nor an effect"),
         ("--for stop_range_scatter", "it is drawn by chance"),
         ("--for noise_range", "it moves no mean"),
-        ("--for lidar --until 'lidar 1 mm'", "so it takes no --for"),
+        ("--for lidar --until 'lidar 1 mm'", "not both"),
         ("--until lidar", "give NAME NUMBER UNIT"),
         ("--until 'lidar 1 km'", "unit 'km' is unknown; give mm, m, mrad, rad, deg"),
         ("--until 'lidar -1 mm'", "'-1' is no number above 0"),

@@ -128,7 +128,7 @@ def apart(part, what):
         (rms(4.0), found(), "red", "4.0 times as large as expected"),
         ({"converged": False}, found(), "red", "not converged"),
         ({}, found("missing_effect"), "red", "worth adding"),
-        ({}, found("bad_data"), "red", "to be mended or left out"),
+        ({}, found("bad_data"), "red", "has to be corrected or left out"),
     ],
 )
 def test_the_light_follows_its_rule(changes, diagnosis, light, reason):

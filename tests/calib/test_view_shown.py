@@ -185,8 +185,8 @@ def test_a_formula_of_ones_own_becomes_an_effect_of_a_plausible_size():
     assert found["sigma"] * 2.0 == pytest.approx(0.01) and found["unit"] == "m"
     assert document("ring + 1", "azimuth", points, [])["unit"] == "rad"
     for text, why in (
-        ("residual * 2", "what a fit leaves"),
-        ("difference_m", "what a fit leaves"),
+        ("residual * 2", "a result of the fit"),
+        ("difference_m", "a result of the fit"),
         ("0 * range", "is 0 at every beam"),
         ("1 / (range - 4)", "no number at some"),
         ("humid", "did you mean humidity"),
