@@ -137,26 +137,18 @@ def gravity_moment(
     yet: ``m = R^T sum((c - o) x (0, 0, -G kg))``, with z of the tree's root up.
     """
     moment = np.zeros((len(joints), len(edges), 3))
-    origins = [_at(tree, tree.edges[tree.edge_names.index(name)].parent, joints) for name in edges]
+    at = [tree.edge_names.index(name) for name in edges]
+    parts = [tree.edges[e] for e in at]
+    origins = [tree.transform(edge.parent, joints) @ edge.T_parent_child for edge in parts]
     for mass in masses:
-        T = _at(tree, mass.frame, joints)
+        T = tree.transform(mass.frame, joints)
         centre_m = T[:, :3, :3] @ mass.centre_m + T[:, :3, 3]
         weight = np.reshape(mass.kg, (-1, 1)) * [[0.0, 0.0, -G]]
-        beyond = {tree.edge_names[i] for i in tree.path(mass.frame)}
-        for n, name in enumerate(edges):
-            if name in beyond:
-                edge = tree.edges[tree.edge_names.index(name)]
-                origin = origins[n] @ edge.T_parent_child
-                about = np.cross(centre_m - origin[:, :3, 3], weight)
-                moment[:, n] += np.einsum("kji,kj->ki", origin[:, :3, :3], about)
+        beyond = set(tree.path(mass.frame))
+        for n in (n for n, e in enumerate(at) if e in beyond):
+            about = np.cross(centre_m - origins[n][:, :3, 3], weight)
+            moment[:, n] += np.einsum("kji,kj->ki", origins[n][:, :3, :3], about)
     return moment
-
-
-def _at(tree: FrameTree, frame: str, joints: Array) -> Array:
-    """Return T_root_frame (K, 4, 4)."""
-    chain = SerialChain([tree.edges[i] for i in tree.path(frame)])
-    ours = [tree.joint_names.index(name) for name in chain.joint_names]
-    return chain.place(np.asarray(joints)[:, ours])
 
 
 def gravity_torque(tree: FrameTree, masses: Sequence[Mass], joints: Array) -> Array:
