@@ -55,21 +55,14 @@ def solve(
     if not problem.calibration:
         raise InputError("nothing is left to estimate: fix fewer names, or choose an effect")
     loop = Loop(problem, prior, progress, start)
-    (loop.take_weights if loop.start.state else loop.doubt_bodies)()
+    if loop.start.state:
+        loop.take_weights()
+    else:
+        loop.doubt_bodies()
     if loop.start.state and problem.scans:
         _go_on(loop, tolerance)
         return _not_raised(loop, loop.estimate(tolerance if spread else None))
-    loop.solve_without_scans()
-    astray = prior is None and loop.bodies_astray()
-    if not astray:
-        loop.reweigh(beams=False)
-    if prior is None and (astray or loop.bodies_astray() or turned_far(problem, loop.values)):
-        # A start that is right costs less before it is solved than a wrong one after.
-        for cost, values in least_turned(problem):
-            if cost < loop.cost():
-                loop.solve_without_scans(values)
-        loop.reweigh(beams=False)
-        loop.lost = loop.bodies_astray()
+    _without_scans(loop, problem, turns=prior is None)
     if problem.scans:
         # Nothing was known of these without scans.
         loop.values |= declared(problem, loop.held) | lidars_turned(loop.problem, loop.values)
@@ -80,6 +73,22 @@ def solve(
     elif loop.start.state:
         _stay_below(loop, lambda: loop.descend(STEADY, beams=False))
     return _not_raised(loop, loop.estimate(tolerance if spread else None))
+
+
+def _without_scans(loop: Loop, problem: Problem, turns: bool) -> None:
+    """Trackers and targets alone, with robust weights; where bodies are then far off, also from
+    starts that are turned, if `turns`."""
+    loop.solve_without_scans()
+    astray = turns and loop.bodies_astray()
+    if not astray:
+        loop.reweigh(beams=False)
+    if turns and (astray or loop.bodies_astray() or turned_far(problem, loop.values)):
+        # A start that is right costs less before it is solved than a wrong one after.
+        for cost, values in least_turned(problem):
+            if cost < loop.cost():
+                loop.solve_without_scans(values)
+        loop.reweigh(beams=False)
+        loop.lost = loop.bodies_astray()
 
 
 def _arrive(loop: Loop, tolerance: float) -> None:
@@ -121,11 +130,12 @@ def _go_on(loop: Loop, tolerance: float) -> None:
 def _stay_below(loop: Loop, descend: Callable[[], bool]) -> None:
     """Go back to the start where the cost is above that of it, and down from there with the weights
     as they are; and where that ends above it as well, stay."""
-    for again in (descend, lambda: None):
-        if not _raised(loop):
-            return
+    if not _raised(loop):
+        return
+    loop.values = values_of(loop.problem, loop.start.state)
+    descend()
+    if _raised(loop):
         loop.values = values_of(loop.problem, loop.start.state)
-        again()
 
 
 def _raised(loop: Loop, more: float = UPHILL, least: float = 0.0) -> bool:
