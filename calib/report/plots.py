@@ -142,6 +142,26 @@ def signed_map(
     return ax.imshow(values, scale, vmin=-limit, vmax=limit, extent=extent, **options)
 
 
+def ring_map(
+    ax: Axes, values: np.ndarray, limit: float, title: str, rings: int | None = None
+) -> Any:
+    """A `signed_map` over azimuth, all around, and ring; of so many `rings` where rows hold several
+    of them."""
+    ax.set_title(title)
+    ax.set_xticks(range(-180, 181, 90))
+    return signed_map(ax, values, (-180, 180, -0.5, (rings or len(values)) - 0.5), limit)
+
+
+def name_ring_maps(figure: Figure, grid: np.ndarray, picture: Any) -> None:
+    """Say what lies along some of these maps, and what their colours, of one scale, are."""
+    for ax in grid[-1]:
+        ax.set_xlabel("azimuth, deg")
+    for ax in grid[:, 0]:
+        ax.set_ylabel("ring")
+    bar = figure.colorbar(picture, ax=grid, orientation="horizontal", aspect=60, extend="both")
+    bar.set_label("mean residual, mm")
+
+
 def signed_cells(ax: Axes, x: np.ndarray, y: np.ndarray, values: np.ndarray, limit: float) -> Any:
     """As `signed_map`, of cells (rows, columns) with these edges, which need not be even."""
     ax.set_facecolor("#d8d8d8")

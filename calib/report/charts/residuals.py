@@ -230,13 +230,8 @@ def _ring_map(maps: Mapping[str, np.ndarray]) -> Figure:
     figure, grid = plots.axes(plots.WIDE_IN, 3.4, 1, len(maps), sharey=True)
     limit = map_limit(list(maps.values()))
     for ax, (title, values) in zip(grid[0], maps.items(), strict=True):
-        picture = plots.signed_map(ax, values, (-180, 180, -0.5, len(values) - 0.5), limit)
-        ax.set_title(title)
-        ax.set_xlabel("azimuth, deg")
-        ax.set_xticks(range(-180, 181, 90))
-    bar = figure.colorbar(picture, ax=grid, orientation="horizontal", aspect=60, extend="both")
-    bar.set_label("mean residual, mm")
-    grid[0, 0].set_ylabel("ring")
+        picture = plots.ring_map(ax, values, limit, title)
+    plots.name_ring_maps(figure, grid, picture)
     return figure
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from functools import partial
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -62,12 +62,9 @@ def _unseen(stops: Sequence[StopMaps]) -> Figure:
     for row, stop in zip(grid, stops, strict=True):
         told = zip(row, stop.map_m, stop.rms_m, ("before", "seen", "held out"), strict=True)
         for ax, map_m, rms_m, what in told:
-            extent = (-180, 180, -0.5, len(map_m) - 0.5)
-            picture = plots.signed_map(ax, 1e3 * map_m, extent, limit)
-            ax.set_title(f"{_short(stop.name)} {what}: {1e3 * rms_m:.2f} mm")
-            ax.set_xticks(range(-180, 181, 90))
-        row[0].set_ylabel("ring")
-    _finish(figure, grid, picture)
+            title = f"{_short(stop.name)} {what}: {1e3 * rms_m:.2f} mm"
+            picture = plots.ring_map(ax, 1e3 * map_m, limit, title)
+    plots.name_ring_maps(figure, grid, picture)
     return figure
 
 
@@ -110,27 +107,16 @@ def _small(maps: Sequence[StopMap], rings: int, limit: float) -> Figure:
     size = (plots.WIDE_IN, 1.2 + 1.15 * rows, rows, MAPS_IN_ROW)
     figure, grid = plots.axes(*size, sharex=True, sharey=True)
     for ax, each in zip(grid.flat, maps, strict=False):
-        extent = (-180, 180, -0.5, rings - 0.5)
-        picture = plots.signed_map(ax, 1e3 * each.map_m, extent, limit)
         what = " held out" if each.held_out else ""
-        ax.set_title(f"{_short(each.name)}{what}: {1e3 * each.rms_m:.2f} mm", fontsize=8)
-        ax.set_xticks(range(-180, 181, 90))
+        title = f"{_short(each.name)}{what}: {1e3 * each.rms_m:.2f} mm"
+        picture = plots.ring_map(ax, 1e3 * each.map_m, limit, title, rings)
+        ax.title.set_fontsize(8)
     for ax in grid.flat[len(maps) :]:
         ax.set_axis_off()
-    for ax in grid[:, 0]:
-        ax.set_ylabel("ring")
-    _finish(figure, grid, picture)
+    plots.name_ring_maps(figure, grid, picture)
     return figure
 
 
 def _short(name: str) -> str:
     """A stop's name as long as fits above a map."""
     return name if len(name) <= NAME else f"{name[: NAME - 1]}…"
-
-
-def _finish(figure: Figure, grid: np.ndarray, picture: Any) -> None:
-    """Say what lies across the maps, and what their colours are."""
-    for ax in grid[-1]:
-        ax.set_xlabel("azimuth, deg")
-    bar = figure.colorbar(picture, ax=grid, orientation="horizontal", aspect=60, extend="both")
-    bar.set_label("mean residual, mm")
