@@ -10,11 +10,11 @@ from scipy.spatial.transform import RigidTransform
 
 from calib.effects import CATALOGUE
 from calib.problem.unknowns import Key
+from calib.results.outstanding import outstanding
 from calib.results.solution import EffectEstimate, FrameEstimate, Part, Solution
 from calib.runs.run import Run
 from calib.show import tables
 from calib.show.comparison import comparison, print_comparison
-from calib.show.misfit import outstanding
 from sensors.documents import json_text
 
 from . import rigs

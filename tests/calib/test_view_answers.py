@@ -14,7 +14,7 @@ import pytest
 from calib.exporters import export
 from calib.results.holdout import held_out
 from calib.runs.reopen import reopened, start_of
-from calib.runs.run import Run
+from calib.runs.run import RESIDUALS, Run
 from calib.solve.fit import stepped
 from calib.view import panels
 from calib.view.effects.expected import Expected
@@ -37,8 +37,6 @@ from tests.calib.workbench import (
     value,
     write,
 )
-
-TABLES = "residuals.parquet"
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +93,7 @@ def dragged(watched: Watched, start: float, end: float) -> None:
 @pytest.mark.slow
 def test_a_part_of_the_plot_lights_its_beams_in_the_room(run):
     """By dragging and by writing; how many they are and how far off is told; a link keeps it."""
-    table = read_table(run.folder / TABLES / "L00P00.parquet")
+    table = read_table(run.folder / RESIDUALS / "L00P00.parquet")
     with shown(run.folder) as (watched, page):
         tab, stage = watched.page, page.picture.stage
         choose(watched, "Over", "ring")

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from calib.runs.add import add
 from calib.runs.calibrate import calibrate
-from calib.runs.run import Run
+from calib.runs.run import RESIDUALS, Run
 from calib.simulation import simulate
 from calib.view.scene import Points, Scene
 from calib.view.shown import colours, plot, sizes
@@ -34,8 +34,6 @@ from tests.calib.workbench import (
     value,
     write,
 )
-
-TABLES = "residuals.parquet"
 
 
 def pair(folder: Path) -> None:
@@ -73,11 +71,11 @@ def cloud(**columns: np.ndarray) -> Points:
 def test_beams_have_their_residual_as_a_fit_without_their_stop_left_it(run):
     """Of stops that were held out; of others there is none, and their columns are not offered."""
     scene = Scene.of(run)
-    stops = {path.stem for path in (run.folder / TABLES / "_held_out").iterdir()}
+    stops = {path.stem for path in (run.folder / RESIDUALS / "_held_out").iterdir()}
     assert 0 < len(stops) < len(scene.stops(0))
     stop = min(stops)
     columns = gathered(scene, 0, [stop]).columns
-    wanted = by_beam(run.folder / TABLES / "_held_out" / f"{stop}.parquet")
+    wanted = by_beam(run.folder / RESIDUALS / "_held_out" / f"{stop}.parquet")
     beams = zip(columns["ring"].tolist(), columns["column"].tolist(), strict=True)
     known = np.array([wanted.get(beam, np.nan) for beam in beams])
     np.testing.assert_array_equal(columns["held_out_m"], known)
@@ -203,7 +201,7 @@ def test_two_runs_stand_side_by_side(runs):
         names = tab.locator("[data-is=side]")
         until(watched, names.all_inner_texts, ["run", "better"])
         first, second = sides.first, sides.second
-        there = by_beam(runs / "better" / TABLES / "L00P00.parquet")
+        there = by_beam(runs / "better" / RESIDUALS / "L00P00.parquet")
         columns = second.points.columns
         beams = zip(columns["ring"].tolist(), columns["column"].tolist(), strict=True)
         np.testing.assert_array_equal(columns["residual_m"], [there[beam] for beam in beams])
@@ -220,9 +218,9 @@ def test_two_runs_stand_side_by_side(runs):
         assert abs(R[:, 2] @ shift) < 0.05 * np.linalg.norm(shift)
         tab.keyboard.press("n")
         tab.wait_for_url(re.compile("stop=L00P01"))
-        next_one = by_beam(runs / "better" / TABLES / "L00P01.parquet")
+        next_one = by_beam(runs / "better" / RESIDUALS / "L00P01.parquet")
         assert len(second.points.xyz_m) == len(next_one)
-        gone = runs / "better" / TABLES / "L01P00.parquet"
+        gone = runs / "better" / RESIDUALS / "L01P00.parquet"
         gone.rename(gone.with_suffix(".gone"))
         choose(watched, "Stop", "L01P00")  # the first is shown all the same
         tab.get_by_text("the run is incomplete").wait_for()
