@@ -9,8 +9,8 @@ from pathlib import Path
 
 from calib.exporters.fitted import Fitted
 from calib.exporters.written import Written, head, write_text
+from calib.results.outstanding import shown
 from calib.runs.estimates import VariableEstimate, variable_estimates
-from calib.show.scale import shown
 from calib.show.tables import LISTED_PARAMETERS, effect_cells, estimate_cell
 from chains import escape
 

@@ -8,10 +8,10 @@ import numpy as np
 
 from calib.report.data import Cell, Table
 from calib.report.evidence import Evidence
+from calib.results.outstanding import shown
 from calib.results.solution import Solution
 from calib.rig import Rig
 from calib.runs.estimates import VariableEstimate, drawn
-from calib.show.scale import shown
 from calib.show.tables import LISTED_PARAMETERS, estimate_texts
 from chains import escape, se3
 

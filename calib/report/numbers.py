@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from calib.report.data import csv_link
-from calib.show.scale import shown
+from calib.results.outstanding import shown
 from chains import escape
 
 if TYPE_CHECKING:

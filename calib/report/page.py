@@ -16,10 +16,10 @@ from calib.report.calibration import calibration_tables
 from calib.report.chart import Absent, Chart
 from calib.report.charts.fit import error_mm
 from calib.report.evidence import Evidence, folder_name
+from calib.results.outstanding import shown
 from calib.show.blunders import BLUNDER_HEADINGS, blunder_cells
 from calib.show.headline import moved_sentence
 from calib.show.misfit import over_beams
-from calib.show.scale import shown
 from calib.show.tables import chance, effect_page, estimate_cell, mm
 from calib.show.verdict import Verdict
 from chains import escape

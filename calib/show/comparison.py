@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from calib.results.outstanding import moves, shown, things
 from calib.runs.asked.moved import SHARED, Moved
 from calib.runs.estimates import comparison
 from calib.runs.ladder import DESCRIBED, FORMULA, Rung, ladder
 from calib.show.headline import DIFFERS, MOVED_WORDS, Words, moved_sentence
-from calib.show.misfit import moves, things, worst_of
-from calib.show.scale import shown
+from calib.show.misfit import worst_of
 from calib.show.tables import (
     ERROR_LABELS,
     LISTED_PARAMETERS,

@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from calib.results.outstanding import shown
 from calib.runs.run import Run
 from calib.show.misfit import over_beams
-from calib.show.scale import shown
 from calib.show.verdict import UNASKED, judge
 
 TOLD_AXES = 3.0  # sigmas of a change, from which the axis along which it went is named

@@ -5,40 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from calib.results.outstanding import (
-    FAR_FROM_CAD,
-    STANDS_OUT,
-    groups,
-    move_told,
-    moves,
-    of_stop,
-    outstanding,
-    standing_out,
-    things,
-    times,
-    together_told,
-)
+from calib.results.outstanding import groups, moves, times
 
 if TYPE_CHECKING:
     from calib.runs.run import Run
-
-__all__ = [
-    "FAR_FROM_CAD",
-    "STANDS_OUT",
-    "beams_told",
-    "furthest",
-    "groups",
-    "move_told",
-    "moves",
-    "of_stop",
-    "outstanding",
-    "over_beams",
-    "standing_out",
-    "things",
-    "times",
-    "together_told",
-    "worst_of",
-]
 
 
 def over_beams(rms_mm: float, summary: Mapping[str, Any], before: str = "") -> str:

@@ -1,12 +1,8 @@
-"""Units in which numbers are shown; round ones for the ends of axes and scales of colour."""
+"""Round numbers for the ends of axes and of scales of colour."""
 
 from __future__ import annotations
 
 import numpy as np
-
-from calib.results.outstanding import DISPLAY_UNITS, shown
-
-__all__ = ["DISPLAY_UNITS", "round_up", "shown"]
 
 
 def round_up(value: float) -> float:

@@ -16,11 +16,11 @@ from rich.text import Text
 from calib.blunders.chance import LEAST_P
 from calib.diagnosis.suggest import span
 from calib.residuals.groups import CAD
+from calib.results.outstanding import shown, standing_out, together_told
 from calib.runs.belief import TOLERATED_OF_CAD, misfit_sentence
 from calib.runs.estimates import VariableEstimate, variable_estimates
 from calib.show.headline import MOVED_WORDS, Words, closing, moved_sentence
-from calib.show.misfit import beams_told, standing_out, together_told
-from calib.show.scale import shown
+from calib.show.misfit import beams_told
 from chains import escape
 
 if TYPE_CHECKING:

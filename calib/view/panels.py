@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from calib.report import plots
+from calib.results import outstanding
 from calib.runs.ladder import FORMULA, Rung
 from calib.runs.run import Run
-from calib.show import misfit
 from calib.show.headline import moved_sentence
 from calib.show.tables import small
 from calib.view.desk import Findings
@@ -129,7 +129,7 @@ def moved(run: Run) -> str:
 
 def standing_out(run: Run) -> str:
     """What of the run does not fit; nothing where nothing stands out."""
-    lines = "".join(f"<li>{escape(line)}</li>" for line in misfit.standing_out(run.summary))
+    lines = "".join(f"<li>{escape(line)}</li>" for line in outstanding.standing_out(run.summary))
     title = '<b style="color:#b3261e">What does not fit</b>'
     return framed(f'{title}<ul data-is="misfits">{lines}</ul>') if lines else ""
 
@@ -146,8 +146,8 @@ def _misfit(ratios: Mapping[str, float]) -> str:
     """What stands out is bold and red."""
     loud = "color:#b3261e;font-weight:600"
     cells = ", ".join(
-        f'<span style="{loud if ratio > misfit.STANDS_OUT else ""}">{escape(name)} '
-        f"{misfit.times(ratio)}</span>"
+        f'<span style="{loud if ratio > outstanding.STANDS_OUT else ""}">{escape(name)} '
+        f"{outstanding.times(ratio)}</span>"
         for name, ratio in ratios.items()
     )
     return f'<div data-is="misfit">Residuals over their sigmas: {cells}</div>' if cells else ""

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from calib.problem.model import recording_names
+from calib.results.outstanding import of_stop
 from calib.runs.run import Run
-from calib.show.misfit import of_stop
 from calib.view import panels
 from calib.view.scene import Points, Scene
 from calib.view.shown import brush, colours, look, plot, sizes, taken

@@ -26,9 +26,8 @@ THICK_M, THIN_M = 0.05, 0.015
 FINEST_M, COARSEST = 0.006, 1 / 350  # of a point: metres, and a share of the room
 LARGER = 1.4  # points that are lit, among others
 APART = 1.08  # two rooms, in widths or heights of one
-FARTHER_FOR_TWO = (
-    1.2  # than two rooms as large as they are in their middle: the nearer parts are larger
-)
+# Than two rooms as large as they are in their middle: the nearer parts are larger.
+FARTHER_FOR_TWO = 1.2
 BEHIND_M = 0.01  # the room is drawn so far behind its surface
 OVERHEAD = 0.75  # of the way from the LiDAR to the ceiling: points above that hide the rest
 LETTER_M = 0.03  # frames are centimetres apart: their names are read from close by

@@ -13,7 +13,7 @@ from calib.report.chart import Absent, Chart
 from calib.report.evidence import Evidence
 from calib.residuals.targets import HangingTarget
 from calib.residuals.tracker import TrackedBody
-from calib.show.misfit import STANDS_OUT
+from calib.results.outstanding import STANDS_OUT
 from calib.show.scale import round_up
 from chains import se3
 

@@ -11,7 +11,8 @@ from calib.report import plots
 from calib.report.chart import Absent, Chart
 from calib.report.evidence import Evidence
 from calib.residuals.groups import JOINTS, SCAN
-from calib.show.misfit import furthest, times
+from calib.results.outstanding import times
+from calib.show.misfit import furthest
 
 if TYPE_CHECKING:
     from calib.report.plots import Figure

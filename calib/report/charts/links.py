@@ -13,10 +13,10 @@ from calib.report import plots
 from calib.report.chart import Absent, Chart
 from calib.report.evidence import Evidence
 from calib.report.numbers import give
+from calib.results.outstanding import shown
 from calib.rig import Rig
 from calib.runs.estimates import VariableEstimate
 from calib.runs.run import RING_NAME
-from calib.show.scale import shown
 from calib.show.tables import LISTED_PARAMETERS
 
 if TYPE_CHECKING:

@@ -9,10 +9,9 @@ from calib.report import plots
 from calib.report.chart import Absent, Chart
 from calib.report.charts.groups import MOST_NAMES, MOST_TICKS
 from calib.report.evidence import Evidence
-from calib.show.misfit import (
+from calib.results.outstanding import (
     FAR_FROM_CAD,
     STANDS_OUT,
-    furthest,
     groups,
     move_told,
     moves,
@@ -21,6 +20,7 @@ from calib.show.misfit import (
     things,
     times,
 )
+from calib.show.misfit import furthest
 
 if TYPE_CHECKING:
     from calib.report.plots import Figure
