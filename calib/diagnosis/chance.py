@@ -315,9 +315,8 @@ def _of_values(effect: Scatter, rows: Told) -> Chance | None:
     statistic, p_value = max((test.p_value() for test in tests), key=lambda each: -each[1])
     p_value = float(after_looks(p_value, len(tests)))
     sd = np.array([test.spread() for test in tests])
-    if (
-        len(tests) == 1 or after_looks(p_value, SCATTER_LOOKS) < ALPHA_SCATTER
-    ):  # the others are worth no effort
+    # The others are worth no effort.
+    if len(tests) == 1 or after_looks(p_value, SCATTER_LOOKS) < ALPHA_SCATTER:
         sd = rows.spread(np.full(len(tests), effect.sigma))
         statistic = max(rows.statistic(sd), statistic)
     pairs = zip(

@@ -42,9 +42,8 @@ NEIGHBOURS = 24  # of a point, through which its plane is laid
 SUPPORT = 200_000  # points among which neighbours are sought
 THICKEST = 0.3  # of a plane's width: what is thicker is none
 FLATTEST_BEAM_RAD = np.radians(85.0)  # flatter beams are corrected as these are
-CORRECTION_PASSES = (
-    3  # looks at the range: a correction changes by a millionth of itself from each to the next
-)
+# Looks at the range: a correction changes by a millionth of itself from each to the next.
+CORRECTION_PASSES = 3
 _SEEN = ("range_m", "azimuth_rad", "elevation_rad", "incidence_rad")  # of any cloud
 
 

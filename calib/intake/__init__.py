@@ -36,9 +36,8 @@ from sensors.stops import write_columns
 
 __all__ = ["Choices", "Imported", "import_files", "sources"]
 
-MOST_CHECKED = (
-    500  # stops; with more, what can be estimated is left to `rigcal check`, for its time
-)
+# Stops; with more, what can be estimated is left to `rigcal check`, for its time.
+MOST_CHECKED = 500
 
 
 @dataclass(frozen=True)

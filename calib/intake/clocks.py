@@ -23,9 +23,8 @@ LEAST_OVERLAP = 0.3  # of the shorter log
 LOG_PARTS = 8  # of the logs, whose own offsets tell the uncertainty
 REACH_S = 0.25  # the offset of a part is sought within it: a clock 100 ppm off needs 40 min for it
 LEAST_S = 2.0  # of a log: less has not one move of an arm in it
-DRIFT_S = (
-    0.02  # from the first part to the last; less is below the time that an arm takes to settle
-)
+# From the first part to the last; less is below the time that an arm takes to settle.
+DRIFT_S = 0.02
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import special
 
-CONFIDENCE = 0.95
+CONFIDENCE = 0.95  # of a band: by convention
 
 
 class TwoWay(NamedTuple):
