@@ -18,12 +18,14 @@ is diagonal, however many there are. All others, the calibration above all, are 
 **Elimination** (`elimination`) takes own unknowns and cells out by the Schur complement,
 ``H_kk - H_ke H_ee^-1 H_ek``: what remains says of the kept unknowns exactly what all rows say, and
 the gain ``H_ee^-1 H_ek`` leads back to those eliminated. The result does not depend on the order
-(`assembly`), the work does:
+(`assembly` has what both share), the work does:
 
 - `CellsFirst`, where stops are few: the finest cells by a division, then the other cells, all while
   stops still are twists; then the chain rule, and the stops' own unknowns.
 - `StopsFirst`, where stops are many: each stop's own unknowns as soon as its sums are there, so
-  that no matrix grows with the number of stops; all cells at the end.
+  that no matrix grows with the number of stops; all cells at the end. A stop without beams has few
+  rows: they are turned by QR until only some of them touch its own unknowns, and no matrix is made
+  of it alone.
 
 The `Linearisation` (`system`) that is left holds ``kept``: the normal equations of the kept
 unknowns and b, without their priors and without rows that touch kept unknowns only (targets, bodies

@@ -41,6 +41,7 @@ class Layout:
         bodies: the problem's blocks of tracked bodies that depend on stops' own unknowns.
         others: the problem's other blocks; the graph takes them as they are.
         unbounded: unknowns that have no prior.
+        scanned: how many stops have beams.
         touched: unknown -> numbers of the stops whose place, or tracked bodies, depend on it; -1
             for a target.
         asked: names of unknowns -> their columns, of those that were asked for.
@@ -57,6 +58,7 @@ class Layout:
     bodies: Sequence[BodiesTogether]
     others: Sequence[Block]
     unbounded: frozenset[str]
+    scanned: int
     touched: Mapping[str, frozenset[int]]
     asked: dict[tuple[str, ...], np.ndarray] = field(default_factory=dict)
 
@@ -113,6 +115,7 @@ class Layout:
             bodies=BodiesTogether.of(bodies),
             others=others,
             unbounded=frozenset(unbounded),
+            scanned=len({key_of(scan) for scan in problem.scans}),
             touched={name: frozenset(seen) for name, seen in touched.items()},
         )
 
@@ -143,11 +146,13 @@ class Layout:
     @property
     def stops_first(self) -> bool:
         """Whether stops are eliminated before cells, each by itself: where that costs less than all
-        in one block. A stop sees about half of all cells."""
+        in one block. A stop sees about half of all cells; where it has no beams, its rows are as
+        few as its unknowns, and their product is made for many stops at once."""
         count, kept = sum(map(len, self.own.values())), len(self.kept)
         in_one = count**3 / 3 + 2 * count**2 * kept + count * kept**2
         seen = kept + (len(self.finest) + len(self.cells)) / 2
-        return in_one > len(self.own) * (PER_ENTRY * seen**2 + PER_STOP)
+        by_stop = len(self.own) * PER_STOP + self.scanned * PER_ENTRY * seen**2
+        return in_one > by_stop + 2 * count * seen**2
 
 
 def positions(size: int, columns: np.ndarray) -> np.ndarray:

@@ -8,11 +8,13 @@ from dataclasses import replace
 import numpy as np
 
 from calib.forward import Placed, place_each
-from calib.linear.assembly import CellsFirst, OwnRows, StopsFirst
+from calib.linear.assembly import OwnRows
+from calib.linear.cells_first import CellsFirst
 from calib.linear.clusters import Gradients
 from calib.linear.layout import Layout
 from calib.linear.parallel import in_order
 from calib.linear.rows import StopRows, StopSums, Weighing
+from calib.linear.stops_first import StopsFirst
 from calib.linear.system import Linearisation, Values
 from calib.problem import Problem
 from calib.residuals.beams import Association

@@ -17,9 +17,10 @@ from unittest import mock
 
 from calib.diagnosis import stand
 from calib.linear import linearise
-from calib.linear.assembly import CellsFirst, StopsFirst
+from calib.linear.cells_first import CellsFirst
 from calib.linear.parallel import workers
 from calib.linear.rows import StopRows
+from calib.linear.stops_first import StopsFirst
 from calib.linear.system import Linearisation
 from calib.problem.model import Source
 from calib.residuals.store import BeamStore

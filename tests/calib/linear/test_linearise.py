@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.linear import assembly
+from calib.linear import cells_first
 from calib.linear.clusters import Gradients
 from calib.linear.layout import Layout
 from calib.linear.parallel import workers
@@ -26,7 +26,7 @@ def case(request, tmp_path_factory):
 def order(request, monkeypatch):
     stops_first, dense = ORDERS[request.param]
     monkeypatch.setattr(Layout, "stops_first", stops_first)
-    monkeypatch.setattr(assembly, "DENSE", dense)
+    monkeypatch.setattr(cells_first, "DENSE", dense)
     return request.param
 
 

@@ -1,0 +1,140 @@
+"""Stops' own unknowns are eliminated first, each stop's as it comes, and all cells at the end.
+
+It holds one matrix over ``[finest cells | coarser cells | kept | b]``, from which each stop's own
+unknowns are gone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from calib.linear.assembly import Assembly, OwnRows
+from calib.linear.elimination import Eliminated, eliminate, square
+from calib.linear.layout import Layout, positions
+from calib.linear.rows import TWIST, StopSums
+from calib.linear.system import Linearisation, Values
+from calib.residuals.compiled import add_at
+
+STOPS_TOGETHER = 256  # without beams, whose rows are multiplied at once: bounds the memory
+
+
+class StopsFirst(Assembly):
+    """Each stop's own unknowns are eliminated as it comes, all cells at the end."""
+
+    def __init__(
+        self, layout: Layout, own: Mapping[int, Sequence[OwnRows]], beams: int, raw: bool
+    ) -> None:
+        super().__init__(layout, own, beams, raw)
+        self.cells = np.concatenate([layout.finest, layout.cells])
+        self.columns = np.concatenate([self.cells, layout.kept, [layout.size]])
+        self.at = positions(layout.size + 1, self.columns)
+        self.total = np.zeros((len(self.columns), len(self.columns)))
+        self.waiting = dict(own)
+
+    def add(self, sums: StopSums) -> None:
+        """Add the beams of a stop, and eliminate what is its own."""
+        super().add(sums)
+        mine, at = self._columns(sums.stop, sums.chain_columns, sums.columns)
+        unit = np.append(self.layout.sigma, 1.0)
+        through, beside = np.zeros((2, TWIST, len(mine)))
+        through[:, at[sums.chain_columns]] = sums.chain * unit[sums.chain_columns]
+        direct = np.append(self.layout.size, sums.columns).astype(int)
+        block, place, scale = sums.whole(), at[direct], unit[direct]
+        beside[:, place] = block[:TWIST, TWIST:] * scale
+        half = block[:TWIST, :TWIST] @ through / 2.0 + beside
+        whole = np.vstack([through, half]).T @ np.vstack([half, through])
+        add_at(whole, place, place, block[TWIST:, TWIST:] * scale * scale[:, None])
+        self._finish(sums.stop, mine, at, whole)
+
+    def add_kept(self, rows: OwnRows) -> None:
+        """Add whitened rows about kept unknowns."""
+        super().add_kept(rows)
+        if self.raw is not None:
+            self._add_raw([rows])
+        rows.add_to(self.total, self.at, self.layout.sigma, len(self.columns) - 1)
+
+    def _columns(self, stop: int, *beams: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Columns (m,) that a stop's rows touch, its own first and the right side last, and where
+        among them each of all stands; those of its beams are given."""
+        size, own = self.layout.size, self.layout.own.get(stop, np.zeros(0, int))
+        rows = (each.columns for each in self.waiting.get(stop, ()))
+        touched = np.unique(np.concatenate([*beams, *rows, [size]]).astype(int))
+        mine = np.concatenate([own, np.setdiff1d(touched, own)])
+        return mine, positions(size + 1, mine)
+
+    def _finish(self, stop: int, mine: np.ndarray, at: np.ndarray, whole: np.ndarray) -> None:
+        """Add a stop's own rows to the matrix of its beams over its columns, and eliminate what is
+        its own; the other arguments are those of `_columns`."""
+        layout, rows = self.layout, self.waiting.pop(stop, ())
+        if self.raw is not None:
+            place = positions(layout.size + 1, layout.kept)[mine]
+            add_at(self.raw, place, place, whole)
+            self._add_raw(rows)
+        for each in rows:
+            each.add_to(whole, at, layout.sigma, len(mine) - 1)
+        count = len(layout.own.get(stop, ()))
+        rest = whole[count:, count:]
+        if count:
+            factor, gain = eliminate(whole[:count, :count], whole[:count, count:], rest)
+            self.eliminated.append(Eliminated(mine[:count], mine[count:], factor, gain))
+        to = self.at[mine[count:]]
+        add_at(self.total, to, to, rest)
+
+    def _finish_without_beams(self, stops: Sequence[int]) -> None:
+        """Eliminate what is their own from stops that have no beams. Their rows are few: they are
+        turned until no more of them touch a stop's own unknowns than there are of these (QR), and
+        all others go into one product."""
+        left, every = [], []
+        for stop in stops:
+            mine, at = self._columns(stop)
+            rows, count = self._stacked(stop, at, len(mine)), len(self.layout.own.get(stop, ()))
+            every.append(_over(rows, positions(self.layout.size, self.layout.kept), mine[:-1]))
+            if count:
+                Q, R = np.linalg.qr(rows[:, :count], mode="complete")
+                rows = Q.T @ rows
+                gain = solve_triangular(R[:count], rows[:count, count:], check_finite=False)
+                gone = Eliminated(mine[:count], mine[count:], R[:count].T, gain)
+                self.eliminated.append(gone)
+            left.append(_over(rows[count:, count:], self.at, mine[count:]))
+        self.total += square(np.vstack(left))
+        if self.raw is not None:
+            self.raw += square(np.vstack(every))
+
+    def _stacked(self, stop: int, at: np.ndarray, width: int) -> np.ndarray:
+        """A stop's own rows (m, width), in units of sigmas, columns where `at` puts them."""
+        found = self.waiting.pop(stop, ())
+        out, first = np.zeros((sum(len(rows.b) for rows in found), width)), 0
+        for rows in found:
+            here = slice(first, first := first + len(rows.b))
+            out[here, at[rows.columns]] = rows.A * self.layout.sigma[rows.columns]
+            out[here, -1] = rows.b
+        return out
+
+    def done(self, values: Values) -> Linearisation:
+        """Eliminate all but the kept."""
+        stops = list(self.waiting)
+        for first in range(0, len(stops), STOPS_TOGETHER):
+            self._finish_without_beams(stops[first : first + STOPS_TOGETHER])
+        count = len(self.cells)
+        if not count:
+            return self._done(values, self.total)
+        prior = self._cell_priors(values, self.cells)
+        self.total[:count, :count] += np.eye(count)
+        self.total[:count, -1] += prior
+        self.total[-1, :count] += prior
+        self.total[-1, -1] += prior @ prior
+        rest = self.total[count:, count:].copy()
+        factor, gain = eliminate(self.total[:count, :count], self.total[:count, count:], rest)
+        self.eliminated.append(Eliminated(self.cells, self.columns[count:], factor, gain))
+        return self._done(values, rest)
+
+
+def _over(rows: np.ndarray, at: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Rows (m, n) of some columns (n,), among the columns that stand somewhere in `at`."""
+    there = at[columns] >= 0
+    out = np.zeros((len(rows), int(at.max(initial=-1)) + 1))
+    out[:, at[columns[there]]] = rows[:, : len(columns)][:, there]
+    return out
