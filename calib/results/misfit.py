@@ -85,15 +85,15 @@ class InstrumentRows:
 def tracker_rows(estimate: Estimate) -> InstrumentRows | None:
     """Rows of tracked bodies: recording, stop, body, and the axis of the body as predicted, turn
     (rx, ry, rz) or shift (tx, ty, tz); None where no body is tracked."""
-    names, out = _stop_names(estimate), _Gathered()
-    for block in estimate.problem.bodies:
+    names, out, bodies = _stop_names(estimate), _Gathered(), estimate.problem.bodies
+    found = [unweighted(block).evaluate(estimate.values, True) for block in bodies]
+    variances = estimate.variances([d for _, d in found])
+    for block, (residual, _), variance in zip(bodies, found, variances, strict=True):
         axes = slice(3, 6) if block.is_point else slice(0, 6)
         stops = [names[key] for key in block.stop_names]
         each = [(*stop, block.body, axis) for stop in stops for axis in DOF[axes]]
-        sigma = np.repeat([block.sigma_rad, block.sigma_m], 3)[axes]
-        residual, d = unweighted(block).evaluate(estimate.values, True)
-        left = 1.0 - estimate.variances([d])[0]
-        out.add(each, POSE_UNITS[axes] * len(stops), np.tile(sigma, len(stops)), residual, left)
+        sigma, units = np.repeat([block.sigma_rad, block.sigma_m], 3)[axes], POSE_UNITS[axes]
+        out.add(each, units * len(stops), np.tile(sigma, len(stops)), residual, 1.0 - variance)
     return out.rows(("recording", "stop", "body", "axis"))
 
 
@@ -126,13 +126,13 @@ def prior_rows(estimate: Estimate) -> InstrumentRows | None:
     start = np.cumsum([0, *(v.dim for v in estimate.variables)])
     variance = np.diag(estimate.covariance)
     at = {v.name: variance[a : a + v.dim] for v, a in zip(estimate.variables, start, strict=False)}
-    for unknown in estimate.problem.variables.values():
-        if unknown.kind != "vector" or unknown.role is Role.TARGET:
-            continue
-        if unknown.role is Role.JOINTS:
-            (seen,) = estimate.variances([{unknown.name: np.eye(unknown.dim)}])
-        else:
-            seen = at.get(unknown.name, np.full(unknown.dim, np.nan))
+    known = [u for u in estimate.problem.variables.values() if u.kind == "vector"]
+    known = [u for u in known if u.role is not Role.TARGET]
+    joints = [u for u in known if u.role is Role.JOINTS]
+    variances = estimate.variances([{u.name: np.eye(u.dim)} for u in joints])
+    at |= {u.name: seen for u, seen in zip(joints, variances, strict=True)}
+    for unknown in known:
+        seen = at.get(unknown.name, np.full(unknown.dim, np.nan))
         left = 1.0 - seen / np.square(unknown.sigma)
         each = [(*owner.get(unknown.name, ("", "")), unknown.name, dof) for dof in unknown.dofs]
         out.add(each, unknown.units, unknown.sigma, _moved(unknown, estimate), left)
