@@ -23,7 +23,7 @@ from calib.effects.own.formula import FormulaEffect
 from calib.linear.clusters import Gradients
 from calib.linear.layout import Layout
 
-# Unknowns: with more, as where every stop has some of its own, no table is made.
+# Unknowns that stops share: with more no table is made.
 MOST_UNKNOWNS = 3000
 ANGLE_SEEN = 1e-6  # of the largest: a joint whose angle changes less at a pose is not seen there
 
@@ -39,16 +39,42 @@ def joint_tables(stand: Stand) -> Iterator[tuple[str, BeamTable]]:
     )
     turned = variables_of(wide, {effect.name for _, effect in levers})
     layout = Layout.of(wide, unbounded=[*chain(*turned.values())])
-    if layout.size > MOST_UNKNOWNS:
+    rows = rows_of_others(wide, layout, values, Gradients(layout.size))
+    A, *of_rows = _without_own(layout, *rows)
+    if A.shape[1] > MOST_UNKNOWNS:
         return
-    A, *of_rows = rows_of_others(wide, layout, values, Gradients(layout.size))
-    A, covariates = A.toarray(), _covariates(stand, layout)
-    at = {joint: layout.columns(turned[effect.name]) for joint, effect in levers}
-    model = np.setdiff1d(np.arange(layout.size), np.concatenate(list(at.values())))
+    covariates, shared = _covariates(stand, layout), _shared(layout)
+    columns = {joint: layout.columns(turned[effect.name]) for joint, effect in levers}
+    at = {joint: np.searchsorted(shared, mine) for joint, mine in columns.items()}
+    model = np.setdiff1d(np.arange(len(shared)), np.concatenate(list(at.values())))
     for joint, columns in at.items():
         if found := _table(A[:, model], A[:, columns].sum(axis=1), *of_rows, covariates):
             weight = sum(len(body.measured) / body.sigma_m**2 for body in wide.bodies)
             yield joint, replace(found, weight_m2=weight, joints=frozenset(rig.joint_names))
+
+
+def _shared(layout: Layout) -> np.ndarray:
+    """Columns (M,) of unknowns that no stop has for itself."""
+    own = np.concatenate([np.zeros(0, int), *layout.own.values()])
+    return np.setdiff1d(np.arange(layout.size), own)
+
+
+def _without_own(
+    layout: Layout, A: csr_array, b: np.ndarray, stop: np.ndarray, place: np.ndarray
+) -> tuple[np.ndarray, ...]:
+    """Rows as `rows_of_others` has them, over the shared unknowns: of each stop those that its own
+    unknowns, as joints' misreadings are, leave (elimination by orthogonal rows: Golub 1965)."""
+    right = np.column_stack([A[:, _shared(layout)].toarray(), b])
+    order = np.argsort(stop, kind="stable")
+    numbers = list(layout.own)
+    first, end = (np.searchsorted(stop[order], numbers, side) for side in ("left", "right"))
+    left = np.ones(len(b), bool)
+    for number, start, stopped in zip(numbers, first, end, strict=True):
+        rows = order[start:stopped]
+        Q, _ = np.linalg.qr(A[rows][:, layout.own[number]].toarray(), mode="complete")
+        right[rows] = Q.T @ right[rows]
+        left[rows[: len(layout.own[number])]] = False
+    return right[left, :-1], right[left, -1], stop[left], place[left]
 
 
 def _lever(number: int, joint: str) -> tuple[str, FormulaEffect]:

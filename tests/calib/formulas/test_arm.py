@@ -1,14 +1,17 @@
 """Formulas of an arm's joints: tables of poses against dense least squares, and a planted error."""
 
 import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.sparse import csr_array
 from threadpoolctl import threadpool_limits
 
 from calib.diagnosis.formulas import find
-from calib.diagnosis.formulas.arm import _table
+from calib.diagnosis.formulas.arm import _table, _without_own
 from calib.diagnosis.stand import Stand
 from calib.problem import build
 from calib.problem.model import Model, Source
@@ -17,6 +20,14 @@ from calib.solve.fit import solve
 STOPS, ROWS, UNKNOWNS = 60, 6, 9
 WILD = "p141"  # x of it is 0.5 m off
 MODEL = Model(("arm_link_length", "arm_joint_offset"))
+
+
+@dataclass
+class Sized:
+    """As much of a layout as tells which columns a stop has for itself."""
+
+    size: int
+    own: Mapping[int, np.ndarray]
 
 
 @pytest.fixture
@@ -53,6 +64,27 @@ def test_a_table_of_poses_explains_what_dense_least_squares_does(rows):
     _, amount = projection.fitted(functions[at])
     dense = np.linalg.lstsq(np.hstack([A[:, model], columns]), b, rcond=None)[0][-2:]
     assert amount == pytest.approx(dense, rel=1e-6)
+
+
+def test_what_stops_have_for_themselves_is_taken_out_of_their_rows(rows):
+    """As readings' errors are: what is left explains what dense least squares with them does."""
+    A, b, stop, place, _ = rows
+    rng = np.random.default_rng(4)
+    own = {k: np.arange(2) + UNKNOWNS + 1 + 2 * k for k in range(STOPS) if k % 5}
+    size = UNKNOWNS + 1 + 2 * STOPS
+    wide = np.hstack([A, np.zeros((len(b), 2 * STOPS))])
+    for k, columns in own.items():
+        wide[np.ix_(stop == k, columns)] = rng.standard_normal((ROWS, 2))
+    layout = Sized(size=size, own=own)
+    less, right, stops, places = _without_own(layout, csr_array(wide), b, stop, place)
+    counts = [ROWS - 2 * (k in own) for k in range(STOPS)]
+    assert np.bincount(stops[stops >= 0]).tolist() == counts
+    np.testing.assert_array_equal(places[stops < 0], 7)
+    whole = np.linalg.lstsq(wide, b, rcond=None)[0]
+    few = np.linalg.lstsq(less[:, : UNKNOWNS + 1], right, rcond=None)[0]
+    np.testing.assert_allclose(few, whole[: UNKNOWNS + 1], rtol=1e-9)
+    left = np.square(right - less[:, : UNKNOWNS + 1] @ few).sum()
+    assert left == pytest.approx(np.square(b - wide @ whole).sum(), rel=1e-9)
 
 
 def test_a_joint_that_no_body_feels_has_no_table(rows):
