@@ -155,12 +155,24 @@ def limit_of(own: float, others: float, groups: int, looks: int) -> tuple[float,
     return known, special.fdtri(own, known, (1.0 - ALPHA_BLUNDER) ** (1.0 / looks))
 
 
+def _bulk(some: Sequence[Shift]) -> float:
+    """How far out the median of some groups is, in squares of what chance makes it; at least 1."""
+    if len(some) < FEWEST_OF_KIND:
+        return 1.0
+    by_chance = special.chdtri([shift.dof for shift in some], 0.5)
+    return max(1.0, float(np.median([shift.statistic for shift in some] / by_chance)))
+
+
 def _judged(some: Sequence[Shift], looks: int) -> Iterator[Blunder]:
-    """Groups of one kind: in units of how far out their bulk is."""
+    """Groups of one kind: in units of how far out their bulk is; a single joint's too, as readings
+    that scatter show most in the joints that move the body furthest."""
     wholes = [shift for shift in some if _whole(shift.group)]
     dof = np.array([shift.dof for shift in wholes])
-    ratio = np.array([shift.statistic for shift in wholes]) / special.chdtri(dof, 0.5)
-    bulk = max(1.0, float(np.median(ratio))) if len(wholes) >= FEWEST_OF_KIND else 1.0
+    of_kind = _bulk(wholes)
+    single: dict[tuple[str, str], list[Shift]] = {}
+    for shift in (s for s in some if not _whole(s.group)):
+        single.setdefault((shift.group.recording, shift.group.what), []).append(shift)
+    of_joint = {joint: max(of_kind, _bulk(mine)) for joint, mine in single.items()}
 
     @cache
     def bounds(own: int) -> tuple[float, float, float]:
@@ -170,6 +182,7 @@ def _judged(some: Sequence[Shift], looks: int) -> Iterator[Blunder]:
 
     for shift in some:
         known, limit, enough = bounds(shift.dof)
+        bulk = of_joint.get((shift.group.recording, shift.group.what), of_kind)
         scaled = shift.statistic / bulk
         p = at_least(special.fdtrc(shift.dof, known, scaled / shift.dof))
         told = {u: np.diag(shift.information)[at].mean() for u, at in shift.parts.items()}

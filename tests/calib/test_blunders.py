@@ -316,6 +316,19 @@ def test_a_stated_sigma_counts_beside_a_few_groups(drawn, monkeypatch):
         assert taken < both.limit < 0.8 * alone.limit, "beyond chance, were the sigma known"
 
 
+def test_no_reading_is_wrong_of_a_joint_all_of_whose_readings_scatter(drawn, monkeypatch):
+    """Each joint is measured by its own readings: those of the first move the LiDAR furthest."""
+    rng, joint = np.random.default_rng(5), "joint_1"
+    mine = {g: s for g, s in drawn.shifts.items() if g.what == joint}
+    far = {g: 16.0 * rng.chisquare(s.dof) for g, s in mine.items()}
+    found = drawn.judged(far, monkeypatch)
+    others = next(b for g, b in found.items() if g.what == "joint_2" and b.shift.dof == 1)
+    assert max(far.values()) > others.limit, "wrong, were it of another joint"
+    assert not any(found[g].found for g in mine)
+    wild = max(far, key=far.get)
+    assert drawn.judged(far | {wild: 60.0 * far[wild]}, monkeypatch)[wild].found
+
+
 def test_a_shift_of_the_detectable_size_is_found_four_times_in_five(drawn, monkeypatch):
     """Of one group, the others being as they are in the recording, along any of its axes."""
     rng, hits = np.random.default_rng(1), []
