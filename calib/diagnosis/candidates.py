@@ -283,7 +283,7 @@ def structure(sources: Sequence[Source], sample: Mapping[str, np.ndarray]) -> li
 def _moved(sources: Sequence[Source]) -> Iterator[PoseShape]:
     """Mount, tracked bodies and tracker, moved by every column that changes from stop to stop."""
     stops = sum(len(s.recording.stops) for s in sources)
-    slips = [e for e in CATALOGUE if isinstance(e, MountSlip) and e.shape_name]
+    slips = [e for e in CATALOGUE if isinstance(e, MountSlip) and e.once]
     slips = [e for e in slips if any(e.params(s.rig) for s in sources)]
     columns = set.intersection(
         *({"time_s", *s.recording.covariates} & {*s.columns} for s in sources)

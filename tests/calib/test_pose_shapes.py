@@ -5,9 +5,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calib.diagnosis.candidates import PoseShape
+from calib.diagnosis.candidates import PoseShape, structure
+from calib.diagnosis.verdict.sentences import WHAT_MOVES
 from calib.effects import CATALOGUE
 from calib.effects.base import View
+from calib.problem.model import Source
 from calib.rig import load_rig
 from calib.runs.calibrate import calibrate
 from calib.runs.diagnose import diagnose
@@ -45,6 +47,16 @@ def test_each_wave_moves_what_the_slip_moves(rig, name):
     for wave, m in ((first, 1), (second, 2)):
         np.testing.assert_allclose(wave[:4].T, whole[:4].T * np.cos(m * angle), atol=1e-12)
         assert not wave[4].any() and whole[4].any()  # where the column has a hole
+
+
+def test_each_thing_that_moves_is_tried_once_and_has_its_words(tmp_path):
+    """Not as often as the catalogue has courses for its motion."""
+    simulate(SPEC, tmp_path / "rec", 1)
+    source = Source.open(tmp_path / "rec")
+    shapes = [e for e in structure([source], {}) if isinstance(e, PoseShape)]
+    tried = [(e.what, e.column) for e in shapes]
+    assert len(tried) == len(set(tried)) > 0
+    assert {what for what, _ in tried} <= set(WHAT_MOVES)
 
 
 @pytest.mark.slow
