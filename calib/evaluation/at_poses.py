@@ -7,7 +7,7 @@ the base included where nothing else tells it. It covers what is in the model.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,17 +18,20 @@ from calib import outputs
 from calib.effects import FrameOffset
 from calib.forward import Placed, place
 from calib.linear.parallel import one_blas_thread
+from calib.problem import Problem
 from calib.problem.model import Source, stop_columns
 from calib.results.intervals import intervals
-from calib.results.reach import body_beyond, placed
+from calib.results.reach import body_beyond, joint_range, placed
 from calib.runs.reopen import problem_of, reopened, start_of, state_of
 from calib.runs.run import Run
+from calib.solve.estimate import Estimate
 from calib.solve.fit import Progress, solve
 from chains import se3
 from chains.errors import InputError
 from sensors.stops import CsvTable, write_columns
 
 AXES = ("x", "y", "z")
+WORKSPACE_POSES = 800  # that are drawn: enough to see where an arm is off, in a picture of 10 cm
 
 
 @dataclass(frozen=True)
@@ -39,6 +42,7 @@ class Predicted:
         body: whose place.
         frame: in whose axes, a tracked body before the joints, or the tracker's frame.
         names: of the poses.
+        place_m: (K, 3) where it truly is, in the axes of the arm's foot.
         error: (K, 6) rotation rad, then m: true less drawn.
         covariance: (K, 6, 6) of the true place.
         warnings: what is to stand above everything that is shown of the run.
@@ -47,9 +51,15 @@ class Predicted:
     body: str
     frame: str
     names: Sequence[str]
+    place_m: np.ndarray
     error: np.ndarray
     covariance: np.ndarray
     warnings: Sequence[str] = ()
+
+    @property
+    def error_m(self) -> np.ndarray:
+        """(K,) how far off the place is as drawn."""
+        return np.linalg.norm(self.error[:, 3:], axis=1)
 
     @property
     def sigma_m(self) -> np.ndarray:
@@ -60,7 +70,7 @@ class Predicted:
         """As the CSV holds it, a row a pose."""
         sigma = np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
         out: dict[str, Any] = {"pose": list(self.names)}
-        out["error_mm"] = 1e3 * np.linalg.norm(self.error[:, 3:], axis=1)
+        out["error_mm"] = 1e3 * self.error_m
         out["sigma_mm"] = 1e3 * self.sigma_m
         for name, values in (("error", self.error), ("sigma", sigma)):
             out |= {f"{name}_{a}_mm": 1e3 * values[:, 3 + i] for i, a in enumerate(AXES)}
@@ -69,7 +79,7 @@ class Predicted:
 
     def document(self) -> dict[str, Any]:
         """In short, as ``--json`` prints it."""
-        told = {"error_mm": np.linalg.norm(self.error[:, 3:], axis=1), "sigma_mm": self.sigma_m}
+        told = {"error_mm": self.error_m, "sigma_mm": self.sigma_m}
         return {
             "warnings": list(self.warnings),
             "body": self.body,
@@ -101,39 +111,90 @@ def evaluate_at(
     problem, source = problem_of(run, sources), sources[0]
     state_of(run, problem)
     estimate = solve(problem, progress=progress, start=start_of(run, sources))
-    beyond = body_beyond(problem)
-    if beyond is None:
+    if body_beyond(problem) is None:
         raise InputError(
             f"{run.folder}: no tracked body hangs from an arm in its recordings, so there is no "
             f"place to predict"
         )
-    rig = source.rig
-    if beyond.base is None and rig.moves != "never":
+    if not says_where_the_base_is(problem):
         raise InputError(
             f"{run.folder}: the base moves and no body on it is tracked, so nothing tells where it "
             f"is at these poses"
         )
-    names, joints, columns = _read(Path(poses), source)
-    stops = place(rig, problem.terms[0], joints, columns, beyond.root, None)
-    true = placed(stops, beyond.body, beyond.base, estimate.values)
-    bends = {t.variable for t in problem.terms[0] if not isinstance(t.effect, FrameOffset)}
-    still = {name: 0 * v if name in bends else v for name, v in estimate.values.items()}
-    drawn = placed(stops, beyond.body, beyond.base, still)
-    known = intervals(estimate, progress).at_least(run.summary["sigmas_widened_by"])
-    found = Predicted(
-        body=beyond.body,
-        frame=beyond.base or rig.world,
-        names=names,
-        error=_apart(drawn.T, true.T),
-        covariance=_covariance(true, known.together(estimate, list(true.d))),
-        warnings=run.warning,
-    )
+    found = predicted(run, problem, estimate, *_read(Path(poses), source), progress)
     if out is not None:
         if Path(out).suffix != ".csv":
             raise InputError(f"{out}: the poses are written as a table; give FILE.csv")
         with outputs.file(out, [run.folder, *run.inputs, poses]) as file:
             write_columns(file, found.columns())
     return found
+
+
+def says_where_the_base_is(problem: Problem) -> bool:
+    """Whether a body that the arm carries can be placed at poses that were not measured: from
+    another before the joints, or where the base never moves."""
+    beyond = body_beyond(problem)
+    return beyond is not None and (beyond.base or problem.sources[0].rig.moves == "never")
+
+
+def predicted(
+    run: Run,
+    problem: Problem,
+    estimate: Estimate,
+    names: Sequence[str],
+    joints: np.ndarray,
+    columns: Mapping[str, np.ndarray],
+    progress: Progress = lambda what, done, total: None,
+) -> Predicted:
+    """Where the arm truly brings its last tracked body, and as drawn; see the module.
+
+    Args:
+        run: as fitted, problem, estimate: of it; the arm is that of its first recording.
+        names: of K poses, joints: (K, J) there, columns: (K,) of covariates that effects ask for.
+        progress: called with what is being done, and how far it is.
+    """
+    rig, beyond = problem.sources[0].rig, body_beyond(problem)
+    stops = place(rig, problem.terms[0], joints, columns, beyond.root, None)
+    true = placed(stops, beyond.body, beyond.base, estimate.values)
+    bends = {t.variable for t in problem.terms[0] if not isinstance(t.effect, FrameOffset)}
+    still = {name: 0 * v if name in bends else v for name, v in estimate.values.items()}
+    drawn = placed(stops, beyond.body, beyond.base, still)
+    foot = rig.tree.edges[rig.tree.edge_names.index(rig.arm_edges[0])].parent
+    T_base = placed(stops, foot, beyond.base, estimate.values).T
+    known = intervals(estimate, progress).at_least(run.summary["sigmas_widened_by"])
+    return Predicted(
+        body=beyond.body,
+        frame=beyond.base or rig.world,
+        names=names,
+        place_m=(se3.inverse(T_base) @ true.T)[:, :3, 3],
+        error=_apart(drawn.T, true.T),
+        covariance=_covariance(true, known.together(estimate, list(true.d))),
+        warnings=run.warning,
+    )
+
+
+def over_workspace(
+    run: Run,
+    problem: Problem,
+    estimate: Estimate,
+    progress: Progress = lambda what, done, total: None,
+) -> tuple[Predicted, Predicted]:
+    """The same at poses that were measured, and at joints drawn over all that they can turn, where
+    all else is as it was at one of those; arguments as of `predicted`."""
+    source, stops = problem.sources[0], body_beyond(problem).stops
+    rng, measured = np.random.default_rng(0), source.recording.joints
+    some = np.sort(rng.choice(stops, min(len(stops), WORKSPACE_POSES), replace=False))
+    at_stop = rng.choice(stops, WORKSPACE_POSES)
+    drawn = rng.uniform(
+        *joint_range(source.rig, measured[stops]), (len(at_stop), measured.shape[1])
+    )
+    found = []
+    for at, joints in ((some, measured[some]), (at_stop, drawn)):
+        columns = {name: np.asarray(column)[at] for name, column in source.columns.items()}
+        columns |= dict(zip(source.rig.joint_names, joints.T, strict=True))
+        names = [source.recording.stops[i] for i in at.tolist()]
+        found.append(predicted(run, problem, estimate, names, joints, columns, progress))
+    return found[0], found[1]
 
 
 def _read(path: Path, source: Source) -> tuple[list[str], np.ndarray, dict[str, np.ndarray]]:

@@ -34,8 +34,8 @@ from calib.runs.ladder import Rung, ladder
 from calib.runs.reopen import problem_of, reopened, start_of, state_of
 from calib.runs.residual_table import UNSEEN_FOLDER, beam_ends, residual_table, table_path
 from calib.runs.run import RESIDUALS, SUMMARY, Run
-from calib.solve.estimate import Start, values_of
-from calib.solve.fit import Progress
+from calib.solve.estimate import Estimate, Start, values_of
+from calib.solve.fit import Progress, solve
 from chains import se3
 from chains.errors import InputError
 from sensors.recording import read_table
@@ -120,6 +120,11 @@ class Evidence:
     def start(self) -> Start:
         """That state, and what the beams met there."""
         return start_of(self.run, self.sources)
+
+    @cached_property
+    def estimate(self) -> Estimate:
+        """The fit once more, from where it was left."""
+        return solve(self.problem, progress=self.progress, start=self.start)
 
     @cached_property
     def prior_sigma(self) -> dict[str, float]:

@@ -5,8 +5,12 @@ import json
 
 import numpy as np
 import pytest
+from scipy.spatial import Delaunay
 
-from calib.evaluation.at_poses import evaluate_at
+from calib.evaluation.arm import Arm
+from calib.evaluation.at_poses import evaluate_at, over_workspace
+from calib.report.charts.bodies import workspace
+from calib.report.evidence import Evidence
 from calib.runs.calibrate import calibrate
 from chains.errors import InputError
 
@@ -78,6 +82,34 @@ def test_far_from_the_measured_poses_less_is_known(world):
     # A quantile of 95 % in space is about 1.6 times the root mean square.
     assert told["sigma_mm"]["mean"] == pytest.approx(at_poses / 1.6, rel=0.3)
     json.dumps(told)
+
+
+def test_a_report_shows_the_workspace_and_where_the_poses_end(world, tmp_path):
+    """The places in the picture are those where the corrected arm brings the body."""
+    _, run, joints, table = world
+    found = evaluate_at(run, table)
+    ours = Arm.of(run, tip="tool").corrected(joints)
+    np.testing.assert_allclose(found.place_m, ours[:, :3, 3], atol=1e-9)
+    (chart,) = workspace(Evidence.of([run]))
+    evidence = Evidence.of([run])
+    measured, drawn = over_workspace(run, evidence.problem, evidence.estimate)
+    for each in (measured, drawn):
+        assert f"{1e3 * np.median(each.sigma_m):.2g} mm" in chart.title
+    assert f"up to {1e3 * drawn.error_m.max():.2g} mm off" in chart.title
+    axes = chart.figure().axes
+    dots = [ax.collections[0].get_offsets() for ax in axes if ax.get_xlabel()][:3]
+    at = drawn.place_m
+    np.testing.assert_allclose(dots[0], np.column_stack([np.hypot(*at[:, :2].T), at[:, 2]]))
+    np.testing.assert_allclose(dots[2], at[:, :2])
+    outline = next(ax for ax in axes if ax.get_xlabel() == "x of the foot, m").lines[0]
+    inside = Delaunay(outline.get_xydata()).find_simplex(0.999 * measured.place_m[:, :2])
+    assert np.mean(inside >= 0) > 0.98
+
+
+def test_a_rig_with_scans_has_no_workspace_in_its_report(tmp_path):
+    run = calibrate([rigs.write(tmp_path / "rec")], tmp_path / "run", hold_out="none")
+    (absent,) = workspace(Evidence.of([run]))
+    assert absent.why
 
 
 def test_what_is_wrong_with_the_poses_is_said(world, tmp_path):

@@ -28,7 +28,9 @@ SECTIONS: Mapping[str, tuple[Charts, ...]] = {
         *(groups.groups, misfit.by_stop, misfit.by_thing, misfit.moves_from_cad),
     ),
     "What was found": (formulas.formulas, knowledge.findings),
-    "The calibration": (links.chain, links.moves, links.effects, knowledge.budget),
+    "The calibration": (
+        *(links.chain, links.moves, links.effects, bodies.workspace, knowledge.budget),
+    ),
     "What is left": (
         *(unseen.unseen, unseen.every_stop),
         *(residuals.ring_map, walls.walls, residuals.thrown_away, residuals.curves),

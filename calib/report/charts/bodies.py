@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.spatial import ConvexHull, QhullError
 
+from calib.evaluation.at_poses import Predicted, over_workspace, says_where_the_base_is
 from calib.report import plots
 from calib.report.chart import Absent, Chart
 from calib.report.evidence import Evidence
@@ -21,6 +23,7 @@ if TYPE_CHECKING:
     from calib.report.plots import Figure
 
 MOST_ARROWS = 1500  # arrows of a body that can be told apart
+WITHIN_COLOURS = 0.98  # of the poses lie within the scale of colours; the rest have its end
 LENGTH = 0.06  # of the picture, for the longest arrow; rounding makes it up to 2.5 times that
 
 
@@ -55,6 +58,66 @@ def tracked(evidence: Evidence) -> Iterator[Chart | Absent]:
         bodies,
         sigma_mm,
     )
+
+
+def workspace(evidence: Evidence) -> Iterator[Chart | Absent]:
+    """How far off an arm is, and how well that is known, wherever its joints can take it."""
+    if evidence.has_beams or not says_where_the_base_is(evidence.problem):
+        yield Absent("workspace", "no arm is seen by a tracker alone")
+        return
+    run = evidence.run, evidence.problem, evidence.estimate
+    measured, drawn = over_workspace(*run, evidence.progress)
+    told = [1e3 * np.median(each.sigma_m) for each in (measured, drawn)]
+    yield Chart(
+        "workspace",
+        f"As drawn, the arm brings '{drawn.body}' up to {1e3 * drawn.error_m.max():.2g} mm off; "
+        f"corrected, its place is known to {told[0]:.2g} mm at the measured poses, and to "
+        f"{told[1]:.2g} mm (median) wherever the joints can take it",
+        "A dot per pose, drawn over all that the joints can turn, from the side (how far out from "
+        "the axis of the arm's foot, and how high) and from above; in colour what is said of it. "
+        "The dashed line holds the poses that were measured: nothing has checked the model "
+        "beyond it.",
+        lambda: _workspace(measured, drawn),
+        wide=True,
+    )
+
+
+def _workspace(measured: Predicted, drawn: Predicted) -> Figure:
+    figure, grid = plots.axes(plots.WIDE_IN, 3.4, 1, 3)
+    off, known = (drawn.error_m, "off as drawn, mm"), (drawn.sigma_m, "known to, mm (sigma)")
+    sides = ("out from the axis of the foot, m", "height above the foot, m")
+    above = ("x of the foot, m", "y of the foot, m")
+    panels = ((_section, sides, off), (_section, sides, known), (_above, above, known))
+    for ax, (view, (across, up), (metres, what)) in zip(grid[0], panels, strict=True):
+        top = np.quantile(1e3 * metres, WITHIN_COLOURS)
+        dots = ax.scatter(*view(drawn), 9, c=1e3 * metres, cmap="viridis", vmin=0.0, vmax=top, lw=0)
+        ax.plot(*_outline(view(measured)), "--", color=plots.BEFORE, lw=1.5)
+        ax.set_aspect("equal", adjustable="box")
+        ax.set_xlabel(across)
+        ax.set_ylabel(up)
+        bar = figure.colorbar(dots, ax=ax, extend="max", orientation="horizontal", location="top")
+        bar.set_label(what)
+    return figure
+
+
+def _above(found: Predicted) -> np.ndarray:
+    """(2, K) as seen from above, m."""
+    return found.place_m[:, :2].T
+
+
+def _section(found: Predicted) -> np.ndarray:
+    """(2, K) distance from the axis of the arm's foot, and height above it, m."""
+    at = found.place_m
+    return np.stack([np.hypot(at[:, 0], at[:, 1]), at[:, 2]])
+
+
+def _outline(at: np.ndarray) -> np.ndarray:
+    """(2, n) the convex outline, closed, of points (2, K); themselves where they lie on a line."""
+    try:
+        corners = ConvexHull(at.T).vertices
+    except QhullError:
+        return at
+    return at[:, np.append(corners, corners[0])]
 
 
 def targets(evidence: Evidence) -> Iterator[Chart | Absent]:
