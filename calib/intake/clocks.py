@@ -309,8 +309,8 @@ def _vertex(values: Array, k: int) -> float:
 
 
 def _parts(a: Array, b: Array, lag: int, step_s: float) -> tuple[Array, Array]:
-    """Of parts of the logs, where each is in the first, in steps, and by how many seconds its own
-    offset differs from that of all; parts that tell nothing are left out.
+    """Of parts of the logs, where the motion of each is in the first, in steps, and by how many
+    seconds its own offset differs from that of all; parts that tell nothing are left out.
 
     Each is sought about the offset of all, then about the line through those found, as clocks that
     drift leave the reach of the former.
@@ -318,7 +318,7 @@ def _parts(a: Array, b: Array, lag: int, step_s: float) -> tuple[Array, Array]:
     start, end = max(0, -lag), min(len(a), len(b) - lag)
     reach = max(2, round(REACH_S / step_s))
     parts = list(itertools.pairwise(np.linspace(start, end, LOG_PARTS + 1).astype(int)))
-    middle = np.array([(low + high) / 2 for low, high in parts])
+    middle = np.array([low + _middle(a[low:high]) for low, high in parts])
     about, found = np.zeros(len(parts)), np.full(len(parts), np.nan)
     for _ in range(2):
         for i, (low, high) in enumerate(parts):
@@ -329,6 +329,14 @@ def _parts(a: Array, b: Array, lag: int, step_s: float) -> tuple[Array, Array]:
         about = np.polyval(np.polyfit(middle[told], found[told], 1), middle)
     told = np.isfinite(found)
     return middle[told], found[told] * step_s
+
+
+def _middle(speed: Array) -> float:
+    """Where a log tells its offset, in steps: at changes of speed, by the square of each."""
+    told = np.nan_to_num(np.diff(speed)) ** 2
+    if not told.any():
+        return len(speed) / 2
+    return float(np.average(np.arange(len(told)) + 0.5, weights=told))
 
 
 def _own_lag(
