@@ -171,7 +171,8 @@ def preview(problem: Problem, progress: Progress = lambda what, done, total: Non
     loop.solve_without_scans()
     loop.reweigh(beams=False)
     if problem.scans:
-        loop.values |= lidars_turned(problem, loop.values)
+        if not loop.bodies_astray():
+            loop.values |= lidars_turned(problem, loop.values)
         loop.fix_association()
     return loop.estimate()
 

@@ -215,8 +215,9 @@ def test_bodies_that_no_start_brings_near_are_not_followed_far(damage, tiny, tmp
     monkeypatch.setattr(fit, "lidars_turned", None)
     steps, step = [], Descent.step
     monkeypatch.setattr(Descent, "step", lambda self: steps.append(1) or step(self))
-    found = solve(build([Source.open(edited(tiny, tmp_path / "rec", damage))], Model()))
-    assert not found.converged and len(steps) <= MAX_PASSES
+    problem = build([Source.open(edited(tiny, tmp_path / "rec", damage))], Model())
+    assert not solve(problem).converged and len(steps) <= MAX_PASSES
+    preview(problem)
 
 
 def test_weights_are_not_sought_for_long_where_rows_stay_hopeless(tmp_path, monkeypatch):
