@@ -8,8 +8,8 @@ import pytest
 import yaml
 
 from .programs import ROOT, script
+from .shown import blocks, unlike
 from .test_docs import run_through
-from .test_readme import shape
 
 TUTORIALS = {  # the folder into which each has its example write, and the figure that it makes
     "tutorial_bumped_lidar": ("bumped", "bumped_lidar.svg"),
@@ -42,17 +42,17 @@ def test_a_tutorial_shows_output_and_a_figure_that_is_there(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", TUTORIALS)
 def test_a_tutorial_shows_what_is_printed(name, tmp_path):
-    """But for the numbers; its figure has the words of the one that its command draws."""
+    """And its figure has the words of the one that its command draws."""
     folder, figure = TUTORIALS[name]
     text = page(name)
     (program,) = re.findall(r"literalinclude\} \.\./(\S+)", text)
     assert f"`python {program} {folder}`" in text
     said = script(ROOT / program, [folder], tmp_path)
-    said = shape(said + run_through(ROOT / "docs" / f"{name}.md", tmp_path).said)
-    shown = re.findall(r"^```text\n(.*?)^```", text, flags=re.M | re.S)
+    said = said + run_through(ROOT / "docs" / f"{name}.md", tmp_path).said
+    shown = blocks("text", text)
     assert shown
     for block in shown:
-        assert shape(block) in said, block
+        assert not unlike(block, said)
     made, kept = ((path / figure).read_text("utf-8") for path in (tmp_path, ROOT / "docs/pictures"))
     words = [[w for w in texts(each) if not re.search(r"\d", w)] for each in (made, kept)]
     assert words[0] == words[1] and len(words[0]) > 1

@@ -25,6 +25,10 @@ REACH_S = 0.25  # the offset of a part is sought within it: a clock 100 ppm off 
 LEAST_S = 2.0  # of a log: less has not one move of an arm in it
 # From the first part to the last; less is below the time that an arm takes to settle.
 DRIFT_S = 0.02
+FINEST = 1 / 20  # of a step: no more is believed of a parabola
+# The sigma of what is added, of how far off left-out offsets are foretold. These err by themselves
+# and by the mean of two others, 1 + 1/2 variances; a time between two of them by 2/3 on average.
+FORETOLD = 2 / 3  # the root of 2/3 over 3/2
 
 
 @dataclass(frozen=True)
@@ -59,7 +63,8 @@ class Offset:
     """What is added to one clock to give another: s, with its sigma, and how alike motions are.
 
     Args:
-        offset_s, sigma_s: of all of both logs together.
+        offset_s: of all of both logs together.
+        sigma_s: of what is added, over the times of the logs.
         likeness: correlation of the two motions at that offset.
         added: what is to be added, its change included.
         drift_s: by how much the offset changes from the first part of the logs to the last; 0 where
@@ -216,7 +221,8 @@ def estimate(mine: Motion, other: Motion) -> Offset | None:
     Both speeds are correlated at all offsets at which enough of them overlaps, masked where either
     is not known. The offset is where a correlation r over n samples is the least likely by chance,
     the maximum of -n log(1 - r^2), to a fraction of a sample by a parabola. Its sigma comes from
-    the scatter of the offsets of parts of the logs.
+    the scatter of the offsets of parts of the logs; where clocks drift apart, from how well these
+    foretell each other.
 
     Returns:
         None where one of the two hardly moves; a sigma of NaN where another offset is as good.
@@ -242,16 +248,10 @@ def estimate(mine: Motion, other: Motion) -> Offset | None:
     drift_s = _drift(shift_s)
     if abs(drift_s) < DRIFT_S:
         return Offset(offset_s, _standard_error(shift_s, step_s), top, added=always)
-    first_s = float(other.time_s[0] - mine.time_s[0]) + int(lag[best]) * step_s
-    at_s, off_s = _pieces(mine.time_s[0] + at * step_s, first_s + shift_s)
-    left = first_s + shift_s - np.interp(mine.time_s[0] + at * step_s, at_s, off_s)
-    return Offset(
-        offset_s=offset_s,
-        sigma_s=_standard_error(left, step_s),
-        likeness=top,
-        drift_s=drift_s,
-        added=Added(off_s, at_s),
-    )
+    ahead_s = float(other.time_s[0] - mine.time_s[0]) + int(lag[best]) * step_s
+    added, missed_s = _pieces(mine.time_s[0] + at * step_s, ahead_s + shift_s)
+    sigma_s = max(FORETOLD * float(np.sqrt(np.mean(np.square(missed_s)))), FINEST * step_s)
+    return Offset(offset_s, sigma_s, top, added=added, drift_s=drift_s)
 
 
 def _step(motion: Motion) -> float:
@@ -309,8 +309,8 @@ def _vertex(values: Array, k: int) -> float:
 
 
 def _parts(a: Array, b: Array, lag: int, step_s: float) -> tuple[Array, Array]:
-    """Of parts of the logs, where each is in the first, in steps, and by how many seconds its own
-    offset differs from that of all; parts that tell nothing are left out.
+    """Of parts of the logs, where the motion of each is in the first, in steps, and by how many
+    seconds its own offset differs from that of all; parts that tell nothing are left out.
 
     Each is sought about the offset of all, then about the line through those found, as clocks that
     drift leave the reach of the former.
@@ -318,7 +318,7 @@ def _parts(a: Array, b: Array, lag: int, step_s: float) -> tuple[Array, Array]:
     start, end = max(0, -lag), min(len(a), len(b) - lag)
     reach = max(2, round(REACH_S / step_s))
     parts = list(itertools.pairwise(np.linspace(start, end, LOG_PARTS + 1).astype(int)))
-    middle = np.array([(low + high) / 2 for low, high in parts])
+    middle = np.array([low + _middle(a[low:high]) for low, high in parts])
     about, found = np.zeros(len(parts)), np.full(len(parts), np.nan)
     for _ in range(2):
         for i, (low, high) in enumerate(parts):
@@ -329,6 +329,14 @@ def _parts(a: Array, b: Array, lag: int, step_s: float) -> tuple[Array, Array]:
         about = np.polyval(np.polyfit(middle[told], found[told], 1), middle)
     told = np.isfinite(found)
     return middle[told], found[told] * step_s
+
+
+def _middle(speed: Array) -> float:
+    """Where a log tells its offset, in steps: at changes of speed, by the square of each."""
+    told = np.nan_to_num(np.diff(speed)) ** 2
+    if not told.any():
+        return len(speed) / 2
+    return float(np.average(np.arange(len(told)) + 0.5, weights=told))
 
 
 def _own_lag(
@@ -353,25 +361,23 @@ def _standard_error(shift_s: Array, step_s: float) -> float:
     if len(shift_s) < 3:
         return step_s
     spread = 1.4826 * np.median(np.abs(shift_s - np.median(shift_s)))
-    least = step_s / 20  # no more is believed of a parabola
-    return max(float(spread / np.sqrt(len(shift_s))), least)
+    return max(float(spread / np.sqrt(len(shift_s))), FINEST * step_s)
 
 
-def _pieces(at_s: Array, offset_s: Array) -> tuple[Array, Array]:
-    """Ends of straight pieces through offsets that drift: all of them, or a line's two, by which
-    predicts each inner offset from the others better."""
-    inner = range(1, len(at_s) - 1)
+def _pieces(at_s: Array, offset_s: Array) -> tuple[Added, Array]:
+    """Straight pieces through offsets that drift, or one line, by which foretells each inner offset
+    from the others better; and by how much that one misses each of these."""
     by_line, by_pieces = [], []
-    for i in inner:
+    for i in range(1, len(at_s) - 1):
         others, x = np.delete(np.arange(len(at_s)), i), at_s[i] - at_s[0]
         line = np.polyfit(at_s[others] - at_s[0], offset_s[others], 1)
         by_line.append(offset_s[i] - np.polyval(line, x))
         by_pieces.append(offset_s[i] - np.interp(at_s[i], at_s[others], offset_s[others]))
     if np.square(by_pieces).sum() < np.square(by_line).sum():
-        return at_s, offset_s
+        return Added(offset_s, at_s), np.array(by_pieces)
     line = np.polyfit(at_s - at_s[0], offset_s, 1)
     ends = at_s[[0, -1]]
-    return ends, np.polyval(line, ends - at_s[0])
+    return Added(np.polyval(line, ends - at_s[0]), ends), np.array(by_line)
 
 
 def _drift(offset_s: Array) -> float:

@@ -64,9 +64,10 @@ def solve(
         return _not_raised(loop, loop.estimate(tolerance if spread else None))
     _without_scans(loop, problem, turns=prior is None)
     if problem.scans:
-        # Nothing was known of these without scans.
-        loop.values |= declared(problem, loop.held) | lidars_turned(loop.problem, loop.values)
-        loop.lost = loop.lost or not loop.look_around()
+        loop.values |= declared(problem, loop.held)  # nothing was known of these without scans
+        if not loop.lost:
+            loop.values |= lidars_turned(loop.problem, loop.values)
+            loop.lost = not loop.look_around()
         if spread:
             loop.begin_spread()
         _arrive(loop, tolerance)
@@ -170,7 +171,8 @@ def preview(problem: Problem, progress: Progress = lambda what, done, total: Non
     loop.solve_without_scans()
     loop.reweigh(beams=False)
     if problem.scans:
-        loop.values |= lidars_turned(problem, loop.values)
+        if not loop.bodies_astray():
+            loop.values |= lidars_turned(problem, loop.values)
         loop.fix_association()
     return loop.estimate()
 

@@ -17,7 +17,7 @@ from sensors.stops import POSE
 from .moving import DH, JOINTS, T_TIP_CUP, T_WORLD_BASE, logged, plan, tip
 
 RNG = np.random.default_rng(3)
-HELD, SPANS = plan(12)
+HELD, SPANS = MOVES = plan(12)
 END_S = float(SPANS[-1, 1])
 
 
@@ -27,21 +27,21 @@ def edges():
     return chain(ArmDescription(to_urdf("arm", rows, False), "arm_base", "arm_end"))
 
 
-def joints(offset_s=0.0, clock="joints", rate_hz=50):
-    time_s = np.arange(0, END_S, 1 / rate_hz)
+def joints(offset_s=0.0, clock="joints", rate_hz=50, moves=MOVES):
+    time_s = np.arange(0, moves[1][-1, 1], 1 / rate_hz)
     return Track(
         name=clock,
         kind="joints",
         clock=clock,
         time_s=time_s - offset_s,
         names=JOINTS,
-        values=logged(HELD, SPANS, time_s),
+        values=logged(*moves, time_s),
     )
 
 
-def cup(offset_s, clock="take", rate_hz=100, noise=2e-4, within=(0, 1)):
-    time_s = np.arange(within[0] * END_S, within[1] * END_S, 1 / rate_hz)
-    pose = T_WORLD_BASE * tip(logged(HELD, SPANS, time_s)) * T_TIP_CUP
+def cup(offset_s, clock="take", rate_hz=100, noise=2e-4, within=(0, 1), moves=MOVES):
+    time_s = np.arange(*(share * moves[1][-1, 1] for share in within), 1 / rate_hz)
+    pose = T_WORLD_BASE * tip(logged(*moves, time_s)) * T_TIP_CUP
     turn = pose.rotation * Rotation.from_rotvec(noise * RNG.normal(size=(len(time_s), 3)))
     values = np.hstack([pose.translation, turn.as_quat(scalar_first=True)])
     return Track(
@@ -128,9 +128,27 @@ def test_a_clock_that_drifts_is_corrected(edges, warps):
     late_s = 0.004 * true_s if not warps else 0.25 * (true_s / END_S) ** 2
     said = align([joints(), replace(drifting, time_s=true_s + late_s)], [], edges, {})
     off_s = said.tracks[1].time_s - true_s
-    assert late_s[-1] > 0.2 and np.abs(off_s).max() < 0.015 and np.abs(off_s).mean() < 0.004
+    assert late_s[-1] > 0.2 and np.abs(off_s).max() < 0.006 and np.abs(off_s).mean() < 0.0015
     (line,) = said.odd
     assert "drifts by -0.2" in line and ("pieces" if warps else "straight line") in line
+
+
+def test_a_bent_clock_is_as_far_off_as_its_sigma_says(edges):
+    """Over motions, bends and noise: what is corrected with pieces is within one and two sigmas as
+    often as chance has it, 68 and 95 %; 71 and 93 % where this was written."""
+    off = []
+    for seed in range(20, 26):
+        moves = plan(12, seed=seed)
+        (mine,) = motions(joints(moves=moves), edges, 0.1)[:1]
+        for bend_s in (0.1, 0.15, 0.2, 0.25, 0.3):
+            bent = cup(0.0, noise=5e-3, moves=moves)
+            true_s = bent.time_s
+            bent = replace(bent, time_s=true_s + bend_s * (true_s / true_s[-1]) ** 2)
+            found = estimate(motions(bent, (), 0.1)[0], mine)
+            if len(found.added.at_s) > 2:
+                off.extend(np.abs(found.added.to(bent.time_s) - true_s) / found.sigma_s)
+    assert len(off) > 100_000
+    assert 0.6 < np.mean(np.array(off) < 1) < 0.8 and 0.88 < np.mean(np.array(off) < 2) < 0.98
 
 
 def test_a_clock_that_keeps_time_is_not_bent(edges):
