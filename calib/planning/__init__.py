@@ -18,9 +18,10 @@ import numpy as np
 from calib import outputs
 from calib.linear.parallel import one_blas_thread
 from calib.planning.alone import nothing_measured
-from calib.planning.places import in_region, where_it_stood
+from calib.planning.found import Found
 from calib.planning.planner import Planner, Step
 from calib.planning.purpose import ALL, Purpose, purpose_of
+from calib.planning.room.places import in_region, where_it_stood
 from calib.planning.scene import PlanningScene
 from calib.planning.stops import Poses
 from calib.planning.tolerance import purpose_until
@@ -42,6 +43,7 @@ __all__ = ["Plan", "is_rig", "plan", "planner_of"]
 CANDIDATE_POSES = 500
 # Stops that are planned where nobody says how many, and until sigmas are small.
 USUAL_STOPS, MOST_PLANNED = 5, 30
+WHEN = ("now", "after")
 
 
 def _silent(what: str, done: int, total: int) -> None:
@@ -64,6 +66,7 @@ class Plan:
         joints: (J,) name and kind, revolute or prismatic, of each.
         keys, units: (P,) of the parameters of the calibration.
         now, after: what is known without and with them; sigmas as a run reports them.
+        found: what would be found of what may be wrong, without and with them.
         effect_units: of the effects in `Known.smallest`.
         candidates: how many poses they were chosen among.
         untold: directions that no stops of this arm determine, however many.
@@ -78,6 +81,7 @@ class Plan:
     units: Sequence[str]
     now: Known
     after: Known
+    found: tuple[Found, Found]
     effect_units: Mapping[str, str]
     candidates: int
     untold: Sequence[Mapping[str, Any]] = ()
@@ -127,6 +131,9 @@ class Plan:
                 }
                 for name in self.now.smallest
             },
+            "smallest_effect": _effects(*self.found),
+            "smallest_blunder": _mishaps(*self.found),
+            "unseen_blunder": {w: f.furthest() for w, f in zip(WHEN, self.found, strict=True)},
             "weak_directions": {
                 "now": list(self.now.weak),
                 "after": list(self.after.weak),
@@ -147,6 +154,39 @@ class Plan:
         """The stops as columns (n,): ``location``, and the joints by name."""
         joints = dict(zip(self._names, self.poses.joints.T, strict=True))
         return {"location": self.poses.location.astype(str), **joints}
+
+
+def _effects(now: Found, after: Found) -> dict[str, Any]:
+    """From which size effects are found, as JSON has it: of those never found, None."""
+
+    def size(found: Found, name: str) -> float | None:
+        each = found.effects.get(name, np.inf)
+        return each if np.isfinite(each) else None
+
+    return {
+        name: {"unit": unit, "now": size(now, name), "after": size(after, name)}
+        for name, unit in sorted(after.units.items())
+    }
+
+
+def _mishaps(now: Found, after: Found) -> dict[str, Any]:
+    """From which size mishaps are found, as JSON has it: of those never found, None."""
+
+    def size(found: Found, kind: str, unit: str) -> dict[str, float] | None:
+        each = found.mishaps.get(kind, {}).get(unit)
+        return each.document() if each else None
+
+    return {
+        kind: {u: {"now": size(now, kind, u), "after": size(after, kind, u)} for u in sizes}
+        for kind, sizes in after.mishaps.items()
+    }
+
+
+def _diagnosed(run: Run) -> dict[str, float]:
+    """Effect -> the size from which the run's diagnosis would have found it, if it had one."""
+    found = run.diagnosis() or {"candidates": []}
+    sizes = {c["effect"]: c["smallest_detectable"] for c in found["candidates"]}
+    return {name: size for name, size in sizes.items() if size and np.isfinite(size)}
 
 
 def _now_after(plan: Plan, name: str, which: int) -> dict[str, float | None]:
@@ -220,7 +260,7 @@ def _planned(planner: Planner, stops: int, candidates: int, seed: int) -> Plan:
     else:
         some = planner.choose(poses, each, stops)
     some = planner.in_order(some)
-    scene, rig = planner.scene, planner.scene.source.rig
+    scene, rig, after = planner.scene, planner.scene.source.rig, planner.after(some)
     return Plan(
         run=planner.folder,
         purpose=planner.aim,
@@ -229,7 +269,8 @@ def _planned(planner: Planner, stops: int, candidates: int, seed: int) -> Plan:
         keys=planner.keys,
         units=planner.units,
         now=planner.now,
-        after=planner.after(some),
+        after=after,
+        found=planner.found_now_and_after(after, some),
         untold=planner.endless(each).weak,
         effect_units={name: scene.unit_of(name) for name in planner.aim.rivals},
         candidates=len(poses.joints),
@@ -276,5 +317,6 @@ def planner_of(
         aim=aim,
         places=places,
         solution=fitted.solution if fitted else None,
+        diagnosed=_diagnosed(fitted) if fitted else {},
         progress=progress,
     )

@@ -15,8 +15,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy import special
 
+from calib.blunders.chance import KNOWN, enough
 from calib.diagnosis.linear import WIDENED
-from calib.diagnosis.score import POWER
 from calib.diagnosis.search import ALPHA_EFFECT
 from calib.linear.parallel import in_order
 from calib.planning.information import Information, inverse
@@ -87,8 +87,7 @@ class Apart(Criterion):
     """
 
     def __init__(self, known: Information, of: Sequence[tuple[np.ndarray, np.ndarray]]) -> None:
-        self.start = known.data + known.paper / WIDENED**2
-        self.effects = of
+        self.start, self.effects = _of_rows(known), of
 
     def of(self, M: np.ndarray) -> np.ndarray:
         out = []
@@ -98,6 +97,11 @@ class Apart(Criterion):
                 np.log(np.maximum(np.einsum("kij,i,j->k", left, size, size), LEAST_INFORMATION))
             )
         return np.mean(out, axis=0)
+
+
+def _of_rows(known: Information) -> np.ndarray:
+    """Information (S, S) against which rivals are told: paper hardly counts."""
+    return known.data + known.paper / WIDENED**2
 
 
 def information_left(
@@ -125,7 +129,23 @@ def information_left(
     return (left + left.mT) / 2
 
 
-def smallest(left: np.ndarray, whole: np.ndarray) -> float:
+def found_from(
+    known: Information, of: np.ndarray, without: Sequence[int] | np.ndarray = (), looks: int = 1
+) -> float:
+    """The size of an effect from which it is found; see `smallest`.
+
+    Args:
+        known: what is known.
+        of: (q,) the effect's components.
+        without: those that play no part.
+        looks: how many effects are looked for.
+    """
+    own = np.outer(known.unit[of], known.unit[of])
+    left = information_left(_of_rows(known)[None], of, without)[0]
+    return smallest(left / own, known.data[np.ix_(of, of)] / own, looks)
+
+
+def smallest(left: np.ndarray, whole: np.ndarray, looks: int = 1) -> float:
     """The root mean square size of an effect's parameters at which it is found.
 
     With a power of 80 % at the level of a diagnosis, in the effect's unit, on average over the
@@ -134,15 +154,15 @@ def smallest(left: np.ndarray, whole: np.ndarray) -> float:
     Args:
         left: (q, q) its information that nothing else can take on.
         whole: (q, q) all of it.
+        looks: how many effects are looked for.
     """
     size = np.sqrt(np.maximum(np.diag(whole), 1e-300))
     values = np.linalg.eigvalsh(left / np.outer(size, size))
     dof = int((values > 1e-6).sum())
     if not dof:
         return float("inf")
-    limit = special.chdtri(dof, ALPHA_EFFECT)
-    noncentral = special.chndtrinc(limit, dof, 1.0 - POWER)
-    return float(np.sqrt(noncentral / (np.trace(left) / len(left))))
+    limit = special.fdtri(dof, KNOWN, (1.0 - ALPHA_EFFECT) ** (1.0 / looks))
+    return float(np.sqrt(enough(dof, KNOWN, limit) / (np.trace(left) / len(left))))
 
 
 def indices(known: Information, at: np.ndarray, stops: int) -> dict[str, float]:

@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 
 from calib.planning.criteria import chosen
+from calib.planning.found import Found, would_be_found
 from calib.planning.information import Information
-from calib.planning.poses import in_order_of_path, reachable
 from calib.planning.purpose import Purpose
+from calib.planning.room.poses import in_order_of_path, reachable
 from calib.planning.scene import PlanningScene
 from calib.planning.stops import Poses
 from calib.planning.worth import Known, criterion
@@ -55,6 +56,7 @@ class Planner:
         aim: what stops are for.
         places: location -> T_world_root (4, 4) where the base may stand.
         solution: what the run found; None without one.
+        diagnosed: effect -> size from which the run's diagnosis would have found it.
         progress: called with what is being done, and how far it is.
     """
 
@@ -63,6 +65,7 @@ class Planner:
     aim: Purpose
     places: Mapping[str, np.ndarray]
     solution: Solution | None
+    diagnosed: Mapping[str, float]
     progress: Progress
 
     def candidates(self, count: int, seed: int) -> Poses:
@@ -158,6 +161,23 @@ class Planner:
     def after(self, poses: Poses) -> Known:
         """What will be known with planned stops, by one linearisation of all."""
         return self._known(self.scene.after(poses), len(poses.joints))
+
+    def found(self, known: Known, poses: Poses | None) -> Found:
+        """What would be found with planned stops, or without any, of which this is known."""
+        sigma = dict(zip(self.keys, known.sigma.tolist(), strict=True))
+        return would_be_found(self.scene, poses, sigma, self.progress)
+
+    def found_now_and_after(self, after: Known, poses: Poses) -> tuple[Found, Found]:
+        """What would be found without planned stops and with them. As rows of a stop err
+        together, a diagnosis finds effects from larger sizes on than independent rows have it; they
+        are taken to go on doing so."""
+        now, then = self.found(self.now, None), self.found(after, poses)
+        times = {
+            name: self.diagnosed[name] / size
+            for name, size in now.effects.items()
+            if np.isfinite(size) and name in self.diagnosed
+        }
+        return now.wider(times), then.wider(times)
 
     def _known(self, information: Information, more: int) -> Known:
         stops = len(self.scene.source.recording.stops) + more

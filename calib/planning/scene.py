@@ -111,7 +111,7 @@ class PlanningScene:
     @cached_property
     def now(self) -> Information:
         """What the recordings say."""
-        return self._known(*self._wide, self.stand.estimate.associations)
+        return self._known(*self.together(None))
 
     @cached_property
     def _pattern(self) -> tuple[Scan, Beams, float]:
@@ -181,6 +181,15 @@ class PlanningScene:
 
     def after(self, poses: Poses) -> Information:
         """What the recordings and planned stops say together."""
+        return self._known(*self.together(poses))
+
+    def together(
+        self, poses: Poses | None
+    ) -> tuple[Problem, dict[str, np.ndarray], Sequence[Association]]:
+        """The problem of what was measured and of planned stops, if there are any: with the
+        surfaces' unknowns, where all of it lies, and what each scan meets."""
+        if poses is None:
+            return *self._wide, self.stand.estimate.associations
         patterns = [self._pattern[:2]] if self.scanned else []
         problem, values = self._with(poses, patterns, apart=False, alone=False)
         estimate = self.stand.estimate
@@ -197,7 +206,7 @@ class PlanningScene:
         for name in problem.cells:
             unknown = problem.variables[name]
             values[name] = started(unknown, estimate.state, unknown.mean)
-        return self._known(problem, values, found)
+        return problem, values, found
 
     def _known(
         self,

@@ -14,9 +14,8 @@ from calib.planning.criteria import (
     Criterion,
     Variance,
     Volume,
+    found_from,
     indices,
-    information_left,
-    smallest,
 )
 from calib.planning.information import Information
 from calib.planning.purpose import Purpose
@@ -87,14 +86,6 @@ def _rival(scene: PlanningScene, known: Information, name: str) -> tuple[np.ndar
 
 def _smallest(scene: PlanningScene, aim: Purpose, known: Information) -> list[tuple[float, float]]:
     """Of each effect the size from which it is found; see `Known`."""
-    out, rows = [], Apart(known, []).start
-    for name in aim.rivals:
-        of, _ = _rival(scene, known, name)
-        own = np.outer(known.unit[of], known.unit[of])
-        whole, others = known.data[np.ix_(of, of)] / own, known.at(scene.unbounded)
-        alone, beside = (
-            smallest(information_left(rows[None], of, without)[0] / own, whole)
-            for without in (np.setdiff1d(others, of), np.zeros(0, int))
-        )
-        out.append((alone, beside))
-    return out
+    others = known.at(scene.unbounded)
+    each = (_rival(scene, known, name)[0] for name in aim.rivals)
+    return [(found_from(known, of, np.setdiff1d(others, of)), found_from(known, of)) for of in each]

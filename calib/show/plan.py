@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 MANY_PARAMETERS = 12  # parameters of an effect, from which on their sigmas are told together
 DIRECTIONS_SHOWN = 4  # directions that are shown
+EFFECTS_SHOWN = 10  # effects that are shown, those that gain most: all are in --json
 WEAK = {
     "now": "hardly determined now",
     "after": "and after these stops",
@@ -39,8 +40,12 @@ def print_plan(plan: Plan) -> None:
     if document["smallest_detectable"]:
         tables.append(_detectable_table(document["smallest_detectable"]))
     tables.append(_sigma_table(plan))
+    tables += [_effects_table(document), _mishaps_table(document)]
     for table in tables:
         console.print(table)
+        console.print()
+    for sentence in _unseen(document["unseen_blunder"]):
+        console.print(sentence)
         console.print()
     same = [row for row in _rows(plan) if row.after >= FALLS * row.now]
     if same:
@@ -174,9 +179,52 @@ def _detectable_table(smallest: Mapping[str, Mapping[str, Any]]) -> Table:
         factor, unit = shown(each["unit"])
         for key, what in (("beside_model", name), ("beside_rivals", f"{name}, told from rivals")):
             sizes = each[key]
-            cells = (
-                "never" if sizes[when] is None else f"{factor * sizes[when]:.3g}"
-                for when in ("now", "after")
-            )
+            cells = (_found(sizes[when], factor) for when in ("now", "after"))
             table.add_row(what, unit, *cells)
     return table
+
+
+def _effects_table(document: Mapping[str, Any]) -> Table:
+    """The effects that the model lacks, those first that stops bring nearest to being found."""
+    every, table = document["smallest_effect"], columns_table("smallest effect", "", "now", "after")
+    gain = sorted(every, key=lambda name: _ratio(every[name]["now"], every[name]["after"]))
+    for name in gain[:EFFECTS_SHOWN]:
+        factor, unit = shown(every[name]["unit"])
+        cells = (_found(every[name][when], factor) for when in ("now", "after"))
+        table.add_row(name, unit, *cells)
+    if more := len(gain[EFFECTS_SHOWN:]):
+        table.add_row(f"and {more} more, in --json")
+    return table
+
+
+def _ratio(now: float | None, after: float | None) -> float:
+    """How much smaller what is found gets: the smaller, the better; 0 of what was never found."""
+    if after is None:
+        return np.inf
+    return 0.0 if now is None else after / now
+
+
+def _found(size: float | None, factor: float) -> str:
+    return "never" if size is None else f"{factor * size:.3g}"
+
+
+def _mishaps_table(document: Mapping[str, Any]) -> Table:
+    """From which size a mishap is found, wherever it happens."""
+    table = columns_table("smallest blunder, at worst", "", "now", "after")
+    for kind, units in document["smallest_blunder"].items():
+        for name, each in units.items():
+            factor, unit = shown(name)
+            sizes = (each[when] and each[when]["worst"] for when in ("now", "after"))
+            table.add_row(kind, unit, *(_found(size, factor) for size in sizes))
+    return table
+
+
+def _unseen(document: Mapping[str, Any]) -> Iterator[str]:
+    """What a mishap that is not found could do."""
+    told = {"now": "A mishap too small to be found", "after": "With these stops one"}
+    for when, what in told.items():
+        if each := document[when]:
+            yield (
+                f"{what} ({each['by']}) could move {each['estimate']} by up to "
+                f"{each['sigmas']:.1f} of its sigmas."
+            )
