@@ -69,7 +69,7 @@ class Plan:
         found: what would be found of what may be wrong, without and with them.
         effect_units: of the effects in `Known.smallest`.
         candidates: how many poses they were chosen among.
-        untold: directions that no stops of this arm determine, however many.
+        endless: what is known with any number of stops of this arm.
         curve: how far from their tolerances sigmas are with how many of them; empty without any.
     """
 
@@ -81,11 +81,16 @@ class Plan:
     units: Sequence[str]
     now: Known
     after: Known
+    endless: Known
     found: tuple[Found, Found]
     effect_units: Mapping[str, str]
     candidates: int
-    untold: Sequence[Mapping[str, Any]] = ()
     curve: Sequence[Step] = ()
+
+    @property
+    def untold(self) -> Sequence[Mapping[str, Any]]:
+        """Directions that no stops of this arm determine, however many."""
+        return self.endless.weak
 
     @property
     def names(self) -> list[str]:
@@ -190,7 +195,8 @@ def _diagnosed(run: Run) -> dict[str, float]:
 
 
 def _now_after(plan: Plan, name: str, which: int) -> dict[str, float | None]:
-    sizes = {"now": plan.now.smallest[name][which], "after": plan.after.smallest[name][which]}
+    known = {"now": plan.now, "after": plan.after, "with_any_number": plan.endless}
+    sizes = {when: each.smallest[name][which] for when, each in known.items()}
     return {when: size if np.isfinite(size) else None for when, size in sizes.items()}
 
 
@@ -271,7 +277,7 @@ def _planned(planner: Planner, stops: int, candidates: int, seed: int) -> Plan:
         now=planner.now,
         after=after,
         found=planner.found_now_and_after(after, some),
-        untold=planner.endless(each).weak,
+        endless=planner.endless(each),
         effect_units={name: scene.unit_of(name) for name in planner.aim.rivals},
         candidates=len(poses.joints),
         curve=curve,

@@ -72,6 +72,9 @@ def _achieved(plan: Plan, document: Mapping[str, Any]) -> Iterator[str]:
             before = "never" if now is None else f"from {factor * now:.3g} {unit}"
             found = f"found from {factor * after:.3g} {unit}"
             yield f"With them {name} is {found}, told from its rivals; now {before}."
+        elif each["beside_rivals"]["with_any_number"] is None:
+            others = ", ".join(n for n in document["rivals"] if n != name) or "the model"
+            yield f"NEVER FOUND: no number of stops of this arm tells {name} from {others}."
     rows = list(_rows(plan))
     fall = [row for row in rows if row.after < FALLS * row.now]
     if not fall:

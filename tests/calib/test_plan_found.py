@@ -4,6 +4,7 @@ the diagnosis of what was measured and against fits of the stops that a plan ask
 from __future__ import annotations
 
 import json
+import shlex
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 import calib
 from calib.planning import planner_of
 from calib.residuals.groups import CAD, Group
+from calib.simulation import PRESETS, simulate
 from tests.worlds import World, write
 
 # Joint 5 never turned; joints 2, 3 and 6 hardly did.
@@ -123,3 +125,41 @@ def test_planned_stops_are_told_by_their_numbers(plan):
     group = Group("body", "~1", "base_markers")
     assert _told(group, {"~1": 2}) == "planned stop 2: base_markers"
     assert _told(group, {}) == "~1: base_markers"
+
+
+def test_a_diagnosis_and_its_report_carry_a_plan_for_each_thing_they_cannot_tell(
+    narrow, rigcal, tmp_path
+):
+    """Each weak direction, and each effect that the model absorbs; commands run as printed."""
+    found = calib.diagnose(narrow).document()
+    weak = [r for r in found["remedies"] if r["of"] == "weak_direction"]
+    assert [r["names"] for r in weak] == [w["parameters"] for w in found["weak_directions"]]
+    untestable = {r["names"][0]: r for r in found["remedies"] if r["of"] == "untestable"}
+    assert untestable.keys() == found["untestable"].keys()
+    for name, why in found["untestable"].items():
+        lacks = why.startswith("the recordings lack")
+        assert (untestable[name]["plan"] is None) == lacks and untestable[name]["needs"] == why
+    said = " ".join(rigcal("diagnose", narrow.folder)[1].split())
+    page = tmp_path / "report.html"
+    assert rigcal("report", narrow.folder, "-o", page)[0] == 0
+    html = page.read_text()
+    commands = [weak[0]["plan"], untestable["range_offset"]["plan"]]
+    for command in commands:
+        assert command in said and command.replace("'", "&#39;") in html
+        words = shlex.split(command)
+        assert words[:2] == ["rigcal", "plan"]
+        code, told, _ = rigcal(*words[1:], "--candidates", 30, "--stops", 1)
+        assert code == 0
+    told = " ".join(told.split())
+    assert "NEVER FOUND: no number of stops of this arm tells range_offset from the model" in told
+
+
+def test_no_stops_are_offered_to_a_rig_for_which_none_can_be_planned(tmp_path):
+    spec = PRESETS["lidar-tracker"].model_copy(
+        update={"column_step": 32, "locations": 2, "stops_per_location": 2}
+    )
+    simulate(spec, tmp_path / "rec")
+    run = calib.fit([tmp_path / "rec"], tmp_path / "run", hold_out="none")
+    found = calib.diagnose(run)
+    assert found.remedies and found.plan == ""
+    assert all(remedy["plan"] is None and remedy["needs"] for remedy in found.remedies)
