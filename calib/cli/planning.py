@@ -20,7 +20,10 @@ from calib.cli.app import (
 from calib.linear.parallel import workers as threads
 
 UNTIL = "The fewest stops until sigmas are so small: 'lidar 0.3 mm, rings 1 mm'."
-FOR = "all; frames, effects or parameters to know better, with commas; effects to separate."
+FOR = (
+    "all; reliability, against blunders; scatter, of stops; frames, effects or parameters to know "
+)
+FOR += "better, with commas; effects to separate."
 
 
 @app.command()

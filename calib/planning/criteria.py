@@ -39,8 +39,16 @@ class Criterion:
         """Of designs (n,), from the information (n, S, S) of all their stops and priors."""
         raise NotImplementedError
 
-    def each(self, base: np.ndarray, more: np.ndarray) -> np.ndarray:
-        """Of designs (n,) that add one stop each, (n, S, S), to the same others (S, S)."""
+    def each(
+        self, base: np.ndarray, more: np.ndarray, others: Sequence[np.ndarray] = ()
+    ) -> np.ndarray:
+        """Of designs (n,) that add one stop each, (n, S, S), to the same others.
+
+        Args:
+            base: (S, S) of all those others and priors.
+            more: (n, S, S) of the stops that are added.
+            others: (S, S) of each planned stop in `base`.
+        """
         cuts = range(0, len(more), DESIGNS_AT_ONCE)
         return np.concatenate(
             list(
@@ -210,7 +218,7 @@ def chosen(
     base, found = criterion.start.copy(), []
     for k in range(count):
         tell(k, count)
-        value = criterion.each(base, each)
+        value = criterion.each(base, each, each[found])
         value[found] = -np.inf
         found.append(int(np.argmax(value)))
         base += each[found[-1]]
@@ -218,7 +226,7 @@ def chosen(
         before = list(found)
         for i, old in enumerate(before):
             rest = base - each[old]
-            value = criterion.each(rest, each)
+            value = criterion.each(rest, each, each[found[:i] + found[i + 1 :]])
             now = value[old]
             value[found] = -np.inf
             best = int(np.argmax(value))

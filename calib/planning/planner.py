@@ -133,8 +133,16 @@ class Planner:
     def lasting(self) -> Information:
         """What is known now of all that planned stops speak of; targets hang where they hang."""
         roles, now = self.scene.problem.variables, self.scene.now
-        keep = [i for i, (n, _) in enumerate(now.keys) if roles[n].role is not Role.TARGET]
+        alone = [u.name for u in roles.values() if u.role is Role.TARGET]
+        alone += [u.name for u in roles.values() if u.owner.effect in self._by_chance]
+        gone = set(alone)
+        keep = [i for i, (name, _) in enumerate(now.keys) if name not in gone]
         return now.onto(np.array(keep))
+
+    @property
+    def _by_chance(self) -> list[str]:
+        """Effects that the plan has scatter by chance: what each is at a stop, no other knows."""
+        return [effect.name for effect in self.aim.added if effect.by_chance]
 
     @cached_property
     def keys(self) -> list[Key]:

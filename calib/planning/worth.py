@@ -18,7 +18,8 @@ from calib.planning.criteria import (
     indices,
 )
 from calib.planning.information import Information
-from calib.planning.purpose import Purpose
+from calib.planning.purpose import RELIABILITY, Purpose
+from calib.planning.reliability import Reliable
 from calib.planning.scene import PlanningScene
 
 
@@ -66,7 +67,13 @@ class Known:
 
 
 def criterion(scene: PlanningScene, aim: Purpose, known: Information) -> Criterion:
-    """By what stops are chosen: D of all, A of some components, T of rivals."""
+    """By what stops are chosen: D of all, A of some components, T of rivals, or A of all once a
+    stop is lost."""
+    if aim.text == RELIABILITY:
+        measured = np.zeros((0, len(known.keys), len(known.keys)))
+        if len(scene.measured.joints):
+            measured = scene.each(scene.measured, known.keys)
+        return Reliable(known, known.at(scene.calibration), measured)
     if aim.rivals:
         return Apart(known, [_rival(scene, known, name) for name in aim.rivals])
     if not aim.components:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from rich.table import Table
 
+from calib.planning.purpose import ALL, RELIABILITY, SCATTER
 from calib.problem.unknowns import Key
 from calib.show.tables import columns_table, print_pairs, shown, terminal
 
@@ -17,6 +18,11 @@ if TYPE_CHECKING:
 MANY_PARAMETERS = 12  # parameters of an effect, from which on their sigmas are told together
 DIRECTIONS_SHOWN = 4  # directions that are shown
 EFFECTS_SHOWN = 10  # effects that are shown, those that gain most: all are in --json
+WHOLE = {
+    ALL: "for the whole calibration",
+    RELIABILITY: "against blunders: no single stop is to carry an estimate",
+    SCATTER: "for the whole calibration, where stops err as a whole by chance",
+}
 WEAK = {
     "now": "hardly determined now",
     "after": "and after these stops",
@@ -112,7 +118,7 @@ def _aim(document: Mapping[str, Any]) -> str:
         first, *others = document["rivals"]
         told = f"to tell {first} from {', '.join(others) or 'the model'}"
     else:
-        told = "for the whole calibration" if what == "all" else f"for {document['why'] or what}"
+        told = WHOLE.get(what, f"for {document['why'] or what}")
     return f"{told}: {document['why']}" if document["rivals"] and document["why"] else told
 
 
