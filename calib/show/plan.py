@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 MANY_PARAMETERS = 12  # parameters of an effect, from which on their sigmas are told together
 DIRECTIONS_SHOWN = 4  # directions that are shown
 EFFECTS_SHOWN = 10  # effects that are shown, those that gain most: all are in --json
-WHOLE = {
+AIMS = {
     ALL: "for the whole calibration",
     RELIABILITY: "against blunders: no single stop is to carry an estimate",
     SCATTER: "for the whole calibration, where stops err as a whole by chance",
@@ -118,7 +118,7 @@ def _aim(document: Mapping[str, Any]) -> str:
         first, *others = document["rivals"]
         told = f"to tell {first} from {', '.join(others) or 'the model'}"
     else:
-        told = WHOLE.get(what, f"for {document['why'] or what}")
+        told = AIMS.get(what, f"for {document['why'] or what}")
     return f"{told}: {document['why']}" if document["rivals"] and document["why"] else told
 
 
