@@ -9,7 +9,7 @@ linearisation of all stops together, measured and planned (`scene`).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +46,7 @@ USUAL_STOPS, MOST_PLANNED = 5, 30
 WHEN = ("now", "after")
 
 
-def _silent(what: str, done: int, total: int) -> None:
+def silent(what: str, done: int, total: int) -> None:
     """Progress that nobody sees."""
 
 
@@ -210,7 +210,7 @@ def plan(
     candidates: int = CANDIDATE_POSES,
     seed: int = 0,
     out: Path | str | None = None,
-    progress: Progress = _silent,
+    progress: Progress = silent,
 ) -> Plan:
     """The stops to measure next.
 
@@ -290,16 +290,34 @@ def planner_of(
     until: str | None = None,
     region: Sequence[float] | None = None,
     seed: int = 0,
-    progress: Progress = _silent,
+    progress: Progress = silent,
 ) -> Planner:
     """What plans stops; arguments and errors as of `plan`."""
-    fitted = run if isinstance(run, Run) else None
-    stand = stand_of(run, progress) if fitted else nothing_measured(run)
-    if fitted is None and region is None:
+    planner = planner_without_places(run, purpose, until, progress)
+    scene, folder = planner.scene, planner.scene.source.recording.folder
+    if planner.solution is None and region is None:
         raise InputError(
             f"{run}: nothing was measured with this rig, so say with --region x0 y0 x1 y1 where on "
-            f"the floor its base may stand, m in the frame '{stand.sources[0].rig.reference_frame}'"
+            f"the floor its base may stand, m in the frame '{scene.source.rig.reference_frame}'"
         )
+    if scene.stand.estimate.scans and not scene.scanned:
+        raise InputError(
+            f"{folder}: there is no mesh, so nothing says what the beams of a planned stop would "
+            "meet; add reference/mesh.ply"
+        )
+    places = where_it_stood(scene.stand.estimate.problem, scene.values)
+    if region is not None:
+        rng = np.random.default_rng(seed)
+        places = in_region(scene.source, region, places, scene.T_world_reference, rng)
+    return replace(planner, places=places)
+
+
+def planner_without_places(
+    run: Run | Path | str, purpose: str | None, until: str | None, progress: Progress
+) -> Planner:
+    """The same, and nothing says where the base may stand."""
+    fitted = run if isinstance(run, Run) else None
+    stand = stand_of(run, progress) if fitted else nothing_measured(run)
     if until:
         aim = purpose_until(stand, until)
     else:
@@ -307,21 +325,11 @@ def planner_of(
     prior = None
     if fitted and fitted.prior:
         prior = earlier(stand.estimate.problem, Run.open(fitted.prior).solution)
-    scene = PlanningScene(stand, aim.added, prior)
-    if stand.estimate.scans and not scene.scanned:
-        raise InputError(
-            f"{scene.source.recording.folder}: there is no mesh, so nothing says what the beams of "
-            "a planned stop would meet; add reference/mesh.ply"
-        )
-    places = where_it_stood(stand.estimate.problem, scene.values)
-    if region is not None:
-        rng = np.random.default_rng(seed)
-        places = in_region(scene.source, region, places, scene.T_world_reference, rng)
     return Planner(
         folder=fitted.folder if fitted else Path(run),
-        scene=scene,
+        scene=PlanningScene(stand, aim.added, prior),
         aim=aim,
-        places=places,
+        places={},
         solution=fitted.solution if fitted else None,
         diagnosed=_diagnosed(fitted) if fitted else {},
         progress=progress,

@@ -96,7 +96,7 @@ class Planner:
         """What all candidates tell, measured again and again: no stops of the arm tell more. As the
         mesh's errors are taken to differ from stop to stop, even these may not tell as much."""
         base = self.lasting
-        return self._known(replace(base, data=base.data + ENDLESS_TIMES * each.sum(axis=0)), 0)
+        return self.known(replace(base, data=base.data + ENDLESS_TIMES * each.sum(axis=0)), 0)
 
     def enough(self, poses: Poses, each: np.ndarray, most: int) -> tuple[Poses, list[Step]]:
         """The fewest stops, one best after another, with which every tolerance is kept, or `most`
@@ -164,11 +164,11 @@ class Planner:
     @cached_property
     def now(self) -> Known:
         """What is known without any planned stop."""
-        return self._known(self.scene.now, 0)
+        return self.known(self.scene.now, 0)
 
     def after(self, poses: Poses) -> Known:
         """What will be known with planned stops, by one linearisation of all."""
-        return self._known(self.scene.after(poses), len(poses.joints))
+        return self.known(self.scene.after(poses), len(poses.joints))
 
     def found(self, known: Known, poses: Poses | None) -> Found:
         """What would be found with planned stops, or without any, of which this is known."""
@@ -187,7 +187,8 @@ class Planner:
         }
         return now.wider(times), then.wider(times)
 
-    def _known(self, information: Information, more: int) -> Known:
+    def known(self, information: Information, more: int) -> Known:
+        """What all rows say, in the words of a run; of so many stops more."""
         stops = len(self.scene.source.recording.stops) + more
         return Known.of(self.scene, self.aim, information, stops, self._wider)
 

@@ -232,7 +232,10 @@ class PlanningScene:
         values: Mapping[str, np.ndarray],
         associations: Sequence[Association],
     ) -> Information:
-        found = of_all(problem, values, associations, self.unbounded)
+        return self.believed(of_all(problem, values, associations, self.unbounded))
+
+    def believed(self, found: Information) -> Information:
+        """The same with the earlier estimate, if there is one, in the place of paper."""
         return found.believing(self.prior) if self.prior else found
 
     def _with(

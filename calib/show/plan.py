@@ -14,6 +14,7 @@ from calib.show.tables import columns_table, print_pairs, shown, terminal
 
 if TYPE_CHECKING:
     from calib.planning import Plan
+    from calib.planning.room.hanging import TargetPlan
 
 MANY_PARAMETERS = 12  # parameters of an effect, from which on their sigmas are told together
 DIRECTIONS_SHOWN = 4  # directions that are shown
@@ -69,6 +70,39 @@ def print_plan(plan: Plan) -> None:
     console.print(table)
 
 
+def print_targets(plan: TargetPlan) -> None:
+    """Print where targets should hang, and what is known without and with them."""
+    console, count = terminal(), len(plan.targets)
+    told = AIMS.get(plan.purpose.text, f"for {plan.purpose.text}")
+    console.print(f"{count} target{'s' * (count != 1)} {told}", style="bold", soft_wrap=True)
+    console.print(_fall(plan))
+    console.print()
+    console.print("Centres of the spheres, m, in the reference's frame.")
+    table = columns_table("target", "x", "y", "z")
+    for row in plan.targets:
+        table.add_row(row["target"], *(f"{row[axis]:.2f}" for axis in "xyz"))
+    for each in (table, _sigma_table(plan)):
+        console.print(each)
+        console.print()
+    same = [row for row in _rows(plan) if row.after >= FALLS * row.now]
+    if same:
+        print_pairs(console, "as well known as before", [("", _together(same))])
+
+
+def _fall(plan: Plan | TargetPlan) -> str:
+    """How many sigmas fall, and which most."""
+    rows = list(_rows(plan))
+    fall = [row for row in rows if row.after < FALLS * row.now]
+    if not fall:
+        return f"None of {len(rows)} expected sigmas falls by more than {100 * (1 - FALLS):.0f} %."
+    most = min(fall, key=lambda row: row.after / row.now)
+    factor, unit = shown(most.unit)
+    return (
+        f"With them {len(fall)} of {len(rows)} sigmas fall; most of all that of {most.name}, from "
+        f"{factor * most.now:.3g} to {factor * most.after:.3g} {unit}."
+    )
+
+
 def _achieved(plan: Plan, document: Mapping[str, Any]) -> Iterator[str]:
     """What the stops are worth, in a sentence or two."""
     for name, each in document["smallest_detectable"].items():
@@ -81,17 +115,7 @@ def _achieved(plan: Plan, document: Mapping[str, Any]) -> Iterator[str]:
         elif each["beside_rivals"]["with_any_number"] is None:
             others = ", ".join(n for n in document["rivals"] if n != name) or "the model"
             yield f"NEVER FOUND: no number of stops of this arm tells {name} from {others}."
-    rows = list(_rows(plan))
-    fall = [row for row in rows if row.after < FALLS * row.now]
-    if not fall:
-        yield f"None of {len(rows)} expected sigmas falls by more than {100 * (1 - FALLS):.0f} %."
-        return
-    most = min(fall, key=lambda row: row.after / row.now)
-    factor, unit = shown(most.unit)
-    yield (
-        f"With them {len(fall)} of {len(rows)} sigmas fall; most of all that of {most.name}, from "
-        f"{factor * most.now:.3g} to {factor * most.after:.3g} {unit}."
-    )
+    yield _fall(plan)
 
 
 def _reached(plan: Plan) -> Iterator[str]:
@@ -137,7 +161,7 @@ def _scale(kind: str) -> float:
     return float(np.degrees(1.0)) if kind == "revolute" else 1e3
 
 
-def _sigma_table(plan: Plan) -> Table:
+def _sigma_table(plan: Plan | TargetPlan) -> Table:
     table = columns_table("expected sigma", "", "now", "after")
     for row in _rows(plan):
         if row.after < FALLS * row.now:
@@ -160,7 +184,7 @@ class _Row(NamedTuple):
         return first.name if count == 1 else f"{first.unknown}, rms of {count}"
 
 
-def _rows(plan: Plan) -> Iterator[_Row]:
+def _rows(plan: Plan | TargetPlan) -> Iterator[_Row]:
     """A row a parameter; of an effect with many in one unit, one for all."""
     by_unknown: dict[str, list[int]] = {}
     for i, key in enumerate(plan.keys):
