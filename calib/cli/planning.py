@@ -44,6 +44,12 @@ Hung = Annotated[
     int | None,
     typer.Option(metavar="N", min=1, help="Instead: where so many targets should hang."),
 ]
+Out = Annotated[
+    Path | None,
+    typer.Option(
+        "-o", "--out", metavar="OUT", help="FILE.csv of them; or a folder, with a picture."
+    ),
+]
 Region = Annotated[
     tuple[float, float, float, float] | None,
     typer.Option(metavar="X0 Y0 X1 Y1", help="Where the base may stand, or targets hang, m."),
@@ -60,9 +66,7 @@ def plan(
     until: Until = None,
     targets: Hung = None,
     region: Region = None,
-    out: Annotated[
-        Path | None, typer.Option("-o", "--out", metavar="FILE.csv", help="Where to write them.")
-    ] = None,
+    out: Out = None,
     candidates: Annotated[
         int, typer.Option(metavar="N", min=1, max=3000, help="Random poses that are looked at.")
     ] = 500,
@@ -72,21 +76,29 @@ def plan(
     as_json: Json = False,
 ) -> None:
     """Plan the next stops, and predict what they determine."""
+    from calib import outputs
+    from calib.outputs.kinds import PLANNED
     from calib.planning import is_rig
     from calib.planning import plan as choose
     from calib.planning.room.hanging import plan_targets as hang
+    from calib.report.planned import inputs_of, write_plan
     from calib.runs.run import Run
 
     if targets is not None and (stops is not None or until is not None):
         raise InputError("give --targets, or --stops and --until; not both")
     opened = run if is_rig(run) else Run.open(run, trust or ())
     more = {"purpose": purpose, "region": region, "candidates": candidates, "seed": seed}
+    folder = out if out is not None and not out.suffix and targets is None else None
+    if folder is not None:
+        outputs.refuse(folder, PLANNED, inputs_of(opened))
     with threads(workers), progress_bar() as progress:
-        more |= {"out": out, "progress": progress}
+        more |= {"out": None if folder else out, "progress": progress}
         if targets is None:
             found = choose(opened, stops, until=until, **more)
         else:
             found = hang(opened, targets, **more)
+        if folder is not None:
+            write_plan(found, folder, opened)
     of = [opened] if isinstance(opened, Run) else []
     warn(of, as_json)
     if as_json:

@@ -63,6 +63,7 @@ class Plan:
         run: the folder of the run, or of the rig.
         purpose: what they were chosen for.
         poses: of the stops, in the order in which to drive to them.
+        measured: of the stops that were measured.
         joints: (J,) name and kind, revolute or prismatic, of each.
         keys, units: (P,) of the parameters of the calibration.
         now, after: what is known without and with them; sigmas as a run reports them.
@@ -76,6 +77,7 @@ class Plan:
     run: Path
     purpose: Purpose
     poses: Poses
+    measured: Poses
     joints: Sequence[tuple[str, str]]
     keys: Sequence[Key]
     units: Sequence[str]
@@ -247,7 +249,7 @@ def plan(
             planner_of(run, purpose, until, region, seed, progress), stops, candidates, seed
         )
     if Path(out).suffix != ".csv":
-        raise InputError(f"{out}: the stops are written as a table; give FILE.csv")
+        raise InputError(f"{out}: the stops are written as a table; give FILE.csv, or a folder")
     inputs = [run.folder, *run.inputs] if isinstance(run, Run) else [run]
     with outputs.file(out, inputs) as file:
         found = _planned(
@@ -271,6 +273,7 @@ def _planned(planner: Planner, stops: int, candidates: int, seed: int) -> Plan:
         run=planner.folder,
         purpose=planner.aim,
         poses=some,
+        measured=scene.measured,
         joints=list(zip(rig.joint_names, rig.joint_kinds, strict=True)),
         keys=planner.keys,
         units=planner.units,

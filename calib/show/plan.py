@@ -36,8 +36,8 @@ def print_plan(plan: Plan) -> None:
     """Print a plan: what it is for and what it achieves, the stops, and all that they are worth."""
     console, document = terminal(), plan.document()
     stops = f"{len(plan.stops)} stop{'s' * (len(plan.stops) != 1)}"
-    console.print(f"{stops} {_aim(document)}", style="bold", soft_wrap=True)
-    for sentence in (*_achieved(plan, document), *_reached(plan)):
+    console.print(f"{stops} {aim(document)}", style="bold", soft_wrap=True)
+    for sentence in (*achieved(plan), *_reached(plan)):
         console.print(sentence)
     console.print()
     console.print(
@@ -54,7 +54,7 @@ def print_plan(plan: Plan) -> None:
     for sentence in _unseen(document["unseen_blunder"]):
         console.print(sentence)
         console.print()
-    same = [row for row in _rows(plan) if row.after >= FALLS * row.now]
+    same = [row for row in known_rows(plan) if row.after >= FALLS * row.now]
     if same:
         print_pairs(console, "as well known as before", [("", _together(same))])
     weak = document["weak_directions"]
@@ -84,14 +84,14 @@ def print_targets(plan: TargetPlan) -> None:
     for each in (table, _sigma_table(plan)):
         console.print(each)
         console.print()
-    same = [row for row in _rows(plan) if row.after >= FALLS * row.now]
+    same = [row for row in known_rows(plan) if row.after >= FALLS * row.now]
     if same:
         print_pairs(console, "as well known as before", [("", _together(same))])
 
 
 def _fall(plan: Plan | TargetPlan) -> str:
     """How many sigmas fall, and which most."""
-    rows = list(_rows(plan))
+    rows = list(known_rows(plan))
     fall = [row for row in rows if row.after < FALLS * row.now]
     if not fall:
         return f"None of {len(rows)} expected sigmas falls by more than {100 * (1 - FALLS):.0f} %."
@@ -101,6 +101,11 @@ def _fall(plan: Plan | TargetPlan) -> str:
         f"With them {len(fall)} of {len(rows)} sigmas fall; most of all that of {most.name}, from "
         f"{factor * most.now:.3g} to {factor * most.after:.3g} {unit}."
     )
+
+
+def achieved(plan: Plan) -> list[str]:
+    """What the stops are worth, in a sentence or two."""
+    return list(_achieved(plan, plan.document()))
 
 
 def _achieved(plan: Plan, document: Mapping[str, Any]) -> Iterator[str]:
@@ -134,7 +139,8 @@ def _reached(plan: Plan) -> Iterator[str]:
         )
 
 
-def _aim(document: Mapping[str, Any]) -> str:
+def aim(document: Mapping[str, Any]) -> str:
+    """What a plan's stops are for, in words, from its document."""
     what = document["for"]
     if document["learning_curve"]:
         told = f"until {document['for']}"
@@ -163,7 +169,7 @@ def _scale(kind: str) -> float:
 
 def _sigma_table(plan: Plan | TargetPlan) -> Table:
     table = columns_table("expected sigma", "", "now", "after")
-    for row in _rows(plan):
+    for row in known_rows(plan):
         if row.after < FALLS * row.now:
             factor, unit = shown(row.unit)
             table.add_row(row.name, unit, f"{factor * row.now:.3g}", f"{factor * row.after:.3g}")
@@ -184,7 +190,7 @@ class _Row(NamedTuple):
         return first.name if count == 1 else f"{first.unknown}, rms of {count}"
 
 
-def _rows(plan: Plan | TargetPlan) -> Iterator[_Row]:
+def known_rows(plan: Plan | TargetPlan) -> Iterator[_Row]:
     """A row a parameter; of an effect with many in one unit, one for all."""
     by_unknown: dict[str, list[int]] = {}
     for i, key in enumerate(plan.keys):
