@@ -34,7 +34,7 @@ from calib.runs.diagnose import stand_of
 from calib.runs.run import MODEL, Run
 from calib.solve.fit import Progress
 from chains.errors import InputError
-from sensors.stops import write_columns
+from sensors.stops import read_cameras, write_columns
 
 __all__ = ["Plan", "is_rig", "plan", "planner_of"]
 
@@ -44,6 +44,7 @@ CANDIDATE_POSES = 500
 # Stops that are planned where nobody says how many, and until sigmas are small.
 USUAL_STOPS, MOST_PLANNED = 5, 30
 WHEN = ("now", "after")
+CAMERAS = "cameras.csv"  # of the tracker, in the recording's folder or the rig's
 
 
 def silent(what: str, done: int, total: int) -> None:
@@ -244,17 +245,18 @@ def plan(
         raise InputError(
             f"{stops} stops out of {candidates} candidates: give at least 1, and no more"
         )
+
+    def made() -> Plan:
+        planner = planner_of(run, purpose, until, region, seed, progress)
+        return _planned(planner, stops, candidates, seed)
+
     if out is None:
-        return _planned(
-            planner_of(run, purpose, until, region, seed, progress), stops, candidates, seed
-        )
+        return made()
     if Path(out).suffix != ".csv":
         raise InputError(f"{out}: the stops are written as a table; give FILE.csv, or a folder")
     inputs = [run.folder, *run.inputs] if isinstance(run, Run) else [run]
     with outputs.file(out, inputs) as file:
-        found = _planned(
-            planner_of(run, purpose, until, region, seed, progress), stops, candidates, seed
-        )
+        found = made()
         write_columns(file, found.columns())
     return found
 
@@ -328,7 +330,9 @@ def planner_without_places(
     prior = None
     if fitted and fitted.prior:
         prior = earlier(stand.estimate.problem, Run.open(fitted.prior).solution)
+    cameras = stand.sources[0].recording.folder / CAMERAS
     return Planner(
+        cameras_m=read_cameras(cameras) if cameras.is_file() else None,
         folder=fitted.folder if fitted else Path(run),
         scene=PlanningScene(stand, aim.added, prior),
         aim=aim,

@@ -174,14 +174,7 @@ def smallest(left: np.ndarray, whole: np.ndarray, looks: int = 1) -> float:
 
 
 def indices(known: Information, at: np.ndarray, stops: int) -> dict[str, float]:
-    """The observability indices O1 to O5 of a calibration.
-
-    Of the singular values s of its Jacobian, all else eliminated, in units of what was known
-    before, priors counted as rows (so that each s is at least about 1).
-
-    O1 = (s_1 ... s_n)^(1/n) / sqrt(stops) (Borm and Menq 1989), O2 = s_n / s_1 (Driels and Pathre
-    1990), O3 = s_n (Nahvi, Hollerbach and Hayward 1994), O4 = s_n^2 / s_1 (Nahvi and Hollerbach
-    1996), O5 = 1 / (1/s_1 + ... + 1/s_n) (Sun and Hollerbach 2008).
+    """The observability indices O1 to O5 of a calibration; see `observability`.
 
     Args:
         known: what all stops say.
@@ -189,12 +182,30 @@ def indices(known: Information, at: np.ndarray, stops: int) -> dict[str, float]:
         stops: how many there are.
     """
     s = 1.0 / np.sqrt(np.linalg.eigvalsh(inverse(known.data + known.paper, at)))
+    return {name: float(value) for name, value in observability(s, stops).items()}
+
+
+def observability(s: np.ndarray, stops: int) -> dict[str, np.ndarray]:
+    """The observability indices of robots, of designs (...).
+
+    Of the singular values s of a calibration's Jacobian, all else eliminated, in units of what was
+    known before, priors counted as rows (so that each s is at least about 1).
+
+    O1 = (s_1 ... s_n)^(1/n) / sqrt(stops) (Borm and Menq 1989), O2 = s_n / s_1 (Driels and Pathre
+    1990), O3 = s_n (Nahvi, Hollerbach and Hayward 1994), O4 = s_n^2 / s_1 (Nahvi and Hollerbach
+    1996), O5 = 1 / (1/s_1 + ... + 1/s_n) (Sun and Hollerbach 2008).
+
+    Args:
+        s: (..., n).
+        stops: how many there are.
+    """
+    least, most = s.min(axis=-1), s.max(axis=-1)
     return {
-        "O1": float(np.exp(np.mean(np.log(s))) / np.sqrt(max(stops, 1))),
-        "O2": float(s.min() / s.max()),
-        "O3": float(s.min()),
-        "O4": float(s.min() ** 2 / s.max()),
-        "O5": float(1.0 / np.sum(1.0 / s)),
+        "O1": np.exp(np.mean(np.log(s), axis=-1)) / np.sqrt(max(stops, 1)),
+        "O2": least / most,
+        "O3": least,
+        "O4": least**2 / most,
+        "O5": 1.0 / np.sum(1.0 / s, axis=-1),
     }
 
 

@@ -58,6 +58,7 @@ class Planner:
         solution: what the run found; None without one.
         diagnosed: effect -> size from which the run's diagnosis would have found it.
         progress: called with what is being done, and how far it is.
+        cameras_m: (C, 3) of the tracker, world frame; None where nothing says where they are.
     """
 
     folder: Path
@@ -67,11 +68,13 @@ class Planner:
     solution: Solution | None
     diagnosed: Mapping[str, float]
     progress: Progress
+    cameras_m: np.ndarray | None = None
 
     def candidates(self, count: int, seed: int) -> Poses:
         """So many random poses; see `reachable`."""
         scene, rng = self.scene, np.random.default_rng(seed)
-        return reachable(scene.source, self.places, scene.T_world_reference, count, rng)
+        T, cameras_m = scene.T_world_reference, self.cameras_m
+        return reachable(scene.source, self.places, T, count, rng, cameras_m)
 
     def look(self, poses: Poses, stops: int) -> np.ndarray:
         """What each of some poses tells (n, S, S), so many of which are wanted.

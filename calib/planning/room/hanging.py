@@ -104,7 +104,7 @@ def plan_targets(
         raise InputError(f"{targets} targets out of {candidates} candidates: give at least 1")
     planner = planner_without_places(run, purpose or ALL, None, progress)
     rng = np.random.default_rng(seed)
-    places = hanging_places(planner.scene, region, candidates, rng)
+    places = hanging_places(planner.scene, region, candidates, rng, planner.cameras_m)
     if len(places) < targets:
         raise InputError(f"only {len(places)} places of so many drawn are clear of the mesh")
     found = _planned(planner, places, targets)

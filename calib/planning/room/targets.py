@@ -14,6 +14,7 @@ import numpy as np
 from calib.diagnosis.linear import beside
 from calib.linear.layout import Layout
 from calib.planning.information import Information, of_all
+from calib.planning.room.sight import seen_by_two
 from calib.planning.scene import PlanningScene
 from calib.planning.stops import MARK
 from calib.problem import Problem, build
@@ -33,7 +34,11 @@ PLACES_DRAWN = 20  # times as many places as are wanted are drawn
 
 
 def hanging_places(
-    scene: PlanningScene, region: Sequence[float] | None, count: int, rng: np.random.Generator
+    scene: PlanningScene,
+    region: Sequence[float] | None,
+    count: int,
+    rng: np.random.Generator,
+    cameras_m: np.ndarray | None = None,
 ) -> np.ndarray:
     """Random places (n, 3) of spheres, reference frame, m: in the box that the tracker was seen to
     reach or, with a region, between the mesh's floor and ceiling there; clear of the mesh.
@@ -43,6 +48,8 @@ def hanging_places(
         region: x and y of two corners, m, in the reference's frame.
         count: how many at most.
         rng: chance.
+        cameras_m: (C, 3) of the tracker, world frame, two of which are to see both markers of each;
+            None where nothing says where they are.
 
     Raises:
         InputError: the rig has no targets, no box, or no place in it is clear.
@@ -63,10 +70,15 @@ def hanging_places(
         clear = [mesh.distance_m(at + share * top) > TARGET_CLEAR_M for share in (0.0, 0.5, 1.0)]
         inside = [_inside(mesh.vertices_m, at + share * top) for share in (0.0, 1.0)]
         at = at[np.all([*clear, *inside], axis=0)]
+    if cameras_m is not None:
+        T = scene.T_world_reference
+        markers = [se3.apply(T, at) + share * _upper(scene) for share in (_lower_share(scene), 1.0)]
+        at = at[np.all([seen_by_two(source, cameras_m, each, T) for each in markers], axis=0)]
     if not len(at):
         raise InputError(
-            f"no place for a target is {TARGET_CLEAR_M:g} m clear of the mesh; give another "
-            "--region"
+            f"no place for a target is {TARGET_CLEAR_M:g} m clear of the mesh"
+            + (" and in two cameras' sight" if cameras_m is not None else "")
+            + "; give another --region"
         )
     return at[:count]
 
@@ -115,6 +127,12 @@ def _upper(scene: PlanningScene) -> np.ndarray:
     """From a sphere to the upper marker above it (3,), world frame, m."""
     below_m = scene.source.rig.target.sphere_below_lower_marker_m
     return -(below_m + _rod_m(scene)) * _down(scene)
+
+
+def _lower_share(scene: PlanningScene) -> float:
+    """Where the lower marker is on the way from the sphere to the upper one."""
+    below_m = scene.source.rig.target.sphere_below_lower_marker_m
+    return below_m / (below_m + _rod_m(scene))
 
 
 def _with_targets(
