@@ -108,7 +108,7 @@ class CsvTable:
         """Take three columns of positions (N, 3) in m."""
         units = "positions are in metres, and this looks like millimetres"
         names = [f"{name}{separator}{axis}" for axis in "xyz"]
-        why = f"{name} needs {', '.join(names)}"
+        why = f"{name or 'each row'} needs {', '.join(names)}"
         return np.array([self.numbers(part, why, _FARTHEST_M, units) for part in names]).T
 
     def pose(self, body: str) -> Array:
@@ -191,6 +191,18 @@ def read_targets(path: Path) -> Targets | None:
         "the two markers are in one place, and so show no direction of gravity",
     )
     return Targets(names, faro, upper, lower)
+
+
+def read_cameras(path: Path) -> Array:
+    """Read where a tracker's cameras are (C, 3), m, in its frame: a CSV with ``camera``, a name,
+    and ``x``, ``y``, ``z``; InputError for fewer than 2, which see nothing in space."""
+    table = CsvTable(path, key="camera")
+    names = table.names()
+    if len(names) < 2:
+        raise InputError(
+            f"{path} has {len(names)} row; it takes 2 cameras to see a marker in space"
+        )
+    return table.points("", "")
 
 
 def write_columns(path: str | Path, columns: Mapping[str, Iterable]) -> None:

@@ -19,6 +19,7 @@ LEVELS = {
 # Power with which an effect, a spread or a blunder of the smallest detectable size is found: by
 # convention (Cohen 1988).
 POWER = 0.8
+KNOWN = 1e6  # degrees of freedom of a scale that is taken as known
 LEAST_P = 1e-6  # nobody knows a tail further out: no p-value is said to be smaller
 
 
@@ -29,6 +30,12 @@ def log_tail(x: float, q: float) -> float:
         return float(np.log(tail))
     half = x / 2
     return float((q / 2 - 1) * np.log(half) - half - special.gammaln(q / 2))
+
+
+def enough(own: float, known: float, limit: float) -> float:
+    """Noncentrality from which a mean square of `own` degrees of freedom, against a scale that
+    `known` of them tell, is beyond a limit with a power of `POWER`."""
+    return float(special.ncfdtrinc(own, known, 1.0 - POWER, limit))
 
 
 def at_least(p: float) -> float:

@@ -7,14 +7,14 @@ tell, and so does the sigma that is stated of them.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
 from scipy import special
 
-from calib.blunders.chance import LEVELS, POWER, after_looks, at_least, log_tail
+from calib.blunders.chance import KNOWN, LEVELS, after_looks, at_least, enough, log_tail
 from calib.blunders.shifts import Shift, shifts
 from calib.linear.system import Linearisation
 from calib.problem.problem import Problem
@@ -24,7 +24,6 @@ ALPHA_BLUNDER = LEVELS["blunder"]
 # How much the median of squares tells of their scale, against their mean, for Gaussian rows.
 MEDIAN = 0.37
 FEWEST_OF_KIND = 4  # groups of a kind, below which these are taken at their sigmas
-KNOWN = 1e6  # degrees of freedom of a scale that is taken as known
 # Degrees of freedom of a sigma that somebody states: a half over the square of its relative
 # uncertainty, a quarter (GUM G.4.2). Where groups are few, it tells more of their scale than they.
 STATED = 8.0
@@ -119,15 +118,21 @@ class LeftOut:
     aside: bool = False
 
 
-def judge(whole: Linearisation, problem: Problem) -> list[Blunder]:
-    """All groups of rows, those that chance explains least first; arguments as of `shifts`."""
+def judge(whole: Linearisation, problem: Problem, planned: Collection[str] = ()) -> list[Blunder]:
+    """All groups of rows, those that chance explains least first.
+
+    Args:
+        whole, problem: as of `shifts`.
+        planned: names of stops that nobody has measured yet, which tell nothing of how far out
+            others of their kind are.
+    """
     kinds: dict[object, list[Shift]] = {}
     gone = {group for source in problem.sources for group in source.without}
     for shift in shifts(whole, problem):
         if shift.dof and shift.group not in gone:
             kinds.setdefault((*_alike(shift.group), shift.of_ranges), []).append(shift)
     looks = sum(len(some) for some in kinds.values())
-    found = [b for some in kinds.values() for b in _judged(some, looks)]
+    found = [b for some in kinds.values() for b in _judged(some, looks, planned)]
     return sorted(found, key=lambda b: -b.evidence)
 
 
@@ -163,14 +168,15 @@ def _bulk(some: Sequence[Shift]) -> float:
     return max(1.0, float(np.median([shift.statistic for shift in some] / by_chance)))
 
 
-def _judged(some: Sequence[Shift], looks: int) -> Iterator[Blunder]:
+def _judged(some: Sequence[Shift], looks: int, planned: Collection[str]) -> Iterator[Blunder]:
     """Groups of one kind: in units of how far out their bulk is; a single joint's too, as readings
     that scatter show most in the joints that move the body furthest."""
-    wholes = [shift for shift in some if _whole(shift.group)]
+    measured = [shift for shift in some if shift.group.stop not in planned]
+    wholes = [shift for shift in measured if _whole(shift.group)]
     dof = np.array([shift.dof for shift in wholes])
     of_kind = _bulk(wholes)
     single: dict[tuple[str, str], list[Shift]] = {}
-    for shift in (s for s in some if not _whole(s.group)):
+    for shift in (s for s in measured if not _whole(s.group)):
         single.setdefault((shift.group.recording, shift.group.what), []).append(shift)
     of_joint = {joint: max(of_kind, _bulk(mine)) for joint, mine in single.items()}
 
@@ -178,10 +184,10 @@ def _judged(some: Sequence[Shift], looks: int) -> Iterator[Blunder]:
     def bounds(own: int) -> tuple[float, float, float]:
         """Of groups of so many dofs: those of the bulk, the limit of F, and its noncentrality."""
         known, limit = limit_of(own, dof.sum() - own, len(wholes), looks)
-        return known, limit, special.ncfdtrinc(own, known, 1.0 - POWER, limit)
+        return known, limit, enough(own, known, limit)
 
     for shift in some:
-        known, limit, enough = bounds(shift.dof)
+        known, limit, least = bounds(shift.dof)
         bulk = of_joint.get((shift.group.recording, shift.group.what), of_kind)
         scaled = shift.statistic / bulk
         p = at_least(special.fdtrc(shift.dof, known, scaled / shift.dof))
@@ -192,7 +198,7 @@ def _judged(some: Sequence[Shift], looks: int) -> Iterator[Blunder]:
             p_adjusted=float(after_looks(p, looks)),
             evidence=-log_tail(scaled, shift.dof),
             limit=float(limit * shift.dof * bulk),
-            enough=float(enough * bulk),
-            detectable={u: float(np.sqrt(enough * bulk / t)) for u, t in told.items() if t > 0},
+            enough=float(least * bulk),
+            detectable={u: float(np.sqrt(least * bulk / t)) for u, t in told.items() if t > 0},
             looks=looks,
         )

@@ -18,9 +18,42 @@ from calib.cli.app import (
     warn,
 )
 from calib.linear.parallel import workers as threads
+from chains.errors import InputError
 
 UNTIL = "The fewest stops until sigmas are so small: 'lidar 0.3 mm, rings 1 mm'."
-FOR = "all; frames, effects or parameters to know better, with commas; effects to separate."
+FOR = (
+    "all; reliability, against blunders; scatter, of stops; frames, effects or parameters to know "
+)
+FOR += "better, with commas; effects to separate."
+
+
+Stops = Annotated[
+    int | None,
+    typer.Option(
+        metavar="N",
+        min=1,
+        help="How many; with --until how many at most.",
+        show_default="5, 30",
+    ),
+]
+For = Annotated[
+    str | None, typer.Option("--for", metavar="WHAT", help=FOR, show_default="what diagnose found")
+]
+Until = Annotated[str | None, typer.Option(metavar="SIGMAS", help=UNTIL, show_default=False)]
+Hung = Annotated[
+    int | None,
+    typer.Option(metavar="N", min=1, help="Instead: where so many targets should hang."),
+]
+Out = Annotated[
+    Path | None,
+    typer.Option(
+        "-o", "--out", metavar="OUT", help="FILE.csv of them; or a folder, with a picture."
+    ),
+]
+Region = Annotated[
+    tuple[float, float, float, float] | None,
+    typer.Option(metavar="X0 Y0 X1 Y1", help="Where the base may stand, or targets hang, m."),
+]
 
 
 @app.command()
@@ -28,29 +61,12 @@ def plan(
     run: Annotated[
         Path, typer.Argument(metavar="RUN_OR_RIG", help="A run; or a rig's folder, with --region.")
     ],
-    stops: Annotated[
-        int | None,
-        typer.Option(
-            metavar="N",
-            min=1,
-            help="How many; with --until how many at most.",
-            show_default="5, 30",
-        ),
-    ] = None,
-    purpose: Annotated[
-        str | None,
-        typer.Option("--for", metavar="WHAT", help=FOR, show_default="what diagnose found"),
-    ] = None,
-    until: Annotated[
-        str | None, typer.Option(metavar="SIGMAS", help=UNTIL, show_default=False)
-    ] = None,
-    region: Annotated[
-        tuple[float, float, float, float] | None,
-        typer.Option(metavar="X0 Y0 X1 Y1", help="Where on the floor the base may stand, m."),
-    ] = None,
-    out: Annotated[
-        Path | None, typer.Option("-o", "--out", metavar="FILE.csv", help="Where to write them.")
-    ] = None,
+    stops: Stops = None,
+    purpose: For = None,
+    until: Until = None,
+    targets: Hung = None,
+    region: Region = None,
+    out: Out = None,
     candidates: Annotated[
         int, typer.Option(metavar="N", min=1, max=3000, help="Random poses that are looked at.")
     ] = 500,
@@ -60,19 +76,35 @@ def plan(
     as_json: Json = False,
 ) -> None:
     """Plan the next stops, and predict what they determine."""
+    from calib import outputs
+    from calib.outputs.kinds import PLANNED
     from calib.planning import is_rig
     from calib.planning import plan as choose
+    from calib.planning.room.hanging import plan_targets as hang
+    from calib.report.planned import inputs_of, write_plan
     from calib.runs.run import Run
 
+    if targets is not None and (stops is not None or until is not None):
+        raise InputError("give --targets, or --stops and --until; not both")
     opened = run if is_rig(run) else Run.open(run, trust or ())
+    more = {"purpose": purpose, "region": region, "candidates": candidates, "seed": seed}
+    folder = out if out is not None and not out.suffix and targets is None else None
+    if folder is not None:
+        outputs.refuse(folder, PLANNED, inputs_of(opened))
     with threads(workers), progress_bar() as progress:
-        found = choose(opened, stops, purpose, until, region, candidates, seed, out, progress)
+        more |= {"out": None if folder else out, "progress": progress}
+        if targets is None:
+            found = choose(opened, stops, until=until, **more)
+        else:
+            found = hang(opened, targets, **more)
+        if folder is not None:
+            write_plan(found, folder, opened)
     of = [opened] if isinstance(opened, Run) else []
     warn(of, as_json)
     if as_json:
         print_json(found.document())
     else:
-        from calib.show.plan import print_plan
+        from calib.show import plan as show
 
-        print_plan(found)
+        show.print_plan(found) if targets is None else show.print_targets(found)
     end_unless_converged(*of)

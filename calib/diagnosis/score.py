@@ -16,7 +16,7 @@ import numpy as np
 from scipy import special
 from scipy.linalg import cho_factor, cho_solve
 
-from calib.blunders.chance import POWER, at_least, log_tail
+from calib.blunders.chance import at_least, enough, log_tail
 from calib.diagnosis.jackknife import ScoreSpread, Shares, by_signs
 from calib.diagnosis.linear import Linear
 from calib.linear.clusters import summed
@@ -228,11 +228,10 @@ class ScoreTest:
         nu = self.chance.nu
         d = max(min(self.chance.d, (self.chance.clusters - 1.0) * nu), 0.5 * nu)
         limit = special.fdtri(nu, d, 1.0 - alpha)
-        noncentral = special.ncfdtrinc(nu, d, 1.0 - POWER, limit)
         # Along a direction of unit length the information is this much, on average.
         each = np.trace(np.linalg.pinv(self.whiten @ self.whiten.T)) / len(self.score)
         scale = max(self.chance.trace, common * self.dof)
-        return float(np.sqrt(noncentral * scale / nu / each))
+        return float(np.sqrt(enough(nu, d, limit) * scale / nu / each))
 
 
 def score_test(scores: Scores, columns: np.ndarray) -> ScoreTest:

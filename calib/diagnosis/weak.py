@@ -50,8 +50,13 @@ def to_be_told_apart(
     confirmed = (c for c in candidates if c["step"])
     for each in sorted(confirmed, key=lambda c: c["step"]):
         if each["indistinguishable_from"]:
-            return [each["add"], *each["indistinguishable_from"]]
+            return group(each)
     return next((list(w["parameters"]) for w in weak if w["sigma_mm"] is None), [])
+
+
+def group(candidate: Mapping[str, Any]) -> list[str]:
+    """A candidate of a diagnosis and its rivals, as commands have them."""
+    return [candidate["add"], *(rival["add"] for rival in candidate["rivals"])]
 
 
 def leaning(solution: Solution, look: Look) -> list[dict[str, Any]]:

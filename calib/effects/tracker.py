@@ -173,5 +173,5 @@ def _in_body(view: View, field: Callable[[np.ndarray], np.ndarray]) -> np.ndarra
     """
     T = np.nan_to_num(view["tracked"])
     shift = field(T[..., :3, 3].reshape(-1, 3))
-    shift = np.swapaxes(T[..., :3, :3], -1, -2) @ shift.reshape(*T.shape[:2], 3, -1)
+    shift = np.swapaxes(T[..., :3, :3], -1, -2) @ shift.reshape(*T.shape[:2], *shift.shape[1:])
     return np.concatenate([np.zeros_like(shift), shift], axis=2)

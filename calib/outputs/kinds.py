@@ -63,6 +63,10 @@ def _lacks_evaluation(folder: Path) -> str:
     return _without("evaluation.json", "points.parquet/_columns.yaml")(folder) or _is_other(folder)
 
 
+def _lacks_plan(folder: Path) -> str:
+    return _without("plan.json", "stops.csv")(folder) or _is_other(folder)
+
+
 def _lacks_export(folder: Path) -> str:
     if other := _is_other(folder):
         return other
@@ -128,6 +132,7 @@ RUN = FolderKind(
 EVALUATION = FolderKind("evaluation", _lacks_evaluation, ("evaluation.json", "points.parquet"))
 EXPORT = FolderKind("export", _lacks_export)
 CLOUDS = FolderKind("folder of corrected clouds", _without(CLOUDS_MARK))
+PLANNED = FolderKind("plan", _lacks_plan, ("stops.csv", "plan.json", "before_after.svg"))
 LADDER = FolderKind("ladder of runs", _lacks_ladder)
 
 

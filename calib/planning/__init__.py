@@ -9,7 +9,7 @@ linearisation of all stops together, measured and planned (`scene`).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +18,10 @@ import numpy as np
 from calib import outputs
 from calib.linear.parallel import one_blas_thread
 from calib.planning.alone import nothing_measured
-from calib.planning.places import in_region, where_it_stood
+from calib.planning.found import Found
 from calib.planning.planner import Planner, Step
 from calib.planning.purpose import ALL, Purpose, purpose_of
+from calib.planning.room.places import in_region, where_it_stood
 from calib.planning.scene import PlanningScene
 from calib.planning.stops import Poses
 from calib.planning.tolerance import purpose_until
@@ -33,7 +34,7 @@ from calib.runs.diagnose import stand_of
 from calib.runs.run import MODEL, Run
 from calib.solve.fit import Progress
 from chains.errors import InputError
-from sensors.stops import write_columns
+from sensors.stops import read_cameras, write_columns
 
 __all__ = ["Plan", "is_rig", "plan", "planner_of"]
 
@@ -42,9 +43,11 @@ __all__ = ["Plan", "is_rig", "plan", "planner_of"]
 CANDIDATE_POSES = 500
 # Stops that are planned where nobody says how many, and until sigmas are small.
 USUAL_STOPS, MOST_PLANNED = 5, 30
+WHEN = ("now", "after")
+CAMERAS = "cameras.csv"  # of the tracker, in the recording's folder or the rig's
 
 
-def _silent(what: str, done: int, total: int) -> None:
+def silent(what: str, done: int, total: int) -> None:
     """Progress that nobody sees."""
 
 
@@ -61,27 +64,36 @@ class Plan:
         run: the folder of the run, or of the rig.
         purpose: what they were chosen for.
         poses: of the stops, in the order in which to drive to them.
+        measured: of the stops that were measured.
         joints: (J,) name and kind, revolute or prismatic, of each.
         keys, units: (P,) of the parameters of the calibration.
         now, after: what is known without and with them; sigmas as a run reports them.
+        found: what would be found of what may be wrong, without and with them.
         effect_units: of the effects in `Known.smallest`.
         candidates: how many poses they were chosen among.
-        untold: directions that no stops of this arm determine, however many.
+        endless: what is known with any number of stops of this arm.
         curve: how far from their tolerances sigmas are with how many of them; empty without any.
     """
 
     run: Path
     purpose: Purpose
     poses: Poses
+    measured: Poses
     joints: Sequence[tuple[str, str]]
     keys: Sequence[Key]
     units: Sequence[str]
     now: Known
     after: Known
+    endless: Known
+    found: tuple[Found, Found]
     effect_units: Mapping[str, str]
     candidates: int
-    untold: Sequence[Mapping[str, Any]] = ()
     curve: Sequence[Step] = ()
+
+    @property
+    def untold(self) -> Sequence[Mapping[str, Any]]:
+        """Directions that no stops of this arm determine, however many."""
+        return self.endless.weak
 
     @property
     def names(self) -> list[str]:
@@ -127,6 +139,9 @@ class Plan:
                 }
                 for name in self.now.smallest
             },
+            "smallest_effect": _effects(*self.found),
+            "smallest_blunder": _mishaps(*self.found),
+            "unseen_blunder": {w: f.furthest() for w, f in zip(WHEN, self.found, strict=True)},
             "weak_directions": {
                 "now": list(self.now.weak),
                 "after": list(self.after.weak),
@@ -149,8 +164,42 @@ class Plan:
         return {"location": self.poses.location.astype(str), **joints}
 
 
+def _effects(now: Found, after: Found) -> dict[str, Any]:
+    """From which size effects are found, as JSON has it: of those never found, None."""
+
+    def size(found: Found, name: str) -> float | None:
+        each = found.effects.get(name, np.inf)
+        return each if np.isfinite(each) else None
+
+    return {
+        name: {"unit": unit, "now": size(now, name), "after": size(after, name)}
+        for name, unit in sorted(after.units.items())
+    }
+
+
+def _mishaps(now: Found, after: Found) -> dict[str, Any]:
+    """From which size mishaps are found, as JSON has it: of those never found, None."""
+
+    def size(found: Found, kind: str, unit: str) -> dict[str, float] | None:
+        each = found.mishaps.get(kind, {}).get(unit)
+        return each.document() if each else None
+
+    return {
+        kind: {u: {"now": size(now, kind, u), "after": size(after, kind, u)} for u in sizes}
+        for kind, sizes in after.mishaps.items()
+    }
+
+
+def _diagnosed(run: Run) -> dict[str, float]:
+    """Effect -> the size from which the run's diagnosis would have found it, if it had one."""
+    found = run.diagnosis() or {"candidates": []}
+    sizes = {c["effect"]: c["smallest_detectable"] for c in found["candidates"]}
+    return {name: size for name, size in sizes.items() if size and np.isfinite(size)}
+
+
 def _now_after(plan: Plan, name: str, which: int) -> dict[str, float | None]:
-    sizes = {"now": plan.now.smallest[name][which], "after": plan.after.smallest[name][which]}
+    known = {"now": plan.now, "after": plan.after, "with_any_number": plan.endless}
+    sizes = {when: each.smallest[name][which] for when, each in known.items()}
     return {when: size if np.isfinite(size) else None for when, size in sizes.items()}
 
 
@@ -164,7 +213,7 @@ def plan(
     candidates: int = CANDIDATE_POSES,
     seed: int = 0,
     out: Path | str | None = None,
-    progress: Progress = _silent,
+    progress: Progress = silent,
 ) -> Plan:
     """The stops to measure next.
 
@@ -196,17 +245,18 @@ def plan(
         raise InputError(
             f"{stops} stops out of {candidates} candidates: give at least 1, and no more"
         )
+
+    def made() -> Plan:
+        planner = planner_of(run, purpose, until, region, seed, progress)
+        return _planned(planner, stops, candidates, seed)
+
     if out is None:
-        return _planned(
-            planner_of(run, purpose, until, region, seed, progress), stops, candidates, seed
-        )
+        return made()
     if Path(out).suffix != ".csv":
-        raise InputError(f"{out}: the stops are written as a table; give FILE.csv")
+        raise InputError(f"{out}: the stops are written as a table; give FILE.csv, or a folder")
     inputs = [run.folder, *run.inputs] if isinstance(run, Run) else [run]
     with outputs.file(out, inputs) as file:
-        found = _planned(
-            planner_of(run, purpose, until, region, seed, progress), stops, candidates, seed
-        )
+        found = made()
         write_columns(file, found.columns())
     return found
 
@@ -220,17 +270,19 @@ def _planned(planner: Planner, stops: int, candidates: int, seed: int) -> Plan:
     else:
         some = planner.choose(poses, each, stops)
     some = planner.in_order(some)
-    scene, rig = planner.scene, planner.scene.source.rig
+    scene, rig, after = planner.scene, planner.scene.source.rig, planner.after(some)
     return Plan(
         run=planner.folder,
         purpose=planner.aim,
         poses=some,
+        measured=scene.measured,
         joints=list(zip(rig.joint_names, rig.joint_kinds, strict=True)),
         keys=planner.keys,
         units=planner.units,
         now=planner.now,
-        after=planner.after(some),
-        untold=planner.endless(each).weak,
+        after=after,
+        found=planner.found_now_and_after(after, some),
+        endless=planner.endless(each),
         effect_units={name: scene.unit_of(name) for name in planner.aim.rivals},
         candidates=len(poses.joints),
         curve=curve,
@@ -243,16 +295,34 @@ def planner_of(
     until: str | None = None,
     region: Sequence[float] | None = None,
     seed: int = 0,
-    progress: Progress = _silent,
+    progress: Progress = silent,
 ) -> Planner:
     """What plans stops; arguments and errors as of `plan`."""
-    fitted = run if isinstance(run, Run) else None
-    stand = stand_of(run, progress) if fitted else nothing_measured(run)
-    if fitted is None and region is None:
+    planner = planner_without_places(run, purpose, until, progress)
+    scene, folder = planner.scene, planner.scene.source.recording.folder
+    if planner.solution is None and region is None:
         raise InputError(
             f"{run}: nothing was measured with this rig, so say with --region x0 y0 x1 y1 where on "
-            f"the floor its base may stand, m in the frame '{stand.sources[0].rig.reference_frame}'"
+            f"the floor its base may stand, m in the frame '{scene.source.rig.reference_frame}'"
         )
+    if scene.stand.estimate.scans and not scene.scanned:
+        raise InputError(
+            f"{folder}: there is no mesh, so nothing says what the beams of a planned stop would "
+            "meet; add reference/mesh.ply"
+        )
+    places = where_it_stood(scene.stand.estimate.problem, scene.values)
+    if region is not None:
+        rng = np.random.default_rng(seed)
+        places = in_region(scene.source, region, places, scene.T_world_reference, rng)
+    return replace(planner, places=places)
+
+
+def planner_without_places(
+    run: Run | Path | str, purpose: str | None, until: str | None, progress: Progress
+) -> Planner:
+    """The same, and nothing says where the base may stand."""
+    fitted = run if isinstance(run, Run) else None
+    stand = stand_of(run, progress) if fitted else nothing_measured(run)
     if until:
         aim = purpose_until(stand, until)
     else:
@@ -260,21 +330,14 @@ def planner_of(
     prior = None
     if fitted and fitted.prior:
         prior = earlier(stand.estimate.problem, Run.open(fitted.prior).solution)
-    scene = PlanningScene(stand, aim.added, prior)
-    if stand.estimate.scans and not scene.scanned:
-        raise InputError(
-            f"{scene.source.recording.folder}: there is no mesh, so nothing says what the beams of "
-            "a planned stop would meet; add reference/mesh.ply"
-        )
-    places = where_it_stood(stand.estimate.problem, scene.values)
-    if region is not None:
-        rng = np.random.default_rng(seed)
-        places = in_region(scene.source, region, places, scene.T_world_reference, rng)
+    cameras = stand.sources[0].recording.folder / CAMERAS
     return Planner(
+        cameras_m=read_cameras(cameras) if cameras.is_file() else None,
         folder=fitted.folder if fitted else Path(run),
-        scene=scene,
+        scene=PlanningScene(stand, aim.added, prior),
         aim=aim,
-        places=places,
+        places={},
         solution=fitted.solution if fitted else None,
+        diagnosed=_diagnosed(fitted) if fitted else {},
         progress=progress,
     )

@@ -15,8 +15,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy import special
 
+from calib.blunders.chance import KNOWN, enough
 from calib.diagnosis.linear import WIDENED
-from calib.diagnosis.score import POWER
 from calib.diagnosis.search import ALPHA_EFFECT
 from calib.linear.parallel import in_order
 from calib.planning.information import Information, inverse
@@ -39,8 +39,16 @@ class Criterion:
         """Of designs (n,), from the information (n, S, S) of all their stops and priors."""
         raise NotImplementedError
 
-    def each(self, base: np.ndarray, more: np.ndarray) -> np.ndarray:
-        """Of designs (n,) that add one stop each, (n, S, S), to the same others (S, S)."""
+    def each(
+        self, base: np.ndarray, more: np.ndarray, others: Sequence[np.ndarray] = ()
+    ) -> np.ndarray:
+        """Of designs (n,) that add one stop each, (n, S, S), to the same others.
+
+        Args:
+            base: (S, S) of all those others and priors.
+            more: (n, S, S) of the stops that are added.
+            others: (S, S) of each planned stop in `base`.
+        """
         cuts = range(0, len(more), DESIGNS_AT_ONCE)
         return np.concatenate(
             list(
@@ -87,8 +95,7 @@ class Apart(Criterion):
     """
 
     def __init__(self, known: Information, of: Sequence[tuple[np.ndarray, np.ndarray]]) -> None:
-        self.start = known.data + known.paper / WIDENED**2
-        self.effects = of
+        self.start, self.effects = _of_rows(known), of
 
     def of(self, M: np.ndarray) -> np.ndarray:
         out = []
@@ -98,6 +105,11 @@ class Apart(Criterion):
                 np.log(np.maximum(np.einsum("kij,i,j->k", left, size, size), LEAST_INFORMATION))
             )
         return np.mean(out, axis=0)
+
+
+def _of_rows(known: Information) -> np.ndarray:
+    """Information (S, S) against which rivals are told: paper hardly counts."""
+    return known.data + known.paper / WIDENED**2
 
 
 def information_left(
@@ -125,7 +137,23 @@ def information_left(
     return (left + left.mT) / 2
 
 
-def smallest(left: np.ndarray, whole: np.ndarray) -> float:
+def found_from(
+    known: Information, of: np.ndarray, without: Sequence[int] | np.ndarray = (), looks: int = 1
+) -> float:
+    """The size of an effect from which it is found; see `smallest`.
+
+    Args:
+        known: what is known.
+        of: (q,) the effect's components.
+        without: those that play no part.
+        looks: how many effects are looked for.
+    """
+    own = np.outer(known.unit[of], known.unit[of])
+    left = information_left(_of_rows(known)[None], of, without)[0]
+    return smallest(left / own, known.data[np.ix_(of, of)] / own, looks)
+
+
+def smallest(left: np.ndarray, whole: np.ndarray, looks: int = 1) -> float:
     """The root mean square size of an effect's parameters at which it is found.
 
     With a power of 80 % at the level of a diagnosis, in the effect's unit, on average over the
@@ -134,26 +162,19 @@ def smallest(left: np.ndarray, whole: np.ndarray) -> float:
     Args:
         left: (q, q) its information that nothing else can take on.
         whole: (q, q) all of it.
+        looks: how many effects are looked for.
     """
     size = np.sqrt(np.maximum(np.diag(whole), 1e-300))
     values = np.linalg.eigvalsh(left / np.outer(size, size))
     dof = int((values > 1e-6).sum())
     if not dof:
         return float("inf")
-    limit = special.chdtri(dof, ALPHA_EFFECT)
-    noncentral = special.chndtrinc(limit, dof, 1.0 - POWER)
-    return float(np.sqrt(noncentral / (np.trace(left) / len(left))))
+    limit = special.fdtri(dof, KNOWN, (1.0 - ALPHA_EFFECT) ** (1.0 / looks))
+    return float(np.sqrt(enough(dof, KNOWN, limit) / (np.trace(left) / len(left))))
 
 
 def indices(known: Information, at: np.ndarray, stops: int) -> dict[str, float]:
-    """The observability indices O1 to O5 of a calibration.
-
-    Of the singular values s of its Jacobian, all else eliminated, in units of what was known
-    before, priors counted as rows (so that each s is at least about 1).
-
-    O1 = (s_1 ... s_n)^(1/n) / sqrt(stops) (Borm and Menq 1989), O2 = s_n / s_1 (Driels and Pathre
-    1990), O3 = s_n (Nahvi, Hollerbach and Hayward 1994), O4 = s_n^2 / s_1 (Nahvi and Hollerbach
-    1996), O5 = 1 / (1/s_1 + ... + 1/s_n) (Sun and Hollerbach 2008).
+    """The observability indices O1 to O5 of a calibration; see `observability`.
 
     Args:
         known: what all stops say.
@@ -161,12 +182,30 @@ def indices(known: Information, at: np.ndarray, stops: int) -> dict[str, float]:
         stops: how many there are.
     """
     s = 1.0 / np.sqrt(np.linalg.eigvalsh(inverse(known.data + known.paper, at)))
+    return {name: float(value) for name, value in observability(s, stops).items()}
+
+
+def observability(s: np.ndarray, stops: int) -> dict[str, np.ndarray]:
+    """The observability indices of robots, of designs (...).
+
+    Of the singular values s of a calibration's Jacobian, all else eliminated, in units of what was
+    known before, priors counted as rows (so that each s is at least about 1).
+
+    O1 = (s_1 ... s_n)^(1/n) / sqrt(stops) (Borm and Menq 1989), O2 = s_n / s_1 (Driels and Pathre
+    1990), O3 = s_n (Nahvi, Hollerbach and Hayward 1994), O4 = s_n^2 / s_1 (Nahvi and Hollerbach
+    1996), O5 = 1 / (1/s_1 + ... + 1/s_n) (Sun and Hollerbach 2008).
+
+    Args:
+        s: (..., n).
+        stops: how many there are.
+    """
+    least, most = s.min(axis=-1), s.max(axis=-1)
     return {
-        "O1": float(np.exp(np.mean(np.log(s))) / np.sqrt(max(stops, 1))),
-        "O2": float(s.min() / s.max()),
-        "O3": float(s.min()),
-        "O4": float(s.min() ** 2 / s.max()),
-        "O5": float(1.0 / np.sum(1.0 / s)),
+        "O1": np.exp(np.mean(np.log(s), axis=-1)) / np.sqrt(max(stops, 1)),
+        "O2": least / most,
+        "O3": least,
+        "O4": least**2 / most,
+        "O5": 1.0 / np.sum(1.0 / s, axis=-1),
     }
 
 
@@ -190,7 +229,7 @@ def chosen(
     base, found = criterion.start.copy(), []
     for k in range(count):
         tell(k, count)
-        value = criterion.each(base, each)
+        value = criterion.each(base, each, each[found])
         value[found] = -np.inf
         found.append(int(np.argmax(value)))
         base += each[found[-1]]
@@ -198,7 +237,7 @@ def chosen(
         before = list(found)
         for i, old in enumerate(before):
             rest = base - each[old]
-            value = criterion.each(rest, each)
+            value = criterion.each(rest, each, each[found[:i] + found[i + 1 :]])
             now = value[old]
             value[found] = -np.inf
             best = int(np.argmax(value))

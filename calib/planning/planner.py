@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 
 from calib.planning.criteria import chosen
+from calib.planning.found import Found, would_be_found
 from calib.planning.information import Information
-from calib.planning.poses import in_order_of_path, reachable
 from calib.planning.purpose import Purpose
+from calib.planning.room.poses import in_order_of_path, reachable
 from calib.planning.scene import PlanningScene
 from calib.planning.stops import Poses
 from calib.planning.worth import Known, criterion
@@ -55,7 +56,9 @@ class Planner:
         aim: what stops are for.
         places: location -> T_world_root (4, 4) where the base may stand.
         solution: what the run found; None without one.
+        diagnosed: effect -> size from which the run's diagnosis would have found it.
         progress: called with what is being done, and how far it is.
+        cameras_m: (C, 3) of the tracker, world frame; None where nothing says where they are.
     """
 
     folder: Path
@@ -63,12 +66,15 @@ class Planner:
     aim: Purpose
     places: Mapping[str, np.ndarray]
     solution: Solution | None
+    diagnosed: Mapping[str, float]
     progress: Progress
+    cameras_m: np.ndarray | None = None
 
     def candidates(self, count: int, seed: int) -> Poses:
         """So many random poses; see `reachable`."""
         scene, rng = self.scene, np.random.default_rng(seed)
-        return reachable(scene.source, self.places, scene.T_world_reference, count, rng)
+        T, cameras_m = scene.T_world_reference, self.cameras_m
+        return reachable(scene.source, self.places, T, count, rng, cameras_m)
 
     def look(self, poses: Poses, stops: int) -> np.ndarray:
         """What each of some poses tells (n, S, S), so many of which are wanted.
@@ -93,7 +99,7 @@ class Planner:
         """What all candidates tell, measured again and again: no stops of the arm tell more. As the
         mesh's errors are taken to differ from stop to stop, even these may not tell as much."""
         base = self.lasting
-        return self._known(replace(base, data=base.data + ENDLESS_TIMES * each.sum(axis=0)), 0)
+        return self.known(replace(base, data=base.data + ENDLESS_TIMES * each.sum(axis=0)), 0)
 
     def enough(self, poses: Poses, each: np.ndarray, most: int) -> tuple[Poses, list[Step]]:
         """The fewest stops, one best after another, with which every tolerance is kept, or `most`
@@ -130,8 +136,16 @@ class Planner:
     def lasting(self) -> Information:
         """What is known now of all that planned stops speak of; targets hang where they hang."""
         roles, now = self.scene.problem.variables, self.scene.now
-        keep = [i for i, (n, _) in enumerate(now.keys) if roles[n].role is not Role.TARGET]
+        alone = [u.name for u in roles.values() if u.role is Role.TARGET]
+        alone += [u.name for u in roles.values() if u.owner.effect in self._by_chance]
+        gone = set(alone)
+        keep = [i for i, (name, _) in enumerate(now.keys) if name not in gone]
         return now.onto(np.array(keep))
+
+    @property
+    def _by_chance(self) -> list[str]:
+        """Effects that the plan has scatter by chance: what each is at a stop, no other knows."""
+        return [effect.name for effect in self.aim.added if effect.by_chance]
 
     @cached_property
     def keys(self) -> list[Key]:
@@ -153,13 +167,31 @@ class Planner:
     @cached_property
     def now(self) -> Known:
         """What is known without any planned stop."""
-        return self._known(self.scene.now, 0)
+        return self.known(self.scene.now, 0)
 
     def after(self, poses: Poses) -> Known:
         """What will be known with planned stops, by one linearisation of all."""
-        return self._known(self.scene.after(poses), len(poses.joints))
+        return self.known(self.scene.after(poses), len(poses.joints))
 
-    def _known(self, information: Information, more: int) -> Known:
+    def found(self, known: Known, poses: Poses | None) -> Found:
+        """What would be found with planned stops, or without any, of which this is known."""
+        sigma = dict(zip(self.keys, known.sigma.tolist(), strict=True))
+        return would_be_found(self.scene, poses, sigma, self.progress)
+
+    def found_now_and_after(self, after: Known, poses: Poses) -> tuple[Found, Found]:
+        """What would be found without planned stops and with them. As rows of a stop err
+        together, a diagnosis finds effects from larger sizes on than independent rows have it; they
+        are taken to go on doing so."""
+        now, then = self.found(self.now, None), self.found(after, poses)
+        times = {
+            name: self.diagnosed[name] / size
+            for name, size in now.effects.items()
+            if np.isfinite(size) and name in self.diagnosed
+        }
+        return now.wider(times), then.wider(times)
+
+    def known(self, information: Information, more: int) -> Known:
+        """What all rows say, in the words of a run; of so many stops more."""
         stops = len(self.scene.source.recording.stops) + more
         return Known.of(self.scene, self.aim, information, stops, self._wider)
 

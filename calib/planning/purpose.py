@@ -1,4 +1,5 @@
-"""What planned stops are for: the whole calibration, some of it, or telling rivals apart."""
+"""What planned stops are for: the whole calibration, some of it, telling rivals apart, or a
+calibration that errors of single stops do little to."""
 
 from __future__ import annotations
 
@@ -9,13 +10,16 @@ from typing import Any
 from calib.diagnosis.stand import Stand
 from calib.diagnosis.weak import to_be_told_apart
 from calib.effects import CATALOGUE, Effect, Site, find, split
+from calib.effects.scatter import StopPoseScatter, StopRangeScatter
 from calib.problem.unknowns import Key, Unknown
 from calib.runs.reopen import proposed
 from calib.runs.run import Run
 from chains.errors import InputError
 from sensors.documents import nearest
 
-ALL = "all"
+ALL, RELIABILITY, SCATTER = "all", "reliability", "scatter"
+# What differs from stop to stop by chance, as a whole: the range zero, and where the LiDAR sits.
+OF_STOPS = (StopRangeScatter, StopPoseScatter)
 
 
 @dataclass(frozen=True)
@@ -29,7 +33,7 @@ class Purpose:
         tolerance: of each of those the sigma that is wanted, in its unit; empty without any.
         rivals: names of effects, each of which is to be told from the others and from the model;
             empty where that is not the purpose.
-        added: those of them that are not in the model.
+        added: those of them that are not in the model, and what is to scatter by chance.
     """
 
     text: str
@@ -50,23 +54,37 @@ def purpose_of(run: Run | None, stand: Stand, text: str | None) -> Purpose:
     Args:
         run: with its diagnosis, if there is one; None of a rig alone, of which `text` says it.
         stand: its fit.
-        text: ``all``; names of frames, effects or single parameters of the model, with commas; or
-            effects, of which one at least is not in the model. By default what the diagnosis says
-            cannot be told apart, then what it says is hardly determined, then all.
+        text: ``all``; ``reliability``, so that no single stop carries an estimate; ``scatter``, as
+            well as can be where stops err as a whole; names of frames, effects or parameters of
+            the model, with commas; or effects, of which one at least is not in the model. By
+            default what the diagnosis says cannot be told apart, then what it says is hardly
+            determined, then all.
 
     Raises:
         InputError: a name is not known.
     """
     if text is None:
         return _from_diagnosis(run, stand)
-    if text == ALL:
-        return Purpose(ALL)
+    if text in (ALL, RELIABILITY):
+        return Purpose(text)
+    if text == SCATTER:
+        return Purpose(SCATTER, added=_of_stops(stand))
     names = split(text)
     found = [components(stand, name) for name in names]
     if not names or all(found):
         return Purpose(text, components=tuple(dict.fromkeys(key for some in found for key in some)))
     missing = [name for name, some in zip(names, found, strict=True) if not some]
     return Purpose(text, rivals=tuple(names), added=tuple(_effects(run, stand, missing)))
+
+
+def _of_stops(stand: Stand) -> tuple[Effect, ...]:
+    """What is to differ from stop to stop, beyond what the model has scatter already."""
+    there, rigs = stand.model.names, [source.rig for source in stand.sources]
+    effects = (effect() for effect in OF_STOPS if effect.name not in there)
+    found = tuple(e for e in effects if any(e.params(rig) for rig in rigs))
+    if not found and not set(there) & {effect.name for effect in OF_STOPS}:
+        raise InputError(f"--for {SCATTER}: without a LiDAR nothing differs from stop to stop")
+    return found
 
 
 def _from_diagnosis(run: Run, stand: Stand) -> Purpose:

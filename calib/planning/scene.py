@@ -16,6 +16,7 @@ from calib.linear.layout import key_of
 from calib.linear.parallel import in_order
 from calib.planning.brightness import Brightness
 from calib.planning.information import Information, of_all, of_each
+from calib.planning.room.places import roots_of
 from calib.planning.stops import (
     PlannedScan,
     PlannedStore,
@@ -30,7 +31,7 @@ from calib.problem import Problem, build
 from calib.problem.model import Source
 from calib.problem.prior import JointPrior
 from calib.problem.surfaces import with_surfaces
-from calib.problem.unknowns import Key
+from calib.problem.unknowns import Key, Role
 from calib.residuals.beams import Association
 from calib.solve.estimate import started
 from calib.solve.reweight import weighted_as
@@ -41,6 +42,8 @@ from sensors.recording import Scan
 # with 300, 600, 1200 the gains of 40 stops have ranks that are correlated by 0.92, 0.96, 0.99 with
 # those of all, and sigmas after five stops are at most 6, 3, 1 % off; 16, 17, 25 ms each, all 51.
 BEAMS_A_STOP = 600
+# Stops that scatter by chance, looked at together: each has columns of its own at all of them.
+SCATTERING = 50
 COMPARED = 6  # stops that were measured, by which it is found how many one of them is worth
 
 
@@ -104,14 +107,15 @@ class PlanningScene:
 
     @property
     def unbounded(self) -> list[str]:
-        """Unknowns of the added effects."""
+        """Unknowns of the added effects, but of those by chance."""
         known = self.stand.estimate.values
-        return [name for name in self._wide[0].variables if name not in known]
+        some = self._wide[0].variables.items()
+        return [n for n, u in some if n not in known and u.role is not Role.SCATTER]
 
     @cached_property
     def now(self) -> Information:
         """What the recordings say."""
-        return self._known(*self._wide, self.stand.estimate.associations)
+        return self._known(*self.together(None))
 
     @cached_property
     def _pattern(self) -> tuple[Scan, Beams, float]:
@@ -132,6 +136,14 @@ class PlanningScene:
         mine = [i for i, scan in scans if scan.recording.folder == folder]
         some = np.linspace(0, max(len(mine) - 1, 0), COMPARED).round().astype(int)
         return [mine[k] for k in np.unique(some)] if mine else []
+
+    @cached_property
+    def measured(self) -> Poses:
+        """The stops of the recording, where they were."""
+        roots = roots_of(self.stand.estimate.problem, self.source.recording)
+        at, recording = np.array(sorted(roots), int), self.source.recording
+        Ts = [self.values[roots[k]] for k in at.tolist()]
+        return Poses(recording.location[at], recording.joints[at], np.reshape(Ts, (-1, 4, 4)))
 
     @cached_property
     def brightness(self) -> Brightness | None:
@@ -170,9 +182,15 @@ class PlanningScene:
 
     def each(self, poses: Poses, keys: Sequence[Key]) -> np.ndarray:
         """What each of some planned stops says by itself (n, S, S), of the components `keys`."""
-        problem, values = self.planned_alone(poses)
-        first = len(self.source.recording.stops)
-        return of_each(problem, values, keys, first, len(poses.joints), self.unbounded)
+        first, count = len(self.source.recording.stops), len(poses.joints)
+        together = SCATTERING if any(e.by_chance for e in self.added) else max(count, 1)
+        parts = []
+        for start in range(0, count, together):
+            some = poses.some(range(start, min(start + together, count)))
+            problem, values = self.planned_alone(some)
+            size = len(some.joints)
+            parts.append(of_each(problem, values, keys, first, size, self.unbounded))
+        return np.concatenate(parts)
 
     def planned_alone(self, poses: Poses) -> tuple[Problem, dict[str, np.ndarray]]:
         """The problem of some planned stops, each a visit of its own, and where all of it lies."""
@@ -181,6 +199,15 @@ class PlanningScene:
 
     def after(self, poses: Poses) -> Information:
         """What the recordings and planned stops say together."""
+        return self._known(*self.together(poses))
+
+    def together(
+        self, poses: Poses | None
+    ) -> tuple[Problem, dict[str, np.ndarray], Sequence[Association]]:
+        """The problem of what was measured and of planned stops, if there are any: with the
+        surfaces' unknowns, where all of it lies, and what each scan meets."""
+        if poses is None:
+            return *self._wide, self.stand.estimate.associations
         patterns = [self._pattern[:2]] if self.scanned else []
         problem, values = self._with(poses, patterns, apart=False, alone=False)
         estimate = self.stand.estimate
@@ -197,7 +224,7 @@ class PlanningScene:
         for name in problem.cells:
             unknown = problem.variables[name]
             values[name] = started(unknown, estimate.state, unknown.mean)
-        return self._known(problem, values, found)
+        return problem, values, found
 
     def _known(
         self,
@@ -205,7 +232,10 @@ class PlanningScene:
         values: Mapping[str, np.ndarray],
         associations: Sequence[Association],
     ) -> Information:
-        found = of_all(problem, values, associations, self.unbounded)
+        return self.believed(of_all(problem, values, associations, self.unbounded))
+
+    def believed(self, found: Information) -> Information:
+        """The same with the earlier estimate, if there is one, in the place of paper."""
         return found.believing(self.prior) if self.prior else found
 
     def _with(

@@ -14,12 +14,12 @@ from calib.planning.criteria import (
     Criterion,
     Variance,
     Volume,
+    found_from,
     indices,
-    information_left,
-    smallest,
 )
 from calib.planning.information import Information
-from calib.planning.purpose import Purpose
+from calib.planning.purpose import RELIABILITY, Purpose
+from calib.planning.reliability import Reliable
 from calib.planning.scene import PlanningScene
 
 
@@ -67,7 +67,13 @@ class Known:
 
 
 def criterion(scene: PlanningScene, aim: Purpose, known: Information) -> Criterion:
-    """By what stops are chosen: D of all, A of some components, T of rivals."""
+    """By what stops are chosen: D of all, A of some components, T of rivals, or A of all once a
+    stop is lost."""
+    if aim.text == RELIABILITY:
+        measured = np.zeros((0, len(known.keys), len(known.keys)))
+        if len(scene.measured.joints):
+            measured = scene.each(scene.measured, known.keys)
+        return Reliable(known, known.at(scene.calibration), measured)
     if aim.rivals:
         return Apart(known, [_rival(scene, known, name) for name in aim.rivals])
     if not aim.components:
@@ -87,14 +93,6 @@ def _rival(scene: PlanningScene, known: Information, name: str) -> tuple[np.ndar
 
 def _smallest(scene: PlanningScene, aim: Purpose, known: Information) -> list[tuple[float, float]]:
     """Of each effect the size from which it is found; see `Known`."""
-    out, rows = [], Apart(known, []).start
-    for name in aim.rivals:
-        of, _ = _rival(scene, known, name)
-        own = np.outer(known.unit[of], known.unit[of])
-        whole, others = known.data[np.ix_(of, of)] / own, known.at(scene.unbounded)
-        alone, beside = (
-            smallest(information_left(rows[None], of, without)[0] / own, whole)
-            for without in (np.setdiff1d(others, of), np.zeros(0, int))
-        )
-        out.append((alone, beside))
-    return out
+    others = known.at(scene.unbounded)
+    each = (_rival(scene, known, name)[0] for name in aim.rivals)
+    return [(found_from(known, of, np.setdiff1d(others, of)), found_from(known, of)) for of in each]

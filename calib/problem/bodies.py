@@ -13,6 +13,8 @@ from calib.residuals.groups import Group
 from calib.residuals.targets import TARGET_PARTS, HangingTarget
 from calib.residuals.tracker import TrackedBody
 
+GRAVITY = "gravity"  # the unknown along which rods hang
+
 
 def add_bodies(problem: Problem, part: SourceStops, places: Places) -> None:
     """Add a block for every tracked body and group of stops that share all unknowns."""
@@ -65,7 +67,7 @@ def add_targets(problem: Problem, part: SourceStops, places: Places) -> None:
     dofs, units = ("across_1", "across_2"), ("rad", "rad")
     problem.add(
         Unknown(
-            name="gravity",
+            name=GRAVITY,
             kind="direction",
             mean=gravity,
             sigma=np.ones(2),
@@ -98,7 +100,7 @@ def add_targets(problem: Problem, part: SourceStops, places: Places) -> None:
             HangingTarget(
                 name=f"target {name}",
                 marker=marker.name,
-                gravity="gravity",
+                gravity=GRAVITY,
                 reference=places.reference,
                 faro_m=np.nan_to_num(targets.faro_m[m]),
                 upper_m=upper_m[m],

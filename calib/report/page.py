@@ -196,12 +196,14 @@ def _candidates(evidence: Evidence) -> dict[str, list[dict[str, Any]]]:
     candidates = evidence.diagnosis["candidates"] if evidence.diagnosis else []
     own = {c["effect"]: c["document"] for c in candidates if isinstance(c.get("document"), Mapping)}
     about |= {name: str(document.get("what", "")) for name, document in own.items()}
+    planned = _planned(evidence, "undistinguished").items()
+    apart = {names[0]: [f"such stops are planned by '{command}'"] for names, command in planned}
     told = [
         {
             "name": c["add"],
             "what": about.get(c["effect"], ""),
             "confirmed": bool(c["step"]) and not c["dressed_up"],
-            "told": "; ".join(_told(c)),
+            "told": "; ".join([*_told(c), *apart.get(c["add"], ())]),
         }
         for c in [c for c in candidates if c["step"] or c["p_adjusted"] < ALPHA_EFFECT][
             :TOLD_CANDIDATES
@@ -253,17 +255,26 @@ def _detectable(evidence: Evidence) -> list[tuple[str, str]]:
     return out
 
 
-def _weak(evidence: Evidence) -> list[tuple[str, str, str]]:
-    """What is weakly determined: names, how much they may be off, what would determine them."""
+def _weak(evidence: Evidence) -> list[tuple[str, str, str, str]]:
+    """What is weakly determined: names, how much they may be off, what would determine them, and
+    the command that plans such stops."""
+    planned = _planned(evidence, "weak_direction")
     directions = evidence.diagnosis["weak_directions"] if evidence.diagnosis else []
     return [
         (
             " and ".join(w["parameters"]),
             "" if w["sigma_mm"] is None else f"± {w['sigma_mm']:.2f} mm",
             w["needs"],
+            planned.get(tuple(w["parameters"]), ""),
         )
         for w in directions[:LISTED_DIRECTIONS]
     ]
+
+
+def _planned(evidence: Evidence, of: str) -> dict[tuple[str, ...], str]:
+    """Names of what a diagnosis could not tell -> the command that plans stops for it."""
+    found = (evidence.diagnosis or {}).get("remedies", ())
+    return {tuple(r["names"]): r["plan"] for r in found if r["of"] == of and r["plan"]}
 
 
 def _untold(evidence: Evidence) -> list[tuple[str, list[str]]]:
@@ -273,8 +284,11 @@ def _untold(evidence: Evidence) -> list[tuple[str, list[str]]]:
         tied, colon, why = entry["why"].partition(": ")
         name = f"{entry['name']}, {tied}" if colon else entry["name"]
         reasons.setdefault(why if colon else tied, []).append(name)
+    planned = _planned(evidence, "untestable")
     for name, why in (evidence.diagnosis or {}).get("untestable", {}).items():
-        reasons.setdefault(f"not tested: {why}", []).append(name)
+        command = planned.get((name,))
+        told = f"{name}: stops, if any help, are planned by '{command}'" if command else name
+        reasons.setdefault(f"not tested: {why}", []).append(told)
     return list(reasons.items())
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -17,9 +17,9 @@ from calib.diagnosis.chance import Spread
 from calib.diagnosis.rejects import rejects
 from calib.diagnosis.search import search
 from calib.diagnosis.stand import Look, Stand
-from calib.diagnosis.verdict import Diagnosis, believed, conclude
+from calib.diagnosis.verdict import ABSORBED_BY_MODEL, Diagnosis, believed, conclude
 from calib.diagnosis.verdict.unnamed import Unnamed, unnamed
-from calib.diagnosis.weak import to_be_told_apart, weak_directions
+from calib.diagnosis.weak import group, to_be_told_apart, weak_directions
 from calib.effects import own_effects
 from calib.effects.reference import FaroScale
 from calib.linear.parallel import one_blas_thread
@@ -107,7 +107,8 @@ def _found(
     apart = to_be_told_apart(result.candidates, result.weak_directions)
     return replace(
         result,
-        plan=command_to_plan(run, apart) if apart else "",
+        plan=command_to_plan(run, apart) if apart and _planned_for(stand) else "",
+        remedies=list(remedies(run, result, _planned_for(stand))),
         scatter=[*_scatter(run, stand), *result.scatter],
         detectable={**_detectable(stand), **_scale_detectable(result)},
         unseen=unseen,
@@ -156,6 +157,35 @@ def _scatter(run: Run, stand: Stand) -> Iterator[dict[str, Any]]:
 def command_to_plan(run: Run, effects: Sequence[str]) -> str:
     """The command that plans stops at which effects differ."""
     return shlex.join(["rigcal", "plan", str(run.folder), "--for", ",".join(effects)])
+
+
+def remedies(run: Run, found: Diagnosis, stops: bool) -> Iterator[dict[str, Any]]:
+    """What would tell of what a diagnosis could not; see `Diagnosis`.
+
+    Args:
+        run: the run.
+        found: its diagnosis.
+        stops: whether stops can be planned for it.
+    """
+    told = [("undistinguished", group(c), c["rivals"][0]["separate"]) for c in _tied(found)]
+    told += [("weak_direction", w["parameters"], w["needs"]) for w in found.weak_directions]
+    told += [("untestable", [name], why) for name, why in found.untestable.items()]
+    for of, names, needs in told:
+        moves = of != "untestable" or needs == ABSORBED_BY_MODEL  # other rows want other columns
+        command = command_to_plan(run, names) if stops and moves else None
+        yield {"of": of, "names": list(names), "needs": needs, "plan": command}
+
+
+def _tied(found: Diagnosis) -> list[Mapping[str, Any]]:
+    """Candidates that were confirmed and have rivals."""
+    return [c for c in found.candidates if c["step"] and c["indistinguishable_from"]]
+
+
+def _planned_for(stand: Stand) -> bool:
+    """Whether stops can be planned: the rig has an arm and, of scans, a mesh."""
+    source = stand.sources[0]
+    meets = source.reference is not None or not stand.problem.scans
+    return bool(source.rig.joint_names) and meets
 
 
 def command_without(run: Run, tokens: Sequence[str]) -> str:

@@ -64,6 +64,7 @@ def _print_tables(console: Console, diagnosis: Diagnosis, residual: str) -> None
         console.print(detectable_table(diagnosis.candidates))
     _print_untestable(console, diagnosis.untestable)
     _print_weak(console, diagnosis.weak_directions)
+    _print_remedies(console, diagnosis)
 
 
 def print_explanation(explanation: Explanation) -> None:
@@ -183,6 +184,20 @@ def _print_weak(console: Console, directions: Sequence[Mapping[str, Any]]) -> No
         rows.append((f"{', '.join(d['parameters'])}{sigma}", d["needs"]))
     if rows:
         print_pairs(console, "weakly determined, and what would determine it", rows)
+
+
+def _print_remedies(console: Console, diagnosis: Diagnosis) -> None:
+    """The commands that plan stops for what was just told; that of the first group stands there."""
+    of = {"undistinguished": [], "weak_direction": [], "untestable": []}
+    for remedy in diagnosis.remedies:
+        of[remedy["of"]].append(remedy["plan"])
+    tied, weak, untestable = of.values()
+    every = (*tied, *weak[:WEAKEST], *untestable)
+    if commands := [command for command in every if command and command != diagnosis.plan]:
+        console.print("Stops that would tell of each, if any stops do, are planned by:")
+        for command in commands:
+            console.print(command, style="bold", soft_wrap=True)
+        console.print()
 
 
 def _estimate(parameters: Mapping[str, Any]) -> str:

@@ -8,14 +8,22 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from rich.table import Table
 
+from calib.planning.purpose import ALL, RELIABILITY, SCATTER
 from calib.problem.unknowns import Key
 from calib.show.tables import columns_table, print_pairs, shown, terminal
 
 if TYPE_CHECKING:
     from calib.planning import Plan
+    from calib.planning.room.hanging import TargetPlan
 
 MANY_PARAMETERS = 12  # parameters of an effect, from which on their sigmas are told together
 DIRECTIONS_SHOWN = 4  # directions that are shown
+EFFECTS_SHOWN = 10  # effects that are shown, those that gain most: all are in --json
+AIMS = {
+    ALL: "for the whole calibration",
+    RELIABILITY: "against blunders: no single stop is to carry an estimate",
+    SCATTER: "for the whole calibration, where stops err as a whole by chance",
+}
 WEAK = {
     "now": "hardly determined now",
     "after": "and after these stops",
@@ -28,8 +36,8 @@ def print_plan(plan: Plan) -> None:
     """Print a plan: what it is for and what it achieves, the stops, and all that they are worth."""
     console, document = terminal(), plan.document()
     stops = f"{len(plan.stops)} stop{'s' * (len(plan.stops) != 1)}"
-    console.print(f"{stops} {_aim(document)}", style="bold", soft_wrap=True)
-    for sentence in (*_achieved(plan, document), *_reached(plan)):
+    console.print(f"{stops} {aim(document)}", style="bold", soft_wrap=True)
+    for sentence in (*achieved(plan), *_reached(plan)):
         console.print(sentence)
     console.print()
     console.print(
@@ -39,10 +47,14 @@ def print_plan(plan: Plan) -> None:
     if document["smallest_detectable"]:
         tables.append(_detectable_table(document["smallest_detectable"]))
     tables.append(_sigma_table(plan))
+    tables += [_effects_table(document), _mishaps_table(document)]
     for table in tables:
         console.print(table)
         console.print()
-    same = [row for row in _rows(plan) if row.after >= FALLS * row.now]
+    for sentence in _unseen(document["unseen_blunder"]):
+        console.print(sentence)
+        console.print()
+    same = [row for row in known_rows(plan) if row.after >= FALLS * row.now]
     if same:
         print_pairs(console, "as well known as before", [("", _together(same))])
     weak = document["weak_directions"]
@@ -58,6 +70,44 @@ def print_plan(plan: Plan) -> None:
     console.print(table)
 
 
+def print_targets(plan: TargetPlan) -> None:
+    """Print where targets should hang, and what is known without and with them."""
+    console, count = terminal(), len(plan.targets)
+    told = AIMS.get(plan.purpose.text, f"for {plan.purpose.text}")
+    console.print(f"{count} target{'s' * (count != 1)} {told}", style="bold", soft_wrap=True)
+    console.print(_fall(plan))
+    console.print()
+    console.print("Centres of the spheres, m, in the reference's frame.")
+    table = columns_table("target", "x", "y", "z")
+    for row in plan.targets:
+        table.add_row(row["target"], *(f"{row[axis]:.2f}" for axis in "xyz"))
+    for each in (table, _sigma_table(plan)):
+        console.print(each)
+        console.print()
+    same = [row for row in known_rows(plan) if row.after >= FALLS * row.now]
+    if same:
+        print_pairs(console, "as well known as before", [("", _together(same))])
+
+
+def _fall(plan: Plan | TargetPlan) -> str:
+    """How many sigmas fall, and which most."""
+    rows = list(known_rows(plan))
+    fall = [row for row in rows if row.after < FALLS * row.now]
+    if not fall:
+        return f"None of {len(rows)} expected sigmas falls by more than {100 * (1 - FALLS):.0f} %."
+    most = min(fall, key=lambda row: row.after / row.now)
+    factor, unit = shown(most.unit)
+    return (
+        f"With them {len(fall)} of {len(rows)} sigmas fall; most of all that of {most.name}, from "
+        f"{factor * most.now:.3g} to {factor * most.after:.3g} {unit}."
+    )
+
+
+def achieved(plan: Plan) -> list[str]:
+    """What the stops are worth, in a sentence or two."""
+    return list(_achieved(plan, plan.document()))
+
+
 def _achieved(plan: Plan, document: Mapping[str, Any]) -> Iterator[str]:
     """What the stops are worth, in a sentence or two."""
     for name, each in document["smallest_detectable"].items():
@@ -67,17 +117,10 @@ def _achieved(plan: Plan, document: Mapping[str, Any]) -> Iterator[str]:
             before = "never" if now is None else f"from {factor * now:.3g} {unit}"
             found = f"found from {factor * after:.3g} {unit}"
             yield f"With them {name} is {found}, told from its rivals; now {before}."
-    rows = list(_rows(plan))
-    fall = [row for row in rows if row.after < FALLS * row.now]
-    if not fall:
-        yield f"None of {len(rows)} expected sigmas falls by more than {100 * (1 - FALLS):.0f} %."
-        return
-    most = min(fall, key=lambda row: row.after / row.now)
-    factor, unit = shown(most.unit)
-    yield (
-        f"With them {len(fall)} of {len(rows)} sigmas fall; most of all that of {most.name}, from "
-        f"{factor * most.now:.3g} to {factor * most.after:.3g} {unit}."
-    )
+        elif each["beside_rivals"]["with_any_number"] is None:
+            others = ", ".join(n for n in document["rivals"] if n != name) or "the model"
+            yield f"NEVER FOUND: no number of stops of this arm tells {name} from {others}."
+    yield _fall(plan)
 
 
 def _reached(plan: Plan) -> Iterator[str]:
@@ -96,7 +139,8 @@ def _reached(plan: Plan) -> Iterator[str]:
         )
 
 
-def _aim(document: Mapping[str, Any]) -> str:
+def aim(document: Mapping[str, Any]) -> str:
+    """What a plan's stops are for, in words, from its document."""
     what = document["for"]
     if document["learning_curve"]:
         told = f"until {document['for']}"
@@ -104,7 +148,7 @@ def _aim(document: Mapping[str, Any]) -> str:
         first, *others = document["rivals"]
         told = f"to tell {first} from {', '.join(others) or 'the model'}"
     else:
-        told = "for the whole calibration" if what == "all" else f"for {document['why'] or what}"
+        told = AIMS.get(what, f"for {document['why'] or what}")
     return f"{told}: {document['why']}" if document["rivals"] and document["why"] else told
 
 
@@ -123,9 +167,9 @@ def _scale(kind: str) -> float:
     return float(np.degrees(1.0)) if kind == "revolute" else 1e3
 
 
-def _sigma_table(plan: Plan) -> Table:
+def _sigma_table(plan: Plan | TargetPlan) -> Table:
     table = columns_table("expected sigma", "", "now", "after")
-    for row in _rows(plan):
+    for row in known_rows(plan):
         if row.after < FALLS * row.now:
             factor, unit = shown(row.unit)
             table.add_row(row.name, unit, f"{factor * row.now:.3g}", f"{factor * row.after:.3g}")
@@ -146,7 +190,7 @@ class _Row(NamedTuple):
         return first.name if count == 1 else f"{first.unknown}, rms of {count}"
 
 
-def _rows(plan: Plan) -> Iterator[_Row]:
+def known_rows(plan: Plan | TargetPlan) -> Iterator[_Row]:
     """A row a parameter; of an effect with many in one unit, one for all."""
     by_unknown: dict[str, list[int]] = {}
     for i, key in enumerate(plan.keys):
@@ -174,9 +218,52 @@ def _detectable_table(smallest: Mapping[str, Mapping[str, Any]]) -> Table:
         factor, unit = shown(each["unit"])
         for key, what in (("beside_model", name), ("beside_rivals", f"{name}, told from rivals")):
             sizes = each[key]
-            cells = (
-                "never" if sizes[when] is None else f"{factor * sizes[when]:.3g}"
-                for when in ("now", "after")
-            )
+            cells = (_found(sizes[when], factor) for when in ("now", "after"))
             table.add_row(what, unit, *cells)
     return table
+
+
+def _effects_table(document: Mapping[str, Any]) -> Table:
+    """The effects that the model lacks, those first that stops bring nearest to being found."""
+    every, table = document["smallest_effect"], columns_table("smallest effect", "", "now", "after")
+    gain = sorted(every, key=lambda name: _ratio(every[name]["now"], every[name]["after"]))
+    for name in gain[:EFFECTS_SHOWN]:
+        factor, unit = shown(every[name]["unit"])
+        cells = (_found(every[name][when], factor) for when in ("now", "after"))
+        table.add_row(name, unit, *cells)
+    if more := len(gain[EFFECTS_SHOWN:]):
+        table.add_row(f"and {more} more, in --json")
+    return table
+
+
+def _ratio(now: float | None, after: float | None) -> float:
+    """How much smaller what is found gets: the smaller, the better; 0 of what was never found."""
+    if after is None:
+        return np.inf
+    return 0.0 if now is None else after / now
+
+
+def _found(size: float | None, factor: float) -> str:
+    return "never" if size is None else f"{factor * size:.3g}"
+
+
+def _mishaps_table(document: Mapping[str, Any]) -> Table:
+    """From which size a mishap is found, wherever it happens."""
+    table = columns_table("smallest blunder, at worst", "", "now", "after")
+    for kind, units in document["smallest_blunder"].items():
+        for name, each in units.items():
+            factor, unit = shown(name)
+            sizes = (each[when] and each[when]["worst"] for when in ("now", "after"))
+            table.add_row(kind, unit, *(_found(size, factor) for size in sizes))
+    return table
+
+
+def _unseen(document: Mapping[str, Any]) -> Iterator[str]:
+    """What a mishap that is not found could do."""
+    told = {"now": "A mishap too small to be found", "after": "With these stops one"}
+    for when, what in told.items():
+        if each := document[when]:
+            yield (
+                f"{what} ({each['by']}) could move {each['estimate']} by up to "
+                f"{each['sigmas']:.1f} of its sigmas."
+            )

@@ -3,8 +3,11 @@
     python -m tests.bench.bench_plan_real DATA
 
 DATA is the folder of `examples/06_what_is_missing_in_a_ur10.py`. From a fit of 15 poses, 60 of
-2,500 are chosen by the volume of the errors (D) and by the mean variance (A), or drawn; the model
-of lengths, zeros and tilts is fitted to them, and held against 2,000 poses that nobody chose from.
+2,500 are chosen by the volume of the errors (D), by the mean variance (A), by each of the
+observability indices of the literature (O1 to O5; see `observability`), by what is left once the
+worst pose is lost, or drawn; the model of lengths, zeros and tilts is fitted to them, and held
+against 2,000 poses that nobody chose from. How well the same model is known from them is printed as
+well: the mean over parameters of sigma over that of all 2,500.
 """
 
 from __future__ import annotations
@@ -22,7 +25,9 @@ import calib
 from calib import problem as problems
 from calib.linear.parallel import one_blas_thread
 from calib.planning import planner_of
-from calib.planning.criteria import Variance, Volume, chosen
+from calib.planning.criteria import Criterion, Variance, Volume, chosen, observability
+from calib.planning.information import Information
+from calib.planning.reliability import Reliable
 from calib.planning.stops import Poses
 from calib.problem.model import Source
 from calib.results.errors import body_errors
@@ -55,6 +60,19 @@ class Series:
         return calib.fit([recorded], f"{recorded} run", calib.Model(GEOMETRY), hold_out="none")
 
 
+class Index(Criterion):
+    """One of the observability indices of some components (n,)."""
+
+    def __init__(self, known: Information, of: np.ndarray, name: str) -> None:
+        self.start, self.at, self.name = known.data + known.paper, of, name
+
+    def of(self, M: np.ndarray) -> np.ndarray:
+        """Of designs (n,), from their information (n, S, S); all have as many stops."""
+        C = np.linalg.inv(M)[:, self.at[:, None], self.at]
+        s = 1.0 / np.sqrt(np.maximum(np.linalg.eigvalsh(C), 1e-300))
+        return observability(s, 1)[self.name]
+
+
 def error_mm(run: calib.Run, folder: Path) -> float:
     """Root mean square of what a run predicts of poses."""
     problem, state = problems.build([Source.open(folder)], calib.Model.read(run.model)), run.state()
@@ -81,16 +99,28 @@ def main(data: Path, made: Path) -> None:
     poses = Poses(np.full(len(pool), location), joints, np.repeat(T[None], len(pool), 0))
     each, known = planner.look(poses, STOPS), planner.lasting
     at = known.at(planner.scene.calibration)
+    many = series.fit(pool, "many")
+    print(f"all {CANDIDATES}: {error_mm(many, held_out):.3f} mm")
+
+    def told(rows: np.ndarray, name: str) -> tuple[float, float]:
+        """Held-out error, mm, and how many times wider than of all poses sigmas are."""
+        run = series.fit(rows, name)
+        sigma = (np.sqrt(np.diag(each.solution.graph)) for each in (run, many))
+        return error_mm(run, held_out), float(np.mean(next(sigma) / next(sigma)))
+
     ways = {"D": Volume(known, at), "A": Variance(known, at, np.ones(len(at)))}
+    ways |= {name: Index(known, at, name) for name in ("O1", "O2", "O3", "O4", "O5")}
+    ways["reliability"] = Reliable(known, at, each[:0])
     for name, by in ways.items():
         best = chosen(by, each, STOPS, lambda done, total: None, exchange=False)
-        print(f"{STOPS} by {name}: {error_mm(series.fit(pool[best], name), held_out):.3f} mm")
-    drawn = [
-        error_mm(series.fit(rng.choice(pool, STOPS, replace=False), f"drawn {k}"), held_out)
-        for k in range(DRAWS)
-    ]
-    print(f"{STOPS} drawn: {min(drawn):.3f} to {max(drawn):.3f} mm, median {np.median(drawn):.3f}")
-    print(f"all {CANDIDATES}: {error_mm(series.fit(pool, 'many'), held_out):.3f} mm")
+        error, wider = told(pool[best], name)
+        print(f"{STOPS} by {name}: {error:.3f} mm, sigmas {wider:.2f} times", flush=True)
+    drawn = [told(rng.choice(pool, STOPS, replace=False), f"drawn {k}") for k in range(DRAWS)]
+    error, wider = np.transpose(drawn)
+    print(
+        f"{STOPS} drawn: {error.min():.3f} to {error.max():.3f} mm, median {np.median(error):.3f}, "
+        f"sigmas {wider.min():.2f} to {wider.max():.2f} times"
+    )
 
 
 if __name__ == "__main__":

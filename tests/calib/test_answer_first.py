@@ -121,6 +121,9 @@ def plan_of(sigma, smallest=None):
         "learning_curve": [],
         "smallest_detectable": smallest or {},
         "sigma": sigma,
+        "smallest_effect": {},
+        "smallest_blunder": {},
+        "unseen_blunder": {"now": None, "after": None},
         "weak_directions": {"now": [], "after": [], "with_any_number": []},
         "observability": {"now": {"lambda": 1.0}, "after": {"lambda": 2.0}},
     }

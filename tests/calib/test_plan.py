@@ -284,13 +284,14 @@ def test_other_rigs_are_planned_for(tmp_path, preset):
 
 def test_a_diagnosis_names_the_plan_that_would_tell_its_rivals_apart():
     """Of a confirmed effect with rivals, or of effects of the model that may be another."""
-    plain = {"step": None, "indistinguishable_from": ["x"], "add": "w"}
-    found = plain | {"step": 2, "add": "arm_gravity_sag", "indistinguishable_from": ["base_flex"]}
+    plain = {"step": None, "indistinguishable_from": ["x"], "rivals": [{"add": "x"}], "add": "w"}
+    rivals = {"indistinguishable_from": ["base_slip"], "rivals": [{"add": "base_slip@816"}]}
+    found = plain | {"step": 2, "add": "arm_gravity_sag"} | rivals
     weak = [
         {"parameters": ["lidar.tz"], "sigma_mm": 0.6},
         {"parameters": ["range_scale", "faro_scale"], "sigma_mm": None},
     ]
-    assert to_be_told_apart([plain, found], weak) == ["arm_gravity_sag", "base_flex"]
+    assert to_be_told_apart([plain, found], weak) == ["arm_gravity_sag", "base_slip@816"]
     assert to_be_told_apart([plain], weak) == ["range_scale", "faro_scale"]
     assert to_be_told_apart([plain], weak[:1]) == []
 

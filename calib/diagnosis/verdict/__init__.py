@@ -36,6 +36,7 @@ VERDICTS = {
 # The held-out error of models that lack nothing, over its floor: of 30 by another simulator, with 6
 # to 30 stops, the largest was 1.23.
 HELD_OUT_BY_CHANCE = 1.25
+ABSORBED_BY_MODEL = "not identifiable: absorbed by the model"
 # Share of structure, or held-out error, that names must explain to be the answer: a choice. Of the
 # rms more than half is left by an answer that explains less than that of the squares.
 ABSORBED = 0.7
@@ -60,6 +61,9 @@ class Diagnosis:
         command: what fits the same without the blunders, or adds the formulas of residual
             structure, ready to be typed; empty without any.
         plan: what plans stops that separate what these do not, ready to be typed; or empty.
+        remedies: what would tell of each weak direction, of each group of effects that nothing
+            tells apart and of each effect that could not be tested: `of` which of these, `names`,
+            what it `needs`, and the command that plans such stops, None where no stops help.
         rejected: what the fit threw away; None without scans, or where nobody looked.
         scatter: how widely things scatter by chance, of the model and of what it lacks.
         detectable: of what is no group of rows: name -> unit -> least size of a mishap to be found.
@@ -79,6 +83,7 @@ class Diagnosis:
     too_few: bool = False
     command: str = ""
     plan: str = ""
+    remedies: Sequence[Mapping[str, Any]] = ()
     rejected: Rejects | None = None
     scatter: Sequence[Mapping[str, Any]] = ()
     detectable: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
@@ -116,6 +121,7 @@ class Diagnosis:
             "blunders": list(self.blunders),
             "command": self.command or None,
             "plan": self.plan or None,
+            "remedies": list(self.remedies),
             **told.groups(self.groups, self.detectable, self.unseen),
             "scatter": list(self.scatter),
             "misfit": dict(self.misfit),
@@ -330,5 +336,5 @@ def _untestable(look: Look) -> dict[str, str]:
         if missing := lacking(effect, look.stand.sources, look.columns):
             found[effect.family] = f"the recordings lack {', '.join(missing)}"
         elif effect.family in gauges:
-            found[effect.family] = "not identifiable: absorbed by the model"
+            found[effect.family] = ABSORBED_BY_MODEL
     return found

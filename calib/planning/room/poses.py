@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from calib.planning.room.sight import in_sight
 from calib.planning.stops import Poses
 from calib.problem.model import Source
 from calib.results.reach import joint_range
@@ -28,6 +29,7 @@ def reachable(
     T_world_reference: np.ndarray,
     count: int,
     rng: np.random.Generator,
+    cameras_m: np.ndarray | None = None,
 ) -> Poses:
     """Random poses of an arm, evenly over its joints' range and the places where its base was.
 
@@ -37,6 +39,8 @@ def reachable(
         T_world_reference: (4, 4).
         count: how many.
         rng: chance.
+        cameras_m: (C, 3) of the tracker, world frame, that are to see every tracked body; None
+            where nothing says where they are.
 
     Raises:
         InputError: the rig has no arm, or it can hardly take any pose there.
@@ -50,12 +54,17 @@ def reachable(
     names, Ts = list(places), np.stack(list(places.values()))
     measured = recording.joints if len(recording.joints) else np.zeros((1, len(rig.joint_names)))
     low, high = joint_range(rig, measured)
-    clear = _Clear.of(source, places, T_world_reference)
+    clear = Clear.of(source, places, T_world_reference)
     found: list[tuple[np.ndarray, np.ndarray]] = []
     for _ in range(TIMES_DRAWN):
         joints = rng.uniform(low, high, (count, len(low)))
         at = rng.integers(len(names), size=count)
         free = clear.of_poses(joints, se3.inverse(T_world_reference) @ Ts[at])
+        if cameras_m is not None and free.any():
+            some = np.flatnonzero(free)
+            tubes = along(clear.points(joints[some])).reshape(len(some), -1, 3)
+            poses = Poses(np.array(names)[at[some]], joints[some], Ts[at[some]])
+            free[some] = in_sight(source, cameras_m, poses, tubes, T_world_reference)
         found.append((joints[free], at[free]))
         if sum(map(len, (each[0] for each in found))) >= count:
             break
@@ -64,11 +73,12 @@ def reachable(
         raise InputError(
             f"{rig.folder}: none of {TIMES_DRAWN * count} random poses of the arm is clear of "
             "itself and of the mesh where its base was"
+            + (", and in the cameras' sight" if cameras_m is not None else "")
         )
     return Poses(np.array(names)[at], joints, Ts[at])
 
 
-class _Clear:
+class Clear:
     """What keeps an arm from a pose.
 
     Args:
@@ -83,7 +93,7 @@ class _Clear:
         moving = [i for i, edge in enumerate(edges, start=1) if edge.joint is not None]
         self.first = moving[0] + 1 if moving else 1  # of the frames that the joints move
         zero = np.zeros((1, len(tree.joint_names)))
-        length = np.linalg.norm(np.diff(self._points(zero), axis=1), axis=2)[0]
+        length = np.linalg.norm(np.diff(self.points(zero), axis=1), axis=2)[0]
         self.tubes = np.flatnonzero(length > ARM_CLEAR_M)
         gap = np.concatenate([[0.0], np.cumsum(length)])
         pairs = [
@@ -99,7 +109,7 @@ class _Clear:
     @classmethod
     def of(
         cls, source: Source, places: Mapping[str, np.ndarray], T_world_reference: np.ndarray
-    ) -> _Clear:
+    ) -> Clear:
         """As of a recording, whose own stops are clear."""
         out, recording = cls(source), source.recording
         known = np.array([str(at) in places for at in recording.location], bool)
@@ -115,7 +125,7 @@ class _Clear:
         apart, room = self._gaps(joints, Ts_reference_root)
         return (apart >= self.least_m).all(axis=1) & (room >= self.room_m).all(axis=1)
 
-    def _points(self, joints: np.ndarray) -> np.ndarray:
+    def points(self, joints: np.ndarray) -> np.ndarray:
         """Origins (n, F, 3) of all frames from the root on, in the root's frame."""
         tree = self.source.rig.tree
         placed = [tree.place(frame, joints).Ts_root_frame[:, :3, 3] for frame in self.frames[1:]]
@@ -126,14 +136,10 @@ class _Clear:
     ) -> tuple[np.ndarray, np.ndarray]:
         """How far tubes are from each other (n, P), and moved frames from the mesh (n, F), m;
         negative outside of the mesh's box."""
-        points = self._points(joints)
-        share = np.linspace(0.0, 1.0, TUBE_POINTS)[:, None]
-        along = [
-            points[:, i, None] * (1 - share) + points[:, i + 1, None] * share
-            for i in range(points.shape[1] - 1)
-        ]
+        points = self.points(joints)
+        tubes = along(points)
         apart = [
-            np.linalg.norm(along[a][:, :, None] - along[b][:, None], axis=3).min(axis=(1, 2))
+            np.linalg.norm(tubes[:, a, :, None] - tubes[:, b, None], axis=3).min(axis=(1, 2))
             for a, b in self.pairs
         ]
         apart_m = np.stack(apart, axis=1) if apart else np.zeros((len(joints), 0))
@@ -147,6 +153,12 @@ class _Clear:
         low, high = mesh.vertices_m.min(axis=0), mesh.vertices_m.max(axis=0)
         inside = ((at > low) & (at < high)).all(axis=2)
         return apart_m, np.where(inside, room_m, -room_m)
+
+
+def along(points_m: np.ndarray) -> np.ndarray:
+    """Points (n, F - 1, K, 3) along the tubes between frames (n, F, 3)."""
+    share = np.linspace(0.0, 1.0, TUBE_POINTS)[:, None]
+    return points_m[:, :-1, None] * (1 - share) + points_m[:, 1:, None] * share
 
 
 def in_order_of_path(

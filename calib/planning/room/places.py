@@ -10,6 +10,7 @@ from calib.problem import Problem
 from calib.problem.model import Source
 from chains import se3
 from chains.errors import InputError
+from sensors.recording import RecordedStops
 from sensors.reference import Reference
 
 PLACES_A_REGION = 6  # that are drawn in a region: a recording of a day has about as many
@@ -21,6 +22,15 @@ BASE_CLEAR_M, BASE_HEIGHT_M = 0.6, 0.3
 def where_it_stood(problem: Problem, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Location -> T_world_root (4, 4) at the first stop there, of the first recording."""
     recording = problem.sources[0].recording
+    found = roots_of(problem, recording)
+    out: dict[str, np.ndarray] = {}
+    for k in sorted(found):
+        out.setdefault(str(recording.location[k]), values[found[k]])
+    return out
+
+
+def roots_of(problem: Problem, recording: RecordedStops) -> dict[int, str]:
+    """Number of every stop of a recording that tells anything -> the unknown that its base is."""
     found: dict[int, str] = {}
     for scan in problem.scans:
         if scan.recording.folder == recording.folder:
@@ -29,10 +39,7 @@ def where_it_stood(problem: Problem, values: Mapping[str, np.ndarray]) -> dict[s
         for folder, k in block.stop_names:
             if folder == recording.folder:
                 found.setdefault(k, block.stops.root)
-    out: dict[str, np.ndarray] = {}
-    for k in sorted(found):
-        out.setdefault(str(recording.location[k]), values[found[k]])
-    return out
+    return found
 
 
 def in_region(

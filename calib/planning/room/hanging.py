@@ -1,0 +1,136 @@
+"""Plans of targets: where to hang the next ones, and what will be known with them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib import outputs
+from calib.linear.parallel import one_blas_thread
+from calib.planning import Planner, planner_without_places, silent
+from calib.planning.criteria import chosen
+from calib.planning.purpose import ALL, RELIABILITY, SCATTER, Purpose
+from calib.planning.room.targets import each_target, hanging_places, known_with
+from calib.planning.worth import Known, criterion
+from calib.problem.unknowns import Key
+from calib.runs.run import Run
+from calib.solve.fit import Progress
+from chains.errors import InputError
+from sensors.stops import write_columns
+
+
+@dataclass(frozen=True)
+class TargetPlan:
+    """Targets to hang, and what they are worth.
+
+    Args:
+        run: the folder of the run, or of the rig.
+        purpose: what they were chosen for.
+        spheres_m: (n, 3) centre of each sphere, in the reference's frame.
+        keys, units: (P,) of the parameters of the calibration.
+        now, after: what is known without and with them.
+        candidates: how many places they were chosen among.
+    """
+
+    run: Path
+    purpose: Purpose
+    spheres_m: np.ndarray
+    keys: Sequence[Key]
+    units: Sequence[str]
+    now: Known
+    after: Known
+    candidates: int
+
+    @property
+    def targets(self) -> list[dict[str, Any]]:
+        """A row for each: its name, and x, y, z of its sphere, m, in the reference's frame."""
+        each = enumerate(self.spheres_m.tolist(), start=1)
+        return [{"target": f"P{k}", "x": x, "y": y, "z": z} for k, (x, y, z) in each]
+
+    def columns(self) -> dict[str, Sequence]:
+        """The same as columns (n,)."""
+        rows = self.targets
+        return {name: [row[name] for row in rows] for name in ("target", "x", "y", "z")}
+
+    def document(self) -> dict[str, Any]:
+        """As ``--json`` prints it."""
+        numbers = zip(self.now.sigma.tolist(), self.after.sigma.tolist(), strict=True)
+        rows = zip(self.keys, self.units, numbers, strict=True)
+        return {
+            "run": str(self.run),
+            **self.purpose.document(),
+            "candidates": self.candidates,
+            "targets": self.targets,
+            "sigma": {k.name: {"unit": u, "now": now, "after": to} for k, u, (now, to) in rows},
+            "weak_directions": {"now": list(self.now.weak), "after": list(self.after.weak)},
+        }
+
+
+@one_blas_thread
+def plan_targets(
+    run: Run | Path | str,
+    targets: int,
+    purpose: str | None = None,
+    region: Sequence[float] | None = None,
+    candidates: int = 500,
+    seed: int = 0,
+    out: Path | str | None = None,
+    progress: Progress = silent,
+) -> TargetPlan:
+    """Where the next targets should hang.
+
+    Args:
+        run: a fitted run; or the folder of a rig of which nothing was measured yet.
+        targets: how many.
+        purpose: what they are for, as of `calib.plan`; by default all of the calibration.
+        region: x and y of two corners, m, in the reference's frame, between which they may hang;
+            without it in the box in which the tracker saw anything.
+        candidates: how many random places they are chosen among.
+        seed: of these.
+        out: a CSV file to write, a row for each: ``target``, and x, y, z of its sphere.
+        progress: called with what is being done, and how far it is.
+
+    Raises:
+        InputError: as of `calib.plan`; or the rig has no targets, or they have no place.
+    """
+    if purpose in (RELIABILITY, SCATTER):
+        raise InputError(f"--for {purpose}: it is about stops, of which targets tell nothing")
+    if targets < 1 or candidates < targets:
+        raise InputError(f"{targets} targets out of {candidates} candidates: give at least 1")
+    planner = planner_without_places(run, purpose or ALL, None, progress)
+    rng = np.random.default_rng(seed)
+    places = hanging_places(planner.scene, region, candidates, rng, planner.cameras_m)
+    if len(places) < targets:
+        raise InputError(f"only {len(places)} places of so many drawn are clear of the mesh")
+    found = _planned(planner, places, targets)
+    if out is not None:
+        if Path(out).suffix != ".csv":
+            raise InputError(f"{out}: the targets are written as a table; give FILE.csv")
+        inputs = [run.folder, *run.inputs] if isinstance(run, Run) else [run]
+        with outputs.file(out, inputs) as file:
+            write_columns(file, found.columns())
+    return found
+
+
+def _planned(planner: Planner, places: np.ndarray, targets: int) -> TargetPlan:
+    """As `plan_targets`, and nothing is written."""
+    scene = planner.scene
+    known, each = each_target(scene, places)
+    by = criterion(scene, planner.aim, known)
+    best = chosen(by, each, targets, partial(planner.progress, "choosing"))
+    some = places[best]
+    return TargetPlan(
+        run=planner.folder,
+        purpose=planner.aim,
+        spheres_m=some,
+        keys=planner.keys,
+        units=planner.units,
+        now=planner.now,
+        after=planner.known(known_with(scene, some), 0),
+        candidates=len(places),
+    )

@@ -1,0 +1,56 @@
+"""A plan as a folder: its table, its document and its picture."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import calib
+from calib.report.planned import MOST_SIGMAS, before_after
+from tests.worlds import World, write
+
+NARROW = World(seed=3, locations=2, stops=5, beams=1200, turned=(1, 0.3, 0.3, 1, 0, 0.3))
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A run of the narrow world."""
+    folder = tmp_path_factory.mktemp("narrow")
+    write(NARROW, folder / "rec")
+    return calib.fit([folder / "rec"], folder / "run", hold_out="none")
+
+
+def test_a_plan_is_written_as_a_folder_that_another_plan_replaces(run, rigcal, tmp_path):
+    words = ["plan", run.folder, "--for", "all", "--candidates", 40]
+    for count in (2, 3):
+        code, _, _ = rigcal(*words, "--stops", count, "-o", tmp_path / "plan")
+        assert code == 0
+        files = sorted(path.name for path in (tmp_path / "plan").iterdir())
+        assert files == ["before_after.svg", "plan.json", "stops.csv"]
+        document = json.loads((tmp_path / "plan/plan.json").read_text())
+        table = pd.read_csv(tmp_path / "plan/stops.csv")
+        assert table.to_dict("records") == document["stops"] and len(table) == count
+    code, _, err = rigcal(*words, "-o", run.folder)
+    assert code == 2 and err.count("\n") == 1
+    assert (run.folder / "solution.yaml").is_file()
+
+
+def test_the_picture_shows_each_sigma_before_and_after_and_says_what_was_found(run):
+    plan = calib.plan(run, stops=3, purpose="all", candidates=60)
+    figure = before_after(plan)
+    left, right = figure.axes
+    now, after = (line.get_xdata() for line in left.lines[-2:])
+    assert (now == 1.0).all() and len(after) <= MOST_SIGMAS
+    assert (np.diff(after) >= 0).all()  # what gains most comes first
+    best = np.min(plan.after.sigma / plan.now.sigma)
+    assert after[0] == pytest.approx(best)
+    title = figure.get_suptitle().replace("\n", " ")
+    assert title.startswith("3 stops for the whole calibration. With them")
+    assert plan.names[int(np.argmin(plan.after.sigma / plan.now.sigma))] in title
+    drawn = np.concatenate([line.get_ydata() for line in right.lines])
+    joints = np.degrees(np.concatenate([plan.measured.joints, plan.poses.joints]))
+    np.testing.assert_allclose(np.sort(drawn), np.sort(joints.ravel()))
+    assert len(plan.measured.joints) == 10
