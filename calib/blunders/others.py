@@ -105,7 +105,8 @@ def at_their_sigmas(
 def whitening(M: np.ndarray, size: np.ndarray) -> np.ndarray:
     """What takes a score (r,) of information M (r, r) to independent ones (dof,) of unit variance,
     in the directions that anything contradicts, in units of `size` (r,)."""
-    values, axes = np.linalg.eigh(M / np.outer(size, size))
+    scaled = M / np.outer(size, size)
+    values, axes = (scaled[0], np.eye(1)) if len(size) == 1 else np.linalg.eigh(scaled)
     seen = values > HELD_ALONE
     return axes[:, seen] / np.sqrt(values[seen]) / size[:, None]
 
