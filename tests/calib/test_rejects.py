@@ -121,6 +121,23 @@ def test_many_beams_off_by_one_size_are_no_mixed_pixels_wherever_they_are(studie
     assert not found.explained and found.beyond_m == pytest.approx(0.03, abs=1e-3)
 
 
+@pytest.mark.parametrize(("share", "explained"), [(0.03, True), (0.07, False)])
+def test_returns_from_anywhere_are_told_where_they_are_many(studied, share, explained):
+    """Though near walls read long and far ones short, which no range explains."""
+
+    def spurious(stop, range_m, azimuth, elevation):
+        rng = np.random.default_rng(stop)
+        anything = rng.uniform(0.5, 8.0, len(range_m))
+        return np.where(rng.random(len(range_m)) < share, anything, range_m)
+
+    found, run = studied(f"spurious{share}", spurious)
+    assert found.explained == explained and found.share == pytest.approx(share, rel=0.2)
+    assert "of the beams at" not in found.sentence, "it is the same everywhere"
+    assert ("mixed pixels may explain" in found.sentence) != explained
+    if not explained:
+        assert diagnose(run).verdict == "unexplained_structure"
+
+
 def test_too_few_stops_or_no_scans_claim_nothing(tmp_path):
     simulate(Spec(lidar=None, mesh=False, targets=0, stops_per_location=8), tmp_path / "rec", 1)
     run = calibrate([tmp_path / "rec"], tmp_path / "run", hold_out="none")

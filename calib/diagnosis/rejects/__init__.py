@@ -56,7 +56,7 @@ def rejects(stand: Stand, progress: Progress = lambda what, done, total: None) -
     counts = count(stand, progress)
     left = np.ones(len(counts.rejected), bool)
     places: list[Place] = []
-    least = 1.0
+    told, least = np.zeros(len(left), bool), 1.0  # those of a place that says why
     while len(places) < MOST_PLACES and len(counts.stop_names) >= FEWEST_STOPS:
         found, p = _most(counts, left)
         least = min(least, p)
@@ -65,6 +65,7 @@ def rejects(stand: Stand, progress: Progress = lambda what, done, total: None) -
         inside, place = found
         places.append(place)
         left &= ~inside
+        told |= inside & (place.structured or place.in_the_way)
     total = int(counts.met.sum())
     rest = counts.rejected[left]
     crowded = _crowded(counts, rest)
@@ -72,7 +73,8 @@ def rejects(stand: Stand, progress: Progress = lambda what, done, total: None) -
     apart = [place for place in places if place.structured]
     outside = 1.0 - sum(place.beams for place in apart)
     usual = len(left) / total - sum(place.rejected for place in apart)
-    beyond = len(rest) / total - hit > CLUTTER
+    others = counts.rejected[~told]
+    beyond = len(others) / total - hit > CLUTTER
     return Rejects(
         share=len(left) / total,
         expected=min(usual / max(outside, 1.0 / total), CLUTTER + hit),
@@ -82,7 +84,7 @@ def rejects(stand: Stand, progress: Progress = lambda what, done, total: None) -
         clutter=hit,
         clutter_stops=tuple(counts.stop_names[i] for i in np.flatnonzero(crowded.any(axis=1))),
         beyond=beyond,
-        beyond_m=float(np.median(rest.residual_m)) if beyond and rest.coherent else None,
+        beyond_m=float(np.median(others.residual_m)) if beyond and others.coherent else None,
     )
 
 

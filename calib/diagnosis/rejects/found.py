@@ -18,6 +18,7 @@ STRUCTURED_SHARE = 0.5
 # Share that mixed pixels may explain, in all or at one place. They are 0.3 to 0.4 % in recordings
 # of two simulators, 1 % at grazing incidence, and 4 % where the simulator does as a paper's rooms.
 CLUTTER = 0.05
+CROWDED = 2.0  # times the share of all, from which a place without structure is named: a choice
 # Ending of a column -> its own unit, the one that people are shown, and the factor between.
 INTERVAL_UNITS = {
     "_rad": ("rad", "deg", 180.0 / np.pi),
@@ -185,7 +186,8 @@ class Rejects:
         if self.beyond:
             said += f", more than the {100 * CLUTTER:.0f} % that mixed pixels may explain"
             said += f", by {1e3 * self.beyond_m:+.1f} mm" if self.beyond_m else ""
-        crowded = [place for place in self.places if place.share > CLUTTER]
+        least = max(CLUTTER, CROWDED * self.share)
+        crowded = [place for place in self.places if place.share > least]
         for place in (self.structured or crowded)[:2]:
             there = f"of the beams at {place.where} it is {percent(place.share)} %"
             said += f"; {there}, and {place.what}"
