@@ -33,6 +33,7 @@ from calib.results.stages import staged
 from calib.runs.diagnose import stand_of
 from calib.runs.run import MODEL, Run
 from calib.solve.fit import Progress
+from chains import se3
 from chains.errors import InputError
 from sensors.stops import read_cameras, write_columns
 
@@ -65,6 +66,7 @@ class Plan:
         purpose: what they were chosen for.
         poses: of the stops, in the order in which to drive to them.
         measured: of the stops that were measured.
+        places: location -> T_reference_root (4, 4) where the base stands at planned stops.
         joints: (J,) name and kind, revolute or prismatic, of each.
         keys, units: (P,) of the parameters of the calibration.
         now, after: what is known without and with them; sigmas as a run reports them.
@@ -79,6 +81,7 @@ class Plan:
     purpose: Purpose
     poses: Poses
     measured: Poses
+    places: Mapping[str, np.ndarray]
     joints: Sequence[tuple[str, str]]
     keys: Sequence[Key]
     units: Sequence[str]
@@ -120,6 +123,7 @@ class Plan:
             **self.purpose.document(),
             "candidates": self.candidates,
             "stops": self.stops,
+            "places": {at: _pose(T) for at, T in self.places.items()},
             "number": {"now": self.now.stops, "after": self.after.stops},
             "sigma": {
                 name: {"unit": unit, "now": now, "after": after}
@@ -162,6 +166,16 @@ class Plan:
         """The stops as columns (n,): ``location``, and the joints by name."""
         joints = dict(zip(self._names, self.poses.joints.T, strict=True))
         return {"location": self.poses.location.astype(str), **joints}
+
+
+def _places(scene: PlanningScene, poses: Poses) -> dict[str, np.ndarray]:
+    """Where the base stands, in the reference's frame."""
+    Ts = se3.inverse(scene.T_world_reference) @ poses.Ts_world_root
+    return dict(zip(poses.location.astype(str).tolist(), Ts, strict=True))
+
+
+def _pose(T: np.ndarray) -> dict[str, list[float]]:
+    return {"xyz_m": T[:3, 3].tolist(), "quat_wxyz": se3.to_quat_wxyz(T).tolist()}
 
 
 def _effects(now: Found, after: Found) -> dict[str, Any]:
@@ -276,6 +290,7 @@ def _planned(planner: Planner, stops: int, candidates: int, seed: int) -> Plan:
         purpose=planner.aim,
         poses=some,
         measured=scene.measured,
+        places=_places(scene, some),
         joints=list(zip(rig.joint_names, rig.joint_kinds, strict=True)),
         keys=planner.keys,
         units=planner.units,

@@ -38,8 +38,9 @@ DIAGNOSE = (
 )
 PLAN = (
     Stage("what is known", ("looking for depth edges", "pass "), 0.08),
-    Stage("candidates", ("looking at candidates",), 0.85),
-    Stage("choice", ("choosing", "how many are enough"), 0.07),
+    Stage("candidates", ("looking at candidates",), 0.75),
+    Stage("choice", ("choosing", "how many are enough"), 0.06),
+    Stage("what would be found", ("what would be found",), 0.11),
 )
 REPORT = (
     Stage("residuals", ("residuals", "derivatives", "stop by stop", "held-out residuals"), 0.22),

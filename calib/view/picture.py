@@ -11,6 +11,7 @@ from calib.problem.model import recording_names
 from calib.results.outstanding import of_stop
 from calib.runs.run import Run
 from calib.view import panels
+from calib.view.plans.ghosts import PLANNED_PATH
 from calib.view.scene import Points, Scene
 from calib.view.shown import brush, colours, look, plot, sizes, taken
 from calib.view.shown.columns import AS_IN_CAD, comparable, gathered
@@ -79,6 +80,7 @@ class Picture:
             (menu.size, self._paint),
             (menu.below, self._paint),
             (menu.moves, self._on_moves),
+            (menu.planned, self._on_planned),
             (panel.stops, self._on_stop),
             (panel.other, self._on_other),
             (panel.beside, self._on_other),
@@ -216,6 +218,7 @@ class Picture:
         points = self._sides.first.go(stop, stops, other)
         wrong = self._sides.follow(stop, stops)
         self.menu.moved.content = panels.moves(self.stage.moves)
+        self.menu.planned.visible = bool(self.stage.ghosts)
         self.menu.show(points is not None)
         self.panel.show(points is not None)
         if points is None:
@@ -370,6 +373,10 @@ class Picture:
         if self.menu.moves.value == (MOVES_PATH in self.stage.hidden):
             self._sides.toggle(MOVES_PATH)
         self.menu.moved.visible = self.menu.moves.value
+
+    def _on_planned(self) -> None:
+        if self.menu.planned.value == (PLANNED_PATH in self.stage.hidden):
+            self._sides.toggle(PLANNED_PATH)
 
     def _on_point(self, event: Any) -> None:
         side = self._sides.picked(np.array(event.ray_origin), np.array(event.ray_direction))

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from calib.view import scene as scenes
+from calib.view.plans.ghosts import PLANNED_PATH, Ghost, draw, ghosts
 from calib.view.scene import Points, Scene
 from calib.view.shown import sizes
 from calib.view.shown.area import Area
@@ -63,13 +64,14 @@ class Drawing:
         self.points: Points | None = None
         self.shown = np.zeros(0, int)
         self.moves: Sequence[Move] = ()
+        self.ghosts: Sequence[Ghost] = ()
         self._middle_m = np.zeros(3)
         self._box = np.zeros((2, 3))
         self.lines_why = ""
         self._shapes: Sequence[Shape] = ()
         self._room: tuple[str, str] | None = None
         self._around: np.ndarray | None = None
-        self.hidden = {MOVES_PATH}
+        self.hidden = {MOVES_PATH, PLANNED_PATH}
         client.scene.configure_default_lights(cast_shadow=False)
 
     @property
@@ -81,7 +83,8 @@ class Drawing:
         """Draw nothing."""
         self.scene, self.points, self._room = None, None, None
         clouds = [name for each in (POINTS, LIT) for name in self._clouds(each)]
-        for name in (ROOM_PATH, RIG_PATH, AXES_PATH, MOVES_PATH, PICKED, NAME_PATH, *clouds):
+        parts = (ROOM_PATH, RIG_PATH, AXES_PATH, MOVES_PATH, PLANNED_PATH)
+        for name in (*parts, PICKED, NAME_PATH, *clouds):
             self._remove(name)
 
     def remove(self) -> None:
@@ -162,6 +165,9 @@ class Drawing:
         self._draw_rig(recording, stop)
         self.moves = moves(self.scene, recording, stop)
         self._draw_moves()
+        self.ghosts = ghosts(self.scene, recording)
+        where, seen = self._at(PLANNED_PATH), PLANNED_PATH not in self.hidden
+        draw(self.client.scene, where, self.ghosts, self._middle_m, seen)
         self.points = points
         if points is None:
             self.show_no_points()
@@ -315,7 +321,7 @@ class Drawing:
                 )
 
     def toggle(self, name: str) -> None:
-        """Hide the room, the rig, its axes or its moves; or show it again."""
+        """Hide the room, the rig, its axes, its moves or planned stops; or show it again."""
         self.hidden ^= {name}
         node = self.client.scene.get_handle_by_name(self._at(name))
         if node is not None:

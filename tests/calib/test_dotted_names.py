@@ -13,7 +13,7 @@ from calib.problem.unknowns import Key, Owner, vector_unknown
 from calib.report.charts.knowledge import tied
 from calib.results.solution import EffectEstimate, Part, Solution
 from calib.runs.run import COVARIANCE, SOLUTION, read_solution
-from calib.show.plan import _rows, _together
+from calib.show.plan import _together, known_rows
 from chains.errors import InputError
 from sensors.documents import write_yaml
 
@@ -89,7 +89,7 @@ def test_a_plan_tells_parameters_of_one_unknown_together():
     keys = [*many, Key("arm@1.2", "joint_1.a"), Key("arm@1.2", "joint_2.a@3")]
     sigma = np.arange(1.0, 15.0)
     known = SimpleNamespace(sigma=sigma)
-    rows = list(_rows(SimpleNamespace(keys=keys, units=["m"] * 14, now=known, after=known)))
+    rows = list(known_rows(SimpleNamespace(keys=keys, units=["m"] * 14, now=known, after=known)))
     assert [row.name for row in rows] == ["arm@1, rms of 12", *(key.name for key in keys[12:])]
     assert rows[0].now == pytest.approx(np.sqrt(np.mean(sigma[:12] ** 2)))
     assert _together(rows) == "arm@1, rms of 12; arm@1.2 joint_1.a, joint_2.a@3"

@@ -15,6 +15,7 @@ MOVES_LABEL = f"Moves x {TIMES}"
 MOVES_HINT = (
     f"How far each link stands from CAD, {TIMES} times as long; grey: less than {SURE:.0f} sigmas"
 )
+PLANNED_HINT = "Where the plan beside the run has the arm stand, by the stops' numbers"
 SIZE_HINT = "A column as the size of the dots, in the room and in the plot"
 PARTS = ("room", "rig", "frames")
 
@@ -40,6 +41,7 @@ class RoomMenu:
         self._lines_why = gui.add_html("", visible=False)
         self.moves = gui.add_checkbox(MOVES_LABEL, bool(asks.get("moves")), hint=MOVES_HINT)
         self.moved = gui.add_html("", visible=False)
+        self.planned = gui.add_checkbox("Planned stops", False, hint=PLANNED_HINT, visible=False)
         self.scan = gui.add_html("")
         self.point = gui.add_html(panels.note(CLICK))
 

@@ -1,0 +1,1 @@
+"""Plans of stops, as the workbench shows them."""
