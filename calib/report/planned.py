@@ -72,7 +72,7 @@ def _drawn(plan: Plan) -> Figure:
     left.set_yticks(at, [row.name for row in rows])
     left.tick_params(axis="y", labelsize=8.5)
     left.set_ylim(len(rows) - 0.5, -0.5)
-    plots.log_axis(left, min(ratio), 1.0)
+    left.set_xlim(0.0, 1.05)
     left.set_xlabel("expected sigma, of what it is now")
     left.set_title(f"The {len(rows)} sigmas that fall most")
     left.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=2)
