@@ -22,6 +22,7 @@ from calib.planning.found import Found
 from calib.planning.planner import Planner, Step
 from calib.planning.purpose import ALL, Purpose, purpose_of
 from calib.planning.room.places import in_region, where_it_stood
+from calib.planning.room.unlike import Unlike, unlike
 from calib.planning.scene import PlanningScene
 from calib.planning.stops import Poses
 from calib.planning.tolerance import purpose_until
@@ -71,6 +72,7 @@ class Plan:
         keys, units: (P,) of the parameters of the calibration.
         now, after: what is known without and with them; sigmas as a run reports them.
         found: what would be found of what may be wrong, without and with them.
+        unlike: in which way they are unlike all that was measured.
         effect_units: of the effects in `Known.smallest`.
         candidates: how many poses they were chosen among.
         endless: what is known with any number of stops of this arm.
@@ -89,6 +91,7 @@ class Plan:
     after: Known
     endless: Known
     found: tuple[Found, Found]
+    unlike: Sequence[Unlike]
     effect_units: Mapping[str, str]
     candidates: int
     curve: Sequence[Step] = ()
@@ -145,6 +148,7 @@ class Plan:
             },
             "smallest_effect": _effects(*self.found),
             "smallest_blunder": _mishaps(*self.found),
+            "unlike_measured": [each.document() for each in self.unlike],
             "unseen_blunder": {w: f.furthest() for w, f in zip(WHEN, self.found, strict=True)},
             "weak_directions": {
                 "now": list(self.now.weak),
@@ -297,6 +301,7 @@ def _planned(planner: Planner, stops: int, candidates: int, seed: int) -> Plan:
         now=planner.now,
         after=after,
         found=planner.found_now_and_after(after, some),
+        unlike=unlike(scene.source, scene.measured, some),
         endless=planner.endless(each),
         effect_units={name: scene.unit_of(name) for name in planner.aim.rivals},
         candidates=len(poses.joints),

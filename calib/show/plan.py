@@ -37,11 +37,11 @@ def print_plan(plan: Plan) -> None:
     console, document = terminal(), plan.document()
     stops = f"{len(plan.stops)} stop{'s' * (len(plan.stops) != 1)}"
     console.print(f"{stops} {aim(document)}", style="bold", soft_wrap=True)
-    for sentence in (*achieved(plan), *_reached(plan)):
+    for sentence in (*achieved(plan), *_unlike(plan), *_reached(plan)):
         console.print(sentence)
     console.print()
     console.print(
-        "Joints in degrees or mm, in the order of a short path; collisions are not checked for."
+        "Joints in degrees or mm, in the order of a short path, on which nothing was checked."
     )
     tables = [_stops_table(plan)]
     if document["smallest_detectable"]:
@@ -121,6 +121,12 @@ def _achieved(plan: Plan, document: Mapping[str, Any]) -> Iterator[str]:
             others = ", ".join(n for n in document["rivals"] if n != name) or "the model"
             yield f"NEVER FOUND: no number of stops of this arm tells {name} from {others}."
     yield _fall(plan)
+
+
+def _unlike(plan: Plan) -> Iterator[str]:
+    """What is at the stops as it never was before."""
+    if plan.unlike:
+        yield f"New at them: {'; '.join(map(str, plan.unlike))}."
 
 
 def _reached(plan: Plan) -> Iterator[str]:
