@@ -177,8 +177,9 @@ def remedies(run: Run, found: Diagnosis, stops: bool) -> Iterator[dict[str, Any]
 
 
 def _tied(found: Diagnosis) -> list[Mapping[str, Any]]:
-    """Candidates that were confirmed and have rivals."""
-    return [c for c in found.candidates if c["step"] and c["indistinguishable_from"]]
+    """Candidates that were confirmed and have rivals; not what scatters by chance, whose rivals are
+    told apart by other instruments and not by other stops."""
+    return [c for c in found.candidates if c["step"] and c["rivals"]]
 
 
 def _planned_for(stand: Stand) -> bool:

@@ -233,7 +233,12 @@ def test_what_the_data_could_not_tell_is_told_with_what_would(pages, first):
 
 
 def test_figures_that_do_not_apply_are_named_with_the_reason(pages, folder):
-    assert [a.id for a in pages[1].contents.absent] == ["groups", "formula", "findings"]
+    assert [a.id for a in pages[1].contents.absent] == [
+        "groups",
+        "formula",
+        "findings",
+        "workspace",
+    ]
     assert "findings</code>: not diagnosed" in pages[1].file.read_text(encoding="utf-8")
 
 
