@@ -20,14 +20,11 @@ import traceback
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
-import yaml
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
@@ -39,7 +36,7 @@ from calib.runs.diagnose import diagnose
 from chains.errors import InputError
 from sensors.documents import plain
 
-from ..calib.arm_worlds import TOOL_M, TOOL_RAD, TRACKER_M, TRACKER_RAD, ArmWorld, bent, exp
+from ..calib.arm_worlds import bent, exp, noise, save
 from ..chains.arms import TABLES
 from .arm_worlds_hidden import KINDS, Session, scaled
 
@@ -58,36 +55,13 @@ def written(folder: Path, case: Case) -> None:
     session = Session.drawn(world, rng, poses)
     T = scaled(KINDS[kind].hide(world, session, rng), size)
     read = session.joints + JOINT_RAD * rng.normal(size=session.joints.shape)
-    noise = rng.normal(size=(poses, 6)) * np.repeat([TRACKER_RAD, TRACKER_M], 3)
-    _write(folder, world, replace(session, joints=read), T * exp(noise), KINDS[kind].needs)
-
-
-def _write(folder: Path, world: ArmWorld, session: Session, T: Any, needs: Sequence[str]) -> None:
-    frames = {
-        "arm_base": {"parent": "base", "xyz_m": [0, 0, 0], "sigma_m": 0, "sigma_rad": 0},
-        "tool": {"parent": "arm_end", "xyz_m": [0.03, 0.02, 0.06]}
-        | {"sigma_m": TOOL_M, "sigma_rad": TOOL_RAD},
-    }
-    rig = {
-        "name": "arm",
-        "arm": {"urdf": "arm.urdf", "base": "arm_base", "tip": "arm_end"}
-        | {"sigma_joint_rad": JOINT_RAD},
-        "frames": frames,
-        "base": {"moves": "never"},
-        "tracker": {"bodies": ["tool"], "sigma_m": TRACKER_M, "sigma_rad": TRACKER_RAD},
-    }
-    (folder / "rig.yaml").write_text(yaml.safe_dump(rig))
-    xyzw = T.rotation.as_quat()
-    table = {"stop": [f"p{k:04d}" for k in range(len(xyzw))], "location": "a"}
-    table |= {"time_s": session.time_s, "temperature_c": session.temperature_c}
-    table |= dict(zip(world.joints, session.joints.T, strict=True))
-    if "payload_kg" in needs:
-        table["payload_kg"] = session.payload_kg
-    if "torque" in needs:
-        table |= {f"{j}.torque": t for j, t in zip(world.joints, session.torque.T, strict=True)}
-    table |= {f"tool.{c}": x for c, x in zip("xyz", T.translation.T, strict=True)}
-    table |= {f"tool.q{c}": xyzw[:, i] for c, i in zip("wxyz", (3, 0, 1, 2), strict=True)}
-    pd.DataFrame(table).to_csv(folder / "stops.csv", index=False)
+    columns = {"time_s": session.time_s, "temperature_c": session.temperature_c}
+    if "payload_kg" in KINDS[kind].needs:
+        columns["payload_kg"] = session.payload_kg
+    if "torque" in KINDS[kind].needs:
+        pairs = zip(world.joints, session.torque.T, strict=True)
+        columns |= {f"{joint}.torque": each for joint, each in pairs}
+    save(folder, world, read, T * exp(noise(rng, poses)), columns, JOINT_RAD)
 
 
 def asked(case: Case) -> dict[str, Any]:

@@ -4,7 +4,9 @@ The world shares no line with the fit's kinematics. In a world of *twists* every
 twist of six numbers, which no name of the program has; in a world of *names* by what the names say.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 import pandas as pd
@@ -88,24 +90,41 @@ def somewhere(rng: np.random.Generator) -> RigidTransform:
 
 def write(folder, world: ArmWorld, rng: np.random.Generator, poses: int) -> None:
     """Write a recording of the world, its URDF being there as ``arm.urdf``."""
+    joints = world.draw(rng, poses)
+    save(folder, world, joints, world.seen(joints) * exp(noise(rng, poses)))
+
+
+def noise(rng: np.random.Generator, poses: int) -> np.ndarray:
+    """(K, 6) twists by which the tracker errs."""
+    return rng.normal(size=(poses, 6)) * np.repeat([TRACKER_RAD, TRACKER_M], 3)
+
+
+def save(
+    folder,
+    world: ArmWorld,
+    joints: np.ndarray,
+    T: RigidTransform,
+    columns: Mapping[str, np.ndarray] = MappingProxyType({}),
+    sigma_joint_rad: float = 0.0,
+) -> None:
+    """Write a recording of poses at which joints (K, J) were read and the tool was seen at T (K,),
+    with more columns (K,) of the stops."""
     frames = {
         "arm_base": {"parent": "base", "xyz_m": [0, 0, 0], "sigma_m": 0, "sigma_rad": 0},
         "tool": {"parent": "arm_end", "xyz_m": [0.03, 0.02, 0.06]}
         | {"sigma_m": TOOL_M, "sigma_rad": TOOL_RAD},
     }
+    arm = {"urdf": "arm.urdf", "base": "arm_base", "tip": "arm_end"}
     rig = {
         "name": "arm",
-        "arm": {"urdf": "arm.urdf", "base": "arm_base", "tip": "arm_end"},
+        "arm": arm | ({"sigma_joint_rad": sigma_joint_rad} if sigma_joint_rad else {}),
         "frames": frames,
         "base": {"moves": "never"},
         "tracker": {"bodies": ["tool"], "sigma_m": TRACKER_M, "sigma_rad": TRACKER_RAD},
     }
     (folder / "rig.yaml").write_text(yaml.safe_dump(rig))
-    joints = world.draw(rng, poses)
-    noise = rng.normal(size=(poses, 6)) * np.repeat([TRACKER_RAD, TRACKER_M], 3)
-    T = world.seen(joints) * exp(noise)
     xyzw = T.rotation.as_quat()
-    table = {"stop": [f"p{k:04d}" for k in range(poses)], "location": "a"}
+    table = {"stop": [f"p{k:04d}" for k in range(len(joints))], "location": "a", **columns}
     table |= dict(zip(world.joints, joints.T, strict=True))
     table |= {f"tool.{c}": x for c, x in zip("xyz", T.translation.T, strict=True)}
     table |= {f"tool.q{c}": xyzw[:, i] for c, i in zip("wxyz", (3, 0, 1, 2), strict=True)}
