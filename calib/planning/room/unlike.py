@@ -13,7 +13,7 @@ from calib.problem.model import Source
 
 # Beyond what was measured, from which a stop is unlike all others: of its span, and at least. A
 # choice: less changes little of what the beams and the tracker see.
-BEYOND, LEAST = 0.1, {"rad": np.radians(5.0), "m": 0.02}
+BEYOND_SPAN, BEYOND_LEAST = 0.1, {"rad": np.radians(5.0), "m": 0.02}
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ def _beyond(
     what: str, tilt: bool, unit: str, measured: np.ndarray, planned: np.ndarray
 ) -> Unlike | None:
     low, high = float(measured.min()), float(measured.max())
-    margin = max(BEYOND * (high - low), LEAST[unit])
+    margin = max(BEYOND_SPAN * (high - low), BEYOND_LEAST[unit])
     out = planned[(planned < low - margin) | (planned > high + margin)]
     if not len(out):
         return None
