@@ -135,6 +135,7 @@ def plan_of(sigma, smallest=None):
         stops=[{"location": "L00"}],
         joints=[],
         curve=None,
+        unlike=(),
         keys=[Key(*name.rsplit(".", 1)) for name in sigma],
         units=[each["unit"] for each in sigma.values()],
         now=now,
