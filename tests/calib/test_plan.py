@@ -23,24 +23,10 @@ from tests.bench.bench_plan import case_of
 from tests.worlds import World, write
 
 from .linear.dense import Dense
+from .narrow import JOINTS, NARROW, fitted, followed, run_of
 
-# Joint 5 never turned; joints 2, 3 and 6 hardly did.
-NARROW = World(seed=3, locations=2, stops=5, beams=1200, turned=(1, 0.3, 0.3, 1, 0, 0.3))
 FEW = {"stops": 3, "candidates": 120}
-JOINTS = [f"joint_{k}" for k in range(1, 7)]
 REGION = (-1.6, -1.2, 1.6, 1.2)
-
-
-def fitted(world, folder):
-    """A run of a world."""
-    write(world, folder / "rec")
-    return calib.fit([folder / "rec"], folder / "run", hold_out="none")
-
-
-def followed(world, plan):
-    """The world in which a plan's stops were measured as well."""
-    then = [(int(s["location"][1:]), tuple(s[name] for name in JOINTS)) for s in plan.stops]
-    return replace(world, then=tuple(then))
 
 
 def sigma(run):
@@ -49,9 +35,8 @@ def sigma(run):
 
 
 @pytest.fixture(scope="module")
-def narrow(tmp_path_factory):
-    """A run of the narrow world."""
-    return fitted(NARROW, tmp_path_factory.mktemp("narrow"))
+def narrow(once):
+    return run_of(once)
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +48,7 @@ def planner(narrow):
 def test_sigmas_are_as_promised(narrow, tmp_path):
     """Of every parameter within 5 %, where planned stops bring much."""
     plan = calib.plan(narrow, **FEW)
-    later = fitted(followed(NARROW, plan), tmp_path)
+    later = fitted(followed(plan), tmp_path)
     assert later.solution.names == tuple(plan.names)
     promised = plan.after.sigma / plan.now.sigma
     kept = sigma(later) / sigma(narrow)

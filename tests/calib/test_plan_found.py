@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 import shlex
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,23 +13,12 @@ import calib
 from calib.planning import planner_of
 from calib.residuals.groups import CAD, Group
 from calib.simulation import PRESETS, simulate
-from tests.worlds import World, write
-
-# Joint 5 never turned; joints 2, 3 and 6 hardly did.
-NARROW = World(seed=3, locations=2, stops=5, beams=1200, turned=(1, 0.3, 0.3, 1, 0, 0.3))
-JOINTS = [f"joint_{k}" for k in range(1, 7)]
-
-
-def fitted(world, folder):
-    """A run of a world."""
-    write(world, folder / "rec")
-    return calib.fit([folder / "rec"], folder / "run", hold_out="none")
+from tests.calib.narrow import fitted, followed, run_of
 
 
 @pytest.fixture(scope="module")
-def narrow(tmp_path_factory):
-    """A run of the narrow world."""
-    return fitted(NARROW, tmp_path_factory.mktemp("narrow"))
+def narrow(once):
+    return run_of(once)
 
 
 @pytest.fixture(scope="module")
@@ -41,8 +29,7 @@ def plan(narrow):
 
 def test_what_would_be_found_after_the_plan_is_found_by_the_stops_it_asks_for(plan, tmp_path):
     """Of every effect that has no rival on paper, and of every kind of mishap."""
-    then = [(int(s["location"][1:]), tuple(s[name] for name in JOINTS)) for s in plan.stops]
-    later = planner_of(fitted(replace(NARROW, then=tuple(then)), tmp_path), "all")
+    later = planner_of(fitted(followed(plan), tmp_path), "all")
     kept, (now, promised) = later.found(later.now, None), plan.found
     names = sorted(kept.effects)
     assert names == sorted(promised.effects) and len(names) > 20

@@ -12,18 +12,13 @@ from calib.planning import planner_of
 from calib.view.plans.ghosts import PLANNED_PATH, draw, ghosts
 from calib.view.scene import Scene
 from chains.errors import InputError
+from tests.calib.narrow import run_of
 from tests.calib.workbench import field, shown, until
-from tests.worlds import World, write
-
-NARROW = World(seed=3, locations=2, stops=5, beams=1200, turned=(1, 0.3, 0.3, 1, 0, 0.3))
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    """A run of the narrow world."""
-    folder = tmp_path_factory.mktemp("narrow")
-    write(NARROW, folder / "rec")
-    return calib.fit([folder / "rec"], folder / "run", hold_out="none")
+def run(once):
+    return run_of(once)
 
 
 class Nodes(list):

@@ -10,17 +10,12 @@ import pytest
 
 import calib
 from calib.report.planned import MOST_SIGMAS, before_after
-from tests.worlds import World, write
-
-NARROW = World(seed=3, locations=2, stops=5, beams=1200, turned=(1, 0.3, 0.3, 1, 0, 0.3))
+from tests.calib.narrow import run_of
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    """A run of the narrow world."""
-    folder = tmp_path_factory.mktemp("narrow")
-    write(NARROW, folder / "rec")
-    return calib.fit([folder / "rec"], folder / "run", hold_out="none")
+def run(once):
+    return run_of(once)
 
 
 def test_a_plan_is_written_as_a_folder_that_another_plan_replaces(run, rigcal, tmp_path):

@@ -14,17 +14,12 @@ from calib.planning.reliability import Reliable
 from calib.planning.worth import criterion
 from calib.problem.unknowns import Key
 from chains.errors import InputError
-from tests.worlds import World, write
-
-NARROW = World(seed=3, locations=2, stops=5, beams=1200, turned=(1, 0.3, 0.3, 1, 0, 0.3))
+from tests.calib.narrow import run_of
 
 
 @pytest.fixture(scope="module")
-def narrow(tmp_path_factory):
-    """A run of the narrow world."""
-    folder = tmp_path_factory.mktemp("narrow")
-    write(NARROW, folder / "rec")
-    return calib.fit([folder / "rec"], folder / "run", hold_out="none")
+def narrow(once):
+    return run_of(once)
 
 
 def silent(done: int, total: int) -> None:

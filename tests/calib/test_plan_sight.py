@@ -6,21 +6,15 @@ import numpy as np
 import pandas as pd
 import pytest
 
-import calib
 from calib.planning import planner_of
 from calib.planning.room.hanging import plan_targets
 from calib.planning.room.sight import CARRIES_M, TUBE_RADIUS_M, _past_tubes
-from tests.worlds import World, write
-
-NARROW = World(seed=3, locations=2, stops=5, beams=1200, turned=(1, 0.3, 0.3, 1, 0, 0.3))
+from tests.calib.narrow import run_of
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    """A run of the narrow world."""
-    folder = tmp_path_factory.mktemp("narrow")
-    write(NARROW, folder / "rec")
-    return calib.fit([folder / "rec"], folder / "run", hold_out="none")
+def run(once):
+    return run_of(once)
 
 
 @pytest.fixture(scope="module")
