@@ -23,9 +23,8 @@ from chains.errors import InputError
 UNTIL = "The fewest stops until sigmas are so small: 'lidar 0.3 mm, rings 1 mm'."
 FOR = (
     "all; reliability, against blunders; scatter, of stops; frames, effects or parameters to know "
+    "better, with commas; effects to separate."
 )
-FOR += "better, with commas; effects to separate."
-
 
 Stops = Annotated[
     int | None,
@@ -78,10 +77,10 @@ def plan(
     """Plan the next stops, and predict what they determine."""
     from calib import outputs
     from calib.outputs.kinds import PLANNED
-    from calib.planning import is_rig
+    from calib.planning import inputs_of, is_rig
     from calib.planning import plan as choose
     from calib.planning.room.hanging import plan_targets as hang
-    from calib.report.planned import inputs_of, write_plan
+    from calib.report.planned import write_plan
     from calib.runs.run import Run
 
     if targets is not None and (stops is not None or until is not None):

@@ -8,10 +8,10 @@ linearisation of all stops together, measured and planned (`scene`).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
@@ -47,6 +47,16 @@ CANDIDATE_POSES = 500
 USUAL_STOPS, MOST_PLANNED = 5, 30
 WHEN = ("now", "after")
 CAMERAS = "cameras.csv"  # of the tracker, in the recording's folder or the rig's
+
+
+class Tabular(Protocol):
+    """What has columns of a table."""
+
+    def columns(self) -> Mapping[str, np.ndarray]:
+        """Name -> values, a row each."""
+
+
+Made = TypeVar("Made", bound=Tabular)
 
 
 def silent(what: str, done: int, total: int) -> None:
@@ -268,12 +278,30 @@ def plan(
         planner = planner_of(run, purpose, until, region, seed, progress)
         return _planned(planner, stops, candidates, seed)
 
+    return written(made, run, out, "stops", "FILE.csv, or a folder")
+
+
+def inputs_of(run: Run | Path | str) -> list[Path | str]:
+    """What is read for a plan, and not to be written over."""
+    return [run.folder, *run.inputs] if isinstance(run, Run) else [run]
+
+
+def written(
+    made: Callable[[], Made], run: Run | Path | str, out: Path | str | None, what: str, give: str
+) -> Made:
+    """A plan, in a table where there is to be one.
+
+    Args:
+        made: makes it, once it is known that the table can be written.
+        run: what it is for.
+        out: the CSV file; none where None.
+        what: what is planned, give: what `out` may be, in words.
+    """
     if out is None:
         return made()
     if Path(out).suffix != ".csv":
-        raise InputError(f"{out}: the stops are written as a table; give FILE.csv, or a folder")
-    inputs = [run.folder, *run.inputs] if isinstance(run, Run) else [run]
-    with outputs.file(out, inputs) as file:
+        raise InputError(f"{out}: the {what} are written as a table; give {give}")
+    with outputs.file(out, inputs_of(run)) as file:
         found = made()
         write_columns(file, found.columns())
     return found

@@ -11,7 +11,7 @@ import numpy as np
 from calib import outputs
 from calib.linear.parallel import one_blas_thread
 from calib.outputs.kinds import PLANNED
-from calib.planning import Plan
+from calib.planning import Plan, inputs_of
 from calib.report import plots
 from calib.runs.run import Run
 from calib.show.plan import achieved, aim, known_rows
@@ -24,11 +24,6 @@ if TYPE_CHECKING:
 MOST_SIGMAS = 20  # parameters that are drawn, those that gain most
 TABLE, DOCUMENT, PICTURE = "stops.csv", "plan.json", "before_after.svg"
 MEASURED = "#b8b8b8"
-
-
-def inputs_of(run: Run | Path) -> list[Path]:
-    """What is read for a plan, and not to be written over."""
-    return [run.folder, *run.inputs] if isinstance(run, Run) else [run]
 
 
 @one_blas_thread

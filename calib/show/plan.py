@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from rich.console import Console
 from rich.table import Table
 
 from calib.planning.purpose import ALL, RELIABILITY, SCATTER
@@ -54,9 +55,7 @@ def print_plan(plan: Plan) -> None:
     for sentence in _unseen(document["unseen_blunder"]):
         console.print(sentence)
         console.print()
-    same = [row for row in known_rows(plan) if row.after >= FALLS * row.now]
-    if same:
-        print_pairs(console, "as well known as before", [("", _together(same))])
+    _print_others(console, plan)
     weak = document["weak_directions"]
     for when, title in WEAK.items():
         pairs = [("", " and ".join(each["parameters"])) for each in weak[when][:DIRECTIONS_SHOWN]]
@@ -84,6 +83,11 @@ def print_targets(plan: TargetPlan) -> None:
     for each in (table, _sigma_table(plan)):
         console.print(each)
         console.print()
+    _print_others(console, plan)
+
+
+def _print_others(console: Console, plan: Plan | TargetPlan) -> None:
+    """Print which parameters are as well known as before."""
     same = [row for row in known_rows(plan) if row.after >= FALLS * row.now]
     if same:
         print_pairs(console, "as well known as before", [("", _together(same))])

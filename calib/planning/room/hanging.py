@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from calib import outputs
 from calib.linear.parallel import one_blas_thread
-from calib.planning import Planner, planner_without_places, silent
+from calib.planning import Planner, planner_without_places, silent, written
 from calib.planning.criteria import chosen
 from calib.planning.purpose import ALL, RELIABILITY, SCATTER, Purpose
 from calib.planning.room.targets import each_target, hanging_places, known_with
@@ -21,7 +20,6 @@ from calib.problem.unknowns import Key
 from calib.runs.run import Run
 from calib.solve.fit import Progress
 from chains.errors import InputError
-from sensors.stops import write_columns
 
 
 @dataclass(frozen=True)
@@ -102,19 +100,16 @@ def plan_targets(
         raise InputError(f"--for {purpose}: it is about stops, of which targets tell nothing")
     if targets < 1 or candidates < targets:
         raise InputError(f"{targets} targets out of {candidates} candidates: give at least 1")
-    planner = planner_without_places(run, purpose or ALL, None, progress)
-    rng = np.random.default_rng(seed)
-    places = hanging_places(planner.scene, region, candidates, rng, planner.cameras_m)
-    if len(places) < targets:
-        raise InputError(f"only {len(places)} places of so many drawn are clear of the mesh")
-    found = _planned(planner, places, targets)
-    if out is not None:
-        if Path(out).suffix != ".csv":
-            raise InputError(f"{out}: the targets are written as a table; give FILE.csv")
-        inputs = [run.folder, *run.inputs] if isinstance(run, Run) else [run]
-        with outputs.file(out, inputs) as file:
-            write_columns(file, found.columns())
-    return found
+
+    def made() -> TargetPlan:
+        planner = planner_without_places(run, purpose or ALL, None, progress)
+        rng = np.random.default_rng(seed)
+        places = hanging_places(planner.scene, region, candidates, rng, planner.cameras_m)
+        if len(places) < targets:
+            raise InputError(f"only {len(places)} places of so many drawn are clear of the mesh")
+        return _planned(planner, places, targets)
+
+    return written(made, run, out, "targets", "FILE.csv")
 
 
 def _planned(planner: Planner, places: np.ndarray, targets: int) -> TargetPlan:
