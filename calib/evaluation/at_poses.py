@@ -20,7 +20,7 @@ from calib.forward import Placed, place
 from calib.linear.parallel import one_blas_thread
 from calib.problem import Problem
 from calib.problem.model import Source, stop_columns
-from calib.results.intervals import intervals
+from calib.results.intervals import Intervals, intervals
 from calib.results.reach import body_beyond, joint_range, placed
 from calib.runs.reopen import problem_of, reopened, start_of, state_of
 from calib.runs.run import Run
@@ -121,7 +121,8 @@ def evaluate_at(
             f"{run.folder}: the base moves and no body on it is tracked, so nothing tells where it "
             f"is at these poses"
         )
-    found = predicted(run, problem, estimate, *_read(Path(poses), source), progress)
+    known = _known(run, estimate, progress)
+    found = _predicted(run, problem, estimate, known, *_read(Path(poses), source))
     if out is not None:
         if Path(out).suffix != ".csv":
             raise InputError(f"{out}: the poses are written as a table; give FILE.csv")
@@ -137,22 +138,22 @@ def says_where_the_base_is(problem: Problem) -> bool:
     return beyond is not None and (beyond.base or problem.sources[0].rig.moves == "never")
 
 
-def predicted(
+def _known(run: Run, estimate: Estimate, progress: Progress) -> Intervals:
+    """Intervals of all unknowns, as the run reports them."""
+    return intervals(estimate, progress).at_least(run.summary["sigmas_widened_by"])
+
+
+def _predicted(
     run: Run,
     problem: Problem,
     estimate: Estimate,
+    known: Intervals,
     names: Sequence[str],
     joints: np.ndarray,
     columns: Mapping[str, np.ndarray],
-    progress: Progress = lambda what, done, total: None,
 ) -> Predicted:
-    """Where the arm truly brings its last tracked body, and as drawn; see the module.
-
-    Args:
-        run: as fitted, problem, estimate: of it; the arm is that of its first recording.
-        names: of K poses, joints: (K, J) there, columns: (K,) of covariates that effects ask for.
-        progress: called with what is being done, and how far it is.
-    """
+    """Where the arm of the first recording truly brings its last tracked body, and as drawn, at K
+    poses with these joints (K, J) and covariates (K,); see the module."""
     rig, beyond = problem.sources[0].rig, body_beyond(problem)
     stops = place(rig, problem.terms[0], joints, columns, beyond.root, None)
     true = placed(stops, beyond.body, beyond.base, estimate.values)
@@ -161,7 +162,6 @@ def predicted(
     drawn = placed(stops, beyond.body, beyond.base, still)
     foot = rig.tree.edges[rig.tree.edge_names.index(rig.arm_edges[0])].parent
     T_base = placed(stops, foot, beyond.base, estimate.values).T
-    known = intervals(estimate, progress).at_least(run.summary["sigmas_widened_by"])
     return Predicted(
         body=beyond.body,
         frame=beyond.base or rig.world,
@@ -180,7 +180,12 @@ def over_workspace(
     progress: Progress = lambda what, done, total: None,
 ) -> tuple[Predicted, Predicted]:
     """The same at poses that were measured, and at joints drawn over all that they can turn, where
-    all else is as it was at one of those; arguments as of `predicted`."""
+    all else is as it was at one of those.
+
+    Args:
+        run: as fitted, problem, estimate: of it; the arm is that of its first recording.
+        progress: called with what is being done, and how far it is.
+    """
     source, stops = problem.sources[0], body_beyond(problem).stops
     rng, measured = np.random.default_rng(0), source.recording.joints
     some = np.sort(rng.choice(stops, min(len(stops), WORKSPACE_POSES), replace=False))
@@ -188,12 +193,12 @@ def over_workspace(
     drawn = rng.uniform(
         *joint_range(source.rig, measured[stops]), (len(at_stop), measured.shape[1])
     )
-    found = []
+    known, found = _known(run, estimate, progress), []
     for at, joints in ((some, measured[some]), (at_stop, drawn)):
         columns = {name: np.asarray(column)[at] for name, column in source.columns.items()}
         columns |= dict(zip(source.rig.joint_names, joints.T, strict=True))
         names = [source.recording.stops[i] for i in at.tolist()]
-        found.append(predicted(run, problem, estimate, names, joints, columns, progress))
+        found.append(_predicted(run, problem, estimate, known, names, joints, columns))
     return found[0], found[1]
 
 

@@ -87,11 +87,13 @@ class StopsFirst(Assembly):
         """Eliminate what is their own from stops that have no beams. Their rows are few: they are
         turned until no more of them touch a stop's own unknowns than there are of these (QR), and
         all others go into one product."""
-        left, every = [], []
+        left, raw = [], []
+        kept = positions(self.layout.size, self.layout.kept)
         for stop in stops:
             mine, at = self._columns(stop)
             rows, count = self._stacked(stop, at, len(mine)), len(self.layout.own.get(stop, ()))
-            every.append(_over(rows, positions(self.layout.size, self.layout.kept), mine[:-1]))
+            if self.raw is not None:
+                raw.append(_over(rows, kept, mine[:-1]))
             if count:
                 Q, R = np.linalg.qr(rows[:, :count], mode="complete")
                 rows = Q.T @ rows
@@ -101,7 +103,7 @@ class StopsFirst(Assembly):
             left.append(_over(rows[count:, count:], self.at, mine[count:]))
         self.total += square(np.vstack(left))
         if self.raw is not None:
-            self.raw += square(np.vstack(every))
+            self.raw += square(np.vstack(raw))
 
     def _stacked(self, stop: int, at: np.ndarray, width: int) -> np.ndarray:
         """A stop's own rows (m, width), in units of sigmas, columns where `at` puts them."""

@@ -40,10 +40,11 @@ def joint_tables(stand: Stand) -> Iterator[tuple[str, BeamTable]]:
     turned = variables_of(wide, {effect.name for _, effect in levers})
     layout = Layout.of(wide, unbounded=[*chain(*turned.values())])
     rows = rows_of_others(wide, layout, values, Gradients(layout.size))
-    A, *of_rows = _without_own(layout, *rows)
+    shared = _shared(layout)
+    A, *of_rows = _without_own(layout, shared, *rows)
     if A.shape[1] > MOST_UNKNOWNS:
         return
-    covariates, shared = _covariates(stand, layout), _shared(layout)
+    covariates = _covariates(stand, layout)
     columns = {joint: layout.columns(turned[effect.name]) for joint, effect in levers}
     at = {joint: np.searchsorted(shared, mine) for joint, mine in columns.items()}
     model = np.setdiff1d(np.arange(len(shared)), np.concatenate(list(at.values())))
@@ -60,11 +61,16 @@ def _shared(layout: Layout) -> np.ndarray:
 
 
 def _without_own(
-    layout: Layout, A: csr_array, b: np.ndarray, stop: np.ndarray, place: np.ndarray
+    layout: Layout,
+    shared: np.ndarray,
+    A: csr_array,
+    b: np.ndarray,
+    stop: np.ndarray,
+    place: np.ndarray,
 ) -> tuple[np.ndarray, ...]:
-    """Rows as `rows_of_others` has them, over the shared unknowns: of each stop those that its own
-    unknowns, as joints' misreadings are, leave (elimination by orthogonal rows: Golub 1965)."""
-    right = np.column_stack([A[:, _shared(layout)].toarray(), b])
+    """Rows as `rows_of_others` has them, over the shared columns (M,): of each stop those that its
+    own unknowns, as joints' misreadings are, leave (elimination by orthogonal rows: Golub 1965)."""
+    right = np.column_stack([A[:, shared].toarray(), b])
     order = np.argsort(stop, kind="stable")
     numbers = list(layout.own)
     first, end = (np.searchsorted(stop[order], numbers, side) for side in ("left", "right"))

@@ -11,7 +11,7 @@ from scipy.sparse import csr_array
 from threadpoolctl import threadpool_limits
 
 from calib.diagnosis.formulas import find
-from calib.diagnosis.formulas.arm import _table, _without_own
+from calib.diagnosis.formulas.arm import _shared, _table, _without_own
 from calib.diagnosis.stand import Stand
 from calib.problem import build
 from calib.problem.model import Model, Source
@@ -76,7 +76,9 @@ def test_what_stops_have_for_themselves_is_taken_out_of_their_rows(rows):
     for k, columns in own.items():
         wide[np.ix_(stop == k, columns)] = rng.standard_normal((ROWS, 2))
     layout = Sized(size=size, own=own)
-    less, right, stops, places = _without_own(layout, csr_array(wide), b, stop, place)
+    less, right, stops, places = _without_own(
+        layout, _shared(layout), csr_array(wide), b, stop, place
+    )
     counts = [ROWS - 2 * (k in own) for k in range(STOPS)]
     assert np.bincount(stops[stops >= 0]).tolist() == counts
     np.testing.assert_array_equal(places[stops < 0], 7)
