@@ -26,9 +26,9 @@ LEAST_S = 2.0  # of a log: less has not one move of an arm in it
 # From the first part to the last; less is below the time that an arm takes to settle.
 DRIFT_S = 0.02
 FINEST = 1 / 20  # of a step: no more is believed of a parabola
-# The sigma of what is added, of how far off left-out offsets are foretold. These err by themselves
+# The sigma of what is added, of how far off left-out offsets are predicted. These err by themselves
 # and by the mean of two others, 1 + 1/2 variances; a time between two of them by 2/3 on average.
-FORETOLD = 2 / 3  # the root of 2/3 over 3/2
+PREDICTED = 2 / 3  # the root of 2/3 over 3/2
 
 
 @dataclass(frozen=True)
@@ -222,7 +222,7 @@ def estimate(mine: Motion, other: Motion) -> Offset | None:
     is not known. The offset is where a correlation r over n samples is the least likely by chance,
     the maximum of -n log(1 - r^2), to a fraction of a sample by a parabola. Its sigma comes from
     the scatter of the offsets of parts of the logs; where clocks drift apart, from how well these
-    foretell each other.
+    predict each other.
 
     Returns:
         None where one of the two hardly moves; a sigma of NaN where another offset is as good.
@@ -250,7 +250,7 @@ def estimate(mine: Motion, other: Motion) -> Offset | None:
         return Offset(offset_s, _standard_error(shift_s, step_s), top, added=always)
     ahead_s = float(other.time_s[0] - mine.time_s[0]) + int(lag[best]) * step_s
     added, missed_s = _pieces(mine.time_s[0] + at * step_s, ahead_s + shift_s)
-    sigma_s = max(FORETOLD * float(np.sqrt(np.mean(np.square(missed_s)))), FINEST * step_s)
+    sigma_s = max(PREDICTED * float(np.sqrt(np.mean(np.square(missed_s)))), FINEST * step_s)
     return Offset(offset_s, sigma_s, top, added=added, drift_s=drift_s)
 
 
@@ -365,8 +365,8 @@ def _standard_error(shift_s: Array, step_s: float) -> float:
 
 
 def _pieces(at_s: Array, offset_s: Array) -> tuple[Added, Array]:
-    """Straight pieces through offsets that drift, or one line, by which foretells each inner offset
-    from the others better; and by how much that one misses each of these."""
+    """Straight pieces through offsets that drift, or one line, whichever predicts each inner offset
+    from the others better; and by how much it misses each of these."""
     by_line, by_pieces = [], []
     for i in range(1, len(at_s) - 1):
         others, x = np.delete(np.arange(len(at_s)), i), at_s[i] - at_s[0]

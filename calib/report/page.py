@@ -287,7 +287,7 @@ def _untold(evidence: Evidence) -> list[tuple[str, list[str]]]:
     planned = _planned(evidence, "untestable")
     for name, why in (evidence.diagnosis or {}).get("untestable", {}).items():
         command = planned.get((name,))
-        told = f"{name}: stops, if any help, are planned by '{command}'" if command else name
+        told = f"{name}: '{command}' plans stops for it, if any can help" if command else name
         reasons.setdefault(f"not tested: {why}", []).append(told)
     return list(reasons.items())
 

@@ -194,7 +194,7 @@ def _print_remedies(console: Console, diagnosis: Diagnosis) -> None:
     tied, weak, untestable = of.values()
     every = (*tied, *weak[:WEAKEST], *untestable)
     if commands := [command for command in every if command and command != diagnosis.plan]:
-        console.print("Stops that would tell of each, if any stops do, are planned by:")
+        console.print("Commands that plan stops for each of these, if any can help:")
         for command in commands:
             console.print(command, style="bold", soft_wrap=True)
         console.print()

@@ -130,7 +130,7 @@ def _achieved(plan: Plan, document: Mapping[str, Any]) -> Iterator[str]:
 def _unlike(plan: Plan) -> Iterator[str]:
     """What is at the stops as it never was before."""
     if plan.unlike:
-        yield f"New at them: {'; '.join(map(str, plan.unlike))}."
+        yield f"New at these stops: {'; '.join(map(str, plan.unlike))}."
 
 
 def _reached(plan: Plan) -> Iterator[str]:
