@@ -61,38 +61,45 @@ class CellsFirst(Assembly):
 
     def done(self, values: Values) -> Linearisation:
         """Eliminate all but the kept."""
-        layout = self.layout
+        layout, cells = self.layout, self.first + np.arange(len(self.layout.cells))
+        # Kept unknowns that no beam depends on but by where its LiDAR is have nothing here yet.
+        there = np.diag(self.rest) > 0
+        there[: self.first + len(cells)] = there[-1] = True
+        there = np.flatnonzero(there)
         over = np.concatenate([layout.cells, layout.kept, [layout.size]])
-        over = np.append(np.full(self.first, BY_TWIST), over).astype(int)
-        unit = np.ones(self.b + 1)
-        unit[self.first : self.b] = layout.sigma[over[self.first : -1]]
-        rest = self.rest * unit * unit[:, None]
+        over = np.append(np.full(self.first, BY_TWIST), over).astype(int)[there]
+        unit = np.append(np.ones(self.first), layout.sigma[over[self.first : -1]])
+        unit = np.append(unit, 1.0)
+        rest = self.rest[np.ix_(there, there)]
+        rest *= unit
+        rest *= unit[:, None]
         if self.raw is not None:
-            cells = np.arange(self.first, self.first + len(layout.cells))
             before = np.delete(np.delete(rest, cells, 0), cells, 1)
-            self.raw += self._chained(before, np.zeros(0, int))[:-1, :-1]
+            beside = np.delete(over, cells)
+            self.raw += self._chained(before, beside, np.zeros(0, int))[:-1, :-1]
             self.raw += self._own_rows[1][:-1, :-1]
         if len(layout.finest):
             own = layout.sigma[layout.finest]
-            cross = self.cross * own[:, None] * unit
+            cross = self.cross[:, there]
+            cross *= own[:, None]
+            cross *= unit
             prior = self._cell_priors(values, layout.finest)
             cross[:, -1] += prior
             rest[-1, -1] += prior @ prior
             factor, gain = eliminate(self.diagonal * own**2 + 1.0, cross, rest)
             self.eliminated.append(Eliminated(layout.finest, over, factor, gain))
-        cells = np.arange(self.first, self.first + len(layout.cells))
-        left = np.setdiff1d(np.arange(self.b + 1), cells)
         if len(cells):
             rest[cells, cells] += 1.0
             prior = self._cell_priors(values, layout.cells)
             rest[cells, -1] += prior
             rest[-1, cells] += prior
             rest[-1, -1] += prior @ prior
+            left = np.delete(np.arange(len(over)), cells)
             cross, block = rest[np.ix_(cells, left)], rest[np.ix_(cells, cells)]
-            rest = rest[np.ix_(left, left)]
+            rest, over = rest[np.ix_(left, left)], over[left]
             factor, gain = eliminate(block, cross, rest)
-            self.eliminated.append(Eliminated(layout.cells, over[left], factor, gain))
-        return self._done(values, self._without_own(rest))
+            self.eliminated.append(Eliminated(layout.cells, over, factor, gain))
+        return self._done(values, self._without_own(rest, over))
 
     @cached_property
     def _own_rows(
@@ -113,13 +120,14 @@ class CellsFirst(Assembly):
             start = here.stop
         return stacked, square(stacked), about_own
 
-    def _without_own(self, rest: np.ndarray) -> np.ndarray:
-        """From [twists | kept | b] to [kept | b]: through the chain, then stops' own unknowns."""
+    def _without_own(self, rest: np.ndarray, over: np.ndarray) -> np.ndarray:
+        """From [twists | kept | b], of the columns `over`, to all [kept | b]: through the chain, then
+        stops' own unknowns."""
         layout = self.layout
         own = np.concatenate([np.zeros(0, int), *layout.own.values()])
         columns = np.concatenate([own, layout.kept, [layout.size]])
         at = positions(layout.size + 1, columns)
-        whole, count = self._chained(rest, own), len(own)
+        whole, count = self._chained(rest, over, own), len(own)
         stacked, gram, about_own = self._own_rows
         whole[count:, count:] += gram
         for mine, rows, A in about_own:  # of own by kept, one side is enough
@@ -132,14 +140,15 @@ class CellsFirst(Assembly):
         self.eliminated.append(Eliminated(own, columns[count:], factor, gain))
         return left
 
-    def _chained(self, rest: np.ndarray, own: np.ndarray) -> np.ndarray:
-        """From [twists | kept | b] to [own | kept | b] by the chain rule, in units of sigmas.
-        Unknowns that place a LiDAR and are neither in `own` nor kept are left out."""
+    def _chained(self, rest: np.ndarray, over: np.ndarray, own: np.ndarray) -> np.ndarray:
+        """From [twists | kept | b], of the columns `over`, to [own | all kept | b] by the chain rule,
+        in units of sigmas. Unknowns that place a LiDAR and are neither in `own` nor kept are left
+        out."""
         layout, first = self.layout, self.first
-        columns = np.concatenate([own, layout.kept])
-        at = positions(layout.size, columns)
+        columns = np.concatenate([own, layout.kept, [layout.size]])
+        at = positions(layout.size + 1, columns)
         used = np.unique(at[np.concatenate([np.zeros(0, int), *(c for _, _, c in self.twists)])])
-        used = used[used >= 0]
+        used, others = used[used >= 0], at[over[first:]]
         chains = []
         for i, (_, d, c) in enumerate(self.twists):
             there = np.flatnonzero(at[c] >= 0)
@@ -147,10 +156,10 @@ class CellsFirst(Assembly):
             chains.append((rows, twist, (d[:, there] * layout.sigma[c[there]]).T))
         beside = _times(chains, len(used), rest[:first])
         inner = _times(chains, len(used), np.ascontiguousarray(beside[:, :first].T))
-        whole = np.zeros((len(columns) + 1, len(columns) + 1))
-        whole[len(own) :, len(own) :] = rest[first:, first:]
+        whole = np.zeros((len(columns), len(columns)))
+        add_at(whole, others, others, rest[first:, first:])
         add_at(whole, used, used, inner)
-        add_both(whole, used, np.arange(len(own), len(whole)), beside[:, first:])
+        add_both(whole, used, others, beside[:, first:])
         return whole
 
 
