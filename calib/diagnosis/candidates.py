@@ -16,6 +16,7 @@ from calib.effects import CATALOGUE, Effect, OneHot, Param, Site, View
 from calib.effects.basis import RANGE
 from calib.effects.rig import MountSlip
 from calib.problem.model import Model, Source
+from calib.problem.shapes import shapes_of
 from calib.rig import Rig
 
 # Bins of a covariate, of each of two, and of azimuth, whose harmonics turn several times about. A
@@ -25,7 +26,6 @@ AZIMUTH_BINS = 24
 # Of columns of the stops: with more parameters than a fifth of these, tests have no power.
 STOPS_A_BIN = 5
 POSE_WAVES = 4  # of a pose over a column: its quarters, as 12 bins have thirds of those
-SHAPE_STEP = 0.01  # relative, to either side, for the derivative by a shape
 # What a range error may depend on alone, and the pairs that matter; others pair with range.
 POINT = ("range_m", "incidence_rad", "azimuth_rad", "elevation_rad", "intensity")
 PAIRS = (*combinations(POINT[:4], 2), ("intensity", "range_m"), ("label", "incidence_rad"))
@@ -156,32 +156,6 @@ class PoseShape(Effect):
         return np.concatenate([self.slips.moved(view, wave) for wave in waves], axis=-1)
 
 
-class ShapeStep(Effect):
-    """What an effect of a model would do more were its shape larger: its derivative, per unit of
-    the shape's logarithm.
-
-    Args:
-        effect: in the model, with a shape.
-        theta: (P,) its parameters as estimated.
-    """
-
-    typical = "derivative"
-
-    def __init__(self, effect: Effect, theta: np.ndarray) -> None:
-        self.effect, self.theta, self.site = effect, theta, effect.site
-        self.name = f"shape of {effect.name}"
-
-    def params(self, rig: Rig) -> tuple[Param, ...]:
-        return (Param("log", "1", 1.0),) if self.effect.params(rig) else ()
-
-    def basis(self, view: View) -> np.ndarray:
-        sides = (
-            self.effect.at(self.effect.shape * f) for f in (1 + SHAPE_STEP, 1 / (1 + SHAPE_STEP))
-        )
-        larger, smaller = (side.basis(view) @ self.theta for side in sides)
-        return (larger - smaller)[..., None] / (2 * np.log1p(SHAPE_STEP))
-
-
 def known_effects(
     model: Model,
     sources: Sequence[Source],
@@ -210,15 +184,6 @@ def known_effects(
     return found
 
 
-def shapes_of(effect: Effect, sources: Sequence[Source]) -> list[float]:
-    """The shapes worth trying, ascending. Of several recordings, as of times at which something
-    slipped, no more than of the one that has most: evenly among those of all."""
-    each = [effect.shapes(stops_view(source)) for source in sources]
-    every = sorted(set().union(*each))
-    chosen = np.linspace(0, len(every) - 1, max(map(len, each))).round().astype(int)
-    return [every[i] for i in np.unique(chosen)]
-
-
 def concerned(effect: Effect, sources: Sequence[Source]) -> bool:
     """Whether a rig has the instrument that an effect is about: an arm under a tracker alone lacks
     nothing of a LiDAR, a scanner or targets."""
@@ -239,12 +204,6 @@ def lacking(effect: Effect, sources: Sequence[Source], columns: frozenset[str]) 
     if not missing and not any(effect.params(s.rig) for s in sources):
         missing.append("hardware that it acts on")
     return missing
-
-
-def stops_view(source: Source) -> View:
-    """The stops of a recording as effects see them."""
-    count = len(source.recording.stops)
-    return View(source.rig, count, source.columns, source.recording.joints)
 
 
 def covariates() -> set[str]:
@@ -283,7 +242,7 @@ def structure(sources: Sequence[Source], sample: Mapping[str, np.ndarray]) -> li
 def _moved(sources: Sequence[Source]) -> Iterator[PoseShape]:
     """Mount, tracked bodies and tracker, moved by every column that changes from stop to stop."""
     stops = sum(len(s.recording.stops) for s in sources)
-    slips = [e for e in CATALOGUE if isinstance(e, MountSlip) and e.once]
+    slips = [e for e in CATALOGUE if isinstance(e, MountSlip) and e.jumps]
     slips = [e for e in slips if any(e.params(s.rig) for s in sources)]
     columns = set.intersection(
         *({"time_s", *s.recording.covariates} & {*s.columns} for s in sources)

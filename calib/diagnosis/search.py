@@ -321,7 +321,7 @@ def _fitted(
         return []
     effect = look.stand.finest(candidate.effect, progress)
     stand = tried(look.stand.with_effects, [effect], progress)
-    theta = stand.theta(effect, whole=False) if stand else 0 * test.estimate()
+    theta = stand.theta(effect) if stand else 0 * test.estimate()
     if look.named.taken_up(candidate, theta) < HELD_BACK:
         return []
     stand, swapped = stand.retuned([f.effect.name for f in found], progress)

@@ -12,30 +12,25 @@ import numpy as np
 
 from calib import problem as problems
 from calib.blunders.judged import Blunder, judge
-from calib.diagnosis.candidates import (
-    ShapeStep,
-    covariates,
-    known_effects,
-    shapes_of,
-    structure,
-)
+from calib.diagnosis.candidates import covariates, known_effects, structure
 from calib.diagnosis.chance import Chance, chances, of_lidar, ranked, rows_by_chance
 from calib.diagnosis.jackknife import Shares
 from calib.diagnosis.linear import Linear, linearise_with, rows_along
 from calib.diagnosis.score import ScoreTest, away_from_model, project, score_test
 from calib.diagnosis.screen import Candidate, Screen, screen
-from calib.effects import CATALOGUE, Effect, Scatter, Site
+from calib.effects import CATALOGUE, Effect, Scatter, ShapeStep, Site
 from calib.forward import named
 from calib.linear.layout import Layout
 from calib.linear.system import Linearisation
 from calib.problem import Problem
 from calib.problem.model import Model, Source
+from calib.problem.shapes import shapes_of, theta_of
 from calib.problem.without import leave_out
 from calib.residuals.groups import Group
 from calib.residuals.scan import ScanStop
 from calib.results.intervals import Intervals, intervals
 from calib.solve.estimate import DOFS, SEEN, Estimate, Start
-from calib.solve.fit import Progress, solve
+from calib.solve.fit import Progress, shapes_freed, solve
 from chains.errors import InputError
 
 FINER = 9  # shapes tried between the two beside the best one
@@ -179,8 +174,9 @@ class Stand:
         Returns:
             The fit with them, and the effects that took the place of others, by the others' names.
         """
-        shaped = [e for e in self.model.effects if e.name in names and e.shape_name and not e.whole]
-        steps = [ShapeStep(e, self.theta(e, whole=True)) for e in shaped]
+        shaped = [e for e in self.model.effects if e.name in names and e.has_derivative_by_shape]
+        values = self.estimate.values
+        steps = [ShapeStep(e, theta_of(self.problem, e, values)) for e in shaped]
         if not steps:
             return self, {}
         linear, at = self.linearise(steps, progress)
@@ -210,30 +206,29 @@ class Stand:
         every = {f"{old}{end}": f"{new}{end}" for old, new in renamed.items() for end in endings}
         return {every.get(name, name): value for name, value in self.estimate.state.items()}
 
-    def theta(self, effect: Effect, whole: bool) -> np.ndarray:
-        """Parameters of an effect of the model: the `whole` effect's, or those that are free."""
-        for terms, source in zip(self.problem.terms, self.sources, strict=True):
-            for term in terms:
-                if term.effect.name == effect.name:
-                    values = self.estimate.values[term.variable]
-                    theta = np.zeros(len(effect.params(source.rig)))
-                    theta[term.free] = values
-                    return theta if whole else values
-        raise ValueError(f"'{effect.name}' is not in the model")
+    def theta(self, effect: Effect) -> np.ndarray:
+        """The free parameters (q,) of an effect of the model."""
+        return self.estimate.values[self._variable(effect)]
 
     def sigma(self, effect: Effect) -> np.ndarray:
         """Sigma (q,) of each free parameter of an effect of the model: see `intervals`. Of several
         rigs, the first that has the effect."""
+        known, estimate = self.known
+        return np.sqrt(np.diag(known.over(estimate, [self._variable(effect)])))
+
+    def _variable(self, effect: Effect) -> str:
+        """The unknown of an effect of the model; of several rigs, the first that has it."""
         terms = (t for some in self.problem.terms for t in some)
-        mine = next((t.variable for t in terms if t.effect.name == effect.name), None)
-        if mine is None:
+        found = next((t.variable for t in terms if t.effect.name == effect.name), None)
+        if found is None:
             raise ValueError(f"'{effect.name}' is not in the model")
-        return np.sqrt(np.diag(self.known.over(self.estimate, [mine])))
+        return found
 
     @cached_property
-    def known(self) -> Intervals:
-        """Intervals of all unknowns, as a fit of the model reports them."""
-        return intervals(self.estimate)
+    def known(self) -> tuple[Intervals, Estimate]:
+        """Intervals of all unknowns, as a fit of the model reports them, and of what they are."""
+        estimate = shapes_freed(self.estimate, self.model)
+        return intervals(estimate), estimate
 
     @cached_property
     def columns(self) -> tuple[frozenset[str], dict[str, np.ndarray]]:

@@ -21,7 +21,16 @@ from calib.effects.arm import (
     ArmLinkLength,
     ArmThermalGrowth,
 )
-from calib.effects.base import Basis, Effect, LazyColumn, OneHot, Param, Site, View
+from calib.effects.base import (
+    Basis,
+    Effect,
+    LazyColumn,
+    OneHot,
+    Param,
+    ShapeStep,
+    Site,
+    View,
+)
 from calib.effects.beams import (
     BeamOriginOffset,
     ElevationScale,
@@ -163,6 +172,7 @@ __all__ = [
     "OneHot",
     "Param",
     "Scatter",
+    "ShapeStep",
     "Site",
     "Trust",
     "View",

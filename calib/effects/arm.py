@@ -75,6 +75,7 @@ class ArmJointSlip(ArmJointOffset):
     confounded_with = ("mount_slip", "base_slip", "arm_joint_offset")
     source = "size assumed"
     shape_name, shape = "t_s", 900.0
+    jumps = True
     sigma = 0.001
 
     def shapes(self, stops: View) -> tuple[float, ...]:

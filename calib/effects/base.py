@@ -20,6 +20,8 @@ import numpy as np
 from calib.rig import Rig
 from chains.errors import InputError
 
+SHAPE_STEP = 0.01  # relative, to either side, for the derivative by a shape
+
 
 class Site(Enum):
     """Where on the path from the room to the number the hardware lies.
@@ -114,6 +116,7 @@ class Effect(ABC):
         shape_name: what the shape is, with its unit (``wavelength_m``); empty where there is none.
         shape: the one chosen.
         whole: True where a shape is a whole number.
+        jumps: True where the basis jumps with the shape, as at the time when something slipped.
         origin: the Python file and class of a user's effect; None for one of the catalogue.
         of_lidar: True when the effect belongs to the mounted LiDAR, so that rigs do not share it.
         by_chance: True where its parameters are drawn by chance, and their spread is estimated.
@@ -133,6 +136,7 @@ class Effect(ABC):
     shape_name: ClassVar[str] = ""
     shape: float = 0.0
     whole: ClassVar[bool] = False
+    jumps: ClassVar[bool] = False
     by_chance: ClassVar[bool] = False
     widens: ClassVar[bool] = False
     seen: Mapping[str, tuple[float, float]] = MappingProxyType({})
@@ -142,6 +146,11 @@ class Effect(ABC):
     def of_scanner(self) -> bool:
         """Whether it is the scanner's error at a place, which its spheres' centres have as well."""
         return self.site is Site.REFERENCE and self.covariates == ("point_m",)
+
+    @property
+    def has_derivative_by_shape(self) -> bool:
+        """Whether its shape can be estimated like a parameter, once it is near."""
+        return bool(self.shape_name) and not self.whole and not self.jumps
 
     @property
     def family(self) -> str:
@@ -184,3 +193,40 @@ class Effect(ABC):
             (rows, *shape of the site, P), or a `OneHot`. One row stands for all where the basis
             depends on nothing that changes.
         """
+
+
+class ShapeStep(Effect):
+    """What an effect of a model would do more were its shape larger: its derivative, per unit of
+    the shape's logarithm.
+
+    Args:
+        effect: in the model, with a shape.
+        theta: rig's name -> (P,) its parameters as estimated.
+        sigma: of the logarithm, before any data.
+    """
+
+    typical = "derivative"
+
+    def __init__(self, effect: Effect, theta: Mapping[str, np.ndarray], sigma: float = 1.0) -> None:
+        self.effect, self.theta, self.sigma, self.site = effect, theta, sigma, effect.site
+        self.name = self.name_of(effect)
+
+    @staticmethod
+    def name_of(effect: Effect) -> str:
+        """What it is called, of an effect."""
+        return f"shape of {effect.name}"
+
+    @property
+    def of_lidar(self) -> bool:
+        return self.effect.of_lidar
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        there = rig.name in self.theta and bool(self.effect.params(rig))
+        return (Param("log", "1", self.sigma),) if there else ()
+
+    def basis(self, view: View) -> np.ndarray:
+        sides = (
+            self.effect.at(self.effect.shape * f) for f in (1 + SHAPE_STEP, 1 / (1 + SHAPE_STEP))
+        )
+        larger, smaller = (side.basis(view) @ self.theta[view.rig.name] for side in sides)
+        return (larger - smaller)[..., None] / (2 * np.log1p(SHAPE_STEP))

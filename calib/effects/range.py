@@ -138,6 +138,7 @@ class RangeStep(RangeEffect):
     confounded_with = ("range_cyclic", "near_range_bias", "range_scale")
     source = "near- and far-field firing: Hesai Pandar128E3X manual"
     shape_name, shape = "r_s_m", 2.75
+    jumps = True
 
     def shapes(self, stops: View) -> tuple[float, ...]:
         return tuple(np.arange(1.0, 5.01, 0.25).tolist())

@@ -54,8 +54,8 @@ class MountSlip(Effect):
     confounded_with = ("mount_creep", "mount", "optitrack_distortion")
     source = "size assumed"
     shape_name, shape = "t_s", 900.0
+    jumps = True
     of_lidar = True
-    once = True  # or little by little
     sigma = np.repeat([0.001, 0.001], 3)
 
     def shapes(self, stops: View) -> tuple[float, ...]:
@@ -93,7 +93,7 @@ class MountCreep(MountSlip):
     typical = "0.05 to 0.5 mm per hour, size assumed; printed resin relaxes"
     confounded_with = ("mount_slip", "warmup_drift", "mount")
     shape_name, shape = "", 0.0
-    once = False
+    jumps = False
     sigma = np.repeat([0.002, 0.001], 3)
 
     def shapes(self, stops: View) -> tuple[float, ...]:
@@ -115,7 +115,7 @@ class MountSettle(MountSlip):
     typical = "0.1 to 1 mm, 0.1 to 1 mrad, size assumed; printed resin and rubber relax"
     confounded_with = ("mount_creep", "mount_slip", "warmup_drift")
     shape_name, shape = "tau_s", 300.0
-    once = False
+    jumps = False
 
     def shapes(self, stops: View) -> tuple[float, ...]:
         """Shares of the time measured in: after a longer one it would look like `mount_creep`."""

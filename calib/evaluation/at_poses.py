@@ -22,10 +22,10 @@ from calib.problem import Problem
 from calib.problem.model import Source, stop_columns
 from calib.results.intervals import Intervals, intervals
 from calib.results.reach import body_beyond, joint_range, placed
-from calib.runs.reopen import problem_of, reopened, start_of, state_of
+from calib.runs.reopen import model_of, problem_of, reopened, start_of, state_of
 from calib.runs.run import Run
 from calib.solve.estimate import Estimate
-from calib.solve.fit import Progress, solve
+from calib.solve.fit import Progress, shapes_freed, solve
 from chains import se3
 from chains.errors import InputError
 from sensors.stops import CsvTable, write_columns
@@ -110,7 +110,9 @@ def evaluate_at(
     sources = reopened(run)
     problem, source = problem_of(run, sources), sources[0]
     state_of(run, problem)
-    estimate = solve(problem, progress=progress, start=start_of(run, sources))
+    fitted = solve(problem, progress=progress, start=start_of(run, sources))
+    estimate = shapes_freed(fitted, model_of(run))
+    problem = estimate.problem
     if body_beyond(problem) is None:
         raise InputError(
             f"{run.folder}: no tracked body hangs from an arm in its recordings, so there is no "

@@ -14,6 +14,7 @@ from calib.results.solution import (
     EffectEstimate,
     FrameEstimate,
     Part,
+    ShapeEstimate,
     effect_document,
     frame_document,
 )
@@ -149,12 +150,19 @@ class _Frame(Document):
     sigma_rad: _Triple
 
 
+class _Shape(Document):
+    name: str
+    value: Number
+    sigma: Number
+
+
 class _Effect(Document):
     formula: str
     unit: str
     names: tuple[str, ...]
     estimate: tuple[Number, ...]
     sigma: tuple[Number, ...]
+    shape: _Shape | None = None
 
 
 class _Rings(Document):
@@ -191,7 +199,13 @@ def _read_part(part: _Part, path: Path | str, marks: Marks, at: tuple[str, ...])
         sigmas = np.array(frame.sigma_m), np.array(frame.sigma_rad)
         frames[name] = FrameEstimate(frame.parent, T, *sigmas)
     effects = {
-        name: EffectEstimate(e.unit, e.names, np.array(e.estimate), np.array(e.sigma))
+        name: EffectEstimate(
+            e.unit,
+            e.names,
+            np.array(e.estimate),
+            np.array(e.sigma),
+            e.shape and ShapeEstimate(**e.shape.model_dump()),
+        )
         for name, e in part.effects.items()
     }
     for name, rings in part.rings.items():

@@ -121,8 +121,8 @@ class CellsFirst(Assembly):
         return stacked, square(stacked), about_own
 
     def _without_own(self, rest: np.ndarray, over: np.ndarray) -> np.ndarray:
-        """From [twists | kept | b], of the columns `over`, to all [kept | b]: through the chain, then
-        stops' own unknowns."""
+        """From [twists | kept | b], of the columns `over`, to [kept | b] with all that are kept:
+        through the chain, then stops' own unknowns."""
         layout = self.layout
         own = np.concatenate([np.zeros(0, int), *layout.own.values()])
         columns = np.concatenate([own, layout.kept, [layout.size]])
@@ -141,9 +141,9 @@ class CellsFirst(Assembly):
         return left
 
     def _chained(self, rest: np.ndarray, over: np.ndarray, own: np.ndarray) -> np.ndarray:
-        """From [twists | kept | b], of the columns `over`, to [own | all kept | b] by the chain rule,
-        in units of sigmas. Unknowns that place a LiDAR and are neither in `own` nor kept are left
-        out."""
+        """From [twists | kept | b], of the columns `over`, to [own | kept | b], with all that are
+        kept, by the chain rule, in units of sigmas. Unknowns that place a LiDAR and are neither in
+        `own` nor kept are left out."""
         layout, first = self.layout, self.first
         columns = np.concatenate([own, layout.kept, [layout.size]])
         at = positions(layout.size + 1, columns)

@@ -11,12 +11,13 @@ from scipy.special import chdtrc
 
 from calib.effects import FrameOffset
 from calib.problem import Problem
+from calib.problem.model import Model
 from calib.problem.prior import JointPrior
 from calib.problem.unknowns import Unknown
 from calib.results.intervals import Intervals, intervals
 from calib.results.solution import Solution
 from calib.solve.estimate import Estimate
-from calib.solve.fit import Progress, solve
+from calib.solve.fit import Progress, shapes_freed, solve
 from chains import se3
 from chains.errors import InputError
 
@@ -98,16 +99,18 @@ class RefittedPrior(NamedTuple):
 
 
 def solve_from(
-    problem: Problem, prior: JointPrior, progress: Progress
-) -> tuple[Estimate, Intervals, list[Link]]:
-    """Estimate with an earlier solution as prior, letting go link by link of what has moved; with
-    its intervals, and what became of each link; see `let_go`."""
-    found: list[tuple[Estimate, Intervals]] = []
+    problem: Problem, model: Model, prior: JointPrior, progress: Progress
+) -> tuple[Estimate, Estimate, Intervals, list[Link]]:
+    """Estimate with an earlier solution as prior, letting go link by link of what has moved; the
+    same with its shapes among the unknowns, the intervals of that, and what became of each link;
+    see `let_go` and `shapes_freed`."""
+    found: list[tuple[Estimate, Estimate, Intervals]] = []
 
     def fit(prior: JointPrior) -> RefittedPrior:
         estimate = solve(problem, prior, progress=progress)
-        known = intervals(estimate, progress)
-        found.append((estimate, known))
+        freed = shapes_freed(estimate, model, prior)
+        known = intervals(freed, progress)
+        found.append((estimate, freed, known))
         held = known.of([v.name for v in prior.held])
         return RefittedPrior(_change(prior, estimate), held.graph, held.covariance)
 

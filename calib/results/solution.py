@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from calib.effects import FrameOffset
+from calib.effects import FrameOffset, ShapeStep
 from calib.effects.rig import DOF
 from calib.forward import Term, named
 from calib.problem import Problem
 from calib.problem.model import Source
 from calib.problem.spread import names_of
 from calib.problem.unknowns import POSE_UNITS, Key
+from calib.results.intervals import Intervals
 from calib.results.observability import not_estimated
 from calib.solve.components import spreads
 from calib.solve.estimate import Estimate
@@ -33,16 +34,28 @@ class FrameEstimate:
 
 
 @dataclass(frozen=True)
+class ShapeEstimate:
+    """The shape of an effect, by its name with the unit (``tau_s``), with its sigma: how far it may
+    be off, other parameters going along with it."""
+
+    name: str
+    value: float
+    sigma: float
+
+
+@dataclass(frozen=True)
 class EffectEstimate:
     """An effect's parameters (P,), with their sigma; 0 is held.
 
     The unit is that of all, or a list with commas that has one for each, as `one_unit` writes it.
+    A shape that was estimated stands beside them.
     """
 
     unit: str
     names: tuple[str, ...]
     estimate: np.ndarray
     sigma: np.ndarray
+    shape: ShapeEstimate | None = None
 
     @property
     def units(self) -> tuple[str, ...]:
@@ -103,14 +116,17 @@ class Solution:
         return out
 
 
-def solution_of(problem: Problem, estimate: Estimate, told: np.ndarray | None = None) -> Solution:
+def solution_of(problem: Problem, estimate: Estimate, known: Intervals | None = None) -> Solution:
     """An estimate as frames and effects, with what it could not tell.
 
     Args:
         problem, estimate: what was estimated, and how it came out.
-        told: (P, P) covariance of its variables, as intervals have it; the graph's where None.
+        known: the intervals of its variables, and of shapes; as the graph has them where None.
     """
-    told = estimate.covariance if told is None else told
+    mine = None if known is None else known.of([v.name for v in estimate.variables])
+    told, graph = estimate.covariance, estimate.covariance
+    if mine is not None:
+        told, graph = mine.covariance, mine.graph
     start = np.cumsum([0] + [v.dim for v in estimate.variables])
     at = {v.name: slice(a, a + v.dim) for v, a in zip(estimate.variables, start, strict=False)}
     shared, recordings, scatter = Part(), {}, spreads(estimate)
@@ -126,7 +142,8 @@ def solution_of(problem: Problem, estimate: Estimate, told: np.ndarray | None = 
             if isinstance(term.effect, FrameOffset):
                 part.frames[term.effect.name] = _frame(source, term, theta, covariance)
             else:
-                part.effects[term.effect.name] = _effect(source, term, theta, covariance)
+                found = _effect(source, term, theta, covariance)
+                part.effects[term.effect.name] = replace(found, shape=_shape(term, known))
         if rig.reference_frame in at:
             covariance = told[at[rig.reference_frame], at[rig.reference_frame]]
             T = estimate.values[rig.reference_frame]
@@ -148,7 +165,7 @@ def solution_of(problem: Problem, estimate: Estimate, told: np.ndarray | None = 
         not_estimated=untold + _absent(problem),
         keys=tuple(key for v in estimate.variables for key in v.keys),
         covariance=told,
-        graph=estimate.covariance,
+        graph=graph,
     )
 
 
@@ -179,6 +196,15 @@ def _effect(
     sigma[term.free] = np.sqrt(np.diag(covariance))
     unit = one_unit([p.unit for p in params])
     return EffectEstimate(unit, tuple(p.name for p in params), estimate, sigma)
+
+
+def _shape(term: Term, known: Intervals | None) -> ShapeEstimate | None:
+    """What is known of the shape of an effect, where that was among the unknowns."""
+    effect, step = term.effect, named(ShapeStep.name_of(term.effect), term.rig)
+    if known is None or step not in known.names:
+        return None
+    log = float(np.sqrt(known.of([step]).covariance[0, 0]))
+    return ShapeEstimate(effect.shape_name, effect.shape, effect.shape * log)
 
 
 def _spread(
@@ -246,11 +272,13 @@ def frame_document(frame: FrameEstimate) -> dict[str, Any]:
 
 def effect_document(effect: EffectEstimate) -> dict[str, Any]:
     """An effect's parameters as the contract writes them."""
+    shape = {} if effect.shape is None else {"shape": asdict(effect.shape)}
     return {
         "unit": effect.unit,
         "names": effect.names,
         "estimate": effect.estimate,
         "sigma": effect.sigma,
+        **shape,
     }
 
 

@@ -62,7 +62,7 @@ from calib.runs.run import (
 )
 from calib.runs.stored import RUN_FORMAT
 from calib.solve.estimate import Estimate, Start
-from calib.solve.fit import Progress, solve
+from calib.solve.fit import Progress, shapes_freed, solve
 from chains.errors import InputError
 from sensors.documents import write_json, write_yaml
 from sensors.recording import write_table
@@ -201,9 +201,11 @@ def _fit(
     links: list[Link] | None = None
     if before is None:
         estimate = solve(problem, progress=progress, start=start)
-        known = intervals(estimate, progress)
+        freed = shapes_freed(estimate, model)  # the same where no effect has a shape
+        known = intervals(freed, progress)
     else:
-        estimate, known, links = solve_from(problem, earlier(problem, before), progress)
+        prior = earlier(problem, before)
+        estimate, freed, known, links = solve_from(problem, model, prior, progress)
     unseen, unit = _held_out(sources, model, estimate, folder / RESIDUALS, choices, progress)
     nominal = _nominal(problem, progress)
     seen_at = ColumnRanges(model.effects)
@@ -222,7 +224,7 @@ def _fit(
     widened = max([1.0, *large.values()])
     known = known.at_least(widened, cad)
     calibration = known.of([v.name for v in estimate.variables])
-    solution = solution_of(problem, estimate, calibration.covariance)
+    solution = solution_of(problem, estimate, known)
     arrays = {"covariance": solution.covariance, "graph": solution.graph}
     np.savez(folder / COVARIANCE, names=np.array(solution.names), **arrays)
     write_state(folder, estimate.state, stored_met(estimate.start, sources))
@@ -233,7 +235,7 @@ def _fit(
     write_rows(folder / RESIDUALS, *rows)
     by = {**misfit_by(estimate, *rows, by_stop), "limit": limits(redundancies(*rows))}
     summary |= {"misfit": misfit(estimate, seen), "misfit_by": by}
-    reached = reach(problem, estimate, known)
+    reached = reach(freed.problem, freed, known)
     summary |= {"sigmas_widened_by": widened, "cad_widened_by": cad, "held_out_by": unit}
     summary |= {"without": list(model.without), "extrapolated": seen_at.sentences()}
     summary |= {"intervals_wider_by": calibration.document(solution.names)}

@@ -16,7 +16,14 @@ import numpy as np
 
 from calib import outputs
 from calib.effects import Trust, trusted
-from calib.results.solution import EffectEstimate, FrameEstimate, Part, Solution, units_of
+from calib.results.solution import (
+    EffectEstimate,
+    FrameEstimate,
+    Part,
+    ShapeEstimate,
+    Solution,
+    units_of,
+)
 from calib.runs.stored import FIT_AGAIN, read_arrays, read_json, read_model, read_summary
 from chains import se3
 from chains.errors import InputError
@@ -310,6 +317,7 @@ def _read_part(data: Mapping[str, Any]) -> Part:
             tuple(e["names"]),
             np.array(e["estimate"], float),
             np.array(e["sigma"], float),
+            ShapeEstimate(**e["shape"]) if "shape" in e else None,
         )
         for name, e in data["effects"].items()
     }

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
 from calib.linear.linearise import beams_cost
+from calib.problem.build import build
+from calib.problem.model import Model
 from calib.problem.problem import Block, Problem
+from calib.problem.shapes import shape_steps
 from calib.solve.added import declared
 from calib.solve.descent import AT_OPTIMUM, LAST, SLOWED, STEADY, UPHILL
 from calib.solve.estimate import Estimate, Start, cost_of, values_of
@@ -231,3 +235,30 @@ def resume(
     if whole:
         loop.linearise_here()
     return loop.as_it_stands(converged, whole)
+
+
+def shapes_freed(
+    estimate: Estimate,
+    model: Model,
+    prior: Block | None = None,
+    progress: Progress = lambda what, done, total: None,
+) -> Estimate:
+    """A fit as it stands, with the shapes of its effects among the unknowns: what is known of a
+    drift depends on what is known of its time constant.
+
+    Args:
+        estimate: of the model, with its graph.
+        model: the model.
+        prior, progress: as of `solve`.
+
+    Returns:
+        The same estimate where no effect has such a shape.
+    """
+    problem = estimate.problem
+    steps = shape_steps(problem, model, estimate.values)
+    if not steps:
+        return estimate
+    wide = build(problem.sources, model.plus(steps), meetings=problem.meetings)
+    there = {name: np.zeros(1) for name in wide.variables if name not in problem.variables}
+    start = replace(estimate.start, state=estimate.state | there)
+    return resume(wide, start, progress, estimate.converged, prior, whole=True)

@@ -17,10 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from calib.diagnosis.candidates import stops_view
 from calib.effects import CATALOGUE, DEFAULT, Effect, Site, find, load_effects
 from calib.problem import Problem, build
 from calib.problem.model import Model, Source
+from calib.problem.shapes import stops_view
 from calib.residuals.targets import HangingTarget
 from calib.residuals.tracker import TrackedBody
 from calib.simulation import Spec, simulate

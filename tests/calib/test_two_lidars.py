@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from calib.diagnosis.candidates import shapes_of, stops_view
 from calib.diagnosis.curves import curves
 from calib.effects import find
 from calib.problem.model import Source
+from calib.problem.shapes import shapes_of, stops_view
 from calib.runs.calibrate import calibrate
 from calib.runs.diagnose import stand_of
 from calib.simulation import Spec, simulate

@@ -14,7 +14,6 @@ from itertools import chain
 import numpy as np
 from scipy.sparse import csr_array, eye_array
 
-from calib.diagnosis.candidates import stops_view
 from calib.diagnosis.formulas.factors import covariates_of
 from calib.diagnosis.formulas.table import BeamTable, rows_of_others
 from calib.diagnosis.linear import beside
@@ -22,6 +21,7 @@ from calib.diagnosis.stand import Stand, variables_of
 from calib.effects.own.formula import FormulaEffect
 from calib.linear.clusters import Gradients
 from calib.linear.layout import Layout
+from calib.problem.shapes import stops_view
 
 # Unknowns that stops share: with more no table is made.
 MOST_UNKNOWNS = 3000

@@ -73,7 +73,7 @@ def _candidate(
     rivals = _rivals(found.found[step - 1]) if step else []
     estimate, sigma = test.estimate(), test.sigma(max(clean, 1.0))
     if step:
-        estimate = found.looks[-1].stand.theta(effect, whole=False)
+        estimate = found.looks[-1].stand.theta(effect)
         sigma = found.looks[-1].stand.sigma(effect)
     level = ALPHA_NOISE if noise else ALPHA_EFFECT
     alpha = -np.expm1(np.log1p(-level) / candidate.looks)
