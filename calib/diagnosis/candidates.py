@@ -15,8 +15,8 @@ import numpy as np
 from calib.effects import CATALOGUE, Effect, OneHot, Param, Site, View
 from calib.effects.basis import RANGE
 from calib.effects.rig import MountSlip
+from calib.problem.build import shapes_of
 from calib.problem.model import Model, Source
-from calib.problem.shapes import shapes_of
 from calib.rig import Rig
 
 # Bins of a covariate, of each of two, and of azimuth, whose harmonics turn several times about. A

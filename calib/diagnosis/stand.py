@@ -23,8 +23,8 @@ from calib.forward import named
 from calib.linear.layout import Layout
 from calib.linear.system import Linearisation
 from calib.problem import Problem
+from calib.problem.build import shapes_of, theta_of
 from calib.problem.model import Model, Source
-from calib.problem.shapes import shapes_of, theta_of
 from calib.problem.without import leave_out
 from calib.residuals.groups import Group
 from calib.residuals.scan import ScanStop

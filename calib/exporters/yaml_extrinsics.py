@@ -200,11 +200,11 @@ def _read_part(part: _Part, path: Path | str, marks: Marks, at: tuple[str, ...])
         frames[name] = FrameEstimate(frame.parent, T, *sigmas)
     effects = {
         name: EffectEstimate(
-            e.unit,
-            e.names,
-            np.array(e.estimate),
-            np.array(e.sigma),
-            e.shape and ShapeEstimate(**e.shape.model_dump()),
+            unit=e.unit,
+            names=e.names,
+            estimate=np.array(e.estimate),
+            sigma=np.array(e.sigma),
+            shape=e.shape and ShapeEstimate(**e.shape.model_dump()),
         )
         for name, e in part.effects.items()
     }

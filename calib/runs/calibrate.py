@@ -201,11 +201,12 @@ def _fit(
     links: list[Link] | None = None
     if before is None:
         estimate = solve(problem, progress=progress, start=start)
-        freed = shapes_freed(estimate, model)  # the same where no effect has a shape
-        known = intervals(freed, progress)
+        wide = shapes_freed(estimate, model)  # the same where no effect has a shape
+        known = intervals(wide, progress)
     else:
-        prior = earlier(problem, before)
-        estimate, freed, known, links = solve_from(problem, model, prior, progress)
+        estimate, wide, known, links = solve_from(
+            problem, model, earlier(problem, before), progress
+        )
     unseen, unit = _held_out(sources, model, estimate, folder / RESIDUALS, choices, progress)
     nominal = _nominal(problem, progress)
     seen_at = ColumnRanges(model.effects)
@@ -235,12 +236,11 @@ def _fit(
     write_rows(folder / RESIDUALS, *rows)
     by = {**misfit_by(estimate, *rows, by_stop), "limit": limits(redundancies(*rows))}
     summary |= {"misfit": misfit(estimate, seen), "misfit_by": by}
-    reached = reach(freed.problem, freed, known)
+    reached = reach(wide.problem, wide, known)
     summary |= {"sigmas_widened_by": widened, "cad_widened_by": cad, "held_out_by": unit}
     summary |= {"without": list(model.without), "extrapolated": seen_at.sentences()}
     summary |= {"intervals_wider_by": calibration.document(solution.names)}
-    summary["rings"] = odd_rings(sources)
-    summary["set_aside"] = sorted(estimate.problem.set_aside)
+    summary |= {"rings": odd_rings(sources), "set_aside": sorted(estimate.problem.set_aside)}
     summary["predicted_mm"] = reached.document() if reached else None
     summary["seconds"] = time.monotonic() - began
     if links is not None:

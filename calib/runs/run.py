@@ -313,11 +313,11 @@ def _read_part(data: Mapping[str, Any]) -> Part:
     }
     effects = {
         name: EffectEstimate(
-            e["unit"],
-            tuple(e["names"]),
-            np.array(e["estimate"], float),
-            np.array(e["sigma"], float),
-            ShapeEstimate(**e["shape"]) if "shape" in e else None,
+            unit=e["unit"],
+            names=tuple(e["names"]),
+            estimate=np.array(e["estimate"], float),
+            sigma=np.array(e["sigma"], float),
+            shape=ShapeEstimate(**e["shape"]) if "shape" in e else None,
         )
         for name, e in data["effects"].items()
     }

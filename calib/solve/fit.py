@@ -8,10 +8,9 @@ from dataclasses import replace
 import numpy as np
 
 from calib.linear.linearise import beams_cost
-from calib.problem.build import build
+from calib.problem.build import build, shape_steps
 from calib.problem.model import Model
 from calib.problem.problem import Block, Problem
-from calib.problem.shapes import shape_steps
 from calib.solve.added import declared
 from calib.solve.descent import AT_OPTIMUM, LAST, SLOWED, STEADY, UPHILL
 from calib.solve.estimate import Estimate, Start, cost_of, values_of

@@ -19,8 +19,8 @@ import numpy as np
 
 from calib.effects import CATALOGUE, DEFAULT, Effect, Site, find, load_effects
 from calib.problem import Problem, build
+from calib.problem.build import stops_view
 from calib.problem.model import Model, Source
-from calib.problem.shapes import stops_view
 from calib.residuals.targets import HangingTarget
 from calib.residuals.tracker import TrackedBody
 from calib.simulation import Spec, simulate

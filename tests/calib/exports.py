@@ -93,3 +93,9 @@ def as_fitted(
         values[name] = se3.log(se3.inverse(T_cad) @ part.frames[name].T_parent_child)
         terms.append(Term(FrameOffset(name), name, np.arange(6)))
     return place(source.rig, terms, joints, {}, "root", None).in_root(frame, values)
+
+
+def none_of(unit: str, names: tuple[str, ...]) -> EffectEstimate:
+    """An effect whose parameters are all 0, and exact."""
+    zeros = np.zeros(len(names))
+    return EffectEstimate(unit=unit, names=names, estimate=zeros, sigma=zeros)

@@ -11,7 +11,7 @@ from calib.planning.purpose import components
 from calib.problem.model import Model
 from calib.problem.unknowns import Key, Owner, vector_unknown
 from calib.report.charts.knowledge import tied
-from calib.results.solution import EffectEstimate, Part, Solution
+from calib.results.solution import Part, Solution
 from calib.runs.run import COVARIANCE, SOLUTION, read_solution
 from calib.show.plan import _together, known_rows
 from chains.errors import InputError
@@ -37,6 +37,8 @@ UNKNOWNS = {
 STAND = SimpleNamespace(
     estimate=SimpleNamespace(problem=SimpleNamespace(calibration=[*UNKNOWNS], variables=UNKNOWNS))
 )
+
+from .exports import none_of
 
 
 @pytest.mark.parametrize("gone", ["range_cyclic@1", "range_cyclic@1.2"])
@@ -70,7 +72,7 @@ def test_one_effect_has_one_owner_however_its_parameters_are_called():
 def test_the_mean_of_a_large_effect_is_of_that_alone_and_of_one_unit():
     units = {"arm@1": "m", "arm@1.2": ", ".join(["m", "rad"] * 8), "arm@1.2.3": "rad"}
     names = tuple(f"joint_{k}.{way}" for k in range(8) for way in ("a", "b"))
-    effects = {n: EffectEstimate(unit, names, *np.zeros((2, 16))) for n, unit in units.items()}
+    effects = {n: none_of(unit, names) for n, unit in units.items()}
     keys = tuple(Key(n, dof) for n in units for dof in names)
     solution = Solution(
         shared=Part(effects=effects),
@@ -96,7 +98,7 @@ def test_a_plan_tells_parameters_of_one_unknown_together():
 
 
 def test_a_solution_is_read_as_it_was_written(tmp_path):
-    own = {n: EffectEstimate("m", dofs, *np.zeros((2, len(dofs)))) for n, dofs in EFFECTS.items()}
+    own = {n: none_of("m", dofs) for n, dofs in EFFECTS.items()}
     solution = Solution(
         shared=Part(),
         recordings={"box": Part(effects=own)},

@@ -24,7 +24,8 @@ def run(tmp_path):
 
     def rings(count):
         names = tuple(f"ring_{k:03d}" for k in range(count))
-        return EffectEstimate("m", names, *rng.normal(0, 0.01, (2, count)))
+        estimate, sigma = rng.normal(0, 0.01, (2, count))
+        return EffectEstimate(unit="m", names=names, estimate=estimate, sigma=sigma)
 
     link = EffectEstimate("m", ("turn", "tip"), np.array([1e-3, 0.0]), np.array([1e-4, 0.0]))
     own = {

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
+from calib.problem.model import Model
 from calib.problem.prior import JointPrior
 from calib.problem.unknowns import Unknown
 from calib.results import recalibrate
@@ -82,9 +83,12 @@ def world(monkeypatch):
         monkeypatch.setattr(recalibrate, "solve", solve)
         known = as_the_graph_has_them if noise == 1.0 else as_the_rows_have_them
         monkeypatch.setattr(recalibrate, "intervals", known)
+        monkeypatch.setattr(recalibrate, "shapes_freed", lambda estimate, *_: estimate)
         prior = JointPrior(variables, values(m), then)
         problem = SimpleNamespace(calibration=NAMES, variables={v.name: v for v in variables})
-        return {link.name: link for link in recalibrate.solve_from(problem, prior, None)[2]}
+        return {
+            link.name: link for link in recalibrate.solve_from(problem, Model(), prior, None)[-1]
+        }
 
     return at
 

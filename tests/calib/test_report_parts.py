@@ -11,9 +11,11 @@ from calib.problem.unknowns import Key
 from calib.report.charts.bodies import Arrows, magnification
 from calib.report.charts.groups import groups
 from calib.report.charts.knowledge import tied
-from calib.results.solution import EffectEstimate, Part, Solution
+from calib.results.solution import Part, Solution
 from calib.runs.run import Run
 from calib.show.verdict import judge
+
+from .exports import none_of
 
 
 def test_correlations_are_those_of_the_covariance_and_large_effects_are_summed_up():
@@ -23,7 +25,7 @@ def test_correlations_are_those_of_the_covariance_and_large_effects_are_summed_u
     covariance[3:, 3:] += 1.0
     covariance[2, 3:] = covariance[3:, 2] = -0.7
     names = {"a": ("x", "y"), "b": ("z",), "rings": tuple(key.dof for key in keys[3:])}
-    effects = {n: EffectEstimate("m", some, *np.zeros((2, len(some)))) for n, some in names.items()}
+    effects = {n: none_of("m", some) for n, some in names.items()}
     shared = Part(effects=effects)
     chosen, matrix = tied(
         Solution(

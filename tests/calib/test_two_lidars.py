@@ -5,8 +5,8 @@ import pytest
 
 from calib.diagnosis.curves import curves
 from calib.effects import find
+from calib.problem.build import shapes_of, stops_view
 from calib.problem.model import Source
-from calib.problem.shapes import shapes_of, stops_view
 from calib.runs.calibrate import calibrate
 from calib.runs.diagnose import stand_of
 from calib.simulation import Spec, simulate

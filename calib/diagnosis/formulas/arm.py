@@ -21,7 +21,7 @@ from calib.diagnosis.stand import Stand, variables_of
 from calib.effects.own.formula import FormulaEffect
 from calib.linear.clusters import Gradients
 from calib.linear.layout import Layout
-from calib.problem.shapes import stops_view
+from calib.problem.build import stops_view
 
 # Unknowns that stops share: with more no table is made.
 MOST_UNKNOWNS = 3000
