@@ -204,9 +204,8 @@ def _fit(
         wide = shapes_freed(estimate, model)  # the same where no effect has a shape
         known = intervals(wide, progress)
     else:
-        estimate, wide, known, links = solve_from(
-            problem, model, earlier(problem, before), progress
-        )
+        held = earlier(problem, before)
+        estimate, wide, known, links = solve_from(problem, model, held, progress)
     unseen, unit = _held_out(sources, model, estimate, folder / RESIDUALS, choices, progress)
     nominal = _nominal(problem, progress)
     seen_at = ColumnRanges(model.effects)
@@ -214,11 +213,7 @@ def _fit(
     seen = sum(by_stop.values(), Errors())
     if not estimate.scans:
         seen = body_errors(problem.bodies, estimate.values, None)
-    if not seen.count and not problem.blocks:
-        raise InputError(
-            f"{sources[0].recording.folder}: no beam meets a surface and no tracked body was seen, "
-            "so there is nothing to fit to; 'rigcal check' says what is missing"
-        )
+    _refuse_nothing(problem, seen)
     bulk = misfit(estimate, seen, weighted=True)  # one wild row widens no sigma
     large = {kind: times for kind, times in bulk.items() if times > TOLERATED}
     cad = large.pop(CAD, 1.0) if before is None else 1.0  # an earlier run stands in place of CAD
@@ -254,6 +249,14 @@ def _refuse_twice(recordings: Sequence[Path]) -> None:
     for recording in recordings:
         if recordings.count(recording) > 1:
             raise InputError(f"{recording} is given twice; as data it counts once")
+
+
+def _refuse_nothing(problem: Problem, seen: Errors) -> None:
+    if not seen.count and not problem.blocks:
+        raise InputError(
+            f"{problem.sources[0].recording.folder}: no beam meets a surface and no tracked body "
+            "was seen, so there is nothing to fit to; 'rigcal check' says what is missing"
+        )
 
 
 def _nominal(problem: Problem, progress: Progress) -> Errors:
