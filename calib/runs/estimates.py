@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from calib.effects.rig import DOF
-from calib.results.solution import EffectEstimate, FrameEstimate
+from calib.results.solution import EffectEstimate, FrameEstimate, ShapeEstimate
 from calib.rig import Rig, load_rig
 from calib.runs.run import Run
 from chains import se3
@@ -32,6 +32,7 @@ class VariableEstimate:
             where no CAD says where it should be.
         sigma: (n,); 0 is held.
         told: (n,) bool, False where the data could not tell.
+        shape: of an effect, where its shape was estimated.
     """
 
     variable: str
@@ -41,6 +42,7 @@ class VariableEstimate:
     estimate: np.ndarray
     sigma: np.ndarray
     told: np.ndarray
+    shape: ShapeEstimate | None = None
 
 
 def variable_estimates(run: Run) -> list[VariableEstimate]:
@@ -166,6 +168,7 @@ def _effect(
         estimate=effect.estimate,
         sigma=effect.sigma,
         told=_told(variable, effect.names, untold),
+        shape=effect.shape,
     )
 
 

@@ -278,7 +278,12 @@ def effects_table(rows: Sequence[VariableEstimate]) -> Table:
 
 
 def effect_cells(row: VariableEstimate) -> Iterable[tuple[str, str, str, bool]]:
-    """Parameter, its cell, unit and whether it was told: one by one, or of each unit a summary."""
+    """Parameter, its cell, unit and whether it was told: one by one, or of each unit a summary; and
+    the shape, whose name ends with its unit."""
+    if row.shape is not None:
+        name, _, unit = row.shape.name.rpartition("_")
+        value, spread = estimate_texts(row.shape.value, row.shape.sigma, unit)
+        yield name, f"{value.lstrip('+')} ± {spread}", shown(unit)[1], True
     if len(row.parameters) > LISTED_PARAMETERS:
         for unit in dict.fromkeys(row.units):
             free = (row.sigma > 0) & (np.array(row.units) == unit)

@@ -17,6 +17,8 @@ from calib.show.plan import _together, known_rows
 from chains.errors import InputError
 from sensors.documents import write_yaml
 
+from .exports import none_of
+
 # Each name is the start, or the end, of another.
 EFFECTS = {
     "range_cyclic@1": ("cos", "sin"),
@@ -37,8 +39,6 @@ UNKNOWNS = {
 STAND = SimpleNamespace(
     estimate=SimpleNamespace(problem=SimpleNamespace(calibration=[*UNKNOWNS], variables=UNKNOWNS))
 )
-
-from .exports import none_of
 
 
 @pytest.mark.parametrize("gone", ["range_cyclic@1", "range_cyclic@1.2"])

@@ -13,7 +13,9 @@ from calib.linear.linearise import beams_cost
 from calib.problem.model import Model
 from calib.results.intervals import intervals
 from calib.runs.calibrate import calibrate
+from calib.runs.estimates import variable_estimates
 from calib.runs.run import Run
+from calib.show.tables import effect_cells
 from calib.simulation import Spec
 from calib.solve.fit import shapes_freed, solve
 
@@ -102,6 +104,8 @@ def test_a_run_tells_the_shape_with_its_sigma(source, tmp_path):
     assert 5 < told["sigma"] < 480
     shape = Run.open(run.folder).solution.shared.effects[DRIFT].shape
     assert shape.sigma == told["sigma"]
+    row = next(row for row in variable_estimates(run) if row.variable == DRIFT)
+    assert next(iter(effect_cells(row))) == ("tau", f"480 ± {told['sigma']:.0f}", "s", True)
     assert "shape" not in document["effects"]["ring_range_offset"]
 
 
