@@ -24,7 +24,7 @@ fit {rec} -o run --effects ring_range_offset --hold-out none --workers {n}
 add run arm_gravity_sag ../mine.yaml -o deeper/run --workers {n}
 fit {rec} -o later --prior run --hold-out stop --without L01P01:joint_2 --workers {n}
 diagnose later --candidates ../mine.yaml --workers {n}
-plan later --stops 2 -o stops.csv --workers {n}
+plan later --stops 2 --candidates 60 -o stops.csv --workers {n}
 evaluate deeper/run
 report later -o report.html
 plot run rings -o rings.svg
@@ -41,7 +41,7 @@ compare run deeper/run later --json
 moved run deeper/run --json
 effects --json
 reproduce deeper/run --json
-plan later --stops 1 --for lidar,arm_gravity_sag --json
+plan later --stops 1 --for lidar,arm_gravity_sag --candidates 60 --json
 """
 SERVING = {"view"}
 WAYS = {  # PYTHONHASHSEED, threads of a BLAS call, threads over stops
