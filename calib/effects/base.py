@@ -209,7 +209,7 @@ class ShapeStep(Effect):
 
     def __init__(self, effect: Effect, theta: Mapping[str, np.ndarray], sigma: float = 1.0) -> None:
         self.effect, self.theta, self.sigma, self.site = effect, theta, sigma, effect.site
-        self.name = self.name_of(effect)
+        self.name, self.shape = self.name_of(effect), effect.shape
 
     @staticmethod
     def name_of(effect: Effect) -> str:

@@ -161,4 +161,4 @@ def theta_of(
 def _width(effect: Effect, sources: Sequence[Source]) -> float:
     """Standard deviation of the logarithm of a shape that is anywhere among those worth trying."""
     tried = [shape for shape in (*shapes_of(effect, sources), effect.shape) if shape > 0]
-    return float(np.log(max(tried) / min(tried)) / np.sqrt(12.0))
+    return float(np.log(max(tried, default=1.0) / min(tried, default=1.0)) / np.sqrt(12.0))

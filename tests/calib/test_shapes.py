@@ -96,6 +96,16 @@ def test_without_such_an_effect_it_is_the_same_estimate(fits):
     assert shapes_freed(fit, Model()) is fit
 
 
+def test_two_shapes_of_one_effect_have_a_sigma_each(source):
+    waves = "range_cyclic@1", "range_cyclic@1.7"
+    model = Model(effects=("ring_range_offset", *waves))
+    fit = solve(problems.build([source], model), spread=False)
+    known = intervals(shapes_freed(fit, model))
+    apart = known.of([f"shape of {name}" for name in waves]).covariance
+    assert np.all(np.diag(apart) > 0)
+    assert abs(apart[0, 1]) < np.sqrt(apart[0, 0] * apart[1, 1])
+
+
 def test_a_run_tells_the_shape_with_its_sigma(source, tmp_path):
     run = calibrate([source.recording.folder], tmp_path / "run", with_shape(480))
     document = yaml.safe_load((run.folder / "solution.yaml").read_text())
