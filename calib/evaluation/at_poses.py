@@ -110,9 +110,7 @@ def evaluate_at(
     sources = reopened(run)
     problem, source = problem_of(run, sources), sources[0]
     state_of(run, problem)
-    fitted = solve(problem, progress=progress, start=start_of(run, sources))
-    estimate = shapes_freed(fitted, model_of(run))
-    problem = estimate.problem
+    estimate = solve(problem, progress=progress, start=start_of(run, sources))
     if body_beyond(problem) is None:
         raise InputError(
             f"{run.folder}: no tracked body hangs from an arm in its recordings, so there is no "
@@ -123,8 +121,8 @@ def evaluate_at(
             f"{run.folder}: the base moves and no body on it is tracked, so nothing tells where it "
             f"is at these poses"
         )
-    known = _known(run, estimate, progress)
-    found = _predicted(run, problem, estimate, known, *_read(Path(poses), source))
+    told = _known(run, estimate, progress)
+    found = _predicted(run, *told, *_read(Path(poses), source))
     if out is not None:
         if Path(out).suffix != ".csv":
             raise InputError(f"{out}: the poses are written as a table; give FILE.csv")
@@ -140,14 +138,15 @@ def says_where_the_base_is(problem: Problem) -> bool:
     return beyond is not None and (beyond.base or problem.sources[0].rig.moves == "never")
 
 
-def _known(run: Run, estimate: Estimate, progress: Progress) -> Intervals:
-    """Intervals of all unknowns, as the run reports them."""
-    return intervals(estimate, progress).at_least(run.summary["sigmas_widened_by"])
+def _known(run: Run, estimate: Estimate, progress: Progress) -> tuple[Estimate, Intervals]:
+    """The estimate with shapes among its unknowns, and the intervals of all, as the run reports
+    them."""
+    freed = shapes_freed(estimate, model_of(run))
+    return freed, intervals(freed, progress).at_least(run.summary["sigmas_widened_by"])
 
 
 def _predicted(
     run: Run,
-    problem: Problem,
     estimate: Estimate,
     known: Intervals,
     names: Sequence[str],
@@ -156,6 +155,7 @@ def _predicted(
 ) -> Predicted:
     """Where the arm of the first recording truly brings its last tracked body, and as drawn, at K
     poses with these joints (K, J) and covariates (K,); see the module."""
+    problem = estimate.problem
     rig, beyond = problem.sources[0].rig, body_beyond(problem)
     stops = place(rig, problem.terms[0], joints, columns, beyond.root, None)
     true = placed(stops, beyond.body, beyond.base, estimate.values)
@@ -177,7 +177,6 @@ def _predicted(
 
 def over_workspace(
     run: Run,
-    problem: Problem,
     estimate: Estimate,
     progress: Progress = lambda what, done, total: None,
 ) -> tuple[Predicted, Predicted]:
@@ -185,9 +184,10 @@ def over_workspace(
     all else is as it was at one of those.
 
     Args:
-        run: as fitted, problem, estimate: of it; the arm is that of its first recording.
+        run: as fitted, estimate: of it; the arm is that of its first recording.
         progress: called with what is being done, and how far it is.
     """
+    problem = estimate.problem
     source, stops = problem.sources[0], body_beyond(problem).stops
     rng, measured = np.random.default_rng(0), source.recording.joints
     some = np.sort(rng.choice(stops, min(len(stops), WORKSPACE_POSES), replace=False))
@@ -195,12 +195,12 @@ def over_workspace(
     drawn = rng.uniform(
         *joint_range(source.rig, measured[stops]), (len(at_stop), measured.shape[1])
     )
-    known, found = _known(run, estimate, progress), []
+    told, found = _known(run, estimate, progress), []
     for at, joints in ((some, measured[some]), (at_stop, drawn)):
         columns = {name: np.asarray(column)[at] for name, column in source.columns.items()}
         columns |= dict(zip(source.rig.joint_names, joints.T, strict=True))
         names = [source.recording.stops[i] for i in at.tolist()]
-        found.append(_predicted(run, problem, estimate, known, names, joints, columns))
+        found.append(_predicted(run, *told, names, joints, columns))
     return found[0], found[1]
 
 

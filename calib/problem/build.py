@@ -1,4 +1,4 @@
-"""From a model and its recordings to a problem."""
+"""From a model and its recordings to a problem; and the shapes of the model's effects there."""
 
 from __future__ import annotations
 

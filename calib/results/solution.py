@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -123,9 +123,9 @@ def solution_of(problem: Problem, estimate: Estimate, known: Intervals | None = 
         problem, estimate: what was estimated, and how it came out.
         known: the intervals of its variables, and of shapes; as the graph has them where None.
     """
-    mine = None if known is None else known.of([v.name for v in estimate.variables])
-    told, graph = estimate.covariance, estimate.covariance
-    if mine is not None:
+    told = graph = estimate.covariance
+    if known is not None:
+        mine = known.of([v.name for v in estimate.variables])
         told, graph = mine.covariance, mine.graph
     start = np.cumsum([0] + [v.dim for v in estimate.variables])
     at = {v.name: slice(a, a + v.dim) for v, a in zip(estimate.variables, start, strict=False)}
@@ -142,8 +142,8 @@ def solution_of(problem: Problem, estimate: Estimate, known: Intervals | None = 
             if isinstance(term.effect, FrameOffset):
                 part.frames[term.effect.name] = _frame(source, term, theta, covariance)
             else:
-                found = _effect(source, term, theta, covariance)
-                part.effects[term.effect.name] = replace(found, shape=_shape(term, known))
+                found = _effect(source, term, theta, covariance, _shape(term, known))
+                part.effects[term.effect.name] = found
         if rig.reference_frame in at:
             covariance = told[at[rig.reference_frame], at[rig.reference_frame]]
             T = estimate.values[rig.reference_frame]
@@ -188,14 +188,23 @@ def _pose(parent: str, T: np.ndarray, covariance: np.ndarray) -> FrameEstimate:
 
 
 def _effect(
-    source: Source, term: Term, theta: np.ndarray, covariance: np.ndarray
+    source: Source,
+    term: Term,
+    theta: np.ndarray,
+    covariance: np.ndarray,
+    shape: ShapeEstimate | None,
 ) -> EffectEstimate:
     params = term.effect.params(source.rig)
     estimate, sigma = np.zeros(len(params)), np.zeros(len(params))
     estimate[term.free] = theta
     sigma[term.free] = np.sqrt(np.diag(covariance))
-    unit = one_unit([p.unit for p in params])
-    return EffectEstimate(unit, tuple(p.name for p in params), estimate, sigma)
+    return EffectEstimate(
+        unit=one_unit([p.unit for p in params]),
+        names=tuple(p.name for p in params),
+        estimate=estimate,
+        sigma=sigma,
+        shape=shape,
+    )
 
 
 def _shape(term: Term, known: Intervals | None) -> ShapeEstimate | None:

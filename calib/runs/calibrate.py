@@ -201,11 +201,11 @@ def _fit(
     links: list[Link] | None = None
     if before is None:
         estimate = solve(problem, progress=progress, start=start)
-        wide = shapes_freed(estimate, model)  # the same where no effect has a shape
-        known = intervals(wide, progress)
+        freed = shapes_freed(estimate, model)  # the same where no effect has a shape
+        known = intervals(freed, progress)
     else:
         held = earlier(problem, before)
-        estimate, wide, known, links = solve_from(problem, model, held, progress)
+        estimate, freed, known, links = solve_from(problem, model, held, progress)
     unseen, unit = _held_out(sources, model, estimate, folder / RESIDUALS, choices, progress)
     nominal = _nominal(problem, progress)
     seen_at = ColumnRanges(model.effects)
@@ -231,7 +231,7 @@ def _fit(
     write_rows(folder / RESIDUALS, *rows)
     by = {**misfit_by(estimate, *rows, by_stop), "limit": limits(redundancies(*rows))}
     summary |= {"misfit": misfit(estimate, seen), "misfit_by": by}
-    reached = reach(wide.problem, wide, known)
+    reached = reach(freed.problem, freed, known)
     summary |= {"sigmas_widened_by": widened, "cad_widened_by": cad, "held_out_by": unit}
     summary |= {"without": list(model.without), "extrapolated": seen_at.sentences()}
     summary |= {"intervals_wider_by": calibration.document(solution.names)}

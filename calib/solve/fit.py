@@ -240,7 +240,6 @@ def shapes_freed(
     estimate: Estimate,
     model: Model,
     prior: Block | None = None,
-    progress: Progress = lambda what, done, total: None,
 ) -> Estimate:
     """A fit as it stands, with the shapes of its effects among the unknowns: what is known of a
     drift depends on what is known of its time constant.
@@ -248,7 +247,7 @@ def shapes_freed(
     Args:
         estimate: of the model, with its graph.
         model: the model.
-        prior, progress: as of `solve`.
+        prior: as of `solve`.
 
     Returns:
         The same estimate where no effect has such a shape.
@@ -260,4 +259,4 @@ def shapes_freed(
     wide = build(problem.sources, model.plus(steps), meetings=problem.meetings)
     there = {name: np.zeros(1) for name in wide.variables if name not in problem.variables}
     start = replace(estimate.start, state=estimate.state | there)
-    return resume(wide, start, progress, estimate.converged, prior, whole=True)
+    return resume(wide, start, converged=estimate.converged, prior=prior, whole=True)

@@ -92,7 +92,7 @@ def test_a_report_shows_the_workspace_and_where_the_poses_end(world, tmp_path):
     np.testing.assert_allclose(found.place_m, ours[:, :3, 3], atol=1e-9)
     (chart,) = workspace(Evidence.of([run]))
     evidence = Evidence.of([run])
-    measured, drawn = over_workspace(run, evidence.problem, evidence.estimate)
+    measured, drawn = over_workspace(run, evidence.estimate)
     for each in (measured, drawn):
         assert f"{1e3 * np.median(each.sigma_m):.2g} mm" in chart.title
     assert f"up to {1e3 * drawn.error_m.max():.2g} mm off" in chart.title

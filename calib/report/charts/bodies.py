@@ -65,8 +65,7 @@ def workspace(evidence: Evidence) -> Iterator[Chart | Absent]:
     if evidence.has_beams or not says_where_the_base_is(evidence.problem):
         yield Absent("workspace", "no arm is seen by a tracker alone")
         return
-    run = evidence.run, evidence.problem, evidence.estimate
-    measured, drawn = over_workspace(*run, evidence.progress)
+    measured, drawn = over_workspace(evidence.run, evidence.estimate, evidence.progress)
     told = [1e3 * np.median(each.sigma_m) for each in (measured, drawn)]
     yield Chart(
         "workspace",
