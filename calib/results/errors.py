@@ -34,6 +34,8 @@ class Errors:
         expected_m2: sum of the variances [m2] that their sigmas lead one to expect.
         rejected: how many have weight 0: their beams meet a surface, and they were rejected.
         rejected_m2: sum of the squares of those [m2].
+        each_m2: mean square [m2] of each stop, or of each tracked position, in order; NaN where a
+            stop has none.
     """
 
     count: int = 0
@@ -42,6 +44,7 @@ class Errors:
     expected_m2: float = 0.0
     rejected: int = 0
     rejected_m2: float = 0.0
+    each_m2: tuple[float, ...] = ()
 
     def __add__(self, other: Errors) -> Errors:
         return Errors(**{name: mine + getattr(other, name) for name, mine in vars(self).items()})
@@ -124,6 +127,7 @@ def row_errors(rows: Rows, predicted_m2: np.ndarray | float = 0.0) -> Errors:
         expected_m2=float(expected[inlier].sum()),
         rejected=len(out),
         rejected_m2=float(out @ out),
+        each_m2=(float(r @ r) / len(r) if len(r) else np.nan,),
     )
 
 
@@ -164,7 +168,13 @@ def body_errors(
             names = list(placed.d)
             d = np.concatenate([placed.d[name][:, 3:] for name in names], axis=2)
             expected += np.einsum("kip,pq,kiq->", d, predicted.covariance_of(names), d)
-        out += Errors(len(distance), float(distance.sum()), float(distance @ distance), expected)
+        out += Errors(
+            count=len(distance),
+            total_m=float(distance.sum()),
+            squares_m2=float(distance @ distance),
+            expected_m2=expected,
+            each_m2=tuple(np.square(distance).tolist()),
+        )
     return out
 
 

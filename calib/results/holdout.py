@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
+from scipy import special
 
 from calib import problem as problems
 from calib.problem import Problem
@@ -21,6 +23,49 @@ from calib.solve.fit import Progress, solve
 
 FOLDS = 5  # a fit leaves out about a fifth of the locations
 POSE_BLOCKS = 3 * FOLDS  # of poses: a fold leaves out three, far from each other
+BY_CHANCE = 0.05  # level at which a fall of the held-out error is called one: by convention
+
+
+@dataclass(frozen=True)
+class Fall:
+    """How the held-out error falls once something is added to a model.
+
+    Args:
+        before_mm, after_mm: its rms.
+        floor_mm: what is expected of it.
+        gain_m2: how much the mean square [m2] of each stop, or of each tracked position, falls;
+            empty where that is not known.
+    """
+
+    before_mm: float
+    after_mm: float
+    floor_mm: float
+    gain_m2: tuple[float, ...] = ()
+
+    @property
+    def spread_mm(self) -> float | None:
+        """Standard error of the fall of the rms, by stops; None where fewer than two tell."""
+        if len(self.gain_m2) < 2:
+            return None
+        return 1e6 * self._spread_m2 / max(self.before_mm + self.after_mm, 1e-12)
+
+    @property
+    def by_chance(self) -> bool:
+        """Whether stops differ so much that the fall may be chance: Student's t, on one side."""
+        if len(self.gain_m2) < 2:
+            return False
+        limit = special.stdtrit(len(self.gain_m2) - 1, 1.0 - BY_CHANCE)
+        return bool(np.mean(self.gain_m2) < limit * self._spread_m2)
+
+    @property
+    def _spread_m2(self) -> float:
+        return float(np.std(self.gain_m2, ddof=1) / np.sqrt(len(self.gain_m2)))
+
+
+def gains_m2(before: Sequence[float], after: Sequence[float]) -> tuple[float, ...]:
+    """How much the mean squares [m2] of stops fall; none where they are not the same stops."""
+    gain = np.subtract(before, after) if len(before) == len(after) else np.zeros(0)
+    return tuple(gain[np.isfinite(gain)].tolist())
 
 
 def folds(sources: Sequence[Source], by: str) -> list[list[np.ndarray]]:

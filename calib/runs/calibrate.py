@@ -232,6 +232,7 @@ def _fit(
     by = {**misfit_by(estimate, *rows, by_stop), "limit": limits(redundancies(*rows))}
     summary |= {"misfit": misfit(estimate, seen), "misfit_by": by}
     reached = reach(freed.problem, freed, known)
+    summary["held_out_each_mm"] = (1e3 * np.sqrt(unseen.each_m2)).tolist()
     summary |= {"sigmas_widened_by": widened, "cad_widened_by": cad, "held_out_by": unit}
     summary |= {"without": list(model.without), "extrapolated": seen_at.sentences()}
     summary |= {"intervals_wider_by": calibration.document(solution.names)}

@@ -28,7 +28,7 @@ from calib.problem.model import default_effects
 from calib.problem.spread import names_of
 from calib.residuals.groups import MESH, Group
 from calib.results.errors import Errors
-from calib.results.holdout import held_out
+from calib.results.holdout import Fall, gains_m2, held_out
 from calib.results.rings import harmful, odd_rings
 from calib.results.stages import DIAGNOSE as DIAGNOSE_STAGES
 from calib.results.stages import staged
@@ -84,12 +84,15 @@ def _found(
     before = run.summary["rms_mm"]["held_out"]
     before = before if refits and run.model["hold_out"] != "none" else None
     if before is not None:
+        each_m2 = run.unseen_m2
         if found.looks[0].stand is not stand and found.found:
-            before = _unseen(found.looks[0].stand, run, progress).rms_mm
+            unseen = _unseen(found.looks[0].stand, run, progress)
+            before, each_m2 = unseen.rms_mm, unseen.each_m2
         for step in found.found:
             unseen = _unseen(step.after.stand, run, progress)
-            falls[step.effect.name] = (before, unseen.rms_mm, unseen.floor_mm)
-            before = unseen.rms_mm
+            gain = gains_m2(each_m2, unseen.each_m2)
+            falls[step.effect.name] = Fall(before, unseen.rms_mm, unseen.floor_mm, gain)
+            before, each_m2 = unseen.rms_mm, unseen.each_m2
     unseen = partial(_unseen, run=run, progress=progress) if before is not None else None
     doubtful = not believed(found, falls)
     formulas = unnamed(found, falls, doubtful, unseen, progress) if run.converged else Unnamed()

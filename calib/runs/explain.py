@@ -13,6 +13,7 @@ from calib.blunders import told
 from calib.diagnosis import Diagnosis
 from calib.effects import Effect, is_known, load_effects, own_effects, read, trust_in
 from calib.problem.model import Model, Source
+from calib.results.holdout import Fall, gains_m2
 from calib.rig import load_rig
 from calib.runs.calibrate import calibrate, grow, recordings_document
 from calib.runs.diagnose import diagnose
@@ -208,7 +209,9 @@ class _Climb:
             run = grow(self.run, model, folder, self.tell)
         # What is drawn anew by chance tells nothing of a stop that was left out.
         chance = any(effect.by_chance for effect in model.effects if effect.name in added)
-        if run.converged and (chance or _falls(self.run, run, LEAST_FALL if added else 0.0)):
+        falls = _falls(self.run, run, LEAST_FALL if added else 0.0)
+        later = added and any(step["added"] for step in self.steps)
+        if run.converged and (chance or (falls and not (later and _by_chance(self.run, run)))):
             self._keep(run, added, dropped)
         else:
             outputs.remove(folder)
@@ -268,6 +271,13 @@ def _falls(before: Run, after: Run, share: float) -> bool:
     was, now = _held_out(before) ** 2, _held_out(after) ** 2
     excess = was - before.summary["rms_mm"]["noise_floor"] ** 2
     return now < was and was - now >= share * excess
+
+
+def _by_chance(before: Run, after: Run) -> bool:
+    """Whether the fall of the held-out error may be chance."""
+    floor = after.summary["rms_mm"]["noise_floor"]
+    gain = gains_m2(before.unseen_m2, after.unseen_m2)
+    return Fall(_held_out(before), _held_out(after), floor, gain).by_chance
 
 
 def _held_out(run: Run) -> float:

@@ -123,6 +123,12 @@ class Run:
         return tuple(_effect_name(effect) for effect in self.model["effects"])
 
     @property
+    def unseen_m2(self) -> list[float]:
+        """Mean square [m2] of each stop that was held out; none of a run that does not tell."""
+        each = self.summary.get("held_out_each_mm") or ()
+        return [np.nan if mm is None else 1e-6 * mm**2 for mm in each]
+
+    @property
     def converged(self) -> bool:
         """Whether the fit ended at an optimum."""
         return bool(self.summary["converged"])

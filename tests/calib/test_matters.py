@@ -2,15 +2,23 @@
 
 import numpy as np
 import pytest
+from scipy.stats import ttest_rel
 
 from calib import add, diagnose, fit
-from calib.diagnosis.search import Search
+from calib.diagnosis.search import NamedEffect, Search
 from calib.diagnosis.stand import Stand
 from calib.diagnosis.verdict import conclude
-from calib.diagnosis.verdict.matters import FALL_MATTERS, SHIFT_MATTERS, Consequences, Matters
+from calib.diagnosis.verdict.matters import (
+    FALL_MATTERS,
+    SHIFT_MATTERS,
+    Consequences,
+    Matters,
+    weighed,
+)
 from calib.effects import find
 from calib.problem import build
 from calib.problem.model import Model, Source
+from calib.results.holdout import Fall, gains_m2
 from calib.simulation import Spec, simulate
 from calib.solve.fit import solve
 
@@ -57,7 +65,7 @@ def test_the_error_falls_by_what_is_explained(look):
     explained = 1e3 * look.named.rms_m(candidate)
     expected = np.sqrt(9.0 - explained**2) - 3.0
     assert weigh.of(candidate, look.named).held_out_mm == pytest.approx(expected)
-    assert weigh.of(candidate, look.named, (5.0, 2.5, 2.0)).held_out_mm == -2.5
+    assert weigh.of(candidate, look.named, Fall(5.0, 2.5, 2.0)).held_out_mm == -2.5
 
 
 @pytest.mark.parametrize(
@@ -71,6 +79,51 @@ def test_the_error_falls_by_what_is_explained(look):
 )
 def test_either_of_them_is_enough(fall_mm, shift, enough):
     assert Matters(fall_mm, shift, 2.0).enough is enough
+
+
+@pytest.mark.parametrize("mean", [0.2, 0.5, 0.9])
+def test_a_fall_is_chance_where_a_t_test_over_stops_says_so(mean):
+    rng = np.random.default_rng(5)
+    before = rng.normal(9.0, 1.0, 12)
+    after = before - rng.normal(mean, 1.0, 12)
+    gone = [*before, np.nan], [*after, 3.0]  # no beam of that stop met anything before
+    fall = Fall(3.0, 2.9, 2.5, gains_m2(*gone))
+    assert fall.by_chance is bool(ttest_rel(before, after, alternative="greater").pvalue > 0.05)
+    spread_m2 = np.std(before - after, ddof=1) / np.sqrt(12)
+    # To first order the rms falls by the mean square's fall over the sum of both.
+    assert fall.spread_mm == pytest.approx(1e6 * spread_m2 / (3.0 + 2.9))
+    assert gains_m2(before, after[1:]) == ()  # other stops: nothing is known
+    assert Fall(3.0, 2.9, 2.5).spread_mm is None and not Fall(3.0, 2.9, 2.5).by_chance
+
+
+@pytest.mark.parametrize("steady", [True, False])
+def test_a_later_name_stands_if_stops_held_out_bear_it_out(look, steady):
+    """Two names lower the held-out error as much; stops differ about one of them."""
+    gain = {True: (4e-8, 5e-8, 6e-8), False: (-9e-8, 2e-8, 22e-8)}
+    falls = {
+        "incidence_angle_bias": Fall(3.0, 2.9, 2.0, gain[False]),  # of the first nobody asks
+        "azimuth_range_harmonic": Fall(2.9, 2.8, 2.0, gain[steady]),
+    }
+    steps = []
+    for name in falls:
+        candidate = next(c for c in look.named.candidates if c.effect.name == name)
+        steps.append(
+            NamedEffect(
+                candidate=candidate,
+                before=look,
+                after=look,
+                judged=candidate.test,
+                p_adjusted=1e-4,
+                rivals=(),
+            )
+        )
+    found = Search(looks=[look], found=steps, blunders=(), unnamed=(), scatter=None)
+    told = weighed(found, falls, {"held_out": 3.0, "fit": 3.0, "noise_floor": 2.0})
+    assert [step.effect.name for step in told.found.found] == list(falls)[: 1 + steady]
+    assert len(told.refused) == 1 - steady
+    if not steady:
+        assert "azimuth_range_harmonic was tried and rejected" in told.refused[0]
+        assert "-0.100 mm, ± 0.016" in told.refused[0]
 
 
 @pytest.mark.slow

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -25,6 +25,7 @@ from calib.diagnosis.verdict.sentences import BAD, UNNAMED, sentences_of, stops_
 from calib.diagnosis.verdict.unnamed import Unnamed
 from calib.problem.model import labels
 from calib.residuals.groups import Group
+from calib.results.holdout import Fall
 from calib.rig import Rig
 
 VERDICTS = {
@@ -138,7 +139,7 @@ def worth_adding(candidates: Sequence[Mapping[str, Any]]) -> list[str]:
 
 def conclude(
     found: Search,
-    held_out: Mapping[str, tuple[float, float, float]],
+    held_out: Mapping[str, Fall],
     summary: Mapping[str, Any],
     weak: Sequence[Mapping[str, Any]],
     rejected: Rejects | None = None,
@@ -150,7 +151,7 @@ def conclude(
 
     Args:
         found: the search.
-        held_out: effect -> held-out rms before and after it was truly fitted, and expected, mm.
+        held_out: effect -> how the held-out error falls once it is truly fitted.
         summary: of the run: its errors, and its misfit by instrument.
         weak: weak directions.
         rejected: what the fit threw away.
@@ -238,7 +239,7 @@ def _verdict(found: Search, hold: bool, more: bool, calm: str) -> str:
     return "missing_effect" if named else UNNAMED
 
 
-def believed(found: Search, held_out: Mapping[str, tuple[float, float, float]]) -> bool:
+def believed(found: Search, held_out: Mapping[str, Fall]) -> bool:
     """Whether the names that a search found are the answer; so they are where there are none.
 
     Args:
@@ -248,14 +249,14 @@ def believed(found: Search, held_out: Mapping[str, tuple[float, float, float]]) 
     return _names_hold(found) and not _leave_most(found, held_out)
 
 
-def _leave_most(found: Search, held_out: Mapping[str, tuple[float, float, float]]) -> bool:
+def _leave_most(found: Search, held_out: Mapping[str, Fall]) -> bool:
     """Whether the names leave most of the held-out error, where that is further above its floor
     than chance puts it."""
     falls = [held_out[s.effect.name] for s in found.found if s.effect.name in held_out]
     if not falls or not found.looks[0].stand.estimate.scans:
         return False
-    after, floor = falls[-1][1:]
-    return after > HELD_OUT_BY_CHANCE * floor and explained(falls[0][0], after, floor) < ABSORBED
+    whole = replace(falls[-1], before_mm=falls[0].before_mm)
+    return whole.after_mm > HELD_OUT_BY_CHANCE * whole.floor_mm and explained(whole) < ABSORBED
 
 
 def _names_hold(found: Search) -> bool:

@@ -12,12 +12,13 @@ from calib.diagnosis.search import ALPHA_EFFECT, ALPHA_NOISE, NamedEffect, Searc
 from calib.diagnosis.suggest import what_separates
 from calib.diagnosis.verdict.matters import Weighed
 from calib.effects import Site
+from calib.results.holdout import Fall
 from calib.results.solution import one_unit
 
 
 def candidate_documents(
     heavy: Weighed,
-    held_out: Mapping[str, tuple[float, float, float]],
+    held_out: Mapping[str, Fall],
     unnamed: bool,
     hold: bool,
 ) -> list[dict[str, Any]]:
@@ -56,9 +57,7 @@ def _ranked(found: Search) -> list[Candidate]:
     return [*confirmed, *rest, *noise]
 
 
-def _candidate(
-    candidate: Candidate, found: Search, held_out: Mapping[str, tuple[float, float, float]]
-) -> dict[str, Any]:
+def _candidate(candidate: Candidate, found: Search, held_out: Mapping[str, Fall]) -> dict[str, Any]:
     """As the contract has it."""
     effect, test, look = candidate.effect, candidate.test, found.looks[0].named
     step = next((i for i, s in enumerate(found.found, 1) if s.effect.name == effect.name), None)
@@ -67,7 +66,7 @@ def _candidate(
     rig = next(s.rig for s in found.looks[0].stand.sources if effect.params(s.rig))
     params = [p for p in effect.params(rig) if p.sigma]
     whole = len(params) == len(test.columns)
-    before, after, floor = held_out.get(effect.name, (None, None, None))
+    fall = held_out.get(effect.name)
     noise = effect.site is Site.NOISE
     clean = (found.looks[-1].noise if noise else found.looks[-1].named).common
     rivals = _rivals(found.found[step - 1]) if step else []
@@ -90,8 +89,12 @@ def _candidate(
         "dof": test.dof,
         "step": step,
         "dressed_up": False,
-        "held_out_rms_mm": {"before": before, "after": after},
-        "error_explained": explained(before, after, floor),
+        "held_out_rms_mm": {
+            "before": fall.before_mm if fall else None,
+            "after": fall.after_mm if fall else None,
+        },
+        "held_out_spread_mm": fall.spread_mm if fall else None,
+        "error_explained": explained(fall) if fall else None,
         "rms_mm": None if noise else 1e3 * look.size_m(candidate),
         "unabsorbed_rms_mm": None if noise else 1e3 * look.rms_m(candidate),
         "parameters": {
@@ -106,11 +109,10 @@ def _candidate(
     }
 
 
-def explained(before: float | None, after: float | None, floor: float | None) -> float | None:
+def explained(fall: Fall) -> float:
     """Share of what the held-out error has above what is expected."""
-    if before is None or after is None or floor is None:
-        return None
-    return (before**2 - after**2) / max(before**2 - floor**2, before**2 - after**2, 1e-12)
+    before, after, floor = np.square([fall.before_mm, fall.after_mm, fall.floor_mm]).tolist()
+    return (before - after) / max(before - floor, before - after, 1e-12)
 
 
 def _rivals(step: NamedEffect) -> list[dict[str, Any]]:

@@ -3,6 +3,9 @@
 With many rows a test sees what no user feels. A finding matters where the held-out error would fall
 by a hundredth of what noise alone makes of it, or a value of the calibration would move by half its
 sigma; one that does neither is a trace.
+
+Once an effect was named, the next name stands only if held-out stops bear it out: where the first
+is nearly right and not wholly, what it leaves is significant, and some effect always takes it in.
 """
 
 from __future__ import annotations
@@ -19,6 +22,7 @@ from calib.diagnosis.screen import Candidate, Screen
 from calib.diagnosis.search import Search
 from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import hangs_on, words
+from calib.results.holdout import Fall
 
 # Where neither is reached a user would decide nothing otherwise: a hundredth of an error is less
 # than two folds of one recording differ by, and half a sigma widens an interval by a tenth.
@@ -74,25 +78,23 @@ class Consequences:
         self.floor_mm = rms_mm["noise_floor"] or 0.0
         self.error_mm = rms_mm["held_out"] or rms_mm["fit"] or 0.0
 
-    def of(
-        self, candidate: Candidate, screen: Screen, fall: tuple[float, float, float] | None = None
-    ) -> Matters:
+    def of(self, candidate: Candidate, screen: Screen, fall: Fall | None = None) -> Matters:
         """What a candidate would change.
 
         Args:
             candidate: of the look.
             screen: of the look, that it is in.
-            fall: the held-out error before and after it was truly fitted, and the floor, mm; where
-                None, what it explains of the residuals is taken off.
+            fall: of the held-out error, once it was truly fitted; where None, what it explains of
+                the residuals is taken off.
         """
         if fall is None:
             explained = 1e3 * screen.rms_m(candidate)
             after = np.sqrt(max(self.error_mm**2 - explained**2, 0.0))
-            fall = self.error_mm, float(after), self.floor_mm
+            fall = Fall(self.error_mm, float(after), self.floor_mm)
         taken, sigma = self._projected
         moved = taken[:, candidate.test.columns] @ candidate.test.estimate()
         shift = float(np.max(np.abs(moved) / sigma, initial=0.0))
-        return Matters(fall[1] - fall[0], shift, fall[2])
+        return Matters(fall.after_mm - fall.before_mm, shift, fall.floor_mm)
 
     @cached_property
     def _projected(self) -> tuple[np.ndarray, np.ndarray]:
@@ -125,25 +127,34 @@ class Weighed:
 
 def weighed(
     found: Search,
-    held_out: Mapping[str, tuple[float, float, float]],
+    held_out: Mapping[str, Fall],
     rms_mm: Mapping[str, float | None],
 ) -> Weighed:
-    """A search without its traces, and without names that predict worse what was held out.
+    """A search without its traces, and without names that stops which were held out speak against
+    or, of a later name, do not bear out.
 
     Args:
         found: the search.
-        held_out: effect -> held-out rms before and after it was truly fitted, and expected, mm.
+        held_out: effect -> how the held-out error falls once it is truly fitted.
         rms_mm: as of `Consequences`.
     """
     matter, named, traces, refused = {}, [], [], []
     for step in found.found:
         screen, name = step.before.named, step.effect.name
-        told = Consequences(step.before, rms_mm).of(step.candidate, screen, held_out.get(name))
+        fall = held_out.get(name)
+        told = Consequences(step.before, rms_mm).of(step.candidate, screen, fall)
         matter[name] = told
         if told.worse:
             refused.append(
                 f"{name} was tried and rejected: it absorbs part of the residuals, but stops that "
                 f"were held out are predicted worse with it ({told.held_out_mm:+.3f} mm)."
+            )
+        elif named and fall is not None and fall.by_chance:
+            refused.append(
+                f"{name} was tried and rejected: what {named[-1].effect.name} leaves of the "
+                f"residuals is significant (adjusted p = {step.p_adjusted:.1g}) and it absorbs "
+                "part of that, but stops held out do not confirm it: their error changes by "
+                f"{told.held_out_mm:+.3f} mm, ± {fall.spread_mm:.3f} by how much stops differ."
             )
         elif told.enough:
             named.append(step)

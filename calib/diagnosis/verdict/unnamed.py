@@ -16,10 +16,10 @@ from calib.diagnosis.suggest import DESCRIBES, span, what_differs, words
 from calib.diagnosis.verdict.matters import FALL_MATTERS
 from calib.effects.own.formula import FormulaEffect
 from calib.results.errors import Errors
+from calib.results.holdout import Fall
 from calib.solve.fit import Progress
 
 MOST_ALIKE = 3  # other forms that are listed
-Falls = Mapping[str, tuple[float, float, float]]
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Unnamed:
 
 def unnamed(
     found: Search,
-    falls: Falls,
+    falls: Mapping[str, Fall],
     doubtful: bool,
     unseen: Callable[[Stand], Errors] | None,
     progress: Progress,
@@ -64,7 +64,7 @@ def unnamed(
 
     Args:
         found: the search.
-        falls: effect -> held-out rms before and after it was fitted, and expected, mm.
+        falls: effect -> how the held-out error falls once it is fitted.
         doubtful: whether its names leave much, so that one formula may explain more.
         unseen: errors of a fit at stops that were held out; None if nobody is to look.
         progress: as of `fit.solve`.
@@ -77,8 +77,8 @@ def unnamed(
         formulas = find(first, progress)
         if formulas:
             after = unseen(_with(first, formulas, progress)).rms_mm
-            before, _, _ = falls[found.found[0].effect.name]
-            named = falls[found.found[-1].effect.name][1]
+            before = falls[found.found[0].effect.name].before_mm
+            named = falls[found.found[-1].effect.name].after_mm
             if after < named - FALL_MATTERS * before:
                 return Unnamed(formulas, True, (before, after))
     # Values by chance take in most of a structure that differs from stop to stop.

@@ -10,6 +10,7 @@ from calib.diagnosis.formulas.why import ARM_JOINT, MECHANISMS, OF_ARM, WHY_JOIN
 from calib.diagnosis.verdict import unnamed as module
 from calib.diagnosis.verdict.unnamed import unnamed
 from calib.effects import CATALOGUE, Site
+from calib.results.holdout import Fall
 
 KNOWN = sorted({c for e in CATALOGUE if e.site is Site.BEAM for c in e.covariates})
 
@@ -78,7 +79,7 @@ class World:
             at_first=(),
             unnamed=(),
         )
-        self.falls = {f"effect_{i}": (4.0 - 0.5 * i, 3.5 - 0.5 * i, 0.0) for i in range(names)}
+        self.falls = {f"effect_{i}": Fall(4.0 - 0.5 * i, 3.5 - 0.5 * i, 0.0) for i in range(names)}
         after = {0: first, names: last} if names else {0: last}
         self.asked = []
 
