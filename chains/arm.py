@@ -1,5 +1,4 @@
-"""An arm as its maker describes it: the chain of joints of a URDF file, what its links weigh, and
-which meshes show them.
+"""An arm as its maker describes it: the chain of joints of a URDF file, and what its links weigh.
 
 URDF: https://wiki.ros.org/urdf/XML/joint. A joint's origin is T_parent_child at zero, its axis
 stands in the child's frame, and what is left out has the defaults given there.
@@ -18,7 +17,7 @@ from chains.errors import InputError
 from chains.frames import Edge, FrameTree, Joint, unknown_name
 from chains.se3 import Array
 from chains.serial import SerialChain
-from chains.xml import parse_xml
+from chains.xml import numbers_of, origin_of, read_robot
 
 G = 9.80665  # m/s^2
 _LONGEST_LINK_M = 10.0  # more is taken for millimetres, of a centre of mass as well
@@ -38,18 +37,6 @@ class Mass:
     centre_m: Array
 
 
-@dataclass(frozen=True)
-class LinkMesh:
-    """A mesh that shows a link: the file's name as the URDF has it, where its origin stands
-    (T_link_mesh (4, 4)), and by what its coordinates are multiplied, per axis (3,), to be metres.
-    """
-
-    link: str
-    file: str
-    T_link_mesh: Array
-    scale: Array
-
-
 def read_arm(urdf_path: str | Path, base: str, tip: str) -> list[Edge]:
     """Return the edges from link ``base`` to link ``tip``, one per URDF joint, in order.
 
@@ -60,7 +47,7 @@ def read_arm(urdf_path: str | Path, base: str, tip: str) -> list[Edge]:
     a joint that there is not or itself, or a length can only be millimetres.
     """
     path = Path(urdf_path)
-    robot = _parse(path)
+    robot = read_robot(path)
     links = [link.get("name", "") for link in robot.findall("link")]
     for link in (base, tip):
         if link not in links:
@@ -79,16 +66,16 @@ def read_masses(urdf_path: str | Path, base: str, tip: str) -> list[Mass]:
     the chain that carries it, its own joints at zero. Raises InputError as ``read_arm`` does.
     """
     path = Path(urdf_path)
-    robot = _parse(path)
+    robot = read_robot(path)
     above = {_link(joint, "child"): joint for joint in robot.findall("joint")}
     masses = []
     try:
         chain = {_link(joint, "child") for joint in _chain(robot, base, tip)}
         for link in robot.findall("link"):
-            kg = float(_numbers(link, "inertial/mass", "value", [0.0])[0])
+            kg = float(numbers_of(link, "inertial/mass", "value", [0.0])[0])
             if kg < 0:
                 raise InputError(f"link '{link.get('name')}' weighs {kg:g} kg; 0 or more is wanted")
-            centre_m, name = _numbers(link, "inertial/origin", "xyz", [0, 0, 0]), link.get("name")
+            centre_m, name = numbers_of(link, "inertial/origin", "xyz", [0, 0, 0]), link.get("name")
             away_m = np.linalg.norm(centre_m)
             if kg and away_m > _LONGEST_LINK_M:
                 raise InputError(
@@ -98,7 +85,7 @@ def read_masses(urdf_path: str | Path, base: str, tip: str) -> list[Mass]:
             climbed: set[str] = set()
             while kg and name not in chain and name in above and name not in climbed:
                 climbed.add(name)
-                T_parent_child = _origin(above[name])
+                T_parent_child = origin_of(above[name])
                 centre_m = T_parent_child[:3, :3] @ centre_m + T_parent_child[:3, 3]
                 name = _link(above[name], "parent")
             if kg and name in chain:
@@ -106,26 +93,6 @@ def read_masses(urdf_path: str | Path, base: str, tip: str) -> list[Mass]:
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     return masses
-
-
-def read_meshes(urdf_path: str | Path, links: Sequence[str]) -> dict[str, list[list[LinkMesh]]]:
-    """Return what may show each of ``links`` that has meshes: all that is to be seen of it
-    (``visual``) or else all that is to be collided with (``collision``).
-
-    Boxes, cylinders and spheres are not read. Raises InputError where the file cannot be read, or a
-    mesh's origin or scale is not three numbers.
-    """
-    path = Path(urdf_path)
-    found: dict[str, list[list[LinkMesh]]] = {}
-    try:
-        for link in _parse(path).findall("link"):
-            name = link.get("name", "")
-            either = [_meshes(name, link.findall(kind)) for kind in ("visual", "collision")]
-            if name in links and any(either):
-                found[name] = [meshes for meshes in either if meshes]
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
-    return found
 
 
 def gravity_moment(
@@ -167,19 +134,6 @@ def gravity_torque(tree: FrameTree, masses: Sequence[Mass], joints: Array) -> Ar
     return torque
 
 
-def _parse(path: Path) -> Element:
-    try:
-        text = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); name a URDF file") from None
-    robot = parse_xml(text, path, "a URDF file")
-    if any("xacro" in element.tag for element in robot.iter()):
-        raise InputError(f"{path}: still holds xacro; write it out with 'xacro FILE > arm.urdf'")
-    if robot.tag != "robot":
-        raise InputError(f"{path}: starts with <{robot.tag}>; a URDF file starts with <robot>")
-    return robot
-
-
 def _chain(robot: Element, base: str, tip: str) -> list[Element]:
     """Return the joints from base to tip, found by climbing from tip."""
     above: dict[str, Element] = {}
@@ -203,7 +157,7 @@ def _chain(robot: Element, base: str, tip: str) -> list[Element]:
 
 
 def _edge(joint: Element) -> Edge:
-    name, T_parent_child = joint.get("name", ""), _origin(joint)
+    name, T_parent_child = joint.get("name", ""), origin_of(joint)
     length_m = np.linalg.norm(T_parent_child[:3, 3])
     if length_m > _LONGEST_LINK_M:
         raise InputError(
@@ -219,27 +173,6 @@ def _edge(joint: Element) -> Edge:
     )
 
 
-def _origin(joint: Element) -> Array:
-    """Return T_parent_child (4, 4) at the joint's zero."""
-    xyz, rpy = (_numbers(joint, "origin", part, [0, 0, 0]) for part in ("xyz", "rpy"))
-    return se3.from_xyz_rpy(xyz, rpy)
-
-
-def _meshes(link: str, parts: Sequence[Element]) -> list[LinkMesh]:
-    """Return the meshes among the ``visual`` or ``collision`` elements of a link."""
-    meshes = [(part, part.find("geometry/mesh")) for part in parts]
-    return [
-        LinkMesh(
-            link=link,
-            file=mesh.get("filename", ""),
-            T_link_mesh=_origin(part),
-            scale=_numbers(part, "geometry/mesh", "scale", [1, 1, 1]),
-        )
-        for part, mesh in meshes
-        if mesh is not None
-    ]
-
-
 def _motion(joint: Element) -> Joint | None:
     name, kind = joint.get("name", ""), joint.get("type")
     if kind == "fixed":
@@ -249,14 +182,14 @@ def _motion(joint: Element) -> Joint | None:
             f"joint '{name}' is of type '{kind}'; only fixed, revolute, continuous and prismatic "
             f"joints can be placed"
         )
-    axis = _numbers(joint, "axis", "xyz", [1, 0, 0])
+    axis = numbers_of(joint, "axis", "xyz", [1, 0, 0])
     length = np.linalg.norm(axis)
     if length == 0:
         raise InputError(f"joint '{name}': axis xyz is 0 0 0; it must point somewhere")
     if kind == "continuous" or joint.find("limit") is None:
         return Joint(name, _KIND[kind], axis / length)
-    lower = float(_numbers(joint, "limit", "lower", [0])[0])
-    upper = float(_numbers(joint, "limit", "upper", [0])[0])
+    lower = float(numbers_of(joint, "limit", "lower", [0])[0])
+    upper = float(numbers_of(joint, "limit", "upper", [0])[0])
     if lower > upper:
         raise InputError(f"joint '{name}': limit lower {lower:g} lies above upper {upper:g}")
     return Joint(name=name, kind=_KIND[kind], axis=axis / length, lower=lower, upper=upper)
@@ -268,8 +201,8 @@ def _following(edge: Edge, element: Element, robot: Element) -> Edge:
     by_name = {joint.get("name"): joint for joint in robot.findall("joint")}
     factor, shift, seen = 1.0, 0.0, [edge.name]
     while (mimic := element.find("mimic")) is not None:
-        shift += factor * float(_numbers(element, "mimic", "offset", [0.0])[0])
-        factor *= float(_numbers(element, "mimic", "multiplier", [1.0])[0])
+        shift += factor * float(numbers_of(element, "mimic", "offset", [0.0])[0])
+        factor *= float(numbers_of(element, "mimic", "multiplier", [1.0])[0])
         other = mimic.get("joint", "")
         if other not in by_name or other in seen:
             what = "follows itself so" if other in seen else "there is no such joint"
@@ -305,21 +238,3 @@ def _link(joint: Element, role: str) -> str:
     if link is None:
         raise InputError(f"joint '{joint.get('name')}' names no {role} link")
     return link
-
-
-def _numbers(owner: Element, tag: str, attribute: str, default: list[float]) -> Array:
-    """Return the finite numbers of one attribute of a joint or link, as many as the default has."""
-    element = owner.find(tag)
-    text = None if element is None else element.get(attribute)
-    if text is None:
-        return np.array(default, float)
-    try:
-        values = np.array([float(word) for word in text.split()])
-    except ValueError:
-        values = np.array([np.nan])
-    if values.shape != (len(default),) or not np.isfinite(values).all():
-        count = "a number" if len(default) == 1 else f"{len(default)} numbers"
-        raise InputError(
-            f"{owner.tag} '{owner.get('name')}': {tag} {attribute} is '{text}'; it must be {count}"
-        )
-    return values

@@ -7,13 +7,14 @@ from typing import Any
 
 import numpy as np
 
+from calib.rig.shapes import Shape
 from calib.view import scene as scenes
 from calib.view.plans.ghosts import PLANNED_PATH, Ghost, draw, ghosts
 from calib.view.scene import Points, Scene
 from calib.view.shown import sizes
 from calib.view.shown.area import Area
+from calib.view.shown.drawn import drawn_shapes
 from calib.view.shown.moves import TIMES, Move, moves
-from calib.view.shown.shapes import Shape, arm_shapes
 from chains import se3
 
 ROOM_PATH, RIG_PATH, AXES_PATH, MOVES_PATH = "/room", "/rig", "/axes", "/moves"
@@ -146,7 +147,7 @@ class Drawing:
 
     def _open_shapes(self, recording: int) -> None:
         """Send the meshes of the arm's links, which `_draw_rig` puts in their places."""
-        self._shapes, self.lines_why = arm_shapes(self.scene.sources[recording].rig)
+        self._shapes, self.lines_why = drawn_shapes(self.scene.sources[recording].rig)
         scene = self.client.scene
         scene.add_frame(self._at(RIG_PATH), show_axes=False, visible=RIG_PATH not in self.hidden)
         for i, shape in enumerate(self._shapes):

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from calib.rig import Rig, load_rig
+from calib.rig.shapes import PACKAGE
 from calib.runs.run import Run
 from calib.view.scene import Scene
-from calib.view.shown.shapes import PACKAGE, arm_shapes
+from calib.view.shown.drawn import drawn_shapes
 from calib.view.stage import RIG_PATH
 from tests.calib.viewed import small_run
 from tests.calib.workbench import shown
@@ -72,7 +73,7 @@ def volume_m3(shape) -> float:
 def test_a_mesh_stands_where_the_urdf_puts_it_in_its_link(rig, tmp_path, scale):
     put(tmp_path, "meshes/part.stl")
     mine = with_meshes(rig, tmp_path, "meshes/part.stl", scale=" ".join(map(str, scale)))
-    shapes, why = arm_shapes(mine)
+    shapes, why = drawn_shapes(mine)
     assert why == ""
     assert sorted(shape.link for shape in shapes) == sorted(links_of(rig))
     x, y, z = scale
@@ -88,7 +89,7 @@ def test_a_mesh_stands_where_the_urdf_puts_it_in_its_link(rig, tmp_path, scale):
 def test_a_mesh_of_a_package_lies_in_the_recording_with_or_without_its_name(rig, tmp_path, place):
     put(tmp_path, place)
     mine = with_meshes(rig, tmp_path, f"{PACKAGE}arm_description/meshes/part.stl")
-    shapes, why = arm_shapes(mine)
+    shapes, why = drawn_shapes(mine)
     assert why == "" and len(shapes) == len(links_of(rig))
 
 
@@ -96,16 +97,16 @@ def test_a_mesh_of_a_package_lies_in_the_recording_with_or_without_its_name(rig,
 def test_a_mesh_outside_of_the_recording_is_not_read(rig, tmp_path, file):
     put(tmp_path, "part.stl")
     mine = with_meshes(rig, tmp_path / "rec", file.format(outside=tmp_path))
-    shapes, why = arm_shapes(mine)
+    shapes, why = drawn_shapes(mine)
     assert not shapes
     assert why.startswith("Drawn as lines: arm_base (the recording has no ")
 
 
 def test_what_is_lacking_is_told_once_and_links_without_meshes_are_not_lacking(rig, tmp_path):
-    assert arm_shapes(rig) == ([], "")
+    assert drawn_shapes(rig) == ([], "")
     mine = with_meshes(rig, tmp_path, f"{PACKAGE}arm/meshes/part.stl")
     others = len(links_of(rig)) - 1
-    assert arm_shapes(mine) == (
+    assert drawn_shapes(mine) == (
         [],
         "Drawn as lines: arm_base (the recording has no 'meshes/part.stl'), and so are "
         f"{others} more links.",
@@ -115,16 +116,16 @@ def test_what_is_lacking_is_told_once_and_links_without_meshes_are_not_lacking(r
 def test_what_is_to_be_collided_with_stands_in_for_what_cannot_be_read(rig, tmp_path):
     put(tmp_path, "part.stl", "part.dae")
     seen = with_meshes(rig, tmp_path, "part.dae")
-    assert "a mesh is read from" in arm_shapes(seen)[1]
+    assert "a mesh is read from" in drawn_shapes(seen)[1]
     both = with_meshes(seen, tmp_path, "part.stl", kind="collision")
-    shapes, why = arm_shapes(both)
+    shapes, why = drawn_shapes(both)
     assert why == "" and len(shapes) == len(links_of(rig))
 
 
 def test_shapes_are_drawn_in_the_place_of_lines(run, rig, tmp_path, monkeypatch):
     put(tmp_path, "part.stl")
     mine = with_meshes(rig, tmp_path, "part.stl", scale="0.1 0.1 0.1")
-    monkeypatch.setattr("calib.view.stage.arm_shapes", lambda _: arm_shapes(mine))
+    monkeypatch.setattr("calib.view.stage.drawn_shapes", lambda _: drawn_shapes(mine))
     scene, links = Scene.of(run), links_of(rig)
     assert not scene.links(0, scene.stops(0)[0], links)[1].any()
     assert scene.links(0, scene.stops(0)[0], links[:-1])[1].sum() == 1
