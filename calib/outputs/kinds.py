@@ -132,7 +132,7 @@ RUN = FolderKind(
 EVALUATION = FolderKind("evaluation", _lacks_evaluation, ("evaluation.json", "points.parquet"))
 EXPORT = FolderKind("export", _lacks_export)
 CLOUDS = FolderKind("folder of corrected clouds", _without(CLOUDS_MARK))
-PLANNED = FolderKind("plan", _lacks_plan, ("stops.csv", "plan.json", "before_after.svg"))
+PLANNED = FolderKind("plan", _lacks_plan, ("stops.csv", "way.csv", "plan.json", "before_after.svg"))
 LADDER = FolderKind("ladder of runs", _lacks_ladder)
 
 

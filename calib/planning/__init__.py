@@ -18,11 +18,12 @@ import numpy as np
 from calib import outputs
 from calib.linear.parallel import one_blas_thread
 from calib.planning.alone import nothing_measured
-from calib.planning.found import Found
+from calib.planning.found import Found, effects_document, mishaps_document
 from calib.planning.planner import Planner, Step
 from calib.planning.purpose import ALL, Purpose, purpose_of
 from calib.planning.room.places import in_region, where_it_stood
 from calib.planning.room.unlike import Unlike, unlike
+from calib.planning.room.ways import Leg, way_document
 from calib.planning.scene import PlanningScene
 from calib.planning.stops import Poses
 from calib.planning.tolerance import purpose_until
@@ -87,6 +88,8 @@ class Plan:
         candidates: how many poses they were chosen among.
         endless: what is known with any number of stops of this arm.
         curve: how far from their tolerances sigmas are with how many of them; empty without any.
+        legs: how to get from each stop to the next, where its location is the same.
+        tubes: of each link whose shapes are not in the recording, why; it is taken for a tube.
     """
 
     run: Path
@@ -105,6 +108,8 @@ class Plan:
     effect_units: Mapping[str, str]
     candidates: int
     curve: Sequence[Step] = ()
+    legs: Sequence[Leg] = ()
+    tubes: Sequence[str] = ()
 
     @property
     def untold(self) -> Sequence[Mapping[str, Any]]:
@@ -136,6 +141,8 @@ class Plan:
             **self.purpose.document(),
             "candidates": self.candidates,
             "stops": self.stops,
+            "way": way_document(self.poses, self._names, self.legs),
+            "tubes": list(self.tubes),
             "places": {at: _pose(T) for at, T in self.places.items()},
             "number": {"now": self.now.stops, "after": self.after.stops},
             "sigma": {
@@ -156,8 +163,8 @@ class Plan:
                 }
                 for name in self.now.smallest
             },
-            "smallest_effect": _effects(*self.found),
-            "smallest_blunder": _mishaps(*self.found),
+            "smallest_effect": effects_document(*self.found),
+            "smallest_blunder": mishaps_document(*self.found),
             "unlike_measured": [each.document() for each in self.unlike],
             "unseen_blunder": {w: f.furthest() for w, f in zip(WHEN, self.found, strict=True)},
             "weak_directions": {
@@ -190,32 +197,6 @@ def _places(scene: PlanningScene, poses: Poses) -> dict[str, np.ndarray]:
 
 def _pose(T: np.ndarray) -> dict[str, list[float]]:
     return {"xyz_m": T[:3, 3].tolist(), "quat_wxyz": se3.to_quat_wxyz(T).tolist()}
-
-
-def _effects(now: Found, after: Found) -> dict[str, Any]:
-    """From which size effects are found, as JSON has it: of those never found, None."""
-
-    def size(found: Found, name: str) -> float | None:
-        each = found.effects.get(name, np.inf)
-        return each if np.isfinite(each) else None
-
-    return {
-        name: {"unit": unit, "now": size(now, name), "after": size(after, name)}
-        for name, unit in sorted(after.units.items())
-    }
-
-
-def _mishaps(now: Found, after: Found) -> dict[str, Any]:
-    """From which size mishaps are found, as JSON has it: of those never found, None."""
-
-    def size(found: Found, kind: str, unit: str) -> dict[str, float] | None:
-        each = found.mishaps.get(kind, {}).get(unit)
-        return each.document() if each else None
-
-    return {
-        kind: {u: {"now": size(now, kind, u), "after": size(after, kind, u)} for u in sizes}
-        for kind, sizes in after.mishaps.items()
-    }
 
 
 def _diagnosed(run: Run) -> dict[str, float]:
@@ -315,7 +296,7 @@ def _planned(planner: Planner, stops: int, candidates: int, seed: int) -> Plan:
         some, curve = planner.enough(poses, each, stops)
     else:
         some = planner.choose(poses, each, stops)
-    some = planner.in_order(some)
+    some, legs = planner.in_order(some, poses)
     scene, rig, after = planner.scene, planner.scene.source.rig, planner.after(some)
     return Plan(
         run=planner.folder,
@@ -334,6 +315,8 @@ def _planned(planner: Planner, stops: int, candidates: int, seed: int) -> Plan:
         effect_units={name: scene.unit_of(name) for name in planner.aim.rivals},
         candidates=len(poses.joints),
         curve=curve,
+        legs=legs,
+        tubes=planner.clear.lacking,
     )
 
 

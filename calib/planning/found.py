@@ -191,3 +191,29 @@ def _told(group: Group, planned: Mapping[str, int]) -> str:
     """A group in words; of planned stops by their numbers."""
     number = planned.get(group.where)
     return str(replace(group, where=f"planned stop {number}") if number else group)
+
+
+def effects_document(now: Found, after: Found) -> dict[str, Any]:
+    """From which size effects are found, as JSON has it: of those never found, None."""
+
+    def size(found: Found, name: str) -> float | None:
+        each = found.effects.get(name, np.inf)
+        return each if np.isfinite(each) else None
+
+    return {
+        name: {"unit": unit, "now": size(now, name), "after": size(after, name)}
+        for name, unit in sorted(after.units.items())
+    }
+
+
+def mishaps_document(now: Found, after: Found) -> dict[str, Any]:
+    """From which size mishaps are found, as JSON has it: of those never found, None."""
+
+    def size(found: Found, kind: str, unit: str) -> dict[str, float] | None:
+        each = found.mishaps.get(kind, {}).get(unit)
+        return each.document() if each else None
+
+    return {
+        kind: {u: {"now": size(now, kind, u), "after": size(after, kind, u)} for u in sizes}
+        for kind, sizes in after.mishaps.items()
+    }

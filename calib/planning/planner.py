@@ -14,13 +14,16 @@ from calib.planning.criteria import chosen
 from calib.planning.found import Found, would_be_found
 from calib.planning.information import Information
 from calib.planning.purpose import Purpose
-from calib.planning.room.poses import in_order_of_path, reachable
+from calib.planning.room.clear import Clear
+from calib.planning.room.poses import reachable
+from calib.planning.room.ways import Leg, way_over
 from calib.planning.scene import PlanningScene
 from calib.planning.stops import Poses
 from calib.planning.worth import Known, criterion
 from calib.problem.unknowns import Key, Role
 from calib.results.solution import Solution
 from calib.solve.fit import Progress
+from chains import se3
 from chains.errors import InputError
 
 # Times that all candidates are measured for what no number of stops gets beyond.
@@ -72,9 +75,13 @@ class Planner:
 
     def candidates(self, count: int, seed: int) -> Poses:
         """So many random poses; see `reachable`."""
-        scene, rng = self.scene, np.random.default_rng(seed)
-        T, cameras_m = scene.T_world_reference, self.cameras_m
-        return reachable(scene.source, self.places, T, count, rng, cameras_m)
+        rng, T = np.random.default_rng(seed), self.scene.T_world_reference
+        return reachable(self.clear, self.places, T, count, rng, self.cameras_m)
+
+    @cached_property
+    def clear(self) -> Clear:
+        """What keeps the arm from a pose."""
+        return Clear.of(self.scene.source, self.places, self.scene.T_world_reference)
 
     def look(self, poses: Poses, stops: int) -> np.ndarray:
         """What each of some poses tells (n, S, S), so many of which are wanted.
@@ -128,9 +135,12 @@ class Planner:
         worst = int(np.argmax(over))
         return Step(known.stops, float(over[worst]), self.names[at[worst]])
 
-    def in_order(self, poses: Poses) -> Poses:
-        """Some poses in the order in which to drive to them."""
-        return poses.some(in_order_of_path(poses.joints, poses.location, list(self.places)))
+    def in_order(self, poses: Poses, among: Poses) -> tuple[Poses, list[Leg]]:
+        """Some poses in the order in which to drive to them, and how to get from each to the next;
+        see `way_over`."""
+        T_reference_world = se3.inverse(self.scene.T_world_reference)
+        order, legs = way_over(poses, among, self.clear, T_reference_world, list(self.places))
+        return poses.some(order), legs
 
     @cached_property
     def lasting(self) -> Information:

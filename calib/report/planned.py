@@ -22,14 +22,14 @@ if TYPE_CHECKING:
     from calib.report.plots import Axes, Figure
 
 MOST_SIGMAS = 20  # parameters that are drawn, those that gain most
-TABLE, DOCUMENT, PICTURE = "stops.csv", "plan.json", "before_after.svg"
+TABLE, WAY, DOCUMENT, PICTURE = "stops.csv", "way.csv", "plan.json", "before_after.svg"
 MEASURED = "#b8b8b8"
 
 
 @one_blas_thread
 def write_plan(plan: Plan, out: Path | str, run: Run | Path) -> None:
-    """Write a plan as a folder: ``stops.csv``, ``plan.json`` as ``--json`` prints it, and
-    ``before_after.svg``.
+    """Write a plan as a folder: ``stops.csv``; ``way.csv``, every pose on the way over them;
+    ``plan.json`` as ``--json`` prints it; ``before_after.svg``.
 
     Args:
         plan: the stops, and what they are worth.
@@ -41,6 +41,8 @@ def write_plan(plan: Plan, out: Path | str, run: Run | Path) -> None:
     """
     with outputs.folder(out, PLANNED, inputs_of(run)) as folder:
         write_columns(folder / TABLE, plan.columns())
+        way = plan.document()["way"]
+        write_columns(folder / WAY, {key: [row[key] for row in way] for key in way[0]})
         write_json(folder / DOCUMENT, plan.document())
         warning = run.warning if isinstance(run, Run) else ()
         plots.save(before_after(plan), folder / PICTURE, warning)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -41,9 +42,9 @@ def print_plan(plan: Plan) -> None:
     for sentence in (*achieved(plan), *_unlike(plan), *_reached(plan)):
         console.print(sentence)
     console.print()
-    console.print(
-        "Joints in degrees or mm, in the order of a short path, on which nothing was checked."
-    )
+    console.print("Joints in degrees or mm, in the order of a short path.")
+    for sentence in _way(document):
+        console.print(sentence)
     tables = [_stops_table(plan)]
     if document["smallest_detectable"]:
         tables.append(_detectable_table(document["smallest_detectable"]))
@@ -67,6 +68,30 @@ def print_plan(plan: Plan) -> None:
     for name, row in (("now", now), ("after", after)):
         table.add_row(name, *(f"{value:.3g}" for value in row.values()))
     console.print(table)
+
+
+def _way(document: Mapping[str, Any]) -> Iterator[str]:
+    """What is known of the way from stop to stop, and for what the arm is taken, in sentences."""
+    way, what = document["way"], "links and room, all joints moving at once"
+    checked = [row for row in document["way"] if row["clear"] is not None and row["stop"]]
+    by = [k["stop"] for row, k in pairwise(way) if row["stop"] is None]
+    shut = [row["stop"] for row in checked if not row["clear"]]
+    if checked and not by and not shut:
+        yield f"The straight way from each to the next is clear of the arm's own {what}."
+    if by:
+        yield (
+            f"Before stop{'s' * (len(by) > 1)} {', '.join(map(str, by))} the arm goes by another "
+            f"pose ('way' of --json; way.csv of -o FOLDER), to stay clear of its own {what}."
+        )
+    if shut:
+        yield (
+            f"No clear way was found to stop{'s' * (len(shut) > 1)} "
+            f"{', '.join(map(str, shut))} from the stop before: drive there by hand."
+        )
+    if document["tubes"]:
+        rest = len(document["tubes"]) - 1
+        more = f", and of {rest} more link{'s' * (rest > 1)}" if rest else ""
+        yield f"Taken for tubes, as their shapes are missing: {document['tubes'][0]}{more}."
 
 
 def print_targets(plan: TargetPlan) -> None:

@@ -19,7 +19,7 @@ from calib.planning.criteria import (
     smallest,
 )
 from calib.planning.information import Information
-from calib.planning.room.poses import in_order_of_path
+from calib.planning.room.ways import in_order_of_path
 
 
 def known(size, prior=1e-6):

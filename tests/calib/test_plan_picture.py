@@ -24,7 +24,7 @@ def test_a_plan_is_written_as_a_folder_that_another_plan_replaces(run, rigcal, t
         code, _, _ = rigcal(*words, "--stops", count, "-o", tmp_path / "plan")
         assert code == 0
         files = sorted(path.name for path in (tmp_path / "plan").iterdir())
-        assert files == ["before_after.svg", "plan.json", "stops.csv"]
+        assert files == ["before_after.svg", "plan.json", "stops.csv", "way.csv"]
         document = json.loads((tmp_path / "plan/plan.json").read_text())
         table = pd.read_csv(tmp_path / "plan/stops.csv")
         assert table.to_dict("records") == document["stops"] and len(table) == count

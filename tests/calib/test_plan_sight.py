@@ -7,8 +7,9 @@ import pandas as pd
 import pytest
 
 from calib.planning import planner_of
+from calib.planning.room.clear import TUBE_RADIUS_M, Clear, InTheWay
 from calib.planning.room.hanging import plan_targets
-from calib.planning.room.sight import CARRIES_M, TUBE_RADIUS_M, _past_tubes
+from calib.planning.room.sight import CARRIES_M, _past_arm
 from tests.calib.narrow import run_of
 
 
@@ -39,7 +40,7 @@ def clear(points_m, mesh, camera, at, T):
     for those about the body."""
     way = camera + np.linspace(0.02, 0.98, 400)[:, None] * (at - camera)
     inside = (way - T[:3, 3]) @ T[:3, :3]
-    near = np.linalg.norm(points_m - at, axis=1) < CARRIES_M
+    near = np.linalg.norm(points_m - at, axis=1) < TUBE_RADIUS_M + CARRIES_M
     gaps = np.linalg.norm(way[:, None] - points_m[~near], axis=2)
     step = np.linalg.norm(at - camera) / 400
     return mesh.distance_m(inside).min() > step and gaps.min() > TUBE_RADIUS_M - step
@@ -54,13 +55,12 @@ def test_what_is_between_hides_what_is_behind_or_carries_does_not():
         ((-0.5, 0.0, 0.0), True),
         ((1.95, 0.0, 0.0), True),
     ):
-        assert _past_tubes(camera, body, np.array([[tube]])).tolist() == [seen]
+        arm = InTheWay(np.array([[tube]]), np.array([TUBE_RADIUS_M]))
+        assert _past_arm(camera, body, arm).tolist() == [seen]
 
 
 def test_two_cameras_see_every_body_at_every_candidate_and_not_at_others(run, cameras):
     from dataclasses import replace
-
-    from calib.planning.room.poses import Clear, along
 
     cameras = cameras[[0, 5]]  # both are to see all
     planner = replace(planner_of(run, "all"), cameras_m=cameras)
@@ -69,7 +69,7 @@ def test_two_cameras_see_every_body_at_every_candidate_and_not_at_others(run, ca
 
     def told(poses):
         """How many bodies two cameras see, at worst, by small steps along each line of sight."""
-        tubes = along(Clear(source).points(poses.joints)).reshape(len(poses.joints), -1, 3)
+        tubes = Clear(source).in_the_way(poses.joints).points_m
         counts = []
         for k, T in enumerate(poses.Ts_world_root):
             world = tubes[k] @ T[:3, :3].T + T[:3, 3]
