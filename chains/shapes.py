@@ -60,8 +60,15 @@ def _shapes(link: str, parts: Sequence[Element]) -> list[LinkShape]:
         kind = next((k for k in ("mesh", *SOLIDS) if part.find(f"geometry/{k}") is not None), None)
         if kind is not None:
             mesh = part.find("geometry/mesh")
-            file, scale = "" if mesh is None else mesh.get("filename", ""), _scale(part, kind)
-            found.append(LinkShape(link, kind, file, origin_of(part), scale))
+            found.append(
+                LinkShape(
+                    link=link,
+                    kind=kind,
+                    file="" if mesh is None else mesh.get("filename", ""),
+                    T_link_shape=origin_of(part),
+                    scale=_scale(part, kind),
+                )
+            )
     return found
 
 
