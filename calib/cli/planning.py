@@ -22,8 +22,8 @@ from chains.errors import InputError
 
 UNTIL = "The fewest stops until sigmas are so small: 'lidar 0.3 mm, rings 1 mm'."
 FOR = (
-    "all; reliability, against blunders; scatter, of stops; frames, effects or parameters to know "
-    "better, with commas; effects to separate."
+    "all; workspace, to predict best wherever the arm goes; reliability, against blunders; "
+    "scatter, of stops; names to know better, with commas; effects to separate."
 )
 
 Stops = Annotated[

@@ -174,6 +174,7 @@ class Plan:
             },
             "learning_curve": [step.document() for step in self.curve],
             "reached": self.reached,
+            "predicted_mm": {w: _mm(k) for w, k in zip(WHEN, (self.now, self.after), strict=True)},
             "observability": {"now": dict(self.now.indices), "after": dict(self.after.indices)},
         }
 
@@ -193,6 +194,10 @@ def _places(scene: PlanningScene, poses: Poses) -> dict[str, np.ndarray]:
     """Where the base stands, in the reference's frame."""
     Ts = se3.inverse(scene.T_world_reference) @ poses.Ts_world_root
     return dict(zip(poses.location.astype(str).tolist(), Ts, strict=True))
+
+
+def _mm(known: Known) -> float | None:
+    return None if known.predicted_m is None else 1e3 * known.predicted_m
 
 
 def _pose(T: np.ndarray) -> dict[str, list[float]]:

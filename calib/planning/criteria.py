@@ -86,6 +86,20 @@ class Variance(Criterion):
         return -np.log(np.einsum("kjj->k", found[:, self.at]) / len(self.at))
 
 
+class Predicted(Criterion):
+    """I-optimality (Box and Draper 1959): the mean variance of what is predicted, of which errors
+    of the S components of `known` make ``W`` (S, S) times their covariance."""
+
+    def __init__(self, known: Information, W: np.ndarray) -> None:
+        values, turn = np.linalg.eigh(W)
+        some = values > INFORMATION_ROUNDING * values[-1]
+        self.start, self.root = known.data + known.paper, turn[:, some] * np.sqrt(values[some])
+
+    def of(self, M: np.ndarray) -> np.ndarray:
+        found = np.linalg.solve(M, np.broadcast_to(self.root, (len(M), *self.root.shape)))
+        return -np.log(np.einsum("kij,ij->k", found, self.root))
+
+
 class Apart(Criterion):
     """T-optimality: each of some effects against its rivals.
 

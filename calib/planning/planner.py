@@ -10,13 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from calib.planning.criteria import chosen
+from calib.planning.criteria import Criterion, Predicted, chosen
 from calib.planning.found import Found, would_be_found
-from calib.planning.information import Information
-from calib.planning.purpose import Purpose
+from calib.planning.information import Information, inverse
+from calib.planning.purpose import WORKSPACE, Purpose
 from calib.planning.room.clear import Clear
 from calib.planning.room.poses import reachable
 from calib.planning.room.ways import Leg, way_over
+from calib.planning.room.workspace import moved_anywhere
 from calib.planning.scene import PlanningScene
 from calib.planning.stops import Poses
 from calib.planning.worth import Known, criterion
@@ -28,6 +29,9 @@ from chains.errors import InputError
 
 # Times that all candidates are measured for what no number of stops gets beyond.
 ENDLESS_TIMES = 1e4
+# Poses that stand for all that an arm can reach: with eight draws of so many the predicted error of
+# a UR10 is within 2.2 % of the mean.
+ANYWHERE = 400
 
 
 @dataclass(frozen=True)
@@ -99,8 +103,20 @@ class Planner:
 
     def choose(self, poses: Poses, each: np.ndarray, stops: int, exchange: bool = True) -> Poses:
         """The best of some poses, from what each tells; without `exchange` the best first."""
-        by, tell = criterion(self.scene, self.aim, self.lasting), partial(self.progress, "choosing")
+        by, tell = self.criterion, partial(self.progress, "choosing")
         return poses.some(chosen(by, each, stops, tell, exchange))
+
+    @property
+    def criterion(self) -> Criterion:
+        """By what stops are chosen."""
+        if self.aim.text != WORKSPACE:
+            return criterion(self.scene, self.aim, self.lasting)
+        return Predicted(self.lasting, moved_anywhere(self.scene, self.lasting, self._anywhere))
+
+    @cached_property
+    def _anywhere(self) -> Poses:
+        """Poses all over what the arm can reach."""
+        return self.candidates(ANYWHERE, seed=ANYWHERE)
 
     def endless(self, each: np.ndarray) -> Known:
         """What all candidates tell, measured again and again: no stops of the arm tell more. As the
@@ -203,7 +219,15 @@ class Planner:
     def known(self, information: Information, more: int) -> Known:
         """What all rows say, in the words of a run; of so many stops more."""
         stops = len(self.scene.source.recording.stops) + more
-        return Known.of(self.scene, self.aim, information, stops, self._wider)
+        known = Known.of(self.scene, self.aim, information, stops, self._wider)
+        if self.aim.text != WORKSPACE:
+            return known
+        model = information.without(self.scene.unbounded)
+        at, wider = model.at(self.scene.calibration), np.ones(len(model.keys))
+        wider[at] = self._wider
+        W = moved_anywhere(self.scene, model, self._anywhere) * np.outer(wider, wider)
+        square_m2 = np.sum(W * inverse(model.data + model.paper, np.arange(len(wider))))
+        return replace(known, predicted_m=float(np.sqrt(square_m2)))
 
     @cached_property
     def _wider(self) -> np.ndarray:

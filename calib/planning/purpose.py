@@ -1,5 +1,5 @@
-"""What planned stops are for: the whole calibration, some of it, telling rivals apart, or a
-calibration that errors of single stops do little to."""
+"""What planned stops are for: the whole calibration or some of it, telling rivals apart, estimates
+that single stops do little to, or predictions that are good wherever the arm can go."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from calib.runs.run import Run
 from chains.errors import InputError
 from sensors.documents import nearest
 
-ALL, RELIABILITY, SCATTER = "all", "reliability", "scatter"
+ALL, RELIABILITY, SCATTER, WORKSPACE = "all", "reliability", "scatter", "workspace"
 # What differs from stop to stop by chance, as a whole: the range zero, and where the LiDAR sits.
 OF_STOPS = (StopRangeScatter, StopPoseScatter)
 
@@ -55,7 +55,8 @@ def purpose_of(run: Run | None, stand: Stand, text: str | None) -> Purpose:
         run: with its diagnosis, if there is one; None of a rig alone, of which `text` says it.
         stand: its fit.
         text: ``all``; ``reliability``, so that no single stop carries an estimate; ``scatter``, as
-            well as can be where stops err as a whole; names of frames, effects or parameters of
+            well as can be where stops err as a whole; ``workspace``, so that what the arm carries
+            is predicted best wherever it can go; names of frames, effects or parameters of
             the model, with commas; or effects, of which one at least is not in the model. By
             default what the diagnosis says cannot be told apart, then what it says is hardly
             determined, then all.
@@ -65,7 +66,7 @@ def purpose_of(run: Run | None, stand: Stand, text: str | None) -> Purpose:
     """
     if text is None:
         return _from_diagnosis(run, stand)
-    if text in (ALL, RELIABILITY):
+    if text in (ALL, RELIABILITY, WORKSPACE):
         return Purpose(text)
     if text == SCATTER:
         return Purpose(SCATTER, added=_of_stops(stand))

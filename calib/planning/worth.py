@@ -34,6 +34,8 @@ class Known:
             the model, and beside the model and its rivals.
         weak: the directions that are hardly determined, as diagnosis.json has them.
         indices: the observability indices.
+        predicted_m: root mean square error, m, of the place of what the arm carries, over all that
+            it can reach; None where that is not what stops are planned for.
     """
 
     stops: int
@@ -41,6 +43,7 @@ class Known:
     smallest: Mapping[str, tuple[float, float]]
     weak: Sequence[Mapping[str, Any]]
     indices: Mapping[str, float]
+    predicted_m: float | None = None
 
     @classmethod
     def of(

@@ -10,7 +10,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from calib.planning.purpose import ALL, RELIABILITY, SCATTER
+from calib.planning.purpose import ALL, RELIABILITY, SCATTER, WORKSPACE
 from calib.problem.unknowns import Key
 from calib.show.tables import columns_table, print_pairs, shown, terminal
 
@@ -25,6 +25,7 @@ AIMS = {
     ALL: "for the whole calibration",
     RELIABILITY: "against blunders: no single stop is to carry an estimate",
     SCATTER: "for the whole calibration, where stops err as a whole by chance",
+    WORKSPACE: "to predict the place of what the arm carries, wherever it can go",
 }
 WEAK = {
     "now": "hardly determined now",
@@ -149,6 +150,12 @@ def _achieved(plan: Plan, document: Mapping[str, Any]) -> Iterator[str]:
         elif each["beside_rivals"]["with_any_number"] is None:
             others = ", ".join(n for n in document["rivals"] if n != name) or "the model"
             yield f"NEVER FOUND: no number of stops of this arm tells {name} from {others}."
+    if document["predicted_mm"]["after"] is not None:
+        now, after = (document["predicted_mm"][when] for when in ("now", "after"))
+        yield (
+            "The place of what the arm carries is then known, wherever it can go, to "
+            f"{after:.3g} mm rms; now to {now:.3g}."
+        )
     yield _fall(plan)
 
 

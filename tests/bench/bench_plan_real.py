@@ -5,9 +5,10 @@
 DATA is the folder of `examples/06_what_is_missing_in_a_ur10.py`. From a fit of 15 poses, 60 of
 2,500 are chosen by the volume of the errors (D), by the mean variance (A), by each of the
 observability indices of the literature (O1 to O5; see `observability`), by what is left once the
-worst pose is lost, or drawn; the model of lengths, zeros and tilts is fitted to them, and held
-against 2,000 poses that nobody chose from. How well the same model is known from them is printed as
-well: the mean over parameters of sigma over that of all 2,500.
+worst pose is lost, by how well the tool's place is predicted, or drawn; the model of lengths, zeros
+and tilts is fitted to them, and held against 2,000 poses that nobody chose from. How well the same
+model is known from them is printed as well: the mean over parameters of sigma over that of all
+2,500.
 """
 
 from __future__ import annotations
@@ -25,9 +26,10 @@ import calib
 from calib import problem as problems
 from calib.linear.parallel import one_blas_thread
 from calib.planning import planner_of
-from calib.planning.criteria import Criterion, Variance, Volume, chosen, observability
+from calib.planning.criteria import Criterion, Predicted, Variance, Volume, chosen, observability
 from calib.planning.information import Information
 from calib.planning.reliability import Reliable
+from calib.planning.room.workspace import moved_anywhere
 from calib.planning.stops import Poses
 from calib.problem.model import Source
 from calib.results.errors import body_errors
@@ -111,6 +113,7 @@ def main(data: Path, made: Path) -> None:
     ways = {"D": Volume(known, at), "A": Variance(known, at, np.ones(len(at)))}
     ways |= {name: Index(known, at, name) for name in ("O1", "O2", "O3", "O4", "O5")}
     ways["reliability"] = Reliable(known, at, each[:0])
+    ways["workspace"] = Predicted(known, moved_anywhere(planner.scene, known, poses))
     for name, by in ways.items():
         best = chosen(by, each, STOPS, lambda done, total: None, exchange=False)
         error, wider = told(pool[best], name)

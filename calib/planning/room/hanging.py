@@ -13,7 +13,7 @@ import numpy as np
 from calib.linear.parallel import one_blas_thread
 from calib.planning import Planner, planner_without_places, silent, written
 from calib.planning.criteria import chosen
-from calib.planning.purpose import ALL, RELIABILITY, SCATTER, Purpose
+from calib.planning.purpose import ALL, RELIABILITY, SCATTER, WORKSPACE, Purpose
 from calib.planning.room.targets import each_target, hanging_places, known_with
 from calib.planning.worth import Known, criterion
 from calib.problem.unknowns import Key
@@ -96,7 +96,7 @@ def plan_targets(
     Raises:
         InputError: as of `calib.plan`; or the rig has no targets, or they have no place.
     """
-    if purpose in (RELIABILITY, SCATTER):
+    if purpose in (RELIABILITY, SCATTER, WORKSPACE):
         raise InputError(f"--for {purpose}: it is about stops, of which targets tell nothing")
     if targets < 1 or candidates < targets:
         raise InputError(f"{targets} targets out of {candidates} candidates: give at least 1")
