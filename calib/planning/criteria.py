@@ -86,7 +86,7 @@ class Variance(Criterion):
         return -np.log(np.einsum("kjj->k", found[:, self.at]) / len(self.at))
 
 
-class Predicted(Criterion):
+class PredictionVariance(Criterion):
     """I-optimality (Box and Draper 1959): the mean variance of what is predicted, of which errors
     of the S components of `known` make ``W`` (S, S) times their covariance."""
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.planning.criteria import Criterion, Predicted, chosen
+from calib.planning.criteria import Criterion, PredictionVariance, chosen
 from calib.planning.found import Found, would_be_found
 from calib.planning.information import Information, inverse
 from calib.planning.purpose import WORKSPACE, Purpose
@@ -111,7 +111,9 @@ class Planner:
         """By what stops are chosen."""
         if self.aim.text != WORKSPACE:
             return criterion(self.scene, self.aim, self.lasting)
-        return Predicted(self.lasting, moved_anywhere(self.scene, self.lasting, self._anywhere))
+        return PredictionVariance(
+            self.lasting, moved_anywhere(self.scene, self.lasting, self._anywhere)
+        )
 
     @cached_property
     def _anywhere(self) -> Poses:

@@ -26,7 +26,14 @@ import calib
 from calib import problem as problems
 from calib.linear.parallel import one_blas_thread
 from calib.planning import planner_of
-from calib.planning.criteria import Criterion, Predicted, Variance, Volume, chosen, observability
+from calib.planning.criteria import (
+    Criterion,
+    PredictionVariance,
+    Variance,
+    Volume,
+    chosen,
+    observability,
+)
 from calib.planning.information import Information
 from calib.planning.reliability import Reliable
 from calib.planning.room.workspace import moved_anywhere
@@ -113,7 +120,7 @@ def main(data: Path, made: Path) -> None:
     ways = {"D": Volume(known, at), "A": Variance(known, at, np.ones(len(at)))}
     ways |= {name: Index(known, at, name) for name in ("O1", "O2", "O3", "O4", "O5")}
     ways["reliability"] = Reliable(known, at, each[:0])
-    ways["workspace"] = Predicted(known, moved_anywhere(planner.scene, known, poses))
+    ways["workspace"] = PredictionVariance(known, moved_anywhere(planner.scene, known, poses))
     for name, by in ways.items():
         best = chosen(by, each, STOPS, lambda done, total: None, exchange=False)
         error, wider = told(pool[best], name)

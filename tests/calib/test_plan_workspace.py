@@ -9,7 +9,7 @@ import pytest
 
 import calib
 from calib.planning import planner_of
-from calib.planning.criteria import Predicted, chosen
+from calib.planning.criteria import PredictionVariance, chosen
 from calib.planning.information import Information
 from calib.planning.room.hanging import plan_targets
 from calib.planning.room.workspace import _at, moved_anywhere
@@ -33,7 +33,7 @@ def test_designs_are_rated_by_the_mean_variance_of_what_is_predicted():
     rng = np.random.default_rng(3)
     keys = tuple(Key("u", f"p{k}") for k in range(4))
     J = rng.standard_normal((50, 3, 4))
-    by = Predicted(
+    by = PredictionVariance(
         Information(keys, np.ones(4), np.zeros((4, 4)), np.eye(4)),
         np.einsum("nip,niq->pq", J, J) / 50,
     )
