@@ -9,7 +9,7 @@ from typing import Any
 
 from calib.runs.run import Run
 from calib.view.desk import Desk
-from calib.view.job import Change, Job, JobMessage, Report
+from calib.view.job import Job, JobMessage, Task
 from calib.view.scene import Scene
 from chains.errors import InputError
 
@@ -61,7 +61,7 @@ class Bench:
         """Whether a job runs."""
         return self._job is not None
 
-    def start(self, by: Any, run: Path, change: Change | Report | None = None) -> None:
+    def start(self, by: Any, run: Path, change: Task | None = None) -> None:
         """Begin a job, as `Job` takes it; `by` is told to those who listen.
 
         Raises:
@@ -70,7 +70,7 @@ class Bench:
         with self._lock:
             if self.busy:
                 raise InputError(
-                    "a fit or a report is being made already; wait for it, or cancel it"
+                    "a fit, a report or a plan is being made already; wait for it, or cancel it"
                 )
             job = self._job = Job(run, change, self._desk.trust)
         threading.Thread(target=self._follow, args=(job, by), daemon=True).start()

@@ -33,6 +33,7 @@ class Findings:
         blunders: what is wrong in the recording.
         curves: mean residual against one covariate each, by its name.
         formulas: a chart for each formula of residual structure.
+        remedies: what would tell of what the diagnosis could not.
     """
 
     heading: str
@@ -42,6 +43,7 @@ class Findings:
     blunders: Sequence[Mapping[str, Any]]
     curves: Mapping[str, DiagnosisCurve]
     formulas: Sequence[Chart] = ()
+    remedies: Sequence[Mapping[str, Any]] = ()
 
     @classmethod
     def read(cls, run: Run) -> Findings | None:
@@ -62,6 +64,7 @@ class Findings:
         names = ("sentences", "candidates", "unexplained", "blunders")
         lists = {name: document[name] for name in names}
         charts = charts_of(document, narrow=True)
+        lists["remedies"] = document.get("remedies", [])
         return cls(heading=document["heading"], curves=curves, formulas=charts, **lists)
 
     @property

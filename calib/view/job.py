@@ -1,6 +1,7 @@
-"""A refit or a diagnosis in a process of its own: the page stays alive, and a job can be stopped.
+"""A refit, a diagnosis or a plan in a process of its own: the page stays alive, and a job can be
+stopped.
 
-The process does what ``rigcal add`` and ``rigcal diagnose`` do, and tells of it through a pipe.
+The process does what ``rigcal add``, ``diagnose`` and ``plan`` do, and tells of it through a pipe.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from sensors.documents import write_yaml
 if TYPE_CHECKING:
     from calib.problem.model import Model
     from calib.runs.run import Run
+    from calib.solve.fit import Progress
 
 PATIENCE_S = 10.0  # for a process that was stopped to clean up
 
@@ -31,12 +33,14 @@ class JobMessage:
     """What a job says of itself.
 
     Args:
-        kind: "progress"; "run", a run folder stands; "done"; "failed"; "stopped".
-        text: what is being done, the folder, or the sentence that says what is wrong.
+        kind: "progress"; "run", a run folder stands; "plan", a plan does; "done"; "failed";
+            "stopped".
+        text: what is being done, the folder, what the plan is worth, or the sentence that says what
+            is wrong.
         share: of the present step that is done, 0 to 1.
     """
 
-    kind: Literal["progress", "run", "done", "failed", "stopped"]
+    kind: Literal["progress", "run", "plan", "done", "failed", "stopped"]
     text: str = ""
     share: float = 0.0
 
@@ -69,20 +73,38 @@ class Report:
     out: Path
 
 
+@dataclass(frozen=True)
+class PlanStops:
+    """Stops to be planned.
+
+    Args:
+        out: folder of the plan.
+        purpose: what they are for, as ``--for`` takes it; None for what the diagnosis needs.
+        stops: how many.
+    """
+
+    out: Path
+    purpose: str | None
+    stops: int
+
+
+Task = Change | Report | PlanStops
+
+
 class Job:
     """A run refitted with a change, and the result diagnosed; a run diagnosed, where nothing is to
-    be changed; or its report written.
+    be changed; its report written; or stops planned for it.
 
     Args:
         run: folder of the run to start from.
-        change: what is to be another, or the report.
+        change: what is to be another, or the report, or the plan.
         trust: the Python files of effects that may run.
     """
 
     def __init__(
         self,
         run: Path,
-        change: Change | Report | None = None,
+        change: Task | None = None,
         trust: Trust = MappingProxyType({}),
     ) -> None:
         # Spawned: a process with threads and libraries such as these cannot be forked safely.
@@ -122,7 +144,7 @@ class Job:
             self._process.kill()
 
 
-def _work(mouth: Connection, run: Path, change: Change | Report | None, trust: Trust) -> None:
+def _work(mouth: Connection, run: Path, change: Task | None, trust: Trust) -> None:
     """What the process does."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the page, which ends its jobs
     signal.signal(signal.SIGTERM, _leave)
@@ -137,7 +159,7 @@ def _work(mouth: Connection, run: Path, change: Change | Report | None, trust: T
         mouth.send(JobMessage("failed", f"internal fault: {type(error).__name__}: {error}"))
 
 
-def _study(mouth: Connection, folder: Path, change: Change | Report | None, trust: Trust) -> None:
+def _study(mouth: Connection, folder: Path, change: Task | None, trust: Trust) -> None:
     from calib.runs.calibrate import grow
     from calib.runs.diagnose import diagnose
     from calib.runs.run import Run
@@ -151,10 +173,24 @@ def _study(mouth: Connection, folder: Path, change: Change | Report | None, trus
 
         report([run], change.out, progress)
         return
+    if isinstance(change, PlanStops):
+        mouth.send(JobMessage("plan", _planned(run, change, progress)))
+        return
     if change is not None:
         run = grow(run, changed(run, change), change.out, progress)
         mouth.send(JobMessage("run", str(run.folder)))
     diagnose(run, progress)
+
+
+def _planned(run: Run, wanted: PlanStops, progress: Progress) -> str:
+    """Plan stops, and write them; what they are worth, in sentences."""
+    from calib.planning import plan
+    from calib.report.planned import write_plan
+    from calib.show.plan import achieved
+
+    found = plan(run, wanted.stops, wanted.purpose, progress=progress)
+    write_plan(found, wanted.out, run)
+    return " ".join(achieved(found))
 
 
 def changed(run: Run, change: Change) -> Model:

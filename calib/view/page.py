@@ -22,9 +22,11 @@ from calib.view.effects.curve import CurveOver
 from calib.view.effects.expected import Asked, Expected
 from calib.view.effects.own import OwnFormula, document
 from calib.view.effects.ticks import Ticks
-from calib.view.job import Change, JobMessage, Report
+from calib.view.job import Change, JobMessage, PlanStops, Report, Task
 from calib.view.leave_out import LeaveOut
 from calib.view.picture import Picture
+from calib.view.plans.ask import AskPlan
+from calib.view.plans.ghosts import plan_beside
 from calib.view.server import Visitor
 from calib.view.shown import brush, look
 from calib.view.shown.menu import NOTHING, fill
@@ -82,6 +84,7 @@ class Page:
         self._add_ladder_widgets()
         self._blunders = LeaveOut(gui, self._heard, self._on_leave_out)
         self._add_findings_widgets()
+        self._plan = AskPlan(gui, self._heard, self._on_plan)
         self._dark = gui.add_checkbox("Dark", bool(self._asks.get("dark")))
         self._dark.on_update(self._heard(self._paint_page))
         self._paint_page()
@@ -223,6 +226,7 @@ class Page:
             raise
         others = {name: run for name, run in desk.runs.items() if name != desk.chosen}
         below = desk.rungs()[-1].below
+        self._plan.of(scene.sources[0].rig)
         self.picture.show(scene, others, desk.name_of(below.folder) if below else None)
         self._tell("")
 
@@ -253,6 +257,7 @@ class Page:
             offered = self.desk.addable(self.findings)
             listed = list(offered)[: panels.SHOWN_CANDIDATES] if self.findings else []
             self._ticks.show(self.desk.effects, offered, listed)
+            self._plan.show(self.findings.remedies if self.findings else [])
 
     def _on_ticks(self, wanted: Mapping[str, Any]) -> str:
         """Show the curve of what was ticked last; what is known of all that is ticked."""
@@ -293,6 +298,9 @@ class Page:
     def _on_leave_out(self, tokens: Sequence[str]) -> None:
         self._start(Change(self.desk.folder_without(), without=tuple(tokens)))
 
+    def _on_plan(self, purpose: str | None, stops: int) -> None:
+        self._start(PlanStops(plan_beside(self.desk.run).parent, purpose, stops))
+
     def _on_take(self, what: str) -> None:
         name = self.desk.run.folder.name
         if what == REPORT_FILE:
@@ -323,7 +331,7 @@ class Page:
 
     # ------------------------------------------------------------------------- in the background
 
-    def _start(self, change: Change | Report | None = None) -> None:
+    def _start(self, change: Task | None = None) -> None:
         self._ask()
         self.bench.start(self, self.desk.run.folder, change)
         self._tell("")
@@ -344,7 +352,7 @@ class Page:
         self._bar.visible = self._doing.visible = busy
         self._cancel.visible = busy and self.may_change
         self._diagnose.disabled = busy or not self.may_change
-        for widget in (self._blunders, self._ticks, self._own):
+        for widget in (self._blunders, self._ticks, self._own, self._plan):
             widget.busy(busy or not self.may_change)
         self._bar.value, self._doing.content = 0.0, panels.note("Starting …")
 
@@ -357,6 +365,8 @@ class Page:
             self._doing.content = panels.note(told.text)
         elif told.kind == "run":
             self._guarded(partial(self._made, Path(told.text), by is self))()
+        elif told.kind == "plan" and by is self:
+            self._guarded(partial(self._planned, told.text))()
         else:
             self._guarded(partial(self._ended, told, by is self))()
 
@@ -369,6 +379,11 @@ class Page:
         else:
             fill(self._run, list(self.desk.runs), self.desk.chosen)
             self._tell(panels.new_run(Rung(self.desk.runs[self.desk.name_of(folder)], None)))
+
+    def _planned(self, worth: str) -> None:
+        """A plan stands beside the run: it is drawn, and told what it is worth."""
+        self.picture.show_planned()
+        self._plan.tell(worth)
 
     def _ended(self, told: JobMessage, here: bool) -> None:
         with self.client.atomic():

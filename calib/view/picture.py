@@ -234,6 +234,12 @@ class Picture:
         if wrong:
             raise InputError(wrong)
 
+    def show_planned(self) -> None:
+        """Draw the plan beside the run."""
+        self._on_stop()
+        self.menu.planned.value = True
+        self._sides.turn(PLANNED_PATH, True)
+
     def _chosen_stops(self) -> list[str]:
         here, wanted = self._sides.first, self.panel.stops.value
         if wanted == THIS:
@@ -370,13 +376,11 @@ class Picture:
         self._sides.toggle({"room": ROOM_PATH, "rig": RIG_PATH, "frames": AXES_PATH}[part])
 
     def _on_moves(self) -> None:
-        if self.menu.moves.value == (MOVES_PATH in self.stage.hidden):
-            self._sides.toggle(MOVES_PATH)
+        self._sides.turn(MOVES_PATH, self.menu.moves.value)
         self.menu.moved.visible = self.menu.moves.value
 
     def _on_planned(self) -> None:
-        if self.menu.planned.value == (PLANNED_PATH in self.stage.hidden):
-            self._sides.toggle(PLANNED_PATH)
+        self._sides.turn(PLANNED_PATH, self.menu.planned.value)
 
     def _on_point(self, event: Any) -> None:
         side = self._sides.picked(np.array(event.ray_origin), np.array(event.ray_direction))

@@ -219,6 +219,11 @@ class Sides:
             self.second = None
         self.first.stage.call("")
 
+    def turn(self, path: str, seen: bool) -> None:
+        """Have what stands under a path seen, or not."""
+        if seen == (path in self.first.stage.hidden):
+            self.toggle(path)
+
     def toggle(self, name: str) -> None:
         """Hide a part of both rooms, or show it again."""
         for side in self:

@@ -13,7 +13,7 @@ from calib.view.plans.ghosts import PLANNED_PATH, draw, ghosts
 from calib.view.scene import Scene
 from chains.errors import InputError
 from tests.calib.narrow import run_of
-from tests.calib.workbench import field, shown, until
+from tests.calib.workbench import button, field, shown, until
 
 
 @pytest.fixture(scope="module")
@@ -81,3 +81,25 @@ def test_a_box_of_the_workbench_shows_them(run, rigcal):
         until(watched, lambda: PLANNED_PATH in stage.hidden, False)
         node = page.picture.stage.client.scene.get_handle_by_name(f"{PLANNED_PATH}/2")
         assert node is not None and len(stage.ghosts) == 2
+
+
+def test_stops_are_planned_on_the_page_and_stand_in_the_room(run):
+    """Where there is a browser. What the diagnosis needs is offered with what else there is."""
+    calib.diagnose(run)
+    out = run.folder.with_name(f"{run.folder.name}-plan")
+    with shown(run.folder) as (watched, page):
+        asked, stage = page._plan, page.picture.stage
+        needed = [r for r in page.findings.remedies if r["plan"]]
+        offered = [",".join(each["names"]) for each in needed]
+        options = ["what the diagnosis needs", *offered, "all", "workspace", "reliability"]
+        assert list(asked._for.options) == list(dict.fromkeys(options)) and needed
+        watched.page.get_by_text("Measure next").click()
+        asked._stops.value, asked._for.value = 2, "workspace"
+        button(watched, "Plan").click()
+        watched.page.get_by_text("The place of what the arm carries is then known").wait_for()
+        until(watched, lambda: len(stage.ghosts), 2)
+        assert PLANNED_PATH not in stage.hidden and page.picture.menu.planned.value
+        until(watched, lambda: page.bench.busy, False)
+        button(watched, "Plan").wait_for()
+    document = json.loads((out / "plan.json").read_text())
+    assert document["for"] == "workspace" and len(document["stops"]) == 2
