@@ -64,7 +64,8 @@ def _lacks_evaluation(folder: Path) -> str:
 
 
 def _lacks_plan(folder: Path) -> str:
-    return _without("plan.json", "stops.csv")(folder) or _is_other(folder)
+    table = "targets.csv" if (folder / "targets.csv").is_file() else "stops.csv"
+    return _without("plan.json", table)(folder) or _is_other(folder)
 
 
 def _lacks_export(folder: Path) -> str:
@@ -132,7 +133,11 @@ RUN = FolderKind(
 EVALUATION = FolderKind("evaluation", _lacks_evaluation, ("evaluation.json", "points.parquet"))
 EXPORT = FolderKind("export", _lacks_export)
 CLOUDS = FolderKind("folder of corrected clouds", _without(CLOUDS_MARK))
-PLANNED = FolderKind("plan", _lacks_plan, ("stops.csv", "way.csv", "plan.json", "before_after.svg"))
+PLANNED = FolderKind(
+    "plan",
+    _lacks_plan,
+    ("stops.csv", "way.csv", "targets.csv", "plan.json", "before_after.svg"),
+)
 LADDER = FolderKind("ladder of runs", _lacks_ladder)
 
 

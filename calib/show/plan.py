@@ -97,10 +97,10 @@ def _way(document: Mapping[str, Any]) -> Iterator[str]:
 
 def print_targets(plan: TargetPlan) -> None:
     """Print where targets should hang, and what is known without and with them."""
-    console, count = terminal(), len(plan.targets)
-    told = AIMS.get(plan.purpose.text, f"for {plan.purpose.text}")
-    console.print(f"{count} target{'s' * (count != 1)} {told}", style="bold", soft_wrap=True)
-    console.print(_fall(plan))
+    console = terminal()
+    heading, fall = achieved_by_targets(plan)
+    console.print(heading.removesuffix("."), style="bold", soft_wrap=True)
+    console.print(fall)
     console.print()
     console.print("Centres of the spheres, m, in the reference's frame.")
     table = columns_table("target", "x", "y", "z")
@@ -136,6 +136,12 @@ def _fall(plan: Plan | TargetPlan) -> str:
 def achieved(plan: Plan) -> list[str]:
     """What the stops are worth, in a sentence or two."""
     return list(_achieved(plan, plan.document()))
+
+
+def achieved_by_targets(plan: TargetPlan) -> list[str]:
+    """How many targets are for what, and what they are worth, in two sentences."""
+    count, told = len(plan.targets), AIMS.get(plan.purpose.text, f"for {plan.purpose.text}")
+    return [f"{count} target{'s' * (count != 1)} {told}.", _fall(plan)]
 
 
 def _achieved(plan: Plan, document: Mapping[str, Any]) -> Iterator[str]:

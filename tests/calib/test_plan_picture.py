@@ -9,6 +9,8 @@ import pandas as pd
 import pytest
 
 import calib
+from calib.planning.room.hanging import plan_targets
+from calib.problem.model import Source
 from calib.report.planned import MOST_SIGMAS, before_after
 from tests.calib.narrow import run_of
 
@@ -49,3 +51,29 @@ def test_the_picture_shows_each_sigma_before_and_after_and_says_what_was_found(r
     joints = np.degrees(np.concatenate([plan.measured.joints, plan.poses.joints]))
     np.testing.assert_allclose(np.sort(drawn), np.sort(joints.ravel()))
     assert len(plan.measured.joints) == 10
+
+
+def test_targets_are_drawn_in_the_room(run, rigcal, tmp_path):
+    out = tmp_path / "hang"
+    words = ["plan", run.folder, "--targets", 2, "--candidates", 40, "-o", out]
+    assert rigcal(*words)[0] == 0 and rigcal(*words)[0] == 0  # the second takes its place
+    names = sorted(path.name for path in out.iterdir())
+    assert names == ["before_after.svg", "plan.json", "targets.csv"]
+    document, table = json.loads((out / "plan.json").read_text()), pd.read_csv(out / "targets.csv")
+    assert table.to_dict("records") == document["targets"]
+    plan = plan_targets(run, 2, candidates=40)
+    figure = before_after(plan)
+    left, right = figure.axes
+    assert figure.get_suptitle().startswith("2 targets for the whole calibration. With them")
+    assert left.get_legend().get_texts()[1].get_text() == "with the planned targets"
+    *room, hung, planned = right.lines
+    np.testing.assert_allclose(np.column_stack(planned.get_data()), plan.spheres_m[:, :2])
+    np.testing.assert_allclose(np.column_stack(hung.get_data()), plan.hung_m[:, :2])
+    assert len(plan.hung_m) == 5 and len(room) == len(plan.room_m)
+    # Edges at which nothing turns are not drawn: a wall's two triangles share one.
+    mesh = Source.open(run.folder.parent / "rec").reference
+    assert 0 < len(plan.room_m) < 0.5 * len(mesh.triangles)
+    low, high = (f(mesh.vertices_m, axis=0) for f in (np.min, np.max))
+    for corner in (low, high):
+        assert (np.abs(plan.room_m - corner).max(axis=2) < 0.01).any()  # walls are uneven
+    assert f"P1, {plan.targets[0]['z']:.2f} m" in [text.get_text() for text in right.texts]

@@ -20,6 +20,11 @@ from calib.problem.unknowns import Key
 from calib.runs.run import Run
 from calib.solve.fit import Progress
 from chains.errors import InputError
+from sensors.reference import Hits
+
+# Mean of the unit normals beside an edge, above which the surface goes on: they turn by less than
+# 20 degrees, a choice for a drawing.
+TURNS_LESS = float(np.cos(np.radians(10.0)))
 
 
 @dataclass(frozen=True)
@@ -33,6 +38,8 @@ class TargetPlan:
         keys, units: (P,) of the parameters of the calibration.
         now, after: what is known without and with them.
         candidates: how many places they were chosen among.
+        hung_m: (M, 3) centre of each sphere that hangs already.
+        room_m: (E, 2, 3) edges of the mesh; none where there is none.
     """
 
     run: Path
@@ -43,6 +50,8 @@ class TargetPlan:
     now: Known
     after: Known
     candidates: int
+    hung_m: np.ndarray
+    room_m: np.ndarray
 
     @property
     def targets(self) -> list[dict[str, Any]]:
@@ -116,7 +125,8 @@ def _planned(planner: Planner, places: np.ndarray, targets: int) -> TargetPlan:
     """As `plan_targets`, and nothing is written."""
     scene = planner.scene
     known, each = each_target(scene, places)
-    by = criterion(scene, planner.aim, known)
+    by, hung = criterion(scene, planner.aim, known), scene.source.recording.targets
+    mesh = scene.source.reference
     best = chosen(by, each, targets, partial(planner.progress, "choosing"))
     some = places[best]
     return TargetPlan(
@@ -128,4 +138,20 @@ def _planned(planner: Planner, places: np.ndarray, targets: int) -> TargetPlan:
         now=planner.now,
         after=planner.known(known_with(scene, some), 0),
         candidates=len(places),
+        hung_m=np.zeros((0, 3)) if hung is None else hung.faro_m,
+        room_m=np.zeros((0, 2, 3)) if mesh is None else _edges(mesh),
     )
+
+
+def _edges(mesh: Hits) -> np.ndarray:
+    """Edges (E, 2, 3) of a mesh at which its surface turns, or ends: a room as it is drawn."""
+    corners = mesh.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    pairs, back = np.unique(np.sort(corners, axis=1), axis=0, return_inverse=True)
+    a, b, c = np.moveaxis(mesh.vertices_m[mesh.triangles], 1, 0)
+    normal = np.cross(b - a, c - a)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    total = np.zeros((len(pairs), 3))
+    np.add.at(total, back.ravel(), np.repeat(normal, 3, axis=0))
+    flat = np.linalg.norm(total, axis=1) > TURNS_LESS * np.bincount(back.ravel())
+    two = np.bincount(back.ravel()) > 1
+    return mesh.vertices_m[pairs[~(flat & two)]]
