@@ -70,7 +70,21 @@ def _effects(
 def _numbers(
     row: VariableEstimate, prior: dict[str, float], order: Sequence[int] | None = None
 ) -> Iterator[list[Cell]]:
-    """Cells of each number of a variable that was not held: its name, itself, `NUMBER_COLUMNS`."""
+    """Cells of each number of a variable that was not held: its name, itself, `NUMBER_COLUMNS`; and
+    of its shape, if it has one, whose name ends with its unit and which no CAD has."""
+    if row.shape is not None:
+        name, _, of = row.shape.name.rpartition("_")
+        scale, unit = shown(of)
+        value, spread = estimate_texts(row.shape.value, row.shape.sigma, of)
+        yield [
+            Cell(name),
+            _cell(scale * row.shape.value, value.lstrip("+")),
+            _cell(scale * row.shape.sigma, spread),
+            Cell(""),
+            Cell(unit),
+            *(Cell(""), Cell("")),
+            Cell("yes" if row.shape.sigma else "no"),
+        ]
     for k in range(len(row.parameters)) if order is None else order:
         estimate, sigma = float(row.estimate[k]), float(row.sigma[k])
         if sigma == 0.0:

@@ -11,6 +11,7 @@ from calib import problem as problems
 from calib.effects import CATALOGUE
 from calib.linear.linearise import beams_cost
 from calib.problem.model import Model
+from calib.report.calibration import _numbers
 from calib.results.intervals import intervals
 from calib.runs.calibrate import calibrate
 from calib.runs.estimates import variable_estimates
@@ -117,6 +118,10 @@ def test_a_run_tells_the_shape_with_its_sigma(source, tmp_path):
     row = next(row for row in variable_estimates(run) if row.variable == DRIFT)
     assert next(iter(effect_cells(row))) == ("tau", f"480 ± {told['sigma']:.0f}", "s", True)
     assert "shape" not in document["effects"]["ring_range_offset"]
+    tau, amount = _numbers(row, {})  # as the report lists them
+    texts = [cell.text for cell in tau]
+    assert texts == ["tau", "480", f"{told['sigma']:.0f}", "", "s", "", "", "yes"]
+    assert amount[0].text == "amount" and len(amount) == len(tau)
 
 
 def test_a_shape_at_which_the_basis_jumps_is_not_estimated():
