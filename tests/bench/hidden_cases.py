@@ -73,7 +73,12 @@ UNKNOWN: dict[str, tuple[frozenset[str], dict[str, Any]]] = {
 
 # The range zero is the rings' mean, which is in every model here; and rounding acts on no sensor.
 _NOT_ALONE = {"range_offset", "range_quantisation", *DEFAULT}
-SINGLES = tuple(e.name for e in CATALOGUE if e.site is not Site.NOISE and e.name not in _NOT_ALONE)
+# What is drawn anew by chance at every stop has a bench of its own (`chance.py`).
+SINGLES = tuple(
+    e.name
+    for e in CATALOGUE
+    if e.site is not Site.NOISE and not e.by_chance and e.name not in _NOT_ALONE
+)
 # Their parameters have one unit, so that a size at which they are found means something.
 OF_ONE_UNIT = tuple(n for n in SINGLES if not find(n).shape_name and "creep" not in n)
 RIVALS = ("ring_elevation_offset", "ring_range_offset")
