@@ -137,6 +137,7 @@ class _Climb:
         self.steps: list[dict[str, Any]] = []
         self.refused: list[str] = []
         self._formulas: Mapping[str, Mapping[str, Any]] = {}
+        self._general: set[str] = set()  # effects that have a more general rival
 
     @property
     def run(self) -> Run:
@@ -163,6 +164,11 @@ class _Climb:
         if not self.run.converged:  # of such a run nothing else is learnt
             return False
         self._formulas = diagnosis.formulas
+        self._general = {
+            each["add"]
+            for each in diagnosis.candidates
+            if any(rival["dof"] > each["dof"] for rival in each["rivals"])
+        }
         names = [*diagnosis.worth_adding, *self._formulas]
         earlier = [name for step in self.steps for name in step["added"]]
         before = len(self.runs)
@@ -210,8 +216,9 @@ class _Climb:
         # What is drawn anew by chance tells nothing of a stop that was left out.
         chance = any(effect.by_chance for effect in model.effects if effect.name in added)
         falls = _falls(self.run, run, LEAST_FALL if added else 0.0)
-        later = added and any(step["added"] for step in self.steps)
-        if run.converged and (chance or (falls and not (later and _by_chance(self.run, run)))):
+        if any(step["added"] for step in self.steps) and self._general.intersection(added):
+            falls = falls and not _by_chance(self.run, run)
+        if run.converged and (chance or falls):
             self._keep(run, added, dropped)
         else:
             outputs.remove(folder)

@@ -26,10 +26,13 @@ class World:
         errors: effects beside those of the first fit -> held-out rms.
         named: the same -> what the diagnosis of that model calls worth adding.
         spoiled: what a diagnosis says to leave out, as long as it is not.
+        judged: effect -> its parameters and rivals; of others `KNOWN`.
+        each: the same as of `errors` -> rms of each stop held out.
     """
 
-    def __init__(self, errors, named, spoiled=()):
+    def __init__(self, errors, named, spoiled=(), judged=None, each=None):
         self.errors, self.named, self.spoiled, self.fits = errors, named, spoiled, []
+        self.judged, self.each = judged or {}, each or {}
 
     def run(self, out, model, below=None):
         names = frozenset(model.names) - frozenset(Model().names)
@@ -38,7 +41,7 @@ class World:
         error = self.errors[names] + 5.0 * len(model.without)
         rms = {"fit": error, "held_out": error, "noise_floor": 1.0}
         grown_from = str(below.folder.resolve()) if below else None
-        summary = {"rms_mm": rms, "converged": True}
+        summary = {"rms_mm": rms, "converged": True, "held_out_each_mm": self.each.get(names)}
         return Run(out, model.document() | {"grown_from": grown_from}, summary, None)
 
     def diagnose(self, run, progress, refits, candidates=()):
@@ -48,11 +51,15 @@ class World:
         spoiled = [token for token in self.spoiled if token not in run.model["without"]]
         return SimpleNamespace(
             worth_adding=adding,
+            candidates=[{"add": name, **self.judged.get(name, KNOWN)} for name in adding],
             formulas={},
             blunders=[{"without": token} for token in spoiled],
             verdict="bad_data" if spoiled else verdict,
             sentences=[str(sorted(names))],
         )
+
+
+KNOWN = {"dof": 1, "rivals": []}
 
 
 def of(*names):
@@ -119,6 +126,20 @@ def test_what_does_not_lower_it_is_refused_and_not_tried_again(climbed, tmp_path
     assert not (tmp_path / "ladder" / "02").exists()
     written = json.loads((tmp_path / "ladder" / EXPLANATION).read_text())
     assert written["refused"] == [A] and len(written["ladder"]) == 2
+
+
+@pytest.mark.parametrize(("general", "steady"), [(True, True), (True, False), (False, False)])
+def test_a_later_one_with_a_more_general_rival_must_help_at_most_stops(climbed, general, steady):
+    """B lowers the error of all stops together; of each, or of one alone."""
+    each = {of(A): [5.0, 5.0, 5.0, 5.0]}
+    each[of(A, B)] = [4.0, 4.1, 3.9, 4.0] if steady else [5.2, 5.1, 5.2, 0.0]
+    errors = {of(): 9.0, of(A): 5.0, of(A, B): 4.0, of(B): 8.0}
+    judged = {B: {"dof": 2, "rivals": [{"dof": 4 if general else 2}]}}
+    found = climbed(World(errors, {of(): [A], of(A): [B]}, (), judged, each))
+    assert [s["added"] for s in found.steps][1:] == (
+        [[A]] if general and not steady else [[A], [B]]
+    )
+    assert found.refused == ([B] if general and not steady else [])
 
 
 def test_at_the_noise_floor_any_fall_counts(climbed):

@@ -97,14 +97,15 @@ def test_a_fall_is_chance_where_a_t_test_over_stops_says_so(mean):
 
 
 @pytest.mark.parametrize("steady", [True, False])
-def test_a_later_name_stands_if_stops_held_out_bear_it_out(look, steady):
+@pytest.mark.parametrize("general", [True, False])
+def test_a_later_name_stands_if_stops_bear_it_out_or_nothing_is_more_general(look, steady, general):
     """Two names lower the held-out error as much; stops differ about one of them."""
     gain = {True: (4e-8, 5e-8, 6e-8), False: (-9e-8, 2e-8, 22e-8)}
     falls = {
         "incidence_angle_bias": Fall(3.0, 2.9, 2.0, gain[False]),  # of the first nobody asks
         "azimuth_range_harmonic": Fall(2.9, 2.8, 2.0, gain[steady]),
     }
-    steps = []
+    steps, more = [], max(look.named.candidates, key=lambda c: c.test.dof)
     for name in falls:
         candidate = next(c for c in look.named.candidates if c.effect.name == name)
         steps.append(
@@ -114,14 +115,17 @@ def test_a_later_name_stands_if_stops_held_out_bear_it_out(look, steady):
                 after=look,
                 judged=candidate.test,
                 p_adjusted=1e-4,
-                rivals=(),
+                rivals=[more if general else candidate],
             )
         )
     found = Search(looks=[look], found=steps, blunders=(), unnamed=(), scatter=None)
     told = weighed(found, falls, {"held_out": 3.0, "fit": 3.0, "noise_floor": 2.0})
-    assert [step.effect.name for step in told.found.found] == list(falls)[: 1 + steady]
-    assert len(told.refused) == 1 - steady
-    if not steady:
+    assert [step.effect.name for step in told.found.found] == list(falls)[
+        : 1 + (steady or not general)
+    ]
+    assert len(told.refused) == (general and not steady)
+    if told.refused:
+        assert f"but so does {more.effect.name}, which is more general" in told.refused[0]
         assert "azimuth_range_harmonic was tried and rejected" in told.refused[0]
         assert "-0.100 mm, ± 0.016" in told.refused[0]
 

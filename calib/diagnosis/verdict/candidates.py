@@ -123,6 +123,7 @@ def _rivals(step: NamedEffect) -> list[dict[str, Any]]:
         {
             "effect": other.effect.family,
             "add": other.effect.name,
+            "dof": other.test.dof,
             "angle_deg": angle_deg(screen, step.candidate, other),
             "odds": float(np.exp(own - other.test.evidence(scale))),
             "separate": what_separates(step.effect, other.effect),

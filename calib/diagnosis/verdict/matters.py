@@ -4,8 +4,10 @@ With many rows a test sees what no user feels. A finding matters where the held-
 by a hundredth of what noise alone makes of it, or a value of the calibration would move by half its
 sigma; one that does neither is a trace.
 
-Once an effect was named, the next name stands only if held-out stops bear it out: where the first
-is nearly right and not wholly, what it leaves is significant, and some effect always takes it in.
+Once an effect was named, what it leaves is significant wherever it is nearly right and not wholly,
+and some effect always takes that in. So a later name does not stand where stops that were held out
+do not bear it out, and another effect, of more parameters, explains as much at its price: then the
+data ask for a more general form, and not for this name.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ import numpy as np
 
 from calib.diagnosis.score import projection
 from calib.diagnosis.screen import Candidate, Screen
-from calib.diagnosis.search import Search
+from calib.diagnosis.search import NamedEffect, Search
 from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import hangs_on, words
 from calib.results.holdout import Fall
@@ -131,7 +133,7 @@ def weighed(
     rms_mm: Mapping[str, float | None],
 ) -> Weighed:
     """A search without its traces, and without names that stops which were held out speak against
-    or, of a later name, do not bear out.
+    or, of a later name that has a more general rival, do not bear out.
 
     Args:
         found: the search.
@@ -149,12 +151,13 @@ def weighed(
                 f"{name} was tried and rejected: it absorbs part of the residuals, but stops that "
                 f"were held out are predicted worse with it ({told.held_out_mm:+.3f} mm)."
             )
-        elif named and fall is not None and fall.by_chance:
+        elif named and fall is not None and fall.by_chance and (other := _more_general(step)):
             refused.append(
                 f"{name} was tried and rejected: what {named[-1].effect.name} leaves of the "
                 f"residuals is significant (adjusted p = {step.p_adjusted:.1g}) and it absorbs "
-                "part of that, but stops held out do not confirm it: their error changes by "
-                f"{told.held_out_mm:+.3f} mm, ± {fall.spread_mm:.3f} by how much stops differ."
+                f"part of that, but so does {other}, which is more general, and stops held out "
+                f"do not confirm it: their error changes by {told.held_out_mm:+.3f} mm, ± "
+                f"{fall.spread_mm:.3f} by how much stops differ."
             )
         elif told.enough:
             named.append(step)
@@ -171,6 +174,12 @@ def weighed(
                 what = " and ".join(words(c) for c in hangs_on(candidate.effect))
                 traces.append(_sentence(f"structure over {what}", candidate, look.unnamed, told))
     return Weighed(replace(found, found=named, **kept), matter, traces, refused=refused)
+
+
+def _more_general(step: NamedEffect) -> str:
+    """A rival with more parameters, which explains as much at its price; empty without any."""
+    own = step.candidate.test.dof
+    return next((r.effect.name for r in step.rivals if r.test.dof > own), "")
 
 
 def _sentence(what: str, candidate: Candidate, screen: Screen, told: Matters) -> str:
