@@ -4,7 +4,9 @@ import os
 import signal
 import sys
 from collections import Counter
+from importlib import import_module
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 
@@ -88,6 +90,24 @@ def once(tmp_path_factory) -> Once:
     base = tmp_path_factory.getbasetemp()
     shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
     return Once(shared / "once", tmp_path_factory.mktemp)
+
+
+@pytest.fixture(scope="module")
+def diagnosed_once():
+    """In this file a run that is diagnosed again, and asked the same, has its diagnosis at once: for
+    tests of what is done with diagnoses."""
+    diagnose = import_module("calib.runs.diagnose")
+    found, make = {}, diagnose._found
+
+    def known(run, progress, refits, candidates):
+        stored = [(run.folder / name).read_bytes() for name in ("solution.yaml", "state.npz")]
+        key = repr((run.folder, run.model, run.summary, stored, refits, candidates))
+        if key not in found:
+            found[key] = make(run, progress, refits, candidates)
+        return found[key]
+
+    with patch.object(diagnose, "_found", known):
+        yield
 
 
 @pytest.fixture
