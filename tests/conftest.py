@@ -94,8 +94,10 @@ def once(tmp_path_factory) -> Once:
 
 @pytest.fixture(scope="module")
 def diagnosed_once():
-    """In this file a run that is diagnosed again, and asked the same, has its diagnosis at once: for
-    tests of what is done with diagnoses."""
+    """In this file a run that is diagnosed again, and asked the same, has its diagnosis at once.
+
+    It is for tests of what is done with diagnoses, not of how they come about.
+    """
     diagnose = import_module("calib.runs.diagnose")
     found, make = {}, diagnose._found
 

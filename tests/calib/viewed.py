@@ -17,14 +17,6 @@ SMALL = {
     "occluded_share": 0,
 }
 
-BOX = {  # of examples 4 and 7
-    "lidar": "hesai_pandarxt32",
-    "room": "box",
-    "locations": 3,
-    "stops_per_location": 2,
-    "column_step": 200,
-}
-
 
 def small_run(folder: Path, **changes: object) -> Run:
     """A fitted run of a few hundred beams at four stops, in ``folder/run``; nothing held out."""
@@ -34,7 +26,7 @@ def small_run(folder: Path, **changes: object) -> Run:
 
 def hidden(folder: Path) -> None:
     """A run whose model lacks what was hidden in its recording, in ``folder/run``."""
-    simulate(Spec(**BOX), folder / "rec", 1, {"incidence_angle_bias": 3.0})
+    simulate("tiny", folder / "rec", 1, {"incidence_angle_bias": 2.0})
     calibrate([folder / "rec"], folder / "run")
 
 
