@@ -1,10 +1,14 @@
 """What every test shares: one thread per BLAS call, an end, real data, and the command line."""
 
+import gc
 import os
 import signal
 import sys
 from collections import Counter
+from collections.abc import Generator
+from importlib import import_module
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 
@@ -20,34 +24,39 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, lambda *_: None)
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
-# Heaviest first, by seconds of a core (105 to 20), browsers too: the last files should be short.
+# Heaviest first, by seconds of a core (90 to 11), browsers too: the last files should be short.
 HEAVY = [
-    "test_docs",
     "test_damage",
+    "test_docs",
     "test_examples",
-    "test_view_browser",
     "test_components",
+    "test_view_browser",
     "test_same_bytes",
-    "test_arm_geometry",
-    "test_linearise",
-    "test_own_effects",
-    "test_pose_shapes",
-    "test_view_shown",
-    "test_formulas_shown",
     "test_converged",
-    "test_mishaps",
-    "test_matters",
-    "test_plan_found",
-    "test_cli_stages",
-    "test_rejects",
-    "test_systematic",
+    "test_arm_geometry",
+    "test_own_effects",
+    "test_linearise",
     "test_readme",
     "test_formulas",
-    "test_outputs_killed",
-    "test_hidden_effects",
+    "test_systematic",
+    "test_formulas_shown",
+    "test_report_pointer",
+    "test_rejects",
+    "test_matters",
     "test_report_odd",
+    "test_pose_shapes",
+    "test_plan_found",
+    "test_view_shown",
+    "test_plan",
+    "test_mishaps",
+    "test_hidden_effects",
+    "test_effects_hidden",
+    "test_explain",
+    "test_turned",
     "test_intervals",
     "test_torn",
+    "test_hostile_names",
+    "test_killed",
 ]
 LIMIT_S = {"slow": 600, "long": 3600}  # of others: see pyproject.toml
 
@@ -62,6 +71,17 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
                 slow[item.path] += 1
     rank = {name: at - len(HEAVY) for at, name in enumerate(HEAVY)}
     items.sort(key=lambda item: (rank.get(item.path.stem, 0), -slow[item.path]))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Look for no garbage while tests are collected: with 5,000 that took 3 s of 8."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()  # what was made so far stays to the end
+        gc.enable()
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -88,6 +108,26 @@ def once(tmp_path_factory) -> Once:
     base = tmp_path_factory.getbasetemp()
     shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
     return Once(shared / "once", tmp_path_factory.mktemp)
+
+
+@pytest.fixture(scope="module")
+def diagnosed_once():
+    """In this file a run that is diagnosed again, and asked the same, has its diagnosis at once.
+
+    It is for tests of what is done with diagnoses, not of how they come about.
+    """
+    diagnose = import_module("calib.runs.diagnose")
+    found, make = {}, diagnose._found
+
+    def known(run, progress, refits, candidates):
+        stored = [(run.folder / name).read_bytes() for name in ("solution.yaml", "state.npz")]
+        key = repr((run.folder, run.model, run.summary, stored, refits, candidates))
+        if key not in found:
+            found[key] = make(run, progress, refits, candidates)
+        return found[key]
+
+    with patch.object(diagnose, "_found", known):
+        yield
 
 
 @pytest.fixture

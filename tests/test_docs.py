@@ -2,14 +2,12 @@
 
 import re
 import shlex
-import shutil
 import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import pytest
 import yaml
 
@@ -21,10 +19,10 @@ from calib.problem.model import Source
 from calib.problem.without import leave_out
 from calib.rig import load_rig
 from calib.runs.run import Run
-from sensors.recording import read_table, write_table
 
 from .programs import ROOT, rigcal, script
 from .shown import blocks, shape, unlike
+from .thinned import thinned
 
 PAGES = sorted((ROOT / "docs").glob("*.md"))
 TOKEN = "L02P01:base_markers"
@@ -149,20 +147,9 @@ def test_the_page_about_ones_own_effects_shows_what_is_printed(tmp_path):
     assert len(places) == 9
 
 
-def thinned(recording: Path, folder: Path, stops: int, columns: int) -> None:
-    """Copy a recording, of so many stops and columns every first."""
-    shutil.copytree(recording, folder)
-    head, *rows = (folder / "stops.csv").read_text().splitlines()
-    (folder / "stops.csv").write_text("\n".join([head, *rows[::stops], ""]))
-    for path in (folder / "scans").iterdir():
-        table = read_table(path)
-        kept = np.isin(table["column"], np.unique(table["column"])[::columns])
-        write_table(path, {name: values[kept] for name, values in table.items()})
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "part", [(2, 8), pytest.param(None, marks=pytest.mark.long)], ids=["in part", "whole"]
+    "part", [(3, 6), pytest.param(None, marks=pytest.mark.long)], ids=["in part", "whole"]
 )
 def test_the_page_about_formulas_shows_what_is_printed(tmp_path, shared, part):
     """Of a part of the recording but for the figures."""

@@ -226,7 +226,7 @@ def test_a_recording_that_is_not_there_leaves_no_folder(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def explained(tmp_path_factory):
+def explained(tmp_path_factory, diagnosed_once):
     """A recording with a hidden effect, explained."""
     folder = tmp_path_factory.mktemp("explain")
     simulate(SMALL, folder / "rec", SEED, {HIDDEN: 3.0})

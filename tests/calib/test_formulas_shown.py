@@ -330,7 +330,7 @@ def test_a_span_that_is_none_is_one_sentence(tmp_path, seen, told):
 
 
 @pytest.mark.slow
-def test_explain_climbs_by_a_formula_and_keeps_it_for_others(tmp_path, rigcal):
+def test_explain_climbs_by_a_formula_and_keeps_it_for_others(tmp_path, rigcal, diagnosed_once):
     """A hump of incidence is in no catalogue. Its file has a page, and fits another recording."""
     (tmp_path / "hump.yaml").write_text(yaml.safe_dump(HUMP))
     for seed, name in ((2, "rec"), (3, "other")):

@@ -1,5 +1,6 @@
 """Writers that die before any step that changes a folder: what they write is old or new."""
 
+import multiprocessing
 import os
 import shutil
 import sys
@@ -12,6 +13,10 @@ from calib.outputs import moves
 
 from .folders import contents, fill, run
 
+# Forked from a process that has loaded no more than this file: one of two gigabytes, as pytest is
+# after many tests, takes three times as long.
+FORKS = multiprocessing.get_context("forkserver")
+FORKS.set_forkserver_preload([__name__])
 STEPS = {"os.rename", "os.remove", "os.rmdir", "os.mkdir", "os.link", "os.truncate"}
 
 
@@ -56,31 +61,36 @@ def before_all(folder: Path) -> Path:
 
 
 def die_before(step: int, write, out: Path, exchange: bool) -> int:
-    """Write in a forked process that ends, as if killed, before a step; how many steps it took."""
-    reader, pipe = os.pipe()
-    child = os.fork()
-    if child == 0:
-        count = 0
-
-        def watch(event, arguments):
-            nonlocal count
-            if event in STEPS:
-                if count == step:
-                    os._exit(9)
-                count += 1
-
+    """Write in a process that ends, as if killed, before a step; how many steps it took."""
+    told, tell = FORKS.Pipe(duplex=False)
+    child = FORKS.Process(target=write_until, args=(step, write, out, exchange, tell))
+    child.start()
+    tell.close()
+    child.join()
+    with told:
         try:
-            if not exchange:
-                moves.exchange = lambda one, other: False
-            sys.addaudithook(watch)
-            write(out)
-            os.write(pipe, str(count).encode())
-        finally:
-            os._exit(0)
-    os.waitpid(child, 0)
-    os.close(pipe)
-    with os.fdopen(reader) as told:
-        return int(told.read() or -1)
+            return told.recv()
+        except EOFError:
+            return -1
+
+
+def write_until(step: int, write, out: Path, exchange: bool, tell) -> None:
+    """In a process of its own: write, and say how many steps that took, or die before a step."""
+    count = 0
+
+    def watch(event, arguments):
+        nonlocal count
+        if event in STEPS:
+            if count == step:
+                os._exit(9)
+            count += 1
+
+    if not exchange:
+        moves.exchange = lambda one, other: False
+    sys.addaudithook(watch)
+    write(out)
+    tell.send(count)
+    os._exit(0)
 
 
 @pytest.mark.parametrize("exchange", [True, False], ids=["exchange", "aside"])

@@ -17,7 +17,7 @@ from tests.calib.narrow import fitted, followed, run_of
 
 
 @pytest.fixture(scope="module")
-def narrow(once):
+def narrow(once, diagnosed_once):
     return run_of(once)
 
 

@@ -17,7 +17,7 @@ from . import foreign
 @pytest.mark.slow
 def test_a_ur10_gives_way_and_errs_with_its_gears(shared, once):
     """Gravity and an error 17 times a turn: what stops that the fit never saw bear out."""
-    folder = once(of_a_ur10, shared / "arms/ur10_tmac")
+    folder = once(of_a_ur10, shared / "arms/ur10_tmac", "D")
     run, sagging, grown = (
         Run.open(folder / f"D-{name}")
         for name in ("geometry", "arm_gravity_sag", "arm_gear_error@17")

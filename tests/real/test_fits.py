@@ -10,6 +10,7 @@ from calib.problem.model import Model
 from calib.runs.calibrate import calibrate
 from chains import se3
 
+from ..thinned import thinned
 from . import foreign
 
 GEOMETRIC = Model(("arm_link_length", "arm_joint_offset", "arm_axis_tilt"))
@@ -66,7 +67,8 @@ def test_still_sweeps_prove_no_ring_offset(shared, tmp_path, model, thickest_mm)
 @pytest.mark.slow
 def test_a_hidden_effect_does_not_pass_unseen(shared, tmp_path):
     """A range bias with incidence can hide in the surfaces: their errors then are past belief."""
-    run = calibrate([shared / "recordings/known_incidence"], tmp_path / "run", hold_out="none")
+    thinned(shared / "recordings/known_incidence", tmp_path / "rec", 2, 4)
+    run = calibrate([tmp_path / "rec"], tmp_path / "run", hold_out="none")
     assert run.summary["misfit"]["reference"] > 3
     assert run.summary["sigmas_widened_by"] > 3
 
@@ -74,7 +76,8 @@ def test_a_hidden_effect_does_not_pass_unseen(shared, tmp_path):
 def test_a_recording_of_another_simulator(shared, tmp_path):
     """Links and rings within their sigmas of the truth, and the held-out error at its floor."""
     folder = shared / "recordings/known_nothing_hidden"
-    run = calibrate([folder], tmp_path / "run")
+    thinned(folder, tmp_path / "rec", 1, 4)
+    run = calibrate([tmp_path / "rec"], tmp_path / "run")
     truth = json.loads(folder.with_suffix(".truth.json").read_text())
     frames = truth["frames"] | {"faro": np.linalg.inv(truth["T_faro_opti"])}
     links = []
