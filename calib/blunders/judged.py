@@ -29,7 +29,7 @@ FEWEST_OF_KIND = 4  # groups of a kind, below which these are taken at their sig
 STATED = 8.0
 # Of groups that nothing tells apart, that which goes wrong most often is named first: bodies are
 # touched, knocked and occluded, scans mixed up; all joints of an arm are seldom wrong at once.
-LIKELY = ("body", "scan", "target", "frame", "surface", "joints", "rings")
+LIKELY = ("body", "scan", "target", "level", "frame", "surface", "joints", "rings")
 # Beyond this what a joint does is far from its derivative: no joint is said to be so far off.
 LINEAR_RAD = 0.5
 ALONG = 0.95  # of an offset's length, along one axis, to be said to lie along it
@@ -138,7 +138,7 @@ def judge(whole: Linearisation, problem: Problem, planned: Collection[str] = ())
 
 def _alike(group: Group) -> tuple[str, str]:
     """Groups that are as likely as each other to be somewhat off."""
-    return group.kind, group.what if group.kind == "body" else ""
+    return group.kind, group.what if group.kind in ("body", "level") else ""
 
 
 def _whole(group: Group) -> bool:

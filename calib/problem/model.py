@@ -17,6 +17,7 @@ from calib.forward import Term, named
 from calib.residuals.groups import Group, GroupKind
 from calib.residuals.store import BeamStore
 from calib.rig import Rig, load_rig
+from calib.rig.recording import recorded
 from chains import se3
 from chains.align import align_points
 from chains.errors import InputError
@@ -212,7 +213,7 @@ def default_effects(recordings: Sequence[Path | str]) -> tuple[str, ...]:
             continue  # what it is instead, the fit says
         rig = load_rig(folder)
         if rig.tracker and rig.joint_names:
-            recording = RecordedStops.open(folder, rig.joint_names, rig.tracker.bodies)
+            recording = recorded(rig)
             for body in filter(rig.joints_to, rig.tracker.bodies):
                 pose = np.isfinite(recording.bodies[body])
                 rows += 3 * int(pose[:, :3].all(axis=1).sum() + pose.all(axis=1).sum())
@@ -261,9 +262,7 @@ class Source:
             InputError: what is wrong, and where.
         """
         rig = load_rig(folder)
-        rings = rig.lidar.rings if rig.lidar else None
-        bodies = rig.tracker.bodies if rig.tracker else ()
-        recording = RecordedStops.open(folder, rig.joint_names, bodies, rings)
+        recording = recorded(rig)
         spec = rig.reference
         mesh = Reference.read(spec.mesh, spec.faces, spec.labels) if spec and spec.mesh else None
         return cls(rig, recording, mesh)

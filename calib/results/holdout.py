@@ -218,8 +218,8 @@ def _among(block: Block, blocks: Sequence[Block]) -> bool:
 def placed(unseen: Problem, trained: Problem, estimate: Estimate) -> tuple[Estimate, set[str]]:
     """Where stops stand whose calibration comes from an estimate of another problem.
 
-    Poses of the unseen stops are found from their tracked bodies; where no body is seen, from
-    their own beams with the calibration held.
+    Poses of the unseen stops are found from their tracked bodies and levels; where no body is seen,
+    from their own beams with the calibration held.
 
     Args:
         unseen: the stops' problem; what does not place them is taken out of it.
@@ -229,14 +229,14 @@ def placed(unseen: Problem, trained: Problem, estimate: Estimate) -> tuple[Estim
         The estimate, and the poses' variables that tracked bodies or the other problem told.
     """
     shared = [n for n in trained.variables if n in unseen.variables]
-    held = [trained.variables[n] for n in shared if trained.variables[n].kind != "direction"]
+    held = [trained.variables[n] for n in shared]
     names = [v.name for v in held]
     covariance = estimate.covariance_of(names)
     prior = JointPrior(held, {n: estimate.values[n] for n in names}, covariance)
-    scans, bodies = unseen.scans, unseen.bodies
+    scans, seen = unseen.scans, unseen.seen
     # Without a LiDAR, bodies before the joints tell where the rig is; those beyond are judged.
-    unseen.blocks = bodies if scans else [b for b in bodies if not b.stops.rig.joints_to(b.body)]
-    told = {block.stops.root for block in unseen.blocks} | set(shared)
+    unseen.blocks = seen if scans else [b for b in seen if not b.stops.rig.joints_to(b.body)]
+    told = {block.stops.root for block in unseen.bodies} | set(shared)
     unseen.scans = [scan for scan in scans if scan.stops.root not in told]
     return solve(unseen, prior, spread=False), told
 

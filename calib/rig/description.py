@@ -2,24 +2,24 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
-import pydantic
 from numpy.typing import NDArray
 
 from calib.outputs import settle
+from calib.rig.document import (
+    RECORDING_FORMAT,
+    ArmDocument,
+    ReferenceDocument,
+    RigDocument,
+)
 from chains import se3
 from chains.arm import Mass, read_arm, read_masses
-from chains.errors import InputError, is_file_name, shortened
+from chains.errors import InputError, shortened
 from chains.frames import Edge, FrameTree, unknown_name
-from sensors.documents import Document, Format, Marks, Number, Triple, read_yaml, validate
-from sensors.lidar import LidarFile, LidarModel, Size, load_lidar
-
-Sigma = Annotated[Number, pydantic.Field(gt=0)]
-
-RECORDING_FORMAT = Format(kind="recording", newest=1)
-LARGEST_FRAME_M = 10.0  # a choice: no rig is larger, and in millimetres no frame is so small
+from sensors.documents import Document, Marks, read_yaml, validate
+from sensors.lidar import LidarModel, load_lidar
 
 
 @dataclass(frozen=True)
@@ -30,6 +30,17 @@ class Tracker:
     bodies: tuple[str, ...]
     sigma_m: float
     sigma_rad: float
+
+
+@dataclass(frozen=True)
+class Levels:
+    """Accelerometers: the frames that have one, its noise, and what is known of up in the world."""
+
+    frames: tuple[str, ...]
+    sigma_rad: float
+    """Of a direction, about either axis across it."""
+    up: tuple[float, float, float] | None = None
+    sigma_up_rad: float | None = None
 
 
 @dataclass(frozen=True)
@@ -84,6 +95,7 @@ class Rig:
     """The URDF that the arm was read from."""
     effects: tuple[Path, ...] = ()
     """Files of formulas: effects of the user's own, candidates of every diagnosis."""
+    levels: Levels | None = None
     labels: dict[int, str] = field(default_factory=dict)
     """Names of the labels of the reference's triangles; empty where nothing names them."""
 
@@ -120,113 +132,6 @@ class Rig:
         return tuple(dict.fromkeys(edge.joint.name for edge in edges if edge.joint is not None))
 
 
-def _file_name(name: str) -> str:
-    if not is_file_name(name):
-        raise ValueError(f"{shortened(name)} is no name for a file, and a rig's names some")
-    return name
-
-
-def _metres(length: float) -> float:
-    if abs(length) > LARGEST_FRAME_M:
-        raise ValueError(f"{length:g} m looks like millimetres; give metres")
-    return length
-
-
-class _Frame(Document):
-    parent: str
-    xyz_m: tuple[Number, Number, Number]
-    rpy_rad: tuple[Number, Number, Number] = (0.0, 0.0, 0.0)
-    sigma_m: Triple
-    sigma_rad: Triple
-
-    @pydantic.field_validator("xyz_m")
-    @classmethod
-    def _in_metres(cls, xyz: tuple[float, ...]) -> tuple[float, ...]:
-        _metres(max(xyz, key=abs))
-        return xyz
-
-    @pydantic.field_validator("rpy_rad")
-    @classmethod
-    def _radians(cls, rpy: tuple[float, ...]) -> tuple[float, ...]:
-        if max(map(abs, rpy)) > 2 * np.pi:
-            raise ValueError(f"{max(rpy, key=abs):g} rad looks like degrees; give radians")
-        return rpy
-
-    @pydantic.field_validator("sigma_m", "sigma_rad")
-    @classmethod
-    def _not_negative(cls, sigma: tuple[float, ...]) -> tuple[float, ...]:
-        if min(sigma) < 0:
-            raise ValueError(f"{min(sigma):g} is negative; a sigma is 0 (exact) or more")
-        return sigma
-
-
-_Lidar = pydantic.create_model(
-    "_Lidar",
-    __base__=Document,
-    model=(str, ...),
-    frame=(str, "lidar"),
-    **{
-        name: (Annotated[field.annotation, pydantic.Field(), *field.metadata], None)
-        for name, field in LidarFile.model_fields.items()
-    },
-)
-
-
-class _Arm(Document):
-    urdf: str
-    base: str
-    tip: str
-    sigma_joint_rad: Size = 0.0
-
-
-class _Base(Document):
-    moves: Literal["stop", "location", "never"] = "stop"
-
-
-class _Tracker(Document):
-    frame: str = "opti"
-    bodies: Annotated[tuple[str, ...], pydantic.Field(min_length=1)]
-    sigma_m: Sigma
-    sigma_rad: Sigma
-
-    @pydantic.field_validator("bodies")
-    @classmethod
-    def _once_each(cls, bodies: tuple[str, ...]) -> tuple[str, ...]:
-        for body in bodies:
-            if bodies.count(body) > 1:
-                raise ValueError(f"{body} is there twice; name every body once")
-        return bodies
-
-
-class _Target(Document):
-    sphere_below_lower_marker_m: Annotated[Number, pydantic.AfterValidator(_metres)]
-    sigma_sphere_m: Size
-    sigma_marker_m: Sigma
-
-
-class _Reference(Document):
-    frame: str = "faro"
-    mesh: str
-    faces: str | None = None
-    labels: str | None = None
-    sigma_m: Size
-
-
-class _RigFile(Document):
-    format: int = RECORDING_FORMAT.newest
-    name: Annotated[str, pydantic.AfterValidator(_file_name)]
-    lidar: _Lidar | None = None
-    arm: _Arm | None = None
-    frames: dict[str, _Frame] = pydantic.Field(default_factory=dict)
-    base: _Base = _Base()
-    tracker: _Tracker | None = None
-    target: _Target | None = None
-    reference: _Reference | None = None
-    shared: tuple[str, ...] = ()
-    own: tuple[str, ...] = ()
-    effects: tuple[str, ...] = ()
-
-
 def load_rig(folder: str | Path) -> Rig:
     """Read and check rig.yaml in a recording's folder, with the URDF and LiDAR model it names.
 
@@ -240,7 +145,7 @@ def load_rig(folder: str | Path) -> Rig:
         raise InputError(f"{path} does not exist; a recording is a folder that holds one")
     data, marks = read_yaml(path)
     RECORDING_FORMAT.check(data, path)
-    file = validate(_RigFile, data, path, marks)
+    file = validate(RigDocument, data, path, marks)
     where = _Where(path, marks)
     arm, masses = _read_arm(file.arm, folder, where)
     reference = _read_reference(file.reference, folder, where) if file.reference else None
@@ -260,6 +165,7 @@ def load_rig(folder: str | Path) -> Rig:
         sigma_joint_rad=file.arm.sigma_joint_rad if file.arm else 0.0,
         moves=file.base.moves,
         tracker=Tracker(**file.tracker.model_dump()) if file.tracker else None,
+        levels=Levels(**file.levels.model_dump()) if file.levels else None,
         target=TargetSpec(**file.target.model_dump()) if file.target else None,
         reference=reference,
         shared=file.shared,
@@ -292,7 +198,9 @@ class _Where:
         return folder / name
 
 
-def _read_arm(arm: _Arm | None, folder: Path, where: _Where) -> tuple[list[Edge], tuple[Mass, ...]]:
+def _read_arm(
+    arm: ArmDocument | None, folder: Path, where: _Where
+) -> tuple[list[Edge], tuple[Mass, ...]]:
     if arm is None:
         return [], ()
     urdf = where.file(folder, arm.urdf, "arm", "urdf")
@@ -300,7 +208,7 @@ def _read_arm(arm: _Arm | None, folder: Path, where: _Where) -> tuple[list[Edge]
     return edges, tuple(read_masses(urdf, arm.base, arm.tip))
 
 
-def _read_tree(file: _RigFile, arm: list[Edge], where: _Where) -> FrameTree:
+def _read_tree(file: RigDocument, arm: list[Edge], where: _Where) -> FrameTree:
     edges = [
         Edge(name, frame.parent, name, se3.from_xyz_rpy(frame.xyz_m, frame.rpy_rad))
         for name, frame in file.frames.items()
@@ -312,14 +220,19 @@ def _read_tree(file: _RigFile, arm: list[Edge], where: _Where) -> FrameTree:
         raise where.wrong(error, "frames") from None
 
 
-def _check_frames(file: _RigFile, tree: FrameTree, where: _Where) -> None:
+def _check_frames(file: RigDocument, tree: FrameTree, where: _Where) -> None:
     """Sensors and bodies stand in the tree, worlds outside of it."""
     named = [(("lidar", "frame"), file.lidar.frame)] if file.lidar else []
     bodies = file.tracker.bodies if file.tracker else ()
     named += [(("tracker", "bodies", i), body) for i, body in enumerate(bodies)]
+    levels = file.levels.frames if file.levels else ()
+    named += [(("levels", "frames", i), frame) for i, frame in enumerate(levels)]
     for key, name in named:
         if name not in tree.frames:
             raise where.wrong(unknown_name("frame", name, tree.frames), *key)
+    if file.levels and file.levels.up and not (file.tracker or file.reference):
+        what = "nothing here has a world to be upright in; give a tracker or a reference, or no up"
+        raise where.wrong(what, "levels", "up")
     for section in ("tracker", "reference"):
         world = getattr(file, section)
         if world and world.frame in tree.frames:
@@ -341,7 +254,7 @@ def _read_lidar(lidar: Document, folder: Path, where: _Where) -> LidarModel:
         raise where.wrong(error, "lidar") from None
 
 
-def _read_reference(reference: _Reference, folder: Path, where: _Where) -> ReferenceSpec:
+def _read_reference(reference: ReferenceDocument, folder: Path, where: _Where) -> ReferenceSpec:
     paths = {
         key: where.file(folder, getattr(reference, key), "reference", key)
         for key in ("mesh", "faces", "labels")

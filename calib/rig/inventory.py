@@ -11,7 +11,7 @@ from calib.rig import Rig
 from calib.rig.suspect import listed
 from sensors.recording import RecordedStops
 from sensors.reference import Reference
-from sensors.stops import Targets
+from sensors.stops import Targets, level_columns, undeclared_levels
 
 FEW_LOCATIONS = 3  # below that no whole location can be held out
 JOINT_STILL = 0.05  # rad or m that a joint travels: too little to tell its own errors
@@ -72,6 +72,8 @@ def of_stops(recording: RecordedStops) -> Iterator[Line]:
     yield "stops", f"{count} at {counted(locations, 'location')}, {when}"
     for body, seen in _seen(recording).items():
         yield body, f"seen at {seen.sum()} of {count} stops"
+    for frame, felt in recording.levels.items():
+        yield f"level in {frame}", f"read at {np.isfinite(felt[:, 0]).sum()} of {count} stops"
     if recording.base_guess is not None:
         given = np.isfinite(recording.base_guess).all(axis=1).sum()
         yield "base_guess", f"given at {given} of {count} stops"
@@ -147,6 +149,16 @@ def odd_stops(rig: Rig, recording: RecordedStops) -> Iterator[str]:
             yield f"{body} is seen at {at.sum()} of {len(at)} stops only; look for what hides it"
     if seen and (unseen := names[~np.any(list(seen.values()), axis=0)]).size:
         yield f"no tracked body is seen at {listed(unseen)}; what they tell rests on their scans"
+
+
+def odd_levels(recording: RecordedStops) -> Iterator[str]:
+    """Columns as an accelerometer writes them, of which rig.yaml says nothing."""
+    for frame in undeclared_levels(recording.covariates):
+        yield (
+            f"stops.csv has {', '.join(level_columns(frame))}, as of an accelerometer in {frame}, "
+            f"and they are covariates only; with levels: {{frames: [{frame}], sigma_rad: 0.001}} "
+            "in rig.yaml they would tell its tilt"
+        )
 
 
 def odd_joints(rig: Rig, recording: RecordedStops) -> Iterator[str]:

@@ -28,11 +28,9 @@ from calib.results.errors import Errors, body_errors, misfit, row_errors, scan_e
 from calib.results.holdout import held_out, unit_of
 from calib.results.intervals import intervals
 from calib.results.misfit import (
+    instrument_rows,
     misfit_by,
-    prior_rows,
     redundancies,
-    target_rows,
-    tracker_rows,
 )
 from calib.results.reach import reach
 from calib.results.recalibrate import Link, earlier, solve_from
@@ -227,9 +225,9 @@ def _fit(
     document = _model_document(sources, model, choices)
     write_yaml(folder / MODEL, document)
     summary = _summary(problem, estimate, nominal, seen, unseen)
-    rows = tracker_rows(estimate), target_rows(estimate), prior_rows(estimate)
-    write_rows(folder / RESIDUALS, *rows)
-    by = {**misfit_by(estimate, *rows, by_stop), "limit": limits(redundancies(*rows))}
+    rows = instrument_rows(estimate)
+    write_rows(folder / RESIDUALS, rows)
+    by = {**misfit_by(estimate, rows, by_stop), "limit": limits(redundancies(rows))}
     summary |= {"misfit": misfit(estimate, seen), "misfit_by": by}
     reached = reach(freed.problem, freed, known)
     summary["held_out_each_mm"] = (1e3 * np.sqrt(unseen.each_m2)).tolist()

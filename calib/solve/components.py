@@ -25,8 +25,9 @@ from calib.problem.spread import Whose, by_chance, read, sigmas, spread_keys, wi
 from calib.problem.unknowns import Unknown
 from calib.problem.without import ROD
 from calib.residuals.groups import Group
+from calib.residuals.seen import BodiesTogether
 from calib.residuals.targets import PARTS_OF_SIGMAS, TARGET_PARTS, HangingTarget
-from calib.residuals.tracker import BodiesTogether, TrackedBody
+from calib.residuals.tracker import TrackedBody
 from calib.solve.estimate import Estimate
 
 PRECISE = {"ftol": 1e-15, "gtol": 1e-7}  # of twice a log-likelihood: sds to some 1e-6 of theirs
