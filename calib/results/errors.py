@@ -184,9 +184,9 @@ def misfit(estimate: Estimate, beams: Errors, weighted: bool = False) -> dict[st
     For instruments that see bodies or targets the root of chi-square over its degrees of freedom,
     their own unknowns taken off; for beams the rms of inliers over what is expected of them; for
     the reference how far its surfaces had to be moved, over how far they may be off; for CAD the
-    root of chi-square of how far frames moved from there, over the redundancy of these moves. About 1 or less when all is
-    well: an effect that is missing in the LiDAR may be laid on beams or on surfaces, and shows in
-    either.
+    root of chi-square of how far frames moved from there, over the redundancy of these moves. About
+    1 or less when all is well: an effect that is missing in the LiDAR may be laid on beams or on
+    surfaces, and shows in either.
 
     Args:
         estimate: the solution.

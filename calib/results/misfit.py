@@ -165,11 +165,11 @@ def misfit_by(
     Returns:
         As summary.json holds it. ``stop``: stop -> ``tracker``, ``bodies`` (body or level ->
         number), ``joints``, ``beams``, those that it has; ``body`` and ``target``: name -> number.
-        All of these say how many times larger than their sigmas allow the residuals are, about 1 when all
-        is well; null where nothing checks them. ``prior``: frame of CAD, or ``effect.parameter`` of
-        geometry -> ``move_sigmas``, how many sigmas of CAD it moved; ``worst``, the parameter that
-        moved furthest; its ``change`` and ``sigma``, in ``unit``. Of several recordings, a stop and
-        a target bear the recording's name before theirs.
+        All of these say how many times larger than their sigmas allow the residuals are, about 1
+        when all is well; null where nothing checks them. ``prior``: frame of CAD, or
+        ``effect.parameter`` of geometry -> ``move_sigmas``, how many sigmas of CAD it moved;
+        ``worst``, the parameter that moved furthest; its ``change`` and ``sigma``, in ``unit``.
+        Of several recordings, a stop and a target bear the recording's name before theirs.
     """
     several = len(estimate.problem.sources) > 1
 
