@@ -28,7 +28,7 @@ SWEEPS = 20.0  # of a stop, where no recording says how many: 2 s at 10 Hz
 SCANS_FOR_BEAMS = 8  # of a recording, from which the directions of its beams are taken
 # Share of recorded beams that are shorter than those of planned stops that are counted on.
 SHORTER_BEAMS = 0.01
-UP = np.array([0.0, 0.0, 1.0])  # what a planned level reads until the fit's state says better
+ANY_WAY = np.array([0.0, 0.0, 1.0])  # what a planned level reads until the fit's state says better
 MARK = "~"  # after the name of a location that is visited again: the base stands elsewhere by then
 
 
@@ -253,7 +253,7 @@ def extended(
         joints=np.concatenate([recording.joints, poses.joints]),
         bodies=bodies,
         levels={
-            frame: np.concatenate([felt, np.tile(UP, (count, 1))])
+            frame: np.concatenate([felt, np.tile(ANY_WAY, (count, 1))])
             for frame, felt in recording.levels.items()
         },
         base_guess=None

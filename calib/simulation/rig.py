@@ -20,7 +20,7 @@ _ARM = (
     ("joint_6", (0, 0, 0), (-np.pi / 2, 0, 0), 1, 170, 0.8, (0, 0, 0.03)),
 )
 _TIP_M = (0, 0, 0.075)
-LEVEL_RAD = 0.0005  # of a fair MEMS inclinometer, assumed
+INCLINOMETER_RAD = 0.0005  # of a fair MEMS inclinometer, assumed
 TIP_POINTS = ("tip_1", "tip_2", "tip_3")
 # Laser-tracker nests on the mount, well apart and off any line.
 _POINTS_M = ((0.12, 0.0, 0.05), (-0.07, 0.1, 0.04), (-0.05, -0.11, 0.11))
@@ -88,7 +88,7 @@ def document(spec: Spec) -> dict[str, Any]:
             "sigma_rad": 0.0003,
         }
     if spec.levels:
-        rig["levels"] = {"frames": list(spec.levels), "sigma_rad": LEVEL_RAD}
+        rig["levels"] = {"frames": list(spec.levels), "sigma_rad": INCLINOMETER_RAD}
     if spec.targets:
         rig["target"] = {
             "sphere_below_lower_marker_m": 0.18,
