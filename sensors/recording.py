@@ -99,7 +99,7 @@ class RecordedStops:
     time_s: Array
     """(K,) of the stops; NaN throughout where stops.csv has no such column."""
     joints: Array
-    """(K, J) what the encoders reported, rad or m."""
+    """(K, J) what the encoders reported, rad or m; NaN = no encoder says."""
     bodies: dict[str, Array]
     """Per tracked body (K, 7) x y z [m] qw qx qy qz; NaN = not seen; a point has only NaN for q."""
     base_guess: Array | None
@@ -124,6 +124,7 @@ class RecordedStops:
         bodies: Sequence[str],
         rings: int | None = None,
         levels: Sequence[str] = (),
+        unread: Sequence[str] = (),
     ) -> Self:
         """Read and check the stops and targets of a recording, without reading any scan.
 
@@ -142,7 +143,7 @@ class RecordedStops:
             stops=stops,
             location=table.locations(),
             time_s=table.times("time_s"),
-            joints=table.joints(joint_names),
+            joints=table.joints(joint_names, unread),
             bodies={body: table.pose(body) for body in bodies},
             levels={frame: table.level(frame) for frame in levels},
             base_guess=table.pose("base_guess") if "base_guess.x" in table else None,

@@ -2,7 +2,7 @@
 
 import csv
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -71,10 +71,14 @@ class CsvTable:
             raise InputError(f"{self.path}: column {name} is missing; every row needs one")
         return self._columns.pop(name)
 
-    def numbers(self, name: str, why: str, largest: float = math.inf, units: str = "") -> Array:
-        """Take a column of finite numbers, none beyond `largest`, which would betray its units."""
+    def numbers(
+        self, name: str, why: str, largest: float = math.inf, units: str = "", gaps: bool = False
+    ) -> Array:
+        """Take a column of finite numbers, none beyond `largest`, which would betray its units;
+        where it may have gaps, an empty cell is NaN."""
         values = self._loose(name, why)
-        self.refuse(~np.isfinite(values), f"{name} is empty or not finite; {why}")
+        finite = np.isfinite(values) | (gaps & np.isnan(values))
+        self.refuse(~finite, f"{name} is empty or not finite; {why}")
         wrong = np.abs(values) > largest
         self.refuse(wrong, lambda row: f"{name} is {values[row]:g}; {units}")
         return values
@@ -101,11 +105,17 @@ class CsvTable:
             return unknown
         return self.numbers(name, "either every stop has its time in seconds, or none")
 
-    def joints(self, names: Sequence[str]) -> Array:
-        """Take the joints (K, J) by name, in rad or m."""
+    def joints(self, names: Sequence[str], unread: Collection[str] = ()) -> Array:
+        """Take the joints (K, J) by name, in rad or m; of those unread NaN where there is none."""
         why = "the arm's URDF has this joint, so every stop needs its value"
         units = "joints are in radians or metres, and this looks like degrees or millimetres"
-        columns = [self.numbers(name, why, _LARGEST_JOINT, units) for name in names]
+        none = {name: np.full(len(self._names), np.nan) for name in unread if name not in self}
+        columns = [
+            none[name]
+            if name in none
+            else self.numbers(name, why, _LARGEST_JOINT, units, gaps=name in unread)
+            for name in names
+        ]
         return np.array(columns).reshape(len(names), len(self._names)).T
 
     def points(self, name: str, separator: str) -> Array:

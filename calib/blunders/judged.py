@@ -17,6 +17,7 @@ from scipy import special
 from calib.blunders.chance import KNOWN, LEVELS, after_looks, at_least, enough, log_tail
 from calib.blunders.shifts import Shift, shifts
 from calib.linear.system import Linearisation
+from calib.problem.model import labels
 from calib.problem.problem import Problem
 from calib.residuals.groups import JOINTS, Group
 
@@ -127,7 +128,9 @@ def judge(whole: Linearisation, problem: Problem, planned: Collection[str] = ())
             others of their kind are.
     """
     kinds: dict[object, list[Shift]] = {}
-    gone = {group for source in problem.sources for group in source.without}
+    pairs = list(zip(problem.sources, labels(problem.sources), strict=True))
+    gone = {group for source, _ in pairs for group in source.without}
+    gone |= {Group("joints", *where, label) for source, label in pairs for where in source.unread}
     for shift in shifts(whole, problem):
         if shift.dof and shift.group not in gone:
             kinds.setdefault((*_alike(shift.group), shift.of_ranges), []).append(shift)

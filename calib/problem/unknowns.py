@@ -16,7 +16,7 @@ UnknownKind = Literal["vector", "pose"]
 # What is known of a pose before any data: the room it is in.
 UNKNOWN_POSE = np.repeat([3.0, 10.0], 3)
 POSE_UNITS = ("rad",) * 3 + ("m",) * 3
-UNREAD = 1.0  # rad or m: a joint whose reading at a stop is left out
+UNREAD = 1.0  # rad or m: a joint that nothing reads at a stop
 EXACT = 1e-7  # rad or m: an encoder without error beside one that is left out
 
 
@@ -103,6 +103,11 @@ class Unknown:
     def told(self) -> int:
         """How many of its numbers rows can tell: of gravity's (3,), the length means nothing."""
         return self.dim - (self.role is Role.GRAVITY)
+
+    @property
+    def unread(self) -> int:
+        """Of joint readings, how many there are not."""
+        return int((self.sigma >= UNREAD).sum())
 
     @property
     def keys(self) -> tuple[Key, ...]:

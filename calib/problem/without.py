@@ -54,14 +54,14 @@ def _matching(source: Source, label: str, token: str) -> list[Group]:
 def _groups(source: Source, label: str = "") -> list[Group]:
     """All that can be left out of a recording that is called so."""
     rig, recording = source.rig, source.recording
-    out = []
+    out, read = [], [name for name in rig.joint_names if name not in rig.passive]
     for k, stop in enumerate(recording.stops):
         out += [Group("body", stop, b, label) for b in recording.bodies if _seen(recording, b)[k]]
         felt = (f for f, each in recording.levels.items() if np.isfinite(each[k, 0]))
         out += [Group("level", stop, level_of(frame), label) for frame in felt]
         out += [Group("scan", stop, SCAN, label)] if recording.has_scan[k] else []
         if rig.joint_names:
-            out += [Group("joints", stop, what, label) for what in (JOINTS, *rig.joint_names)]
+            out += [Group("joints", stop, what, label) for what in (JOINTS, *read)]
     for target in recording.targets.names if recording.targets else ():
         out += [Group("target", target, what, label) for what in (*TARGET_PARTS, ROD)]
     out += [Group("frame", CAD, frame) for frame in rig.frame_sigma]

@@ -142,7 +142,7 @@ class _Checker:
             found.contents.extend(inventory.of_rig(rig))
             found.odd.extend(inventory.odd_rig(rig))
         if rig and recording:
-            found.contents.extend(inventory.of_stops(recording))
+            found.contents.extend(inventory.of_stops(rig, recording))
             found.odd.extend(inventory.odd_stops(rig, recording))
             found.odd.extend(inventory.odd_levels(recording))
             found.odd.extend(inventory.odd_joints(rig, recording))

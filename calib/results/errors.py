@@ -156,8 +156,12 @@ def body_errors(
     values: Mapping[str, np.ndarray],
     predicted: Estimate | None,
 ) -> Errors:
-    """Distances between tracked and predicted positions of bodies; arguments as above."""
-    out = Errors()
+    """Distances between tracked and predicted positions of bodies; arguments as above.
+
+    Rows that the estimate rests on have less error than their noise, by what it takes from them:
+    their residuals' covariance is R - A C A^T, and R + A C A^T that of other rows.
+    """
+    out, own = Errors(), [] if predicted is None else predicted.problem.blocks
     for block in blocks:
         placed = block.stops.in_world(block.body, values)
         added = sum((B @ values[n] for n, B in block.bases.items()), np.zeros((1, 6)))
@@ -167,7 +171,8 @@ def body_errors(
         if predicted is not None:
             names = list(placed.d)
             d = np.concatenate([placed.d[name][:, 3:] for name in names], axis=2)
-            expected += np.einsum("kip,pq,kiq->", d, predicted.covariance_of(names), d)
+            known = np.einsum("kip,pq,kiq->", d, predicted.covariance_of(names), d)
+            expected += -known if any(block is each for each in own) else known
         out += Errors(
             count=len(distance),
             total_m=float(distance.sum()),
@@ -234,9 +239,9 @@ def _of_blocks(
             rows = [(b, r[bulk], bulk[bulk]) for b, r, bulk in rows if bulk.any()]
     seen = [unknowns[n] for n in {n: None for b, *_ in rows for n in b.variables}]
     joints = [u for u in seen if u.role is Role.JOINTS]
-    free = sum(u.told for u in seen if u.role in own)
+    free = sum(u.told for u in seen if u.role in own) + sum(u.unread for u in joints)
     if weighted:
-        free += sum(u.dim for u in joints if u.weight < 1.0)
+        free += sum(u.dim - u.unread for u in joints if u.weight < 1.0)
         joints = [u for u in joints if u.weight >= 1.0]
     chi2 = sum(float(r @ r) for _, r, _ in rows)
     chi2 += sum(_prior_cost(u, values[u.name]) for u in joints)

@@ -12,10 +12,10 @@ from calib import problem as problems
 from calib.problem import Problem
 from calib.problem.model import Model, Source
 from calib.problem.prior import JointPrior
-from calib.problem.problem import Block
 from calib.problem.spread import spread_of, with_spread
 from calib.problem.surfaces import parts_of
 from calib.residuals.scan import ScanStop
+from calib.residuals.seen import SeenBody
 from calib.residuals.surfaces import PlaneSurface
 from calib.results.errors import Errors, Keep, body_errors, scan_errors
 from calib.solve.estimate import Estimate, Start
@@ -204,15 +204,11 @@ def predict(
     scans, bodies = unseen.scans, unseen.bodies
     predicted, told = placed(unseen, trained, estimate)
     if not scans:
-        judged = [b for b in bodies if not _among(b, unseen.blocks) and b.stops.root in told]
+        beyond = [b for b in bodies if b.stops.rig.joints_to(b.body)]
+        judged = [b for b in beyond if b.stops.root in told]
         return body_errors(judged, predicted.values, predicted)
     each = (_scan(scan, predicted, scan.stops.root in told, keep) for scan in scans)
     return sum(each, Errors())
-
-
-def _among(block: Block, blocks: Sequence[Block]) -> bool:
-    """Whether it is one of them, itself."""
-    return any(block is each for each in blocks)
 
 
 def placed(unseen: Problem, trained: Problem, estimate: Estimate) -> tuple[Estimate, set[str]]:
@@ -234,11 +230,18 @@ def placed(unseen: Problem, trained: Problem, estimate: Estimate) -> tuple[Estim
     covariance = estimate.covariance_of(names)
     prior = JointPrior(held, {n: estimate.values[n] for n in names}, covariance)
     scans, seen = unseen.scans, unseen.seen
-    # Without a LiDAR, bodies before the joints tell where the rig is; those beyond are judged.
-    unseen.blocks = seen if scans else [b for b in seen if not b.stops.rig.joints_to(b.body)]
+    # Without a LiDAR, bodies before the joints tell where the rig is; those beyond are judged, and
+    # tell of themselves no more than how joints stand that nothing reads.
+    unseen.blocks = [b for b in seen if scans or _places(b)]
     told = {block.stops.root for block in unseen.bodies} | set(shared)
     unseen.scans = [scan for scan in scans if scan.stops.root not in told]
     return solve(unseen, prior, spread=False), told
+
+
+def _places(block: SeenBody) -> bool:
+    """Whether a stop without a scan is placed by this, too."""
+    rig = block.stops.rig
+    return bool(rig.passive) or not rig.joints_to(block.body)
 
 
 def _scan(scan: ScanStop, predicted: Estimate, told: bool, keep: Keep) -> Errors:

@@ -243,6 +243,9 @@ def _absent(problem: Problem) -> list[dict[str, str]]:
         out.append(
             {"name": "arm", "why": "the rig has no arm; add 'arm' to rig.yaml with its URDF"}
         )
+    for joint in dict.fromkeys(joint for rig in rigs for joint in rig.passive):
+        why = "nothing reads this joint, so its zero cannot be told from where it is; read it"
+        out.append({"name": joint, "why": why})
     if scans and not problem.scans:
         why = (
             "no scans, so the LiDAR's place and its offsets are not seen; add scans/<stop>.parquet"

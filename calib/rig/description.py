@@ -96,6 +96,8 @@ class Rig:
     effects: tuple[Path, ...] = ()
     """Files of formulas: effects of the user's own, candidates of every diagnosis."""
     levels: Levels | None = None
+    passive: tuple[str, ...] = ()
+    """Joints that nothing reads: unknown at every stop."""
     labels: dict[int, str] = field(default_factory=dict)
     """Names of the labels of the reference's triangles; empty where nothing names them."""
 
@@ -162,6 +164,7 @@ def load_rig(folder: str | Path) -> Rig:
         lidar_frame=file.lidar.frame if file.lidar else None,
         arm_edges=tuple(edge.name for edge in arm),
         joint_names=tree.joint_names,
+        passive=file.arm.passive if file.arm else (),
         sigma_joint_rad=file.arm.sigma_joint_rad if file.arm else 0.0,
         moves=file.base.moves,
         tracker=Tracker(**file.tracker.model_dump()) if file.tracker else None,
@@ -230,6 +233,9 @@ def _check_frames(file: RigDocument, tree: FrameTree, where: _Where) -> None:
     for key, name in named:
         if name not in tree.frames:
             raise where.wrong(unknown_name("frame", name, tree.frames), *key)
+    for i, joint in enumerate(file.arm.passive if file.arm else ()):
+        if joint not in tree.joint_names:
+            raise where.wrong(unknown_name("joint", joint, tree.joint_names), "arm", "passive", i)
     if file.levels and file.levels.up and not (file.tracker or file.reference):
         what = "nothing here has a world to be upright in; give a tracker or a reference, or no up"
         raise where.wrong(what, "levels", "up")

@@ -29,6 +29,13 @@ def _metres(length: float) -> float:
     return length
 
 
+def _once_each(names: tuple[str, ...]) -> tuple[str, ...]:
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"{name} is there twice; name each once")
+    return names
+
+
 class FrameDocument(Document):
     """An edge from CAD, and how sure CAD is of it."""
 
@@ -78,19 +85,13 @@ class ArmDocument(Document):
     base: str
     tip: str
     sigma_joint_rad: Size = 0.0
+    passive: Annotated[tuple[str, ...], pydantic.AfterValidator(_once_each)] = ()
 
 
 class BaseDocument(Document):
     """When the base may stand elsewhere."""
 
     moves: Literal["stop", "location", "never"] = "stop"
-
-
-def _once_each(names: tuple[str, ...]) -> tuple[str, ...]:
-    for name in names:
-        if names.count(name) > 1:
-            raise ValueError(f"{name} is there twice; name each once")
-    return names
 
 
 Names = Annotated[

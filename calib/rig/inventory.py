@@ -65,7 +65,7 @@ def of_rig(rig: Rig) -> Iterator[Line]:
     yield "rig", f"{rig.name}: {', '.join(parts) or 'nothing on it'}"
 
 
-def of_stops(recording: RecordedStops) -> Iterator[Line]:
+def of_stops(rig: Rig, recording: RecordedStops) -> Iterator[Line]:
     """Stops, locations, and how often each body is seen."""
     count, locations = len(recording.stops), len(set(recording.location))
     when = f"over {np.ptp(recording.time_s) / 60:.0f} min" if recording.timed else "no times"
@@ -74,6 +74,8 @@ def of_stops(recording: RecordedStops) -> Iterator[Line]:
         yield body, f"seen at {seen.sum()} of {count} stops"
     for frame, felt in recording.levels.items():
         yield f"level in {frame}", f"read at {np.isfinite(felt[:, 0]).sum()} of {count} stops"
+    for joint in rig.passive:
+        yield joint, f"read by nothing: estimated at each of {count} stops"
     if recording.base_guess is not None:
         given = np.isfinite(recording.base_guess).all(axis=1).sum()
         yield "base_guess", f"given at {given} of {count} stops"
@@ -165,9 +167,12 @@ def odd_joints(rig: Rig, recording: RecordedStops) -> Iterator[str]:
     """Joints at rest, or beyond their limits."""
     names = np.array(recording.stops)
     values = dict(zip(rig.joint_names, recording.joints.T, strict=True))
+    values = {name: at for name, at in values.items() if name not in rig.passive}
     if still := [name for name, at in values.items() if np.ptp(at) < JOINT_STILL]:
         yield f"{listed(still)} hardly moved, too little to tell their own errors; move them"
     for joint in (j for edge in rig.tree.edges if (j := edge.joint) is not None and j.leads):
+        if joint.name not in values:
+            continue
         at, unit = values[joint.name], "rad" if joint.kind == "revolute" else "m"
         beyond = (at < joint.lower - LIMIT_SLACK) | (at > joint.upper + LIMIT_SLACK)
         if beyond.any():

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Self
 
 from calib.rig.description import Rig, load_rig
+from calib.rig.unread import with_unread
 from sensors import recording
 
 
@@ -21,6 +22,7 @@ class Recording(recording.RecordedStops):
         bodies: Sequence[str] | None = None,
         rings: int | None = None,
         levels: Sequence[str] | None = None,
+        unread: Sequence[str] | None = None,
     ) -> Self:
         """Read and check the stops and targets of a recording, without reading any scan.
 
@@ -30,19 +32,21 @@ class Recording(recording.RecordedStops):
             bodies: those that are tracked, likewise.
             rings: how many the LiDAR has, likewise.
             levels: frames with an accelerometer, likewise.
+            unread: joints that nothing reads, likewise: NaN where the file has no number.
 
         Raises:
             InputError: what is wrong, and where.
         """
         said = columns_of(load_rig(folder))
         given = {"joint_names": joint_names, "bodies": bodies, "rings": rings, "levels": levels}
+        given["unread"] = unread
         chosen = {name: each for name, each in given.items() if each is not None}
         return super().open(folder, **(said | chosen))
 
 
 def recorded(rig: Rig) -> recording.RecordedStops:
-    """The recording of a rig, likewise; InputError says what is wrong."""
-    return recording.RecordedStops.open(rig.folder, **columns_of(rig))
+    """The recording of a rig, with a value for every joint; InputError says what is wrong."""
+    return with_unread(rig, recording.RecordedStops.open(rig.folder, **columns_of(rig)))
 
 
 def columns_of(rig: Rig) -> dict[str, Sequence[str] | int | None]:
@@ -52,4 +56,5 @@ def columns_of(rig: Rig) -> dict[str, Sequence[str] | int | None]:
         "bodies": rig.tracker.bodies if rig.tracker else (),
         "rings": rig.lidar.rings if rig.lidar else None,
         "levels": rig.levels.frames if rig.levels else (),
+        "unread": rig.passive,
     }

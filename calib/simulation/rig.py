@@ -76,7 +76,7 @@ def document(spec: Spec) -> dict[str, Any]:
             "base": "arm_base",
             "tip": "arm_end",
             "sigma_joint_rad": 0.0001,
-        }
+        } | ({"passive": list(spec.passive)} if spec.passive else {})
     rig["frames"] = _frames(spec)
     rig["base"] = {"moves": spec.base_moves}
     if spec.tracker:

@@ -37,6 +37,7 @@ def write_stops(path: Path, world: World, spec: Spec, rng: np.random.Generator) 
         **stops.columns,
         **dict(zip(rig.joint_names, stops.joints.T, strict=True)),
     }
+    columns = {name: column for name, column in columns.items() if name not in rig.passive}
     hidden = rng.random(len(stops.names)) < spec.occluded_share
     for body, Ts_opti_body in world.tracked(spec.noise, rng).items():
         pose = _pose(Ts_opti_body)
