@@ -1,5 +1,6 @@
 """rig.yaml: what is bolted to what, what measures it, and how sure its builder is."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -75,8 +76,8 @@ class Rig:
     """Per frame (6,) [rad rad rad m m m] how sure CAD is, about the child's axes; 0 = exact."""
     lidar: LidarModel | None
     lidar_frame: str | None
-    arm_edges: tuple[str, ...]
-    """URDF joints between the arm's base and tip, in order, fixed ones included."""
+    chains: tuple[tuple[str, ...], ...]
+    """Per tip of the arm, the URDF joints between its base and there, in order, fixed ones too."""
     joint_names: tuple[str, ...]
     """Those that move, as the stops name them."""
     sigma_joint_rad: float
@@ -112,15 +113,34 @@ class Rig:
         return self.reference.frame if self.reference else "faro"
 
     @property
+    def arm_edges(self) -> tuple[str, ...]:
+        """URDF joints of all chains, each once."""
+        return tuple(dict.fromkeys(name for chain in self.chains for name in chain))
+
+    @property
+    def arm_base(self) -> str | None:
+        """The link that all chains begin at."""
+        return self.edge(self.chains[0][0]).parent if self.chains else None
+
+    @property
+    def tips(self) -> tuple[str, ...]:
+        """The links that the chains end at."""
+        return tuple(self.edge(chain[-1]).child for chain in self.chains)
+
+    def edge(self, name: str) -> Edge:
+        """The edge of the tree that is called so."""
+        return self.tree.edges[self.tree.edge_names.index(name)]
+
+    def beyond(self, tips: Sequence[str]) -> frozenset[str]:
+        """Frames of CAD that hang from any of some links."""
+        ways = {name: self.tree.path(name) for name in self.frame_sigma}
+        carried = {n: {self.tree.edges[i].parent for i in way} for n, way in ways.items()}
+        return frozenset(n for n, links in carried.items() if not links.isdisjoint(tips))
+
+    @property
     def beyond_arm(self) -> frozenset[str]:
-        """Frames that hang from the arm's tip; all of them where there is no arm."""
-        edges = self.tree.edges
-        arm = {self.tree.edge_names.index(name) for name in self.arm_edges}
-        return frozenset(
-            name
-            for name in self.frame_sigma
-            if arm <= set(self.tree.path(edges[self.tree.edge_names.index(name)].child))
-        )
+        """Frames that hang from the arm's tips; all of them where there is no arm."""
+        return self.beyond(self.tips) if self.chains else frozenset(self.frame_sigma)
 
     @property
     def joint_kinds(self) -> tuple[str, ...]:
@@ -162,7 +182,7 @@ def load_rig(folder: str | Path) -> Rig:
         },
         lidar=_read_lidar(file.lidar, folder, where) if file.lidar else None,
         lidar_frame=file.lidar.frame if file.lidar else None,
-        arm_edges=tuple(edge.name for edge in arm),
+        chains=_chains(file.arm, tree),
         joint_names=tree.joint_names,
         passive=file.arm.passive if file.arm else (),
         sigma_joint_rad=file.arm.sigma_joint_rad if file.arm else 0.0,
@@ -207,8 +227,17 @@ def _read_arm(
     if arm is None:
         return [], ()
     urdf = where.file(folder, arm.urdf, "arm", "urdf")
-    edges = read_arm(urdf, arm.base, arm.tip)
-    return edges, tuple(read_masses(urdf, arm.base, arm.tip))
+    edges = read_arm(urdf, arm.base, *arm.tip)
+    return edges, tuple(read_masses(urdf, arm.base, *arm.tip))
+
+
+def _chains(arm: ArmDocument | None, tree: FrameTree) -> tuple[tuple[str, ...], ...]:
+    """The edges from the arm's base to each of its tips; none where these are one."""
+    if arm is None:
+        return ()
+    below = len(tree.path(arm.base))
+    chains = (tree.path(tip)[below:] for tip in arm.tip)
+    return tuple(tuple(tree.edge_names[i] for i in chain) for chain in chains if chain)
 
 
 def _read_tree(file: RigDocument, arm: list[Edge], where: _Where) -> FrameTree:

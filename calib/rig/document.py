@@ -36,6 +36,15 @@ def _once_each(names: tuple[str, ...]) -> tuple[str, ...]:
     return names
 
 
+Names = Annotated[
+    tuple[str, ...], pydantic.Field(min_length=1), pydantic.AfterValidator(_once_each)
+]
+
+
+def _in_a_row(tip: str | tuple[str, ...]) -> tuple[str, ...]:
+    return (tip,) if isinstance(tip, str) else tip
+
+
 class FrameDocument(Document):
     """An edge from CAD, and how sure CAD is of it."""
 
@@ -79,11 +88,11 @@ LidarDocument = pydantic.create_model(
 
 
 class ArmDocument(Document):
-    """The URDF, and the links between which the arm is."""
+    """The URDF, the link that the arm begins at, and that or those where it ends."""
 
     urdf: str
     base: str
-    tip: str
+    tip: Annotated[str | Names, pydantic.AfterValidator(_in_a_row)]
     sigma_joint_rad: Size = 0.0
     passive: Annotated[tuple[str, ...], pydantic.AfterValidator(_once_each)] = ()
 
@@ -92,11 +101,6 @@ class BaseDocument(Document):
     """When the base may stand elsewhere."""
 
     moves: Literal["stop", "location", "never"] = "stop"
-
-
-Names = Annotated[
-    tuple[str, ...], pydantic.Field(min_length=1), pydantic.AfterValidator(_once_each)
-]
 
 
 class TrackerDocument(Document):

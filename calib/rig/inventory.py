@@ -128,11 +128,13 @@ def _odd_masses(rig: Rig) -> Iterator[str]:
         return
     if len(kg) >= ALL_ALIKE and len(set(kg)) == 1:
         yield f"all {len(kg)} links with a mass weigh {kg[0]:g} kg in the URDF; are these measured?"
-    edges = (rig.tree.edges[rig.tree.edge_names.index(name)] for name in rig.arm_edges)
-    length_m = sum(float(np.linalg.norm(edge.T_parent_child[:3, 3])) for edge in edges)
-    if not LIGHTEST * length_m**3 < sum(kg) < HEAVIEST * length_m**3:
+    longest = max(
+        sum(float(np.linalg.norm(rig.edge(name).T_parent_child[:3, 3])) for name in chain)
+        for chain in rig.chains
+    )
+    if not LIGHTEST * longest**3 < sum(kg) < HEAVIEST * longest**3:
         yield (
-            f"the arm's links weigh {sum(kg):g} kg in the URDF, at a length of {length_m:.2f} m; "
+            f"the arm's links weigh {sum(kg):g} kg in the URDF, at a length of {longest:.2f} m; "
             "inertial/mass is in kg"
         )
 

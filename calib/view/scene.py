@@ -155,8 +155,7 @@ class Scene:
         rig = self.sources[recording].rig
         edges = rig.tree.edges
         named = [e.child for e in edges if e.name not in rig.arm_edges]
-        arm = [e for e in edges if e.name in rig.arm_edges]
-        ends = [arm[0].parent, arm[-1].child] if arm else []
+        ends = [rig.arm_base, *rig.tips] if rig.chains else []
         names = dict.fromkeys((rig.tree.root, *ends, *named))
         return {name: self.place(recording, stop, name) for name in names}
 
