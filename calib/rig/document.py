@@ -41,7 +41,7 @@ Names = Annotated[
 ]
 
 
-def _in_a_row(tip: str | tuple[str, ...]) -> tuple[str, ...]:
+def _in_a_row(tip: object) -> object:
     return (tip,) if isinstance(tip, str) else tip
 
 
@@ -92,7 +92,7 @@ class ArmDocument(Document):
 
     urdf: str
     base: str
-    tip: Annotated[str | Names, pydantic.AfterValidator(_in_a_row)]
+    tip: Annotated[Names, pydantic.BeforeValidator(_in_a_row)]
     sigma_joint_rad: Size = 0.0
     passive: Annotated[tuple[str, ...], pydantic.AfterValidator(_once_each)] = ()
 
