@@ -97,6 +97,7 @@ def test_a_run_says_what_is_not_read_and_judges_stops_by_what_is_left(folders, t
 
 def test_a_check_says_which_joints_are_unread(folders):
     found = check(folders[1], graph=False)
+    assert not found.suspects
     assert dict(found.contents)["joint_5"] == "read by nothing: estimated at each of 40 stops"
     assert not [odd for odd in found.odd if "joint_" in odd]
 
