@@ -17,6 +17,7 @@ from calib.report import report
 from calib.residuals.levels import Level
 from calib.results.check import check
 from calib.runs.run import RESIDUALS
+from calib.show.tables import print_run
 from calib.simulation import PRESETS, Spec, simulate
 from calib.solve.fit import solve
 from chains import se3
@@ -199,6 +200,15 @@ def test_a_run_tells_how_far_each_level_is_off(run):
     assert 0.8 < run.summary["misfit"]["level"] < 1.2
     assert 0.7 < run.summary["misfit_by"]["body"]["arm_3.level"] < 1.3
     assert run.residuals("level").shape[0] == 96
+
+
+def test_a_run_tells_which_way_is_up(recording, run, capsys):
+    truth = json.loads((recording.parent / "rec.truth.json").read_text())
+    up, true = run.summary["up"], np.linalg.inv(truth["T_faro_opti"])[:3, 2]
+    assert up["frame"] == "opti" and 0 < up["sigma_rad"] < rigs.LEVEL_RAD
+    assert np.linalg.norm(np.cross(up["xyz"], true)) < 4 * up["sigma_rad"]
+    print_run(run)
+    assert up["told"].split(",")[0] in " ".join(capsys.readouterr().out.split())
 
 
 def test_a_level_that_was_knocked_is_named_and_left_out(recording, tmp_path):
