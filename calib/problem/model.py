@@ -179,7 +179,7 @@ class Model:
             for i, p in enumerate(effect.params(rig))
             if p.sigma
             and f"{effect.name}.{p.name}" not in self.fixed
-            and not any(p.name == j or p.name.startswith(f"{j}.") for j in passive)
+            and rig.joint_of(p.name) not in passive
         ]
         return np.array(free, int)
 

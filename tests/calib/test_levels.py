@@ -10,6 +10,7 @@ from scipy.stats import chi2
 
 import calib
 from calib.forward import place
+from calib.planning.stops import Poses, at_their_places, extended
 from calib.problem import build
 from calib.problem.model import Model, Source
 from calib.problem.without import leave_out
@@ -226,9 +227,18 @@ def test_a_level_that_was_knocked_is_named_and_left_out(recording, tmp_path):
     assert np.isfinite(source.recording.levels["base"]).all()
 
 
-def test_a_plan_counts_on_levels(run):
-    planned = calib.plan(run, stops=2)
-    assert len(planned.stops) == 2
+def test_a_plan_counts_on_levels(recording, run):
+    """A planned stop has their rows, and they read there what they should."""
+    source = Source.open(recording)
+    known = build([source], Model()).initial
+    joints, root = source.recording.joints[:1] + 0.1, known["root@L00P00"][None]
+    poses = Poses(np.array(["L00"]), joints, root)
+    longer = extended(source, poses, (), np.eye(4), apart=False)
+    problem, values = at_their_places(build([longer], Model()), known, longer, 16, poses)
+    planned = [b for b in problem.seen if b.stop_names[0][1] == 16]
+    assert [b.kind for b in planned] == ["tracker"] * 2 + ["level"] * len(FRAMES)
+    assert np.abs(np.concatenate([b.evaluate(values, False)[0] for b in planned])).max() < 1e-6
+    assert len(calib.plan(run, stops=2).stops) == 2
 
 
 def test_a_report_draws_levels(run, tmp_path):
