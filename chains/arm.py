@@ -37,40 +37,42 @@ class Mass:
     centre_m: Array
 
 
-def read_arm(urdf_path: str | Path, base: str, tip: str) -> list[Edge]:
-    """Return the edges from link ``base`` to link ``tip``, one per URDF joint, in order.
+def read_arm(urdf_path: str | Path, base: str, *tips: str) -> list[Edge]:
+    """Return the edges from link ``base`` to each of some links, one per URDF joint, in order.
+
+    What leads to several tips is there once.
 
     Edges carry the joint's name, frames the links' names; fixed joints are edges without a Joint,
     continuous ones revolute without limits. One that mimics another moves by the other's name, its
     URDF offset in its origin. Metres and radians. Raises InputError where the file cannot be read,
-    a link is missing, no chain leads from base to tip, a joint's type is not supported, one mimics
-    a joint that there is not or itself, or a length can only be millimetres.
+    a link is missing, no chain leads from base to a tip, a joint's type is not supported, one
+    mimics a joint that there is not or itself, or a length can only be millimetres.
     """
     path = Path(urdf_path)
     robot = read_robot(path)
     links = [link.get("name", "") for link in robot.findall("link")]
-    for link in (base, tip):
+    for link in (base, *tips):
         if link not in links:
             raise InputError(f"{path}: {unknown_name('link', link, links)}")
     try:
-        edges = [_following(_edge(joint), joint, robot) for joint in _chain(robot, base, tip)]
-        return _led(edges)
+        joints = {id(joint): joint for tip in tips for joint in _chain(robot, base, tip)}
+        return _led([_following(_edge(joint), joint, robot) for joint in joints.values()])
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
 
 
-def read_masses(urdf_path: str | Path, base: str, tip: str) -> list[Mass]:
+def read_masses(urdf_path: str | Path, base: str, *tips: str) -> list[Mass]:
     """Return what weighs on the arm's joints, link by link, in kg and m.
 
-    The base's own mass weighs on none. A link that hangs beside the chain counts for the link of
-    the chain that carries it, its own joints at zero. Raises InputError as ``read_arm`` does.
+    The base's own mass weighs on none. A link that hangs beside the chains counts for the link of
+    a chain that carries it, its own joints at zero. Raises InputError as ``read_arm`` does.
     """
     path = Path(urdf_path)
     robot = read_robot(path)
     above = {_link(joint, "child"): joint for joint in robot.findall("joint")}
     masses = []
     try:
-        chain = {_link(joint, "child") for joint in _chain(robot, base, tip)}
+        chain = {_link(joint, "child") for tip in tips for joint in _chain(robot, base, tip)}
         for link in robot.findall("link"):
             kg = float(numbers_of(link, "inertial/mass", "value", [0.0])[0])
             if kg < 0:

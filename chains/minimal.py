@@ -14,6 +14,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from chains import se3
 from chains.frames import Edge, FrameTree
 from chains.se3 import Array
 
@@ -36,7 +37,10 @@ class Slip:
 
 @lru_cache(maxsize=32)
 def own_slips(
-    tree: FrameTree, arm: tuple[str, ...], base_held: bool, tip_held: bool
+    tree: FrameTree,
+    chains: tuple[tuple[str, ...], ...],
+    base_held: bool,
+    tips_held: tuple[bool, ...],
 ) -> tuple[Slip, ...]:
     """Return what an arm's geometry can be off by beside its joints' zeros and origins' lengths.
 
@@ -46,30 +50,39 @@ def own_slips(
 
     Args:
         tree: the frames.
-        arm: the edges from the arm's base to its tip, in order.
-        base_held, tip_held: whether other unknowns place the base and the tool, six numbers each.
-            Where they do not, the first axis and the edge behind the last joint have what is then
-            missing.
+        chains: per tip, the edges from the arm's base to it, in order.
+        base_held, tips_held: whether other unknowns place the base, and the tool at each tip, six
+            numbers each. Where they do not, the first axes and the edges behind the last joints
+            have what is then missing.
     """
+    arm = tuple(dict.fromkeys(name for chain in chains for name in chain))
     edges = [tree.edges[tree.edge_names.index(name)] for name in arm]
     moving = [i for i, edge in enumerate(edges) if edge.joint is not None]
     if not moving:
         return ()
-    by_twist, by_joint, by_tool = _columns(tree, arm, edges)
+    by_base, by_twist, by_joint, by_tools = _columns(tree, chains, edges)
     span = _Span()
-    span.take(by_twist[0][:, : 6 * base_held])
-    span.take(by_tool[:, : 6 * tip_held])
+    span.take(by_base[:, : 6 * base_held])
+    for by_tool, held in zip(by_tools, tips_held, strict=True):
+        span.take(by_tool[:, : 6 * held])
     for column in by_joint.T:
         span.take(column[:, None])
     for edge, columns in zip(edges, by_twist, strict=True):
         span.take(columns[:, 3:] @ (edge.T_parent_child[:3, :3].T @ edge.T_parent_child[:3, 3:]))
     slips = []
-    for i in [*moving, *range(moving[-1] + 1, len(edges))[:1]]:
+    behind = [arm.index(name) for chain in chains for name in _behind(tree, chain)]
+    for i in [*moving, *dict.fromkeys(behind)]:
         for kind, unit, plane in _ways(edges[i]):
             directions = plane @ span.take(by_twist[i] @ plane)
             for letter, twist in zip("abc", directions.T, strict=False):
                 slips.append(Slip(arm[i], f"{kind}_{letter}", unit, twist))
     return tuple(slips)
+
+
+def _behind(tree: FrameTree, chain: Sequence[str]) -> Sequence[str]:
+    """Return the edge of a chain behind its last joint, if there is one."""
+    moves = [tree.edges[tree.edge_names.index(name)].joint is not None for name in chain]
+    return chain[len(moves) - moves[::-1].index(True) :][:1] if any(moves) else ()
 
 
 def across(axis: Array) -> Array:
@@ -87,24 +100,30 @@ def _ways(edge: Edge) -> list[tuple[str, str, Array]]:
 
 
 def _columns(
-    tree: FrameTree, arm: Sequence[str], edges: Sequence[Edge]
-) -> tuple[list[Array], Array, Array]:
-    """Return the tool's motion, in units of the arm's length, by the twist (R, 6) of each of its
-    edges, by its joints (R, J), and by a twist of the tool itself (R, 6)."""
+    tree: FrameTree, chains: Sequence[Sequence[str]], edges: Sequence[Edge]
+) -> tuple[Array, list[Array], Array, list[Array]]:
+    """Return the motion of all tools, in units of the arm's length, by a twist of the base (R, 6),
+    by that of each edge (R, 6), by the joints (R, J), and by a twist of each tool itself (R, 6)."""
     length_m = sum(float(np.linalg.norm(edge.T_parent_child[:3, 3])) for edge in edges) or 1.0
     turns = {e.joint.name: e.joint.kind == "revolute" for e in edges if e.joint is not None}
     reach = np.array([np.pi if turns.get(name, True) else length_m for name in tree.joint_names])
     drawn = np.random.default_rng(0).uniform(-reach, reach, (RANDOM_POSES, len(reach)))
-    placed = tree.place(edges[-1].child, drawn)
+    tips = [tree.edges[tree.edge_names.index(chain[-1])].child for chain in chains]
+    placed = [tree.place(tip, drawn) for tip in tips]
     unit = np.repeat([1.0, 1.0 / length_m], 3)
 
-    def rows(motion: Array) -> Array:
-        return (unit[:, None] * motion).reshape(6 * RANDOM_POSES, -1)
+    def rows(*motions: Array) -> Array:
+        each = [(unit[:, None] * motion).reshape(6 * RANDOM_POSES, -1) for motion in motions]
+        return np.vstack(each)
 
-    by_twist = [rows(placed.d_twist[:, :, tree.edge_names.index(name)]) for name in arm]
+    T_root_base = tree.transform(edges[0].parent, drawn)
+    by_base = [se3.adjoint(se3.inverse(p.Ts_root_frame) @ T_root_base) for p in placed]
+    at = [tree.edge_names.index(edge.name) for edge in edges]
+    by_twist = [rows(*(p.d_twist[:, :, e] for p in placed)) for e in at]
     own = [tree.joint_names.index(name) for name in turns]
-    by_tool = rows(np.broadcast_to(np.eye(6), (RANDOM_POSES, 6, 6)))
-    return by_twist, rows(placed.d_joint[:, :, own]), by_tool
+    eye, none = np.broadcast_to(np.eye(6), (RANDOM_POSES, 6, 6)), np.zeros((RANDOM_POSES, 6, 6))
+    by_tools = [rows(*(eye if tip == own_tip else none for tip in tips)) for own_tip in tips]
+    return rows(*by_base), by_twist, rows(*(p.d_joint[:, :, own] for p in placed)), by_tools
 
 
 class _Span:

@@ -5,10 +5,10 @@ import warnings
 import zipfile
 import zlib
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from tokenize import TokenError
-from typing import Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,9 @@ from chains import escape
 from chains.errors import InputError
 from chains.sizes import check_claim
 from sensors.documents import read_text
+
+if TYPE_CHECKING:
+    import pandas
 
 LONGEST_NUMBER = 32  # characters
 
@@ -177,3 +180,12 @@ def connected(count: int, a: NDArray[np.int64], b: NDArray[np.int64]) -> NDArray
         if np.array_equal(new, lowest):
             return np.unique(lowest, return_inverse=True)[1].astype(np.int64)
         lowest = new
+
+
+def data_frame(columns: Mapping[str, np.ndarray]) -> "pandas.DataFrame":
+    """Columns (N,) as a `pandas.DataFrame`; InputError where pandas is not installed."""
+    try:
+        import pandas
+    except ImportError:
+        raise InputError("a table needs pandas: pip install pandas") from None
+    return pandas.DataFrame(dict(columns))

@@ -6,7 +6,7 @@ This is the pyarrow door: `read_table` and `write_table` serve whoever needs a P
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -17,7 +17,8 @@ from chains.errors import InputError
 from chains.sizes import check_claim, most
 from sensors.documents import write_atomically
 from sensors.holds import Columns, average_hold
-from sensors.stops import POSE, Array, CsvTable, Targets, read_targets
+from sensors.numbers import data_frame
+from sensors.stops import POSE, Array, CsvTable, Targets, level_columns, read_targets
 
 if TYPE_CHECKING:
     import pandas
@@ -98,7 +99,7 @@ class RecordedStops:
     time_s: Array
     """(K,) of the stops; NaN throughout where stops.csv has no such column."""
     joints: Array
-    """(K, J) what the encoders reported, rad or m."""
+    """(K, J) what the encoders reported, rad or m; NaN = no encoder says."""
     bodies: dict[str, Array]
     """Per tracked body (K, 7) x y z [m] qw qx qy qz; NaN = not seen; a point has only NaN for q."""
     base_guess: Array | None
@@ -112,6 +113,8 @@ class RecordedStops:
     """How many rings the sensor has, None = not checked."""
     joint_names: tuple[str, ...] = ()
     """(J,) of the columns of `joints`."""
+    levels: dict[str, Array] = field(default_factory=dict)
+    """Per frame with an accelerometer (K, 3) unit vectors along what it felt; NaN = not read."""
 
     @classmethod
     def open(
@@ -120,12 +123,14 @@ class RecordedStops:
         joint_names: Sequence[str],
         bodies: Sequence[str],
         rings: int | None = None,
+        levels: Sequence[str] = (),
+        unread: Sequence[str] = (),
     ) -> Self:
         """Read and check the stops and targets of a recording, without reading any scan.
 
         Raises InputError, one sentence with file, row and column, for what is missing, has the
         wrong type, or cannot be: half a pose, a quaternion far from unit length (nearly unit ones
-        are normalised), degrees for radians, millimetres for metres.
+        are normalised), degrees for radians, millimetres for metres, a level that was not at rest.
         """
         folder = Path(folder)
         path = folder / "stops.csv"
@@ -138,8 +143,9 @@ class RecordedStops:
             stops=stops,
             location=table.locations(),
             time_s=table.times("time_s"),
-            joints=table.joints(joint_names),
+            joints=table.joints(joint_names, unread),
             bodies={body: table.pose(body) for body in bodies},
+            levels={frame: table.level(frame) for frame in levels},
             base_guess=table.pose("base_guess") if "base_guess.x" in table else None,
             covariates=table.rest(),
             targets=read_targets(folder / "targets.csv"),
@@ -170,6 +176,11 @@ class RecordedStops:
                     for body, pose in poses.items()
                     for i, part in enumerate(POSE)
                     if i < 3 or not np.isnan(pose[:, 3:]).all()
+                },
+                **{
+                    column: felt[:, i]
+                    for frame, felt in self.levels.items()
+                    for i, column in enumerate(level_columns(frame))
                 },
                 **self.covariates,
             }
@@ -239,15 +250,6 @@ def unpack_zstd(data: bytes, size: int) -> bytes:
         return pyarrow.decompress(data, decompressed_size=size, codec="zstd", asbytes=True)
     except OSError as error:
         raise ValueError(str(error)) from None
-
-
-def data_frame(columns: Mapping[str, np.ndarray]) -> "pandas.DataFrame":
-    """Columns (N,) as a `pandas.DataFrame`; InputError where pandas is not installed."""
-    try:
-        import pandas
-    except ImportError:
-        raise InputError("a table needs pandas: pip install pandas") from None
-    return pandas.DataFrame(dict(columns))
 
 
 @contextmanager

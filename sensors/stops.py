@@ -2,7 +2,7 @@
 
 import csv
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,10 @@ from sensors.numbers import read_csv
 Array = NDArray[np.float64]
 
 POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
+_FELT = ("ax", "ay", "az")
+# Of the usual length of what an accelerometer feels, by which a stop's may differ at rest: zero
+# offsets of cheap ones are 0.08 g at most (ADXL345, MPU-6050: data sheets).
+_OFF_REST = 0.1
 _FARTHEST_M = 1000.0  # a choice: no tracker sees so far; in millimetres, what is a metre away is
 _LARGEST_JOINT = 4 * math.pi  # rad or m, a choice: wrists turn twice about at most
 
@@ -67,10 +71,14 @@ class CsvTable:
             raise InputError(f"{self.path}: column {name} is missing; every row needs one")
         return self._columns.pop(name)
 
-    def numbers(self, name: str, why: str, largest: float = math.inf, units: str = "") -> Array:
-        """Take a column of finite numbers, none beyond `largest`, which would betray its units."""
+    def numbers(
+        self, name: str, why: str, largest: float = math.inf, units: str = "", gaps: bool = False
+    ) -> Array:
+        """Take a column of finite numbers, none beyond `largest`, which would betray its units;
+        where it may have gaps, an empty cell is NaN."""
         values = self._loose(name, why)
-        self.refuse(~np.isfinite(values), f"{name} is empty or not finite; {why}")
+        finite = np.isfinite(values) | (gaps & np.isnan(values))
+        self.refuse(~finite, f"{name} is empty or not finite; {why}")
         wrong = np.abs(values) > largest
         self.refuse(wrong, lambda row: f"{name} is {values[row]:g}; {units}")
         return values
@@ -97,11 +105,17 @@ class CsvTable:
             return unknown
         return self.numbers(name, "either every stop has its time in seconds, or none")
 
-    def joints(self, names: Sequence[str]) -> Array:
-        """Take the joints (K, J) by name, in rad or m."""
+    def joints(self, names: Sequence[str], unread: Collection[str] = ()) -> Array:
+        """Take the joints (K, J) by name, in rad or m; of those unread NaN where there is none."""
         why = "the arm's URDF has this joint, so every stop needs its value"
         units = "joints are in radians or metres, and this looks like degrees or millimetres"
-        columns = [self.numbers(name, why, _LARGEST_JOINT, units) for name in names]
+        none = {name: np.full(len(self._names), np.nan) for name in unread if name not in self}
+        columns = [
+            none[name]
+            if name in none
+            else self.numbers(name, why, _LARGEST_JOINT, units, gaps=name in unread)
+            for name in names
+        ]
         return np.array(columns).reshape(len(names), len(self._names)).T
 
     def points(self, name: str, separator: str) -> Array:
@@ -148,6 +162,32 @@ class CsvTable:
         )
         return np.hstack([pose[:, :3], pose[:, 3:] / length])
 
+    def level(self, frame: str) -> Array:
+        """Take what an accelerometer felt at rest, in any unit, as unit vectors (K, 3); NaN where
+        it was not read."""
+        names = level_columns(frame)
+        why = f"the level in {frame} needs {', '.join(names)}"
+        felt = np.array([self._loose(name, why) for name in names]).T
+        missing = ~np.isfinite(felt)
+        self.refuse(
+            missing.any(axis=1) & ~np.isnan(felt).all(axis=1),
+            lambda row: (
+                f"{names[np.argmax(missing[row])]} is empty or not finite, though the level in "
+                f"{frame} was read; give all three, or leave all of them empty"
+            ),
+        )
+        length = np.linalg.norm(felt, axis=1)
+        self.refuse(length == 0, f"{', '.join(names)} are all 0; leave what was not read empty")
+        usual = np.median(length[np.isfinite(length)]) if np.isfinite(length).any() else 1.0
+        self.refuse(
+            np.abs(length - usual) > _OFF_REST * usual,
+            lambda row: (
+                f"{', '.join(names)} have length {length[row]:.4g}, and {usual:.4g} at most stops; "
+                "at rest it is always that of gravity, so leave this row's empty"
+            ),
+        )
+        return felt / length[:, None]
+
     def rest(self) -> dict[str, Array]:
         """Give every other numeric column; one that is mostly numbers must be so throughout."""
         for name, values in self._columns.items():
@@ -175,6 +215,18 @@ class CsvTable:
             row = int(np.argmax(wrong))
             problem = what if isinstance(what, str) else what(row)
             raise InputError(f"{self.path}: row {row + 1} ({self._names[row]}): {problem}")
+
+
+def level_columns(frame: str) -> list[str]:
+    """Of what an accelerometer in a frame feels."""
+    return [f"{frame}.{axis}" for axis in _FELT]
+
+
+def undeclared_levels(columns: Iterable[str]) -> list[str]:
+    """Frames of which all three columns of an accelerometer are among these."""
+    every = set(columns)
+    frames = (name.removesuffix(f".{_FELT[0]}") for name in every if name.endswith(f".{_FELT[0]}"))
+    return sorted(frame for frame in frames if every.issuperset(level_columns(frame)))
 
 
 def read_targets(path: Path) -> Targets | None:

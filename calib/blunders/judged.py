@@ -17,6 +17,7 @@ from scipy import special
 from calib.blunders.chance import KNOWN, LEVELS, after_looks, at_least, enough, log_tail
 from calib.blunders.shifts import Shift, shifts
 from calib.linear.system import Linearisation
+from calib.problem.model import labels
 from calib.problem.problem import Problem
 from calib.residuals.groups import JOINTS, Group
 
@@ -29,7 +30,7 @@ FEWEST_OF_KIND = 4  # groups of a kind, below which these are taken at their sig
 STATED = 8.0
 # Of groups that nothing tells apart, that which goes wrong most often is named first: bodies are
 # touched, knocked and occluded, scans mixed up; all joints of an arm are seldom wrong at once.
-LIKELY = ("body", "scan", "target", "frame", "surface", "joints", "rings")
+LIKELY = ("body", "scan", "target", "level", "frame", "surface", "joints", "rings")
 # Beyond this what a joint does is far from its derivative: no joint is said to be so far off.
 LINEAR_RAD = 0.5
 ALONG = 0.95  # of an offset's length, along one axis, to be said to lie along it
@@ -127,7 +128,9 @@ def judge(whole: Linearisation, problem: Problem, planned: Collection[str] = ())
             others of their kind are.
     """
     kinds: dict[object, list[Shift]] = {}
-    gone = {group for source in problem.sources for group in source.without}
+    pairs = list(zip(problem.sources, labels(problem.sources), strict=True))
+    gone = {group for source, _ in pairs for group in source.without}
+    gone |= {Group("joints", *where, label) for source, label in pairs for where in source.unread}
     for shift in shifts(whole, problem):
         if shift.dof and shift.group not in gone:
             kinds.setdefault((*_alike(shift.group), shift.of_ranges), []).append(shift)
@@ -138,7 +141,7 @@ def judge(whole: Linearisation, problem: Problem, planned: Collection[str] = ())
 
 def _alike(group: Group) -> tuple[str, str]:
     """Groups that are as likely as each other to be somewhat off."""
-    return group.kind, group.what if group.kind == "body" else ""
+    return group.kind, group.what if group.kind in ("body", "level") else ""
 
 
 def _whole(group: Group) -> bool:

@@ -17,12 +17,12 @@ from calib.problem.unknowns import Role
 from calib.problem.without import ROD, of_the_arm
 from calib.residuals.groups import ALONG_BEAMS, CAD, JOINTS, MESH, Group
 from calib.residuals.scan import ScanStop
+from calib.residuals.seen import BodiesTogether, SeenBody
 from calib.residuals.targets import HangingTarget
-from calib.residuals.tracker import BodiesTogether, TrackedBody
+from calib.residuals.tracker import TWIST_NAMES
 from calib.rig import Rig
 from calib.solve.reweight import unweighted
 
-TWIST_NAMES = ("about x", "about y", "about z", "x", "y", "z")
 SCAN_SHIFT = (*TWIST_NAMES, ALONG_BEAMS)  # of a scan
 SEVERAL_SCANS = 3  # scans, for most of them to say that the range zero of one is not theirs
 # Block (none for a prior), whitened derivative by each unknown, and right side: see `Graph`.
@@ -92,39 +92,37 @@ def group_rows(
 
 
 def _bodies(whole: Linearisation) -> Iterator[GroupRows]:
-    """Every body at every stop where it was seen; offsets in the tracker's axes."""
+    """Every body at every stop where it was seen, by the tracker or as a level."""
     layout = whole.layout
-    blocks = _tracked(layout)
+    blocks = _seen(layout)
     plain = [unweighted(b) for b in blocks]
     weight = {id(p): b.weight for p, b in zip(plain, blocks, strict=True)}
     for together in BodiesTogether.of(plain):
         for block, (residual, d) in zip(
             together.blocks, together.evaluate(whole.values), strict=True
         ):
-            per = len(residual) // len(block.measured)
+            per = len(block.axes)
             A, columns = np.hstack(list(d.values())), layout.columns(list(d))
             weights = weight[id(block)]
             weights = np.ones(len(block.measured)) if weights is None else weights
             for k, group in enumerate(block.groups):
                 here = slice(per * k, per * (k + 1))
-                turn = np.eye(6)
-                turn[3:, 3:] = block.measured[k, :3, :3]
                 yield GroupRows(
                     A=A[here],
                     columns=columns,
                     b=-residual[here],
                     weight=np.full(per, weights[k]),
-                    sigma=np.repeat([block.sigma_rad, block.sigma_m], 3)[-per:],
-                    axes=TWIST_NAMES[-per:],
-                    units=("rad",) * (per - 3) + ("m",) * 3,
+                    sigma=block.sigma,
+                    axes=block.axes,
+                    units=block.units,
                     groups={group: np.eye(per)},
-                    turn=turn[-per:, -per:],
+                    turn=block.turn(k),
                 )
 
 
-def _tracked(layout: Layout) -> list[TrackedBody]:
+def _seen(layout: Layout) -> list[SeenBody]:
     own = [b for together in layout.bodies for b in together.blocks]
-    return own + [b for b in layout.others if isinstance(b, TrackedBody)]
+    return own + [b for b in layout.others if isinstance(b, SeenBody)]
 
 
 def _targets(whole: Linearisation, graph_rows: GraphRows) -> Iterator[GroupRows]:
@@ -249,7 +247,7 @@ def _exact_joints(whole: Linearisation, problem: Problem) -> Iterator[GroupRows]
     layout, names = whole.layout, _stop_names(whole.layout, problem)
     found: dict[int, list[_JointSums]] = {}
     rigs: dict[int, Rig] = {}
-    for block in _tracked(layout):
+    for block in _seen(layout):
         if _is_exact(block.stops):
             for key, sums in zip(block.stop_names, _JointSums.of_body(block, whole), strict=True):
                 rigs[layout.stops[key]] = block.stops.rig
@@ -294,7 +292,7 @@ class _JointSums:
     columns: np.ndarray
 
     @classmethod
-    def of_body(cls, block: TrackedBody, whole: Linearisation) -> Iterator[_JointSums]:
+    def of_body(cls, block: SeenBody, whole: Linearisation) -> Iterator[_JointSums]:
         """The rows of a body at each of its stops."""
         noisy = replace(block, weight=None, stops=block.stops.with_joint_noise(NOISE))
         count, K = len(block.stops.rig.joint_names), len(block.measured)

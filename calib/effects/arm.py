@@ -149,7 +149,8 @@ def _slips(rig: Rig) -> tuple[Slip, ...]:
     unsure = {name for name, sigma in rig.frame_sigma.items() if np.any(sigma)}
     bodies = rig.tracker.bodies if rig.tracker else ()
     base_held = bool(unsure - rig.beyond_arm) or all(rig.joints_to(body) for body in bodies)
-    return own_slips(rig.tree, rig.arm_edges, base_held, bool(unsure & rig.beyond_arm))
+    tips_held = tuple(bool(unsure & rig.beyond([tip])) for tip in rig.tips)
+    return own_slips(rig.tree, rig.chains, base_held, tips_held)
 
 
 class ArmJointScale(Effect):

@@ -139,8 +139,7 @@ class BaseFlex(Effect):
 
     def basis(self, view: View) -> np.ndarray:
         """At the edge that leads to the arm's base; at the arm's first where there is none."""
-        tree = view.rig.tree
-        first = tree.edges[tree.edge_names.index(view.rig.arm_edges[0])]
+        tree, first = view.rig.tree, view.rig.edge(view.rig.chains[0][0])
         edge = next((edge for edge in tree.edges if edge.child == first.parent), first)
         moment = gravity_moment(tree, masses(view), [edge.name], view.joints)[:, 0]
         basis = np.zeros((len(moment), len(tree.edges), 6, 2))
@@ -183,15 +182,13 @@ class MountBending(Effect):
 
 
 def masses(view: View) -> list[Mass]:
-    """What weighs on the arm at the view's stops: its links, and the payload at its tip."""
+    """What weighs on the arm at the view's stops: its links, and the payload at its first tip."""
     payload = [_payload(view)] if "payload_kg" in view.columns else []
     return [*view.rig.masses, *payload]
 
 
 def _payload(view: View) -> Mass:
-    tree = view.rig.tree
-    tip = tree.edges[tree.edge_names.index(view.rig.arm_edges[-1])].child
-    return Mass(tip, finite(view["payload_kg"]), np.zeros(3))
+    return Mass(view.rig.tips[0], finite(view["payload_kg"]), np.zeros(3))
 
 
 def _per_joint(rig: Rig) -> tuple[Param, ...]:

@@ -129,15 +129,15 @@ class MountSettle(MountSlip):
 
 
 def mount_edges(rig: Rig) -> tuple[int, ...]:
-    """The edges beyond the arm's tip, or beyond the root without an arm, on the way to the LiDAR.
+    """The edges beyond a tip of the arm, or beyond the root without one, on the way to the LiDAR.
 
     Without a LiDAR, on the way to the first tracked body there; none where nothing hangs there.
     """
     bodies = rig.tracker.bodies if rig.tracker else ()
-    arm = {rig.tree.edge_names.index(name) for name in rig.arm_edges}
+    ends = rig.tips or (rig.tree.root,)
     for frame in (rig.lidar_frame, *bodies):
         path = rig.tree.path(frame) if frame else ()
-        beyond = tuple(path[i] for i in range(len(path)) if arm <= set(path[:i]))
-        if beyond:
-            return beyond
+        at = [i for i, edge in enumerate(path) if rig.tree.edges[edge].parent in ends]
+        if at:
+            return path[at[0] :]
     return ()

@@ -70,7 +70,7 @@ class Arm:
 
         Args:
             run: the run.
-            tip: a frame that the arm carries; its own tip where None.
+            tip: a frame that the arm carries; its own tip, or the first of them, where None.
             rig: whose, where the run has several.
 
         Raises:
@@ -92,8 +92,7 @@ class Arm:
         """The arm of a rig, of which a part of a solution says what was found; see `of`."""
         if not rig.joint_names:
             raise InputError(f"rig {rig.name} has no arm")
-        edges = [rig.tree.edges[rig.tree.edge_names.index(name)] for name in rig.arm_edges]
-        base, tip = edges[0].parent, tip or edges[-1].child
+        base, tip = rig.arm_base, tip or rig.tips[0]
         above = rig.tree.path(base)
         if rig.tree.path(tip)[: len(above)] != above or not rig.joints_to(tip):
             raise InputError(f"frame '{tip}' is not carried by the arm; name one that it carries")

@@ -162,8 +162,7 @@ def _predicted(
     bends = {t.variable for t in problem.terms[0] if not isinstance(t.effect, FrameOffset)}
     still = {name: 0 * v if name in bends else v for name, v in estimate.values.items()}
     drawn = placed(stops, beyond.body, beyond.base, still)
-    foot = rig.tree.edges[rig.tree.edge_names.index(rig.arm_edges[0])].parent
-    T_base = placed(stops, foot, beyond.base, estimate.values).T
+    T_base = placed(stops, rig.arm_base, beyond.base, estimate.values).T
     return Predicted(
         body=beyond.body,
         frame=beyond.base or rig.world,

@@ -28,23 +28,30 @@ DH_CONVENTIONS = (
 
 @for_every_rig
 def write_dh(fit: FittedRig, folder: Path) -> Written:
-    """Write dh.yaml.
+    """Write dh.yaml; of an arm with several tips a table for each, in their order.
 
     Raises:
         Unheld: the rig has no arm that moves.
     """
-    tree = fit.rig.tree
-    drawn = [tree.edges[tree.edge_names.index(name)] for name in fit.rig.arm_edges]
-    if not fit.rig.joint_names:
+    rig = fit.rig
+    if not rig.joint_names:
         raise Unheld("the rig has no arm")
-    if any(edge.joint is not None and not edge.joint.leads for edge in drawn):
+    arm = [rig.edge(name) for name in rig.arm_edges]
+    if any(edge.joint is not None and not edge.joint.leads for edge in arm):
         raise Unheld("a joint follows another, and such a table has no place for it")
-    edges = [replace(edge, T_parent_child=fit.origins[edge.name]) for edge in drawn]
-    document = {"calibrated": _document(edges, drawn), "drawn": _document(drawn, drawn)}
-    not_held = [NO_PLACE_FOR_SIGMAS, *fit.not_held(fit.fixed)]
-    path = fit.file(folder, "dh.yaml")
-    write_text(path, commented(fit.head(DH_CONVENTIONS, not_held)) + yaml_text(document))
-    return Written([path], not_held)
+    not_held, paths = [NO_PLACE_FOR_SIGMAS, *fit.not_held(fit.fixed)], []
+    for number, chain in enumerate(rig.chains, 1):
+        drawn = [rig.edge(name) for name in chain]
+        if all(edge.joint is None for edge in drawn):
+            continue
+        edges = [replace(edge, T_parent_child=fit.origins[edge.name]) for edge in drawn]
+        document = {"calibrated": _document(edges, drawn), "drawn": _document(drawn, drawn)}
+        name = "dh.yaml"
+        if len(rig.chains) > 1:
+            name, document = f"dh_{number}.yaml", {"tip_link": drawn[-1].child, **document}
+        paths.append(fit.file(folder, name))
+        write_text(paths[-1], commented(fit.head(DH_CONVENTIONS, not_held)) + yaml_text(document))
+    return Written(paths, not_held)
 
 
 def _document(edges: Sequence[Edge], drawn: Sequence[Edge]) -> dict[str, Any]:

@@ -189,8 +189,10 @@ def _from_logs(gathered: Gathered, choices: Choices) -> _Cut:
     timed = bool(gathered.sweeps) and finite_times(gathered.sweeps)
     if not tracks:
         return _still(gathered, timed)
-    clocks = align(tracks, gathered.sweeps if timed else [], gathered.edges, choices.clock_offsets)
-    holds = find_holds(clocks.tracks, gathered.edges, choices.still, choices.min_hold_s)
+    clocks = align(
+        tracks, gathered.sweeps if timed else [], gathered.read_chain, choices.clock_offsets
+    )
+    holds = find_holds(clocks.tracks, gathered.read_chain, choices.still, choices.min_hold_s)
     columns, odd = stops.table(clocks.tracks, holds.spans_s)
     share: scans.Share = []
     if timed:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -52,11 +52,17 @@ class Gathered:
     spheres: Spheres | None
     understood: list[str]
     odd: list[str]
+    passive: Collection[str] = ()
 
     @property
     def joints(self) -> list[str]:
-        """Names of the arm's moving joints, in order."""
-        return [j.name for edge in self.edges if (j := edge.joint) is not None and j.leads]
+        """Names of the arm's moving joints that something reads, in order."""
+        return list(_read_joints(self.edges, self.passive))
+
+    @property
+    def read_chain(self) -> list[Edge]:
+        """The arm's chain, where its joints tell how its tip moves: where all of them are read."""
+        return [] if self.passive else self.edges
 
 
 def sources(words: Sequence[str]) -> list[Given]:
@@ -112,8 +118,8 @@ def gather(
     arms += [_read(kind, files, options, progress) for kind, files in given if kind in ARMS]
     arm = _only([f.arm for f in arms if f.arm], "describe an arm", [k for k, _ in given])
     edges = chain(arm)
-    kinds = {j.name: j.kind for e in edges if (j := e.joint) is not None and j.leads}
-    options = replace(options, joints=kinds)
+    passive = section(rig, "arm").get("passive") or () if rig else ()
+    options = replace(options, joints=_read_joints(edges, passive))
     rest = [_read(kind, files, options, progress) for kind, files in given if kind not in ARMS]
     if arm is None:
         arm = _only([f.arm for f in rest if f.arm], "describe an arm", [k for k, _ in given])
@@ -132,11 +138,18 @@ def gather(
         spheres=_only([f.spheres for f in contents if f.spheres], "hold spheres", names),
         understood=[line for f in contents for line in f.understood],
         odd=[line for f in contents for line in f.odd],
+        passive=passive,
     )
 
 
 def _read(kind: str, files: Sequence[Path], options: Options, progress: Progress) -> Contents:
     return READERS[kind].read(files, options, progress)
+
+
+def _read_joints(edges: Sequence[Edge], passive: Collection[str]) -> dict[str, str]:
+    """Name -> kind of the moving joints of a chain that something reads, in order."""
+    joints = (j for edge in edges if (j := edge.joint) is not None and j.leads)
+    return {joint.name: joint.kind for joint in joints if joint.name not in passive}
 
 
 def chain(arm: ArmDescription | None) -> list[Edge]:
@@ -162,8 +175,15 @@ def section(rig: Path, name: str) -> dict[str, Any]:
 def _arm_of(rig: Path) -> dict[str, str]:
     """Where the arm's URDF is and between which links it moves, or nothing."""
     arm = section(rig, "arm")
-    whole = {"urdf", "base", "tip"} <= arm.keys()
-    return {key: str(arm[key]) for key in ("urdf", "base", "tip")} if whole else {}
+    if not {"urdf", "base", "tip"} <= arm.keys():
+        return {}
+    tips = arm["tip"] if isinstance(arm["tip"], list) else [arm["tip"]]
+    if len(tips) != 1:
+        raise InputError(
+            f"{rig}: arm.tip: import follows an arm to one tip; name one here, and the others in "
+            "the recording's rig.yaml"
+        )
+    return {"urdf": str(arm["urdf"]), "base": str(arm["base"]), "tip": str(tips[0])}
 
 
 def refuse_parts(gathered: Gathered, rig: Path | None) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 
 from calib.intake.gather import Gathered, section
 from calib.intake.roles import Mounted, Roles, find_roles
-from calib.rig.description import RECORDING_FORMAT
+from calib.rig.document import RECORDING_FORMAT
 from chains import escape, se3
 from chains.errors import InputError
 from sensors.documents import nearest, write_atomically

@@ -16,7 +16,7 @@ import numpy as np
 from calib.problem.problem import Block, Problem
 from calib.problem.unknowns import Role, Unknown
 from calib.residuals.scan import ScanStop
-from calib.residuals.tracker import BodiesTogether, TrackedBody
+from calib.residuals.seen import BodiesTogether, SeenBody
 
 StopKey = tuple[object, int]
 # What taking a stop's own unknowns out by itself costs, in multiplications of dense algebra: for
@@ -38,7 +38,7 @@ class Layout:
         own: stop -> columns of its own unknowns.
         finest: (C,) columns of the finest cells of each mesh; cells: (D,) of all others.
         kept: (S,) columns that are not eliminated, ascending.
-        bodies: the problem's blocks of tracked bodies that depend on stops' own unknowns.
+        bodies: the problem's blocks of seen bodies that depend on stops' own unknowns.
         others: the problem's other blocks; the graph takes them as they are.
         unbounded: unknowns that have no prior.
         scanned: how many stops have beams.
@@ -169,7 +169,7 @@ def key_of(scan: ScanStop) -> StopKey:
 
 def keys_of(block: Block) -> Sequence[StopKey]:
     """Which stops a block speaks of; none for a target."""
-    return block.stop_names if isinstance(block, TrackedBody) else ()
+    return block.stop_names if isinstance(block, SeenBody) else ()
 
 
 def _cells(unknowns: Mapping[str, Unknown]) -> tuple[list[str], list[str]]:

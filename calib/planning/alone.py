@@ -49,6 +49,7 @@ def nothing_measured(folder: Path | str) -> Stand:
         has_scan=none.astype(bool),
         rings=rig.lidar.rings if rig.lidar else None,
         joint_names=rig.joint_names,
+        levels={frame: np.zeros((0, 3)) for frame in (rig.levels.frames if rig.levels else ())},
     )
     model, source = Model(), Source(rig, recording, mesh)
     problem = build([source], model)

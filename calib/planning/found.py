@@ -180,6 +180,7 @@ def _kind(group: Group) -> str:
         return "all joints of a stop" if group.what == JOINTS else "a joint"
     said = {
         "body": group.what,
+        "level": group.what,
         "target": f"a target's {TARGET_WORDS.get(group.what, group.what)}",
         "frame": "paper: a frame or a length",
         "surface": "a surface of the mesh",

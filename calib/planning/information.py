@@ -26,7 +26,7 @@ from calib.problem.surfaces import with_surfaces
 from calib.problem.unknowns import Key, Role, Unknown
 from calib.residuals.beams import Association
 from calib.residuals.compiled import add_at, add_both
-from calib.residuals.tracker import BodiesTogether
+from calib.residuals.seen import BodiesTogether
 from calib.solve.clustered import of_graph
 from calib.solve.graph import Graph
 
@@ -192,7 +192,7 @@ def _of_bodies(
 ) -> dict[int, list[tuple[np.ndarray, np.ndarray]]]:
     """Number of a stop -> whitened rows of its bodies, and the columns of these."""
     found: dict[int, list[tuple[np.ndarray, np.ndarray]]] = {}
-    for together in BodiesTogether.of(problem.bodies):
+    for together in BodiesTogether.of(problem.seen):
         for block, (_, d) in zip(together.blocks, together.evaluate(values), strict=True):
             columns = layout.columns(list(d))
             rows = np.split(np.hstack(list(d.values())), len(block.measured))

@@ -18,8 +18,8 @@ from calib.problem import Problem
 from calib.problem.model import Source
 from calib.residuals.beams import Association, Rows, Surface
 from calib.residuals.scan import ScanStop
+from calib.residuals.seen import SeenBody
 from calib.residuals.store import BeamStore
-from calib.residuals.tracker import TrackedBody
 from chains import se3
 from sensors.lidar import Beams, LidarModel, beams
 from sensors.recording import Scan
@@ -28,6 +28,7 @@ SWEEPS = 20.0  # of a stop, where no recording says how many: 2 s at 10 Hz
 SCANS_FOR_BEAMS = 8  # of a recording, from which the directions of its beams are taken
 # Share of recorded beams that are shorter than those of planned stops that are counted on.
 SHORTER_BEAMS = 0.01
+ANY_WAY = np.array([0.0, 0.0, 1.0])  # what a planned level reads until the fit's state says better
 MARK = "~"  # after the name of a location that is visited again: the base stands elsewhere by then
 
 
@@ -221,7 +222,7 @@ def extended(
     """A recording with planned stops after its own.
 
     What effects may ask of a stop beside its joints (temperature, load) stays as at the last stop;
-    its time is one stop later. Bodies that were ever tracked are seen.
+    its time is one stop later. Bodies that were ever tracked are seen, and levels read.
 
     Args:
         source: the recording.
@@ -251,6 +252,10 @@ def extended(
         time_s=np.concatenate([recording.time_s, later]),
         joints=np.concatenate([recording.joints, poses.joints]),
         bodies=bodies,
+        levels={
+            frame: np.concatenate([felt, np.tile(ANY_WAY, (count, 1))])
+            for frame, felt in recording.levels.items()
+        },
         base_guess=None
         if recording.base_guess is None
         else np.concatenate([recording.base_guess, _pose(guess)]),
@@ -303,9 +308,8 @@ def at_their_places(
     """
     folder = source.recording.folder
     values = {n: u.mean for n, u in problem.variables.items()} | problem.initial | dict(known)
-    blocks = problem.bodies
     roots = [(s.stops.root, s.index) for s in problem.scans if s.recording.folder == folder]
-    roots += [(b.stops.root, k) for b in blocks for at, k in b.stop_names if at == folder]
+    roots += [(b.stops.root, k) for b in problem.seen for at, k in b.stop_names if at == folder]
     for root, k in roots:
         if k >= first and root not in known:
             values[root] = poses.Ts_world_root[k - first]
@@ -319,18 +323,12 @@ def at_their_places(
         problem,
         scans=scans,
         blocks=[
-            _as_predicted(b, values, folder, first) if isinstance(b, TrackedBody) else b
+            b.as_predicted(values, _planned(b, folder, first)) if isinstance(b, SeenBody) else b
             for b in problem.blocks
         ],
     ), values
 
 
-def _as_predicted(
-    block: TrackedBody, values: Mapping[str, np.ndarray], folder: object, first: int
-) -> TrackedBody:
-    """A block whose planned stops are seen where they should be."""
-    planned = np.array([at == folder and k >= first for at, k in block.stop_names])
-    if not planned.any():
-        return block
-    measured = np.where(planned[:, None, None], block.seen(values), block.measured)
-    return replace(block, measured=measured)
+def _planned(block: SeenBody, folder: object, first: int) -> np.ndarray:
+    """Which (K,) of a block's stops are planned."""
+    return np.array([at == folder and k >= first for at, k in block.stop_names])

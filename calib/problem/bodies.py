@@ -1,4 +1,4 @@
-"""Rows of the tracker: bodies at stops, and targets on their rods."""
+"""Rows of the tracker and of levels: bodies at stops, and targets on their rods."""
 
 from __future__ import annotations
 
@@ -8,12 +8,14 @@ from calib.effects import Site, View
 from calib.problem import start
 from calib.problem.places import Places
 from calib.problem.problem import Problem, SourceStops
-from calib.problem.unknowns import Owner, Role, Unknown, vector_unknown
-from calib.residuals.groups import Group
+from calib.problem.unknowns import Owner, Role, vector_unknown
+from calib.residuals.groups import Group, level_of
+from calib.residuals.levels import Level
 from calib.residuals.targets import TARGET_PARTS, HangingTarget
 from calib.residuals.tracker import TrackedBody
 
-GRAVITY = "gravity"  # the unknown along which rods hang
+GRAVITY = "gravity"  # the unknown of where down is: rods hang along it, levels feel it
+NO_LEVEL_READ = np.array([0.0, 0.0, -1.0])  # until one is, down is where most worlds have it
 
 
 def add_bodies(problem: Problem, part: SourceStops, places: Places) -> None:
@@ -43,6 +45,51 @@ def add_bodies(problem: Problem, part: SourceStops, places: Places) -> None:
             )
 
 
+def add_levels(problem: Problem, part: SourceStops, places: Places) -> None:
+    """Add gravity, and a block for every level and group of stops that share all unknowns."""
+    levels, recording = part.source.rig.levels, part.source.recording
+    if levels is None:
+        return
+    blocks = [
+        Level(
+            name=f"{level_of(frame)} at {recording.stops[read[0]]}",
+            stops=places.bind(root, read),
+            body=frame,
+            measured=felt[read],
+            gravity=GRAVITY,
+            sigma_rad=levels.sigma_rad,
+            stop_names=[(recording.folder, int(k)) for k in read],
+            groups=tuple(
+                Group("level", recording.stops[k], level_of(frame), part.label) for k in read
+            ),
+        )
+        for frame, felt in recording.levels.items()
+        for (root, _), index in places.stops.items()
+        if len(read := index[np.isfinite(felt[index, 0])])
+    ]
+    turns = [block.seen(problem.initial).T[:, :3, :3] for block in blocks]
+    ups = [np.matvec(R, b.measured).sum(axis=0) for R, b in zip(turns, blocks, strict=True)]
+    _add_gravity(problem, -np.sum(ups, axis=0) if blocks else NO_LEVEL_READ)
+    problem.blocks += blocks
+
+
+def _add_gravity(problem: Problem, down: np.ndarray) -> None:
+    """Add where down (3,) is, of any length: about there, or as some rig.yaml says."""
+    said = [s.rig.levels for s in problem.sources if s.rig.levels and s.rig.levels.up]
+    best = min(said, key=lambda levels: levels.sigma_up_rad, default=None)
+    mean, sigma_rad = (-np.array(best.up), best.sigma_up_rad) if best else (down, 1.0)
+    problem.add(
+        vector_unknown(
+            GRAVITY,
+            np.full(3, sigma_rad),
+            dofs=("x", "y", "z"),
+            units=("rad",) * 3,
+            mean=mean / np.linalg.norm(mean),
+            role=Role.GRAVITY,
+        )
+    )
+
+
 def _tracker_bases(part: SourceStops) -> dict[str, np.ndarray]:
     """What the tracker adds to every body at every stop, (K or 1, B, 6, P) by unknown."""
     source = part.source
@@ -60,22 +107,11 @@ def add_targets(problem: Problem, part: SourceStops, places: Places) -> None:
     targets, spec = part.source.recording.targets, part.source.rig.target
     if targets is None or spec is None or places.reference is None:
         return
-    gravity, lower_m = start.gravity(part.source), start.lower_markers(targets)
+    down, lower_m = start.gravity(part.source), start.lower_markers(targets)
     upper_m = np.where(np.isfinite(targets.upper_m), targets.upper_m, lower_m)
     parts = (targets.lower_m, targets.upper_m, targets.faro_m)
     whole = np.stack([np.isfinite(part).all(axis=1) for part in parts], axis=1)
-    dofs, units = ("across_1", "across_2"), ("rad", "rad")
-    problem.add(
-        Unknown(
-            name=GRAVITY,
-            kind="direction",
-            mean=gravity,
-            sigma=np.ones(2),
-            dofs=dofs,
-            units=units,
-            role=Role.TARGET,
-        )
-    )
+    _add_gravity(problem, down)
     shape = len(targets.names), 3
     view = View(part.source.rig, shape[0], {"point_m": targets.faro_m}, np.zeros((1, 0)))
     shifts, scanned = (

@@ -10,7 +10,7 @@ import numpy as np
 from calib.effects import Effect, ShapeStep, View
 from calib.forward import Term
 from calib.problem.beams import add_beams
-from calib.problem.bodies import add_bodies, add_targets
+from calib.problem.bodies import add_bodies, add_levels, add_targets
 from calib.problem.model import Model, Source, labels
 from calib.problem.places import Places
 from calib.problem.problem import Problem, SourceStops
@@ -67,6 +67,7 @@ def build(
         places = Places(problem, part, model)
         add_bodies(problem, part, places)
         add_targets(problem, part, places)
+        add_levels(problem, part, places)  # rods show where down is whatever the rig's pose
         if part.has_lidar:
             add_beams(problem, part, places)
     if not problem.calibration:

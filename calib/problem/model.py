@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 
 from calib import effects
-from calib.effects import Effect, FrameOffset
+from calib.effects import Effect, FrameOffset, Site
 from calib.forward import Term, named
-from calib.residuals.groups import Group, GroupKind
+from calib.residuals.groups import JOINTS, Group, GroupKind
 from calib.residuals.store import BeamStore
 from calib.rig import Rig, load_rig
+from calib.rig.recording import recorded
 from chains import se3
 from chains.align import align_points
 from chains.errors import InputError
@@ -171,10 +172,16 @@ class Model:
     def _free(self, effect: Effect, rig: Rig) -> np.ndarray:
         if effect.name in self.fixed:
             return np.zeros(0, int)
-        params = enumerate(effect.params(rig))
-        return np.array(
-            [i for i, p in params if p.sigma and f"{effect.name}.{p.name}" not in self.fixed], int
-        )
+        # What changes a joint that is unknown at every stop changes nothing that is measured.
+        passive = rig.passive if effect.site is Site.JOINTS else ()
+        free = [
+            i
+            for i, p in enumerate(effect.params(rig))
+            if p.sigma
+            and f"{effect.name}.{p.name}" not in self.fixed
+            and rig.joint_of(p.name) not in passive
+        ]
+        return np.array(free, int)
 
     def _check_names(self, rig: Rig) -> None:
         taken = {*rig.frame_sigma, rig.reference_frame, "gravity", "planes"}
@@ -212,7 +219,7 @@ def default_effects(recordings: Sequence[Path | str]) -> tuple[str, ...]:
             continue  # what it is instead, the fit says
         rig = load_rig(folder)
         if rig.tracker and rig.joint_names:
-            recording = RecordedStops.open(folder, rig.joint_names, rig.tracker.bodies)
+            recording = recorded(rig)
             for body in filter(rig.joints_to, rig.tracker.bodies):
                 pose = np.isfinite(recording.bodies[body])
                 rows += 3 * int(pose[:, :3].all(axis=1).sum() + pose.all(axis=1).sum())
@@ -261,9 +268,7 @@ class Source:
             InputError: what is wrong, and where.
         """
         rig = load_rig(folder)
-        rings = rig.lidar.rings if rig.lidar else None
-        bodies = rig.tracker.bodies if rig.tracker else ()
-        recording = RecordedStops.open(folder, rig.joint_names, bodies, rings)
+        recording = recorded(rig)
         spec = rig.reference
         mesh = Reference.read(spec.mesh, spec.faces, spec.labels) if spec and spec.mesh else None
         return cls(rig, recording, mesh)
@@ -285,6 +290,15 @@ class Source:
     def lacks(self, kind: GroupKind) -> set[tuple[str, str]]:
         """Where and what of one kind is left out."""
         return {(group.where, group.what) for group in self.without if group.kind == kind}
+
+    @cached_property
+    def unread(self) -> frozenset[tuple[str, str]]:
+        """Stop and joint of every reading that there is not, as it was left out or never made."""
+        stops, names = self.recording.stops, self.rig.joint_names
+        gone = self.lacks("joints")
+        gone |= {(stop, name) for stop, what in gone if what == JOINTS for name in names}
+        gone |= {(stop, name) for stop in stops for name in self.rig.passive}
+        return frozenset((stop, name) for stop, name in gone if name in names)
 
     @cached_property
     def store(self) -> BeamStore:

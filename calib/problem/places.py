@@ -19,7 +19,7 @@ from calib.problem.unknowns import (
     pose_unknown,
     vector_unknown,
 )
-from calib.residuals.groups import JOINTS, Group
+from calib.residuals.groups import Group
 from chains import se3
 from chains.errors import InputError
 
@@ -95,7 +95,7 @@ class Places:
         if self.part.source.rig.sigma_joint_rad and self.part.source.rig.joint_names:
             return [(int(k), np.array([k])) for k in stops]
         recording = self.part.source.recording
-        unread = {stop for stop, _ in self.part.source.lacks("joints")}
+        unread = {stop for stop, _ in self.part.source.unread}
         single = recording.has_scan[stops] | [recording.stops[k] in unread for k in stops]
         alone = [(int(k), np.array([k])) for k in stops[single]]
         together = stops[~single]
@@ -193,12 +193,11 @@ class Places:
         return stops.with_joint_noise(name)
 
     def _joint_sigma(self, index: np.ndarray) -> np.ndarray:
-        """How well the encoders (J,) are known at stops that share all unknowns; readings that are
-        left out are free."""
+        """How well the encoders (J,) are known at stops that share all unknowns; readings that
+        there are not are free."""
         source = self.part.source
-        lacks = source.lacks("joints")
         (stop, *others), names = [source.recording.stops[k] for k in index], source.rig.joint_names
-        if others or not lacks:
+        if others or not source.unread:
             return np.full(len(names), source.rig.sigma_joint_rad)
-        free = [not lacks.isdisjoint({(stop, JOINTS), (stop, name)}) for name in names]
+        free = [(stop, name) in source.unread for name in names]
         return np.where(free, UNREAD, source.rig.sigma_joint_rad)

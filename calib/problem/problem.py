@@ -12,6 +12,7 @@ from calib.forward import Derivatives, Term, Values
 from calib.problem.model import Source
 from calib.problem.unknowns import Unknown
 from calib.residuals.scan import ScanStop
+from calib.residuals.seen import SeenBody
 from calib.residuals.surfaces import Meeting
 from calib.residuals.tracker import TrackedBody
 
@@ -20,7 +21,7 @@ class Block(Protocol):
     """Whitened rows of one kind that should be zero but for unit noise.
 
     ``evaluate`` gives residuals (m,) and, when asked, the derivative by each unknown: (m, n) for a
-    vector, (m, 6) for a pose by its right increment, (m, 3) for a direction by its components.
+    vector, (m, 6) for a pose by its right increment.
     """
 
     name: str
@@ -90,7 +91,7 @@ class Problem:
         variables: the unknowns, by name.
         initial: values to start from.
         calibration: unknowns that describe the hardware, in the order in which they are shown.
-        blocks: tracker and target rows.
+        blocks: rows of trackers, levels and targets.
         scans: one per stop with a scan.
         meetings: per source, what its beams meet.
         cells: unknowns of surfaces, once what beams meet is settled.
@@ -115,9 +116,14 @@ class Problem:
         return [block for block in self.blocks if isinstance(block, TrackedBody)]
 
     @property
+    def seen(self) -> list[SeenBody]:
+        """The blocks of bodies at stops, whatever instrument sees them."""
+        return [block for block in self.blocks if isinstance(block, SeenBody)]
+
+    @property
     def set_aside(self) -> frozenset[str]:
         """Tokens of the scans, and of the bodies at stops, that a fit has set aside."""
-        weights = ((b.groups, b.weight) for b in self.bodies if b.weight is not None)
+        weights = ((b.groups, b.weight) for b in self.seen if b.weight is not None)
         bodies = (g for groups, w in weights for g, x in zip(groups, w, strict=True) if x == 0)
         return frozenset(g.token for g in (*(scan.group for scan in self.aside), *bodies))
 
@@ -129,7 +135,7 @@ class Problem:
         kept = [scan for scan in every if scan.group.token not in tokens]
         gone = [scan for scan in every if scan.group.token in tokens]
         blocks = [
-            block.setting_aside(tokens) if isinstance(block, TrackedBody) else block
+            block.setting_aside(tokens) if isinstance(block, SeenBody) else block
             for block in self.blocks
         ]
         return replace(self, scans=kept, aside=gone, blocks=blocks)

@@ -12,11 +12,11 @@ import numpy as np
 from calib.effects.rig import DOF
 from chains import se3
 
-UnknownKind = Literal["vector", "pose", "direction"]
+UnknownKind = Literal["vector", "pose"]
 # What is known of a pose before any data: the room it is in.
 UNKNOWN_POSE = np.repeat([3.0, 10.0], 3)
 POSE_UNITS = ("rad",) * 3 + ("m",) * 3
-UNREAD = 1.0  # rad or m: a joint whose reading at a stop is left out
+UNREAD = 1.0  # rad or m: a joint that nothing reads at a stop
 EXACT = 1e-7  # rad or m: an encoder without error beside one that is left out
 
 
@@ -26,7 +26,8 @@ class Role(Enum):
     CALIBRATION = "calibration"  # what a user wants to know: frames, effects, the reference's place
     PLACE = "place"  # where the rig's root stands at a stop, at a location, or always
     JOINTS = "joints"  # what the encoders misreport at one stop
-    TARGET = "target"  # a rod's marker, and gravity
+    TARGET = "target"  # a rod's marker
+    GRAVITY = "gravity"  # which way is down
     PLANE = "plane"  # planes found in the scans
     SURFACE = "surface"  # how far parts of the mesh, or of planes, stand off the room
     SCATTER = "scatter"  # what chance does anew to each stop or location
@@ -72,7 +73,7 @@ class Unknown:
 
     Args:
         name: unique.
-        kind: "vector" (n,), "pose" (4, 4), or "direction", a unit vector (3,).
+        kind: "vector" (n,), or "pose" (4, 4).
         mean: what was known before, in the shape of the kind.
         sigma: (dim,) how well it was known, per tangent direction; never zero.
         dofs: (dim,) a name per tangent direction.
@@ -99,6 +100,16 @@ class Unknown:
         return len(self.sigma)
 
     @property
+    def told(self) -> int:
+        """How many of its numbers rows can tell: of gravity's (3,), the length means nothing."""
+        return self.dim - (self.role is Role.GRAVITY)
+
+    @property
+    def unread(self) -> int:
+        """Of joint readings, how many there are not."""
+        return int((self.sigma >= UNREAD).sum())
+
+    @property
     def keys(self) -> tuple[Key, ...]:
         """(dim,) of its parameters."""
         return tuple(Key(self.name, dof) for dof in self.dofs)
@@ -120,11 +131,11 @@ class Unknown:
         return replace(self, sigma=sigma, scatter={**self.scatter, unit: sd})
 
     def moved(self, value: np.ndarray, step: np.ndarray) -> np.ndarray:
-        """A vector or pose after a step (dim,) of its tangent: ``T exp(step)``, ``x + step``."""
+        """A value after a step (dim,) of its tangent: ``T exp(step)``, ``x + step``."""
         return value @ se3.exp(step) if self.kind == "pose" else value + step
 
     def difference(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """How a vector or pose b differs from a, as a tangent (dim,) at a."""
+        """How a value b differs from a, as a tangent (dim,) at a."""
         return se3.log(se3.inverse(a) @ b) if self.kind == "pose" else b - a
 
 

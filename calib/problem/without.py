@@ -13,7 +13,7 @@ import numpy as np
 
 from calib.effects import DEFAULT, Effect, Site, find
 from calib.problem.model import Source, labels
-from calib.residuals.groups import CAD, JOINTS, MESH, SCAN, Group
+from calib.residuals.groups import CAD, JOINTS, MESH, SCAN, Group, level_of
 from calib.residuals.targets import TARGET_PARTS
 from chains.errors import InputError
 from sensors.documents import nearest
@@ -54,12 +54,14 @@ def _matching(source: Source, label: str, token: str) -> list[Group]:
 def _groups(source: Source, label: str = "") -> list[Group]:
     """All that can be left out of a recording that is called so."""
     rig, recording = source.rig, source.recording
-    out = []
+    out, read = [], [name for name in rig.joint_names if name not in rig.passive]
     for k, stop in enumerate(recording.stops):
         out += [Group("body", stop, b, label) for b in recording.bodies if _seen(recording, b)[k]]
+        felt = (f for f, each in recording.levels.items() if np.isfinite(each[k, 0]))
+        out += [Group("level", stop, level_of(frame), label) for frame in felt]
         out += [Group("scan", stop, SCAN, label)] if recording.has_scan[k] else []
         if rig.joint_names:
-            out += [Group("joints", stop, what, label) for what in (JOINTS, *rig.joint_names)]
+            out += [Group("joints", stop, what, label) for what in (JOINTS, *read)]
     for target in recording.targets.names if recording.targets else ():
         out += [Group("target", target, what, label) for what in (*TARGET_PARTS, ROD)]
     out += [Group("frame", CAD, frame) for frame in rig.frame_sigma]
@@ -91,6 +93,11 @@ def _left_out(source: Source, group: Group) -> Source:
         seen = recording.bodies[group.what].copy()
         seen[at] = np.nan
         recording = replace(recording, bodies=recording.bodies | {group.what: seen})
+    elif group.kind == "level":
+        levels = {frame: felt.copy() for frame, felt in recording.levels.items()}
+        frame = next(frame for frame in levels if level_of(frame) == group.what)
+        levels[frame][recording.stops.index(group.where)] = np.nan
+        recording = replace(recording, levels=levels)
     elif group.kind == "scan":
         has_scan = recording.has_scan.copy()
         has_scan[recording.stops.index(group.where)] = False
@@ -125,7 +132,7 @@ def _refusal(sources: Sequence[Source], token: str, called: Sequence[str]) -> st
         return f"--without {token}: several recordings have that; say which: {choice}"
     known = [group.token for s in sources for group in _groups(s)]
     return (
-        f"--without {token}: no recording has that; write STOP:BODY, STOP:scan, STOP:joints, "
-        "STOP:JOINT, TARGET:sphere, lower, upper or rod, cad:FRAME, cad:EFFECT.PARAMETER or "
-        f"mesh:surface_N{nearest(token, known)}"
+        f"--without {token}: no recording has that; write STOP:BODY, STOP:FRAME.level, STOP:scan, "
+        "STOP:joints, STOP:JOINT, TARGET:sphere, lower, upper or rod, cad:FRAME, "
+        f"cad:EFFECT.PARAMETER or mesh:surface_N{nearest(token, known)}"
     )

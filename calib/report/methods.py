@@ -29,7 +29,7 @@ def table(run: Run) -> pandas.DataFrame:
         InputError: the run is incomplete, or pandas is not installed.
     """
     from calib.runs.asked.tables import parameters
-    from sensors.recording import data_frame
+    from sensors.numbers import data_frame
 
     return data_frame(parameters(run))
 
@@ -39,13 +39,13 @@ def residuals(run: Run, kind: str = "beams") -> pandas.DataFrame:
 
     Args:
         run: the run.
-        kind: "beams", "tracker", "target" or "prior".
+        kind: "beams", "tracker", "level", "target" or "prior".
 
     Raises:
         InputError: the run has none of that kind, or pandas is not installed.
     """
     from calib.runs.asked.tables import residuals as found
-    from sensors.recording import data_frame
+    from sensors.numbers import data_frame
 
     return data_frame(found(run, kind))
 

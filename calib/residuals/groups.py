@@ -5,10 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-GroupKind = Literal["body", "joints", "scan", "target", "frame", "rings", "surface"]
+GroupKind = Literal["body", "level", "joints", "scan", "target", "frame", "rings", "surface"]
+AT_STOPS = ("body", "level", "joints", "scan")  # kinds that a stop has
 SCAN, JOINTS = "scan", "joints"  # what of a stop, beside its bodies and single joints
 CAD, MESH = "cad", "mesh"  # where, of what belongs to no stop and no target
 ALONG_BEAMS = "along the beams"  # the direction of a range zero
+
+
+def level_of(frame: str) -> str:
+    """What the level in a frame is called: the tracker may see a body of this name."""
+    return f"{frame}.level"
 
 
 @dataclass(frozen=True)
@@ -18,8 +24,8 @@ class Group:
     Args:
         kind: what kind of thing it is, as diagnosis.json has it.
         where: the stop or target; `CAD` for what rig.yaml or the URDF says, `MESH` for a surface.
-        what: the body, `SCAN`, `JOINTS` or one joint; the part of the target; the frame or
-            ``effect.parameter``; the surface.
+        what: the body, a level as `level_of` has it, `SCAN`, `JOINTS` or one joint; the part of the
+            target; the frame or ``effect.parameter``; the surface.
         recording: name of its folder, where there are several recordings.
     """
 
@@ -31,7 +37,7 @@ class Group:
     @property
     def stop(self) -> str | None:
         """The stop that it is of."""
-        return self.where if self.kind in ("body", "joints", "scan") else None
+        return self.where if self.kind in AT_STOPS else None
 
     @property
     def bare(self) -> str:

@@ -9,6 +9,7 @@ import numpy as np
 
 from calib.forward import Derivatives, Values
 from calib.residuals.groups import Group
+from calib.residuals.levels import down
 
 TARGET_PARTS = ("lower", "upper", "sphere")  # of a target, three rows each, in their order
 PARTS_OF_SIGMAS = {"sphere": ("sphere",), "marker": ("lower", "upper")}  # of which parts
@@ -25,7 +26,7 @@ class HangingTarget:
     Args:
         name: for messages.
         marker: variable of p (3,), world frame.
-        gravity: variable of g, a direction (pointing down) in the world frame.
+        gravity: variable of g (3,), down in the world frame; its length means nothing.
         reference: variable of T_world_faro.
         faro_m, upper_m, lower_m: (3,) measured.
         below_m: L, sphere centre below the lower marker.
@@ -71,7 +72,8 @@ class HangingTarget:
 
     def evaluate(self, values: Values, derivatives: bool) -> tuple[np.ndarray, Derivatives | None]:
         """Nine whitened rows [lower marker, upper marker across the rod, sphere]."""
-        p, g, T = values[self.marker], values[self.gravity], values[self.reference]
+        p, T = values[self.marker], values[self.reference]
+        g, by_gravity = down(values[self.gravity])
         rod = self.upper_m - p
         across = rod - g * (g @ rod)
         sphere = p + self.below_m * g + sum(b @ values[n] for n, b in self.shift.items())
@@ -89,11 +91,13 @@ class HangingTarget:
         if not derivatives:
             return root * residual, None
         found = self._derivatives(g, rod, R_t, in_faro)
+        found[self.gravity] = found[self.gravity] @ by_gravity
         return root * residual, {n: d * np.c_[root] for n, d in found.items()}
 
     def _derivatives(
         self, g: np.ndarray, rod: np.ndarray, R_t: np.ndarray, in_faro: np.ndarray
     ) -> Derivatives:
+        """By each unknown; of gravity, by its unit vector."""
         marker, sphere, eye = 1.0 / self.sigma_marker_m, 1.0 / self.sigma_sphere_m, np.eye(3)
         along = np.outer(g, g)
         by_p = np.vstack([-eye * marker, (along - eye) * marker, -R_t * sphere])

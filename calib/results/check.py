@@ -21,6 +21,7 @@ from calib.results.reach import Reach, reach
 from calib.results.solution import solution_of
 from calib.rig import Rig, inventory, load_rig
 from calib.rig.inventory import PlacedScan
+from calib.rig.recording import recorded
 from calib.rig.scale import odd_mesh, odd_targets
 from calib.rig.scanned import ScanSums, odd_scans, of_scans
 from calib.rig.suspect import Suspect
@@ -141,8 +142,9 @@ class _Checker:
             found.contents.extend(inventory.of_rig(rig))
             found.odd.extend(inventory.odd_rig(rig))
         if rig and recording:
-            found.contents.extend(inventory.of_stops(recording))
+            found.contents.extend(inventory.of_stops(rig, recording))
             found.odd.extend(inventory.odd_stops(rig, recording))
+            found.odd.extend(inventory.odd_levels(recording))
             found.odd.extend(inventory.odd_joints(rig, recording))
             self._tell(odd_bodies(rig, recording))
         scans = self._read_scans(rig)
@@ -271,10 +273,7 @@ def _open(folder: Path, rig: Rig | None) -> RecordedStops:
     """The recording, its joints and bodies included where the rig says which they are."""
     if rig is None:
         return RecordedStops.open(folder, (), ())
-    bodies = rig.tracker.bodies if rig.tracker else ()
-    return RecordedStops.open(
-        folder, rig.joint_names, bodies, rig.lidar.rings if rig.lidar else None
-    )
+    return recorded(rig)
 
 
 def _place(scan: ScanStop, values: Values) -> PlacedScan:

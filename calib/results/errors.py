@@ -156,8 +156,12 @@ def body_errors(
     values: Mapping[str, np.ndarray],
     predicted: Estimate | None,
 ) -> Errors:
-    """Distances between tracked and predicted positions of bodies; arguments as above."""
-    out = Errors()
+    """Distances between tracked and predicted positions of bodies; arguments as above.
+
+    Rows that the estimate rests on have less error than their noise, by what it takes from them:
+    their residuals' covariance is R - A C A^T, and R + A C A^T that of other rows.
+    """
+    out, own = Errors(), [] if predicted is None else predicted.problem.blocks
     for block in blocks:
         placed = block.stops.in_world(block.body, values)
         added = sum((B @ values[n] for n, B in block.bases.items()), np.zeros((1, 6)))
@@ -167,7 +171,8 @@ def body_errors(
         if predicted is not None:
             names = list(placed.d)
             d = np.concatenate([placed.d[name][:, 3:] for name in names], axis=2)
-            expected += np.einsum("kip,pq,kiq->", d, predicted.covariance_of(names), d)
+            known = np.einsum("kip,pq,kiq->", d, predicted.covariance_of(names), d)
+            expected += -known if any(block is each for each in own) else known
         out += Errors(
             count=len(distance),
             total_m=float(distance.sum()),
@@ -181,12 +186,12 @@ def body_errors(
 def misfit(estimate: Estimate, beams: Errors, weighted: bool = False) -> dict[str, float]:
     """How many times larger than their sigmas allow the residuals are, by kind of instrument.
 
-    For trackers and targets the root of chi-square over its degrees of freedom, their own unknowns
-    taken off; for beams the rms of inliers over what is expected of them; for the reference how far
-    its surfaces had to be moved, over how far they may be off; for CAD the root of chi-square of
-    how far frames moved from there, over the redundancy of these moves. About 1 or less when all is
-    well: an effect that is missing in the LiDAR may be laid on beams or on surfaces, and shows in
-    either.
+    For instruments that see bodies or targets the root of chi-square over its degrees of freedom,
+    their own unknowns taken off; for beams the rms of inliers over what is expected of them; for
+    the reference how far its surfaces had to be moved, over how far they may be off; for CAD the
+    root of chi-square of how far frames moved from there, over the redundancy of these moves. About
+    1 or less when all is well: an effect that is missing in the LiDAR may be laid on beams or on
+    surfaces, and shows in either.
 
     Args:
         estimate: the solution.
@@ -197,11 +202,12 @@ def misfit(estimate: Estimate, beams: Errors, weighted: bool = False) -> dict[st
     """
     values, unknowns = estimate.values, estimate.problem.variables
     out = {}
-    for kind in ("tracker", "target"):
+    # Beams, where there are any, hold where the rig stands; what is a level's own is not there.
+    place = set() if beams.count else {Role.PLACE}
+    owners = {"tracker": place, "level": {Role.GRAVITY}, "target": {Role.TARGET, Role.GRAVITY}}
+    for kind, own in owners.items():
         blocks = [b for b in estimate.problem.blocks if b.kind == kind]
         if blocks:
-            # Beams, where there are any, hold where the rig stands.
-            own = {Role.TARGET} if kind == "tracker" and beams.count else {Role.TARGET, Role.PLACE}
             out[kind] = _of_blocks(estimate, blocks, own, weighted)
     if beams.count and estimate.scans:
         out["beams"] = beams.misfit
@@ -215,7 +221,7 @@ def misfit(estimate: Estimate, beams: Errors, weighted: bool = False) -> dict[st
 def _of_blocks(
     estimate: Estimate, blocks: Sequence[Block], own: Container[Role], weighted: bool
 ) -> float:
-    """Of trackers or targets; see `misfit`.
+    """Of trackers, levels or targets; see `misfit`.
 
     Args:
         estimate: the solution.
@@ -233,9 +239,9 @@ def _of_blocks(
             rows = [(b, r[bulk], bulk[bulk]) for b, r, bulk in rows if bulk.any()]
     seen = [unknowns[n] for n in {n: None for b, *_ in rows for n in b.variables}]
     joints = [u for u in seen if u.role is Role.JOINTS]
-    free = sum(u.dim for u in seen if u.role in own)
+    free = sum(u.told for u in seen if u.role in own) + sum(u.unread for u in joints)
     if weighted:
-        free += sum(u.dim for u in joints if u.weight < 1.0)
+        free += sum(u.dim - u.unread for u in joints if u.weight < 1.0)
         joints = [u for u in joints if u.weight >= 1.0]
     chi2 = sum(float(r @ r) for _, r, _ in rows)
     chi2 += sum(_prior_cost(u, values[u.name]) for u in joints)

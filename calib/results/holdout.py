@@ -12,10 +12,10 @@ from calib import problem as problems
 from calib.problem import Problem
 from calib.problem.model import Model, Source
 from calib.problem.prior import JointPrior
-from calib.problem.problem import Block
 from calib.problem.spread import spread_of, with_spread
 from calib.problem.surfaces import parts_of
 from calib.residuals.scan import ScanStop
+from calib.residuals.seen import SeenBody
 from calib.residuals.surfaces import PlaneSurface
 from calib.results.errors import Errors, Keep, body_errors, scan_errors
 from calib.solve.estimate import Estimate, Start
@@ -204,22 +204,18 @@ def predict(
     scans, bodies = unseen.scans, unseen.bodies
     predicted, told = placed(unseen, trained, estimate)
     if not scans:
-        judged = [b for b in bodies if not _among(b, unseen.blocks) and b.stops.root in told]
+        beyond = [b for b in bodies if b.stops.rig.joints_to(b.body)]
+        judged = [b for b in beyond if b.stops.root in told]
         return body_errors(judged, predicted.values, predicted)
     each = (_scan(scan, predicted, scan.stops.root in told, keep) for scan in scans)
     return sum(each, Errors())
 
 
-def _among(block: Block, blocks: Sequence[Block]) -> bool:
-    """Whether it is one of them, itself."""
-    return any(block is each for each in blocks)
-
-
 def placed(unseen: Problem, trained: Problem, estimate: Estimate) -> tuple[Estimate, set[str]]:
     """Where stops stand whose calibration comes from an estimate of another problem.
 
-    Poses of the unseen stops are found from their tracked bodies; where no body is seen, from
-    their own beams with the calibration held.
+    Poses of the unseen stops are found from their tracked bodies and levels; where no body is seen,
+    from their own beams with the calibration held.
 
     Args:
         unseen: the stops' problem; what does not place them is taken out of it.
@@ -229,16 +225,23 @@ def placed(unseen: Problem, trained: Problem, estimate: Estimate) -> tuple[Estim
         The estimate, and the poses' variables that tracked bodies or the other problem told.
     """
     shared = [n for n in trained.variables if n in unseen.variables]
-    held = [trained.variables[n] for n in shared if trained.variables[n].kind != "direction"]
+    held = [trained.variables[n] for n in shared]
     names = [v.name for v in held]
     covariance = estimate.covariance_of(names)
     prior = JointPrior(held, {n: estimate.values[n] for n in names}, covariance)
-    scans, bodies = unseen.scans, unseen.bodies
-    # Without a LiDAR, bodies before the joints tell where the rig is; those beyond are judged.
-    unseen.blocks = bodies if scans else [b for b in bodies if not b.stops.rig.joints_to(b.body)]
-    told = {block.stops.root for block in unseen.blocks} | set(shared)
+    scans, seen = unseen.scans, unseen.seen
+    # Without a LiDAR, bodies before the joints tell where the rig is; those beyond are judged, and
+    # tell of themselves no more than how joints stand that nothing reads.
+    unseen.blocks = [b for b in seen if scans or _places(b)]
+    told = {block.stops.root for block in unseen.bodies} | set(shared)
     unseen.scans = [scan for scan in scans if scan.stops.root not in told]
     return solve(unseen, prior, spread=False), told
+
+
+def _places(block: SeenBody) -> bool:
+    """Whether a stop without a scan is placed by this, too."""
+    rig = block.stops.rig
+    return bool(rig.passive) or not rig.joints_to(block.body)
 
 
 def _scan(scan: ScanStop, predicted: Estimate, told: bool, keep: Keep) -> Errors:

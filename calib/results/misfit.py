@@ -15,12 +15,10 @@ from typing import Any
 import numpy as np
 
 from calib.effects import FrameOffset, Site
-from calib.effects.rig import DOF
 from calib.linear.layout import StopKey, key_of
 from calib.problem.model import Source, recording_names
-from calib.problem.unknowns import POSE_UNITS, Role, Unknown
+from calib.problem.unknowns import Role, Unknown
 from calib.residuals.targets import TARGET_PARTS, HangingTarget
-from calib.residuals.tracker import TrackedBody
 from calib.results.errors import Errors
 from calib.solve.estimate import Estimate
 from calib.solve.reweight import unweighted
@@ -29,6 +27,7 @@ from calib.solve.reweight import unweighted
 # below 0.01 observations are "not checkable").
 UNCHECKED = 0.01
 XYZ = ("x", "y", "z")
+SEEN_BY = ("tracker", "level")  # instruments that see bodies at stops
 # What says how the rig is built.
 GEOMETRY_SITES = Site.EDGE, Site.JOINTS, Site.TARGET, Site.REFERENCE
 
@@ -82,19 +81,31 @@ class InstrumentRows:
         return groups, np.array([number[key] for key in keys], int)
 
 
-def tracker_rows(estimate: Estimate) -> InstrumentRows | None:
-    """Rows of tracked bodies: recording, stop, body, and the axis of the body as predicted, turn
-    (rx, ry, rz) or shift (tx, ty, tz); None where no body is tracked."""
-    names, out, bodies = _stop_names(estimate), _Gathered(), estimate.problem.bodies
+def seen_rows(estimate: Estimate, kind: str) -> InstrumentRows | None:
+    """Rows of bodies as an instrument, "tracker" or "level", sees them: recording, stop, body, as
+    `Group.what` has it, and axis; None where it sees none.
+
+    The tracker's axes are those of the body as predicted, turn (rx, ry, rz) or shift (tx, ty, tz);
+    a level's are two across what it felt.
+    """
+    names, out = _stop_names(estimate), _Gathered()
+    bodies = [block for block in estimate.problem.seen if block.kind == kind]
     found = [unweighted(block).evaluate(estimate.values, True) for block in bodies]
     variances = estimate.variances([d for _, d in found])
     for block, (residual, _), variance in zip(bodies, found, variances, strict=True):
-        axes = slice(3, 6) if block.is_point else slice(0, 6)
         stops = [names[key] for key in block.stop_names]
-        each = [(*stop, block.body, axis) for stop in stops for axis in DOF[axes]]
-        sigma, units = np.repeat([block.sigma_rad, block.sigma_m], 3)[axes], POSE_UNITS[axes]
-        out.add(each, units * len(stops), np.tile(sigma, len(stops)), residual, 1.0 - variance)
+        what = block.groups[0].what
+        each = [(*stop, what, axis) for stop in stops for axis in block.dofs]
+        sigma = np.tile(block.sigma, len(stops))
+        out.add(each, block.units * len(stops), sigma, residual, 1.0 - variance)
     return out.rows(("recording", "stop", "body", "axis"))
+
+
+def instrument_rows(estimate: Estimate) -> dict[str, InstrumentRows]:
+    """Rows by kind, of those kinds that there are: "tracker", "level", "target" and "prior"."""
+    found = {kind: seen_rows(estimate, kind) for kind in SEEN_BY}
+    found |= {"target": target_rows(estimate), "prior": prior_rows(estimate)}
+    return {kind: rows for kind, rows in found.items() if rows is not None}
 
 
 def target_rows(estimate: Estimate) -> InstrumentRows | None:
@@ -127,7 +138,7 @@ def prior_rows(estimate: Estimate) -> InstrumentRows | None:
     variance = np.diag(estimate.covariance)
     at = {v.name: variance[a : a + v.dim] for v, a in zip(estimate.variables, start, strict=False)}
     known = [u for u in estimate.problem.variables.values() if u.kind == "vector"]
-    known = [u for u in known if u.role is not Role.TARGET]
+    known = [u for u in known if u.role not in (Role.TARGET, Role.GRAVITY)]
     joints = [u for u in known if u.role is Role.JOINTS]
     variances = estimate.variances([{u.name: np.eye(u.dim)} for u in joints])
     at |= {u.name: seen for u, seen in zip(joints, variances, strict=True)}
@@ -141,26 +152,24 @@ def prior_rows(estimate: Estimate) -> InstrumentRows | None:
 
 def misfit_by(
     estimate: Estimate,
-    tracker: InstrumentRows | None,
-    target: InstrumentRows | None,
-    prior: InstrumentRows | None,
+    rows: Mapping[str, InstrumentRows],
     beams: Mapping[tuple[str, str], Errors],
 ) -> dict[str, Any]:
-    """Where the model does not fit: by stop, tracked body, target, and part of the geometry.
+    """Where the model does not fit: by stop, body that is seen, target, and part of the geometry.
 
     Args:
         estimate: the solution.
-        tracker, target, prior: its rows.
+        rows: its rows, by kind: "tracker", "level", "target" or "prior".
         beams: recording and stop -> errors of its beams.
 
     Returns:
-        As summary.json holds it. ``stop``: stop -> ``tracker``, ``bodies`` (body -> number),
-        ``joints``, ``beams``, those that it has; ``body`` and ``target``: name -> number. All of
-        these say how many times larger than their sigmas allow the residuals are, about 1 when all
-        is well; null where nothing checks them. ``prior``: frame of CAD, or ``effect.parameter`` of
-        geometry -> ``move_sigmas``, how many sigmas of CAD it moved; ``worst``, the parameter that
-        moved furthest; its ``change`` and ``sigma``, in ``unit``. Of several recordings, a stop and
-        a target bear the recording's name before theirs.
+        As summary.json holds it. ``stop``: stop -> ``tracker``, ``bodies`` (body or level ->
+        number), ``joints``, ``beams``, those that it has; ``body`` and ``target``: name -> number.
+        All of these say how many times larger than their sigmas allow the residuals are, about 1
+        when all is well; null where nothing checks them. ``prior``: frame of CAD, or
+        ``effect.parameter`` of geometry -> ``move_sigmas``, how many sigmas of CAD it moved;
+        ``worst``, the parameter that moved furthest; its ``change`` and ``sigma``, in ``unit``.
+        Of several recordings, a stop and a target bear the recording's name before theirs.
     """
     several = len(estimate.problem.sources) > 1
 
@@ -168,18 +177,19 @@ def misfit_by(
         return f"{recording}.{name}" if several else name
 
     stops: dict[str, dict[str, Any]] = {}
-    if tracker:
-        for key, times in tracker.misfit("recording", "stop").items():
+    if "tracker" in rows:
+        for key, times in rows["tracker"].misfit("recording", "stop").items():
             stops[label(*key)] = {"tracker": times, "bodies": {}}
-        for (*key, body), times in tracker.misfit("recording", "stop", "body").items():
-            stops[label(*key)]["bodies"][body] = times
-    for key, times in (prior.misfit("recording", "stop") if prior else {}).items():
+    for seen in _seen(rows):
+        for (*key, body), times in seen.misfit("recording", "stop", "body").items():
+            stops.setdefault(label(*key), {}).setdefault("bodies", {})[body] = times
+    for key, times in _misfit(rows, "prior", "recording", "stop").items():
         if key[1]:
             stops.setdefault(label(*key), {})["joints"] = times
     for key, errors in beams.items():
         stops.setdefault(label(*key), {})["beams"] = errors.misfit
-    bodies = tracker.misfit("body") if tracker else {}
-    targets = target.misfit("recording", "target") if target else {}
+    bodies = {key: times for seen in _seen(rows) for key, times in seen.misfit("body").items()}
+    targets = _misfit(rows, "target", "recording", "target")
     return {
         "stop": stops,
         "body": {body: times for (body,), times in bodies.items()},
@@ -188,20 +198,31 @@ def misfit_by(
     }
 
 
-def redundancies(
-    tracker: InstrumentRows | None, target: InstrumentRows | None, prior: InstrumentRows | None
-) -> dict[str, list[float]]:
+def redundancies(rows: Mapping[str, InstrumentRows]) -> dict[str, list[float]]:
     """The redundancy of each group that `misfit_by` tells of, by kind: a body's name, "joints" or
     "target"; arguments as there."""
     found: dict[str, list[float]] = {}
-    for (*_, body), x in (tracker.expected("recording", "stop", "body") if tracker else {}).items():
-        found.setdefault(body, []).append(x)
-    for (_, stop), x in (prior.expected("recording", "stop") if prior else {}).items():
-        if stop:
-            found.setdefault("joints", []).append(x)
-    if target:
-        found["target"] = list(target.expected("recording", "target").values())
+    for seen in _seen(rows):
+        for (*_, body), x in seen.expected("recording", "stop", "body").items():
+            found.setdefault(body, []).append(x)
+    if "prior" in rows:
+        for (_, stop), x in rows["prior"].expected("recording", "stop").items():
+            if stop:
+                found.setdefault("joints", []).append(x)
+    if "target" in rows:
+        found["target"] = list(rows["target"].expected("recording", "target").values())
     return found
+
+
+def _seen(rows: Mapping[str, InstrumentRows]) -> list[InstrumentRows]:
+    """Those of bodies at stops."""
+    return [rows[kind] for kind in SEEN_BY if kind in rows]
+
+
+def _misfit(
+    rows: Mapping[str, InstrumentRows], kind: str, *by: str
+) -> dict[tuple[str, ...], float | None]:
+    return rows[kind].misfit(*by) if kind in rows else {}
 
 
 @dataclass
@@ -269,11 +290,7 @@ def _owners(estimate: Estimate) -> dict[str, tuple[str, str]]:
     """Unknown of what encoders misreport -> the recording and stop that it is of."""
     names, problem = _stop_names(estimate), estimate.problem
     scans = [(scan.stops.noise, key_of(scan)) for scan in problem.scans]
-    bodies = [
-        (block.stops.noise, block.stop_names[0])
-        for block in problem.blocks
-        if isinstance(block, TrackedBody)
-    ]
+    bodies = [(block.stops.noise, block.stop_names[0]) for block in problem.seen]
     return {noise: names[key] for noise, key in scans + bodies if noise is not None}
 
 

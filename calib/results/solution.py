@@ -12,9 +12,11 @@ from calib.effects import FrameOffset, ShapeStep
 from calib.effects.rig import DOF
 from calib.forward import Term, named
 from calib.problem import Problem
+from calib.problem.bodies import GRAVITY
 from calib.problem.model import Source
 from calib.problem.spread import names_of
 from calib.problem.unknowns import POSE_UNITS, Key
+from calib.residuals.levels import down
 from calib.results.intervals import Intervals
 from calib.results.observability import not_estimated
 from calib.solve.components import spreads
@@ -169,6 +171,25 @@ def solution_of(problem: Problem, estimate: Estimate, known: Intervals | None = 
     )
 
 
+def up_of(estimate: Estimate, widened: float) -> dict[str, Any] | None:
+    """Which way is up in the world's frame, as levels and rods tell, as summary.json holds it; None
+    where no rig has a level.
+
+    Args:
+        estimate: the solution.
+        widened: by how much its sigmas are too small.
+    """
+    problem = estimate.problem
+    if GRAVITY not in problem.variables or not any(s.rig.levels for s in problem.sources):
+        return None
+    g, by_gravity = down(estimate.values[GRAVITY])
+    C = by_gravity @ estimate.covariance_of([GRAVITY]) @ by_gravity.T
+    world, sigma_rad = problem.sources[0].rig.world, widened * float(np.sqrt(np.trace(C) / 2))
+    lean, known = 1e3 * np.arctan2(np.hypot(*g[:2]), -g[2]), 1e3 * sigma_rad
+    told = f"up lies {lean:.2f} mrad off z of '{world}', and is known to {known:.2g} mrad"
+    return {"frame": world, "xyz": -g, "sigma_rad": sigma_rad, "told": told}
+
+
 def _frame(source: Source, term: Term, theta: np.ndarray, covariance: np.ndarray) -> FrameEstimate:
     tree = source.rig.tree
     edge = tree.edges[tree.edge_names.index(term.effect.name)]
@@ -243,6 +264,9 @@ def _absent(problem: Problem) -> list[dict[str, str]]:
         out.append(
             {"name": "arm", "why": "the rig has no arm; add 'arm' to rig.yaml with its URDF"}
         )
+    for joint in dict.fromkeys(joint for rig in rigs for joint in rig.passive):
+        why = "nothing reads this joint, so its zero cannot be told from where it is; read it"
+        out.append({"name": joint, "why": why})
     if scans and not problem.scans:
         why = (
             "no scans, so the LiDAR's place and its offsets are not seen; add scans/<stop>.parquet"

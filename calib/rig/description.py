@@ -1,25 +1,26 @@
 """rig.yaml: what is bolted to what, what measures it, and how sure its builder is."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
-import pydantic
 from numpy.typing import NDArray
 
 from calib.outputs import settle
+from calib.rig.document import (
+    RECORDING_FORMAT,
+    ArmDocument,
+    ReferenceDocument,
+    RigDocument,
+)
 from chains import se3
 from chains.arm import Mass, read_arm, read_masses
-from chains.errors import InputError, is_file_name, shortened
+from chains.errors import InputError, shortened
 from chains.frames import Edge, FrameTree, unknown_name
-from sensors.documents import Document, Format, Marks, Number, Triple, read_yaml, validate
-from sensors.lidar import LidarFile, LidarModel, Size, load_lidar
-
-Sigma = Annotated[Number, pydantic.Field(gt=0)]
-
-RECORDING_FORMAT = Format(kind="recording", newest=1)
-LARGEST_FRAME_M = 10.0  # a choice: no rig is larger, and in millimetres no frame is so small
+from sensors.documents import Document, Marks, read_yaml, validate
+from sensors.lidar import LidarModel, load_lidar
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,17 @@ class Tracker:
     bodies: tuple[str, ...]
     sigma_m: float
     sigma_rad: float
+
+
+@dataclass(frozen=True)
+class Levels:
+    """Accelerometers: the frames that have one, its noise, and what is known of up in the world."""
+
+    frames: tuple[str, ...]
+    sigma_rad: float
+    """Of a direction, about either axis across it."""
+    up: tuple[float, float, float] | None = None
+    sigma_up_rad: float | None = None
 
 
 @dataclass(frozen=True)
@@ -64,8 +76,8 @@ class Rig:
     """Per frame (6,) [rad rad rad m m m] how sure CAD is, about the child's axes; 0 = exact."""
     lidar: LidarModel | None
     lidar_frame: str | None
-    arm_edges: tuple[str, ...]
-    """URDF joints between the arm's base and tip, in order, fixed ones included."""
+    chains: tuple[tuple[str, ...], ...]
+    """Per tip of the arm, the URDF joints between its base and there, in order, fixed ones too."""
     joint_names: tuple[str, ...]
     """Those that move, as the stops name them."""
     sigma_joint_rad: float
@@ -84,6 +96,9 @@ class Rig:
     """The URDF that the arm was read from."""
     effects: tuple[Path, ...] = ()
     """Files of formulas: effects of the user's own, candidates of every diagnosis."""
+    levels: Levels | None = None
+    passive: tuple[str, ...] = ()
+    """Joints that nothing reads: unknown at every stop."""
     labels: dict[int, str] = field(default_factory=dict)
     """Names of the labels of the reference's triangles; empty where nothing names them."""
 
@@ -98,15 +113,34 @@ class Rig:
         return self.reference.frame if self.reference else "faro"
 
     @property
+    def arm_edges(self) -> tuple[str, ...]:
+        """URDF joints of all chains, each once."""
+        return tuple(dict.fromkeys(name for chain in self.chains for name in chain))
+
+    @property
+    def arm_base(self) -> str | None:
+        """The link that all chains begin at."""
+        return self.edge(self.chains[0][0]).parent if self.chains else None
+
+    @property
+    def tips(self) -> tuple[str, ...]:
+        """The links that the chains end at."""
+        return tuple(self.edge(chain[-1]).child for chain in self.chains)
+
+    def edge(self, name: str) -> Edge:
+        """The edge of the tree that is called so."""
+        return self.tree.edges[self.tree.edge_names.index(name)]
+
+    def beyond(self, tips: Sequence[str]) -> frozenset[str]:
+        """Frames of CAD that hang from any of some links."""
+        ways = {name: self.tree.path(name) for name in self.frame_sigma}
+        carried = {n: {self.tree.edges[i].parent for i in way} for n, way in ways.items()}
+        return frozenset(n for n, links in carried.items() if not links.isdisjoint(tips))
+
+    @property
     def beyond_arm(self) -> frozenset[str]:
-        """Frames that hang from the arm's tip; all of them where there is no arm."""
-        edges = self.tree.edges
-        arm = {self.tree.edge_names.index(name) for name in self.arm_edges}
-        return frozenset(
-            name
-            for name in self.frame_sigma
-            if arm <= set(self.tree.path(edges[self.tree.edge_names.index(name)].child))
-        )
+        """Frames that hang from the arm's tips; all of them where there is no arm."""
+        return self.beyond(self.tips) if self.chains else frozenset(self.frame_sigma)
 
     @property
     def joint_kinds(self) -> tuple[str, ...]:
@@ -114,117 +148,15 @@ class Rig:
         kinds = {j.name: j.kind for e in self.tree.edges if (j := e.joint) is not None and j.leads}
         return tuple(kinds[name] for name in self.joint_names)
 
+    def joint_of(self, parameter: str) -> str:
+        """The moving joint that a parameter is named after, alone or before a point; else empty."""
+        mine = (j for j in self.joint_names if parameter == j or parameter.startswith(f"{j}."))
+        return max(mine, key=len, default="")  # a joint's name may have a point in it, too
+
     def joints_to(self, frame: str) -> tuple[str, ...]:
         """The moving joints between the root and a frame."""
         edges = (self.tree.edges[i] for i in self.tree.path(frame))
         return tuple(dict.fromkeys(edge.joint.name for edge in edges if edge.joint is not None))
-
-
-def _file_name(name: str) -> str:
-    if not is_file_name(name):
-        raise ValueError(f"{shortened(name)} is no name for a file, and a rig's names some")
-    return name
-
-
-def _metres(length: float) -> float:
-    if abs(length) > LARGEST_FRAME_M:
-        raise ValueError(f"{length:g} m looks like millimetres; give metres")
-    return length
-
-
-class _Frame(Document):
-    parent: str
-    xyz_m: tuple[Number, Number, Number]
-    rpy_rad: tuple[Number, Number, Number] = (0.0, 0.0, 0.0)
-    sigma_m: Triple
-    sigma_rad: Triple
-
-    @pydantic.field_validator("xyz_m")
-    @classmethod
-    def _in_metres(cls, xyz: tuple[float, ...]) -> tuple[float, ...]:
-        _metres(max(xyz, key=abs))
-        return xyz
-
-    @pydantic.field_validator("rpy_rad")
-    @classmethod
-    def _radians(cls, rpy: tuple[float, ...]) -> tuple[float, ...]:
-        if max(map(abs, rpy)) > 2 * np.pi:
-            raise ValueError(f"{max(rpy, key=abs):g} rad looks like degrees; give radians")
-        return rpy
-
-    @pydantic.field_validator("sigma_m", "sigma_rad")
-    @classmethod
-    def _not_negative(cls, sigma: tuple[float, ...]) -> tuple[float, ...]:
-        if min(sigma) < 0:
-            raise ValueError(f"{min(sigma):g} is negative; a sigma is 0 (exact) or more")
-        return sigma
-
-
-_Lidar = pydantic.create_model(
-    "_Lidar",
-    __base__=Document,
-    model=(str, ...),
-    frame=(str, "lidar"),
-    **{
-        name: (Annotated[field.annotation, pydantic.Field(), *field.metadata], None)
-        for name, field in LidarFile.model_fields.items()
-    },
-)
-
-
-class _Arm(Document):
-    urdf: str
-    base: str
-    tip: str
-    sigma_joint_rad: Size = 0.0
-
-
-class _Base(Document):
-    moves: Literal["stop", "location", "never"] = "stop"
-
-
-class _Tracker(Document):
-    frame: str = "opti"
-    bodies: Annotated[tuple[str, ...], pydantic.Field(min_length=1)]
-    sigma_m: Sigma
-    sigma_rad: Sigma
-
-    @pydantic.field_validator("bodies")
-    @classmethod
-    def _once_each(cls, bodies: tuple[str, ...]) -> tuple[str, ...]:
-        for body in bodies:
-            if bodies.count(body) > 1:
-                raise ValueError(f"{body} is there twice; name every body once")
-        return bodies
-
-
-class _Target(Document):
-    sphere_below_lower_marker_m: Annotated[Number, pydantic.AfterValidator(_metres)]
-    sigma_sphere_m: Size
-    sigma_marker_m: Sigma
-
-
-class _Reference(Document):
-    frame: str = "faro"
-    mesh: str
-    faces: str | None = None
-    labels: str | None = None
-    sigma_m: Size
-
-
-class _RigFile(Document):
-    format: int = RECORDING_FORMAT.newest
-    name: Annotated[str, pydantic.AfterValidator(_file_name)]
-    lidar: _Lidar | None = None
-    arm: _Arm | None = None
-    frames: dict[str, _Frame] = pydantic.Field(default_factory=dict)
-    base: _Base = _Base()
-    tracker: _Tracker | None = None
-    target: _Target | None = None
-    reference: _Reference | None = None
-    shared: tuple[str, ...] = ()
-    own: tuple[str, ...] = ()
-    effects: tuple[str, ...] = ()
 
 
 def load_rig(folder: str | Path) -> Rig:
@@ -240,7 +172,7 @@ def load_rig(folder: str | Path) -> Rig:
         raise InputError(f"{path} does not exist; a recording is a folder that holds one")
     data, marks = read_yaml(path)
     RECORDING_FORMAT.check(data, path)
-    file = validate(_RigFile, data, path, marks)
+    file = validate(RigDocument, data, path, marks)
     where = _Where(path, marks)
     arm, masses = _read_arm(file.arm, folder, where)
     reference = _read_reference(file.reference, folder, where) if file.reference else None
@@ -255,11 +187,13 @@ def load_rig(folder: str | Path) -> Rig:
         },
         lidar=_read_lidar(file.lidar, folder, where) if file.lidar else None,
         lidar_frame=file.lidar.frame if file.lidar else None,
-        arm_edges=tuple(edge.name for edge in arm),
+        chains=_chains(file.arm, tree),
         joint_names=tree.joint_names,
+        passive=file.arm.passive if file.arm else (),
         sigma_joint_rad=file.arm.sigma_joint_rad if file.arm else 0.0,
         moves=file.base.moves,
         tracker=Tracker(**file.tracker.model_dump()) if file.tracker else None,
+        levels=Levels(**file.levels.model_dump()) if file.levels else None,
         target=TargetSpec(**file.target.model_dump()) if file.target else None,
         reference=reference,
         shared=file.shared,
@@ -292,15 +226,26 @@ class _Where:
         return folder / name
 
 
-def _read_arm(arm: _Arm | None, folder: Path, where: _Where) -> tuple[list[Edge], tuple[Mass, ...]]:
+def _read_arm(
+    arm: ArmDocument | None, folder: Path, where: _Where
+) -> tuple[list[Edge], tuple[Mass, ...]]:
     if arm is None:
         return [], ()
     urdf = where.file(folder, arm.urdf, "arm", "urdf")
-    edges = read_arm(urdf, arm.base, arm.tip)
-    return edges, tuple(read_masses(urdf, arm.base, arm.tip))
+    edges = read_arm(urdf, arm.base, *arm.tip)
+    return edges, tuple(read_masses(urdf, arm.base, *arm.tip))
 
 
-def _read_tree(file: _RigFile, arm: list[Edge], where: _Where) -> FrameTree:
+def _chains(arm: ArmDocument | None, tree: FrameTree) -> tuple[tuple[str, ...], ...]:
+    """The edges from the arm's base to each of its tips; none where these are one."""
+    if arm is None:
+        return ()
+    below = len(tree.path(arm.base))
+    chains = (tree.path(tip)[below:] for tip in arm.tip)
+    return tuple(tuple(tree.edge_names[i] for i in chain) for chain in chains if chain)
+
+
+def _read_tree(file: RigDocument, arm: list[Edge], where: _Where) -> FrameTree:
     edges = [
         Edge(name, frame.parent, name, se3.from_xyz_rpy(frame.xyz_m, frame.rpy_rad))
         for name, frame in file.frames.items()
@@ -312,14 +257,22 @@ def _read_tree(file: _RigFile, arm: list[Edge], where: _Where) -> FrameTree:
         raise where.wrong(error, "frames") from None
 
 
-def _check_frames(file: _RigFile, tree: FrameTree, where: _Where) -> None:
+def _check_frames(file: RigDocument, tree: FrameTree, where: _Where) -> None:
     """Sensors and bodies stand in the tree, worlds outside of it."""
     named = [(("lidar", "frame"), file.lidar.frame)] if file.lidar else []
     bodies = file.tracker.bodies if file.tracker else ()
     named += [(("tracker", "bodies", i), body) for i, body in enumerate(bodies)]
+    levels = file.levels.frames if file.levels else ()
+    named += [(("levels", "frames", i), frame) for i, frame in enumerate(levels)]
     for key, name in named:
         if name not in tree.frames:
             raise where.wrong(unknown_name("frame", name, tree.frames), *key)
+    for i, joint in enumerate(file.arm.passive if file.arm else ()):
+        if joint not in tree.joint_names:
+            raise where.wrong(unknown_name("joint", joint, tree.joint_names), "arm", "passive", i)
+    if file.levels and file.levels.up and not (file.tracker or file.reference):
+        what = "nothing here has a world to be upright in; give a tracker or a reference, or no up"
+        raise where.wrong(what, "levels", "up")
     for section in ("tracker", "reference"):
         world = getattr(file, section)
         if world and world.frame in tree.frames:
@@ -341,7 +294,7 @@ def _read_lidar(lidar: Document, folder: Path, where: _Where) -> LidarModel:
         raise where.wrong(error, "lidar") from None
 
 
-def _read_reference(reference: _Reference, folder: Path, where: _Where) -> ReferenceSpec:
+def _read_reference(reference: ReferenceDocument, folder: Path, where: _Where) -> ReferenceSpec:
     paths = {
         key: where.file(folder, getattr(reference, key), "reference", key)
         for key in ("mesh", "faces", "labels")

@@ -11,7 +11,7 @@ from calib.rig import Rig
 from calib.rig.suspect import listed
 from sensors.recording import RecordedStops
 from sensors.reference import Reference
-from sensors.stops import Targets
+from sensors.stops import Targets, level_columns, undeclared_levels
 
 FEW_LOCATIONS = 3  # below that no whole location can be held out
 JOINT_STILL = 0.05  # rad or m that a joint travels: too little to tell its own errors
@@ -65,13 +65,17 @@ def of_rig(rig: Rig) -> Iterator[Line]:
     yield "rig", f"{rig.name}: {', '.join(parts) or 'nothing on it'}"
 
 
-def of_stops(recording: RecordedStops) -> Iterator[Line]:
+def of_stops(rig: Rig, recording: RecordedStops) -> Iterator[Line]:
     """Stops, locations, and how often each body is seen."""
     count, locations = len(recording.stops), len(set(recording.location))
     when = f"over {np.ptp(recording.time_s) / 60:.0f} min" if recording.timed else "no times"
     yield "stops", f"{count} at {counted(locations, 'location')}, {when}"
     for body, seen in _seen(recording).items():
         yield body, f"seen at {seen.sum()} of {count} stops"
+    for frame, felt in recording.levels.items():
+        yield f"level in {frame}", f"read at {np.isfinite(felt[:, 0]).sum()} of {count} stops"
+    for joint in rig.passive:
+        yield joint, f"read by nothing: estimated at each of {count} stops"
     if recording.base_guess is not None:
         given = np.isfinite(recording.base_guess).all(axis=1).sum()
         yield "base_guess", f"given at {given} of {count} stops"
@@ -124,11 +128,13 @@ def _odd_masses(rig: Rig) -> Iterator[str]:
         return
     if len(kg) >= ALL_ALIKE and len(set(kg)) == 1:
         yield f"all {len(kg)} links with a mass weigh {kg[0]:g} kg in the URDF; are these measured?"
-    edges = (rig.tree.edges[rig.tree.edge_names.index(name)] for name in rig.arm_edges)
-    length_m = sum(float(np.linalg.norm(edge.T_parent_child[:3, 3])) for edge in edges)
-    if not LIGHTEST * length_m**3 < sum(kg) < HEAVIEST * length_m**3:
+    longest = max(
+        sum(float(np.linalg.norm(rig.edge(name).T_parent_child[:3, 3])) for name in chain)
+        for chain in rig.chains
+    )
+    if not LIGHTEST * longest**3 < sum(kg) < HEAVIEST * longest**3:
         yield (
-            f"the arm's links weigh {sum(kg):g} kg in the URDF, at a length of {length_m:.2f} m; "
+            f"the arm's links weigh {sum(kg):g} kg in the URDF, at a length of {longest:.2f} m; "
             "inertial/mass is in kg"
         )
 
@@ -149,13 +155,26 @@ def odd_stops(rig: Rig, recording: RecordedStops) -> Iterator[str]:
         yield f"no tracked body is seen at {listed(unseen)}; what they tell rests on their scans"
 
 
+def odd_levels(recording: RecordedStops) -> Iterator[str]:
+    """Columns as an accelerometer writes them, of which rig.yaml says nothing."""
+    for frame in undeclared_levels(recording.covariates):
+        yield (
+            f"stops.csv has {', '.join(level_columns(frame))}, as of an accelerometer in {frame}, "
+            f"and they are covariates only; with levels: {{frames: [{frame}], sigma_rad: 0.001}} "
+            "in rig.yaml they would tell its tilt"
+        )
+
+
 def odd_joints(rig: Rig, recording: RecordedStops) -> Iterator[str]:
     """Joints at rest, or beyond their limits."""
     names = np.array(recording.stops)
     values = dict(zip(rig.joint_names, recording.joints.T, strict=True))
+    values = {name: at for name, at in values.items() if name not in rig.passive}
     if still := [name for name, at in values.items() if np.ptp(at) < JOINT_STILL]:
         yield f"{listed(still)} hardly moved, too little to tell their own errors; move them"
     for joint in (j for edge in rig.tree.edges if (j := edge.joint) is not None and j.leads):
+        if joint.name not in values:
+            continue
         at, unit = values[joint.name], "rad" if joint.kind == "revolute" else "m"
         beyond = (at < joint.lower - LIMIT_SLACK) | (at > joint.upper + LIMIT_SLACK)
         if beyond.any():

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Self
 
-from calib.rig.description import load_rig
+from calib.rig.description import Rig, load_rig
+from calib.rig.unread import with_unread
 from sensors import recording
 
 
@@ -20,6 +21,8 @@ class Recording(recording.RecordedStops):
         joint_names: Sequence[str] | None = None,
         bodies: Sequence[str] | None = None,
         rings: int | None = None,
+        levels: Sequence[str] | None = None,
+        unread: Sequence[str] | None = None,
     ) -> Self:
         """Read and check the stops and targets of a recording, without reading any scan.
 
@@ -28,14 +31,30 @@ class Recording(recording.RecordedStops):
             joint_names: of the columns of joints; what is not given, rig.yaml says.
             bodies: those that are tracked, likewise.
             rings: how many the LiDAR has, likewise.
+            levels: frames with an accelerometer, likewise.
+            unread: joints that nothing reads, likewise: NaN where the file has no number.
 
         Raises:
             InputError: what is wrong, and where.
         """
-        rig = load_rig(folder)
-        joint_names = rig.joint_names if joint_names is None else joint_names
-        if bodies is None:
-            bodies = rig.tracker.bodies if rig.tracker else ()
-        if rings is None and rig.lidar:
-            rings = rig.lidar.rings
-        return super().open(folder, joint_names, bodies, rings)
+        said = columns_of(load_rig(folder))
+        given = {"joint_names": joint_names, "bodies": bodies, "rings": rings, "levels": levels}
+        given["unread"] = unread
+        chosen = {name: each for name, each in given.items() if each is not None}
+        return super().open(folder, **(said | chosen))
+
+
+def recorded(rig: Rig) -> recording.RecordedStops:
+    """The recording of a rig, with a value for every joint; InputError says what is wrong."""
+    return with_unread(rig, recording.RecordedStops.open(rig.folder, **columns_of(rig)))
+
+
+def columns_of(rig: Rig) -> dict[str, Sequence[str] | int | None]:
+    """What a rig's recording has columns for: the arguments of `RecordedStops.open`."""
+    return {
+        "joint_names": rig.joint_names,
+        "bodies": rig.tracker.bodies if rig.tracker else (),
+        "rings": rig.lidar.rings if rig.lidar else None,
+        "levels": rig.levels.frames if rig.levels else (),
+        "unread": rig.passive,
+    }

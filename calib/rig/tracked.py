@@ -118,8 +118,9 @@ def _repeated(rig: Rig, recording: RecordedStops, body: str) -> np.ndarray:
 
 def _pairs(rig: Rig, recording: RecordedStops, usable: Mapping[str, np.ndarray]) -> Iterator[_Pair]:
     """Each body as the tracker sees it, where the rig's root stands still; else as the body
-    nearest to the root does."""
-    bodies = sorted((b for b in usable if usable[b].any()), key=lambda b: len(rig.joints_to(b)))
+    nearest to the root does. None beyond a joint that nothing reads, which would follow it."""
+    read = (b for b in usable if set(rig.passive).isdisjoint(rig.joints_to(b)))
+    bodies = sorted((b for b in read if usable[b].any()), key=lambda b: len(rig.joints_to(b)))
     still = np.zeros((1, len(rig.tree.edges), 6))
     placed = {b: rig.tree.place(b, recording.joints, still) for b in bodies}
     place = np.zeros(len(recording.stops), int)

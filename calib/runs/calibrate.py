@@ -28,16 +28,14 @@ from calib.results.errors import Errors, body_errors, misfit, row_errors, scan_e
 from calib.results.holdout import held_out, unit_of
 from calib.results.intervals import intervals
 from calib.results.misfit import (
+    instrument_rows,
     misfit_by,
-    prior_rows,
     redundancies,
-    target_rows,
-    tracker_rows,
 )
 from calib.results.reach import reach
 from calib.results.recalibrate import Link, earlier, solve_from
 from calib.results.rings import documents as odd_rings
-from calib.results.solution import solution_of
+from calib.results.solution import solution_of, up_of
 from calib.results.stages import FIT, staged
 from calib.runs.belief import TOLERATED, limits
 from calib.runs.reopen import model_of, proposed, reopened, start_of, stored_met
@@ -227,9 +225,9 @@ def _fit(
     document = _model_document(sources, model, choices)
     write_yaml(folder / MODEL, document)
     summary = _summary(problem, estimate, nominal, seen, unseen)
-    rows = tracker_rows(estimate), target_rows(estimate), prior_rows(estimate)
-    write_rows(folder / RESIDUALS, *rows)
-    by = {**misfit_by(estimate, *rows, by_stop), "limit": limits(redundancies(*rows))}
+    rows = instrument_rows(estimate)
+    write_rows(folder / RESIDUALS, rows)
+    by = {**misfit_by(estimate, rows, by_stop), "limit": limits(redundancies(rows))}
     summary |= {"misfit": misfit(estimate, seen), "misfit_by": by}
     reached = reach(freed.problem, freed, known)
     summary["held_out_each_mm"] = (1e3 * np.sqrt(unseen.each_m2)).tolist()
@@ -238,6 +236,7 @@ def _fit(
     summary |= {"intervals_wider_by": calibration.document(solution.names)}
     summary |= {"rings": odd_rings(sources), "set_aside": sorted(estimate.problem.set_aside)}
     summary["predicted_mm"] = reached.document() if reached else None
+    summary |= {"up": up} if (up := up_of(estimate, widened)) else {}
     summary["seconds"] = time.monotonic() - began
     if links is not None:
         summary["links"] = [link_document(link) for link in links]

@@ -32,19 +32,13 @@ def recording_of(scan: ScanStop, sources: Sequence[Source]) -> str:
     return next(name for source, name in pairs if source.recording is scan.recording)
 
 
-def write_rows(
-    folder: Path,
-    tracker: InstrumentRows | None,
-    target: InstrumentRows | None,
-    prior: InstrumentRows | None,
-) -> None:
-    """Write the rows of trackers, targets and priors beside those of beams, those that there are.
+def write_rows(folder: Path, rows: Mapping[str, InstrumentRows]) -> None:
+    """Write the rows of instruments and priors, by kind, beside those of beams.
 
     Their files begin with an underscore, which readers of a folder of tables take as not of it.
     """
-    for kind, rows in (("tracker", tracker), ("target", target), ("prior", prior)):
-        if rows is not None:
-            write_table(folder / f"_{kind}.parquet", rows.table())
+    for kind, some in rows.items():
+        write_table(folder / f"_{kind}.parquet", some.table())
 
 
 def residual_table(rows: Rows) -> dict[str, np.ndarray]:

@@ -103,6 +103,8 @@ def print_run(run: Run, whole: bool = False) -> None:
     console.print(error_table(summary))
     if told := beams_told(summary):
         print_pairs(console, "of how many beams", [("", line) for line in told])
+    if up := summary.get("up"):
+        print_pairs(console, "which way is up", [("", up["told"])])
     if predicted := summary.get("predicted_mm"):
         print_pairs(console, "how well the arm is known", [("", t) for t in predicted["told"]])
     if told := standing_out(summary):

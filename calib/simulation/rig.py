@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.rig.description import RECORDING_FORMAT
+from calib.rig.document import RECORDING_FORMAT
 from calib.simulation.spec import Spec
 
 # name, origin xyz (m), origin rpy (rad), axis z, limit (degrees), mass of the link behind it (kg),
@@ -20,6 +20,7 @@ _ARM = (
     ("joint_6", (0, 0, 0), (-np.pi / 2, 0, 0), 1, 170, 0.8, (0, 0, 0.03)),
 )
 _TIP_M = (0, 0, 0.075)
+INCLINOMETER_RAD = 0.0005  # of a fair MEMS inclinometer, assumed
 TIP_POINTS = ("tip_1", "tip_2", "tip_3")
 # Laser-tracker nests on the mount, well apart and off any line.
 _POINTS_M = ((0.12, 0.0, 0.05), (-0.07, 0.1, 0.04), (-0.05, -0.11, 0.11))
@@ -75,7 +76,7 @@ def document(spec: Spec) -> dict[str, Any]:
             "base": "arm_base",
             "tip": "arm_end",
             "sigma_joint_rad": 0.0001,
-        }
+        } | ({"passive": list(spec.passive)} if spec.passive else {})
     rig["frames"] = _frames(spec)
     rig["base"] = {"moves": spec.base_moves}
     if spec.tracker:
@@ -86,6 +87,8 @@ def document(spec: Spec) -> dict[str, Any]:
             "sigma_m": 0.00003 if fine else 0.0002,
             "sigma_rad": 0.0003,
         }
+    if spec.levels:
+        rig["levels"] = {"frames": list(spec.levels), "sigma_rad": INCLINOMETER_RAD}
     if spec.targets:
         rig["target"] = {
             "sphere_below_lower_marker_m": 0.18,

@@ -24,6 +24,8 @@ class Spec(Document):
         raw: every sweep is written, else the average per direction.
         arm, mesh, targets: whether there is one, and how many hang.
         tracker: bodies seen as poses, as points, or no tracker.
+        levels: frames, the LiDAR's or links of the arm, with an accelerometer.
+        passive: joints of the arm that nothing reads.
         base_moves: when the base stands elsewhere; where no tracker sees it, stops have a guess.
         mesh_error_m: sd of the reference mesh, smooth over each surface and common to it in halves.
         mixed_pixel_share: share of the returns whose range is a mixture or far off.
@@ -48,6 +50,8 @@ class Spec(Document):
     raw: bool = False
     arm: bool = True
     tracker: Literal["poses", "points"] | None = "poses"
+    levels: tuple[str, ...] = ()
+    passive: tuple[str, ...] = ()
     mesh: bool = True
     targets: int = pydantic.Field(default=5, ge=0)
     base_moves: Literal["stop", "location", "never"] = "stop"

@@ -27,6 +27,7 @@ GUESS = np.repeat([np.radians(1.0), 0.02], 3)  # rad, m: error of a guessed base
 RATE = 0.25  # rad/s: sd of a joint's speed while the arm moves
 PAYLOAD_KG, FRICTION = 2.5, 0.05  # as small arms carry; a share of the largest torque, assumed
 POSES_TRIED = 200
+GRAVITY_M_S2 = 9.81
 UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -247,6 +248,16 @@ class World:
             jitter = se3.exp(sigma * rng.standard_normal((count, 6)))
             seen[body] = self.columns["tracked"][:, b] @ se3.exp(added[:, b]) @ jitter
         return seen
+
+    def felt(self, noise: float, rng: np.random.Generator) -> dict[str, np.ndarray]:
+        """What accelerometers felt at rest: frame -> (K, 3) m/s2; up is the FARO's z."""
+        levels, count = self.truth.rig.levels, len(self.joints)
+        out = {}
+        for frame in levels.frames if levels else ():
+            tilt = noise * levels.sigma_rad * rng.standard_normal((count, 3))
+            up = self.in_faro(frame)[:, 2, :3]
+            out[frame] = GRAVITY_M_S2 * np.matvec(se3.so3_exp(tilt), up)
+        return out
 
     def guessed(self, moves: str, rng: np.random.Generator) -> np.ndarray:
         """Rough T_faro_root (K, 4, 4), off by about 2 cm and 1 degree wherever the base stood."""

@@ -15,7 +15,7 @@ from chains import se3
 from sensors.documents import write_json
 from sensors.recording import write_table
 from sensors.reference import Reference
-from sensors.stops import POSE, write_columns
+from sensors.stops import POSE, level_columns, write_columns
 
 
 def write_reference(folder: Path, mesh: Reference) -> None:
@@ -37,6 +37,7 @@ def write_stops(path: Path, world: World, spec: Spec, rng: np.random.Generator) 
         **stops.columns,
         **dict(zip(rig.joint_names, stops.joints.T, strict=True)),
     }
+    columns = {name: column for name, column in columns.items() if name not in rig.passive}
     hidden = rng.random(len(stops.names)) < spec.occluded_share
     for body, Ts_opti_body in world.tracked(spec.noise, rng).items():
         pose = _pose(Ts_opti_body)
@@ -44,6 +45,8 @@ def write_stops(path: Path, world: World, spec: Spec, rng: np.random.Generator) 
             pose[hidden] = np.nan
         parts = POSE[:3] if spec.tracker == "points" else POSE
         columns |= {f"{body}.{part}": pose[:, i] for i, part in enumerate(parts)}
+    for frame, felt in world.felt(spec.noise, rng).items():
+        columns |= dict(zip(level_columns(frame), felt.T, strict=True))
     if not spec.tracker:
         pose = _pose(world.guessed(spec.base_moves, rng))
         columns |= {f"base_guess.{part}": pose[:, i] for i, part in enumerate(POSE)}

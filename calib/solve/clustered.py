@@ -21,7 +21,7 @@ from calib.linear.parallel import in_order
 from calib.linear.rows import PLACES, StopRows
 from calib.problem.problem import Block, Problem, SurfaceCells
 from calib.residuals.beams import Association
-from calib.residuals.tracker import TrackedBody
+from calib.residuals.seen import SeenBody
 from calib.solve.graph import Graph
 
 T = TypeVar("T")
@@ -136,7 +136,7 @@ def each_stop(
 
 
 def of_stops(layout: Layout, values: Values) -> Iterator[ClusteredRows]:
-    """Rows about what stops alone have: tracked bodies, and priors."""
+    """Rows about what stops alone have: bodies that are seen there, and priors."""
     for stop, found in own_rows(layout, values).items():
         for rows in found.values():
             yield rows.of_stop(stop)
@@ -163,7 +163,7 @@ def of_graph(
     for block, by, b in graph.linear_rows(values):
         A, columns, name = np.hstack(list(by.values())), layout.columns(list(by)), next(iter(by))
         stop = nowhere = np.full(len(b), -1)
-        if isinstance(block, TrackedBody):
+        if isinstance(block, SeenBody):
             numbers = [layout.stops[key] for key in keys_of(block)]
             stop = np.repeat(numbers, len(b) // len(numbers))
         elif block is None:

@@ -25,8 +25,8 @@ from calib.problem.spread import Whose, by_chance, read, sigmas, spread_keys, wi
 from calib.problem.unknowns import Unknown
 from calib.problem.without import ROD
 from calib.residuals.groups import Group
+from calib.residuals.seen import BodiesTogether, SeenBody
 from calib.residuals.targets import PARTS_OF_SIGMAS, TARGET_PARTS, HangingTarget
-from calib.residuals.tracker import BodiesTogether, TrackedBody
 from calib.solve.estimate import Estimate
 
 PRECISE = {"ftol": 1e-15, "gtol": 1e-7}  # of twice a log-likelihood: sds to some 1e-6 of theirs
@@ -255,7 +255,7 @@ def squares(estimate: Estimate) -> Sums:
     return out | _of_bodies(bodies, estimate)
 
 
-def _of_bodies(bodies: Sequence[TrackedBody], estimate: Estimate) -> Sums:
+def _of_bodies(bodies: Sequence[SeenBody], estimate: Estimate) -> Sums:
     """Of tracked bodies."""
     found: dict[Whose, list[tuple[float, float]]] = {}
     together = BodiesTogether.of(bodies)
@@ -266,7 +266,7 @@ def _of_bodies(bodies: Sequence[TrackedBody], estimate: Estimate) -> Sums:
         count = len(block.measured)
         weight = np.ones(count) if block.weight is None else block.weight
         left = np.repeat(weight, len(residual) // count) - seen
-        for k, unit in enumerate(("m",) if block.is_point else ("rad", "m")):
+        for k, unit in enumerate(dict.fromkeys(block.units)):
             mine = [each.reshape(count, -1, 3)[:, k] for each in (residual, left)]
             sums = float(np.square(mine[0]).sum()), float(mine[1].sum())
             found.setdefault(Whose("body", block.body, unit), []).append(sums)

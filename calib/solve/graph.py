@@ -48,8 +48,7 @@ class KeptRows:
         place = positions(layout.size, layout.kept)
         by = {
             name: root[:, place[layout.at[name]]] / layout.sigma[layout.at[name]]
-            for name, unknown in layout.outer().items()
-            if unknown.kind != "direction"
+            for name in layout.outer()
         }
         spoken = {name: d for name, d in by.items() if d.any()}
         return [cls(-root[:, -1], spoken)] if spoken else []
@@ -247,7 +246,6 @@ class Graph:
         make = {
             "vector": gtsam.PriorFactorVector,
             "pose": gtsam.PriorFactorPose3,
-            "direction": gtsam.PriorFactorUnit3,
         }[v.kind]
         return make(self._key[v.name], _wrap(v.kind, v.mean), noise)
 
@@ -269,8 +267,6 @@ class Graph:
             if jacobians is not None:
                 for i, v in enumerate(variables):
                     d = derivative[v.name]
-                    if v.kind == "direction":
-                        d = d @ gtsam.Unit3(now[v.name]).basis()
                     if d.shape != (block.rows, v.dim):
                         raise ValueError(
                             f"block '{block.name}': derivative by '{v.name}' has shape {d.shape}, "
@@ -298,11 +294,9 @@ def _check_finite(block: Block, values: np.ndarray, what: str) -> None:
         raise FloatingPointError(f"block '{block.name}' has a {what} that is not finite")
 
 
-def _wrap(kind: UnknownKind, value: np.ndarray) -> np.ndarray | gtsam.Pose3 | gtsam.Unit3:
+def _wrap(kind: UnknownKind, value: np.ndarray) -> np.ndarray | gtsam.Pose3:
     if kind == "vector":
         return np.asarray(value, float)
-    if kind == "direction":
-        return gtsam.Unit3(np.asarray(value, float))
     # Pose3(4x4) keeps a rotation as given; make it orthonormal.
     return gtsam.Pose3(gtsam.Rot3.ClosestTo(value[:3, :3]), value[:3, 3])
 
@@ -310,6 +304,4 @@ def _wrap(kind: UnknownKind, value: np.ndarray) -> np.ndarray | gtsam.Pose3 | gt
 def _read(kind: UnknownKind, values: gtsam.Values, key: int) -> np.ndarray:
     if kind == "vector":
         return values.atVector(key)
-    if kind == "direction":
-        return values.atUnit3(key).point3()
     return values.atPose3(key).matrix()

@@ -1,4 +1,4 @@
-"""Robust weights of what is no beam: tracked bodies, targets, joint readings and values on paper.
+"""Robust weights of what is no beam: bodies that are seen, targets, joint readings and paper.
 
 A fit first takes all of them at their sigmas. If a group of rows is then further off than chance
 puts one, it gets Huber's weight, and the fit goes on (iteratively reweighted least squares). So
@@ -18,8 +18,8 @@ from calib.problem.problem import Block, Problem
 from calib.problem.spread import spread_of, with_spread
 from calib.problem.unknowns import Role, Unknown
 from calib.residuals.robust import huber_weight
+from calib.residuals.seen import BodiesTogether, SeenBody
 from calib.residuals.targets import TARGET_PARTS, HangingTarget
-from calib.residuals.tracker import BodiesTogether, TrackedBody
 
 SETTLED_WEIGHT = 0.01  # relative change of a weight, and so of how hard a group pulls
 
@@ -84,7 +84,7 @@ def unweighted(block: Block) -> Block:
     left out stay so."""
     if getattr(block, "weight", None) is None:
         return block
-    if isinstance(block, TrackedBody):
+    if isinstance(block, SeenBody):
         return replace(block, weight=None)
     whole = np.where(block.weight > 0, 1.0, 0.0)
     return replace(block, weight=None if whole.all() else whole)
@@ -99,13 +99,14 @@ def _of_blocks(blocks: Sequence[Block], values: Mapping[str, np.ndarray]) -> Ite
                 np.arange(len(TARGET_PARTS)) == TARGET_PARTS.index("upper"), 2, 3
             )  # across its rod
             yield _Norms("target", block, np.linalg.norm(rows, axis=1), dof)
-    bodies = [b for b in blocks if isinstance(b, TrackedBody)]
+    bodies = [b for b in blocks if isinstance(b, SeenBody)]
     owner = {id(plain[id(b)]): b for b in bodies}
     for together in BodiesTogether.of([plain[id(b)] for b in bodies]):
         for block, (residual, _) in zip(together.blocks, together.evaluate(values), strict=True):
             rows = residual.reshape(len(block.measured), -1)
             dof = np.full(len(rows), rows.shape[1])
-            yield _Norms(block.body, owner[id(block)], np.linalg.norm(rows, axis=1), dof)
+            kind = f"{block.kind} {block.body}"
+            yield _Norms(kind, owner[id(block)], np.linalg.norm(rows, axis=1), dof)
 
 
 def _of_priors(

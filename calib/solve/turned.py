@@ -11,8 +11,9 @@ from scipy.spatial.transform import Rotation
 from calib.forward import Placed
 from calib.problem.problem import Problem
 from calib.residuals.scan import ScanStop
+from calib.residuals.seen import BodiesTogether
 from calib.residuals.surfaces import MeshSurface
-from calib.residuals.tracker import BodiesTogether, TrackedBody
+from calib.residuals.tracker import TrackedBody
 from chains import se3
 from chains.align import mean_pose
 from sensors.lidar import Beams

@@ -20,7 +20,7 @@ class RowsOfKind:
     """All rows of one kind in an estimate.
 
     Args:
-        name: "beams", "tracker", "target" or "prior".
+        name: "beams", "tracker", "level", "target" or "prior".
         blocks: how many scans, bodies or targets they are of.
         rows: how many.
         variables: the unknowns that they speak of, those that are eliminated included.

@@ -16,7 +16,6 @@ from calib.forward import Stops
 from calib.problem import Problem
 from calib.problem.model import Source
 from calib.residuals.scan import ScanStop
-from calib.residuals.tracker import TrackedBody
 from calib.runs.reopen import problem_of, reopened, state_of
 from calib.runs.residual_table import UNSEEN_FOLDER, beam_ends, residual_table, table_path
 from calib.runs.run import RESIDUALS, Run
@@ -156,8 +155,7 @@ class Scene:
         rig = self.sources[recording].rig
         edges = rig.tree.edges
         named = [e.child for e in edges if e.name not in rig.arm_edges]
-        arm = [e for e in edges if e.name in rig.arm_edges]
-        ends = [arm[0].parent, arm[-1].child] if arm else []
+        ends = [rig.arm_base, *rig.tips] if rig.chains else []
         names = dict.fromkeys((rig.tree.root, *ends, *named))
         return {name: self.place(recording, stop, name) for name in names}
 
@@ -289,10 +287,9 @@ class Scene:
         """(recording, stop) -> the geometry that places it, and its row there; in their order."""
         number = {s.recording.folder: i for i, s in enumerate(self.sources)}
         placed: dict[tuple[int, int], tuple[Stops, int]] = {}
-        for block in self.problem.blocks:
-            if isinstance(block, TrackedBody):
-                for row, (folder, k) in enumerate(block.stop_names):
-                    placed[number[folder], k] = block.stops, row
+        for block in self.problem.seen:
+            for row, (folder, k) in enumerate(block.stop_names):
+                placed[number[folder], k] = block.stops, row
         for scan in self.problem.scans:
             placed[number[scan.recording.folder], scan.index] = scan.stops, 0
         return dict(sorted(placed.items(), key=lambda item: item[0]))

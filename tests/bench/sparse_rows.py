@@ -60,15 +60,13 @@ def optimum(work: Work) -> Values:
 class SparseRows:
     """The rows of a frozen work as scipy takes them, by the tangent x of all unknowns at the start.
 
-    Derivatives are by each unknown's own increment (by a direction's components), then by x.
+    Derivatives are by each unknown's own increment, then by x.
     """
 
     def __init__(self, work: Work) -> None:
         self.work, self.unknowns = work, work.problem.variables
         self.at = _slices({n: u.dim for n, u in self.unknowns.items()})
-        wide = {n: 3 if u.kind == "direction" else u.dim for n, u in self.unknowns.items()}
-        self.own = _slices(wide)
-        self.size, self.width = sum(u.dim for u in self.unknowns.values()), sum(wide.values())
+        self.size = sum(u.dim for u in self.unknowns.values())
         self._last: tuple[bytes, Part] | None = None
 
     def optimum(self) -> np.ndarray:
@@ -99,7 +97,7 @@ class SparseRows:
             parts = [self._prior(u, values[name]) for name, u in self.unknowns.items()]
             for block in problem.blocks:
                 residual, d = block.evaluate(values, derivatives=True)
-                columns = np.concatenate([np.r_[self.own[name]] for name in d])
+                columns = np.concatenate([np.r_[self.at[name]] for name in d])
                 parts.append((residual, self._csr(np.hstack(list(d.values())), columns)))
             placed = lidars(problem.scans, values)
             parts += [self._beams(i, values, placed[i]) for i in range(len(placed))]
@@ -109,27 +107,24 @@ class SparseRows:
 
     def _charts(self, x: np.ndarray) -> csr_array:
         """Derivative of the unknowns' own increments by x."""
-        start, unknowns = self.work.start, self.unknowns.items()
-        return block_diag([_chart(u, start[n], x[self.at[n]]) for n, u in unknowns], "csr")
+        return block_diag([_chart(u, x[self.at[n]]) for n, u in self.unknowns.items()], "csr")
 
     def _prior(self, u: Unknown, value: np.ndarray) -> Part:
         # As GTSAM does, the derivative by a pose's increment is taken for one.
-        across = csr_array(_across(u.mean).T) if u.kind == "direction" else eye_array(u.dim)
-        derivative = (across / u.sigma[:, None]).tocoo()
-        columns = derivative.col + self.own[u.name].start
-        at = (derivative.data, (derivative.row, columns))
-        residual = across @ _increment(u, u.mean, value) / u.sigma
-        return residual, csr_array(at, shape=(u.dim, self.width))
+        rows = np.arange(u.dim)
+        at = (1.0 / u.sigma, (rows, rows + self.at[u.name].start))
+        residual = _increment(u, u.mean, value) / u.sigma
+        return residual, csr_array(at, shape=(u.dim, self.size))
 
     def _beams(self, i: int, values: Values, placed: Placed) -> Part:
         rows = self.work.problem.scans[i].rows(values, self.work.associations[i])
         root = np.sqrt(rows.weight) / rows.sigma_m
         d = {name: block[0] for name, block in placed.d.items() if block.any()}
-        chain = np.concatenate([np.r_[self.own[name]] for name in d])
+        chain = np.concatenate([np.r_[self.at[name]] for name in d])
         columns = np.empty((len(root), len(chain) + len(rows.sparse)), np.int32)
         columns[:, : len(chain)] = chain
         for g, c in enumerate(rows.sparse, len(chain)):
-            columns[:, g] = self.own[c.variable].start + c.components[c.index]
+            columns[:, g] = self.at[c.variable].start + c.components[c.index]
         sparse = [np.where(c.index >= 0, c.value, 0.0) for c in rows.sparse]
         derivative = np.column_stack([rows.by_twist @ np.hstack(list(d.values())), *sparse])
         return root * rows.residual_m, self._csr(derivative * root[:, None], columns)
@@ -139,7 +134,7 @@ class SparseRows:
         count, each = derivative.shape
         starts = each * np.arange(count + 1)
         columns = np.broadcast_to(columns, derivative.shape).ravel()
-        return csr_array((derivative.ravel(), columns, starts), shape=(count, self.width))
+        return csr_array((derivative.ravel(), columns, starts), shape=(count, self.size))
 
 
 def _slices(sizes: Mapping[str, int]) -> dict[str, slice]:
@@ -147,27 +142,12 @@ def _slices(sizes: Mapping[str, int]) -> dict[str, slice]:
     return {n: slice(a, b) for n, a, b in zip(sizes, ends, ends[1:], strict=False)}
 
 
-def _across(direction: np.ndarray) -> np.ndarray:
-    """(3, 2) two unit vectors at right angles to a direction."""
-    return np.linalg.svd(direction[None])[2][1:].T
-
-
 def _moved(u: Unknown, value: np.ndarray, x: np.ndarray) -> np.ndarray:
-    if u.kind == "pose":
-        return value @ se3.exp(x)
-    if u.kind == "direction":
-        moved = value + _across(value) @ x
-        return moved / np.linalg.norm(moved)
-    return value + x
+    return value @ se3.exp(x) if u.kind == "pose" else value + x
 
 
-def _chart(u: Unknown, value: np.ndarray, x: np.ndarray) -> np.ndarray | csr_array:
-    if u.kind == "pose":
-        return se3.right_jacobian(x)
-    if u.kind == "direction":
-        g = _moved(u, value, x)
-        return (np.eye(3) - np.outer(g, g)) @ _across(value) / np.sqrt(1 + x @ x)
-    return eye_array(u.dim)
+def _chart(u: Unknown, x: np.ndarray) -> np.ndarray | csr_array:
+    return se3.right_jacobian(x) if u.kind == "pose" else eye_array(u.dim)
 
 
 def _increment(u: Unknown, a: np.ndarray, b: np.ndarray) -> np.ndarray:

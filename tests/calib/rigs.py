@@ -21,6 +21,7 @@ WALL_STEPS = 5
 RINGS, COLUMNS = 16, 25
 BEAM_ORIGIN_M = (0.03, 0.01)
 BELOW_M = 0.18
+LEVEL_RAD = 0.001
 
 # name: parent, xyz_m, rpy_rad, sigma_m, sigma_rad
 FRAMES = {
@@ -193,7 +194,11 @@ def write(
             row |= _pose_cells(body, seen * RigidTransform.from_exp_coords(noise))
         rough = RigidTransform.from_exp_coords(rng.normal(0, 0.02, 6))
         moved = RigidTransform.from_translation(offset_m)
-        stops.append(row | _pose_cells("base_guess", moved * T_faro_base * rough))
+        row |= _pose_cells("base_guess", moved * T_faro_base * rough)
+        for frame in rig.get("levels", {"frames": ()})["frames"]:
+            own = np.random.default_rng([seed, k, *map(ord, frame)])
+            row |= _felt_cells(frame, T_faro_base * placed(frame, true, hardware), own)
+        stops.append(row)
     _write_csv(folder / "stops.csv", stops)
     _write_csv(folder / "targets.csv", _targets(np.array(offset_m), rng))
     return folder
@@ -274,6 +279,13 @@ def _pose_cells(body: str, T: RigidTransform) -> dict[str, float]:
     return {f"{body}.{n}": float(v) for n, v in zip(names, cells, strict=True)}
 
 
+def _felt_cells(frame: str, T: RigidTransform, rng: np.random.Generator) -> dict[str, float]:
+    """What holds the frame up, in g, off by a milliradian."""
+    tilt = Rotation.from_rotvec(rng.normal(0, LEVEL_RAD, 3))
+    felt = tilt.apply(T.rotation.inv().apply([0.0, 0.0, 1.0]))
+    return {f"{frame}.{axis}": float(a) for axis, a in zip(("ax", "ay", "az"), felt, strict=True)}
+
+
 def _write_csv(path: Path, rows: Sequence[Mapping[str, object]]) -> None:
     with path.open("w", newline="") as file:
         table = csv.DictWriter(file, list(rows[0]))
@@ -294,11 +306,9 @@ def _write_mesh(path: Path, vertices: np.ndarray, triangles: np.ndarray) -> None
 
 
 def retract(kind: str, value: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """The value moved by a tangent, as gtsam moves a vector, a pose or a direction."""
+    """The value moved by a tangent, as gtsam moves a vector or a pose."""
     if kind == "pose":
         return value @ gtsam.Pose3.Expmap(step).matrix()
-    if kind == "direction":
-        return gtsam.Unit3(value).retract(step).point3()
     return value + step
 
 
@@ -319,10 +329,10 @@ def differences(
     step: float = 1e-5,
 ) -> np.ndarray:
     """Derivative (m, dim) of a function of the state by one variable's tangent, both sides."""
-    dim = {"pose": 6, "direction": 2}.get(kind, np.size(values[name]))
+    dim = 6 if kind == "pose" else np.size(values[name])
 
-    def at(direction: np.ndarray) -> np.ndarray:
-        return function({**values, name: retract(kind, values[name], direction)}).ravel()
+    def at(moved: np.ndarray) -> np.ndarray:
+        return function({**values, name: retract(kind, values[name], moved)}).ravel()
 
     return np.stack([(at(e) - at(-e)) / (2 * step) for e in step * np.eye(dim)], axis=1)
 
@@ -345,6 +355,5 @@ def assert_block_derivatives(block: object, variables: Mapping, values: Mapping)
     for name in block.variables:
         kind = variables[name].kind if name in variables else "vector"
         expected = differences(lambda v: block.evaluate(v, False)[0], values, name, kind)
-        d = found[name] @ gtsam.Unit3(values[name]).basis() if kind == "direction" else found[name]
-        assert d.shape == (block.rows, expected.shape[1])
-        assert_derivative(d, expected, name)
+        assert found[name].shape == (block.rows, expected.shape[1])
+        assert_derivative(found[name], expected, name)

@@ -51,7 +51,7 @@ def named(folder, name, rng):
     zeros = {joint: 0.005 * rng.normal() for joint in world.joints}
     truth["arm_joint_offset"] = np.array(list(zeros.values()))
     tree = FrameTree(edges)
-    slips, sizes = own_slips(tree, tuple(e.name for e in edges), True, True), []
+    slips, sizes = own_slips(tree, (tuple(e.name for e in edges),), True, (True,)), []
     for slip in slips:
         sizes.append({"rad": 0.003, "m": 0.005}[slip.unit] * rng.normal())
         twists[slip.edge] += sizes[-1] * slip.twist

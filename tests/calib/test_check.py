@@ -18,7 +18,7 @@ from calib.solve.fit import solve
 from chains import se3
 from chains.arm import Mass
 from chains.errors import InputError
-from chains.frames import Edge, FrameTree
+from chains.frames import Edge
 from sensors.recording import read_table
 
 from . import broken, rigs
@@ -319,8 +319,8 @@ def weighing(*kg: float, length_m: float = 0.4):
         tracker=None,
         target=None,
         reference=None,
-        arm_edges=tuple(edge.name for edge in edges),
-        tree=FrameTree(edges),
+        chains=(tuple(edge.name for edge in edges),),
+        edge={edge.name: edge for edge in edges}.get,
         masses=masses,
     )
 

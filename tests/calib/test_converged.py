@@ -41,8 +41,7 @@ def whitened(problem, values):
     """Every row of trackers, targets and priors, plainly one after the other."""
     rows = [block.evaluate(values, False)[0] for block in problem.blocks]
     for v in problem.variables.values():
-        if v.kind != "direction":
-            rows.append(v.difference(v.mean, values[v.name]) / v.prior_sigma)
+        rows.append(v.difference(v.mean, values[v.name]) / v.prior_sigma)
     return np.concatenate(rows)
 
 

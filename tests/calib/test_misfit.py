@@ -13,7 +13,14 @@ import yaml
 from calib.problem import build
 from calib.problem.model import Model, Source
 from calib.results.errors import Errors
-from calib.results.misfit import InstrumentRows, misfit_by, prior_rows, target_rows, tracker_rows
+from calib.results.misfit import (
+    InstrumentRows,
+    instrument_rows,
+    misfit_by,
+    prior_rows,
+    seen_rows,
+    target_rows,
+)
 from calib.runs.calibrate import calibrate
 from calib.show.comparison import print_comparison
 from calib.solve.fit import solve
@@ -152,7 +159,7 @@ def test_redundancy_is_that_of_the_hat_matrix(tmp_path):
     measured = np.vstack(rows)
     A = np.vstack([measured, prior])
     hat = np.einsum("ij,ji->i", A, np.linalg.solve(A.T @ A, A.T))
-    tracker, known = tracker_rows(estimate), prior_rows(estimate)
+    tracker, known = seen_rows(estimate, "tracker"), prior_rows(estimate)
     np.testing.assert_allclose(tracker.redundancy, 1 - hat[: len(measured)], atol=1e-6)
     vectors = np.concatenate(
         [np.arange(s.start, s.stop) for n, s in at.items() if problem.variables[n].kind == "vector"]
@@ -203,7 +210,7 @@ def test_a_tracker_row_is_measured_less_predicted(tmp_path):
     plain = solve(build([Source.open(recording)], SMALL))
     broken.cells("stops.csv", r"mount_markers\.z", lambda z: z + 0.5, row=1)(recording)
     problem = build([Source.open(recording)], SMALL)
-    before, after = tracker_rows(plain), tracker_rows(_at(plain, problem))
+    before, after = (seen_rows(e, "tracker") for e in (plain, _at(plain, problem)))
     change = after.table()["residual"] - before.table()["residual"]
     mine = (after.names["stop"] == "s1") & (after.names["body"] == "mount_markers")
     shift = mine & np.char.startswith(after.names["axis"], "t")
@@ -252,9 +259,9 @@ def test_errors_add_up():
 def test_nothing_tracked_and_no_targets_leaves_what_is_known_of_beams(tmp_path):
     problem = build([Source.open(rigs.write(tmp_path / "rec", tracker=None, target=None))], SMALL)
     estimate = solve(problem)
-    assert tracker_rows(estimate) is None and target_rows(estimate) is None
-    prior, beams = prior_rows(estimate), {("box", "s1"): Errors(4, 0.0, 4.0, 1.0)}
-    found = misfit_by(estimate, None, None, prior, beams)
+    rows, beams = instrument_rows(estimate), {("box", "s1"): Errors(4, 0.0, 4.0, 1.0)}
+    assert set(rows) == {"prior"}
+    found = misfit_by(estimate, rows, beams)
     assert found["stop"]["s1"]["beams"] == 2 and found["body"] == found["target"] == {}
 
 

@@ -36,6 +36,9 @@ class Dense:
         ends = np.cumsum([0, *(v.dim for v in self.variables)])
         self.at = {v.name: slice(a, a + v.dim) for v, a in zip(self.variables, ends, strict=False)}
         self.size = int(ends[-1])
+        # Gravity's length has a sigma of 1: steps for millirad would be lost in rounding there.
+        steps = [np.full(v.dim, 3e-5 if v.name == "gravity" else 3e-7) for v in self.variables]
+        self.step = np.concatenate(steps)
         pairs = zip(estimate.scans, estimate.associations, strict=True)
         self.stops = [self._stop(scan, association) for scan, association in pairs]
         scales = [np.full(len(stop["sigma"]), stop["scale"]) for stop in self.stops]
@@ -67,6 +70,7 @@ class Dense:
         values = {v.name: self._moved(v, x[:, self.at[v.name]]) for v in self.variables}
         self.hardware = self._hardware(values)
         parts = [*self._priors(values), *self._bodies(values), *self._targets(values)]
+        parts += self._levels(values)
         return np.concatenate([*parts, *(self._beams(s, values) for s in self.stops)], axis=1)
 
     def robust(self, rows):
@@ -78,14 +82,14 @@ class Dense:
         z[:] = np.sign(z) * self.reach * np.sqrt(u * (3 - 3 * u + u * u) / 3)
         return rows
 
-    def around(self, x, step=3e-7):
+    def around(self, x):
         """Rows at, and on both sides of, a tangent x (P,) along every component."""
-        return self.rows(np.vstack([x, x + step * np.eye(self.size), x - step * np.eye(self.size)]))
+        return self.rows(np.vstack([x, x + np.diag(self.step), x - np.diag(self.step)]))
 
-    def jacobian(self, around, step=3e-7):
+    def jacobian(self, around):
         """(m, P) by differences."""
         plus, minus = np.split(around[1:], 2)
-        return (plus - minus).T / (2 * step)
+        return (plus - minus).T / (2 * self.step)
 
     def weights(self, rows):
         """Square roots of the robust weights of one state's rows (m,)."""
@@ -95,13 +99,11 @@ class Dense:
         return root
 
     def _moved(self, v, step):
-        """Vectors (N, dim), directions (N, 3), or N poses."""
+        """Vectors (N, dim), or N poses."""
         found = self.estimate.values[v.name]
         if v.kind == "vector":
             return found + step
-        if v.kind == "pose":
-            return RigidTransform.from_matrix(found) * RigidTransform.from_exp_coords(step)
-        return np.stack([rigs.retract("direction", found, one) for one in step])
+        return RigidTransform.from_matrix(found) * RigidTransform.from_exp_coords(step)
 
     def _whole(self, name, values, dofs):
         """An effect's parameters (N, P), those that are held included."""
@@ -156,24 +158,39 @@ class Dense:
 
     def _targets(self, values):
         targets, spec = self.source.recording.targets, self.source.rig.target
-        for m, name in enumerate(targets.names if "gravity" in values else ()):
-            p, g = values[f"target:{name}"], values["gravity"]
+        for m, name in enumerate(targets.names if "target:t0" in values else ()):
+            p, g = values[f"target:{name}"], _unit(values["gravity"])
             yield (targets.lower_m[m] - p) / spec.sigma_marker_m
             yield np.cross(g, targets.upper_m[m] - p) / spec.sigma_marker_m
             centre = values["faro"].inv().apply(p + rigs.BELOW_M * g)
             yield (targets.faro_m[m] - centre) / spec.sigma_sphere_m
+
+    def _levels(self, values):
+        """By the rotation vectors that turn what should be felt into what was."""
+        levels, recording = self.source.rig.levels, self.source.recording
+        for frame, felt in recording.levels.items():
+            for up, stop in zip(felt, recording.stops, strict=True):
+                if np.isfinite(up).all():
+                    turn = self._place(frame, stop, values).rotation
+                    should = turn.inv().apply(-_unit(values["gravity"]))
+                    axis = np.cross(should, up)
+                    sine = np.linalg.norm(axis, axis=1, keepdims=True)
+                    yield np.arctan2(sine, (should @ up)[:, None]) * axis / sine / levels.sigma_rad
 
     def _priors(self, values):
         for v in self.variables:
             if v.kind == "pose":
                 apart = RigidTransform.from_matrix(v.mean).inv() * values[v.name]
                 yield apart.as_exp_coords() / v.sigma
-            elif v.kind == "direction":
-                yield np.cross(v.mean, values[v.name]) / v.sigma[0]
             else:
                 yield (values[v.name] - v.mean) / v.sigma
 
 
+def _unit(vectors):
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+LEVELS = {"frames": ["base", "arm_2", "lidar"], "sigma_rad": rigs.LEVEL_RAD}
 PERFECT = {"frame": "faro", "mesh": "reference/mesh.ply", "sigma_m": 0}
 CASES = {  # changes of rig.yaml, and what is held
     "everything": ({}, ()),
@@ -182,6 +199,16 @@ CASES = {  # changes of rig.yaml, and what is held
         ("ring_range_offset.ring_003", "lidar.tz", "mount"),
     ),
     "no lidar": ({"lidar": None}, ("arm_link_length.lift",)),
+    "levels": ({"levels": LEVELS}, ()),
+    "levels alone": (
+        {
+            "tracker": None,
+            "target": None,
+            "reference": PERFECT,
+            "levels": {**LEVELS, "up": [0.001, 0.0, 2.0], "sigma_up_rad": 0.002},
+        },
+        (),
+    ),
 }
 
 

@@ -10,7 +10,8 @@ from calib.forward import place_each
 from calib.linear.linearise import lidars
 from calib.problem import build
 from calib.problem.model import Model, Source
-from calib.residuals.tracker import BodiesTogether, TrackedBody
+from calib.residuals.seen import BodiesTogether
+from calib.residuals.tracker import TrackedBody
 from calib.simulation import Spec
 
 from . import rigs, simulated

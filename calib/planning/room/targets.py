@@ -112,7 +112,7 @@ def _inside(vertices_m: np.ndarray, at_m: np.ndarray) -> np.ndarray:
 def _down(scene: PlanningScene) -> np.ndarray:
     """Along which rods hang (3,), world frame: as estimated, or down in the reference's frame."""
     down = scene.values.get(GRAVITY)
-    return -scene.T_world_reference[:3, 2] if down is None else np.asarray(down)
+    return -scene.T_world_reference[:3, 2] if down is None else down / np.linalg.norm(down)
 
 
 def _rod_m(scene: PlanningScene) -> float:
@@ -179,7 +179,7 @@ def each_target(scene: PlanningScene, at_m: np.ndarray) -> tuple[Information, np
     bare = replace(problem, blocks=[weightless.get(id(b), b) for b in problem.blocks])
     met = scene.stand.estimate.associations
     known = scene.believed(of_all(bare, values, met, scene.unbounded))
-    markers = {n for n, u in problem.variables.items() if u.role is Role.TARGET} - {GRAVITY}
+    markers = {n for n, u in problem.variables.items() if u.role is Role.TARGET}
     known = known.onto(np.array([i for i, (n, _) in enumerate(known.keys) if n not in markers]))
     layout = Layout.of(problem, unbounded=scene.unbounded)
     graph = Graph(list(layout.outer().values()), layout.others, layout.unbounded)

@@ -23,14 +23,16 @@ if TYPE_CHECKING:
 BLOCK_NAMES = {
     "beams": "{rows} beams\nof {blocks} scans",
     "tracker": "{rows} numbers\nof the tracker",
+    "level": "{rows} numbers\nof levels",
     "target": "{rows} numbers\nof {blocks} targets",
     "prior": "the earlier run,\n{rows} numbers",
 }
-SHORT_NAMES = {"target": "targets", "prior": "earlier"}
+SHORT_NAMES = {"level": "levels", "target": "targets", "prior": "earlier"}
 GROUPS = {
     Role.PLACE: "places of the rig",
     Role.JOINTS: "joint readings",
-    Role.TARGET: "targets and gravity",
+    Role.TARGET: "targets",
+    Role.GRAVITY: "gravity",
     Role.PLANE: "planes",
     Role.SURFACE: "parts of surfaces",
     Role.SCATTER: "scatter by chance",

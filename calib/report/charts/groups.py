@@ -10,14 +10,13 @@ import numpy as np
 from calib.report import plots
 from calib.report.chart import Absent, Chart
 from calib.report.evidence import Evidence
-from calib.residuals.groups import JOINTS, SCAN
+from calib.residuals.groups import AT_STOPS, JOINTS, SCAN
 from calib.results.outstanding import times
 from calib.show.misfit import furthest
 
 if TYPE_CHECKING:
     from calib.report.plots import Figure
 
-AT_STOPS = ("body", "joints", "scan")  # kinds that a stop has; others have columns of their own
 LEAST_DRAWN = 0.1  # of what chance allows: what is less is drawn there
 MOST_NAMES = 5  # groups or stops that are named in a picture: more would hide each other
 MOST_TICKS = 40  # stops whose names are written below
@@ -98,7 +97,8 @@ def _place(token: str) -> str:
 
 
 def _columns(found: Mapping[str, tuple[str, float]], stops: Mapping[str, int]) -> dict[str, int]:
-    """Place -> its column: stops in their order, recording by recording, then all others."""
+    """Place -> its column: stops in their order, recording by recording, then all others, which
+    have columns of their own."""
     at_stop = {_place(t): kind in AT_STOPS for t, (kind, _) in found.items()}
 
     def order(place: str) -> tuple[bool, str, int, str]:

@@ -90,12 +90,10 @@ def _children(
     prior: dict[str, float],
     out: list[ChainLink],
 ) -> None:
-    arm = [edge for edge in rig.tree.edges if edge.name in rig.arm_edges]
-    if arm and arm[0].parent == parent:
-        joints = len(rig.joint_names)
-        what = f"the arm: {joints} joints, from its URDF"
-        out.append(ChainLink(arm[-1].child, depth, parent=parent, what=what))
-        _children(rig, arm[-1].child, depth + 1, fitted, prior, out)
+    for tip in rig.tips if parent == rig.arm_base else ():
+        what = f"the arm: {len(rig.joints_to(tip))} joints, from its URDF"
+        out.append(ChainLink(tip, depth, parent=parent, what=what))
+        _children(rig, tip, depth + 1, fitted, prior, out)
     for edge in rig.tree.edges:
         if edge.parent == parent and edge.name in rig.frame_sigma:
             mine = fitted.get(edge.child)

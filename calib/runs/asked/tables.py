@@ -13,7 +13,7 @@ from chains.errors import InputError
 from sensors.documents import nearest
 from sensors.recording import read_table
 
-BEAM_RESIDUALS, INSTRUMENTS = "beams", ("tracker", "target", "prior")
+BEAM_RESIDUALS, INSTRUMENTS = "beams", ("tracker", "level", "target", "prior")
 
 
 def parameters(run: Run) -> dict[str, np.ndarray]:
@@ -65,8 +65,9 @@ def residuals(run: Run, kind: str = BEAM_RESIDUALS) -> dict[str, np.ndarray]:
     Args:
         run: the run.
         kind: "beams" of all stops, with what effects look at and the robust ``weight``; or
-            "tracker", "target" or "prior", whose ``whitened`` is the residual over its sigma. Where
-            rows of a table have several units each has its columns, NaN in rows of the others.
+            "tracker", "level", "target" or "prior", whose ``whitened`` is the residual over its
+            sigma. Where rows of a table have several units each has its columns, NaN in rows
+            of the others.
 
     Raises:
         InputError: the run has none of that kind.

@@ -120,6 +120,30 @@ def test_a_rig_of_ones_own_is_taken_as_it_is(files, tmp_path):
     assert any("foot was tracked" in line for line in done.odd)
 
 
+def test_joints_that_a_rig_calls_passive_need_no_column(files, tmp_path):
+    bring(files, tmp_path / "a", "table log.csv tum cup.txt dh arm.yaml")
+    passive, mine = JOINTS[1], tmp_path / "a" / "mine.yaml"
+    rig = yaml.safe_load((tmp_path / "a/rig.yaml").read_text())
+    table = stops_of(tmp_path / "a")
+    lines = [",".join(n for n in table if n != passive)]
+    lines += [",".join(row) for row in zip(*(table[n] for n in table if n != passive), strict=True)]
+    (tmp_path / "stops.csv").write_text("\n".join(lines))
+    mine.write_text(yaml.safe_dump(rig))
+    with pytest.raises(InputError, match=f"the arm's joint {passive} is not among the columns"):
+        bring(tmp_path, tmp_path / "b", "table stops.csv", rig=mine)
+    rig["arm"]["passive"] = [passive]
+    mine.write_text(yaml.safe_dump(rig))
+    bring(tmp_path, tmp_path / "b", "table stops.csv", rig=mine)
+    assert passive not in stops_of(tmp_path / "b")
+
+
+def test_an_arm_of_several_tips_is_not_imported(files, tmp_path):
+    mine = tmp_path / "mine.yaml"
+    mine.write_text("name: x\narm: {urdf: arm.urdf, base: a, tip: [b, c]}\n")
+    with pytest.raises(InputError, match=r"mine\.yaml: arm\.tip: import follows an arm to one tip"):
+        bring(files, tmp_path / "b", "table log.csv dh arm.yaml", rig=mine)
+
+
 def test_left_handed_axes_are_named(files, tmp_path):
     rows = np.loadtxt(files / "cup.txt")
     rows[:, [3, 4, 5]] *= -1  # z reversed: z, and the turns about x and y

@@ -24,8 +24,6 @@ def away(unknown: Unknown, value: np.ndarray) -> np.ndarray:
     """How far a value is from what was known before, as gtsam's priors say."""
     if unknown.kind == "pose":
         return gtsam.Pose3.Logmap(gtsam.Pose3(np.linalg.inv(unknown.mean) @ value))
-    if unknown.kind == "direction":
-        return gtsam.Unit3(unknown.mean).localCoordinates(gtsam.Unit3(value))
     return value - unknown.mean
 
 
@@ -66,7 +64,7 @@ class Dense:
             residual, d = block.evaluate(self.values, True)
             kind = "body" if isinstance(block, TrackedBody) else "other"
             name = f"{kind}:{','.join(block.variables)}"
-            by = {n: self._tangent(n, x) for n, x in d.items()}
+            by = dict(d)
             self._add(-residual, by, name, of=f"block {i}")
         without = {name for block in self.held for name in block.variables}
         for name, unknown in unknowns.items():
@@ -86,11 +84,6 @@ class Dense:
         for name, d in by.items():
             A[:, self.at[name]] += d
         self._parts.append((A, b, kind, cluster or [None] * len(b)))
-
-    def _tangent(self, name: str, d: np.ndarray) -> np.ndarray:
-        if self.problem.variables[name].kind == "direction":
-            return d @ gtsam.Unit3(self.values[name]).basis()
-        return d
 
     def _prior(self, name: str, unknown: Unknown) -> None:
         def residual(values: Values) -> np.ndarray:

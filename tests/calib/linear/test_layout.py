@@ -126,7 +126,7 @@ def test_calibration_targets_and_planes_are_always_kept(tmp_path):
     found = build([source], Model(), [np.array([False, True, False, False])])
     layout = Layout.of(found)
     assert own(layout) == {0: {f"root@{stop}", f"joints@{stop}"}}
-    always = (Role.CALIBRATION, Role.TARGET, Role.PLANE)
+    always = (Role.CALIBRATION, Role.TARGET, Role.GRAVITY, Role.PLANE)
     names = {name for name, u in found.variables.items() if u.role in always}
     assert "planes" in names and "gravity" in names and names <= set(layout.outer())
     assert layout.touched["gravity"] == {-1}

@@ -1,0 +1,199 @@
+"""What an instrument says of a body at stops: the rows, weights and groups that all such share."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import ClassVar, NamedTuple, Self
+
+import numpy as np
+
+from calib.forward import Derivatives, Placed, Stops, Values
+from calib.residuals.groups import Group
+from chains import se3
+
+
+class Compared(NamedTuple):
+    """Measured less predicted, in the rows' units.
+
+    Args:
+        rows: (K, n).
+        by_twist: (K, n, 6) by the body's right increment.
+        direct: variable -> (K, n, P), of what else is predicted with.
+    """
+
+    rows: np.ndarray
+    by_twist: np.ndarray
+    direct: Derivatives
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeenBody(ABC):
+    """One body at K stops that share every variable, as an instrument has it.
+
+    Rows of stops where the instrument said nothing are left out by the caller.
+
+    Args:
+        name: for messages.
+        stops: the K stops.
+        body: the body's frame.
+        measured: (K, ...) what the instrument says.
+        bases: variable -> (K or 1, 6, P), what the instrument adds to the body's pose, per unit.
+        stop_names: (K,) recording and number of each stop: rows of one err together.
+        groups: (K,) the names of those rows.
+        weight: (K,) robust weight of each stop's rows, 0 where set aside; 1 where None.
+    """
+
+    name: str
+    stops: Stops
+    body: str
+    measured: np.ndarray
+    bases: Mapping[str, np.ndarray] = field(default_factory=dict)
+    stop_names: Sequence[tuple[Path, int]] = ()
+    groups: tuple[Group, ...] = ()
+    weight: np.ndarray | None = None
+
+    kind: ClassVar[str]
+
+    @property
+    @abstractmethod
+    def axes(self) -> tuple[str, ...]:
+        """(n,) of the rows of a stop."""
+
+    @property
+    @abstractmethod
+    def dofs(self) -> tuple[str, ...]:
+        """(n,) what tables call these axes."""
+
+    @property
+    @abstractmethod
+    def units(self) -> tuple[str, ...]:
+        """(n,) of these rows."""
+
+    @property
+    @abstractmethod
+    def sigma(self) -> np.ndarray:
+        """(n,) of these rows, in their units."""
+
+    @abstractmethod
+    def compare(self, T_world_body: np.ndarray, values: Values) -> Compared:
+        """Measured less predicted, of a body that is seen there (K, 4, 4)."""
+
+    @abstractmethod
+    def predicted(self, values: Values) -> np.ndarray:
+        """What the instrument should say (K, ...)."""
+
+    def turn(self, k: int) -> np.ndarray:
+        """(n, n) from the rows' axes at a stop to those in which people are told an offset."""
+        return np.eye(len(self.axes))
+
+    @property
+    def variables(self) -> tuple[str, ...]:
+        return (*self.stops.variables, *self.bases)
+
+    @property
+    def rows(self) -> int:
+        return len(self.measured) * len(self.axes)
+
+    def setting_aside(self, tokens: Collection[str]) -> Self:
+        """The block with these stops' rows, and no others, set aside; see `Group.token`."""
+        now = np.ones(len(self.groups)) if self.weight is None else self.weight
+        gone = np.array([group.token in tokens for group in self.groups])
+        weight = np.where(gone, 0.0, np.where(now > 0, now, 1.0))
+        return replace(self, weight=None if (weight == 1.0).all() else weight)
+
+    def as_predicted(self, values: Values, where: np.ndarray) -> Self:
+        """The block with what the instrument should say at some of its stops, (K,) bool."""
+        if not where.any():
+            return self
+        chosen = where.reshape(-1, *(1,) * (self.measured.ndim - 1))
+        return replace(self, measured=np.where(chosen, self.predicted(values), self.measured))
+
+    def seen(self, values: Values, derivatives: bool = False) -> Placed:
+        """T_world_body as the instrument should see it, all that it adds included."""
+        placed = self.stops.in_world(self.body, values, derivatives)
+        if not self.bases:
+            return placed
+        added = sum(basis @ values[name] for name, basis in self.bases.items())
+        d = placed.d
+        if derivatives:
+            back = se3.adjoint(se3.inverse(se3.exp(added)))
+            d = {name: back @ each for name, each in d.items()}
+            d |= {n: se3.right_jacobian(added) @ b for n, b in self.bases.items()}
+        return Placed(placed.T @ se3.exp(added), d)
+
+    def evaluate(self, values: Values, derivatives: bool) -> tuple[np.ndarray, Derivatives | None]:
+        """Whitened rows, stop by stop, and their derivatives."""
+        seen = self.seen(values, derivatives)
+        rows, by_twist, direct = self.compare(seen.T, values)
+        weight = 1.0 / self.sigma
+        if self.weight is not None:
+            weight = weight * np.sqrt(self.weight)[:, None]
+        residual = (rows * weight).ravel()
+        if not derivatives:
+            return residual, None
+        by_twist = by_twist * weight[..., None]
+        d = {n: by_twist @ np.asarray(each) for n, each in seen.d.items()}
+        d |= {n: each * weight[..., None] for n, each in direct.items()}
+        return residual, {n: each.reshape(len(residual), -1) for n, each in d.items()}
+
+
+@dataclass(frozen=True)
+class BodiesTogether:
+    """Blocks of one body at single stops, evaluated in one go.
+
+    Args:
+        blocks: as they are in the problem.
+        whole: all of them as one block, see `Stops.together`.
+    """
+
+    blocks: Sequence[SeenBody]
+    whole: SeenBody
+
+    @classmethod
+    def of(cls, blocks: Sequence[SeenBody]) -> list[BodiesTogether]:
+        """Blocks, grouped by what they share."""
+        groups: dict[object, list[SeenBody]] = {}
+        for block in blocks:
+            shared = tuple(n for n in block.variables if n not in block.stops.own)
+            like = (block.kind, block.body, block.axes, id(block.stops.rig), len(block.measured))
+            groups.setdefault((*like, shared, block.stops.noise is None), []).append(block)
+        return [cls(found, _whole(found)) for found in groups.values()]
+
+    def evaluate(self, values: Values) -> Iterator[tuple[np.ndarray, Derivatives]]:
+        """Rows and derivatives of each block, as `SeenBody.evaluate` gives them."""
+        own = {
+            name: np.concatenate([np.repeat(values[v][None], len(b.measured), 0) for v, b in pairs])
+            for name, pairs in self._own().items()
+        }
+        residual, d = self.whole.evaluate({**values, **own}, True)
+        count = len(self.blocks)
+        rows = residual.reshape(count, -1)
+        by = {name: x.reshape(count, rows.shape[1], -1) for name, x in d.items()}
+        for k, block in enumerate(self.blocks):
+            named = dict(zip(self.whole.stops.own, block.stops.own, strict=True))
+            yield rows[k], {named.get(name, name): x[k] for name, x in by.items()}
+
+    def _own(self) -> dict[str, list[tuple[str, SeenBody]]]:
+        names = self.whole.stops.own
+        return {n: [(b.stops.own[i], b) for b in self.blocks] for i, n in enumerate(names)}
+
+
+def _whole(blocks: Sequence[SeenBody]) -> SeenBody:
+    first = blocks[0]
+    bases = {
+        n: np.concatenate(
+            [np.broadcast_to(b.bases[n], (len(b.measured), *x.shape[1:])) for b in blocks]
+        )
+        for n, x in first.bases.items()
+    }
+    weights = [np.ones(len(b.measured)) if b.weight is None else b.weight for b in blocks]
+    return replace(
+        first,
+        stops=Stops.together([b.stops for b in blocks]),
+        measured=np.concatenate([b.measured for b in blocks]),
+        bases=bases,
+        weight=None if all(b.weight is None for b in blocks) else np.concatenate(weights),
+    )

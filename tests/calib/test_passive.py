@@ -1,0 +1,128 @@
+"""Joints that nothing reads: where they are is found from the tracker, and all else beside them."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+import yaml
+
+import calib
+from calib.problem import build
+from calib.problem.model import Model, Source
+from calib.problem.without import leave_out
+from calib.results.check import check
+from calib.results.errors import misfit
+from calib.simulation import PRESETS, Spec, simulate
+from calib.solve.fit import solve
+from chains.errors import InputError
+
+from .broken import cells
+
+OFF_RAD = 0.03  # what hardware that is some mm and mrad off its drawing puts a start off by
+
+
+def simulated(folder, *passive, seed=3, **changed):
+    few = {"passive": passive, "occluded_share": 0, "locations": 4, "stops_per_location": 10}
+    simulate(Spec(**{**PRESETS["arm-tracker"].model_dump(), **few, **changed}), folder, seed)
+    return folder
+
+
+def rewrite(folder, change):
+    rig = yaml.safe_load((folder / "rig.yaml").read_text())
+    change(rig)
+    (folder / "rig.yaml").write_text(yaml.safe_dump(rig))
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    """The same arm, all of its joints read, and two of them not."""
+    folder = tmp_path_factory.mktemp("passive")
+    both = ("joint_2", "joint_5")
+    return simulated(folder / "read"), simulated(folder / "unread", *both)
+
+
+def test_a_fit_begins_near_where_the_joints_were(folders):
+    read, unread = (Source.open(folder).recording for folder in folders)
+    away = np.abs(unread.joints - read.joints)
+    assert 0 < away.max() < OFF_RAD and not away[:, [0, 2, 3, 5]].any()
+    given = calib.Recording.open(folders[1]).joints
+    assert np.isnan(given[:, [1, 4]]).all() and np.isfinite(given[:, [0, 2, 3, 5]]).all()
+
+
+@pytest.mark.parametrize("passive", [("joint_3",), ("joint_2", "joint_5")])
+def test_where_the_base_stands_still_nothing_before_the_joints_need_be_seen(tmp_path, passive):
+    read = Source.open(simulated(tmp_path / "read", base_moves="never")).recording.joints
+    folder = simulated(tmp_path / "rec", *passive, base_moves="never")
+
+    def only_the_tip(rig):
+        rig["tracker"]["bodies"] = ["mount_markers"]
+        del rig["frames"]["base_markers"]
+
+    rewrite(folder, only_the_tip)
+    found = Source.open(folder).recording.joints
+    assert 0 < np.abs(found - read).max() < 1.5 * OFF_RAD
+
+
+def test_joints_and_parameters_come_out_within_their_sigmas(folders):
+    read, unread = (Source.open(folder) for folder in folders)
+    truth = json.loads((folders[1].parent / "unread.truth.json").read_text())["effects"]
+    estimate = solve(build([unread], Model()))
+    variables, z = estimate.problem.variables, []
+    assert variables["arm_joint_offset"].dofs == ("joint_1", "joint_3", "joint_4", "joint_6")
+    true = np.array(truth["arm_joint_offset"])
+    off = estimate.values["arm_joint_offset"] - true[[0, 2, 3, 5]]
+    z.append(off / np.sqrt(np.diag(estimate.covariance_of(["arm_joint_offset"]))))
+    for k, stop in enumerate(unread.recording.stops):
+        name = f"joints@{stop}"
+        at = unread.recording.joints[k] + estimate.values[name]
+        sigma = np.sqrt(np.diag(estimate.covariance_of([name])))
+        # What encoders err by was drawn when the arm was simulated, at their sigma.
+        both = np.hypot(sigma, unread.rig.sigma_joint_rad)
+        z.append(((at - read.recording.joints[k] - true) / both)[[1, 4]])
+    z = np.concatenate(z)
+    assert np.abs(z).max() < 4.5 and np.sqrt(np.mean(np.square(z))) < 1.3
+    assert 0.4 < misfit(estimate, calib.results.errors.Errors())["tracker"] < 1.2
+
+
+def test_a_run_says_what_is_not_read_and_judges_stops_by_what_is_left(folders, tmp_path):
+    run = calib.fit(folders[1], tmp_path / "run")
+    rms = run.summary["rms_mm"]
+    assert 0.7 < rms["held_out"] / rms["noise_floor"] < 1.3 and rms["noise_floor"] < 1.0
+    why = {each["name"]: each["why"] for each in run.solution.not_estimated}
+    assert "nothing reads this joint" in why["joint_2"] and "joint_5" in why
+    found = calib.diagnose(run)
+    assert found.verdict == "adequate" and not found.blunders
+
+
+def test_a_check_says_which_joints_are_unread(folders):
+    found = check(folders[1], graph=False)
+    assert not found.suspects
+    assert dict(found.contents)["joint_5"] == "read by nothing: estimated at each of 40 stops"
+    assert not [odd for odd in found.odd if "joint_" in odd]
+
+
+def test_a_column_of_a_passive_joint_is_where_its_estimate_begins(folders, tmp_path):
+    folder = shutil.copytree(folders[0], tmp_path / "rec")
+    rewrite(folder, lambda rig: rig["arm"].update(passive=["joint_2"]))
+    cells("stops.csv", "joint_2", lambda q: q + 0.01)(folder)
+    cells("stops.csv", "joint_2", lambda _: "", row=3)(folder)
+    before, here = (Source.open(f).recording.joints[:, 1] for f in (folders[0], folder))
+    off = here - before
+    assert abs(off[3]) < OFF_RAD
+    np.testing.assert_allclose(np.delete(off, 3), 0.01, atol=1e-12)
+    assert solve(build([Source.open(folder)], Model())).converged
+
+
+def test_what_makes_no_sense_of_passive_joints_is_refused(folders, tmp_path):
+    folder = shutil.copytree(folders[1], tmp_path / "rec")
+    with pytest.raises(InputError, match="no recording has that"):
+        leave_out([Source.open(folder)], ["L00P01:joint_2"])
+    rewrite(folder, lambda rig: rig["arm"].update(passive=["joint_22"]))
+    with pytest.raises(
+        InputError, match=r"rig\.yaml:\d+: arm\.passive\.0: joint 'joint_22'.*joint_2"
+    ):
+        Source.open(folder)
+    rewrite(folder, lambda rig: rig["arm"].update(passive=["joint_2"]))
+    with pytest.raises(InputError, match="column joint_5 is missing"):
+        Source.open(folder)
