@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,7 +14,7 @@ from calib.linear.assembly import OwnRows
 from calib.linear.cells_first import CellsFirst
 from calib.linear.clusters import Gradients
 from calib.linear.layout import Layout
-from calib.linear.parallel import in_order
+from calib.linear.parallel import over_stops
 from calib.linear.rows import StopRows, StopSums, Weighing
 from calib.linear.stops_first import StopsFirst
 from calib.linear.system import Linearisation, Values
@@ -58,32 +60,66 @@ def linearise(
     order = StopsFirst if layout.stops_first else CellsFirst
     assembly = order(layout, own, count, gradients is not None)
     placed = lidars(problem.scans, values) if count else []
-    found: list[tuple[Weighing, float, float]] = []  # each stop's weighing, its cost, and before
-
-    def work(i: int) -> tuple[StopSums, SpreadRows | None, tuple | None, tuple]:
-        at = problem.scans[i], layout, values, placed[i], associations[i]
-        rows = StopRows.of(*at, newton, *slowed[i : i + 1])
-        here = Weighing.of(rows.rows)
-        costs = here.cost(rows.rows), weighed[i].cost(rows.rows) if weighed else 0.0
-        by_cluster = None
-        if gradients is not None:
-            parts, cluster = rows.places()
-            by_cluster = parts, cluster, *rows.gradient(cluster, len(parts))
-        return rows.sums(), rows.rows.spread, by_cluster, (here, *costs)
-
-    for i, (sums, spread, by_cluster, told) in enumerate(in_order(work, count)):
+    scans = problem.scans[:count]
+    work = partial(_of_stop, layout, values, newton, gradients is not None)
+    asked = placed, associations, slowed or [None] * count, weighed or [None] * count
+    found: list[_OfStop] = []
+    for i, stop in enumerate(over_stops(work, scans, *asked)):
         progress(i, count)
-        found.append(told)
-        assembly.add(sums)
-        places = _add_clusters(gradients, problem.scans[i], sums.stop, by_cluster)
-        if spread is not None:
-            rows = spread_rows(spread, layout)
+        found.append(stop._replace(sums=None, spread=None, by_cluster=None))
+        assembly.add(stop.sums)
+        places = _add_clusters(gradients, scans[i], stop.sums.stop, stop.by_cluster)
+        if stop.spread is not None:
+            rows = spread_rows(stop.spread, layout)
             assembly.add_kept(rows)
             if places is not None:
-                gradients.add_rows(rows.of_stop(sums.stop, places))
-    cost, before = (sum(each[k] for each in found) for k in (1, 2))
-    told = {"weighed": [each for each, _, _ in found], "beams_cost": cost}
-    return replace(assembly.done(values), cost_before=before if weighed else None, **told)
+                gradients.add_rows(rows.of_stop(stop.sums.stop, places))
+    return replace(
+        assembly.done(values),
+        weighed=[stop.weighed for stop in found],
+        beams_cost=sum(stop.cost for stop in found),
+        cost_before=sum(stop.cost_before for stop in found) if weighed else None,
+    )
+
+
+class _OfStop(NamedTuple):
+    """What a stop adds: its sums, its rows of scatter within holds, gradients by cluster where they
+    are wanted, how it was weighed, its cost, and that as it was weighed before."""
+
+    sums: StopSums | None
+    spread: SpreadRows | None
+    by_cluster: tuple[np.ndarray, ...] | None
+    weighed: Weighing
+    cost: float
+    cost_before: float
+
+
+def _of_stop(
+    layout: Layout,
+    values: Values,
+    newton: bool,
+    clustered: bool,
+    scan: ScanStop,
+    placed: Placed,
+    association: Association | None,
+    slowed: Weighing | None,
+    weighed: Weighing | None,
+) -> _OfStop:
+    """Of the scan of one stop, whose LiDAR is `placed`; other arguments as of `linearise`."""
+    rows = StopRows.of(scan, layout, values, placed, association, newton, slowed)
+    here = Weighing.of(rows.rows)
+    by_cluster = None
+    if clustered:
+        parts, cluster = rows.places()
+        by_cluster = parts, cluster, *rows.gradient(cluster, len(parts))
+    return _OfStop(
+        sums=rows.sums(),
+        spread=rows.rows.spread,
+        by_cluster=by_cluster,
+        weighed=here,
+        cost=here.cost(rows.rows),
+        cost_before=0.0 if weighed is None else weighed.cost(rows.rows),
+    )
 
 
 def _add_clusters(
@@ -117,13 +153,16 @@ def beams_cost(
         weighed: per scan, how its beams are to be weighed.
     """
     placed = lidars(problem.scans, values)
+    work = partial(_cost_of_stop, values)
+    return sum(over_stops(work, problem.scans, placed, associations, weighed))
 
-    def work(i: int) -> float:
-        rows = problem.scans[i].rows(values, associations[i], placed[i].T[0])
-        scatter = 0.0 if rows.spread is None else float(np.square(rows.spread.residual).sum()) / 2
-        return weighed[i].cost(rows) + scatter
 
-    return sum(in_order(work, len(problem.scans)))
+def _cost_of_stop(
+    values: Values, scan: ScanStop, placed: Placed, association: Association, weighed: Weighing
+) -> float:
+    rows = scan.rows(values, association, placed.T[0])
+    scatter = 0.0 if rows.spread is None else float(np.square(rows.spread.residual).sum()) / 2
+    return weighed.cost(rows) + scatter
 
 
 def lidars(scans: Sequence[ScanStop], values: Values) -> list[Placed]:
