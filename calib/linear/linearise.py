@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 
 from calib.forward import Placed, place_each
-from calib.linear.assembly import OwnRows
+from calib.linear.assembly import KeptSums, OwnRows
 from calib.linear.cells_first import CellsFirst
-from calib.linear.clusters import Gradients
+from calib.linear.clusters import Gradients, summed
 from calib.linear.layout import Layout
 from calib.linear.parallel import over_stops
 from calib.linear.rows import StopRows, StopSums, Weighing
@@ -66,14 +65,15 @@ def linearise(
     found: list[_OfStop] = []
     for i, stop in enumerate(over_stops(work, scans, *asked)):
         progress(i, count)
-        found.append(stop._replace(sums=None, spread=None, by_cluster=None))
+        found.append(stop.without_sums())
         assembly.add(stop.sums)
-        places = _add_clusters(gradients, scans[i], stop.sums.stop, stop.by_cluster)
-        if stop.spread is not None:
-            rows = spread_rows(stop.spread, layout)
-            assembly.add_kept(rows)
-            if places is not None:
-                gradients.add_rows(rows.of_stop(stop.sums.stop, places))
+        if stop.scatter is not None:
+            assembly.add_kept(stop.scatter)
+        if gradients is not None:
+            places = gradients.numbers(scans[i].room, stop.met)
+            at = np.full(len(places), stop.sums.stop)
+            for gradient, columns in stop.gradients:
+                gradients.add(gradient, columns, at, places)
     return replace(
         assembly.done(values),
         weighed=[stop.weighed for stop in found],
@@ -82,16 +82,29 @@ def linearise(
     )
 
 
-class _OfStop(NamedTuple):
-    """What a stop adds: its sums, its rows of scatter within holds, gradients by cluster where they
-    are wanted, how it was weighed, its cost, and that as it was weighed before."""
+@dataclass(frozen=True)
+class _OfStop:
+    """What a stop adds.
+
+    Args:
+        sums: of its beams; scatter: of its rows of scatter within holds, None where it has none.
+        met: (G,) what its beams meet, where gradients are wanted.
+        gradients: of beams, and of rows of scatter, (G, n) by what is met, and the columns (n,).
+        weighed: how its beams were weighed.
+        cost: of them; cost_before: the same as they were weighed before.
+    """
 
     sums: StopSums | None
-    spread: SpreadRows | None
-    by_cluster: tuple[np.ndarray, ...] | None
+    scatter: KeptSums | None
+    met: np.ndarray | None
+    gradients: Sequence[tuple[np.ndarray, np.ndarray]]
     weighed: Weighing
     cost: float
     cost_before: float
+
+    def without_sums(self) -> _OfStop:
+        """What is kept of it until all stops are done."""
+        return replace(self, sums=None, scatter=None, met=None, gradients=())
 
 
 def _of_stop(
@@ -107,35 +120,25 @@ def _of_stop(
 ) -> _OfStop:
     """Of the scan of one stop, whose LiDAR is `placed`; other arguments as of `linearise`."""
     rows = StopRows.of(scan, layout, values, placed, association, newton, slowed)
-    here = Weighing.of(rows.rows)
-    by_cluster = None
+    here, scatter = Weighing.of(rows.rows), None
+    if rows.rows.spread is not None:
+        scatter = spread_rows(rows.rows.spread, layout)
+    met, gradients = None, []
     if clustered:
-        parts, cluster = rows.places()
-        by_cluster = parts, cluster, *rows.gradient(cluster, len(parts))
+        met, cluster = rows.places()
+        gradients.append(rows.gradient(cluster, len(met)))
+        if scatter is not None:
+            by_row = scatter.b[:, None] * scatter.A
+            gradients.append((summed(by_row, cluster), scatter.columns))
     return _OfStop(
         sums=rows.sums(),
-        spread=rows.rows.spread,
-        by_cluster=by_cluster,
+        scatter=None if scatter is None else KeptSums.of(scatter),
+        met=met,
+        gradients=gradients,
         weighed=here,
         cost=here.cost(rows.rows),
         cost_before=0.0 if weighed is None else weighed.cost(rows.rows),
     )
-
-
-def _add_clusters(
-    gradients: Gradients | None,
-    scan: ScanStop,
-    stop: int,
-    by_cluster: tuple[np.ndarray, ...] | None,
-) -> np.ndarray | None:
-    """Add the gradients of a stop's beams, where they are wanted; the place (N,) that each of them
-    errs with."""
-    if by_cluster is None:
-        return None
-    parts, cluster, gradient, columns = by_cluster
-    places = gradients.numbers(scan.room, parts)
-    gradients.add(gradient, columns, np.full(len(parts), stop), places)
-    return places[cluster]
 
 
 def beams_cost(
