@@ -116,9 +116,13 @@ Workers = Annotated[
     typer.Option(
         min=1,
         metavar="N",
-        help="Threads over stops, all cores if not given; the result is the same.",
+        help="Processes that share the stops; if not given, threads on all cores.",
         show_default=False,
     ),
+]
+Scheduler = Annotated[
+    str | None,
+    typer.Option(metavar="ADDRESS", help="A Dask cluster whose workers share them instead."),
 ]
 
 

@@ -55,18 +55,14 @@ def workers(count: int | None) -> Iterator[None]:
 
 
 @contextmanager
-def executing(
-    count: int | None = None,
-    scheduler: str | None = None,
-    say: Callable[[str], None] = lambda sentence: None,
-) -> Iterator[Crew | None]:
+def executing(count: int | None = None, scheduler: str | None = None) -> Iterator[Crew | None]:
     """Ask stops of so many processes within, or of the workers of a Dask cluster; of threads on all
-    cores where neither is given, and of this thread alone for a count of 1.
+    cores where neither is given, and of this thread alone for a count of 1. Where a worker ends,
+    another goes on with its stops, and the log of `rigcal` says so.
 
     Args:
         count: how many processes.
         scheduler: address of a Dask scheduler.
-        say: takes a sentence where a worker ends, and another goes on with its stops.
 
     Raises:
         InputError: both are given, or the cluster cannot do it.
@@ -79,7 +75,7 @@ def executing(
         return
     from calib.linear.parallel.crew import Crew
 
-    crew = Crew(_lines(count or 0, scheduler), say)
+    crew = Crew(_lines(count or 0, scheduler))
     token = _CREW.set(crew)
     try:
         with workers(count):

@@ -6,6 +6,7 @@ are taken in the order of the stops, whoever is done first.
 
 from __future__ import annotations
 
+import logging
 import pickle
 import traceback
 from collections import deque
@@ -27,6 +28,8 @@ from chains.errors import InputError
 AHEAD = 2  # stops of each worker: one that it works on, and one that waits
 LIVES = 3  # of a worker, while it works on one stop; the next may be in want of the same memory
 ATTEMPTS = 3  # to send what a worker has not let go, after which everything is sent
+
+_LOG = logging.getLogger("rigcal")
 
 
 class WorkerGoneError(Exception):
@@ -97,11 +100,10 @@ class Crew:
 
     Args:
         lines: to each of them.
-        say: takes a sentence where one of them ended.
     """
 
-    def __init__(self, lines: Sequence[Line], say: Callable[[str], None]) -> None:
-        self.lines, self.say = lines, say
+    def __init__(self, lines: Sequence[Line]) -> None:
+        self.lines = lines
         self.parcels, self.traffic = Parcels(), Traffic()
         self._holders: dict[int, str] = {}  # line -> what the process at its end calls itself
         self._threads = [ThreadPoolExecutor(1) for _ in lines]
@@ -152,7 +154,7 @@ class Crew:
                         f"{line.name} {gone} {stop}, {life} times; where memory is short, take "
                         "fewer --workers"
                     ) from None
-                self.say(f"{line.name} {gone} {stop}; another goes on with it")
+                _LOG.warning("%s %s %s; another goes on with it", line.name, gone, stop)
                 line.renew()
         self.traffic.stops += 1
         if not good:
