@@ -119,16 +119,11 @@ class Parcels:
         if lacking:
             raise LackingError(*lacking)
 
-        def load(key: Key) -> Any:
-            if key not in here:
-                here[key] = _Unpickler(parcel.along[key], load).load()
-                self._take(here[key], key)
-            return here[key]
-
+        opening = _Opening(here, parcel.along, self._take)
         for key, data in parcel.along.items():
-            self._keep(key, load(key), len(data))
+            self._keep(key, opening.load(key), len(data))
             self.held(sender, [key])
-        return _Unpickler(parcel.body, load).load()
+        return _Unpickler(parcel.body, opening).load()
 
     def held(self, holder: str, keys: Sequence[Key], holds: bool = True) -> None:
         """Take down what another process holds, or does not."""
@@ -211,7 +206,32 @@ class _Pickler(pickle.Pickler):
         return NotImplemented
 
 
+@dataclass(frozen=True)
+class _Opening:
+    """A parcel that is being opened.
+
+    Args:
+        here: objects by their key.
+        along: others, pickled.
+        take: notes the key of one that was unpickled.
+    """
+
+    here: dict[Key, Any]
+    along: dict[Key, bytes]
+    take: Callable[[Any, Key], object]
+
+    def load(self, key: Key) -> Any:
+        """The object of a key."""
+        if key not in self.here:
+            self.here[key] = found = _Unpickler(self.along[key], self).load()
+            self.take(found, key)
+        return self.here[key]
+
+
 class _Unpickler(pickle.Unpickler):
-    def __init__(self, data: bytes, load: Callable[[Key], Any]) -> None:
+    def __init__(self, data: bytes, opening: _Opening) -> None:
         super().__init__(io.BytesIO(data))
-        self.persistent_load = load
+        self.opening = opening
+
+    def persistent_load(self, key: Key) -> Any:
+        return self.opening.load(key)
