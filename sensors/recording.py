@@ -4,6 +4,7 @@ This is the pyarrow door: `read_table` and `write_table` serve whoever needs a P
 """
 
 import hashlib
+import io
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -221,12 +222,17 @@ def read_table(path: str | Path) -> dict[str, np.ndarray]:
 
 def write_table(path: str | Path, columns: Mapping[str, np.ndarray]) -> None:
     """Write columns of equal length to a Parquet file (zstd), whole or not at all."""
-    import pyarrow
+    with write_atomically(path) as temporary:
+        temporary.write_bytes(table_bytes(columns))
+
+
+def table_bytes(columns: Mapping[str, np.ndarray]) -> bytes:
+    """Columns of equal length as a Parquet file (zstd) holds them."""
     import pyarrow.parquet
 
-    table = pyarrow.table({name: _arrow(values) for name, values in columns.items()})
-    with write_atomically(path) as temporary:
-        pyarrow.parquet.write_table(table, temporary, compression="zstd")
+    table, file = pyarrow.table({n: _arrow(c) for n, c in columns.items()}), io.BytesIO()
+    pyarrow.parquet.write_table(table, file, compression="zstd")
+    return file.getvalue()
 
 
 def unpack_zstd(data: bytes, size: int) -> bytes:

@@ -57,7 +57,6 @@ WAYS = {
     "one thread": "--workers 1",
     "threads": "",
     "two processes": "--workers 2",
-    "three processes": "--workers 3",
     "cluster": "--scheduler {address}",
 }
 
