@@ -21,8 +21,10 @@ from calib.linear.parallel.crew import WorkerGoneError, serve
 PROGRAM = """
 import json, sys
 sys.path[:] = json.loads(sys.argv[1])
-from calib.linear.parallel.processes import main
-main()
+from calib.linear.parallel.processes import own_pipes, serve_on
+pipes = own_pipes()
+import calib.linear.linearise  # while the first message is on its way
+serve_on(*pipes)
 """
 LENGTH_BYTES = 8  # before each message: how long it is
 ONE_THREAD: Mapping[str, str] = {f"{x}_NUM_THREADS": "1" for x in ("MKL", "OMP", "OPENBLAS")}
@@ -100,15 +102,17 @@ def _received(pipe: BinaryIO) -> bytes | None:
     return message if len(message) == size else None
 
 
-def main() -> None:
-    """Serve until the other end is closed. What libraries print goes to stderr."""
+def own_pipes() -> tuple[BinaryIO, BinaryIO]:
+    """Where messages come from and answers go, in a worker. What libraries print goes to stderr."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # without sessions, as on Windows, it comes here
     source, sink = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
-    nothing = os.open(os.devnull, os.O_RDONLY)
-    os.dup2(nothing, 0)
+    os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
     os.dup2(2, 1)
-    import calib.linear.linearise  # noqa: F401  while the first message is on its way
+    return source, sink
 
+
+def serve_on(source: BinaryIO, sink: BinaryIO) -> None:
+    """Answer messages until the other end is closed."""
     with suppress(BrokenPipeError):
         while (message := _received(source)) is not None:
             _send(sink, serve(message))
