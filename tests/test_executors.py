@@ -53,6 +53,7 @@ for line in sys.argv[1:]:
     except SystemExit as end:
         assert end.code in (0, 3), line
 """
+PATHS = {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
 WAYS = {
     "one thread": "--workers 1",
     "threads": "",
@@ -63,23 +64,21 @@ WAYS = {
 
 @contextmanager
 def cluster():
-    """The address of a Dask cluster of two workers, processes of their own."""
+    """A Dask cluster of two workers, processes of their own."""
     distributed = pytest.importorskip(
         "distributed", reason="the extra 'cluster' is not installed: no Dask cluster is tried"
     )
-    path = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONPATH", path)
+        patch.setenv("PYTHONPATH", PATHS["PYTHONPATH"])
         how = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None}
         with distributed.LocalCluster(**how) as found:
-            yield found.scheduler_address
+            yield found
 
 
 def program(how, folder):
     """The commands, run so in a folder; what they said on stderr."""
     lines = [line.format(how=how) for line in COMMANDS]
-    variables = {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
-    done = execute([sys.executable, "-c", PROGRAM, *lines], folder, 4 * LIMIT_S, **variables)
+    done = execute([sys.executable, "-c", PROGRAM, *lines], folder, 4 * LIMIT_S, **PATHS)
     assert done.returncode == 0, done.stderr
     return done.stderr
 
@@ -123,8 +122,8 @@ def alone(recording, tmp_path_factory):
 def test_files_are_the_same_byte_by_byte(way, alone, recording, tmp_path):
     folder = prepared(tmp_path / "there", recording)
     if way == "cluster":
-        with cluster() as address:
-            program(WAYS[way].format(address=address), folder)
+        with cluster() as found:
+            program(WAYS[way].format(address=found.scheduler_address), folder)
     else:
         assert program(WAYS[way], folder) == ""
     here = written(folder)
@@ -137,11 +136,11 @@ def test_files_are_the_same_byte_by_byte(way, alone, recording, tmp_path):
 
 @contextmanager
 def fitting(folder, *options):
-    """A fit by two workers at its passes, in a session as of a terminal; and its workers."""
-    command = [*RIGCAL, "-v", "fit", "rec", "-o", "run", "--workers", "2", *options]
-    how = {"cwd": folder, "text": True, "start_new_session": True}
-    how["env"] = os.environ | {"PYTHONPATH": str(ROOT)}
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, **how)
+    """A fit by two workers at its passes, in a session as of a terminal; and its processes."""
+    options = options or ("--workers", "2")
+    words = [*RIGCAL, "-v", "fit", "rec", "-o", "run", *options]
+    how = {"cwd": folder, "text": True, "start_new_session": True, "env": os.environ | PATHS}
+    process = subprocess.Popen(words, stderr=subprocess.PIPE, stdout=subprocess.PIPE, **how)
     try:
         for line in process.stderr:
             if "pass 2" in line:
@@ -198,6 +197,20 @@ def test_a_fit_whose_workers_are_killed_ends_as_any_other(recording, tmp_path):
         len(re.findall(r"worker [12] of 2 was ended by SIGKILL at stop '\w+'; another", err)) == 2
     )
     command(["fit", "rec", "-o", "run", "--workers", "1"], there)
+    assert written(here) == written(there)
+
+
+@pytest.mark.slow
+def test_a_worker_of_a_cluster_that_is_killed_changes_nothing(recording, tmp_path):
+    here, there = (prepared(tmp_path / name, recording) for name in ("here", "there"))
+    with cluster() as found:
+        pids = [worker.pid for worker in found.workers.values()]
+        options = ("--hold-out", "none", "--scheduler", found.scheduler_address)
+        with fitting(here, *options) as (process, _):
+            os.kill(pids[0], signal.SIGKILL)
+            _, err = process.communicate(timeout=LIMIT_S)
+    assert process.returncode == 0, err
+    command(["fit", "rec", "-o", "run", "--hold-out", "none", "--workers", "1"], there)
     assert written(here) == written(there)
 
 

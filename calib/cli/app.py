@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import io
+import logging
 import re
 import sys
 import time
@@ -79,6 +80,7 @@ def manners(
     """Take down what is said of how much is to be said."""
     global _stdout, _verbose
     _stdout, _verbose = sys.stdout, verbose
+    logging.getLogger("rigcal").setLevel(logging.INFO if verbose else logging.WARNING)
     if quiet:
         context.with_resource(redirect_stdout(io.StringIO()))
 

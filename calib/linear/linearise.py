@@ -14,11 +14,11 @@ from calib.linear.cells_first import CellsFirst
 from calib.linear.clusters import Gradients, summed
 from calib.linear.layout import Layout
 from calib.linear.parallel import over_stops
-from calib.linear.rows import StopRows, StopSums, Weighing
+from calib.linear.rows import State, StopRows, StopSums, Weighing
 from calib.linear.stops_first import StopsFirst
 from calib.linear.system import Linearisation, Values
 from calib.problem import Problem
-from calib.residuals.beams import Association
+from calib.residuals.beams import Association, Rows
 from calib.residuals.scan import ScanStop
 from calib.residuals.spread import SpreadRows
 from chains import se3
@@ -60,7 +60,7 @@ def linearise(
     assembly = order(layout, own, count, gradients is not None)
     placed = lidars(problem.scans, values) if count else []
     scans = problem.scans[:count]
-    work = partial(_of_stop, layout, values, newton, gradients is not None)
+    work = partial(_of_stop, layout, State(values), newton, gradients is not None)
     asked = placed, associations, slowed or [None] * count, weighed or [None] * count
     found: list[_OfStop] = []
     for i, stop in enumerate(over_stops(work, scans, *asked)):
@@ -109,7 +109,7 @@ class _OfStop:
 
 def _of_stop(
     layout: Layout,
-    values: Values,
+    state: State,
     newton: bool,
     clustered: bool,
     scan: ScanStop,
@@ -119,8 +119,9 @@ def _of_stop(
     weighed: Weighing | None,
 ) -> _OfStop:
     """Of the scan of one stop, whose LiDAR is `placed`; other arguments as of `linearise`."""
-    rows = StopRows.of(scan, layout, values, placed, association, newton, slowed)
-    here, scatter = Weighing.of(rows.rows), None
+    rows = StopRows.of(scan, layout, state.values, placed, association, newton, slowed)
+    here, scatter = Weighing.of(rows.rows, state, placed.T[0]), None
+    at = partial(_rows_at, scan, association)
     if rows.rows.spread is not None:
         scatter = spread_rows(rows.rows.spread, layout)
     met, gradients = None, []
@@ -136,8 +137,8 @@ def _of_stop(
         met=met,
         gradients=gradients,
         weighed=here,
-        cost=here.cost(rows.rows),
-        cost_before=0.0 if weighed is None else weighed.cost(rows.rows),
+        cost=here.cost(rows.rows, at),
+        cost_before=0.0 if weighed is None else weighed.cost(rows.rows, at),
     )
 
 
@@ -165,7 +166,13 @@ def _cost_of_stop(
 ) -> float:
     rows = scan.rows(values, association, placed.T[0])
     scatter = 0.0 if rows.spread is None else float(np.square(rows.spread.residual).sum()) / 2
-    return weighed.cost(rows) + scatter
+    return weighed.cost(rows, partial(_rows_at, scan, association)) + scatter
+
+
+def _rows_at(
+    scan: ScanStop, association: Association | None, values: Values, T: np.ndarray
+) -> Rows:
+    return scan.rows(values, association, T)
 
 
 def lidars(scans: Sequence[ScanStop], values: Values) -> list[Placed]:

@@ -88,11 +88,17 @@ def serve(message: bytes) -> bytes:
 
 @dataclass
 class Traffic:
-    """What went to workers and came back, in bytes; and of how many stops."""
+    """What went to workers and came back, in bytes; and how often a stop was asked for."""
 
     down: int = 0
     up: int = 0
     stops: int = 0
+
+    def __str__(self) -> str:
+        down, up = (sent / max(self.stops, 1) / 1e3 for sent in (self.down, self.up))
+        return (
+            f"workers were asked {self.stops} stops: {down:.0f} kB down and {up:.0f} kB up a stop"
+        )
 
 
 class Crew:
@@ -134,6 +140,7 @@ class Crew:
     def close(self) -> None:
         """End the workers, whatever they do."""
         self._closed = True
+        _LOG.info("%s", self.traffic)
         for line in self.lines:
             line.close()
         for thread in self._threads:

@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 
 from calib.effects.own.files import code_of, of_code
 from calib.linear.layout import Layout
-from calib.linear.rows import Weighing
+from calib.linear.rows import State, Weighing
 from calib.residuals.beams import Association
 from calib.residuals.scan import ScanStop
 from calib.residuals.store import BeamStore
@@ -40,13 +40,13 @@ Key = tuple[str, int]
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """What is to be done with each stop of a pass: the state is in it, and travels once a pass."""
+    """What is to be done with each stop of a pass."""
 
     work: Callable[..., Any]
 
 
 ONCE = (Task, Layout, ScanStop, BeamStore, RecordedStops, Rig, Reference, MeshSurface)
-ONCE += (PlaneSurface, Association, Weighing)
+ONCE += (PlaneSurface, Association, State, Weighing)
 
 
 class Parcel(NamedTuple):
@@ -173,7 +173,9 @@ class Parcels:
         return found
 
     def _keep(self, key: Key, what: object, size: int) -> None:
-        """Keep an object, and let go those that were not used for longest."""
+        """Keep an object of which so much travelled, and let go those that were not used for
+        longest."""
+        size += getattr(what, "nbytes", 0)
         gone = []
         with self._lock:
             if size > self.kept_bytes or key in self._kept:
