@@ -70,7 +70,7 @@ def executing(count: int | None = None, scheduler: str | None = None) -> Iterato
     if scheduler is not None and count is not None:
         raise InputError("--scheduler and --workers: give one; a cluster has workers of its own")
     if scheduler is None and (count or 1) == 1:
-        with workers(count):
+        with workers(count or _WORKERS.get()):
             yield None
         return
     from calib.linear.parallel.crew import Crew
