@@ -4,6 +4,7 @@ This is the pyarrow door: `read_table` and `write_table` serve whoever needs a P
 """
 
 import hashlib
+import io
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -28,8 +29,7 @@ if TYPE_CHECKING:
 _PARTS = ("rig.yaml", "*.urdf", "stops.csv", "targets.csv", "scans/*.parquet", "reference/*")
 _BATCH_ROWS = 1 << 20  # read at once: bounds the memory
 _FARTHEST_M = 200.0  # median range, as of clouds that are imported: see `sensors.readers.clouds`
-# Median spread of a hold: a choice. Of LiDARs it is 0.01 to 0.05 m, in millimetres 10 to 50.
-_LARGEST_SPREAD_M = 0.5
+_LARGEST_SPREAD_M = 0.5  # median of a hold, a choice: of LiDARs 0.01 to 0.05 m, in mm 10 to 50
 _KINDS = {"x": "f", "y": "f", "z": "f", "ring": "iu", "column": "iu"}
 
 
@@ -68,8 +68,7 @@ class Scan:
         """The points as a `pyarrow.Table`, a row each; columns as of `columns`."""
         import pyarrow
 
-        arrays = {name: np.ascontiguousarray(values) for name, values in self.columns().items()}
-        return pyarrow.table(arrays)
+        return pyarrow.table({n: np.ascontiguousarray(c) for n, c in self.columns().items()})
 
     def to_pandas(self) -> "pandas.DataFrame":
         """The points as a `pandas.DataFrame`; InputError where pandas is not installed."""
@@ -232,12 +231,17 @@ def read_table(path: str | Path) -> dict[str, np.ndarray]:
 
 def write_table(path: str | Path, columns: Mapping[str, np.ndarray]) -> None:
     """Write columns of equal length to a Parquet file (zstd), whole or not at all."""
-    import pyarrow
+    with write_atomically(path) as temporary:
+        temporary.write_bytes(table_bytes(columns))
+
+
+def table_bytes(columns: Mapping[str, np.ndarray]) -> bytes:
+    """Columns of equal length as a Parquet file (zstd) holds them."""
     import pyarrow.parquet
 
     table = pyarrow.table({name: _arrow(values) for name, values in columns.items()})
-    with write_atomically(path) as temporary:
-        pyarrow.parquet.write_table(table, temporary, compression="zstd")
+    pyarrow.parquet.write_table(table, file := io.BytesIO(), compression="zstd")
+    return file.getvalue()
 
 
 def unpack_zstd(data: bytes, size: int) -> bytes:

@@ -30,6 +30,8 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("chains", "sensors", "calib")  # each may import itself and those before it
 DOORS = {
     "PIL": "sensors/readers/packets/osf.py",
+    "dask": "calib/linear/parallel/cluster.py",
+    "distributed": "calib/linear/parallel/cluster.py",
     "gtsam": "calib/solve/graph.py",
     "laspy": "sensors/readers/clouds/las.py",
     "matplotlib": "calib/report/plots.py",
@@ -43,7 +45,8 @@ DOORS = {
     "xacrodoc": "chains/readers/xacro.py",
     "yaml": "sensors/documents.py",
 }
-NOT_AT_STARTUP = {"gtsam", "matplotlib", "numba", "open3d", "pyarrow", "pydantic", "scipy", "viser"}
+NOT_AT_STARTUP = {"distributed", "gtsam", "matplotlib", "numba", "open3d", "pyarrow", "pydantic"}
+NOT_AT_STARTUP |= {"scipy", "viser"}
 LONGEST_FILE, LONGEST_FUNCTION = 400, 60
 MOST_FILES = 12  # a room, beside its __init__.py
 MOST_PARAMETERS, MOST_POSITIONAL = 12, 4

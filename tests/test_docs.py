@@ -187,6 +187,12 @@ def test_the_page_about_same_bytes_shows_what_is_printed(tmp_path):
     assert set(keys) == set(Run.open(tmp_path / "grown").model)
 
 
+def test_the_page_about_large_recordings_shows_what_is_printed(tmp_path):
+    page = run_through(ROOT / "docs/scale.md", tmp_path)
+    (shown,) = (block for block in blocks("text", page.text) if "identical" in block)
+    assert page.said.endswith(shown)
+
+
 @pytest.mark.slow
 def test_the_page_about_chance_shows_what_is_printed(tmp_path):
     session = run_through(ROOT / "docs/by_chance.md", tmp_path)

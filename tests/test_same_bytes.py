@@ -44,7 +44,7 @@ reproduce deeper/run --json
 plan later --stops 1 --for lidar,arm_gravity_sag --candidates 60 --json
 """
 SERVING = {"view"}
-WAYS = {  # PYTHONHASHSEED, threads of a BLAS call, threads over stops
+WAYS = {  # PYTHONHASHSEED, threads of a BLAS call, processes over stops
     "a": ("1", "1", "1"),
     "b/c": ("20240", "3", "3"),
 }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import io
+import logging
 import re
 import sys
 import time
@@ -79,6 +80,7 @@ def manners(
     """Take down what is said of how much is to be said."""
     global _stdout, _verbose
     _stdout, _verbose = sys.stdout, verbose
+    logging.getLogger("rigcal").setLevel(logging.INFO if verbose else logging.WARNING)
     if quiet:
         context.with_resource(redirect_stdout(io.StringIO()))
 
@@ -116,9 +118,13 @@ Workers = Annotated[
     typer.Option(
         min=1,
         metavar="N",
-        help="Threads over stops, all cores if not given; the result is the same.",
+        help="Processes that share the stops; if not given, threads on all cores.",
         show_default=False,
     ),
+]
+Scheduler = Annotated[
+    str | None,
+    typer.Option(metavar="ADDRESS", help="A Dask cluster whose workers share them instead."),
 ]
 
 

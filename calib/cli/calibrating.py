@@ -12,6 +12,7 @@ from calib.cli.app import (
     Json,
     Out,
     Runs,
+    Scheduler,
     Trust,
     Workers,
     app,
@@ -22,7 +23,7 @@ from calib.cli.app import (
     say,
     verbose,
 )
-from calib.linear.parallel import workers as threads
+from calib.linear.parallel import executing
 from chains.errors import InputError
 
 if TYPE_CHECKING:
@@ -98,6 +99,7 @@ def fit(
         Path | None, typer.Option(metavar="RUN", help="An earlier run instead of CAD.")
     ] = None,
     workers: Workers = None,
+    scheduler: Scheduler = None,
     as_json: Json = False,
 ) -> None:
     """Estimate all parameters of a rig jointly.
@@ -110,7 +112,7 @@ def fit(
     from calib.runs.calibrate import calibrate
 
     chosen = Model.of(effects, fix or [], without or [], recordings)
-    with threads(workers), progress_bar() as progress:
+    with executing(workers, scheduler), progress_bar() as progress:
         run = calibrate(recordings, out, chosen, hold_out, folds, prior, progress)
     _tell(run, as_json)
 
@@ -128,6 +130,7 @@ def add(
     without: Without = None,
     trust: Trust = None,
     workers: Workers = None,
+    scheduler: Scheduler = None,
     as_json: Json = False,
 ) -> None:
     """Add effects to the model of a run, and refit it."""
@@ -137,7 +140,7 @@ def add(
     from calib.runs.run import Run
 
     grown_from = Run.open(run, trust or ())
-    with threads(workers), progress_bar() as progress:
+    with executing(workers, scheduler), progress_bar() as progress:
         _tell(grow(grown_from, effects or [], out, progress, without or []), as_json)
 
 
@@ -152,6 +155,7 @@ def diagnose(
     ] = None,
     trust: Trust = None,
     workers: Workers = None,
+    scheduler: Scheduler = None,
     as_json: Json = False,
 ) -> None:
     """Test a run's model: missing effects, blunders, scatter.
@@ -162,7 +166,7 @@ def diagnose(
     from calib.runs.run import Run
 
     fitted = Run.open(run, trust or ())
-    with threads(workers), progress_bar() as progress:
+    with executing(workers, scheduler), progress_bar() as progress:
         diagnosis = find(fitted, progress, refits, candidates or ())
     if as_json:
         print_json(diagnosis.document())
@@ -184,6 +188,7 @@ def explain(
         str | None, typer.Option("--candidates", metavar="FILE", help=CANDIDATES_HELP)
     ] = None,
     workers: Workers = None,
+    scheduler: Scheduler = None,
     as_json: Json = False,
 ) -> None:
     """Fit, diagnose and add until nothing is missing.
@@ -194,7 +199,7 @@ def explain(
     from calib.runs.explain import explain as climb
 
     chosen = Model.of(effects, fix or [], without or [], recordings)
-    with threads(workers), progress_bar() as progress:
+    with executing(workers, scheduler), progress_bar() as progress:
         explanation = climb(recordings, out, chosen, progress, candidates or ())
     if as_json:
         print_json(explanation.document())
@@ -253,6 +258,7 @@ def reproduce(
         ),
     ] = None,
     workers: Workers = None,
+    scheduler: Scheduler = None,
     trust: Trust = None,
     as_json: Json = False,
 ) -> None:
@@ -263,7 +269,7 @@ def reproduce(
     from calib.runs.reproduce import reproduce as make_again
     from calib.runs.run import Run
 
-    with threads(workers), progress_bar() as progress:
+    with executing(workers, scheduler), progress_bar() as progress:
         found = make_again(Run.open(run, trust or ()), recordings or (), progress)
     if as_json:
         print_json(found.document())

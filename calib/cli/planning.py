@@ -10,7 +10,6 @@ import typer
 from calib.cli.app import (
     Json,
     Trust,
-    Workers,
     app,
     end_unless_converged,
     print_json,
@@ -49,6 +48,12 @@ Out = Annotated[
         "-o", "--out", metavar="OUT", help="FILE.csv of them; or a folder, with a picture."
     ),
 ]
+Threads = Annotated[
+    int | None,
+    typer.Option(
+        min=1, metavar="N", help="Threads, all cores if not given; the result is the same."
+    ),
+]
 Region = Annotated[
     tuple[float, float, float, float] | None,
     typer.Option(metavar="X0 Y0 X1 Y1", help="Where the base may stand, or targets hang, m."),
@@ -71,7 +76,7 @@ def plan(
     ] = 500,
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same stops.")] = 0,
     trust: Trust = None,
-    workers: Workers = None,
+    workers: Threads = None,
     as_json: Json = False,
 ) -> None:
     """Plan the next stops, and predict what they determine."""

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.linear.clusters import ClusteredRows
-from calib.linear.elimination import Eliminated
+from calib.linear.elimination import Eliminated, square
 from calib.linear.layout import Layout, positions
 from calib.linear.rows import TWIST, OwnSums, StopSums
 from calib.linear.system import Linearisation, Values
 from calib.problem.unknowns import Role
-from calib.residuals.compiled import add_gram
+from calib.residuals.compiled import add_at, add_gram
 
 
 @dataclass(frozen=True)
@@ -53,9 +53,32 @@ class OwnRows:
         add_gram(target, np.append(at[self.columns], b), rows)
 
 
+@dataclass(frozen=True)
+class KeptSums:
+    """The Gram matrix of whitened rows about kept unknowns.
+
+    Args:
+        gram: (n + 1, n + 1) over the columns and, last, the right side.
+        columns: (n,) by which.
+    """
+
+    gram: np.ndarray
+    columns: np.ndarray
+
+    @classmethod
+    def of(cls, rows: OwnRows) -> KeptSums:
+        """Of rows, however many."""
+        return cls(square(np.column_stack([rows.A, rows.b])), rows.columns)
+
+    def add_to(self, target: np.ndarray, at: np.ndarray, sigma: np.ndarray, b: int = -1) -> None:
+        """Add it to another; arguments as of `OwnRows.add_to`."""
+        place, unit = np.append(at[self.columns], b), np.append(sigma[self.columns], 1.0)
+        add_at(target, place, place, self.gram * unit * unit[:, None])
+
+
 class Assembly:
-    """What both orders share: give it each stop's sums by `add`, other rows about kept unknowns by
-    `add_kept`, then call ``done``.
+    """What both orders share: give it each stop's sums by `add`, those of other rows about kept
+    unknowns by `add_kept`, then call ``done``.
 
     Args:
         layout: which column is what.
@@ -89,16 +112,16 @@ class Assembly:
         if self.raw is not None:
             self.scans[sums.stop] = sums.alone()
 
-    def _add_raw(self, found: Iterable[OwnRows]) -> None:
+    def _add_raw(self, found: Iterable[OwnRows | KeptSums]) -> None:
         """Add what rows say of kept columns."""
         at = positions(self.layout.size, self.layout.kept)
         for rows in found:
             rows.add_to(self.raw, at, self.layout.sigma)
 
-    def add_kept(self, rows: OwnRows) -> None:
-        """Add whitened rows about kept unknowns."""
-        self.chi2 += float(rows.b @ rows.b)
-        self.touched[rows.columns] |= np.any(rows.A != 0, axis=0)
+    def add_kept(self, sums: KeptSums) -> None:
+        """Add the sums of whitened rows about kept unknowns."""
+        self.chi2 += float(sums.gram[-1, -1])
+        self.touched[sums.columns] |= np.diag(sums.gram)[:-1] > 0
 
     def _cell_priors(self, values: Values, columns: np.ndarray) -> np.ndarray:
         """Right side (n,) of the priors of cells, in units of their sigmas: the derivative is 1."""

@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
-from calib.linear.assembly import Assembly, OwnRows
+from calib.linear.assembly import Assembly, KeptSums, OwnRows
 from calib.linear.elimination import BY_TWIST, Eliminated, eliminate, square
 from calib.linear.layout import Layout, positions
 from calib.linear.rows import TWIST, StopSums
@@ -54,10 +54,10 @@ class CellsFirst(Assembly):
         parts = self.rest, self.cross, self.diagonal
         add_sparse(sums.with_sparse, sums.own, sparse, fine, *parts)
 
-    def add_kept(self, rows: OwnRows) -> None:
-        """Add whitened rows about kept unknowns."""
-        super().add_kept(rows)
-        rows.add_to(self.rest, self.at, np.ones(self.layout.size), self.b)
+    def add_kept(self, sums: KeptSums) -> None:
+        """Add the sums of whitened rows about kept unknowns."""
+        super().add_kept(sums)
+        sums.add_to(self.rest, self.at, np.ones(self.layout.size), self.b)
 
     def done(self, values: Values) -> Linearisation:
         """Eliminate all but the kept."""

@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from calib.forward import Placed, place_each
-from calib.linear.assembly import OwnRows
+from calib.linear.assembly import KeptSums, OwnRows
 from calib.linear.cells_first import CellsFirst
-from calib.linear.clusters import Gradients
+from calib.linear.clusters import Gradients, summed
 from calib.linear.layout import Layout
-from calib.linear.parallel import in_order
-from calib.linear.rows import StopRows, StopSums, Weighing
+from calib.linear.parallel import over_stops
+from calib.linear.rows import State, StopRows, StopSums, Weighing
 from calib.linear.stops_first import StopsFirst
 from calib.linear.system import Linearisation, Values
 from calib.problem import Problem
-from calib.residuals.beams import Association
+from calib.residuals.beams import Association, Rows
 from calib.residuals.scan import ScanStop
 from calib.residuals.spread import SpreadRows
 from chains import se3
@@ -58,48 +59,87 @@ def linearise(
     order = StopsFirst if layout.stops_first else CellsFirst
     assembly = order(layout, own, count, gradients is not None)
     placed = lidars(problem.scans, values) if count else []
-    found: list[tuple[Weighing, float, float]] = []  # each stop's weighing, its cost, and before
-
-    def work(i: int) -> tuple[StopSums, SpreadRows | None, tuple | None, tuple]:
-        at = problem.scans[i], layout, values, placed[i], associations[i]
-        rows = StopRows.of(*at, newton, *slowed[i : i + 1])
-        here = Weighing.of(rows.rows)
-        costs = here.cost(rows.rows), weighed[i].cost(rows.rows) if weighed else 0.0
-        by_cluster = None
-        if gradients is not None:
-            parts, cluster = rows.places()
-            by_cluster = parts, cluster, *rows.gradient(cluster, len(parts))
-        return rows.sums(), rows.rows.spread, by_cluster, (here, *costs)
-
-    for i, (sums, spread, by_cluster, told) in enumerate(in_order(work, count)):
+    scans = problem.scans[:count]
+    work = partial(_of_stop, layout, State(values), newton, gradients is not None)
+    asked = placed, associations, slowed or [None] * count, weighed or [None] * count
+    found: list[_OfStop] = []
+    for i, stop in enumerate(over_stops(work, scans, *asked)):
         progress(i, count)
-        found.append(told)
-        assembly.add(sums)
-        places = _add_clusters(gradients, problem.scans[i], sums.stop, by_cluster)
-        if spread is not None:
-            rows = spread_rows(spread, layout)
-            assembly.add_kept(rows)
-            if places is not None:
-                gradients.add_rows(rows.of_stop(sums.stop, places))
-    cost, before = (sum(each[k] for each in found) for k in (1, 2))
-    told = {"weighed": [each for each, _, _ in found], "beams_cost": cost}
-    return replace(assembly.done(values), cost_before=before if weighed else None, **told)
+        found.append(stop.without_sums())
+        assembly.add(stop.sums)
+        if stop.scatter is not None:
+            assembly.add_kept(stop.scatter)
+        if gradients is not None:
+            places = gradients.numbers(scans[i].room, stop.met)
+            at = np.full(len(places), stop.sums.stop)
+            for gradient, columns in stop.gradients:
+                gradients.add(gradient, columns, at, places)
+    return replace(
+        assembly.done(values),
+        weighed=[stop.weighed for stop in found],
+        beams_cost=sum(stop.cost for stop in found),
+        cost_before=sum(stop.cost_before for stop in found) if weighed else None,
+    )
 
 
-def _add_clusters(
-    gradients: Gradients | None,
+@dataclass(frozen=True)
+class _OfStop:
+    """What a stop adds.
+
+    Args:
+        sums: of its beams; scatter: of its rows of scatter within holds, None where it has none.
+        met: (G,) what its beams meet, where gradients are wanted.
+        gradients: of beams, and of rows of scatter, (G, n) by what is met, and the columns (n,).
+        weighed: how its beams were weighed.
+        cost: of them; cost_before: the same as they were weighed before.
+    """
+
+    sums: StopSums | None
+    scatter: KeptSums | None
+    met: np.ndarray | None
+    gradients: Sequence[tuple[np.ndarray, np.ndarray]]
+    weighed: Weighing
+    cost: float
+    cost_before: float
+
+    def without_sums(self) -> _OfStop:
+        """What is kept of it until all stops are done."""
+        return replace(self, sums=None, scatter=None, met=None, gradients=())
+
+
+def _of_stop(
+    layout: Layout,
+    state: State,
+    newton: bool,
+    clustered: bool,
     scan: ScanStop,
-    stop: int,
-    by_cluster: tuple[np.ndarray, ...] | None,
-) -> np.ndarray | None:
-    """Add the gradients of a stop's beams, where they are wanted; the place (N,) that each of them
-    errs with."""
-    if by_cluster is None:
-        return None
-    parts, cluster, gradient, columns = by_cluster
-    places = gradients.numbers(scan.room, parts)
-    gradients.add(gradient, columns, np.full(len(parts), stop), places)
-    return places[cluster]
+    placed: Placed,
+    association: Association | None,
+    slowed: Weighing | None,
+    weighed: Weighing | None,
+) -> _OfStop:
+    """Of the scan of one stop, whose LiDAR is `placed`; other arguments as of `linearise`."""
+    rows = StopRows.of(scan, layout, state.values, placed, association, newton, slowed)
+    here, scatter = Weighing.of(rows.rows, state, placed.T[0]), None
+    at = partial(_rows_at, scan, association)
+    if rows.rows.spread is not None:
+        scatter = spread_rows(rows.rows.spread, layout)
+    met, gradients = None, []
+    if clustered:
+        met, cluster = rows.places()
+        gradients.append(rows.gradient(cluster, len(met)))
+        if scatter is not None:
+            by_row = scatter.b[:, None] * scatter.A
+            gradients.append((summed(by_row, cluster), scatter.columns))
+    return _OfStop(
+        sums=rows.sums(),
+        scatter=None if scatter is None else KeptSums.of(scatter),
+        met=met,
+        gradients=gradients,
+        weighed=here,
+        cost=here.cost(rows.rows, at),
+        cost_before=0.0 if weighed is None else weighed.cost(rows.rows, at),
+    )
 
 
 def beams_cost(
@@ -117,13 +157,22 @@ def beams_cost(
         weighed: per scan, how its beams are to be weighed.
     """
     placed = lidars(problem.scans, values)
+    work = partial(_cost_of_stop, values)
+    return sum(over_stops(work, problem.scans, placed, associations, weighed))
 
-    def work(i: int) -> float:
-        rows = problem.scans[i].rows(values, associations[i], placed[i].T[0])
-        scatter = 0.0 if rows.spread is None else float(np.square(rows.spread.residual).sum()) / 2
-        return weighed[i].cost(rows) + scatter
 
-    return sum(in_order(work, len(problem.scans)))
+def _cost_of_stop(
+    values: Values, scan: ScanStop, placed: Placed, association: Association, weighed: Weighing
+) -> float:
+    rows = scan.rows(values, association, placed.T[0])
+    scatter = 0.0 if rows.spread is None else float(np.square(rows.spread.residual).sum()) / 2
+    return weighed.cost(rows, partial(_rows_at, scan, association)) + scatter
+
+
+def _rows_at(
+    scan: ScanStop, association: Association | None, values: Values, T: np.ndarray
+) -> Rows:
+    return scan.rows(values, association, T)
 
 
 def lidars(scans: Sequence[ScanStop], values: Values) -> list[Placed]:

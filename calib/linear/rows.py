@@ -7,13 +7,14 @@ summed without zeros. Sums here are in the unknowns' own units; `assembly` scale
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_array
 
-from calib.forward import Placed
+from calib.forward import Placed, Values
 from calib.linear.elimination import square
 from calib.linear.layout import Layout, key_of
 from calib.residuals.beams import Association, Rows
@@ -27,30 +28,58 @@ BLOCK = 8192  # rows that are weighted at once: bounds the memory
 ZERO = "range_offset"  # the effect that lengthens all ranges alike
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
+class State:
+    """The values of all unknowns, which many stops are asked at."""
+
+    values: Mapping[str, np.ndarray]
+
+
+@dataclass(frozen=True, eq=False)
 class Weighing:
     """How the beams of one stop were weighed at a state, so that another can be held against it.
 
-    Sigmas and robust scale follow the state; a cost can be compared only at the same ones.
+    Sigmas and robust scale follow the state; a cost can be compared only at the same ones. The
+    sigmas stay in the process that computed them; another computes them anew from the state.
 
     Args:
-        sigma_m: (N,) single precision: it is kept for every stop while a fit runs.
+        state: where the rows were.
+        T: (4, 4) where the LiDAR was then.
         scale: how many sigmas wide the bulk was.
+        sigma_m: (N,) single precision: it is kept for every stop while a fit runs.
         kept: whether that scale is to stay as it is wherever the state goes.
     """
 
-    sigma_m: np.ndarray
+    state: State
+    T: np.ndarray
     scale: float
+    sigma_m: np.ndarray | None
     kept: bool = False
 
     @classmethod
-    def of(cls, rows: Rows) -> Weighing:
+    def of(cls, rows: Rows, state: State, T: np.ndarray) -> Weighing:
         """As these rows are weighed."""
-        return cls(rows.sigma_m.astype(np.float32), rows.scale)
+        return cls(state, T, rows.scale, rows.sigma_m.astype(np.float32))
 
-    def cost(self, rows: Rows) -> float:
-        """Half the robust chi-square of rows of that stop, at any state."""
-        return tukey_cost(np.where(rows.usable, rows.residual_m / self.sigma_m, 0.0), self.scale)
+    def cost(self, rows: Rows, at: Callable[[Values, np.ndarray], Rows]) -> float:
+        """Half the robust chi-square of rows of that stop, at any state.
+
+        Args:
+            rows: these.
+            at: gives the rows of the stop at a state where its LiDAR is at T (4, 4).
+        """
+        sigma_m = self.sigma_m
+        if sigma_m is None:
+            sigma_m = at(self.state.values, self.T).sigma_m.astype(np.float32)
+        return tukey_cost(np.where(rows.usable, rows.residual_m / sigma_m, 0.0), self.scale)
+
+    @property
+    def nbytes(self) -> int:
+        """What it takes here."""
+        return 0 if self.sigma_m is None else self.sigma_m.nbytes
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "sigma_m": None}
 
 
 @dataclass(frozen=True)
@@ -246,6 +275,14 @@ class StopSums:
         between += by_sparse[: len(self.with_sparse)].T @ self.with_sparse @ by_sparse
         own = by_sparse.T @ (self.own[:, None] * by_sparse)
         return by_dense.T @ self.dense @ by_dense + own + between + between.T
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without zeros: of the products of sparse columns few are not (1 in 22 where there are 303
+        by 817), and they are most of what a stop sends."""
+        return {**vars(self), "with_sparse": csr_array(self.with_sparse)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state, with_sparse=state["with_sparse"].toarray())
 
     def whole(self) -> np.ndarray:
         """(7 + d + s, same) over [twist | b | d columns | s columns]."""

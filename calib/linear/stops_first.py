@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from calib.linear.assembly import Assembly, OwnRows
+from calib.linear.assembly import Assembly, KeptSums, OwnRows
 from calib.linear.elimination import Eliminated, eliminate, square
 from calib.linear.layout import Layout, positions
 from calib.linear.rows import TWIST, StopSums
@@ -49,12 +49,12 @@ class StopsFirst(Assembly):
         add_at(whole, place, place, block[TWIST:, TWIST:] * scale * scale[:, None])
         self._finish(sums.stop, mine, at, whole)
 
-    def add_kept(self, rows: OwnRows) -> None:
-        """Add whitened rows about kept unknowns."""
-        super().add_kept(rows)
+    def add_kept(self, sums: KeptSums) -> None:
+        """Add the sums of whitened rows about kept unknowns."""
+        super().add_kept(sums)
         if self.raw is not None:
-            self._add_raw([rows])
-        rows.add_to(self.total, self.at, self.layout.sigma, len(self.columns) - 1)
+            self._add_raw([sums])
+        sums.add_to(self.total, self.at, self.layout.sigma, len(self.columns) - 1)
 
     def _columns(self, stop: int, *beams: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Columns (m,) that a stop's rows touch, its own first and the right side last, and where

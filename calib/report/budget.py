@@ -99,7 +99,7 @@ def _jacobians(
             progress("derivatives", k, len(chosen))
             scan = problem.scans[i]
             part = met.get(key_of(scan))
-            known = None if part is None else scan.met(values, part)
+            known = None if part is None else scan.settled(part, values)
             jacobian = beam_jacobian(scan, values, known)
             yield jacobian, len(next(iter(jacobian.values())))
         return

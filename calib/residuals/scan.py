@@ -132,12 +132,15 @@ class ScanStop:
         _, ray = self._read()
         return self._associate(self.pose(values), ray, values, near_edges)
 
-    def met(self, values: Values, part: np.ndarray) -> Association:
-        """What is to be kept of what the beams met, the parts (N,), at a state.
+    def settled(self, part: np.ndarray | None, values: Values) -> Association:
+        """What is to be kept of what the beams meet at a state: of the parts (N,) that they are
+        known to have met, or anew, and then without those beside a depth edge.
 
         Raises:
             InputError: there are not so many beams.
         """
+        if part is None:
+            return self.associate(values, near_edges=True)
         _, ray = self._read()
         if part.shape != ray.range_m.shape:
             raise InputError(

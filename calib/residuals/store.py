@@ -48,11 +48,15 @@ class BeamStore:
                 self._bytes += size
         return found
 
+    def _scan(self, stop: int) -> Scan:
+        """A scan, to look at once: it takes no place of those that are asked for in each pass."""
+        return self._kept[stop][0] if stop in self._kept else self.recording.scan(stop)
+
     @cached_property
     def median_intensity(self) -> float:
         """Of all returns of the recording; NaN where none has an intensity, or most are dark."""
         scanned = np.flatnonzero(self.recording.has_scan).tolist()
-        found = np.concatenate([np.zeros(0), *(self.read(k)[0].intensity for k in scanned)])
+        found = np.concatenate([np.zeros(0), *(self._scan(k).intensity for k in scanned)])
         found = found[np.isfinite(found)]
         median = float(np.median(found)) if len(found) else 0.0
         return median if median > 0 else float("nan")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy as np
 from calib.effects import FrameOffset
 from calib.problem.problem import Block, Problem
 from calib.problem.unknowns import Role, Unknown
-from calib.residuals.beams import Association, Rows
+from calib.residuals.beams import Rows
 from calib.residuals.groups import CAD
 from calib.residuals.scan import ScanStop
 from calib.residuals.tracker import TrackedBody
@@ -21,7 +21,6 @@ from chains import se3
 # Redundancy of all that CAD says of frames, below which nothing is told of how right it is: with
 # less than one row's worth, chance alone puts the ratio anywhere.
 CHECKED = 1.0
-Keep = Callable[[ScanStop, Rows], None]  # what becomes of the rows of a stop
 
 
 @dataclass(frozen=True)
@@ -85,31 +84,6 @@ class Errors:
         return 1e3 * float(np.sqrt(self.expected_m2 / self.count)) if self.count else None
 
 
-def scan_errors(
-    scan: ScanStop,
-    values: Mapping[str, np.ndarray],
-    association: Association | None,
-    predicted: Estimate | None,
-    keep: Keep = lambda scan, rows: None,
-) -> Errors:
-    """Range residuals of a stop's beams that meet a surface.
-
-    Args:
-        scan: the stop.
-        values: the state.
-        association: what each beam meets; found anew where None.
-        predicted: where the stop's pose was predicted and not fitted to this scan, the estimate
-            whose marginals say how well; its share belongs to what is expected.
-        keep: shown the stop and its rows.
-    """
-    rows = scan.rows(values, association)
-    keep(scan, rows)
-    if predicted is None:
-        return row_errors(rows)
-    variance = _predicted_variance(scan, values, predicted, rows.by_twist)
-    return row_errors(rows, variance + _by_chance(rows, predicted))
-
-
 def row_errors(rows: Rows, predicted_m2: np.ndarray | float = 0.0) -> Errors:
     """Range residuals of a stop's beams that meet a surface.
 
@@ -131,24 +105,42 @@ def row_errors(rows: Rows, predicted_m2: np.ndarray | float = 0.0) -> Errors:
     )
 
 
-def _predicted_variance(
-    scan: ScanStop, values: Mapping[str, np.ndarray], predicted: Estimate, by_twist: np.ndarray
-) -> np.ndarray:
-    placed = scan.stops.in_reference(scan.stops.rig.lidar_frame, values)
-    names = list(placed.d)
-    d = np.hstack([placed.d[name][0] for name in names])
-    twist = d @ predicted.covariance_of(names) @ d.T
-    return np.einsum("ni,ij,nj->n", by_twist, twist, by_twist)
+@dataclass(frozen=True)
+class Foretold:
+    """How well it is known where a stop stands that was predicted, and not fitted to its scan.
 
+    Args:
+        twist: (6, 6) covariance of its LiDAR's right increment.
+        chance: unknown -> (n,) variances of what chance does anew to each stop or location, which
+            no other tells.
+    """
 
-def _by_chance(rows: Rows, predicted: Estimate) -> np.ndarray:
-    """Variance (N,) of what chance does anew to each stop or location, which no other tells."""
-    known, out = predicted.problem.variables, np.zeros(len(rows.residual_m))
-    for column in rows.sparse:
-        if column.variable in known and known[column.variable].role is Role.SCATTER:
-            variance = np.diag(predicted.covariance_of([column.variable]))[column.components]
-            out += np.where(column.index >= 0, np.square(column.value), 0) * variance[column.index]
-    return out
+    twist: np.ndarray
+    chance: Mapping[str, np.ndarray]
+
+    @classmethod
+    def of(cls, scan: ScanStop, predicted: Estimate) -> Foretold:
+        """By an estimate's marginals."""
+        placed = scan.stops.in_reference(scan.stops.rig.lidar_frame, predicted.values)
+        names, known = list(placed.d), predicted.problem.variables
+        d = np.hstack([placed.d[name][0] for name in names])
+        acting = (t.variable for t in scan.terms if t.variable in known)
+        drawn = [name for name in acting if known[name].role is Role.SCATTER]
+        return cls(
+            twist=d @ predicted.covariance_of(names) @ d.T,
+            chance={name: np.diag(predicted.covariance_of([name])) for name in drawn},
+        )
+
+    def variance_m2(self, rows: Rows) -> np.ndarray:
+        """What that adds (N,) to what is expected of the residuals."""
+        out = np.einsum("ni,ij,nj->n", rows.by_twist, self.twist, rows.by_twist)
+        for column in rows.sparse:
+            if column.variable in self.chance:
+                variance = self.chance[column.variable][column.components]
+                out += (
+                    np.where(column.index >= 0, np.square(column.value), 0) * variance[column.index]
+                )
+        return out
 
 
 def body_errors(
@@ -156,10 +148,16 @@ def body_errors(
     values: Mapping[str, np.ndarray],
     predicted: Estimate | None,
 ) -> Errors:
-    """Distances between tracked and predicted positions of bodies; arguments as above.
+    """Distances between tracked and predicted positions of bodies.
 
     Rows that the estimate rests on have less error than their noise, by what it takes from them:
     their residuals' covariance is R - A C A^T, and R + A C A^T that of other rows.
+
+    Args:
+        blocks: of the bodies.
+        values: the state.
+        predicted: where their place was predicted and not fitted, the estimate whose marginals say
+            how well; its share belongs to what is expected.
     """
     out, own = Errors(), [] if predicted is None else predicted.problem.blocks
     for block in blocks:

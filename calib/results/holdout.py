@@ -2,24 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 from scipy import special
 
 from calib import problem as problems
+from calib.linear.parallel import over_stops
 from calib.problem import Problem
 from calib.problem.model import Model, Source
 from calib.problem.prior import JointPrior
 from calib.problem.spread import spread_of, with_spread
 from calib.problem.surfaces import parts_of
+from calib.residuals.beams import Rows
 from calib.residuals.scan import ScanStop
 from calib.residuals.seen import SeenBody
 from calib.residuals.surfaces import PlaneSurface
-from calib.results.errors import Errors, Keep, body_errors, scan_errors
+from calib.results.errors import Errors, Foretold, body_errors, row_errors
 from calib.solve.estimate import Estimate, Start
 from calib.solve.fit import Progress, solve
+
+Values = Mapping[str, np.ndarray]
 
 FOLDS = 5  # a fit leaves out about a fifth of the locations
 POSE_BLOCKS = 3 * FOLDS  # of poses: a fold leaves out three, far from each other
@@ -66,6 +72,19 @@ def gains_m2(before: Sequence[float], after: Sequence[float]) -> tuple[float, ..
     """How much the mean squares [m2] of stops fall; none where they are not the same stops."""
     gain = np.subtract(before, after) if len(before) == len(after) else np.zeros(0)
     return tuple(gain[np.isfinite(gain)].tolist())
+
+
+@dataclass(frozen=True)
+class Keep:
+    """What becomes of the rows of a stop that a fit left out.
+
+    Args:
+        of: makes what is kept of them: a function of a module, as `over_stops` has it.
+        take: takes that, here.
+    """
+
+    of: Callable[[Rows], Any]
+    take: Callable[[ScanStop, Any], None]
 
 
 def folds(sources: Sequence[Source], by: str) -> list[list[np.ndarray]]:
@@ -156,7 +175,7 @@ def held_out(
     count: int,
     progress: Progress,
     start: Start | None = None,
-    keep: Keep = lambda scan, rows: None,
+    keep: Keep | None = None,
     fit: Callable[..., Estimate] = near,
 ) -> Errors:
     """Residuals of stops left out of the fit, their poses told by tracker and arm alone.
@@ -168,7 +187,7 @@ def held_out(
         count: how many folds to evaluate.
         progress: as of `fit.solve`.
         start: a fit of all stops: each fold's fit is near it, and starts from there.
-        keep: shown every stop left out and its rows, where there are scans.
+        keep: what becomes of the rows of every stop left out, where there are scans.
         fit: `near`, or `fit.stepped` for what is known from one linearisation.
     """
     out = Errors()
@@ -198,7 +217,7 @@ def predict(
     unseen: Problem,
     trained: Problem,
     estimate: Estimate,
-    keep: Keep = lambda scan, rows: None,
+    keep: Keep | None = None,
 ) -> Errors:
     """Residuals of a problem whose calibration comes from an estimate of another; see `placed`."""
     scans, bodies = unseen.scans, unseen.bodies
@@ -207,8 +226,13 @@ def predict(
         beyond = [b for b in bodies if b.stops.rig.joints_to(b.body)]
         judged = [b for b in beyond if b.stops.root in told]
         return body_errors(judged, predicted.values, predicted)
-    each = (_scan(scan, predicted, scan.stops.root in told, keep) for scan in scans)
-    return sum(each, Errors())
+    known = [Foretold.of(s, predicted) if s.stops.root in told else None for s in scans]
+    work, out = partial(_unseen, predicted.values, keep and keep.of), Errors()
+    for scan, (errors, kept) in zip(scans, over_stops(work, scans, known), strict=True):
+        out += errors
+        if keep is not None:
+            keep.take(scan, kept)
+    return out
 
 
 def placed(unseen: Problem, trained: Problem, estimate: Estimate) -> tuple[Estimate, set[str]]:
@@ -244,6 +268,10 @@ def _places(block: SeenBody) -> bool:
     return bool(rig.passive) or not rig.joints_to(block.body)
 
 
-def _scan(scan: ScanStop, predicted: Estimate, told: bool, keep: Keep) -> Errors:
-    association = scan.associate(predicted.values, near_edges=True)
-    return scan_errors(scan, predicted.values, association, predicted if told else None, keep)
+def _unseen(
+    values: Values, of: Callable[[Rows], Any] | None, scan: ScanStop, known: Foretold | None
+) -> tuple[Errors, Any]:
+    """Range residuals of a stop's beams that meet a surface, and what is kept `of` its rows."""
+    rows = scan.rows(values, scan.associate(values, near_edges=True))
+    errors = row_errors(rows, 0.0 if known is None else known.variance_m2(rows))
+    return errors, None if of is None else of(rows)

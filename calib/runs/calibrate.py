@@ -17,15 +17,15 @@ from calib import problem as problems
 from calib.blunders.chance import at_least
 from calib.diagnosis.formulas.seen import ColumnRanges
 from calib.effects import Effect, is_known, load_effects, split, trust_in
-from calib.linear.parallel import one_blas_thread
+from calib.forward import Values
+from calib.linear.parallel import one_blas_thread, over_stops
 from calib.problem import Problem
 from calib.problem.model import Model, Source
 from calib.problem.without import leave_out
-from calib.residuals.beams import Rows
 from calib.residuals.groups import CAD
 from calib.residuals.scan import ScanStop
-from calib.results.errors import Errors, body_errors, misfit, row_errors, scan_errors
-from calib.results.holdout import held_out, unit_of
+from calib.results.errors import Errors, body_errors, misfit, row_errors
+from calib.results.holdout import Keep, held_out, unit_of
 from calib.results.intervals import intervals
 from calib.results.misfit import (
     instrument_rows,
@@ -41,10 +41,10 @@ from calib.runs.belief import TOLERATED, limits
 from calib.runs.reopen import model_of, proposed, reopened, start_of, stored_met
 from calib.runs.residual_table import (
     UNSEEN_FOLDER,
-    recording_of,
-    residual_table,
-    table_path,
+    residual_bytes,
+    write_residuals,
     write_rows,
+    write_stop,
 )
 from calib.runs.run import (
     COVARIANCE,
@@ -63,7 +63,6 @@ from calib.solve.estimate import Estimate, Start
 from calib.solve.fit import Progress, shapes_freed, solve
 from chains.errors import InputError
 from sensors.documents import write_json, write_yaml
-from sensors.recording import write_table
 
 
 @one_blas_thread
@@ -207,7 +206,7 @@ def _fit(
     unseen, unit = _held_out(sources, model, estimate, folder / RESIDUALS, choices, progress)
     nominal = _nominal(problem, progress)
     seen_at = ColumnRanges(model.effects)
-    by_stop = _write_residuals(problem, estimate, folder / RESIDUALS, progress, seen_at)
+    by_stop = write_residuals(folder / RESIDUALS, estimate, seen_at, progress)
     seen = sum(by_stop.values(), Errors())
     if not estimate.scans:
         seen = body_errors(problem.bodies, estimate.values, None)
@@ -264,28 +263,14 @@ def _nominal(problem: Problem, progress: Progress) -> Errors:
     if not problem.scans:
         return body_errors(problem.bodies, problem.initial, None)
     total = Errors()
-    for i, scan in enumerate(problem.scans):
+    for i, found in enumerate(over_stops(partial(_errors, problem.initial), problem.scans)):
         progress("nominal residuals", i, len(problem.scans))
-        total += scan_errors(scan, problem.initial, None, None)
+        total += found
     return total
 
 
-def _write_residuals(
-    problem: Problem, estimate: Estimate, folder: Path, progress: Progress, seen: ColumnRanges
-) -> dict[tuple[str, str], Errors]:
-    """Write every beam's residual, stop by stop, and show `seen` what effects look at; sums of
-    the residuals, by recording and stop."""
-    folder.mkdir(exist_ok=True)
-    found = {}
-    for i, (scan, association) in enumerate(
-        zip(estimate.scans, estimate.associations, strict=True)
-    ):
-        progress("writing residuals", i, len(estimate.scans))
-        rows = scan.rows(estimate.values, association)
-        seen.look(rows.view.columns, rows.usable)
-        write_table(table_path(folder, scan, problem.sources), residual_table(rows))
-        found[recording_of(scan, problem.sources), scan.name] = row_errors(rows)
-    return found
+def _errors(values: Values, scan: ScanStop) -> Errors:
+    return row_errors(scan.rows(values))
 
 
 def _held_out(
@@ -300,16 +285,10 @@ def _held_out(
     a fit that did not converge, none."""
     if choices.hold_out == "none" or not estimate.converged:
         return Errors(), None
-    keep = partial(_write_unseen, sources, folder / UNSEEN_FOLDER)
+    keep = Keep(residual_bytes, partial(write_stop, folder / UNSEEN_FOLDER, sources))
     how = (choices.hold_out, choices.folds, progress, estimate.start, keep)
     unseen = held_out(sources, model, *how)
     return unseen, unit_of(sources, choices.hold_out) if unseen.count else None
-
-
-def _write_unseen(sources: Sequence[Source], folder: Path, scan: ScanStop, rows: Rows) -> None:
-    """Write the residuals of a stop as a fit without it predicts them."""
-    folder.mkdir(parents=True, exist_ok=True)
-    write_table(table_path(folder, scan, sources), residual_table(rows))
 
 
 def _summary(

@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
+from calib.diagnosis.formulas.seen import ColumnRanges
+from calib.forward import Values
+from calib.linear.parallel import over_stops
 from calib.problem.model import Source, recording_names
-from calib.residuals.beams import Rows
+from calib.residuals.beams import Association, Rows
 from calib.residuals.scan import ScanStop
+from calib.results.errors import Errors, row_errors
 from calib.results.misfit import InstrumentRows
-from sensors.recording import write_table
+from calib.solve.estimate import Estimate
+from calib.solve.fit import Progress
+from sensors.documents import write_atomically
+from sensors.recording import table_bytes, write_table
 
 _FIRST = ("ring", "column", "range_m", "incidence_rad", "azimuth_rad", "elevation_rad", "intensity")
 UNSEEN_FOLDER = "_held_out"  # folder of those stops as a fit without them predicts them
@@ -39,6 +47,42 @@ def write_rows(folder: Path, rows: Mapping[str, InstrumentRows]) -> None:
     """
     for kind, some in rows.items():
         write_table(folder / f"_{kind}.parquet", some.table())
+
+
+def write_residuals(
+    folder: Path, estimate: Estimate, seen: ColumnRanges, progress: Progress
+) -> dict[tuple[str, str], Errors]:
+    """Write every beam's residual, stop by stop, and show `seen` what effects look at; sums of
+    the residuals, by recording and stop."""
+    folder.mkdir(exist_ok=True)
+    found, scans, sources = {}, estimate.scans, estimate.problem.sources
+    work = partial(_of_stop, estimate.values, seen.fresh())
+    for i, stop in enumerate(over_stops(work, scans, estimate.associations)):
+        progress("writing residuals", i, len(scans))
+        table, looked_at, found[recording_of(scans[i], sources), scans[i].name] = stop
+        seen.include(looked_at)
+        write_stop(folder, sources, scans[i], table)
+    return found
+
+
+def _of_stop(
+    values: Values, seen: ColumnRanges, scan: ScanStop, association: Association
+) -> tuple[bytes, ColumnRanges, Errors]:
+    """The table of a stop, what `seen` has then seen, and sums."""
+    rows, seen = scan.rows(values, association), seen.fresh()
+    seen.look(rows.view.columns, rows.usable)
+    return residual_bytes(rows), seen, row_errors(rows)
+
+
+def write_stop(folder: Path, sources: Sequence[Source], scan: ScanStop, table: bytes) -> None:
+    """Write a stop's table, as `residual_bytes` gives it."""
+    with write_atomically(table_path(folder, scan, sources)) as temporary:
+        temporary.write_bytes(table)
+
+
+def residual_bytes(rows: Rows) -> bytes:
+    """The table of a stop as its file holds it."""
+    return table_bytes(residual_table(rows))
 
 
 def residual_table(rows: Rows) -> dict[str, np.ndarray]:

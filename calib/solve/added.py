@@ -8,13 +8,16 @@ from anywhere. So what was added begins there, all else held, if Tukey's cost is
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 from scipy.sparse import csr_array, hstack
 
-from calib.linear.parallel import in_order
+from calib.forward import Values
+from calib.linear.parallel import over_stops
 from calib.problem.problem import Problem
-from calib.residuals.beams import Association, Columns, Rows
+from calib.residuals.beams import Association, Columns
+from calib.residuals.scan import ScanStop
 
 HUBER = 1.345  # sigmas: 95 % efficiency on normal rows (Holland and Welsch 1977)
 MOST_PASSES = 5  # a choice: the cost is convex, and it is but where the fit begins
@@ -52,10 +55,7 @@ def begun(
         information, right = np.diag(1.0 / sigma**2), (mean - theta) / sigma**2
         cost = float(np.sum(np.square((theta - mean) / sigma)) / 2)
 
-        def work(i: int) -> tuple[np.ndarray, np.ndarray, float]:
-            return _normal(scans[i].rows(here, associations[i]), at)
-
-        for gram, gradient, beams in in_order(work, len(scans)):
+        for gram, gradient, beams in over_stops(partial(_normal, here, at), scans, associations):
             information, right, cost = information + gram, right - gradient, cost + beams
         return information, right, cost
 
@@ -79,8 +79,11 @@ def declared(problem: Problem, held: Collection[str]) -> dict[str, np.ndarray]:
     return {n: initial[n] for n in felt if not np.array_equal(initial[n], known[n].mean)}
 
 
-def _normal(rows: Rows, at: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, float]:
+def _normal(
+    values: Values, at: Mapping[str, np.ndarray], scan: ScanStop, association: Association
+) -> tuple[np.ndarray, np.ndarray, float]:
     """One stop's weighted Gram matrix and gradient of some unknowns, and its cost after Tukey."""
+    rows = scan.rows(values, association)
     count, parts = len(rows.residual_m), []
     for name, i in at.items():
         dense = rows.dense.get(name, np.zeros((count, len(i))))

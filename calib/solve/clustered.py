@@ -9,24 +9,27 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
 from scipy.sparse import csr_array, diags_array
 
+from calib.forward import Placed
 from calib.linear.clusters import CellSums, ClusteredRows, Gradients
 from calib.linear.layout import Layout, keys_of
 from calib.linear.linearise import lidars, own_rows, spread_rows
-from calib.linear.parallel import in_order
+from calib.linear.parallel import over_stops
 from calib.linear.rows import PLACES, StopRows
 from calib.problem.problem import Block, Problem, SurfaceCells
 from calib.residuals.beams import Association
+from calib.residuals.scan import ScanStop
 from calib.residuals.seen import SeenBody
 from calib.solve.graph import Graph
 
 T = TypeVar("T")
 Values = Mapping[str, np.ndarray]
-Found = Callable[[StopRows, np.ndarray, int, int], T]
+Found = Callable[[StopRows, np.ndarray, int], T]
 
 
 @dataclass(frozen=True)
@@ -55,7 +58,7 @@ class BeamsAlong:
 
     def rows(self) -> Iterator[ClusteredRows]:
         """Each row, weighted."""
-        for (A, b, more, stop, cluster), place in self._each_stop(self._rows_of):
+        for (A, b, more, stop, cluster), place in self._each_stop(_rows_along):
             at = np.full(len(cluster), stop), place[cluster]
             yield self._clustered(A, b, *at)
             if more is not None:
@@ -64,36 +67,11 @@ class BeamsAlong:
     def cells(self) -> Iterator[tuple[CellSums, ClusteredRows | None]]:
         """Sums of the weighted rows of each stop, by what they look at; and its rows of scatter
         within holds, where there are any."""
-        for (sums, more, stop, cluster), place in self._each_stop(self._cells_of):
+        for (sums, more, stop, cluster), place in self._each_stop(_cells_along):
             found = None
             if more is not None:
                 found = self._clustered(*more, np.full(len(cluster), stop), place[cluster])
             yield CellSums(stop=stop, place=place, **sums), found
-
-    def _rows_of(
-        self, rows: StopRows, cluster: np.ndarray, count: int, scan: int
-    ) -> tuple[Any, ...]:
-        root = np.sqrt(rows.weight)
-        A = rows.along(self.directions) * root[:, None]
-        return A, root * rows.b, self._scatter(rows), rows.stop, cluster
-
-    def _cells_of(
-        self, rows: StopRows, cluster: np.ndarray, count: int, scan: int
-    ) -> tuple[Any, ...]:
-        gradient, columns = rows.gradient(cluster, count)
-        sums = {
-            "moved": gradient @ self.directions[columns],
-            "share": rows.squares_along(self.directions, cluster, count),
-            "products": rows.sums().along(self.directions),
-        }
-        return sums, self._scatter(rows), rows.stop, cluster
-
-    def _scatter(self, rows: StopRows) -> tuple[np.ndarray, np.ndarray] | None:
-        """Derivatives and right side of the rows of scatter within holds."""
-        if rows.rows.spread is None:
-            return None
-        more = spread_rows(rows.rows.spread, self.layout)
-        return more.A @ self.directions[more.columns], more.b
 
     def _clustered(
         self, A: np.ndarray, b: np.ndarray, stop: np.ndarray, place: np.ndarray
@@ -101,9 +79,42 @@ class BeamsAlong:
         along = np.arange(self.directions.shape[1])
         return ClusteredRows(A=A, b=b, columns=along, stop=stop, place=place)
 
-    def _each_stop(self, found: Found[T]) -> Iterator[tuple[T, np.ndarray]]:
+    def _each_stop(self, found: Callable[..., T]) -> Iterator[tuple[T, np.ndarray]]:
         state = self.problem, self.layout, self.values, self.associations
-        return each_stop(*state, self.places, found, self.kinds, self.progress)
+        along = partial(found, self.layout, self.directions)
+        return each_stop(*state, self.places, along, self.kinds, self.progress)
+
+
+def _rows_along(
+    layout: Layout, directions: np.ndarray, rows: StopRows, cluster: np.ndarray, count: int
+) -> tuple[Any, ...]:
+    root = np.sqrt(rows.weight)
+    A = rows.along(directions) * root[:, None]
+    return A, root * rows.b, _scatter(layout, directions, rows), rows.stop, cluster
+
+
+def _cells_along(
+    layout: Layout, directions: np.ndarray, rows: StopRows, cluster: np.ndarray, count: int
+) -> tuple[Any, ...]:
+    gradient, columns = rows.gradient(cluster, count)
+    sums = {
+        "moved": gradient @ directions[columns],
+        "share": rows.squares_along(directions, cluster, count),
+        "products": rows.sums().along(directions),
+    }
+    scatter = _scatter(layout, directions, rows)
+    # Which row meets what is asked of rows of scatter alone.
+    return sums, scatter, rows.stop, None if scatter is None else cluster
+
+
+def _scatter(
+    layout: Layout, directions: np.ndarray, rows: StopRows
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Derivatives and right side of the rows of scatter within holds."""
+    if rows.rows.spread is None:
+        return None
+    more = spread_rows(rows.rows.spread, layout)
+    return more.A @ directions[more.columns], more.b
 
 
 def each_stop(
@@ -120,19 +131,29 @@ def each_stop(
     `BeamsAlong`.
 
     Args:
-        found: called with the rows of a stop, which of what they meet each meets, how many there
-            are, and the number of the scan.
+        found: a function of a module, or a partial of one, called with the rows of a stop, which of
+            what they meet each meets, and how many there are.
     """
-    scans, placed = problem.scans, lidars(problem.scans, values)
-
-    def work(i: int) -> tuple[np.ndarray, T]:
-        rows = StopRows.of(scans[i], layout, values, placed[i], associations[i])
-        parts, cluster = rows.places(kinds)
-        return parts, found(rows, cluster, len(parts), i)
-
-    for i, (parts, told) in enumerate(in_order(work, len(scans))):
+    scans = problem.scans
+    work = partial(_of_rows, layout, values, found, kinds)
+    of_each = over_stops(work, scans, lidars(scans, values), associations)
+    for i, (parts, told) in enumerate(of_each):
         progress(i, len(scans))
-        yield told, places.numbers(scans[i].room, parts)  # here: threads would race for them
+        yield told, places.numbers(scans[i].room, parts)  # here: their order is that of the stops
+
+
+def _of_rows(
+    layout: Layout,
+    values: Values,
+    found: Found[T],
+    kinds: Sequence[str],
+    scan: ScanStop,
+    placed: Placed,
+    association: Association,
+) -> tuple[np.ndarray, T]:
+    rows = StopRows.of(scan, layout, values, placed, association)
+    parts, cluster = rows.places(kinds)
+    return parts, found(rows, cluster, len(parts))
 
 
 def of_stops(layout: Layout, values: Values) -> Iterator[ClusteredRows]:

@@ -10,16 +10,17 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from calib.linear.layout import StopKey, key_of
-from calib.linear.parallel import in_order
+from calib.linear.parallel import over_stops
 from calib.problem.problem import Block, Problem
 from calib.problem.spread import by_chance, widening, with_spread
 from calib.problem.surfaces import well_seen, with_surfaces
 from calib.problem.unknowns import Unknown
-from calib.residuals.beams import Association
+from calib.residuals.scan import ScanStop
 from calib.residuals.surfaces import MeshSurface
 from calib.solve.added import begun
 from calib.solve.components import sds, squares, told, wider
@@ -341,14 +342,9 @@ class Loop(Descent):
         self.problem, self.seen = self.given, dict(seen or self.values)
         met = self.start.met if met is None and seen is not None else met or {}
         scans, found = self.problem.scans, []
-
-        def work(i: int) -> Association:
-            part = met.get(key_of(scans[i]))
-            if part is None:
-                return scans[i].associate(self.seen, near_edges=True)
-            return scans[i].met(self.seen, part)
-
-        for i, association in enumerate(in_order(work, len(scans))):
+        parts = [met.get(key_of(scan)) for scan in scans]
+        work = partial(ScanStop.settled, values=self.seen)
+        for i, association in enumerate(over_stops(work, scans, parts)):
             self.progress("looking for depth edges", i, len(scans))
             found.append(association)
         self.problem, self.associations = with_surfaces(self.given, well_seen(self.given, found))

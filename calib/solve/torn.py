@@ -10,12 +10,13 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from scipy.special import ndtri
 
 from calib.linear.layout import StopKey, key_of
-from calib.linear.parallel import in_order
+from calib.linear.parallel import over_stops
 from calib.problem.problem import Problem
 from calib.residuals.groups import Group
 from calib.residuals.scan import ScanStop
@@ -97,7 +98,7 @@ def borne_out(problem: Problem, values: Values) -> tuple[set[str], dict[str, np.
     wrong: set[str] = set()
     stood: dict[str, np.ndarray] = {}
     for scan in asked:
-        tried = [(_width(scan, values, T), g, T) for g, T in _stands(problem, scan, values)]
+        tried = [(_width(values, scan, T), g, T) for g, T in _stands(problem, scan, values)]
         first, *others = sorted(tried, key=lambda each: each[0])
         if others and first[0] < SCANS_ALIKE * usual and SCANS_ALIKE * first[0] < others[0][0]:
             wrong |= {group.token for _, group, _ in others}
@@ -121,11 +122,9 @@ def _usual(problem: Problem, values: Values, asked: Sequence[ScanStop]) -> float
     """How many sigmas wide the residuals of most other scans are."""
     keys = set(map(key_of, asked))
     others = [scan for scan in problem.scans if key_of(scan) not in keys]
-
-    def width(i: int) -> float:
-        return _width(others[i], values, values[others[i].stops.root])
-
-    return float(np.median(list(in_order(width, len(others))))) if others else np.inf
+    stands = [values[scan.stops.root] for scan in others]
+    widths = list(over_stops(partial(_width, values), others, stands))
+    return float(np.median(widths)) if others else np.inf
 
 
 def _stands(problem: Problem, scan: ScanStop, values: Values) -> Iterator[tuple[Group, np.ndarray]]:
@@ -138,7 +137,7 @@ def _stands(problem: Problem, scan: ScanStop, values: Values) -> Iterator[tuple[
             yield block.groups[k], block.measured[k] @ se3.inverse(T)
 
 
-def _width(scan: ScanStop, values: Values, T_world_root: np.ndarray) -> float:
+def _width(values: Values, scan: ScanStop, T_world_root: np.ndarray) -> float:
     """How many sigmas wide the residuals of most beams are with the rig standing there: half of the
     beams of a LiDAR that is off along one axis, on floor and ceiling, tell nothing of it."""
     try:

@@ -1,27 +1,37 @@
-"""How time and memory grow with rows and with stops, from recording to verdict.
+"""How time and memory grow with rows and with stops, from recording to verdict; by each executor.
 
-    python tests/bench/bench_scale.py [--columns 64,16,4,1] [--stops 8,16,32]
-                                      [--many 30,100,300] [--workers 1,2]
+    python tests/bench/bench_scale.py [--columns 64,16,4] [--stops 8,16] [--many 30,100]
+                                      [--shared 16] [--repeats 1]
 
 Recordings of the preset `default` are made in a temporary folder, then `rigcal fit` and `rigcal
-diagnose` are run on each, one process after another. Three series: more beams in each of 8 stops
+diagnose` are run on each, one program after another. Three series: more beams in each of 8 stops
 (every so many-th column of an OS0-128 is kept), more stops at full resolution, and many stops of
 some 1,000 beams. A line of a series gives seconds on the clock and peak memory (VmHWM, Linux
 alone). Below it stand the power of rows with which CPU seconds grow, those of 8 stops of 128 beams
-taken off for the start, and megabytes a stop. The last table compares numbers of threads on the
-largest recording of the second series. Ratios are of one run on one machine.
+taken off for the start, and megabytes a stop.
+
+The last table shares the stops of one recording at full resolution among threads, processes and,
+where distributed is installed, the workers of a Dask cluster: seconds on the clock, how many times
+faster than one thread, CPU seconds of the program and of its workers, the most memory that it and
+any worker take, and what travels for a stop. Each way is tried as often as `--repeats`, in turns,
+and the fastest counts, as a busy machine only adds. All ratios are of one run on one machine.
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import json
+import re
+import resource
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -39,38 +49,54 @@ FEW = 8  # stops in the series of more beams
 
 @dataclass(frozen=True)
 class Cost:
-    """Of one process: seconds on the clock and of all its threads, and its peak memory."""
+    """Of one program: seconds on the clock and of all its threads, its peak memory; CPU seconds of
+    its workers and the peak of the largest; and kB that a stop sends to them and back."""
 
     wall_s: float
     cpu_s: float
     peak_mb: float
+    workers_s: float
+    worker_mb: float
+    sent_kb: str = ""
 
 
-def cost(arguments: Sequence[str | Path]) -> Cost:
+def cost(arguments: Sequence[str | Path], threads: int | None = None) -> Cost:
     """Run rigcal with such arguments in a process of its own.
+
+    Args:
+        arguments: of the command.
+        threads: how many at most; all cores where None.
 
     Raises:
         RuntimeError: it failed.
     """
-    command = [sys.executable, __file__, OWN, *map(str, arguments)]
+    command = [sys.executable, __file__, OWN, str(threads or ""), "-v", *map(str, arguments)]
     start = time.perf_counter()
     done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True)
     wall_s = time.perf_counter() - start
     *said, last = done.stderr.splitlines()
     if done.returncode:
         raise RuntimeError("\n".join(said))
-    return Cost(wall_s, *json.loads(last))
+    sent = re.search(r"each (\d+) kB down and (\d+) kB up", done.stderr)
+    names = ("cpu_s", "peak_mb", "workers_s", "worker_mb")
+    told = dict(zip(names, json.loads(last), strict=True))
+    return Cost(wall_s=wall_s, **told, sent_kb=" + ".join(sent.groups()) if sent else "")
 
 
 def of_this_process() -> None:
     """Run rigcal here, and print what it cost as the last line."""
     from calib.cli import main
+    from calib.linear.parallel import workers
 
-    sys.argv = ["rigcal", *sys.argv[2:]]
+    threads, *arguments = sys.argv[2:]
+    sys.argv = ["rigcal", *arguments]
     try:
-        main()
+        with workers(int(threads) if threads else None):
+            main()
     finally:
-        print(f"\n{json.dumps([time.process_time(), own_peak_mb()])}", file=sys.stderr)
+        ended = resource.getrusage(resource.RUSAGE_CHILDREN)
+        of_workers = ended.ru_utime + ended.ru_stime, ended.ru_maxrss * 1024 / 1e6
+        print(f"\n{json.dumps([time.process_time(), own_peak_mb(), *of_workers])}", file=sys.stderr)
 
 
 def exponent(sizes: Sequence[float], costs: Sequence[float], start: float) -> float:
@@ -90,11 +116,11 @@ def recorded(folder: Path, stops: int, every: int) -> Path:
     return out
 
 
-def both(recording: Path, *options: str) -> tuple[Cost, Cost]:
+def both(recording: Path, *options: str, threads: int | None = None) -> tuple[Cost, Cost]:
     """What the fit of a recording costs, and the diagnosis."""
     run = recording.with_name(f"{recording.name}-run")
-    fit = cost(["fit", recording, "-o", run, *options])
-    return fit, cost(["diagnose", run, *options])
+    fit = cost(["fit", recording, "-o", run, *options], threads)
+    return fit, cost(["diagnose", run, *options], threads)
 
 
 def series(
@@ -125,44 +151,75 @@ def series(
         console.print(line)
 
 
+@contextmanager
+def ways() -> Iterator[dict[str, Callable[[Path], tuple[Cost, Cost]]]]:
+    """How stops may be shared, by name; a Dask cluster runs meanwhile, where it can."""
+    found = {
+        "1 thread": partial(both, threads=1),
+        "2 threads": partial(both, threads=2),
+        "2 processes": lambda recording: both(recording, "--workers", "2"),
+    }
+    if importlib.util.find_spec("distributed") is None:
+        yield found
+        return
+    from distributed import LocalCluster
+
+    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+        address = cluster.scheduler_address
+        found["2 Dask workers"] = lambda recording: both(recording, "--scheduler", address)
+        yield found
+
+
+def executors(console: Console, recording: Path, repeats: int) -> None:
+    """The table of executors."""
+    with ways() as known:
+        tried: dict[str, list[tuple[Cost, Cost]]] = {name: [] for name in known}
+        for _ in range(repeats):
+            for name, run in known.items():
+                tried[name].append(run(recording))
+    for k, command in enumerate(("fit", "diagnose")):
+        columns = ("s", "ratio", "CPU s", "of workers", "MB", "a worker", "kB a stop, down + up")
+        table = Table("executor", *columns, title=f"{command}, {recording.name} stops_columns")
+        first = None
+        for name, costs in tried.items():
+            best = min((each[k] for each in costs), key=lambda found: found.wall_s)
+            first = first or best
+            cells = [best.wall_s, first.wall_s / best.wall_s, best.cpu_s, best.workers_s]
+            memory = [best.peak_mb, best.worker_mb]
+            numbers = [*(f"{x:.1f}" for x in cells), *(f"{x:,.0f}" for x in memory)]
+            table.add_row(name, *numbers, best.sent_kb)
+        console.print(table)
+
+
 def numbers(text: str) -> list[int]:
     """Of a list with commas."""
-    return [int(part) for part in text.split(",")]
+    return [int(part) for part in text.split(",") if part]
 
 
 def main() -> None:
     """Print all tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--columns", type=numbers, default=[64, 16, 4, 1])
-    parser.add_argument("--stops", type=numbers, default=[8, 16, 32])
-    parser.add_argument("--many", type=numbers, default=[30, 100, 300])
-    parser.add_argument("--workers", type=numbers, default=[1, 2])
+    parser.add_argument("--columns", type=numbers, default=[64, 16, 4])
+    parser.add_argument("--stops", type=numbers, default=[8, 16])
+    parser.add_argument("--many", type=numbers, default=[30, 100])
+    parser.add_argument("--shared", type=int, default=16, help="stops that executors share")
+    parser.add_argument("--repeats", type=int, default=1)
     wanted = parser.parse_args()
-    console = Console(width=100)
+    console = Console(width=110)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        start = both(recorded(folder, FEW, COLUMNS))
-        console.print(f"the start: fit {start[0].cpu_s:.1f} s, diagnose {start[1].cpu_s:.1f} s")
-        series(console, "more beams a stop", folder, [(FEW, c) for c in wanted.columns], start)
-        series(console, "more stops", folder, [(s, 1) for s in wanted.stops], start)
-        series(console, "many stops", folder, [(s, EVERY) for s in wanted.many], start)
-        table = Table("threads", "fit s", "ratio", "diagnose s", "ratio ", title="threads")
-        first: tuple[Cost, Cost] | None = None
-        for count in wanted.workers:
-            found = both(recorded(folder, wanted.stops[-1], 1), "--workers", str(count))
-            first = first or found
-            pairs = zip(found, first, strict=True)
-            cells = [f(c, one) for c, one in pairs for f in (_seconds, _ratio)]
-            table.add_row(str(count), *cells)
-        console.print(table)
-
-
-def _seconds(cost: Cost, first: Cost) -> str:
-    return f"{cost.wall_s:.1f}"
-
-
-def _ratio(cost: Cost, first: Cost) -> str:
-    return f"{first.wall_s / cost.wall_s:.2f}"
+        if wanted.columns or wanted.stops or wanted.many:
+            start = both(recorded(folder, FEW, COLUMNS))
+            console.print(f"the start: fit {start[0].cpu_s:.1f} s, diagnose {start[1].cpu_s:.1f} s")
+        for what, sizes in (
+            ("more beams a stop", [(FEW, c) for c in wanted.columns]),
+            ("more stops", [(s, 1) for s in wanted.stops]),
+            ("many stops", [(s, EVERY) for s in wanted.many]),
+        ):
+            if sizes:
+                series(console, what, folder, sizes, start)
+        if wanted.shared:
+            executors(console, recorded(folder, wanted.shared, 1), wanted.repeats)
 
 
 if __name__ == "__main__":

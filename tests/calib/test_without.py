@@ -109,7 +109,7 @@ def test_no_beam_meets_a_surface_that_is_left_out(box, tmp_path):
         met = a.associate(values, near_edges=False).part
         expected = np.where(source.reference.facts(met)[2] == 2, -1, met)
         np.testing.assert_array_equal(b.associate(values, near_edges=False).part, expected)
-        np.testing.assert_array_equal(b.met(values, met).part, expected)
+        np.testing.assert_array_equal(b.settled(met, values).part, expected)
         assert 0 < np.sum(expected >= 0) < np.sum(met >= 0)
     # A run that grows from another knows what beams met there.
     run = calibrate([box], tmp_path / "run", Model(("ring_range_offset",)), "none")

@@ -40,8 +40,20 @@ class ColumnRanges:
             values = values[rows] if len(values) > 1 else values
             values = values[np.isfinite(values)]
             if len(values):
-                low, high = self._ends.get(name, (np.inf, -np.inf))
-                self._ends[name] = min(low, float(values.min())), max(high, float(values.max()))
+                self._include(name, float(values.min()), float(values.max()))
+
+    def fresh(self) -> ColumnRanges:
+        """The same that has seen nothing."""
+        return ColumnRanges(self._effects)
+
+    def include(self, others: ColumnRanges) -> None:
+        """Take in what others were shown."""
+        for name, ends in others._ends.items():
+            self._include(name, *ends)
+
+    def _include(self, name: str, low: float, high: float) -> None:
+        ends = self._ends.get(name, (np.inf, -np.inf))
+        self._ends[name] = min(ends[0], low), max(ends[1], high)
 
     def sentences(self) -> list[str]:
         """A warning for each effect that is used beyond where it was seen."""

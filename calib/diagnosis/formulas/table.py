@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
@@ -92,10 +92,7 @@ class BeamTable:
         places = Gradients(layout.size)
         beams = sum(int(np.count_nonzero(a.part >= 0)) for a in estimate.associations)
         share = min(1.0, most / max(beams, 1))
-
-        def found(rows: StopRows, met: np.ndarray, count: int, scan: int) -> _Drawn:
-            return _Drawn.of(rows, met, share, scan, TWIST * len(scans), layout.size)
-
+        found = partial(_Drawn.of, share, TWIST * len(scans), layout.size)
         state = problem, layout, values, estimate.associations
         every = list(each_stop(*state, places, found, progress=progress))
         drawn, place = [d for d, _ in every], [numbers[d.met] for d, numbers in every]
@@ -338,11 +335,12 @@ class _Drawn:
 
     @classmethod
     def of(
-        cls, rows: StopRows, met: np.ndarray, share: float, number: int, begin: int, size: int
+        cls, share: float, begin: int, size: int, rows: StopRows, met: np.ndarray, count: int
     ) -> _Drawn:
-        """A share of a stop's beams; so many columns of unknowns begin after the twists'."""
+        """A share of a stop's beams; so many columns of unknowns begin after the twists'. The last
+        arguments are those of `each_stop`."""
         usable = np.flatnonzero(rows.rows.usable & np.isfinite(rows.rows.residual_m))
-        drawn = np.random.default_rng(number).choice(usable, round(share * len(usable)), False)
+        drawn = np.random.default_rng(rows.stop).choice(usable, round(share * len(usable)), False)
         picked, columns = np.sort(drawn), {}
         for name, values in covariates_of(rows.rows.view):
             columns[name] = (values[picked] if len(values) > 1 else values).astype(float)
@@ -351,7 +349,7 @@ class _Drawn:
             columns=columns,
             residual_m=rows.rows.residual_m[picked],
             sigma_m=rows.rows.sigma_m[picked],
-            twists=_twists(rows, picked, TWIST * number, begin, begin + size),
+            twists=_twists(rows, picked, TWIST * rows.stop, begin, begin + size),
             chain=_rows_over(rows.chain, rows.chain_columns, size),
             met=met[picked],
         )

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
 from calib.diagnosis.candidates import STOPS_A_BIN
 from calib.diagnosis.stand import Stand
-from calib.linear.parallel import in_order
+from calib.forward import Values
+from calib.linear.parallel import over_stops
 from calib.linear.rows import PLACES
+from calib.residuals.beams import Association
 from calib.residuals.robust import TUKEY
+from calib.residuals.scan import ScanStop
 from calib.solve.fit import Progress
 
 CELLS, REJECT_BINS = 240, 12  # of a covariate: where an interval may end, and what is tested
@@ -190,7 +193,9 @@ def count(stand: Stand, progress: Progress) -> Counts:
     by_place = [np.zeros((0, axis.count), int) for axis in axes]
     cells = [np.zeros(len(axis.bins), int) for axis in axes]
     met, of_place = np.zeros((len(scans), 0), int), np.zeros((0, 1), int)
-    for i, found in enumerate(in_order(lambda i: _count_stop(stand, i, axes), len(scans))):
+    work = partial(_count_stop, stand.estimate.values, axes)
+    of_each = over_stops(work, scans, stand.estimate.associations, range(len(scans)))
+    for i, found in enumerate(of_each):
         progress("looking at what was rejected", i, len(scans))
         place, surface = (
             numbers.of(scans[i].room, parts)
@@ -248,9 +253,10 @@ class _Counted:
     rejected: Rejected
 
 
-def _count_stop(stand: Stand, i: int, axes: Sequence[CellAxis]) -> _Counted:
-    scan, estimate = stand.estimate.scans[i], stand.estimate
-    rows = scan.rows(estimate.values, estimate.associations[i])
+def _count_stop(
+    values: Values, axes: Sequence[CellAxis], scan: ScanStop, association: Association, i: int
+) -> _Counted:
+    rows = scan.rows(values, association)
     used, view = np.flatnonzero(rows.usable), rows.view
     kinds = [name for name in ("region", *PLACES) if name in view.columns]
     places, place = _numbered(np.asarray(view[kinds[0]])[used])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import sys
 from collections.abc import Mapping
+from operator import attrgetter
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -16,6 +17,7 @@ from chains.errors import InputError
 from sensors.documents import nearest, read_yaml
 
 YAML, PYTHON = (".yaml", ".yml"), ".py"
+_RUN: dict[str, Code] = {}  # name of a module made here -> the file that was run
 
 
 def is_file(text: str) -> bool:
@@ -107,21 +109,37 @@ def _formulas(path: str) -> list[Effect]:
     ]
 
 
+def _module_name(code: Code) -> str:
+    return f"rigcal_effects_{code.sha256[:16]}"
+
+
 def _run(code: Code) -> ModuleType:
     """The module of a Python file.
 
     It is compiled from the bytes that were hashed: an importer would take a cached .pyc for it,
     which need not be made from the same text.
     """
-    module = ModuleType(f"rigcal_effects_{code.sha256[:16]}")
+    module = ModuleType(_module_name(code))
     module.__file__ = str(code.path)
-    sys.modules[module.__name__] = module
+    sys.modules[module.__name__], _RUN[module.__name__] = module, code
     try:
         exec(compile(code.source, str(code.path), "exec", dont_inherit=True), module.__dict__)
     except (Exception, SystemExit) as error:
         del sys.modules[module.__name__]
         raise InputError(f"{code.path} cannot be run: {type(error).__name__}: {error}") from error
     return module
+
+
+def code_of(what: object) -> Code | None:
+    """The file that defines a class or a function, where it is one that was run here."""
+    defined = inspect.isclass(what) or inspect.isfunction(what)
+    return _RUN.get(what.__module__) if defined else None
+
+
+def of_code(code: Code, name: str) -> Any:
+    """A class or a function of a file, which is run unless it was; for another process."""
+    module = sys.modules.get(_module_name(code)) or _run(code)
+    return attrgetter(name)(module)
 
 
 def _made(code: Code, name: str, kind: type[Effect]) -> Effect:
