@@ -295,8 +295,8 @@ def test_every_name_in_the_table_is_one(session):
     }
     words |= {"EFFECT.PARAMETER": "arm_link_length.joint_3", "FRAME": "lidar"}
     words |= {"surface_N": f"surface_{int(source.reference.surface.max())}"}
-    assert len(tokens) == 11
-    for token in tokens:
+    assert len(tokens) == 12
+    for token in (t for t in tokens if not t.endswith(".level")):  # this rig has none
         for word, name in words.items():
             token = token.replace(word, name)
         assert leave_out([source], [token])[0] is not source, token

@@ -20,7 +20,7 @@ from calib.evaluation.tally import Evaluated
 from calib.problem import Problem
 from calib.problem.model import Model, Source
 from calib.results import holdout
-from calib.results.errors import Errors, scan_errors
+from calib.results.errors import Errors, row_errors
 from calib.runs.reopen import model_of
 from calib.runs.run import Run
 from calib.solve.estimate import Start, values_of
@@ -57,7 +57,7 @@ class State:
         scans = [scan for scan in self.problem.scans if scan.name in chosen]
         each = (scan.associate(self.values, near_edges=True) for scan in scans)
         pairs = zip(scans, each, strict=True)
-        return sum((scan_errors(s, self.values, met, None) for s, met in pairs), Errors())
+        return sum((row_errors(s.rows(self.values, met)) for s, met in pairs), Errors())
 
 
 @dataclass(frozen=True)
