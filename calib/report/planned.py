@@ -14,6 +14,7 @@ from calib.linear.parallel import one_blas_thread
 from calib.outputs.kinds import PLANNED
 from calib.planning import Plan, inputs_of
 from calib.planning.room.hanging import TargetPlan
+from calib.planning.room.ways import way_columns
 from calib.report import plots
 from calib.runs.run import Run
 from calib.show.plan import achieved, achieved_by_targets, aim, known_rows
@@ -46,8 +47,8 @@ def write_plan(plan: Plan | TargetPlan, out: Path | str, run: Run | Path) -> Non
     with outputs.folder(out, PLANNED, inputs_of(run)) as folder:
         if isinstance(plan, Plan):
             write_columns(folder / TABLE, plan.columns())
-            way = document["way"]
-            write_columns(folder / WAY, {key: [row[key] for row in way] for key in way[0]})
+            names = [name for name, _ in plan.joints]
+            write_columns(folder / WAY, way_columns(document["way"], names))
         else:
             write_columns(folder / TARGETS, plan.columns())
         write_json(folder / DOCUMENT, document)

@@ -9,7 +9,7 @@ from typing import Any
 
 from calib.runs.run import Run
 from calib.view.desk import Desk
-from calib.view.job import Job, JobMessage, Task
+from calib.view.job import JOB_ENDS, Job, JobMessage, Task
 from calib.view.scene import Scene
 from chains.errors import InputError
 
@@ -86,7 +86,7 @@ class Bench:
         for told in job.listen():
             if told.kind == "run":
                 self._desk.add(Path(told.text))
-            elif told.kind != "progress":
+            elif told.kind in JOB_ENDS:
                 self._job = None
             for hear in list(self._hearers):
                 hear(told, by)

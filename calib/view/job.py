@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from calib.runs.run import Run
     from calib.solve.fit import Progress
 
+JOB_ENDS = ("done", "failed", "stopped")  # kinds of message after which a job says no more
 PATIENCE_S = 10.0  # for a process that was stopped to clean up
 
 

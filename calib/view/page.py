@@ -365,8 +365,9 @@ class Page:
             self._doing.content = panels.note(told.text)
         elif told.kind == "run":
             self._guarded(partial(self._made, Path(told.text), by is self))()
-        elif told.kind == "plan" and by is self:
-            self._guarded(partial(self._planned, told.text))()
+        elif told.kind == "plan":
+            if by is self:
+                self._guarded(partial(self._planned, told.text))()
         else:
             self._guarded(partial(self._ended, told, by is self))()
 

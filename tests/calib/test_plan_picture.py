@@ -77,3 +77,13 @@ def test_targets_are_drawn_in_the_room(run, rigcal, tmp_path):
     for corner in (low, high):
         assert (np.abs(plan.room_m - corner).max(axis=2) < 0.01).any()  # walls are uneven
     assert f"P1, {plan.targets[0]['z']:.2f} m" in [text.get_text() for text in right.texts]
+
+
+def test_a_plan_without_stops_is_written_too(run, rigcal, tmp_path):
+    """What is wanted is known already."""
+    words = ["plan", run.folder, "--until", "lidar.xyz 500 mm", "--candidates", 40]
+    code, out, _ = rigcal(*words, "-o", tmp_path / "plan")
+    assert code == 0 and "0 stops" in out
+    for name in ("stops", "way"):
+        table = pd.read_csv(tmp_path / "plan" / f"{name}.csv")
+        assert table.empty and "joint_1" in table.columns

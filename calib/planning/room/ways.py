@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -77,7 +77,7 @@ def way_over(
 
 
 def way_document(poses: Poses, names: Sequence[str], legs: Sequence[Leg]) -> list[dict[str, Any]]:
-    """The way as JSON has it, and as columns of a table: every pose on it, the stops and those to
+    """The way as JSON has it: every pose on it, the stops and those to
     go by; ``stop`` is the number of a stop, from 1, or None; ``clear`` whether the way to it is
     known to be, None where it begins or the base moves.
 
@@ -96,6 +96,11 @@ def way_document(poses: Poses, names: Sequence[str], legs: Sequence[Leg]) -> lis
             where = {"location": str(at), **dict(zip(names, angles.tolist(), strict=True))}
             out.append({**where, "stop": stop, "clear": leg.clear if leg else None})
     return out
+
+
+def way_columns(way: Sequence[Mapping[str, Any]], names: Sequence[str]) -> dict[str, list[Any]]:
+    """The same as columns of a table."""
+    return {key: [row[key] for row in way] for key in ("location", *names, "stop", "clear")}
 
 
 def between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
