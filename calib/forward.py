@@ -9,7 +9,7 @@ unknown is the derivative by site times the basis.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -55,6 +55,11 @@ class Placed:
 
     T: np.ndarray
     d: Derivatives
+
+    def by(self, names: Iterable[str]) -> np.ndarray:
+        """(K, 6, n) its right increment by all components of these variables, side by side."""
+        some, count = (self.d[name] for name in names), len(self.T)
+        return np.concatenate([np.broadcast_to(d, (count, *d.shape[1:])) for d in some], axis=2)
 
 
 @dataclass(frozen=True)

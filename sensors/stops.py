@@ -133,16 +133,7 @@ class CsvTable:
         names = [f"{body}.{part}" for part in POSE]
         if not any(name in self for name in names[3:]):
             names = names[:3]
-        why = f"{body} needs {', '.join(names)}"
-        pose = np.array([self._loose(name, why) for name in names]).T
-        missing = ~np.isfinite(pose)
-        self.refuse(
-            missing.any(axis=1) & ~np.isnan(pose).all(axis=1),
-            lambda row: (
-                f"{names[np.argmax(missing[row])]} is empty or not finite, though {body} was"
-                " seen; give its whole pose, or leave all of it empty"
-            ),
-        )
+        pose = self._whole(names, body, f"{body} was seen; give its whole pose, or leave all of it")
         self.refuse(
             (np.abs(pose[:, :3]) > _FARTHEST_M).any(axis=1),
             lambda row: (
@@ -166,16 +157,8 @@ class CsvTable:
         """Take what an accelerometer felt at rest, in any unit, as unit vectors (K, 3); NaN where
         it was not read."""
         names = level_columns(frame)
-        why = f"the level in {frame} needs {', '.join(names)}"
-        felt = np.array([self._loose(name, why) for name in names]).T
-        missing = ~np.isfinite(felt)
-        self.refuse(
-            missing.any(axis=1) & ~np.isnan(felt).all(axis=1),
-            lambda row: (
-                f"{names[np.argmax(missing[row])]} is empty or not finite, though the level in "
-                f"{frame} was read; give all three, or leave all of them empty"
-            ),
-        )
+        what = f"the level in {frame}"
+        felt = self._whole(names, what, f"{what} was read; give all three, or leave all of them")
         length = np.linalg.norm(felt, axis=1)
         self.refuse(length == 0, f"{', '.join(names)} are all 0; leave what was not read empty")
         usual = np.median(length[np.isfinite(length)]) if np.isfinite(length).any() else 1.0
@@ -187,6 +170,18 @@ class CsvTable:
             ),
         )
         return felt / length[:, None]
+
+    def _whole(self, names: Sequence[str], what: str, but: str) -> Array:
+        """Take the columns (K, n) that something needs, of which a row has all or none."""
+        found = np.array([self._loose(n, f"{what} needs {', '.join(names)}") for n in names]).T
+        missing = ~np.isfinite(found)
+        self.refuse(
+            missing.any(axis=1) & ~np.isnan(found).all(axis=1),
+            lambda row: (
+                f"{names[np.argmax(missing[row])]} is empty or not finite, though {but} empty"
+            ),
+        )
+        return found
 
     def rest(self) -> dict[str, Array]:
         """Give every other numeric column; one that is mostly numbers must be so throughout."""

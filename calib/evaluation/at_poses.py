@@ -21,7 +21,7 @@ from calib.linear.parallel import one_blas_thread
 from calib.problem import Problem
 from calib.problem.model import Source, stop_columns
 from calib.results.intervals import Intervals, intervals
-from calib.results.reach import body_beyond, joint_range, placed
+from calib.results.reach import body_beyond, columns_at, joint_range, placed
 from calib.runs.reopen import model_of, problem_of, reopened, start_of, state_of
 from calib.runs.run import Run
 from calib.solve.estimate import Estimate
@@ -196,8 +196,7 @@ def over_workspace(
     )
     told, found = _known(run, estimate, progress), []
     for at, joints in ((some, measured[some]), (at_stop, drawn)):
-        columns = {name: np.asarray(column)[at] for name, column in source.columns.items()}
-        columns |= dict(zip(source.rig.joint_names, joints.T, strict=True))
+        columns = columns_at(source, at, joints)
         names = [source.recording.stops[i] for i in at.tolist()]
         found.append(_predicted(run, *told, names, joints, columns))
     return found[0], found[1]
@@ -224,8 +223,6 @@ def _apart(drawn: np.ndarray, true: np.ndarray) -> np.ndarray:
 
 def _covariance(true: Placed, covariance: np.ndarray) -> np.ndarray:
     """(K, 6, 6) of the true poses, in the same axes."""
-    parts = [np.broadcast_to(d, (len(true.T), *d.shape[1:])) for d in true.d.values()]
-    R = true.T[:, :3, :3]
-    d = np.concatenate(parts, axis=2)
+    R, d = true.T[:, :3, :3], true.by(true.d)
     d = np.concatenate([R @ d[:, :3], R @ d[:, 3:]], axis=1)
     return d @ covariance @ d.mT

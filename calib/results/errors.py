@@ -168,7 +168,7 @@ def body_errors(
         expected = 3.0 * block.sigma_m**2 * len(distance)
         if predicted is not None:
             names = list(placed.d)
-            d = np.concatenate([placed.d[name][:, 3:] for name in names], axis=2)
+            d = placed.by(names)[:, 3:]
             known = np.einsum("kip,pq,kiq->", d, predicted.covariance_of(names), d)
             expected += -known if any(block is each for each in own) else known
         out += Errors(

@@ -102,8 +102,8 @@ def reach(problem: Problem, estimate: Estimate, known: Intervals | None = None) 
     stops = beyond.stops
     rng, range_ = np.random.default_rng(0), joint_range(rig, source.recording.joints[stops])
     at_stop = rng.choice(stops, DRAWN_POSES)
-    here = _stops(problem, stops, source.recording.joints[stops], root)
-    there = _stops(
+    here = at_joints(problem, stops, source.recording.joints[stops], root)
+    there = at_joints(
         problem, at_stop, rng.uniform(*range_, (DRAWN_POSES, len(rig.joint_names))), root
     )
     seen, drawn = (placed(each, body, base, estimate.values) for each in (here, there))
@@ -158,21 +158,29 @@ def _is_of(block: TrackedBody, source: Source) -> bool:
     return block.stop_names[0][0] == source.recording.folder
 
 
-def _stops(problem: Problem, at_stop: np.ndarray, joints: np.ndarray, root: str) -> Stops:
-    """The first rig with these joints (n, J), all else as at one of its stops (n,)."""
+def at_joints(problem: Problem, at_stop: np.ndarray | None, joints: np.ndarray, root: str) -> Stops:
+    """The first rig with these joints (n, J), all else as at one of its stops (n,); None where it
+    has none."""
     source = problem.sources[0]
-    columns = {name: np.asarray(column)[at_stop] for name, column in source.columns.items()}
-    columns |= dict(zip(source.rig.joint_names, joints.T, strict=True))
+    columns = columns_at(source, at_stop, joints)
     return place(source.rig, problem.terms[0], joints, columns, root, None)
+
+
+def columns_at(
+    source: Source, at_stop: np.ndarray | None, joints: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Columns (n, ...) that effects look at; arguments as of `at_joints`."""
+    known = {} if at_stop is None else source.columns
+    columns = {name: np.asarray(column)[at_stop] for name, column in known.items()}
+    return columns | dict(zip(source.rig.joint_names, joints.T, strict=True))
 
 
 def joint_range(rig: Rig, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Least and largest value (J,) of each joint, rad or m, as the URDF says; a whole turn where
     it does not, and of a prismatic one what was seen of it in `joints` (K, J)."""
-    known = {j.name: j for e in rig.tree.edges if (j := e.joint) is not None and j.leads}
     turns = np.array(rig.joint_kinds) == "revolute"
     free = np.stack([np.where(turns, -np.pi, joints.min(0)), np.where(turns, np.pi, joints.max(0))])
-    said = np.array([[known[n].lower, known[n].upper] for n in rig.joint_names]).T
+    said = np.array([[j.lower, j.upper] for j in rig.joints]).T
     return tuple(np.where(np.isfinite(said), said, free))
 
 
@@ -195,6 +203,5 @@ def _errors(covariance: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 def _error(placed: Placed, names: Sequence[str], errors: np.ndarray) -> float:
     """The length, m, below which 95 % of the errors of position lie."""
-    d = np.concatenate([np.broadcast_to(placed.d[n], (len(placed.T), *placed.d[n].shape[1:]))
-                        for n in names], axis=2)[:, 3:]  # fmt: skip
+    d = placed.by(names)[:, 3:]
     return float(np.quantile(np.linalg.norm(d @ errors, axis=1), TOLD_SHARE))

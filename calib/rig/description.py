@@ -18,7 +18,7 @@ from calib.rig.document import (
 from chains import se3
 from chains.arm import Mass, read_arm, read_masses
 from chains.errors import InputError, shortened
-from chains.frames import Edge, FrameTree, unknown_name
+from chains.frames import Edge, FrameTree, Joint, unknown_name
 from sensors.documents import Document, Marks, read_yaml, validate
 from sensors.lidar import LidarModel, load_lidar
 
@@ -143,10 +143,15 @@ class Rig:
         return self.beyond(self.tips) if self.chains else frozenset(self.frame_sigma)
 
     @property
+    def joints(self) -> tuple[Joint, ...]:
+        """Those that move by a value of their own, as `joint_names` has them."""
+        known = {j.name: j for e in self.tree.edges if (j := e.joint) is not None and j.leads}
+        return tuple(known[name] for name in self.joint_names)
+
+    @property
     def joint_kinds(self) -> tuple[str, ...]:
         """ "revolute" or "prismatic", by joint."""
-        kinds = {j.name: j.kind for e in self.tree.edges if (j := e.joint) is not None and j.leads}
-        return tuple(kinds[name] for name in self.joint_names)
+        return tuple(joint.kind for joint in self.joints)
 
     def joint_of(self, parameter: str) -> str:
         """The moving joint that a parameter is named after, alone or before a point; else empty."""

@@ -172,7 +172,7 @@ def odd_joints(rig: Rig, recording: RecordedStops) -> Iterator[str]:
     values = {name: at for name, at in values.items() if name not in rig.passive}
     if still := [name for name, at in values.items() if np.ptp(at) < JOINT_STILL]:
         yield f"{listed(still)} hardly moved, too little to tell their own errors; move them"
-    for joint in (j for edge in rig.tree.edges if (j := edge.joint) is not None and j.leads):
+    for joint in rig.joints:
         if joint.name not in values:
             continue
         at, unit = values[joint.name], "rad" if joint.kind == "revolute" else "m"

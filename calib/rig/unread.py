@@ -46,10 +46,8 @@ def with_unread(rig: Rig, recording: RecordedStops) -> RecordedStops:
 
 def _limits(rig: Rig) -> tuple[Array, Array]:
     """(J,) of all joints; a whole turn, or a metre either way, where the URDF has none."""
-    by = {j.name: j for e in rig.tree.edges if (j := e.joint) is not None and j.leads}
-    joints = [by[name] for name in rig.joint_names]
-    far = np.array([np.pi if j.kind == "revolute" else 1.0 for j in joints])
-    said = np.array([[j.lower, j.upper] for j in joints]).T
+    far = np.array([np.pi if j.kind == "revolute" else 1.0 for j in rig.joints])
+    said = np.array([[j.lower, j.upper] for j in rig.joints]).T
     lower, upper = np.where(np.isfinite(said), said, [-far, far])
     return lower, upper
 

@@ -116,8 +116,7 @@ def _bases(
 def _joints(rig: Rig, spec: Spec, placed: int, count: int, rng: np.random.Generator) -> np.ndarray:
     """Joints (count, J) well within their limits, as the spec has them where the base stands after
     so many placings; `level` keeps the arm's tip upright."""
-    moving = {j.name: j for e in rig.tree.edges if (j := e.joint) is not None and j.leads}
-    limits = np.array([[moving[j].lower, moving[j].upper] for j in rig.joint_names]).reshape(-1, 2)
+    limits = np.array([[joint.lower, joint.upper] for joint in rig.joints]).reshape(-1, 2)
     q = rng.uniform(*(0.85 * limits.T), (count, len(limits)))
     if spec.poses == "one_joint":
         q[:, np.arange(len(limits)) != placed % len(limits)] = 0.0

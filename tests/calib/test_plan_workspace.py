@@ -12,10 +12,10 @@ from calib.planning import planner_of
 from calib.planning.criteria import PredictionVariance, chosen
 from calib.planning.information import Information
 from calib.planning.room.hanging import plan_targets
-from calib.planning.room.workspace import _at, moved_anywhere
+from calib.planning.room.workspace import moved_anywhere
 from calib.planning.worth import criterion
 from calib.problem.unknowns import Key
-from calib.results.reach import placed
+from calib.results.reach import at_joints, placed
 from chains.errors import InputError
 from tests.calib.narrow import run_of
 
@@ -54,7 +54,8 @@ def test_errors_of_the_calibration_move_the_lidar_by_as_much_as_is_told(narrow):
     values = dict(scene.values)
 
     def at(moved):
-        stops = _at(scene, poses, "")
+        first = np.zeros(len(poses.joints), int)
+        stops = at_joints(scene.stand.estimate.problem, first, poses.joints, "")
         return placed(stops, lidar, base, moved).T[:, :3, 3]
 
     here, count = at(values), 0

@@ -87,10 +87,7 @@ class Clear:
         self._leave_out_what_is_built_so()
 
     def _leave_out_what_is_built_so(self) -> None:
-        rig, recording = self.source.rig, self.source.recording
-        zero = np.zeros((1, len(rig.joint_names)))
-        low, high = joint_range(rig, recording.joints if len(recording.joints) else zero)
-        joints = np.random.default_rng(0).uniform(low, high, (BUILT_SO_POSES, len(low)))
+        joints = self.drawn(BUILT_SO_POSES, np.random.default_rng(0))
         touch = self._apart_m(self._ends_of_parts(joints)) < self.least_m
         differ = touch.mean(axis=0) < BUILT_SO
         self.pairs, self.least_m = self.pairs[differ], self.least_m[differ]
@@ -115,6 +112,13 @@ class Clear:
             out.room_m = np.minimum(out.room_m, room.min(axis=0, initial=np.inf))
         return out
 
+    def drawn(self, count: int, rng: np.random.Generator) -> np.ndarray:
+        """Random joints (n, J), evenly over their range."""
+        measured = self.source.recording.joints
+        known = measured if len(measured) else np.zeros((1, measured.shape[1]))
+        low, high = joint_range(self.source.rig, known)
+        return rng.uniform(low, high, (count, len(low)))
+
     def of_poses(self, joints: np.ndarray, Ts_reference_root: np.ndarray) -> np.ndarray:
         """(n,) whether each pose is clear, and within the mesh's box."""
         apart, room = self._gaps(joints, Ts_reference_root)
@@ -125,14 +129,14 @@ class Clear:
         points, of = self.parts.points(self._ends_of_parts(joints))
         return InTheWay(points, np.maximum(self.parts.radius_m, TUBE_RADIUS_M)[of])
 
-    def _ends(self, joints: np.ndarray) -> np.ndarray:
+    def _frames(self, joints: np.ndarray) -> np.ndarray:
         """Poses (n, F, 4, 4) of all frames from the root on, in the root's frame."""
         tree = self.source.rig.tree
         root = np.broadcast_to(np.eye(4), (len(joints), 4, 4))
         return np.stack([root, *(tree.transform(f, joints) for f in self.frames[1:])], axis=1)
 
     def _ends_of_parts(self, joints: np.ndarray) -> np.ndarray:
-        return self.parts.placed(self._ends(joints))
+        return self.parts.placed(self._frames(joints))
 
     def _apart_m(self, ends_m: np.ndarray) -> np.ndarray:
         """(n, P) how far lines of pairs of parts are from each other."""

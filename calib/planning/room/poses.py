@@ -9,7 +9,6 @@ import numpy as np
 from calib.planning.room.clear import Clear
 from calib.planning.room.sight import in_sight
 from calib.planning.stops import Poses
-from calib.results.reach import joint_range
 from chains import se3
 from chains.errors import InputError
 
@@ -38,13 +37,11 @@ def reachable(
     Raises:
         InputError: it can hardly take any pose there.
     """
-    source, rig, recording = clear.source, clear.source.rig, clear.source.recording
+    source = clear.source
     names, Ts = list(places), np.stack(list(places.values()))
-    measured = recording.joints if len(recording.joints) else np.zeros((1, len(rig.joint_names)))
-    low, high = joint_range(rig, measured)
     found: list[tuple[np.ndarray, np.ndarray]] = []
     for _ in range(TIMES_DRAWN):
-        joints = rng.uniform(low, high, (count, len(low)))
+        joints = clear.drawn(count, rng)
         at = rng.integers(len(names), size=count)
         free = clear.of_poses(joints, se3.inverse(T_world_reference) @ Ts[at])
         if cameras_m is not None and free.any():
@@ -58,8 +55,8 @@ def reachable(
     joints, at = (np.concatenate(parts)[:count] for parts in zip(*found, strict=True))
     if not len(joints):
         raise InputError(
-            f"{rig.folder}: none of {TIMES_DRAWN * count} random poses of the arm is clear of "
-            "itself and of the mesh where its base was"
+            f"{source.rig.folder}: none of {TIMES_DRAWN * count} random poses of the arm is clear "
+            "of itself and of the mesh where its base was"
             + (", and in the cameras' sight" if cameras_m is not None else "")
         )
     return Poses(np.array(names)[at], joints, Ts[at])

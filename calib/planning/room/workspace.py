@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from calib.forward import Stops, place
 from calib.planning.information import Information
 from calib.planning.scene import PlanningScene
 from calib.planning.stops import Poses
-from calib.results.reach import body_beyond, placed
+from calib.results.reach import at_joints, body_beyond, placed
 from chains.errors import InputError
 
 
@@ -36,7 +35,8 @@ def moved_anywhere(scene: PlanningScene, known: Information, poses: Poses) -> np
             "could be predicted"
         )
     names = {name for name, _ in known.keys}
-    stops = _at(scene, poses, beyond.root if beyond else "")
+    at_stop = np.zeros(len(poses.joints), int) if scene.source.recording.stops else None
+    stops = at_joints(problem, at_stop, poses.joints, beyond.root if beyond else "")
     base = beyond.base if beyond else None
     if base is None and not (beyond and beyond.root in names):
         base = rig.tree.root
@@ -44,21 +44,6 @@ def moved_anywhere(scene: PlanningScene, known: Information, poses: Poses) -> np
     at, out = {key: i for i, key in enumerate(known.keys)}, np.zeros((len(known.keys),) * 2)
     mine = [name for name in seen.d if name in names]
     columns = np.array([at[key] for n in mine for key in problem.variables[n].keys], int)
-    count = len(poses.joints)
-    J = np.concatenate(
-        [np.broadcast_to(seen.d[n][:, 3:], (count, 3, seen.d[n].shape[2])) for n in mine], axis=2
-    )
-    J = J * known.unit[columns]
-    out[np.ix_(columns, columns)] = np.einsum("nip,niq->pq", J, J) / count
+    J = seen.by(mine)[:, 3:] * known.unit[columns]
+    out[np.ix_(columns, columns)] = np.einsum("nip,niq->pq", J, J) / len(J)
     return out
-
-
-def _at(scene: PlanningScene, poses: Poses, root: str) -> Stops:
-    """The rig at these poses, all else as at its first stop."""
-    source, count = scene.source, len(poses.joints)
-    columns = {
-        name: np.repeat(np.asarray(column)[:1], count) for name, column in source.columns.items()
-    }
-    columns |= dict(zip(source.rig.joint_names, poses.joints.T, strict=True))
-    terms = scene.stand.estimate.problem.terms[0]
-    return place(source.rig, terms, poses.joints, columns, root, None)
