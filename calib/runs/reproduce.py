@@ -242,7 +242,9 @@ def _moves(run: Run, again: Run) -> Iterator[tuple[str, float]]:
     for prefix, part, other in pairs:
         for name in (n for n in part.frames if n in other.frames):
             frame, T_now = part.frames[name], other.frames[name].T_parent_child
-            apart = se3.log(se3.inverse(frame.T_parent_child) @ T_now)
+            R_t, t = frame.T_parent_child[:3, :3].T, frame.T_parent_child[:3, 3]
+            # Of a pose that is the same both are 0 exactly, which no product of inverses is.
+            apart = np.r_[se3.so3_log(R_t @ T_now[:3, :3]), R_t @ (T_now[:3, 3] - t)]
             yield from _sigmas(prefix + name, _DOF, apart, np.r_[frame.sigma_rad, frame.sigma_m])
         for name in (n for n in part.effects if n in other.effects):
             was, now = part.effects[name], other.effects[name]
