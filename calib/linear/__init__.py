@@ -3,8 +3,9 @@
 **Normal equations.** At a state, whitened rows ``A x = b`` (b is minus the residual) are fully
 described by the Gram matrix of ``[A | b]``: ``H = A^T A``, ``h = A^T b`` and ``b^T b``. It is a sum
 over rows, so each stop's million beams become one small matrix (`rows`), stops side by side on
-threads (`parallel`), and no row is looked at again. A stop's beams know where the LiDAR is only
-through its twist, 6 columns; the chain rule, ``d twist / d unknowns``, is applied to the sums.
+threads, in processes or on a cluster (`parallel`), and no row is looked at again. A stop's beams
+know where the LiDAR is only through its twist, 6 columns; the chain rule, ``d twist / d unknowns``,
+is applied to the sums.
 
 **Units.** Every column is scaled by the prior sigma of its unknown. A prior then adds 1 to the
 diagonal of what is eliminated, so that its blocks can always be factored, and metres and radians

@@ -169,7 +169,8 @@ def of_each(
     """
     scans = problem.scans
     met = list(in_order(lambda i: scans[i].associate(values, near_edges=True), len(scans)))
-    problem, met = with_surfaces(problem, met)
+    problem = with_surfaces(problem, met)
+    scans = problem.scans
     values = {n: u.mean for n, u in problem.variables.items()} | dict(values)
     values |= {name: problem.variables[name].mean for name in problem.cells}
     layout = Layout.of(problem, unbounded=unbounded)

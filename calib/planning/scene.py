@@ -220,7 +220,7 @@ class PlanningScene:
             return met or scan.associate(values, near_edges=True)
 
         found = list(in_order(meets, len(problem.scans)))
-        problem, found = with_surfaces(problem, found)
+        problem = with_surfaces(problem, found)
         for name in problem.cells:
             unknown = problem.variables[name]
             values[name] = started(unknown, estimate.state, unknown.mean)

@@ -11,6 +11,7 @@ import numpy as np
 from calib.forward import Derivatives, Term, Values
 from calib.problem.model import Source
 from calib.problem.unknowns import Unknown
+from calib.residuals.beams import CellNumbers
 from calib.residuals.scan import ScanStop
 from calib.residuals.seen import SeenBody
 from calib.residuals.surfaces import Meeting
@@ -148,9 +149,16 @@ class Problem:
         return unknown.name
 
     def with_cells(self, unknowns: Sequence[Unknown], cells: Mapping[str, SurfaceCells]) -> Problem:
-        """The problem with unknowns of its surfaces."""
+        """The problem with unknowns of its surfaces; its scans know which of these moves what."""
+        numbers = {name: CellNumbers.of(some.column, some.parts) for name, some in cells.items()}
+
+        def numbered(scan: ScanStop) -> ScanStop:
+            felt = {n: numbers[n] for n, some in cells.items() if some.room == scan.room}
+            return replace(scan, cells=felt if scan.reference_sigma_m else {})
+
         return replace(
             self,
+            scans=[numbered(scan) for scan in self.scans],
             variables=self.variables | {u.name: u for u in unknowns},
             initial=self.initial | {u.name: u.mean for u in unknowns},
             cells=cells,

@@ -28,19 +28,13 @@ LOST_BEAMS = 0.5  # of these, below which a plane that was found has lost its be
 SURFACE_SHARES = {"surface": 0.6, "region": 0.6, "patch": 2.0}
 
 
-def with_surfaces(
-    problem: Problem, associations: Sequence[Association]
-) -> tuple[Problem, list[Association]]:
+def with_surfaces(problem: Problem, associations: Sequence[Association]) -> Problem:
     """A problem with the unknowns of the surfaces that its beams meet.
 
     Args:
         problem: without them.
         associations: per scan, what its beams meet, with their patches.
-
-    Returns:
-        The problem, and the associations with each beam's cells.
     """
-    numbered = [dict(a.cells) for a in associations]
     unknowns: list[Unknown] = []
     cells: dict[str, SurfaceCells] = {}
     for room, scans in _by_room(problem).items():
@@ -49,12 +43,9 @@ def with_surfaces(
             continue
         on_planes = isinstance(first.meeting, PlaneSurface)
         for column, kind in kinds_of(first).items():
-            parts_in = {i: _parts(problem, associations[i], i, column) for i in scans}
-            last = max(int(p.max(initial=-1)) for p in parts_in.values())
-            seen = sum(np.bincount(p + 1, minlength=last + 2) for p in parts_in.values())
-            parts = np.flatnonzero(seen[1:])  # counted from -1: nothing is met
-            number = np.full(last + 2, -1, np.int32)  # the last stands for -1
-            number[parts] = np.arange(len(parts))
+            met = (np.unique(problem.scans[i].parts(associations[i], column)) for i in scans)
+            parts = np.unique(np.concatenate(list(met)))
+            parts = parts[parts >= 0].astype(int)
             name = kind if on_planes else f"{room}/reference_{column}"
             sigma_m = cell_sigma_m(first, column)
             unknowns.append(_unknown(name, room, column, parts, sigma_m))
@@ -65,10 +56,7 @@ def with_surfaces(
                 surface=first.meeting.surface_of(column, parts),
                 room=room,
             )
-            for i in scans:
-                numbered[i][name] = number[parts_in[i]]
-    found = [replace(a, cells=n) for a, n in zip(associations, numbered, strict=True)]
-    return problem.with_cells(unknowns, cells), found
+    return problem.with_cells(unknowns, cells)
 
 
 def kinds_of(scan: ScanStop) -> dict[str, str]:
@@ -121,12 +109,6 @@ def _unknown(name: str, room: int | str, column: str, parts: np.ndarray, sigma_m
         role=Role.SURFACE,
         owner=Owner(room=room),
     )
-
-
-def _parts(problem: Problem, association: Association, scan: int, column: str) -> np.ndarray:
-    if column in association.patches:
-        return np.where(association.part >= 0, association.patches[column], -1)
-    return problem.scans[scan].meeting.surfaces(association)
 
 
 def _by_room(problem: Problem) -> dict[int | str, list[int]]:

@@ -48,13 +48,34 @@ class Association:
     Args:
         part: (N,) triangle or plane; -1 for nothing.
         patches: kind of patch -> (N,) patch of the surface, -1 for none; empty if not kept.
-        cells: unknown of the surfaces -> (N,) its component that moves what the beam meets, -1 for
-            none; empty where the model has no such unknowns.
     """
 
     part: np.ndarray
     patches: Mapping[str, np.ndarray] = field(default_factory=dict)
-    cells: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class CellNumbers:
+    """Which component of an unknown of the surfaces moves each part of a kind.
+
+    Args:
+        column: the kind: surface, region or patch.
+        number: (L + 1,) of each part; -1 for those that it does not move, the last one too.
+    """
+
+    column: str
+    number: np.ndarray
+
+    @classmethod
+    def of(cls, column: str, parts: np.ndarray) -> CellNumbers:
+        """Of parts (P,), ascending, that are moved by one component after another."""
+        number = np.full(int(parts.max(initial=-1)) + 2, -1, np.int32)
+        number[parts] = np.arange(len(parts))
+        return cls(column, number)
+
+    def of_beams(self, part: np.ndarray) -> np.ndarray:
+        """Of the parts (N,) that beams meet; -1 where they meet none."""
+        return self.number[np.minimum(part, len(self.number) - 1)]
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from calib.effects import LazyColumn, OneHot, Site, View
 from calib.forward import Stops, Term, Values
 from calib.residuals.beams import (
     Association,
+    CellNumbers,
     Columns,
     Ranges,
     Rows,
@@ -82,6 +83,7 @@ class ScanStop:
         store, alike: its recording's scans as beams, and those of all recordings by this LiDAR.
         room: the mesh, or the recording whose planes these are.
         group: the name of its rows.
+        cells: unknown of the surfaces -> which component moves what beams are known to meet.
         reference_scatter_m: kind of part, "surface", "region" or "patch" -> how widely such parts
             scatter beyond what is stated of them, which is in `reference_sigma_m`.
     """
@@ -99,6 +101,7 @@ class ScanStop:
     group: Group
     reference_scatter_m: Mapping[str, float] = field(default_factory=dict, kw_only=True)
     alike: tuple[BeamStore, ...] = ()
+    cells: Mapping[str, CellNumbers] = field(default_factory=dict, kw_only=True)
 
     @property
     def stated_sigma_m(self) -> float:
@@ -168,6 +171,12 @@ class ScanStop:
             association = self._associate(T, ray, values, near_edges=False)
         return self._rows(self._seen(T, values, association, scan, ray), T)
 
+    def parts(self, association: Association, kind: str) -> np.ndarray:
+        """The parts (N,) of a kind that beams meet, -1 for none."""
+        if kind in association.patches:
+            return np.where(association.part >= 0, association.patches[kind], -1)
+        return self.meeting.surfaces(association)
+
     def ranges(self, values: Values) -> Ranges:
         """Every beam that meets the surface, before and after what the effects correct."""
         T = self.pose(values)
@@ -226,8 +235,11 @@ class ScanStop:
         if error[Site.BEAM][:, 1:].any():
             ray = turned(ray, -error[Site.BEAM][:, 1], -error[Site.BEAM][:, 2])
             surface = self.meeting.meet(T, ray, values, association)
-        shifts = (np.append(values[n], 0.0)[index] for n, index in association.cells.items())
-        cells = [(n, index, len(values[n])) for n, index in association.cells.items()]
+        cells = [
+            (name, cell.of_beams(self.parts(association, cell.column)), len(values[name]))
+            for name, cell in (self.cells if association.patches else {}).items()
+        ]
+        shifts = (np.append(values[n], 0.0)[index] for n, index, _ in cells)
         return _Seen(
             scan=scan,
             ray=ray,

@@ -347,7 +347,8 @@ class Loop(Descent):
         for i, association in enumerate(over_stops(work, scans, parts)):
             self.progress("looking for depth edges", i, len(scans))
             found.append(association)
-        self.problem, self.associations = with_surfaces(self.given, well_seen(self.given, found))
+        self.associations = well_seen(self.given, found)
+        self.problem = with_surfaces(self.given, self.associations)
         for name in self.problem.cells:
             unknown = self.problem.variables[name]
             self.values[name] = started(unknown, known, unknown.mean)

@@ -52,9 +52,8 @@ def without_mesh_errors(stand: Stand, effects: Sequence[Effect]) -> Scores:
     fit = stand.estimate
     bare = replace(
         fit,
-        problem=replace(fit.problem, cells={}),
         # What the mesh's errors took on is in the residual again.
-        associations=[replace(a, cells={}) for a in fit.associations],
+        problem=replace(fit.problem, cells={}, scans=[replace(s, cells={}) for s in fit.scans]),
     )
     linear, _ = replace(stand, estimate=bare).linearise(effects, silent)
     none = np.full(1, -1)

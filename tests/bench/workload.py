@@ -97,7 +97,7 @@ class Work:
     def cast(self, i: int) -> Association:
         """What the beams of a stop meet at the start, found anew."""
         found = self.problem.scans[i].associate(self.start, near_edges=False)
-        return replace(found, cells=self.associations[i].cells)
+        return replace(found, patches=self.associations[i].patches)
 
 
 def _every(scan: Scan, n: int) -> Scan:

@@ -86,10 +86,10 @@ def bent(problem):
     views = [scan.rows(values, a).view for scan, a in pairs]
     patches = ({kind: view[kind] for kind in ("region", "patch")} for view in views)
     with_patches = [replace(a, patches=p) for a, p in zip(association, patches, strict=True)]
-    problem, association = with_surfaces(problem, with_patches)
+    problem = with_surfaces(problem, with_patches)
     cells = {name: problem.variables[name] for name in problem.cells}
     values |= rigs.shaken(cells, problem.initial, 0.01)
-    return SimpleNamespace(problem=problem, values=values, association=association)
+    return SimpleNamespace(problem=problem, values=values, association=with_patches)
 
 
 def dense(columns, count, dim):

@@ -72,7 +72,7 @@ def test_a_stop_says_what_its_rows_say_without_what_it_has_alone(planner):
     problem, values = scene.planned_alone(poses)
     blocks = [b for b in problem.blocks if isinstance(b, TrackedBody)]
     met = [scan.associate(values, near_edges=True) for scan in problem.scans]
-    problem, met = with_surfaces(replace(problem, blocks=blocks), met)
+    problem = with_surfaces(replace(problem, blocks=blocks), met)
     values |= {name: problem.variables[name].mean for name in problem.cells}
     dense = Dense(problem, values, met)
     whole = (dense.A * dense.sigma).T @ (dense.A * dense.sigma)

@@ -9,7 +9,7 @@ import pytest
 from calib.effects import Effect, Param, Site
 from calib.forward import Term
 from calib.problem.build import effect_unknown
-from calib.residuals.beams import Association
+from calib.residuals.beams import Association, CellNumbers
 from calib.residuals.robust import tukey_weight
 from calib.residuals.scan import turned
 from sensors.lidar import Beams, beams
@@ -197,23 +197,25 @@ def test_a_beam_that_meets_no_plane_says_nothing_and_divides_by_nothing(on_plane
 
 def test_a_shifted_surface_stands_off_along_its_normal(on_mesh):
     """true = mesh + d n, n towards the sensor: nearer, so what is measured reads longer."""
-    scan, values = replace(on_mesh.problem.scans[0], terms=[]), on_mesh.values
-    plain = replace(on_mesh.association[0], cells={})
-    before = scan.rows(values, plain)
-    surfaces, index = np.unique(before.view["surface"], return_inverse=True)
-    theta = np.linspace(-0.02, 0.03, len(surfaces))
-    after = scan.rows({**values, "shift": theta}, replace(plain, cells={"shift": index}))
-    expected = before.residual_m + theta[index] / np.cos(before.view["incidence_rad"])
-    np.testing.assert_allclose(after.residual_m, expected, atol=1e-9)
+    scan, met = replace(on_mesh.problem.scans[0], terms=[], cells={}), on_mesh.association[0]
+    before = scan.rows(on_mesh.values, met)
+    surface = before.view["surface"]
+    cells = CellNumbers.of("surface", np.unique(surface[surface >= 0]))
+    index = cells.of_beams(surface)
+    theta = np.linspace(-0.02, 0.03, index.max() + 1)
+    shifted = replace(scan, cells={"shift": cells})
+    after = shifted.rows({**on_mesh.values, "shift": theta}, met)
+    moved_m = np.where(index >= 0, theta[index] / np.cos(before.view["incidence_rad"]), 0.0)
+    np.testing.assert_allclose(after.residual_m, before.residual_m + moved_m, atol=1e-9)
 
 
 def test_a_part_that_no_unknown_names_stays(on_mesh):
-    scan, values = on_mesh.problem.scans[0], on_mesh.values
-    plain = replace(on_mesh.association[0], cells={})
-    before = scan.rows(values, plain)
+    scan, met = replace(on_mesh.problem.scans[0], cells={}), on_mesh.association[0]
+    before = scan.rows(on_mesh.values, met)
     surface = before.view["surface"]
     index = np.select([surface == 1, surface == 4], [0, 1], -1)
-    moved = scan.rows({**values, "shift": np.ones(2)}, replace(plain, cells={"shift": index}))
+    some = replace(scan, cells={"shift": CellNumbers.of("surface", np.array([1, 4]))})
+    moved = some.rows({**on_mesh.values, "shift": np.ones(2)}, met)
     still = index < 0
     np.testing.assert_array_equal(moved.residual_m[still], before.residual_m[still])
     assert np.abs(moved.residual_m - before.residual_m)[~still].min() > 0.9
@@ -225,6 +227,7 @@ def test_every_beam_moves_with_the_cells_that_it_meets_and_with_no_other(on_mesh
     for scan, association in zip(on_mesh.problem.scans, on_mesh.association, strict=True):
         view = scan.rows(on_mesh.values, association).view
         for name, cells in on_mesh.problem.cells.items():
-            index = association.cells[name]
+            met = scan.parts(association, cells.column)
+            index = scan.cells[name].of_beams(met)
             np.testing.assert_array_equal(cells.parts[index], view[cells.column])
             np.testing.assert_array_equal(cells.surface[index], view["surface"])

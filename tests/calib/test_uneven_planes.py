@@ -57,7 +57,8 @@ def test_cells_are_a_partition_of_the_beams_of_each_plane(fitted):
     seen = {name: [] for name in names}
     for scan, met in zip(estimate.scans, estimate.associations, strict=True):
         assert isinstance(scan.meeting, PlaneSurface)
-        for name, cell in met.cells.items():
+        for name, cells in scan.cells.items():
+            cell = cells.of_beams(scan.parts(met, cells.column))
             np.testing.assert_array_equal(cell >= 0, met.part >= 0)
             mine = met.part >= 0
             of = estimate.problem.cells[name].surface[cell[mine]]
@@ -76,7 +77,8 @@ def test_cells_are_as_wide_as_they_are_said_to_be(fitted):
     rows = scan.rows(estimate.values, met)
     points = rows.view["point_m"]
     for kind, width_m in scan.meeting.patches_m.items():
-        cell = met.cells[f"{scan.meeting.variable}/{kind}"]
+        cells = scan.cells[f"{scan.meeting.variable}/{kind}"]
+        cell = cells.of_beams(scan.parts(met, kind))
         for number in np.unique(cell[cell >= 0])[:50]:
             assert np.ptp(points[cell == number], axis=0).max() < 2.2 * width_m
 

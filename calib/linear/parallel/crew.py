@@ -145,6 +145,8 @@ class Crew:
             line.close()
         for thread in self._threads:
             thread.shutdown(cancel_futures=True)
+        for line in self.lines:  # a thread may just have taken another
+            line.close()
 
     def _done(self, at: int, task: Task, arguments: tuple[Any, ...]) -> Any:
         """What becomes of a task at a stop; by a new worker where one ends."""
@@ -156,13 +158,14 @@ class Crew:
             except WorkerGoneError as gone:
                 self._holders.pop(at, None)
                 stop = f"at stop '{arguments[0].name}'"
+                if not self._closed:
+                    line.renew()
                 if self._closed or life == LIVES:
                     raise InputError(
                         f"{line.name} {gone} {stop}, {life} times; where memory is short, take "
                         "fewer --workers"
                     ) from None
                 _LOG.warning("%s %s %s; another goes on with it", line.name, gone, stop)
-                line.renew()
         self.traffic.stops += 1
         if not good:
             raise found

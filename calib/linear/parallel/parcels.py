@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 from calib.effects.own.files import code_of, of_code
 from calib.linear.layout import Layout
 from calib.linear.rows import State, Weighing
-from calib.residuals.beams import Association
+from calib.residuals.beams import Association, CellNumbers
 from calib.residuals.scan import ScanStop
 from calib.residuals.store import BeamStore
 from calib.residuals.surfaces import MeshSurface, PlaneSurface
@@ -34,7 +34,7 @@ from calib.rig import Rig
 from sensors.recording import RecordedStops
 from sensors.reference import Reference
 
-KEPT_PARCELS_BYTES = 2e9  # in each process: what 64 million beams met (28 bytes each), and a mesh
+KEPT_PARCELS_BYTES = 2e9  # in each process: what 150 million beams met (12 bytes each), and a mesh
 Key = tuple[str, int]
 
 
@@ -46,7 +46,7 @@ class Task:
 
 
 ONCE = (Task, Layout, ScanStop, BeamStore, RecordedStops, Rig, Reference, MeshSurface)
-ONCE += (PlaneSurface, Association, State, Weighing)
+ONCE += (PlaneSurface, CellNumbers, Association, State, Weighing)
 
 
 class Parcel(NamedTuple):
