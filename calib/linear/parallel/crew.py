@@ -96,9 +96,7 @@ class Traffic:
 
     def __str__(self) -> str:
         down, up = (sent / max(self.stops, 1) / 1e3 for sent in (self.down, self.up))
-        return (
-            f"workers were asked {self.stops} stops: {down:.0f} kB down and {up:.0f} kB up a stop"
-        )
+        return f"sent to workers: {self.stops} stops, each {down:.0f} kB down and {up:.0f} kB up"
 
 
 class Crew:
@@ -140,7 +138,8 @@ class Crew:
     def close(self) -> None:
         """End the workers, whatever they do."""
         self._closed = True
-        _LOG.info("%s", self.traffic)
+        if self.traffic.stops:
+            _LOG.info("%s", self.traffic)
         for line in self.lines:
             line.close()
         for thread in self._threads:
