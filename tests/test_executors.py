@@ -193,9 +193,10 @@ def test_a_fit_whose_workers_are_killed_ends_as_any_other(recording, tmp_path):
             time.sleep(0.5)
         _, err = process.communicate(timeout=LIMIT_S)
     assert process.returncode == 0, err
-    assert (
-        len(re.findall(r"worker [12] of 2 was ended by SIGKILL at stop '\w+'; another", err)) == 2
-    )
+    ended = re.findall(r"worker [12] of 2 was ended by SIGKILL at stop '\w+'; another", err)
+    assert len(ended) == 2
+    said = r"^rigcal: sent to workers: \d+ stops, each \d+ kB down and \d+ kB up$"
+    assert len(re.findall(said, err, re.M)) == 1
     command(["fit", "rec", "-o", "run", "--workers", "1"], there)
     assert written(here) == written(there)
 

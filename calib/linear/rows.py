@@ -279,10 +279,15 @@ class StopSums:
     def __getstate__(self) -> dict[str, Any]:
         """Without zeros: of the products of sparse columns few are not (1 in 22 where there are 303
         by 817), and they are most of what a stop sends."""
-        return {**vars(self), "with_sparse": csr_array(self.with_sparse)}
+        at = np.flatnonzero(self.with_sparse).astype(np.int32)
+        kept = self.with_sparse.shape, at, self.with_sparse.ravel()[at]
+        return {**vars(self), "with_sparse": kept}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        vars(self).update(state, with_sparse=state["with_sparse"].toarray())
+        shape, at, entries = state["with_sparse"]
+        dense = np.zeros(shape)
+        dense.ravel()[at] = entries
+        vars(self).update(state, with_sparse=dense)
 
     def whole(self) -> np.ndarray:
         """(7 + d + s, same) over [twist | b | d columns | s columns]."""
