@@ -133,6 +133,27 @@ def test_imported_files_give_the_same_fit(tmp_path):
     assert len(rows) == 6 and np.array(rows, float).max() < 0.01
 
 
+@pytest.mark.long
+def test_of_a_formula_the_other_series_says_what_is_of_the_arm(shared, tmp_path):
+    """Form and amounts of the pan's two places are those of both series; the wave is A's alone."""
+    said = example(9, tmp_path, shared / "arms/ur10_tmac")
+    pan, lift = re.split("^formula of series ", said, flags=re.M)[1:]
+    assert "shoulder_pan_joint" in pan.splitlines()[0]
+    assert "shoulder_lift_joint" in lift.splitlines()[0]
+    for formula, falls in ((pan, (0.85, 0.94)), (lift, (0.92, 0.97))):
+        errors = np.array(re.findall(r"(\S+) -> (\S+) mm held out", formula), float)
+        assert (errors[:, 1] < falls * errors[:, 0]).all()
+    rows = re.findall(r"(\S+) ± (\S+) mrad in \w, (\S+) ± (\S+) in \w: (.+)", pan)
+    assert len(rows) == 4
+    for *numbers, term in rows:
+        here, sigma, there, spread = map(float, numbers)
+        apart = abs(here - there) / np.hypot(sigma, spread)
+        if term.startswith(("sin", "cos")):
+            assert abs(there) < 3.5 * spread and abs(here) > 4 * sigma
+        else:
+            assert apart < 3 and there > 5 * spread
+
+
 @pytest.mark.slow
 def test_the_study_in_short_ranks_the_methods(tmp_path):
     said = script(ROOT / "examples/paper_study.py", [tmp_path, "--quick"], tmp_path)
@@ -142,5 +163,6 @@ def test_the_study_in_short_ranks_the_methods(tmp_path):
     assert "| joint graph" in (tmp_path / "study.md").read_text(encoding="utf-8")
 
 
-def test_without_its_data_the_ur10_example_says_so(tmp_path):
-    assert "skipped: nowhere" in example(6, tmp_path, "nowhere")
+@pytest.mark.parametrize("number", [6, 9])
+def test_without_their_data_the_ur10_examples_say_so(number, tmp_path):
+    assert "skipped: nowhere" in example(number, tmp_path, "nowhere")
