@@ -5,11 +5,9 @@ CASE 2021, https://github.com/christianlandgraf/ipa-robot-accuracy (MIT licence)
 in which its `Series_A` and `Series_D` are. The same pose repeats to 0.06 mm; with all lengths,
 zeros and tilts of joints fitted, held-out poses are off by 0.44 mm rms, in either series.
 
-In both series the diagnosis names `arm_gravity_sag` (in A it trusts no name fully) and
-`arm_gear_error`, at 16.8 turns in A and 15.7 in D, the best of the orders that it tries. An order
-that drifts like this asks for a closer look: joint by joint it is 17 that stands out, in pan, lift,
-elbow and wrist 2, in both series; lift errs by 0.26 mrad in A and 0.22 in D, the elbow by 0.26 and
-0.24, with the same signs. One whole number in every joint is what an encoder or a motor would do;
+In both series the diagnosis names `arm_gravity_sag` and `arm_gear_error@17`, an error that repeats
+17 times a turn, and gives a formula for what is left; example 9 follows that. Lift errs 17 times a
+turn by 0.26 mrad in A and 0.22 in D, the elbow by 0.26 and 0.24, with the same signs. One number in every joint is what an encoder or a motor would do;
 which of the two, these data do not say. Lift and elbow give way by 8 and 16 microrad per N m in A,
 by 9 and 18 in D.
 
@@ -18,8 +16,7 @@ tool free, D's error falls from 0.46 to 0.36 mm, below the 0.40 mm to which geom
 fitted to D itself. From D to A it falls from 0.54 to 0.44 mm.
 
 `rigcal explain` goes on without help to 0.30 mm held out in A and in D, in four steps each, and
-then says that structure without a name is left, over the arm's first three joints. It is right:
-0.30 mm is five times the repeatability. Air temperature explains 0.01 mm (p = 0.9 in A, 0.6 in D).
+then says that structure without a name is left. It is right: 0.30 mm is five times the repeatability. Air temperature explains 0.01 mm (p = 0.9 in A, 0.6 in D).
 
     python examples/06_what_is_missing_in_a_ur10.py [FOLDER] [DATA]
 """

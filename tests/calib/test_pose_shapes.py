@@ -15,6 +15,7 @@ from calib.runs.calibrate import calibrate
 from calib.runs.diagnose import diagnose
 from calib.simulation import Spec, simulate
 
+from ..bench.formulas_worlds import Case, written
 from ..mishaps import Scene
 from ..mishaps.scene import QUAT
 
@@ -61,21 +62,47 @@ def test_each_thing_that_moves_is_tried_once_and_has_its_words(tmp_path):
     assert {what for what, _ in tried} <= set(WHAT_MOVES)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("body", sorted(WHERE))
-def test_a_body_that_moves_with_temperature_is_told(tmp_path, body):
-    simulate(SPEC, tmp_path / "rec", 1)
-    scene = Scene(tmp_path / "rec", np.random.default_rng())
+def moved(folder, body):
+    """A recording whose body moves with temperature."""
+    simulate(SPEC, folder, 1)
+    scene = Scene(folder, np.random.default_rng())
     rows = np.flatnonzero(scene.seen(body))
     (temperature,) = scene.stops.numbers("temperature_c")[rows].T
     quat = scene.stops.numbers(*(f"{body}.{q}" for q in QUAT))[rows]
     far = MOVED_M * np.cos(np.pi * (temperature - temperature.min()) / np.ptp(temperature))
     shift = Rotation.from_quat(quat, scalar_first=True).apply(far[:, None] * [0.0, 0.0, 1.0])
     scene.move(body, rows, shift, np.zeros(3))
-    run = calibrate([tmp_path / "rec"], tmp_path / "run", hold_out="none")
+    return folder
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("body", sorted(WHERE))
+def test_a_body_that_moves_with_temperature_is_told(tmp_path, body):
+    run = calibrate([moved(tmp_path / "rec", body)], tmp_path / "run", hold_out="none")
     diagnose(run, refits=False)
     found = run.diagnosis()
     assert found["verdict"] == "unexplained_structure"
     assert found["unexplained"][0]["covariates"] == ["temperature_c"]
     said = " ".join(found["sentences"])
     assert f"depends on temperature, as if the tracked body {WHERE[body]} moved" in said
+
+
+@pytest.mark.slow
+def test_no_formula_of_the_range_takes_the_place_of_a_motion(tmp_path):
+    run = calibrate([moved(tmp_path / "rec", "mount_markers")], tmp_path / "run")
+    diagnosis = diagnose(run)
+    assert diagnosis.verdict == "unexplained_structure" and not diagnosis.formulas
+    assert diagnosis.unexplained[0]["moves"] == "body"
+
+
+@pytest.mark.slow
+def test_an_error_of_azimuth_is_told_as_a_formula_though_it_looks_like_a_motion(tmp_path):
+    """In a room of planes `sin(azimuth)` that grows with temperature is nearly the LiDAR going
+    sideways; with the formula nothing is left beside it, and with the motion much is."""
+    case = Case("", ("sin(azimuth_rad) * (temperature_c - 26)",), "planes", 8, times=1.0)
+    run = calibrate([written(case, tmp_path / "case").folder], tmp_path / "run")
+    found = diagnose(run)
+    (formula,) = found.unexplained
+    assert sorted(formula["covariates"]) == ["azimuth_rad", "temperature_c"]
+    after = formula["held_out_rms_mm"]["after"]
+    assert after < 1.1 * run.summary["rms_mm"]["noise_floor"] / 2

@@ -20,7 +20,7 @@ from calib.diagnosis.search import ALPHA_UNNAMED, FEWEST_STOPS, Search, suspects
 from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import formula, hangs_on
 from calib.diagnosis.verdict.candidates import candidate_documents, explained
-from calib.diagnosis.verdict.matters import weighed
+from calib.diagnosis.verdict.matters import HELD_OUT_BY_CHANCE, weighed
 from calib.diagnosis.verdict.sentences import BAD, UNNAMED, sentences_of, stops_of, unconfirmed
 from calib.diagnosis.verdict.unnamed import Unnamed
 from calib.problem.model import labels
@@ -34,9 +34,6 @@ VERDICTS = {
     UNNAMED: "structure that no effect explains",
     BAD: "something in the recording is wrong",
 }
-# The held-out error of models that lack nothing, over its floor: of 30 by another simulator, with 6
-# to 30 stops, the largest was 1.23.
-HELD_OUT_BY_CHANCE = 1.25
 ABSORBED_BY_MODEL = "not identifiable: absorbed by the model"
 # Share of structure, or held-out error, that names must explain to be the answer: a choice. Of the
 # rms more than half is left by an answer that explains less than that of the squares.

@@ -56,10 +56,10 @@ def sentences_of(
     if doubt:
         out = [doubt, *out]
     elif verdict == UNNAMED:
-        beside = any(c["step"] and not c["dressed_up"] for c in candidates)
-        what = "Besides, there" if beside else "There"
+        named = [c["add"] for c in candidates if c["step"] and not c["dressed_up"]]
+        beside = f"Beside {' and '.join(named)}, there" if named else "There"
         out = [
-            f"{what} is residual structure that no known effect explains.",
+            f"{beside} is residual structure that no known effect explains.",
             *(line for each in formulas for line in _formula_sentences(each, residual)),
             *out,
         ]

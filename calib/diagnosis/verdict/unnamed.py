@@ -13,7 +13,7 @@ from calib.diagnosis.formulas.why import why
 from calib.diagnosis.search import Search
 from calib.diagnosis.stand import Stand
 from calib.diagnosis.suggest import DESCRIBES, span, what_differs, words
-from calib.diagnosis.verdict.matters import FALL_MATTERS
+from calib.diagnosis.verdict.matters import FALL_MATTERS, HELD_OUT_BY_CHANCE
 from calib.effects.own.formula import FormulaEffect
 from calib.results.errors import Errors
 from calib.results.holdout import Fall
@@ -60,7 +60,8 @@ def unnamed(
     progress: Progress,
 ) -> Unnamed:
     """Look for formulas of what a search left: of the ranges, or of a joint where there are none.
-    Where structure of poses leads, none is sought.
+    Where something seems to move instead, a formula takes its place only if nothing is left beside
+    it: an error of the range that follows azimuth looks much like a motion, and a motion like it.
 
     Args:
         found: the search.
@@ -70,10 +71,11 @@ def unnamed(
         progress: as of `fit.solve`.
     """
     leading = next(iter(found.at_first or found.unnamed), None)
-    if leading and isinstance(leading.effect, PoseShape):  # formulas move beams and joints
+    moves = leading is not None and isinstance(leading.effect, PoseShape)
+    if moves and unseen is None:
         return Unnamed()
     first, last = found.looks[0].stand, found.looks[-1].stand
-    if found.found and doubtful and unseen is not None:
+    if found.found and doubtful and unseen is not None and not moves:
         formulas = find(first, progress)
         if formulas:
             after = unseen(_with(first, formulas, progress)).rms_mm
@@ -90,6 +92,8 @@ def unnamed(
         return Unnamed(formulas)
     before, after = unseen(last), unseen(_with(last, formulas, progress))
     fall_mm = before.rms_mm, after.rms_mm
+    if moves and after.rms_mm > HELD_OUT_BY_CHANCE * after.floor_mm:
+        return Unnamed()
     # A gross structure is rejected, not fitted: what falls then is the share of such beams.
     fewer = (before.rejected_share or 0.0) - (after.rejected_share or 0.0) > FALL_MATTERS
     if fewer or fall_mm[0] - fall_mm[1] > FALL_MATTERS * after.floor_mm:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calib.diagnosis.verdict import HELD_OUT_BY_CHANCE
+from calib.diagnosis.verdict.matters import HELD_OUT_BY_CHANCE
 from calib.report import plots
 from calib.report.chart import Absent, Chart
 from calib.report.evidence import Evidence, folder_name
