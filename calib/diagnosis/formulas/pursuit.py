@@ -178,7 +178,7 @@ def _stands_out(fitted: Projection, bases: Bases, smooth: Smooth) -> bool:
     """Whether chance hardly makes so large a smooth function: of others no forms are tried, which
     takes time. One of as many directions as there are stops, as over a few walls, none of them
     can confirm; a form has fewer, and is judged on its own."""
-    judged = _judged(fitted, bases.of(smooth.covariates))
+    judged = _judged(fitted, bases.columns(smooth.covariates, smooth.plain))
     p = float(after_looks(judged.p_value(), smooth.looks))
     return p < PLAUSIBLE or judged.dof >= judged.clusters
 

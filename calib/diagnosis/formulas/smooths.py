@@ -1,8 +1,10 @@
 """What a residual depends on: smooth functions of one, two or three covariates, tested together.
 
 Every column that beams or stops have is looked at, alone, in pairs, and with the best pairs a
-third. The p-value is adjusted for all tests (Westfall and Young 1993), and stops and surfaces are
-the clusters, as for the catalogue's effects.
+third. Few stops cannot confirm a function of many knots, and few knots do not see what turns over
+a whole range; so products of lines, and of sines of angles, are looked at besides. The p-value is
+adjusted for all tests (Westfall and Young 1993), and stops and surfaces are the clusters, as for
+the catalogue's effects.
 """
 
 from __future__ import annotations
@@ -31,6 +33,9 @@ MOST_CLASSES = 6  # of a label, those of most beams
 PATTERN = 4  # rings after which electronics repeat: chips of 4, 8 and 16 channels
 
 
+_Set = tuple[tuple[str, ...], bool]  # covariates, and whether by lines and sines
+
+
 @dataclass(frozen=True)
 class Smooth:
     """A smooth function of some covariates, tested.
@@ -40,12 +45,14 @@ class Smooth:
         test: of its columns.
         looks: by how many independent looks a p-value pays.
         evidence: see `ScoreTest.evidence`.
+        plain: whether it is a product of lines and sines; otherwise it is one of knots.
     """
 
     covariates: tuple[str, ...]
     test: ScoreTest
     looks: float
     evidence: float
+    plain: bool = False
 
 
 @dataclass(frozen=True)
@@ -60,6 +67,7 @@ class Bases:
     table: BeamTable
     stops: int
     _made: dict[tuple[str, int], np.ndarray] = field(default_factory=dict, repr=False)
+    _lines: dict[str, np.ndarray] = field(default_factory=dict, repr=False)
 
     def names(self) -> list[str]:
         """Covariates that differ; rings stand for elevations where these are the same."""
@@ -72,6 +80,29 @@ class Bases:
             if key not in self._made:
                 self._made[key] = self._one(*key)
         return product_of([np.ones((len(self.table), 1)), *(self._made[key] for key in keys)])
+
+    def columns(self, covariates: Sequence[str], plain: bool) -> np.ndarray:
+        """(N, K) columns of one smooth function that is tested."""
+        return self.plain(covariates) if plain else self.of(covariates)
+
+    def plain(self, covariates: Sequence[str]) -> np.ndarray:
+        """(N, K) columns of the product of a line of each; of a joint sine and cosine, of azimuth
+        those of two harmonics."""
+        for name in covariates:
+            if name not in self._lines:
+                self._lines[name] = self._line(name)
+        return product_of([self._lines[name] for name in covariates])
+
+    def _line(self, name: str) -> np.ndarray:
+        """(N, K) columns of one covariate, each with a mean of zero but those of angles."""
+        values = self.table.covariates[name]
+        turns = {"azimuth_rad": (1, 2)}.get(name, (1,) if name in self.table.joints else ())
+        if turns:
+            waves = [f(m * values) for m in turns for f in (np.sin, np.cos)]
+            columns = np.stack(waves, axis=1)
+        else:
+            columns = ((values - np.nanmean(values)) / np.nanstd(values))[:, None]
+        return np.nan_to_num(columns)
 
     def _one(self, name: str, together: int) -> np.ndarray:
         """(N, K) columns of one covariate beside others."""
@@ -135,25 +166,33 @@ def screen_smooths(
     table = bases.table
     names = bases.names()
     points = [n for n in names if n not in table.by_stop] or names  # of an arm, all are of stops
-    sets: list[tuple[str, ...]] = [(n,) for n in names]
-    sets += [p for p in combinations(names, 2) if set(p) & set(points)]
+    sets: list[_Set] = [((n,), False) for n in names]
+    pairs = [p for p in combinations(names, 2) if set(p) & set(points)]
+    sets += [(p, plain) for p in pairs for plain in (False, True) if not (plain and "label" in p)]
     found = dict(_tested(projection, bases, sets, progress))
     common = _common([t for t, _ in found.values()])
-    pairs = sorted((s for s in found if len(s) == 2), key=lambda s: -found[s][0].evidence(common))
+    best = sorted((s for s in found if len(s[0]) == 2), key=lambda s: -found[s][0].evidence(common))
     thirds = {
         tuple(sorted((*pair, n), key=names.index)): None
-        for pair in pairs[:MOST_THIRDS]
+        for pair in list(dict.fromkeys(pair for pair, _ in best))[:MOST_THIRDS]
         for n in names
         if n not in pair and "label" not in (n, *pair)
     }
     threes, tried = _threes(projection, bases, names, points)
-    found |= dict(_tested(projection, bases, list(thirds | dict.fromkeys(threes)), progress))
+    more = [(each, False) for each in thirds | dict.fromkeys(threes)]
+    found |= dict(_tested(projection, bases, [*more, *((each, True) for each in threes)], progress))
     drawn = [chance for _, chance in found.values()]
     looks = looked(np.min(drawn, axis=0)) if drawn else 1.0
     every = [
-        # Of threes that were chosen by their products, all that there are have been looked at.
-        Smooth(s, t, looks + tried * (s in threes and s not in thirds), t.evidence(common))
-        for s, (t, _) in found.items()
+        Smooth(
+            covariates=s,
+            test=t,
+            # Of threes that were chosen by their products, all that there are have been looked at.
+            looks=looks + tried * (s in threes and s not in thirds),
+            evidence=t.evidence(common),
+            plain=plain,
+        )
+        for (s, plain), (t, _) in found.items()
     ]
     return sorted(every, key=lambda s: -s.evidence)
 
@@ -167,40 +206,29 @@ def _threes(
     sets = [s for s in combinations(plain, 3) if set(s) & set(points)]
     if not sets:
         return [], 0
-    lines = {n: _lines(n, bases.table.covariates[n]) for n in plain}
     explained = []
     for i in range(0, len(sets), THREES_AT_ONCE):
-        some = [product_of([lines[n] for n in s]) for s in sets[i : i + THREES_AT_ONCE]]
+        some = [bases.plain(s) for s in sets[i : i + THREES_AT_ONCE]]
         statistic, dof = projection.explained(some)
         explained += [-log_tail(x, d) if d else 0.0 for x, d in zip(statistic, dof, strict=True)]
     best = np.argsort(-np.array(explained), kind="stable")[:MOST_THIRDS]
     return [sets[i] for i in best], len(sets)
 
 
-def _lines(name: str, values: np.ndarray) -> np.ndarray:
-    """(N, 1) a line with a mean of zero; of azimuth the first two harmonics."""
-    if name == "azimuth_rad":
-        turns = [f(m * values) for m in (1, 2) for f in (np.sin, np.cos)]
-        columns = np.stack(turns, axis=1)
-    else:
-        columns = ((values - np.nanmean(values)) / np.nanstd(values))[:, None]
-    return np.nan_to_num(columns)
-
-
 def _tested(
     projection: Projection,
     bases: Bases,
-    sets: Sequence[tuple[str, ...]],
+    sets: Sequence[_Set],
     progress: Callable[[int, int], None],
-) -> Iterator[tuple[tuple[str, ...], tuple[ScoreTest, np.ndarray]]]:
+) -> Iterator[tuple[_Set, tuple[ScoreTest, np.ndarray]]]:
     """Each set's test, and by rank the p-values (R,) of the same on scores by chance."""
-    for i, names in enumerate(sets):
+    for i, each in enumerate(sets):
         progress(i, len(sets))
-        columns = bases.of(names)
+        columns = bases.columns(*each)
         scores = projection.scores(columns)
         found = score_test(scores, np.arange(columns.shape[1]))
         if found.dof:
-            yield names, (found, _by_chance(scores, found, projection.table.signs))
+            yield each, (found, _by_chance(scores, found, projection.table.signs))
 
 
 def _by_chance(scores: Scores, found: ScoreTest, signs: np.ndarray) -> np.ndarray:

@@ -1,5 +1,7 @@
 """What a residual depends on: the right covariates first, and nothing where nothing is."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -93,6 +95,28 @@ def test_the_right_covariates_come_first(names):
     assert found[0].covariates == names
     assert found[0].evidence > np.log(found[0].looks / ALPHA)
     assert 1.0 <= found[0].looks < len(found)
+
+
+def test_stops_that_are_few_confirm_a_joint_that_turns_beside_azimuth():
+    """A joint has two knots in 30 stops, which do not see a cosine; its own sine and cosine do."""
+
+    def elbow(rng, c):
+        return {"elbow": np.repeat(rng.uniform(-1.2, 1.2, 30), len(c["ring"]) // 30)}
+
+    def turns(c):
+        return 0.003 * np.cos(2 * c["elbow"]) * np.sin(c["azimuth_rad"])
+
+    beams = table(5, more=elbow, hidden=turns, scatter_m=0.0005)
+    beams = replace(beams, by_stop=beams.by_stop | {"elbow"}, joints=frozenset({"elbow"}))
+    found = screen_smooths(beams.projection(), Bases(beams, 30))
+    assert found[0].covariates == ("azimuth_rad", "elbow") and found[0].plain
+    (step,) = pursue(beams, ALPHA, lambda *_: None)
+    assert {*step.form.term.covariates} == {"azimuth_rad", "elbow"}
+    value = step.form.term.columns(beams.covariates)
+    columns = np.column_stack([np.ones(len(beams)), np.sin(beams.covariates["azimuth_rad"])])
+    off = np.linalg.lstsq(np.hstack([value, columns]), turns(beams.covariates), rcond=None)[0]
+    left = turns(beams.covariates) - np.hstack([value, columns]) @ off
+    assert np.std(left) < 0.1 * np.std(turns(beams.covariates))
 
 
 def test_columns_that_go_along_with_the_right_one_come_after_it():

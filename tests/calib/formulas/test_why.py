@@ -117,12 +117,19 @@ def test_a_formula_that_predicts_unseen_stops_no_better_is_refused(monkeypatch, 
 
 
 @pytest.mark.parametrize("where", ["at_first", "unnamed"])
-def test_where_what_is_mounted_moves_no_formula_of_beams_is_sought(monkeypatch, where):
-    world = World(monkeypatch, last=2.1)
+@pytest.mark.parametrize(("after", "told"), [(2.4, True), (2.6, False)])
+def test_a_formula_takes_the_place_of_a_motion_where_it_leaves_nothing(
+    monkeypatch, where, after, told
+):
+    """Nothing is 1.25 times the floor: 2.5 mm."""
+    world = World(monkeypatch, last=after)
     by_name = {e.name: e for e in CATALOGUE}
     moved = PoseShape(by_name["mount_slip"], "time_s", (0.0, 100.0), 1)
     setattr(world.search, where, [SimpleNamespace(effect=moved)])
-    assert not world.unnamed().formulas and not world.asked
+    found = world.unnamed()
+    assert bool(found.formulas) == told and not found.refused
+    world.asked.clear()
+    assert not world.unnamed(looks=False).formulas and not world.asked
 
 
 def test_nobody_looks_and_a_formula_is_told_without_a_gain(monkeypatch):
