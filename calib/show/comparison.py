@@ -77,6 +77,7 @@ def ladder_table(rungs: Sequence[Rung]) -> Table:
     table = columns_table("ladder", "model", "held out, mm", "fit, mm", "expected, mm")
     for column in table.columns[2:]:
         column.justify = "right"
+    table.columns[1].overflow = "fold"  # names are there to be copied
     for rung in rungs:
         rms = rung.run.summary["rms_mm"]
         below = rung.below.summary["rms_mm"] if rung.below else {}
