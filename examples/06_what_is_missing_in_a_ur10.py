@@ -26,32 +26,12 @@ import sys
 import tempfile
 from pathlib import Path
 
-import numpy as np
-from ur10_tmac import recording
+from ur10_tmac import elsewhere_mm, recording
 
 import calib
-from calib import problem as problems
-from calib.problem.model import Source
-from calib.problem.prior import JointPrior
-from calib.results.errors import body_errors
-from calib.solve.fit import solve
 
 GEOMETRY = calib.Model(("arm_link_length", "arm_joint_offset", "arm_axis_tilt"))
 STEPS = ("arm_gravity_sag", "arm_gear_error@17", "arm_gear_error@34")
-
-
-def elsewhere_mm(run: calib.Run, folder: Path) -> float:
-    """The error on other poses with the arm as a run found it, only base and tool being free."""
-    problem = problems.build([Source.open(folder)], calib.Model.read(run.model))
-    held = [v for n, v in problem.variables.items() if n in run.solution.shared.effects]
-    means = {}
-    for variable in held:
-        effect = run.solution.shared.effects[variable.name]
-        known = dict(zip(effect.names, effect.estimate, strict=True))
-        means[variable.name] = np.array([known.get(dof, 0.0) for dof in variable.dofs])
-    tight = 1e-16 * np.eye(sum(v.dim for v in held))
-    solved = solve(problem, JointPrior(held, means, tight))
-    return body_errors(problem.blocks, solved.values, None).rms_mm
 
 
 out = Path(sys.argv[1] if len(sys.argv) > 1 else tempfile.mkdtemp(prefix="rigcal-"))
