@@ -206,6 +206,15 @@ def dot_key(
     figure.legend(handles=handles, title=title, title_fontsize=8, columnspacing=1, **where)
 
 
+def number_above(ax: Axes, text: str, x: float, y: float) -> None:
+    """Write a number above a point, readable where a line runs through it."""
+    from matplotlib.patheffects import withStroke
+
+    halo = [withStroke(linewidth=3, foreground="white")]
+    where = {"textcoords": "offset points", "ha": "center", "path_effects": halo}
+    ax.annotate(text, (x, y), (0, 8), **where)
+
+
 def with_plain_text(figure: Figure) -> Figure:
     """The figure, its texts without control characters, which neither XML nor a font has; names
     along its axes that would leave no room for what is drawn are shortened."""

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.patheffects import withStroke
 
 from calib.diagnosis.verdict.matters import HELD_OUT_BY_CHANCE
 from calib.report import plots
@@ -69,8 +68,7 @@ def _ladder(evidence: Evidence) -> Figure:
         at = np.array(shown)[described], y[described]
         ax.plot(*at, "D", ms=9, mfc="white", mew=2, color=plots.AFTER, label="with a formula")
     for value, at in zip([rms[0]["nominal"], *shown], range(len(rungs) + 1), strict=True):
-        number = ax.annotate(f"{value:.2f}", (value, at), (0, 8), textcoords="offset points")
-        number.set(ha="center", path_effects=[withStroke(linewidth=3, foreground="white")])
+        plots.number_above(ax, f"{value:.2f}", value, at)
     ax.set_yticks(range(len(rungs) + 1), ["as in CAD", *names])
     ax.set_ylim(len(rungs) + 0.5, -0.6)
     values = [rms[0]["nominal"], *shown, *floors, *(r["fit"] for r in rms)]
