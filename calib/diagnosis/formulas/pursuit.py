@@ -165,7 +165,7 @@ def _step(
     if not over:
         return None
     chosen, alike = simplest(sorted(over, key=lambda f: -f.evidence), len(bases.names()))
-    p = _by_chance(fitted, chosen, over[chosen])
+    p = _by_chance(fitted, bases, chosen, over[chosen])
     return ConfirmedTerm(
         form=chosen,
         alike=alike,
@@ -189,11 +189,12 @@ def _judged(fitted: Projection, columns: np.ndarray) -> ScoreTest:
     return fitted.table.projection(columns).judged(columns)
 
 
-def _by_chance(fitted: Projection, form: Form, smooth: Smooth) -> float:
+def _by_chance(fitted: Projection, bases: Bases, form: Form, smooth: Smooth) -> float:
     """How often chance makes a form of these covariates that explains as much: no more than as
     many forms do as were tried, whole or with those of its columns alone that are needed
     (Bonferroni); where a smooth function explains it, nor more than such functions do (the
-    S-method of Scheffe 1953). The smallest of these bounds, as many times."""
+    S-method of Scheffe 1953), by what the form itself scatters or, where few clusters tell that, by
+    what the function does in all its directions. The smallest of these bounds, as many times."""
     columns = form.term.columns(fitted.table.covariates)
     (kept,) = needed(fitted, [form.term], [columns])
     whole = _judged(fitted, columns)
@@ -203,6 +204,7 @@ def _by_chance(fitted: Projection, form: Form, smooth: Smooth) -> float:
         bounds.append(form.tried * ways * _tail(_judged(fitted, columns[:, kept])))
     if smooth.test.statistic > COVERS * form.statistic:
         bounds.append(_tail(whole, max(smooth.test.dof, whole.dof)))
+        bounds.append(_judged(fitted, bases.columns(smooth.covariates, smooth.plain)).p_value())
     return at_least(min(1.0, len(bounds) * min(bounds)))
 
 
