@@ -28,6 +28,7 @@ except ImportError:  # Windows: nothing is locked there
     fcntl = None  # type: ignore[assignment]
 
 DRAFT, LOCK = "draft", "lock"
+KEPT = "kept"  # parts that are done, which outlive the draft of a command that was killed
 _OURS = (DRAFT, WHOLE, ENTRIES, BESIDE, "aside")  # nothing else in a workshop is ever touched
 _ATTEMPTS = 100  # a workshop may be taken away while it is entered, by the one who leaves
 _LOG = logging.getLogger("rigcal")
@@ -102,6 +103,10 @@ def workshop(path: Path) -> Iterator[Workshop]:
             _settle(shop)
             shop._record({}, [])
             yield shop
+            _remove(work / KEPT)
+        except Exception:  # and not Ctrl-C: as after a kill, the same command may come again
+            _remove(work / KEPT)
+            raise
         finally:
             _leave(work, lock)
             for above in made:
@@ -215,11 +220,14 @@ def _settle(shop: Workshop) -> None:
     _, inodes, dropped = _read(shop.lock)
     if inodes:
         carry_out(work, path, inodes, dropped)
+        _remove(work / KEPT)
         stand = "the new one stands, whole"
     elif os.path.lexists(path):
         stand = "the earlier one stands, whole"
     else:
-        stand = "nothing of it was kept"
+        stand = "none stands yet" if os.path.lexists(work / KEPT) else "nothing of it was kept"
+    if os.path.lexists(work / KEPT):
+        stand += ", and what it had done is kept for the same command to go on from"
     shop._record({}, [])
     for name in _OURS:
         _remove(work / name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from calib.problem import Problem, build
 from calib.problem.model import Model, Source
 from calib.problem.without import leave_out
 from calib.rig import load_rig
-from calib.runs.run import DIAGNOSIS, MODEL, STATE, Run
+from calib.runs.run import DIAGNOSIS, MODEL, SOLUTION, STATE, Run, versions
 from calib.runs.stored import FIT_AGAIN
 from calib.solve.estimate import DOFS, Start
 from chains.errors import InputError
@@ -31,6 +32,18 @@ def model_of(run: Run) -> Model:
         NotTrustedError: it has an effect of a Python file that the user did not say may run.
     """
     return Model.read(run.model, run.folder / MODEL, run.trust)
+
+
+def identity(run: Run) -> dict[str, Any]:
+    """All of a run that what is made of it depends on, its recordings included, as JSON holds it:
+    digests of its files, the files that may run, and what computes."""
+    files = [run.folder / name for name in (MODEL, STATE, SOLUTION)]
+    return {
+        "files": [hashlib.sha256(path.read_bytes()).hexdigest() for path in files],
+        "set_aside": sorted(run.set_aside),
+        "trust": sorted(run.trust),
+        "versions": versions(),
+    }
 
 
 def effects_that_may_run(run: Run) -> tuple[list[Effect], str]:
