@@ -130,7 +130,12 @@ def test_files_are_the_same_byte_by_byte(way, alone, recording, tmp_path):
     else:
         assert program(WAYS[way], folder) == ""
     here = written(folder)
-    made = {"run/solution.yaml", "run/diagnosis.json", "run/evaluation.json", "corrected/rec/rig.yaml"}
+    made = {
+        "run/solution.yaml",
+        "run/diagnosis.json",
+        "run/evaluation.json",
+        "corrected/rec/rig.yaml",
+    }
     assert here.keys() == alone.keys() and made <= here.keys()
     assert [name for name in here if here[name] != alone[name]] == []
 

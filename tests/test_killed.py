@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 
 from calib import outputs
+from calib.outputs.workshop import KEPT
 from calib.rig import load_rig
 from calib.runs.run import Run
 
@@ -185,7 +186,15 @@ def world(tmp_path_factory):
 
 
 def leftovers(world: World) -> list[Path]:
-    return [path for path in world.folder.rglob(".*") if path.name != outputs.CLOUDS_MARK]
+    """What commands leave that are killed, but for parts that the same one will go on from."""
+    hidden = [path for path in world.folder.rglob(".*") if path.name != outputs.CLOUDS_MARK]
+    return [path for path in hidden if KEPT not in path.parts and path not in parts(world)]
+
+
+def parts(world: World) -> list[Path]:
+    """Workshops in which nothing is but such parts."""
+    works = world.folder.rglob(".*.rigcal")
+    return [work for work in works if [path.name for path in work.iterdir()] == [KEPT]]
 
 
 def look(path: Path) -> None:
@@ -239,6 +248,9 @@ def killed_at_every_step(world: World, case: Case, caplog, exchange=True, all_st
         code = world.run(case.words, at, exchange)
         assert code == (-signal.SIGKILL if at < len(steps) else 0), at
         found_whole(world, case, old, new, caplog)
+        if parts(world):
+            assert world.run(case.words) == 0, world.said()
+            assert world.contents(case) == new and parts(world) == []
     assert world.run(case.words) == 0, world.said()
     assert world.contents(case) == new and leftovers(world) == []
 
