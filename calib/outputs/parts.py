@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 from calib.outputs.moves import link
 from calib.outputs.workshop import KEPT
-from sensors.documents import write_atomically
+from sensors.documents import plain, write_atomically
 
 Finished = tuple[Any, bytes]  # what is told of a part, as JSON holds it, and what its file holds
 _LOG = logging.getLogger("rigcal")
@@ -107,10 +107,9 @@ def kept(draft: Path, asked: Mapping[str, Any]) -> Kept:
         draft: the folder to fill, as `calib.outputs.folder` or `entries` gave it.
         asked: all that the parts depend on, as JSON holds it.
     """
-    key = hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()
+    key = hashlib.sha256(json.dumps(plain(asked), sort_keys=True).encode()).hexdigest()
     here = draft.parent / KEPT / key
-    here.mkdir(parents=True, exist_ok=True)
-    for other in here.parent.iterdir():
+    for other in here.parent.glob("*"):
         if other != here:
             shutil.rmtree(other, ignore_errors=True)
     return Kept(here)

@@ -198,7 +198,9 @@ def test_a_part_that_is_not_whole_is_done_again(tmp_path):
     assert done == [[0, 1, 2, 3, 4], [1, 2, 3]]
 
 
-@pytest.mark.parametrize(("error", "stays"), [(KeyboardInterrupt, True), (OSError(28, "no room"), False)])
+@pytest.mark.parametrize(
+    ("error", "stays"), [(KeyboardInterrupt, True), (OSError(28, "full"), False)]
+)
 def test_parts_stay_after_ctrl_c_and_not_after_an_error(tmp_path, error, stays):
     def work(some):
         yield None, b"0"
