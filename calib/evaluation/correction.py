@@ -23,6 +23,7 @@ from calib.residuals.store import common_median
 from calib.rig import Rig, load_rig
 from calib.runs.reopen import effects_that_may_run
 from calib.runs.run import Run
+from chains import remote
 from chains.errors import InputError
 from sensors.documents import nearest
 from sensors.lidar import Beams, beams
@@ -199,13 +200,13 @@ def _check_rings(rig: Rig, path: Path, columns: Columns, seen: np.ndarray) -> No
 
 def _median_intensity(run: Run, rig: Rig) -> float:
     """As of `Correction`."""
-    mine = [Path(r["path"]) for r in run.model["recordings"] if r["rig"] == rig.name]
+    mine = [remote.here(r["path"]) for r in run.model["recordings"] if r["rig"] == rig.name]
     return common_median([Source.open(path).store for path in mine])
 
 
 def _rig(run: Run, name: str | None) -> Rig:
     """The rig whose LiDAR is meant."""
-    folders = {r["rig"]: Path(r["path"]) for r in run.model["recordings"]}
+    folders = {r["rig"]: remote.here(r["path"]) for r in run.model["recordings"]}
     if name is None and len(folders) > 1:
         raise InputError(
             f"{run.folder} has several rigs: say whose LiDAR with --rig, {', '.join(folders)}"

@@ -31,6 +31,7 @@ from calib.outputs.kinds import (
 from calib.outputs.moves import BESIDE, ENTRIES, WHOLE, link
 from calib.outputs.parts import Finished, Kept, KeptPart, kept
 from calib.outputs.workshop import settle, workshop
+from chains import remote
 
 __all__ = [
     "CLOUDS",
@@ -62,9 +63,9 @@ Paths = Path | str | Iterable[Path | str]
 
 
 def each(paths: Paths) -> list[Path]:
-    """One path, or several, in a list."""
+    """One path, or several, in a list; a URL as the folder here that stands for it."""
     several = [paths] if isinstance(paths, Path | str) else paths
-    return [Path(path) for path in several]
+    return [remote.here(path, anew=True) for path in several]
 
 
 @contextmanager

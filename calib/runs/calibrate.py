@@ -62,6 +62,7 @@ from calib.runs.run import (
 from calib.runs.stored import RUN_FORMAT
 from calib.solve.estimate import Estimate, Start
 from calib.solve.fit import Progress, shapes_freed, solve
+from chains import remote
 from chains.errors import InputError
 from sensors.documents import write_json, write_yaml
 
@@ -335,7 +336,7 @@ def recordings_document(sources: Sequence[Source]) -> list[dict[str, str]]:
     """Recordings as model.yaml names them: where they are, whose, and what was in them."""
     return [
         {
-            "path": str(s.recording.folder.resolve()),
+            "path": remote.url_of(s.recording.folder) or str(s.recording.folder.resolve()),
             "rig": s.rig.name,
             "sha256": s.recording.digest(),
         }

@@ -17,6 +17,7 @@ from calib.rig import load_rig
 from calib.runs.run import DIAGNOSIS, MODEL, SOLUTION, STATE, Run, versions
 from calib.runs.stored import FIT_AGAIN
 from calib.solve.estimate import DOFS, Start
+from chains import remote
 from chains.errors import InputError
 from sensors.recording import digest
 from sensors.reference import Reference
@@ -74,7 +75,8 @@ def proposed(run: Run, names: Sequence[str]) -> list[Effect]:
     found = [read(described[n], run.folder / DIAGNOSIS, run.trust) for n in names if n in described]
     if set(names) <= described.keys():
         return found
-    rest = own_effects(load_rig(folder) for folder in run.recordings if folder.is_dir())
+    there = (folder for folder in map(remote.here, run.recordings) if folder.is_dir())
+    rest = own_effects(map(load_rig, there))
     return [*found, *(e for e in rest if e.name in names and e.name not in described)]
 
 
@@ -184,7 +186,7 @@ def as_it_was(recording: Mapping[str, str], path: Path, run: Run) -> None:
 
 
 def _reopened(recording: Mapping[str, str], run: Run) -> Source:
-    path = Path(recording["path"])
+    path = remote.here(recording["path"])
     as_it_was(recording, path, run)
     known = _opened.get((path, recording["sha256"]))
     source = known or Source.open(path)
