@@ -82,6 +82,7 @@ class Pass:
         """The linearisation, and the graph; computed now where the journal knew the summary."""
         if self._whole is None:
             self._whole = self._compute()
+            del self._compute  # and with it how beams were weighed before
         return self._whole
 
     def _summary(self) -> Answer:
