@@ -2,8 +2,7 @@
 
 The same input leads the same way: a computation that is begun again asks the same questions in the
 same order. Each answer, some small arrays, is kept under its number as it is found, and with a
-digest of what was asked; one that is known is read and not computed. Where anything else was asked
-by then, as after a change of the program, nothing more is taken from there.
+digest of what was asked; one that is known is read and not computed.
 """
 
 from __future__ import annotations

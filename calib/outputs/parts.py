@@ -2,8 +2,8 @@
 
 What a stop adds to an output depends on that stop and on what was asked alone. Each is kept beside
 the draft as it is done: under another name first, then renamed, with a digest of its bytes. The
-folder's name is a digest of all that was asked: a command that was asked anything else finds
-nothing there, and removes it. `workshop` sweeps it when the output stands.
+folder's name is a digest of all that was asked, and of the program: a command that was asked
+anything else finds nothing there, and removes it. `workshop` sweeps it when the output stands.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import json
 import logging
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -100,6 +101,17 @@ def _beside(file: Path) -> Path:
     return file.with_name(f"{file.name}.json")
 
 
+@cache
+def _program() -> str:
+    """A digest that changes with the program: names of its files, their sizes and times."""
+    root, sha = Path(__file__).parents[2], hashlib.sha256()
+    packages = (root / name for name in ("chains", "sensors", "calib"))
+    for path in sorted(path for package in packages for path in package.rglob("*.py")):
+        stat = path.stat()
+        sha.update(f"{path.relative_to(root)}\0{stat.st_size}\0{stat.st_mtime_ns}\0".encode())
+    return sha.hexdigest()
+
+
 def kept(draft: Path, asked: Mapping[str, Any]) -> Kept:
     """What a command that was asked the same had done before it was killed, and will have done.
 
@@ -107,7 +119,8 @@ def kept(draft: Path, asked: Mapping[str, Any]) -> Kept:
         draft: the folder to fill, as `calib.outputs.folder` or `entries` gave it.
         asked: all that the parts depend on, as JSON holds it.
     """
-    key = hashlib.sha256(json.dumps(plain(asked), sort_keys=True).encode()).hexdigest()
+    everything = json.dumps([plain(asked), _program()], sort_keys=True)
+    key = hashlib.sha256(everything.encode()).hexdigest()
     here = draft.parent / KEPT / key
     for other in here.parent.glob("*"):
         if other != here:
