@@ -22,7 +22,7 @@ from pathlib import Path
 from threading import Lock
 from typing import Any
 
-from chains.errors import InputError
+from chains.errors import CutShortError, InputError
 
 CACHE_BYTES = 20e9  # of scans: a choice; a disk has it, and it is 20,000 scans of 131,072 beams
 ROOM = 0.9  # of it is what stays when it is full, so that not each scan has to look for room
@@ -149,7 +149,7 @@ def _fetch(url: str, path: Path, size: int | None, version: int) -> None:
             files.get_file(name, str(temporary))
         came = temporary.stat().st_size
         if size is not None and came != size:
-            raise InputError(f"{url}: {came} of its {size} bytes came; try again")
+            raise CutShortError(f"{url}: {came} of its {size} bytes came; try again")
         if path.parent.name == _SCANS:
             _make_room(temporary, came)
         os.utime(temporary, (time.time(), version))
@@ -205,7 +205,7 @@ def _reaching(url: str) -> Iterator[None]:
         raise InputError(f"{url}: nothing is there; give the URL of a recording's folder") from None
     except Exception as error:
         why = (str(error) or type(error).__name__).splitlines()[0]
-        raise InputError(f"{url} cannot be reached: {why}") from None
+        raise CutShortError(f"{url} cannot be reached: {why}") from None
 
 
 def _version(info: dict[str, Any]) -> tuple[int | None, int]:

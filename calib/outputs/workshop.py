@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from calib.outputs.moves import BESIDE, ENTRIES, WHOLE, carry_out, stands, target_of
-from chains.errors import InputError
+from chains.errors import CutShortError, InputError
 
 try:
     import fcntl
@@ -104,8 +104,9 @@ def workshop(path: Path) -> Iterator[Workshop]:
             shop._record({}, [])
             yield shop
             _remove(work / KEPT)
-        except Exception:  # and not Ctrl-C: as after a kill, the same command may come again
-            _remove(work / KEPT)
+        except Exception as error:  # and not Ctrl-C: as after a kill, it may be asked for again
+            if not isinstance(error, CutShortError | MemoryError):
+                _remove(work / KEPT)
             raise
         finally:
             _leave(work, lock)

@@ -10,7 +10,7 @@ import pytest
 
 from calib import outputs
 from calib.outputs import moves
-from chains.errors import InputError
+from chains.errors import CutShortError, InputError
 
 from .folders import contents, fill, run
 
@@ -199,9 +199,13 @@ def test_a_part_that_is_not_whole_is_done_again(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("error", "stays"), [(KeyboardInterrupt, True), (OSError(28, "full"), False)]
+    ("error", "stays"),
+    [
+        *[(KeyboardInterrupt, True), (CutShortError("no more workers"), True)],
+        *[(MemoryError, True), (OSError(28, "full"), False), (InputError("wrong"), False)],
+    ],
 )
-def test_parts_stay_after_ctrl_c_and_not_after_an_error(tmp_path, error, stays):
+def test_parts_stay_where_the_same_command_may_do_better(tmp_path, error, stays):
     def work(some):
         yield None, b"0"
         raise error
@@ -211,7 +215,7 @@ def test_parts_stay_after_ctrl_c_and_not_after_an_error(tmp_path, error, stays):
             for part in outputs.kept(new, {}).each("parts", 2, work):
                 part.put(new / "model.yaml")
 
-    with pytest.raises((KeyboardInterrupt, InputError)):
+    with pytest.raises((KeyboardInterrupt, MemoryError, InputError)):
         write()
     assert [path.name for path in tmp_path.glob(".*/*")] == ["kept"] * stays
 
