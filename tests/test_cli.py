@@ -269,4 +269,7 @@ def test_an_interrupted_fit_leaves_the_earlier_run_as_it_was(folder):
         assert process.wait(60) == 130
         assert process.stdout.read() == ""
     assert "rigcal: interrupted" in "".join(shown)
+    assert "what was done of it is kept, for the same command to go on from" in "".join(shown)
+    assert {path.name for path in (folder / ".run.rigcal").iterdir()} == {"kept"}
+    shutil.rmtree(folder / ".run.rigcal")
     assert contents(folder) == before

@@ -28,6 +28,7 @@ except ImportError:  # Windows: nothing is locked there
     fcntl = None  # type: ignore[assignment]
 
 DRAFT, LOCK = "draft", "lock"
+TO_GO_ON = "for the same command to go on from"
 KEPT = "kept"  # parts that are done, which outlive the draft of a command that was killed
 _OURS = (DRAFT, WHOLE, ENTRIES, BESIDE, "aside")  # nothing else in a workshop is ever touched
 _ATTEMPTS = 100  # a workshop may be taken away while it is entered, by the one who leaves
@@ -109,6 +110,8 @@ def workshop(path: Path) -> Iterator[Workshop]:
                 _remove(work / KEPT)
             raise
         finally:
+            if os.path.lexists(work / KEPT):
+                _LOG.warning("%s: what was done of it is kept, %s", path, TO_GO_ON)
             _leave(work, lock)
             for above in made:
                 with suppress(OSError):
@@ -228,7 +231,7 @@ def _settle(shop: Workshop) -> None:
     else:
         stand = "none stands yet" if os.path.lexists(work / KEPT) else "nothing of it was kept"
     if os.path.lexists(work / KEPT):
-        stand += ", and what it had done is kept for the same command to go on from"
+        stand += f", and what it had done is kept, {TO_GO_ON}"
     shop._record({}, [])
     for name in _OURS:
         _remove(work / name)

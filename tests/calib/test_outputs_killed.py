@@ -175,7 +175,7 @@ def test_parts_that_were_done_are_used_by_the_same_command(tmp_path, caplog, exc
         again(world / "run")
         assert contents(world) == new, step
         assert not [*world.rglob(".*.rigcal")]
-    assert "what it had done is kept" in caplog.text
+    assert "what it had done is kept, for the same command" in caplog.text
     used = [f"parts: {n} of 3 were done before" in caplog.text for n in (1, 2, 3)]
     assert used == [again is in_parts] * 3
 
