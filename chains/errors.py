@@ -1,4 +1,4 @@
-"""The one exception that speaks to users, and how it names what they probably meant."""
+"""The exceptions that speak to users, and how it names what they probably meant."""
 
 import difflib
 from collections.abc import Collection
@@ -11,6 +11,10 @@ class InputError(ValueError):
     right. The command line prints it alone and exits with 2; every other exception is a fault of
     the program.
     """
+
+
+class CutShortError(InputError):
+    """What was asked was right, and something else ended it: the same command may go on later."""
 
 
 LONGEST_NAME = 80  # bytes: tables are called RIG.STOP.parquet, and file systems take 255

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from chains import remote
 from chains.errors import InputError
 from chains.sizes import check_claim, most
 from sensors.documents import write_atomically
@@ -197,8 +198,8 @@ class RecordedStops:
 def digest(folder: str | Path) -> str:
     """Return the SHA-256 (hex) of the names and contents of a recording's files."""
     folder, sha = Path(folder), hashlib.sha256()
-    files = {path for part in _PARTS for path in folder.glob(part) if path.is_file()}
-    for path in sorted(files):
+    files = sorted({path for part in _PARTS for path in remote.files(folder, part)})
+    for path in map(remote.fetched, files):
         sha.update(f"{path.relative_to(folder).as_posix()}\0{path.stat().st_size}\0".encode())
         with open(path, "rb") as file:
             while block := file.read(1 << 20):
@@ -213,8 +214,7 @@ def read_scan(path: str | Path, rings: int | None = None) -> Scan:
     InputError for a file that is missing or empty, lacks a column or has one of the wrong type,
     and for rings (0 to `rings` - 1) or ranges that the sensor cannot have delivered.
     """
-    path = Path(path)
-    with _open_parquet(path) as file:
+    with _open_parquet(path := Path(path)) as file:
         names = _check_types(path, file)
         if "scan" in names:
             columns = average_hold(lambda wanted: _batches(path, file, wanted), names)
@@ -263,7 +263,7 @@ def _open_parquet(path: Path) -> Iterator["ParquetFile"]:
     import pyarrow.parquet
 
     try:
-        with pyarrow.parquet.ParquetFile(path) as file:
+        with pyarrow.parquet.ParquetFile(remote.fetched(path)) as file:
             rows, columns = file.metadata.num_rows, file.metadata.num_columns
             check_claim(path, 8 * rows * columns, f"{rows} rows of {columns} columns")
             yield file
@@ -321,7 +321,7 @@ def _batches(path: Path, file: "ParquetFile", names: Sequence[str]) -> Iterator[
 
 def _find_scans(folder: Path, stops: Sequence[str]) -> NDArray[np.bool_]:
     """Say which stops have a scan; scans of which none belongs to a stop are a mistake."""
-    names = {path.stem for path in folder.glob("*.parquet")}
+    names = {path.stem for path in remote.files(folder, "*.parquet")}
     if names and names.isdisjoint(stops):
         raise InputError(
             f"{folder} holds {min(names)}.parquet, but nothing named after a stop of stops.csv,"

@@ -32,6 +32,7 @@ DOORS = {
     "PIL": "sensors/readers/packets/osf.py",
     "dask": "calib/linear/parallel/cluster.py",
     "distributed": "calib/linear/parallel/cluster.py",
+    "fsspec": "chains/remote.py",
     "gtsam": "calib/solve/graph.py",
     "laspy": "sensors/readers/clouds/las.py",
     "matplotlib": "calib/report/plots.py",
@@ -46,7 +47,7 @@ DOORS = {
     "yaml": "sensors/documents.py",
 }
 NOT_AT_STARTUP = {"distributed", "gtsam", "matplotlib", "numba", "open3d", "pyarrow", "pydantic"}
-NOT_AT_STARTUP |= {"scipy", "viser"}
+NOT_AT_STARTUP |= {"fsspec", "scipy", "viser"}
 LONGEST_FILE, LONGEST_FUNCTION = 400, 60
 MOST_FILES = 12  # a room, beside its __init__.py
 MOST_PARAMETERS, MOST_POSITIONAL = 12, 4

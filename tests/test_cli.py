@@ -261,12 +261,15 @@ def test_an_interrupted_fit_leaves_the_earlier_run_as_it_was(folder):
     before = contents(folder)
     arguments = ["fit", folder / "rec", "-o", folder / "run", "--hold-out", "stop", "--folds", 3]
     with at_a_terminal(*arguments) as (process, shown):
-        while "pass" not in "".join(shown):
+        while not list(folder.glob(".run.rigcal/kept/*/*.npz")):  # beside its result
             assert process.poll() is None, "".join(shown)
             threading.Event().wait(0.01)
-        assert list(folder.glob(".run.*")), "it writes elsewhere than beside its result"
         process.send_signal(signal.SIGINT)
         assert process.wait(60) == 130
         assert process.stdout.read() == ""
     assert "rigcal: interrupted" in "".join(shown)
+    said = re.sub(r"\s+", " ", re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", "".join(shown)))
+    assert "what was done of it is kept, for the same command to go on from" in said
+    assert {path.name for path in (folder / ".run.rigcal").iterdir()} == {"kept"}
+    shutil.rmtree(folder / ".run.rigcal")
     assert contents(folder) == before

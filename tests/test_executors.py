@@ -41,6 +41,8 @@ MODEL = "ring_range_offset,intensity_range_walk,noise_range,mine.yaml,bent.py"
 COMMANDS = (
     f"fit rec -o run --effects {MODEL} {{how}}",
     "diagnose run --trust bent.py {how}",
+    "evaluate run --trust bent.py {how}",
+    "apply run rec -o corrected --trust bent.py {how}",
 )
 # Runs its arguments as commands in one process, as starting takes long.
 PROGRAM = """
@@ -92,8 +94,9 @@ def prepared(folder, recording):
 
 
 def written(folder):
-    """Every file of a run by its name, without what its `seconds` and folder say."""
-    files = {p.relative_to(folder / "run"): p for p in (folder / "run").rglob("*") if p.is_file()}
+    """Every file of the outputs by its name, without what its `seconds` and folder say."""
+    outputs = (folder / "run", folder / "corrected")
+    files = {p.relative_to(folder): p for out in outputs for p in out.rglob("*") if p.is_file()}
     gone = rb'^ "seconds": [0-9.e-]+,?\n'
     return {
         str(name): re.sub(gone, b"", p.read_bytes(), flags=re.M).replace(bytes(folder), b"HERE")
@@ -127,7 +130,13 @@ def test_files_are_the_same_byte_by_byte(way, alone, recording, tmp_path):
     else:
         assert program(WAYS[way], folder) == ""
     here = written(folder)
-    assert here.keys() == alone.keys() and {"solution.yaml", "diagnosis.json"} <= here.keys()
+    made = {
+        "run/solution.yaml",
+        "run/diagnosis.json",
+        "run/evaluation.json",
+        "corrected/rec/rig.yaml",
+    }
+    assert here.keys() == alone.keys() and made <= here.keys()
     assert [name for name in here if here[name] != alone[name]] == []
 
 

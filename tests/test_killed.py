@@ -5,6 +5,7 @@ and without a system that can exchange two folders; and at moments drawn by chan
 themselves do is tested in tests/calib/test_outputs_killed.py, without commands.
 """
 
+import itertools
 import json
 import os
 import re
@@ -21,6 +22,7 @@ import numpy as np
 import pytest
 
 from calib import outputs
+from calib.outputs.workshop import KEPT
 from calib.rig import load_rig
 from calib.runs.run import Run
 
@@ -185,7 +187,15 @@ def world(tmp_path_factory):
 
 
 def leftovers(world: World) -> list[Path]:
-    return [path for path in world.folder.rglob(".*") if path.name != outputs.CLOUDS_MARK]
+    """What commands leave that are killed, but for parts that the same one will go on from."""
+    hidden = [path for path in world.folder.rglob(".*") if path.name != outputs.CLOUDS_MARK]
+    return [path for path in hidden if KEPT not in path.parts and path not in parts(world)]
+
+
+def parts(world: World) -> list[Path]:
+    """Workshops in which nothing is but such parts."""
+    works = world.folder.rglob(".*.rigcal")
+    return [work for work in works if [path.name for path in work.iterdir()] == [KEPT]]
 
 
 def look(path: Path) -> None:
@@ -239,6 +249,9 @@ def killed_at_every_step(world: World, case: Case, caplog, exchange=True, all_st
         code = world.run(case.words, at, exchange)
         assert code == (-signal.SIGKILL if at < len(steps) else 0), at
         found_whole(world, case, old, new, caplog)
+        if parts(world):
+            assert world.run(case.words) == 0, world.said()
+            assert world.contents(case) == new and parts(world) == []
     assert world.run(case.words) == 0, world.said()
     assert world.contents(case) == new and leftovers(world) == []
 
@@ -260,6 +273,34 @@ def around_renames(steps: list[str]) -> list[int]:
 @pytest.mark.parametrize("name", QUICK)
 def test_a_command_killed_at_a_rename_leaves_old_or_new(world, name, caplog):
     killed_at_every_step(world, CASES[name], caplog, all_steps=False)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("words", ["fit lean -o leaned", "add seen range_scale -o leaned"])
+def test_a_fit_that_is_killed_goes_on_from_what_it_knows(world, words):
+    """To the same bytes, from any of its passes; a fit that is asked anything else knows nothing.
+
+    The estimate takes the same way on two processes as on threads.
+    """
+    case = Case(words, ("leaned",))
+    world.restore(case)
+    assert world.run(words) == 0, world.said()
+    steps, new = world.steps.read_text().splitlines(), world.contents(case)
+    renames = around_renames(steps)
+    used = []
+    for at, how in zip(renames[1:-3:4], itertools.cycle(["", " --workers 2"])):
+        world.restore(case)
+        assert world.run(words + how, at) == -signal.SIGKILL
+        assert world.run(f"-v {words}") == 0, world.said()
+        assert world.contents(case) == new and leftovers(world) == parts(world) == []
+        told = re.search(r"^rigcal: (\d+) answers of passes", world.said(), re.M)
+        used.append(int(told[1]) if told else 0)
+    assert used == sorted(used) and used[0] > 0 and used[-1] > 5
+    world.restore(case)
+    assert world.run(words, renames[-5]) == -signal.SIGKILL
+    other = "fit lean -o leaned --effects range_offset"
+    assert world.run(f"-v {other}") == 0 and "answers of passes" not in world.said()
+    assert leftovers(world) == parts(world) == []
 
 
 @pytest.mark.long

@@ -134,7 +134,12 @@ def test_it_is_refused_before_any_work(made, rigcal, monkeypatch):
 
     for place in (
         *("runs.calibrate.leave_out", "runs.calibrate.reopened", "evaluation.reopened"),
-        *("evaluation.apply.Correction", "exporters.Fitted", "intake.gather", "simulation._record"),
+        *(
+            "evaluation.correction.Correction",
+            "exporters.Fitted",
+            "intake.gather",
+            "simulation._record",
+        ),
         *("report.Evidence.of", "runs.explain.calibrate", "runs.diagnose.stand_of"),
         *("planning.stand_of",),
     ):

@@ -10,13 +10,16 @@ import typer
 from calib.cli.app import (
     Json,
     Runs,
+    Scheduler,
     Trust,
+    Workers,
     app,
     end_unless_converged,
     print_json,
     progress_bar,
     warn,
 )
+from calib.linear.parallel import executing
 from chains.errors import InputError
 
 if TYPE_CHECKING:
@@ -40,6 +43,8 @@ def evaluate(
         ),
     ] = None,
     trust: Trust = None,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
     as_json: Json = False,
 ) -> None:
     """Compute accuracy and precision of every return.
@@ -55,7 +60,7 @@ def evaluate(
     if at is not None:
         _predict(opened, at, out, raw, as_json)
         return
-    with progress_bar() as progress:
+    with executing(workers, scheduler), progress_bar() as progress:
         evaluations = evaluate_all(opened, out, raw, progress)
     warn(opened, as_json)
     if as_json:

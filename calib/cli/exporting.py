@@ -7,7 +7,19 @@ from typing import Annotated
 
 import typer
 
-from calib.cli.app import Force, Json, Out, Trust, app, print_json, progress_bar, say
+from calib.cli.app import (
+    Force,
+    Json,
+    Out,
+    Scheduler,
+    Trust,
+    Workers,
+    app,
+    print_json,
+    progress_bar,
+    say,
+)
+from calib.linear.parallel import executing
 
 
 @app.command()
@@ -75,6 +87,8 @@ def apply(
     ] = None,
     trust: Trust = None,
     force: Force = False,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
     as_json: Json = False,
 ) -> None:
     """Correct point clouds by the estimated effects of a run."""
@@ -82,7 +96,7 @@ def apply(
     from calib.runs.run import Run
 
     opened = Run.open(run, trust or ())
-    with progress_bar() as progress:
+    with executing(workers, scheduler), progress_bar() as progress:
         done = correct(opened, clouds, out, rig, progress, force)
     document = {
         "warnings": opened.warning,

@@ -12,7 +12,9 @@ from calib.cli.app import (
     Json,
     Out,
     Runs,
+    Scheduler,
     Trust,
+    Workers,
     app,
     end_unless_converged,
     print_json,
@@ -20,17 +22,25 @@ from calib.cli.app import (
     say,
     warn,
 )
+from calib.linear.parallel import executing
 from chains.errors import InputError
 
 
 @app.command()
-def report(runs: Runs, out: Out, trust: Trust = None, as_json: Json = False) -> None:
+def report(
+    runs: Runs,
+    out: Out,
+    trust: Trust = None,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    as_json: Json = False,
+) -> None:
     """Write a report: one HTML page that needs no network."""
     from calib.report import report as write
     from calib.runs.run import Run
 
     opened = [Run.open(run, trust or ()) for run in runs]
-    with progress_bar() as progress:
+    with executing(workers, scheduler), progress_bar() as progress:
         written = write(opened, out, progress)
     warn(opened, as_json)
     say(written.document(), f"wrote {out}: {written.summary}", as_json)

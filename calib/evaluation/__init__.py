@@ -17,7 +17,8 @@ scatter by s about e, so a hold says the same raw or averaged.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,17 +27,17 @@ import numpy as np
 from calib import outputs
 from calib.evaluation.tally import FLAT_M, Columns, Evaluated, Tally
 from calib.forward import Values
-from calib.linear.parallel import one_blas_thread
+from calib.linear.parallel import one_blas_thread, over_stops
 from calib.residuals.beams import Ranges
 from calib.residuals.scan import ScanStop
 from calib.residuals.surfaces import Meeting, MeshSurface
-from calib.runs.reopen import problem_of, reopened, state_of
+from calib.runs.reopen import identity, problem_of, reopened, state_of
 from calib.runs.run import Run
 from calib.solve.estimate import values_of
 from calib.solve.fit import Progress
 from chains.errors import InputError
 from sensors.documents import write_json, write_yaml
-from sensors.recording import write_table
+from sensors.recording import table_bytes
 
 EVALUATION_FILE, POINTS_FILE, MEANING_FILE = "evaluation.json", "points.parquet", "_columns.yaml"
 POINT_COLUMNS = {
@@ -130,10 +131,23 @@ def _nearest(scan: ScanStop, ranges: Ranges, some: np.ndarray, error_m: np.ndarr
     return -np.einsum("ni,ni->n", ahead_m, ranges.normal[some])
 
 
-def _each(scans: Sequence[ScanStop], values: Values, progress: Progress) -> Iterator[Evaluated]:
-    for i, scan in enumerate(scans):
-        progress("evaluating", i, len(scans))
-        yield evaluate_stop(scan, values)
+def tabled(done: Evaluated, raw: bool = False) -> outputs.Finished:
+    """A stop as it is written: its path under ``points.parquet`` and its sums, and its points.
+
+    Args:
+        done: the stop.
+        raw: whether its sums are of the returns before correction.
+    """
+    tally = Tally(raw)
+    tally.add(done)
+    names = {"sensor": done.sensor, "location": done.location, "stop": done.stop}
+    folders = [f"{key}={_part(name)}" for key, name in names.items()]
+    path = "/".join([*folders, f"{done.rig}.parquet"])
+    return {"path": path, "sums": tally.sums()}, table_bytes(done.points)
+
+
+def _of_stop(values: Values, raw: bool, scan: ScanStop) -> outputs.Finished:
+    return tabled(evaluate_stop(scan, values), raw)
 
 
 @one_blas_thread
@@ -168,8 +182,15 @@ def evaluate(
             raise InputError(
                 f"{run.folder}: its recordings hold no scans, so there is no LiDAR to evaluate"
             )
-        stops = _each(problem.scans, values_of(problem, state_of(run, problem)), progress)
-        return write_evaluation(stops, folder, raw, sources[0].rig.labels, run.warning)
+        scans, values = problem.scans, values_of(problem, state_of(run, problem))
+        work = partial(_of_stop, values, raw)
+        stops = outputs.kept(folder, {**identity(run), "raw": raw}).each(
+            "stops to evaluate",
+            len(scans),
+            lambda some: over_stops(work, [scans[i] for i in some]),
+            partial(progress, "evaluating"),
+        )
+        return write_evaluation(stops, folder, sources[0].rig.labels, raw, run.warning)
 
 
 def evaluate_all(
@@ -198,19 +219,19 @@ def evaluate_all(
 
 
 def write_evaluation(
-    stops: Iterable[Evaluated],
+    stops: Iterable[outputs.KeptPart],
     folder: Path,
-    raw: bool,
     labels: Mapping[int, str],
+    raw: bool = False,
     warnings: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Write evaluated stops as they come, and sum them up; one is in memory at a time.
 
     Args:
-        stops: any number of them, evaluated.
+        stops: any number of them, as `tabled` has each.
         folder: where evaluation.json and points.parquet/ go; neither is there yet.
-        raw: as of `evaluate`.
         labels: their names, where they have any.
+        raw: as of `evaluate`.
         warnings: what is to stand above everything that is shown of the run.
 
     Returns:
@@ -220,12 +241,9 @@ def write_evaluation(
     points.mkdir(parents=True)
     tally = Tally(raw)
     write_yaml(points / MEANING_FILE, POINT_COLUMNS)
-    for done in stops:
-        tally.add(done)
-        names = {"sensor": done.sensor, "location": done.location, "stop": done.stop}
-        place = points / "/".join(f"{key}={_part(name)}" for key, name in names.items())
-        place.mkdir(parents=True, exist_ok=True)
-        write_table(place / f"{done.rig}.parquet", done.points)
+    for stop in stops:
+        tally.include(stop.told["sums"])
+        stop.put(points / stop.told["path"])
     document = {"warnings": list(warnings), **tally.document(labels)}
     write_json(folder / EVALUATION_FILE, document)
     return document

@@ -1,120 +1,33 @@
-"""Corrected clouds: what a run has learnt of its LiDAR, taken off what that measures.
+"""Corrected clouds: copies of files and of recordings, without what a run knows to be wrong.
 
-A point is a beam that starts where the sensor's beams do; its effects say by how much it was read
-long, and turned. Effects look at the range and incidence of the surface, which a cloud does not
-know: the range is the measured one, corrected and looked at again, and the incidence that of the
-plane through a point's neighbours.
+Scans of a recording are corrected stop by stop, by whoever works on stops.
 """
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from calib import outputs
 from calib.diagnosis.formulas.seen import ColumnRanges
-from calib.effects import Effect, LazyColumn, Site, View
-from calib.linear.parallel import one_blas_thread
+from calib.evaluation.correction import Correction, correct
+from calib.linear.parallel import one_blas_thread, over_stops
+from calib.linear.rows import State
 from calib.problem.model import Source
-from calib.residuals.beams import site_error
-from calib.residuals.scan import turned
-from calib.residuals.store import common_median
-from calib.rig import Rig, load_rig
-from calib.runs.reopen import effects_that_may_run, problem_of, reopened, state_of
+from calib.residuals.scan import ScanStop
+from calib.runs.reopen import identity, problem_of, reopened, state_of
 from calib.runs.run import Run
 from calib.solve.estimate import values_of
 from calib.solve.fit import Progress
 from chains.errors import InputError
-from sensors.documents import nearest
-from sensors.lidar import Beams, beams
+from sensors.lidar import Beams
 from sensors.meshes import read_cloud, write_cloud
-from sensors.recording import read_table, write_table
-
-Columns = dict[str, np.ndarray]
-KnownOfBeams = Callable[
-    [Beams], Mapping[str, np.ndarray]
-]  # beams of points -> what else is known of them
-NEIGHBOURS = 24  # of a point, through which its plane is laid
-SUPPORT = 200_000  # points among which neighbours are sought
-THICKEST = 0.3  # of a plane's width: what is thicker is none
-FLATTEST_BEAM_RAD = np.radians(85.0)  # flatter beams are corrected as these are
-# Looks at the range: a correction changes by a millionth of itself from each to the next.
-CORRECTION_PASSES = 3
-_SEEN = ("range_m", "azimuth_rad", "elevation_rad", "incidence_rad")  # of any cloud
-
-
-@dataclass(frozen=True)
-class Correction:
-    """What a run takes off the clouds of one of its LiDARs.
-
-    Args:
-        rig: as on paper.
-        effects: the model's effects on beams, and the estimate (P,) of each.
-        closed: effects that are not known here, as their Python file may not run -> that sentence.
-        median_intensity: to which effects hold others, in the unit of the run's recordings; NaN
-            where no effect asks.
-    """
-
-    rig: Rig
-    effects: Sequence[tuple[Effect, np.ndarray]]
-    closed: Mapping[str, str] = field(default_factory=dict)
-    median_intensity: float = float("nan")
-
-    @classmethod
-    def of(cls, run: Run, rig_name: str | None = None) -> Correction:
-        """That of a run's LiDAR, of the rig named where there are several.
-
-        Raises:
-            InputError: the run has several rigs and none is named, or its recording is gone.
-        """
-        rig = _rig(run, rig_name)
-        part = run.solution.part(rig.name)
-        effects, why = effects_that_may_run(run)
-        known = {e.name: e for e in effects if e.name in part.effects}
-        of_beams = [e for e in known.values() if e.site is Site.BEAM and not e.by_chance]
-        closed = {
-            name: f"is not known: {why}" for name in part.effects if why and name not in known
-        }
-        chance = (e.name for e in known.values() if e.by_chance)
-        closed |= {name: "is another one each time, by chance" for name in chance}
-        asked = any("intensity" in e.covariates for e in of_beams)
-        return cls(
-            rig,
-            [(e, part.effects[e.name].estimate) for e in of_beams],
-            closed=closed,
-            median_intensity=_median_intensity(run, rig) if asked else float("nan"),
-        )
-
-    def usable(self, columns: Collection[str]) -> tuple[Correction, dict[str, str]]:
-        """What can be corrected where these columns are known, and what of it not, and why."""
-        known = {*columns, *_SEEN}
-        lacking = {e.name: sorted({*e.covariates} - known) for e, _ in self.effects}
-        kept = [(e, theta) for e, theta in self.effects if not lacking[e.name]]
-        why = {name: f"needs {', '.join(missing)}" for name, missing in lacking.items() if missing}
-        return replace(self, effects=kept), {**why, **self.closed}
-
-    def apply(self, xyz_m: np.ndarray, columns: Mapping[str, LazyColumn]) -> np.ndarray:
-        """Corrected points (N, 3) of points as the driver gives them, in the LiDAR's frame.
-
-        Args:
-            xyz_m: (N, 3), each a return.
-            columns: (N,) or (1,) of what effects may look at, beside what points say themselves.
-        """
-        ray = beams(xyz_m, self.rig.lidar.beam_origin_m)
-        error = np.zeros((len(xyz_m), 3))
-        if "intensity" in columns:
-            columns = {**columns, "intensity": columns["intensity"] / self.median_intensity}
-        for _ in range(CORRECTION_PASSES):
-            there = {"range_m": ray.range_m - error[:, 0], **_angles(ray), **columns}
-            view = View(self.rig, len(xyz_m), there, np.zeros((1, 0)))
-            each = (site_error(e.basis(view), theta) for e, theta in self.effects)
-            error = sum(each, np.zeros((len(xyz_m), 3)))
-        back = turned(ray, -error[:, 1], -error[:, 2]) if error[:, 1:].any() else ray
-        return back.origin_m + (ray.range_m - error[:, 0])[:, None] * back.direction
+from sensors.recording import digest, read_table, table_bytes, write_table
 
 
 @dataclass(frozen=True)
@@ -163,9 +76,13 @@ def apply(
     with outputs.folder(out, outputs.CLOUDS, [*clouds, run.folder, *run.inputs]) as folder:
         (folder / outputs.CLOUDS_MARK).write_text("corrected by rigcal\n", encoding="utf-8")
         correction = Correction.of(run, rig)
+        recordings = {n: digest(c) for n, c in zip(names, clouds, strict=True) if c.is_dir()}
+        asked = {**identity(run), "rig": rig, "recordings": recordings}
+        kept = outputs.kept(folder, asked)
         for i, (cloud, name) in enumerate(zip(clouds, names, strict=True)):
             if cloud.is_dir():
-                one = _apply_recording(run, correction, cloud, folder / name, progress)
+                stops = _of_recording(run, cloud)
+                one = _apply_recording(correction, stops, cloud, folder / name, kept, progress)
             else:
                 progress("correcting", i, len(clouds))
                 one = _apply_file(correction, cloud, folder / name)
@@ -177,165 +94,99 @@ def _apply_file(correction: Correction, cloud: Path, target: Path) -> Applied:
     parquet = cloud.suffix.lower() == ".parquet"
     columns = read_table(cloud) if parquet else read_cloud(cloud)
     reach = ColumnRanges(e for e, _ in correction.effects)
-    rms_m, left_out = _correct(correction, cloud, columns, reach)
+    rms_m, left_out = correct(correction, cloud, columns, reach)
     (write_table if parquet else write_cloud)(target, columns)
     return Applied(target, len(columns["x"]), rms_m, left_out, extrapolated=reach.sentences())
 
 
+@dataclass(frozen=True)
+class _Stop:
+    """A stop of a recording whose scan is corrected.
+
+    Args:
+        name, path: of its scan.
+        columns: of the stop, which are known (1,) of all its points.
+        met: its beams against the mesh, of a recording that the run was fitted to, and where that
+            stands.
+    """
+
+    name: str
+    path: Path
+    columns: Mapping[str, np.ndarray]
+    met: tuple[ScanStop, State] | None = None
+
+    def known(self, ray: Beams) -> Mapping[str, np.ndarray]:
+        """What is known of beams beside what their points say."""
+        if self.met is None:
+            return self.columns
+        scan, state = self.met
+        return scan.what_meets(ray, state.values)
+
+
 def _apply_recording(
-    run: Run, correction: Correction, folder: Path, target: Path, progress: Progress
+    correction: Correction,
+    stops: Sequence[_Stop],
+    folder: Path,
+    target: Path,
+    kept: outputs.Kept,
+    progress: Progress,
 ) -> Applied:
     """A recording's copy with its scans corrected."""
-    met = dict(_met(run, folder))  # but for scans that were left out, or set aside
-    stops = (dict(_unmet(Source.open(folder))) | met).items()
-    points, squares, left_out = 0, 0.0, {}
+    corrected = {stop.path for stop in stops}
+    shutil.copytree(
+        folder, target, ignore=lambda at, names: {n for n in names if Path(at, n) in corrected}
+    )
     reach = ColumnRanges(e for e, _ in correction.effects)
-    shutil.copytree(folder, target)
-    for i, (stop, known) in enumerate(stops):
-        progress("correcting", i, len(stops))
-        path = target / "scans" / f"{stop}.parquet"
-        columns = read_table(path)
-        rms_m, without = _correct(correction, path, columns, reach, known)
-        write_table(path, columns)
-        points, left_out = points + len(columns["x"]), left_out | without
-        squares += len(columns["x"]) * rms_m**2
+    parts = kept.each(
+        f"scans of {target.name}",
+        len(stops),
+        lambda some: over_stops(partial(_of_stop, correction), [stops[i] for i in some]),
+        partial(progress, "correcting"),
+    )
+    points, squares, left_out = 0, 0.0, {}
+    for stop, part in zip(stops, parts, strict=True):
+        part.put(target / stop.path.relative_to(folder))
+        points, left_out = points + part.told["points"], left_out | part.told["left_out"]
+        squares += part.told["points"] * part.told["rms_m"] ** 2
+        reach.include(part.told["seen"])
     rms_m = float(np.sqrt(squares / max(points, 1)))
     return Applied(target, points, rms_m, left_out, extrapolated=reach.sentences())
 
 
-def _unmet(source: Source) -> list[tuple[str, KnownOfBeams]]:
-    """Stops with a scan, and what is known of all points of each: the columns of the stop."""
+def _of_stop(correction: Correction, stop: _Stop) -> outputs.Finished:
+    columns, reach = read_table(stop.path), ColumnRanges(e for e, _ in correction.effects)
+    rms_m, left_out = correct(correction, stop.path, columns, reach, stop.known)
+    told = {"points": len(columns["x"]), "rms_m": rms_m, "left_out": left_out}
+    return {**told, "seen": reach.ends}, table_bytes(columns)
+
+
+def _of_recording(run: Run, folder: Path) -> list[_Stop]:
+    """Its stops with a scan; of one that the run was fitted to with what beams meet on the mesh,
+    but where a scan was left out, or set aside."""
+    met, source = _met(run, folder), Source.open(folder)
+    columns = {n: c for n, c in source.columns.items() if c.ndim == 1}
     return [
-        (stop, lambda ray, k=k: {n: c[[k]] for n, c in source.columns.items() if c.ndim == 1})
+        _Stop(
+            name=stop,
+            path=folder / "scans" / f"{stop}.parquet",
+            columns={n: c[[k]] for n, c in columns.items()},
+            met=met.get(stop),
+        )
         for k, stop in enumerate(source.recording.stops)
         if source.recording.has_scan[k]
     ]
 
 
-def _met(run: Run, folder: Path) -> list[tuple[str, KnownOfBeams]]:
-    """The same of a recording that the run was fitted to; and what its beams meet on the mesh."""
+def _met(run: Run, folder: Path) -> dict[str, tuple[ScanStop, State]]:
+    """Scans of a recording that the run was fitted to, by their stop, and where the run stands;
+    none where it has no mesh, or is another."""
     if folder.resolve() not in [path.resolve() for path in run.recordings]:
-        return []
+        return {}
     sources = reopened(run)
     wanted = next(s for s in sources if s.recording.folder.resolve() == folder.resolve())
     if wanted.reference is None:
-        return []
+        return {}
     problem = problem_of(run, sources)
-    values = values_of(problem, state_of(run, problem))
+    state = State(values_of(problem, state_of(run, problem)))
     scans = [scan for scan in problem.scans if scan.recording is wanted.recording]
-    return [(scan.name, lambda ray, scan=scan: scan.what_meets(ray, values)) for scan in scans]
-
-
-def _correct(
-    correction: Correction,
-    path: Path,
-    columns: Columns,
-    reach: ColumnRanges,
-    known: KnownOfBeams = lambda ray: {},
-) -> tuple[float, dict[str, str]]:
-    """Correct a cloud's columns x y z in place, and show `reach` what effects look at; by how much,
-    rms in m, and what was left out."""
-    lacking = [axis for axis in "xyz" if axis not in columns]
-    if lacking:
-        raise InputError(f"{path}: column {lacking[0]} is missing; a cloud has x, y and z in m")
-    xyz_m = np.stack([columns[axis] for axis in "xyz"], axis=-1).astype(float)
-    seen = np.flatnonzero(np.isfinite(xyz_m).all(axis=1) & xyz_m.any(axis=1))
-    _check_rings(correction.rig, path, columns, seen)
-    numbers = {n: c for n, c in columns.items() if c.ndim == 1 and c.dtype.kind in "fiu"}
-    ray = beams(xyz_m[seen], correction.rig.lidar.beam_origin_m)
-    told = known(ray)
-    there = {n: c[seen] for n, c in numbers.items()} | told
-    if "ring" in there:  # some formats hold it as a float
-        there["ring"] = there["ring"].astype(np.int64)
-    usable, left_out = correction.usable(there)
-    if any("incidence_rad" in e.covariates for e, _ in usable.effects):
-        met = _incidence(xyz_m[seen], usable.rig, there.get("incidence_rad"))
-        blind, there["incidence_rad"] = np.isnan(met), np.nan_to_num(met)
-        needy = [e.name for e, _ in usable.effects if "incidence_rad" in e.covariates]
-        if blind.any():
-            why = f"needs incidence, and {blind.mean():.1%} of the points lie on no plane"
-            left_out |= dict.fromkeys(needy, why)
-    reach.look({"range_m": ray.range_m, **_angles(ray), **there})
-    corrected_m = usable.apply(xyz_m[seen], there)
-    moved_m = np.linalg.norm(corrected_m - xyz_m[seen], axis=1)
-    for k, axis in enumerate("xyz"):
-        columns[axis] = columns[axis].copy()
-        columns[axis][seen] = corrected_m[:, k]
-    return float(np.sqrt(np.mean(moved_m**2))) if len(seen) else 0.0, left_out
-
-
-def _incidence(xyz_m: np.ndarray, rig: Rig, met_rad: np.ndarray | None) -> np.ndarray:
-    """Incidence (N,) on what the beams are known to meet, or else on their neighbours' planes."""
-    if met_rad is None:
-        incidence_rad = incidence(xyz_m, rig)
-    elif np.isnan(met_rad).any():
-        incidence_rad = np.where(np.isnan(met_rad), incidence(xyz_m, rig), met_rad)
-    else:
-        incidence_rad = met_rad
-    return np.minimum(incidence_rad, FLATTEST_BEAM_RAD)
-
-
-def incidence(xyz_m: np.ndarray, rig: Rig) -> np.ndarray:
-    """Incidence (N,) rad of beams on the planes through each point's nearest neighbours.
-
-    The plane's normal is the direction in which the neighbours spread least; NaN where they spread
-    nearly as much along it as along one of the plane's: an edge, or too few of them.
-    """
-    from scipy.spatial import cKDTree
-
-    ray = beams(xyz_m, rig.lidar.beam_origin_m)
-    some = xyz_m[:: max(1, len(xyz_m) // SUPPORT)]
-    _, near = cKDTree(some).query(xyz_m, k=min(NEIGHBOURS, len(some)), workers=-1)
-    out = np.empty(len(xyz_m))
-    for rows in np.array_split(np.arange(len(xyz_m)), 1 + len(xyz_m) // SUPPORT):
-        away_m = some[near[rows]]
-        away_m -= away_m.mean(axis=1, keepdims=True)
-        variance, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", away_m, away_m))
-        along = np.abs(np.einsum("ni,ni->n", axes[:, :, 0], ray.direction[rows]))
-        plane = variance[:, 0] < THICKEST**2 * variance[:, 1]
-        out[rows] = np.where(plane, np.arccos(np.minimum(along, 1.0)), np.nan)
-    return out
-
-
-def _angles(ray: Beams) -> Columns:
-    return {"azimuth_rad": ray.azimuth_rad, "elevation_rad": ray.elevation_rad}
-
-
-def _check_rings(rig: Rig, path: Path, columns: Columns, seen: np.ndarray) -> None:
-    """Rings of the cloud are those of the LiDAR, counted from 0."""
-    if "ring" not in columns or not len(seen):
-        return
-    ring = columns["ring"][seen].astype(np.int64)
-    if ring.min() < 0 or ring.max() >= rig.lidar.rings:
-        raise InputError(
-            f"{path}: ring {ring.min()} to {ring.max()}, but {rig.lidar.name} has 0 to "
-            f"{rig.lidar.rings - 1}; count from 0, or give a run of this LiDAR"
-        )
-
-
-def _median_intensity(run: Run, rig: Rig) -> float:
-    """As of `Correction`."""
-    mine = [Path(r["path"]) for r in run.model["recordings"] if r["rig"] == rig.name]
-    return common_median([Source.open(path).store for path in mine])
-
-
-def _rig(run: Run, name: str | None) -> Rig:
-    """The rig whose LiDAR is meant."""
-    folders = {r["rig"]: Path(r["path"]) for r in run.model["recordings"]}
-    if name is None and len(folders) > 1:
-        raise InputError(
-            f"{run.folder} has several rigs: say whose LiDAR with --rig, {', '.join(folders)}"
-        )
-    if name is not None and name not in folders:
-        raise InputError(
-            f"--rig {name}: {run.folder} has no such rig{nearest(name, list(folders))}"
-        )
-    path = folders[name] if name else next(iter(folders.values()))
-    if not path.is_dir():
-        raise InputError(
-            f"{path}, which {run.folder} was fitted to, is no longer there; put it back"
-        )
-    rig = load_rig(path)
-    if rig.lidar is None:
-        raise InputError(f"{path}: this rig has no LiDAR, so there are no clouds to correct")
-    return rig
+    return {scan.name: (scan, state) for scan in scans}

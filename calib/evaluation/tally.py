@@ -87,6 +87,35 @@ class Tally:
         self._nearest += _sums(count[some], away_m, np.abs(away_m), across_m).sum(axis=0)
         self._add_planes(done, error_m, count, spread_m)
 
+    def sums(self) -> dict[str, Any]:
+        """All of them as JSON holds them."""
+        planes = {
+            rig: [[s, self._label[rig, s], *sums.tolist()] for s, sums in mine.items()]
+            for rig, mine in self._planes.items()
+        }
+        return {
+            "whole": self._whole.tolist(),
+            "nearest": self._nearest.tolist(),
+            "by": {name: table.tolist() for name, table in self._by.items()},
+            "errors": self._errors.tolist(),
+            "spreads": self._spreads.tolist(),
+            "planes": planes,
+        }
+
+    def include(self, sums: Mapping[str, Any]) -> None:
+        """Add what another's `sums` told."""
+        self._whole += sums["whole"]
+        self._nearest += sums["nearest"]
+        self._errors += sums["errors"]
+        self._spreads += sums["spreads"]
+        for name, table in sums["by"].items():
+            self._by[name] = _added(self._by[name], np.reshape(table, (-1, 6)))
+        for rig, planes in sums["planes"].items():
+            mine = self._planes.setdefault(rig, {})
+            for s, label, *moments in planes:
+                mine[s] = mine.get(s, 0.0) + np.array(moments)
+                self._label[rig, s] = label
+
     def _add_planes(
         self, done: Evaluated, error_m: np.ndarray, count: np.ndarray, spread_m: np.ndarray
     ) -> None:

@@ -3,7 +3,8 @@
 Every command that writes does it through one of these: `folder`, `file`, `entries`, `remove`.
 Each refuses what is not its own to write before any work is done, keeps other processes off, and
 makes what it writes beside its place, into which it is moved when all went well. A command that is
-killed leaves a whole old or a whole new one: see `workshop`, and `moves` for how.
+killed leaves a whole old or a whole new one: see `workshop`, and `moves` for how. What it had done
+of the new one by then is `kept`, where it comes in parts.
 """
 
 from __future__ import annotations
@@ -27,8 +28,10 @@ from calib.outputs.kinds import (
     is_exported,
     refuse,
 )
-from calib.outputs.moves import BESIDE, ENTRIES, WHOLE
+from calib.outputs.moves import BESIDE, ENTRIES, WHOLE, link
+from calib.outputs.parts import Finished, Kept, KeptPart, kept
 from calib.outputs.workshop import settle, workshop
+from chains import remote
 
 __all__ = [
     "CLOUDS",
@@ -39,13 +42,17 @@ __all__ = [
     "RECORDING",
     "RUN",
     "SIMULATED",
+    "Finished",
     "FolderKind",
+    "Kept",
+    "KeptPart",
     "Paths",
     "each",
     "entries",
     "file",
     "folder",
     "is_exported",
+    "kept",
     "refuse",
     "remove",
     "settle",
@@ -56,9 +63,9 @@ Paths = Path | str | Iterable[Path | str]
 
 
 def each(paths: Paths) -> list[Path]:
-    """One path, or several, in a list."""
+    """One path, or several, in a list; a URL as the folder here that stands for it."""
     several = [paths] if isinstance(paths, Path | str) else paths
-    return [Path(path) for path in several]
+    return [remote.here(path, anew=True) for path in several]
 
 
 @contextmanager
@@ -158,14 +165,6 @@ def _take_over(old: Path, new: Path, kind: FolderKind) -> None:
         if kind.holds(entry.name) or os.path.lexists(target):
             continue
         if entry.is_dir() and not entry.is_symlink():
-            shutil.copytree(entry, target, symlinks=True, copy_function=_link)
+            shutil.copytree(entry, target, symlinks=True, copy_function=link)
         else:
-            _link(entry, target)
-
-
-def _link(source: Path | str, target: Path | str) -> None:
-    """The same file under another name; a copy where the disk cannot."""
-    try:
-        os.link(source, target, follow_symlinks=False)
-    except OSError:
-        shutil.copy2(source, target, follow_symlinks=False)
+            link(entry, target)

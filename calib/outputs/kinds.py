@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from calib.outputs.workshop import settle
+from chains import remote
 from chains.errors import InputError
 
 CLOUDS_MARK = ".rigcal-clouds"
@@ -161,6 +162,8 @@ def refuse(
             recording or run; or it is there, and neither empty nor of that kind; or it is
             write-protected.
     """
+    if url := remote.url_of(remote.place(path)):
+        raise InputError(f"{url}: an output is written to this machine's disk; give another -o")
     try:
         target = Path(path).resolve()
         for each in inputs:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -118,3 +119,11 @@ def exchange(one: Path, other: Path) -> bool:
     if code in _NOT_THERE:
         return False
     raise OSError(code, os.strerror(code), str(other))
+
+
+def link(source: Path | str, target: Path | str) -> None:
+    """The same file under another name; a copy where the disk cannot."""
+    try:
+        os.link(source, target, follow_symlinks=False)
+    except OSError:
+        shutil.copy2(source, target, follow_symlinks=False)

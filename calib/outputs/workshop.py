@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from calib.outputs.moves import BESIDE, ENTRIES, WHOLE, carry_out, stands, target_of
-from chains.errors import InputError
+from chains.errors import CutShortError, InputError
 
 try:
     import fcntl
@@ -28,6 +28,8 @@ except ImportError:  # Windows: nothing is locked there
     fcntl = None  # type: ignore[assignment]
 
 DRAFT, LOCK = "draft", "lock"
+TO_GO_ON = "for the same command to go on from"
+KEPT = "kept"  # parts that are done, which outlive the draft of a command that was killed
 _OURS = (DRAFT, WHOLE, ENTRIES, BESIDE, "aside")  # nothing else in a workshop is ever touched
 _ATTEMPTS = 100  # a workshop may be taken away while it is entered, by the one who leaves
 _LOG = logging.getLogger("rigcal")
@@ -102,7 +104,14 @@ def workshop(path: Path) -> Iterator[Workshop]:
             _settle(shop)
             shop._record({}, [])
             yield shop
+            _remove(work / KEPT)
+        except Exception as error:  # and not Ctrl-C: as after a kill, it may be asked for again
+            if not isinstance(error, CutShortError | MemoryError):
+                _remove(work / KEPT)
+            raise
         finally:
+            if os.path.lexists(work / KEPT):
+                _LOG.warning("%s: what was done of it is kept, %s", path, TO_GO_ON)
             _leave(work, lock)
             for above in made:
                 with suppress(OSError):
@@ -215,11 +224,14 @@ def _settle(shop: Workshop) -> None:
     _, inodes, dropped = _read(shop.lock)
     if inodes:
         carry_out(work, path, inodes, dropped)
+        _remove(work / KEPT)
         stand = "the new one stands, whole"
     elif os.path.lexists(path):
         stand = "the earlier one stands, whole"
     else:
-        stand = "nothing of it was kept"
+        stand = "none stands yet" if os.path.lexists(work / KEPT) else "nothing of it was kept"
+    if os.path.lexists(work / KEPT):
+        stand += f", and what it had done is kept, {TO_GO_ON}"
     shop._record({}, [])
     for name in _OURS:
         _remove(work / name)

@@ -18,7 +18,7 @@ from calib.residuals.groups import JOINTS, Group, GroupKind
 from calib.residuals.store import BeamStore
 from calib.rig import Rig, load_rig
 from calib.rig.recording import recorded
-from chains import se3
+from chains import remote, se3
 from chains.align import align_points
 from chains.errors import InputError
 from sensors.documents import nearest
@@ -68,7 +68,7 @@ class Model:
             named = default_effects(recordings)
         else:
             whole = all(map(effects.is_known, effects.split(chosen)))
-            there = [r for r in recordings if not whole and (Path(r) / "rig.yaml").is_file()]
+            there = [r for r in recordings if not whole and (remote.here(r) / "rig.yaml").is_file()]
             own = effects.own_effects(map(load_rig, there))
             named = effects.load_effects(chosen, own=own)
         return cls(named, tuple(fixed), tuple(without))
@@ -215,7 +215,7 @@ def default_effects(recordings: Sequence[Path | str]) -> tuple[str, ...]:
     """
     rows, most = 0, 0
     for folder in recordings:
-        if not (Path(folder) / "rig.yaml").is_file():
+        if not (remote.here(folder) / "rig.yaml").is_file():
             continue  # what it is instead, the fit says
         rig = load_rig(folder)
         if rig.tracker and rig.joint_names:

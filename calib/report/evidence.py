@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from calib.forward import Values
+from calib.linear.parallel import over_stops
 from calib.problem import Problem
 from calib.problem.model import Source, same_mesh
 from calib.report.budget import Budget, budget
@@ -308,10 +310,16 @@ class Evidence:
         meshes = [source.reference for source in self.sources]
         rooms = [next(i for i, m in enumerate(meshes) if same_mesh(m, mesh)) for mesh in meshes]
         scans = self.problem.scans if scans is None else scans
-        for k, scan in enumerate(scans):
+        if kept:
+            tables = (_checked(kept(scan)) for scan in scans)
+        elif run is None:
+            tables = over_stops(partial(_as_in_cad, self.problem.initial), scans)
+        else:
+            tables = (self._columns(run, scan) for scan in scans)
+        for k, (scan, columns) in enumerate(zip(scans, tables, strict=True)):
             self.progress(what, k, len(scans))
             yield StopResiduals(
-                columns=_checked(kept(scan)) if kept else self._columns(run, scan),
+                columns=columns,
                 stop=self._stop(scan, self.problem.scans.index(scan)),
                 room=rooms[self._source(scan)],
                 sigma_angle_rad=scan.lidar.sigma_angle_rad,
@@ -321,7 +329,7 @@ class Evidence:
     def _columns(self, run: Run | None, scan: ScanStop) -> dict[str, np.ndarray]:
         """The residuals of a stop: as a run left them, or with everything as in CAD."""
         if run is None:
-            return residual_table(scan.rows(self.problem.initial))
+            return _as_in_cad(self.problem.initial, scan)
         path = table_path(run.folder / RESIDUALS, scan, self.sources)
         if not path.is_file():
             raise InputError(f"{path} is missing; the run is incomplete, fit it again")
@@ -341,6 +349,11 @@ class Evidence:
             if (told or name in source.rig.joint_names) and np.ndim(column) == 1:
                 out[name] = float(column[scan.index])
         return out
+
+
+def _as_in_cad(initial: Values, scan: ScanStop) -> dict[str, np.ndarray]:
+    """The residuals of a stop with everything as in CAD."""
+    return residual_table(scan.rows(initial))
 
 
 def _checked(path: Path) -> dict[str, np.ndarray]:

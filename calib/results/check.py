@@ -29,7 +29,7 @@ from calib.rig.tracked import odd_bodies
 from calib.solve.estimate import Estimate
 from calib.solve.fit import Progress, preview
 from calib.solve.turned import lidars_turned
-from chains import se3
+from chains import remote, se3
 from chains.errors import InputError
 from sensors.recording import RecordedStops, read_scan
 from sensors.reference import Reference
@@ -113,7 +113,7 @@ def check(
     Raises:
         InputError: there is no such folder.
     """
-    folder = Path(folder)
+    folder = remote.here(folder, anew=True)
     if not folder.is_dir():
         raise InputError(f"{folder}: there is no such folder; a recording is one, with a rig.yaml")
     found = Check(folder)
@@ -179,7 +179,7 @@ class _Checker:
             return None
 
     def _read_scans(self, rig: Rig | None) -> ScanSums:
-        paths = sorted((self.folder / "scans").glob("*.parquet"))
+        paths = sorted(remote.files(self.folder / "scans", "*.parquet"))
         rings = rig.lidar.rings if rig and rig.lidar else None
         scans = ScanSums(rig.lidar if rig else None)
         for i, path in enumerate(paths):

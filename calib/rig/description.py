@@ -15,7 +15,7 @@ from calib.rig.document import (
     ReferenceDocument,
     RigDocument,
 )
-from chains import se3
+from chains import remote, se3
 from chains.arm import Mass, read_arm, read_masses
 from chains.errors import InputError, shortened
 from chains.frames import Edge, FrameTree, Joint, unknown_name
@@ -170,7 +170,7 @@ def load_rig(folder: str | Path) -> Rig:
     Raises InputError, one sentence with file, line and key, for unknown keys and frames, missing
     files, frames that form no tree, and numbers that look like millimetres or degrees.
     """
-    folder = Path(folder)
+    folder = remote.here(folder)
     settle(folder)
     path = folder / "rig.yaml"
     if not path.is_file():

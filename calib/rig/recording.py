@@ -37,11 +37,11 @@ class Recording(recording.RecordedStops):
         Raises:
             InputError: what is wrong, and where.
         """
-        said = columns_of(load_rig(folder))
+        said = columns_of(rig := load_rig(folder))
         given = {"joint_names": joint_names, "bodies": bodies, "rings": rings, "levels": levels}
         given["unread"] = unread
         chosen = {name: each for name, each in given.items() if each is not None}
-        return super().open(folder, **(said | chosen))
+        return super().open(rig.folder, **(said | chosen))
 
 
 def recorded(rig: Rig) -> recording.RecordedStops:

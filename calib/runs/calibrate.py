@@ -19,6 +19,7 @@ from calib.diagnosis.formulas.seen import ColumnRanges
 from calib.effects import Effect, is_known, load_effects, split, trust_in
 from calib.forward import Values
 from calib.linear.parallel import one_blas_thread, over_stops
+from calib.outputs.journal import going_on
 from calib.problem import Problem
 from calib.problem.model import Model, Source
 from calib.problem.without import leave_out
@@ -38,7 +39,7 @@ from calib.results.rings import documents as odd_rings
 from calib.results.solution import solution_of, up_of
 from calib.results.stages import FIT, staged
 from calib.runs.belief import TOLERATED, limits
-from calib.runs.reopen import model_of, proposed, reopened, start_of, stored_met
+from calib.runs.reopen import identity, model_of, proposed, reopened, start_of, stored_met
 from calib.runs.residual_table import (
     UNSEEN_FOLDER,
     residual_bytes,
@@ -61,6 +62,7 @@ from calib.runs.run import (
 from calib.runs.stored import RUN_FORMAT
 from calib.solve.estimate import Estimate, Start
 from calib.solve.fit import Progress, shapes_freed, solve
+from chains import remote
 from chains.errors import InputError
 from sensors.documents import write_json, write_yaml
 
@@ -95,7 +97,10 @@ def calibrate(
         _refuse_twice([r.resolve() for r in recordings])
         model = model or Model.of(None, (), (), recordings)
         sources = leave_out([Source.open(r) for r in recordings], model.without)
-        _fit(sources, model, folder, _Choices(Path(out), hold_out, folds, prior), progress)
+        choices = _Choices(Path(out), hold_out, folds, prior)
+        document = _model_document(sources, model, choices)
+        with going_on(outputs.kept(folder, document)):
+            _fit(sources, model, document, folder, choices, progress)
     return Run.open(out, trust_in(model.effects))
 
 
@@ -123,7 +128,9 @@ def grow(
         _refuse_idle(model, run, sources)
         hold_out, folds = run.model["hold_out"], run.model["folds"]
         choices = _Choices(Path(out), hold_out, folds, run.prior, grown_from=run)
-        _fit(sources, model, folder, choices, progress, start)
+        document = _model_document(sources, model, choices)
+        with going_on(outputs.kept(folder, {**document, "grown_from": identity(run)})):
+            _fit(sources, model, document, folder, choices, progress, start)
     return Run.open(out, {**run.trust, **trust_in(model.effects)})
 
 
@@ -186,6 +193,7 @@ class _Choices:
 def _fit(
     sources: Sequence[Source],
     model: Model,
+    document: dict[str, Any],
     folder: Path,
     choices: _Choices,
     progress: Progress,
@@ -221,7 +229,6 @@ def _fit(
     arrays = {"covariance": solution.covariance, "graph": solution.graph}
     np.savez(folder / COVARIANCE, names=np.array(solution.names), **arrays)
     write_state(folder, estimate.state, stored_met(estimate.start, sources))
-    document = _model_document(sources, model, choices)
     write_yaml(folder / MODEL, document)
     summary = _summary(problem, estimate, nominal, seen, unseen)
     rows = instrument_rows(estimate)
@@ -329,7 +336,7 @@ def recordings_document(sources: Sequence[Source]) -> list[dict[str, str]]:
     """Recordings as model.yaml names them: where they are, whose, and what was in them."""
     return [
         {
-            "path": str(s.recording.folder.resolve()),
+            "path": remote.url_of(s.recording.folder) or str(s.recording.folder.resolve()),
             "rig": s.rig.name,
             "sha256": s.recording.digest(),
         }

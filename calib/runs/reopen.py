@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,9 +14,10 @@ from calib.problem import Problem, build
 from calib.problem.model import Model, Source
 from calib.problem.without import leave_out
 from calib.rig import load_rig
-from calib.runs.run import DIAGNOSIS, MODEL, STATE, Run
+from calib.runs.run import DIAGNOSIS, MODEL, SOLUTION, STATE, Run, versions
 from calib.runs.stored import FIT_AGAIN
 from calib.solve.estimate import DOFS, Start
+from chains import remote
 from chains.errors import InputError
 from sensors.recording import digest
 from sensors.reference import Reference
@@ -31,6 +33,18 @@ def model_of(run: Run) -> Model:
         NotTrustedError: it has an effect of a Python file that the user did not say may run.
     """
     return Model.read(run.model, run.folder / MODEL, run.trust)
+
+
+def identity(run: Run) -> dict[str, Any]:
+    """All of a run that what is made of it depends on, its recordings included, as JSON holds it:
+    digests of its files, the files that may run, and what computes."""
+    files = [run.folder / name for name in (MODEL, STATE, SOLUTION)]
+    return {
+        "files": [hashlib.sha256(path.read_bytes()).hexdigest() for path in files],
+        "set_aside": sorted(run.set_aside),
+        "trust": sorted(run.trust),
+        "versions": versions(),
+    }
 
 
 def effects_that_may_run(run: Run) -> tuple[list[Effect], str]:
@@ -61,7 +75,8 @@ def proposed(run: Run, names: Sequence[str]) -> list[Effect]:
     found = [read(described[n], run.folder / DIAGNOSIS, run.trust) for n in names if n in described]
     if set(names) <= described.keys():
         return found
-    rest = own_effects(load_rig(folder) for folder in run.recordings if folder.is_dir())
+    there = (folder for folder in map(remote.here, run.recordings) if folder.is_dir())
+    rest = own_effects(map(load_rig, there))
     return [*found, *(e for e in rest if e.name in names and e.name not in described)]
 
 
@@ -171,7 +186,7 @@ def as_it_was(recording: Mapping[str, str], path: Path, run: Run) -> None:
 
 
 def _reopened(recording: Mapping[str, str], run: Run) -> Source:
-    path = Path(recording["path"])
+    path = remote.here(recording["path"])
     as_it_was(recording, path, run)
     known = _opened.get((path, recording["sha256"]))
     source = known or Source.open(path)

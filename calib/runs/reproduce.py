@@ -28,7 +28,7 @@ from calib.runs.run import (
     versions,
 )
 from calib.solve.fit import Progress
-from chains import se3
+from chains import remote, se3
 from chains.errors import InputError
 from sensors.documents import read_yaml
 from sensors.recording import read_table
@@ -113,7 +113,7 @@ def reproduce(
     if moved and len(moved) != len(stored):
         count = f"{len(moved)} recordings are given, and {run.folder} was fitted to"
         raise InputError(f"{count} {len(stored)}; give each of them, in the order of {MODEL}")
-    paths = moved or run.recordings
+    paths = moved or [remote.here(path) for path in run.recordings]
     for each, path in zip(stored, paths, strict=True):
         if not path.is_dir():
             raise InputError(

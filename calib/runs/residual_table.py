@@ -60,7 +60,7 @@ def write_residuals(
     for i, stop in enumerate(over_stops(work, scans, estimate.associations)):
         progress("writing residuals", i, len(scans))
         table, looked_at, found[recording_of(scans[i], sources), scans[i].name] = stop
-        seen.include(looked_at)
+        seen.include(looked_at.ends)
         write_stop(folder, sources, scans[i], table)
     return found
 

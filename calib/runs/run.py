@@ -25,7 +25,7 @@ from calib.results.solution import (
     units_of,
 )
 from calib.runs.stored import FIT_AGAIN, read_arrays, read_json, read_model, read_summary
-from chains import se3
+from chains import remote, se3
 from chains.errors import InputError
 from sensors.documents import read_yaml
 
@@ -95,7 +95,7 @@ class Run:
     @property
     def recordings(self) -> list[Path]:
         """Where the recordings were that this run was fitted to."""
-        return [Path(r["path"]) for r in self.model["recordings"]]
+        return [remote.place(r["path"]) for r in self.model["recordings"]]
 
     @property
     def grown_from(self) -> Path | None:

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from calib.linear.layout import Layout
 from calib.linear.linearise import linearise
-from calib.linear.rows import Weighing
+from calib.linear.parallel import over_stops
+from calib.linear.rows import State, Weighing
 from calib.linear.system import Linearisation
+from calib.outputs.journal import Answer, Journal
 from calib.problem.problem import Block, Problem
 from calib.residuals.beams import Association
+from calib.residuals.scan import ScanStop
 from calib.solve.estimate import cost_of
 from calib.solve.graph import Graph, KeptRows
 from calib.solve.torn import astray
@@ -46,6 +50,101 @@ UPHILL = 1e-9  # of a cost: a step that raises it by more is shortened
 SHORTEST_STEP, LONGEST_STEP = 1e-3, 2.0  # of a step: how much of it may be taken
 
 
+class Pass:
+    """One pass at a state: what the way on depends on, and all the rest where it is asked for.
+
+    Args:
+        values: the state.
+        compute: linearises everything there: that, and the graph that it is in.
+        journal: of the fit; None where the pass is not worth keeping.
+        asked: what the linearisation depends on beside the state and what was asked before.
+    """
+
+    def __init__(
+        self,
+        values: Mapping[str, np.ndarray],
+        compute: Callable[[], tuple[Linearisation, Graph]],
+        journal: Journal | None,
+        asked: Mapping[str, object],
+    ) -> None:
+        self.values, self._compute, self._journal = values, compute, journal
+        self._whole: tuple[Linearisation, Graph] | None = None
+        self._found = self._answer(asked, self._summary)
+        self._weighed: Sequence[Weighing] | None = None
+
+    def _answer(self, asked: Mapping[str, object], compute: Callable[[], Answer]) -> Answer:
+        if self._journal is None:
+            return compute()
+        return self._journal.answer({**asked, **self.values}, compute)
+
+    @property
+    def whole(self) -> tuple[Linearisation, Graph]:
+        """The linearisation, and the graph; computed now where the journal knew the summary."""
+        if self._whole is None:
+            self._whole = self._compute()
+            del self._compute  # and with it how beams were weighed before
+        return self._whole
+
+    def _summary(self) -> Answer:
+        linear, graph = self.whole
+        before = np.nan if linear.cost_before is None else linear.cost_before
+        return {
+            "of_rest": np.float64(cost_of(linear, graph, self.values) - linear.beams_chi2 / 2),
+            "of_beams": np.float64(linear.beams_cost),
+            "before": np.float64(before),
+            "T": np.array([each.T for each in linear.weighed]),
+            "scale": np.array([each.scale for each in linear.weighed]),
+        }
+
+    @property
+    def beams_cost(self) -> float:
+        """Half the robust chi-square of the beams, as they are weighed here."""
+        return float(self._found["of_beams"])
+
+    @property
+    def cost(self) -> float:
+        """Half the robust chi-square of everything, priors included."""
+        return float(self._found["of_rest"]) + self.beams_cost
+
+    @property
+    def cost_before(self) -> float:
+        """The same with beams weighed as they were elsewhere, where that was asked for."""
+        before = float(self._found["before"])
+        return self.cost if np.isnan(before) else float(self._found["of_rest"]) + before
+
+    @property
+    def scale(self) -> np.ndarray:
+        """(K,) how many sigmas wide the bulk of each scan's residuals is."""
+        return self._found["scale"]
+
+    @property
+    def weighed(self) -> Sequence[Weighing]:
+        """How the beams of each scan are weighed."""
+        if self._whole is not None:
+            return self._whole[0].weighed
+        if self._weighed is None:
+            state, pairs = State(self.values), zip(self._found["T"], self.scale, strict=True)
+            self._weighed = [Weighing(state, T, float(scale), None) for T, scale in pairs]
+        return self._weighed
+
+    def step(self, outer: Sequence[str]) -> tuple[dict[str, np.ndarray], float]:
+        """One step of the graph, as of `Descent.step`.
+
+        Args:
+            outer: the unknowns that are in the graph.
+        """
+
+        def compute() -> Answer:
+            linear, graph = self.whole
+            _, moved, fall = graph.step(self.values)
+            kept = np.concatenate([np.zeros(0), *(moved[n] for n in outer)])
+            fall += (linear.chi2 - linear.kept[-1, -1]) / 2
+            return {"": np.float64(fall), **moved, **linear.step(kept)}
+
+        found = dict(self._answer({}, compute))
+        return {name: x for name, x in found.items() if name}, float(found[""])
+
+
 class Descent:
     """A problem at a state, and the way down from there.
 
@@ -66,19 +165,24 @@ class Descent:
         self.passes = 0
         # Whether beams were in what was linearised last; None where that was not at plain weights.
         self.plain: bool | None = None
-        self.linear: Linearisation | None = None
-        self.graph: Graph | None = None
+        self.journal = Journal()
+        self.here: Pass | None = None  # where everything was linearised last
         self.scales: Sequence[Weighing] = ()  # of every scan, where they are kept
         self.lay_out()
 
+    @property
+    def linear(self) -> Linearisation:
+        """All that was linearised last."""
+        return self.here.whole[0]
+
+    @property
+    def graph(self) -> Graph:
+        """The graph that it is in."""
+        return self.here.whole[1]
+
     def cost(self) -> float:
         """Half the robust chi-square where all was linearised last, priors included."""
-        return self._cost(self.linear.beams_cost)
-
-    def _cost(self, of_beams: float) -> float:
-        """The same, with the beams' part given."""
-        linear = self.linear
-        return cost_of(linear, self.graph, linear.values) - linear.beams_chi2 / 2 + of_beams
+        return self.here.cost
 
     def descend(
         self,
@@ -107,11 +211,11 @@ class Descent:
             if before is None:
                 self.linearise_here(beams)
             else:
-                slowed = self.linear.weighed if count >= SLOWED or swings else ()
+                slowed = self.here.weighed if count >= SLOWED or swings else ()
                 self.linearise(newton=newton, beams=beams, weighed=weighed, slowed=slowed)
             self.passes += 1
             if before is not None:
-                fell = cost - self._cost_before()
+                fell = cost - self.here.cost_before
                 lowest = _lowest(part, fall, fell)
                 if fell < -UPHILL * cost - STEADY:
                     part = min(lowest, part / 2)
@@ -123,9 +227,9 @@ class Descent:
                         return False
                     continue
                 part = max(1.0, lowest)
-            before, cost, weighed = self.values, self.cost(), self.linear.weighed
+            before, cost, weighed = self.values, self.cost(), self.here.weighed
             tangent, fall = self.step()
-            swings = abs(cost - self._cost_before()) > fall
+            swings = abs(cost - self.here.cost_before) > fall
             length = self.size(tangent)
             self.values = self.moved(before, tangent, part)
             if length < size and fall < max(least, COST_ROUNDING * cost):
@@ -140,7 +244,7 @@ class Descent:
 
     def keep_scales(self) -> None:
         """Weigh beams from here on by the robust scales that they have now."""
-        self.scales = [replace(each, kept=True) for each in self.linear.weighed]
+        self.scales = [replace(each, kept=True) for each in self.here.weighed]
 
     def descend_bodies(self, least: float) -> bool:
         """Descend by trackers and targets alone; whether that came to its end. Given up where
@@ -172,19 +276,16 @@ class Descent:
         else:
             self.descend_bodies(max(STEADY, ROUGHLY * fall))
 
-    def _cost_before(self) -> float:
-        """The cost here, beams weighed as they were before the step."""
-        told = self.linear.cost_before
-        return self._cost(self.linear.beams_cost if told is None else told)
-
     def lay_out(self) -> None:
         """Take the problem as it is now."""
         self.layout, self.plain = Layout.of(self.problem, kept=self.held), None
+        outer = self.layout.outer()
+        self._space = Graph(list(outer.values()), (), frozenset(outer))  # in which steps are taken
 
     def linearise_here(self, beams: bool = True) -> None:
         """Linearise everything at the present state, unless that was done last; without `beams`,
         trackers and targets alone."""
-        if self.plain is not beams or self.linear.values is not self.values:
+        if self.plain is not beams or self.here.values is not self.values:
             self.linearise(beams=beams)
 
     def linearise(
@@ -199,11 +300,15 @@ class Descent:
         self.plain = None if associate or newton or slowed else beams
         slowed = self.scales if beams and self.scales else slowed
         found = [None] * len(self.problem.scans) if associate else self.associations
-        self.linear, self.graph = self.linearised(
-            self.values, beams, associations=found, newton=newton, weighed=weighed, slowed=slowed
-        )
+        how = {"associations": found, "newton": newton, "weighed": weighed, "slowed": slowed}
+        asked = {"associate": associate, "newton": newton}
+        asked |= {"slowed": [(each.scale, each.kept) for each in slowed]}
+        asked |= {"weighed": [each.scale for each in weighed]}
+        worth = beams and bool(self.problem.scans)  # trackers and targets alone cost little
+        compute = self.linearising(self.values, beams, **how)
+        self.here = Pass(self.values, compute, self.journal if worth else None, asked)
 
-    def linearised(
+    def linearising(
         self,
         values: Mapping[str, np.ndarray],
         beams: bool,
@@ -211,30 +316,52 @@ class Descent:
         newton: bool = False,
         weighed: Sequence[Weighing] = (),
         slowed: Sequence[Weighing] = (),
-    ) -> tuple[Linearisation, Graph]:
-        """The linearisation at a state, and the graph that it is in."""
-        what = f"pass {self.passes + 1}"
-        linear = linearise(
-            self.problem,
-            values,
-            associations,
-            newton,
-            self.layout,
-            beams=beams,
-            weighed=weighed,
-            slowed=slowed,
-            progress=lambda done, total: self.progress(what, done, total),
-        )
-        blocks = [*self.layout.others, *self.prior, *KeptRows.of(linear)]
-        return linear, Graph(list(self.layout.outer().values()), blocks, self.held)
+    ) -> Callable[[], tuple[Linearisation, Graph]]:
+        """What computes the linearisation at a state, and the graph that it is in: of the problem
+        as it is now, whatever becomes of it until then."""
+        what, problem, layout = f"pass {self.passes + 1}", self.problem, self.layout
+
+        def compute() -> tuple[Linearisation, Graph]:
+            linear = linearise(
+                problem,
+                values,
+                associations,
+                newton,
+                layout,
+                beams=beams,
+                weighed=weighed,
+                slowed=slowed,
+                progress=lambda done, total: self.progress(what, done, total),
+            )
+            blocks = [*layout.others, *self.prior, *KeptRows.of(linear)]
+            return linear, Graph(list(layout.outer().values()), blocks, self.held)
+
+        return compute
+
+    def looked(
+        self, seen: Mapping[str, np.ndarray], parts: Sequence[np.ndarray | None]
+    ) -> list[Association]:
+        """What the beams of each scan meet at a state: these parts, or where None is given, as they
+        look; what they then saw, the journal keeps."""
+        found: list[Association] = []
+
+        def look() -> Answer:
+            work = partial(ScanStop.settled, values=seen)
+            for i, association in enumerate(over_stops(work, self.problem.scans, parts)):
+                self.progress("looking for depth edges", i, len(parts))
+                found.append(association)
+            return {str(i): association.part for i, association in enumerate(found)}
+
+        known = self.journal.answer(seen, look)
+        if not found:
+            parts = list(known.values())
+            look()
+        return found
 
     def step(self) -> tuple[dict[str, np.ndarray], float]:
         """One step of the graph: the tangent step of every unknown, and by how much half the
         chi-square was to fall."""
-        _, moved, fall = self.graph.step(self.values)
-        kept = np.concatenate([np.zeros(0), *(moved[n] for n in self.layout.outer())])
-        fall += (self.linear.chi2 - self.linear.kept[-1, -1]) / 2
-        return moved | self.linear.step(kept), fall
+        return self.here.step(list(self.layout.outer()))
 
     def moved(
         self, before: Mapping[str, np.ndarray], tangent: Mapping[str, np.ndarray], part: float = 1.0
@@ -242,7 +369,7 @@ class Descent:
         """The state after a part of a step."""
         step = {name: part * each for name, each in tangent.items()}
         inner = {n: self.layout.unknowns[n].moved(before[n], step[n]) for n in self.layout.inner()}
-        return {**before, **self.graph.moved(before, step), **inner}
+        return {**before, **self._space.moved(before, step), **inner}
 
     def size(self, tangent: Mapping[str, np.ndarray]) -> float:
         """The largest change of the calibration in a step, m or rad."""

@@ -69,7 +69,9 @@ def solve(
     if problem.scans:
         loop.values |= declared(problem, loop.held)  # nothing was known of these without scans
         if not loop.lost:
-            loop.values |= lidars_turned(loop.problem, loop.values)
+            loop.values |= loop.journal.answer(
+                loop.values, lambda: lidars_turned(loop.problem, loop.values)
+            )
             loop.lost = not loop.look_around()
         if spread:
             loop.begin_spread()
@@ -151,9 +153,10 @@ def _raised(loop: Loop, more: float = UPHILL, least: float = 0.0) -> bool:
     """
     loop.linearise_here()
     first, cost = values_of(loop.problem, loop.start.state), loop.cost()
-    linear, graph = loop.linearised(first, beams=False)
-    beams = beams_cost(loop.problem, first, loop.associations, loop.linear.weighed)
-    return cost > (cost_of(linear, graph, first) + beams) * (1 + more) + least
+    linear, graph = loop.linearising(first, beams=False)()
+    asked = loop.problem, first, loop.associations, loop.here.weighed
+    of_beams = loop.journal.answer(first, lambda: {"cost": np.float64(beams_cost(*asked))})["cost"]
+    return cost > (cost_of(linear, graph, first) + of_beams) * (1 + more) + least
 
 
 def _not_raised(loop: Loop, estimate: Estimate) -> Estimate:

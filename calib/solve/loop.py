@@ -10,17 +10,15 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
 from calib.linear.layout import StopKey, key_of
-from calib.linear.parallel import over_stops
+from calib.outputs.journal import Answer
 from calib.problem.problem import Block, Problem
 from calib.problem.spread import by_chance, widening, with_spread
 from calib.problem.surfaces import well_seen, with_surfaces
 from calib.problem.unknowns import Unknown
-from calib.residuals.scan import ScanStop
 from calib.residuals.surfaces import MeshSurface
 from calib.solve.added import begun
 from calib.solve.components import sds, squares, told, wider
@@ -198,7 +196,8 @@ class Loop(Descent):
             if self.problem.scans and not (settled and self.given is first):
                 self.passes += 1
                 self.values = self.moved(self.values, self.step()[0])
-            found = self._spread()
+            answer = self.journal.answer(self.values, self._spread)
+            found = {key: float(sd) for key, sd in answer.items()}
             given = with_spread(self.given, found, least)
             if given is self.given:
                 break
@@ -217,7 +216,7 @@ class Loop(Descent):
         """The unknowns by chance that no prior holds to an earlier estimate."""
         return [u for u in by_chance(self.problem) if u.name not in self.held]
 
-    def _spread(self) -> dict[str, float]:
+    def _spread(self) -> Answer:
         """Key of a spread -> what it is, as all rows have it where they were linearised last."""
         some, out = self._drawn(), {}
         if some:
@@ -228,7 +227,7 @@ class Loop(Descent):
             out |= dict(zip(now, sd.tolist(), strict=True))
         if widening(self.problem):
             out |= wider(self.problem, squares(self.as_it_stands(True, whole=True)))
-        return out
+        return {key: np.float64(sd) for key, sd in out.items()}
 
     def _met(self) -> dict[StopKey, np.ndarray]:
         """What beams meet now."""
@@ -245,7 +244,7 @@ class Loop(Descent):
                 self._ask_scans()
             self.linearise(associate=True)
             self.passes += 1
-            scale = np.array([each.scale for each in self.linear.weighed])
+            scale = self.here.scale
             if count <= TIMES_ASKED and self._set_aside(scale, count == TIMES_ASKED):
                 continue
             if count > HOPEFUL and np.median(scale) > HOPELESS:
@@ -319,7 +318,7 @@ class Loop(Descent):
     def rows_hopeless(self) -> bool:
         """Whether rows of trackers and targets, as weighed, were hopelessly wide a step ago."""
         rows = sum(block.rows for block in self.problem.blocks)
-        return 0 < rows * HOPELESS**2 < 2 * (self.cost() - self.linear.beams_cost)
+        return 0 < rows * HOPELESS**2 < 2 * (self.cost() - self.here.beams_cost)
 
     def seen_before(self) -> dict[str, np.ndarray]:
         """Where the start was when it took what its beams met."""
@@ -341,13 +340,8 @@ class Loop(Descent):
         known = {**self.start.state, **self._cells()}
         self.problem, self.seen = self.given, dict(seen or self.values)
         met = self.start.met if met is None and seen is not None else met or {}
-        scans, found = self.problem.scans, []
-        parts = [met.get(key_of(scan)) for scan in scans]
-        work = partial(ScanStop.settled, values=self.seen)
-        for i, association in enumerate(over_stops(work, scans, parts)):
-            self.progress("looking for depth edges", i, len(scans))
-            found.append(association)
-        self.associations = well_seen(self.given, found)
+        parts = [met.get(key_of(scan)) for scan in self.problem.scans]
+        self.associations = well_seen(self.given, self.looked(self.seen, parts))
         self.problem = with_surfaces(self.given, self.associations)
         for name in self.problem.cells:
             unknown = self.problem.variables[name]

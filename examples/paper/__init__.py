@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from calib import outputs
-from calib.evaluation import write_evaluation
+from calib.evaluation import tabled, write_evaluation
 from calib.problem.model import Source
 from calib.runs.calibrate import calibrate, grow, grown_model
 from calib.runs.diagnose import diagnose
@@ -138,7 +138,12 @@ def _judged(case: Case, explained: bool, tell: Progress) -> _One:
     sequence = State(before.problem, offsets_by_ring(before.values, *known))
     labels = case.source.rig.labels
     with outputs.folder(case.work / "sequence", outputs.EVALUATION) as folder:
-        write_evaluation(sequence.evaluated(case.stops(), tell), folder, False, labels)
+        stops = outputs.kept(folder, {}).each(
+            "stops",
+            len(case.stops()),
+            lambda _: map(tabled, sequence.evaluated(case.stops(), tell)),
+        )
+        write_evaluation(stops, folder, labels)
 
     fitted = {name: case.fitted(run, tell) for name, run in _runs(case, explained, tell).items()}
     states = {ON_PAPER: case.on_paper(), SEQUENCE: sequence, **fitted}

@@ -20,7 +20,7 @@ from workload import recorded, threads, timed
 
 from calib import outputs
 from calib import problem as problems
-from calib.evaluation import evaluate_stop, write_evaluation
+from calib.evaluation import evaluate_stop, tabled, write_evaluation
 from calib.evaluation.tally import Evaluated
 from calib.problem import Problem
 from calib.problem.model import Model, Source
@@ -39,7 +39,10 @@ def each(problem: Problem, copies: int = 1) -> Iterator[Evaluated]:
 def ours(problem: Problem, folder: Path, copies: int = 1) -> None:
     """A whole evaluation, written."""
     with outputs.folder(folder, outputs.EVALUATION) as draft:
-        write_evaluation(each(problem, copies), draft, False, {})
+        stops = outputs.kept(draft, {}).each(
+            "stops", copies * len(problem.scans), lambda _: map(tabled, each(problem, copies))
+        )
+        write_evaluation(stops, draft, {})
 
 
 def theirs(problem: Problem, tables: Sequence[dict], folder: Path) -> None:

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from calib.effects import find
-from calib.evaluation.apply import Correction, apply, incidence
+from calib.evaluation.apply import apply
+from calib.evaluation.correction import Correction, incidence
 from calib.problem.model import Model, Source
 from calib.runs.calibrate import calibrate
 from calib.runs.run import Run

@@ -57,6 +57,17 @@ def test_what_is_not_to_be_written_is_refused_and_left_alone(tmp_path, out, word
     assert not [*tmp_path.rglob("*.rigcal")]
 
 
+@pytest.mark.parametrize("out", ["s3://bucket/run", Path("s3://bucket/run")])
+def test_a_url_is_no_place_to_write(out, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with (
+        pytest.raises(InputError, match=r"^s3://bucket/run: an output is written to this machine"),
+        outputs.folder(out, outputs.RUN),
+    ):
+        pytest.fail("it was let through")
+    assert [*tmp_path.iterdir()] == []
+
+
 def test_a_file_is_no_part_of_what_is_read(tmp_path):
     done = run(tmp_path / "run")
     (tmp_path / "page.html").symlink_to(done / "solution.yaml")

@@ -20,11 +20,13 @@ class ColumnRanges:
 
     Args:
         effects: those with `Effect.seen` are asked about.
+
+    `ends` are the least and the largest value of each column so far.
     """
 
     def __init__(self, effects: Iterable[Effect]) -> None:
         self._effects = [effect for effect in effects if effect.seen]
-        self._ends: dict[str, tuple[float, float]] = {}
+        self.ends: dict[str, tuple[float, float]] = {}
 
     def look(self, columns: Mapping[str, Any], rows: np.ndarray | slice = slice(None)) -> None:
         """Take in one batch.
@@ -46,14 +48,14 @@ class ColumnRanges:
         """The same that has seen nothing."""
         return ColumnRanges(self._effects)
 
-    def include(self, others: ColumnRanges) -> None:
-        """Take in what others were shown."""
-        for name, ends in others._ends.items():
-            self._include(name, *ends)
+    def include(self, ends: Mapping[str, tuple[float, float]]) -> None:
+        """Take in the ends of what another was shown."""
+        for name, each in ends.items():
+            self._include(name, *each)
 
     def _include(self, name: str, low: float, high: float) -> None:
-        ends = self._ends.get(name, (np.inf, -np.inf))
-        self._ends[name] = min(ends[0], low), max(ends[1], high)
+        ends = self.ends.get(name, (np.inf, -np.inf))
+        self.ends[name] = min(ends[0], low), max(ends[1], high)
 
     def sentences(self) -> list[str]:
         """A warning for each effect that is used beyond where it was seen."""
@@ -62,7 +64,7 @@ class ColumnRanges:
     def _sentence(self, effect: Effect) -> str:
         beyond = []
         for name, (low, high) in effect.seen.items():
-            here = self._ends.get(name, (low, high))
+            here = self.ends.get(name, (low, high))
             slack = BEYOND_SEEN * (high - low)
             if here[0] < low - slack or here[1] > high + slack:
                 beyond.append(f"{span(name, low, high)}, and here goes {_ends_of(name, *here)}")

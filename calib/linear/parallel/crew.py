@@ -23,7 +23,7 @@ from calib.linear.parallel.parcels import (
     Parcels,
     Task,
 )
-from chains.errors import InputError
+from chains.errors import CutShortError, InputError
 
 AHEAD = 2  # stops of each worker: one that it works on, and one that waits
 LIVES = 3  # of a worker, while it works on one stop; the next may be in want of the same memory
@@ -160,7 +160,7 @@ class Crew:
                 if not self._closed:
                     line.renew()
                 if self._closed or life == LIVES:
-                    raise InputError(
+                    raise CutShortError(
                         f"{line.name} {gone} {stop}, {life} times; where memory is short, take "
                         "fewer --workers"
                     ) from None

@@ -6,7 +6,8 @@ stand in all else by their key; a process is sent those that it does not hold. I
 sent up to `KEPT_PARCELS_BYTES`, what was used last, and says what it lacks.
 
 Scans never travel: a store of scans is sent as where the recording is, and reads for itself.
-Relative paths are sent as absolute ones, and effects from a user's Python file with that file.
+Relative paths are sent as absolute ones, those that stand for a URL as that, and effects from a
+user's Python file with that file.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ from calib.residuals.scan import ScanStop
 from calib.residuals.store import BeamStore
 from calib.residuals.surfaces import MeshSurface, PlaneSurface
 from calib.rig import Rig
+from chains import remote
 from sensors.recording import RecordedStops
 from sensors.reference import Reference
 
@@ -200,7 +202,10 @@ class _Pickler(pickle.Pickler):
         return self.key(obj) if type(obj) in ONCE and obj is not self.top else None
 
     def reducer_override(self, obj: Any) -> Any:
-        """Otherwise than usual: relative paths, and what a user's Python file defines."""
+        """Otherwise than usual: relative paths, those that stand for a URL, and what a user's
+        Python file defines."""
+        if isinstance(obj, Path) and (url := remote.url_of(obj)) is not None:
+            return remote.place, (url,)
         if isinstance(obj, Path) and not obj.is_absolute():
             return Path, (str(obj.absolute()),)
         if (code := code_of(obj)) is not None:
