@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -146,16 +146,20 @@ def achieved_by_targets(plan: TargetPlan) -> list[str]:
 
 def _achieved(plan: Plan, document: Mapping[str, Any]) -> Iterator[str]:
     """What the stops are worth, in a sentence or two."""
+    never = {
+        (each["effect"], each["from"]): each["smallest"] for each in document["never_told_apart"]
+    }
     for name, each in document["smallest_detectable"].items():
         now, after = (each["beside_rivals"][when] for when in ("now", "after"))
         factor, unit = shown(each["unit"])
-        if after is not None:
+        rivals = [rival for rival in each["beside"] if (name, rival) not in never]
+        told = f", told from {_and(rivals)}" if rivals else ""
+        if after is not None and (told or not each["beside"]):
             before = "never" if now is None else f"from {factor * now:.3g} {unit}"
-            found = f"found from {factor * after:.3g} {unit}"
-            yield f"With them {name} is {found}, told from its rivals; now {before}."
-        elif each["beside_rivals"]["with_any_number"] is None:
-            others = ", ".join(n for n in document["rivals"] if n != name) or "the model"
-            yield f"NEVER FOUND: no number of stops of this arm tells {name} from {others}."
+            yield f"With them {name} is found from {factor * after:.3g} {unit}{told}; now {before}."
+        elif each["beside_rivals"]["with_any_number"] is None and not each["beside"]:
+            yield f"NEVER FOUND: no number of stops of this arm tells {name} from the model."
+    yield from _never(document)
     if document["predicted_mm"]["after"] is not None:
         now, after = (document["predicted_mm"][when] for when in ("now", "after"))
         yield (
@@ -163,6 +167,23 @@ def _achieved(plan: Plan, document: Mapping[str, Any]) -> Iterator[str]:
             f"{after:.3g} mm rms; now to {now:.3g}."
         )
     yield _fall(plan)
+
+
+def _never(document: Mapping[str, Any]) -> Iterator[str]:
+    """Which rivals no stops tell apart."""
+    for each in document["never_told_apart"]:
+        name, rival, size = (each[key] for key in ("effect", "from", "smallest"))
+        factor, unit = shown(document["smallest_detectable"][name]["unit"])
+        least = "never" if size is None else f"only from {factor * size:.3g} {unit}"
+        yield (
+            f"NOT TOLD APART by any stops: with all {document['candidates']} poses {name} would be "
+            f"told from {rival} {least}, and is as a rule smaller."
+        )
+
+
+def _and(names: Iterable[str]) -> str:
+    *first, last = names
+    return f"{', '.join(first)} and {last}" if first else last
 
 
 def _unlike(plan: Plan) -> Iterator[str]:
@@ -264,8 +285,9 @@ def _detectable_table(smallest: Mapping[str, Mapping[str, Any]]) -> Table:
     table = columns_table("smallest that is found", "", "now", "after")
     for name, each in smallest.items():
         factor, unit = shown(each["unit"])
-        for key, what in (("beside_model", name), ("beside_rivals", f"{name}, told from rivals")):
-            sizes = each[key]
+        rows = {name: each["beside_model"]}
+        rows |= {f"{name}, told from {rival}": sizes for rival, sizes in each["beside"].items()}
+        for what, sizes in rows.items():
             cells = (_found(sizes[when], factor) for when in ("now", "after"))
             table.add_row(what, unit, *cells)
     return table

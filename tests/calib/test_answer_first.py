@@ -123,6 +123,7 @@ def plan_of(sigma, smallest=None):
         "way": [],
         "tubes": [],
         "smallest_detectable": smallest or {},
+        "never_told_apart": [],
         "sigma": sigma,
         "smallest_effect": {},
         "smallest_blunder": {},
@@ -171,11 +172,12 @@ def test_a_plan_that_achieves_nothing_says_so(capsys):
 
 def test_a_plan_to_tell_effects_apart_says_from_which_size(capsys):
     sizes = {"now": None, "after": 0.0004}
-    smallest = {"range_scale": {"unit": "1", "beside_model": sizes, "beside_rivals": sizes}}
+    each = {"unit": "1", "beside_model": sizes, "beside_rivals": sizes}
+    smallest = {"range_scale": {**each, "beside": {"faro_scale": sizes}}}
     plan = plan_of({"lidar.tx": {"unit": "m", "now": 0.0006, "after": 0.0006}}, smallest)
     print_plan(plan)
     out = " ".join(capsys.readouterr().out.split())
-    assert "range_scale is found from 0.0004 (no unit), told from its rivals; now never" in out
+    assert "range_scale is found from 0.0004 (no unit), told from faro_scale; now never" in out
 
 
 def test_the_table_of_a_run_says_what_is_identifiable(run):
