@@ -87,8 +87,8 @@ class Plan:
         effect_units: of the effects in `Known.smallest`.
         candidates: how many poses they were chosen among.
         endless: what is known with any number of stops of this arm.
-        alike: an effect and a rival that it is not told from at its usual size, though all
-            candidates were measured -> the size that it would have to have.
+        alike: an effect and a rival that does next to the same at all candidates -> the size from
+            which the effect were told from it, had all of them been measured.
         curve: how far from their tolerances sigmas are with how many of them; empty without any.
         legs: how to get from each stop to the next, where its location is the same.
         tubes: of each link whose shapes are not in the recording, why; it is taken for a tube.

@@ -108,8 +108,8 @@ class Planner:
         return poses.some(chosen(by, each, stops, tell, exchange))
 
     def criterion(self, each: np.ndarray) -> Criterion:
-        """By what stops are chosen, from what each of those tells that there are. Rivals that all
-        of them do not tell apart play no part, unless there are no others."""
+        """By what stops are chosen, from what each of those tells that there are. Rivals that
+        do next to the same at all of them play no part, unless there are no others."""
         if self.aim.text == WORKSPACE:
             return PredictionVariance(
                 self.lasting, moved_anywhere(self.scene, self.lasting, self._anywhere)
@@ -118,7 +118,7 @@ class Planner:
         return criterion(self.scene, self.aim, self.lasting, apart or None)
 
     def alike(self, each: np.ndarray) -> dict[Pair, float]:
-        """Rivals that all stops together do not tell apart; see `calib.planning.worth.alike`."""
+        """Rivals that do next to the same at all stops; see `calib.planning.worth.alike`."""
         most = replace(self.lasting, data=self.lasting.data + each.sum(axis=0))
         return alike(self.scene, self.aim, most)
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.diagnosis.weak import hardly_known
+from calib.diagnosis.weak import STANDS_IN, hardly_known
 from calib.planning.criteria import (
     Apart,
     Criterion,
@@ -101,20 +101,17 @@ def criterion(
 
 
 def alike(scene: PlanningScene, aim: Purpose, most: Information) -> dict[Pair, float]:
-    """An effect and a rival that it is not told from at its usual size, though all stops were
-    measured that can be -> the size that it would have to have.
+    """An effect and a rival that does next to the same at all stops that can be measured -> the
+    size from which the effect is told from it by all of them.
 
     Args:
         scene, aim: what is planned, and what for.
         most: what all those stops say.
     """
-    out = {}
-    for name, beside in _smallest(scene, aim, most).items():
-        variables = [term.variable for term in scene.terms_of(name)]
-        sigma = np.concatenate([scene.problem.variables[v].sigma for v in variables])
-        usual = np.sqrt(np.mean(np.square(sigma)))
-        out |= {(name, r): size for r, size in beside.items() if r != name and size > usual}
-    return out
+    least = np.sqrt(1.0 - STANDS_IN)
+    every = _smallest(scene, aim, most).items()
+    pairs = ((name, rival, sizes) for name, sizes in every for rival in sizes)
+    return {(n, r): sizes[r] for n, r, sizes in pairs if sizes[n] < least * sizes[r]}
 
 
 def _rival(scene: PlanningScene, known: Information, name: str) -> tuple[np.ndarray, np.ndarray]:

@@ -176,8 +176,8 @@ def _never(document: Mapping[str, Any]) -> Iterator[str]:
         factor, unit = shown(document["smallest_detectable"][name]["unit"])
         least = "never" if size is None else f"only from {factor * size:.3g} {unit}"
         yield (
-            f"NOT TOLD APART by any stops: with all {document['candidates']} poses {name} would be "
-            f"told from {rival} {least}, and is as a rule smaller."
+            f"NOT TOLD APART by any stops: at all {document['candidates']} poses {rival} does next "
+            f"to what {name} does, which would be told from it {least}."
         )
 
 
