@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from calib.diagnosis.everywhere import Everywhere
 from calib.diagnosis.score import projection
 from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import what_separates
@@ -71,41 +72,64 @@ def leaning(solution: Solution, look: Look) -> list[dict[str, Any]]:
         return []
     known, keys = known[usable], [solution.keys[i] for i in usable]
     graph = solution.covariance if solution.graph is None else solution.graph
-    return hardly_known(keys, graph[np.ix_(usable, usable)], known)
+    everywhere = Everywhere.of(look.stand)
+    return hardly_known(keys, graph[np.ix_(usable, usable)], known, everywhere)
 
 
 def hardly_known(
-    keys: Sequence[Key], covariance: np.ndarray, known: np.ndarray
+    keys: Sequence[Key],
+    covariance: np.ndarray,
+    known: np.ndarray,
+    everywhere: Everywhere | None = None,
 ) -> list[dict[str, Any]]:
-    """The directions that data hardly determine, the weakest first.
+    """The directions that data hardly determine, the weakest first; after them those that no stops
+    of the arm determine, of which `alike` names what moves all that is seen alike.
 
     Args:
         keys: (P,) of the parameters.
         covariance: (P, P) of them.
         known: (P,) their sigmas before any data.
+        everywhere: what they move that is seen, at any pose of the arm; None where nobody says.
     """
-    scaled = covariance / np.outer(known, known)
-    values, axes = np.linalg.eigh(scaled)
-    untold = values > UNTOLD
-    gauges, _ = echelon(axes[:, untold], np.ones(len(known)))
-    gauges = gauges / np.linalg.norm(gauges, axis=0)
-    weak = [*((1.0, axis) for axis in gauges.T)]
-    weak += sorted(zip(values[~untold], axes.T[~untold], strict=True), key=lambda pair: -pair[0])
+    still, rest = np.zeros((len(known), 0)), np.eye(len(known))
+    if everywhere is not None:
+        still, rest = everywhere.split(keys, known)
+    values, axes = np.linalg.eigh(rest.T @ (covariance / np.outer(known, known)) @ rest)
+    untold, axes = values > UNTOLD, rest @ axes
+    weak = [(1.0, axis, False) for axis in _of_space(axes[:, untold])]
+    told = sorted(zip(values[~untold], axes.T[~untold], strict=True), key=lambda pair: -pair[0])
+    weak += [(value, axis, False) for value, axis in told if value >= LEANS]
+    weak += [(1.0, axis, True) for axis in _of_space(still)]
     out = []
-    for value, axis in weak[:MOST_DIRECTIONS]:
-        if value < LEANS:
-            break
+    for value, axis, nowhere in weak[:MOST_DIRECTIONS]:
         named = [int(i) for i in np.argsort(-np.abs(axis)) if abs(axis[i]) > NAMED_SHARE]
         if named:
             moved = np.sqrt(value) * np.abs(axis * known)[named]
+            alike = everywhere.movers(keys, axis * known, NAMED_SHARE) if nowhere else []
             out.append(
                 {
                     "parameters": [keys[i].name for i in named],
                     "sigma_mm": float(1e3 * moved.max()),
-                    "needs": _needs([keys[i] for i in named]),
+                    "needs": _alike(alike) if alike else _needs([keys[i] for i in named]),
+                    "alike": alike,
                 }
             )
     return out
+
+
+def _of_space(space: np.ndarray) -> np.ndarray:
+    """Directions (r, P) of unit length that span a space (P, r)."""
+    if not space.shape[1]:
+        return space.T
+    directions = echelon(space, np.ones(len(space)))[0].T
+    return directions / np.linalg.norm(directions, axis=1)[:, None]
+
+
+def _alike(names: Sequence[str]) -> str:
+    return (
+        f"a measurement of {' or '.join(names)} itself; no stops tell, as at every pose of the arm "
+        "they move all that is seen alike"
+    )
 
 
 def _needs(keys: Sequence[Key]) -> str:
@@ -142,5 +166,6 @@ def _stand_in(name: str, effect: Effect, other: Effect) -> dict[str, Any]:
     return {
         "parameters": [name, other.family],
         "sigma_mm": None,
+        "alike": [],
         "needs": f"{what_separates(effect, other)}: on these data {name} absorbs {other.family}",
     }

@@ -67,7 +67,12 @@ class Known:
             stops=stops,
             sigma=wider * np.sqrt(np.diag(model.covariance(every))),
             smallest=_smallest(scene, aim, known),
-            weak=hardly_known([model.keys[i] for i in own], model.covariance(own), model.unit[own]),
+            weak=hardly_known(
+                [model.keys[i] for i in own],
+                model.covariance(own),
+                model.unit[own],
+                scene.everywhere,
+            ),
             indices=indices(model, every, stops),
         )
 

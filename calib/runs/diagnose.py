@@ -170,11 +170,16 @@ def remedies(run: Run, found: Diagnosis, stops: bool) -> Iterator[dict[str, Any]
         found: its diagnosis.
         stops: whether stops can be planned for it.
     """
-    told = [("undistinguished", group(c), c["rivals"][0]["separate"]) for c in _tied(found)]
-    told += [("weak_direction", w["parameters"], w["needs"]) for w in found.weak_directions]
-    told += [("untestable", [name], why) for name, why in found.untestable.items()]
-    for of, names, needs in told:
-        moves = of != "untestable" or needs == ABSORBED_BY_MODEL  # other rows want other columns
+    told = [("undistinguished", group(c), c["rivals"][0]["separate"], True) for c in _tied(found)]
+    told += [
+        ("weak_direction", w["parameters"], w["needs"], not w["alike"])
+        for w in found.weak_directions
+    ]
+    told += [  # other rows want other columns
+        ("untestable", [name], why, why == ABSORBED_BY_MODEL)
+        for name, why in found.untestable.items()
+    ]
+    for of, names, needs, moves in told:
         command = command_to_plan(run, names) if stops and moves else None
         yield {"of": of, "names": list(names), "needs": needs, "plan": command}
 

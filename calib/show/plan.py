@@ -32,6 +32,9 @@ WEAK = {
     "after": "and after these stops",
     "with_any_number": "and after any number of stops of this arm: measure it directly",
 }
+# Of a sigma, what any number of stops leaves of it at least, where none help: a choice.
+SETTLED = 0.9
+ASKED_SHOWN = 4  # parameters that stops are for, that are told in a sentence
 FALLS = 0.99  # of a sigma: one that falls by less is told together with all such
 
 
@@ -146,9 +149,7 @@ def achieved_by_targets(plan: TargetPlan) -> list[str]:
 
 def _achieved(plan: Plan, document: Mapping[str, Any]) -> Iterator[str]:
     """What the stops are worth, in a sentence or two."""
-    never = {
-        (each["effect"], each["from"]): each["smallest"] for each in document["never_told_apart"]
-    }
+    never = {(each["effect"], each["from"]) for each in document["never_told_apart"]}
     for name, each in document["smallest_detectable"].items():
         now, after = (each["beside_rivals"][when] for when in ("now", "after"))
         factor, unit = shown(each["unit"])
@@ -160,6 +161,8 @@ def _achieved(plan: Plan, document: Mapping[str, Any]) -> Iterator[str]:
         elif each["beside_rivals"]["with_any_number"] is None and not each["beside"]:
             yield f"NEVER FOUND: no number of stops of this arm tells {name} from the model."
     yield from _never(document)
+    if plan.purpose.components and not plan.purpose.tolerance:
+        yield from _asked(plan)
     if document["predicted_mm"]["after"] is not None:
         now, after = (document["predicted_mm"][when] for when in ("now", "after"))
         yield (
@@ -167,6 +170,30 @@ def _achieved(plan: Plan, document: Mapping[str, Any]) -> Iterator[str]:
             f"{after:.3g} mm rms; now to {now:.3g}."
         )
     yield _fall(plan)
+
+
+def _asked(plan: Plan) -> Iterator[str]:
+    """What becomes of the parameters that the stops are for."""
+    at = [plan.keys.index(key) for key in plan.purpose.components]
+    helped, never = [], []
+    for i in at:
+        now, after, endless = (k.sigma[i] for k in (plan.now, plan.after, plan.endless))
+        factor, unit = shown(plan.units[i])
+        if endless > SETTLED * now:
+            never.append(f"{plan.names[i]} stays at {factor * now:.3g} {unit}")
+        else:
+            helped.append(f"{plan.names[i]} from {factor * now:.3g} to {factor * after:.3g} {unit}")
+    if helped:
+        more = len(helped) - ASKED_SHOWN
+        rest = f" and {more} more" if more > 0 else ""
+        yield f"With them sigmas fall: {'; '.join(helped[:ASKED_SHOWN])}{rest}."
+    if never:
+        more = len(never) - ASKED_SHOWN
+        rest = f" and {more} more" if more > 0 else ""
+        yield (
+            f"NO STOPS of this arm help: the sigma of {'; '.join(never[:ASKED_SHOWN])}{rest}, "
+            "however many they are. Measure it itself."
+        )
 
 
 def _never(document: Mapping[str, Any]) -> Iterator[str]:

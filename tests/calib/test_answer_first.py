@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from calib.effects import CATALOGUE
+from calib.planning.purpose import Purpose
 from calib.problem.unknowns import Key
 from calib.results.check import Check
 from calib.runs.run import Run
@@ -137,6 +138,7 @@ def plan_of(sigma, smallest=None):
     )
     return SimpleNamespace(
         stops=[{"location": "L00"}],
+        purpose=Purpose("all"),
         joints=[],
         curve=None,
         unlike=(),

@@ -1,0 +1,81 @@
+"""Changes of an arm's geometry that no pose shows, and those that other poses show."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calib.diagnosis.everywhere import Everywhere
+from calib.planning import planner_of
+from calib.results.reach import at_joints, placed
+
+from .narrow import run_of
+
+
+@pytest.fixture(scope="module")
+def planner(once):
+    """Of a recording whose joint 5 never turned, and joints 2, 3 and 6 hardly."""
+    return planner_of(run_of(once), "all")
+
+
+FRAME = ("rx", "ry", "rz", "tx", "ty", "tz")
+
+
+@pytest.mark.parametrize(
+    ("names", "still"),
+    [
+        # Along the first joint's axis, as is where the arm's base is tilted.
+        ((*(f"arm_base.{dof}" for dof in FRAME), "arm_link_length.joint_1"), 1),
+        ((*(f"mount.{dof}" for dof in FRAME), "arm_joint_offset.joint_6"), 1),  # about the last one
+        (("arm_joint_offset.joint_2", "arm_joint_offset.joint_3"), 0),
+        (("arm_link_length.joint_3", "arm_link_length.joint_5"), 0),
+    ],
+)
+def test_what_moves_nothing_at_any_pose_is_told_from_what_moves_something_at_some(
+    planner, names, still
+):
+    everywhere = Everywhere.of(planner.scene.stand)
+    keys = [key for key in planner.keys if key.name in names]
+    none, rest = everywhere.split(keys, np.ones(len(keys)))
+    assert (none.shape[1], rest.shape[1]) == (still, len(names) - still)
+    for direction in none.T:
+        assert names[-1] in everywhere.movers(keys, direction, 0.2)
+
+
+def test_what_is_said_to_move_nothing_moves_nothing_when_it_is_changed(planner):
+    """By the rig's own kinematics at other poses, the estimate moved along each direction."""
+    scene, problem = planner.scene, planner.scene.stand.estimate.problem
+    rig, values = scene.source.rig, dict(scene.values)
+    weak = [w for w in planner.now.weak if w["alike"]]
+    assert len(weak) >= 4 and not any("faro" in name for w in weak for name in w["parameters"])
+    everywhere, known = scene.everywhere, scene.now
+    at = known.at(scene.calibration)
+    keys, unit = [known.keys[i] for i in at], known.unit[at]
+    none, _ = everywhere.split(keys, unit)
+    joints = np.random.default_rng(5).uniform(-2, 2, (20, len(rig.joint_names)))
+
+    def seen(values):
+        stops = at_joints(problem, np.zeros(20, int), joints, "")
+        base = rig.tracker.bodies[0]
+        return np.stack([placed(stops, f, base, values).T for f in ("mount_markers", "lidar")])
+
+    assert none.shape[1] >= 6
+    for direction in none.T:
+        change, moved = 0.1 * direction * unit, dict(values)
+        for name in scene.calibration:
+            mine = np.array([key.unknown == name for key in keys])
+            unknown = problem.variables[name]
+            moved[name] = unknown.moved(values[name], change[mine]) if mine.any() else values[name]
+        by = np.abs(seen(moved) - seen(values)).max()
+        parts = np.abs(change).max()
+        assert by < 0.02 * parts  # what is left is of second order
+
+
+def test_any_number_of_stops_leaves_what_no_pose_shows(planner):
+    poses = planner.candidates(60, 0)
+    endless = planner.endless(planner.look(poses, 3))
+    now, then = (
+        {tuple(w["parameters"]) for w in k.weak if w["alike"]} for k in (planner.now, endless)
+    )
+    assert now <= then  # of so many the first are told
+    assert any(not w["alike"] for w in planner.now.weak)
