@@ -136,8 +136,9 @@ def _needs(keys: Sequence[Key]) -> str:
     owners = list(dict.fromkeys(key.unknown for key in keys))
     if len(owners) > 1:
         return f"stops at which {' and '.join(owners)} act differently; only their sum is seen"
-    names = " and ".join(key.name for key in keys)
-    return f"a measurement of {names} itself, or stops that it moves more"
+    one = len(keys) == 1
+    stops = "that it moves more" if one else "at which they act differently; only their sum is seen"
+    return f"a measurement of {' or '.join(key.name for key in keys)} itself, or stops {stops}"
 
 
 def standing_in(look: Look) -> list[dict[str, Any]]:

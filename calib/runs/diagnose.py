@@ -158,8 +158,10 @@ def _scatter(run: Run, stand: Stand) -> Iterator[dict[str, Any]]:
 
 
 def command_to_plan(run: Run, effects: Sequence[str]) -> str:
-    """The command that plans stops at which effects differ."""
-    return shlex.join(["rigcal", "plan", str(run.folder), "--for", ",".join(effects)])
+    """The command that plans stops at which effects differ, and writes them beside the run, where
+    the workbench shows them."""
+    out = ["-o", f"{run.folder}-plan"]
+    return shlex.join(["rigcal", "plan", str(run.folder), "--for", ",".join(effects), *out])
 
 
 def remedies(run: Run, found: Diagnosis, stops: bool) -> Iterator[dict[str, Any]]:
