@@ -8,7 +8,9 @@ from typing import Self
 
 import numpy as np
 
+from calib.diagnosis.linear import beside
 from calib.diagnosis.stand import Stand
+from calib.effects import Effect
 from calib.forward import Placed
 from calib.problem.unknowns import Key
 from calib.results.reach import at_joints, body_beyond, joint_range, placed
@@ -17,6 +19,9 @@ POSES = 100  # that are drawn: enough for a change that moves something at some 
 # Of what one parameter moves in the median, that a change moves: less is rounding. In the tests'
 # worlds those that cancel are below 1e-12, and all others above 0.3.
 CANCELS = 1e-6
+# Of what an effect moves, that another can move as well: a choice; its sigma is then 5.8 times as
+# large beside the other.
+STANDS_IN = 0.97
 
 
 @dataclass(frozen=True)
@@ -25,19 +30,29 @@ class Everywhere:
 
     Args:
         keys: (P,) of the parameters.
+        effects: (P,) whose they are; empty of a frame's.
         J: (R, P) of rotations, rad, and places, m, per unit of each.
     """
 
     keys: Sequence[Key]
+    effects: Sequence[str]
     J: np.ndarray
 
     @classmethod
-    def of(cls, stand: Stand) -> Self | None:
+    def of(cls, stand: Stand, added: Sequence[Effect] = ()) -> Self | None:
         """Of the LiDAR, bodies and levels of the first rig of a fit, told from a tracked body
         before the joints, or else from the tracker where the base stands still; None where the rig
-        has no arm, or nothing tells where its base is."""
-        problem, source = stand.estimate.problem, stand.sources[0]
-        rig, values = source.rig, stand.estimate.values
+        has no arm, or nothing tells where its base is.
+
+        Args:
+            stand: the fit.
+            added: effects besides its model.
+        """
+        problem, values = stand.estimate.problem, stand.estimate.values
+        if added:
+            problem, values = beside(stand.problem_of(stand.model.plus(added)), stand.estimate)
+        source = stand.sources[0]
+        rig = source.rig
         beyond, recording = body_beyond(problem), source.recording
         bodies = rig.tracker.bodies if rig.tracker else ()
         base = next((body for body in bodies if not rig.joints_to(body)), None)
@@ -56,7 +71,8 @@ class Everywhere:
             np.concatenate([_at_all(there, n, widths[n]) for n in names], axis=1) for there in each
         ]
         keys = [key for n in names for key in problem.variables[n].keys]
-        return cls(keys, np.concatenate(J)) if keys else None
+        effects = [problem.variables[n].owner.effect for n in names for _ in range(widths[n])]
+        return cls(keys, effects, np.concatenate(J)) if keys else None
 
     def split(self, keys: Sequence[Key], known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Directions of unit length, at right angles, that together span all changes: those (P, r)
@@ -72,6 +88,21 @@ class Everywhere:
         seen = np.concatenate([moved / scale, np.diag(np.where(own > 0, 0.0, 1.0))])
         _, size, turn = np.linalg.svd(seen, full_matrices=False)
         return turn[size < CANCELS].T, turn[size >= CANCELS].T
+
+    def alike(self, effect: str, other: str) -> bool:
+        """Whether another effect, and all else that there is, moves what an effect moves: but for
+        next to nothing of what is left of that without the other."""
+        effects = np.array(self.effects)
+        mine, theirs = effects == effect, effects == other
+        left, alone = (self._left(mine, rest) for rest in (~mine, ~(mine | theirs)))
+        return bool(mine.any() and theirs.any() and left < (1.0 - STANDS_IN) * alone)
+
+    def _left(self, mine: np.ndarray, others: np.ndarray) -> float:
+        """Sum of squares of what some columns move that others cannot."""
+        size = np.maximum(np.linalg.norm(self.J, axis=0), 1e-300)
+        mine, others = self.J[:, mine], (self.J / size)[:, others]
+        rest = mine - others @ np.linalg.lstsq(others, mine, rcond=CANCELS)[0]
+        return float(np.sum(np.square(rest)))
 
     def movers(self, keys: Sequence[Key], change: np.ndarray, share: float) -> list[str]:
         """Names of the parameters whose parts of a change (P,) move most of what is seen, each by

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.diagnosis.everywhere import Everywhere
+from calib.diagnosis.everywhere import STANDS_IN, Everywhere
 from calib.diagnosis.score import projection
 from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import what_separates
@@ -22,9 +22,6 @@ LEANS = 0.5
 # Of a direction of unit length, in priors' sigmas, for a parameter to be named: a choice; one that
 # is left out holds 4 % of its square at most.
 NAMED_SHARE = 0.2
-# Of what a candidate does, that an effect of the model can absorb: a choice; its sigma is then 5.8
-# times as large beside the other.
-STANDS_IN = 0.97
 MOST_DIRECTIONS = 8  # that are told, the weakest: a choice, as nobody reads more
 
 
@@ -50,14 +47,21 @@ def to_be_told_apart(
     """
     confirmed = (c for c in candidates if c["step"])
     for each in sorted(confirmed, key=lambda c: c["step"]):
-        if each["indistinguishable_from"]:
-            return group(each)
+        if names := to_be_planned(each):
+            return names
     return next((list(w["parameters"]) for w in weak if w["sigma_mm"] is None), [])
 
 
 def group(candidate: Mapping[str, Any]) -> list[str]:
     """A candidate of a diagnosis and its rivals, as commands have them."""
     return [candidate["add"], *(rival["add"] for rival in candidate["rivals"])]
+
+
+def to_be_planned(candidate: Mapping[str, Any]) -> list[str]:
+    """A candidate of a diagnosis and those of its rivals that stops can tell it from; none where
+    there are none. A diagnosis of an earlier version does not say which are alike."""
+    rivals = [rival["add"] for rival in candidate["rivals"] if not rival.get("alike")]
+    return [candidate["add"], *rivals] if rivals else []
 
 
 def leaning(solution: Solution, look: Look) -> list[dict[str, Any]]:

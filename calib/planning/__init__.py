@@ -42,7 +42,7 @@ from sensors.stops import read_cameras, write_columns
 __all__ = ["Plan", "is_rig", "plan", "planner_of"]
 
 # Poses that are looked at. On the page's example 50, 200, 500, 1500 of them bring the smallest sag
-# that is told from its rival to 0.071, 0.062, 0.061, 0.059 mrad/(N m) (mean of two seeds).
+# that is told from its rival to 0.071, 0.061, 0.060, 0.058 mrad/(N m) (mean of two seeds).
 CANDIDATE_POSES = 500
 # Stops that are planned where nobody says how many, and until sigmas are small.
 USUAL_STOPS, MOST_PLANNED = 5, 30

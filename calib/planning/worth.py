@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from calib.diagnosis.weak import STANDS_IN, hardly_known
+from calib.diagnosis.everywhere import STANDS_IN
+from calib.diagnosis.weak import hardly_known
 from calib.planning.criteria import (
     Apart,
     Criterion,

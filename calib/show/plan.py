@@ -214,7 +214,13 @@ def _and(names: Iterable[str]) -> str:
 
 
 def _unlike(plan: Plan) -> Iterator[str]:
-    """What is at the stops as it never was before."""
+    """What changed alike so far, and is at the stops as it never was before."""
+    now, after = (
+        [w["parameters"] for w in known.weak if not w["alike"]] for known in (plan.now, plan.after)
+    )
+    for names in (each for each in now if each not in after and plan.measured.joints.size):
+        alike = "change alike" if len(names) > 1 else "changes little"
+        yield f"So far {_and(names)} {alike} in all that is seen; at these stops not."
     if plan.unlike:
         yield f"New at these stops: {'; '.join(map(str, plan.unlike))}."
 

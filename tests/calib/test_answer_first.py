@@ -133,7 +133,7 @@ def plan_of(sigma, smallest=None):
         "observability": {"now": {"lambda": 1.0}, "after": {"lambda": 2.0}},
     }
     now, after = (
-        SimpleNamespace(sigma=np.array([each[when] for each in sigma.values()]))
+        SimpleNamespace(sigma=np.array([each[when] for each in sigma.values()]), weak=[])
         for when in ("now", "after")
     )
     return SimpleNamespace(
@@ -141,6 +141,7 @@ def plan_of(sigma, smallest=None):
         purpose=Purpose("all"),
         joints=[],
         curve=None,
+        measured=SimpleNamespace(joints=np.zeros((1, 6))),
         unlike=(),
         keys=[Key(*name.rsplit(".", 1)) for name in sigma],
         units=[each["unit"] for each in sigma.values()],

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from calib.diagnosis.everywhere import Everywhere
+from calib.diagnosis.weak import to_be_planned, to_be_told_apart
+from calib.effects import find
 from calib.planning import planner_of
 from calib.results.reach import at_joints, placed
 
@@ -79,3 +81,44 @@ def test_any_number_of_stops_leaves_what_no_pose_shows(planner):
     )
     assert now <= then  # of so many the first are told
     assert any(not w["alike"] for w in planner.now.weak)
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "alike"),
+    [
+        ("arm_gravity_sag", "arm_link_bending", True),
+        ("arm_gravity_sag", "arm_joint_scale", False),
+        ("arm_gravity_sag", "arm_joint_eccentricity", False),
+    ],
+)
+def test_effects_that_are_alike_at_every_pose_are_those_that_all_stops_hardly_tell(
+    planner, once, one, other, alike
+):
+    """By kinematics alone, and by what the beams and bodies of all candidates say: two ways."""
+    everywhere = Everywhere.of(planner.scene.stand, (find(one), find(other)))
+    assert everywhere.alike(one, other) == everywhere.alike(other, one) == alike
+    rivals = planner_of(run_of(once), f"{one},{other}")
+    poses = rivals.candidates(60, 0)
+    never = rivals.alike(rivals.look(poses, 3))
+    assert ((one, other) in never) == alike
+
+
+def test_no_stops_are_asked_for_where_none_separate():
+    rivals = [{"add": "b", "alike": True, "effect": "b"}, {"add": "c", "alike": False}]
+    candidate = {"add": "a", "rivals": rivals, "step": 1, "indistinguishable_from": ["b", "c"]}
+    assert to_be_planned(candidate) == to_be_told_apart([candidate], []) == ["a", "c"]
+    only = candidate | {"rivals": rivals[:1]}
+    assert to_be_planned(only) == to_be_told_apart([only], []) == []
+    earlier = candidate | {"rivals": [{"add": "b"}]}  # of an earlier version
+    assert to_be_planned(earlier) == ["a", "b"]
+
+
+def test_a_plan_says_what_changed_alike_so_far_and_what_never_will(once, rigcal):
+    """Joint 5 never turned, so that the axes of joints 4 and 6 were one line."""
+    words = ["plan", run_of(once).folder, "--candidates", 60, "--stops", 3, "--for"]
+    told = [" ".join(rigcal(*words, name)[1].split()) for name in ("arm_joint_offset", "mount.tz")]
+    names = "arm_joint_offset.joint_4, arm_joint_offset.joint_6 and mount.rz"
+    assert f"So far {names} change alike in all that is seen; at these stops not." in told[0]
+    assert "With them sigmas fall: arm_joint_offset." in told[0] and "joint_5 at " in told[0]
+    assert "NO STOPS of this arm help: the sigma of mount.tz stays at" in told[1]
+    assert "With them sigmas fall: mount" not in told[1]
