@@ -57,7 +57,7 @@ class Everywhere:
         bodies = rig.tracker.bodies if rig.tracker else ()
         base = next((body for body in bodies if not rig.joints_to(body)), None)
         root = beyond.root if beyond else ""
-        if not rig.joint_names or (base is None and root not in problem.calibration):
+        if not rig.joint_names or (base is None and (beyond is None or rig.moves != "never")):
             return None
         rng, count = np.random.default_rng(0), len(recording.stops)
         known = recording.joints if count else np.zeros((1, len(rig.joint_names)))
@@ -71,8 +71,14 @@ class Everywhere:
             np.concatenate([_at_all(there, n, widths[n]) for n in names], axis=1) for there in each
         ]
         keys = [key for n in names for key in problem.variables[n].keys]
+        J = np.concatenate(J)
+        if base is None and root not in names:  # wherever the base stands
+            free = np.concatenate([_at_all(there, root, 6) for there in each])
+            left = J - free @ np.linalg.lstsq(free, J)[0]
+            size = CANCELS * np.linalg.norm(J, axis=0)
+            J = np.where(np.linalg.norm(left, axis=0) < size, 0.0, left)
         effects = [problem.variables[n].owner.effect for n in names for _ in range(widths[n])]
-        return cls(keys, effects, np.concatenate(J)) if keys else None
+        return cls(keys, effects, J) if keys else None
 
     def split(self, keys: Sequence[Key], known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Directions of unit length, at right angles, that together span all changes: those (P, r)
@@ -85,7 +91,8 @@ class Everywhere:
         moved = self._moved(keys, known)
         own = np.linalg.norm(moved, axis=0)
         scale = np.median(own[own > 0]) if own.any() else 1.0
-        seen = np.concatenate([moved / scale, np.diag(np.where(own > 0, 0.0, 1.0))])
+        others = np.array([key not in self.keys for key in keys], float)
+        seen = np.concatenate([moved / scale, np.diag(others)])
         _, size, turn = np.linalg.svd(seen, full_matrices=False)
         return turn[size < CANCELS].T, turn[size >= CANCELS].T
 
@@ -106,8 +113,10 @@ class Everywhere:
 
     def movers(self, keys: Sequence[Key], change: np.ndarray, share: float) -> list[str]:
         """Names of the parameters whose parts of a change (P,) move most of what is seen, each by
-        itself: by no less than a share of what the first of them does."""
+        itself: by no less than a share of what the first of them does. Where none moves anything
+        that another place of the base would not, those whose parts are largest."""
         own = np.linalg.norm(self._moved(keys, change), axis=0)
+        own = own if own.any() else np.abs(change)
         order = np.argsort(-own, kind="stable")
         return [keys[i].name for i in order if own[i] > share * own.max()]
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.diagnosis.everywhere import STANDS_IN, Everywhere
+from calib.diagnosis.everywhere import CANCELS, STANDS_IN, Everywhere
 from calib.diagnosis.score import projection
 from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import what_separates
@@ -109,7 +109,8 @@ def hardly_known(
         named = [int(i) for i in np.argsort(-np.abs(axis)) if abs(axis[i]) > NAMED_SHARE]
         if named:
             moved = np.sqrt(value) * np.abs(axis * known)[named]
-            alike = everywhere.movers(keys, axis * known, NAMED_SHARE) if nowhere else []
+            part = np.where(np.abs(axis) > CANCELS, axis, 0.0) * known
+            alike = everywhere.movers(keys, part, NAMED_SHARE) if nowhere else []
             out.append(
                 {
                     "parameters": [keys[i].name for i in named],
@@ -130,9 +131,13 @@ def _of_space(space: np.ndarray) -> np.ndarray:
 
 
 def _alike(names: Sequence[str]) -> str:
+    """Of one alone it is the base that could as well stand elsewhere."""
+    moved = "they move all that is seen alike"
+    if len(names) == 1:
+        moved = "it moves all that is seen as another place of the base would"
     return (
         f"a measurement of {' or '.join(names)} itself; no stops tell, as at every pose of the arm "
-        "they move all that is seen alike"
+        f"{moved}"
     )
 
 

@@ -10,8 +10,9 @@ from calib.diagnosis.weak import to_be_planned, to_be_told_apart
 from calib.effects import find
 from calib.planning import planner_of
 from calib.results.reach import at_joints, placed
+from tests.worlds import World
 
-from .narrow import run_of
+from .narrow import fitted, run_of
 
 
 @pytest.fixture(scope="module")
@@ -122,3 +123,20 @@ def test_a_plan_says_what_changed_alike_so_far_and_what_never_will(once, rigcal)
     assert "With them sigmas fall: arm_joint_offset." in told[0] and "joint_5 at " in told[0]
     assert "NO STOPS of this arm help: the sigma of mount.tz stays at" in told[1]
     assert "With them sigmas fall: mount" not in told[1]
+
+
+def test_with_a_mesh_of_one_wall_the_arm_keeps_off_it(tmp_path):
+    """Its box is flat, so that every stop that was measured lies outside."""
+    wall_m, few = 4.0, (1.0, 0.4, 0.4, 0.4, 0.4, 1.0)
+    world = World(seed=14, locations=2, stops=3, beams=800, meshed=(2,), turned=few)
+    planner = planner_of(fitted(world, tmp_path), "all")
+    clear, source = planner.clear, planner.scene.source
+    assert len(planner.candidates(40, 0).joints) == 40
+    joints = clear.drawn(200, np.random.default_rng(0))
+    T = np.eye(4)
+    T[:3, 3] = wall_m - 0.5, 0.0, 0.12
+    Ts = np.broadcast_to(T, (200, 4, 4))
+    lidar = (Ts @ source.rig.tree.place("lidar", joints).Ts_root_frame)[:, 0, 3]
+    told = clear.of_poses(joints, Ts)
+    assert np.sum(lidar > wall_m - 0.05) > 20 and told.sum() > 20
+    assert lidar[told].max() < wall_m - 0.05
