@@ -5,11 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+import calib
 from calib.diagnosis.everywhere import Everywhere
 from calib.diagnosis.weak import to_be_planned, to_be_told_apart
 from calib.effects import find
 from calib.planning import planner_of
 from calib.results.reach import at_joints, placed
+from calib.simulation import PRESETS, simulate
 from tests.worlds import World
 
 from .narrow import fitted, run_of
@@ -140,3 +142,20 @@ def test_with_a_mesh_of_one_wall_the_arm_keeps_off_it(tmp_path):
     told = clear.of_poses(joints, Ts)
     assert np.sum(lidar > wall_m - 0.05) > 20 and told.sum() > 20
     assert lidar[told].max() < wall_m - 0.05
+
+
+def test_where_the_base_may_be_anywhere_it_takes_on_what_moves_all_alike(tmp_path):
+    """A turn about the first joint, and the height of its place, of an arm that nothing but a
+    tracker sees."""
+    spec = PRESETS["laser-tracker"]
+    simulate(spec, tmp_path / "rec", seed=1)
+    run = calib.fit([tmp_path / "rec"], tmp_path / "run", hold_out="none")
+    everywhere = Everywhere.of(planner_of(run, "all").scene.stand)
+    names = [key.name for key in everywhere.keys]
+    still = [np.linalg.norm(column) == 0 for column in everywhere.J.T]
+    mine = {name for name, none in zip(names, still, strict=True) if none}
+    assert "arm_joint_offset.joint_1" in mine and "arm_joint_offset.joint_2" not in mine
+    keys = [everywhere.keys[names.index("arm_joint_offset.joint_1")]]
+    none, rest = everywhere.split(keys, np.ones(1))
+    assert none.shape[1] == 1 and not rest.shape[1]
+    assert everywhere.movers(keys, none[:, 0], 0.2) == ["arm_joint_offset.joint_1"]
