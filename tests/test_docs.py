@@ -213,7 +213,7 @@ def test_the_page_about_chance_shows_what_is_printed(tmp_path):
 def test_the_page_about_plans_shows_what_is_printed(tmp_path):
     session = run_through(ROOT / "docs/plan.md", tmp_path)
     shown = blocks("text", session.text)
-    assert len(shown) == 3 and not any(unlike(part, session.said) for part in shown)
+    assert len(shown) == 4 and not any(unlike(part, session.said) for part in shown)
     table = (tmp_path / "stops.csv").read_text().splitlines()
     assert table[0] == "location," + ",".join(f"joint_{k}" for k in range(1, 7))
     assert len(table) == 6

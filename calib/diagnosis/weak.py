@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from calib.diagnosis.everywhere import CANCELS, STANDS_IN, Everywhere
 from calib.diagnosis.score import projection
 from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import what_separates
@@ -21,9 +22,6 @@ LEANS = 0.5
 # Of a direction of unit length, in priors' sigmas, for a parameter to be named: a choice; one that
 # is left out holds 4 % of its square at most.
 NAMED_SHARE = 0.2
-# Of what a candidate does, that an effect of the model can absorb: a choice; its sigma is then 5.8
-# times as large beside the other.
-STANDS_IN = 0.97
 MOST_DIRECTIONS = 8  # that are told, the weakest: a choice, as nobody reads more
 
 
@@ -49,14 +47,21 @@ def to_be_told_apart(
     """
     confirmed = (c for c in candidates if c["step"])
     for each in sorted(confirmed, key=lambda c: c["step"]):
-        if each["indistinguishable_from"]:
-            return group(each)
+        if names := to_be_planned(each):
+            return names
     return next((list(w["parameters"]) for w in weak if w["sigma_mm"] is None), [])
 
 
 def group(candidate: Mapping[str, Any]) -> list[str]:
     """A candidate of a diagnosis and its rivals, as commands have them."""
     return [candidate["add"], *(rival["add"] for rival in candidate["rivals"])]
+
+
+def to_be_planned(candidate: Mapping[str, Any]) -> list[str]:
+    """A candidate of a diagnosis and those of its rivals that stops can tell it from; none where
+    there are none. A diagnosis of an earlier version does not say which are alike."""
+    rivals = [rival["add"] for rival in candidate["rivals"] if not rival.get("alike")]
+    return [candidate["add"], *rivals] if rivals else []
 
 
 def leaning(solution: Solution, look: Look) -> list[dict[str, Any]]:
@@ -71,49 +76,78 @@ def leaning(solution: Solution, look: Look) -> list[dict[str, Any]]:
         return []
     known, keys = known[usable], [solution.keys[i] for i in usable]
     graph = solution.covariance if solution.graph is None else solution.graph
-    return hardly_known(keys, graph[np.ix_(usable, usable)], known)
+    everywhere = Everywhere.of(look.stand)
+    return hardly_known(keys, graph[np.ix_(usable, usable)], known, everywhere)
 
 
 def hardly_known(
-    keys: Sequence[Key], covariance: np.ndarray, known: np.ndarray
+    keys: Sequence[Key],
+    covariance: np.ndarray,
+    known: np.ndarray,
+    everywhere: Everywhere | None = None,
 ) -> list[dict[str, Any]]:
-    """The directions that data hardly determine, the weakest first.
+    """The directions that data hardly determine, the weakest first; after them those that no stops
+    of the arm determine, of which `alike` names what moves all that is seen alike.
 
     Args:
         keys: (P,) of the parameters.
         covariance: (P, P) of them.
         known: (P,) their sigmas before any data.
+        everywhere: what they move that is seen, at any pose of the arm; None where nobody says.
     """
-    scaled = covariance / np.outer(known, known)
-    values, axes = np.linalg.eigh(scaled)
-    untold = values > UNTOLD
-    gauges, _ = echelon(axes[:, untold], np.ones(len(known)))
-    gauges = gauges / np.linalg.norm(gauges, axis=0)
-    weak = [*((1.0, axis) for axis in gauges.T)]
-    weak += sorted(zip(values[~untold], axes.T[~untold], strict=True), key=lambda pair: -pair[0])
+    still, rest = np.zeros((len(known), 0)), np.eye(len(known))
+    if everywhere is not None:
+        still, rest = everywhere.split(keys, known)
+    values, axes = np.linalg.eigh(rest.T @ (covariance / np.outer(known, known)) @ rest)
+    untold, axes = values > UNTOLD, rest @ axes
+    weak = [(1.0, axis, False) for axis in _of_space(axes[:, untold])]
+    told = sorted(zip(values[~untold], axes.T[~untold], strict=True), key=lambda pair: -pair[0])
+    weak += [(value, axis, False) for value, axis in told if value >= LEANS]
+    weak += [(1.0, axis, True) for axis in _of_space(still)]
     out = []
-    for value, axis in weak[:MOST_DIRECTIONS]:
-        if value < LEANS:
-            break
+    for value, axis, nowhere in weak[:MOST_DIRECTIONS]:
         named = [int(i) for i in np.argsort(-np.abs(axis)) if abs(axis[i]) > NAMED_SHARE]
         if named:
             moved = np.sqrt(value) * np.abs(axis * known)[named]
+            part = np.where(np.abs(axis) > CANCELS, axis, 0.0) * known
+            alike = everywhere.movers(keys, part, NAMED_SHARE) if nowhere else []
             out.append(
                 {
                     "parameters": [keys[i].name for i in named],
                     "sigma_mm": float(1e3 * moved.max()),
-                    "needs": _needs([keys[i] for i in named]),
+                    "needs": _alike(alike) if alike else _needs([keys[i] for i in named]),
+                    "alike": alike,
                 }
             )
     return out
+
+
+def _of_space(space: np.ndarray) -> np.ndarray:
+    """Directions (r, P) of unit length that span a space (P, r)."""
+    if not space.shape[1]:
+        return space.T
+    directions = echelon(space, np.ones(len(space)))[0].T
+    return directions / np.linalg.norm(directions, axis=1)[:, None]
+
+
+def _alike(names: Sequence[str]) -> str:
+    """Of one alone it is the base that could as well stand elsewhere."""
+    moved = "they move all that is seen alike"
+    if len(names) == 1:
+        moved = "it moves all that is seen as another place of the base would"
+    return (
+        f"a measurement of {' or '.join(names)} itself; no stops tell, as at every pose of the arm "
+        f"{moved}"
+    )
 
 
 def _needs(keys: Sequence[Key]) -> str:
     owners = list(dict.fromkeys(key.unknown for key in keys))
     if len(owners) > 1:
         return f"stops at which {' and '.join(owners)} act differently; only their sum is seen"
-    names = " and ".join(key.name for key in keys)
-    return f"a measurement of {names} itself, or stops that it moves more"
+    one = len(keys) == 1
+    stops = "that it moves more" if one else "at which they act differently; only their sum is seen"
+    return f"a measurement of {' or '.join(key.name for key in keys)} itself, or stops {stops}"
 
 
 def standing_in(look: Look) -> list[dict[str, Any]]:
@@ -142,5 +176,6 @@ def _stand_in(name: str, effect: Effect, other: Effect) -> dict[str, Any]:
     return {
         "parameters": [name, other.family],
         "sigma_mm": None,
+        "alike": [],
         "needs": f"{what_separates(effect, other)}: on these data {name} absorbs {other.family}",
     }

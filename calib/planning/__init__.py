@@ -27,7 +27,7 @@ from calib.planning.room.ways import Leg, way_document
 from calib.planning.scene import PlanningScene
 from calib.planning.stops import Poses
 from calib.planning.tolerance import purpose_until
-from calib.planning.worth import Known
+from calib.planning.worth import Known, Pair
 from calib.problem.unknowns import Key
 from calib.results.recalibrate import earlier
 from calib.results.stages import PLAN as STAGES
@@ -42,7 +42,7 @@ from sensors.stops import read_cameras, write_columns
 __all__ = ["Plan", "is_rig", "plan", "planner_of"]
 
 # Poses that are looked at. On the page's example 50, 200, 500, 1500 of them bring the smallest sag
-# that is told from its rival to 0.071, 0.062, 0.061, 0.059 mrad/(N m) (mean of two seeds).
+# that is told from its rival to 0.071, 0.061, 0.060, 0.058 mrad/(N m) (mean of two seeds).
 CANDIDATE_POSES = 500
 # Stops that are planned where nobody says how many, and until sigmas are small.
 USUAL_STOPS, MOST_PLANNED = 5, 30
@@ -87,6 +87,8 @@ class Plan:
         effect_units: of the effects in `Known.smallest`.
         candidates: how many poses they were chosen among.
         endless: what is known with any number of stops of this arm.
+        alike: an effect and a rival that does next to the same at all candidates -> the size from
+            which the effect were told from it, had all of them been measured.
         curve: how far from their tolerances sigmas are with how many of them; empty without any.
         legs: how to get from each stop to the next, where its location is the same.
         tubes: of each link whose shapes are not in the recording, why; it is taken for a tube.
@@ -103,6 +105,7 @@ class Plan:
     now: Known
     after: Known
     endless: Known
+    alike: Mapping[Pair, float]
     found: tuple[Found, Found]
     unlike: Sequence[Unlike]
     effect_units: Mapping[str, str]
@@ -158,11 +161,20 @@ class Plan:
             "smallest_detectable": {
                 name: {
                     "unit": self.effect_units[name],
-                    "beside_model": _now_after(self, name, 0),
-                    "beside_rivals": _now_after(self, name, 1),
+                    "beside_model": _now_after(self, name, [name]),
+                    "beside_rivals": _now_after(self, name, self.told_from(name)),
+                    "beside": {
+                        rival: _now_after(self, name, [rival])
+                        for rival in self.now.smallest
+                        if rival != name
+                    },
                 }
                 for name in self.now.smallest
             },
+            "never_told_apart": [
+                {"effect": name, "from": rival, "smallest": size if np.isfinite(size) else None}
+                for (name, rival), size in self.alike.items()
+            ],
             "smallest_effect": effects_document(*self.found),
             "smallest_blunder": mishaps_document(*self.found),
             "unlike_measured": [each.document() for each in self.unlike],
@@ -177,6 +189,12 @@ class Plan:
             "predicted_mm": {w: _mm(k) for w, k in zip(WHEN, (self.now, self.after), strict=True)},
             "observability": {"now": dict(self.now.indices), "after": dict(self.after.indices)},
         }
+
+    def told_from(self, name: str) -> list[str]:
+        """The rivals from which stops can tell an effect; all of them, where they can from none;
+        itself, where it has none."""
+        rivals = [rival for rival in self.now.smallest if rival != name]
+        return [r for r in rivals if (name, r) not in self.alike] or rivals or [name]
 
     @property
     def reached(self) -> bool | None:
@@ -211,9 +229,10 @@ def _diagnosed(run: Run) -> dict[str, float]:
     return {name: size for name, size in sizes.items() if size and np.isfinite(size)}
 
 
-def _now_after(plan: Plan, name: str, which: int) -> dict[str, float | None]:
+def _now_after(plan: Plan, name: str, rivals: Sequence[str]) -> dict[str, float | None]:
+    """From which size an effect is found beside each of those."""
     known = {"now": plan.now, "after": plan.after, "with_any_number": plan.endless}
-    sizes = {when: each.smallest[name][which] for when, each in known.items()}
+    sizes = {w: max(k.smallest[name][rival] for rival in rivals) for w, k in known.items()}
     return {when: size if np.isfinite(size) else None for when, size in sizes.items()}
 
 
@@ -314,6 +333,7 @@ def _planned(planner: Planner, stops: int, candidates: int, seed: int) -> Plan:
         units=planner.units,
         now=planner.now,
         after=after,
+        alike=planner.alike(each),
         found=planner.found_now_and_after(after, some),
         unlike=unlike(scene.source, scene.measured, some),
         endless=planner.endless(each),

@@ -4,13 +4,16 @@ In M, the information of all stops and priors, n components are of interest and 
 
 - D: minus the log of the volume of the ellipsoid in which the n components lie.
 - A: minus the log of the mean of their variances, each in units of what was known before.
-- T: how far apart the data put two rivals (Atkinson and Fedorov 1975): how much of the one is left
-  once the other, and all that the model can take on, is taken off; the mean of the logs of both.
+- T: how far apart the data put rivals (Atkinson and Fedorov 1975): how much of the one is left once
+  the other, and all that the model can take on, is taken off. Of all pairs the hardest counts most:
+  minus the log of the mean of the squared sizes from which one is told from the other, each in
+  units of the size from which it is found now, had it no rival.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import permutations
 
 import numpy as np
 from scipy import special
@@ -101,24 +104,54 @@ class PredictionVariance(Criterion):
 
 
 class Apart(Criterion):
-    """T-optimality: each of some effects against its rivals.
+    """T-optimality: each of some effects against each of its rivals.
 
     Args:
         known: with the columns of all of them.
         of: of each effect its components (q,) and the size (q,) that it is taken to have.
+        added: components of all of them that the model lacks; beside a pair the others play no
+            part.
+        pairs: numbers of an effect and of that which it is to be told from: its own, where that is
+            the model alone. Every pair where None.
     """
 
-    def __init__(self, known: Information, of: Sequence[tuple[np.ndarray, np.ndarray]]) -> None:
-        self.start, self.effects = _of_rows(known), of
+    def __init__(
+        self,
+        known: Information,
+        of: Sequence[tuple[np.ndarray, np.ndarray]],
+        added: np.ndarray,
+        pairs: Sequence[tuple[int, int]] | None = None,
+    ) -> None:
+        self.start, self.effects, self.added = _of_rows(known), of, added
+        self.every = np.unique(np.concatenate([*(at for at, _ in of), added]).astype(int))
+        self.pairs = every_pair(len(of)) if pairs is None else pairs
+        # An effect of its usual size is to be found at least, where now none is.
+        self.wanted = [1.0 + self.told(self.start[None], i, i)[0] for i, _ in self.pairs]
 
     def of(self, M: np.ndarray) -> np.ndarray:
-        out = []
-        for at, size in self.effects:
-            left = information_left(M, at)
-            out.append(
-                np.log(np.maximum(np.einsum("kij,i,j->k", left, size, size), LEAST_INFORMATION))
-            )
-        return np.mean(out, axis=0)
+        left = information_left(M, self.every)
+        told = [self._of_pair(left, *pair) for pair in self.pairs]
+        short = [
+            w / np.maximum(x, LEAST_INFORMATION) for w, x in zip(self.wanted, told, strict=True)
+        ]
+        return -np.log(np.mean(short, axis=0))
+
+    def told(self, M: np.ndarray, effect: int, rival: int) -> np.ndarray:
+        """Information (n,) that tells an effect from a rival, in the mean over its components."""
+        return self._of_pair(information_left(M, self.every), effect, rival)
+
+    def _of_pair(self, left: np.ndarray, effect: int, rival: int) -> np.ndarray:
+        """The same from that (n, E, E) on all of them beside the model."""
+        (at, size), (other, _) = self.effects[effect], self.effects[rival]
+        without = np.setdiff1d(self.added, np.concatenate([at, other]))
+        places = (np.searchsorted(self.every, each) for each in (at, without))
+        own = information_left(left, *places)
+        return np.einsum("nii,i->n", own, np.square(size)) / len(at)
+
+
+def every_pair(count: int) -> list[tuple[int, int]]:
+    """Numbers of an effect and of a rival, of all of them; a single one against the model."""
+    return list(permutations(range(count), 2)) if count > 1 else [(0, 0)]
 
 
 def _of_rows(known: Information) -> np.ndarray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from itertools import permutations
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from calib.planning.room.ways import Leg, way_over
 from calib.planning.room.workspace import moved_anywhere
 from calib.planning.scene import PlanningScene
 from calib.planning.stops import Poses
-from calib.planning.worth import Known, criterion
+from calib.planning.worth import Known, Pair, alike, criterion
 from calib.problem.unknowns import Key, Role
 from calib.results.solution import Solution
 from calib.solve.fit import Progress
@@ -103,17 +104,23 @@ class Planner:
 
     def choose(self, poses: Poses, each: np.ndarray, stops: int, exchange: bool = True) -> Poses:
         """The best of some poses, from what each tells; without `exchange` the best first."""
-        by, tell = self.criterion, partial(self.progress, "choosing")
+        by, tell = self.criterion(each), partial(self.progress, "choosing")
         return poses.some(chosen(by, each, stops, tell, exchange))
 
-    @property
-    def criterion(self) -> Criterion:
-        """By what stops are chosen."""
-        if self.aim.text != WORKSPACE:
-            return criterion(self.scene, self.aim, self.lasting)
-        return PredictionVariance(
-            self.lasting, moved_anywhere(self.scene, self.lasting, self._anywhere)
-        )
+    def criterion(self, each: np.ndarray) -> Criterion:
+        """By what stops are chosen, from what each of those tells that there are. Rivals that
+        do next to the same at all of them play no part, unless there are no others."""
+        if self.aim.text == WORKSPACE:
+            return PredictionVariance(
+                self.lasting, moved_anywhere(self.scene, self.lasting, self._anywhere)
+            )
+        apart = set(permutations(self.aim.rivals, 2)) - set(self.alike(each))
+        return criterion(self.scene, self.aim, self.lasting, apart or None)
+
+    def alike(self, each: np.ndarray) -> dict[Pair, float]:
+        """Rivals that do next to the same at all stops; see `calib.planning.worth.alike`."""
+        most = replace(self.lasting, data=self.lasting.data + each.sum(axis=0))
+        return alike(self.scene, self.aim, most)
 
     @cached_property
     def _anywhere(self) -> Poses:

@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
+from calib.diagnosis.everywhere import Everywhere
 from calib.diagnosis.linear import beside
 from calib.diagnosis.stand import Stand
 from calib.effects import Effect
@@ -76,6 +77,11 @@ class PlanningScene:
     def T_world_reference(self) -> np.ndarray:
         """(4, 4) as estimated; none where both are one frame."""
         return self.values.get(self.source.rig.reference_frame, np.eye(4))
+
+    @cached_property
+    def everywhere(self) -> Everywhere | None:
+        """What its geometry moves that is seen, at any pose of the arm."""
+        return Everywhere.of(self.stand)
 
     @cached_property
     def _wide(self) -> tuple[Problem, dict[str, np.ndarray]]:

@@ -19,7 +19,7 @@ from calib.diagnosis.search import search
 from calib.diagnosis.stand import Look, Stand
 from calib.diagnosis.verdict import ABSORBED_BY_MODEL, Diagnosis, believed, conclude
 from calib.diagnosis.verdict.unnamed import Unnamed, unnamed
-from calib.diagnosis.weak import group, to_be_told_apart, weak_directions
+from calib.diagnosis.weak import group, to_be_planned, to_be_told_apart, weak_directions
 from calib.effects import own_effects
 from calib.effects.reference import FaroScale
 from calib.linear.parallel import one_blas_thread
@@ -158,8 +158,10 @@ def _scatter(run: Run, stand: Stand) -> Iterator[dict[str, Any]]:
 
 
 def command_to_plan(run: Run, effects: Sequence[str]) -> str:
-    """The command that plans stops at which effects differ."""
-    return shlex.join(["rigcal", "plan", str(run.folder), "--for", ",".join(effects)])
+    """The command that plans stops at which effects differ, and writes them beside the run, where
+    the workbench shows them."""
+    out = ["-o", f"{run.folder}-plan"]
+    return shlex.join(["rigcal", "plan", str(run.folder), "--for", ",".join(effects), *out])
 
 
 def remedies(run: Run, found: Diagnosis, stops: bool) -> Iterator[dict[str, Any]]:
@@ -170,13 +172,25 @@ def remedies(run: Run, found: Diagnosis, stops: bool) -> Iterator[dict[str, Any]
         found: its diagnosis.
         stops: whether stops can be planned for it.
     """
-    told = [("undistinguished", group(c), c["rivals"][0]["separate"]) for c in _tied(found)]
-    told += [("weak_direction", w["parameters"], w["needs"]) for w in found.weak_directions]
-    told += [("untestable", [name], why) for name, why in found.untestable.items()]
-    for of, names, needs in told:
-        moves = of != "untestable" or needs == ABSORBED_BY_MODEL  # other rows want other columns
-        command = command_to_plan(run, names) if stops and moves else None
+    told = [("undistinguished", group(c), _separate(c), to_be_planned(c)) for c in _tied(found)]
+    told += [
+        ("weak_direction", w["parameters"], w["needs"], [] if w["alike"] else w["parameters"])
+        for w in found.weak_directions
+    ]
+    told += [  # other rows want other columns
+        ("untestable", [name], why, [name] if why == ABSORBED_BY_MODEL else [])
+        for name, why in found.untestable.items()
+    ]
+    for of, names, needs, planned in told:
+        command = command_to_plan(run, planned) if stops and planned else None
         yield {"of": of, "names": list(names), "needs": needs, "plan": command}
+
+
+def _separate(candidate: Mapping[str, Any]) -> str:
+    """What would separate a candidate from its rivals: of those that stops can tell it from, if
+    there are any."""
+    rivals = sorted(candidate["rivals"], key=lambda rival: rival["alike"])
+    return rivals[0]["separate"]
 
 
 def _tied(found: Diagnosis) -> list[Mapping[str, Any]]:

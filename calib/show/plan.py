@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -32,6 +32,9 @@ WEAK = {
     "after": "and after these stops",
     "with_any_number": "and after any number of stops of this arm: measure it directly",
 }
+# Of a sigma, what any number of stops leaves of it at least, where none help: a choice.
+SETTLED = 0.9
+ASKED_SHOWN = 4  # parameters that stops are for, that are told in a sentence
 FALLS = 0.99  # of a sigma: one that falls by less is told together with all such
 
 
@@ -146,16 +149,20 @@ def achieved_by_targets(plan: TargetPlan) -> list[str]:
 
 def _achieved(plan: Plan, document: Mapping[str, Any]) -> Iterator[str]:
     """What the stops are worth, in a sentence or two."""
+    never = {(each["effect"], each["from"]) for each in document["never_told_apart"]}
     for name, each in document["smallest_detectable"].items():
         now, after = (each["beside_rivals"][when] for when in ("now", "after"))
         factor, unit = shown(each["unit"])
-        if after is not None:
+        rivals = [rival for rival in each["beside"] if (name, rival) not in never]
+        told = f", told from {_and(rivals)}" if rivals else ""
+        if after is not None and (told or not each["beside"]):
             before = "never" if now is None else f"from {factor * now:.3g} {unit}"
-            found = f"found from {factor * after:.3g} {unit}"
-            yield f"With them {name} is {found}, told from its rivals; now {before}."
-        elif each["beside_rivals"]["with_any_number"] is None:
-            others = ", ".join(n for n in document["rivals"] if n != name) or "the model"
-            yield f"NEVER FOUND: no number of stops of this arm tells {name} from {others}."
+            yield f"With them {name} is found from {factor * after:.3g} {unit}{told}; now {before}."
+        elif each["beside_rivals"]["with_any_number"] is None and not each["beside"]:
+            yield f"NEVER FOUND: no number of stops of this arm tells {name} from the model."
+    yield from _never(document)
+    if plan.purpose.components and not plan.purpose.tolerance:
+        yield from _asked(plan)
     if document["predicted_mm"]["after"] is not None:
         now, after = (document["predicted_mm"][when] for when in ("now", "after"))
         yield (
@@ -165,8 +172,55 @@ def _achieved(plan: Plan, document: Mapping[str, Any]) -> Iterator[str]:
     yield _fall(plan)
 
 
+def _asked(plan: Plan) -> Iterator[str]:
+    """What becomes of the parameters that the stops are for."""
+    at = [plan.keys.index(key) for key in plan.purpose.components]
+    helped, never = [], []
+    for i in at:
+        now, after, endless = (k.sigma[i] for k in (plan.now, plan.after, plan.endless))
+        factor, unit = shown(plan.units[i])
+        if endless > SETTLED * now:
+            never.append(f"{plan.names[i]} stays at {factor * now:.3g} {unit}")
+        else:
+            helped.append(f"{plan.names[i]} from {factor * now:.3g} to {factor * after:.3g} {unit}")
+    if helped:
+        more = len(helped) - ASKED_SHOWN
+        rest = f" and {more} more" if more > 0 else ""
+        yield f"With them sigmas fall: {'; '.join(helped[:ASKED_SHOWN])}{rest}."
+    if never:
+        more = len(never) - ASKED_SHOWN
+        rest = f" and {more} more" if more > 0 else ""
+        yield (
+            f"NO STOPS of this arm help: the sigma of {'; '.join(never[:ASKED_SHOWN])}{rest}, "
+            "however many they are. Measure it itself."
+        )
+
+
+def _never(document: Mapping[str, Any]) -> Iterator[str]:
+    """Which rivals no stops tell apart."""
+    for each in document["never_told_apart"]:
+        name, rival, size = (each[key] for key in ("effect", "from", "smallest"))
+        factor, unit = shown(document["smallest_detectable"][name]["unit"])
+        least = "never" if size is None else f"only from {factor * size:.3g} {unit}"
+        yield (
+            f"NOT TOLD APART by any stops: at all {document['candidates']} poses {rival} does next "
+            f"to what {name} does, which would be told from it {least}."
+        )
+
+
+def _and(names: Iterable[str]) -> str:
+    *first, last = names
+    return f"{', '.join(first)} and {last}" if first else last
+
+
 def _unlike(plan: Plan) -> Iterator[str]:
-    """What is at the stops as it never was before."""
+    """What changed alike so far, and is at the stops as it never was before."""
+    now, after = (
+        [w["parameters"] for w in known.weak if not w["alike"]] for known in (plan.now, plan.after)
+    )
+    for names in (each for each in now if each not in after and plan.measured.joints.size):
+        alike = "change alike" if len(names) > 1 else "changes little"
+        yield f"So far {_and(names)} {alike} in all that is seen; at these stops not."
     if plan.unlike:
         yield f"New at these stops: {'; '.join(map(str, plan.unlike))}."
 
@@ -264,8 +318,9 @@ def _detectable_table(smallest: Mapping[str, Mapping[str, Any]]) -> Table:
     table = columns_table("smallest that is found", "", "now", "after")
     for name, each in smallest.items():
         factor, unit = shown(each["unit"])
-        for key, what in (("beside_model", name), ("beside_rivals", f"{name}, told from rivals")):
-            sizes = each[key]
+        rows = {name: each["beside_model"]}
+        rows |= {f"{name}, told from {rival}": sizes for rival, sizes in each["beside"].items()}
+        for what, sizes in rows.items():
             cells = (_found(sizes[when], factor) for when in ("now", "after"))
             table.add_row(what, unit, *cells)
     return table

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from calib.effects import CATALOGUE
+from calib.planning.purpose import Purpose
 from calib.problem.unknowns import Key
 from calib.results.check import Check
 from calib.runs.run import Run
@@ -123,6 +124,7 @@ def plan_of(sigma, smallest=None):
         "way": [],
         "tubes": [],
         "smallest_detectable": smallest or {},
+        "never_told_apart": [],
         "sigma": sigma,
         "smallest_effect": {},
         "smallest_blunder": {},
@@ -131,13 +133,15 @@ def plan_of(sigma, smallest=None):
         "observability": {"now": {"lambda": 1.0}, "after": {"lambda": 2.0}},
     }
     now, after = (
-        SimpleNamespace(sigma=np.array([each[when] for each in sigma.values()]))
+        SimpleNamespace(sigma=np.array([each[when] for each in sigma.values()]), weak=[])
         for when in ("now", "after")
     )
     return SimpleNamespace(
         stops=[{"location": "L00"}],
+        purpose=Purpose("all"),
         joints=[],
         curve=None,
+        measured=SimpleNamespace(joints=np.zeros((1, 6))),
         unlike=(),
         keys=[Key(*name.rsplit(".", 1)) for name in sigma],
         units=[each["unit"] for each in sigma.values()],
@@ -171,11 +175,12 @@ def test_a_plan_that_achieves_nothing_says_so(capsys):
 
 def test_a_plan_to_tell_effects_apart_says_from_which_size(capsys):
     sizes = {"now": None, "after": 0.0004}
-    smallest = {"range_scale": {"unit": "1", "beside_model": sizes, "beside_rivals": sizes}}
+    each = {"unit": "1", "beside_model": sizes, "beside_rivals": sizes}
+    smallest = {"range_scale": {**each, "beside": {"faro_scale": sizes}}}
     plan = plan_of({"lidar.tx": {"unit": "m", "now": 0.0006, "after": 0.0006}}, smallest)
     print_plan(plan)
     out = " ".join(capsys.readouterr().out.split())
-    assert "range_scale is found from 0.0004 (no unit), told from its rivals; now never" in out
+    assert "range_scale is found from 0.0004 (no unit), told from faro_scale; now never" in out
 
 
 def test_the_table_of_a_run_says_what_is_identifiable(run):

@@ -64,7 +64,7 @@ def test_one_effect_has_one_owner_however_its_parameters_are_called():
     (direction,) = hardly_known([KEYS[i + 2] for i in both], np.full((2, 2), 0.5), np.ones(2))
     names = [f"box/range_cyclic@1.2.{dof}" for dof in ("joint_2.tx", "joint_2.tx@0.5")]
     assert direction["parameters"] == names
-    assert direction["needs"].startswith(f"a measurement of {' and '.join(names)} itself")
+    assert direction["needs"].startswith(f"a measurement of {' or '.join(names)} itself")
     other = hardly_known([KEYS[0], KEYS[2]], np.full((2, 2), 0.5), np.ones(2))[0]["needs"]
     assert "box/range_cyclic@1 and box/range_cyclic@1.2 act differently" in other
 

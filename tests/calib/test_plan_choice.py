@@ -51,7 +51,7 @@ def test_no_other_stop_in_place_of_one_is_better_and_few_designs_are(seed, kind)
         "D": Volume(start, np.arange(4)),
         "A": Variance(start, np.arange(4), np.ones(4)),
         "D of two": Volume(start, np.arange(2)),
-        "T": Apart(start, [(np.array([k]), np.ones(1)) for k in (2, 3)]),
+        "T": Apart(start, [(np.array([k]), np.ones(1)) for k in (2, 3)], np.array([2, 3])),
     }[kind]
     found = chosen(by, each, 3, silent)
     assert len(set(found)) == 3

@@ -121,6 +121,9 @@ def test_a_diagnosis_and_its_report_carry_a_plan_for_each_thing_they_cannot_tell
     found = calib.diagnose(narrow).document()
     weak = [r for r in found["remedies"] if r["of"] == "weak_direction"]
     assert [r["names"] for r in weak] == [w["parameters"] for w in found["weak_directions"]]
+    helped = [r["plan"] is not None for r in weak]
+    assert helped == [not w["alike"] for w in found["weak_directions"]]
+    assert True in helped and False in helped
     untestable = {r["names"][0]: r for r in found["remedies"] if r["of"] == "untestable"}
     assert untestable.keys() == found["untestable"].keys()
     for name, why in found["untestable"].items():

@@ -75,7 +75,8 @@ def test_errors_of_the_calibration_move_the_lidar_by_as_much_as_is_told(narrow):
 def test_the_lidar_is_predicted_better_than_by_other_stops(narrow):
     planner = planner_of(narrow, "workspace")
     poses = planner.candidates(120, 0)
-    each, by = planner.look(poses, 4), planner.criterion
+    each = planner.look(poses, 4)
+    by = planner.criterion(each)
     mine = chosen(by, each, 4, silent)
     volume = criterion(planner.scene, planner_of(narrow, "all").aim, planner.lasting)
     rng = np.random.default_rng(0)

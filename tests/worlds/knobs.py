@@ -32,6 +32,7 @@ class World:
         mesh_error_factor: how many times the mesh is worse than rig.yaml says.
         warp_m: how far the middle of one wall is bowed out of the mesh's plane.
         uneven_m: standard deviation of how far surfaces lie off flat, smoothly; no mesh has it.
+        meshed: numbers of the rectangles that the mesh has; empty for all of them.
         clutter: share of the beams that hit boxes which are not in the mesh, about.
         turned: share of its range that each joint goes through, about its middle; 0 never turns.
         then: stops that follow: the number of a location, and what the encoders are to say there.
@@ -54,6 +55,7 @@ class World:
     mesh_error_factor: float = 1.0
     warp_m: float = 0.0
     uneven_m: float = 0.0
+    meshed: tuple[int, ...] = ()
     clutter: float = 0.0
     turned: tuple[float, ...] = (1.0,) * 6
     then: tuple[tuple[int, tuple[float, ...]], ...] = ()

@@ -136,7 +136,13 @@ class Mesh:
     label: np.ndarray
 
 
-def scanned(quads: Quads, rng: np.random.Generator, sigma_m: float, warp_m: float) -> Mesh:
+def scanned(
+    quads: Quads,
+    rng: np.random.Generator,
+    sigma_m: float,
+    warp_m: float,
+    meshed: tuple[int, ...] = (),
+) -> Mesh:
     """The mesh of rectangles, off along their normals by errors that are smooth over each.
 
     Args:
@@ -144,6 +150,7 @@ def scanned(quads: Quads, rng: np.random.Generator, sigma_m: float, warp_m: floa
         rng: of the errors.
         sigma_m: their standard deviation.
         warp_m: how far the middle of the wall `WARPED` is off besides.
+        meshed: numbers of the rectangles that it has; empty for all.
     """
     vertices, faces, labels, first = [], [], [], 0
     for q, normal in enumerate(quads.normal):
@@ -154,6 +161,8 @@ def scanned(quads: Quads, rng: np.random.Generator, sigma_m: float, warp_m: floa
         error = sigma_m * _waves(points, rng)
         if q == WARPED:
             error += warp_m * np.sin(np.pi * a.ravel()) * np.sin(np.pi * b.ravel())
+        if meshed and q not in meshed:
+            continue
         number = np.arange(a.size).reshape(a.shape) + first
         w, x, y, z = (number[i, j].ravel() for i, j in _corners())
         vertices.append(points + error[:, None] * normal)

@@ -45,7 +45,7 @@ def write(world: World, folder: Path, beams: Path | None = None) -> dict[str, An
     rods.insert(0, "target", [f"T{i + 1}" for i in range(len(rods))])
     rods.to_csv(folder / "targets.csv", index=False)
     sigma_m = SIGMA_MESH_M * world.mesh_error_factor
-    mesh = room.scanned(there, world.rng("mesh"), sigma_m, world.warp_m)
+    mesh = room.scanned(there, world.rng("mesh"), sigma_m, world.warp_m, world.meshed)
     _write_reference(mesh, folder / "reference")
     share = _scans(world, rig, stops, there, (folder / "scans", beams))
     truth = _truth(world, rig, stops) | {"clutter_share": share}

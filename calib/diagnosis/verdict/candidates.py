@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from calib.diagnosis.everywhere import Everywhere
 from calib.diagnosis.screen import Candidate, angle_deg
 from calib.diagnosis.search import ALPHA_EFFECT, ALPHA_NOISE, NamedEffect, Search
 from calib.diagnosis.suggest import what_separates
@@ -14,6 +15,11 @@ from calib.diagnosis.verdict.matters import Weighed
 from calib.effects import Site
 from calib.results.holdout import Fall
 from calib.results.solution import one_unit
+
+ALIKE = (
+    "no stops (at every pose of the arm both move all that is seen alike), but a measurement of "
+    "one of them itself"
+)
 
 
 def candidate_documents(
@@ -119,6 +125,7 @@ def _rivals(step: NamedEffect) -> list[dict[str, Any]]:
     screen = step.before.named
     scale = max(step.after.named.common, step.judged.inflation)
     own = step.candidate.test.evidence(scale)
+    alike = {other.effect.name for other in step.rivals if _alike(step, other)}
     return [
         {
             "effect": other.effect.family,
@@ -126,7 +133,19 @@ def _rivals(step: NamedEffect) -> list[dict[str, Any]]:
             "dof": other.test.dof,
             "angle_deg": angle_deg(screen, step.candidate, other),
             "odds": float(np.exp(own - other.test.evidence(scale))),
-            "separate": what_separates(step.effect, other.effect),
+            "separate": (
+                ALIKE if other.effect.name in alike else what_separates(step.effect, other.effect)
+            ),
+            "alike": other.effect.name in alike,
         }
         for other in step.rivals
     ]
+
+
+def _alike(step: NamedEffect, other: Candidate) -> bool:
+    """Whether an effect and a rival move alike all that is seen, at every pose of the arm."""
+    both = (step.effect, other.effect)
+    if not all(effect.site in (Site.EDGE, Site.JOINTS) for effect in both):
+        return False
+    everywhere = Everywhere.of(step.before.stand, both)
+    return everywhere is not None and everywhere.alike(*(effect.name for effect in both))

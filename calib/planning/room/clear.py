@@ -84,6 +84,7 @@ class Clear:
         clear = np.maximum(*self.parts.clear_m[self.pairs.T]) if pairs else np.zeros(0)
         self.least_m = clear + self.parts.radius_m[self.pairs].sum(axis=1)
         self.room_m = (self.parts.radius_m + self.parts.clear_m)[self.moving]
+        self.outside_m = 0.0
         self._leave_out_what_is_built_so()
 
     def _leave_out_what_is_built_so(self) -> None:
@@ -107,9 +108,11 @@ class Clear:
         known = np.array([str(at) in places for at in recording.location], bool)
         if known.any():
             roots = np.stack([places[str(at)] for at in recording.location[known]])
-            apart, room = out._gaps(recording.joints[known], se3.inverse(T_world_reference) @ roots)
+            Ts_reference_root = se3.inverse(T_world_reference) @ roots
+            apart, room, outside = out._gaps(recording.joints[known], Ts_reference_root)
             out.least_m = np.minimum(out.least_m, apart.min(axis=0, initial=np.inf))
             out.room_m = np.minimum(out.room_m, room.min(axis=0, initial=np.inf))
+            out.outside_m = float(outside.max(initial=0.0))
         return out
 
     def drawn(self, count: int, rng: np.random.Generator) -> np.ndarray:
@@ -120,9 +123,11 @@ class Clear:
         return rng.uniform(low, high, (count, len(low)))
 
     def of_poses(self, joints: np.ndarray, Ts_reference_root: np.ndarray) -> np.ndarray:
-        """(n,) whether each pose is clear, and within the mesh's box."""
-        apart, room = self._gaps(joints, Ts_reference_root)
-        return (apart >= self.least_m).all(axis=1) & (room >= self.room_m).all(axis=1)
+        """(n,) whether each pose is clear, and no further out of the mesh's box than the arm was at
+        a stop that was measured: a mesh of one wall has a flat box."""
+        apart, room, outside = self._gaps(joints, Ts_reference_root)
+        clear = (apart >= self.least_m).all(axis=1) & (room >= self.room_m).all(axis=1)
+        return clear & (outside <= self.outside_m).all(axis=1)
 
     def in_the_way(self, joints: np.ndarray) -> InTheWay:
         """What of the arm (n, J) is in lines of sight."""
@@ -145,21 +150,26 @@ class Clear:
 
     def _gaps(
         self, joints: np.ndarray, Ts_reference_root: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """How far lines of parts are from each other (n, P), and those of moving parts from the
-        mesh (n, M), m; negative outside of the mesh's box."""
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """How far lines of parts are from each other (n, P), those of moving parts from the mesh
+        (n, M), and how far these reach out of the mesh's box (n, M), m."""
         ends = self._ends_of_parts(joints)
         apart_m, mesh = self._apart_m(ends), self.source.reference
         if mesh is None:
-            return apart_m, np.full((len(joints), len(self.room_m)), np.inf)
+            none = np.zeros((len(joints), len(self.room_m)))
+            return apart_m, none + np.inf, none
         points, of = self.parts.points(ends[:, self.moving])
         at = np.einsum("nij,nkj->nki", Ts_reference_root[:, :3, :3], points)
         at += Ts_reference_root[:, None, :3, 3]
         room_m = mesh.distance_m(at.reshape(-1, 3)).reshape(at.shape[:2])
         low, high = mesh.vertices_m.min(axis=0), mesh.vertices_m.max(axis=0)
-        inside = ((at > low) & (at < high)).all(axis=2)
-        room_m, starts = np.where(inside, room_m, -room_m), np.flatnonzero(np.diff(of, prepend=-1))
-        return apart_m, np.minimum.reduceat(room_m, starts, axis=1)
+        outside_m = np.linalg.norm(at - np.clip(at, low, high), axis=2)
+        starts = np.flatnonzero(np.diff(of, prepend=-1))
+        return (
+            apart_m,
+            np.minimum.reduceat(room_m, starts, axis=1),
+            np.maximum.reduceat(outside_m, starts, axis=1),
+        )
 
 
 def _parts(rig: Rig, frames: list[str]) -> tuple[Capsules, list[str]]:
