@@ -13,19 +13,21 @@ Rows of beams are left as they are: a stop has thousands, and a model follows no
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
+from scipy.linalg import cho_factor, cho_solve
 
-from calib.blunders.others import Others
 from calib.linear.clusters import ClusteredRows
 from calib.linear.layout import Layout, positions
-from calib.linear.system import Linearisation
+from calib.linear.linearise import prior_rows
+from calib.problem.unknowns import Role
 from calib.results.intervals import ALONE
 
-NONE = np.zeros(0, int)
+Values = Mapping[str, np.ndarray]
+ROUNDED = 1e-12  # of the largest: a direction that what a stop has alone does not touch
 
 
 @dataclass(frozen=True)
@@ -41,67 +43,79 @@ class Leverage:
     covariance: np.ndarray
 
     @classmethod
-    def of(cls, whole: Linearisation) -> Self:
-        """At the solution of a fit; candidates beside it take in nothing."""
-        layout = whole.layout
+    def of(cls, information: np.ndarray, layout: Layout, values: Values, widened: float) -> Self:
+        """At the solution of a fit.
+
+        Args:
+            information: (S, S) of what is kept of the layout, in units of priors' sigmas, with the
+                priors of the hardware; these are so many times `widened`.
+            layout: of the fit's unknowns and of candidates beside them, which take in nothing.
+            values: the state.
+        """
         if layout.scanned:
             return cls((), np.zeros((0, 0)))
         names = [name for name in layout.outer() if name not in layout.unbounded]
-        at = positions(layout.size, layout.kept)[layout.columns(names)]
-        return cls(names, Others.of(whole).kept[np.ix_(at, at)])
+        at, start = positions(layout.size, layout.kept)[layout.columns(names)], 0
+        block = information[np.ix_(at, at)]
+        priors = prior_rows(layout, names, values)
+        for name in names:
+            end = start + layout.unknowns[name].dim
+            if layout.unknowns[name].role is Role.CALIBRATION:
+                A = priors[name].A * layout.sigma[layout.at[name]]
+                block[start:end, start:end] += (1.0 - widened**-2.0) * A.T @ A
+            start = end
+        unit = layout.sigma[layout.columns(names)]
+        C = cho_solve(cho_factor(block), np.eye(len(block))) * np.outer(unit, unit)
+        return cls(names, C)
 
-    def grown(self, rows: Sequence[ClusteredRows], layout: Layout) -> Iterator[ClusteredRows]:
+    def grown(self, rows: Sequence[ClusteredRows], layout: Layout) -> list[ClusteredRows]:
         """The same rows, whitened and all but those of beams, with the residuals of each stop as
         large as errors are."""
         if not self.names:
-            yield from rows
-            return
-        shared = layout.columns(self.names)
-        grown = [some.b.copy() for some in rows]
-        for stop, parts in _by_stop(rows).items():
-            kept, own = (
-                np.concatenate([_over(rows[i], k, at, layout.size) for i, k in parts])
-                for at in (shared, layout.own.get(stop, NONE))
-            )
-            e = _grown(np.concatenate([rows[i].b[k] for i, k in parts]), kept, own, self.covariance)
-            ends = np.cumsum([len(k) for _, k in parts])[:-1]
-            for (i, k), mine in zip(parts, np.split(e, ends), strict=True):
-                grown[i][k] = mine
-        for some, b in zip(rows, grown, strict=True):
-            yield some._replace(b=b)
+            return list(rows)
+        stop, e = (np.concatenate([getattr(some, k) for some in rows]) for k in ("stop", "b"))
+        ends = np.cumsum([0, *(len(some.b) for some in rows)])
+        kept, own = self._derivatives(rows, ends, layout)
+        count = np.bincount(stop[stop >= 0], minlength=1)
+        order = np.argsort(stop, kind="stable")[(stop < 0).sum() :]
+        first = np.cumsum([0, *count])[:-1]
+        e = e.copy()
+        for size in np.unique(count[count > 0]).tolist():
+            at = order[first[count == size][:, None] + np.arange(size)]
+            e[at] = _grown(e[at], kept[at], own[at], self.covariance)
+        pairs = zip(rows, ends, ends[1:], strict=False)
+        return [some._replace(b=e[start:end]) for some, start, end in pairs]
 
-
-def _by_stop(rows: Sequence[ClusteredRows]) -> dict[int, list[tuple[int, np.ndarray]]]:
-    """Stop -> where its rows are: in which of them, and which of these (n,)."""
-    found: dict[int, list[tuple[int, np.ndarray]]] = {}
-    for i, some in enumerate(rows):
-        order = np.argsort(some.stop, kind="stable")
-        stops, first = np.unique(some.stop[order], return_index=True)
-        for stop, mine in zip(stops.tolist(), np.split(order, first[1:]), strict=True):
-            if stop >= 0:
-                found.setdefault(stop, []).append((i, mine))
-    return found
-
-
-def _over(rows: ClusteredRows, some: np.ndarray, columns: np.ndarray, size: int) -> np.ndarray:
-    """Derivatives (n, c) of some rows (n,) by some of so many columns."""
-    at = positions(size, columns)[rows.columns]
-    out = np.zeros((len(some), len(columns)))
-    out[:, at[at >= 0]] = rows.A[some][:, at >= 0]
-    return out
+    def _derivatives(
+        self, rows: Sequence[ClusteredRows], ends: np.ndarray, layout: Layout
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Derivatives (R, S) of all rows by what stops share, and (R, O) by what each has alone."""
+        shared = positions(layout.size, layout.columns(self.names))
+        alone = np.full(layout.size, -1)
+        for columns in layout.own.values():
+            alone[columns] = np.arange(len(columns))
+        out = [np.zeros((ends[-1], int(at.max(initial=-1)) + 1)) for at in (shared, alone)]
+        for some, start, end in zip(rows, ends, ends[1:], strict=False):
+            for whole, at in zip(out, (shared, alone), strict=True):
+                to = at[some.columns]
+                if (to >= 0).any():
+                    whole[start:end, to[to >= 0]] = some.A[:, to >= 0]
+        return out[0], out[1]
 
 
 def _grown(e: np.ndarray, kept: np.ndarray, own: np.ndarray, C: np.ndarray) -> np.ndarray:
-    """A stop's residuals (m,) as large as errors are.
+    """Residuals (K, m) of stops as large as errors are.
 
     Args:
         e: as they are.
-        kept, own: (m, .) derivatives by what stops share, and by what it has alone, which takes in
-            all that it can.
+        kept, own: (K, m, .) derivatives by what stops share, and by what each has alone, which
+            takes in all that it can.
         C: covariance of what stops share.
     """
-    if own.shape[1]:
-        axes = np.linalg.qr(own)[0]
-        kept = kept - axes @ (axes.T @ kept)
-    values, axes = np.linalg.eigh(kept @ C @ kept.T)
-    return axes @ ((axes.T @ e) / np.sqrt(1.0 - np.clip(values, 0.0, ALONE)))
+    if own.shape[2]:
+        axes, size, _ = np.linalg.svd(own, full_matrices=False)
+        axes = axes * (size > ROUNDED * size[:, :1])[:, None]
+        kept = kept - axes @ (axes.mT @ kept)
+    values, axes = np.linalg.eigh(kept @ C @ kept.mT)
+    root = 1.0 / np.sqrt(1.0 - np.clip(values, 0.0, ALONE))
+    return np.matvec(axes, root * np.matvec(axes.mT, e))

@@ -149,15 +149,16 @@ def linearise_with(
     information, raw = linear.kept[:-1, :-1].copy(), linear.raw.copy()
     at = positions(layout.size, layout.kept)
     others = list(other_rows(wide, layout, values, gradients))
-    leverage, more = Leverage.of(linear), np.zeros(layout.size)
-    for rows, grown in zip(others, leverage.grown(others, layout), strict=True):
-        gradients.add_rows(grown)
-        more[rows.columns] += rows.A.T @ (grown.b - rows.b)
+    for rows in others:
         place = at[rows.columns]
         if (place >= 0).all():  # the others are in the linearisation
             scaled = rows.A * layout.sigma[rows.columns]
             information[np.ix_(place, place)] += scaled.T @ scaled
             raw[np.ix_(place, place)] += scaled.T @ scaled
+    leverage, more = Leverage.of(information, layout, values, WIDENED), np.zeros(layout.size)
+    for rows, grown in zip(others, leverage.grown(others, layout), strict=True):
+        gradients.add_rows(grown)
+        more[rows.columns] += rows.A.T @ (grown.b - rows.b)
     unit = layout.sigma[layout.kept]
     table, stop, place = gradients.table()
     return Linear(

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from calib import problem as problems
-from calib.diagnosis.leverage import Leverage
 from calib.diagnosis.linear import WIDENED, other_rows
 from calib.diagnosis.score import project, score_test
 from calib.diagnosis.stand import Stand
@@ -48,8 +47,8 @@ def fitted(folder):
 @pytest.mark.parametrize("make", [arm, hands, lambda f, s: arm(f, s, 2e-5)])
 def test_a_stop_grows_by_its_part_of_the_hat_matrix(tmp_path, make):
     stand = fitted(make(tmp_path, 1))
-    whole = stand.linearise([], quiet)[0].whole
-    layout, values = whole.layout, stand.estimate.values
+    linear = stand.linearise([], quiet)[0]
+    layout, values = linear.whole.layout, stand.estimate.values
     rows = list(other_rows(stand.problem, layout, values, Gradients(layout.size)))
     A = np.concatenate([_dense(r, layout.size) for r in rows])
     e, stop = (np.concatenate([getattr(r, k) for r in rows]) for k in ("b", "stop"))
@@ -58,7 +57,7 @@ def test_a_stop_grows_by_its_part_of_the_hat_matrix(tmp_path, make):
     scale = np.linalg.norm(A, axis=0)
     known = A * wide[:, None] / scale
     C = np.linalg.pinv(known.T @ known, rcond=1e-13)
-    grown = np.concatenate([r.b for r in Leverage.of(whole).grown(rows, layout)])
+    grown = np.concatenate([r.b for r in linear.leverage.grown(rows, layout)])
     for k in (0, 7):
         mine = stop == k
         values, axes = np.linalg.eigh((A[mine] / scale) @ C @ (A[mine] / scale).T)
