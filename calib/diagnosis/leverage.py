@@ -27,7 +27,7 @@ from calib.problem.unknowns import Role
 from calib.results.intervals import ALONE
 
 Values = Mapping[str, np.ndarray]
-ROUNDED = 1e-12  # of the largest: a direction that what a stop has alone does not touch
+UNTOUCHED_SHARE = 1e-12  # of the largest: a direction that what a stop has alone does not touch
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ def _grown(e: np.ndarray, kept: np.ndarray, own: np.ndarray, C: np.ndarray) -> n
     """
     if own.shape[2]:
         axes, size, _ = np.linalg.svd(own, full_matrices=False)
-        axes = axes * (size > ROUNDED * size[:, :1])[:, None]
+        axes = axes * (size > UNTOUCHED_SHARE * size[:, :1])[:, None]
         kept = kept - axes @ (axes.mT @ kept)
     values, axes = np.linalg.eigh(kept @ C @ kept.mT)
     root = 1.0 / np.sqrt(1.0 - np.clip(values, 0.0, ALONE))

@@ -1,7 +1,7 @@
 """What gives way under its load: joints, links, the base, the mount.
 
-The weights are those of the URDF's links, and ``payload_kg`` at the arm's tip where stops have that
-column. The root's z axis is taken to point up.
+The weights are those of the URDF's links, and what stops say each tip of the arm carries. The
+root's z axis is taken to point up.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from calib.effects.base import Effect, Param, Site, View
 from calib.effects.basis import finite
 from calib.effects.rig import mount_edges
 from calib.rig import Rig
+from calib.rig.columns import PAYLOAD
 from chains import se3
 from chains.arm import Mass, gravity_moment, gravity_torque
 
@@ -54,7 +55,7 @@ class ArmPayloadSag(ArmGravitySag):
     """
 
     name = "arm_payload_sag"
-    formula = "q_i = reported_i + p_i * torque of the payload, at the tip, about joint i"
+    formula = "q_i = reported_i + p_i * torque of the payloads, at the tips, about joint i"
     covariates = ("joints", "payload_kg")
     confounded_with = ("arm_gravity_sag", "arm_torque_sag")
 
@@ -63,7 +64,7 @@ class ArmPayloadSag(ArmGravitySag):
 
     def torque(self, view: View) -> np.ndarray:
         """What each joint (K, J) gives way to, N m or N."""
-        return gravity_torque(view.rig.tree, [_payload(view)], view.joints)
+        return gravity_torque(view.rig.tree, _payloads(view), view.joints)
 
 
 class ArmTorqueSag(ArmGravitySag):
@@ -182,13 +183,19 @@ class MountBending(Effect):
 
 
 def masses(view: View) -> list[Mass]:
-    """What weighs on the arm at the view's stops: its links, and the payload at its first tip."""
-    payload = [_payload(view)] if "payload_kg" in view.columns else []
-    return [*view.rig.masses, *payload]
+    """What weighs on the arm at the view's stops: its links, and the payload at each tip."""
+    return [*view.rig.masses, *_payloads(view)]
 
 
-def _payload(view: View) -> Mass:
-    return Mass(view.rig.tips[0], finite(view["payload_kg"]), np.zeros(3))
+def _payloads(view: View) -> list[Mass]:
+    """What the tips carry: the first ``payload_kg``, any other ``<tip>.payload_kg``."""
+    tips = view.rig.tips
+    columns = {tip: f"{tip}.{PAYLOAD}" for tip in tips} | {tip: PAYLOAD for tip in tips[:1]}
+    return [
+        Mass(tip, finite(view[column]), np.zeros(3))
+        for tip, column in columns.items()
+        if column in view.columns
+    ]
 
 
 def _per_joint(rig: Rig) -> tuple[Param, ...]:

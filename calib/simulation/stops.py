@@ -10,8 +10,8 @@ import numpy as np
 
 from calib.effects import Site, View
 from calib.effects.elastic import masses
-from calib.problem.model import stop_columns
 from calib.rig import Rig
+from calib.rig.columns import stop_columns
 from calib.simulation.room import FLOOR_CENTRE_M
 from calib.simulation.spec import Spec
 from calib.simulation.truth import Truth
