@@ -205,7 +205,8 @@ def misfit(estimate: Estimate, beams: Errors, weighted: bool = False) -> dict[st
     out = {}
     # Beams, where there are any, hold where the rig stands; what is a level's own is not there.
     place = set() if beams.count else {Role.PLACE}
-    owners = {"tracker": place, "level": {Role.GRAVITY}, "target": {Role.TARGET, Role.GRAVITY}}
+    level = {Role.GRAVITY, Role.ZERO}
+    owners = {"tracker": place, "level": level, "target": {Role.TARGET, Role.GRAVITY}}
     for kind, own in owners.items():
         blocks = [b for b in estimate.problem.blocks if b.kind == kind]
         if blocks:

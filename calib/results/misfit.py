@@ -139,7 +139,7 @@ def prior_rows(estimate: Estimate) -> InstrumentRows | None:
     variance = np.diag(estimate.covariance)
     at = {v.name: variance[a : a + v.dim] for v, a in zip(estimate.variables, start, strict=False)}
     known = [u for u in estimate.problem.variables.values() if u.kind == "vector"]
-    known = [u for u in known if u.role not in (Role.TARGET, Role.GRAVITY)]
+    known = [u for u in known if u.role not in (Role.TARGET, Role.GRAVITY, Role.ZERO)]
     joints = [u for u in known if u.role is Role.JOINTS]
     variances = estimate.variances([{u.name: np.eye(u.dim)} for u in joints])
     at |= {u.name: seen for u, seen in zip(joints, variances, strict=True)}
