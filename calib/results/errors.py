@@ -13,7 +13,7 @@ from calib.problem.unknowns import Role, Unknown
 from calib.residuals.beams import Rows
 from calib.residuals.groups import CAD
 from calib.residuals.scan import ScanStop
-from calib.residuals.seen import evaluated
+from calib.residuals.seen import SeenBody, evaluated
 from calib.residuals.tracker import TrackedBody
 from calib.solve.estimate import Estimate
 from calib.solve.reweight import unweighted
@@ -233,8 +233,8 @@ def _of_blocks(
             and all count with their weights.
     """
     values, unknowns = estimate.values, estimate.problem.variables
-    counted = blocks if weighted else map(unweighted, blocks)
-    rows = [(b, b.evaluate(values, False)[0], _bulk(b)) for b in counted]
+    counted = list(blocks if weighted else map(unweighted, blocks))
+    rows = [(b, r, _bulk(b)) for b, r in zip(counted, _rows_of(counted, values), strict=True)]
     if weighted:
         told = sum(int(bulk.sum()) for *_, bulk in rows)
         if 2 * told > sum(b.rows for b in blocks):
@@ -248,6 +248,13 @@ def _of_blocks(
     chi2 = sum(float(r @ r) for _, r, _ in rows)
     chi2 += sum(_prior_cost(u, values[u.name]) for u in joints)
     return float(np.sqrt(chi2 / max(1, sum(len(r) for _, r, _ in rows) - free)))
+
+
+def _rows_of(blocks: Sequence[Block], values: Mapping[str, np.ndarray]) -> list[np.ndarray]:
+    """Whitened rows of each of some blocks of one kind."""
+    if isinstance(blocks[0], SeenBody):
+        return [rows for rows, _ in evaluated(blocks, values)]
+    return [block.evaluate(values, False)[0] for block in blocks]
 
 
 def _bulk(block: Block) -> np.ndarray:
