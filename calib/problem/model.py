@@ -17,7 +17,7 @@ from calib.forward import Term, named
 from calib.residuals.groups import JOINTS, Group, GroupKind
 from calib.residuals.store import BeamStore
 from calib.rig import Rig, load_rig
-from calib.rig.columns import stop_columns, tracked_poses
+from calib.rig.columns import stop_columns, tracked_poses, up_in_root
 from calib.rig.recording import recorded
 from chains.errors import InputError
 from sensors.documents import nearest
@@ -312,6 +312,8 @@ class Source:
         columns |= {"stop": np.array(recording.stops), "location": recording.location}
         if self.rig.tracker:
             columns["tracked"] = tracked_poses(self.rig, recording)
+        if self.rig.levels:
+            columns["up"] = up_in_root(self.rig, recording)
         return {**columns, **recording.covariates}
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from calib.rig.description import Rig
 from chains import se3
 from chains.align import align_points
+from chains.arm import UPRIGHT
 from chains.errors import InputError
 from sensors.recording import RecordedStops
 
@@ -64,6 +65,19 @@ def _payload(rig: Rig, count: int, recorded: Mapping[str, np.ndarray]) -> dict[s
             "carries; keep one of the columns"
         )
     return {PAYLOAD: recorded.get(own[0], np.zeros(count))}
+
+
+def up_in_root(rig: Rig, recording: RecordedStops) -> np.ndarray:
+    """Unit vectors (K, 3) that point up in the root's frame, as levels say there on average, the
+    chain as on paper; where none was read, as at all other stops."""
+    said = [
+        np.matvec(rig.tree.transform(frame, recording.joints)[:, :3, :3], felt)
+        for frame, felt in recording.levels.items()
+    ]
+    up = np.nansum([np.full((len(recording.stops), 3), np.nan), *said], axis=0)
+    elsewhere = up.sum(axis=0) if up.any() else UPRIGHT
+    up = np.where(up.any(axis=1, keepdims=True), up, elsewhere)
+    return up / np.linalg.norm(up, axis=1, keepdims=True)
 
 
 def tracked_poses(rig: Rig, recording: RecordedStops) -> np.ndarray:

@@ -45,6 +45,36 @@ def test_joints_sag_along_gravity(source):
     np.testing.assert_allclose(basis[:, 0, 0], 0, atol=1e-9)  # its axis is upright
 
 
+@pytest.mark.parametrize("name", ["arm_gravity_sag", "base_flex"])
+def test_weights_pull_where_levels_say_that_down_is(source, name):
+    """The base leans otherwise at every stop; the slope of the height along up, downhill."""
+    joints, tree, rng = source.recording.joints, source.rig.tree, np.random.default_rng(3)
+    up = np.array([0.0, 0.0, 1.0]) + 0.2 * rng.normal(size=(len(joints), 3))
+    up /= np.linalg.norm(up, axis=1, keepdims=True)
+    basis = find(name).basis(stops_of(source, up=up))
+
+    def energy(twist, step):
+        total = 0.0
+        for mass in source.rig.masses:
+            T = tree.transform(mass.frame, joints + step, twist)
+            at = (T @ np.append(mass.centre_m, 1.0))[:, :3]
+            total = total + 9.80665 * mass.kg * np.vecdot(at, up)
+        return total
+
+    edge, nothing = tree.edge_names.index("arm_base"), np.zeros(joints.shape[1])
+    for axis in (0, 1):
+        twist, step = np.zeros((1, len(tree.edges), 6)), np.zeros(joints.shape[1])
+        if name == "base_flex":
+            twist[0, edge, axis] = 1e-5
+            found = basis[:, edge, axis, axis]
+        else:
+            step[axis] = 1e-5
+            found = basis[:, axis, axis]
+        slope = energy(twist, nothing + step) - energy(-twist, nothing - step)
+        np.testing.assert_allclose(found, -slope / 2e-5, atol=1e-5)
+    assert np.abs(basis[:, 0] if name == "arm_gravity_sag" else basis).max() > 1
+
+
 def test_a_payload_weighs_at_the_tip(source):
     joints, kg = source.recording.joints, np.linspace(0, 2, len(source.recording.stops))
     kg[0] = np.nan

@@ -19,6 +19,7 @@ from calib.problem.without import leave_out
 from calib.report import report
 from calib.residuals.levels import Level
 from calib.results.check import check
+from calib.rig.columns import up_in_root
 from calib.runs.run import RESIDUALS
 from calib.show.tables import print_run
 from calib.simulation import PRESETS, Spec, simulate
@@ -212,6 +213,19 @@ def test_a_run_tells_which_way_is_up(recording, run, capsys):
     assert np.linalg.norm(np.cross(up["xyz"], true)) < 4 * up["sigma_rad"]
     print_run(run)
     assert up["told"].split(",")[0] in " ".join(capsys.readouterr().out.split())
+
+
+def test_levels_say_where_up_is_in_the_rig_at_every_stop(recording):
+    source = Source.open(recording)
+    truth = json.loads((recording.parent / "rec.truth.json").read_text())
+    true = np.stack([np.array(at["T_faro_root"])[2, :3] for at in truth["stops"].values()])
+    off = np.linalg.norm(np.cross(source.columns["up"], true), axis=1)
+    assert off.max() < 0.01  # of hardware some mrad off its drawing
+    assert np.abs(true[:, :2]).max() > 0.001 or off.max() < 0.005
+    for felt in source.recording.levels.values():
+        felt[3] = np.nan
+    alone = up_in_root(source.rig, source.recording)
+    assert np.isfinite(alone).all() and np.allclose(np.linalg.norm(alone, axis=1), 1.0)
 
 
 def test_the_zeros_of_accelerometers_are_found_where_they_are_told_of(recording, tmp_path, capsys):
