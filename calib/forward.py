@@ -103,8 +103,10 @@ class Stops:
     def some(self, index: np.ndarray, root: str) -> Stops:
         """Those of the stops, with their root."""
 
+        chosen = slice(index[0], index[0] + 1) if len(index) == 1 else index  # a view: no copy
+
         def of(bases: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-            return {n: basis if len(basis) == 1 else basis[index] for n, basis in bases.items()}
+            return {n: basis if len(basis) == 1 else basis[chosen] for n, basis in bases.items()}
 
         bases = {"edge_bases": of(self.edge_bases), "joint_bases": of(self.joint_bases)}
         return replace(self, joints=self.joints[index], root=root, **bases)

@@ -20,6 +20,7 @@ from chains.serial import SerialChain
 from chains.xml import numbers_of, origin_of, read_robot
 
 G = 9.80665  # m/s^2
+UPRIGHT = np.array([0.0, 0.0, 1.0])  # up in a root that stands level
 _LONGEST_LINK_M = 10.0  # more is taken for millimetres, of a centre of mass as well
 _KIND: dict[str | None, Literal["revolute", "prismatic"]] = {
     "revolute": "revolute",
@@ -98,12 +99,17 @@ def read_masses(urdf_path: str | Path, base: str, *tips: str) -> list[Mass]:
 
 
 def gravity_moment(
-    tree: FrameTree, masses: Sequence[Mass], edges: Sequence[str], joints: Array
+    tree: FrameTree,
+    masses: Sequence[Mass],
+    edges: Sequence[str],
+    joints: Array,
+    up: Array = UPRIGHT,
 ) -> Array:
     """Return the moment of weights about the origins of edges (K, n, 3), N m.
 
     Of each edge, of all masses beyond it, in the axes of its origin, which its joint has not turned
-    yet: ``m = R^T sum((c - o) x (0, 0, -G kg))``, with z of the tree's root up.
+    yet: ``m = R^T sum((c - o) x (-G kg up))``, with the unit vector ``up`` (3,), or (K, 3) by stop,
+    in the tree's root.
     """
     moment = np.zeros((len(joints), len(edges), 3))
     at = [tree.edge_names.index(name) for name in edges]
@@ -112,7 +118,7 @@ def gravity_moment(
     for mass in masses:
         T = tree.transform(mass.frame, joints)
         centre_m = T[:, :3, :3] @ mass.centre_m + T[:, :3, 3]
-        weight = np.reshape(mass.kg, (-1, 1)) * [[0.0, 0.0, -G]]
+        weight = -G * np.reshape(mass.kg, (-1, 1)) * up
         beyond = set(tree.path(mass.frame))
         for n in (n for n, e in enumerate(at) if e in beyond):
             about = np.cross(centre_m - origins[n][:, :3, 3], weight)
@@ -120,11 +126,13 @@ def gravity_moment(
     return moment
 
 
-def gravity_torque(tree: FrameTree, masses: Sequence[Mass], joints: Array) -> Array:
+def gravity_torque(
+    tree: FrameTree, masses: Sequence[Mass], joints: Array, up: Array = UPRIGHT
+) -> Array:
     """Return what gravity exerts on every joint (K, J), N m about or N along its axis.
 
-    ``tau = -d(potential energy) / dq`` at ``joints`` (K, J), with z of the tree's root up: a joint
-    that gave way would turn along it.
+    ``tau = -d(potential energy) / dq`` at ``joints`` (K, J), with the unit vector ``up`` (3,), or
+    (K, 3) by stop, in the tree's root: a joint that gave way would turn along it.
     """
     torque = np.zeros(np.shape(joints))
     for mass in masses:
@@ -132,7 +140,8 @@ def gravity_torque(tree: FrameTree, masses: Sequence[Mass], joints: Array) -> Ar
         ours = [tree.joint_names.index(name) for name in chain.joint_names]
         axes = chain.axes(joints[:, ours])
         centre_m = axes.T[:, :3, :3] @ mass.centre_m + axes.T[:, :3, 3]
-        torque[:, ours] -= G * np.reshape(mass.kg, (-1, 1)) * axes.velocities(centre_m)[..., 2]
+        rise = np.vecdot(axes.velocities(centre_m), np.atleast_2d(up)[:, None])
+        torque[:, ours] -= G * np.reshape(mass.kg, (-1, 1)) * rise
     return torque
 
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import csr_array
 
+from calib.diagnosis.leverage import Leverage
 from calib.linear.clusters import ClusteredRows, Gradients
 from calib.linear.layout import Layout, positions
 from calib.linear.linearise import linearise
@@ -35,7 +36,7 @@ class Linear:
     """Normal equations of S unknowns about a solution, and their right side by clusters of rows.
 
     What belongs to stops and surfaces is eliminated from the equations, but not from the gradients:
-    these are over all U unknowns.
+    these are over all U unknowns, and made of residuals as large as errors are (`leverage`).
 
     Args:
         candidates: unknowns that the model does not have; they have no prior.
@@ -44,7 +45,9 @@ class Linear:
         columns: unknown -> its columns among the U.
         information: (S, S) of all rows; the priors of the hardware widened.
         raw: (S, S) the same before anything was eliminated.
-        gradient: (C, U) sparse, of each cluster of rows; their sum is the whole gradient.
+        gradient: (C, U) sparse, of each cluster of rows.
+        score: (U,) the whole gradient, of residuals as they are.
+        leverage: of the model on the rows.
         stop: (C,) which stop the rows of a cluster belong to, -1 for none.
         place: (C,) which part of the room they look at, -1 for none.
         weight_m2: sum of the beams' weights over their variances [1/m2]; without beams that of the
@@ -61,6 +64,8 @@ class Linear:
     information: np.ndarray
     raw: np.ndarray
     gradient: csr_array
+    score: np.ndarray
+    leverage: Leverage
     stop: np.ndarray
     place: np.ndarray
     weight_m2: float
@@ -76,6 +81,7 @@ def rows_along(
     wide: Problem,
     estimate: Estimate,
     away: Mapping[str, np.ndarray],
+    leverage: Leverage,
     progress: Callable[[int, int], None],
 ) -> Iterator[ClusteredRows]:
     """All rows along some directions, weighted; no more than a few stops' in memory.
@@ -84,6 +90,7 @@ def rows_along(
         wide: the model's problem with candidates' unknowns added.
         estimate: the model's solution.
         away: unknown -> (dim, r) the directions in it, of those of the problem and of surfaces.
+        leverage: of the model on these rows.
         progress: called with how many stops are done, and of how many.
     """
     wide, values = beside(wide, estimate)
@@ -102,7 +109,8 @@ def rows_along(
     )
     yield from beams.rows()
     every = np.arange(directions.shape[1])
-    for rows in other_rows(wide, layout, values, places):
+    others = list(other_rows(wide, layout, values, places))
+    for rows in leverage.grown(others, layout):
         yield rows._replace(A=rows.A @ directions[rows.columns], columns=every)
 
 
@@ -140,13 +148,17 @@ def linearise_with(
     )
     information, raw = linear.kept[:-1, :-1].copy(), linear.raw.copy()
     at = positions(layout.size, layout.kept)
-    for rows in other_rows(wide, layout, values, gradients):
-        gradients.add_rows(rows)
+    others = list(other_rows(wide, layout, values, gradients))
+    for rows in others:
         place = at[rows.columns]
         if (place >= 0).all():  # the others are in the linearisation
             scaled = rows.A * layout.sigma[rows.columns]
             information[np.ix_(place, place)] += scaled.T @ scaled
             raw[np.ix_(place, place)] += scaled.T @ scaled
+    leverage, more = Leverage.of(information, layout, values, WIDENED), np.zeros(layout.size)
+    for rows, grown in zip(others, leverage.grown(others, layout), strict=True):
+        gradients.add_rows(grown)
+        more[rows.columns] += rows.A.T @ (grown.b - rows.b)
     unit = layout.sigma[layout.kept]
     table, stop, place = gradients.table()
     return Linear(
@@ -157,6 +169,8 @@ def linearise_with(
         information=information / np.outer(unit, unit),
         raw=raw / np.outer(unit, unit),
         gradient=table,
+        leverage=leverage,
+        score=np.asarray(table.sum(axis=0)).ravel() - more,
         stop=stop,
         place=place,
         weight_m2=linear.weight_m2 or sum(len(b.measured) / b.sigma_m**2 for b in wide.bodies),

@@ -37,7 +37,8 @@ class Scores:
         score: (Q,).
         information: (Q, Q) left after projection.
         whole: (Q, Q) before it.
-        cells: (C, Q) shares of the score, of rows of one stop and one place.
+        cells: (C, Q) shares of the score, of rows of one stop and one place, by
+            residuals as large as errors are (`leverage`).
         stop, place: (C,) the numbers of these, -1 for none.
         weight_m2: of all beams, 1/m2.
         spent: how many unknowns of the model differ by stop alone.
@@ -135,7 +136,7 @@ def project(linear: Linear, names: Sequence[str], spent: int = 0) -> Scores:
     return Scores(
         at=at,
         owner={name: linear.owner[name] for name in names},
-        score=cells.sum(axis=0),
+        score=linear.score[own] + linear.score[others] @ away[others],
         information=information_left(linear, names),
         whole=linear.raw[np.ix_(theirs, theirs)],
         cells=cells,

@@ -321,7 +321,7 @@ class Look:
         def tell(done: int, total: int) -> None:
             progress("fitting the candidates", done, total)
 
-        for rows in rows_along(wide, stand.estimate, by_name, tell):
+        for rows in rows_along(wide, stand.estimate, by_name, self.linear.leverage, tell):
             shares.add(rows)
         return found.judged(shares)
 

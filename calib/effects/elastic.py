@@ -1,7 +1,7 @@
 """What gives way under its load: joints, links, the base, the mount.
 
-The weights are those of the URDF's links, and ``payload_kg`` at the arm's tip where stops have that
-column. The root's z axis is taken to point up.
+The weights are those of the URDF's links, and what stops say each tip of the arm carries. Up
+is where levels say; without any, the root's z axis is taken to point up.
 """
 
 from __future__ import annotations
@@ -12,8 +12,9 @@ from calib.effects.base import Effect, Param, Site, View
 from calib.effects.basis import finite
 from calib.effects.rig import mount_edges
 from calib.rig import Rig
+from calib.rig.columns import PAYLOAD
 from chains import se3
-from chains.arm import Mass, gravity_moment, gravity_torque
+from chains.arm import UPRIGHT, Mass, gravity_moment, gravity_torque
 
 PER_TORQUE = {"revolute": "rad/(N m)", "prismatic": "m/N"}
 SOFT = 2e-4  # rad/(N m): a soft gear, as of a small collaborative arm
@@ -42,7 +43,7 @@ class ArmGravitySag(Effect):
 
     def torque(self, view: View) -> np.ndarray:
         """What each joint (K, J) gives way to, N m or N."""
-        return gravity_torque(view.rig.tree, masses(view), view.joints)
+        return gravity_torque(view.rig.tree, masses(view), view.joints, up(view))
 
 
 class ArmPayloadSag(ArmGravitySag):
@@ -54,7 +55,7 @@ class ArmPayloadSag(ArmGravitySag):
     """
 
     name = "arm_payload_sag"
-    formula = "q_i = reported_i + p_i * torque of the payload, at the tip, about joint i"
+    formula = "q_i = reported_i + p_i * torque of the payloads, at the tips, about joint i"
     covariates = ("joints", "payload_kg")
     confounded_with = ("arm_gravity_sag", "arm_torque_sag")
 
@@ -63,7 +64,7 @@ class ArmPayloadSag(ArmGravitySag):
 
     def torque(self, view: View) -> np.ndarray:
         """What each joint (K, J) gives way to, N m or N."""
-        return gravity_torque(view.rig.tree, [_payload(view)], view.joints)
+        return gravity_torque(view.rig.tree, _payloads(view), view.joints, up(view))
 
 
 class ArmTorqueSag(ArmGravitySag):
@@ -113,7 +114,7 @@ class ArmLinkBending(Effect):
         leading = {e.joint.name: e for e in tree.edges if e.joint is not None and e.joint.leads}
         edges = [leading[joint] for joint in joints]
         names = [edge.name for edge in edges]
-        moment = gravity_moment(tree, masses(view), names, view.joints)
+        moment = gravity_moment(tree, masses(view), names, view.joints, up(view))
         axes = np.stack([edge.joint.axis for edge in edges])
         moment -= np.einsum("kni,ni,nj->knj", moment, axes, axes)
         basis = np.zeros((len(moment), len(tree.edges), 6, len(joints)))
@@ -141,7 +142,7 @@ class BaseFlex(Effect):
         """At the edge that leads to the arm's base; at the arm's first where there is none."""
         tree, first = view.rig.tree, view.rig.edge(view.rig.chains[0][0])
         edge = next((edge for edge in tree.edges if edge.child == first.parent), first)
-        moment = gravity_moment(tree, masses(view), [edge.name], view.joints)[:, 0]
+        moment = gravity_moment(tree, masses(view), [edge.name], view.joints, up(view))[:, 0]
         basis = np.zeros((len(moment), len(tree.edges), 6, 2))
         for axis in (0, 1):
             basis[:, tree.edge_names.index(edge.name), axis, axis] = moment[:, axis]
@@ -151,7 +152,7 @@ class BaseFlex(Effect):
 class MountBending(Effect):
     """The mount bends under the LiDAR's weight. It gives way alike to all sides.
 
-    The lever points from the mount to the LiDAR as CAD has it, gravity along -z of the root.
+    The lever points from the mount to the LiDAR as CAD has it.
     """
 
     name = "mount_bending"
@@ -177,18 +178,30 @@ class MountBending(Effect):
         length_m = np.linalg.norm(lever_m, axis=1, keepdims=True)
         lever = np.where(length_m > 1e-9, lever_m / np.maximum(length_m, 1e-9), [0.0, 0.0, 1.0])
         basis = np.zeros((len(lever), len(tree.edges), 6, 1))
-        basis[:, edge, :3, 0] = np.cross(lever, -T_root_mount[:, 2, :3])
+        down = -np.matvec(T_root_mount[:, :3, :3].mT, up(view))
+        basis[:, edge, :3, 0] = np.cross(lever, down)
         return basis
 
 
 def masses(view: View) -> list[Mass]:
-    """What weighs on the arm at the view's stops: its links, and the payload at its first tip."""
-    payload = [_payload(view)] if "payload_kg" in view.columns else []
-    return [*view.rig.masses, *payload]
+    """What weighs on the arm at the view's stops: its links, and the payload at each tip."""
+    return [*view.rig.masses, *_payloads(view)]
 
 
-def _payload(view: View) -> Mass:
-    return Mass(view.rig.tips[0], finite(view["payload_kg"]), np.zeros(3))
+def up(view: View) -> np.ndarray:
+    """The unit vector (3,), or (K, 3) by stop, that points up in the root's frame."""
+    return view["up"] if "up" in view.columns else UPRIGHT
+
+
+def _payloads(view: View) -> list[Mass]:
+    """What the tips carry: the first ``payload_kg``, any other ``<tip>.payload_kg``."""
+    tips = view.rig.tips
+    columns = {tip: f"{tip}.{PAYLOAD}" for tip in tips} | {tip: PAYLOAD for tip in tips[:1]}
+    return [
+        Mass(tip, finite(view[column]), np.zeros(3))
+        for tip, column in columns.items()
+        if column in view.columns
+    ]
 
 
 def _per_joint(rig: Rig) -> tuple[Param, ...]:

@@ -19,9 +19,10 @@ from calib.effects import FrameOffset
 from calib.forward import Placed, place
 from calib.linear.parallel import one_blas_thread
 from calib.problem import Problem
-from calib.problem.model import Source, stop_columns
+from calib.problem.model import Source
 from calib.results.intervals import Intervals, intervals
 from calib.results.reach import body_beyond, columns_at, joint_range, placed
+from calib.rig.columns import stop_columns
 from calib.runs.reopen import model_of, problem_of, reopened, start_of, state_of
 from calib.runs.run import Run
 from calib.solve.estimate import Estimate

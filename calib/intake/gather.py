@@ -40,7 +40,8 @@ Given = tuple[str, Sequence[Path]]
 
 @dataclass(frozen=True)
 class Gathered:
-    """What all sources hold; the fields are those of `Contents`, `edges` the arm's chain."""
+    """What all sources hold; the fields are those of `Contents`, `edges` the arm's, to all of its
+    tips."""
 
     tracks: list[Track]
     sweeps: list[Sweeps]
@@ -61,8 +62,9 @@ class Gathered:
 
     @property
     def read_chain(self) -> list[Edge]:
-        """The arm's chain, where its joints tell how its tip moves: where all of them are read."""
-        return [] if self.passive else self.edges
+        """The arm's chain to its first tip, where its joints tell how that moves: where all of them
+        are read."""
+        return [] if self.passive or self.arm is None else chain(replace(self.arm, others=()))
 
 
 def sources(words: Sequence[str]) -> list[Given]:
@@ -117,6 +119,8 @@ def gather(
     arms = [Contents(arm=_arm_beside(rig))] if rig else []
     arms += [_read(kind, files, options, progress) for kind, files in given if kind in ARMS]
     arm = _only([f.arm for f in arms if f.arm], "describe an arm", [k for k, _ in given])
+    others = _tips_of(rig)[1:] if rig else ()
+    arm = arm and replace(arm, others=others)
     edges = chain(arm)
     passive = section(rig, "arm").get("passive") or () if rig else ()
     options = replace(options, joints=_read_joints(edges, passive))
@@ -124,6 +128,7 @@ def gather(
     if arm is None:
         arm = _only([f.arm for f in rest if f.arm], "describe an arm", [k for k, _ in given])
         arm = with_ends("the description of the arm", arm, options) if arm else None
+        arm = arm and replace(arm, others=others)
         edges = chain(arm)
     contents = [*arms, *rest]
     names = [kind for kind, _ in given]
@@ -153,14 +158,14 @@ def _read_joints(edges: Sequence[Edge], passive: Collection[str]) -> dict[str, s
 
 
 def chain(arm: ArmDescription | None) -> list[Edge]:
-    """The edges of an arm from its base to its tip; none of no arm."""
+    """The edges of an arm from its base to its tips; none of no arm."""
     if arm is None:
         return []
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "arm.urdf"
         path.write_text(arm.urdf, encoding="utf-8")
         try:
-            return read_arm(path, arm.base, arm.tip)
+            return read_arm(path, arm.base, arm.tip, *arm.others)
         except InputError as error:
             raise InputError(str(error).replace(str(path), "the arm")) from None
 
@@ -174,16 +179,16 @@ def section(rig: Path, name: str) -> dict[str, Any]:
 
 def _arm_of(rig: Path) -> dict[str, str]:
     """Where the arm's URDF is and between which links it moves, or nothing."""
-    arm = section(rig, "arm")
-    if not {"urdf", "base", "tip"} <= arm.keys():
+    arm, tips = section(rig, "arm"), _tips_of(rig)
+    if not {"urdf", "base"} <= arm.keys() or not tips:
         return {}
-    tips = arm["tip"] if isinstance(arm["tip"], list) else [arm["tip"]]
-    if len(tips) != 1:
-        raise InputError(
-            f"{rig}: arm.tip: import follows an arm to one tip; name one here, and the others in "
-            "the recording's rig.yaml"
-        )
-    return {"urdf": str(arm["urdf"]), "base": str(arm["base"]), "tip": str(tips[0])}
+    return {"urdf": str(arm["urdf"]), "base": str(arm["base"]), "tip": tips[0]}
+
+
+def _tips_of(rig: Path) -> tuple[str, ...]:
+    """The links that the arm ends at."""
+    tip = section(rig, "arm").get("tip") or ()
+    return tuple(map(str, tip)) if isinstance(tip, list) else (str(tip),) if tip else ()
 
 
 def refuse_parts(gathered: Gathered, rig: Path | None) -> None:

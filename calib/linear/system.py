@@ -17,6 +17,7 @@ from calib.linear.rows import OwnSums, Weighing
 
 Values = Mapping[str, np.ndarray]
 ROWS_AT_ONCE = 1024  # rows whose variances are computed at once: bounds the memory
+ELIMINATED_AT_ONCE = 128  # stops whose unknowns follow from the kept in one product, likewise
 
 
 @dataclass(frozen=True)
@@ -86,8 +87,10 @@ class Linearisation:
         layout = self.layout
         out = np.zeros((layout.size + 1, kept.shape[1]))
         out[layout.kept], out[-1] = kept[:-1], kept[-1]
-        by_twist = None
-        for each in reversed(self.eliminated):
+        by_twist, together = None, self._about_kept()
+        if together:
+            self._follow_kept(out, together)
+        for each in reversed(self.eliminated[: len(self.eliminated) - len(together)]):
             if each.twists:
                 if by_twist is None:
                     by_twist = self._twists(out)
@@ -96,6 +99,29 @@ class Linearisation:
             else:
                 out[each.columns] = -each.gain @ out[each.over]
         return out[:-1]
+
+    def _about_kept(self) -> Sequence[Eliminated]:
+        """The last that were eliminated, which depend on nothing but what was kept."""
+        is_kept = np.append(np.zeros(self.layout.size, bool), True)
+        is_kept[self.layout.kept] = True
+        count = 0
+        for each in reversed(self.eliminated):
+            if each.twists or not is_kept[each.over].all():
+                break
+            count += 1
+        return self.eliminated[len(self.eliminated) - count :]
+
+    def _follow_kept(self, out: np.ndarray, some: Sequence[Eliminated]) -> None:
+        """Write into `out` (U + 1, q) what follows from the kept alone, many at once."""
+        over = np.append(self.layout.kept, self.layout.size)
+        at, kept = positions(self.layout.size + 1, over), out[over]
+        for first in range(0, len(some), ELIMINATED_AT_ONCE):
+            batch = some[first : first + ELIMINATED_AT_ONCE]
+            gain = np.zeros((sum(len(each.columns) for each in batch), len(over)))
+            ends = np.cumsum([0, *(len(each.columns) for each in batch)])
+            for each, start, end in zip(batch, ends, ends[1:], strict=False):
+                gain[start:end, at[each.over]] = each.gain
+            out[np.concatenate([each.columns for each in batch])] = -gain @ kept
 
     def followed(self, kept: np.ndarray) -> np.ndarray:
         """Directions in all unknowns (U, q) that follow from those in the kept (S, q), in the
@@ -138,9 +164,13 @@ class Linearisation:
         sigma = self.layout.sigma
         left = np.hstack([rows * sigma, np.zeros((len(rows), 1))])
         by_twist = np.zeros((len(rows), 6 * len(self.twists)))
+        touched = np.any(left != 0, axis=0)
         for each in self.eliminated:
-            if each.twists == 0 and by_twist.any():
+            if each.twists == 0 and self.twists and by_twist.any():
                 self._through(by_twist, left)
+                touched = np.any(left != 0, axis=0)
+            if not touched[each.columns].any():
+                continue
             some = np.flatnonzero(np.any(left[:, each.columns] != 0, axis=1))
             if not len(some):
                 continue
@@ -149,6 +179,7 @@ class Linearisation:
             further = mine @ each.gain
             by_twist[some, : each.twists] -= further[:, : each.twists]
             left[np.ix_(some, each.over[each.twists :])] -= further[:, each.twists :]
+            touched[each.over[each.twists :]] = True
         self._through(by_twist, left)
         last = left[:, self.layout.kept] / sigma[self.layout.kept]
         yield np.arange(len(rows)), last, kept @ last.T

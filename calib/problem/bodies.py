@@ -13,6 +13,7 @@ from calib.residuals.groups import Group, level_of
 from calib.residuals.levels import Level
 from calib.residuals.targets import TARGET_PARTS, HangingTarget
 from calib.residuals.tracker import TrackedBody
+from chains import se3
 
 GRAVITY = "gravity"  # the unknown of where down is: rods hang along it, levels feel it
 NO_LEVEL_READ = np.array([0.0, 0.0, -1.0])  # until one is, down is where most worlds have it
@@ -46,10 +47,12 @@ def add_bodies(problem: Problem, part: SourceStops, places: Places) -> None:
 
 
 def add_levels(problem: Problem, part: SourceStops, places: Places) -> None:
-    """Add gravity, and a block for every level and group of stops that share all unknowns."""
+    """Add gravity, the zeros of levels, and a block for every level and group of stops that share
+    all unknowns."""
     levels, recording = part.source.rig.levels, part.source.recording
     if levels is None:
         return
+    zeros = {frame: _add_zero(problem, part, frame) for frame in levels.frames}
     blocks = [
         Level(
             name=f"{level_of(frame)} at {recording.stops[read[0]]}",
@@ -58,6 +61,7 @@ def add_levels(problem: Problem, part: SourceStops, places: Places) -> None:
             measured=felt[read],
             gravity=GRAVITY,
             sigma_rad=levels.sigma_rad,
+            bases={name: turned_by_zero(felt[read]) for name in zeros[frame]},
             stop_names=[(recording.folder, int(k)) for k in read],
             groups=tuple(
                 Group("level", recording.stops[k], level_of(frame), part.label) for k in read
@@ -71,6 +75,34 @@ def add_levels(problem: Problem, part: SourceStops, places: Places) -> None:
     ups = [np.matvec(R, b.measured).sum(axis=0) for R, b in zip(turns, blocks, strict=True)]
     _add_gravity(problem, -np.sum(ups, axis=0) if blocks else NO_LEVEL_READ)
     problem.blocks += blocks
+
+
+def zero_of(prefix: str, frame: str) -> str:
+    """Name of the unknown of what the axes of a frame's level read where they feel nothing; of
+    several recordings, before it stands which."""
+    return f"{prefix}{level_of(frame)} zero"
+
+
+def _add_zero(problem: Problem, part: SourceStops, frame: str) -> list[str]:
+    """Add the zeros of a level, where they may differ from none; their name."""
+    sigma = part.source.rig.levels.sigma_zero_rad
+    if sigma is None:
+        return []
+    unknown = vector_unknown(
+        zero_of(part.prefix, frame),
+        np.full(3, sigma),
+        dofs=("x", "y", "z"),
+        units=("rad",) * 3,
+        role=Role.ZERO,
+        owner=Owner(recording=part.label, where=frame),
+    )
+    return [problem.add(unknown)]
+
+
+def turned_by_zero(felt: np.ndarray) -> np.ndarray:
+    """The twist (K, 6, 3) of a level per unit of its zeros b, over 1 g: what it feels along m
+    (K, 3) becomes ``m + b``, as if it had turned by ``b x m``."""
+    return np.concatenate([-se3.skew(felt), np.zeros((len(felt), 3, 3))], axis=1)
 
 
 def _add_gravity(problem: Problem, down: np.ndarray) -> None:

@@ -17,9 +17,9 @@ from calib.forward import Term, named
 from calib.residuals.groups import JOINTS, Group, GroupKind
 from calib.residuals.store import BeamStore
 from calib.rig import Rig, load_rig
+from calib.rig.columns import stop_columns, tracked_poses, up_in_root
 from calib.rig.recording import recorded
-from chains import remote, se3
-from chains.align import align_points
+from chains import remote
 from chains.errors import InputError
 from sensors.documents import nearest
 from sensors.recording import RecordedStops
@@ -313,6 +313,8 @@ class Source:
         columns |= {"stop": np.array(recording.stops), "location": recording.location}
         if self.rig.tracker:
             columns["tracked"] = tracked_poses(self.rig, recording)
+        if self.rig.levels:
+            columns["up"] = up_in_root(self.rig, recording)
         return {**columns, **recording.covariates}
 
 
@@ -343,56 +345,3 @@ def same_mesh(a: Reference | None, b: Reference | None) -> bool:
     if a is None or b is None or a is b:
         return a is b
     return np.array_equal(a.vertices_m, b.vertices_m) and np.array_equal(a.triangles, b.triangles)
-
-
-def stop_columns(
-    rig: Rig, joints: np.ndarray, time_s: np.ndarray, recorded: Mapping[str, np.ndarray]
-) -> dict[str, np.ndarray]:
-    """What follows from when and how the arm came to each of K stops, (K,) each.
-
-    Each joint by its name as reported, rad or m; ``torques`` (K, J), N m or N, where any column
-    ``<joint>.torque`` was recorded; and, where the times are known: ``time_s``;
-    ``elapsed_s`` since the first stop; ``travel.<joint>``, how far a joint went since the stop
-    before, rad or m; ``moved.<joint>``, which way: -1, 0 or 1. Of the first both are 0: nothing
-    is known of it.
-
-    Args:
-        rig: whose joints they are.
-        joints: (K, J) reported.
-        time_s: (K,) of the stops; NaN where nothing says when they were made.
-        recorded: the recording's own columns.
-    """
-    columns = dict(zip(rig.joint_names, joints.T, strict=True))
-    torques = {name: f"{name}.torque" for name in rig.joint_names}
-    if any(name in recorded for name in torques.values()):
-        unknown = np.full(len(joints), np.nan)
-        columns["torques"] = np.stack([recorded.get(c, unknown) for c in torques.values()], axis=1)
-    if not np.isfinite(time_s).all():
-        return columns
-    order = np.argsort(time_s, kind="stable")
-    travel = np.zeros(np.shape(joints))
-    travel[order[1:]] = np.diff(joints[order], axis=0)
-    columns |= {"time_s": time_s, "elapsed_s": time_s - time_s.min(initial=np.inf)}
-    for name, went in zip(rig.joint_names, travel.T, strict=True):
-        columns |= {f"travel.{name}": went, f"moved.{name}": np.sign(went)}
-    return columns
-
-
-def tracked_poses(rig: Rig, recording: RecordedStops) -> np.ndarray:
-    """T_world_body (K, B, 4, 4) of the tracked bodies as measured, NaN where not known.
-
-    Bodies seen as points are turned as CAD says, the rig lying as three or more points say.
-    """
-    seen = np.stack([recording.bodies[body] for body in rig.tracker.bodies], axis=1)
-    T = se3.from_xyz_quat(seen[..., :3], seen[..., 3:])
-    nominal = [rig.tree.place(b, recording.joints).Ts_root_frame for b in rig.tracker.bodies]
-    nominal = np.stack(nominal, axis=1)
-    points = np.isfinite(seen[..., 0]) & ~np.isfinite(seen[..., 3:]).all(axis=-1)
-    for k in np.flatnonzero(points.any(axis=1)):
-        at = np.flatnonzero(points[k])
-        try:
-            T_world_root, _ = align_points(seen[k, at, :3], nominal[k, at, :3, 3])
-        except InputError:
-            continue
-        T[k, at, :3, :3] = T_world_root[:3, :3] @ nominal[k, at, :3, :3]
-    return T

@@ -28,6 +28,7 @@ class Role(Enum):
     JOINTS = "joints"  # what the encoders misreport at one stop
     TARGET = "target"  # a rod's marker
     GRAVITY = "gravity"  # which way is down
+    ZERO = "zero"  # what the axes of a level read where they feel nothing
     PLANE = "plane"  # planes found in the scans
     SURFACE = "surface"  # how far parts of the mesh, or of planes, stand off the room
     SCATTER = "scatter"  # what chance does anew to each stop or location

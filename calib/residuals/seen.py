@@ -164,11 +164,7 @@ class BodiesTogether:
 
     def evaluate(self, values: Values) -> Iterator[tuple[np.ndarray, Derivatives]]:
         """Rows and derivatives of each block, as `SeenBody.evaluate` gives them."""
-        own = {
-            name: np.concatenate([np.repeat(values[v][None], len(b.measured), 0) for v, b in pairs])
-            for name, pairs in self._own().items()
-        }
-        residual, d = self.whole.evaluate({**values, **own}, True)
+        residual, d = self.whole.evaluate({**values, **self._at(values)}, True)
         count = len(self.blocks)
         rows = residual.reshape(count, -1)
         by = {name: x.reshape(count, rows.shape[1], -1) for name, x in d.items()}
@@ -176,9 +172,31 @@ class BodiesTogether:
             named = dict(zip(self.whole.stops.own, block.stops.own, strict=True))
             yield rows[k], {named.get(name, name): x[k] for name, x in by.items()}
 
+    def in_world(self, values: Values) -> Iterator[np.ndarray]:
+        """T_world_body (K, 4, 4) of each block, without what the instrument adds."""
+        T = self.whole.stops.in_world(self.whole.body, {**values, **self._at(values)}, False).T
+        return iter(T.reshape(len(self.blocks), -1, 4, 4))
+
+    def _at(self, values: Values) -> dict[str, np.ndarray]:
+        """Values of the blocks' own unknowns, as those of the whole."""
+        return {
+            name: np.concatenate([np.repeat(values[v][None], len(b.measured), 0) for v, b in pairs])
+            for name, pairs in self._own().items()
+        }
+
     def _own(self) -> dict[str, list[tuple[str, SeenBody]]]:
         names = self.whole.stops.own
         return {n: [(b.stops.own[i], b) for b in self.blocks] for i, n in enumerate(names)}
+
+
+def evaluated(blocks: Sequence[SeenBody], values: Values) -> list[tuple[np.ndarray, Derivatives]]:
+    """Whitened rows and derivatives of each of some blocks, in their order."""
+    found = {
+        id(block): each
+        for together in BodiesTogether.of(blocks)
+        for block, each in zip(together.blocks, together.evaluate(values), strict=True)
+    }
+    return [found[id(block)] for block in blocks]
 
 
 def _whole(blocks: Sequence[SeenBody]) -> SeenBody:

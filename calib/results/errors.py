@@ -13,10 +13,10 @@ from calib.problem.unknowns import Role, Unknown
 from calib.residuals.beams import Rows
 from calib.residuals.groups import CAD
 from calib.residuals.scan import ScanStop
+from calib.residuals.seen import SeenBody, evaluated
 from calib.residuals.tracker import TrackedBody
 from calib.solve.estimate import Estimate
 from calib.solve.reweight import unweighted
-from chains import se3
 
 # Redundancy of all that CAD says of frames, below which nothing is told of how right it is: with
 # less than one row's worth, chance alone puts the ratio anywhere.
@@ -159,26 +159,29 @@ def body_errors(
         predicted: where their place was predicted and not fitted, the estimate whose marginals say
             how well; its share belongs to what is expected.
     """
-    out, own = Errors(), [] if predicted is None else predicted.problem.blocks
-    for block in blocks:
-        placed = block.stops.in_world(block.body, values)
-        added = sum((B @ values[n] for n, B in block.bases.items()), np.zeros((1, 6)))
-        seen = placed.T @ se3.exp(added)
-        distance = np.linalg.norm(block.measured[:, :3, 3] - seen[:, :3, 3], axis=1)
-        expected = 3.0 * block.sigma_m**2 * len(distance)
-        if predicted is not None:
-            names = list(placed.d)
-            d = placed.by(names)[:, 3:]
-            known = np.einsum("kip,pq,kiq->", d, predicted.covariance_of(names), d)
-            expected += -known if any(block is each for each in own) else known
+    out, own = Errors(), set() if predicted is None else set(map(id, predicted.problem.blocks))
+    found = evaluated([unweighted(block) for block in blocks], values)
+    at = [_positions(block) for block in blocks]
+    known = [np.zeros(3)] * len(blocks)
+    if predicted is not None:
+        rows = zip(found, at, strict=True)
+        known = predicted.variances([{n: x[some] for n, x in d.items()} for (_, d), some in rows])
+    for block, (residual, _), some, variance in zip(blocks, found, at, known, strict=True):
+        squares = np.square(block.sigma_m * residual[some]).reshape(-1, 3).sum(axis=1)
+        more = float(variance.sum()) * (-1.0 if id(block) in own else 1.0)
         out += Errors(
-            count=len(distance),
-            total_m=float(distance.sum()),
-            squares_m2=float(distance @ distance),
-            expected_m2=expected,
-            each_m2=tuple(np.square(distance).tolist()),
+            count=len(squares),
+            total_m=float(np.sqrt(squares).sum()),
+            squares_m2=float(squares.sum()),
+            expected_m2=block.sigma_m**2 * (3.0 * len(squares) + more),
+            each_m2=tuple(squares.tolist()),
         )
     return out
+
+
+def _positions(block: TrackedBody) -> np.ndarray:
+    """Which of a block's rows are of positions."""
+    return np.flatnonzero(np.tile(np.array(block.units) == "m", len(block.measured)))
 
 
 def misfit(estimate: Estimate, beams: Errors, weighted: bool = False) -> dict[str, float]:
@@ -202,7 +205,8 @@ def misfit(estimate: Estimate, beams: Errors, weighted: bool = False) -> dict[st
     out = {}
     # Beams, where there are any, hold where the rig stands; what is a level's own is not there.
     place = set() if beams.count else {Role.PLACE}
-    owners = {"tracker": place, "level": {Role.GRAVITY}, "target": {Role.TARGET, Role.GRAVITY}}
+    level = {Role.GRAVITY, Role.ZERO}
+    owners = {"tracker": place, "level": level, "target": {Role.TARGET, Role.GRAVITY}}
     for kind, own in owners.items():
         blocks = [b for b in estimate.problem.blocks if b.kind == kind]
         if blocks:
@@ -229,8 +233,8 @@ def _of_blocks(
             and all count with their weights.
     """
     values, unknowns = estimate.values, estimate.problem.variables
-    counted = blocks if weighted else map(unweighted, blocks)
-    rows = [(b, b.evaluate(values, False)[0], _bulk(b)) for b in counted]
+    counted = list(blocks if weighted else map(unweighted, blocks))
+    rows = [(b, r, _bulk(b)) for b, r in zip(counted, _rows_of(counted, values), strict=True)]
     if weighted:
         told = sum(int(bulk.sum()) for *_, bulk in rows)
         if 2 * told > sum(b.rows for b in blocks):
@@ -244,6 +248,13 @@ def _of_blocks(
     chi2 = sum(float(r @ r) for _, r, _ in rows)
     chi2 += sum(_prior_cost(u, values[u.name]) for u in joints)
     return float(np.sqrt(chi2 / max(1, sum(len(r) for _, r, _ in rows) - free)))
+
+
+def _rows_of(blocks: Sequence[Block], values: Mapping[str, np.ndarray]) -> list[np.ndarray]:
+    """Whitened rows of each of some blocks of one kind."""
+    if isinstance(blocks[0], SeenBody):
+        return [rows for rows, _ in evaluated(blocks, values)]
+    return [block.evaluate(values, False)[0] for block in blocks]
 
 
 def _bulk(block: Block) -> np.ndarray:

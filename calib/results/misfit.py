@@ -18,6 +18,7 @@ from calib.effects import FrameOffset, Site
 from calib.linear.layout import StopKey, key_of
 from calib.problem.model import Source, recording_names
 from calib.problem.unknowns import Role, Unknown
+from calib.residuals.seen import evaluated
 from calib.residuals.targets import TARGET_PARTS, HangingTarget
 from calib.results.errors import Errors
 from calib.solve.estimate import Estimate
@@ -90,7 +91,7 @@ def seen_rows(estimate: Estimate, kind: str) -> InstrumentRows | None:
     """
     names, out = _stop_names(estimate), _Gathered()
     bodies = [block for block in estimate.problem.seen if block.kind == kind]
-    found = [unweighted(block).evaluate(estimate.values, True) for block in bodies]
+    found = evaluated([unweighted(block) for block in bodies], estimate.values)
     variances = estimate.variances([d for _, d in found])
     for block, (residual, _), variance in zip(bodies, found, variances, strict=True):
         stops = [names[key] for key in block.stop_names]
@@ -138,7 +139,7 @@ def prior_rows(estimate: Estimate) -> InstrumentRows | None:
     variance = np.diag(estimate.covariance)
     at = {v.name: variance[a : a + v.dim] for v, a in zip(estimate.variables, start, strict=False)}
     known = [u for u in estimate.problem.variables.values() if u.kind == "vector"]
-    known = [u for u in known if u.role not in (Role.TARGET, Role.GRAVITY)]
+    known = [u for u in known if u.role not in (Role.TARGET, Role.GRAVITY, Role.ZERO)]
     joints = [u for u in known if u.role is Role.JOINTS]
     variances = estimate.variances([{u.name: np.eye(u.dim)} for u in joints])
     at |= {u.name: seen for u, seen in zip(joints, variances, strict=True)}

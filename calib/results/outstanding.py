@@ -84,7 +84,8 @@ def outstanding(summary: Mapping[str, Any]) -> dict[str, float]:
     """
     found = groups(summary)
     like = {key: key.rpartition(", ")[2] if ", " in key else "target" for key in found}
-    ratios = {name: [x for key, x in found.items() if like[key] == name] for name in like.values()}
+    kinds = set(like.values())
+    ratios = {name: [x for key, x in found.items() if like[key] == name] for name in kinds}
     usual = {name: max(1.0, median_low([1.0, *each])) for name, each in ratios.items()}
     limit = summary.get("misfit_by", {}).get("limit", {})
     least = {name: max(STANDS_OUT, limit.get(name, 0.0)) for name in ratios}

@@ -15,7 +15,7 @@ from calib.problem import Problem
 from calib.problem.bodies import GRAVITY
 from calib.problem.model import Source
 from calib.problem.spread import names_of
-from calib.problem.unknowns import POSE_UNITS, Key
+from calib.problem.unknowns import POSE_UNITS, Key, Role
 from calib.residuals.levels import down
 from calib.results.intervals import Intervals
 from calib.results.observability import not_estimated
@@ -188,6 +188,26 @@ def up_of(estimate: Estimate, widened: float) -> dict[str, Any] | None:
     lean, known = 1e3 * np.arctan2(np.hypot(*g[:2]), -g[2]), 1e3 * sigma_rad
     told = f"up lies {lean:.2f} mrad off z of '{world}', and is known to {known:.2g} mrad"
     return {"frame": world, "xyz": -g, "sigma_rad": sigma_rad, "told": told}
+
+
+def zeros_of(estimate: Estimate, widened: float) -> list[dict[str, Any]]:
+    """What the axes of each level read where they feel nothing, over 1 g, as summary.json holds it.
+
+    Args:
+        estimate: the solution.
+        widened: by how much its sigmas are too small.
+    """
+    out = []
+    for name in (n for n, u in estimate.problem.variables.items() if u.role is Role.ZERO):
+        owner, xyz = estimate.problem.variables[name].owner, estimate.values[name]
+        sigma = widened * np.sqrt(np.diag(estimate.covariance_of([name])))
+        axes = zip("xyz", 1e3 * xyz, 1e3 * sigma, strict=True)
+        told = ", ".join(f"{axis} {b:+.2f} ± {s:.2g}" for axis, b, s in axes)
+        out.append(
+            {"frame": owner.where, "recording": owner.recording, "xyz": xyz, "sigma_rad": sigma}
+            | {"told": f"zeros of the level in '{owner.where}', mrad: {told}"}
+        )
+    return out
 
 
 def _frame(source: Source, term: Term, theta: np.ndarray, covariance: np.ndarray) -> FrameEstimate:

@@ -40,6 +40,8 @@ class Levels:
     frames: tuple[str, ...]
     sigma_rad: float
     """Of a direction, about either axis across it."""
+    sigma_zero_rad: float | None = None
+    """Of what an axis reads where it feels nothing, over 1 g; None where that counts as none."""
     up: tuple[float, float, float] | None = None
     sigma_up_rad: float | None = None
 

@@ -117,6 +117,7 @@ class LevelsDocument(Document):
 
     frames: Names
     sigma_rad: Sigma
+    sigma_zero_rad: Sigma | None = None
     up: tuple[Number, Number, Number] | None = None
     sigma_up_rad: Sigma | None = None
 

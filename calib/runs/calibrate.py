@@ -36,7 +36,7 @@ from calib.results.misfit import (
 from calib.results.reach import reach
 from calib.results.recalibrate import Link, earlier, solve_from
 from calib.results.rings import documents as odd_rings
-from calib.results.solution import solution_of, up_of
+from calib.results.solution import solution_of, up_of, zeros_of
 from calib.results.stages import FIT, staged
 from calib.runs.belief import TOLERATED, limits
 from calib.runs.reopen import identity, model_of, proposed, reopened, start_of, stored_met
@@ -243,6 +243,7 @@ def _fit(
     summary |= {"rings": odd_rings(sources), "set_aside": sorted(estimate.problem.set_aside)}
     summary["predicted_mm"] = reached.document() if reached else None
     summary |= {"up": up} if (up := up_of(estimate, widened)) else {}
+    summary |= {"level_zeros": zeros} if (zeros := zeros_of(estimate, widened)) else {}
     summary["seconds"] = time.monotonic() - began
     if links is not None:
         summary["links"] = [link_document(link) for link in links]

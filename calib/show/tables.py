@@ -104,7 +104,8 @@ def print_run(run: Run, whole: bool = False) -> None:
     if told := beams_told(summary):
         print_pairs(console, "of how many beams", [("", line) for line in told])
     if up := summary.get("up"):
-        print_pairs(console, "which way is up", [("", up["told"])])
+        zeros = [("", zero["told"]) for zero in summary.get("level_zeros", ())]
+        print_pairs(console, "which way is up", [("", up["told"]), *zeros])
     if predicted := summary.get("predicted_mm"):
         print_pairs(console, "how well the arm is known", [("", t) for t in predicted["told"]])
     if told := standing_out(summary):

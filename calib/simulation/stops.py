@@ -10,8 +10,8 @@ import numpy as np
 
 from calib.effects import Site, View
 from calib.effects.elastic import masses
-from calib.problem.model import stop_columns
 from calib.rig import Rig
+from calib.rig.columns import stop_columns
 from calib.simulation.room import FLOOR_CENTRE_M
 from calib.simulation.spec import Spec
 from calib.simulation.truth import Truth
@@ -52,7 +52,8 @@ class SimulatedStops:
         """What effects may look at (K,), by name, as in a fit."""
         known = {"stop": np.array(self.names), "location": np.array(self.location)}
         own = stop_columns(rig, self.joints, self.columns["time_s"], self.columns)
-        return {**own, **self.columns, **known}
+        up = {"up": self.Ts_faro_root[:, 2, :3]} if rig.levels else {}
+        return {**own, **up, **self.columns, **known}
 
 
 def plan(rig: Rig, spec: Spec, mesh: Reference, rng: np.random.Generator) -> SimulatedStops:

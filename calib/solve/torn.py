@@ -20,6 +20,7 @@ from calib.linear.parallel import over_stops
 from calib.problem.problem import Problem
 from calib.residuals.groups import Group
 from calib.residuals.scan import ScanStop
+from calib.residuals.seen import BodiesTogether
 from calib.residuals.tracker import TrackedBody
 from chains import se3
 from chains.errors import InputError
@@ -44,8 +45,14 @@ def away(problem: Problem, values: Values) -> dict[str, list[tuple[TrackedBody, 
     """Body -> its blocks, and at each of their K stops how far (K,) it was seen from where the
     chain puts it, in m or rad, whichever is more."""
     out: dict[str, list[tuple[TrackedBody, np.ndarray]]] = {}
+    together = BodiesTogether.of(problem.bodies)
+    placed = {
+        id(b): T
+        for some in together
+        for b, T in zip(some.blocks, some.in_world(values), strict=True)
+    }
     for block in problem.bodies:
-        T = block.stops.in_world(block.body, values, False).T
+        T = placed[id(block)]
         far = np.linalg.norm(block.measured[:, :3, 3] - T[:, :3, 3], axis=1)
         if not block.is_point:
             turn = se3.so3_log(T[:, :3, :3].mT @ block.measured[:, :3, :3])

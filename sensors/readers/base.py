@@ -78,11 +78,15 @@ class Sweeps:
 
 @dataclass(frozen=True)
 class ArmDescription:
-    """An arm: the text of a URDF, and the links between which it moves (None = not known)."""
+    """An arm: the text of a URDF, and the links between which it moves (None = not known).
+
+    It may end at more than the first tip: at ``others``, too.
+    """
 
     urdf: str
     base: str | None = None
     tip: str | None = None
+    others: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

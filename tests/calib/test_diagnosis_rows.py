@@ -52,7 +52,7 @@ def every_row(stand, linear):
     wide = problem_with(stand, ADDED)
     unit = np.eye(linear.gradient.shape[1])
     away = {name: unit[at] for name, at in linear.columns.items()}
-    found = list(rows_along(wide, stand.estimate, away, lambda done, total: None))
+    found = list(rows_along(wide, stand.estimate, away, linear.leverage, lambda done, total: None))
     return np.vstack([rows.A for rows in found]), np.concatenate([rows.b for rows in found])
 
 
@@ -62,7 +62,7 @@ def sizes(A):
     return np.where(size > 0, size, 1.0)
 
 
-def test_places_are_numbered_in_the_order_of_stops_however_many_threads(stand, monkeypatch):
+def test_places_are_numbered_in_the_order_of_stops_however_many_threads(stand, linear, monkeypatch):
     """The first stop takes longest, and each meets a place of its own."""
 
     def places(rows, kinds):
@@ -72,10 +72,11 @@ def test_places_are_numbered_in_the_order_of_stops_however_many_threads(stand, m
     monkeypatch.setattr(StopRows, "places", places)
     wide, nothing = problem_with(stand, ()), lambda done, total: None
     away = {name: np.zeros((v.dim, 1)) for name, v in stand.estimate.problem.variables.items()}
+    along = wide, stand.estimate, away, linear.leverage, nothing
 
     def found(count):
         with workers(count):
-            return [rows.place for rows in rows_along(wide, stand.estimate, away, nothing)]
+            return [rows.place for rows in rows_along(*along)]
 
     for alone, together in zip(found(1), found(4), strict=True):
         np.testing.assert_array_equal(together, alone)
@@ -196,7 +197,8 @@ def shares_of(look, candidate):
     away = away_from_model(look.linear, names) @ candidate.test.whiten
     by_name = {name: away[at] for name, at in look.linear.columns.items()}
     wide, shares = problem_with(look.stand, names), Shares()
-    for rows in rows_along(wide, look.stand.estimate, by_name, lambda done, total: None):
+    told = look.linear.leverage, lambda done, total: None
+    for rows in rows_along(wide, look.stand.estimate, by_name, *told):
         shares.add(rows)
     return shares
 

@@ -3,13 +3,18 @@
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import calib
 from calib.effects import View, find
-from calib.problem.model import Source, stop_columns
+from calib.problem.build import stops_view
+from calib.problem.model import Source
+from calib.rig.columns import stop_columns
 from calib.simulation import load_spec
+from chains.errors import InputError
 
+from . import two_arms
 from .hidden import hide, placed, stops_of
 from .simulated import changed, made
 
@@ -40,6 +45,36 @@ def test_joints_sag_along_gravity(source):
     np.testing.assert_allclose(basis[:, 0, 0], 0, atol=1e-9)  # its axis is upright
 
 
+@pytest.mark.parametrize("name", ["arm_gravity_sag", "base_flex"])
+def test_weights_pull_where_levels_say_that_down_is(source, name):
+    """The base leans otherwise at every stop; the slope of the height along up, downhill."""
+    joints, tree, rng = source.recording.joints, source.rig.tree, np.random.default_rng(3)
+    up = np.array([0.0, 0.0, 1.0]) + 0.2 * rng.normal(size=(len(joints), 3))
+    up /= np.linalg.norm(up, axis=1, keepdims=True)
+    basis = find(name).basis(stops_of(source, up=up))
+
+    def energy(twist, step):
+        total = 0.0
+        for mass in source.rig.masses:
+            T = tree.transform(mass.frame, joints + step, twist)
+            at = (T @ np.append(mass.centre_m, 1.0))[:, :3]
+            total = total + 9.80665 * mass.kg * np.vecdot(at, up)
+        return total
+
+    edge, nothing = tree.edge_names.index("arm_base"), np.zeros(joints.shape[1])
+    for axis in (0, 1):
+        twist, step = np.zeros((1, len(tree.edges), 6)), np.zeros(joints.shape[1])
+        if name == "base_flex":
+            twist[0, edge, axis] = 1e-5
+            found = basis[:, edge, axis, axis]
+        else:
+            step[axis] = 1e-5
+            found = basis[:, axis, axis]
+        slope = energy(twist, nothing + step) - energy(-twist, nothing - step)
+        np.testing.assert_allclose(found, -slope / 2e-5, atol=1e-5)
+    assert np.abs(basis[:, 0] if name == "arm_gravity_sag" else basis).max() > 1
+
+
 def test_a_payload_weighs_at_the_tip(source):
     joints, kg = source.recording.joints, np.linspace(0, 2, len(source.recording.stops))
     kg[0] = np.nan
@@ -58,6 +93,29 @@ def test_joints_give_way_to_the_payload_alone_by_a_coefficient_of_its_own(source
     found = find("arm_payload_sag").basis(stops_of(source, payload_kg=kg))
     np.testing.assert_allclose(found, more, atol=1e-9)
     assert np.abs(found).max() > 1
+
+
+def test_each_tip_has_a_payload_of_its_own(tmp_path):
+    """What the right hand carries pulls at the torso and the right arm, by the height it rises."""
+    rng = np.random.default_rng(2)
+    two_arms.write(tmp_path / "rec", two_arms.drawn(rng), 6, rng)
+    table = pd.read_csv(tmp_path / "rec/stops.csv")
+    kg = np.linspace(0.5, 3.0, len(table))
+    table.assign(**{"right_hand.payload_kg": kg}).to_csv(tmp_path / "rec/stops.csv", index=False)
+    source = Source.open(tmp_path / "rec")
+    assert not source.columns["payload_kg"].any()  # the left hand carries none
+    found = find("arm_payload_sag").basis(stops_view(source))
+    rig, q = source.rig, source.recording.joints
+    for j, step in enumerate(1e-5 * np.eye(q.shape[1])):
+        up, down = (rig.tree.transform("right_hand", q + s)[:, 2, 3] for s in (step, -step))
+        expected = -kg * 9.80665 * (up - down) / 2e-5
+        np.testing.assert_allclose(found[:, j, j], expected, atol=1e-5)
+        if rig.joint_names[j].startswith("left"):
+            assert not found[:, j].any()
+    both = table.assign(**{"payload_kg": 1.0, "left_hand.payload_kg": 1.0})
+    both.to_csv(tmp_path / "rec/stops.csv", index=False)
+    with pytest.raises(InputError, match=r"payload_kg and left_hand\.payload_kg both say what"):
+        _ = Source.open(tmp_path / "rec").columns
 
 
 def test_joints_give_way_to_the_torques_that_were_measured(source):

@@ -7,8 +7,9 @@ import pytest
 from scipy.spatial.transform import RigidTransform
 
 from calib.effects import View, find
-from calib.problem.model import Source, stop_columns, tracked_poses
+from calib.problem.model import Source
 from calib.rig import load_rig
+from calib.rig.columns import stop_columns, tracked_poses
 from calib.simulation import PRESETS, simulate
 from chains import se3
 from chains.errors import InputError

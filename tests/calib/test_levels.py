@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,11 +13,13 @@ import calib
 from calib.forward import place
 from calib.planning.stops import Poses, at_their_places, extended
 from calib.problem import build
+from calib.problem.bodies import turned_by_zero
 from calib.problem.model import Model, Source
 from calib.problem.without import leave_out
 from calib.report import report
 from calib.residuals.levels import Level
 from calib.results.check import check
+from calib.rig.columns import up_in_root
 from calib.runs.run import RESIDUALS
 from calib.show.tables import print_run
 from calib.simulation import PRESETS, Spec, simulate
@@ -210,6 +213,55 @@ def test_a_run_tells_which_way_is_up(recording, run, capsys):
     assert np.linalg.norm(np.cross(up["xyz"], true)) < 4 * up["sigma_rad"]
     print_run(run)
     assert up["told"].split(",")[0] in " ".join(capsys.readouterr().out.split())
+
+
+def test_levels_say_where_up_is_in_the_rig_at_every_stop(recording):
+    source = Source.open(recording)
+    truth = json.loads((recording.parent / "rec.truth.json").read_text())
+    true = np.stack([np.array(at["T_faro_root"])[2, :3] for at in truth["stops"].values()])
+    off = np.linalg.norm(np.cross(source.columns["up"], true), axis=1)
+    assert off.max() < 0.01  # of hardware some mrad off its drawing
+    assert np.abs(true[:, :2]).max() > 0.001 or off.max() < 0.005
+    for felt in source.recording.levels.values():
+        felt[3] = np.nan
+    alone = up_in_root(source.rig, source.recording)
+    assert np.isfinite(alone).all() and np.allclose(np.linalg.norm(alone, axis=1), 1.0)
+
+
+def test_the_zeros_of_accelerometers_are_found_where_they_are_told_of(recording, tmp_path, capsys):
+    """Some mg on each axis. The arm turns one level every way; the base's is always upright, and
+    along what it feels its zero shows nowhere."""
+    folder = shutil.copytree(recording, tmp_path / "rec")
+    zeros = {frame: 1e-3 * np.random.default_rng(7).normal(0, 6.0, 3) for frame in FRAMES}
+    for frame, zero in zeros.items():
+        for axis, b in zip("xyz", zero, strict=True):
+            cells("stops.csv", rf"{frame}\.a{axis}", lambda a, b=b: a + 9.80665 * b)(folder)
+    off = calib.fit(folder, tmp_path / "off")
+    assert off.summary["misfit"]["level"] > 2.0
+    rig = yaml.safe_load((folder / "rig.yaml").read_text())
+    rig["levels"]["sigma_zero_rad"] = 0.006
+    (folder / "rig.yaml").write_text(yaml.safe_dump(rig))
+    run = calib.fit(folder, tmp_path / "run")
+    assert 0.8 < run.summary["misfit"]["level"] < 1.2
+    found = {zero["frame"]: zero for zero in run.summary["level_zeros"]}
+    z = [(found[f]["xyz"] - b) / found[f]["sigma_rad"] for f, b in zeros.items()]
+    assert np.abs(z).max() < 3.5 and 0.3 < np.sqrt(np.mean(np.square(z))) < 1.6
+    assert max(found["arm_3"]["sigma_rad"]) < 0.001 < 0.005 < found["base"]["sigma_rad"][2] < 0.0061
+    print_run(run)
+    assert found["arm_3"]["told"].split(",")[0] in " ".join(capsys.readouterr().out.split())
+    assert calib.diagnose(run).verdict == "adequate"
+
+
+def test_a_zero_turns_what_is_felt_as_it_does(problem):
+    """To the first order; against the direction of the sum."""
+    block = next(b for b in problem.blocks if isinstance(b, Level))
+    zero = np.array([0.004, -0.003, 0.005])
+    felt = block.predicted(problem.initial)
+    moved = replace(block, bases={"zero": turned_by_zero(felt)})
+    expected = felt + zero
+    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+    found = moved.predicted({**problem.initial, "zero": zero})
+    np.testing.assert_allclose(found, expected, atol=4e-5)
 
 
 def test_a_level_that_was_knocked_is_named_and_left_out(recording, tmp_path):

@@ -4,6 +4,7 @@ import json
 import shutil
 
 import numpy as np
+import pandas as pd
 import pytest
 import yaml
 
@@ -50,18 +51,57 @@ def test_a_fit_begins_near_where_the_joints_were(folders):
     assert np.isnan(given[:, [1, 4]]).all() and np.isfinite(given[:, [0, 2, 3, 5]]).all()
 
 
-@pytest.mark.parametrize("passive", [("joint_3",), ("joint_2", "joint_5")])
+def only_the_tip(rig):
+    rig["tracker"]["bodies"] = ["mount_markers"]
+    del rig["frames"]["base_markers"]
+
+
+@pytest.mark.parametrize(
+    "passive",
+    [
+        ("joint_3",),
+        ("joint_2", "joint_5"),
+        ("joint_2", "joint_3"),
+        ("joint_1",),
+        ("joint_1", "joint_2"),
+        ("joint_1", "joint_4"),
+        ("joint_1", "joint_2", "joint_3"),
+    ],
+)
 def test_where_the_base_stands_still_nothing_before_the_joints_need_be_seen(tmp_path, passive):
-    read = Source.open(simulated(tmp_path / "read", base_moves="never")).recording.joints
-    folder = simulated(tmp_path / "rec", *passive, base_moves="never")
-
-    def only_the_tip(rig):
-        rig["tracker"]["bodies"] = ["mount_markers"]
-        del rig["frames"]["base_markers"]
-
+    """But for where the first joint's zero is, which goes with where the base stands."""
+    read = Source.open(simulated(tmp_path / "read", seed=4, base_moves="never")).recording.joints
+    folder = simulated(tmp_path / "rec", *passive, seed=4, base_moves="never")
     rewrite(folder, only_the_tip)
+    off = Source.open(folder).recording.joints - read
+    off[:, 0] = np.angle(np.exp(1j * (off[:, 0] - off[0, 0])))
+    assert 0 < np.ptp(off, axis=0).max() < 2 * 1.5 * OFF_RAD
+    assert np.abs(off[:, 1:]).max() < 3 * OFF_RAD
+
+
+def test_a_fit_comes_to_the_same_optimum_where_the_first_joint_is_passive_too(tmp_path):
+    """As from the joints that were there, to which a column leads it."""
+    passive = ("joint_1", "joint_4")
+    costs = []
+    for name, given in (("rec", passive), ("led", ())):
+        folder = simulated(tmp_path / name, *given, base_moves="never")
+        rewrite(folder, only_the_tip)
+        rewrite(folder, lambda rig: rig["arm"].update(passive=list(passive)))
+        estimate = solve(build([Source.open(folder)], Model()))
+        assert estimate.converged
+        costs.append(estimate.cost)
+    assert costs[0] == pytest.approx(costs[1], abs=1.0)
+
+
+def test_a_single_marker_beyond_it_shows_a_joint(tmp_path):
+    """The base is tracked, and of what the arm carries only where a marker is."""
+    read = Source.open(simulated(tmp_path / "read", base_moves="never")).recording.joints
+    folder = simulated(tmp_path / "rec", "joint_2", base_moves="never")
+    table = pd.read_csv(folder / "stops.csv")
+    turn = [f"mount_markers.q{part}" for part in "wxyz"]
+    table.drop(columns=turn).to_csv(folder / "stops.csv", index=False)
     found = Source.open(folder).recording.joints
-    assert 0 < np.abs(found - read).max() < 1.5 * OFF_RAD
+    assert 0 < np.abs(found - read).max() < OFF_RAD
 
 
 def test_joints_and_parameters_come_out_within_their_sigmas(folders):

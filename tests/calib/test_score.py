@@ -10,6 +10,7 @@ from scipy.sparse import csr_array
 from calib.blunders.chance import log_tail
 from calib.diagnosis import score
 from calib.diagnosis.jackknife import Shares
+from calib.diagnosis.leverage import Leverage
 from calib.diagnosis.linear import Linear
 from calib.diagnosis.screen import looked, rivals, screen
 from calib.effects import Site
@@ -70,6 +71,8 @@ class World:
             information=J.T @ J,
             raw=J.T @ J,
             gradient=csr_array(pick @ J),
+            score=J.T @ fitted,
+            leverage=Leverage((), np.zeros((0, 0))),
             stop=stop,
             place=place,
             weight_m2=float(len(J)),

@@ -33,6 +33,7 @@ GROUPS = {
     Role.JOINTS: "joint readings",
     Role.TARGET: "targets",
     Role.GRAVITY: "gravity",
+    Role.ZERO: "zeros of levels",
     Role.PLANE: "planes",
     Role.SURFACE: "parts of surfaces",
     Role.SCATTER: "scatter by chance",

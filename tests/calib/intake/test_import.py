@@ -9,12 +9,14 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from calib.cli import main
 from calib.intake import Choices, import_files, sources
+from calib.problem.model import Source
 from calib.rig import load_rig
 from calib.runs.calibrate import calibrate
 from chains.errors import InputError
 from sensors.readers import READERS
 from sensors.readers.base import Options
 
+from .. import two_arms
 from .moving import (
     JOINTS,
     T_BASE_FOOT,
@@ -137,11 +139,21 @@ def test_joints_that_a_rig_calls_passive_need_no_column(files, tmp_path):
     assert passive not in stops_of(tmp_path / "b")
 
 
-def test_an_arm_of_several_tips_is_not_imported(files, tmp_path):
-    mine = tmp_path / "mine.yaml"
-    mine.write_text("name: x\narm: {urdf: arm.urdf, base: a, tip: [b, c]}\n")
-    with pytest.raises(InputError, match=r"mine\.yaml: arm\.tip: import follows an arm to one tip"):
-        bring(files, tmp_path / "b", "table log.csv dh arm.yaml", rig=mine)
+def test_an_arm_of_several_tips_is_imported_with_the_joints_of_all(tmp_path):
+    mine = tmp_path / "made" / "rec"
+    mine.parent.mkdir()
+    rng = np.random.default_rng(4)
+    two_arms.write(mine, two_arms.drawn(rng), 12, rng)
+    done = bring(mine, tmp_path / "b", "table stops.csv", rig=mine / "rig.yaml")
+    before, after = (Source.open(f) for f in (mine, done.folder))
+    assert after.rig.tips == two_arms.HANDS
+    np.testing.assert_allclose(after.recording.joints, before.recording.joints)
+    for body, pose in before.recording.bodies.items():
+        np.testing.assert_allclose(after.recording.bodies[body], pose, atol=1e-9)
+    text = (mine / "rig.yaml").read_text().replace("- right_hand\n", "- rihgt_hand\n", 1)
+    (mine / "rig.yaml").write_text(text)
+    with pytest.raises(InputError, match="link 'rihgt_hand' is unknown; did you mean"):
+        bring(mine, tmp_path / "c", "table stops.csv", rig=mine / "rig.yaml")
 
 
 def test_left_handed_axes_are_named(files, tmp_path):
