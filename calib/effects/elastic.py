@@ -64,7 +64,8 @@ class ArmPayloadSag(ArmGravitySag):
 
     def torque(self, view: View) -> np.ndarray:
         """What each joint (K, J) gives way to, N m or N."""
-        return gravity_torque(view.rig.tree, _payloads(view), view.joints, up(view))
+        payloads = _payloads(view) or view[PAYLOAD]  # which says that there is no such column
+        return gravity_torque(view.rig.tree, payloads, view.joints, up(view))
 
 
 class ArmTorqueSag(ArmGravitySag):

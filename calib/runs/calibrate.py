@@ -354,7 +354,7 @@ def _model_document(sources: Sequence[Source], model: Model, choices: _Choices) 
         "hold_out": choices.hold_out,
         "folds": choices.folds,
         "prior": _way(choices.out, Path(choices.prior)) if choices.prior else None,
-        "prior_sha256": solution_digest(Path(choices.prior)) if choices.prior else None,
+        "prior_sha256": solution_digest(Run.open(choices.prior).folder) if choices.prior else None,
         "grown_from": _way(choices.out, below.folder) if below else None,
         "steps": _steps(below) if below else [],
         "versions": versions(),
