@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from calib.diagnosis.curves import curves
+from calib.diagnosis.verdict.curves import curves
 from calib.effects import find
 from calib.problem.build import shapes_of, stops_view
 from calib.problem.model import Source

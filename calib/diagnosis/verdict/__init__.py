@@ -13,13 +13,13 @@ from calib.blunders.chance import log_tail
 from calib.blunders.judged import Blunder, LeftOut
 from calib.blunders.reach import FurthestMoved
 from calib.diagnosis.candidates import PoseShape, concerned, lacking
-from calib.diagnosis.curves import Curve, curves
 from calib.diagnosis.rejects import Rejects
 from calib.diagnosis.screen import ODDS, Candidate, Screen
 from calib.diagnosis.search import ALPHA_UNNAMED, FEWEST_STOPS, Search, suspects
 from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import formula, hangs_on
 from calib.diagnosis.verdict.candidates import candidate_documents, explained
+from calib.diagnosis.verdict.curves import Curve, curves
 from calib.diagnosis.verdict.matters import HELD_OUT_BY_CHANCE, weighed
 from calib.diagnosis.verdict.sentences import BAD, UNNAMED, sentences_of, stops_of, unconfirmed
 from calib.diagnosis.verdict.unnamed import Unnamed
