@@ -15,6 +15,7 @@ from scipy.sparse import csr_array
 
 from calib.diagnosis.leverage import Leverage
 from calib.linear.clusters import ClusteredRows, Gradients
+from calib.linear.elimination import square
 from calib.linear.layout import Layout, positions
 from calib.linear.linearise import linearise
 from calib.linear.system import Linearisation
@@ -149,12 +150,15 @@ def linearise_with(
     information, raw = linear.kept[:-1, :-1].copy(), linear.raw.copy()
     at = positions(layout.size, layout.kept)
     others = list(other_rows(wide, layout, values, gradients))
+    alike: dict[bytes, list[ClusteredRows]] = {}  # of the same unknowns, as most poses of an arm
     for rows in others:
-        place = at[rows.columns]
-        if (place >= 0).all():  # the others are in the linearisation
-            scaled = rows.A * layout.sigma[rows.columns]
-            information[np.ix_(place, place)] += scaled.T @ scaled
-            raw[np.ix_(place, place)] += scaled.T @ scaled
+        if (at[rows.columns] >= 0).all():  # the others are in the linearisation
+            alike.setdefault(rows.columns.tobytes(), []).append(rows)
+    for some in alike.values():
+        place, sigma = at[some[0].columns], layout.sigma[some[0].columns]
+        gram = square(np.vstack([rows.A for rows in some]) * sigma)
+        information[np.ix_(place, place)] += gram
+        raw[np.ix_(place, place)] += gram
     leverage, more = Leverage.of(information, layout, values, WIDENED), np.zeros(layout.size)
     for rows, grown in zip(others, leverage.grown(others, layout), strict=True):
         gradients.add_rows(grown)
