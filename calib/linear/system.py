@@ -196,13 +196,12 @@ class Linearisation:
         tables = [np.hstack(list(by.values())) for by in some]
         ends = np.cumsum([0, *(len(table) for table in tables)])
         wide = [0, *(n for table in tables for n in [table.shape[1]] * len(table))]
-        at = [
-            np.tile(self.layout.columns(list(by)), len(t))
-            for by, t in zip(some, tables, strict=True)
-        ]
-        data = np.concatenate([np.zeros(0), *(table.ravel() for table in tables)])
-        at = np.concatenate([np.zeros(0, int), *at])
-        rows = csr_array((data, at, np.cumsum(wide)), shape=(ends[-1], self.layout.size))
+        data, columns = [np.zeros(0)], [np.zeros(0, int)]
+        for by, table in zip(some, tables, strict=True):
+            data.append(table.ravel())
+            columns.append(np.tile(self.layout.columns(list(by)), len(table)))
+        entries = np.concatenate(data), np.concatenate(columns), np.cumsum(wide)
+        rows = csr_array(entries, shape=(ends[-1], self.layout.size))
         found = np.zeros(rows.shape[0])
         for first in range(0, len(found), ROWS_AT_ONCE):
             here = slice(first, first + ROWS_AT_ONCE)
