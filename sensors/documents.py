@@ -382,12 +382,10 @@ def json_text(data: Any) -> str:
 
 def plain(data: Any) -> Any:
     """Turn numpy values, tuples and paths, however deep, into plain Python."""
-    if isinstance(data, np.ndarray | np.generic):
-        return data.tolist()
-    if isinstance(data, str | int | float):
-        return data
     if isinstance(data, Mapping):
         return {str(key): plain(value) for key, value in data.items()}
+    if isinstance(data, np.ndarray | np.generic):
+        return data.tolist()
     if isinstance(data, list | tuple):
         return [plain(value) for value in data]
     return str(data) if isinstance(data, Path) else data

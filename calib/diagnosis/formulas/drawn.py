@@ -13,7 +13,7 @@ from calib.linear.rows import TWIST, StopRows
 
 
 @dataclass(frozen=True, kw_only=True)
-class Drawn:
+class DrawnBeams:
     """Beams of one stop, and nothing of its others.
 
     Args:
@@ -34,7 +34,7 @@ class Drawn:
     @classmethod
     def of(
         cls, share: float, begin: int, size: int, rows: StopRows, met: np.ndarray, count: int
-    ) -> Drawn:
+    ) -> DrawnBeams:
         """A share of a stop's beams; so many columns of unknowns begin after the twists'. The last
         arguments are those of `each_stop`."""
         usable = np.flatnonzero(rows.rows.usable & np.isfinite(rows.rows.residual_m))

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from scipy.sparse import block_diag, csr_array, eye_array, hstack, issparse, vstack
 
-from calib.diagnosis.formulas.drawn import Drawn, rows_over
+from calib.diagnosis.formulas.drawn import DrawnBeams, rows_over
 from calib.diagnosis.jackknife import Shares
 from calib.diagnosis.linear import beside, other_rows
 from calib.diagnosis.score import GAUGE, Scores, ScoreTest, score_test
@@ -94,7 +94,7 @@ class BeamTable:
         places = Gradients(layout.size)
         beams = sum(int(np.count_nonzero(a.part >= 0)) for a in estimate.associations)
         share = min(1.0, most / max(beams, 1))
-        found = partial(Drawn.of, share, TWIST * len(scans), layout.size)
+        found = partial(DrawnBeams.of, share, TWIST * len(scans), layout.size)
         state = problem, layout, values, estimate.associations
         every = list(each_stop(*state, places, found, progress=progress))
         drawn, place = [d for d, _ in every], [numbers[d.met] for d, numbers in every]
