@@ -29,9 +29,7 @@ REACHED = 1e-8  # of the arm's length, and rad: no more steps
 # Least damping of a step, of squares of the arm's length; beyond it half the squared error, which
 # keeps steps short where an arm is stretched (Sugihara 2011, IEEE Trans. Robotics 27(5)).
 DAMPING = 1e-8
-LEAST_DAMPED = (
-    1e-4  # times the damping: with less, arms of seven joints have no step but by rounding
-)
+LEAST_DAMPED = 1e-4  # times the damping: with less, seven joints leave a step to rounding
 GIVEN_UP = 1e4  # times the damping: no step brings the tip nearer
 
 

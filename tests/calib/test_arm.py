@@ -98,19 +98,6 @@ def test_what_is_commanded_brings_the_tip_where_it_should_be(tmp_path, name):
     assert (off_m < size + 0.02).all() and np.median(size) > 1e-4, "there was something to correct"
 
 
-def test_seven_joints_are_damped_enough_at_every_pose(tmp_path):
-    """Where an arm is stretched many steps follow each other; their damping may not vanish."""
-    rng = np.random.default_rng(8)
-    world = arm_worlds.bent(tmp_path, "iiwa7", rng, size=0.0)
-    source = opened(tmp_path, "iiwa7", world, rng, poses=2)
-    part, known, _ = found(source, ("arm_link_length", "arm_geometry"), rng, size=0.3)
-    arm = Arm.as_found(source.rig, part, known, "tool")
-    joints = rng.uniform(-2, 2, (20_000, 7))
-    command = arm.to_command(joints)
-    assert np.isfinite(command.joints).all()
-    assert np.mean(command.off_m < 1e-7) > 0.9
-
-
 def test_an_arm_of_few_joints_says_how_far_it_stays_off(tmp_path):
     rng = np.random.default_rng(7)
     world = arm_worlds.bent(tmp_path, "scara", rng, size=0.0)
