@@ -103,7 +103,8 @@ class Stops:
     def some(self, index: np.ndarray, root: str) -> Stops:
         """Those of the stops, with their root."""
 
-        chosen = slice(index[0], index[0] + 1) if len(index) == 1 else index  # a view: no copy
+        beside = (np.diff(index) == 1).all()
+        chosen = slice(index[0], index[-1] + 1) if beside else index  # a view: no copy
 
         def of(bases: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
             return {n: basis if len(basis) == 1 else basis[chosen] for n, basis in bases.items()}

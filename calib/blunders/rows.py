@@ -98,11 +98,9 @@ def _bodies(whole: Linearisation) -> Iterator[GroupRows]:
     plain = [unweighted(b) for b in blocks]
     weight = {id(p): b.weight for p, b in zip(plain, blocks, strict=True)}
     for together in BodiesTogether.of(plain):
-        for block, (residual, d) in zip(
-            together.blocks, together.evaluate(whole.values), strict=True
-        ):
-            per = len(block.axes)
-            A, columns = np.hstack(list(d.values())), layout.columns(list(d))
+        every = together.rows(whole.values)
+        for block, (residual, A, names) in zip(together.blocks, every, strict=True):
+            per, columns = len(block.axes), layout.columns(names)
             weights = weight[id(block)]
             weights = np.ones(len(block.measured)) if weights is None else weights
             for k, group in enumerate(block.groups):

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -29,6 +30,8 @@ from calib.problem.problem import Problem
 from calib.problem.spread import Whose
 from calib.residuals.groups import ALONG_BEAMS, Group
 from calib.solve.components import Sums, Told, squares_beside_bodies
+
+Squares = Mapping[str, tuple[float, float]]
 
 
 @dataclass(frozen=True)
@@ -55,14 +58,14 @@ class Shift:
     information: np.ndarray
     axes: Sequence[str]
     units: Sequence[str]
-    squares: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    squares: Squares = field(default_factory=dict)
 
     @property
     def of_ranges(self) -> bool:
         """Whether it is a range zero, and not a place."""
         return list(self.axes) == [ALONG_BEAMS]
 
-    @property
+    @cached_property
     def parts(self) -> dict[str, np.ndarray]:
         """Unit -> directions (r,) in it, which have one length together."""
         units = np.array(self.units)
@@ -172,15 +175,24 @@ def _against(others: Others, sets: Sequence[Sequence[GroupRows]]) -> Iterator[Sh
 
 def _of_set(some: Sequence[GroupRows], H: np.ndarray, b: np.ndarray) -> Iterator[Shift]:
     for rows, here in zip(some, parts([rows] for rows in some), strict=True):
-        of = _of_rows if rows.information is None else _of_sums
-        for group in rows.groups:
-            yield of(group, rows, b[here], H[here, here])
+        left, squares = rows.own_information - H[here, here], {}
+        of = _of_sums
+        if rows.information is None:
+            of, squares = _of_rows, _squares(rows, b[here], np.diag(left))
+        for group, own in rows.groups.items():
+            yield of(group, own, rows, b[here], left, squares)
 
 
-def _of_sums(group: Group, rows: GroupRows, score: np.ndarray, explained: np.ndarray) -> Shift:
+def _of_sums(
+    group: Group,
+    own: np.ndarray,
+    rows: GroupRows,
+    score: np.ndarray,
+    left: np.ndarray,
+    squares: Squares,
+) -> Shift:
     """The score test of a shift that some rows of the stop alone have."""
-    own = rows.groups[group]
-    left, score = own.T @ (rows.information - explained) @ own, own.T @ score
+    left, score = own.T @ left @ own, own.T @ score
     size = np.sqrt(np.maximum(np.diag(own.T @ rows.information @ own), 1e-300))
     at = np.argmax(own, axis=0)
     whiten = whitening(left, size)
@@ -194,13 +206,20 @@ def _of_sums(group: Group, rows: GroupRows, score: np.ndarray, explained: np.nda
         information=left if len(score) == len(left) else np.zeros_like(left),
         axes=[rows.axes[i] for i in at],
         units=[rows.units[i] for i in at],
+        squares=squares,
     )
 
 
-def _of_rows(group: Group, rows: GroupRows, b: np.ndarray, H: np.ndarray) -> Shift:
+def _of_rows(
+    group: Group,
+    own: np.ndarray,
+    rows: GroupRows,
+    b: np.ndarray,
+    left: np.ndarray,
+    squares: Squares,
+) -> Shift:
     """The residual of a group under the fit without it; see the module."""
-    own = rows.groups[group]
-    values, axes = np.linalg.eigh(own.T @ (np.eye(len(H)) - H) @ own)
+    values, axes = np.linalg.eigh(own.T @ left @ own)
     seen = values > HELD_ALONE
     values, basis = values[seen], own @ axes[:, seen]
     along = (basis.T @ b) / values
@@ -216,12 +235,13 @@ def _of_rows(group: Group, rows: GroupRows, b: np.ndarray, H: np.ndarray) -> Shi
         information=(told * values) @ told.T,
         axes=[rows.axes[i] for i in at],
         units=[rows.units[i] for i in at],
-        squares=_squares(rows, b, H),
+        squares=squares,
     )
 
 
-def _squares(rows: GroupRows, b: np.ndarray, H: np.ndarray) -> dict[str, tuple[float, float]]:
-    units, left = np.array(rows.units), 1.0 - np.diag(H)
+def _squares(rows: GroupRows, b: np.ndarray, left: np.ndarray) -> Squares:
+    """Unit -> sum of squares (m,) of rows of it, and of their redundancies `left`."""
+    units = np.array(rows.units)
     return {
         unit: (float(np.square(b[units == unit]).sum()), float(left[units == unit].sum()))
         for unit in dict.fromkeys(rows.units)

@@ -15,6 +15,7 @@ from scipy.sparse import csr_array
 
 from calib.diagnosis.leverage import Leverage
 from calib.linear.clusters import ClusteredRows, Gradients
+from calib.linear.elimination import square
 from calib.linear.layout import Layout, positions
 from calib.linear.linearise import linearise
 from calib.linear.system import Linearisation
@@ -47,9 +48,10 @@ class Linear:
         raw: (S, S) the same before anything was eliminated.
         gradient: (C, U) sparse, of each cluster of rows.
         score: (U,) the whole gradient, of residuals as they are.
-        leverage: of the model on the rows.
+        others: all rows but those of beams, of residuals as large as errors are.
         stop: (C,) which stop the rows of a cluster belong to, -1 for none.
         place: (C,) which part of the room they look at, -1 for none.
+        places: part of the room -> its number.
         weight_m2: sum of the beams' weights over their variances [1/m2]; without beams that of the
             tracked positions.
         whole: the linearisation that these are made of.
@@ -65,9 +67,10 @@ class Linear:
     raw: np.ndarray
     gradient: csr_array
     score: np.ndarray
-    leverage: Leverage
+    others: Sequence[ClusteredRows]
     stop: np.ndarray
     place: np.ndarray
+    places: dict[object, int]
     weight_m2: float
     whole: Linearisation
     directions: Callable[[np.ndarray], np.ndarray]
@@ -78,40 +81,39 @@ class Linear:
 
 
 def rows_along(
+    linear: Linear,
     wide: Problem,
     estimate: Estimate,
-    away: Mapping[str, np.ndarray],
-    leverage: Leverage,
+    away: np.ndarray,
     progress: Callable[[int, int], None],
 ) -> Iterator[ClusteredRows]:
-    """All rows along some directions, weighted; no more than a few stops' in memory.
+    """All rows along some directions, weighted; no more than a few stops' beams in memory.
 
     Args:
-        wide: the model's problem with candidates' unknowns added.
+        linear: that knows these directions, and the rows that are of no beam.
+        wide: the model's problem with the unknowns added that beams are to be differentiated by.
         estimate: the model's solution.
-        away: unknown -> (dim, r) the directions in it, of those of the problem and of surfaces.
-        leverage: of the model on these rows.
+        away: (U, r) the directions.
         progress: called with how many stops are done, and of how many.
     """
+    every = np.arange(away.shape[1])
+    for rows in linear.others:
+        yield rows._replace(A=rows.A @ away[rows.columns], columns=every)
+    if not wide.scans:
+        return
     wide, values = beside(wide, estimate)
     candidates = [name for name in wide.variables if name not in estimate.values]
     layout = Layout.of(wide, unbounded=candidates)
-    directions = np.concatenate([away[name] for name in layout.at])
-    places, met = Gradients(layout.size), estimate.associations
     beams = BeamsAlong(
         problem=wide,
         layout=layout,
         values=values,
-        associations=met,
-        directions=directions,
-        places=places,
+        associations=estimate.associations,
+        directions=np.concatenate([away[linear.columns[name]] for name in layout.at]),
+        places=Gradients(layout.size, linear.places),
         progress=progress,
     )
     yield from beams.rows()
-    every = np.arange(directions.shape[1])
-    others = list(other_rows(wide, layout, values, places))
-    for rows in leverage.grown(others, layout):
-        yield rows._replace(A=rows.A @ directions[rows.columns], columns=every)
 
 
 def beside(wide: Problem, estimate: Estimate) -> tuple[Problem, dict[str, np.ndarray]]:
@@ -149,16 +151,20 @@ def linearise_with(
     information, raw = linear.kept[:-1, :-1].copy(), linear.raw.copy()
     at = positions(layout.size, layout.kept)
     others = list(other_rows(wide, layout, values, gradients))
+    alike: dict[bytes, list[ClusteredRows]] = {}  # of the same unknowns, as most poses of an arm
     for rows in others:
-        place = at[rows.columns]
-        if (place >= 0).all():  # the others are in the linearisation
-            scaled = rows.A * layout.sigma[rows.columns]
-            information[np.ix_(place, place)] += scaled.T @ scaled
-            raw[np.ix_(place, place)] += scaled.T @ scaled
-    leverage, more = Leverage.of(information, layout, values, WIDENED), np.zeros(layout.size)
-    for rows, grown in zip(others, leverage.grown(others, layout), strict=True):
-        gradients.add_rows(grown)
-        more[rows.columns] += rows.A.T @ (grown.b - rows.b)
+        if (at[rows.columns] >= 0).all():  # the others are in the linearisation
+            alike.setdefault(rows.columns.tobytes(), []).append(rows)
+    for some in alike.values():
+        place, sigma = at[some[0].columns], layout.sigma[some[0].columns]
+        gram = square(np.vstack([rows.A for rows in some]) * sigma)
+        information[np.ix_(place, place)] += gram
+        raw[np.ix_(place, place)] += gram
+    grown = Leverage.of(information, layout, values, WIDENED).grown(others, layout)
+    more = np.zeros(layout.size)
+    for rows, larger in zip(others, grown, strict=True):
+        gradients.add_rows(larger)
+        more[rows.columns] += rows.A.T @ (larger.b - rows.b)
     unit = layout.sigma[layout.kept]
     table, stop, place = gradients.table()
     return Linear(
@@ -169,10 +175,11 @@ def linearise_with(
         information=information / np.outer(unit, unit),
         raw=raw / np.outer(unit, unit),
         gradient=table,
-        leverage=leverage,
+        others=grown,
         score=np.asarray(table.sum(axis=0)).ravel() - more,
         stop=stop,
         place=place,
+        places=gradients.places,
         weight_m2=linear.weight_m2 or sum(len(b.measured) / b.sigma_m**2 for b in wide.bodies),
         whole=linear,
         directions=linear.followed,

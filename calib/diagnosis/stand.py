@@ -312,16 +312,16 @@ class Look:
     def judged(self, candidate: Candidate, progress: Progress) -> ScoreTest:
         """A candidate's test with its clusters jackknifed: see `jackknife`."""
         stand, found = self.stand, candidate.test
-        wide = stand.problem_of(stand.model.plus((candidate.effect,)))
-        names = variables_of(wide, {candidate.effect.name})[candidate.effect.name]
+        names = [n for n, at in self.named.scores.at.items() if at.start in found.columns]
         away = away_from_model(self.linear, names) @ found.whiten
-        by_name = {name: away[at] for name, at in self.linear.columns.items()}
-        shares = Shares()
+        wide, shares = stand.problem, Shares()
+        if wide.scans:
+            wide = stand.problem_of(stand.model.plus((candidate.effect,)))
 
         def tell(done: int, total: int) -> None:
             progress("fitting the candidates", done, total)
 
-        for rows in rows_along(wide, stand.estimate, by_name, self.linear.leverage, tell):
+        for rows in rows_along(self.linear, wide, stand.estimate, away, tell):
             shares.add(rows)
         return found.judged(shares)
 

@@ -29,6 +29,7 @@ REACHED = 1e-8  # of the arm's length, and rad: no more steps
 # Least damping of a step, of squares of the arm's length; beyond it half the squared error, which
 # keeps steps short where an arm is stretched (Sugihara 2011, IEEE Trans. Robotics 27(5)).
 DAMPING = 1e-8
+LEAST_DAMPED = 1e-4  # times the damping: with less, seven joints leave a step to rounding
 GIVEN_UP = 1e4  # times the damping: no step brings the tip nearer
 
 
@@ -178,7 +179,8 @@ class Arm:
             tried[:, self._ours] += self._step(tried, off[moving], damped[moving])
             then = left(tried, moving)
             nearer = np.linalg.norm(then, axis=1) < np.linalg.norm(off[moving], axis=1)
-            damped[moving] *= np.where(nearer, 0.1, 10.0)
+            times = damped[moving] * np.where(nearer, 0.1, 10.0)
+            damped[moving] = np.maximum(times, LEAST_DAMPED)
             better = moving[nearer]
             command[better], off[better] = tried[nearer], then[nearer]
 

@@ -9,6 +9,7 @@ factored whatever the data leave open.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
@@ -37,7 +38,7 @@ class Eliminated:
     factor: np.ndarray
     gain: np.ndarray
 
-    @property
+    @cached_property
     def twists(self) -> int:
         """How many of `over` are columns of twists."""
         return int(np.searchsorted(self.over != BY_TWIST, True))

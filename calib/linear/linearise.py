@@ -198,10 +198,10 @@ def own_rows(layout: Layout, values: Values) -> dict[int, dict[str, OwnRows]]:
     found: dict[int, dict[str, OwnRows]] = {stop: {} for stop in layout.own}
     owner = {int(c): stop for stop, columns in layout.own.items() for c in columns}
     for together in layout.bodies:
-        for block, (residual, d) in zip(together.blocks, together.evaluate(values), strict=True):
-            stop = next(owner[k] for n in d if (k := layout.at[n].start) in owner)
-            columns = layout.columns(list(d))
-            found[stop][block.name] = OwnRows(np.hstack(list(d.values())), -residual, columns, True)
+        every = together.rows(values)
+        for block, (residual, A, names) in zip(together.blocks, every, strict=True):
+            stop = next(owner[k] for n in names if (k := layout.at[n].start) in owner)
+            found[stop][block.name] = OwnRows(A, -residual, layout.columns(names), True)
     mine = [name for name, at in layout.at.items() if at.start in owner]
     for name, rows in prior_rows(layout, mine, values).items():
         found[owner[layout.at[name].start]][name] = rows

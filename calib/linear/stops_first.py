@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from scipy.linalg import solve_triangular
 
 from calib.linear.assembly import Assembly, KeptSums, OwnRows
 from calib.linear.elimination import Eliminated, eliminate, square
@@ -59,7 +58,7 @@ class StopsFirst(Assembly):
     def _columns(self, stop: int, *beams: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Columns (m,) that a stop's rows touch, its own first and the right side last, and where
         among them each of all stands; those of its beams are given."""
-        size, own = self.layout.size, self.layout.own.get(stop, np.zeros(0, int))
+        size, own = self.layout.size, self._own(stop)
         rows = (each.columns for each in self.waiting.get(stop, ()))
         touched = np.unique(np.concatenate([*beams, *rows, [size]]).astype(int))
         mine = np.concatenate([own, np.setdiff1d(touched, own)])
@@ -75,7 +74,7 @@ class StopsFirst(Assembly):
             self._add_raw(rows)
         for each in rows:
             each.add_to(whole, at, layout.sigma, len(mine) - 1)
-        count = len(layout.own.get(stop, ()))
+        count = len(self._own(stop))
         rest = whole[count:, count:]
         if count:
             factor, gain = eliminate(whole[:count, :count], whole[:count, count:], rest)
@@ -89,30 +88,55 @@ class StopsFirst(Assembly):
         all others go into one product."""
         left, raw = [], []
         kept = positions(self.layout.size, self.layout.kept)
-        for stop in stops:
-            mine, at = self._columns(stop)
-            rows, count = self._stacked(stop, at, len(mine)), len(self.layout.own.get(stop, ()))
+        for some in self._alike(stops):
+            mine, at = self._columns(some[0])
+            rows, count = self._stacked(some, at, len(mine)), len(self._own(some[0]))
             if self.raw is not None:
                 raw.append(_over(rows, kept, mine[:-1]))
             if count:
-                Q, R = np.linalg.qr(rows[:, :count], mode="complete")
-                rows = Q.T @ rows
-                gain = solve_triangular(R[:count], rows[:count, count:], check_finite=False)
-                gone = Eliminated(mine[:count], mine[count:], R[:count].T, gain)
-                self.eliminated.append(gone)
-            left.append(_over(rows[count:, count:], self.at, mine[count:]))
+                Q, R = np.linalg.qr(rows[:, :, :count], mode="complete")
+                rows = Q.mT @ rows
+                R, over = R[:, :count], mine[count:]
+                gains = np.linalg.solve(R, rows[:, :count, count:])
+                self.eliminated += [
+                    Eliminated(self._own(stop), over, root.T, gain)
+                    for stop, root, gain in zip(some, R, gains, strict=True)
+                ]
+            left.append(_over(rows[:, count:, count:], self.at, mine[count:]))
+            for stop in some:
+                del self.waiting[stop]
         self.total += square(np.vstack(left))
         if self.raw is not None:
             self.raw += square(np.vstack(raw))
 
-    def _stacked(self, stop: int, at: np.ndarray, width: int) -> np.ndarray:
-        """A stop's own rows (m, width), in units of sigmas, columns where `at` puts them."""
-        found = self.waiting.pop(stop, ())
-        out, first = np.zeros((sum(len(rows.b) for rows in found), width)), 0
-        for rows in found:
-            here = slice(first, first := first + len(rows.b))
-            out[here, at[rows.columns]] = rows.A * self.layout.sigma[rows.columns]
-            out[here, -1] = rows.b
+    def _own(self, stop: int) -> np.ndarray:
+        return self.layout.own.get(stop, np.zeros(0, int))
+
+    def _alike(self, stops: Sequence[int]) -> list[list[int]]:
+        """Stops whose rows touch the same unknowns, but for their own, in the same order."""
+        found: dict[object, list[int]] = {}
+        place = np.full(self.layout.size, -1)
+        for stop in stops:
+            own = self._own(stop)
+            place[own] = -2 - np.arange(len(own))
+            like: list[object] = [len(own)]
+            for rows in self.waiting[stop]:
+                at = place[rows.columns]
+                like += [len(rows.b), np.where(at < -1, at, rows.columns).tobytes()]
+            place[own] = -1
+            found.setdefault(tuple(like), []).append(stop)
+        return list(found.values())
+
+    def _stacked(self, stops: Sequence[int], at: np.ndarray, width: int) -> np.ndarray:
+        """Own rows (K, m, width) of stops that are alike, in units of sigmas; `at` says where the
+        columns of the first of them stand."""
+        each = list(zip(*(self.waiting[stop] for stop in stops), strict=True))
+        out, first = np.zeros((len(stops), sum(len(rows[0].b) for rows in each), width)), 0
+        for rows in each:
+            here = slice(first, first := first + len(rows[0].b))
+            sigma = self.layout.sigma[np.stack([r.columns for r in rows])]
+            out[:, here, at[rows[0].columns]] = np.stack([r.A for r in rows]) * sigma[:, None]
+            out[:, here, -1] = np.stack([r.b for r in rows])
         return out
 
     def done(self, values: Values) -> Linearisation:
@@ -135,8 +159,9 @@ class StopsFirst(Assembly):
 
 
 def _over(rows: np.ndarray, at: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Rows (m, n) of some columns (n,), among the columns that stand somewhere in `at`."""
-    there = at[columns] >= 0
+    """Rows (K, m, n) of some columns (n,), each (K m,) among the columns that stand somewhere in
+    `at`."""
+    rows, there = rows.reshape(-1, rows.shape[2]), at[columns] >= 0
     out = np.zeros((len(rows), int(at.max(initial=-1)) + 1))
     out[:, at[columns[there]]] = rows[:, : len(columns)][:, there]
     return out

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse import csr_array, vstack
+from scipy.sparse import csr_array
 
 from calib.linear.elimination import Eliminated
 from calib.linear.layout import Layout, positions
@@ -193,19 +193,21 @@ class Linearisation:
             some: of each set, unknown -> (m, n) the rows over its tangents.
             kept: (S, S) covariance of the kept.
         """
-        tables = [csr_array((0, self.layout.size))]
-        for by in some:
-            mine = csr_array(np.hstack(list(by.values())))
-            columns = self.layout.columns(list(by))[mine.indices]
-            shape = (mine.shape[0], self.layout.size)
-            tables.append(csr_array((mine.data, columns, mine.indptr), shape=shape))
-        rows = csr_array(vstack(tables))
+        tables = [np.hstack(list(by.values())) for by in some]
+        ends = np.cumsum([0, *(len(table) for table in tables)])
+        wide = [0, *(n for table in tables for n in [table.shape[1]] * len(table))]
+        data, columns = [np.zeros(0)], [np.zeros(0, int)]
+        for by, table in zip(some, tables, strict=True):
+            data.append(table.ravel())
+            columns.append(np.tile(self.layout.columns(list(by)), len(table)))
+        entries = np.concatenate(data), np.concatenate(columns), np.cumsum(wide)
+        rows = csr_array(entries, shape=(ends[-1], self.layout.size))
         found = np.zeros(rows.shape[0])
         for first in range(0, len(found), ROWS_AT_ONCE):
             here = slice(first, first + ROWS_AT_ONCE)
             for at, mine, known in self._shares(rows[here].toarray(), kept):
                 found[here][at] += np.einsum("ij,ji->i", mine, known)
-        return np.split(found, np.cumsum([table.shape[0] for table in tables[1:]]))[:-1]
+        return np.split(found, ends[1:])[:-1]
 
     def _through(self, by_twist: np.ndarray, left: np.ndarray) -> None:
         """Move what stands by the twists of all stops (q, 6 K) to the unknowns behind them."""

@@ -162,6 +162,21 @@ class BodiesTogether:
             groups.setdefault((*like, shared, block.stops.noise is None), []).append(block)
         return [cls(found, _whole(found)) for found in groups.values()]
 
+    def residuals(self, values: Values) -> Iterator[np.ndarray]:
+        """Whitened rows (m,) of each block."""
+        residual, _ = self.whole.evaluate({**values, **self._at(values)}, False)
+        return iter(residual.reshape(len(self.blocks), -1))
+
+    def rows(self, values: Values) -> Iterator[tuple[np.ndarray, np.ndarray, list[str]]]:
+        """Whitened rows (m,) of each block, their derivatives (m, n), and by which unknowns."""
+        residual, d = self.whole.evaluate({**values, **self._at(values)}, True)
+        count = len(self.blocks)
+        A = np.hstack(list(d.values())).reshape(count, -1, sum(x.shape[1] for x in d.values()))
+        each = zip(residual.reshape(count, -1), A, self.blocks, strict=True)
+        for rows, by, block in each:
+            named = dict(zip(self.whole.stops.own, block.stops.own, strict=True))
+            yield rows, by, [named.get(name, name) for name in d]
+
     def evaluate(self, values: Values) -> Iterator[tuple[np.ndarray, Derivatives]]:
         """Rows and derivatives of each block, as `SeenBody.evaluate` gives them."""
         residual, d = self.whole.evaluate({**values, **self._at(values)}, True)

@@ -199,8 +199,12 @@ def intervals(estimate: Estimate, progress: Progress = lambda what, done, total:
             rows, stops = rows._replace(stop=np.full(len(rows.b), stops)), stops + 1
         if not isinstance(block, KeptRows):
             others.append(rows)
-    for rows in others:
-        sums.add(rows._replace(A=rows.A @ directions[rows.columns]))
+    A = np.vstack([rows.A @ directions[rows.columns] for rows in others])
+    b, stop, place = (
+        np.concatenate([getattr(r, k) for r in others]) for k in ("b", "stop", "place")
+    )
+    every = np.arange(directions.shape[1])
+    sums.add(ClusteredRows(A=A, b=b, columns=every, stop=stop, place=place))
     known = layout.outer()
     return Intervals(
         names=tuple(known),
@@ -277,7 +281,7 @@ class _Sums:
         self.cells.append(np.stack([stop[first], part[first]]))
         self.moved.append(summed(A * b[:, None], at))
         self.share.append(summed(np.square(A), at))
-        for one in np.unique(stop[stop >= 0]).tolist():
+        for one in np.unique(stop[stop >= 0])[: MOST_WHOLE_STOPS + 1].tolist():
             mine = A[stop == one]
             self._add_products(one, mine.T @ mine)
 

@@ -102,7 +102,7 @@ def _of_blocks(blocks: Sequence[Block], values: Mapping[str, np.ndarray]) -> Ite
     bodies = [b for b in blocks if isinstance(b, SeenBody)]
     owner = {id(plain[id(b)]): b for b in bodies}
     for together in BodiesTogether.of([plain[id(b)] for b in bodies]):
-        for block, (residual, _) in zip(together.blocks, together.evaluate(values), strict=True):
+        for block, residual in zip(together.blocks, together.residuals(values), strict=True):
             rows = residual.reshape(len(block.measured), -1)
             dof = np.full(len(rows), rows.shape[1])
             kind = f"{block.kind} {block.body}"

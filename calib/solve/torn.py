@@ -44,20 +44,17 @@ Values = Mapping[str, np.ndarray]
 def away(problem: Problem, values: Values) -> dict[str, list[tuple[TrackedBody, np.ndarray]]]:
     """Body -> its blocks, and at each of their K stops how far (K,) it was seen from where the
     chain puts it, in m or rad, whichever is more."""
-    out: dict[str, list[tuple[TrackedBody, np.ndarray]]] = {}
-    together = BodiesTogether.of(problem.bodies)
-    placed = {
-        id(b): T
-        for some in together
-        for b, T in zip(some.blocks, some.in_world(values), strict=True)
-    }
-    for block in problem.bodies:
-        T = placed[id(block)]
-        far = np.linalg.norm(block.measured[:, :3, 3] - T[:, :3, 3], axis=1)
-        if not block.is_point:
-            turn = se3.so3_log(T[:, :3, :3].mT @ block.measured[:, :3, :3])
+    off: dict[int, np.ndarray] = {}
+    for some in BodiesTogether.of(problem.bodies):
+        T, measured = np.concatenate(list(some.in_world(values))), some.whole.measured
+        far = np.linalg.norm(measured[:, :3, 3] - T[:, :3, 3], axis=1)
+        if not some.whole.is_point:
+            turn = se3.so3_log(T[:, :3, :3].mT @ measured[:, :3, :3])
             far = np.maximum(far, np.linalg.norm(turn, axis=1))
-        out.setdefault(block.body, []).append((block, far))
+        off |= zip(map(id, some.blocks), far.reshape(len(some.blocks), -1), strict=True)
+    out: dict[str, list[tuple[TrackedBody, np.ndarray]]] = {}
+    for block in problem.bodies:
+        out.setdefault(block.body, []).append((block, off[id(block)]))
     return out
 
 

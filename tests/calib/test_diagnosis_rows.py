@@ -50,9 +50,8 @@ def linear(stand):
 def every_row(stand, linear):
     """All rows, one by one, along every unknown."""
     wide = problem_with(stand, ADDED)
-    unit = np.eye(linear.gradient.shape[1])
-    away = {name: unit[at] for name, at in linear.columns.items()}
-    found = list(rows_along(wide, stand.estimate, away, linear.leverage, lambda done, total: None))
+    away = np.eye(linear.gradient.shape[1])
+    found = list(rows_along(linear, wide, stand.estimate, away, lambda done, total: None))
     return np.vstack([rows.A for rows in found]), np.concatenate([rows.b for rows in found])
 
 
@@ -71,12 +70,11 @@ def test_places_are_numbered_in_the_order_of_stops_however_many_threads(stand, l
 
     monkeypatch.setattr(StopRows, "places", places)
     wide, nothing = problem_with(stand, ()), lambda done, total: None
-    away = {name: np.zeros((v.dim, 1)) for name, v in stand.estimate.problem.variables.items()}
-    along = wide, stand.estimate, away, linear.leverage, nothing
+    along = stand.estimate, np.zeros((linear.gradient.shape[1], 1)), nothing
 
     def found(count):
         with workers(count):
-            return [rows.place for rows in rows_along(*along)]
+            return [rows.place for rows in rows_along(replace(linear, places={}), wide, *along)]
 
     for alone, together in zip(found(1), found(4), strict=True):
         np.testing.assert_array_equal(together, alone)
@@ -195,10 +193,9 @@ def test_shares_of_clusters_add_up_to_the_whole(looked, name):
 def shares_of(look, candidate):
     names = [candidate.effect.name]
     away = away_from_model(look.linear, names) @ candidate.test.whiten
-    by_name = {name: away[at] for name, at in look.linear.columns.items()}
     wide, shares = problem_with(look.stand, names), Shares()
-    told = look.linear.leverage, lambda done, total: None
-    for rows in rows_along(wide, look.stand.estimate, by_name, *told):
+    told = look.stand.estimate, away, lambda done, total: None
+    for rows in rows_along(look.linear, wide, *told):
         shares.add(rows)
     return shares
 

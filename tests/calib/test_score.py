@@ -10,7 +10,6 @@ from scipy.sparse import csr_array
 from calib.blunders.chance import log_tail
 from calib.diagnosis import score
 from calib.diagnosis.jackknife import Shares
-from calib.diagnosis.leverage import Leverage
 from calib.diagnosis.linear import Linear
 from calib.diagnosis.screen import looked, rivals, screen
 from calib.effects import Site
@@ -72,9 +71,10 @@ class World:
             raw=J.T @ J,
             gradient=csr_array(pick @ J),
             score=J.T @ fitted,
-            leverage=Leverage((), np.zeros((0, 0))),
+            others=(),
             stop=stop,
             place=place,
+            places={},
             weight_m2=float(len(J)),
             whole=None,
             directions=lambda kept: kept,

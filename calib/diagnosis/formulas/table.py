@@ -13,15 +13,15 @@ from functools import cached_property, partial
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
-from scipy.sparse import block_diag, csr_array, eye_array, hstack, vstack
+from scipy.sparse import block_diag, csr_array, eye_array, hstack, issparse, vstack
 
-from calib.diagnosis.formulas.factors import covariates_of
+from calib.diagnosis.formulas.drawn import DrawnBeams, rows_over
 from calib.diagnosis.jackknife import Shares
 from calib.diagnosis.linear import beside, other_rows
 from calib.diagnosis.score import GAUGE, Scores, ScoreTest, score_test
 from calib.linear.clusters import ClusteredRows, Gradients, summed
 from calib.linear.layout import Layout
-from calib.linear.rows import TWIST, StopRows
+from calib.linear.rows import TWIST
 from calib.problem import Problem
 from calib.residuals.robust import MAD
 from calib.solve.added import HUBER
@@ -33,6 +33,7 @@ from calib.solve.estimate import Estimate
 # sigma.
 MOST_BEAMS = 20_000
 FORMULA_DRAWS = 499  # scores of chance: 25 of them beyond the quantile that counts looks
+Matrix = csr_array | np.ndarray
 WEIGHING_PASSES = 3  # of weighing, after which weights of a gross structure change by less than 1 %
 
 
@@ -49,7 +50,8 @@ class BeamTable:
         twists: (N, V) derivative of the residual by twists of the LiDAR, stop by stop, and by the
             U unknowns that act on beams otherwise.
         chain: (V, U) of these by all unknowns.
-        others: (R, U) whitened rows of trackers, targets and priors; others_b: (R,) their right
+        others: (R, U) whitened rows of trackers, targets and priors; like `twists` sparse of beams,
+            and dense of an arm, all of whose unknowns act on each pose; others_b: (R,) their right
             side; others_stop, others_place: (R,) of which they are, -1 for none.
         unit: of `residual_m` and `sigma_m`: m of a range, or rad of a joint; see `joint_tables`.
         joints: which covariates are joints of the arm.
@@ -63,9 +65,9 @@ class BeamTable:
     stop: np.ndarray
     place: np.ndarray
     share: float
-    twists: csr_array
+    twists: Matrix
     chain: csr_array
-    others: csr_array
+    others: Matrix
     others_b: np.ndarray
     others_stop: np.ndarray
     others_place: np.ndarray
@@ -92,7 +94,7 @@ class BeamTable:
         places = Gradients(layout.size)
         beams = sum(int(np.count_nonzero(a.part >= 0)) for a in estimate.associations)
         share = min(1.0, most / max(beams, 1))
-        found = partial(_Drawn.of, share, TWIST * len(scans), layout.size)
+        found = partial(DrawnBeams.of, share, TWIST * len(scans), layout.size)
         state = problem, layout, values, estimate.associations
         every = list(each_stop(*state, places, found, progress=progress))
         drawn, place = [d for d, _ in every], [numbers[d.met] for d, numbers in every]
@@ -120,9 +122,9 @@ class BeamTable:
         return len(self.residual_m)
 
     @cached_property
-    def twists_T(self) -> csr_array:
+    def twists_T(self) -> Matrix:
         """(V, N) the same by columns, row after row: products with it are three times as fast."""
-        return csr_array(self.twists.T)
+        return self.twists.T.tocsr() if issparse(self.twists) else self.twists.T
 
     @cached_property
     def signs(self) -> np.ndarray:
@@ -136,7 +138,7 @@ class BeamTable:
     @cached_property
     def of_others(self) -> tuple[np.ndarray, np.ndarray]:
         """What trackers, targets and priors say: (U, U) information, (U,) right side."""
-        return (self.others.T @ self.others).toarray(), self.others.T @ self.others_b
+        return _dense(self.others.T @ self.others), self.others.T @ self.others_b
 
     @cached_property
     def cells(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -152,10 +154,9 @@ class BeamTable:
         """The table of a model that has such columns (N, F) of the range, too: its last unknowns,
         of which nothing was known."""
         more = columns_m.shape[1]
-        own = csr_array(columns_m)
         chain = block_diag([self.chain, eye_array(more)], format="csr")
-        others = hstack([self.others, csr_array((self.others.shape[0], more))], format="csr")
-        twists = hstack([self.twists, -own], format="csr")
+        others = _wider(self.others, np.zeros((len(self.others_b), more)))
+        twists = _wider(self.twists, -columns_m)
         return replace(self, twists=twists, chain=chain, others=others)
 
     def projection(self, columns_m: np.ndarray | None = None) -> Projection:
@@ -198,8 +199,7 @@ class Projection:
     @property
     def chi2(self) -> float:
         """Of these rows at their weights, and of all others."""
-        away = self.table.others @ self.step - self.table.others_b
-        return float(self.weight @ np.square(self.left_m) + away @ away)
+        return float(self.weight @ np.square(self.left_m) + self._away @ self._away)
 
     @property
     def weight_m2(self) -> float:
@@ -210,9 +210,9 @@ class Projection:
     def of(cls, table: BeamTable, weight: np.ndarray) -> Projection:
         """Fit the model at these weights (N,)."""
         T, chain = table.twists, table.chain
-        gram = table.twists_T @ T.multiply(weight[:, None]).tocsr()
+        gram = table.twists_T @ (T * weight[:, None])
         information, right = table.of_others
-        H = information + (chain.T @ gram @ chain).toarray()
+        H = information + _dense(chain.T @ gram @ chain)
         H[np.diag_indices(len(H))] *= 1.0 + 1e-12
         H[np.diag_indices(len(H))] += 1e-12 * np.median(np.diag(H))
         factor = cho_factor(H)  # upper
@@ -228,24 +228,26 @@ class Projection:
     def fitted(self, columns_m: np.ndarray) -> tuple[Projection, np.ndarray]:
         """With columns (N, k) fitted beside the model, and what they are multiplied by (k,); 0 of
         what the model absorbs."""
-        kept, taken = left = self.off(columns_m)
-        theta = self._test(columns_m, left).estimate()
+        (kept, taken), theta = self.off(columns_m), self.test(columns_m).estimate()
         beside = replace(self, left_m=self.left_m - kept @ theta, step=self.step - taken @ theta)
         return beside, theta
 
     def off(self, columns_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """What is left of columns (N, Q) of the range, in the beams (N, Q), and how the model's
         unknowns (U, Q) absorb the rest."""
-        table, weighted = self.table, self.weight[:, None] * columns_m
-        taken = cho_solve(self.factor, -(table.chain.T @ (table.twists_T @ weighted)))
-        return columns_m + table.twists @ (table.chain @ taken), taken
+        taken = cho_solve(self.factor, -self._crossed(self.weight[:, None] * columns_m))
+        return columns_m + self.table.twists @ (self.table.chain @ taken), taken
+
+    def _crossed(self, weighted: np.ndarray) -> np.ndarray:
+        """Products (U, Q) of the model's unknowns with weighted columns (N, Q)."""
+        return self.table.chain.T @ (self.table.twists_T @ weighted)
 
     def explained(self, blocks: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """What blocks of columns (N, k) of the range would explain, each alone: in squared sigmas
         (B,), and in how many directions (B,)."""
         columns = np.hstack(blocks)
         weighted = self.weight[:, None] * columns
-        crossed = self.table.chain.T @ (self.table.twists_T @ weighted)
+        crossed = self._crossed(weighted)
         root = solve_triangular(self.factor[0], crossed, trans=1, check_finite=False)
         score = self.left_m @ weighted
         found, start = [], 0
@@ -256,54 +258,69 @@ class Projection:
         statistic, dof = zip(*found, strict=True)
         return np.array(statistic), np.array(dof)
 
+    @cached_property
+    def _away(self) -> np.ndarray:
+        """(R,) what the model leaves of the other rows."""
+        return self.table.others @ self.step - self.table.others_b
+
+    @cached_property
+    def _by_cell(self) -> Matrix:
+        """(C, U) what the rows of each cell say of the model's unknowns."""
+        table, (stop, _, cell) = self.table, self.table.cells
+        right = np.concatenate([self.weight * self.left_m, self._away])
+        stacked = vstack if issparse(table.twists) else np.vstack
+        rows = stacked([table.twists @ table.chain, table.others])
+        return csr_array((right, (cell, np.arange(len(cell)))), (len(stop), len(cell))) @ rows
+
     def scores(self, columns_m: np.ndarray) -> Scores:
         """Scores of columns (N, Q) of the range, of one candidate; see `calib.diagnosis.score`."""
-        return self._scores(columns_m, self.off(columns_m))
-
-    def test(self, columns_m: np.ndarray) -> ScoreTest:
-        """The test of columns (N, q) together."""
-        return self._test(columns_m, self.off(columns_m))
-
-    def _test(self, columns_m: np.ndarray, kept: tuple[np.ndarray, np.ndarray]) -> ScoreTest:
-        return score_test(self._scores(columns_m, kept), np.arange(columns_m.shape[1]))
-
-    def _scores(self, columns_m: np.ndarray, kept: tuple[np.ndarray, np.ndarray]) -> Scores:
-        """As `scores`, with what `off` gives."""
-        table = self.table
-        weighted = self.weight[:, None] * columns_m
-        information = weighted.T @ kept[0]
-        away = table.others @ self.step - table.others_b
-        shares = [
-            kept[0] * (self.weight * self.left_m)[:, None],
-            (table.others @ kept[1]) * away[:, None],
-        ]
-        stop, place, cell = table.cells
-        cells = summed(np.vstack(shares), cell)
+        table, weighted = self.table, self.weight[:, None] * columns_m
+        (stop, place, cell), crossed = table.cells, self._crossed(weighted)
+        taken, whole = cho_solve(self.factor, -crossed), weighted.T @ columns_m
+        information = whole + crossed.T @ taken
+        cells = self._by_cell @ taken
+        own = summed(weighted * self.left_m[:, None], cell[: len(table)])
+        cells[: len(own)] += own
         return Scores(
             at={},
             owner={},
             score=cells.sum(axis=0),
             information=(information + information.T) / 2,
-            whole=weighted.T @ columns_m,
+            whole=whole,
             cells=cells,
             stop=stop,
             place=place,
             weight_m2=self.weight_m2,
         )
 
+    def test(self, columns_m: np.ndarray) -> ScoreTest:
+        """The test of columns (N, q) together."""
+        return score_test(self.scores(columns_m), np.arange(columns_m.shape[1]))
+
     def judged(self, columns_m: np.ndarray) -> ScoreTest:
         """The test of columns (N, q) with its clusters left out one by one: see `jackknife`."""
-        table, kept = self.table, self.off(columns_m)
-        found = self._test(columns_m, kept)
+        table, (kept, taken) = self.table, self.off(columns_m)
+        found = self.test(columns_m)
         root, every = np.sqrt(self.weight), np.arange(found.dof)
-        away = table.others @ self.step - table.others_b
+        of_beams, of_others = root[:, None] * (kept @ found.whiten), taken @ found.whiten
         shares = Shares()
         for A, b, stop, place in (
-            (root[:, None] * (kept[0] @ found.whiten), root * self.left_m, table.stop, table.place),
-            (table.others @ (kept[1] @ found.whiten), away, table.others_stop, table.others_place),
+            (of_beams, root * self.left_m, table.stop, table.place),
+            (table.others @ of_others, self._away, table.others_stop, table.others_place),
         ):
             shares.add(ClusteredRows(A=A, b=b, columns=every, stop=stop, place=place))
         return found.judged(shares)
+
+
+def _dense(matrix: Matrix) -> np.ndarray:
+    return matrix.toarray() if issparse(matrix) else matrix
+
+
+def _wider(left: Matrix, right: np.ndarray) -> Matrix:
+    """Columns (N, k) beside a matrix (N, n), which stays as it is, sparse or dense."""
+    if issparse(left):
+        return csr_array(hstack([left, csr_array(right)]))
+    return np.hstack([left, right])
 
 
 def _explained(score: np.ndarray, whole: np.ndarray, left: np.ndarray) -> tuple[float, int]:
@@ -314,80 +331,12 @@ def _explained(score: np.ndarray, whole: np.ndarray, left: np.ndarray) -> tuple[
     return float(np.sum(np.square(along) / values[seen])), int(seen.sum())
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Drawn:
-    """Beams of one stop, and nothing of its others.
-
-    Args:
-        stop: its number.
-        columns: covariates (n,) of these; (1,) of the stop.
-        residual_m, sigma_m, twists, chain: as of `BeamTable`.
-        met: (n,) which of what any beam of the stop meets each does.
-    """
-
-    stop: int
-    columns: Mapping[str, np.ndarray]
-    residual_m: np.ndarray
-    sigma_m: np.ndarray
-    twists: csr_array
-    chain: csr_array
-    met: np.ndarray
-
-    @classmethod
-    def of(
-        cls, share: float, begin: int, size: int, rows: StopRows, met: np.ndarray, count: int
-    ) -> _Drawn:
-        """A share of a stop's beams; so many columns of unknowns begin after the twists'. The last
-        arguments are those of `each_stop`."""
-        usable = np.flatnonzero(rows.rows.usable & np.isfinite(rows.rows.residual_m))
-        drawn = np.random.default_rng(rows.stop).choice(usable, round(share * len(usable)), False)
-        picked, columns = np.sort(drawn), {}
-        for name, values in covariates_of(rows.rows.view):
-            columns[name] = (values[picked] if len(values) > 1 else values).astype(float)
-        return cls(
-            stop=rows.stop,
-            columns=columns,
-            residual_m=rows.rows.residual_m[picked],
-            sigma_m=rows.rows.sigma_m[picked],
-            twists=_twists(rows, picked, TWIST * rows.stop, begin, begin + size),
-            chain=_rows_over(rows.chain, rows.chain_columns, size),
-            met=met[picked],
-        )
-
-    def column(self, name: str) -> np.ndarray:
-        """A covariate (n,)."""
-        return np.broadcast_to(self.columns[name], len(self.residual_m))
-
-
-def _twists(rows: StopRows, picked: np.ndarray, first: int, begin: int, size: int) -> csr_array:
-    """Derivative (n, size) of the residuals of some beams of a scan, whose twist has the columns
-    from `first`; those of unknowns begin at `begin`."""
-    wide = rows.dense.shape[1] - TWIST - 1
-    dense = np.hstack([rows.dense[picked, :TWIST], rows.dense[picked, TWIST + 1 :]])
-    own = np.concatenate([np.arange(first, first + TWIST), begin + rows.columns[:wide]])
-    found = rows.index[picked]
-    met = found >= 0
-    sparse = begin + rows.columns[wide:][np.where(met, found, 0)] if rows.sparse else found
-    at = np.hstack([np.broadcast_to(own, dense.shape), sparse])
-    values = np.hstack([dense, np.where(met, rows.value[picked], 0.0)])
-    ends = np.arange(len(picked) + 1) * at.shape[1]
-    out = csr_array((values.ravel(), at.ravel(), ends), (len(picked), size))
-    out.eliminate_zeros()
-    return out
-
-
 def rows_of_others(
     problem: Problem, layout: Layout, values: Mapping[str, np.ndarray], places: Gradients
 ) -> tuple[csr_array, np.ndarray, np.ndarray, np.ndarray]:
     """Rows of trackers, targets and priors: (R, U) whitened, (R,) their right side, and the stop
     and place (R,) of each."""
     rows = list(other_rows(problem, layout, values, places))
-    A = csr_array(vstack([_rows_over(r.A, r.columns, layout.size) for r in rows]))
+    A = csr_array(vstack([rows_over(r.A, r.columns, layout.size) for r in rows]))
     b, stop, place = (np.concatenate([getattr(r, k) for r in rows]) for k in ("b", "stop", "place"))
     return A, b, stop, place
-
-
-def _rows_over(A: np.ndarray | csr_array, columns: np.ndarray, size: int) -> csr_array:
-    """Rows over some columns as rows over all of them."""
-    found = csr_array(A)
-    return csr_array((found.data, columns[found.indices], found.indptr), (found.shape[0], size))

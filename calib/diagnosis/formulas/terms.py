@@ -16,6 +16,7 @@ PLACES_BESIDE = (0, -4, -3, -2, -1, 1, 2, 3, 4)  # which of them; where none is 
 NUDGE = 0.01  # of a covariate's range, for the derivative by a constant
 GAUSS_NEWTON_STEPS = 6  # of Gauss-Newton; two or three are enough from where the places are
 STEP_PARTS = (1.0, 0.5, 0.25)  # of a step that are tried
+ROUNDING = 1e-9  # of what is explained: places no pose lies between are equally good
 ENOUGH = 1e-4  # of what is explained: steps that gain less are the last
 
 
@@ -89,7 +90,7 @@ def refine(projection: Projection, term: FormulaTerm, kept: Sequence[int] = ()) 
             tried = [term.at(_with(term.constants, i, place)) for place in places.tolist()]
             columns = _changed(term, tried, covariates)
             explained, _ = projection.explained([each[:, kept] for each in columns])
-            term = tried[int(np.argmax(explained))]
+            term = tried[_best(explained)]
     return _descended(projection, term, kept, ends)
 
 
@@ -136,11 +137,16 @@ def _descended(
         tried = [term.at(np.clip(now + part * step, *ends.T).tolist()) for part in STEP_PARTS]
         found = explained(tried)
         gain = found.max() - best
-        if gain > 0.0:
-            term, best = tried[int(np.argmax(found))], found.max()
+        if gain > ROUNDING * best:
+            term, best = tried[_best(found)], found.max()
         if gain < ENOUGH * best:
             break
     return term
+
+
+def _best(explained: np.ndarray) -> int:
+    """The first of those that explain most: which of several alike is no matter of rounding."""
+    return int(np.argmax(explained >= (1.0 - ROUNDING) * explained.max()))
 
 
 def _changed(
