@@ -7,9 +7,9 @@ zeros and tilts of joints fitted, held-out poses are off by 0.45 mm rms in A and
 
 In both series the diagnosis names `arm_gravity_sag` and `arm_gear_error@17`, an error that repeats
 17 times a turn, and gives a formula for what is left: example 9. By the gear order lift errs by
-0.26 mrad in A and 0.22 in D, the elbow by 0.26 and 0.24, with the same signs. One whole number in
+0.28 mrad in A and 0.21 in D, the elbow by 0.25 and 0.24, with the same signs. One whole number in
 every joint is what an encoder or a motor would do; which of the two, these data do not say. Lift
-and elbow give way by 8 and 16 microrad per N m in A, by 9 and 18 in D.
+and elbow give way by 9 and 16 microrad per N m in A, by 10 and 19 in D.
 
 What is of the arm and not of the series carries over. With the arm as A found it and only base and
 tool free, D's error falls from 0.46 to 0.36 mm, below the 0.40 mm to which geometry alone can be
@@ -17,7 +17,7 @@ fitted to D itself. From D to A it falls from 0.54 to 0.44 mm.
 
 `rigcal explain` goes on without help, by formulas, to 0.18 mm held out in A and 0.29 mm in D, and
 then says that structure without a name is left. It is right: 0.18 mm is three times the
-repeatability. Air temperature explains 0.01 mm (p = 0.9 in A, 0.6 in D).
+repeatability. Growth with temperature is not significant (p = 0.5 in A, 0.7 in D).
 
     python examples/06_what_is_missing_in_a_ur10.py [FOLDER] [DATA]
 """

@@ -6,7 +6,7 @@ arm repeats to 0.06 mm. Of each series by itself, `diagnose` gives a formula for
 
 They are the same formula, found twice. Both are of the shoulder lift joint: a step of 0.4 mrad at
 -2.15 rad, one of 0.2 mrad at -1.78 rad (A) or -1.79 rad (D), and 0.4 mrad around -1.38 rad, drawn
-as a bump in A and as a window in D. Places agree within what is said of them, 3 to 9 mrad.
+as a bump in A and as a window in D. Places of steps agree within 1.4 of their joint sigmas.
 
 Then each formula is fitted to the other series. Only its form is taken along; the amounts are
 estimated anew. Those of all three terms agree, both ways; the error of held-out poses falls to

@@ -104,12 +104,16 @@ def written(folder):
     }
 
 
-@pytest.fixture(scope="module")
-def recording(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("executors")
+def simulated(folder):
+    """A small recording in a folder."""
     (folder / "spec.yaml").write_text(SPEC)
     command(["simulate", "spec.yaml", "-o", "rec", "--seed", "3"], folder)
     return folder / "rec"
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    return simulated(tmp_path_factory.mktemp("executors"))
 
 
 @pytest.fixture(scope="module")

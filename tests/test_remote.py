@@ -17,10 +17,8 @@ import pytest
 from chains import remote
 
 from .programs import LIMIT_S, ROOT, execute
-from .programs import rigcal as command
-from .test_executors import PROGRAM
+from .test_executors import PROGRAM, simulated
 
-SPEC = "{lidar: hesai_pandarxt32, locations: 3, stops_per_location: 2, column_step: 200}"
 COMMANDS = (
     "fit {rec} -o run --hold-out none --workers 2",
     "add run range_scale -o grown",
@@ -33,10 +31,7 @@ PATHS = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("remote")
-    (folder / "spec.yaml").write_text(SPEC)
-    command(["simulate", "spec.yaml", "-o", "rec", "--seed", "3"], folder)
-    return folder / "rec"
+    return simulated(tmp_path_factory.mktemp("remote"))
 
 
 def written(recording, folder, **environment):

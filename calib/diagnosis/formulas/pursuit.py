@@ -8,8 +8,9 @@ forms do equally well, stop by stop (Vuong 1989), the simplest is taken and the 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import product
 
 import numpy as np
@@ -153,8 +154,13 @@ def _step(
     fitted: Projection, bases: Bases, smooths: Sequence[Smooth], alpha: float
 ) -> ConfirmedTerm | None:
     """The best term over the sets of covariates that explain most, judged."""
+
+    @cache
+    def judged(covariates: tuple[str, ...], plain: bool) -> ScoreTest:
+        return _judged(fitted, bases.columns(covariates, plain))
+
     likely = (s for s in smooths[:SMOOTHS_JUDGED] if s.evidence > np.log(s.looks / alpha))
-    best = next((s for s in likely if _stands_out(fitted, bases, s)), None)
+    best = next((s for s in likely if _stands_out(judged(s.covariates, s.plain), s)), None)
     if best is None:
         return None
     inside = [s for s in smooths if set(s.covariates) < set(best.covariates)]
@@ -165,7 +171,7 @@ def _step(
     if not over:
         return None
     chosen, alike = simplest(sorted(over, key=lambda f: -f.evidence), len(bases.names()))
-    p = _by_chance(fitted, bases, chosen, over[chosen])
+    p = _by_chance(fitted, chosen, over[chosen], judged)
     return ConfirmedTerm(
         form=chosen,
         alike=alike,
@@ -174,11 +180,10 @@ def _step(
     )
 
 
-def _stands_out(fitted: Projection, bases: Bases, smooth: Smooth) -> bool:
+def _stands_out(judged: ScoreTest, smooth: Smooth) -> bool:
     """Whether chance hardly makes so large a smooth function: of others no forms are tried, which
     takes time. One of as many directions as there are stops, as over a few walls, none of them
     can confirm; a form has fewer, and is judged on its own."""
-    judged = _judged(fitted, bases.columns(smooth.covariates, smooth.plain))
     p = float(after_looks(judged.p_value(), smooth.looks))
     return p < PLAUSIBLE or judged.dof >= judged.clusters
 
@@ -189,7 +194,12 @@ def _judged(fitted: Projection, columns: np.ndarray) -> ScoreTest:
     return fitted.table.projection(columns).judged(columns)
 
 
-def _by_chance(fitted: Projection, bases: Bases, form: Form, smooth: Smooth) -> float:
+def _by_chance(
+    fitted: Projection,
+    form: Form,
+    smooth: Smooth,
+    judged: Callable[[tuple[str, ...], bool], ScoreTest],
+) -> float:
     """How often chance makes a form of these covariates that explains as much: no more than as
     many forms do as were tried, whole or with those of its columns alone that are needed
     (Bonferroni); where a smooth function explains it, nor more than such functions do (the
@@ -204,7 +214,7 @@ def _by_chance(fitted: Projection, bases: Bases, form: Form, smooth: Smooth) -> 
         bounds.append(form.tried * ways * _tail(_judged(fitted, columns[:, kept])))
     if smooth.test.statistic > COVERS * form.statistic:
         bounds.append(_tail(whole, max(smooth.test.dof, whole.dof)))
-        bounds.append(_judged(fitted, bases.columns(smooth.covariates, smooth.plain)).p_value())
+        bounds.append(judged(smooth.covariates, smooth.plain).p_value())
     return at_least(min(1.0, len(bounds) * min(bounds)))
 
 
