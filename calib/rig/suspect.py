@@ -32,7 +32,7 @@ class Suspect:
         return [fields | {"stop": stop} for stop in (*self.stops,) or (None,)]
 
 
-def listed(names: Sequence[Any], most: int = 3) -> str:
+def listed(names: Sequence[Any], most: int = 3, between: str = ", ") -> str:
     """The first few names, and how many more there are."""
     more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(map(str, names[:most])) + more
+    return between.join(map(str, names[:most])) + more

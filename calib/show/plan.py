@@ -12,6 +12,7 @@ from rich.table import Table
 
 from calib.planning.purpose import ALL, RELIABILITY, SCATTER, WORKSPACE
 from calib.problem.unknowns import Key
+from calib.rig.suspect import listed
 from calib.show.tables import columns_table, print_pairs, shown, terminal
 
 if TYPE_CHECKING:
@@ -184,14 +185,10 @@ def _asked(plan: Plan) -> Iterator[str]:
         else:
             helped.append(f"{plan.names[i]} from {factor * now:.3g} to {factor * after:.3g} {unit}")
     if helped:
-        more = len(helped) - ASKED_SHOWN
-        rest = f" and {more} more" if more > 0 else ""
-        yield f"With them sigmas fall: {'; '.join(helped[:ASKED_SHOWN])}{rest}."
+        yield f"With them sigmas fall: {listed(helped, ASKED_SHOWN, '; ')}."
     if never:
-        more = len(never) - ASKED_SHOWN
-        rest = f" and {more} more" if more > 0 else ""
         yield (
-            f"NO STOPS of this arm help: the sigma of {'; '.join(never[:ASKED_SHOWN])}{rest}, "
+            f"NO STOPS of this arm help: the sigma of {listed(never, ASKED_SHOWN, '; ')}, "
             "however many they are. Measure it itself."
         )
 
