@@ -13,26 +13,21 @@ are comparable. Unknowns without a prior (``unbounded``: candidates of a diagnos
 
 **Three kinds of unknowns** (`layout`). *Own* unknowns of a stop, its pose and joint errors, are
 touched by that stop alone. *Cells* are displacements of parts of the mesh, of three sizes: surface,
-region, patch. A beam meets one patch, so no row touches two of the finest cells: their block of H
-is diagonal, however many there are. All others, the calibration above all, are *kept*.
+region, patch. All others, the calibration above all, are *kept*.
 
 **Elimination** (`elimination`) takes own unknowns and cells out by the Schur complement,
 ``H_kk - H_ke H_ee^-1 H_ek``: what remains says of the kept unknowns exactly what all rows say, and
-the gain ``H_ee^-1 H_ek`` leads back to those eliminated. The result does not depend on the order
-(`assembly` has what both share), the work does:
-
-- `CellsFirst`, where stops are few: the finest cells by a division, then the other cells, all while
-  stops still are twists; then the chain rule, and the stops' own unknowns.
-- `StopsFirst`, where stops are many: each stop's own unknowns as soon as its sums are there, so
-  that no matrix grows with the number of stops; all cells at the end. A stop without beams has few
-  rows: they are turned by QR until only some of them touch its own unknowns, and no matrix is made
-  of it alone.
+the gain ``H_ee^-1 H_ek`` leads back to those eliminated. The result does not depend on the order,
+the work does. `Assembly` (`assembly`) takes out stops first, so that no matrix grows with their
+number. What goes with a stop is the square of a few rows, six of which are wide, as a stop's beams
+know the LiDAR by six numbers; rows of many stops go into one product. Where a stop has no beams,
+its own rows are turned by QR until only some of them touch its own unknowns. All cells go at the
+end, in one block: there are never many more of them, however large the room.
 
 The `Linearisation` (`system`) that is left holds ``kept``: the normal equations of the kept
 unknowns and b, without their priors and without rows that touch kept unknowns only (targets, bodies
 whose pose several stops share): `calib.solve.graph` adds those and solves. For tests of what is
 missing, ``J^T W b`` is also kept apart for each cluster of rows that err together (`clusters`).
 
-`linearise` is the way in. A new order of elimination is a subclass of `Assembly` with ``add``,
-``add_kept`` and ``done``, chosen by `Layout.stops_first`.
+`linearise` is the way in.
 """

@@ -1,22 +1,28 @@
-"""From sums of stops to normal equations of what is kept: what both orders of elimination share.
+"""From sums of stops to normal equations of what is kept.
 
-Both give the same result; see `calib.linear` for which is taken when.
+Unknowns of stops are taken out first, many stops at a time, and all cells at the end: no matrix
+grows with the number of stops, and most of the work is in products of large matrices.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg.blas import dsyrk
 
 from calib.linear.clusters import ClusteredRows
-from calib.linear.elimination import Eliminated, square
+from calib.linear.elimination import Eliminated, eliminate, square
 from calib.linear.layout import Layout, positions
 from calib.linear.rows import TWIST, OwnSums, StopSums
 from calib.linear.system import Linearisation, Values
 from calib.problem.unknowns import Role
-from calib.residuals.compiled import add_at, add_gram
+from calib.residuals.compiled import add_at, add_sparse
+
+# Entries of a stop's rows by all columns that wait, of all stops together: bounds the memory.
+WAITING_ENTRIES = 2_000_000
+STOPS_TOGETHER = 256  # without beams, whose rows are multiplied at once, likewise
 
 
 @dataclass(frozen=True)
@@ -40,18 +46,6 @@ class OwnRows:
         place = none if place is None else place
         return ClusteredRows(A=self.A, b=self.b, columns=self.columns, stop=at, place=place)
 
-    def add_to(self, target: np.ndarray, at: np.ndarray, sigma: np.ndarray, b: int = -1) -> None:
-        """Add their Gram matrix to another.
-
-        Args:
-            target: (N, N), added to.
-            at: (U,) where columns stand in it, -1 for those that do not.
-            sigma: (U,) units of the columns.
-            b: where the right side stands; -1 if it does not.
-        """
-        rows = np.column_stack([self.A * sigma[self.columns], self.b])
-        add_gram(target, np.append(at[self.columns], b), rows)
-
 
 @dataclass(frozen=True)
 class KeptSums:
@@ -70,36 +64,60 @@ class KeptSums:
         """Of rows, however many."""
         return cls(square(np.column_stack([rows.A, rows.b])), rows.columns)
 
-    def add_to(self, target: np.ndarray, at: np.ndarray, sigma: np.ndarray, b: int = -1) -> None:
-        """Add it to another; arguments as of `OwnRows.add_to`."""
-        place, unit = np.append(at[self.columns], b), np.append(sigma[self.columns], 1.0)
-        add_at(target, place, place, self.gram * unit * unit[:, None])
+
+@dataclass(frozen=True)
+class _Scanned:
+    """A stop's beams, as far as they say something of where its LiDAR is.
+
+    Args:
+        stop: its number.
+        information: (6, 6) of the twist.
+        beside: (6, n) products of the twist with unknowns and, first, the right side, in units of
+            sigmas; at: (n,) where these stand.
+        chain: (6, m) derivative of the twist, in units of sigmas, by the columns (m,).
+    """
+
+    stop: int
+    information: np.ndarray
+    beside: np.ndarray
+    at: np.ndarray
+    chain: np.ndarray
+    columns: np.ndarray
 
 
 class Assembly:
-    """What both orders share: give it each stop's sums by `add`, those of other rows about kept
-    unknowns by `add_kept`, then call ``done``.
+    """Give it each stop's sums by `add`, those of other rows about kept unknowns by `add_kept`,
+    then call ``done``.
+
+    Its matrix is over ``[finest cells | coarser cells | kept | b]``, in units of sigmas. Half of it
+    is held: the whole is that and its transpose. So a product of two different columns is added
+    once: below the diagonal where one of them is a cell, else on either side.
 
     Args:
         layout: which column is what.
         own: stop -> rows about its own unknowns.
-        beams: how many stops have beams.
         raw: whether the Gram matrix before eliminations is wanted.
     """
 
-    def __init__(
-        self, layout: Layout, own: Mapping[int, Sequence[OwnRows]], beams: int, raw: bool
-    ) -> None:
-        self.layout, self.own = layout, own
+    def __init__(self, layout: Layout, own: Mapping[int, Sequence[OwnRows]], raw: bool) -> None:
+        self.layout, self.waiting = layout, dict(own)
         self.raw = np.zeros((len(layout.kept), len(layout.kept))) if raw else None
+        self.cells = np.concatenate([layout.finest, layout.cells])
+        self.columns = np.concatenate([self.cells, layout.kept, [layout.size]])
+        self.at = positions(layout.size + 1, self.columns)
+        self.half = np.zeros((len(self.columns), len(self.columns)))
+        # What goes with stops' own unknowns, apart where it is asked what there was before.
+        self.taken = np.zeros_like(self.half) if raw else self.half
         self.chi2 = sum(float(rows.b @ rows.b) for each in own.values() for rows in each)
         self.touched = np.zeros(layout.size, bool)
         for rows in (r for each in own.values() for r in each if r.measured):
             self.touched[rows.columns] |= np.any(rows.A != 0, axis=0)
         self.weight_m2 = self.beams_chi2 = 0.0
         self.eliminated: list[Eliminated] = []
-        self.twists: list[tuple[int, np.ndarray, np.ndarray]] = []
         self.scans: dict[int, OwnSums] = {}
+        self.scanned: list[_Scanned] = []
+        widest = max(map(len, layout.own.values()), default=0) + 2 * TWIST
+        self.together = max(WAITING_ENTRIES // (widest * len(self.columns)), 1)
 
     def add(self, sums: StopSums) -> None:
         """Add the beams of a stop."""
@@ -111,38 +129,247 @@ class Assembly:
         self.touched[sums.chain_columns] |= np.any(sums.chain != 0, axis=0)
         if self.raw is not None:
             self.scans[sums.stop] = sums.alone()
-
-    def _add_raw(self, found: Iterable[OwnRows | KeptSums]) -> None:
-        """Add what rows say of kept columns."""
-        at = positions(self.layout.size, self.layout.kept)
-        for rows in found:
-            rows.add_to(self.raw, at, self.layout.sigma)
+        sigma, width = self.layout.sigma, sums.dense.shape[1] - TWIST
+        at = np.append(len(self.columns) - 1, self.at[sums.columns])
+        unit = np.append(1.0, sigma[sums.columns])
+        dense = sums.dense[TWIST:, TWIST:] * unit[:width] * unit[:width, None]
+        with_dense = sums.with_dense.T * unit[width:]
+        add_at(self.half, at[:width], at[:width], dense / 2)
+        add_at(self.half, at[:width], at[width:], with_dense[TWIST:] * unit[:width, None])
+        add_sparse(self.half, at[width:], unit[width:], sums.with_sparse, sums.own)
+        by_twist = np.hstack([sums.dense[:TWIST, TWIST:] * unit[:width], with_dense[:TWIST]])
+        found = _Scanned(
+            stop=sums.stop,
+            information=sums.dense[:TWIST, :TWIST],
+            beside=by_twist,
+            at=at,
+            chain=sums.chain * sigma[sums.chain_columns],
+            columns=sums.chain_columns,
+        )
+        self.scanned.append(found)
+        if len(self.scanned) >= self.together:
+            self._finish_scanned()
 
     def add_kept(self, sums: KeptSums) -> None:
         """Add the sums of whitened rows about kept unknowns."""
         self.chi2 += float(sums.gram[-1, -1])
         self.touched[sums.columns] |= np.diag(sums.gram)[:-1] > 0
+        unit = np.append(self.layout.sigma[sums.columns], 1.0)
+        at = np.append(self.at[sums.columns], len(self.columns) - 1)
+        add_at(self.half, at, at, sums.gram * unit * unit[:, None] / 2)
 
-    def _cell_priors(self, values: Values, columns: np.ndarray) -> np.ndarray:
+    def done(self, values: Values) -> Linearisation:
+        """Eliminate all but the kept."""
+        self._finish_scanned()
+        count = len(self.cells)
+        if self.raw is not None:
+            before = self.half[count:-1, count:-1]
+            self.raw += before + before.T
+            self.half += self.taken
+        stops = list(self.waiting)
+        for first in range(0, len(stops), STOPS_TOGETHER):
+            self._finish_without_beams(stops[first : first + STOPS_TOGETHER])
+        rest = self.half[count:, count:] + self.half[count:, count:].T
+        if count:
+            prior = self._cell_priors(values)
+            block, cross = self.half[:count, :count], self.half[count:, :count].T
+            np.einsum("ii->i", block)[:] *= 2.0
+            np.einsum("ii->i", block)[:] += 1.0
+            cross[:, -1] += prior
+            rest[-1, -1] += prior @ prior
+            factor, gain = eliminate(block, cross, rest)
+            self.eliminated.append(Eliminated(self.cells, self.columns[count:], factor, gain))
+        return Linearisation(
+            layout=self.layout,
+            values=values,
+            kept=rest,
+            raw=self.raw,
+            chi2=self.chi2,
+            touched=self.touched,
+            eliminated=self.eliminated,
+            scans=self.scans,
+            weight_m2=self.weight_m2,
+            beams_chi2=self.beams_chi2,
+        )
+
+    def _cell_priors(self, values: Values) -> np.ndarray:
         """Right side (n,) of the priors of cells, in units of their sigmas: the derivative is 1."""
         whole = np.zeros(self.layout.size)
         for name, at in self.layout.at.items():
             if self.layout.unknowns[name].role is Role.SURFACE:
                 whole[at] = -values[name] / self.layout.unknowns[name].sigma
-        self.chi2 += float(whole[columns] @ whole[columns])
-        return whole[columns]
+        self.chi2 += float(whole[self.cells] @ whole[self.cells])
+        return whole[self.cells]
 
-    def _done(self, values: Values, kept: np.ndarray) -> Linearisation:
-        return Linearisation(
-            beams_chi2=self.beams_chi2,
-            layout=self.layout,
-            values=values,
-            kept=kept,
-            raw=self.raw,
-            chi2=self.chi2,
-            touched=self.touched,
-            eliminated=self.eliminated,
-            twists=self.twists,
-            scans=self.scans,
-            weight_m2=self.weight_m2,
-        )
+    # ------------------------------------------------------------------------ stops with beams
+
+    def _finish_scanned(self) -> None:
+        """Add what the beams of the stops that wait say of where their LiDARs are, and the stops'
+        own rows; eliminate what is their own.
+
+        With the twist ``t = T_o o + T_k k`` of own and kept unknowns, its information A and what it
+        has with all others B, a stop adds ``T_k' Z + Z' T_k - T_k' A T_k`` to the others, where
+        ``Z = A T_k + B``; its own have ``T_o' A T_o`` with each other and ``T_o' Z`` with the rest.
+        """
+        beams, self.scanned = {each.stop: each for each in self.scanned}, []
+        kept = positions(self.layout.size, self.layout.kept)
+        for some in self._alike(list(beams)):
+            mine, at = self._columns(some[0])
+            count, rows = len(self._own(some[0])), self._stacked(some, at, len(mine))
+            others = self.at[mine[count:]]
+            A = np.stack([beams[stop].information for stop in some])
+            T_own = np.zeros((len(some), TWIST, count))
+            T_kept = np.zeros((len(some), TWIST, len(self.layout.kept)))
+            Z = np.zeros((len(some), TWIST, len(self.columns)))
+            place = np.full(self.layout.size, -1)
+            for i, stop in enumerate(some):
+                each = beams[stop]
+                place[self._own(stop)] = np.arange(count)
+                here, there = place[each.columns], kept[each.columns]
+                T_own[i][:, here[here >= 0]] = each.chain[:, here >= 0]
+                T_kept[i][:, there[there >= 0]] = each.chain[:, there >= 0]
+                Z[i][:, each.at] = each.beside
+                place[self._own(stop)] = -1
+                self.waiting.pop(stop, None)
+            moved = A @ T_kept
+            Z[:, :, len(self.cells) : -1] += moved
+            self._add_through(T_kept, moved, Z)
+            self._add_squares(rows[:, :, count:], others)
+            if not count:
+                continue
+            block = T_own.mT @ A @ T_own + rows[:, :, :count].mT @ rows[:, :, :count]
+            factor = np.linalg.cholesky(block)
+            gain = self._without(factor, T_own, Z, rows, others)
+            for i, stop in enumerate(some):
+                over = np.flatnonzero(gain[i].any(axis=0))
+                found = Eliminated(self._own(stop), self.columns[over], factor[i], gain[i][:, over])
+                self.eliminated.append(found)
+
+    def _without(
+        self,
+        factor: np.ndarray,
+        T_own: np.ndarray,
+        Z: np.ndarray,
+        rows: np.ndarray,
+        others: np.ndarray,
+    ) -> np.ndarray:
+        """Take from the matrix what goes with the own unknowns of some stops; their gains (K, o, N)
+        over all columns.
+
+        What goes is the square of ``W = L^-1 (T_o' Z + R_o' R_r)``, with L the factor and R the own
+        rows. Its rows are turned until but six of them, as a twist has, touch more than R does.
+
+        Args:
+            factor: (K, o, o), T_own: (K, 6, o), Z: (K, 6, N) as of `_finish_scanned`.
+            rows: (K, m, o + r) own rows, of which the last r stand at `others` (r,).
+        """
+        count = factor.shape[1]
+        wide = min(count, TWIST)
+        Q, R = np.linalg.qr(np.linalg.solve(factor, T_own.mT), mode="complete")
+        by_rows = rows[:, :, :count].mT @ rows[:, :, count:]
+        by_rows = Q.mT @ np.linalg.solve(factor, by_rows)
+        W, beyond = R[:, :wide] @ Z, by_rows[:, wide:]
+        W[:, :, others] += by_rows[:, :wide]
+        _subtract_square(self.taken, W.reshape(-1, W.shape[2]))
+        self.taken[np.ix_(others, others)] -= square(beyond.reshape(-1, len(others))) / 2
+        turned = np.linalg.solve(factor.mT, Q)
+        gain = turned[:, :, :wide] @ W
+        gain[:, :, others] += turned[:, :, wide:] @ beyond
+        return gain
+
+    def _add_through(self, T: np.ndarray, moved: np.ndarray, Z: np.ndarray) -> None:
+        """Add what twists say by the kept unknowns (K, 6, S) they depend on."""
+        used, first = np.flatnonzero(T.any(axis=(0, 1))), len(self.cells)
+        chain = T.reshape(-1, T.shape[2])[:, used]
+        self.half[first + used] += chain.T @ Z.reshape(-1, Z.shape[2])
+        both = chain.T @ moved.reshape(-1, T.shape[2])[:, used]
+        self.half[np.ix_(first + used, first + used)] -= both / 2
+
+    def _add_squares(self, rows: np.ndarray, at: np.ndarray) -> None:
+        """Add the products of rows (K, m, n) over columns that stand at (n,)."""
+        self.half[np.ix_(at, at)] += square(rows.reshape(-1, len(at))) / 2
+
+    # --------------------------------------------------------------------- stops without beams
+
+    def _finish_without_beams(self, stops: Sequence[int]) -> None:
+        """Eliminate what is their own from stops that have no beams. Their rows are few: they are
+        turned until no more of them touch a stop's own unknowns than there are of these (QR), and
+        all others go into one product."""
+        raw = []
+        kept = positions(self.layout.size, self.layout.kept)
+        for some in self._alike(stops):
+            mine, at = self._columns(some[0])
+            rows, count = self._stacked(some, at, len(mine)), len(self._own(some[0]))
+            if self.raw is not None:
+                raw.append(_over(rows, kept, mine[:-1]))
+            if count:
+                Q, R = np.linalg.qr(rows[:, :, :count], mode="complete")
+                rows = Q.mT @ rows
+                R, over = R[:, :count], mine[count:]
+                gains = np.linalg.solve(R, rows[:, :count, count:])
+                self.eliminated += [
+                    Eliminated(self._own(stop), over, root.T, gain)
+                    for stop, root, gain in zip(some, R, gains, strict=True)
+                ]
+            self._add_squares(rows[:, count:, count:], self.at[mine[count:]])
+            for stop in some:
+                del self.waiting[stop]
+        if self.raw is not None:
+            self.raw += square(np.vstack(raw))
+
+    # ------------------------------------------------------------------------- stops' own rows
+
+    def _columns(self, stop: int) -> tuple[np.ndarray, np.ndarray]:
+        """Columns (m,) that a stop's own rows touch, its own first and the right side last, and
+        where among them each of all stands."""
+        size, own = self.layout.size, self._own(stop)
+        rows = (each.columns for each in self.waiting.get(stop, ()))
+        touched = np.unique(np.concatenate([*rows, [size]]).astype(int))
+        mine = np.concatenate([own, np.setdiff1d(touched, own)])
+        return mine, positions(size + 1, mine)
+
+    def _own(self, stop: int) -> np.ndarray:
+        return self.layout.own.get(stop, np.zeros(0, int))
+
+    def _alike(self, stops: Sequence[int]) -> list[list[int]]:
+        """Stops whose rows touch the same unknowns, but for their own, in the same order."""
+        found: dict[object, list[int]] = {}
+        place = np.full(self.layout.size, -1)
+        for stop in stops:
+            own = self._own(stop)
+            place[own] = -2 - np.arange(len(own))
+            like: list[object] = [len(own)]
+            for rows in self.waiting.get(stop, ()):
+                at = place[rows.columns]
+                like += [len(rows.b), np.where(at < -1, at, rows.columns).tobytes()]
+            place[own] = -1
+            found.setdefault(tuple(like), []).append(stop)
+        return list(found.values())
+
+    def _stacked(self, stops: Sequence[int], at: np.ndarray, width: int) -> np.ndarray:
+        """Own rows (K, m, width) of stops that are alike, in units of sigmas; `at` says where the
+        columns of the first of them stand."""
+        each = list(zip(*(self.waiting.get(stop, ()) for stop in stops), strict=True))
+        out, first = np.zeros((len(stops), sum(len(rows[0].b) for rows in each), width)), 0
+        for rows in each:
+            here = slice(first, first := first + len(rows[0].b))
+            sigma = self.layout.sigma[np.stack([r.columns for r in rows])]
+            out[:, here, at[rows[0].columns]] = np.stack([r.A for r in rows]) * sigma[:, None]
+            out[:, here, -1] = np.stack([r.b for r in rows])
+        return out
+
+
+def _subtract_square(target: np.ndarray, rows: np.ndarray) -> None:
+    """Take ``rows.T @ rows`` off a matrix of which half is held, below its diagonal."""
+    # Each pair of columns once, and each column by itself twice as much as is held of it.
+    dsyrk(-1.0, rows.T, beta=1.0, c=target.T, overwrite_c=1)
+    np.einsum("ii->i", target)[:] += np.einsum("ij,ij->j", rows, rows) / 2
+
+
+def _over(rows: np.ndarray, at: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Rows (K, m, n) of some columns (n,), each (K m,) among the columns that stand somewhere in
+    `at`."""
+    rows, there = rows.reshape(-1, rows.shape[2]), at[columns] >= 0
+    out = np.zeros((len(rows), int(at.max(initial=-1)) + 1))
+    out[:, at[columns[there]]] = rows[:, : len(columns)][:, there]
+    return out

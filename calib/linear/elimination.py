@@ -9,14 +9,11 @@ factored whatever the data leave open.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 from scipy.linalg.blas import dsyrk
 from scipy.linalg.lapack import dpstrf
-
-BY_TWIST = -2  # in `Eliminated.over`: a column of a stop's twist, which is no unknown
 
 
 @dataclass(frozen=True)
@@ -27,9 +24,9 @@ class Eliminated:
 
     Args:
         columns: (e,) which unknowns.
-        over: (r,) columns of the others they depend on: `BY_TWIST` for each of the twists, which
-            come first, and U, the number of unknowns, for the right side.
-        factor: (e, e) lower Cholesky factor of their block, or (e,) its diagonal.
+        over: (r,) columns of the others they depend on, and U, the number of unknowns, for the
+            right side.
+        factor: (e, e) lower Cholesky factor of their block.
         gain: (e, r).
     """
 
@@ -38,22 +35,15 @@ class Eliminated:
     factor: np.ndarray
     gain: np.ndarray
 
-    @cached_property
-    def twists(self) -> int:
-        """How many of `over` are columns of twists."""
-        return int(np.searchsorted(self.over != BY_TWIST, True))
-
     def onto(self, to: np.ndarray) -> Eliminated:
         """The same over fewer others: `to` (U + 1,) says where each column is then, -1 where it is
         not."""
-        over = np.where(self.over == BY_TWIST, BY_TWIST, to[self.over])
+        over = to[self.over]
         there = over != -1
         return replace(self, columns=to[self.columns], over=over[there], gain=self.gain[:, there])
 
     def solve(self, right: np.ndarray) -> np.ndarray:
         """``H_ee^-1 @ right``, of (e, q)."""
-        if self.factor.ndim == 1:
-            return right / self.factor[:, None]
         return cho_solve((self.factor, True), right, check_finite=False)
 
 
@@ -63,7 +53,8 @@ def eliminate(
     """Take unknowns out of normal equations.
 
     Args:
-        block: (e, e) of those, positive definite; or (e,) where it is diagonal.
+        block: (e, e) of those, positive definite, of which only what is on the diagonal and below
+            it is read; or (e,) where it is diagonal.
         cross: (e, r) of them and the others.
         rest: (r, r) of the others, symmetric; the Schur complement takes its place.
 

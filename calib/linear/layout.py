@@ -19,11 +19,6 @@ from calib.residuals.scan import ScanStop
 from calib.residuals.seen import BodiesTogether, SeenBody
 
 StopKey = tuple[object, int]
-# What taking a stop's own unknowns out by itself costs, in multiplications of dense algebra: for
-# each entry of the matrix over its columns, and besides. Measured on one core at 1.5e10 a second:
-# 300 stops with 203 kept unknowns, 2.0 s a pass, and 2.2 s in one block; with 2,840, 52 s and 19 s;
-# 360 stops with 686, 3.9 s and 4.0 s; 100 stops with 6 unknowns each and no scan, 10 ms and 3 ms.
-PER_ENTRY, PER_STOP = 100, 1.5e6
 
 
 @dataclass(frozen=True)
@@ -142,17 +137,6 @@ class Layout:
         """Unknowns that the graph solves for."""
         gone = set(self.inner())
         return {name: u for name, u in self.unknowns.items() if name not in gone}
-
-    @property
-    def stops_first(self) -> bool:
-        """Whether stops are eliminated before cells, each by itself: where that costs less than all
-        in one block. A stop sees about half of all cells; where it has no beams, its rows are as
-        few as its unknowns, and their product is made for many stops at once."""
-        count, kept = sum(map(len, self.own.values())), len(self.kept)
-        in_one = count**3 / 3 + 2 * count**2 * kept + count * kept**2
-        seen = kept + (len(self.finest) + len(self.cells)) / 2
-        by_stop = len(self.own) * PER_STOP + self.scanned * PER_ENTRY * seen**2
-        return in_one > by_stop + 2 * count * seen**2
 
 
 def positions(size: int, columns: np.ndarray) -> np.ndarray:

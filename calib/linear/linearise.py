@@ -9,13 +9,11 @@ from functools import partial
 import numpy as np
 
 from calib.forward import Placed, place_each
-from calib.linear.assembly import KeptSums, OwnRows
-from calib.linear.cells_first import CellsFirst
+from calib.linear.assembly import Assembly, KeptSums, OwnRows
 from calib.linear.clusters import Gradients, summed
 from calib.linear.layout import Layout
 from calib.linear.parallel import over_stops
 from calib.linear.rows import State, StopRows, StopSums, Weighing
-from calib.linear.stops_first import StopsFirst
 from calib.linear.system import Linearisation, Values
 from calib.problem import Problem
 from calib.residuals.beams import Association, Rows
@@ -56,8 +54,7 @@ def linearise(
     layout = layout or Layout.of(problem)
     count = len(problem.scans) if beams else 0
     own = {stop: list(rows.values()) for stop, rows in own_rows(layout, values).items()}
-    order = StopsFirst if layout.stops_first else CellsFirst
-    assembly = order(layout, own, count, gradients is not None)
+    assembly = Assembly(layout, own, gradients is not None)
     placed = lidars(problem.scans, values) if count else []
     scans = problem.scans[:count]
     work = partial(_of_stop, layout, State(values), newton, gradients is not None)

@@ -17,7 +17,7 @@ from calib.linear.rows import OwnSums, Weighing
 
 Values = Mapping[str, np.ndarray]
 ROWS_AT_ONCE = 1024  # rows whose variances are computed at once: bounds the memory
-ELIMINATED_AT_ONCE = 128  # stops whose unknowns follow from the kept in one product, likewise
+ELIMINATED_AT_ONCE = 128  # whose unknowns follow from others in one product, likewise
 
 
 @dataclass(frozen=True)
@@ -35,8 +35,6 @@ class Linearisation:
         chi2: of all rows in it, before anything was eliminated.
         touched: (U,) bool, whether any beam or tracked body depends on a column.
         eliminated: what was eliminated, in that order.
-        twists: per stop with beams its number, the derivative (6, n) of its LiDAR's twist, and the
-            columns (n,) of that; empty unless cells were eliminated while stops were twists.
         scans: stop -> what its beams say of a shift that it alone has; empty unless gradients were
             asked for.
         weight_m2: sum of the beams' weights over their variances, 1/m2.
@@ -53,7 +51,6 @@ class Linearisation:
     chi2: float
     touched: np.ndarray
     eliminated: Sequence[Eliminated]
-    twists: Sequence[tuple[int, np.ndarray, np.ndarray]]
     scans: Mapping[int, OwnSums]
     weight_m2: float
     beams_chi2: float
@@ -74,7 +71,6 @@ class Linearisation:
             raw=None if self.raw is None else self.raw[np.ix_(at, at)],
             touched=self.touched[here],
             eliminated=[each.onto(to) for each in self.eliminated],
-            twists=[(stop, d[:, to[c] >= 0], to[c[to[c] >= 0]]) for stop, d, c in self.twists],
             scans={stop: sums.onto(to) for stop, sums in self.scans.items()},
         )
 
@@ -87,41 +83,28 @@ class Linearisation:
         layout = self.layout
         out = np.zeros((layout.size + 1, kept.shape[1]))
         out[layout.kept], out[-1] = kept[:-1], kept[-1]
-        by_twist, together = None, self._about_kept()
-        if together:
-            self._follow_kept(out, together)
-        for each in reversed(self.eliminated[: len(self.eliminated) - len(together)]):
-            if each.twists:
-                if by_twist is None:
-                    by_twist = self._twists(out)
-                others = out[each.over[each.twists :]]
-                out[each.columns] = -each.gain @ np.vstack([by_twist, others])
-            else:
-                out[each.columns] = -each.gain @ out[each.over]
+        for some in self._batches():
+            over = np.unique(np.concatenate([each.over for each in some]))
+            at = positions(layout.size + 1, over)
+            gain, first = np.zeros((sum(len(each.columns) for each in some), len(over))), 0
+            for each in some:
+                gain[first : first + len(each.columns), at[each.over]] = each.gain
+                first += len(each.columns)
+            out[np.concatenate([each.columns for each in some])] = -gain @ out[over]
         return out[:-1]
 
-    def _about_kept(self) -> Sequence[Eliminated]:
-        """The last that were eliminated, which depend on nothing but what was kept."""
-        is_kept = np.append(np.zeros(self.layout.size, bool), True)
-        is_kept[self.layout.kept] = True
-        count = 0
+    def _batches(self) -> Iterator[list[Eliminated]]:
+        """What was eliminated, last first, as many together as do not depend on each other."""
+        some: list[Eliminated] = []
+        among = np.zeros(self.layout.size + 1, bool)
         for each in reversed(self.eliminated):
-            if each.twists or not is_kept[each.over].all():
-                break
-            count += 1
-        return self.eliminated[len(self.eliminated) - count :]
-
-    def _follow_kept(self, out: np.ndarray, some: Sequence[Eliminated]) -> None:
-        """Write into `out` (U + 1, q) what follows from the kept alone, many at once."""
-        over = np.append(self.layout.kept, self.layout.size)
-        at, kept = positions(self.layout.size + 1, over), out[over]
-        for first in range(0, len(some), ELIMINATED_AT_ONCE):
-            batch = some[first : first + ELIMINATED_AT_ONCE]
-            gain = np.zeros((sum(len(each.columns) for each in batch), len(over)))
-            ends = np.cumsum([0, *(len(each.columns) for each in batch)])
-            for each, start, end in zip(batch, ends, ends[1:], strict=False):
-                gain[start:end, at[each.over]] = each.gain
-            out[np.concatenate([each.columns for each in batch])] = -gain @ kept
+            if some and (len(some) == ELIMINATED_AT_ONCE or among[each.over].any()):
+                yield some
+                some, among[:] = [], False
+            some.append(each)
+            among[each.columns] = True
+        if some:
+            yield some
 
     def followed(self, kept: np.ndarray) -> np.ndarray:
         """Directions in all unknowns (U, q) that follow from those in the kept (S, q), in the
@@ -129,13 +112,6 @@ class Linearisation:
         sigma = self.layout.sigma
         scaled = np.vstack([kept / sigma[self.layout.kept, None], np.zeros((1, kept.shape[1]))])
         return self.directions(scaled) * sigma[:, None]
-
-    def _twists(self, out: np.ndarray) -> np.ndarray:
-        used = np.unique(np.concatenate([np.zeros(0, int), *(c for _, _, c in self.twists)]))
-        chain = np.zeros((6 * len(self.twists), len(used)))
-        for i, (_, d, c) in enumerate(self.twists):
-            chain[6 * i : 6 * (i + 1), np.searchsorted(used, c)] = d
-        return chain @ (self.layout.sigma[used, None] * out[used])
 
     def step(self, kept: np.ndarray) -> dict[str, np.ndarray]:
         """Tangent step of each eliminated unknown, given that of the kept (S,) in their units."""
@@ -163,12 +139,8 @@ class Linearisation:
         arguments as of `covariance`."""
         sigma = self.layout.sigma
         left = np.hstack([rows * sigma, np.zeros((len(rows), 1))])
-        by_twist = np.zeros((len(rows), 6 * len(self.twists)))
         touched = np.any(left != 0, axis=0)
         for each in self.eliminated:
-            if each.twists == 0 and self.twists and by_twist.any():
-                self._through(by_twist, left)
-                touched = np.any(left != 0, axis=0)
             if not touched[each.columns].any():
                 continue
             some = np.flatnonzero(np.any(left[:, each.columns] != 0, axis=1))
@@ -176,11 +148,8 @@ class Linearisation:
                 continue
             mine = left[np.ix_(some, each.columns)]
             yield some, mine, each.solve(mine.T)
-            further = mine @ each.gain
-            by_twist[some, : each.twists] -= further[:, : each.twists]
-            left[np.ix_(some, each.over[each.twists :])] -= further[:, each.twists :]
-            touched[each.over[each.twists :]] = True
-        self._through(by_twist, left)
+            left[np.ix_(some, each.over)] -= mine @ each.gain
+            touched[each.over] = True
         last = left[:, self.layout.kept] / sigma[self.layout.kept]
         yield np.arange(len(rows)), last, kept @ last.T
 
@@ -208,10 +177,3 @@ class Linearisation:
             for at, mine, known in self._shares(rows[here].toarray(), kept):
                 found[here][at] += np.einsum("ij,ji->i", mine, known)
         return np.split(found, ends[1:])[:-1]
-
-    def _through(self, by_twist: np.ndarray, left: np.ndarray) -> None:
-        """Move what stands by the twists of all stops (q, 6 K) to the unknowns behind them."""
-        for i, (_, d, columns) in enumerate(self.twists):
-            mine = by_twist[:, 6 * i : 6 * (i + 1)]
-            left[:, columns] += mine @ d * self.layout.sigma[columns]
-        by_twist[:] = 0.0

@@ -158,40 +158,28 @@ def cross_sums(
 
 @compiled
 def add_sparse(
+    half: np.ndarray,
+    at: np.ndarray,
+    unit: np.ndarray,
     with_sparse: np.ndarray,
     own: np.ndarray,
-    at: np.ndarray,
-    fine: np.ndarray,
-    rest: np.ndarray,
-    cross: np.ndarray,
-    diagonal: np.ndarray,
 ) -> None:
-    """Add sums of sparse columns to normal equations that are kept in three parts.
+    """Add sums of sparse columns to a matrix of which half is held, below its diagonal: the whole
+    is that and its transpose.
 
     Args:
+        half: (n, n), added to.
+        at: (s,) where each column stands in it, unit: (s,) what it is multiplied by.
         with_sparse, own: (last, s) and (s,) as `cross_sums` gives them.
-        at: (s,) where each column stands in `rest`, for those that stand there.
-        fine: (s,) where it stands among those whose block is diagonal; -1 for the others.
-        rest: (n, n), cross: (C, n) and diagonal: (C,), added to.
     """
     rows, size = with_sparse.shape
     for a in range(size):
-        if fine[a] >= 0:
-            diagonal[fine[a]] += own[a]
-        else:
-            rest[at[a], at[a]] += own[a]
+        half[at[a], at[a]] += own[a] * unit[a] * unit[a] / 2.0
     for a in range(rows):
-        mine, row = fine[a], at[a]
         for b in range(size):
             v = with_sparse[a, b]
             if v != 0.0:
-                if mine >= 0:
-                    cross[mine, at[b]] += v
-                elif fine[b] >= 0:
-                    cross[fine[b], row] += v
-                else:
-                    rest[row, at[b]] += v
-                    rest[at[b], row] += v
+                half[max(at[a], at[b]), min(at[a], at[b])] += v * unit[a] * unit[b]
 
 
 @compiled
@@ -282,21 +270,3 @@ def add_both(target: np.ndarray, rows: np.ndarray, columns: np.ndarray, block: n
                 if columns[j] >= 0:
                     target[rows[i], columns[j]] += block[i, j]
                     target[columns[j], rows[i]] += block[i, j]
-
-
-@compiled
-def add_gram(target: np.ndarray, at: np.ndarray, rows: np.ndarray) -> None:
-    """``target[at[i], at[j]] += rows[:, i] . rows[:, j]``; those at -1 are left out."""
-    count, width = rows.shape
-    for i in range(width):
-        if at[i] < 0:
-            continue
-        for j in range(i, width):
-            if at[j] < 0:
-                continue
-            total = 0.0
-            for k in range(count):
-                total += rows[k, i] * rows[k, j]
-            target[at[i], at[j]] += total
-            if j > i:
-                target[at[j], at[i]] += total

@@ -17,10 +17,9 @@ from unittest import mock
 
 from calib.diagnosis import stand
 from calib.linear import linearise
-from calib.linear.cells_first import CellsFirst
+from calib.linear.assembly import Assembly
 from calib.linear.parallel import workers
 from calib.linear.rows import StopRows
-from calib.linear.stops_first import StopsFirst
 from calib.linear.system import Linearisation
 from calib.problem.model import Source
 from calib.residuals.store import BeamStore
@@ -30,15 +29,15 @@ from calib.solve.graph import Graph, KeptRows
 from sensors.reference import Reference
 
 STARTING, REST = "starting, importing", "all else"
-# StopsFirst eliminates as it adds.
+# Stops are eliminated as they are added.
 PARTS: dict[str, tuple[tuple[Any, str], ...]] = {
     "reading": ((Source, "open"), (BeamStore, "read"), (Run, "open")),
     "casting": ((Reference, "first_triangle"),),
     "depth edges": ((Reference, "near_edge"),),
     "placing": ((linearise, "lidars"), (linearise, "own_rows")),
     "rows": ((StopRows, "of"),),
-    "sums": ((StopRows, "sums"), (StopRows, "gradient"), (CellsFirst, "add")),
-    "eliminating": ((CellsFirst, "done"), (StopsFirst, "add"), (StopsFirst, "done")),
+    "sums": ((StopRows, "sums"), (StopRows, "gradient")),
+    "eliminating": ((Assembly, "add"), (Assembly, "done")),
     "graph": (*((Graph, n) for n in ("__init__", "step", "solve", "error")), (KeptRows, "of")),
     "covariance": ((Graph, "covariance"), (Linearisation, "covariance")),
     "testing": (*((stand, n) for n in ("project", "screen")), (diagnose, "weak_directions")),

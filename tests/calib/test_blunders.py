@@ -10,7 +10,6 @@ from calib.blunders import judged
 from calib.blunders.shifts import Shift, shifts, standing_alone
 from calib.effects import find
 from calib.linear.clusters import Gradients
-from calib.linear.layout import Layout
 from calib.problem import build
 from calib.problem.model import Model, Source
 from calib.residuals.groups import CAD, Group
@@ -63,9 +62,7 @@ def assert_same(shift, off, tolerance=1e-6):
 # ------------------------------------------------------------------------------------------ algebra
 
 
-@pytest.mark.parametrize("stops_first", [False, True], ids=["cells first", "stops first"])
-def test_every_group_is_off_as_dense_rows_say(both, stops_first, monkeypatch):
-    monkeypatch.setattr(Layout, "stops_first", stops_first)
+def test_every_group_is_off_as_dense_rows_say(both):
     case, there = both
     here = found(case)
     known = {*there[CAD].parts, *there[CAD].scans}

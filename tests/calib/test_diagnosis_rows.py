@@ -12,7 +12,6 @@ from calib.diagnosis.jackknife import Shares
 from calib.diagnosis.linear import rows_along
 from calib.diagnosis.score import away_from_model, project, score_test
 from calib.diagnosis.stand import Stand
-from calib.linear.layout import Layout
 from calib.linear.parallel import workers
 from calib.linear.rows import PLACES, StopRows
 from calib.problem.model import Model
@@ -84,10 +83,7 @@ def problem_with(stand, names):
     return stand.problem_of(stand.model.plus(tuple(effects.find(name) for name in names)))
 
 
-@pytest.mark.parametrize("order", [True, False])
-def test_without_its_candidates_a_linearisation_is_that_of_the_fit(stand, order, monkeypatch):
-    """Whichever is eliminated first, stops or cells."""
-    monkeypatch.setattr(Layout, "stops_first", order)
+def test_without_its_candidates_a_linearisation_is_that_of_the_fit(stand):
     wide = stand.linearise([effects.find(name) for name in ADDED], quiet)[0].whole
     fitted = stand.linearise([], quiet)[0].whole
     found = wide.onto(fitted.layout)

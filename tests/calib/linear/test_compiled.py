@@ -151,37 +151,22 @@ def test_square_sums_are_those_of_rows_along_directions(sizes):
     assert not found[6].any()
 
 
-@pytest.mark.parametrize("fine", ["first", "last", "none"])
-def test_add_sparse_puts_every_product_where_its_columns_stand(fine):
-    """Three groups, of which one is that whose block is kept as a diagonal."""
+def test_add_sparse_puts_every_product_once_below_the_diagonal_where_its_columns_stand():
     rng = np.random.default_rng(3)
     sizes = (6, 4, 5)
     dense, weight, index, value, full, last = rows(rng, 200, sizes)
-    group = np.repeat(np.arange(3), sizes)
-    is_fine = group == {"first": 0, "last": 2, "none": -1}[fine]
-    places, cells = 20, 9  # more of both than there are columns
-    at = np.where(is_fine, -1, rng.permutation(places)[: len(group)])
-    number = np.full(len(group), -1)
-    number[is_fine] = rng.permutation(cells)[: is_fine.sum()]
-    rest, cross, diagonal = (
-        rng.normal(size=(places, places)),
-        np.ones((cells, places)),
-        np.ones(cells),
-    )
-    before = rest.copy(), cross.copy(), diagonal.copy()
-    _, with_sparse, own = compiled.cross_sums(dense, weight, index, value, len(group), last)
-    compiled.add_sparse(with_sparse, own, at, number, rest, cross, diagonal)
-    gram = full.T @ (weight[:, None] * full)
-    coarse = np.flatnonzero(~is_fine)
+    count, places = sum(sizes), 20  # more places than columns
+    at, unit = rng.permutation(places)[:count], rng.uniform(0.5, 2.0, count)
+    half = rng.normal(size=(places, places))
+    before = half.copy()
+    _, with_sparse, own = compiled.cross_sums(dense, weight, index, value, count, last)
+    compiled.add_sparse(half, at, unit, with_sparse, own)
+    full = full * unit
     expected = np.zeros((places, places))
-    expected[np.ix_(at[coarse], at[coarse])] = gram[np.ix_(coarse, coarse)]
-    close(rest - before[0], expected)
-    cells_by = np.zeros((cells, places))
-    cells_by[np.ix_(number[is_fine], at[coarse])] = gram[np.ix_(is_fine, coarse)]
-    close(cross - before[1], cells_by)
-    own_by = np.zeros(cells)
-    own_by[number[is_fine]] = np.diag(gram)[is_fine]
-    close(diagonal - before[2], own_by)
+    expected[np.ix_(at, at)] = full.T @ (weight[:, None] * full)
+    added = half - before
+    assert not np.triu(added, 1).any()
+    close(added + added.T, expected)
 
 
 @pytest.mark.parametrize("both", [False, True])

@@ -40,6 +40,8 @@ def test_what_is_left_is_what_the_others_say_once_the_first_have_taken_all_they_
     )
     np.testing.assert_array_equal(left, left.T)
     np.testing.assert_allclose(gain, taken, rtol=1e-7, atol=1e-9)
+    if diagonal:
+        return
     right = rng.normal(size=(count, 3))
     gone = Eliminated(np.arange(count), np.arange(count, len(whole)), factor, gain)
     expected = np.linalg.solve(whole[:count, :count], right)

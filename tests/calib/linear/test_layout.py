@@ -1,7 +1,5 @@
 """Which unknowns are a stop's own, which are cells, and which are kept."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -137,12 +135,3 @@ def test_what_has_no_prior_is_not_scaled(problem):
     layout = Layout.of(problem(), unbounded=["mount"])
     np.testing.assert_array_equal(layout.sigma[layout.at["mount"]], np.ones(6))
     assert layout.unbounded == {"mount"}
-
-
-def test_stops_go_first_where_that_is_less_work(problem):
-    """Not four of them; a thousand do, unless far more unknowns than theirs are kept."""
-    layout = Layout.of(preview(problem(seen=False)).problem)
-    assert not layout.stops_first
-    many = replace(layout, own={stop: np.arange(12) for stop in range(1000)})
-    assert many.stops_first
-    assert not replace(many, kept=np.arange(50_000)).stops_first

@@ -5,16 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.linear import cells_first
+from calib.linear import assembly
 from calib.linear.clusters import Gradients
-from calib.linear.layout import Layout
 from calib.linear.parallel import workers
 
 from .. import rigs
 from .cases import CASES, made
 
-# Order of elimination, and whether the chain behind twists is taken stop by stop or as a whole.
-ORDERS = {"cells first": (False, 10**9), "by blocks": (False, 0), "stops first": (True, 0)}
+TOGETHER = {"one by one": 1, "all at once": 10**9}  # entries of stops that wait for each other
 
 
 @pytest.fixture(scope="module", params=CASES)
@@ -22,11 +20,10 @@ def case(request, tmp_path_factory):
     return made(request.param, tmp_path_factory.mktemp("linear"))
 
 
-@pytest.fixture(params=ORDERS)
-def order(request, monkeypatch):
-    stops_first, dense = ORDERS[request.param]
-    monkeypatch.setattr(Layout, "stops_first", stops_first)
-    monkeypatch.setattr(cells_first, "DENSE", dense)
+@pytest.fixture(params=TOGETHER)
+def together(request, monkeypatch):
+    monkeypatch.setattr(assembly, "WAITING_ENTRIES", TOGETHER[request.param])
+    monkeypatch.setattr(assembly, "STOPS_TOGETHER", min(TOGETHER[request.param], 256))
     return request.param
 
 
@@ -56,7 +53,7 @@ def sizes(matrix):
     return np.where(size > 0, size, 1.0)
 
 
-def test_what_is_kept_is_the_schur_complement_of_dense_rows(case, order):
+def test_what_is_kept_is_the_schur_complement_of_dense_rows(case, together):
     gradients = Gradients(len(case.dense.sigma))
     linear = case.linear(gradients=gradients)
     A, b = case.dense.some(in_linearisation(case))
@@ -79,7 +76,7 @@ def test_what_is_kept_is_the_schur_complement_of_dense_rows(case, order):
     np.testing.assert_allclose(back[gone], -taken @ ahead, atol=limit)
 
 
-def test_what_is_touched_and_how_sure_beams_are(case, order):
+def test_what_is_touched_and_how_sure_beams_are(case, together):
     linear = case.linear()
     wanted = in_linearisation(case)
     A, _ = case.dense.some(lambda kind: wanted(kind) and not kind.startswith("prior"))
@@ -91,7 +88,7 @@ def test_what_is_touched_and_how_sure_beams_are(case, order):
 
 
 @pytest.mark.parametrize("newton", [False, True])
-def test_the_step_of_every_unknown_is_that_of_dense_rows(case, order, newton):
+def test_the_step_of_every_unknown_is_that_of_dense_rows(case, together, newton):
     """To a millionth of its sigma, and with it by how much the cost was to fall."""
     dense = replace(case.dense, newton=newton)
     linear = case.linear(newton)
@@ -114,7 +111,7 @@ def test_the_step_of_every_unknown_is_that_of_dense_rows(case, order, newton):
         np.testing.assert_allclose(after[name], stepped, atol=1e-9)
 
 
-def test_covariances_are_those_of_dense_rows(case, order):
+def test_covariances_are_those_of_dense_rows(case, together):
     """Of what is kept, of a stop's own, and of both together."""
     linear = case.linear()
     estimate, dense = case.estimate(linear), case.dense
@@ -129,7 +126,7 @@ def test_covariances_are_those_of_dense_rows(case, order):
             np.testing.assert_allclose(found, correlation[np.ix_(at, at)], atol=1e-6)
 
 
-def test_covariances_of_rows_over_any_unknowns_are_those_of_dense_rows(case, order):
+def test_covariances_of_rows_over_any_unknowns_are_those_of_dense_rows(case, together):
     """Rows about one kind of unknown each, about all of them at once, and about nothing."""
     linear, dense = case.linear(), case.dense
     estimate, layout, rng = case.estimate(linear), linear.layout, np.random.default_rng(5)
@@ -151,7 +148,9 @@ def test_covariances_of_rows_over_any_unknowns_are_those_of_dense_rows(case, ord
     np.testing.assert_array_equal(kept, before[1])
 
 
-def test_variances_of_sets_of_rows_are_the_diagonals_of_their_covariances(case, order, monkeypatch):
+def test_variances_of_sets_of_rows_are_the_diagonals_of_their_covariances(
+    case, together, monkeypatch
+):
     """Of no set, of one, of several; also where not all rows are looked at at once."""
     linear = case.linear()
     kept = case.estimate(linear).covariance_of(list(linear.layout.outer()))
@@ -170,7 +169,7 @@ def test_variances_of_sets_of_rows_are_the_diagonals_of_their_covariances(case, 
         np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
-def test_what_beams_say_of_their_lidars_twist_is_what_their_rows_say(case, order):
+def test_what_beams_say_of_their_lidars_twist_is_what_their_rows_say(case, together):
     """Of a twist that one stop alone has: its information, its score, its products with all."""
     linear, dense = case.linear(gradients=Gradients(len(case.dense.sigma))), case.dense
     assert case.linear().scans == {}, "nobody asked"
@@ -196,12 +195,12 @@ def test_what_beams_say_of_their_lidars_twist_is_what_their_rows_say(case, order
         np.testing.assert_allclose(cross / unit, twist.T @ A / unit, atol=1e-9)
 
 
-def test_the_cost_is_half_the_sum_of_all_squares(case, order):
+def test_the_cost_is_half_the_sum_of_all_squares(case, together):
     estimate = case.estimate(case.linear())
     assert estimate.cost == pytest.approx(case.dense.b @ case.dense.b / 2, rel=1e-9)
 
 
-def test_gradients_by_cluster_are_those_of_their_rows(case, order):
+def test_gradients_by_cluster_are_those_of_their_rows(case, together):
     gradients = Gradients(len(case.dense.sigma))
     case.linear(gradients=gradients)
     chosen = np.flatnonzero(case.dense.kind == "beams")
@@ -225,14 +224,12 @@ def test_gradients_by_cluster_are_those_of_their_rows(case, order):
     np.testing.assert_allclose(table.sum(axis=0) / size, total / size, atol=1e-8)
 
 
-def test_both_orders_say_the_same(case, monkeypatch):
+def test_stops_taken_out_one_by_one_or_at_once_say_the_same(case, monkeypatch):
     found = []
-    for stops_first in (False, True):
-        monkeypatch.setattr(Layout, "stops_first", stops_first)
-        gradients = Gradients(len(case.dense.sigma))
-        found.append(case.linear(gradients=gradients))
+    for entries in TOGETHER.values():
+        monkeypatch.setattr(assembly, "WAITING_ENTRIES", entries)
+        found.append(case.linear(gradients=Gradients(len(case.dense.sigma))))
     a, b = found
-    assert len(a.twists) == len(case.start.problem.scans) and not b.twists
     size = np.append(sizes(a.raw), np.sqrt(a.chi2))
     unit = np.outer(size, size)
     np.testing.assert_allclose(a.kept / unit, b.kept / unit, atol=1e-10)
@@ -240,7 +237,7 @@ def test_both_orders_say_the_same(case, monkeypatch):
     assert a.chi2 == pytest.approx(b.chi2, rel=1e-12)
 
 
-def test_the_number_of_threads_changes_no_bit(case, order):
+def test_the_number_of_threads_changes_no_bit(case, together):
     def found(count):
         gradients = Gradients(len(case.dense.sigma))
         with workers(count):
