@@ -31,6 +31,9 @@ from calib.problem.spread import Whose
 from calib.residuals.groups import ALONG_BEAMS, Group
 from calib.solve.components import Sums, Told, squares_beside_bodies
 
+# Scans that tell how places of the LiDAR scatter, of more: a choice. So many tell it to 1 part in
+# 24, and the matrix over 6 unknowns of each is factored in 2 s, that of 1,000 in 40 s.
+TELLING_SCANS = 300
 Squares = Mapping[str, tuple[float, float]]
 
 
@@ -137,7 +140,8 @@ def beside_bodies(
 
 def of_poses(whole: Linearisation, problem: Problem, wild: Collection[Group]) -> Told | None:
     """What all rows say of twists (6 K) of the LiDAR at stops, those of a kind in one group: 0 of
-    shifts, 1 of turns. Of the `wild` scans, nothing; None where there is no other."""
+    shifts, 1 of turns. Of the `wild` scans, nothing; None where there is no other. Where there are
+    many stops, K of them at even intervals stand for all."""
     every = [
         rows
         for rows in scan_rows(whole, problem)
@@ -145,6 +149,7 @@ def of_poses(whole: Linearisation, problem: Problem, wild: Collection[Group]) ->
     ]
     if not every:
         return None
+    every = every[:: -(-len(every) // TELLING_SCANS)]
     H, b = Others.of(whole).against(every)
     raw = block_diag(*(rows.information for rows in every))
     size = np.sqrt(np.maximum(np.diag(raw), 1e-300))

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from calib.blunders import judged
-from calib.blunders.shifts import Shift, shifts, standing_alone
+from calib.blunders.shifts import Shift, of_poses, shifts, standing_alone
 from calib.effects import find
 from calib.linear.clusters import Gradients
 from calib.problem import build
@@ -343,3 +343,23 @@ def test_a_shift_of_the_detectable_size_is_found_four_times_in_five(drawn, monke
                 hits.append(now.found)
     assert len(hits) > 200
     assert 0.7 < np.mean(hits) < 0.9
+
+
+@pytest.mark.parametrize("most", [1, 2, 3])
+def test_of_many_scans_some_at_even_intervals_tell_what_they_tell_among_all(
+    tmp_path, monkeypatch, most
+):
+    case, linear = with_range_zero(tmp_path)
+    every = of_poses(linear, case.start.problem, [])
+    monkeypatch.setattr("calib.blunders.shifts.TELLING_SCANS", most)
+    some = of_poses(linear, case.start.problem, [])
+    scans, step = len(case.start.problem.scans), {1: 4, 2: 2, 3: 2}[most]
+    assert scans == 4
+    at = np.arange(6 * scans).reshape(scans, 6)[::step].ravel()
+    assert len(some.score) == len(at) <= 6 * most
+    size = np.sqrt(np.diag(every.information)[at])
+    np.testing.assert_allclose(some.score / size, every.score[at] / size, atol=1e-6)
+    unit = np.outer(size, size)
+    expected = every.information[np.ix_(at, at)] / unit
+    np.testing.assert_allclose(some.information / unit, expected, atol=1e-6)
+    np.testing.assert_array_equal(some.group, every.group[at])

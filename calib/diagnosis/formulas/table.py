@@ -12,13 +12,13 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve, solve_triangular
-from scipy.sparse import block_diag, csr_array, eye_array, hstack, issparse, vstack
+from scipy.sparse import block_diag, csr_array, diags_array, eye_array, hstack, issparse, vstack
 
 from calib.diagnosis.formulas.drawn import DrawnBeams, rows_over
 from calib.diagnosis.jackknife import Shares
 from calib.diagnosis.linear import beside, other_rows
 from calib.diagnosis.score import GAUGE, Scores, ScoreTest, score_test
+from calib.linear.arrow import Arrow
 from calib.linear.clusters import ClusteredRows, Gradients, summed
 from calib.linear.layout import Layout
 from calib.linear.rows import TWIST
@@ -56,6 +56,7 @@ class BeamTable:
         unit: of `residual_m` and `sigma_m`: m of a range, or rad of a joint; see `joint_tables`.
         joints: which covariates are joints of the arm.
         weight_m2: of all that was measured, 1/m2; None where that is these rows.
+        own: columns of unknowns that only one stop has, of each stop.
     """
 
     covariates: Mapping[str, np.ndarray]
@@ -74,6 +75,7 @@ class BeamTable:
     unit: str = "m"
     joints: frozenset[str] = frozenset()
     weight_m2: float | None = None
+    own: Sequence[np.ndarray] = ()
 
     @classmethod
     def of(
@@ -116,6 +118,7 @@ class BeamTable:
             others_stop=others_stop,
             others_place=others_place,
             joints=frozenset(scans[0].stops.rig.joint_names),
+            own=list(layout.own.values()),
         )
 
     def __len__(self) -> int:
@@ -136,9 +139,9 @@ class BeamTable:
         )
 
     @cached_property
-    def of_others(self) -> tuple[np.ndarray, np.ndarray]:
+    def of_others(self) -> tuple[Matrix, np.ndarray]:
         """What trackers, targets and priors say: (U, U) information, (U,) right side."""
-        return _dense(self.others.T @ self.others), self.others.T @ self.others_b
+        return self.others.T @ self.others, self.others.T @ self.others_b
 
     @cached_property
     def cells(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -194,7 +197,7 @@ class Projection:
     weight: np.ndarray
     left_m: np.ndarray
     step: np.ndarray
-    factor: tuple[np.ndarray, bool]
+    factor: Arrow
 
     @property
     def chi2(self) -> float:
@@ -212,12 +215,11 @@ class Projection:
         T, chain = table.twists, table.chain
         gram = table.twists_T @ (T * weight[:, None])
         information, right = table.of_others
-        H = information + _dense(chain.T @ gram @ chain)
-        H[np.diag_indices(len(H))] *= 1.0 + 1e-12
-        H[np.diag_indices(len(H))] += 1e-12 * np.median(np.diag(H))
-        factor = cho_factor(H)  # upper
+        H = information + chain.T @ gram @ chain
+        size = H.diagonal()
+        factor = Arrow.of(H + diags_array(1e-12 * (size + np.median(size))), table.own)
         raw = table.residual_m
-        step = cho_solve(factor, right - chain.T @ (table.twists_T @ (weight * raw)))
+        step = factor.solve(right - chain.T @ (table.twists_T @ (weight * raw)))
         left_m = raw + T @ (chain @ step)
         return cls(table=table, weight=weight, left_m=left_m, step=step, factor=factor)
 
@@ -235,7 +237,7 @@ class Projection:
     def off(self, columns_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """What is left of columns (N, Q) of the range, in the beams (N, Q), and how the model's
         unknowns (U, Q) absorb the rest."""
-        taken = cho_solve(self.factor, -self._crossed(self.weight[:, None] * columns_m))
+        taken = self.factor.solve(-self._crossed(self.weight[:, None] * columns_m))
         return columns_m + self.table.twists @ (self.table.chain @ taken), taken
 
     def _crossed(self, weighted: np.ndarray) -> np.ndarray:
@@ -248,7 +250,7 @@ class Projection:
         columns = np.hstack(blocks)
         weighted = self.weight[:, None] * columns
         crossed = self._crossed(weighted)
-        root = solve_triangular(self.factor[0], crossed, trans=1, check_finite=False)
+        root = self.factor.root(crossed)
         score = self.left_m @ weighted
         found, start = [], 0
         for block in blocks:
@@ -276,7 +278,7 @@ class Projection:
         """Scores of columns (N, Q) of the range, of one candidate; see `calib.diagnosis.score`."""
         table, weighted = self.table, self.weight[:, None] * columns_m
         (stop, place, cell), crossed = table.cells, self._crossed(weighted)
-        taken, whole = cho_solve(self.factor, -crossed), weighted.T @ columns_m
+        taken, whole = self.factor.solve(-crossed), weighted.T @ columns_m
         information = whole + crossed.T @ taken
         cells = self._by_cell @ taken
         own = summed(weighted * self.left_m[:, None], cell[: len(table)])
@@ -310,10 +312,6 @@ class Projection:
         ):
             shares.add(ClusteredRows(A=A, b=b, columns=every, stop=stop, place=place))
         return found.judged(shares)
-
-
-def _dense(matrix: Matrix) -> np.ndarray:
-    return matrix.toarray() if issparse(matrix) else matrix
 
 
 def _wider(left: Matrix, right: np.ndarray) -> Matrix:

@@ -1,0 +1,40 @@
+"""An arrow's factor, against dense algebra."""
+
+import numpy as np
+import pytest
+from scipy.sparse import csr_array
+
+from calib.linear.arrow import Arrow
+
+
+def arrow(rng, sizes, shared):
+    """H of rows that touch one set each, or none, and what all share; and the sets' columns."""
+    columns = rng.permutation(sum(sizes) + shared)  # of all sets, then of what is shared
+    own = np.split(columns[: sum(sizes)], np.cumsum(sizes)[:-1]) if sizes else []
+    common = columns[sum(sizes) :]
+    rows = []
+    for mine in [*own, np.zeros(0, int)]:
+        touched = np.concatenate([mine, common])
+        some = np.zeros((len(touched) + 2, len(columns)))
+        some[:, touched] = rng.normal(size=(len(some), len(touched)))
+        rows.append(some * 10.0 ** rng.uniform(-3, 3, len(columns)))
+    A = np.vstack(rows)
+    return A.T @ A, own
+
+
+@pytest.mark.parametrize("sparse", [False, True])
+@pytest.mark.parametrize(
+    ("sizes", "shared"), [([3, 3, 3], 5), ([2, 4, 2, 1], 3), ([], 4), ([4], 1)], ids=str
+)
+def test_it_solves_as_dense_algebra_does(sizes, shared, sparse):
+    rng = np.random.default_rng(len(sizes) + shared)
+    H, own = arrow(rng, sizes, shared)
+    factor = Arrow.of(csr_array(H) if sparse else H, own)
+    size = np.sqrt(np.diag(H))
+    right = rng.normal(size=(len(H), 3)) * size[:, None]
+    expected = np.linalg.solve(H / np.outer(size, size), right / size[:, None]) / size[:, None]
+    found = factor.solve(right)
+    np.testing.assert_allclose(found * size[:, None], expected * size[:, None], rtol=1e-6)
+    np.testing.assert_allclose(factor.solve(right[:, 0]), found[:, 0], rtol=1e-12)
+    root = factor.root(right)
+    np.testing.assert_allclose(root.T @ root, right.T @ expected, rtol=1e-6, atol=1e-9)
