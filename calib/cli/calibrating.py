@@ -41,6 +41,10 @@ Without = Annotated[
     list[str] | None,
     typer.Option(metavar="STOP:BODY", help="Leave out a blunder, as 'diagnose' names it."),
 ]
+Beams = Annotated[
+    int | None,
+    typer.Option(metavar="N", help="Use N beams of each scan: a first answer.", min=1),
+]
 
 
 @app.command()
@@ -98,6 +102,7 @@ def fit(
     prior: Annotated[
         Path | None, typer.Option(metavar="RUN", help="An earlier run instead of CAD.")
     ] = None,
+    beams: Beams = None,
     workers: Workers = None,
     scheduler: Scheduler = None,
     as_json: Json = False,
@@ -111,7 +116,7 @@ def fit(
     from calib.problem.model import Model
     from calib.runs.calibrate import calibrate
 
-    chosen = Model.of(effects, fix or [], without or [], recordings)
+    chosen = Model.of(effects, fix or [], without or [], recordings, beams)
     with executing(workers, scheduler), progress_bar() as progress:
         run = calibrate(recordings, out, chosen, hold_out, folds, prior, progress)
     _tell(run, as_json)
@@ -128,20 +133,26 @@ def add(
         ),
     ] = None,
     without: Without = None,
+    every_beam: Annotated[
+        bool, typer.Option("--every-beam", help="Use all beams, where RUN used some.")
+    ] = False,
     trust: Trust = None,
     workers: Workers = None,
     scheduler: Scheduler = None,
     as_json: Json = False,
 ) -> None:
     """Add effects to the model of a run, and refit it."""
-    if not effects and not without:
-        raise InputError("give an EFFECT to add, or what to leave out with --without")
+    if not effects and not without and not every_beam:
+        raise InputError(
+            "give an EFFECT to add, or what to leave out with --without, or --every-beam"
+        )
     from calib.runs.add import add as grow
     from calib.runs.run import Run
 
     grown_from = Run.open(run, trust or ())
     with executing(workers, scheduler), progress_bar() as progress:
-        _tell(grow(grown_from, effects or [], out, progress, without or []), as_json)
+        grown = grow(grown_from, effects or [], out, progress, without or [], every_beam)
+        _tell(grown, as_json)
 
 
 @app.command()
@@ -187,6 +198,7 @@ def explain(
     candidates: Annotated[
         str | None, typer.Option("--candidates", metavar="FILE", help=CANDIDATES_HELP)
     ] = None,
+    beams: Beams = None,
     workers: Workers = None,
     scheduler: Scheduler = None,
     as_json: Json = False,
@@ -198,7 +210,7 @@ def explain(
     from calib.problem.model import Model
     from calib.runs.explain import explain as climb
 
-    chosen = Model.of(effects, fix or [], without or [], recordings)
+    chosen = Model.of(effects, fix or [], without or [], recordings, beams)
     with executing(workers, scheduler), progress_bar() as progress:
         explanation = climb(recordings, out, chosen, progress, candidates or ())
     if as_json:

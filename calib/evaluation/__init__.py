@@ -176,7 +176,7 @@ def evaluate(
     else:
         place = outputs.folder(out, outputs.EVALUATION, [run.folder, *run.inputs])
     with place as folder:
-        sources = reopened(run)
+        sources = reopened(run, every_beam=True)
         problem = problem_of(run, sources)
         if not problem.scans:
             raise InputError(

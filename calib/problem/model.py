@@ -37,11 +37,13 @@ class Model:
         fixed: names kept at their nominal value: a frame or effect, or one parameter of it as
             ``name.parameter``, ``lidar.tz`` say.
         without: what of the recordings is left out, as `Group.token` names it.
+        beams: how many beams of each scan are used at most; all where None.
     """
 
     effects: tuple[Effect, ...] = effects.DEFAULT
     fixed: tuple[str, ...] = ()
     without: tuple[str, ...] = ()
+    beams: int | None = None
 
     def __post_init__(self) -> None:
         chosen = (effects.find(e) if isinstance(e, str) else e for e in self.effects)
@@ -54,11 +56,12 @@ class Model:
         fixed: Sequence[str],
         without: Sequence[str] = (),
         recordings: Sequence[Path | str] = (),
+        beams: int | None = None,
     ) -> Model:
         """The model that a command line names: effects with commas, or `default_effects`.
 
         Args:
-            chosen, fixed, without: as the command line has them.
+            chosen, fixed, without, beams: as the command line has them.
             recordings: to be fitted; effects that their ``rig.yaml`` names go by their names here.
 
         Raises:
@@ -71,7 +74,7 @@ class Model:
             there = [r for r in recordings if not whole and (remote.here(r) / "rig.yaml").is_file()]
             own = effects.own_effects(map(load_rig, there))
             named = effects.load_effects(chosen, own=own)
-        return cls(named, tuple(fixed), tuple(without))
+        return cls(named, tuple(fixed), tuple(without), beams)
 
     @classmethod
     def read(
@@ -92,15 +95,17 @@ class Model:
             InputError: an effect that there is not, or no longer.
         """
         found = tuple(effects.read(effect, path, trust) for effect in document["effects"])
-        return cls(found, tuple(document["fixed"]), tuple(document.get("without", ())))
+        left_out = tuple(document.get("without", ()))
+        return cls(found, tuple(document["fixed"]), left_out, document.get("beams"))
 
     def document(self) -> dict[str, Any]:
         """As model.yaml holds it."""
-        return {
+        out = {
             "effects": [e.document() for e in self.effects],
             "fixed": list(self.fixed),
             "without": list(self.without),
         }
+        return out if self.beams is None else {**out, "beams": self.beams}
 
     def plus(self, added: Sequence[Effect]) -> Model:
         """The model with more effects.
@@ -130,7 +135,7 @@ class Model:
                 raise InputError(f"effect '{name}' is not in the model{nearest(name, self.names)}")
         kept = tuple(e for e in self.effects if e.name not in names)
         fixed = (held for held in self.fixed if self._effect_of(held) not in names)
-        return Model(kept, tuple(fixed), self.without)
+        return replace(self, effects=kept, fixed=tuple(fixed))
 
     def _effect_of(self, held: str) -> str:
         """The effect that a user holds, or of which one parameter; empty where it is a frame.
@@ -252,6 +257,7 @@ class Source:
         reference: its mesh, if it has one.
         without: what is left out.
         given: the recording as it is on disk, where something is left out.
+        beams: how many beams of each scan are used at most; all where None.
     """
 
     rig: Rig
@@ -259,6 +265,7 @@ class Source:
     reference: Reference | None
     without: tuple[Group, ...] = ()
     given: RecordedStops | None = None
+    beams: int | None = None
 
     @classmethod
     def open(cls, folder: Path | str) -> Source:
@@ -282,6 +289,10 @@ class Source:
             out.__dict__["store"] = self.store
         return out
 
+    def of_beams(self, most: int | None) -> Source:
+        """The same with so many beams of each scan at most, or with all of them."""
+        return self if most == self.beams else replace(self, beams=most)
+
     @property
     def whole(self) -> Source:
         """The same with nothing left out."""
@@ -303,7 +314,7 @@ class Source:
     @cached_property
     def store(self) -> BeamStore:
         """Its scans as beams; of a rig with a LiDAR."""
-        return BeamStore(self.recording, self.rig.lidar.beam_origin_m)
+        return BeamStore(self.recording, self.rig.lidar.beam_origin_m, self.beams)
 
     @cached_property
     def columns(self) -> dict[str, np.ndarray]:

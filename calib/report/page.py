@@ -301,6 +301,7 @@ def _provenance(evidence: Evidence) -> list[tuple[str, str]]:
     ]
     out += [
         ("model", ", ".join(evidence.run.effects) or "no effects"),
+        ("beams", f"{evidence.run.beams:,} of each scan at most" if evidence.run.beams else "all"),
         ("left out", ", ".join(evidence.run.left_out) or "nothing"),
         ("set aside", ", ".join(evidence.run.set_aside) or "nothing"),
         ("held fixed", ", ".join(model["fixed"]) or "nothing but what CAD has exact"),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from threading import Lock
 from typing import Any
@@ -23,10 +23,12 @@ class BeamStore:
     Args:
         recording: whose.
         beam_origin_m: (2,) of its LiDAR, radial and tangential.
+        most: how many beams of each scan there are at most; all where None.
     """
 
     recording: RecordedStops
     beam_origin_m: tuple[float, float]
+    most: int | None = None
     _kept: dict[int, tuple[Scan, Beams]] = field(default_factory=dict, repr=False)
     _bytes: float = 0.0
     _lock: Lock = field(default_factory=Lock, repr=False)
@@ -39,7 +41,7 @@ class BeamStore:
         """
         if stop in self._kept:
             return self._kept[stop]
-        scan = self.recording.scan(stop)
+        scan = self._scan(stop)
         found = scan, beams(scan.xyz_m, self.beam_origin_m)
         size = _size(found)
         with self._lock:
@@ -50,7 +52,9 @@ class BeamStore:
 
     def _scan(self, stop: int) -> Scan:
         """A scan, to look at once: it takes no place of those that are asked for in each pass."""
-        return self._kept[stop][0] if stop in self._kept else self.recording.scan(stop)
+        if stop in self._kept:
+            return self._kept[stop][0]
+        return _thinned(self.recording.scan(stop), self.most, stop)
 
     @cached_property
     def median_intensity(self) -> float:
@@ -63,10 +67,22 @@ class BeamStore:
 
     def __getstate__(self) -> dict[str, object]:
         """Without what was read: another process reads for itself."""
-        return {"recording": self.recording, "beam_origin_m": self.beam_origin_m}
+        return {n: getattr(self, n) for n in ("recording", "beam_origin_m", "most")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__init__(**state)
+
+
+def _thinned(scan: Scan, most: int | None, stop: int) -> Scan:
+    """So many beams of a scan, one drawn from each of as many equal parts of it: scans are stored
+    by ring or by column, so these are spread over all directions."""
+    count = len(scan.ring)
+    if most is None or count <= most:
+        return scan
+    ends = np.linspace(0, count, most + 1).astype(int)
+    at = np.random.default_rng(stop).integers(ends[:-1], ends[1:])
+    columns = {n: c[at] for n, c in vars(scan).items() if isinstance(c, np.ndarray)}
+    return replace(scan, **columns, extra={n: c[at] for n, c in scan.extra.items()})
 
 
 def common_median(stores: Sequence[BeamStore]) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from calib.runs.calibrate import grow, grown_model
@@ -16,6 +17,7 @@ def add(
     out: Path | str,
     progress: Progress = lambda what, done, total: None,
     without: Sequence[str] = (),
+    every_beam: bool = False,
 ) -> Run:
     """Fit a run's model and more effects to the same recordings, from where that run stood.
 
@@ -25,9 +27,11 @@ def add(
         out: the run folder to make; an earlier run there is replaced, anything else is refused.
         progress: called with what is being done, and how far it is.
         without: what more is left out of the recordings, as ``--without`` names it.
+        every_beam: True to use all beams of each scan, where the run used some.
 
     Raises:
         InputError: an effect is unknown or in the model already, or the run's recordings are not
             what they were.
     """
-    return grow(run, grown_model(run, effects).leaving_out(without), out, progress)
+    model = grown_model(run, effects).leaving_out(without)
+    return grow(run, replace(model, beams=None) if every_beam else model, out, progress)

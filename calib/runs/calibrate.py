@@ -96,7 +96,8 @@ def calibrate(
     with outputs.folder(out, outputs.RUN, inputs) as folder:
         _refuse_twice([r.resolve() for r in recordings])
         model = model or Model.of(None, (), (), recordings)
-        sources = leave_out([Source.open(r) for r in recordings], model.without)
+        opened = [Source.open(r).of_beams(model.beams) for r in recordings]
+        sources = leave_out(opened, model.without)
         choices = _Choices(Path(out), hold_out, folds, prior)
         document = _model_document(sources, model, choices)
         with going_on(outputs.kept(folder, document)):
@@ -123,7 +124,7 @@ def grow(
         InputError: the run's recordings are not what they were, or it is of an earlier version.
     """
     with outputs.folder(out, outputs.RUN, [run.folder, *run.inputs]) as folder:
-        sources = reopened(run, model.without)
+        sources = [s.of_beams(model.beams) for s in reopened(run, model.without)]
         start = start_of(run, sources)
         _refuse_idle(model, run, sources)
         hold_out, folds = run.model["hold_out"], run.model["folds"]

@@ -224,6 +224,7 @@ def command_without(run: Run, tokens: Sequence[str]) -> str:
         if run.model[key] != as_a_rule:
             chosen += [f"--{key.replace('_', '-')}", str(run.model[key])]
     chosen += ["--prior", str(run.prior)] if run.prior else []
+    chosen += ["--beams", str(run.beams)] if run.beams else []
     return shlex.join(["rigcal", "fit", *map(str, run.recordings), *out, *chosen, *without])
 
 

@@ -95,29 +95,34 @@ def _described(run: Run) -> dict[str, Any]:
         ) from None
 
 
-def reopened(run: Run, without: Sequence[str] | None = None) -> list[Source]:
+def reopened(
+    run: Run, without: Sequence[str] | None = None, every_beam: bool = False
+) -> list[Source]:
     """A run's recordings, as they were when the run was fitted to them.
 
     Args:
         run: the run.
         without: what is left out of them; what the run left out where None.
+        every_beam: True for all beams of each scan, whatever the run used.
 
     Raises:
         InputError: one is gone, or has changed; or one does not have what is to be left out.
     """
-    found = [_reopened(recording, run) for recording in run.model["recordings"]]
+    most = None if every_beam else run.beams
+    found = [_reopened(recording, run).of_beams(most) for recording in run.model["recordings"]]
     return leave_out(found, run.model.get("without", ()) if without is None else without)
 
 
 def start_of(run: Run, sources: Sequence[Source]) -> Start:
-    """Where a run's fit stood, for another fit of its recordings.
+    """Where a run's fit stood, for another fit of its recordings; of other beams of these it is not
+    known what they meet.
 
     Raises:
         InputError: the run is of an earlier version.
     """
     folders = [source.recording.folder for source in sources]
     met = {}
-    for name, part in run.met().items():
+    for name, part in run.met().items() if sources[0].beams == run.beams else ():
         number, _, stop = name.partition("/")
         known = number.isdecimal() and stop.isdecimal() and int(number) < len(sources)
         mesh = sources[int(number)].reference if known else None

@@ -179,6 +179,11 @@ class Run:
         """What was left out of its recordings."""
         return list(self.model.get("without", ()))
 
+    @property
+    def beams(self) -> int | None:
+        """How many beams of each scan it used at most; all where None."""
+        return self.model.get("beams")
+
     def refuse_unconverged(self, force: bool) -> None:
         """Raise InputError for a fit that did not converge, unless its numbers are wanted still."""
         if not (self.converged or force):

@@ -74,6 +74,7 @@ class _Model(_Part):
     grown_from: str | None
     versions: dict[str, str]
     without: list[str] = []  # noqa: RUF012 - pydantic copies it
+    beams: int | None = pydantic.Field(None, ge=1)
 
 
 def read_model(path: Path) -> dict[str, Any]:
