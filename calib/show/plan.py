@@ -200,8 +200,8 @@ def _never(document: Mapping[str, Any]) -> Iterator[str]:
         factor, unit = shown(document["smallest_detectable"][name]["unit"])
         least = "never" if size is None else f"only from {factor * size:.3g} {unit}"
         yield (
-            f"NOT TOLD APART by any stops: at all {document['candidates']} poses {rival} does next "
-            f"to what {name} does, which would be told from it {least}."
+            f"NOT TOLD APART by any stops: at all {document['candidates']} poses {rival} moves all "
+            f"that is seen almost as {name} does, which could be told from it {least}."
         )
 
 

@@ -91,5 +91,5 @@ def test_rivals_that_no_stops_tell_apart_are_printed(once, rigcal):
     code, told, _ = rigcal(*words)
     assert code == 0
     said = " ".join(told.split())
-    assert f"at all 40 poses {BENDING} does next to what {SAG} does" in said
+    assert f"at all 40 poses {BENDING} moves all that is seen almost as {SAG} does" in said
     assert f"With them {SAG} is found" not in said

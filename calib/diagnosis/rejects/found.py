@@ -10,6 +10,7 @@ import numpy as np
 
 from calib.blunders import told
 from calib.diagnosis.suggest import words
+from calib.rig.suspect import listed
 
 MOST_NAMED = 6  # stops or surfaces that a sentence names
 # Share of beams that makes a place structured, whatever their residuals do: a choice, ten times
@@ -75,7 +76,7 @@ class Place:
     def where(self) -> str:
         """In words: azimuth -40 to 0 deg."""
         if self.names:
-            return f"{words(self.covariate)} {listed(self.names)}"
+            return f"{words(self.covariate)} {listed(self.names, MOST_NAMED)}"
         _, unit, scale = unit_of(self.covariate)
         lower, upper = scale * self.lower, scale * self.upper
         if self.covariate == "ring":
@@ -193,7 +194,7 @@ class Rejects:
             said += f"; {there}, and {place.what}"
         if self.clutter_stops:
             said += f"; {percent(self.clutter)} % hit something that is not in the mesh, at stop "
-            said += listed(self.clutter_stops)
+            said += listed(self.clutter_stops, MOST_NAMED)
         return said + "."
 
     def unexplained(self) -> list[dict[str, Any]]:
@@ -227,12 +228,6 @@ class Rejects:
 def unit_of(covariate: str) -> tuple[str, str, float]:
     """Unit of a column, the unit in which people are shown it, and the factor between the two."""
     return next((u for end, u in INTERVAL_UNITS.items() if covariate.endswith(end)), ("", "", 1.0))
-
-
-def listed(names: Sequence[str]) -> str:
-    """Names with commas, no more than a sentence bears."""
-    more = len(names) - MOST_NAMED
-    return ", ".join(names[:MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
 def percent(share: float) -> str:
