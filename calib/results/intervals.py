@@ -186,9 +186,7 @@ def intervals(estimate: Estimate, progress: Progress = lambda what, done, total:
         progress=tell,
     )
     for cells, scatter in beams.cells():
-        sums.add_stop(cells)
-        if scatter is not None:
-            sums.add(scatter)
+        sums.add_stop(cells, scatter)
     others = [*of_stops(layout, values), *_of_cells(estimate, places)]
     frames, paper = in_cad(problem), np.zeros_like(estimate.kept)
     for block, name, rows in of_graph(estimate.graph, layout, values):
@@ -245,6 +243,54 @@ def _regions(estimate: Estimate) -> dict[tuple[object, str], dict[int, int]]:
 
 
 @dataclass
+class _Clusters:
+    """What clusters of one kind add to each of P parameters.
+
+    Args:
+        parameters: P.
+        row: number of a cluster -> its row in what follows, of which there are more than are used.
+        moved: (m, P) what the cluster's rows add.
+        share: (m, P) of what is known of a parameter.
+    """
+
+    parameters: int
+    row: dict[int, int] = field(default_factory=dict)
+    moved: np.ndarray = field(init=False)
+    share: np.ndarray = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.moved, self.share = np.zeros((2, 1, self.parameters))
+
+    def add(self, number: np.ndarray, moved: np.ndarray, share: np.ndarray) -> None:
+        """Add (c, P) to the clusters of these numbers (c,), of which one may stand twice."""
+        rows = [self.row.setdefault(n, len(self.row)) for n in number.tolist()]
+        if len(self.row) > len(self.moved):
+            more = ((0, 2 * len(self.row) - len(self.moved)), (0, 0))
+            self.moved, self.share = np.pad(self.moved, more), np.pad(self.share, more)
+        np.add.at(self.moved, rows, moved)
+        np.add.at(self.share, rows, share)
+
+    def squares(
+        self, known: Mapping[int, np.ndarray] = MappingProxyType({})
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The sum over clusters of u^2 (P,), and its degrees of freedom.
+
+        Args:
+            known: number of a cluster -> its u (P,); of the others each parameter by itself.
+        """
+        count = len(self.row)
+        share = np.minimum(self.share[:count], ALONE)
+        u = self.moved[:count] / np.sqrt(1.0 - share)
+        for cluster, whole in known.items():
+            u[self.row[cluster]] = whole
+        product = np.square(share) / (1.0 - share)  # of two clusters' u, expected
+        among = np.square(product.sum(axis=0)) - np.square(product).sum(axis=0)
+        least = np.maximum(np.square(share).sum(axis=0) + among, 1e-300)
+        d = np.maximum(np.square(share.sum(axis=0)) / least, 1.0)
+        return np.square(u).sum(axis=0), d
+
+
+@dataclass
 class _Sums:
     """What clusters of rows add to each of P parameters, in units of the graph's sigma.
 
@@ -252,25 +298,33 @@ class _Sums:
         root: (P, P) lower Cholesky factor of the correlations, as the graph has them.
         priors: (P, P) products of rows that belong to no cluster.
         stops: stop -> (P, P) the same of its rows.
-        cells: pairs (2, c) of stop and part, -1 for none; moved: (c, P) what their rows add; share:
-            (c, P) of what is known of a parameter. Each for some of the rows.
+        by_stop, by_part: clusters. What has no stop is a cluster of its part among the stops, and
+            the other way round: number n is then -1 - n.
+        by_both: (P,) the sum of u^2 over cells of stop and part.
     """
 
     root: np.ndarray
     priors: np.ndarray
+    by_stop: _Clusters
+    by_part: _Clusters
+    by_both: np.ndarray
     stops: dict[int, np.ndarray] = field(default_factory=dict)
-    cells: list[np.ndarray] = field(default_factory=list)
-    moved: list[np.ndarray] = field(default_factory=list)
-    share: list[np.ndarray] = field(default_factory=list)
 
     @classmethod
     def over(cls, correlation: np.ndarray) -> _Sums:
         """With no rows yet."""
-        safe = correlation + CORRELATION_ROUNDING * np.eye(len(correlation))
-        return cls(np.linalg.cholesky(safe), np.zeros_like(correlation))
+        count = len(correlation)
+        return cls(
+            root=np.linalg.cholesky(correlation + CORRELATION_ROUNDING * np.eye(count)),
+            priors=np.zeros_like(correlation),
+            by_stop=_Clusters(count),
+            by_part=_Clusters(count),
+            by_both=np.zeros(count),
+        )
 
     def add(self, rows: ClusteredRows) -> None:
-        """Add whitened rows along the directions of the parameters."""
+        """Add whitened rows along the directions of the parameters: all that there are of a stop
+        and part, but for beams."""
         alone = (rows.stop < 0) & (rows.place < 0)
         if alone.any():
             self.priors += rows.A[alone].T @ rows.A[alone]
@@ -278,19 +332,33 @@ class _Sums:
             return
         A, b, stop, part = (x[~alone] for x in (rows.A, rows.b, rows.stop, rows.place))
         _, first, at = np.unique(_pairs(stop, part), True, True)
-        self.cells.append(np.stack([stop[first], part[first]]))
-        self.moved.append(summed(A * b[:, None], at))
-        self.share.append(summed(np.square(A), at))
+        moved, share = summed(A * b[:, None], at), summed(np.square(A), at)
+        self._add_cells(stop[first], part[first], moved, share)
         for one in np.unique(stop[stop >= 0])[: MOST_WHOLE_STOPS + 1].tolist():
             mine = A[stop == one]
             self._add_products(one, mine.T @ mine)
 
-    def add_stop(self, sums: CellSums) -> None:
-        """Add the whitened rows of a stop along the directions of the parameters, as sums."""
-        self.cells.append(np.stack([np.full(len(sums.place), sums.stop), sums.place]))
-        self.moved.append(sums.moved)
-        self.share.append(sums.share)
-        self._add_products(sums.stop, sums.products)
+    def add_stop(self, sums: CellSums, scatter: ClusteredRows | None = None) -> None:
+        """Add the whitened rows of the beams of a stop along the directions of the parameters, as
+        sums, and its rows of scatter within holds."""
+        moved, share, products = sums.moved, sums.share, sums.products
+        if scatter is not None:
+            order = np.argsort(sums.place)
+            at = order[np.searchsorted(sums.place, scatter.place, sorter=order)]
+            moved, share = moved.copy(), share.copy()
+            np.add.at(moved, at, scatter.A * scatter.b[:, None])
+            np.add.at(share, at, np.square(scatter.A))
+            products = products + scatter.A.T @ scatter.A
+        self._add_cells(np.full(len(sums.place), sums.stop), sums.place, moved, share)
+        self._add_products(sums.stop, products)
+
+    def _add_cells(
+        self, stop: np.ndarray, part: np.ndarray, moved: np.ndarray, share: np.ndarray
+    ) -> None:
+        """Add (c, P) of cells of stop and part (c,), each of which is added once."""
+        self.by_stop.add(np.where(stop >= 0, stop, -1 - part), moved, share)
+        self.by_part.add(np.where(part >= 0, part, -1 - stop), moved, share)
+        self.by_both += (np.square(moved) / (1.0 - np.minimum(share, ALONE))).sum(axis=0)
 
     def _add_products(self, stop: int, products: np.ndarray) -> None:
         if len(self.stops) <= MOST_WHOLE_STOPS:
@@ -298,60 +366,28 @@ class _Sums:
 
     def wider(self) -> np.ndarray:
         """How many times wider the intervals are than the graph has them (P,)."""
-        if not self.cells:
-            return np.ones(len(self.priors))
-        (stop, part), moved = np.hstack(self.cells), np.vstack(self.moved)
-        share = np.vstack(self.share)
-        # What has no stop is a cluster of its part among the stops, and the other way round.
-        stops = np.where(stop >= 0, stop, -1 - part)
-        by_stop, d_stop = _squares(moved, share, stops, self._of_stops(moved, stops))
-        by_part, d_part = _squares(moved, share, np.where(part >= 0, part, -1 - stop))
-        by_both, _ = _squares(moved, share, _pairs(stop, part))
-        beyond = np.maximum(by_part - by_both, 0.0)
+        by_stop, d_stop = self.by_stop.squares(self._of_stops())
+        by_part, d_part = self.by_part.squares()
+        beyond = np.maximum(by_part - self.by_both, 0.0)
         variance = np.diag(self.priors) + by_stop + beyond
         d = np.square(variance) / np.maximum(by_stop**2 / d_stop + beyond**2 / d_part, 1e-300)
         wider = (
             np.sqrt(variance) * special.stdtrit(np.clip(d, FEWEST_DOF, NORMAL_DOF), LEVEL) / NORMAL
         )
-        return np.where(share.sum(axis=0) > ROUNDED_SHARE, np.maximum(1.0, wider), 1.0)
+        known = self.by_stop.share.sum(axis=0) > ROUNDED_SHARE
+        return np.where(known, np.maximum(1.0, wider), 1.0)
 
-    def _of_stops(self, moved: np.ndarray, number: np.ndarray) -> dict[int, np.ndarray]:
-        """Stop -> u (P,) of all parameters at once, where stops are few; from what cells (C, P)
-        add, and the number (C,) of the cluster of each."""
+    def _of_stops(self) -> dict[int, np.ndarray]:
+        """Stop -> u (P,) of all parameters at once, where stops are few."""
         found = {}
         for stop, products in self.stops.items() if len(self.stops) <= MOST_WHOLE_STOPS else ():
             half = solve_triangular(self.root, products, lower=True)
             values, axes = np.linalg.eigh(solve_triangular(self.root, half.T, lower=True))
-            t = moved[number == stop].sum(axis=0)
+            t = self.by_stop.moved[self.by_stop.row[stop]]
             along = axes.T @ solve_triangular(self.root, t, lower=True)
             u = along / np.sqrt(1.0 - np.clip(values, 0.0, ALONE))
             found[stop] = self.root @ axes @ u
         return found
-
-
-def _squares(
-    moved: np.ndarray,
-    share: np.ndarray,
-    number: np.ndarray,
-    known: Mapping[int, np.ndarray] = MappingProxyType({}),
-) -> tuple[np.ndarray, np.ndarray]:
-    """The sum over clusters of u^2 (P,), and its degrees of freedom.
-
-    Args:
-        moved, share: (C, P) what cells add, and their share.
-        number: (C,) of the cluster of each.
-        known: number of a cluster -> its u (P,); of the others each parameter by itself.
-    """
-    clusters, at = np.unique(number, return_inverse=True)
-    share = np.minimum(summed(share, at), ALONE)
-    u = summed(moved, at) / np.sqrt(1.0 - share)
-    for cluster, whole in known.items():
-        u[np.searchsorted(clusters, cluster)] = whole
-    product = np.square(share) / (1.0 - share)  # of two clusters' u, expected
-    among = np.square(product.sum(axis=0)) - np.square(product).sum(axis=0)
-    least = np.maximum(np.square(share).sum(axis=0) + among, 1e-300)
-    d = np.maximum(np.square(share.sum(axis=0)) / least, 1.0)
-    return np.square(u).sum(axis=0), d
 
 
 def _pairs(stop: np.ndarray, part: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ from scipy import stats
 from scipy.linalg import sqrtm
 
 from calib import problem as problems
-from calib.linear.clusters import ClusteredRows, Gradients
+from calib.linear.clusters import CellSums, ClusteredRows, Gradients
 from calib.problem.model import Model, Source
 from calib.results.intervals import ROOM_PARTS, Intervals, _Sums, intervals
 from calib.simulation import Spec
@@ -59,7 +59,8 @@ def test_the_formula_is_that_of_the_module():
     sigma = np.sqrt(np.diag(C))
     A, paper = J @ C / sigma, prior @ C / sigma
     sums = _Sums.over(C / np.outer(sigma, sigma))
-    for some in np.array_split(rng.permutation(count), 7):
+    for stops in np.array_split(rng.permutation(12), 7):  # each cell at once
+        some = rng.permutation(np.flatnonzero(np.isin(stop, stops)))
         sums.add(rows(A[some], b[some], stop[some], part[some]))
     sums.add(rows(paper, np.zeros(2), np.full(2, -1), np.full(2, -1)))
     root, by_stop = np.linalg.cholesky(C), np.zeros(3)
@@ -179,6 +180,30 @@ def test_what_rests_on_cad_alone_is_as_much_wider_as_cad_is_worse():
 # ---------------------------------------------------------------------------------------- fits
 
 
+def test_beams_as_sums_and_their_scatter_are_worth_what_their_rows_are():
+    rng = np.random.default_rng(4)
+    size, whole, parts = 3, _Sums.over(np.eye(3)), _Sums.over(np.eye(3))
+    for stop in range(6):
+        A, b = 0.1 * rng.normal(size=(60, size)), rng.normal(size=60)
+        place = rng.permutation(np.r_[[7, 2, 9, 4], rng.choice([7, 2, 9, 4], 56)])
+        first, more = np.arange(40), np.arange(40, 60)  # beams, and scatter within their holds
+        place[:4] = [7, 2, 9, 4]
+        whole.add(rows(A, b, np.full(60, stop), place))
+        met = np.array([7, 2, 9, 4])
+        pick = (place[first] == met[:, None]).astype(float)
+        sums = CellSums(
+            stop=stop,
+            place=met,
+            moved=pick @ (A * b[:, None])[first],
+            share=pick @ np.square(A[first]),
+            products=A[first].T @ A[first],
+        )
+        scatter = rows(A[more], b[more], np.full(20, stop), place[more])
+        parts.add_stop(sums, scatter)
+    assert (whole.wider() > 1.1).any()
+    np.testing.assert_allclose(parts.wider(), whole.wider(), rtol=1e-10)
+
+
 @pytest.fixture(scope="module")
 def fitted(tmp_path_factory):
     source, _ = made(tmp_path_factory.mktemp("rows") / "rec", SMALL, 4)
@@ -194,9 +219,11 @@ def test_the_rows_of_a_fit_are_all_that_is_known_and_lead_nowhere(fitted, monkey
         seen.moved = seen.moved + (rows.A.T @ rows.b)
         seen.share = seen.share + np.square(rows.A).sum(axis=0)
 
-    def add_stop(self, sums):
+    def add_stop(self, sums, scatter):
         seen.moved = seen.moved + sums.moved.sum(axis=0)
         seen.share = seen.share + sums.share.sum(axis=0)
+        if scatter is not None:
+            add(self, scatter)
 
     monkeypatch.setattr(_Sums, "add", add)
     monkeypatch.setattr(_Sums, "add_stop", add_stop)
@@ -213,7 +240,7 @@ def test_priors_of_patches_are_with_their_region_and_each_target_is_a_cluster(fi
         for pair in zip(rows.stop.tolist(), rows.place.tolist(), strict=True):
             cells[pair] = cells.get(pair, 0) + 1
 
-    def add_stop(self, sums):
+    def add_stop(self, sums, scatter):
         cells.update({(sums.stop, part): 1 for part in sums.place.tolist()})
 
     monkeypatch.setattr(_Sums, "add", add)
