@@ -29,6 +29,7 @@ from calib.linear.system import Linearisation
 from calib.problem.problem import Problem
 from calib.problem.spread import Whose
 from calib.residuals.groups import ALONG_BEAMS, Group
+from calib.residuals.store import drawn_evenly
 from calib.solve.components import Sums, Told, squares_beside_bodies
 
 # Scans that tell how places of the LiDAR scatter, of more: a choice. So many tell it to 1 part in
@@ -141,7 +142,7 @@ def beside_bodies(
 def of_poses(whole: Linearisation, problem: Problem, wild: Collection[Group]) -> Told | None:
     """What all rows say of twists (6 K) of the LiDAR at stops, those of a kind in one group: 0 of
     shifts, 1 of turns. Of the `wild` scans, nothing; None where there is no other. Where there are
-    many stops, K of them at even intervals stand for all."""
+    many stops, K of them, drawn evenly, stand for all."""
     every = [
         rows
         for rows in scan_rows(whole, problem)
@@ -149,7 +150,7 @@ def of_poses(whole: Linearisation, problem: Problem, wild: Collection[Group]) ->
     ]
     if not every:
         return None
-    every = every[:: -(-len(every) // TELLING_SCANS)]
+    every = [every[i] for i in drawn_evenly(len(every), TELLING_SCANS, seed=0)]
     H, b = Others.of(whole).against(every)
     raw = block_diag(*(rows.information for rows in every))
     size = np.sqrt(np.maximum(np.diag(raw), 1e-300))

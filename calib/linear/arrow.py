@@ -37,16 +37,15 @@ class Arrow:
     def of(cls, H: csr_array | np.ndarray, own: Sequence[np.ndarray]) -> Arrow:
         """Of a symmetric positive definite matrix; `own` are the columns of each set."""
         shared = np.setdiff1d(np.arange(H.shape[0]), np.concatenate([np.zeros(0, int), *own]))
-        sets = [
-            np.stack([c for c in own if len(c) == size]) for size in sorted({len(c) for c in own})
-        ]
+        sizes = sorted({len(c) for c in own} - {0})
+        sets = [np.stack([c for c in own if len(c) == size]) for size in sizes]
         inverse, beside = [], [np.zeros((0, len(shared)))]
         for columns in sets:
             block = _part(H, columns.reshape(-1, 1), np.repeat(columns, columns.shape[1], axis=0))
             block = block.reshape(*columns.shape, columns.shape[1])
             inverse.append(np.linalg.inv(np.linalg.cholesky(block)))
             cross = _dense(H[columns.ravel()][:, shared]).reshape(*columns.shape, len(shared))
-            beside.append((inverse[-1] @ cross).reshape(-1, len(shared)))
+            beside.append((inverse[-1] @ cross).reshape(columns.size, len(shared)))
         W = np.vstack(beside)
         left = _dense(H[shared][:, shared]) - square(W)
         factor = cholesky(left, overwrite_a=True, check_finite=False)
@@ -55,7 +54,7 @@ class Arrow:
     def root(self, right: np.ndarray) -> np.ndarray:
         """``N right`` of (U, q), with ``N' N = H^-1``; its rows are in an order of their own."""
         own = [
-            (inverse @ right[columns]).reshape(-1, right.shape[1])
+            (inverse @ right[columns]).reshape(columns.size, right.shape[1])
             for columns, inverse in zip(self.sets, self.inverse, strict=True)
         ]
         first = np.vstack([np.zeros((0, right.shape[1])), *own])
@@ -65,14 +64,14 @@ class Arrow:
 
     def solve(self, right: np.ndarray) -> np.ndarray:
         """``H^-1 right`` of (U,) or (U, q)."""
-        columns = right.reshape(len(right), -1)
+        columns = right if right.ndim == 2 else right[:, None]
         found, count = self.root(columns), len(self.beside)
         out = np.empty_like(columns)
         shared = solve_triangular(self.factor, found[count:], check_finite=False)
         out[self.shared] = shared
         first, start = found[:count] - self.beside @ shared, 0
         for some, inverse in zip(self.sets, self.inverse, strict=True):
-            mine = first[start : start + some.size].reshape(*some.shape, -1)
+            mine = first[start : start + some.size].reshape(*some.shape, columns.shape[1])
             out[some] = inverse.mT @ mine
             start += some.size
         return out.reshape(right.shape)

@@ -20,7 +20,7 @@ from calib.linear.system import Linearisation, Values
 from calib.problem.unknowns import Role
 from calib.residuals.compiled import add_at, add_sparse
 
-# Entries of a stop's rows by all columns that wait, of all stops together: bounds the memory.
+# Most entries of the rows of stops that wait, over all columns: bounds the memory.
 WAITING_ENTRIES = 2_000_000
 STOPS_TOGETHER = 256  # without beams, whose rows are multiplied at once, likewise
 
@@ -42,8 +42,8 @@ class OwnRows:
 
     def of_stop(self, stop: int, place: np.ndarray | None = None) -> ClusteredRows:
         """The same as rows of a stop, each of a place (m,); -1 for none, as without it."""
-        at, none = np.full(len(self.b), stop), np.full(len(self.b), -1)
-        place = none if place is None else place
+        at = np.full(len(self.b), stop)
+        place = np.full(len(self.b), -1) if place is None else place
         return ClusteredRows(A=self.A, b=self.b, columns=self.columns, stop=at, place=place)
 
 
@@ -91,7 +91,8 @@ class Assembly:
 
     Its matrix is over ``[finest cells | coarser cells | kept | b]``, in units of sigmas. Half of it
     is held: the whole is that and its transpose. So a product of two different columns is added
-    once: below the diagonal where one of them is a cell, else on either side.
+    once, below the diagonal where one of them is a cell; of two that are kept it may stand on
+    either side, or half of it on both.
 
     Args:
         layout: which column is what.
@@ -257,7 +258,7 @@ class Assembly:
         over all columns.
 
         What goes is the square of ``W = L^-1 (T_o' Z + R_o' R_r)``, with L the factor and R the own
-        rows. Its rows are turned until but six of them, as a twist has, touch more than R does.
+        rows. Its rows are turned so that only six, the rank of a twist, touch more columns than R.
 
         Args:
             factor: (K, o, o), T_own: (K, 6, o), Z: (K, 6, N) as of `_finish_scanned`.

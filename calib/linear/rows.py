@@ -247,16 +247,6 @@ class StopSums:
     zero: Sequence[int]
     weight_m2: float
 
-    @property
-    def dense_columns(self) -> np.ndarray:
-        """(d,) columns of the layout."""
-        return self.columns[: self.dense.shape[1] - TWIST - 1]
-
-    @property
-    def sparse_columns(self) -> np.ndarray:
-        """(s,) columns of the layout."""
-        return self.columns[self.dense.shape[1] - TWIST - 1 :]
-
     def alone(self) -> OwnSums:
         """What they say of a twist of the LiDAR, and of a range zero, that this stop alone has."""
         own = [*range(TWIST), *self.zero]

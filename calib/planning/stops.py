@@ -141,7 +141,8 @@ def pattern(source: Source) -> tuple[Scan, Beams, float]:
     """
     scanned = np.flatnonzero(source.recording.has_scan)
     some = scanned[np.unique(np.linspace(0, len(scanned) - 1, SCANS_FOR_BEAMS).round().astype(int))]
-    read = [source.store.read(k) for k in some.tolist()]
+    store = source.of_beams(None).store
+    read = [store.read(k) for k in some.tolist()]
     ring, column, count = (
         np.concatenate([getattr(scan, name) for scan, _ in read])
         for name in ("ring", "column", "count")

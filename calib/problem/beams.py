@@ -97,8 +97,9 @@ def _planes_unknown(found: PlaneSurface, owner: Owner) -> Unknown:
 def _find_planes(problem: Problem, part: SourceStops, places: Places) -> Planes:
     recording, rig = part.source.recording, part.source.rig
     finder = PlaneFinder(noise_m=rig.lidar.sigma_range_m)
+    store = part.source.of_beams(None).store  # the same planes, however many beams are used
     for k, stops in places.scanned():
-        _, ray = part.source.store.read(k)
+        _, ray = store.read(k)
         T = stops.in_reference(rig.lidar_frame, problem.initial, False).T[0]
         points_m = ray.origin_m + ray.range_m[:, None] * ray.direction
         finder.add(k, se3.apply(T, points_m), T[:3, 3])

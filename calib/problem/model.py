@@ -48,6 +48,8 @@ class Model:
     def __post_init__(self) -> None:
         chosen = (effects.find(e) if isinstance(e, str) else e for e in self.effects)
         object.__setattr__(self, "effects", tuple(chosen))
+        if self.beams is not None and self.beams < 1:
+            raise InputError(f"beams {self.beams}: use at least one beam of each scan")
 
     @classmethod
     def of(

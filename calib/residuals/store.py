@@ -54,13 +54,16 @@ class BeamStore:
         """A scan, to look at once: it takes no place of those that are asked for in each pass."""
         if stop in self._kept:
             return self._kept[stop][0]
-        return _thinned(self.recording.scan(stop), self.most, stop)
+        scan = self.recording.scan(stop)
+        return scan if self.most is None else _thinned(scan, self.most, stop)
 
     @cached_property
     def median_intensity(self) -> float:
-        """Of all returns of the recording; NaN where none has an intensity, or most are dark."""
+        """Of all returns of the recording, however many beams are used; NaN where none has an
+        intensity, or most are dark."""
         scanned = np.flatnonzero(self.recording.has_scan).tolist()
-        found = np.concatenate([np.zeros(0), *(self._scan(k).intensity for k in scanned)])
+        scan = self._scan if self.most is None else self.recording.scan
+        found = np.concatenate([np.zeros(0), *(scan(k).intensity for k in scanned)])
         found = found[np.isfinite(found)]
         median = float(np.median(found)) if len(found) else 0.0
         return median if median > 0 else float("nan")
@@ -73,14 +76,19 @@ class BeamStore:
         self.__init__(**state)
 
 
-def _thinned(scan: Scan, most: int | None, stop: int) -> Scan:
-    """So many beams of a scan, one drawn from each of as many equal parts of it: scans are stored
-    by ring or by column, so these are spread over all directions."""
-    count = len(scan.ring)
-    if most is None or count <= most:
-        return scan
+def drawn_evenly(count: int, most: int, seed: int) -> np.ndarray:
+    """Which of so many (most,), ascending, one drawn from each of as many equal parts; all of them
+    where they are no more."""
+    if count <= most:
+        return np.arange(count)
     ends = np.linspace(0, count, most + 1).astype(int)
-    at = np.random.default_rng(stop).integers(ends[:-1], ends[1:])
+    return np.random.default_rng(seed).integers(ends[:-1], ends[1:])
+
+
+def _thinned(scan: Scan, most: int, stop: int) -> Scan:
+    """So many beams of a scan: scans are stored by ring or by column, so that beams drawn evenly
+    are spread over all directions."""
+    at = drawn_evenly(len(scan.ring), most, stop)
     columns = {n: c[at] for n, c in vars(scan).items() if isinstance(c, np.ndarray)}
     return replace(scan, **columns, extra={n: c[at] for n, c in scan.extra.items()})
 

@@ -21,8 +21,9 @@ def odd_rings(sources: Iterable[Source]) -> Iterator[tuple[Source, RingFinding]]
         scanned = np.flatnonzero(source.recording.has_scan)[:LOOKED]
         if source.rig.lidar is not None and len(scanned):
             sums = ScanSums(source.rig.lidar)
+            store = source.of_beams(None).store
             for k in scanned.tolist():
-                sums.add(source.recording.stops[k], source.store.read(k)[0])
+                sums.add(source.recording.stops[k], store.read(k)[0])
             found = numbering(sums)
             if found is not None:
                 yield source, found

@@ -9,6 +9,7 @@ from pathlib import Path
 from calib.runs.calibrate import grow, grown_model
 from calib.runs.run import Run
 from calib.solve.fit import Progress
+from chains.errors import InputError
 
 
 def add(
@@ -31,7 +32,9 @@ def add(
 
     Raises:
         InputError: an effect is unknown or in the model already, or the run's recordings are not
-            what they were.
+            what they were; or every beam is asked for, which the run used, and nothing else.
     """
+    if every_beam and run.beams is None and not effects and not without:
+        raise InputError(f"{run.folder} used all beams already; give an EFFECT to add")
     model = grown_model(run, effects).leaving_out(without)
     return grow(run, replace(model, beams=None) if every_beam else model, out, progress)

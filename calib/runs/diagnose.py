@@ -213,10 +213,8 @@ def command_without(run: Run, tokens: Sequence[str]) -> str:
     effects = run.model["effects"]
     out = ["-o", f"{run.folder}-without"]
     if any(not isinstance(effect, str) for effect in effects):  # of files, or with a shape
-        named = (e["python"] for e in effects if not isinstance(e, str) and "python" in e)
-        trust = [part for file in dict.fromkeys(named) for part in ("--trust", str(file))]
         new = without[-2 * len(tokens) :]
-        return shlex.join(["rigcal", "add", str(run.folder), *out, *new, *trust])
+        return shlex.join(["rigcal", "add", str(run.folder), *out, *new, *run.trusting])
     usual = default_effects(run.recordings)
     chosen = [] if tuple(effects) == usual else ["--effects", ",".join(effects)]
     chosen += [part for name in run.model["fixed"] for part in ("--fix", name)]

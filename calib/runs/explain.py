@@ -253,6 +253,7 @@ class _Climb:
         except InputError:
             return None
         wanted = {
+            "beams": None,
             **model.document(),
             "recordings": self._told,
             "hold_out": "location",
@@ -260,7 +261,7 @@ class _Climb:
         }
         if run.grown_from != (below.folder.resolve() if below else None):
             return None
-        return run if all(run.model[key] == plain(wanted[key]) for key in wanted) else None
+        return run if all(run.model.get(key) == plain(wanted[key]) for key in wanted) else None
 
     @cached_property
     def _own(self) -> tuple[Effect, ...]:

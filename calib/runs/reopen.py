@@ -23,7 +23,7 @@ from sensors.recording import digest
 from sensors.reference import Reference
 
 OPENED = 4  # recordings that stay open in a process: to grow and diagnose runs of them again
-_opened: dict[tuple[Path, str], Source] = {}
+_opened: dict[tuple[Path, str, int | None], Source] = {}
 
 
 def model_of(run: Run) -> Model:
@@ -109,13 +109,13 @@ def reopened(
         InputError: one is gone, or has changed; or one does not have what is to be left out.
     """
     most = None if every_beam else run.beams
-    found = [_reopened(recording, run).of_beams(most) for recording in run.model["recordings"]]
+    found = [_reopened(recording, run, most) for recording in run.model["recordings"]]
     return leave_out(found, run.model.get("without", ()) if without is None else without)
 
 
 def start_of(run: Run, sources: Sequence[Source]) -> Start:
-    """Where a run's fit stood, for another fit of its recordings; of other beams of these it is not
-    known what they meet.
+    """Where a run's fit stood, for another fit of its recordings. What beams met is known where the
+    same beams are used.
 
     Raises:
         InputError: the run is of an earlier version.
@@ -190,12 +190,13 @@ def as_it_was(recording: Mapping[str, str], path: Path, run: Run) -> None:
         )
 
 
-def _reopened(recording: Mapping[str, str], run: Run) -> Source:
+def _reopened(recording: Mapping[str, str], run: Run, most: int | None) -> Source:
     path = remote.here(recording["path"])
     as_it_was(recording, path, run)
-    known = _opened.get((path, recording["sha256"]))
-    source = known or Source.open(path)
+    key = path, recording["sha256"], most
+    known = _opened.get(key)
+    source = known or Source.open(path).of_beams(most)
     if known is None and len(_opened) == OPENED:
         _opened.clear()
-    _opened[path, recording["sha256"]] = source
+    _opened[key] = source
     return source

@@ -184,6 +184,13 @@ class Run:
         """How many beams of each scan it used at most; all where None."""
         return self.model.get("beams")
 
+    @property
+    def trusting(self) -> list[str]:
+        """The options by which a command trusts the Python files of its effects."""
+        effects = (e for e in self.model["effects"] if not isinstance(e, str))
+        files = dict.fromkeys(e["python"] for e in effects if "python" in e)
+        return [part for file in files for part in ("--trust", str(file))]
+
     def refuse_unconverged(self, force: bool) -> None:
         """Raise InputError for a fit that did not converge, unless its numbers are wanted still."""
         if not (self.converged or force):

@@ -98,12 +98,12 @@ def closing(run: Run) -> list[str]:
     what = {"held_out": "held-out error", "fit": "error of the fit, none held out"}[kind]
     error = over_beams(rms[kind], run.summary, before).partition("; ")[0]
     first = f"{what}: {error}; {rms['noise_floor']:.2f} mm expected if the model is right"
-    folder = shlex.quote(str(run.folder))
     some = []
-    if run.beams:
+    if run.beams and run.summary["residual"] == "range":
+        whole = ["rigcal", "add", str(run.folder), "--every-beam", "-o", f"{run.folder}-all"]
         some.append(
             f"of each scan {run.beams:,} beams at most were used: a first answer. All of them: "
-            f"rigcal add {folder} --every-beam -o {folder}-all"
+            f"{shlex.join([*whole, *run.trusting])}"
         )
     if diagnosis:
         return [first, *some, f"verdict: {verdict.meaning}. {verdict.sentence}"]
@@ -112,4 +112,9 @@ def closing(run: Run) -> list[str]:
         why, more = reasons[0].partition(": ")[0], len(reasons) - 1
         others = f" (and {more} more reason{'s' * (more > 1)})" if more else ""
         told = f"{verdict.meaning}; {why}{others}"
-    return [first, *some, f"verdict so far: {told}", f"next: rigcal diagnose {folder}"]
+    return [
+        first,
+        *some,
+        f"verdict so far: {told}",
+        f"next: rigcal diagnose {shlex.quote(str(run.folder))}",
+    ]

@@ -10,10 +10,12 @@ import pytest
 import calib
 from calib.problem.model import Source
 from calib.runs.diagnose import command_without
+from calib.runs.ladder import ladder
 from calib.runs.reopen import reopened
 from calib.runs.reproduce import reproduce
 from calib.simulation import Spec, simulate
 from chains import se3
+from chains.errors import InputError
 
 SPEC = Spec(lidar="hesai_pandarxt32", locations=4, stops_per_location=2, column_step=4)
 SOME = 1500
@@ -127,3 +129,39 @@ def test_some_beams_are_asked_for_and_told_on_the_command_line(made, rigcal, tmp
     assert rigcal(*fit, "--beams", 0)[0] == 2
     model = replace(calib.Model(), beams=7)
     assert model.minus(["ring_range_offset"]).beams == 7
+    with pytest.raises(InputError, match="at least one beam"):
+        calib.Model(beams=0)
+    with pytest.raises(InputError, match="used all beams already"):
+        calib.add(calib.Run.open(made / "all"), [], tmp_path / "no", every_beam=True)
+
+
+def test_the_ladder_says_that_beams_came_to_it(made):
+    rungs = ladder([calib.Run.open(made / "grown")])
+    assert [rung.step for rung in rungs] == ["start", "all beams"]
+
+
+def test_an_explanation_by_other_beams_goes_on_from_no_rung(made, tmp_path):
+    recording = [made / "rec"]
+    for beams in (400, None, 600):
+        found = calib.explain(recording, tmp_path / "ladder", calib.Model(beams=beams))
+        assert {run.beams for run in found.runs} == {beams}
+
+
+def test_planes_are_those_of_all_beams(tmp_path):
+    """Without a mesh: fewer beams would show fewer planes, and what is evaluated then are others
+    than those that were fitted."""
+    spec = Spec(mesh=False, targets=0, locations=3, stops_per_location=2, column_step=20)
+    simulate(spec, tmp_path / "rec", 1)
+    runs = [
+        calib.fit([tmp_path / "rec"], tmp_path / name, calib.Model(beams=beams), hold_out="none")
+        for name, beams in (("some", 2000), ("all", None))
+    ]
+    some, whole = (run.state()["planes"] for run in runs)
+    assert some.shape == whole.shape
+    accuracy = [calib.evaluate(run)["accuracy_mm"] for run in runs]
+    assert accuracy[0] == pytest.approx(accuracy[1], rel=0.1)
+
+
+def test_the_usual_intensity_is_that_of_all_beams(made):
+    source = Source.open(made / "rec")
+    assert source.of_beams(100).store.median_intensity == source.store.median_intensity > 0

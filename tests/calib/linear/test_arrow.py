@@ -24,7 +24,9 @@ def arrow(rng, sizes, shared):
 
 @pytest.mark.parametrize("sparse", [False, True])
 @pytest.mark.parametrize(
-    ("sizes", "shared"), [([3, 3, 3], 5), ([2, 4, 2, 1], 3), ([], 4), ([4], 1)], ids=str
+    ("sizes", "shared"),
+    [([3, 3, 3], 5), ([2, 4, 2, 1], 3), ([], 4), ([4], 1), ([3, 0, 2], 2), ([3, 2], 0)],
+    ids=str,
 )
 def test_it_solves_as_dense_algebra_does(sizes, shared, sparse):
     rng = np.random.default_rng(len(sizes) + shared)
@@ -36,5 +38,6 @@ def test_it_solves_as_dense_algebra_does(sizes, shared, sparse):
     found = factor.solve(right)
     np.testing.assert_allclose(found * size[:, None], expected * size[:, None], rtol=1e-6)
     np.testing.assert_allclose(factor.solve(right[:, 0]), found[:, 0], rtol=1e-12)
+    assert factor.solve(right[:, :0]).shape == (len(H), 0)
     root = factor.root(right)
     np.testing.assert_allclose(root.T @ root, right.T @ expected, rtol=1e-6, atol=1e-9)
