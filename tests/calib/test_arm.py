@@ -111,6 +111,27 @@ def test_an_arm_of_few_joints_says_how_far_it_stays_off(tmp_path):
     assert (command.off_rad > 1e-4).all() and command.off_rad.max() < 0.05
 
 
+def test_an_arm_of_seven_joints_reaches_towards_what_is_out_of_reach(tmp_path):
+    """Every step brings the tip nearer, and so damps the next less: without an end to that, seven
+    joints have no least step."""
+    world = arm_worlds.bent(tmp_path, "iiwa7", np.random.default_rng(9), size=0.0)
+    source = opened(tmp_path, "iiwa7", world, np.random.default_rng(9), poses=2)
+    part, known, _ = found(source, (), np.random.default_rng(9), size=0.0)
+    arm = Arm.as_found(source.rig, part, known)
+    for seed, beyond_m in ((0, 0.0), (1, 1e-3), (2, 0.05), (3, 0.3)):
+        rng = np.random.default_rng(seed)
+        joints = rng.uniform(-2, 2, (200, 7))
+        joints[:, [1, 3, 5]] *= 0.02 * rng.uniform(0, 1)  # stretched
+        wanted = arm.corrected(joints)
+        out = wanted[:, :3, 3] / np.linalg.norm(wanted[:, :3, 3], axis=1, keepdims=True)
+        wanted[:, :3, 3] += beyond_m * out
+        start = joints + rng.normal(0, 0.1, joints.shape)
+        command = arm.joints_for(wanted, start)
+        before = np.linalg.norm(wanted[:, :3, 3] - arm.corrected(start)[:, :3, 3], axis=1)
+        assert np.isfinite(command.joints).all()
+        assert (command.off_m < np.maximum(before, beyond_m) + 0.02).all()
+
+
 def test_what_cannot_be_is_said(source):
     rng = np.random.default_rng(8)
     part, known, _ = found(source, ["arm_thermal_growth"], rng)
