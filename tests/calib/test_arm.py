@@ -116,9 +116,10 @@ def test_an_arm_of_seven_joints_reaches_towards_what_is_out_of_reach(tmp_path):
     joints have no least step."""
     world = arm_worlds.bent(tmp_path, "iiwa7", np.random.default_rng(9), size=0.0)
     source = opened(tmp_path, "iiwa7", world, np.random.default_rng(9), poses=2)
-    part, known, _ = found(source, (), np.random.default_rng(9), size=0.0)
+    names = ("arm_link_length", "arm_joint_offset", "arm_geometry")
+    part, known, _ = found(source, names, np.random.default_rng(9), size=0.3)
     arm = Arm.as_found(source.rig, part, known)
-    for seed, beyond_m in ((0, 0.0), (1, 1e-3), (2, 0.05), (3, 0.3)):
+    for seed, beyond_m in ((0, 0.0), (2, 1e-6), (3, 1e-3), (4, 0.3)):
         rng = np.random.default_rng(seed)
         joints = rng.uniform(-2, 2, (200, 7))
         joints[:, [1, 3, 5]] *= 0.02 * rng.uniform(0, 1)  # stretched
