@@ -17,6 +17,7 @@ from calib.report.chart import Absent, Chart
 from calib.report.charts.fit import error_mm
 from calib.report.evidence import Evidence, folder_name
 from calib.results.outstanding import shown
+from calib.runs.run import Run
 from calib.show.blunders import BLUNDER_HEADINGS, blunder_cells
 from calib.show.headline import moved_sentence
 from calib.show.misfit import over_beams
@@ -292,6 +293,12 @@ def _untold(evidence: Evidence) -> list[tuple[str, list[str]]]:
     return list(reasons.items())
 
 
+def _beams(run: Run) -> list[tuple[str, str]]:
+    if run.summary["residual"] != "range":
+        return []
+    return [("beams", f"{run.beams:,} of each scan at most" if run.beams else "all")]
+
+
 def _provenance(evidence: Evidence) -> list[tuple[str, str]]:
     model = evidence.run.model
     out = [("run", str(evidence.run.folder))]
@@ -301,7 +308,7 @@ def _provenance(evidence: Evidence) -> list[tuple[str, str]]:
     ]
     out += [
         ("model", ", ".join(evidence.run.effects) or "no effects"),
-        ("beams", f"{evidence.run.beams:,} of each scan at most" if evidence.run.beams else "all"),
+        *_beams(evidence.run),
         ("left out", ", ".join(evidence.run.left_out) or "nothing"),
         ("set aside", ", ".join(evidence.run.set_aside) or "nothing"),
         ("held fixed", ", ".join(model["fixed"]) or "nothing but what CAD has exact"),
