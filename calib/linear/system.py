@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -138,20 +139,42 @@ class Linearisation:
         rows (n,), these over some unknowns (n, e), and the unknowns' covariance with them (e, n);
         arguments as of `covariance`."""
         sigma = self.layout.sigma
-        left = np.hstack([rows * sigma, np.zeros((len(rows), 1))])
-        touched = np.any(left != 0, axis=0)
-        for each in self.eliminated:
-            if not touched[each.columns].any():
-                continue
-            some = np.flatnonzero(np.any(left[:, each.columns] != 0, axis=1))
+        touched = np.flatnonzero(np.any(rows != 0, axis=0))
+        concerned = self._concerned(touched)
+        # Over no more columns than these rows come to: of many stops they touch a few.
+        parts = [p for each in concerned for p in (each.columns, each.over)]
+        columns = np.unique(np.concatenate([touched, self.layout.kept, [self.layout.size], *parts]))
+        at = positions(self.layout.size + 1, columns)
+        left = np.zeros((len(rows), len(columns)))
+        left[:, at[touched]] = rows[:, touched] * sigma[touched]
+        for each in concerned:
+            mine = left[:, at[each.columns]]
+            some = np.flatnonzero(np.any(mine != 0, axis=1))
             if not len(some):
                 continue
-            mine = left[np.ix_(some, each.columns)]
+            mine = mine[some]
             yield some, mine, each.solve(mine.T)
-            left[np.ix_(some, each.over)] -= mine @ each.gain
-            touched[each.over] = True
-        last = left[:, self.layout.kept] / sigma[self.layout.kept]
+            left[np.ix_(some, at[each.over])] -= mine @ each.gain
+        last = left[:, at[self.layout.kept]] / sigma[self.layout.kept]
         yield np.arange(len(rows)), last, kept @ last.T
+
+    @cached_property
+    def _step(self) -> np.ndarray:
+        """(U + 1,) in which step of the elimination each column goes; -1 for those that stay."""
+        out = np.full(self.layout.size + 1, -1)
+        for i, each in enumerate(self.eliminated):
+            out[each.columns] = i
+        return out
+
+    def _concerned(self, touched: np.ndarray) -> list[Eliminated]:
+        """The steps of the elimination, in order, that rows which touch some columns (n,) go
+        through."""
+        wanted, found = set(self._step[touched].tolist()), []
+        for i in range(len(self.eliminated) if max(wanted, default=-1) >= 0 else 0):
+            if i in wanted:
+                found.append(self.eliminated[i])
+                wanted |= set(np.unique(self._step[self.eliminated[i].over]).tolist())
+        return found
 
     def variances(
         self, some: Sequence[Mapping[str, np.ndarray]], kept: np.ndarray

@@ -267,8 +267,12 @@ class _Clusters:
         if len(self.row) > len(self.moved):
             more = ((0, 2 * len(self.row) - len(self.moved)), (0, 0))
             self.moved, self.share = np.pad(self.moved, more), np.pad(self.share, more)
-        np.add.at(self.moved, rows, moved)
-        np.add.at(self.share, rows, share)
+        if len(set(rows)) == len(rows):  # ten times as fast
+            self.moved[rows] += moved
+            self.share[rows] += share
+        else:
+            np.add.at(self.moved, rows, moved)
+            np.add.at(self.share, rows, share)
 
     def squares(
         self, known: Mapping[int, np.ndarray] = MappingProxyType({})
