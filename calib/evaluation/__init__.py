@@ -176,7 +176,7 @@ def evaluate(
     else:
         place = outputs.folder(out, outputs.EVALUATION, [run.folder, *run.inputs])
     with place as folder:
-        sources = reopened(run, every_beam=True)
+        sources = [source.of_beams(None) for source in reopened(run)]
         problem = problem_of(run, sources)
         if not problem.scans:
             raise InputError(

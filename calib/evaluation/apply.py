@@ -182,7 +182,7 @@ def _met(run: Run, folder: Path) -> dict[str, tuple[ScanStop, State]]:
     none where it has no mesh, or is another."""
     if folder.resolve() not in [path.resolve() for path in run.recordings]:
         return {}
-    sources = reopened(run, every_beam=True)
+    sources = [source.of_beams(None) for source in reopened(run)]
     wanted = next(s for s in sources if s.recording.folder.resolve() == folder.resolve())
     if wanted.reference is None:
         return {}

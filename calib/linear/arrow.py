@@ -41,8 +41,8 @@ class Arrow:
         sets = [np.stack([c for c in own if len(c) == size]) for size in sizes]
         inverse, beside = [], [np.zeros((0, len(shared)))]
         for columns in sets:
-            block = _part(H, columns.reshape(-1, 1), np.repeat(columns, columns.shape[1], axis=0))
-            block = block.reshape(*columns.shape, columns.shape[1])
+            i, j = np.broadcast_arrays(columns[:, :, None], columns[:, None, :])
+            block = np.asarray(H[i.ravel(), j.ravel()]).reshape(i.shape)
             inverse.append(np.linalg.inv(np.linalg.cholesky(block)))
             cross = _dense(H[columns.ravel()][:, shared]).reshape(*columns.shape, len(shared))
             beside.append((inverse[-1] @ cross).reshape(columns.size, len(shared)))
@@ -75,11 +75,6 @@ class Arrow:
             out[some] = inverse.mT @ mine
             start += some.size
         return out.reshape(right.shape)
-
-
-def _part(H: csr_array | np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    found = H[np.broadcast_to(rows, columns.shape).ravel(), columns.ravel()]
-    return np.asarray(found).ravel()
 
 
 def _dense(matrix: csr_array | np.ndarray) -> np.ndarray:

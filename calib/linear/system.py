@@ -159,8 +159,8 @@ class Linearisation:
         yield np.arange(len(rows)), last, kept @ last.T
 
     @cached_property
-    def _step(self) -> np.ndarray:
-        """(U + 1,) in which step of the elimination each column goes; -1 for those that stay."""
+    def _gone_in(self) -> np.ndarray:
+        """(U + 1,) in which step of the elimination each column goes; -1 for those kept."""
         out = np.full(self.layout.size + 1, -1)
         for i, each in enumerate(self.eliminated):
             out[each.columns] = i
@@ -169,11 +169,11 @@ class Linearisation:
     def _concerned(self, touched: np.ndarray) -> list[Eliminated]:
         """The steps of the elimination, in order, that rows which touch some columns (n,) go
         through."""
-        wanted, found = set(self._step[touched].tolist()), []
-        for i in range(len(self.eliminated) if max(wanted, default=-1) >= 0 else 0):
+        wanted, found = set(self._gone_in[touched].tolist()), []
+        for i, each in enumerate(self.eliminated):
             if i in wanted:
-                found.append(self.eliminated[i])
-                wanted |= set(np.unique(self._step[self.eliminated[i].over]).tolist())
+                found.append(each)
+                wanted.update(self._gone_in[each.over].tolist())
         return found
 
     def variances(

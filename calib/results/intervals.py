@@ -263,16 +263,13 @@ class _Clusters:
 
     def add(self, number: np.ndarray, moved: np.ndarray, share: np.ndarray) -> None:
         """Add (c, P) to the clusters of these numbers (c,), of which one may stand twice."""
-        rows = [self.row.setdefault(n, len(self.row)) for n in number.tolist()]
+        numbers, at = np.unique(number, return_inverse=True)
+        rows = [self.row.setdefault(n, len(self.row)) for n in numbers.tolist()]
         if len(self.row) > len(self.moved):
             more = ((0, 2 * len(self.row) - len(self.moved)), (0, 0))
             self.moved, self.share = np.pad(self.moved, more), np.pad(self.share, more)
-        if len(set(rows)) == len(rows):  # ten times as fast
-            self.moved[rows] += moved
-            self.share[rows] += share
-        else:
-            np.add.at(self.moved, rows, moved)
-            np.add.at(self.share, rows, share)
+        self.moved[rows] += summed(moved, at)
+        self.share[rows] += summed(share, at)
 
     def squares(
         self, known: Mapping[int, np.ndarray] = MappingProxyType({})
@@ -345,15 +342,13 @@ class _Sums:
     def add_stop(self, sums: CellSums, scatter: ClusteredRows | None = None) -> None:
         """Add the whitened rows of the beams of a stop along the directions of the parameters, as
         sums, and its rows of scatter within holds."""
-        moved, share, products = sums.moved, sums.share, sums.products
+        place, moved, share, products = sums.place, sums.moved, sums.share, sums.products
         if scatter is not None:
-            order = np.argsort(sums.place)
-            at = order[np.searchsorted(sums.place, scatter.place, sorter=order)]
-            moved, share = moved.copy(), share.copy()
-            np.add.at(moved, at, scatter.A * scatter.b[:, None])
-            np.add.at(share, at, np.square(scatter.A))
+            place, at = np.unique(np.append(place, scatter.place), return_inverse=True)
+            moved = summed(np.vstack([moved, scatter.A * scatter.b[:, None]]), at)
+            share = summed(np.vstack([share, np.square(scatter.A)]), at)
             products = products + scatter.A.T @ scatter.A
-        self._add_cells(np.full(len(sums.place), sums.stop), sums.place, moved, share)
+        self._add_cells(np.full(len(place), sums.stop), place, moved, share)
         self._add_products(sums.stop, products)
 
     def _add_cells(

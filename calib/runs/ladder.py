@@ -68,8 +68,7 @@ class Rung:
         changes = [f"{signs.get(name, '+')} {name}" for name in self.added]
         changes += [f"- {name}" for name in self.dropped]
         changes += [f"without {listed(self.left_out)}"] if self.left_out else []
-        if self.below and self.below.beams != self.run.beams:
-            changes.append("all beams" if self.run.beams is None else f"{self.run.beams} beams")
+        changes += ["all beams"] if self.below and self.below.beams and not self.run.beams else []
         return ", ".join(changes if self.below else ["start", *changes]) or "the same model"
 
     def document(self) -> dict[str, Any]:

@@ -95,21 +95,17 @@ def _described(run: Run) -> dict[str, Any]:
         ) from None
 
 
-def reopened(
-    run: Run, without: Sequence[str] | None = None, every_beam: bool = False
-) -> list[Source]:
+def reopened(run: Run, without: Sequence[str] | None = None) -> list[Source]:
     """A run's recordings, as they were when the run was fitted to them.
 
     Args:
         run: the run.
         without: what is left out of them; what the run left out where None.
-        every_beam: True for all beams of each scan, whatever the run used.
 
     Raises:
         InputError: one is gone, or has changed; or one does not have what is to be left out.
     """
-    most = None if every_beam else run.beams
-    found = [_reopened(recording, run, most) for recording in run.model["recordings"]]
+    found = [_reopened(recording, run) for recording in run.model["recordings"]]
     return leave_out(found, run.model.get("without", ()) if without is None else without)
 
 
@@ -190,12 +186,12 @@ def as_it_was(recording: Mapping[str, str], path: Path, run: Run) -> None:
         )
 
 
-def _reopened(recording: Mapping[str, str], run: Run, most: int | None) -> Source:
+def _reopened(recording: Mapping[str, str], run: Run) -> Source:
     path = remote.here(recording["path"])
     as_it_was(recording, path, run)
-    key = path, recording["sha256"], most
+    key = path, recording["sha256"], run.beams
     known = _opened.get(key)
-    source = known or Source.open(path).of_beams(most)
+    source = known or Source.open(path).of_beams(run.beams)
     if known is None and len(_opened) == OPENED:
         _opened.clear()
     _opened[key] = source

@@ -98,15 +98,15 @@ def closing(run: Run) -> list[str]:
     what = {"held_out": "held-out error", "fit": "error of the fit, none held out"}[kind]
     error = over_beams(rms[kind], run.summary, before).partition("; ")[0]
     first = f"{what}: {error}; {rms['noise_floor']:.2f} mm expected if the model is right"
-    some = []
+    first_answer = []
     if run.beams and run.summary["residual"] == "range":
         whole = ["rigcal", "add", str(run.folder), "--every-beam", "-o", f"{run.folder}-all"]
-        some.append(
+        first_answer.append(
             f"of each scan {run.beams:,} beams at most were used: a first answer. All of them: "
             f"{shlex.join([*whole, *run.trusting])}"
         )
     if diagnosis:
-        return [first, *some, f"verdict: {verdict.meaning}. {verdict.sentence}"]
+        return [first, *first_answer, f"verdict: {verdict.meaning}. {verdict.sentence}"]
     told = "no contradiction to the model; not diagnosed yet"
     if reasons := [each for each in verdict.reasons if not each.startswith(UNASKED)]:
         why, more = reasons[0].partition(": ")[0], len(reasons) - 1
@@ -114,7 +114,7 @@ def closing(run: Run) -> list[str]:
         told = f"{verdict.meaning}; {why}{others}"
     return [
         first,
-        *some,
+        *first_answer,
         f"verdict so far: {told}",
         f"next: rigcal diagnose {shlex.quote(str(run.folder))}",
     ]

@@ -198,10 +198,10 @@ def _never(document: Mapping[str, Any]) -> Iterator[str]:
     for each in document["never_told_apart"]:
         name, rival, size = (each[key] for key in ("effect", "from", "smallest"))
         factor, unit = shown(document["smallest_detectable"][name]["unit"])
-        least = "never" if size is None else f"only from {factor * size:.3g} {unit}"
+        least = "at no size" if size is None else f"only from {factor * size:.3g} {unit} on"
         yield (
             f"NOT TOLD APART by any stops: at all {document['candidates']} poses {rival} moves all "
-            f"that is seen almost as {name} does, which could be told from it {least}."
+            f"that is seen almost as {name} does, which could be told apart {least}."
         )
 
 

@@ -80,7 +80,7 @@ def test_a_run_says_how_many_beams_it_used_and_all_that_is_made_of_it_uses_these
     assert points["some"] < 8 * SOME < points["all"] / 2
     assert points["grown"] == pytest.approx(points["all"], rel=1e-3)  # but for some near edges
     (source,) = reopened(run)
-    assert source.beams == SOME and reopened(run, every_beam=True)[0].beams is None
+    assert source.beams == SOME and source.of_beams(None).beams is None
     assert f"--beams {SOME}" in command_without(run, ["L00P00:scan"])
     diagnosis = calib.diagnose(run, refits=False)
     assert diagnosis.verdict == "adequate", diagnosis.sentences

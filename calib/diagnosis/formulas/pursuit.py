@@ -205,9 +205,8 @@ def _by_chance(
     No more often than as many forms do as were tried, whole or with those of its columns alone that
     are needed (Bonferroni). Where a smooth function explains it, nor more often than the best of
     such functions does (the S-method of Scheffe 1953), by what the form itself scatters, or than
-    that function does, in all its directions. The function is the form's gate: half of the level is
-    its own, and the other bounds share the other half, as one of them is enough (weighted
-    Bonferroni, Holm 1979).
+    that function does, in all its directions. Half of the level is for the test of that function,
+    and the other bounds share the other half equally (weighted Bonferroni, Holm 1979).
     """
     columns = form.term.columns(fitted.table.covariates)
     (kept,) = needed(fitted, [form.term], [columns])
@@ -216,11 +215,13 @@ def _by_chance(
     if 0 < len(kept) < columns.shape[1]:
         ways = special.comb(columns.shape[1], len(kept))
         bounds.append(form.tried * ways * _tail(_judged(fitted, columns[:, kept])))
-    if smooth.test.statistic <= COVERS * form.statistic:
-        return at_least(min(1.0, len(bounds) * min(bounds)))
-    bounds.append(_tail(whole, max(smooth.test.dof, whole.dof)))
-    gate = judged(smooth.covariates, smooth.plain).p_value()
-    return at_least(min(1.0, 2.0 * min(gate, len(bounds) * min(bounds))))
+    covered = smooth.test.statistic > COVERS * form.statistic
+    if covered:
+        bounds.append(_tail(whole, max(smooth.test.dof, whole.dof)))
+    p = len(bounds) * min(bounds)
+    if covered:
+        p = 2.0 * min(p, judged(smooth.covariates, smooth.plain).p_value())
+    return at_least(min(1.0, p))
 
 
 def _tail(found: ScoreTest, among: int = 0) -> float:
