@@ -83,7 +83,7 @@ class Search:
         unnamed: structure that is confirmed after all of them, strongest first.
         scatter: the effect on the scatter that is confirmed, if one is.
         at_first: structure that is confirmed before any of them; empty, as not asked for, unless
-            the first of them is dressed up.
+            the first of them is dressed up, or stops that were held out speak against it.
         chance: what scatters by chance beside all that was found, strongest first.
         unsettled: what scatters beside that, and with which no fit comes to an optimum.
     """

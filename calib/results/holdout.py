@@ -49,6 +49,11 @@ class Fall:
     gain_m2: tuple[float, ...] = ()
 
     @property
+    def rises(self) -> bool:
+        """Whether stops that were held out are predicted worse with it."""
+        return self.after_mm > self.before_mm
+
+    @property
     def spread_mm(self) -> float | None:
         """Standard error of the fall of the rms, by stops; None where fewer than two tell."""
         if len(self.gain_m2) < 2:

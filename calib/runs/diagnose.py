@@ -15,7 +15,7 @@ from calib.blunders import told
 from calib.blunders.reach import FurthestMoved, hardly_checked, reaches
 from calib.diagnosis.chance import Spread
 from calib.diagnosis.rejects import rejects
-from calib.diagnosis.search import search
+from calib.diagnosis.search import search, structures
 from calib.diagnosis.stand import Look, Stand
 from calib.diagnosis.verdict import ABSORBED_BY_MODEL, Diagnosis, believed, conclude
 from calib.diagnosis.verdict.unnamed import Unnamed, unnamed
@@ -96,6 +96,9 @@ def _found(
     unseen = partial(_unseen, run=run, progress=progress) if before is not None else None
     doubtful = not believed(found, falls)
     formulas = unnamed(found, falls, doubtful, unseen, progress) if run.converged else Unnamed()
+    if falls and next(iter(falls.values())).rises and not found.at_first:
+        # A name that stops held out refuse says nothing by itself: is there structure without it?
+        found = replace(found, at_first=structures(found.looks[0], progress))
     result = conclude(
         found,
         falls,

@@ -92,7 +92,10 @@ FAMILIES = {
     "pair": 1.0,
     "rival": 1.0,
     "detectable": None,
+    "pair-shot": None,
+    "triple-shot": None,
 }
+TOGETHER = {"pair": 2, "pair-shot": 2, "triple-shot": 3}  # how many are hidden at once
 
 
 @dataclass(frozen=True)
@@ -139,7 +142,8 @@ def case(family: str, number: int) -> Case:
     """The case of this number."""
     seed = SEED + 1000 * list(FAMILIES).index(family) + number
     rng = np.random.default_rng(seed)
-    lidar, step, room = SETUPS[number % len(SETUPS)]
+    # So that what is hidden in turn comes to every set-up, also where their counts have a divisor.
+    lidar, step, room = SETUPS[(number + number // len(SETUPS)) % len(SETUPS)]
     spec = Spec(
         lidar=lidar,
         column_step=step,
@@ -172,12 +176,15 @@ def _hidden(family: str, number: int, rng: np.random.Generator) -> tuple[str, ..
         return (RIVALS[number % len(RIVALS)],)
     if family == "detectable":
         return (_nth(OF_ONE_UNIT, number),)
-    if family == "pair":
-        first = _nth(SINGLES, number)
-        near = {first, *find(first).confounded_with}
-        others = [n for n in SINGLES if n not in near and first not in find(n).confounded_with]
-        return first, str(rng.choice(others))
-    return (_nth(SINGLES, number),)
+    chosen = [_nth(SINGLES, number)]
+    while len(chosen) < TOGETHER.get(family, 1):
+        apart = [n for n in SINGLES if not any(n == c or _confounded(n, c) for c in chosen)]
+        chosen.append(str(rng.choice(apart)))
+    return tuple(chosen)
+
+
+def _confounded(one: str, other: str) -> bool:
+    return other in find(one).confounded_with or one in find(other).confounded_with
 
 
 def _nth(names: Sequence[str], number: int) -> str:

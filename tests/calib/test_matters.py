@@ -130,6 +130,37 @@ def test_a_later_name_stands_if_stops_bear_it_out_or_nothing_is_more_general(loo
         assert "-0.100 mm, ± 0.016" in told.refused[0]
 
 
+@pytest.mark.parametrize("structure", [True, False])
+def test_a_name_that_held_out_stops_refuse_says_something_only_where_structure_does(
+    look, structure
+):
+    candidate = next(c for c in look.named.candidates if c.effect.name == "incidence_angle_bias")
+    step = NamedEffect(
+        candidate=candidate,
+        before=look,
+        after=look,
+        judged=candidate.test,
+        p_adjusted=1e-3,
+        rivals=[],
+    )
+    strongest = max(look.unnamed.candidates, key=lambda c: c.evidence)
+    found = Search(
+        looks=[look],
+        found=[step],
+        blunders=(),
+        unnamed=(),
+        scatter=None,
+        at_first=[strongest] if structure else [],
+    )
+    falls = {"incidence_angle_bias": Fall(2.0, 2.1, 2.0)}
+    rms_mm = {"held_out": 2.0, "fit": 2.0, "noise_floor": 2.0}
+    told = conclude(found, falls, {"rms_mm": rms_mm, "misfit": {}}, [])
+    assert told.verdict == ("unexplained_structure" if structure else "adequate")
+    assert len(told.unexplained) == structure and not told.worth_adding
+    assert structure or "none that matters is significant" in told.sentences[0]
+    assert any("incidence_angle_bias was tried and rejected" in s for s in told.sentences)
+
+
 @pytest.mark.slow
 def test_what_matters_stands_with_each_finding_and_a_trace_is_said_to_be_one(tmp_path):
     """0.08 mm of 1.6, of a pattern that no value of the calibration is like."""

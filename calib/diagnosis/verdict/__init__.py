@@ -160,7 +160,8 @@ def conclude(
     found, first = heavy.found, found.looks[0]
     spoilt = [*rings, *(rejected.blunders() if rejected and not found.found else [])]
     hold = believed(found, held_out) and not formulas.instead
-    more = bool(heavy.refused or formulas.formulas or (rejected and not rejected.explained))
+    refused = bool(heavy.refused and found.at_first)
+    more = bool(refused or formulas.formulas or (rejected and not rejected.explained))
     more |= found.unsettled is not None
     bad = bool(spoilt or found.blunders)
     doubt = None if bad or more else _unconfirmed(found, summary["rms_mm"])
@@ -286,8 +287,8 @@ def _absorbed(found: Search) -> float:
 
 def _without_a_name(found: Search, verdict: str) -> list[tuple[Screen, Candidate]]:
     """The residual structure that is left; as it stood at first if the first name is not to be
-    believed."""
-    worn = verdict == UNNAMED and bool(found.found) and found.dressed_up(0)
+    believed, or was refused and none is left."""
+    worn = verdict == UNNAMED and (found.dressed_up(0) if found.found else bool(found.at_first))
     left, look = (found.at_first, 0) if worn else (found.unnamed, -1)
     return [(found.looks[look].unnamed, c) for c in left]
 

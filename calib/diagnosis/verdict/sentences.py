@@ -37,7 +37,7 @@ def sentences_of(
     found, traces = heavy.found, heavy.traces
     look = found.looks[0]
     residual = _residual(look)
-    out = _first_sentences(verdict, look, bool(traces))
+    out = _first_sentences(verdict, look, bool(traces or heavy.refused))
     out += [each["sentence"] for each in blunders[:MOST_LISTED]]
     if len(blunders) > MOST_LISTED:
         out.append(f"And {len(blunders) - MOST_LISTED} more, in diagnosis.json.")
@@ -94,8 +94,9 @@ def unconfirmed(candidate: Candidate, rms_mm: Mapping[str, float]) -> str:
     )
 
 
-def _first_sentences(verdict: str, look: Look, traces: bool) -> list[str]:
-    """That nothing can be said, or that nothing is missing."""
+def _first_sentences(verdict: str, look: Look, beside: bool) -> list[str]:
+    """That nothing can be said, or that nothing is missing, `beside` what is significant and does
+    not matter."""
     stops = stops_of(look)
     if stops < FEWEST_STOPS:
         return [
@@ -107,7 +108,7 @@ def _first_sentences(verdict: str, look: Look, traces: bool) -> list[str]:
     out = [
         f"The model is adequate: of {len(look.named.candidates)} known effects and "
         f"{len(look.unnamed.candidates)} kinds of structure none "
-        f"{'that matters ' if traces else ''}is significant."
+        f"{'that matters ' if beside else ''}is significant."
     ]
     described = [effect.name for effect in look.stand.model.effects if effect.seen]
     if described:
