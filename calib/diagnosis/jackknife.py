@@ -26,6 +26,12 @@ inverted, so there may be more parameters than clusters. There are two ways to V
   variance there is infinite. Clusters fewer than two for each parameter that one of them tells as
   one (the sum of the largest eigenvalues of the I_c) tell nothing: parameters fit their errors.
 
+Where few clusters hold most of the information, few degrees of freedom are left, however well all
+others agree. The second way is then told from those others: without the cluster that holds most,
+without the next, and so on, as long as that finds a smaller effect (`Judges`). Information alone
+decides which they are, so no p-value is chosen; this one is doubled, as it hardly depends on the
+first. A mishap of one stop, or the shape of one wall, then neither makes an effect nor hides one.
+
 The smaller of both p-values counts: where nothing is missing the second is hardly ever the smaller,
 but for a single parameter, where both are nearly the same. Measured by `tests/bench/bench_size.py`
 at a nominal 0.05, with 1, 4, 16 and 64 parameters and 6 to 60 stops, 240 draws each: where rows err
@@ -53,13 +59,13 @@ number.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 from scipy import special
 
-from calib.linear.clusters import ClusteredRows
+from calib.linear.clusters import ClusteredRows, summed
 from calib.results.intervals import ALONE
 
 UNKNOWN_VARIANCE = 1e12  # variance, of a whitened score, where nothing tells it
@@ -67,6 +73,11 @@ UNKNOWN_VARIANCE = 1e12  # variance, of a whitened score, where nothing tells it
 # benchmark: with fewer, 0.1 to 1.0 of empty worlds where stops err show something; else below 0.1.
 PER_PARAMETER = 2
 SLIGHT_SHARE = 0.05  # of a direction's information: the others predict a cluster with less to 5 %
+# Of a part's information, from which a cluster is worth a look without it: where none holds as much
+# there are ten degrees of freedom or more, and the test's limit is at most 2.6 times the least.
+HEAVY = 0.1
+LIMIT = 1e-4  # about the level of one test of an effect after all looks, for what judges it best
+HIGHEST_WORTH = 1.0 / float(special.chdtri(1.0, LIMIT))  # of a share of 1: with d without end
 
 
 @dataclass(frozen=True)
@@ -77,12 +88,16 @@ class ScoreSpread:
         covariance: (r, r) of the score.
         nu, d: degrees of freedom of the statistic over the covariance's trace.
         clusters: how many even clusters would tell as much of the covariance.
+        ratio: of the statistic to that trace, where not all clusters judge it.
+        share: of the information, that judges it.
     """
 
     covariance: np.ndarray
     nu: float
     d: float
     clusters: float
+    ratio: float | None = None
+    share: float = 1.0
 
     @property
     def trace(self) -> float:
@@ -92,6 +107,8 @@ class ScoreSpread:
         """How often chance alone makes as large a statistic; always, where nothing tells."""
         if self.d <= 0.0:
             return 1.0
+        if self.ratio is not None:  # it hardly depends on the test by all: two tests are paid for
+            return min(2.0 * float(special.fdtrc(self.nu, self.d, self.ratio)), 1.0)
         return float(special.fdtrc(self.nu, self.d, statistic / max(self.trace, 1e-300)))
 
 
@@ -159,16 +176,13 @@ class Shares:
         bounds = np.flatnonzero((np.diff(stop) != 0) | (np.diff(place) != 0)) + 1
         for some in np.split(order, bounds):
             mine, right = rows.A[some], rows.b[some]
+            score, information = mine.T @ right, mine.T @ mine
             cell = int(rows.stop[some[0]]), int(rows.place[some[0]])
-            self._sum(self.cells, cell, mine.T @ right, mine.T @ mine)
-
-    @staticmethod
-    def _sum(to: dict, key: object, score: np.ndarray, information: np.ndarray) -> None:
-        if key in to:
-            to[key][0] += score
-            to[key][1] += information
-        else:
-            to[key] = [score.copy(), information.copy()]
+            if cell in self.cells:
+                self.cells[cell][0] += score
+                self.cells[cell][1] += information
+            else:
+                self.cells[cell] = [score, information]
 
     def left_out(self, nu: float, spent: int = 0) -> ScoreSpread:
         """Chance from leaving out cluster after cluster; see the module.
@@ -177,24 +191,8 @@ class Shares:
             nu: degrees of freedom of the statistic, by signs.
             spent: how many unknowns of the model differ by stop alone.
         """
-        ways = [self._clusters(0), self._clusters(1), self.cells]
-        scores = [np.stack([score for score, _ in way.values()]) for way in ways]
-        clusters = [
-            Clusters.of(
-                np.stack([information for _, information in way.values()]),
-                sum(isinstance(key, int) for key in way) or len(way),
-            )
-            for way in ways
-        ]
-        return by_leaving_out(clusters, scores, nu, spent)
-
-    def _clusters(self, way: int) -> dict[int | tuple[int, int], list[np.ndarray]]:
-        """Score and information of each cluster: by stop (0) or by place (1); by cell of rows that
-        have none."""
-        found: dict[int | tuple[int, int], list[np.ndarray]] = {}
-        for cell, (score, information) in self.cells.items():
-            self._sum(found, cell[way] if cell[way] >= 0 else cell, score, information)
-        return found
+        scores, information = (np.stack(each) for each in zip(*self.cells.values(), strict=True))
+        return Judges.of(np.array(list(self.cells)), information, spent).chance(scores, nu)
 
 
 @dataclass(frozen=True)
@@ -262,3 +260,137 @@ def by_leaving_out(
     parts, of_stops = np.array([np.trace(by_stop), np.trace(more)]), max(ways[0].d - spent, 1.0)
     d = parts.sum() ** 2 / max(float(np.sum(parts**2 / [of_stops, ways[1].d])), 1e-300)
     return ScoreSpread(by_stop + more, nu, float(d), float(d) + 1.0)
+
+
+@dataclass(frozen=True)
+class Part:
+    """Cells of stop and place, all or some.
+
+    Args:
+        kept: (n,) which of all cells.
+        whiten: (r, k), of what these say of the whitened score.
+        share: of the information.
+        cells: (m, 2) numbers of stop and place of each, -1 for none.
+        clusters: by stop, by place, and by both.
+        spent: how many unknowns of the model differ by stop alone.
+    """
+
+    kept: np.ndarray
+    whiten: np.ndarray
+    share: float
+    cells: np.ndarray
+    clusters: tuple[Clusters, ...]
+    spent: int
+
+    @classmethod
+    def of(
+        cls, cells: np.ndarray, information: np.ndarray, kept: np.ndarray, spent: int
+    ) -> Part | None:
+        """Those `kept` of cells (n, 2) that hold so much of the information, (n, r, r); None where
+        that is next to nothing."""
+        cells, mine = cells[kept], information[kept]
+        whole = mine.sum(axis=0)
+        values, axes = np.linalg.eigh(whole)
+        seen = values > SLIGHT_SHARE
+        if not seen.any():
+            return None
+        whiten = axes[:, seen] / np.sqrt(values[seen])
+        if kept.all():
+            whiten = np.eye(len(whole))
+        else:
+            mine = whiten.T @ mine @ whiten
+        counts = (_stated(cells, 0), _stated(cells, 1), len(cells))
+        clusters = tuple(
+            Clusters.of(_added(mine, numbers), count)
+            for numbers, count in zip(_ways(cells), counts, strict=True)
+        )
+        share = float(np.trace(whole)) / len(whole)
+        return cls(kept, whiten, share, cells, clusters, spent)
+
+    @cached_property
+    def worth(self) -> float:
+        """How small an effect it finds, but for a factor: its information over the limit of the
+        test with its degrees of freedom."""
+        if self.clusters[0].crowded or self.clusters[1].crowded:
+            return 0.0
+        d = max(min(self.clusters[0].d - self.spent, self.clusters[1].d), 1.0)
+        return self.share / float(special.fdtri(1.0, d, 1.0 - LIMIT))
+
+    @cached_property
+    def _shares(self) -> list[np.ndarray]:
+        """Of its information, by stop and by place."""
+        parts = (np.trace(each.information, axis1=1, axis2=2) for each in self.clusters[:2])
+        return [each / len(self.whiten.T) for each in parts]
+
+    @property
+    def heaviest(self) -> float:
+        """The largest share of its information that a stop, or a place, holds."""
+        return float(max(each.max() for each in self._shares))
+
+    def without_the_heaviest(self) -> np.ndarray:
+        """Which of all cells (n,) are left without the stop, or the place, that holds most."""
+        way = int(np.argmax([each.max() for each in self._shares]))
+        gone = _ways(self.cells)[way] == np.argmax(self._shares[way])
+        left = self.kept.copy()
+        left[np.flatnonzero(left)[gone]] = False
+        return left
+
+    def sums(self, scores: np.ndarray) -> list[np.ndarray]:
+        """Shares of the score by stop, by place, and by both, from those (n, r) of all cells."""
+        mine = scores[self.kept] @ self.whiten
+        return [_added(mine, numbers) for numbers in _ways(self.cells)]
+
+
+@dataclass(frozen=True)
+class Judges:
+    """All cells, and those that tell most of a candidate. Scores have no part in which these are.
+
+    Args:
+        every: all of them.
+        best: of these, and of what is left without the cluster that holds most, without the next,
+            and so on, the one that would find the smallest effect.
+    """
+
+    every: Part
+    best: Part
+
+    @classmethod
+    def of(cls, cells: np.ndarray, information: np.ndarray, spent: int = 0) -> Judges:
+        """Of cells (n, 2) of stop and place, -1 for none; (n, r, r); and as of `Part`."""
+        every = best = this = Part.of(cells, information, np.ones(len(cells), bool), spent)
+        while every.worth and this.heaviest > HEAVY:
+            this = Part.of(cells, information, this.without_the_heaviest(), spent)
+            if this is None or this.share < best.worth / HIGHEST_WORTH:
+                break
+            best = max(best, this, key=lambda part: part.worth)
+        return cls(every, best)
+
+    def chance(self, scores: np.ndarray, nu: float) -> ScoreSpread:
+        """From scores (n, r) of all cells; `nu` is that of the statistic, by signs."""
+        every = by_leaving_out(self.every.clusters, self.every.sums(scores), nu, self.every.spent)
+        if self.best is self.every:
+            return every
+        ways, stops = self.best.sums(scores), self.best.clusters[0].count
+        nu = by_signs(ways, stops, self.best.spent).nu
+        rest = by_leaving_out(self.best.clusters, ways, nu, self.best.spent)
+        ratio = float(np.square(ways[0].sum(axis=0)).sum()) / max(rest.trace, 1e-300)
+        return replace(rest, covariance=every.covariance, ratio=ratio, share=self.best.share)
+
+
+def _ways(cells: np.ndarray) -> list[np.ndarray]:
+    """Numbers (n,) of the clusters that cells (n, 2) are in: by stop and by place, where a cell
+    without one is a cluster of its own; and each its own."""
+    own = np.arange(len(cells))
+    some = (np.where(each >= 0, each, -1 - own) for each in cells.T)
+    return [*(np.unique(each, return_inverse=True)[1] for each in some), own]
+
+
+def _stated(cells: np.ndarray, way: int) -> int:
+    """How many stops (0), or places (1), cells (n, 2) have; of cells that have none, how many."""
+    return len(np.unique(cells[cells[:, way] >= 0, way])) or len(cells)
+
+
+def _added(values: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Sums (G, ...) of values (n, ...) by group (n,)."""
+    sums = summed(values.reshape(len(values), -1), at)
+    return sums.reshape(-1, *values.shape[1:])

@@ -231,6 +231,7 @@ class ScoreTest:
         limit = special.fdtri(nu, d, 1.0 - alpha)
         # Along a direction of unit length the information is this much, on average.
         each = np.trace(np.linalg.pinv(self.whiten @ self.whiten.T)) / len(self.score)
+        each *= self.chance.share
         scale = max(self.chance.trace, common * self.dof)
         return float(np.sqrt(enough(nu, d, limit) * scale / nu / each))
 

@@ -15,9 +15,10 @@ from calib.blunders import told
 from calib.blunders.reach import FurthestMoved, hardly_checked, reaches
 from calib.diagnosis.chance import Spread
 from calib.diagnosis.rejects import rejects
-from calib.diagnosis.search import search, structures
+from calib.diagnosis.search import Search, search, structures
 from calib.diagnosis.stand import Look, Stand
 from calib.diagnosis.verdict import ABSORBED_BY_MODEL, Diagnosis, believed, conclude
+from calib.diagnosis.verdict.matters import HELD_OUT_BY_CHANCE
 from calib.diagnosis.verdict.unnamed import Unnamed, unnamed
 from calib.diagnosis.weak import group, to_be_planned, to_be_told_apart, weak_directions
 from calib.effects import own_effects
@@ -32,7 +33,7 @@ from calib.results.holdout import Fall, gains_m2, held_out
 from calib.results.rings import harmful, odd_rings
 from calib.results.stages import DIAGNOSE as DIAGNOSE_STAGES
 from calib.results.stages import staged
-from calib.runs.belief import cautions, forbids
+from calib.runs.belief import cautions, forbids, over_floor
 from calib.runs.reopen import model_of, reopened, start_of, state_of
 from calib.runs.run import DIAGNOSIS, Run
 from calib.solve.fit import Progress, resume
@@ -80,23 +81,14 @@ def _found(
         suspect = [told.suspect(found.blunders[0])]
         found = replace(found, looks=found.looks[:1], blunders=())
     rejected = rejects(found.looks[0].stand, progress) if run.converged else None
-    falls = {}
-    before = run.summary["rms_mm"]["held_out"]
-    before = before if refits and run.model["hold_out"] != "none" else None
-    if before is not None:
-        each_m2 = run.unseen_m2
-        if found.looks[0].stand is not stand and found.found:
-            unseen = _unseen(found.looks[0].stand, run, progress)
-            before, each_m2 = unseen.rms_mm, unseen.each_m2
-        for step in found.found:
-            unseen = _unseen(step.after.stand, run, progress)
-            gain = gains_m2(each_m2, unseen.each_m2)
-            falls[step.effect.name] = Fall(before, unseen.rms_mm, unseen.floor_mm, gain)
-            before, each_m2 = unseen.rms_mm, unseen.each_m2
-    unseen = partial(_unseen, run=run, progress=progress) if before is not None else None
+    refits = refits and run.summary["rms_mm"]["held_out"] is not None
+    refits = refits and run.model["hold_out"] != "none"
+    falls = _falls(found, stand, run, progress) if refits else {}
+    unseen = partial(_unseen, run=run, progress=progress) if refits else None
     doubtful = not believed(found, falls)
     formulas = unnamed(found, falls, doubtful, unseen, progress) if run.converged else Unnamed()
-    if falls and next(iter(falls.values())).rises and not found.at_first:
+    first = next((falls.get(step.effect.name) for step in found.found), None)
+    if first is not None and first.rises and not found.at_first:
         # A name that stops held out refuse says nothing by itself: is there structure without it?
         found = replace(found, at_first=structures(found.looks[0], progress))
     result = conclude(
@@ -128,6 +120,26 @@ def _found(
         ],
         command=_command(run, result),
     )
+
+
+def _falls(found: Search, stand: Stand, run: Run, progress: Progress) -> dict[str, Fall]:
+    """How the held-out error falls with each name that was found, after those before it; without
+    any, with all that scatters by chance, where it is larger than expected."""
+    falls = {}
+    before, each_m2 = run.summary["rms_mm"]["held_out"], run.unseen_m2
+    if found.looks[0].stand is not stand and found.found:
+        unseen = _unseen(found.looks[0].stand, run, progress)
+        before, each_m2 = unseen.rms_mm, unseen.each_m2
+    for step in found.found:
+        unseen = _unseen(step.after.stand, run, progress)
+        gain = gains_m2(each_m2, unseen.each_m2)
+        falls[step.effect.name] = Fall(before, unseen.rms_mm, unseen.floor_mm, gain)
+        before, each_m2 = unseen.rms_mm, unseen.each_m2
+    if found.chance and not found.found and over_floor(run) > HELD_OUT_BY_CHANCE:
+        # What scatters is in the expected error only once the model has it.
+        unseen = _unseen(found.looks[-1].stand, run, progress)
+        falls[found.chance[-1].effect.name] = Fall(before, unseen.rms_mm, unseen.floor_mm)
+    return falls
 
 
 def _cautions(run: Run, found: Diagnosis) -> list[str]:

@@ -30,7 +30,7 @@ import numpy as np
 from scipy import stats
 from threadpoolctl import threadpool_limits
 
-from calib.diagnosis.jackknife import Clusters, ScoreSpread, by_leaving_out, by_signs
+from calib.diagnosis.jackknife import Clusters, Judges, ScoreSpread, by_signs
 
 PLACES, EACH = 25, 2
 STOPS, PARAMETERS = (6, 8, 12, 20, 30, 60), (1, 4, 16, 64)
@@ -73,6 +73,11 @@ FAMILIES = {
     "within stops, stops err": Family(by_stop=0.0, within=True, stop_sd=3.0),
     "surfaces err": Family(place_sd=3.0),
     "three surfaces, these err": Family(places=3, place_sd=3.0),
+    "three surfaces": Family(places=3),
+    "one stop": Family(stops=1),
+    "one stop, stops err": Family(stops=1, stop_sd=3.0),
+    "one surface": Family(places=1),
+    "one surface, surfaces err a little": Family(places=1, place_sd=0.5),
     "both err": Family(stop_sd=0.5, place_sd=0.5),
     "model by stop, stops err": Family(stop_sd=3.0, model_by_stop=3),
 }
@@ -105,12 +110,9 @@ class World:
         seen = values > 1e-6 * values.max()
         self.columns = mine @ (axes[:, seen] / np.sqrt(values[seen]))
         information = np.einsum("bki,bkj->bij", self._cells(), self._cells())
-        self.clusters = [
-            Clusters.of(way, count)
-            for way, count in zip(
-                self._ways(information), (stops, PLACES, stops * PLACES), strict=True
-            )
-        ]
+        cells = np.stack(np.divmod(np.arange(stops * PLACES), PLACES), axis=1)
+        self.judges = Judges.of(cells, information, family.model_by_stop)
+        self.clusters = self.judges.every.clusters
 
     def _cells(self) -> np.ndarray:
         return self.columns.reshape(self.stops * PLACES, EACH, -1)
@@ -138,7 +140,7 @@ def p_values(
     statistic = float(score @ score)
     spent = world.family.model_by_stop
     signs = by_signs(ways, world.stops, spent)
-    out = by_leaving_out(world.clusters, ways, signs.nu, spent)
+    out = world.judges.chance(ways[2], signs.nu)
     found = {"signs": signs.p_value(statistic), "out": out.p_value(statistic)}
     found["judged"] = min(found.values())
     stop, place, both = (c.covariance(w) for c, w in zip(world.clusters, ways, strict=True))
@@ -204,7 +206,11 @@ def sizes(names: list[str], draws: int) -> Iterator[str]:
 def power(draws: int) -> Iterator[str]:
     """Lines of the table of power at 0.001."""
     yield f"\n{'power at 0.001, 30 stops':26}{'sigmas':>10}{'signs':>8}{'judged':>8}{'webb':>8}"
-    for name, family in (("all stops", Family()), ("three stops", Family(stops=3))):
+    for name, family in (
+        ("all stops", Family()),
+        ("three stops", Family(stops=3)),
+        ("two surfaces", Family(places=2)),
+    ):
         for effect in (4.0, 6.0, 10.0, 30.0, 100.0):
             p = drawn(family, 30, 1, draws // 4, effect)
             share = "".join(f"{np.mean(p[t] < 1e-3):8.2f}" for t in ("signs", "judged", "webb"))

@@ -35,6 +35,7 @@ SETUPS = (
     ("hesai_pandarqt64", 24, "box"),
 )
 SEED = 20_000
+UNFELT_MM = 1e-3  # at an effect's usual size: no beam feels it (a body slips), so it has that size
 PROBE = 0.1  # of an effect's usual size: small enough to be linear, large enough to be exact
 
 # What no catalogue has: name -> covariates that tell it, and its formula effect. Sizes are set.
@@ -72,7 +73,8 @@ UNKNOWN: dict[str, tuple[frozenset[str], dict[str, Any]]] = {
 }
 
 # The range zero is the rings' mean, which is in every model here; and rounding acts on no sensor.
-_NOT_ALONE = {"range_offset", "range_quantisation", *DEFAULT}
+# What needs columns that these recordings lack is hidden in arms (`arm_effects.py`).
+_NOT_ALONE = {"range_offset", "range_quantisation", *DEFAULT, "arm_payload_sag", "arm_torque_sag"}
 # What is drawn anew by chance at every stop has a bench of its own (`chance.py`).
 SINGLES = tuple(
     e.name
@@ -221,7 +223,9 @@ def record(case: Case, folder: Path) -> tuple[Source, dict[str, Any], Hidden]:
     if size_mm is None:
         lidar = Source.open(folder / "twin").rig.lidar
         size_mm = 1e3 * float(lidar.sigma_range(2.5, 0.5))
-    hide = {text: size_mm / each for text, each in zip(texts, mm, strict=True)}
+    felt = [each > UNFELT_MM for each in mm]
+    sizes = [size_mm / each if there else 1.0 for each, there in zip(mm, felt, strict=True)]
+    hide = dict(zip(texts, sizes, strict=True))
     return written(case, folder, hide, mm)
 
 

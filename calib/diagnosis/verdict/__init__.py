@@ -148,7 +148,8 @@ def conclude(
 
     Args:
         found: the search.
-        held_out: effect -> how the held-out error falls once it is truly fitted.
+        held_out: effect -> how the held-out error falls once it is truly fitted; of the last that
+            scatters by chance, where that error was larger than expected without.
         summary: of the run: its errors, and its misfit by instrument.
         weak: weak directions.
         rejected: what the fit threw away.
@@ -164,7 +165,8 @@ def conclude(
     more = bool(refused or formulas.formulas or (rejected and not rejected.explained))
     more |= found.unsettled is not None
     bad = bool(spoilt or found.blunders)
-    doubt = None if bad or more else _unconfirmed(found, summary["rms_mm"])
+    over = _over_the_expected(found, held_out, summary["rms_mm"])
+    doubt = None if bad or more else _unconfirmed(found, over)
     calm = BAD if forbids else UNNAMED if doubt else "adequate"
     verdict = BAD if bad else _verdict(found, hold, more, calm)
     candidates = candidate_documents(heavy, held_out, verdict == UNNAMED, hold)
@@ -172,7 +174,7 @@ def conclude(
     thrown = rejected.unexplained() if rejected and verdict == UNNAMED else []
     unexplained = _structure(found, verdict, formulas, thrown, doubt)
     blunders = [*spoilt, *(told.document(left, _rig(left, first)) for left in found.blunders)]
-    unsure = unconfirmed(doubt, summary["rms_mm"]) if doubt else ""
+    unsure = unconfirmed(doubt, over) if doubt else ""
     sentences = sentences_of(verdict, heavy, candidates, unexplained, untestable, blunders, unsure)
     if forbids and verdict in (BAD, UNNAMED) and not blunders:
         sentences.insert(0 if verdict == BAD else len(sentences), _disbelief(forbids))
@@ -201,14 +203,25 @@ def _disbelief(forbids: Sequence[str]) -> str:
     return f"This run should not be used as it stands: {'; '.join(forbids)}."
 
 
-def _unconfirmed(found: Search, rms_mm: Mapping[str, float]) -> Candidate | None:
+def _over_the_expected(
+    found: Search, held_out: Mapping[str, Fall], rms_mm: Mapping[str, float | None]
+) -> float:
+    """The held-out error over the expected one, of the model with what scatters by chance; 0 where
+    nothing was held out."""
+    falls = (held_out.get(each.effect.name) for each in reversed(found.chance))
+    if fall := next(filter(None, falls), None):
+        return fall.after_mm / fall.floor_mm
+    error, floor = rms_mm.get("held_out"), rms_mm["noise_floor"]
+    unknown = error is None or not floor or found.chance
+    return 0.0 if unknown else error / floor
+
+
+def _unconfirmed(found: Search, over: float) -> Candidate | None:
     """Structure that single beams show, where the held-out error is larger than chance makes it and
-    nothing is found: so few stops, or walls, see each part of it that they may differ by chance as
-    much. What scatters by chance is in the expected error only once the model has it."""
-    held_out, floor = rms_mm.get("held_out"), rms_mm["noise_floor"]
-    over = held_out is not None and held_out > HELD_OUT_BY_CHANCE * floor
-    there = found.unnamed or found.found or found.chance
-    if there or not over or not found.looks[0].stand.estimate.scans:
+    no structure or effect is found: so few stops, or walls, see each part of it that they may
+    differ by chance as much."""
+    there = found.unnamed or found.found or not found.looks[0].stand.estimate.scans
+    if there or over <= HELD_OUT_BY_CHANCE:
         return None
     return next(suspects(found.looks[-1].unnamed, ALPHA_UNNAMED), None)
 

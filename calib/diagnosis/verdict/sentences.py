@@ -82,10 +82,10 @@ def sentences_of(
     return out
 
 
-def unconfirmed(candidate: Candidate, rms_mm: Mapping[str, float]) -> str:
-    """Of structure that too few stops see for any test to confirm it."""
+def unconfirmed(candidate: Candidate, over: float) -> str:
+    """Of structure that too few stops see for any test to confirm it, where the held-out error is
+    so many times the expected one."""
     what = " and ".join(words(c) for c in hangs_on(candidate.effect))
-    over = rms_mm["held_out"] / rms_mm["noise_floor"]
     return (
         f"The held-out error is {over:.1f} times as large as expected, and no test confirms why. "
         f"Taken one by one, the beams show residuals that depend on {what}, but too few stops or "
