@@ -103,13 +103,21 @@ class ScoreSpread:
     def trace(self) -> float:
         return float(np.trace(self.covariance))
 
+    @property
+    def looks(self) -> int:
+        """How many tests are paid for: one by some clusters hardly depends on that by all."""
+        return 1 if self.ratio is None else 2
+
+    def over(self, statistic: float) -> float:
+        """The statistic over its trace."""
+        return statistic / max(self.trace, 1e-300) if self.ratio is None else self.ratio
+
     def p_value(self, statistic: float) -> float:
         """How often chance alone makes as large a statistic; always, where nothing tells."""
         if self.d <= 0.0:
             return 1.0
-        if self.ratio is not None:  # it hardly depends on the test by all: two tests are paid for
-            return min(2.0 * float(special.fdtrc(self.nu, self.d, self.ratio)), 1.0)
-        return float(special.fdtrc(self.nu, self.d, statistic / max(self.trace, 1e-300)))
+        p = float(special.fdtrc(self.nu, self.d, self.over(statistic)))
+        return min(self.looks * p, 1.0)
 
 
 def by_signs(ways: Sequence[np.ndarray], stops: int, spent: int = 0) -> ScoreSpread:
@@ -286,8 +294,7 @@ class Part:
     def of(
         cls, cells: np.ndarray, information: np.ndarray, kept: np.ndarray, spent: int
     ) -> Part | None:
-        """Those `kept` of cells (n, 2) that hold so much of the information, (n, r, r); None where
-        that is next to nothing."""
+        """Some of the cells (n, 2), which hold (n, r, r); None where that is next to nothing."""
         cells, mine = cells[kept], information[kept]
         whole = mine.sum(axis=0)
         values, axes = np.linalg.eigh(whole)
@@ -309,8 +316,7 @@ class Part:
 
     @cached_property
     def worth(self) -> float:
-        """How small an effect it finds, but for a factor: its information over the limit of the
-        test with its degrees of freedom."""
+        """How small an effect it finds: its information over the limit of its test."""
         if self.clusters[0].crowded or self.clusters[1].crowded:
             return 0.0
         d = max(min(self.clusters[0].d - self.spent, self.clusters[1].d), 1.0)
@@ -324,7 +330,7 @@ class Part:
 
     @property
     def heaviest(self) -> float:
-        """The largest share of its information that a stop, or a place, holds."""
+        """The largest of these shares."""
         return float(max(each.max() for each in self._shares))
 
     def without_the_heaviest(self) -> np.ndarray:
@@ -343,20 +349,15 @@ class Part:
 
 @dataclass(frozen=True)
 class Judges:
-    """All cells, and those that tell most of a candidate. Scores have no part in which these are.
-
-    Args:
-        every: all of them.
-        best: of these, and of what is left without the cluster that holds most, without the next,
-            and so on, the one that would find the smallest effect.
-    """
+    """All cells, and the part of them that finds the smallest effect: without the cluster that
+    holds most, without the next, and so on. Scores have no say in which it is."""
 
     every: Part
     best: Part
 
     @classmethod
     def of(cls, cells: np.ndarray, information: np.ndarray, spent: int = 0) -> Judges:
-        """Of cells (n, 2) of stop and place, -1 for none; (n, r, r); and as of `Part`."""
+        """Arguments as of `Part`."""
         every = best = this = Part.of(cells, information, np.ones(len(cells), bool), spent)
         while every.worth and this.heaviest > HEAVY:
             this = Part.of(cells, information, this.without_the_heaviest(), spent)

@@ -11,7 +11,7 @@ import pytest
 from scipy import stats
 
 from calib.blunders.chance import LEAST_P, after_looks, at_least
-from calib.diagnosis.jackknife import UNKNOWN_VARIANCE, Clusters, by_signs
+from calib.diagnosis.jackknife import UNKNOWN_VARIANCE, Clusters, Shares, by_signs
 
 BENCH = Path(__file__).parents[1] / "bench"
 DRAWS = 800
@@ -38,6 +38,9 @@ def bench():
         ("stops err", 16, 30),
         ("by stop, stops err", 1, 20),
         ("three stops, stops err", 1, 30),
+        ("three surfaces", 1, 30),
+        ("one stop, stops err", 1, 12),
+        ("one surface, surfaces err a little", 4, 30),
         ("within stops, stops err", 4, 12),
         ("both err", 1, 12),
         ("model by stop, stops err", 1, 12),
@@ -47,6 +50,25 @@ def bench():
 def test_a_judged_test_has_its_size(bench, family, parameters, stops):
     p = bench.drawn(bench.FAMILIES[family], stops, parameters, DRAWS)["judged"]
     assert LOWEST < np.mean(p < 0.05) < HIGHEST
+
+
+@pytest.mark.parametrize("stops, places", [(3, 0), (0, 2)])
+def test_what_few_clusters_dominate_is_found_by_the_others(bench, stops, places):
+    """Thirty stops all show it; few of them, or two of 25 walls, hold most of the information."""
+    p = bench.drawn(bench.Family(stops=stops, places=places), 30, 1, 64, effect=30.0)["judged"]
+    assert np.mean(p < 1e-3) > 0.9
+
+
+@pytest.mark.parametrize("agree", [True, False])
+def test_the_cluster_that_holds_most_says_nothing_without_the_others(agree):
+    """One stop shows 30 sigmas of an effect; the others show as much each as it would have there,
+    or what chance makes of it."""
+    rng, holds = np.random.default_rng(0), np.array([0.8, *np.full(20, 0.01)])
+    scores = 30.0 * holds if agree else 30.0 * holds * (np.arange(21) == 0)
+    scores = scores + np.sqrt(holds) * rng.standard_normal(21)
+    shares = Shares({(k, -1): [scores[k : k + 1], holds[k] * np.eye(1)] for k in range(21)})
+    p = shares.left_out(1.0).p_value(float(scores.sum() ** 2))
+    assert p < 1e-4 if agree else p > 0.05
 
 
 def test_with_degrees_of_freedom_that_are_not_there_it_would_not(bench):

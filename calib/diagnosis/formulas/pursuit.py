@@ -230,8 +230,9 @@ def _tail(found: ScoreTest, among: int = 0) -> float:
     chance = found.chance
     if chance.d <= 0.0:
         return 1.0
-    each = found.statistic / max(chance.trace / found.dof, 1.0)
-    return float(special.fdtrc(among or chance.nu, chance.d, each / (among or found.dof)))
+    each = min(chance.over(found.statistic) * found.dof, found.statistic)
+    tail = float(special.fdtrc(among or chance.nu, chance.d, each / (among or found.dof)))
+    return min(chance.looks * tail, 1.0)
 
 
 def form(projection: Projection, term: FormulaTerm, tried: int) -> Form:
