@@ -271,7 +271,7 @@ def by_leaving_out(
 
 
 @dataclass(frozen=True)
-class Part:
+class SomeCells:
     """Cells of stop and place, all or some.
 
     Args:
@@ -293,7 +293,7 @@ class Part:
     @classmethod
     def of(
         cls, cells: np.ndarray, information: np.ndarray, kept: np.ndarray, spent: int
-    ) -> Part | None:
+    ) -> SomeCells | None:
         """Some of the cells (n, 2), which hold (n, r, r); None where that is next to nothing."""
         cells, mine = cells[kept], information[kept]
         whole = mine.sum(axis=0)
@@ -312,7 +312,9 @@ class Part:
             for numbers, count in zip(_ways(cells), counts, strict=True)
         )
         share = float(np.trace(whole)) / len(whole)
-        return cls(kept, whiten, share, cells, clusters, spent)
+        return cls(
+            kept=kept, whiten=whiten, share=share, cells=cells, clusters=clusters, spent=spent
+        )
 
     @cached_property
     def worth(self) -> float:
@@ -352,15 +354,15 @@ class Judges:
     """All cells, and the part of them that finds the smallest effect: without the cluster that
     holds most, without the next, and so on. Scores have no say in which it is."""
 
-    every: Part
-    best: Part
+    every: SomeCells
+    best: SomeCells
 
     @classmethod
     def of(cls, cells: np.ndarray, information: np.ndarray, spent: int = 0) -> Judges:
-        """Arguments as of `Part`."""
-        every = best = this = Part.of(cells, information, np.ones(len(cells), bool), spent)
+        """Arguments as of `SomeCells`."""
+        every = best = this = SomeCells.of(cells, information, np.ones(len(cells), bool), spent)
         while every.worth and this.heaviest > HEAVY:
-            this = Part.of(cells, information, this.without_the_heaviest(), spent)
+            this = SomeCells.of(cells, information, this.without_the_heaviest(), spent)
             if this is None or this.share < best.worth / HIGHEST_WORTH:
                 break
             best = max(best, this, key=lambda part: part.worth)

@@ -20,7 +20,7 @@ from scipy import special
 
 from calib.blunders.chance import KNOWN, enough
 from calib.diagnosis.linear import WIDENED
-from calib.diagnosis.search import ALPHA_EFFECT
+from calib.diagnosis.search.confirmed import ALPHA_EFFECT
 from calib.linear.parallel import in_order
 from calib.planning.information import Information, inverse
 

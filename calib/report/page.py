@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from calib.diagnosis.search import ALPHA_EFFECT
+from calib.diagnosis.search.confirmed import ALPHA_EFFECT
 from calib.diagnosis.verdict.sentences import UNNAMED
 from calib.effects import CATALOGUE
 from calib.report.calibration import calibration_tables

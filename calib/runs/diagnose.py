@@ -15,7 +15,8 @@ from calib.blunders import told
 from calib.blunders.reach import FurthestMoved, hardly_checked, reaches
 from calib.diagnosis.chance import Spread
 from calib.diagnosis.rejects import rejects
-from calib.diagnosis.search import Search, search, structures
+from calib.diagnosis.search import Search, search
+from calib.diagnosis.search.confirmed import structures
 from calib.diagnosis.stand import Look, Stand
 from calib.diagnosis.verdict import ABSORBED_BY_MODEL, Diagnosis, believed, conclude
 from calib.diagnosis.verdict.matters import HELD_OUT_BY_CHANCE

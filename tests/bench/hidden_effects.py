@@ -24,7 +24,8 @@ from threadpoolctl import threadpool_limits
 
 from calib import problem as problems
 from calib.diagnosis.score import project, score_test
-from calib.diagnosis.search import ALPHA_EFFECT, Search, search
+from calib.diagnosis.search import Search, search
+from calib.diagnosis.search.confirmed import ALPHA_EFFECT
 from calib.diagnosis.stand import Stand
 from calib.diagnosis.suggest import hangs_on
 from calib.diagnosis.verdict import conclude

@@ -4,8 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from calib.diagnosis import search
-from calib.diagnosis.search import _adapted
+from calib.diagnosis.search import mishaps
 
 
 class ScriptedLook:
@@ -29,14 +28,16 @@ class ScriptedLook:
 def left_out(monkeypatch):
     """How many blunders are left out, by a script of looks: those to leave out, whether an effect
     outdoes them, and whether nothing stands out."""
-    monkeypatch.setattr(search, "stray_scans", lambda problem, values, checked: [])
-    monkeypatch.setattr(search, "_wild", lambda look: look.wild)
-    monkeypatch.setattr(search, "_outdone", lambda look, by: look.outdone)
-    monkeypatch.setattr(search, "_quiet", lambda look: look.quiet)
+    monkeypatch.setattr(mishaps, "stray_scans", lambda problem, values, checked: [])
+    monkeypatch.setattr(mishaps, "_wild", lambda look: look.wild)
+    monkeypatch.setattr(mishaps, "_outdone", lambda look, by: look.outdone)
+    monkeypatch.setattr(mishaps, "_quiet", lambda look: look.quiet)
 
     def run(*script):
         left = []
-        look = _adapted(ScriptedLook(script), left, lambda what, done, total: None, named=False)
+        look = mishaps.adapted(
+            ScriptedLook(script), left, lambda what, done, total: None, named=False
+        )
         assert look.count == len(left), "the look is that of what was left out"
         return len(left)
 
@@ -76,4 +77,4 @@ def test_a_fit_without_optimum_is_mended_in_two_rounds_or_not_at_all(left_out, m
     looks = [(ONE, False, False)] * 5 + [QUIET]
     assert left_out(*looks) == 5
     monkeypatch.setattr(ScriptedLook, "converged", False)
-    assert left_out(*looks) == search.MENDED == 2
+    assert left_out(*looks) == mishaps.MENDED == 2

@@ -5,7 +5,7 @@ import pytest
 
 from calib import effects
 from calib import problem as problems
-from calib.diagnosis.search import judged
+from calib.diagnosis.search.confirmed import judged
 from calib.diagnosis.stand import Stand
 from calib.effects import Effect, OneHot, Param, Site
 from calib.problem.model import Model

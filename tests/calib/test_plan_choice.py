@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from calib.diagnosis.search import ALPHA_EFFECT
+from calib.diagnosis.search.confirmed import ALPHA_EFFECT
 from calib.planning.criteria import (
     Apart,
     Variance,

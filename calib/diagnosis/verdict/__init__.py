@@ -13,9 +13,10 @@ from calib.blunders.chance import log_tail
 from calib.blunders.judged import Blunder, LeftOut
 from calib.blunders.reach import FurthestMoved
 from calib.diagnosis.candidates import PoseShape, concerned, lacking
-from calib.diagnosis.rejects import Rejects
+from calib.diagnosis.rejects import FEWEST_STOPS, Rejects
 from calib.diagnosis.screen import ODDS, Candidate, Screen
-from calib.diagnosis.search import ALPHA_UNNAMED, FEWEST_STOPS, Search, suspects
+from calib.diagnosis.search import Search
+from calib.diagnosis.search.confirmed import ALPHA_UNNAMED, suspects
 from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import formula, hangs_on
 from calib.diagnosis.verdict.candidates import candidate_documents, explained
@@ -154,25 +155,22 @@ def conclude(
         weak: weak directions.
         rejected: what the fit threw away.
         forbids: why the run is not to be believed, whatever its model explains; a clause each.
-        rings: whose numbers are wrong, as blunders.
-        formulas: of residual structure.
+        rings, formulas: whose numbers are wrong, as blunders; and those of residual structure.
     """
     heavy = weighed(found, held_out, summary["rms_mm"])
     found, first = heavy.found, found.looks[0]
     spoilt = [*rings, *(rejected.blunders() if rejected and not found.found else [])]
     hold = believed(found, held_out) and not formulas.instead
-    refused = bool(heavy.refused and found.at_first)
-    more = bool(refused or formulas.formulas or (rejected and not rejected.explained))
-    more |= found.unsettled is not None
-    bad = bool(spoilt or found.blunders)
+    more = formulas.formulas or (rejected and not rejected.explained)
+    more = bool(more or found.unsettled or (heavy.refused and found.at_first))
     over = _over_the_expected(found, held_out, summary["rms_mm"])
+    bad = bool(spoilt or found.blunders)
     doubt = None if bad or more else _unconfirmed(found, over)
     calm = BAD if forbids else UNNAMED if doubt else "adequate"
     verdict = BAD if bad else _verdict(found, hold, more, calm)
     candidates = candidate_documents(heavy, held_out, verdict == UNNAMED, hold)
     untestable = _untestable(first)
-    thrown = rejected.unexplained() if rejected and verdict == UNNAMED else []
-    unexplained = _structure(found, verdict, formulas, thrown, doubt)
+    unexplained = _structure(found, verdict, formulas, rejected, doubt)
     blunders = [*spoilt, *(told.document(left, _rig(left, first)) for left in found.blunders)]
     unsure = unconfirmed(doubt, over) if doubt else ""
     sentences = sentences_of(verdict, heavy, candidates, unexplained, untestable, blunders, unsure)
@@ -180,8 +178,8 @@ def conclude(
         sentences.insert(0 if verdict == BAD else len(sentences), _disbelief(forbids))
     sentences += [formulas.refused] if formulas.refused else []
     if rejected:
-        first_of_all = not formulas.formulas and verdict == UNNAMED and not rejected.explained
-        sentences.insert(0 if first_of_all else len(sentences), rejected.sentence)
+        leads = not formulas.formulas and verdict == UNNAMED and not rejected.explained
+        sentences.insert(0 if leads else len(sentences), rejected.sentence)
     return Diagnosis(
         verdict=verdict,
         sentences=sentences,
@@ -310,11 +308,12 @@ def _structure(
     found: Search,
     verdict: str,
     formulas: Unnamed,
-    thrown: Sequence[Mapping[str, Any]],
+    rejected: Rejects | None,
     doubt: Candidate | None,
 ) -> list[Mapping[str, Any]]:
-    """Residual structure: formulas, or bins where there are none, be they in doubt; and what was
-    `thrown` away."""
+    """Residual structure: formulas, or bins where there are none, be they in doubt; and that of
+    what was rejected."""
+    thrown = rejected.unexplained() if rejected and verdict == UNNAMED else []
     taken = found.looks[0].stand.model.names
     if formulas.formulas:
         drawn = {c for each in formulas.formulas for c in each.covariates}

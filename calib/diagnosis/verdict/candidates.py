@@ -9,7 +9,8 @@ import numpy as np
 
 from calib.diagnosis.everywhere import Everywhere
 from calib.diagnosis.screen import Candidate, angle_deg
-from calib.diagnosis.search import ALPHA_EFFECT, ALPHA_NOISE, NamedEffect, Search
+from calib.diagnosis.search import NamedEffect, Search
+from calib.diagnosis.search.confirmed import ALPHA_EFFECT, ALPHA_NOISE
 from calib.diagnosis.suggest import what_separates
 from calib.diagnosis.verdict.matters import Weighed
 from calib.effects import Site

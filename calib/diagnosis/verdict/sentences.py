@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from calib.diagnosis.rejects import FEWEST_STOPS
 from calib.diagnosis.screen import Candidate
-from calib.diagnosis.search import FEWEST_STOPS, NamedEffect
+from calib.diagnosis.search import NamedEffect
 from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import hangs_on, words
 from calib.diagnosis.verdict.matters import FALL_MATTERS, Weighed

@@ -1,0 +1,264 @@
+"""From one look to a named effect: the best explanation is judged, then fitted, then looked past.
+
+What scatters from stop to stop may be chance: the model gets that scatter, and all is looked at
+again beside it. A blunder is an explanation like any other: its rows are left out, and the rest is
+fitted and looked at again (detection, identification and adaptation: Teunissen 1990).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from calib.blunders.judged import Blunder, LeftOut
+from calib.diagnosis.chance import Chance
+from calib.diagnosis.score import ScoreTest
+from calib.diagnosis.screen import ODDS, Candidate, rivals
+from calib.diagnosis.search.confirmed import (
+    ALPHA_EFFECT,
+    judged,
+    scattering,
+    structures,
+    suspects,
+)
+from calib.diagnosis.search.mishaps import adapted, restored
+from calib.diagnosis.stand import Look, Stand, tried
+from calib.effects import Effect
+from calib.residuals.groups import CAD, MESH
+from calib.solve.fit import Progress
+
+MOST_NEEDED = 3  # an explanation that needs more names than this is none: a choice
+FEWEST_ALIKE = 2  # stops with a blunder each, for one effect to be asked for in their place
+# Of what a test says of an effect, below which a fit does not bear it out: a choice, far below the
+# whole that it takes up where the test is right.
+HELD_BACK = 0.1
+
+
+@dataclass(frozen=True)
+class NamedEffect:
+    """An effect that the data confirm.
+
+    Args:
+        candidate: as it stood out before, in its best shape.
+        before, after: the looks before it was fitted and after.
+        judged: its test with clusters jackknifed.
+        p_adjusted: as judged.
+        rivals: candidates that explain as much, and what to tell them apart by.
+    """
+
+    candidate: Candidate
+    before: Look
+    after: Look
+    judged: ScoreTest
+    p_adjusted: float
+    rivals: Sequence[Candidate]
+
+    @property
+    def effect(self) -> Effect:
+        return self.candidate.effect
+
+    def with_effect(self, effect: Effect | None) -> NamedEffect:
+        """With another shape of its effect, if there is one."""
+        if effect is None:
+            return self
+        return replace(self, candidate=replace(self.candidate, effect=effect))
+
+
+@dataclass(frozen=True)
+class Search:
+    """What was found, step by step.
+
+    Args:
+        looks: from the fit as it was, or without the blunders found in it, and after each effect.
+        found: named effects, in the order in which they were added.
+        blunders: what was left out, in that order.
+        unnamed: structure that is confirmed after all of them, strongest first.
+        scatter: the effect on the scatter that is confirmed, if one is.
+        at_first: structure that is confirmed before any of them; empty, as not asked for, unless
+            the first of them is dressed up, or stops that were held out speak against it.
+        chance: what scatters by chance beside all that was found, strongest first.
+        unsettled: what scatters beside that, and with which no fit comes to an optimum.
+    """
+
+    looks: Sequence[Look]
+    found: Sequence[NamedEffect]
+    blunders: Sequence[LeftOut]
+    unnamed: Sequence[Candidate]
+    scatter: Candidate | None
+    at_first: Sequence[Candidate] = ()
+    chance: Sequence[Chance] = ()
+    unsettled: Chance | None = None
+
+    def dressed_up(self, i: int) -> bool:
+        """Whether residual structure would have explained more than the i-th name did."""
+        common, step = self.looks[-1].named.common, self.found[i]
+        bins = (c.test.evidence(common) for c in step.before.unnamed.candidates)
+        return step.candidate.test.evidence(common) < max(bins, default=0.0) - ODDS
+
+
+Steps = tuple[list[Look], list[NamedEffect], list[LeftOut]]
+
+
+def search(stand: Stand, progress: Progress, most: int = MOST_NEEDED) -> Search:
+    """Name what is missing, one effect after another, then ask whether that is all.
+
+    Args:
+        stand: a fitted model.
+        progress: as of `fit.solve`.
+        most: how many effects are named at most; with none, blunders are all that is looked for:
+            away from an optimum any effect, structure or scatter seems missing.
+    """
+    looks, found, left = plain = _steps(stand, progress, most)
+    chance: list[Chance] = []
+    unsettled: Chance | None = None
+    while most and (strongest := next((c for c in looks[-1].chance if c.found), None)):
+        others = [c for c in looks[-1].chance if c.found and c is not strongest]
+        chance.append(strongest)
+        widens = strongest.effect.widens
+        base = looks[-1].stand if widens else stand
+        added = [c.effect for c in chance[-1 if widens else 0 :]]
+        beside = tried(base.with_effects, added, progress)
+        if beside is None or not beside.estimate.converged:
+            unsettled = chance.pop()
+            break
+        if widens:
+            looks = [*looks, beside.look(progress)]
+        else:
+            looks, found, left = _steps(beside, progress, most)
+        tested = {c.effect.name for c in looks[-1].chance}  # with it, and others that still can be
+        near = (c for c in others if strongest.statistic - c.statistic < 2 * ODDS)
+        alike = [*near, *(c for c in others if c.effect.name not in tested)]
+        rivals = tuple(dict.fromkeys(c.effect.name for c in alike))
+        chance[-1] = replace(strongest, rivals=rivals)
+    last = looks[-1]
+    still = (c.beside(last.stand.estimate) for c in chance)
+    done = Search(
+        looks=looks,
+        found=found,
+        blunders=left,
+        unnamed=structures(last, progress) if most else (),
+        scatter=scattering(last, progress) if most else None,
+        chance=[c for c in still if c.found],
+        unsettled=unsettled,
+    )
+    if done.chance and done.unnamed and structures(plain[0][0], progress):
+        if not plain[1] and _chance_leads(plain[0][-1]):
+            plain = _steps(stand, progress, most, chance_leads=False)
+        done = _without_chance(done, plain, progress)
+    if done.found and done.dressed_up(0):
+        return replace(done, at_first=structures(done.looks[0], progress))
+    return done
+
+
+def _without_chance(done: Search, steps: Steps, progress: Progress) -> Search:
+    """The same without values by chance in the model, if structure is left then: values by stop
+    take in most of a structure that differs from stop to stop, and what still stands beside them
+    would seem to be a trace."""
+    looks, found, left = steps
+    if not (unnamed := structures(looks[-1], progress)):
+        return done
+    scatter = scattering(looks[-1], progress)
+    return replace(done, looks=looks, found=found, blunders=left, unnamed=unnamed, scatter=scatter)
+
+
+def _steps(stand: Stand, progress: Progress, most: int, chance_leads: bool = True) -> Steps:
+    """Effects and blunders, one after another, with no more by chance than the model has: the
+    looks, and both, as `Search` has them."""
+    first, looks, found, left = stand, [stand.look(progress)], [], []
+    while True:
+        before, mishaps = looks[-1], len(left)
+        looks[-1] = adapted(before, left, progress, named=bool(found))
+        wild = [each.blunder for each in left[mishaps:] if not each.aside]
+        if len(found) < most and (more := _one_for_all(before, wild, found, progress)):
+            del left[mishaps:]
+            found, looks[-1] = more, before
+            looks.append(found[-1].after)
+            continue
+        if chance_leads and not found and _chance_leads(looks[-1]):
+            break
+        more = _named(looks[-1], found, progress) if len(found) < most else found
+        if len(more) == len(found):
+            break
+        found = more
+        looks.append(found[-1].after)
+    looks[-1], left = restored(first, looks[-1], left, progress) if found else (looks[-1], left)
+    return looks, found, left
+
+
+def _chance_leads(look: Look) -> bool:
+    """Whether values by chance explain more than any effect or structure does, and than wider
+    sigmas, which would take in whatever is missing."""
+    every = (*look.named.candidates, *look.unnamed.candidates)
+    best = max((c.test.statistic for c in every), default=0.0)
+    found = [c for c in look.chance if c.found]
+    return bool(found) and not found[0].effect.widens and found[0].statistic > best
+
+
+def _named(look: Look, found: list[NamedEffect], progress: Progress) -> list[NamedEffect]:
+    """What was found, and the best candidate that is confirmed, fitted; with it others may have
+    better shapes. Which one is best may change once it is fitted, as rows then scatter less."""
+    for candidate in suspects(look.named, ALPHA_EFFECT):
+        if more := _fitted(look, candidate, found, progress):
+            likelier = _likelier(more[-1])
+            return (likelier and _fitted(look, likelier, found, progress)) or more
+    return found
+
+
+def _one_for_all(
+    look: Look, wild: Sequence[Blunder], found: list[NamedEffect], progress: Progress
+) -> list[NamedEffect]:
+    """What was found, and one effect that leaves none of several blunders a blunder, with fewer
+    parameters than they have; nothing where there is none.
+
+    What slips late is seen by few stops, and these may seem to be as many mishaps: a robust fit
+    gives them little weight, so an effect explains less than each of them at first.
+    """
+    if len({b.group.where for b in wild} - {CAD, MESH}) < FEWEST_ALIKE:
+        return []
+    for candidate in suspects(look.named, ALPHA_EFFECT):
+        fewer = candidate.test.dof < sum(len(b.shift.offset) for b in wild)
+        if fewer and (more := _fitted(look, candidate, found, progress, wild)):
+            return more
+    return []
+
+
+def _fitted(
+    look: Look,
+    candidate: Candidate,
+    found: list[NamedEffect],
+    progress: Progress,
+    instead: Sequence[Blunder] = (),
+) -> list[NamedEffect]:
+    """What was found, and a candidate, fitted; nothing where it is not confirmed. `Instead` of
+    blunders it is confirmed where it leaves none: the recording is then as sure to be otherwise."""
+    test, p = judged(look, candidate, progress)
+    p = max((b.p_adjusted for b in instead), default=p)
+    if p >= ALPHA_EFFECT:
+        return []
+    effect = look.stand.finest(candidate.effect, progress)
+    stand = tried(look.stand.with_effects, [effect], progress)
+    theta = stand.theta(effect) if stand else 0 * test.estimate()
+    if look.named.taken_up(candidate, theta) < HELD_BACK:
+        return []
+    stand, swapped = stand.retuned([f.effect.name for f in found], progress)
+    after = stand.look(progress)
+    if instead and any(b.found for b in after.blunders):
+        return []
+    step = NamedEffect(
+        candidate=replace(candidate, effect=effect, p_value=test.p_value()),
+        before=look,
+        after=after,
+        judged=test,
+        p_adjusted=p,
+        rivals=rivals(look.named, candidate, max(after.named.common, test.inflation)),
+    )
+    return [*(f.with_effect(swapped.get(f.effect.name)) for f in found), step]
+
+
+def _likelier(step: NamedEffect) -> Candidate | None:
+    """A rival that explains more than the named effect does, beyond the odds of chance, where rows
+    scatter as they do with that in the model."""
+    scale = max(step.after.named.common, step.judged.inflation)
+    best = max(step.rivals, key=lambda c: c.test.evidence(scale), default=step.candidate)
+    more = best.test.evidence(scale) - step.candidate.test.evidence(scale)
+    return best if more > ODDS else None

@@ -1,0 +1,79 @@
+"""What of a look is confirmed: candidates and structure, their clusters left out one by one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from calib.blunders.chance import LEVELS, after_looks, log_tail
+from calib.diagnosis.rejects import FEWEST_STOPS
+from calib.diagnosis.score import ScoreTest, score_test
+from calib.diagnosis.screen import Candidate, Screen
+from calib.diagnosis.stand import Look
+from calib.solve.fit import Progress
+
+ALPHA_EFFECT = LEVELS["effect"]
+ALPHA_UNNAMED = LEVELS["structure"]
+ALPHA_NOISE = LEVELS["effect on the scatter"]
+# Of the leading structure's evidence, for another covariate to be named too: a choice, as what has
+# half of it may be the cause where covariates go together.
+ALSO_NAMED = 0.5
+SUSPECTS_JUDGED = 3  # of most evidence, before a look is called quiet: each costs a jackknife
+
+
+def structures(look: Look, progress: Progress) -> list[Candidate]:
+    """Structure that is confirmed, strongest first; single covariates that could stand for it."""
+    out: list[Candidate] = []
+    for candidate in look.unnamed.candidates:
+        if not stands_out(candidate, ALPHA_UNNAMED):
+            continue
+        instead = out and len(candidate.effect.covariates) == 1
+        instead = instead and candidate.evidence > ALSO_NAMED * out[0].evidence
+        if instead or not _covered(look.unnamed, candidate, out):
+            test, p = judged(look, candidate, progress)
+            if p < ALPHA_UNNAMED:
+                out.append(replace(candidate, p_value=test.p_value(), p_adjusted=p))
+    return out
+
+
+def _covered(screen: Screen, candidate: Candidate, by: Sequence[Candidate]) -> bool:
+    """Whether others leave a candidate nothing to explain."""
+    if not by:
+        return False
+    columns = np.unique(np.concatenate([c.test.columns for c in by]))
+    there = score_test(screen.scores, columns)
+    both = score_test(screen.scores, np.union1d(columns, candidate.test.columns))
+    gain = max(both.statistic - there.statistic, 0.0) / max(screen.common, 1.0)
+    more = both.dof - there.dof
+    return more < 1 or -log_tail(gain, more) < np.log(candidate.looks / ALPHA_UNNAMED)
+
+
+def scattering(look: Look, progress: Progress) -> Candidate | None:
+    """The effect on the scatter that is confirmed, if one is."""
+    for candidate in suspects(look.noise, ALPHA_NOISE):
+        test, p = judged(look, candidate, progress)
+        if p < ALPHA_NOISE:
+            return replace(candidate, test=test, p_value=test.p_value(), p_adjusted=p)
+    return None
+
+
+def judged(look: Look, candidate: Candidate, progress: Progress) -> tuple[ScoreTest, float]:
+    """A candidate's test, its clusters jackknifed, and its p-value adjusted for all tests."""
+    found = look.judged(candidate, progress)
+    return found, float(after_looks(found.p_value(), candidate.looks))
+
+
+def suspects(screen: Screen, alpha: float) -> Iterator[Candidate]:
+    """Candidates found if rows were independent, or found by clusters, best first."""
+    standing_out = [c for c in screen.candidates if stands_out(c, alpha)]
+    yield from standing_out[:SUSPECTS_JUDGED]
+
+
+def stands_out(candidate: Candidate, alpha: float) -> bool:
+    """Whether it is found if rows were independent, or by clusters; never by too few stops."""
+    if candidate.test.clusters < FEWEST_STOPS:
+        return False
+    alone = -log_tail(candidate.test.statistic, candidate.test.dof)
+    return candidate.p_adjusted < alpha or alone > np.log(candidate.looks / alpha)

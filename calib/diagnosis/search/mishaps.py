@@ -1,0 +1,129 @@
+"""Rows that nothing but a mishap explains are left out, and the rest is looked at again: detection,
+identification and adaptation (Teunissen 1990)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from calib.blunders.aside import stray_scans
+from calib.blunders.judged import Blunder, LeftOut
+from calib.blunders.shifts import standing_alone
+from calib.diagnosis.screen import ODDS
+from calib.diagnosis.search.confirmed import ALPHA_EFFECT, ALPHA_UNNAMED, stands_out
+from calib.diagnosis.stand import Look, Stand, tried
+from calib.residuals.groups import CAD, JOINTS, MESH
+from calib.solve.fit import Progress
+
+ADAPTED, MENDED = 8, 2  # rounds of leaving out; of 76 fits without optimum one was mended, in two
+# Of the leading blunder's evidence, from which others at other places are left out with it: a
+# choice; what is left over is found by the next look.
+AS_FAR = 0.1
+
+
+def adapted(look: Look, left: list[LeftOut], progress: Progress, named: bool) -> Look:
+    """A look without the blunders that explain more than any effect or structure would, or leave
+    these nothing to explain; they are added to those left out. Once an effect was `named`, no value
+    of CAD is left out: lengths absorb part of an effect whose name is wrong.
+
+    Several blunders at once may look like an effect: where one of them that an effect outdoes is
+    left out, and the next then outdoes it, they are left out together if nothing stands out after.
+    """
+    on_trial: tuple[Look, int] | None = None  # where to go back to, and how many were left out
+    for _ in range(ADAPTED if look.stand.estimate.converged else MENDED):
+        estimate = look.stand.estimate
+        stray = list(stray_scans(estimate.problem, estimate.values, look.checked))
+        wild = [] if stray else _wild(look)
+        wild = [b for b in wild if not (named and b.group.kind == "frame")]
+        groups = [each.blunder.group for each in stray] + [b.group for b in wild]
+        if not groups or (on_trial and wild and _outdone(look, wild[0])):
+            break
+        if (stand := tried(look.stand.without, groups, progress)) is None:
+            break
+        after = stand.look(progress)
+        quiet = _quiet(after)
+        if on_trial is None and wild and _outdone(look, wild[0]) and not quiet:
+            on_trial = look, len(left)
+        elif quiet:
+            on_trial = None
+        left += [*stray, *_left_out(look, wild, after)]
+        look = after
+    if on_trial:
+        look, count = on_trial
+        del left[count:]
+    return look
+
+
+def _left_out(look: Look, wild: Sequence[Blunder], after: Look) -> Iterator[LeftOut]:
+    """Blunders, each with what explained as much before, and explains nothing after."""
+    loud = {b.group for b in after.blunders if b.found}
+    for each in wild:
+        near = (b for b in look.blunders if each.evidence - b.evidence < ODDS)
+        others = [b for b in near if b.found and b.group not in {*loud, each.group}]
+        others = [b for b in others if b not in wild and (b.possible or b.group.what == JOINTS)]
+        yield LeftOut(each, [b.group for b in others if len(wild) == 1 or _meet(each, b)])
+
+
+def restored(
+    first: Stand, last: Look, left: list[LeftOut], progress: Progress
+) -> tuple[Look, list[LeftOut]]:
+    """What was left out of the first fit is tested once more, beside the effects that have been
+    named since: those that explain it leave no blunder there (backward elimination)."""
+    aside = [each.blunder.group for each in left if each.aside]
+    less = len(aside) < len(left)
+    if (stand := tried(last.stand.without, aside, progress, first) if less else None) is None:
+        return last, left
+    look = stand.look(progress)
+    found = {blunder.group for blunder in look.blunders if blunder.found}
+    kept = [each for each in left if each.aside or each.blunder.group in found]
+    if len(kept) == len(left):
+        return last, left
+    if len(kept) > len(aside):
+        groups = [each.blunder.group for each in kept]
+        look = last.stand.without(groups, progress, of=first).look(progress)
+    return look, kept
+
+
+def _meet(a: Blunder, b: Blunder) -> bool:
+    """Whether two groups are of one place, or either of them is of none."""
+    fixed = {CAD, MESH}
+    return a.group.where == b.group.where or not fixed.isdisjoint({a.group.where, b.group.where})
+
+
+def _wild(look: Look) -> list[Blunder]:
+    """Blunders to leave out now: the worst of each place, as far out as the worst of all, of those
+    that stand out beside each other."""
+    found = [b for b in look.blunders if b.found]
+    places: dict[tuple[str, str], list[Blunder]] = {}
+    for each in found:
+        if each.evidence > AS_FAR * found[0].evidence:
+            places.setdefault((each.group.recording, each.group.where), []).append(each)
+    worst = [likeliest(here) for here in places.values()]
+    if len(worst) < 2:
+        return worst
+    some = [(b.shift, b.limit) for b in sorted(worst, key=lambda b: -b.evidence)]
+    alone = standing_alone(look.fitted, look.stand.estimate.problem, some)
+    return [b for b in worst if b.group in alone]
+
+
+def _outdone(look: Look, by: Blunder) -> bool:
+    """Whether an effect or a structure explains more than a blunder, at its price: also one that
+    chance by stops may make, as where stops scatter none of them is a blunder."""
+    every = (*look.named.candidates, *look.unnamed.candidates)
+    best = max((c.evidence - np.log(c.looks) for c in every), default=0.0)
+    return by.evidence - np.log(by.looks) < best
+
+
+def _quiet(look: Look) -> bool:
+    """Whether no effect and no structure is significant: bins, or a name that acts like bins, take
+    on what one stop has alone, but one stop left out does not take an effect away."""
+    named = any(stands_out(c, ALPHA_EFFECT) for c in look.named.candidates)
+    return not named and not any(stands_out(c, ALPHA_UNNAMED) for c in look.unnamed.candidates)
+
+
+def likeliest(here: Sequence[Blunder]) -> Blunder:
+    """Of groups of one place, furthest out first, the likeliest that can stand for the first."""
+    here = [b for b in here if b.possible] or here
+    near = (b for b in here if here[0].evidence - b.evidence < ODDS)
+    return min(near, key=lambda b: b.likely)
