@@ -7,9 +7,12 @@ fitted and looked at again (detection, identification and adaptation: Teunissen 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
+from calib.blunders.chance import log_tail
 from calib.blunders.judged import Blunder, LeftOut
 from calib.diagnosis.chance import Chance
 from calib.diagnosis.score import ScoreTest
@@ -92,8 +95,27 @@ class Search:
     def dressed_up(self, i: int) -> bool:
         """Whether residual structure would have explained more than the i-th name did."""
         common, step = self.looks[-1].named.common, self.found[i]
-        bins = (c.test.evidence(common) for c in step.before.unnamed.candidates)
-        return step.candidate.test.evidence(common) < max(bins, default=0.0) - ODDS
+        test = step.candidate.test
+        bins = (e for _, e in in_place(test.statistic, step.before, step.after, common))
+        return test.evidence(common) < max(bins, default=0.0) - ODDS
+
+
+def in_place(
+    explained: float, before: Look, after: Look, common: float
+) -> Iterator[tuple[Candidate, float]]:
+    """Structure and its evidence in place of names: it explains no more than these do, and what
+    they leave it.
+
+    Args:
+        explained: by the names, in squared sigmas.
+        before, after: the looks without them and with them.
+        common: as of `ScoreTest.evidence`.
+    """
+    left = {c.effect.name: c.test.statistic for c in after.unnamed.candidates}
+    for candidate in before.unnamed.candidates:
+        most = explained + left.get(candidate.effect.name, np.inf)
+        statistic = min(candidate.test.statistic, most)
+        yield candidate, -log_tail(statistic / max(common, 1e-300), candidate.test.dof)
 
 
 Steps = tuple[list[Look], list[NamedEffect], list[LeftOut]]

@@ -15,7 +15,7 @@ from calib.blunders.reach import FurthestMoved
 from calib.diagnosis.candidates import PoseShape, concerned, lacking
 from calib.diagnosis.rejects import FEWEST_STOPS, Rejects
 from calib.diagnosis.screen import ODDS, Candidate, Screen
-from calib.diagnosis.search import Search
+from calib.diagnosis.search import Search, in_place
 from calib.diagnosis.search.confirmed import ALPHA_UNNAMED, suspects
 from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import formula, hangs_on
@@ -282,8 +282,8 @@ def _names_hold(found: Search) -> bool:
     together = sum(t.statistic for t in tests), sum(t.dof for t in tests)
     price = sum(np.log(step.candidate.looks) for step in found.found)
     named = -log_tail(together[0] / common, together[1]) - price
-    unnamed = found.looks[0].unnamed.candidates
-    bins = (c.test.evidence(common) - np.log(c.looks) for c in unnamed)
+    structure = in_place(together[0], found.looks[0], found.looks[-1], common)
+    bins = (evidence - np.log(c.looks) for c, evidence in structure)
     return named > max(bins, default=0.0) - ODDS
 
 
