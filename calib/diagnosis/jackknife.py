@@ -27,10 +27,10 @@ inverted, so there may be more parameters than clusters. There are two ways to V
   one (the sum of the largest eigenvalues of the I_c) tell nothing: parameters fit their errors.
 
 Where few clusters hold most of the information, few degrees of freedom are left, however well all
-others agree. The second way is then told from those others: without the cluster that holds most,
-without the next, and so on, as long as that finds a smaller effect (`Judges`). Information alone
-decides which they are, so no p-value is chosen; this one is doubled, as it hardly depends on the
-first. A mishap of one stop, or the shape of one wall, then neither makes an effect nor hides one.
+others agree. Then the others are asked by themselves, in the second way: those without the cluster
+that holds most, without the next, and so on, which would find the smallest effect (`Judges`).
+Information alone decides which they are; their p-value is doubled, as it hardly depends on that of
+all. A mishap of one stop, or the shape of one wall, then neither makes an effect nor hides one.
 
 The smaller of both p-values counts: where nothing is missing the second is hardly ever the smaller,
 but for a single parameter, where both are nearly the same. Measured by `tests/bench/bench_size.py`
@@ -192,15 +192,16 @@ class Shares:
             else:
                 self.cells[cell] = [score, information]
 
-    def left_out(self, nu: float, spent: int = 0) -> ScoreSpread:
-        """Chance from leaving out cluster after cluster; see the module.
+    def left_out(self, nu: float, spent: int = 0) -> tuple[ScoreSpread, ...]:
+        """Chance from leaving out cluster after cluster, of all and of those that tell most where
+        few dominate; see the module.
 
         Args:
             nu: degrees of freedom of the statistic, by signs.
             spent: how many unknowns of the model differ by stop alone.
         """
         scores, information = (np.stack(each) for each in zip(*self.cells.values(), strict=True))
-        return Judges.of(np.array(list(self.cells)), information, spent).chance(scores, nu)
+        return Judges.of(np.array(list(self.cells)), information, spent).chances(scores, nu)
 
 
 @dataclass(frozen=True)
@@ -325,20 +326,15 @@ class SomeCells:
         return self.share / float(special.fdtri(1.0, d, 1.0 - LIMIT))
 
     @cached_property
-    def _shares(self) -> list[np.ndarray]:
+    def shares(self) -> list[np.ndarray]:
         """Of its information, by stop and by place."""
         parts = (np.trace(each.information, axis1=1, axis2=2) for each in self.clusters[:2])
         return [each / len(self.whiten.T) for each in parts]
 
-    @property
-    def heaviest(self) -> float:
-        """The largest of these shares."""
-        return float(max(each.max() for each in self._shares))
-
     def without_the_heaviest(self) -> np.ndarray:
         """Which of all cells (n,) are left without the stop, or the place, that holds most."""
-        way = int(np.argmax([each.max() for each in self._shares]))
-        gone = _ways(self.cells)[way] == np.argmax(self._shares[way])
+        way = int(np.argmax([each.max() for each in self.shares]))
+        gone = _ways(self.cells)[way] == np.argmax(self.shares[way])
         left = self.kept.copy()
         left[np.flatnonzero(left)[gone]] = False
         return left
@@ -361,23 +357,25 @@ class Judges:
     def of(cls, cells: np.ndarray, information: np.ndarray, spent: int = 0) -> Judges:
         """Arguments as of `SomeCells`."""
         every = best = this = SomeCells.of(cells, information, np.ones(len(cells), bool), spent)
-        while every.worth and this.heaviest > HEAVY:
+        while every.worth and max(each.max() for each in this.shares) > HEAVY:
             this = SomeCells.of(cells, information, this.without_the_heaviest(), spent)
             if this is None or this.share < best.worth / HIGHEST_WORTH:
                 break
             best = max(best, this, key=lambda part: part.worth)
         return cls(every, best)
 
-    def chance(self, scores: np.ndarray, nu: float) -> ScoreSpread:
-        """From scores (n, r) of all cells; `nu` is that of the statistic, by signs."""
+    def chances(self, scores: np.ndarray, nu: float) -> tuple[ScoreSpread, ...]:
+        """From scores (n, r) of all cells: by all, and by the best part where that is not all; `nu`
+        is that of the statistic, by signs."""
         every = by_leaving_out(self.every.clusters, self.every.sums(scores), nu, self.every.spent)
         if self.best is self.every:
-            return every
+            return (every,)
         ways, stops = self.best.sums(scores), self.best.clusters[0].count
         nu = by_signs(ways, stops, self.best.spent).nu
         rest = by_leaving_out(self.best.clusters, ways, nu, self.best.spent)
         ratio = float(np.square(ways[0].sum(axis=0)).sum()) / max(rest.trace, 1e-300)
-        return replace(rest, covariance=every.covariance, ratio=ratio, share=self.best.share)
+        wider = rest.trace / len(rest.covariance) * np.eye(len(every.covariance))
+        return every, replace(rest, covariance=wider, ratio=ratio, share=self.best.share)
 
 
 def _ways(cells: np.ndarray) -> list[np.ndarray]:

@@ -188,7 +188,7 @@ class ScoreTest:
     def judged(self, shares: Shares) -> ScoreTest:
         """The same with its clusters left out one by one."""
         left_out = shares.left_out(self.chances[0].nu, self.spent)
-        return replace(self, chances=(*self.chances, left_out))
+        return replace(self, chances=(*self.chances, *left_out))
 
     def p_value(self) -> float:
         """How often chance alone explains as much."""
@@ -226,14 +226,17 @@ class ScoreTest:
         """
         if not self.dof:
             return np.inf
-        nu = self.chance.nu
-        d = max(min(self.chance.d, (self.chance.clusters - 1.0) * nu), 0.5 * nu)
-        limit = special.fdtri(nu, d, 1.0 - alpha)
         # Along a direction of unit length the information is this much, on average.
         each = np.trace(np.linalg.pinv(self.whiten @ self.whiten.T)) / len(self.score)
-        each *= self.chance.share
-        scale = max(self.chance.trace, common * self.dof)
-        return float(np.sqrt(enough(nu, d, limit) * scale / nu / each))
+        return min(self._detectable(chance, common, alpha) for chance in self.chances) / each**0.5
+
+    def _detectable(self, chance: ScoreSpread, common: float, alpha: float) -> float:
+        """The same of a whitened parameter, by one of the tests."""
+        nu = chance.nu
+        d = max(min(chance.d, (chance.clusters - 1.0) * nu), 0.5 * nu)
+        limit = special.fdtri(nu, d, 1.0 - alpha / chance.looks)
+        scale = max(chance.trace, common * self.dof)
+        return float(np.sqrt(enough(nu, d, limit) * scale / nu / chance.share))
 
 
 def score_test(scores: Scores, columns: np.ndarray) -> ScoreTest:

@@ -140,8 +140,8 @@ def p_values(
     statistic = float(score @ score)
     spent = world.family.model_by_stop
     signs = by_signs(ways, world.stops, spent)
-    out = world.judges.chance(ways[2], signs.nu)
-    found = {"signs": signs.p_value(statistic), "out": out.p_value(statistic)}
+    out = min(c.p_value(statistic) for c in world.judges.chances(ways[2], signs.nu))
+    found = {"signs": signs.p_value(statistic), "out": out}
     found["judged"] = min(found.values())
     stop, place, both = (c.covariance(w) for c, w in zip(world.clusters, ways, strict=True))
     more = (place - both) * (np.trace(place - both) > 0.0)

@@ -284,10 +284,17 @@ def test_a_name_is_held_against_structure_at_the_price_of_both(looks, hold):
     def explains(evidence, looks):
         # Of two degrees of freedom the tail is exp(-x / 2).
         test = SimpleNamespace(statistic=2 * evidence, dof=2, evidence=lambda common: evidence)
-        return SimpleNamespace(test=test, looks=looks)
+        return SimpleNamespace(test=test, looks=looks, effect=SimpleNamespace(name="bins"))
 
-    named, bins = explains(50.0, 30.0), explains(52.0, looks)
-    look = SimpleNamespace(named=SimpleNamespace(common=1.0))
-    look.unnamed = SimpleNamespace(candidates=[bins])
-    found = SimpleNamespace(looks=[look], found=[SimpleNamespace(candidate=named)])
-    assert _names_hold(found) == hold
+    named = explains(50.0, 30.0)
+
+    def names_hold(bins, left):
+        looks = [SimpleNamespace(named=SimpleNamespace(common=1.0)) for _ in range(2)]
+        for look, candidate in zip(looks, (bins, explains(left, looks)), strict=True):
+            look.unnamed = SimpleNamespace(candidates=[candidate])
+        return _names_hold(SimpleNamespace(looks=looks, found=[SimpleNamespace(candidate=named)]))
+
+    assert names_hold(explains(52.0, looks), left=2.0) == hold
+    # In its place it explains no more than the name does, and what that leaves it.
+    much = explains(60.0, 30.0)
+    assert names_hold(much, left=1.0) and not names_hold(much, left=9.0)
