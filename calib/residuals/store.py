@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 from threading import Lock
 from typing import Any
 
@@ -13,7 +16,19 @@ import numpy as np
 from sensors.lidar import Beams, beams
 from sensors.recording import RecordedStops, Scan
 
-KEPT_BYTES = 256e6  # of scans and beams of one recording; what is beyond is read again each time
+LEAST_KEPT_BYTES = 256e6
+KEPT_SHARE = 0.25  # of the memory, where each core has a process of its own: a choice
+
+
+def _kept_bytes() -> float:
+    """Of scans and beams of one recording; what is beyond is read again each time."""
+    memory = float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    with suppress(OSError, ValueError):  # there is no such file, or it says "max"
+        memory = min(memory, float(Path("/sys/fs/cgroup/memory.max").read_text(encoding="ascii")))
+    return max(LEAST_KEPT_BYTES, KEPT_SHARE * memory / (os.cpu_count() or 1))
+
+
+KEPT_BYTES = _kept_bytes()
 
 
 @dataclass

@@ -2,7 +2,7 @@
 
     python tests/bench/bench_memory.py [--stops 4] [--rows 131072]
 
-The store of scans, which takes 256 MB at most, is left out. Each fit, evaluation and application
+The store of scans is left out. Each fit, evaluation and application
 runs in a process of its own, which takes stops one by one; its peak is the operating system's
 (VmHWM, Linux alone).
 """
