@@ -37,10 +37,10 @@ but for a single parameter, where both are nearly the same. Measured by `tests/b
 at a nominal 0.05, with 1, 4, 16 and 64 parameters and 6 to 60 stops, 240 draws each: where rows err
 alone, stops err together by up to three times a row's sigma, stops and surfaces do by half of it,
 three stops show most of the effect, or it acts within stops only, 0.02 to 0.07 of empty worlds
-show something, stops averaged over (0.12 in the worst of 192 cases); none, where parameters that
+show something, stops averaged over (0.12 in the worst of 240 cases); none, where parameters that
 act by stop are as many as the stops. A limit: 0.13 with few stops where surfaces err by three times
-a row's sigma and the model does not know it. An effect of 30 sigmas that three of thirty stops show
-is found at 0.001 in 0.9 of worlds, by signs alone in none.
+a row's sigma and the model does not know it. Of an effect of 10 sigmas that three of thirty stops,
+or two of 25 surfaces, show, 0.7 and 0.9 are found at 0.001, by signs alone none.
 
 A model that itself has unknowns which differ by stop alone, a drift say, fits a part of what stops
 err by, and residuals scatter less than errors. With n stops and k such unknowns, covariances by
