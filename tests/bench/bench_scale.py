@@ -1,7 +1,7 @@
 """How time and memory grow with rows and with stops, from recording to verdict; by each executor.
 
     python tests/bench/bench_scale.py [--columns 64,16,4] [--stops 8,16] [--many 30,100]
-                                      [--shared 16] [--repeats 1]
+                                      [--shared 16] [--repeats 1] [--models]
 
 Recordings of the preset `default` are made in a temporary folder, then `rigcal fit` and `rigcal
 diagnose` are run on each, one program after another. Three series: more beams in each of 8 stops
@@ -9,6 +9,10 @@ diagnose` are run on each, one program after another. Three series: more beams i
 some 1,000 beams. A line of a series gives seconds on the clock and peak memory (VmHWM, Linux
 alone). Below it stand the power of rows with which CPU seconds grow, those of 8 stops of 128 beams
 taken off for the start, and megabytes a stop.
+
+`--models` asks what a model costs, with 8 stops of some 8,000 beams: by LiDARs of 32, 64 and 128
+rings, by effects of the catalogue beside the default ones, and in a room of few surfaces and of
+many; CPU seconds.
 
 The last table shares the stops of one recording at full resolution among threads, processes and,
 where distributed is installed, the workers of a Dask cluster: seconds on the clock, how many times
@@ -39,12 +43,34 @@ from bench_memory import own_peak_mb
 from rich.console import Console
 from rich.table import Table
 
+from calib.effects import DEFAULT
 from calib.simulation import Spec, simulate
 
 COLUMNS = 1024  # of an OS0-128 per turn, of 128 beams each
 OWN = "--of-this-process"
+SURFACE_PARTS = {f"state/0/reference_{part}" for part in ("surface", "region", "patch")}
 EVERY = 128  # of the columns, in the series of many stops
 FEW = 8  # stops in the series of more beams
+# LiDAR, every how many-th column for some 8,000 beams; the last is that of the other tables.
+LIDARS = (("hesai_pandarxt32", 8), ("hesai_pandarqt64", 5), ("ouster_os0_128_rev7", 16))
+EFFECTS = (
+    "incidence_angle_bias",
+    "intensity_range_walk",
+    "range_scale",
+    "azimuth_range_harmonic",
+    "encoder_eccentricity",
+    "elevation_scale",
+    "beam_origin_offset",
+    "spin_axis_wobble",
+    "arm_gravity_sag",
+    "arm_joint_eccentricity",
+    "arm_joint_scale",
+    "base_flex",
+    "mount_bending",
+    "warmup_drift",
+    "label_range_offset",
+    "arm_link_bending",
+)
 
 
 @dataclass(frozen=True)
@@ -151,6 +177,33 @@ def series(
         console.print(line)
 
 
+def models(console: Console, folder: Path) -> None:
+    """The table of what a model has."""
+    columns = ("unknowns of all stops", "parts of surfaces", "fit CPU s", "diagnose CPU s")
+    table = Table("", *columns, title="models")
+    *_, (wide, every) = LIDARS
+    tried = [(lidar, lidar, step, "lab", 0) for lidar, step in LIDARS]
+    tried += [(f"{count} effects more", wide, every, "lab", count) for count in (4, 8, 16)]
+    tried.append(("a bare room", wide, every, "box", 0))
+    for name, lidar, step, room, count in tried:
+        out = folder / f"{lidar}_{room}"
+        if not out.exists():
+            spec = Spec(
+                lidar=lidar, room=room, column_step=step, locations=2, stops_per_location=FEW // 2
+            )
+            simulate(spec, out, seed=3)
+        more = ["--effects", ",".join([*DEFAULT, *EFFECTS[:count]])] if count else []
+        run = folder / f"{out.name}-{count}"
+        fit = cost(["fit", out, "-o", run, *more])
+        with np.load(run / "covariance.npz") as known, np.load(run / "state.npz") as state:
+            unknowns = len(known["names"])
+            parts = sum(len(state[n]) for n in state.files if n in SURFACE_PARTS)
+        diagnosis = cost(["diagnose", run])
+        seconds = (f"{each.cpu_s:.1f}" for each in (fit, diagnosis))
+        table.add_row(name, f"{unknowns}", f"{parts}", *seconds)
+    console.print(table)
+
+
 @contextmanager
 def ways() -> Iterator[dict[str, Callable[[Path], tuple[Cost, Cost]]]]:
     """How stops may be shared, by name; a Dask cluster runs meanwhile, where it can."""
@@ -204,6 +257,7 @@ def main() -> None:
     parser.add_argument("--many", type=numbers, default=[30, 100])
     parser.add_argument("--shared", type=int, default=16, help="stops that executors share")
     parser.add_argument("--repeats", type=int, default=1)
+    parser.add_argument("--models", action="store_true", help="what a model costs, too")
     wanted = parser.parse_args()
     console = Console(width=110)
     with tempfile.TemporaryDirectory() as name:
@@ -218,6 +272,8 @@ def main() -> None:
         ):
             if sizes:
                 series(console, what, folder, sizes, start)
+        if wanted.models:
+            models(console, folder)
         if wanted.shared:
             executors(console, recorded(folder, wanted.shared, 1), wanted.repeats)
 
