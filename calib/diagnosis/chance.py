@@ -151,6 +151,7 @@ class Chance:
             "step": step,
             "dressed_up": False,
             "held_out_rms_mm": {"before": None, "after": None},
+            "rejected_share": {"before": None, "after": None},
             "error_explained": None,
             "rms_mm": size_mm,
             "unabsorbed_rms_mm": size_mm,

@@ -32,6 +32,9 @@ POSE_BLOCKS = 3 * FOLDS  # of poses: a fold leaves out three, far from each othe
 BY_CHANCE = 0.05  # level at which a fall of the held-out error is called one: by convention
 
 
+TAKEN_BACK = 0.01  # of all beams: as a hundredth of an error matters (`diagnosis.verdict.matters`)
+
+
 @dataclass(frozen=True)
 class Fall:
     """How the held-out error falls once something is added to a model.
@@ -41,17 +44,25 @@ class Fall:
         floor_mm: what is expected of it.
         gain_m2: how much the mean square [m2] of each stop, or of each tracked position, falls;
             empty where that is not known.
+        rejected_share: of the beams held out, before and after, where it may take some back.
     """
 
     before_mm: float
     after_mm: float
     floor_mm: float
     gain_m2: tuple[float, ...] = ()
+    rejected_share: tuple[float, float] | None = None
 
     @property
     def rises(self) -> bool:
         """Whether stops that were held out are predicted worse with it."""
-        return self.after_mm > self.before_mm
+        return self.after_mm > self.before_mm and not self.takes_back
+
+    @property
+    def takes_back(self) -> bool:
+        """Whether so many fewer beams are rejected with it that its error is of others."""
+        before, after = self.rejected_share or (0.0, 0.0)
+        return before - after > TAKEN_BACK
 
     @property
     def spread_mm(self) -> float | None:

@@ -19,6 +19,7 @@ from calib.diagnosis.search import Search, search
 from calib.diagnosis.search.confirmed import structures
 from calib.diagnosis.stand import Look, Stand
 from calib.diagnosis.verdict import ABSORBED_BY_MODEL, Diagnosis, believed, conclude
+from calib.diagnosis.verdict.known import by_name
 from calib.diagnosis.verdict.matters import HELD_OUT_BY_CHANCE
 from calib.diagnosis.verdict.unnamed import Unnamed, unnamed
 from calib.diagnosis.weak import group, to_be_planned, to_be_told_apart, weak_directions
@@ -88,6 +89,8 @@ def _found(
     unseen = partial(_unseen, run=run, progress=progress) if refits else None
     doubtful = not believed(found, falls)
     formulas = unnamed(found, falls, doubtful, unseen, progress) if run.converged else Unnamed()
+    if formulas.formulas and unseen and (known := by_name(found, formulas, unseen, progress)):
+        (found, falls), formulas = known, Unnamed()
     first = next((falls.get(step.effect.name) for step in found.found), None)
     if first is not None and first.rises and not found.at_first:
         # A name that stops held out refuse says nothing by itself: is there structure without it?

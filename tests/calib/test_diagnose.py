@@ -32,6 +32,7 @@ CANDIDATE = {
     "statistic",
     "dof",
     "held_out_rms_mm",
+    "rejected_share",
     "error_explained",
     "parameters",
     "smallest_detectable",

@@ -99,6 +99,26 @@ def test_a_sector_is_no_adequate_model_and_its_formula_takes_it_up(studied, tmp_
     assert left.explained and left.share < 0.02
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("by_m", [-0.016, 0.025])
+def test_a_step_whose_beams_were_rejected_has_its_name(tmp_path, by_m):
+    """Of the beams beyond it 98 % have no weight, and no test of `range_step` is left; a formula is
+    found, and does what the effect of the catalogue does."""
+    simulate(SMALL.model_copy(update={"column_step": 80}), tmp_path / "rec", 1)
+    change_ranges(tmp_path / "rec", lambda _, range_m, *__: range_m + by_m * (range_m > 4.4))
+    found = diagnose(calibrate([tmp_path / "rec"], tmp_path / "run"))
+    assert found.verdict == "missing_effect" and not found.formulas
+    (name,) = found.worth_adding
+    family, shape = name.split("@")
+    assert family == "range_step" and float(shape) == pytest.approx(4.4, abs=0.02)
+    first = found.candidates[0]
+    (amount,), (sigma,) = (first["parameters"][key] for key in ("estimate", "sigma"))
+    assert abs(amount - by_m) < 3 * max(sigma, 1e-4)
+    before, after = (first["rejected_share"][key] for key in ("before", "after"))
+    assert after < 0.015 < before - 0.03
+    assert 2.0 < first["rms_mm"] < 1e3 * abs(by_m)
+
+
 def test_somebody_in_the_room_is_no_error_of_the_lidar(studied):
     found, _ = studied("person", person)
     assert found.explained and not found.structured

@@ -101,7 +101,8 @@ def _candidate(candidate: Candidate, found: Search, held_out: Mapping[str, Fall]
             "after": fall.after_mm if fall else None,
         },
         "held_out_spread_mm": fall.spread_mm if fall else None,
-        "error_explained": explained(fall) if fall else None,
+        "rejected_share": _shares(fall),
+        "error_explained": None if fall is None or fall.takes_back else explained(fall),
         "rms_mm": None if noise else 1e3 * look.size_m(candidate),
         "unabsorbed_rms_mm": None if noise else 1e3 * look.rms_m(candidate),
         "parameters": {
@@ -114,6 +115,12 @@ def _candidate(candidate: Candidate, found: Search, held_out: Mapping[str, Fall]
         "indistinguishable_from": [r["effect"] for r in rivals],
         "rivals": rivals,
     }
+
+
+def _shares(fall: Fall | None) -> dict[str, float | None]:
+    """Of the beams held out that were rejected, where it takes some back."""
+    both = fall.rejected_share if fall and fall.takes_back else None
+    return dict(zip(("before", "after"), both or (None, None), strict=True))
 
 
 def explained(fall: Fall) -> float:

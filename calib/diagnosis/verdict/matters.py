@@ -42,22 +42,25 @@ class Matters:
         held_out_mm: of the held-out error; negative where it falls.
         largest_shift_sigmas: of any value of the calibration, in its own sigma.
         floor_mm: the error that noise alone makes.
+        takes_back: whether far fewer beams are rejected with it.
     """
 
     held_out_mm: float
     largest_shift_sigmas: float
     floor_mm: float
+    takes_back: bool = False
 
     @property
     def worse(self) -> bool:
         """Whether stops that were held out are predicted worse with it."""
-        return self.held_out_mm > FALL_MATTERS * self.floor_mm
+        return self.held_out_mm > FALL_MATTERS * self.floor_mm and not self.takes_back
 
     @property
     def enough(self) -> bool:
         """Whether it is more than a trace."""
         return (
-            -self.held_out_mm > FALL_MATTERS * self.floor_mm
+            self.takes_back
+            or -self.held_out_mm > FALL_MATTERS * self.floor_mm
             or self.largest_shift_sigmas > SHIFT_MATTERS
         )
 
@@ -99,7 +102,7 @@ class Consequences:
         taken, sigma = self._projected
         moved = taken[:, candidate.test.columns] @ candidate.test.estimate()
         shift = float(np.max(np.abs(moved) / sigma, initial=0.0))
-        return Matters(fall.after_mm - fall.before_mm, shift, fall.floor_mm)
+        return Matters(fall.after_mm - fall.before_mm, shift, fall.floor_mm, fall.takes_back)
 
     @cached_property
     def _projected(self) -> tuple[np.ndarray, np.ndarray]:

@@ -191,6 +191,8 @@ def _step_sentences(step: NamedEffect, candidate: Mapping[str, Any], worn: bool)
             f"{why}."
         ]
     fall = f"; the held-out error goes from {before:.2f} to {after:.2f} mm" if after else ""
+    was, now = (candidate["rejected_share"][k] for k in ("before", "after"))
+    fall += "" if was is None else f", rejected beams from {100 * was:.1f} to {100 * now:.1f} %"
     out = [
         f"{step.effect.name} is missing: it changes {_residual(step.before)} by "
         f"{candidate['rms_mm']:.2f} mm rms, of which {candidate['unabsorbed_rms_mm']:.2f} mm is "

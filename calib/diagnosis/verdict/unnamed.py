@@ -78,7 +78,7 @@ def unnamed(
     if found.found and doubtful and unseen is not None and not moves:
         formulas = find(first, progress)
         if formulas:
-            after = unseen(_with(first, formulas, progress)).rms_mm
+            after = unseen(with_formulas(first, formulas, progress)).rms_mm
             before = falls[found.found[0].effect.name].before_mm
             named = falls[found.found[-1].effect.name].after_mm
             if after < named - FALL_MATTERS * before:
@@ -90,14 +90,15 @@ def unnamed(
     formulas = find(last, progress)
     if not formulas or unseen is None:
         return Unnamed(formulas)
-    before, after = unseen(last), unseen(_with(last, formulas, progress))
+    before, after = unseen(last), unseen(with_formulas(last, formulas, progress))
     fall_mm = before.rms_mm, after.rms_mm
     if moves and after.rms_mm > HELD_OUT_BY_CHANCE * after.floor_mm:
         return Unnamed()
     # A gross structure is rejected, not fitted: what falls then is the share of such beams.
-    fewer = (before.rejected_share or 0.0) - (after.rejected_share or 0.0) > FALL_MATTERS
-    if fewer or fall_mm[0] - fall_mm[1] > FALL_MATTERS * after.floor_mm:
-        return Unnamed(formulas, False, fall_mm, (before.rejected_share, after.rejected_share))
+    thrown = before.rejected_share or 0.0, after.rejected_share or 0.0
+    fall = Fall(*fall_mm, after.floor_mm, rejected_share=thrown)
+    if fall.takes_back or fall_mm[0] - fall_mm[1] > FALL_MATTERS * after.floor_mm:
+        return Unnamed(formulas, False, fall_mm, thrown)
     over = " and ".join(words(c) for c in formulas[0].covariates)
     return Unnamed(
         refused=f"A formula over {over} fits part of the residuals, but stops that were held out "
@@ -105,7 +106,7 @@ def unnamed(
     )
 
 
-def _with(stand: Stand, formulas: Sequence[Formula], progress: Progress) -> Stand:
+def with_formulas(stand: Stand, formulas: Sequence[Formula], progress: Progress) -> Stand:
     """A model with formulas, fitted."""
     taken = list(stand.model.names)
     effects = []
