@@ -1,5 +1,7 @@
 """What a finding would change, as predicted, is what it does change once it is fitted."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy.stats import ttest_rel
@@ -7,7 +9,7 @@ from scipy.stats import ttest_rel
 from calib import add, diagnose, fit
 from calib.diagnosis.search import NamedEffect, Search
 from calib.diagnosis.stand import Stand
-from calib.diagnosis.verdict import conclude
+from calib.diagnosis.verdict import _over_the_expected, _unconfirmed, conclude
 from calib.diagnosis.verdict.matters import (
     FALL_MATTERS,
     SHIFT_MATTERS,
@@ -128,6 +130,19 @@ def test_a_later_name_stands_if_stops_bear_it_out_or_nothing_is_more_general(loo
         assert f"but so does {more.effect.name}, which is more general" in told.refused[0]
         assert "azimuth_range_harmonic was tried and rejected" in told.refused[0]
         assert "-0.100 mm, ± 0.016" in told.refused[0]
+
+
+@pytest.mark.parametrize(("times", "doubted"), [(1.3, False), (1.6, True)])
+def test_scatter_does_not_excuse_what_it_does_not_explain(look, times, doubted):
+    """The error that counts is that of the model with what scatters; without, nobody knows."""
+    chance = [SimpleNamespace(effect=SimpleNamespace(name="stop_range_scatter"))]
+    found = Search([look], found=(), blunders=(), unnamed=(), scatter=None, chance=chance)
+    rms_mm = {"held_out": 9.0, "fit": 2.0, "noise_floor": 2.0}
+    assert _over_the_expected(found, {}, rms_mm) == 0.0
+    falls = {"stop_range_scatter": Fall(9.0, times * 3.0, 3.0)}
+    over = _over_the_expected(found, falls, rms_mm)
+    assert over == pytest.approx(times)
+    assert (_unconfirmed(found, over) is not None) == doubted
 
 
 @pytest.mark.parametrize("structure", [True, False])

@@ -21,7 +21,11 @@ from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import formula, hangs_on
 from calib.diagnosis.verdict.candidates import candidate_documents, explained
 from calib.diagnosis.verdict.curves import Curve, curves
-from calib.diagnosis.verdict.matters import HELD_OUT_BY_CHANCE, weighed
+from calib.diagnosis.verdict.matters import (
+    HELD_OUT_BESIDE_SCATTER,
+    HELD_OUT_BY_CHANCE,
+    weighed,
+)
 from calib.diagnosis.verdict.sentences import BAD, UNNAMED, sentences_of, stops_of, unconfirmed
 from calib.diagnosis.verdict.unnamed import Unnamed
 from calib.problem.model import labels
@@ -219,7 +223,7 @@ def _unconfirmed(found: Search, over: float) -> Candidate | None:
     no structure or effect is found: so few stops, or walls, see each part of it that they may
     differ by chance as much."""
     there = found.unnamed or found.found or not found.looks[0].stand.estimate.scans
-    if there or over <= HELD_OUT_BY_CHANCE:
+    if there or over <= (HELD_OUT_BESIDE_SCATTER if found.chance else HELD_OUT_BY_CHANCE):
         return None
     return next(suspects(found.looks[-1].unnamed, ALPHA_UNNAMED), None)
 
