@@ -91,6 +91,30 @@ def test_it_is_named_and_sized_and_nothing_else_is(recording, tmp_path, mishap):
     assert abs(estimate - size) < 4 * sigma < size
 
 
+@pytest.mark.slow
+def test_what_slips_late_is_one_effect_and_not_a_mishap_at_every_stop_after_it(tmp_path):
+    spec = SPEC.model_copy(update={"locations": 5, "column_step": 100})
+    simulate(spec, tmp_path / "sound", 2)
+    times_s = Source.open(tmp_path / "sound").recording.time_s
+    times_s = times_s - times_s[0]
+    late_s = (times_s[-4] + times_s[-3]) / 2
+    simulate(spec, tmp_path / "rec", 2, {f"arm_joint_slip@{late_s:.0f}": 5.0})
+    found = searched(tmp_path / "rec")
+    (step,) = found.found
+    assert step.effect.family == "arm_joint_slip" and not found.blunders
+    assert times_s[-4] < step.effect.shape < times_s[-3]
+
+
+def test_mishaps_of_two_stops_are_no_effect(recording, tmp_path):
+    """One effect might explain both: none does, as they have nothing in common."""
+    rec = shutil.copytree(recording, tmp_path / "rec")
+    MISHAPS["a body"][0](rec)
+    broken.cells("stops.csv", r"mount_markers\.x", lambda x: x - 0.006, 10)(rec)
+    found = searched(rec)
+    tokens = {left.blunder.group.token for left in found.blunders}
+    assert tokens == {NAMES["a body"], "L03P01:mount_markers"} and not found.found
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("seed", range(8))
 def test_where_nothing_was_done_nothing_is_named(tmp_path, seed):
