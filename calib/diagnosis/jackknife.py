@@ -28,7 +28,7 @@ inverted, so there may be more parameters than clusters. There are two ways to V
 
 Where few clusters hold most of the information, few degrees of freedom are left, however well all
 others agree. Then the others are asked by themselves, in the second way: those without the cluster
-that holds most, without the next, and so on, which would find the smallest effect (`Judges`).
+that holds most, without the next, and so on, which would find the smallest effect (`judges`).
 Information alone decides which they are; their p-value is doubled, as it hardly depends on that of
 all. A mishap of one stop, or the shape of one wall, then neither makes an effect nor hides one.
 
@@ -59,13 +59,12 @@ number.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from scipy import special
 
-from calib.linear.clusters import ClusteredRows, summed
 from calib.results.intervals import ALONE
 
 UNKNOWN_VARIANCE = 1e12  # variance, of a whitened score, where nothing tells it
@@ -73,11 +72,6 @@ UNKNOWN_VARIANCE = 1e12  # variance, of a whitened score, where nothing tells it
 # benchmark: with fewer, 0.1 to 1.0 of empty worlds where stops err show something; else below 0.1.
 PER_PARAMETER = 2
 SLIGHT_SHARE = 0.05  # of a direction's information: the others predict a cluster with less to 5 %
-# Of a part's information, from which a cluster is worth a look without it: where none holds as much
-# there are ten degrees of freedom or more, and the test's limit is at most 2.6 times the least.
-HEAVY = 0.1
-LIMIT = 1e-4  # about the level of one test of an effect after all looks, for what judges it best
-HIGHEST_WORTH = 1.0 / float(special.chdtri(1.0, LIMIT))  # of a share of 1: with d without end
 
 
 @dataclass(frozen=True)
@@ -171,39 +165,6 @@ def _beyond(by_place: np.ndarray, both: np.ndarray) -> np.ndarray:
     return more if np.trace(more) > 0.0 else np.zeros_like(more)
 
 
-@dataclass
-class Shares:
-    """Each cluster's share of a candidate's whitened score and of its information."""
-
-    cells: dict[tuple[int, int], list[np.ndarray]] = field(default_factory=dict)
-
-    def add(self, rows: ClusteredRows) -> None:
-        """Add rows along the candidate's directions, projected off the model and whitened."""
-        order = np.lexsort([rows.place, rows.stop])
-        stop, place = rows.stop[order], rows.place[order]
-        bounds = np.flatnonzero((np.diff(stop) != 0) | (np.diff(place) != 0)) + 1
-        for some in np.split(order, bounds):
-            mine, right = rows.A[some], rows.b[some]
-            score, information = mine.T @ right, mine.T @ mine
-            cell = int(rows.stop[some[0]]), int(rows.place[some[0]])
-            if cell in self.cells:
-                self.cells[cell][0] += score
-                self.cells[cell][1] += information
-            else:
-                self.cells[cell] = [score, information]
-
-    def left_out(self, nu: float, spent: int = 0) -> tuple[ScoreSpread, ...]:
-        """Chance from leaving out cluster after cluster, of all and of those that tell most where
-        few dominate; see the module.
-
-        Args:
-            nu: degrees of freedom of the statistic, by signs.
-            spent: how many unknowns of the model differ by stop alone.
-        """
-        scores, information = (np.stack(each) for each in zip(*self.cells.values(), strict=True))
-        return Judges.of(np.array(list(self.cells)), information, spent).chances(scores, nu)
-
-
 @dataclass(frozen=True)
 class Clusters:
     """What can be said of clusters before their scores are known.
@@ -269,129 +230,3 @@ def by_leaving_out(
     parts, of_stops = np.array([np.trace(by_stop), np.trace(more)]), max(ways[0].d - spent, 1.0)
     d = parts.sum() ** 2 / max(float(np.sum(parts**2 / [of_stops, ways[1].d])), 1e-300)
     return ScoreSpread(by_stop + more, nu, float(d), float(d) + 1.0)
-
-
-@dataclass(frozen=True)
-class SomeCells:
-    """Cells of stop and place, all or some.
-
-    Args:
-        kept: (n,) which of all cells.
-        whiten: (r, k), of what these say of the whitened score.
-        share: of the information.
-        cells: (m, 2) numbers of stop and place of each, -1 for none.
-        clusters: by stop, by place, and by both.
-        spent: how many unknowns of the model differ by stop alone.
-    """
-
-    kept: np.ndarray
-    whiten: np.ndarray
-    share: float
-    cells: np.ndarray
-    clusters: tuple[Clusters, ...]
-    spent: int
-
-    @classmethod
-    def of(
-        cls, cells: np.ndarray, information: np.ndarray, kept: np.ndarray, spent: int
-    ) -> SomeCells | None:
-        """Some of the cells (n, 2), which hold (n, r, r); None where that is next to nothing."""
-        cells, mine = cells[kept], information[kept]
-        whole = mine.sum(axis=0)
-        values, axes = np.linalg.eigh(whole)
-        seen = values > SLIGHT_SHARE
-        if not seen.any():
-            return None
-        whiten = axes[:, seen] / np.sqrt(values[seen])
-        if kept.all():
-            whiten = np.eye(len(whole))
-        else:
-            mine = whiten.T @ mine @ whiten
-        counts = (_stated(cells, 0), _stated(cells, 1), len(cells))
-        clusters = tuple(
-            Clusters.of(_added(mine, numbers), count)
-            for numbers, count in zip(_ways(cells), counts, strict=True)
-        )
-        share = float(np.trace(whole)) / len(whole)
-        return cls(
-            kept=kept, whiten=whiten, share=share, cells=cells, clusters=clusters, spent=spent
-        )
-
-    @cached_property
-    def worth(self) -> float:
-        """How small an effect it finds: its information over the limit of its test."""
-        if self.clusters[0].crowded or self.clusters[1].crowded:
-            return 0.0
-        d = max(min(self.clusters[0].d - self.spent, self.clusters[1].d), 1.0)
-        return self.share / float(special.fdtri(1.0, d, 1.0 - LIMIT))
-
-    @cached_property
-    def shares(self) -> list[np.ndarray]:
-        """Of its information, by stop and by place."""
-        parts = (np.trace(each.information, axis1=1, axis2=2) for each in self.clusters[:2])
-        return [each / len(self.whiten.T) for each in parts]
-
-    def without_the_heaviest(self) -> np.ndarray:
-        """Which of all cells (n,) are left without the stop, or the place, that holds most."""
-        way = int(np.argmax([each.max() for each in self.shares]))
-        gone = _ways(self.cells)[way] == np.argmax(self.shares[way])
-        left = self.kept.copy()
-        left[np.flatnonzero(left)[gone]] = False
-        return left
-
-    def sums(self, scores: np.ndarray) -> list[np.ndarray]:
-        """Shares of the score by stop, by place, and by both, from those (n, r) of all cells."""
-        mine = scores[self.kept] @ self.whiten
-        return [_added(mine, numbers) for numbers in _ways(self.cells)]
-
-
-@dataclass(frozen=True)
-class Judges:
-    """All cells, and the part of them that finds the smallest effect: without the cluster that
-    holds most, without the next, and so on. Scores have no say in which it is."""
-
-    every: SomeCells
-    best: SomeCells
-
-    @classmethod
-    def of(cls, cells: np.ndarray, information: np.ndarray, spent: int = 0) -> Judges:
-        """Arguments as of `SomeCells`."""
-        every = best = this = SomeCells.of(cells, information, np.ones(len(cells), bool), spent)
-        while every.worth and max(each.max() for each in this.shares) > HEAVY:
-            this = SomeCells.of(cells, information, this.without_the_heaviest(), spent)
-            if this is None or this.share < best.worth / HIGHEST_WORTH:
-                break
-            best = max(best, this, key=lambda part: part.worth)
-        return cls(every, best)
-
-    def chances(self, scores: np.ndarray, nu: float) -> tuple[ScoreSpread, ...]:
-        """From scores (n, r) of all cells: by all, and by the best part where that is not all; `nu`
-        is that of the statistic, by signs."""
-        every = by_leaving_out(self.every.clusters, self.every.sums(scores), nu, self.every.spent)
-        if self.best is self.every:
-            return (every,)
-        ways, stops = self.best.sums(scores), self.best.clusters[0].count
-        nu = by_signs(ways, stops, self.best.spent).nu
-        rest = by_leaving_out(self.best.clusters, ways, nu, self.best.spent)
-        ratio = float(np.square(ways[0].sum(axis=0)).sum()) / max(rest.trace, 1e-300)
-        wider = rest.trace / len(rest.covariance) * np.eye(len(every.covariance))
-        return every, replace(rest, covariance=wider, ratio=ratio, share=self.best.share)
-
-
-def _ways(cells: np.ndarray) -> list[np.ndarray]:
-    """Numbers (n,) of the clusters that cells (n, 2) are in: by stop and by place, where a cell
-    without one is a cluster of its own; and each its own."""
-    own = np.arange(len(cells))
-    some = (np.where(each >= 0, each, -1 - own) for each in cells.T)
-    return [*(np.unique(each, return_inverse=True)[1] for each in some), own]
-
-
-def _stated(cells: np.ndarray, way: int) -> int:
-    """How many stops (0), or places (1), cells (n, 2) have; of cells that have none, how many."""
-    return len(np.unique(cells[cells[:, way] >= 0, way])) or len(cells)
-
-
-def _added(values: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Sums (G, ...) of values (n, ...) by group (n,)."""
-    sums = summed(values.reshape(len(values), -1), at)
-    return sums.reshape(-1, *values.shape[1:])

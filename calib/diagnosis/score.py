@@ -17,7 +17,8 @@ from scipy import special
 from scipy.linalg import cho_factor, cho_solve
 
 from calib.blunders.chance import at_least, enough, log_tail
-from calib.diagnosis.jackknife import ScoreSpread, Shares, by_signs
+from calib.diagnosis.jackknife import ScoreSpread, by_signs
+from calib.diagnosis.judges import Shares
 from calib.diagnosis.linear import Linear
 from calib.linear.clusters import summed
 from calib.problem.unknowns import Owner

@@ -14,7 +14,7 @@ from calib import problem as problems
 from calib.blunders.judged import Blunder, judge
 from calib.diagnosis.candidates import covariates, known_effects, structure
 from calib.diagnosis.chance import Chance, chances, of_lidar, ranked, rows_by_chance
-from calib.diagnosis.jackknife import Shares
+from calib.diagnosis.judges import Shares
 from calib.diagnosis.linear import Linear, linearise_with, rows_along
 from calib.diagnosis.score import ScoreTest, away_from_model, project, score_test
 from calib.diagnosis.screen import Candidate, Screen, screen

@@ -30,7 +30,8 @@ import numpy as np
 from scipy import stats
 from threadpoolctl import threadpool_limits
 
-from calib.diagnosis.jackknife import Clusters, Judges, ScoreSpread, by_signs
+from calib.diagnosis.jackknife import Clusters, ScoreSpread, by_signs
+from calib.diagnosis.judges import Judges
 
 PLACES, EACH = 25, 2
 STOPS, PARAMETERS = (6, 8, 12, 20, 30, 60), (1, 4, 16, 64)
@@ -112,7 +113,7 @@ class World:
         information = np.einsum("bki,bkj->bij", self._cells(), self._cells())
         cells = np.stack(np.divmod(np.arange(stops * PLACES), PLACES), axis=1)
         self.judges = Judges.of(cells, information, family.model_by_stop)
-        self.clusters = self.judges.every.clusters
+        self.clusters = [*self.judges.every.clusters, self.judges.every.alone]
 
     def _cells(self) -> np.ndarray:
         return self.columns.reshape(self.stops * PLACES, EACH, -1)

@@ -8,7 +8,7 @@ import pytest
 
 from calib import effects
 from calib import problem as problems
-from calib.diagnosis.jackknife import Shares
+from calib.diagnosis.judges import Shares
 from calib.diagnosis.linear import rows_along
 from calib.diagnosis.score import away_from_model, project, score_test
 from calib.diagnosis.stand import Stand

@@ -9,7 +9,7 @@ from scipy.sparse import csr_array
 
 from calib.blunders.chance import log_tail
 from calib.diagnosis import score
-from calib.diagnosis.jackknife import Shares
+from calib.diagnosis.judges import Shares
 from calib.diagnosis.linear import Linear
 from calib.diagnosis.screen import looked, rivals, screen
 from calib.effects import Site

@@ -11,7 +11,8 @@ import pytest
 from scipy import stats
 
 from calib.blunders.chance import LEAST_P, after_looks, at_least
-from calib.diagnosis.jackknife import UNKNOWN_VARIANCE, Clusters, Shares, by_signs
+from calib.diagnosis.jackknife import UNKNOWN_VARIANCE, Clusters, by_signs
+from calib.diagnosis.judges import Shares
 
 BENCH = Path(__file__).parents[1] / "bench"
 DRAWS = 800

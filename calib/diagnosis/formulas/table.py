@@ -15,7 +15,7 @@ import numpy as np
 from scipy.sparse import block_diag, csr_array, diags_array, eye_array, hstack, issparse, vstack
 
 from calib.diagnosis.formulas.drawn import DrawnBeams, rows_over
-from calib.diagnosis.jackknife import Shares
+from calib.diagnosis.judges import Shares
 from calib.diagnosis.linear import beside, other_rows
 from calib.diagnosis.score import GAUGE, Scores, ScoreTest, score_test
 from calib.linear.arrow import Arrow

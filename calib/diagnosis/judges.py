@@ -1,0 +1,195 @@
+"""Which clusters judge a candidate: all, and those that tell most where few of them dominate.
+
+Where few clusters hold most of the information, few degrees of freedom are left, however well all
+others agree. Then the others are asked by themselves as well; see `jackknife`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from scipy import special
+
+from calib.diagnosis.jackknife import Clusters, ScoreSpread, by_leaving_out, by_signs
+from calib.linear.clusters import ClusteredRows, summed
+
+SLIGHT_LEFT = 0.05  # of a direction's information: with less of it left, nobody is asked about it
+# Of a part's information, from which a cluster is worth a look without it: where none holds as much
+# there are ten degrees of freedom or more, and the test's limit is at most 2.6 times the least.
+HEAVY = 0.1
+LIMIT = 1e-4  # about the level of one test of an effect after all looks, for what judges it best
+HIGHEST_WORTH = 1.0 / float(special.chdtri(1.0, LIMIT))  # of a share of 1: with d without end
+
+
+@dataclass
+class Shares:
+    """Each cluster's share of a candidate's whitened score and of its information."""
+
+    cells: dict[tuple[int, int], list[np.ndarray]] = field(default_factory=dict)
+
+    def add(self, rows: ClusteredRows) -> None:
+        """Add rows along the candidate's directions, projected off the model and whitened."""
+        order = np.lexsort([rows.place, rows.stop])
+        stop, place = rows.stop[order], rows.place[order]
+        bounds = np.flatnonzero((np.diff(stop) != 0) | (np.diff(place) != 0)) + 1
+        for some in np.split(order, bounds):
+            mine, right = rows.A[some], rows.b[some]
+            score, information = mine.T @ right, mine.T @ mine
+            cell = int(rows.stop[some[0]]), int(rows.place[some[0]])
+            if cell in self.cells:
+                self.cells[cell][0] += score
+                self.cells[cell][1] += information
+            else:
+                self.cells[cell] = [score, information]
+
+    def left_out(self, nu: float, spent: int = 0) -> tuple[ScoreSpread, ...]:
+        """Chance from leaving out cluster after cluster, of all and of those that tell most where
+        few dominate; see the module.
+
+        Args:
+            nu: degrees of freedom of the statistic, by signs.
+            spent: how many unknowns of the model differ by stop alone.
+        """
+        scores, information = (np.stack(each) for each in zip(*self.cells.values(), strict=True))
+        return Judges.of(np.array(list(self.cells)), information, spent).chances(scores, nu)
+
+
+@dataclass(frozen=True)
+class SomeCells:
+    """Cells of stop and place, all or some.
+
+    Args:
+        kept: (n,) which of all cells.
+        information: (n, r, r) of the whitened score, of all of them.
+        whiten: (r, k), of what the kept ones say; they hold this share of the information.
+        ways: numbers (n,) of the stop and of the place of each; -1 for those that are not kept.
+        clusters: by stop and by place.
+        spent: how many unknowns of the model differ by stop alone.
+    """
+
+    kept: np.ndarray
+    information: np.ndarray = field(repr=False)
+    whiten: np.ndarray
+    share: float
+    ways: tuple[np.ndarray, ...]
+    clusters: tuple[Clusters, ...]
+    spent: int
+
+    @classmethod
+    def of(
+        cls, cells: np.ndarray, information: np.ndarray, kept: np.ndarray, spent: int
+    ) -> SomeCells | None:
+        """Some of the cells (n, 2), which hold (n, r, r); None where that is next to nothing."""
+        ways = tuple(_numbered(cells, kept, way) for way in (0, 1))
+        by_stop, by_place = (_added(information, way) for way in ways)
+        whole = by_stop.sum(axis=0)
+        values, axes = np.linalg.eigh(whole)
+        seen = values > SLIGHT_LEFT
+        if not seen.any():
+            return None
+        whiten = axes[:, seen] / np.sqrt(values[seen])
+        if kept.all():
+            whiten = np.eye(len(values))
+        clusters = tuple(
+            Clusters.of(whiten.T @ each @ whiten, _stated(cells[kept], way))
+            for way, each in enumerate((by_stop, by_place))
+        )
+        return cls(
+            kept=kept,
+            information=information,
+            whiten=whiten,
+            share=float(np.trace(whole)) / len(whole),
+            ways=ways,
+            clusters=clusters,
+            spent=spent,
+        )
+
+    @cached_property
+    def worth(self) -> float:
+        """How small an effect it finds: its information over the limit of its test."""
+        if self.clusters[0].crowded or self.clusters[1].crowded:
+            return 0.0
+        d = max(min(self.clusters[0].d - self.spent, self.clusters[1].d), 1.0)
+        return self.share / float(special.fdtri(1.0, d, 1.0 - LIMIT))
+
+    @cached_property
+    def shares(self) -> list[np.ndarray]:
+        """Of its information, by stop and by place."""
+        parts = (np.trace(each.information, axis1=1, axis2=2) for each in self.clusters)
+        return [each / len(self.whiten.T) for each in parts]
+
+    def without_the_heaviest(self) -> np.ndarray:
+        """Which of all cells (n,) are left without the stop, or the place, that holds most."""
+        way = int(np.argmax([each.max() for each in self.shares]))
+        return self.kept & (self.ways[way] != np.argmax(self.shares[way]))
+
+    def spread(self, scores: np.ndarray, nu: float | None = None) -> tuple[ScoreSpread, float]:
+        """Chance from the scores (n, r) of all cells, and the statistic; `nu` is that of the
+        statistic, by signs, and as these cells have it where None."""
+        mine = scores @ self.whiten
+        ways = [*(_added(mine, way) for way in self.ways), mine[self.kept]]
+        if nu is None:
+            nu = by_signs(ways, self.clusters[0].count, self.spent).nu
+        clusters = (*self.clusters, self.alone)
+        statistic = float(np.square(ways[0].sum(axis=0)).sum())
+        return by_leaving_out(clusters, ways, nu, self.spent), statistic
+
+    @property
+    def alone(self) -> Clusters:
+        """Each cell a cluster."""
+        whole = self.kept.all()
+        kept = self.information if whole else self.information[self.kept]
+        return Clusters.of(kept if whole else self.whiten.T @ kept @ self.whiten, len(kept))
+
+
+@dataclass(frozen=True)
+class Judges:
+    """All cells, and the part of them that finds the smallest effect: without the cluster that
+    holds most, without the next, and so on. Scores have no say in which it is."""
+
+    every: SomeCells
+    best: SomeCells
+
+    @classmethod
+    def of(cls, cells: np.ndarray, information: np.ndarray, spent: int = 0) -> Judges:
+        """As of `SomeCells`."""
+        every = best = this = SomeCells.of(cells, information, np.ones(len(cells), bool), spent)
+        while every.worth and max(each.max() for each in this.shares) > HEAVY:
+            this = SomeCells.of(cells, information, this.without_the_heaviest(), spent)
+            if this is None or this.share < best.worth / HIGHEST_WORTH:
+                break
+            best = max(best, this, key=lambda part: part.worth)
+        return cls(every, best)
+
+    def chances(self, scores: np.ndarray, nu: float) -> tuple[ScoreSpread, ...]:
+        """From scores (n, r) of all cells: by all, and by the best part where that is not all; `nu`
+        is that of the statistic, by signs."""
+        every, _ = self.every.spread(scores, nu)
+        if self.best is self.every:
+            return (every,)
+        rest, statistic = self.best.spread(scores)
+        wider = rest.trace / len(rest.covariance) * np.eye(len(every.covariance))
+        ratio = statistic / max(rest.trace, 1e-300)
+        return every, replace(rest, covariance=wider, ratio=ratio, share=self.best.share)
+
+
+def _numbered(cells: np.ndarray, kept: np.ndarray, way: int) -> np.ndarray:
+    """Numbers (n,) of the stops (0) or places (1) of cells (n, 2); one without is a cluster of its
+    own, and one that is not kept has -1."""
+    own = np.where(cells[:, way] >= 0, cells[:, way], -1 - np.arange(len(cells)))
+    found = np.full(len(cells), -1)
+    found[kept] = np.unique(own[kept], return_inverse=True)[1]
+    return found
+
+
+def _stated(cells: np.ndarray, way: int) -> int:
+    """How many stops (0), or places (1), cells (n, 2) have; of cells that have none, how many."""
+    return len(np.unique(cells[cells[:, way] >= 0, way])) or len(cells)
+
+
+def _added(values: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Sums (G, ...) of values (n, ...) by group (n,); -1 for none."""
+    sums = summed(values.reshape(len(values), -1), at)
+    return sums.reshape(-1, *values.shape[1:])
