@@ -19,6 +19,7 @@ SLIGHT_LEFT = 0.05  # of a direction's information: with less of it left, nobody
 # Of a part's information, from which a cluster is worth a look without it: where none holds as much
 # there are ten degrees of freedom or more, and the test's limit is at most 2.6 times the least.
 HEAVY = 0.1
+DISAGREE = 0.01  # how seldom clusters left out would be as far from what others say: a choice
 LIMIT = 1e-4  # about the level of one test of an effect after all looks, for what judges it best
 HIGHEST_WORTH = 1.0 / float(special.chdtri(1.0, LIMIT))  # of a share of 1: with d without end
 
@@ -63,7 +64,8 @@ class SomeCells:
     Args:
         kept: (n,) which of all cells.
         information: (n, r, r) of the whitened score, of all of them.
-        whiten: (r, k), of what the kept ones say; they hold this share of the information.
+        whiten: (r, k), of what the kept ones say.
+        share: of the information, that they hold.
         ways: numbers (n,) of the stop and of the place of each; -1 for those that are not kept.
         clusters: by stop and by place.
         spent: how many unknowns of the model differ by stop alone.
@@ -156,7 +158,9 @@ class Judges:
     def of(cls, cells: np.ndarray, information: np.ndarray, spent: int = 0) -> Judges:
         """As of `SomeCells`."""
         every = best = this = SomeCells.of(cells, information, np.ones(len(cells), bool), spent)
-        while every.worth and max(each.max() for each in this.shares) > HEAVY:
+        if not every.worth:
+            return cls(every, every)
+        while max(each.max() for each in this.shares) > HEAVY:
             this = SomeCells.of(cells, information, this.without_the_heaviest(), spent)
             if this is None or this.share < best.worth / HIGHEST_WORTH:
                 break
@@ -170,9 +174,27 @@ class Judges:
         if self.best is self.every:
             return (every,)
         rest, statistic = self.best.spread(scores)
+        if not self._agree(scores, rest):
+            return (every,)
         wider = rest.trace / len(rest.covariance) * np.eye(len(every.covariance))
         ratio = statistic / max(rest.trace, 1e-300)
         return every, replace(rest, covariance=wider, ratio=ratio, share=self.best.share)
+
+    def _agree(self, scores: np.ndarray, rest: ScoreSpread) -> bool:
+        """Whether the clusters left out show what the others say, as far as these scatter. An error
+        of their own would have moved the model, and by that the others, the other way."""
+        kept, whiten = self.best.kept, self.best.whiten
+        told = scores[kept].sum(axis=0) @ whiten @ whiten.T
+        held = self.best.information[~kept].sum(axis=0)
+        off = scores[~kept].sum(axis=0) - held @ told
+        variance = held + held @ whiten @ whiten.T @ held
+        values, axes = np.linalg.eigh(variance)
+        seen = values > SLIGHT_LEFT
+        if not seen.any() or rest.d <= 0.0:
+            return True
+        square = float(np.sum(np.square(axes[:, seen].T @ off) / values[seen]))
+        times = square / max(rest.trace / len(rest.covariance), 1e-300) / int(seen.sum())
+        return bool(special.fdtrc(int(seen.sum()), rest.d, times) > DISAGREE)
 
 
 def _numbered(cells: np.ndarray, kept: np.ndarray, way: int) -> np.ndarray:

@@ -230,6 +230,10 @@ def _told(candidate: dict[str, Any]) -> list[str]:
     before, after = (candidate["held_out_rms_mm"][k] for k in ("before", "after"))
     if before is not None and after is not None:
         out.append(f"the held-out error goes from {before:.2f} to {after:.2f} mm with it")
+        share = candidate.get("rejected_share") or {}  # which earlier versions did not write
+        if share.get("before") is not None:
+            ends = (f"{100 * share[key]:.1f}" for key in ("before", "after"))
+            out.append(f"rejected beams go from {' to '.join(ends)} %")
     parameters = candidate["parameters"]
     if len(parameters["names"]) == 1:
         unit = parameters["unit"]

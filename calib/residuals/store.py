@@ -10,6 +10,7 @@ from functools import cached_property
 from pathlib import Path
 from threading import Lock
 from typing import Any
+from weakref import WeakSet
 
 import numpy as np
 
@@ -21,7 +22,7 @@ KEPT_SHARE = 0.25  # of the memory, where each core has a process of its own: a 
 
 
 def _kept_bytes() -> float:
-    """Of scans and beams of one recording; what is beyond is read again each time."""
+    """Of scans and beams of all recordings together; what is beyond is read again each time."""
     memory = float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     with suppress(OSError, ValueError):  # there is no such file, or it says "max"
         memory = min(memory, float(Path("/sys/fs/cgroup/memory.max").read_text(encoding="ascii")))
@@ -29,11 +30,13 @@ def _kept_bytes() -> float:
 
 
 KEPT_BYTES = _kept_bytes()
+_STORES: WeakSet[BeamStore] = WeakSet()  # that share it
 
 
-@dataclass
+@dataclass(eq=False)
 class BeamStore:
-    """The scans of a recording and their beams, as many as fit into `KEPT_BYTES`.
+    """The scans of a recording and their beams, as many as fit into `KEPT_BYTES`
+    beside those of other recordings.
 
     Args:
         recording: whose.
@@ -48,6 +51,9 @@ class BeamStore:
     _bytes: float = 0.0
     _lock: Lock = field(default_factory=Lock, repr=False)
 
+    def __post_init__(self) -> None:
+        _STORES.add(self)
+
     def read(self, stop: int) -> tuple[Scan, Beams]:
         """The scan of one stop, by its index, and its beams.
 
@@ -60,7 +66,8 @@ class BeamStore:
         found = scan, beams(scan.xyz_m, self.beam_origin_m)
         size = _size(found)
         with self._lock:
-            if stop not in self._kept and self._bytes + size <= KEPT_BYTES:
+            full = sum(store._bytes for store in list(_STORES)) + size > KEPT_BYTES
+            if stop not in self._kept and not full:
                 self._kept[stop] = found
                 self._bytes += size
         return found

@@ -20,7 +20,7 @@ from calib.diagnosis.search.confirmed import structures
 from calib.diagnosis.stand import Look, Stand
 from calib.diagnosis.verdict import ABSORBED_BY_MODEL, Diagnosis, believed, conclude
 from calib.diagnosis.verdict.known import by_name
-from calib.diagnosis.verdict.matters import HELD_OUT_BY_CHANCE
+from calib.diagnosis.verdict.matters import HELD_OUT_BY_CHANCE, weighed
 from calib.diagnosis.verdict.unnamed import Unnamed, unnamed
 from calib.diagnosis.weak import group, to_be_planned, to_be_told_apart, weak_directions
 from calib.effects import own_effects
@@ -89,10 +89,11 @@ def _found(
     unseen = partial(_unseen, run=run, progress=progress) if refits else None
     doubtful = not believed(found, falls)
     formulas = unnamed(found, falls, doubtful, unseen, progress) if run.converged else Unnamed()
-    if formulas.formulas and unseen and (known := by_name(found, formulas, unseen, progress)):
+    known = by_name(found, formulas, unseen, progress) if unseen else None
+    if known and believed(*known) and weighed(*known, run.summary["rms_mm"]).found.found:
         (found, falls), formulas = known, Unnamed()
-    first = next((falls.get(step.effect.name) for step in found.found), None)
-    if first is not None and first.rises and not found.at_first:
+    rise = any(falls[s.effect.name].rises for s in found.found if s.effect.name in falls)
+    if rise and not found.at_first:
         # A name that stops held out refuse says nothing by itself: is there structure without it?
         found = replace(found, at_first=structures(found.looks[0], progress))
     result = conclude(
@@ -139,10 +140,13 @@ def _falls(found: Search, stand: Stand, run: Run, progress: Progress) -> dict[st
         gain = gains_m2(each_m2, unseen.each_m2)
         falls[step.effect.name] = Fall(before, unseen.rms_mm, unseen.floor_mm, gain)
         before, each_m2 = unseen.rms_mm, unseen.each_m2
-    if found.chance and not found.found and over_floor(run) > HELD_OUT_BY_CHANCE:
+    last = found.looks[-1].stand
+    scatter = [c.effect.name for c in found.chance if c.effect.name in last.model.names]
+    nothing = not found.found and not found.unnamed
+    if scatter and nothing and over_floor(run) > HELD_OUT_BY_CHANCE:
         # What scatters is in the expected error only once the model has it.
-        unseen = _unseen(found.looks[-1].stand, run, progress)
-        falls[found.chance[-1].effect.name] = Fall(before, unseen.rms_mm, unseen.floor_mm)
+        unseen = _unseen(last, run, progress)
+        falls[scatter[-1]] = Fall(before, unseen.rms_mm, unseen.floor_mm)
     return falls
 
 

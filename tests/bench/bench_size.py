@@ -51,6 +51,9 @@ class Family:
             them show 0.15 of it.
         stop_sd, place_sd: errors that the rows of a stop, or a surface, share, in those of a row.
         by_stop: how many unknowns of the model differ by stop alone.
+        model: how many more of its unknowns all rows share.
+        lone_sd: errors that the rows of the first stop and, where places differ, of the first
+            surface share.
     """
 
     by_row: float = 1.0
@@ -62,6 +65,8 @@ class Family:
     stop_sd: float = 0.0
     place_sd: float = 0.0
     model_by_stop: int = 0
+    model: int = 0
+    lone_sd: float = 0.0
 
 
 FAMILIES = {
@@ -79,6 +84,8 @@ FAMILIES = {
     "one stop, stops err": Family(stops=1, stop_sd=3.0),
     "one surface": Family(places=1),
     "one surface, surfaces err a little": Family(places=1, place_sd=0.5),
+    "one stop, it errs, wide model": Family(stops=1, lone_sd=10.0, model=15),
+    "one surface, it errs, wide model": Family(places=1, lone_sd=3.0, model=15),
     "both err": Family(stop_sd=0.5, place_sd=0.5),
     "model by stop, stops err": Family(stop_sd=3.0, model_by_stop=3),
 }
@@ -104,7 +111,9 @@ class World:
         if family.places:
             mine *= np.where(self.place < family.places, 1.0, 0.15)[:, None]
         model = rng.standard_normal((stops, family.model_by_stop))[self.stop]
-        model = np.column_stack([np.ones(rows), rng.standard_normal(rows), model])
+        shared = rng.standard_normal((rows, 1 + family.model))
+        shared += rng.standard_normal((stops, 1 + family.model))[self.stop] * bool(family.model)
+        model = np.column_stack([np.ones(rows), shared, model])
         self.model = np.linalg.qr(model)[0]
         mine -= self.model @ (self.model.T @ mine)
         values, axes = np.linalg.eigh(mine.T @ mine)
@@ -128,6 +137,8 @@ class World:
         b = rng.standard_normal(len(self.stop))
         b += self.family.stop_sd * rng.standard_normal(self.stops)[self.stop]
         b += self.family.place_sd * rng.standard_normal(PLACES)[self.place]
+        lone = self.place if self.family.places else self.stop
+        b += self.family.lone_sd * rng.standard_normal() * (lone == 0)
         b += effect * self.columns[:, 0]
         b -= self.model @ (self.model.T @ b)
         return self._ways(np.einsum("bki,bk->bi", self._cells(), b.reshape(-1, EACH)))

@@ -230,7 +230,8 @@ def _tail(found: ScoreTest, among: int = 0) -> float:
     chance = found.chance
     if chance.d <= 0.0:
         return 1.0
-    each = min(chance.over(found.statistic) * found.dof, found.statistic)
+    narrower = min(chance.trace / found.dof, 1.0)  # by chance: no less than single rows scatter
+    each = chance.over(found.statistic) * found.dof * narrower
     tail = float(special.fdtrc(among or chance.nu, chance.d, each / (among or found.dof)))
     return min(chance.looks * tail, 1.0)
 

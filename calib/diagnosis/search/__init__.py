@@ -27,7 +27,6 @@ from calib.diagnosis.search.confirmed import (
 from calib.diagnosis.search.mishaps import adapted, restored
 from calib.diagnosis.stand import Look, Stand, tried
 from calib.effects import Effect
-from calib.residuals.groups import CAD, MESH
 from calib.solve.fit import Progress
 
 MOST_NEEDED = 3  # an explanation that needs more names than this is none: a choice
@@ -45,7 +44,7 @@ class NamedEffect:
         candidate: as it stood out before, in its best shape.
         before, after: the looks before it was fitted and after.
         judged: its test with clusters jackknifed.
-        p_adjusted: as judged.
+        p_adjusted: as judged, or of the blunders in whose place it stands.
         rivals: candidates that explain as much, and what to tell them apart by.
     """
 
@@ -235,7 +234,7 @@ def _one_for_all(
     What slips late is seen by few stops, and these may seem to be as many mishaps: a robust fit
     gives them little weight, so an effect explains less than each of them at first.
     """
-    if len({b.group.where for b in wild} - {CAD, MESH}) < FEWEST_ALIKE:
+    if len({(b.group.recording, b.group.stop) for b in wild if b.group.stop}) < FEWEST_ALIKE:
         return []
     for candidate in suspects(look.named, ALPHA_EFFECT):
         fewer = candidate.test.dof < sum(len(b.shift.offset) for b in wild)
@@ -267,7 +266,7 @@ def _fitted(
     if instead and any(b.found for b in after.blunders):
         return []
     step = NamedEffect(
-        candidate=replace(candidate, effect=effect, p_value=test.p_value()),
+        candidate=replace(candidate, effect=effect, p_value=min(test.p_value(), p)),
         before=look,
         after=after,
         judged=test,

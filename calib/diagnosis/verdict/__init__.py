@@ -171,7 +171,7 @@ def conclude(
     bad = bool(spoilt or found.blunders)
     doubt = None if bad or more else _unconfirmed(found, over)
     calm = BAD if forbids else UNNAMED if doubt else "adequate"
-    verdict = BAD if bad else _verdict(found, hold, more, calm)
+    verdict = BAD if bad else _verdict(found, hold, more or bool(doubt and found.chance), calm)
     candidates = candidate_documents(heavy, held_out, verdict == UNNAMED, hold)
     untestable = _untestable(first)
     unexplained = _structure(found, verdict, formulas, rejected, doubt)
@@ -222,7 +222,9 @@ def _unconfirmed(found: Search, over: float) -> Candidate | None:
     """Structure that single beams show, where the held-out error is larger than chance makes it and
     no structure or effect is found: so few stops, or walls, see each part of it that they may
     differ by chance as much."""
-    there = found.unnamed or found.found or not found.looks[0].stand.estimate.scans
+    there = (
+        found.unnamed or found.found or found.at_first or not found.looks[0].stand.estimate.scans
+    )
     if there or over <= (HELD_OUT_BESIDE_SCATTER if found.chance else HELD_OUT_BY_CHANCE):
         return None
     return next(suspects(found.looks[-1].unnamed, ALPHA_UNNAMED), None)
@@ -266,7 +268,7 @@ def _leave_most(found: Search, held_out: Mapping[str, Fall]) -> bool:
     """Whether the names leave most of the held-out error, where that is further above its floor
     than chance puts it."""
     falls = [held_out[s.effect.name] for s in found.found if s.effect.name in held_out]
-    if not falls or not found.looks[0].stand.estimate.scans:
+    if not falls or falls[-1].takes_back or not found.looks[0].stand.estimate.scans:
         return False
     whole = replace(falls[-1], before_mm=falls[0].before_mm)
     return whole.after_mm > HELD_OUT_BY_CHANCE * whole.floor_mm and explained(whole) < ABSORBED

@@ -23,7 +23,7 @@ from calib.diagnosis.verdict.unnamed import Unnamed, with_formulas
 from calib.effects import Effect, Site
 from calib.problem.build import shapes_of
 from calib.results.errors import Errors
-from calib.results.holdout import Fall
+from calib.results.holdout import TAKEN_BACK, Fall
 from calib.solve.fit import Progress
 
 # Of what a formula does, in squared sigmas, which an effect does too: a choice. What it leaves is
@@ -57,7 +57,9 @@ def by_name(
     if effect is None or (stand := tried(look.stand.with_effects, [effect], progress)) is None:
         return None
     errors = unseen(stand)
-    if errors.rms_mm > with_formulas_mm + FALL_MATTERS * errors.floor_mm:
+    (thrown, still), now = formulas.thrown or (0.0, 0.0), errors.rejected_share or 0.0
+    worse = errors.rms_mm > with_formulas_mm + FALL_MATTERS * errors.floor_mm
+    if worse or now > still + TAKEN_BACK:
         return None
     after, sure = stand.look(progress), formulas.formulas[0].steps[0]
     candidate = next(c for c in alike if c.effect.family == effect.family)
@@ -65,12 +67,11 @@ def by_name(
     step = _as_fitted(candidate, look, after, sure.p_adjusted)
     unnamed = structures(after, progress)
     named = replace(found, looks=[*found.looks, after], found=[step], unnamed=unnamed)
-    before, _ = formulas.thrown or (0.0, 0.0)
     fall = Fall(
         before_mm=before_mm,
         after_mm=errors.rms_mm,
         floor_mm=errors.floor_mm,
-        rejected_share=(before, errors.rejected_share or 0.0),
+        rejected_share=(thrown, now),
     )
     return named, {effect.name: fall}
 
@@ -82,10 +83,13 @@ def _as_fitted(candidate: Candidate, before: Look, after: Look, p_adjusted: floa
     scores = project(after.linear, names)
     theta = np.concatenate([estimate.values[name] for name in names])
     told = scores.information @ theta
+    own = score_test(scores, np.arange(len(theta)))
     test = replace(
         candidate.test,
         statistic=float(theta @ told),
-        whiten=score_test(scores, np.arange(len(theta))).whiten,
+        whiten=own.whiten,
+        chances=own.chances,
+        clusters=own.clusters,
         score=told,
     )
     whole = before.named.scores.whole.copy()

@@ -182,6 +182,8 @@ def weighed(
             elif key == "unnamed":
                 what = " and ".join(words(c) for c in hangs_on(candidate.effect))
                 traces.append(_sentence(f"structure over {what}", candidate, look.unnamed, told))
+    if not refused and not named:
+        kept["at_first"] = []  # nothing stands in the way of what is left
     return Weighed(replace(found, found=named, **kept), matter, traces, refused=refused)
 
 
