@@ -19,6 +19,7 @@ SLIGHT_LEFT = 0.05  # of a direction's information: with less of it left, nobody
 # Of a part's information, from which a cluster is worth a look without it: where none holds as much
 # there are ten degrees of freedom or more, and the test's limit is at most 2.6 times the least.
 HEAVY = 0.1
+NEARLY = 0.25  # of what others say, by which clusters left out may be off whatever they scatter
 DISAGREE = 0.01  # how seldom clusters left out would be as far from what others say: a choice
 LIMIT = 1e-4  # about the level of one test of an effect after all looks, for what judges it best
 HIGHEST_WORTH = 1.0 / float(special.chdtri(1.0, LIMIT))  # of a share of 1: with d without end
@@ -181,18 +182,23 @@ class Judges:
         return every, replace(rest, covariance=wider, ratio=ratio, share=self.best.share)
 
     def _agree(self, scores: np.ndarray, rest: ScoreSpread) -> bool:
-        """Whether the clusters left out show what the others say, as far as these scatter. An error
-        of their own would have moved the model, and by that the others, the other way."""
+        """Whether the clusters left out show what the others say, within a quarter of it or as far as
+        these scatter. An error of their own would have moved the model, and by that the others, the
+        other way; an effect whose shape is not quite right is off by less."""
         kept, whiten = self.best.kept, self.best.whiten
         told = scores[kept].sum(axis=0) @ whiten @ whiten.T
         held = self.best.information[~kept].sum(axis=0)
-        off = scores[~kept].sum(axis=0) - held @ told
+        said = held @ told
+        off = scores[~kept].sum(axis=0) - said
         variance = held + held @ whiten @ whiten.T @ held
         values, axes = np.linalg.eigh(variance)
         seen = values > SLIGHT_LEFT
         if not seen.any() or rest.d <= 0.0:
             return True
-        square = float(np.sum(np.square(axes[:, seen].T @ off) / values[seen]))
+        root = axes[:, seen] / np.sqrt(values[seen])
+        square = float(np.square(off @ root).sum())
+        if square < NEARLY**2 * float(np.square(said @ root).sum()):
+            return True
         times = square / max(rest.trace / len(rest.covariance), 1e-300) / int(seen.sum())
         return bool(special.fdtrc(int(seen.sum()), rest.d, times) > DISAGREE)
 
