@@ -30,11 +30,11 @@ Where few clusters hold most of the information, few degrees of freedom are left
 others agree. Then the others are asked by themselves, in the second way: those without the cluster
 that holds most, without the next, and so on, which would find the smallest effect (`judges`).
 Information alone decides which they are; their p-value is doubled, as it hardly depends on that of
-all. They count only where the clusters left out agree with them, to a quarter or by chance: an error
-of such a cluster moves the model, and by that all others alike. A limit, of signs as well: with 17
-unknowns that all stops share, and one stop that holds a third of the information and errs by ten of
-a row's sigmas, 0.1 to 0.7 of empty worlds show something at 0.001 (family "one stop, it errs").
-Such a stop is a blunder, which is left out before.
+all. They count only where the clusters left out agree with them, to a quarter or by chance: an
+error of such a cluster moves the model, and by that all others alike. A limit, of signs as well:
+with 17 unknowns that all stops share, and one stop that holds a third of the information and errs
+by ten of a row's sigmas, 0.1 to 0.7 of empty worlds show something at 0.001 (family "one stop, it
+errs"). Such a stop is a blunder, which is left out before.
 
 The smaller of both p-values counts: where nothing is missing the second is hardly ever the smaller,
 but for a single parameter, where both are nearly the same. Measured by `tests/bench/bench_size.py`

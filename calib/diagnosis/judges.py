@@ -182,7 +182,7 @@ class Judges:
         return every, replace(rest, covariance=wider, ratio=ratio, share=self.best.share)
 
     def _agree(self, scores: np.ndarray, rest: ScoreSpread) -> bool:
-        """Whether the clusters left out show what the others say, within a quarter of it or as far as
+        """Whether the clusters left out show what the others say, to a quarter of it or as far as
         these scatter. An error of their own would have moved the model, and by that the others, the
         other way; an effect whose shape is not quite right is off by less."""
         kept, whiten = self.best.kept, self.best.whiten
