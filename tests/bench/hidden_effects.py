@@ -31,6 +31,7 @@ from calib.diagnosis.suggest import hangs_on
 from calib.diagnosis.verdict import conclude
 from calib.effects import Effect
 from calib.problem.model import Source
+from calib.results.holdout import held_out
 from calib.solve.fit import solve
 from sensors.documents import plain
 
@@ -104,9 +105,12 @@ def _described(case: Case, hidden: Hidden, truth: dict[str, Any]) -> dict[str, A
 
 def _said(found: Search) -> dict[str, Any]:
     """What the diagnosis says, and the numbers behind it."""
-    summary = {"misfit": {}, "rms_mm": dict.fromkeys(("held_out", "fit", "noise_floor"), 0.0)}
-    said = conclude(found, {}, summary, ())
     first = found.looks[0]
+    stand = first.stand
+    unseen = held_out(stand.sources, stand.model, "location", 2, silent, stand.estimate.start)
+    rms_mm = dict.fromkeys(("held_out", "fit"), unseen.rms_mm)
+    summary = {"misfit": {}, "rms_mm": {**rms_mm, "noise_floor": unseen.floor_mm}}
+    said = conclude(found, {}, summary, ())
     named = first.named
     return {
         "verdict": said.verdict,
