@@ -52,7 +52,7 @@ class Poses:
         return Poses(self.location[at], self.joints[at], self.Ts_world_root[at])
 
 
-@dataclass
+@dataclass(eq=False)
 class PlannedStore(BeamStore):
     """The scans of a recording, and of the stops planned after its last: directions without ranges.
 
