@@ -89,7 +89,7 @@ class World:
             return [] if error is None else [SimpleNamespace(covariates=("wind",), after=error)]
 
         monkeypatch.setattr(module, "find", find)
-        monkeypatch.setattr(module, "with_formulas", lambda stand, formulas, progress: formulas[0].after)
+        monkeypatch.setattr(module, "with_formulas", lambda _, formulas, __: formulas[0].after)
 
     def unnamed(self, doubtful=False, looks=True):
         def unseen(stand):
