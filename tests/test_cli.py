@@ -259,7 +259,7 @@ def test_progress_is_shown_at_a_terminal_and_never_on_stdout(folder):
 
 def test_an_interrupted_fit_leaves_the_earlier_run_as_it_was(folder):
     before = contents(folder)
-    arguments = ["fit", folder / "rec", "-o", folder / "run", "--hold-out", "stop", "--folds", 3]
+    arguments = ["fit", folder / "rec", "-o", folder / "run", "--hold-out", "stop", "--folds", 5]
     with at_a_terminal(*arguments) as (process, shown):
         while not list(folder.glob(".run.rigcal/kept/*/*.npz")):  # beside its result
             assert process.poll() is None, "".join(shown)
