@@ -32,9 +32,10 @@ that holds most, without the next, and so on, which would find the smallest effe
 Information alone decides which they are; their p-value is doubled, as it hardly depends on that of
 all. They count only where the clusters left out agree with them, to a quarter or by chance: an
 error of such a cluster moves the model, and by that all others alike. A limit, of signs as well:
-with 17 unknowns that all stops share, and one stop that holds a third of the information and errs
-by ten of a row's sigmas, 0.1 to 0.7 of empty worlds show something at 0.001 (family "one stop, it
-errs"). Such a stop is a blunder, which is left out before.
+with 17 unknowns that all stops share, and one stop that holds half of the information or more and
+errs by ten of a row's sigmas, 0.5 to 0.9 of empty worlds show something (family "one stop, it errs,
+wide model", 1 and 4 parameters, 12 to 30 stops). In a recording such a stop is a blunder, which is
+left out before.
 
 The smaller of both p-values counts: where nothing is missing the second is hardly ever the smaller,
 but for a single parameter, where both are nearly the same. Measured by `tests/bench/bench_size.py`
@@ -43,8 +44,9 @@ alone, stops err together by up to three times a row's sigma, stops and surfaces
 three stops show most of the effect, or it acts within stops only, 0.02 to 0.07 of empty worlds
 show something, stops averaged over (0.12 in the worst of 240 cases); none, where parameters that
 act by stop are as many as the stops. A limit: 0.13 with few stops where surfaces err by three times
-a row's sigma and the model does not know it. Of an effect of 10 sigmas that three of thirty stops,
-or two of 25 surfaces, show, 0.7 and 0.9 are found at 0.001, by signs alone none.
+a row's sigma and the model does not know it. An effect of 10 sigmas is found at 0.001 in 0.7 of
+worlds where three of thirty stops show most of it, in 0.9 where two of 25 surfaces do, and by signs
+alone in none.
 
 A model that itself has unknowns which differ by stop alone, a drift say, fits a part of what stops
 err by, and residuals scatter less than errors. With n stops and k such unknowns, covariances by
@@ -87,7 +89,7 @@ class ScoreSpread:
         nu, d: degrees of freedom of the statistic over the covariance's trace.
         clusters: how many even clusters would tell as much of the covariance.
         ratio: of the statistic to that trace, where not all clusters judge it.
-        share: of the information, that judges it.
+        share: of the information, that these clusters hold.
     """
 
     covariance: np.ndarray

@@ -15,13 +15,14 @@ from scipy import special
 from calib.diagnosis.jackknife import Clusters, ScoreSpread, by_leaving_out, by_signs
 from calib.linear.clusters import ClusteredRows, summed
 
-SLIGHT_LEFT = 0.05  # of a direction's information: with less of it left, nobody is asked about it
+SLIGHT_LEFT = 0.05  # of a direction's information: with less of it left, it is not tested
 # Of a part's information, from which a cluster is worth a look without it: where none holds as much
 # there are ten degrees of freedom or more, and the test's limit is at most 2.6 times the least.
 HEAVY = 0.1
-NEARLY = 0.25  # of what others say, by which clusters left out may be off whatever they scatter
-DISAGREE = 0.01  # how seldom clusters left out would be as far from what others say: a choice
-LIMIT = 1e-4  # about the level of one test of an effect after all looks, for what judges it best
+# Share of what the others say by which clusters left out may differ from it in any case; beyond it,
+# the p-value below which they disagree. Both are choices.
+NEARLY, DISAGREE = 0.25, 0.01
+LIMIT = 1e-4  # the level at which parts are compared: about that of one test after all looks
 HIGHEST_WORTH = 1.0 / float(special.chdtri(1.0, LIMIT))  # of a share of 1: with d without end
 
 

@@ -155,13 +155,7 @@ class Stand:
         """An effect with its shape chosen more finely than the grid on which it was found."""
         if not effect.shape_name:
             return effect
-        grid = shapes_of(effect, self.sources)
-        i = grid.index(effect.shape)
-        ends = grid[max(0, i - 1)], grid[min(len(grid) - 1, i + 1)]
-        spaced = (np.geomspace if ends[0] > 0 else np.linspace)(*ends, FINER)
-        spaced = np.rint(spaced) if effect.whole else spaced
-        finer = {f"{shape:.6g}": None for shape in (*spaced, effect.shape)}
-        shaped = [effect.at(float(shape)) for shape in finer]
+        shaped = finer(effect, shapes_of(effect, self.sources))
         linear, at = self.linearise(shaped, progress)
         scores = project(linear, linear.candidates)
         return max(shaped, key=lambda e: score_test(scores, at[e.name]).statistic)
@@ -324,6 +318,16 @@ class Look:
         for rows in rows_along(self.linear, wide, stand.estimate, away, tell):
             shares.add(rows)
         return found.judged(shares)
+
+
+def finer(effect: Effect, grid: Sequence[float]) -> list[Effect]:
+    """An effect in finer shapes between those of a grid beside its own, which is one of them."""
+    i = grid.index(effect.shape)
+    ends = grid[max(0, i - 1)], grid[min(len(grid) - 1, i + 1)]
+    spaced = (np.geomspace if ends[0] > 0 else np.linspace)(*ends, FINER)
+    spaced = np.rint(spaced) if effect.whole else spaced
+    shapes = {float(f"{shape:.6g}") for shape in (*spaced, effect.shape)}
+    return [effect.at(shape) for shape in sorted(shapes)]
 
 
 def tried(fit: Callable[..., Stand], *of: Any) -> Stand | None:

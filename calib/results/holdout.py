@@ -30,9 +30,8 @@ Values = Mapping[str, np.ndarray]
 FOLDS = 5  # a fit leaves out about a fifth of the locations
 POSE_BLOCKS = 3 * FOLDS  # of poses: a fold leaves out three, far from each other
 BY_CHANCE = 0.05  # level at which a fall of the held-out error is called one: by convention
-
-
-TAKEN_BACK = 0.01  # of all beams: as a hundredth of an error matters (`diagnosis.verdict.matters`)
+# Of all beams, fewer of which are rejected: a hundredth, as of an error (`FALL_MATTERS`).
+TAKEN_BACK = 0.01
 
 
 @dataclass(frozen=True)

@@ -137,8 +137,9 @@ class World:
         b = rng.standard_normal(len(self.stop))
         b += self.family.stop_sd * rng.standard_normal(self.stops)[self.stop]
         b += self.family.place_sd * rng.standard_normal(PLACES)[self.place]
-        lone = self.place if self.family.places else self.stop
-        b += self.family.lone_sd * rng.standard_normal() * (lone == 0)
+        if self.family.lone_sd:
+            lone = self.place if self.family.places else self.stop
+            b += self.family.lone_sd * rng.standard_normal() * (lone == 0)
         b += effect * self.columns[:, 0]
         b -= self.model @ (self.model.T @ b)
         return self._ways(np.einsum("bki,bk->bi", self._cells(), b.reshape(-1, EACH)))

@@ -250,8 +250,8 @@ def _fitted(
     progress: Progress,
     instead: Sequence[Blunder] = (),
 ) -> list[NamedEffect]:
-    """What was found, and a candidate, fitted; nothing where it is not confirmed. `Instead` of
-    blunders it is confirmed where it leaves none: the recording is then as sure to be otherwise."""
+    """What was found, and a candidate, fitted; nothing where it is not confirmed. One that is tried
+    `instead` of blunders is confirmed if it leaves no blunder, at their p-value."""
     test, p = judged(look, candidate, progress)
     p = max((b.p_adjusted for b in instead), default=p)
     if p >= ALPHA_EFFECT:

@@ -153,13 +153,13 @@ def conclude(
 
     Args:
         found: the search.
-        held_out: effect -> how the held-out error falls once it is truly fitted; of the last that
-            scatters by chance, where that error was larger than expected without.
+        held_out: effect, or what scatters -> how the held-out error falls once it is fitted.
         summary: of the run: its errors, and its misfit by instrument.
         weak: weak directions.
         rejected: what the fit threw away.
         forbids: why the run is not to be believed, whatever its model explains; a clause each.
-        rings, formulas: whose numbers are wrong, as blunders; and those of residual structure.
+        rings: whose numbers are wrong, as blunders.
+        formulas: of residual structure.
     """
     heavy = weighed(found, held_out, summary["rms_mm"])
     found, first = heavy.found, found.looks[0]

@@ -17,9 +17,9 @@ from calib.diagnosis.score import information_left, project, score_test
 from calib.diagnosis.screen import Candidate
 from calib.diagnosis.search import NamedEffect, Search
 from calib.diagnosis.search.confirmed import structures
-from calib.diagnosis.stand import FINER, Look, Stand, tried, variables_of
+from calib.diagnosis.stand import Look, Stand, finer, tried, variables_of
 from calib.diagnosis.verdict.matters import FALL_MATTERS
-from calib.diagnosis.verdict.unnamed import Unnamed, with_formulas
+from calib.diagnosis.verdict.unnamed import Unnamed
 from calib.effects import Effect, Site
 from calib.problem.build import shapes_of
 from calib.results.errors import Errors
@@ -35,8 +35,8 @@ ZOOMS = 3  # on the best shape, each to a quarter of the interval
 def by_name(
     found: Search, formulas: Unnamed, unseen: Callable[[Stand], Errors], progress: Progress
 ) -> tuple[Search, dict[str, Fall]] | None:
-    """A search with the effect that formulas draw, and how the held-out error falls with it; None
-    where there is none, or an effect was named.
+    """A search with the effect that formulas describe, and how the held-out error falls with it;
+    None where there is none, or an effect was named.
 
     Args:
         found: the search.
@@ -44,7 +44,7 @@ def by_name(
         unseen: errors of a fit at stops that were held out.
         progress: as of `fit.solve`.
     """
-    if found.found or formulas.fall_mm is None:
+    if found.found or formulas.fitted is None:
         return None
     look, (before_mm, with_formulas_mm) = found.looks[-1], formulas.fall_mm
     drawn = {c for each in formulas.formulas for c in each.covariates}
@@ -52,8 +52,7 @@ def by_name(
     alike = [c for c in alike if c.effect.site is Site.BEAM]
     if not alike:
         return None
-    drawn_by = with_formulas(look.stand, formulas.formulas, progress)
-    effect = _doing_the_same(drawn_by, look.stand.model.names, alike, progress)
+    effect = _doing_the_same(formulas.fitted, look.stand.model.names, alike, progress)
     if effect is None or (stand := tried(look.stand.with_effects, [effect], progress)) is None:
         return None
     errors = unseen(stand)
@@ -120,10 +119,7 @@ def _doing_the_same(
     best = max(shaped, key=lambda e: likeness[e.name])
     grid = sorted(e.shape for e in shaped if e.family == best.family and e.shape_name)
     for _ in range(ZOOMS if grid else 0):
-        i = grid.index(best.shape)
-        ends = grid[max(0, i - 1)], grid[min(len(grid) - 1, i + 1)]
-        grid = sorted({*np.linspace(*ends, FINER).tolist(), best.shape})
-        shaped = list({(e := best.at(float(f"{shape:.6g}"))).name: e for shape in grid}.values())
+        shaped = finer(best, grid)
         grid = [e.shape for e in shaped]
         likeness = _likeness(stand, formulas, shaped, progress)
         best = max(shaped, key=lambda e: likeness[e.name])

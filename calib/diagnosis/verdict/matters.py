@@ -33,7 +33,7 @@ FALL_MATTERS, SHIFT_MATTERS = 0.01, 0.5
 # to 30 stops, the largest was 1.23.
 HELD_OUT_BY_CHANCE = 1.25
 # The same of models with something that scatters beyond its sigma: of 24 by that simulator the
-# largest was 1.31, with a mesh three times as bad as stated, whose errors are no steps.
+# largest was 1.31, with a mesh three times as bad as stated, whose errors steps only approach.
 HELD_OUT_BESIDE_SCATTER = 1.4
 
 

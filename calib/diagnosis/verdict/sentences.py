@@ -10,7 +10,8 @@ from calib.diagnosis.screen import Candidate
 from calib.diagnosis.search import NamedEffect
 from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import hangs_on, words
-from calib.diagnosis.verdict.matters import FALL_MATTERS, Weighed
+from calib.diagnosis.verdict.matters import Weighed
+from calib.results.holdout import TAKEN_BACK
 
 UNNAMED, BAD = "unexplained_structure", "bad_data"
 MOST_LISTED = 6  # untestable effects and rivals that a sentence names
@@ -142,7 +143,7 @@ def _formula_sentences(each: Mapping[str, Any], residual: str) -> list[str]:
     before, after = (each["held_out_rms_mm"][k] for k in ("before", "after"))
     fall = f" The held-out error goes from {before:.2f} to {after:.2f} mm." if after else ""
     was, now = (each["rejected_share"][k] for k in ("before", "after"))
-    if None not in (was, now) and was - now > FALL_MATTERS:
+    if None not in (was, now) and was - now > TAKEN_BACK:
         fall += f" Rejected beams go from {100 * was:.1f} to {100 * now:.1f} %."
     out = [
         f"Its formula: {each['says']}.",

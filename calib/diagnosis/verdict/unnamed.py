@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from calib.diagnosis.candidates import PoseShape
@@ -34,6 +34,7 @@ class Unnamed:
         thrown: the share of the held-out beams without weight, before and after; None where that
             is not known.
         refused: a sentence, where held-out stops are predicted no better with them.
+        fitted: the model with them, where they are told and somebody looked.
     """
 
     formulas: Sequence[Formula] = ()
@@ -41,6 +42,7 @@ class Unnamed:
     fall_mm: tuple[float, float] | None = None
     thrown: tuple[float, float] | None = None
     refused: str = ""
+    fitted: Stand | None = field(default=None, repr=False, compare=False)
 
     def documents(self, taken: Sequence[str]) -> list[dict[str, Any]]:
         """As in diagnosis.json, to be added by names that the model has not."""
@@ -90,7 +92,8 @@ def unnamed(
     formulas = find(last, progress)
     if not formulas or unseen is None:
         return Unnamed(formulas)
-    before, after = unseen(last), unseen(with_formulas(last, formulas, progress))
+    fitted = with_formulas(last, formulas, progress)
+    before, after = unseen(last), unseen(fitted)
     fall_mm = before.rms_mm, after.rms_mm
     if moves and after.rms_mm > HELD_OUT_BY_CHANCE * after.floor_mm:
         return Unnamed()
@@ -98,7 +101,7 @@ def unnamed(
     thrown = before.rejected_share or 0.0, after.rejected_share or 0.0
     fall = Fall(*fall_mm, after.floor_mm, rejected_share=thrown)
     if fall.takes_back or fall_mm[0] - fall_mm[1] > FALL_MATTERS * after.floor_mm:
-        return Unnamed(formulas, False, fall_mm, thrown)
+        return Unnamed(formulas, False, fall_mm, thrown, fitted=fitted)
     over = " and ".join(words(c) for c in formulas[0].covariates)
     return Unnamed(
         refused=f"A formula over {over} fits part of the residuals, but stops that were held out "
