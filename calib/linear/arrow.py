@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
 from scipy.sparse import csr_array, issparse
+from scipy.sparse.csgraph import connected_components
 
 from calib.linear.elimination import square
 
@@ -75,6 +76,23 @@ class Arrow:
             out[some] = inverse.mT @ mine
             start += some.size
         return out.reshape(right.shape)
+
+
+def apart(H: csr_array, among: np.ndarray) -> list[np.ndarray]:
+    """Some columns of H (U, U) in sets between which it has no entry."""
+    _, label = connected_components(H[among][:, among], directed=False)
+    order = np.argsort(label, kind="stable")
+    return np.split(among[order], np.flatnonzero(np.diff(label[order])) + 1)
+
+
+def cheapest(size: int, *ways: Sequence[np.ndarray]) -> Sequence[np.ndarray]:
+    """Of several ways to have sets of so many unknowns apart, that with the fewest products to
+    factor it by."""
+
+    def products(own: Sequence[np.ndarray]) -> int:
+        return (size - sum(map(len, own))) ** 3 + sum(len(columns) ** 3 for columns in own)
+
+    return min(ways, key=products)
 
 
 def _dense(matrix: csr_array | np.ndarray) -> np.ndarray:

@@ -18,7 +18,7 @@ from calib.diagnosis.formulas.drawn import DrawnBeams, rows_over
 from calib.diagnosis.judges import Shares
 from calib.diagnosis.linear import beside, other_rows
 from calib.diagnosis.score import GAUGE, Scores, ScoreTest, score_test
-from calib.linear.arrow import Arrow
+from calib.linear.arrow import Arrow, apart, cheapest
 from calib.linear.clusters import ClusteredRows, Gradients, summed
 from calib.linear.layout import Layout
 from calib.linear.rows import TWIST
@@ -56,7 +56,8 @@ class BeamTable:
         unit: of `residual_m` and `sigma_m`: m of a range, or rad of a joint; see `joint_tables`.
         joints: which covariates are joints of the arm.
         weight_m2: of all that was measured, 1/m2; None where that is these rows.
-        own: columns of unknowns that only one stop has, of each stop.
+        own: sets of unknowns of which no row depends on two: those that only one stop has, of each
+            stop, or parts of surfaces, of each surface.
     """
 
     covariates: Mapping[str, np.ndarray]
@@ -102,7 +103,11 @@ class BeamTable:
         drawn, place = [d for d, _ in every], [numbers[d.met] for d, numbers in every]
         names = [n for n in drawn[0].columns if all(n in d.columns for d in drawn)]
         others, b, others_stop, others_place = rows_of_others(problem, layout, values, places)
-        chains = [*(d.chain for d in drawn), eye_array(layout.size, format="csr")]
+        twists = csr_array(vstack([d.twists for d in drawn]))
+        chain = csr_array(vstack([*(d.chain for d in drawn), eye_array(layout.size, format="csr")]))
+        met = abs(twists) @ abs(chain)
+        cells = np.concatenate([layout.finest, layout.cells])
+        surfaces = apart(met.T @ met + abs(others).T @ abs(others), cells)
         return cls(
             covariates={n: np.concatenate([d.column(n) for d in drawn]) for n in names},
             by_stop=frozenset(n for n in names if all(len(d.columns[n]) == 1 for d in drawn)),
@@ -111,14 +116,14 @@ class BeamTable:
             stop=np.concatenate([np.full(len(d.residual_m), d.stop) for d in drawn]),
             place=np.concatenate(place),
             share=share,
-            twists=csr_array(vstack([d.twists for d in drawn])),
-            chain=csr_array(vstack(chains)),
+            twists=twists,
+            chain=chain,
             others=others,
             others_b=b,
             others_stop=others_stop,
             others_place=others_place,
             joints=frozenset(scans[0].stops.rig.joint_names),
-            own=list(layout.own.values()),
+            own=cheapest(layout.size, list(layout.own.values()), surfaces),
         )
 
     def __len__(self) -> int:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array
 
-from calib.linear.arrow import Arrow
+from calib.linear.arrow import Arrow, apart, cheapest
 
 
 def arrow(rng, sizes, shared):
@@ -41,3 +41,32 @@ def test_it_solves_as_dense_algebra_does(sizes, shared, sparse):
     assert factor.solve(right[:, :0]).shape == (len(H), 0)
     root = factor.root(right)
     np.testing.assert_allclose(root.T @ root, right.T @ expected, rtol=1e-6, atol=1e-9)
+
+
+def test_sets_apart_are_those_that_no_row_ties():
+    rng = np.random.default_rng(0)
+    H, own = arrow(rng, [3, 1, 2], 4)
+    among = np.concatenate(own)
+    found = {frozenset(some.tolist()) for some in apart(csr_array(H), rng.permutation(among))}
+    assert found == {frozenset(some.tolist()) for some in own}
+    (whole,) = apart(csr_array(H), np.arange(len(H)))  # what all share ties all
+    assert sorted(whole.tolist()) == list(range(len(H)))
+
+
+def test_the_cheapest_sets_leave_least_that_is_shared():
+    few, many = [np.arange(6)], [np.arange(6 + 3 * k, 9 + 3 * k) for k in range(10)]
+    assert cheapest(40, few, many) is many
+    assert cheapest(40, few, []) is few
+    one_large = [np.arange(36)]  # a set is factored whole
+    assert cheapest(40, one_large, many) is many
+
+
+@pytest.mark.parametrize("by", ["stops", "surfaces"])
+def test_an_answer_does_not_depend_on_the_sets(by):
+    rng = np.random.default_rng(3)
+    H, own = arrow(rng, [3, 3, 2], 4)
+    sets = own if by == "stops" else own[1:]
+    right = rng.normal(size=(len(H), 2)) * np.sqrt(np.diag(H))[:, None]
+    alone = Arrow.of(csr_array(H), []).solve(right)
+    found, size = Arrow.of(csr_array(H), sets).solve(right), np.sqrt(np.diag(H))[:, None]
+    np.testing.assert_allclose(found * size, alone * size, rtol=1e-6)
