@@ -15,6 +15,7 @@ from functools import cached_property
 import numpy as np
 from scipy import special
 from scipy.linalg import cho_factor, cho_solve
+from scipy.sparse import csr_array, vstack
 
 from calib.blunders.chance import at_least, enough, log_tail
 from calib.diagnosis.jackknife import ScoreSpread, by_signs
@@ -117,7 +118,11 @@ def away_from_model(linear: Linear, names: Sequence[str]) -> np.ndarray:
 
 def information_left(linear: Linear, names: Sequence[str]) -> np.ndarray:
     """Information (Q, Q) that is left of variables once projected."""
-    theirs, model, taken = projection(linear, names)
+    return _left(linear, *projection(linear, names))
+
+
+def _left(linear: Linear, theirs: np.ndarray, model: np.ndarray, taken: np.ndarray) -> np.ndarray:
+    """The same, projected so."""
     left = linear.information[np.ix_(theirs, theirs)]
     left = left - linear.information[np.ix_(theirs, model)] @ taken
     return (left + left.T) / 2
@@ -130,17 +135,17 @@ def project(linear: Linear, names: Sequence[str], spent: int = 0) -> Scores:
     for name in names:
         size = len(linear.at[name])
         at[name], start = slice(start, start + size), start + size
-    theirs, away = linear.among(names), away_from_model(linear, names)
-    own = np.concatenate([np.r_[linear.columns[name]] for name in names])
-    others = np.setdiff1d(np.flatnonzero(np.any(away != 0, axis=1)), own)
-    cells = linear.gradient[:, own].toarray() + linear.gradient[:, others] @ away[others]
+    theirs, model, taken = projection(linear, names)
+    every = csr_array(vstack([linear.gradient, csr_array(linear.score[None])]))
+    shares = linear.onto_kept(every)
+    shares = shares[:, theirs] - shares[:, model] @ taken
     return Scores(
         at=at,
         owner={name: linear.owner[name] for name in names},
-        score=linear.score[own] + linear.score[others] @ away[others],
-        information=information_left(linear, names),
+        score=shares[-1],
+        information=_left(linear, theirs, model, taken),
         whole=linear.raw[np.ix_(theirs, theirs)],
-        cells=cells,
+        cells=shares[:-1],
         stop=linear.stop,
         place=linear.place,
         weight_m2=linear.weight_m2,

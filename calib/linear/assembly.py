@@ -162,14 +162,13 @@ class Assembly:
     def done(self, values: Values) -> Linearisation:
         """Eliminate all but the kept."""
         self._finish_scanned()
-        count = len(self.cells)
+        count, stops = len(self.cells), list(self.waiting)
+        for first in range(0, len(stops), STOPS_TOGETHER):
+            self._finish_without_beams(stops[first : first + STOPS_TOGETHER])
         if self.raw is not None:
             before = self.half[count:-1, count:-1]
             self.raw += before + before.T
             self.half += self.taken
-        stops = list(self.waiting)
-        for first in range(0, len(stops), STOPS_TOGETHER):
-            self._finish_without_beams(stops[first : first + STOPS_TOGETHER])
         rest = self.half[count:, count:] + self.half[count:, count:].T
         if count:
             prior = self._cell_priors(values)
@@ -294,15 +293,13 @@ class Assembly:
 
     def _finish_without_beams(self, stops: Sequence[int]) -> None:
         """Eliminate what is their own from stops that have no beams. Their rows are few: they are
-        turned until no more of them touch a stop's own unknowns than there are of these (QR), and
-        all others go into one product."""
+        turned until no more of them touch a stop's own unknowns than there are of these (QR), which
+        go with these, and all others go into one product."""
         raw = []
         kept = positions(self.layout.size, self.layout.kept)
         for some in self._alike(stops):
             mine, at = self._columns(some[0])
             rows, count = self._stacked(some, at, len(mine)), len(self._own(some[0]))
-            if self.raw is not None:
-                raw.append(_over(rows, kept, mine[:-1]))
             if count:
                 Q, R = np.linalg.qr(rows[:, :, :count], mode="complete")
                 rows = Q.mT @ rows
@@ -312,10 +309,12 @@ class Assembly:
                     Eliminated(self._own(stop), over, root.T, gain)
                     for stop, root, gain in zip(some, R, gains, strict=True)
                 ]
+                if self.raw is not None:
+                    raw.append(_over(rows[:, :count, count:], kept, over[:-1]))
             self._add_squares(rows[:, count:, count:], self.at[mine[count:]])
             for stop in some:
                 del self.waiting[stop]
-        if self.raw is not None:
+        if raw:
             self.raw += square(np.vstack(raw))
 
     # ------------------------------------------------------------------------- stops' own rows

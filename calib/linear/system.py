@@ -120,6 +120,15 @@ class Linearisation:
         moved = self.directions(scaled[:, None])[:, 0] * self.layout.sigma
         return {name: moved[self.layout.at[name]] for name in self.layout.inner()}
 
+    def onto_kept(self, rows: csr_array) -> np.ndarray:
+        """Rows (n, S) over the kept alone, of rows (n, U) over all: with the eliminated unknowns as
+        they follow from the kept (see `followed`), the products are the same."""
+        out = np.zeros((rows.shape[0], len(self.layout.kept)))
+        for first in range(0, len(out), ROWS_AT_ONCE):
+            here = slice(first, first + ROWS_AT_ONCE)
+            *_, (_, out[here], _) = self._passed_on(rows[here])
+        return out
+
     def covariance(self, rows: np.ndarray, kept: np.ndarray) -> np.ndarray:
         """Covariance (q, q) of ``rows @ unknowns``.
 
@@ -128,35 +137,43 @@ class Linearisation:
             kept: (S, S) covariance of the kept.
         """
         out = np.zeros((len(rows), len(rows)))
-        for some, mine, known in self._shares(rows, kept):
+        for some, mine, known in self._shares(csr_array(rows), kept):
             out[np.ix_(some, some)] += mine @ known
         return out
 
     def _shares(
-        self, rows: np.ndarray, kept: np.ndarray
+        self, rows: csr_array, kept: np.ndarray
     ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         """What each step of the elimination, and the kept, add to a covariance of rows: of which
         rows (n,), these over some unknowns (n, e), and the unknowns' covariance with them (e, n);
         arguments as of `covariance`."""
-        sigma = self.layout.sigma
-        touched = np.flatnonzero(np.any(rows != 0, axis=0))
+        for some, mine, step in self._passed_on(rows):
+            yield some, mine, kept @ mine.T if step is None else step.solve(mine.T)
+
+    def _passed_on(
+        self, rows: csr_array
+    ) -> Iterator[tuple[np.ndarray, np.ndarray, Eliminated | None]]:
+        """Rows (q, U) as unknowns are eliminated: of each step which rows (n,) touch what goes in
+        it, these over that (n, e), in units of sigmas, and the step; last, all rows over the kept
+        (q, S), in the unknowns' own units."""
+        sigma, kept = self.layout.sigma, self.layout.kept
+        touched = np.unique(rows.indices)
         concerned = self._concerned(touched)
         # Over no more columns than these rows come to: of many stops they touch a few.
         parts = [p for each in concerned for p in (each.columns, each.over)]
-        columns = np.unique(np.concatenate([touched, self.layout.kept, [self.layout.size], *parts]))
+        columns = np.unique(np.concatenate([touched, kept, [self.layout.size], *parts]))
         at = positions(self.layout.size + 1, columns)
-        left = np.zeros((len(rows), len(columns)))
-        left[:, at[touched]] = rows[:, touched] * sigma[touched]
+        scaled = rows.data * sigma[rows.indices], at[rows.indices], rows.indptr
+        left = csr_array(scaled, (rows.shape[0], len(columns))).toarray()
         for each in concerned:
             mine = left[:, at[each.columns]]
             some = np.flatnonzero(np.any(mine != 0, axis=1))
             if not len(some):
                 continue
             mine = mine[some]
-            yield some, mine, each.solve(mine.T)
+            yield some, mine, each
             left[np.ix_(some, at[each.over])] -= mine @ each.gain
-        last = left[:, at[self.layout.kept]] / sigma[self.layout.kept]
-        yield np.arange(len(rows)), last, kept @ last.T
+        yield np.arange(len(left)), left[:, at[kept]] / sigma[kept], None
 
     @cached_property
     def _gone_in(self) -> np.ndarray:
@@ -197,6 +214,6 @@ class Linearisation:
         found = np.zeros(rows.shape[0])
         for first in range(0, len(found), ROWS_AT_ONCE):
             here = slice(first, first + ROWS_AT_ONCE)
-            for at, mine, known in self._shares(rows[here].toarray(), kept):
+            for at, mine, known in self._shares(rows[here], kept):
                 found[here][at] += np.einsum("ij,ji->i", mine, known)
         return np.split(found, ends[1:])[:-1]

@@ -165,25 +165,22 @@ def _true(found: Search, effect: Effect, truth: dict[str, Any]) -> dict[str, Any
 
 
 def _estimate(found: Search, effect: Effect, truth: dict[str, Any]) -> dict[str, Any] | None:
-    """Errors of the estimate in its sigmas, where the effect was named with its shape."""
+    """Errors of the estimate, in the sigmas that are told and in those of its test, where the
+    effect was named with its shape."""
     step = next((s for s in found.found if s.effect.name == effect.name), None)
     if step is None:
         return None
     stand, look = step.after.stand, step.after
     term = next(t for t in stand.problem.terms[0] if t.effect.name == effect.name)
     theta = np.array(truth["effects"][effect.name])[term.free]
-    start = 0
-    for variable in stand.estimate.variables:
-        if variable.name == term.variable:
-            break
-        start += variable.dim
-    chosen = slice(start, start + len(theta))
-    by_fit = np.sqrt(np.diag(stand.estimate.covariance)[chosen])
-    scores = project(look.linear, [term.variable])
-    by_test = score_test(scores, np.arange(len(theta))).sigma(look.named.common)
-    told = by_fit < LEFT_SIGMA * variable.sigma
-    off = (stand.estimate.values[term.variable] - theta)[told]
-    return {"by_fit": (off / by_fit[told]).tolist(), "by_test": (off / by_test[told]).tolist()}
+    told, sigma = stand.sigma(effect), stand.problem.variables[term.variable].sigma
+    by_test = score_test(project(look.linear, [term.variable]), np.arange(len(theta)))
+    known = told < LEFT_SIGMA * sigma
+    off = (stand.theta(effect) - theta)[known]
+    return {
+        "told": (off / told[known]).tolist(),
+        "by_test": (off / by_test.sigma(look.named.common)[known]).tolist(),
+    }
 
 
 def main() -> None:

@@ -191,12 +191,12 @@ def _others(of: dict[str, list[Result]]) -> list[tuple[str, ...]]:
 def _estimates(results: Sequence[Result]) -> list[tuple[str, ...]]:
     """Per sigma, how often the truth is within; every case counts alike."""
     lines = []
-    for key, what in (("by_fit", "the fit's"), ("by_test", "the clusters'")):
+    for key, what in (("told", "the sigma told"), ("by_test", "the test's sigma")):
         off = [np.abs(e[key]) for r in results for e in r["estimates"] if e and e[key]]
         if off:
             value = np.mean([np.mean(z < WITHIN) for z in off])
             rms = np.sqrt(np.mean([np.mean(z**2) for z in off]))
-            what = f"estimates within 95 % by {what} sigma"
+            what = f"estimates within 95 % by {what}"
             row = (what, str(len(off)), f"{value:.3f}", f"rms {rms:.2f} sigma", "0.93 to 0.97")
             lines.append(row)
     return lines

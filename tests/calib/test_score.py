@@ -78,6 +78,7 @@ class World:
             weight_m2=float(len(J)),
             whole=None,
             directions=lambda kept: kept,
+            onto_kept=csr_array.toarray,
         )
 
 

@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.sparse import csr_array
 
-from calib.linear import assembly
+from calib.linear import assembly, system
 from calib.linear.clusters import Gradients
 from calib.linear.parallel import workers
 
@@ -124,6 +125,19 @@ def test_covariances_are_those_of_dense_rows(case, together):
             at = dense.columns(names)
             found = estimate.covariance_of(names) / np.outer(sigma[at], sigma[at])
             np.testing.assert_allclose(found, correlation[np.ix_(at, at)], atol=1e-6)
+
+
+def test_rows_over_the_kept_say_of_them_what_those_over_all_say(case, together, monkeypatch):
+    """Whatever the kept do, the others following; some rows at a time, and those about nothing."""
+    monkeypatch.setattr(system, "ROWS_AT_ONCE", 4)
+    linear, rng = case.linear(), np.random.default_rng(6)
+    sigma, kept = linear.layout.sigma, linear.layout.kept
+    rows = rng.normal(size=(9, len(sigma))) * (rng.random((9, len(sigma))) < 0.2) / sigma
+    rows[4] = 0.0
+    moves = rng.normal(size=(len(kept), 3)) * sigma[kept, None]
+    expected = rows @ linear.followed(moves)
+    found = linear.onto_kept(csr_array(rows)) @ moves
+    np.testing.assert_allclose(found, expected, atol=1e-9 * np.abs(expected).max(initial=1.0))
 
 
 def test_covariances_of_rows_over_any_unknowns_are_those_of_dense_rows(case, together):
