@@ -1,7 +1,8 @@
 """Which clusters judge a candidate: all, and those that tell most where few of them dominate.
 
 Where few clusters hold most of the information, few degrees of freedom are left, however well all
-others agree. Then the others are asked by themselves as well; see `jackknife`.
+others agree. Then the others are asked by themselves as well, or all of them about those of its
+directions that no cluster dominates; see `jackknife`.
 """
 
 from __future__ import annotations
@@ -19,6 +20,10 @@ SLIGHT_LEFT = 0.05  # of a direction's information: with less of it left, it is 
 # Of a part's information, from which a cluster is worth a look without it: where none holds as much
 # there are ten degrees of freedom or more, and the test's limit is at most 2.6 times the least.
 HEAVY = 0.1
+# Of a direction's information: a cluster that holds more is not asked about it, nor any other.
+# Tried one after the other, as more shares leave fewer directions and more degrees of freedom.
+HELD_BY_ONE = (0.9, 0.7, 0.5)
+SAME_DIRECTION = 1e-6  # singular value of unit directions, below which one follows from the others
 # Share of what the others say by which clusters left out may differ from it in any case; beyond it,
 # the p-value below which they disagree. Both are choices.
 NEARLY, DISAGREE = 0.25, 0.01
@@ -66,7 +71,7 @@ class SomeCells:
     Args:
         kept: (n,) which of all cells.
         information: (n, r, r) of the whitened score, of all of them.
-        whiten: (r, k), of what the kept ones say.
+        whiten: (r, k), of what the kept ones say of the directions that are asked about.
         share: of the information, that they hold.
         ways: numbers (n,) of the stop and of the place of each; -1 for those that are not kept.
         clusters: by stop and by place.
@@ -83,19 +88,25 @@ class SomeCells:
 
     @classmethod
     def of(
-        cls, cells: np.ndarray, information: np.ndarray, kept: np.ndarray, spent: int
+        cls,
+        cells: np.ndarray,
+        information: np.ndarray,
+        kept: np.ndarray,
+        spent: int,
+        axes: np.ndarray | None = None,
     ) -> SomeCells | None:
-        """Some of the cells (n, 2), which hold (n, r, r); None where that is next to nothing."""
+        """Some of the cells (n, 2), which hold (n, r, r), about all directions or these (r, k), of
+        unit length and at right angles; None where they say next to nothing."""
         ways = tuple(_numbered(cells, kept, way) for way in (0, 1))
         by_stop, by_place = (_added(information, way) for way in ways)
         whole = by_stop.sum(axis=0)
-        values, axes = np.linalg.eigh(whole)
+        values, vectors = np.linalg.eigh(whole)
         seen = values > SLIGHT_LEFT
         if not seen.any():
             return None
-        whiten = axes[:, seen] / np.sqrt(values[seen])
+        whiten = vectors[:, seen] / np.sqrt(values[seen])
         if kept.all():
-            whiten = np.eye(len(values))
+            whiten = np.eye(len(values)) if axes is None else axes
         clusters = tuple(
             Clusters.of(whiten.T @ each @ whiten, _stated(cells[kept], way))
             for way, each in enumerate((by_stop, by_place))
@@ -104,7 +115,7 @@ class SomeCells:
             kept=kept,
             information=information,
             whiten=whiten,
-            share=float(np.trace(whole)) / len(whole),
+            share=float(np.trace(whole)) / len(whole) * whiten.shape[1] / int(seen.sum()),
             ways=ways,
             clusters=clusters,
             spent=spent,
@@ -129,6 +140,18 @@ class SomeCells:
         way = int(np.argmax([each.max() for each in self.shares]))
         return self.kept & (self.ways[way] != np.argmax(self.shares[way]))
 
+    def held_by_no_one(self, most: float) -> np.ndarray:
+        """Those of its directions (r, k) of which no stop, and no place, holds more than a share;
+        all cells being kept."""
+        axes = self.whiten
+        while axes.shape[1]:
+            held = [_held(each.information, self.whiten.T @ axes, most) for each in self.clusters]
+            if not (found := np.hstack(held)).shape[1]:
+                break
+            along, size, _ = np.linalg.svd(found)
+            axes = axes @ along[:, int((size > SAME_DIRECTION).sum()) :]
+        return axes
+
     def spread(self, scores: np.ndarray, nu: float | None = None) -> tuple[ScoreSpread, float]:
         """Chance from the scores (n, r) of all cells, and the statistic; `nu` is that of the
         statistic, by signs, and as these cells have it where None."""
@@ -143,15 +166,17 @@ class SomeCells:
     @property
     def alone(self) -> Clusters:
         """Each cell a cluster."""
-        whole = self.kept.all()
-        kept = self.information if whole else self.information[self.kept]
-        return Clusters.of(kept if whole else self.whiten.T @ kept @ self.whiten, len(kept))
+        kept, wide = self.information, self.whiten.shape
+        if not self.kept.all() or wide[0] > wide[1]:
+            kept = self.whiten.T @ kept[self.kept] @ self.whiten
+        return Clusters.of(kept, len(kept))
 
 
 @dataclass(frozen=True)
 class Judges:
-    """All cells, and the part of them that finds the smallest effect: without the cluster that
-    holds most, without the next, and so on. Scores have no say in which it is."""
+    """All cells, and what of them finds the smallest effect: those without the cluster that holds
+    most, without the next, and so on, or all about the directions that none dominates. Scores have
+    no say in which it is."""
 
     every: SomeCells
     best: SomeCells
@@ -159,8 +184,14 @@ class Judges:
     @classmethod
     def of(cls, cells: np.ndarray, information: np.ndarray, spent: int = 0) -> Judges:
         """As of `SomeCells`."""
-        every = best = this = SomeCells.of(cells, information, np.ones(len(cells), bool), spent)
-        if not every.worth:
+        whole = np.ones(len(cells), bool)
+        every = best = this = SomeCells.of(cells, information, whole, spent)
+        for most in HELD_BY_ONE:
+            axes = every.held_by_no_one(most)
+            if 0 < axes.shape[1] < len(axes):
+                part = SomeCells.of(cells, information, whole, spent, axes)
+                best = max(best, part, key=lambda part: part.worth)
+        if not best.worth:
             return cls(every, every)
         while max(each.max() for each in this.shares) > HEAVY:
             this = SomeCells.of(cells, information, this.without_the_heaviest(), spent)
@@ -202,6 +233,17 @@ class Judges:
             return True
         times = square / max(rest.trace / len(rest.covariance), 1e-300) / int(seen.sum())
         return bool(special.fdtrc(int(seen.sum()), rest.d, times) > DISAGREE)
+
+
+def _held(information: np.ndarray, axes: np.ndarray, most: float) -> np.ndarray:
+    """Directions among some (r, k) of which one cluster holds more than a share of the information
+    (c, r, r), all of them side by side (k, h)."""
+    found = [np.zeros((axes.shape[1], 0))]
+    for each in information:
+        if np.linalg.norm(each) > most:  # no less than what it holds of any direction
+            values, vectors = np.linalg.eigh(axes.T @ each @ axes)
+            found.append(vectors[:, values > most])
+    return np.hstack(found)
 
 
 def _numbered(cells: np.ndarray, kept: np.ndarray, way: int) -> np.ndarray:

@@ -16,7 +16,7 @@ webb    a restricted wild bootstrap by stops, with Webb's weights, studentised b
 KS      largest distance of the judged p-values from a uniform distribution
 
 The last table is power: effects of some sizes that all stops show, or three of them. One thread
-and five minutes.
+and ten minutes.
 """
 
 from __future__ import annotations
@@ -48,7 +48,8 @@ class Family:
     Args:
         act: how the candidate acts: sizes of its columns by row, by stop and by surface; `within`:
             its mean of every stop is taken off; `stops`, `places`: all but so many of
-            them show 0.15 of it.
+            them show 0.15 of it; `owned`: the first two surfaces show so much of its parameters,
+            all others 0.05 of these.
         stop_sd, place_sd: errors that the rows of a stop, or a surface, share, in those of a row.
         by_stop: how many unknowns of the model differ by stop alone.
         model: how many more of its unknowns all rows share.
@@ -62,6 +63,7 @@ class Family:
     within: bool = False
     stops: int = 0
     places: int = 0
+    owned: float = 0.0
     stop_sd: float = 0.0
     place_sd: float = 0.0
     model_by_stop: int = 0
@@ -86,6 +88,11 @@ FAMILIES = {
     "one surface, surfaces err a little": Family(places=1, place_sd=0.5),
     "one stop, it errs, wide model": Family(stops=1, lone_sd=10.0, model=15),
     "one surface, it errs, wide model": Family(places=1, lone_sd=3.0, model=15),
+    "two surfaces own half": Family(owned=0.5),
+    "two surfaces own half, stops err": Family(owned=0.5, stop_sd=3.0),
+    "two surfaces own half, both err": Family(owned=0.5, stop_sd=0.5, place_sd=0.5),
+    "two surfaces own half, one errs": Family(owned=0.5, lone_sd=3.0),
+    "two surfaces own half, one errs, wide model": Family(owned=0.5, lone_sd=3.0, model=15),
     "both err": Family(stop_sd=0.5, place_sd=0.5),
     "model by stop, stops err": Family(stop_sd=3.0, model_by_stop=3),
 }
@@ -110,6 +117,10 @@ class World:
             mine *= np.where(self.stop < family.stops, 1.0, 0.15)[:, None]
         if family.places:
             mine *= np.where(self.place < family.places, 1.0, 0.15)[:, None]
+        if family.owned:
+            last = round(family.owned * parameters)
+            theirs = self.place[:, None] == np.arange(last) % 2
+            mine[:, :last] *= np.where(theirs, 1.0, 0.05)
         model = rng.standard_normal((stops, family.model_by_stop))[self.stop]
         shared = rng.standard_normal((rows, 1 + family.model))
         shared += rng.standard_normal((stops, 1 + family.model))[self.stop] * bool(family.model)
@@ -138,9 +149,9 @@ class World:
         b += self.family.stop_sd * rng.standard_normal(self.stops)[self.stop]
         b += self.family.place_sd * rng.standard_normal(PLACES)[self.place]
         if self.family.lone_sd:
-            lone = self.place if self.family.places else self.stop
+            lone = self.place if self.family.places or self.family.owned else self.stop
             b += self.family.lone_sd * rng.standard_normal() * (lone == 0)
-        b += effect * self.columns[:, 0]
+        b += effect * self.columns.sum(axis=1) / np.sqrt(self.columns.shape[1])
         b -= self.model @ (self.model.T @ b)
         return self._ways(np.einsum("bki,bk->bi", self._cells(), b.reshape(-1, EACH)))
 
@@ -206,28 +217,30 @@ def drawn(
 def sizes(names: list[str], draws: int) -> Iterator[str]:
     """Lines of the table of sizes."""
     tests = ("signs", "out", "judged", "CV3", "webb")
-    yield f"{'family':26}{'r':>4}{'stops':>6}" + "".join(f"{t:>8}" for t in (*tests, "KS"))
+    yield f"{'family':44}{'r':>4}{'stops':>6}" + "".join(f"{t:>8}" for t in (*tests, "KS"))
     for name in names:
         for parameters in PARAMETERS:
             for stops in STOPS:
                 p = drawn(FAMILIES[name], stops, parameters, draws)
                 share = "".join(f"{np.mean(p[t] < LEVEL):8.3f}" for t in tests)
                 distance = stats.kstest(p["judged"], "uniform").statistic
-                yield f"{name:26}{parameters:4}{stops:6}{share}{distance:8.3f}"
+                yield f"{name:44}{parameters:4}{stops:6}{share}{distance:8.3f}"
 
 
 def power(draws: int) -> Iterator[str]:
     """Lines of the table of power at 0.001."""
-    yield f"\n{'power at 0.001, 30 stops':26}{'sigmas':>10}{'signs':>8}{'judged':>8}{'webb':>8}"
+    yield f"\n{'power at 0.001, 30 stops':44}{'sigmas':>10}{'signs':>8}{'judged':>8}{'webb':>8}"
     for name, family in (
         ("all stops", Family()),
         ("three stops", Family(stops=3)),
         ("two surfaces", Family(places=2)),
+        ("of 16 parameters, two surfaces own half", Family(owned=0.5)),
     ):
+        parameters = 16 if family.owned else 1
         for effect in (4.0, 6.0, 10.0, 30.0, 100.0):
-            p = drawn(family, 30, 1, draws // 4, effect)
+            p = drawn(family, 30, parameters, draws // 4, effect)
             share = "".join(f"{np.mean(p[t] < 1e-3):8.2f}" for t in ("signs", "judged", "webb"))
-            yield f"{name:26}{effect:10.0f}{share}"
+            yield f"{name:44}{effect:10.0f}{share}"
 
 
 if __name__ == "__main__":

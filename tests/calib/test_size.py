@@ -43,6 +43,7 @@ def bench():
         ("one stop, stops err", 1, 12),
         ("one surface, surfaces err a little", 4, 30),
         ("within stops, stops err", 4, 12),
+        ("two surfaces own half, one errs", 4, 30),
         ("both err", 1, 12),
         ("model by stop, stops err", 1, 12),
         ("model by stop, stops err", 4, 30),
@@ -58,6 +59,27 @@ def test_what_few_clusters_dominate_is_found_by_the_others(bench, stops, places)
     """Thirty stops all show it; few of them, or two of 25 walls, hold most of the information."""
     p = bench.drawn(bench.Family(stops=stops, places=places), 30, 1, 64, effect=30.0)["judged"]
     assert np.mean(p < 1e-3) > 0.9
+
+
+def test_directions_that_few_clusters_dominate_leave_the_others_to_be_judged(bench):
+    """Two of 25 walls alone show eight of sixteen parameters, as rings that meet one wall are; all
+    show the others."""
+    p = bench.drawn(bench.Family(owned=0.5), 30, 16, 64, effect=30.0)["judged"]
+    assert np.mean(p < 1e-3) > 0.9
+
+
+@pytest.mark.parametrize("shown", ["by one", "by all"])
+def test_a_cluster_says_nothing_of_a_direction_that_it_alone_holds(shown):
+    """Of two parameters one wall alone shows the first, and all show the second alike."""
+    rng, walls = np.random.default_rng(1), 20
+    holds = np.zeros((walls, 2, 2))
+    holds[0, 0, 0], holds[:, 1, 1] = 1.0, 1.0 / walls
+    size = np.array([30.0, 0.0] if shown == "by one" else [0.0, 30.0])
+    scores = holds @ size + np.sqrt(holds.diagonal(axis1=1, axis2=2)) * rng.normal(size=(walls, 2))
+    shares = Shares({(k % 10, k): [scores[k], holds[k]] for k in range(walls)})
+    statistic = float(np.square(scores.sum(axis=0)).sum())
+    p = min(each.p_value(statistic) for each in shares.left_out(1.5))
+    assert p > 0.05 if shown == "by one" else p < 1e-4
 
 
 @pytest.mark.parametrize("agree", [True, False])
