@@ -205,6 +205,13 @@ class ScoreTest:
         ranks what candidates explain, at a price for their parameters, and decides nothing."""
         return -log_tail(self.statistic / max(common, 1e-300), self.dof)
 
+    def log_score(self, common: float) -> float:
+        """By how much it raises the log-likelihood of rows that it was not fitted to, as far as
+        those can tell that it was: half of what it explains, less one for each parameter (Akaike
+        1974; Stone 1977, JRSS B 39: the same as leaving them out). Rows scatter wider by `common`.
+        """
+        return self.statistic / max(common, 1e-300) / 2.0 - self.dof
+
     def estimate(self) -> np.ndarray:
         """Parameters (q,) after one step; 0 along gauges."""
         return self.whiten @ (self.whiten.T @ self.score)

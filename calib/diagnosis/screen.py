@@ -155,16 +155,17 @@ def looked(smallest: np.ndarray) -> float:
 
 
 def rivals(screen: Screen, best: Candidate, scale: float) -> list[Candidate]:
-    """Candidates that explain nearly as much as the best one, at their price.
+    """Candidates that would predict other stops nearly as well as the best one, or better; which
+    of them has fewest parameters is no evidence of the data.
 
     Args:
         screen: the look at which all of them were missing.
         best: the leading candidate.
         scale: how much wider than their sigmas allow rows scatter once it is in the model.
     """
-    own = best.test.evidence(scale)
+    own = best.test.log_score(scale)
     others = (c for c in screen.candidates if c.effect.family != best.effect.family)
-    return [c for c in others if own - c.test.evidence(scale) < ODDS]
+    return [c for c in others if own - c.test.log_score(scale) < ODDS]
 
 
 def angle_deg(screen: Screen, a: Candidate, b: Candidate) -> float:

@@ -132,7 +132,7 @@ def explained(fall: Fall) -> float:
 def _rivals(step: NamedEffect) -> list[dict[str, Any]]:
     screen = step.before.named
     scale = max(step.after.named.common, step.judged.inflation)
-    own = step.candidate.test.evidence(scale)
+    own = step.candidate.test.log_score(scale)
     alike = {other.effect.name for other in step.rivals if _alike(step, other)}
     return [
         {
@@ -140,7 +140,7 @@ def _rivals(step: NamedEffect) -> list[dict[str, Any]]:
             "add": other.effect.name,
             "dof": other.test.dof,
             "angle_deg": angle_deg(screen, step.candidate, other),
-            "odds": float(np.exp(own - other.test.evidence(scale))),
+            "odds": float(np.exp(own - other.test.log_score(scale))),
             "separate": (
                 ALIKE if other.effect.name in alike else what_separates(step.effect, other.effect)
             ),
