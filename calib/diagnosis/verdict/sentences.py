@@ -202,10 +202,14 @@ def _step_sentences(step: NamedEffect, candidate: Mapping[str, Any], worn: bool)
     for rival in candidate["rivals"][:MOST_LISTED]:
         out.append(
             f"On these data it is not distinguishable from {rival['effect']} (odds "
-            f"{rival['odds']:.1f} to 1); "
-            f"{rival['separate']} would separate them."
+            f"{_odds(rival['odds'])}); {rival['separate']} would separate them."
         )
     return out
+
+
+def _odds(odds: float) -> str:
+    """That of an effect against a rival, as people say it."""
+    return f"{odds:.1f} to 1" if odds >= 1.0 else f"1 to {1.0 / max(odds, 1e-6):.1f}"
 
 
 def _residual(look: Look) -> str:
