@@ -11,7 +11,7 @@ from calib.blunders.chance import log_tail
 from calib.diagnosis import score
 from calib.diagnosis.judges import Shares
 from calib.diagnosis.linear import Linear
-from calib.diagnosis.screen import looked, rivals, screen
+from calib.diagnosis.screen import ODDS, looked, rivals, screen
 from calib.effects import Site
 from calib.linear.clusters import ClusteredRows
 from calib.problem.unknowns import Owner
@@ -202,9 +202,8 @@ def test_intervals_cover():
     assert 0.90 < np.mean(np.abs(z) < 1.96) < 0.99
 
 
-def named(world):
+def named(world, chosen=("one", "twin", "several", "rings", "gauge")):
     found = scores(world)
-    chosen = ("one", "twin", "several", "rings", "gauge")
     site = Site.BEAM
     effects = [SimpleNamespace(name=n, family=n, covariates=(n,), site=site) for n in chosen]
     return screen(found, effects, {n: np.r_[found.at[n]] for n in chosen})
@@ -234,6 +233,40 @@ def test_independent_looks_are_counted():
 def test_the_smallest_of_many_is_adjusted_to_five_percent():
     least = [min(c.p_adjusted for c in named(World(seed)).candidates) for seed in range(150)]
     assert np.mean(np.array(least) < 0.05) < 0.11
+
+
+@pytest.mark.parametrize("name", ["one", "several", "rings"])
+@pytest.mark.parametrize("size", [0.0, 0.05])
+def test_the_log_score_is_what_other_rows_gain_by_a_fit(name, size):
+    """The same stops once more, with other errors: half the fall of their chi-square by what was
+    estimated from the first, on average over draws."""
+    gains = []
+    for seed in range(120):
+        first, again = (World(s, **({name: size} if size else {})) for s in (seed, 10_000 + seed))
+        found = trial(first, name)
+        column = first.columns[name] @ found.whiten
+        away = column - first.model @ np.linalg.lstsq(first.model, column, rcond=None)[0]
+        effect = away @ (found.whiten.T @ found.score)
+        fell = np.sum(np.square(again.b)) - np.sum(np.square(again.b - effect))
+        gains.append((found.log_score(1.0), fell / 2))
+    told, seen = np.mean(gains, axis=0)
+    sigma = np.std(np.subtract(*np.transpose(gains))) / np.sqrt(len(gains))
+    assert told == pytest.approx(seen, abs=4 * sigma)
+    assert sigma < 1.5  # of the price of 1 to 39
+
+
+def test_what_explains_as_much_with_more_parameters_is_a_rival(monkeypatch):
+    """It is none by the price that ranks candidates, which favours few parameters the more, the
+    larger an effect is."""
+    world, rng = World(8, several=1.0), np.random.default_rng(3)
+    more = rng.standard_normal((len(world.b), 2))
+    world.columns["wider"] = np.hstack([world.columns["several"], more])
+    monkeypatch.setitem(THEIRS, "wider", 5)
+    found = named(world, ("several", "wider"))
+    best, other = found.candidates
+    assert best.effect.name == "several"
+    assert best.evidence - other.evidence > ODDS
+    assert rivals(found, best, 1.0) == [other]
 
 
 def test_a_twin_is_a_rival_and_another_effect_is_none():
