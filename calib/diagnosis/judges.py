@@ -140,12 +140,11 @@ class SomeCells:
         way = int(np.argmax([each.max() for each in self.shares]))
         return self.kept & (self.ways[way] != np.argmax(self.shares[way]))
 
-    def held_by_no_one(self, most: float) -> np.ndarray:
-        """Those of its directions (r, k) of which no stop, and no place, holds more than a share;
-        all cells being kept."""
-        axes = self.whiten
+    def held_by_no_one(self, axes: np.ndarray, most: float) -> np.ndarray:
+        """Those among some directions (r, k) of which no stop, and no place, holds more than a
+        share; all cells being kept, in all directions."""
         while axes.shape[1]:
-            held = [_held(each.information, self.whiten.T @ axes, most) for each in self.clusters]
+            held = [_held(each.information, axes, most) for each in self.clusters]
             if not (found := np.hstack(held)).shape[1]:
                 break
             along, size, _ = np.linalg.svd(found)
@@ -186,9 +185,12 @@ class Judges:
         """As of `SomeCells`."""
         whole = np.ones(len(cells), bool)
         every = best = this = SomeCells.of(cells, information, whole, spent)
+        axes = every.whiten
         for most in HELD_BY_ONE:
-            axes = every.held_by_no_one(most)
-            if 0 < axes.shape[1] < len(axes):
+            axes = every.held_by_no_one(axes, most)
+            if axes.shape[1] <= len(axes) * best.worth / HIGHEST_WORTH:
+                break
+            if axes.shape[1] < len(axes):
                 part = SomeCells.of(cells, information, whole, spent, axes)
                 best = max(best, part, key=lambda part: part.worth)
         if not best.worth:
