@@ -43,7 +43,7 @@ AS = {"ring": "elevation_rad"}  # what goes along with another covariate
 # knots are few.
 COVERS = 0.9
 SAME_FORM = 1e-6  # of what two forms explain: one is the other and what the model absorbs
-COLUMNS_AT_ONCE = 64  # what a processor keeps near, as more take longer: 400 half as long again
+COLUMNS_AT_ONCE = 64  # what fits into a processor's cache; 400 take half as long again
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ TURN_KNOTS = {1: 24, 2: 8, 3: 6}  # of azimuth, evenly round: 4 would not see tw
 STOPS_A_KNOT = 5  # of columns of the stops, as of bins: with fewer, tests have no power
 FEW = 8  # values of a column, up to which each is a class of its own
 MOST_THIRDS = 2  # pairs to which a third covariate is tried; also threes, by their product alone
-THREES_AT_ONCE = 16  # of threes: what a processor keeps near, as more take four times as long
+THREES_AT_ONCE = 16  # of threes: what fits into a processor's cache; 200 take four times as long
 MOST_CLASSES = 6  # of a label, those of most beams
 PATTERN = 4  # rings after which electronics repeat: chips of 4, 8 and 16 channels
 
