@@ -99,14 +99,13 @@ class SomeCells:
         unit length and at right angles; None where they say next to nothing."""
         ways = tuple(_numbered(cells, kept, way) for way in (0, 1))
         by_stop, by_place = (_added(information, way) for way in ways)
-        whole = by_stop.sum(axis=0)
+        axes = np.eye(information.shape[1]) if axes is None else axes
+        whole = axes.T @ by_stop.sum(axis=0) @ axes
         values, vectors = np.linalg.eigh(whole)
         seen = values > SLIGHT_LEFT
         if not seen.any():
             return None
-        whiten = vectors[:, seen] / np.sqrt(values[seen])
-        if kept.all():
-            whiten = np.eye(len(values)) if axes is None else axes
+        whiten = axes if kept.all() else axes @ (vectors[:, seen] / np.sqrt(values[seen]))
         clusters = tuple(
             Clusters.of(whiten.T @ each @ whiten, _stated(cells[kept], way))
             for way, each in enumerate((by_stop, by_place))
@@ -115,7 +114,7 @@ class SomeCells:
             kept=kept,
             information=information,
             whiten=whiten,
-            share=float(np.trace(whole)) / len(whole) * whiten.shape[1] / int(seen.sum()),
+            share=float(np.trace(whole)) / len(axes),
             ways=ways,
             clusters=clusters,
             spent=spent,

@@ -55,10 +55,6 @@ class Linear:
         weight_m2: sum of the beams' weights over their variances [1/m2]; without beams that of the
             tracked positions.
         whole: the linearisation that these are made of.
-        directions: from directions (S, q) in the unknowns that were not eliminated to those in all
-            unknowns (U, q): the eliminated ones follow the others.
-        onto_kept: from rows (n, U) over all unknowns to those (n, S) over what was not eliminated,
-            likewise.
     """
 
     candidates: tuple[str, ...]
@@ -75,8 +71,6 @@ class Linear:
     places: dict[object, int]
     weight_m2: float
     whole: Linearisation
-    directions: Callable[[np.ndarray], np.ndarray]
-    onto_kept: Callable[[csr_array], np.ndarray]
 
     def among(self, names: Sequence[str]) -> np.ndarray:
         """Columns of some unknowns among the S, in the order given."""
@@ -185,8 +179,6 @@ def linearise_with(
         places=gradients.places,
         weight_m2=linear.weight_m2 or sum(len(b.measured) / b.sigma_m**2 for b in wide.bodies),
         whole=linear,
-        directions=linear.followed,
-        onto_kept=linear.onto_kept,
     )
 
 

@@ -113,7 +113,7 @@ def away_from_model(linear: Linear, names: Sequence[str]) -> np.ndarray:
     theirs, model, taken = projection(linear, names)
     kept = np.zeros((len(linear.information), len(theirs)))
     kept[theirs], kept[model] = np.eye(len(theirs)), -taken
-    return linear.directions(kept)
+    return linear.whole.followed(kept)
 
 
 def information_left(linear: Linear, names: Sequence[str]) -> np.ndarray:
@@ -137,7 +137,7 @@ def project(linear: Linear, names: Sequence[str], spent: int = 0) -> Scores:
         at[name], start = slice(start, start + size), start + size
     theirs, model, taken = projection(linear, names)
     every = csr_array(vstack([linear.gradient, csr_array(linear.score[None])]))
-    shares = linear.onto_kept(every)
+    shares = linear.whole.onto_kept(every)
     shares = shares[:, theirs] - shares[:, model] @ taken
     return Scores(
         at=at,
@@ -206,10 +206,9 @@ class ScoreTest:
         return -log_tail(self.statistic / max(common, 1e-300), self.dof)
 
     def log_score(self, common: float) -> float:
-        """By how much it raises the log-likelihood of rows that it was not fitted to, as far as
-        those can tell that it was: half of what it explains, less one for each parameter (Akaike
-        1974; Stone 1977, JRSS B 39: the same as leaving them out). Rows scatter wider by `common`.
-        """
+        """By how much it is expected to raise the log-likelihood of rows that it is not fitted to:
+        half of what it explains, less one for each parameter (Akaike 1974; leaving rows out gives
+        the same where there are many: Stone 1977, JRSS B 39). `common` is their inflation."""
         return self.statistic / max(common, 1e-300) / 2.0 - self.dof
 
     def estimate(self) -> np.ndarray:

@@ -155,8 +155,7 @@ def looked(smallest: np.ndarray) -> float:
 
 
 def rivals(screen: Screen, best: Candidate, scale: float) -> list[Candidate]:
-    """Candidates that would predict other stops nearly as well as the best one, or better; which
-    of them has fewest parameters is no evidence of the data.
+    """Candidates that are expected to predict other rows about as well as the best one, or better.
 
     Args:
         screen: the look at which all of them were missing.

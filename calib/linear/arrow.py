@@ -78,9 +78,10 @@ class Arrow:
         return out.reshape(right.shape)
 
 
-def apart(H: csr_array, among: np.ndarray) -> list[np.ndarray]:
-    """Some columns of H (U, U) in sets between which it has no entry."""
-    _, label = connected_components(H[among][:, among], directed=False)
+def apart(rows: csr_array, among: np.ndarray) -> list[np.ndarray]:
+    """Some columns of rows (R, U), in sets of which no row touches two."""
+    touched = abs(rows[:, among])
+    _, label = connected_components(touched.T @ touched, directed=False)
     order = np.argsort(label, kind="stable")
     return np.split(among[order], np.flatnonzero(np.diff(label[order])) + 1)
 

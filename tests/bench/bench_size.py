@@ -15,8 +15,8 @@ webb    a restricted wild bootstrap by stops, with Webb's weights, studentised b
         out: left
 KS      largest distance of the judged p-values from a uniform distribution
 
-The last table is power: effects of some sizes that all stops show, or three of them. One thread
-and ten minutes.
+The last table is power: effects of some sizes that all stops show, or three of them. One thread,
+and some two minutes a family.
 """
 
 from __future__ import annotations

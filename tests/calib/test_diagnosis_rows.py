@@ -125,7 +125,7 @@ def test_the_equations_are_those_of_all_rows_with_the_others_eliminated(linear, 
     square, both = np.ix_(order, order), np.outer(scale[kept], scale[kept])
     np.testing.assert_allclose(linear.raw[square] / both, unit[np.ix_(kept, kept)], atol=1e-9)
     np.testing.assert_allclose(linear.information[square] / both, schur, atol=1e-9)
-    directions = linear.directions(np.eye(len(linear.information))[:, order] / scale[kept])
+    directions = linear.whole.followed(np.eye(len(linear.information))[:, order] / scale[kept])
     np.testing.assert_allclose(directions[gone] * scale[gone, None], -back, atol=1e-7)
     np.testing.assert_allclose(directions[kept] * scale[kept, None], np.eye(len(kept)), atol=1e-12)
 

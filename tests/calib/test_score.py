@@ -76,9 +76,7 @@ class World:
             place=place,
             places={},
             weight_m2=float(len(J)),
-            whole=None,
-            directions=lambda kept: kept,
-            onto_kept=csr_array.toarray,
+            whole=SimpleNamespace(followed=lambda kept: kept, onto_kept=csr_array.toarray),
         )
 
 

@@ -62,8 +62,8 @@ def test_what_few_clusters_dominate_is_found_by_the_others(bench, stops, places)
 
 
 def test_directions_that_few_clusters_dominate_leave_the_others_to_be_judged(bench):
-    """Two of 25 walls alone show eight of sixteen parameters, as rings that meet one wall are; all
-    show the others."""
+    """Two of 25 walls alone show eight of sixteen parameters, as a wall does with rings that meet
+    nothing else; all walls show the others."""
     p = bench.drawn(bench.Family(owned=0.5), 30, 16, 64, effect=30.0)["judged"]
     assert np.mean(p < 1e-3) > 0.9
 

@@ -105,9 +105,8 @@ class BeamTable:
         others, b, others_stop, others_place = rows_of_others(problem, layout, values, places)
         twists = csr_array(vstack([d.twists for d in drawn]))
         chain = csr_array(vstack([*(d.chain for d in drawn), eye_array(layout.size, format="csr")]))
-        met = abs(twists) @ abs(chain)
         cells = np.concatenate([layout.finest, layout.cells])
-        surfaces = apart(met.T @ met + abs(others).T @ abs(others), cells)
+        surfaces = apart(csr_array(vstack([twists @ chain, others])), cells)
         return cls(
             covariates={n: np.concatenate([d.column(n) for d in drawn]) for n in names},
             by_stop=frozenset(n for n in names if all(len(d.columns[n]) == 1 for d in drawn)),

@@ -43,13 +43,22 @@ def test_it_solves_as_dense_algebra_does(sizes, shared, sparse):
     np.testing.assert_allclose(root.T @ root, right.T @ expected, rtol=1e-6, atol=1e-9)
 
 
+def rows_of(own, size):
+    """Rows that touch one set each, and what all share."""
+    rows = np.ones((len(own), size))
+    for some, row in zip(own, rows, strict=True):
+        row[np.setdiff1d(np.concatenate(own), some)] = 0.0
+    return rows
+
+
 def test_sets_apart_are_those_that_no_row_ties():
     rng = np.random.default_rng(0)
     H, own = arrow(rng, [3, 1, 2], 4)
     among = np.concatenate(own)
-    found = {frozenset(some.tolist()) for some in apart(csr_array(H), rng.permutation(among))}
+    rows = csr_array(rows_of(own, len(H)))
+    found = {frozenset(some.tolist()) for some in apart(rows, rng.permutation(among))}
     assert found == {frozenset(some.tolist()) for some in own}
-    (whole,) = apart(csr_array(H), np.arange(len(H)))  # what all share ties all
+    (whole,) = apart(rows, np.arange(len(H)))  # what all share ties all
     assert sorted(whole.tolist()) == list(range(len(H)))
 
 
