@@ -7,8 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
+from scipy.sparse import csr_array
 
 from calib.blunders.rows import GraphRows, GroupRows, group_rows
+from calib.linear.clusters import Entries, over_all
 from calib.linear.layout import positions
 from calib.linear.system import Linearisation
 from calib.problem.problem import Problem
@@ -50,13 +52,11 @@ class Others:
         b = np.concatenate([rows.b for rows in every]) - A @ self.step
         return self.whole.covariance(A, self.kept), b
 
-    def spread(self, every: Sequence[GroupRows]) -> np.ndarray:
+    def spread(self, every: Sequence[GroupRows]) -> csr_array:
         """The same rows (m, U) over all unknowns."""
-        ends = np.cumsum([0, *(len(rows.A) for rows in every)])
-        A = np.zeros((ends[-1], self.whole.layout.size))
-        for rows, start in zip(every, ends, strict=False):
-            np.add.at(A[start : start + len(rows.A)].T, rows.columns, rows.A.T)
-        return A
+        return over_all(
+            [Entries.of(rows.A, rows.columns) for rows in every], self.whole.layout.size
+        )
 
     def groups(self, problem: Problem) -> Iterator[list[Sequence[GroupRows]]]:
         """All groups of rows, those of one place in a set; no more sets at once than memory should
@@ -105,10 +105,16 @@ def at_their_sigmas(
 def whitening(M: np.ndarray, size: np.ndarray) -> np.ndarray:
     """What takes a score (r,) of information M (r, r) to independent ones (dof,) of unit variance,
     in the directions that anything contradicts, in units of `size` (r,)."""
-    scaled = M / np.outer(size, size)
-    values, axes = (scaled[0], np.eye(1)) if len(size) == 1 else np.linalg.eigh(scaled)
+    values, axes = contradicted(M / np.outer(size, size))
+    return axes / np.sqrt(values) / size[:, None]
+
+
+def contradicted(M: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Eigenvalues (dof,) and eigenvectors (r, dof) of a redundancy (r, r), in the directions that
+    anything contradicts."""
+    values, axes = (M[0], np.eye(1)) if len(M) == 1 else np.linalg.eigh(M)
     seen = values > HELD_ALONE
-    return axes[:, seen] / np.sqrt(values[seen]) / size[:, None]
+    return values[seen], axes[:, seen]
 
 
 def _kept_covariance(whole: Linearisation, graph_rows: GraphRows) -> np.ndarray:

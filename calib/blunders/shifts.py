@@ -23,7 +23,7 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg import block_diag
 
-from calib.blunders.others import HELD_ALONE, Others, at_their_sigmas, parts, whitening
+from calib.blunders.others import Others, at_their_sigmas, contradicted, parts, whitening
 from calib.blunders.rows import GroupRows, group_rows, scan_rows
 from calib.linear.system import Linearisation
 from calib.problem.problem import Problem
@@ -154,9 +154,8 @@ def of_poses(whole: Linearisation, problem: Problem, wild: Collection[Group]) ->
     H, b = Others.of(whole).against(every)
     raw = block_diag(*(rows.information for rows in every))
     size = np.sqrt(np.maximum(np.diag(raw), 1e-300))
-    values, axes = np.linalg.eigh((raw - H) / np.outer(size, size))
-    axes = axes[:, values > HELD_ALONE]
-    told, along = size[:, None] * axes * values[values > HELD_ALONE], size[:, None] * axes
+    values, axes = contradicted((raw - H) / np.outer(size, size))
+    told, along = size[:, None] * axes * values, size[:, None] * axes
     return Told(
         score=along @ (axes.T @ (b / size)),
         information=told @ along.T,
@@ -225,9 +224,8 @@ def _of_rows(
     squares: Squares,
 ) -> Shift:
     """The residual of a group under the fit without it; see the module."""
-    values, axes = np.linalg.eigh(own.T @ left @ own)
-    seen = values > HELD_ALONE
-    values, basis = values[seen], own @ axes[:, seen]
+    values, axes = contradicted(own.T @ left @ own)
+    basis = own @ axes
     along = (basis.T @ b) / values
     at = np.flatnonzero(np.any(own != 0, axis=1))
     turned = (basis if rows.turn is None else rows.turn @ basis)[at]

@@ -353,12 +353,11 @@ def rows_by_chance(
         whole: all rows, linearised at the fit.
         problem: of the fit.
     """
-    sums: dict[Whose, Checks] = {}
+    seen: dict[Whose, list[tuple[float, float]]] = {}
     for shift in (b.shift for b in blunders if not b.found and b.group.kind == "body"):
         for unit, squares_there in shift.squares.items():
-            body = Whose("body", shift.group.what, unit)
-            here, before = Checks.alone(*squares_there), sums.get(body)
-            sums[body] = here if before is None else before + here
+            seen.setdefault(Whose("body", shift.group.what, unit), []).append(squares_there)
+    sums = {body: Checks.alone(*np.sum(mine, axis=0)) for body, mine in seen.items()}
     sites = {effect.site for effect in effects} - {Site.TRACKER}
     if whose := {each for site in sites for each in rows_at(problem, site)}:
         sums |= beside_bodies(whole, problem, whose, [b.group for b in blunders if b.found])

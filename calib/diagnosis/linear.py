@@ -14,10 +14,11 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from calib.diagnosis.leverage import Leverage
+from calib.linear.assembly import OwnRows
 from calib.linear.clusters import ClusteredRows, Gradients
 from calib.linear.elimination import square
 from calib.linear.layout import Layout, positions
-from calib.linear.linearise import linearise
+from calib.linear.linearise import linearise, own_rows
 from calib.linear.system import Linearisation
 from calib.problem.problem import Problem
 from calib.problem.unknowns import Owner
@@ -136,18 +137,19 @@ def linearise_with(
     """
     wide, values = beside(wide, estimate)
     layout = Layout.of(wide, unbounded=candidates)
-    gradients = Gradients(layout.size)
+    gradients, own = Gradients(layout.size), own_rows(layout, values)
     linear = linearise(
         wide,
         values,
         estimate.associations,
         layout=layout,
         gradients=gradients,
+        own=own,
         progress=lambda done, total: progress("testing what is missing", done, total),
     )
     information, raw = linear.kept[:-1, :-1].copy(), linear.raw.copy()
     at = positions(layout.size, layout.kept)
-    others = list(other_rows(wide, layout, values, gradients))
+    others = list(other_rows(wide, layout, values, gradients, own))
     alike: dict[bytes, list[ClusteredRows]] = {}  # of the same unknowns, as most poses of an arm
     for rows in others:
         if (at[rows.columns] >= 0).all():  # the others are in the linearisation
@@ -183,11 +185,15 @@ def linearise_with(
 
 
 def other_rows(
-    wide: Problem, layout: Layout, values: Mapping[str, np.ndarray], places: Gradients
+    wide: Problem,
+    layout: Layout,
+    values: Mapping[str, np.ndarray],
+    places: Gradients,
+    own: Mapping[int, Sequence[OwnRows]],
 ) -> Iterator[ClusteredRows]:
     """Rows of tracked bodies, targets and priors, with the stop and place that each errs with: each
     target, and each row of a prior that no stop has for itself, is a place of its own."""
-    yield from of_stops(layout, values)
+    yield from of_stops(own)
     for cells, rows in of_cells(wide, layout, values):
         yield rows._replace(place=places.numbers(cells.room, cells.surface))
     graph = Graph(list(layout.outer().values()), layout.others, layout.unbounded)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import csr_array, issparse, vstack
+from scipy.sparse import csr_array, issparse
 
 
 def summed(values: np.ndarray, at: np.ndarray) -> np.ndarray:
@@ -14,6 +15,37 @@ def summed(values: np.ndarray, at: np.ndarray) -> np.ndarray:
     used = np.flatnonzero(at >= 0)
     shape = (int(at.max(initial=-1)) + 1, len(at))
     return csr_array((np.ones(len(used)), (at[used], used)), shape=shape) @ values
+
+
+class Entries(NamedTuple):
+    """Rows over some of U columns, as what in them is not zero.
+
+    Args:
+        values: (E,), row after row.
+        columns: (E,) of each.
+        count: (m,) how many each row has.
+    """
+
+    values: np.ndarray
+    columns: np.ndarray
+    count: np.ndarray
+
+    @classmethod
+    def of(cls, A: np.ndarray | csr_array, columns: np.ndarray) -> Entries:
+        """Of rows (m, n) over some columns (n,), of which one may stand more than once."""
+        if issparse(A):
+            found = csr_array(A)
+            return cls(found.data, columns[found.indices], np.diff(found.indptr))
+        row, at = np.nonzero(A)
+        return cls(A[row, at], columns[at], np.bincount(row, minlength=len(A)))
+
+
+def over_all(some: Sequence[Entries], size: int) -> csr_array:
+    """Some rows, one after the other, over all columns (R, U)."""
+    if not some:
+        return csr_array((0, size))
+    values, columns, count = map(np.concatenate, zip(*some, strict=True))
+    return csr_array((values, columns, np.append(0, np.cumsum(count))), shape=(len(count), size))
 
 
 class ClusteredRows(NamedTuple):
@@ -60,7 +92,7 @@ class Gradients:
 
     size: int
     places: dict[object, int] = field(default_factory=dict)
-    _tables: list[csr_array] = field(default_factory=list)
+    _tables: list[Entries] = field(default_factory=list)
     _clusters: list[np.ndarray] = field(default_factory=list)
 
     def place(self, key: object) -> int:
@@ -72,12 +104,14 @@ class Gradients:
         return np.array([self.place((room, part)) for part in parts.tolist()], int)
 
     def add(
-        self, gradient: np.ndarray, columns: np.ndarray, stop: np.ndarray, place: np.ndarray
+        self,
+        gradient: np.ndarray | csr_array,
+        columns: np.ndarray,
+        stop: np.ndarray,
+        place: np.ndarray,
     ) -> None:
         """Add clusters (C, n) over some columns (n,), of stops and places (C,), -1 for none."""
-        found = csr_array(gradient)
-        entries = (found.data, columns[found.indices], found.indptr)
-        self._tables.append(csr_array(entries, shape=(len(stop), self.size)))
+        self._tables.append(Entries.of(gradient, columns))
         self._clusters.append(np.stack([stop, place]))
 
     def add_rows(self, rows: ClusteredRows) -> None:
@@ -96,4 +130,4 @@ class Gradients:
     def table(self) -> tuple[csr_array, np.ndarray, np.ndarray]:
         """All clusters (C, U), sparse; the stop and the place (C,) of each."""
         stop, place = np.concatenate(self._clusters, axis=1)
-        return csr_array(vstack(self._tables)), stop, place
+        return over_all(self._tables, self.size), stop, place

@@ -168,5 +168,7 @@ def _cells(unknowns: Mapping[str, Unknown]) -> tuple[list[str], list[str]]:
 
 
 def _join(at: Mapping[str, slice], names: Sequence[str]) -> np.ndarray:
-    every = (np.arange(at[name].start, at[name].stop) for name in names)
-    return np.concatenate([np.zeros(0, int), *every])
+    first = np.array([at[name].start for name in names], int)
+    size = np.array([at[name].stop for name in names], int) - first
+    before = np.cumsum(size) - size
+    return np.repeat(first - before, size) + np.arange(size.sum())

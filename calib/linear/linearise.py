@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -35,6 +35,7 @@ def linearise(
     progress: Progress = lambda done, total: None,
     weighed: Sequence[Weighing] = (),
     slowed: Sequence[Weighing] = (),
+    own: Mapping[int, Sequence[OwnRows]] | None = None,
 ) -> Linearisation:
     """Linearise all rows of beams and tracked bodies at a state.
 
@@ -50,10 +51,11 @@ def linearise(
         weighed: how the beams were weighed at another state, where costs are to be compared.
         slowed: how they were weighed before, if robust scales are to go but half the way on, or
             to stay.
+        own: the rows about stops' own unknowns, as `own_rows` has them, where they are known.
     """
     layout = layout or Layout.of(problem)
     count = len(problem.scans) if beams else 0
-    own = {stop: list(rows.values()) for stop, rows in own_rows(layout, values).items()}
+    own = own_rows(layout, values) if own is None else own
     assembly = Assembly(layout, own, gradients is not None)
     placed = lidars(problem.scans, values) if count else []
     scans = problem.scans[:count]
@@ -190,18 +192,17 @@ def spread_rows(spread: SpreadRows, layout: Layout) -> OwnRows:
     return OwnRows(np.hstack(list(spread.columns.values())), -spread.residual, columns, True)
 
 
-def own_rows(layout: Layout, values: Values) -> dict[int, dict[str, OwnRows]]:
-    """Stop -> rows of its tracked bodies, and of the priors of its own unknowns, by name."""
-    found: dict[int, dict[str, OwnRows]] = {stop: {} for stop in layout.own}
+def own_rows(layout: Layout, values: Values) -> dict[int, list[OwnRows]]:
+    """Stop -> rows of its tracked bodies, and of the priors of its own unknowns."""
+    found: dict[int, list[OwnRows]] = {stop: [] for stop in layout.own}
     owner = {int(c): stop for stop, columns in layout.own.items() for c in columns}
     for together in layout.bodies:
-        every = together.rows(values)
-        for block, (residual, A, names) in zip(together.blocks, every, strict=True):
+        for residual, A, names in together.rows(values):
             stop = next(owner[k] for n in names if (k := layout.at[n].start) in owner)
-            found[stop][block.name] = OwnRows(A, -residual, layout.columns(names), True)
+            found[stop].append(OwnRows(A, -residual, layout.columns(names), True))
     mine = [name for name, at in layout.at.items() if at.start in owner]
     for name, rows in prior_rows(layout, mine, values).items():
-        found[owner[layout.at[name].start]][name] = rows
+        found[owner[layout.at[name].start]].append(rows)
     return found
 
 

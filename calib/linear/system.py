@@ -12,6 +12,7 @@ from functools import cached_property
 import numpy as np
 from scipy.sparse import csr_array
 
+from calib.linear.clusters import Entries, over_all
 from calib.linear.elimination import Eliminated
 from calib.linear.layout import Layout, positions
 from calib.linear.rows import OwnSums, Weighing
@@ -129,15 +130,15 @@ class Linearisation:
             *_, (_, out[here], _) = self._passed_on(rows[here])
         return out
 
-    def covariance(self, rows: np.ndarray, kept: np.ndarray) -> np.ndarray:
+    def covariance(self, rows: csr_array, kept: np.ndarray) -> np.ndarray:
         """Covariance (q, q) of ``rows @ unknowns``.
 
         Args:
             rows: (q, U) over all unknowns.
             kept: (S, S) covariance of the kept.
         """
-        out = np.zeros((len(rows), len(rows)))
-        for some, mine, known in self._shares(csr_array(rows), kept):
+        out = np.zeros((rows.shape[0], rows.shape[0]))
+        for some, mine, known in self._shares(rows, kept):
             out[np.ix_(some, some)] += mine @ known
         return out
 
@@ -204,13 +205,9 @@ class Linearisation:
         """
         tables = [np.hstack(list(by.values())) for by in some]
         ends = np.cumsum([0, *(len(table) for table in tables)])
-        wide = [0, *(n for table in tables for n in [table.shape[1]] * len(table))]
-        data, columns = [np.zeros(0)], [np.zeros(0, int)]
-        for by, table in zip(some, tables, strict=True):
-            data.append(table.ravel())
-            columns.append(np.tile(self.layout.columns(list(by)), len(table)))
-        entries = np.concatenate(data), np.concatenate(columns), np.cumsum(wide)
-        rows = csr_array(entries, shape=(ends[-1], self.layout.size))
+        columns = (self.layout.columns(list(by)) for by in some)
+        entries = [Entries.of(*each) for each in zip(tables, columns, strict=True)]
+        rows = over_all(entries, self.layout.size)
         found = np.zeros(rows.shape[0])
         for first in range(0, len(found), ROWS_AT_ONCE):
             here = slice(first, first + ROWS_AT_ONCE)

@@ -36,6 +36,7 @@ from scipy import special
 from scipy.linalg import solve_triangular
 
 from calib.linear.clusters import CellSums, ClusteredRows, Gradients, summed
+from calib.linear.linearise import own_rows
 from calib.linear.rows import PLACES
 from calib.results.errors import in_cad
 from calib.solve.clustered import BeamsAlong, of_cells, of_graph, of_stops
@@ -187,7 +188,7 @@ def intervals(estimate: Estimate, progress: Progress = lambda what, done, total:
     )
     for cells, scatter in beams.cells():
         sums.add_stop(cells, scatter)
-    others = [*of_stops(layout, values), *_of_cells(estimate, places)]
+    others = [*of_stops(own_rows(layout, values)), *_of_cells(estimate, places)]
     frames, paper = in_cad(problem), np.zeros_like(estimate.kept)
     for block, name, rows in of_graph(estimate.graph, layout, values):
         if block is None and name in frames:

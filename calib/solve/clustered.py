@@ -16,9 +16,10 @@ import numpy as np
 from scipy.sparse import csr_array, diags_array
 
 from calib.forward import Placed
+from calib.linear.assembly import OwnRows
 from calib.linear.clusters import CellSums, ClusteredRows, Gradients
 from calib.linear.layout import Layout, keys_of
-from calib.linear.linearise import lidars, own_rows, spread_rows
+from calib.linear.linearise import lidars, spread_rows
 from calib.linear.parallel import over_stops
 from calib.linear.rows import PLACES, StopRows
 from calib.problem.problem import Block, Problem, SurfaceCells
@@ -156,11 +157,10 @@ def _of_rows(
     return parts, found(rows, cluster, len(parts))
 
 
-def of_stops(layout: Layout, values: Values) -> Iterator[ClusteredRows]:
-    """Rows about what stops alone have: bodies that are seen there, and priors."""
-    for stop, found in own_rows(layout, values).items():
-        for rows in found.values():
-            yield rows.of_stop(stop)
+def of_stops(own: Mapping[int, Sequence[OwnRows]]) -> Iterator[ClusteredRows]:
+    """Rows about what stops alone have, as `own_rows` gives them: bodies that are seen there, and
+    priors."""
+    return (rows.of_stop(stop) for stop, some in own.items() for rows in some)
 
 
 def of_cells(

@@ -10,13 +10,12 @@ variances of greatest likelihood are those of restricted maximum likelihood (Pat
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import astuple, dataclass, replace
-from functools import reduce
-from operator import add
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import minimize, minimize_scalar
 
+from calib.linear.clusters import Entries, over_all
 from calib.linear.elimination import inverse_and_log_det
 from calib.linear.system import Linearisation, Values
 from calib.problem.places import joints_at
@@ -181,9 +180,14 @@ class Checks:
         square = np.square(axes[:, seen].T @ residual)
         return cls(square, np.minimum(values[seen], 1.0), np.ones(int(seen.sum())))
 
-    def __add__(self, other: Checks) -> Checks:
-        pairs = zip(astuple(self), astuple(other), strict=True)
-        return Checks(*(np.concatenate(pair) for pair in pairs))
+    @classmethod
+    def together(cls, some: Sequence[Checks]) -> Checks:
+        """Of all of these rows."""
+        return cls(
+            square=np.concatenate([each.square for each in some]),
+            redundancy=np.concatenate([each.redundancy for each in some]),
+            count=np.concatenate([each.count for each in some]),
+        )
 
     @property
     def total(self) -> float:
@@ -315,10 +319,9 @@ def _of_joints(
     parts = (np.concatenate(each) for each in (residual, sigma, columns))
     found = []
     for v, s, c in zip(*(_batches(part) for part in parts), strict=True):
-        rows = np.zeros((len(c), linear.layout.size))
-        rows[np.arange(len(c)), c] = 1.0 / s
+        rows = over_all([Entries(1.0 / s, c, np.ones(len(c), int))], linear.layout.size)
         found.append(Checks.of(v, np.eye(len(c)) - linear.covariance(rows, kept)))
-    return reduce(add, found)
+    return Checks.together(found)
 
 
 def _batches(rows: np.ndarray) -> list[np.ndarray]:
@@ -355,16 +358,14 @@ def _of_cells(
     variances: Callable[[Sequence[Mapping[str, np.ndarray]]], list[np.ndarray]],
 ) -> dict[Whose, Checks]:
     """Of what parts of surfaces stand off, by their kind."""
-    out: dict[Whose, Checks] = {}
+    sums: dict[Whose, list[tuple[float, float]]] = {}
     each = variances([{n: np.eye(problem.variables[n].dim)} for n in cells])
     for (name, some), seen in zip(cells.items(), each, strict=True):
         sigma = problem.variables[name].sigma
         total = float(np.square(values[name] / sigma).sum())
-        found = Checks.alone(total, float(np.sum(1.0 - seen / np.square(sigma))))
-        whose = Whose("surface", some.kind, "m")
-        before = out.get(whose)
-        out[whose] = found if before is None else before + found
-    return out
+        left = float(np.sum(1.0 - seen / np.square(sigma)))
+        sums.setdefault(Whose("surface", some.kind, "m"), []).append((total, left))
+    return {whose: Checks.alone(*np.sum(mine, axis=0)) for whose, mine in sums.items()}
 
 
 def wider(problem: Problem, sums: Sums) -> dict[str, float]:

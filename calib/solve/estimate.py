@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
+from calib.linear.clusters import Entries, over_all
 from calib.linear.layout import StopKey, key_of
 from calib.linear.system import Linearisation
 from calib.problem.problem import Problem
@@ -126,8 +127,8 @@ class Estimate:
         if all(name in outer for name in names):
             return self.graph.covariance(self.values, names)
         columns = layout.columns(names)
-        rows = np.zeros((len(columns), layout.size))
-        rows[np.arange(len(columns)), columns] = 1.0
+        one_each = Entries(np.ones(len(columns)), columns, np.ones(len(columns), int))
+        rows = over_all([one_each], layout.size)
         return self.linear.covariance(rows, self.kept)
 
     def variances(self, some: Sequence[Mapping[str, np.ndarray]]) -> list[np.ndarray]:

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from calib.diagnosis.formulas.factors import covariates_of
+from calib.linear.clusters import Entries, over_all
 from calib.linear.rows import TWIST, StopRows
 
 
@@ -48,7 +49,7 @@ class DrawnBeams:
             residual_m=rows.rows.residual_m[picked],
             sigma_m=rows.rows.sigma_m[picked],
             twists=_twists(rows, picked, TWIST * rows.stop, begin, begin + size),
-            chain=rows_over(rows.chain, rows.chain_columns, size),
+            chain=over_all([Entries.of(rows.chain, rows.chain_columns)], size),
             met=met[picked],
         )
 
@@ -72,9 +73,3 @@ def _twists(rows: StopRows, picked: np.ndarray, first: int, begin: int, size: in
     out = csr_array((values.ravel(), at.ravel(), ends), (len(picked), size))
     out.eliminate_zeros()
     return out
-
-
-def rows_over(A: np.ndarray | csr_array, columns: np.ndarray, size: int) -> csr_array:
-    """Rows (R, n) over some columns as rows over all of them."""
-    found = csr_array(A)
-    return csr_array((found.data, columns[found.indices], found.indptr), (found.shape[0], size))

@@ -14,13 +14,14 @@ from functools import cached_property, partial
 import numpy as np
 from scipy.sparse import block_diag, csr_array, diags_array, eye_array, hstack, issparse, vstack
 
-from calib.diagnosis.formulas.drawn import DrawnBeams, rows_over
+from calib.diagnosis.formulas.drawn import DrawnBeams
 from calib.diagnosis.judges import Shares
 from calib.diagnosis.linear import beside, other_rows
 from calib.diagnosis.score import GAUGE, Scores, ScoreTest, score_test
 from calib.linear.arrow import Arrow, apart, cheapest
-from calib.linear.clusters import ClusteredRows, Gradients, summed
+from calib.linear.clusters import ClusteredRows, Entries, Gradients, over_all, summed
 from calib.linear.layout import Layout
+from calib.linear.linearise import own_rows
 from calib.linear.rows import TWIST
 from calib.problem import Problem
 from calib.residuals.robust import MAD
@@ -338,7 +339,7 @@ def rows_of_others(
 ) -> tuple[csr_array, np.ndarray, np.ndarray, np.ndarray]:
     """Rows of trackers, targets and priors: (R, U) whitened, (R,) their right side, and the stop
     and place (R,) of each."""
-    rows = list(other_rows(problem, layout, values, places))
-    A = csr_array(vstack([rows_over(r.A, r.columns, layout.size) for r in rows]))
+    rows = list(other_rows(problem, layout, values, places, own_rows(layout, values)))
+    A = over_all([Entries.of(r.A, r.columns) for r in rows], layout.size)
     b, stop, place = (np.concatenate([getattr(r, k) for r in rows]) for k in ("b", "stop", "place"))
     return A, b, stop, place

@@ -154,7 +154,7 @@ def test_covariances_of_rows_over_any_unknowns_are_those_of_dense_rows(case, tog
     rows = rows / np.sqrt(np.diag(covariance))
     kept = estimate.covariance_of(list(layout.outer()))
     before = rows.copy(), kept.copy()
-    found, expected = linear.covariance(rows, kept), rows @ covariance @ rows.T
+    found, expected = linear.covariance(csr_array(rows), kept), rows @ covariance @ rows.T
     size = sizes(expected)
     unit = np.outer(size, size)
     np.testing.assert_allclose(found / unit, expected / unit, atol=1e-6)
@@ -179,7 +179,7 @@ def test_variances_of_sets_of_rows_are_the_diagonals_of_their_covariances(
     for by, found in zip(sets, linear.variances(sets, kept), strict=True):
         rows = np.zeros((len(found), linear.layout.size))
         rows[:, linear.layout.columns(list(by))] = np.hstack(list(by.values()))
-        expected = np.diag(linear.covariance(rows, kept))
+        expected = np.diag(linear.covariance(csr_array(rows), kept))
         np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
