@@ -316,16 +316,12 @@ def _of_joints(
     residual = [(values[u.name] / u.prior_sigma)[i] for u, i in zip(some, at, strict=True)]
     sigma = [u.prior_sigma[i] for u, i in zip(some, at, strict=True)]
     columns = [linear.layout.columns([u.name])[i] for u, i in zip(some, at, strict=True)]
-    parts = (np.concatenate(each) for each in (residual, sigma, columns))
-    found = []
-    for v, s, c in zip(*(_batches(part) for part in parts), strict=True):
+    parts, found = (np.concatenate(each) for each in (residual, sigma, columns)), []
+    batches = (np.array_split(part, -(-len(part) // READINGS_TOGETHER)) for part in parts)
+    for v, s, c in zip(*batches, strict=True):
         rows = over_all([Entries(1.0 / s, c, np.ones(len(c), int))], linear.layout.size)
         found.append(Checks.of(v, np.eye(len(c)) - linear.covariance(rows, kept)))
     return Checks.together(found)
-
-
-def _batches(rows: np.ndarray) -> list[np.ndarray]:
-    return np.array_split(rows, -(-len(rows) // READINGS_TOGETHER))
 
 
 def _of_targets(
