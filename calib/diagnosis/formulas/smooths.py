@@ -20,7 +20,6 @@ from calib.diagnosis.formulas.factors import product_of
 from calib.diagnosis.formulas.table import BeamTable, Projection
 from calib.diagnosis.score import Scores, ScoreTest, score_test
 from calib.diagnosis.screen import by_rank, looked
-from calib.linear.parallel import in_order
 
 # Knots of a function of one covariate, of each of two and of three. A pair of 5 x 5 sees what turns
 # three times over its range; finer things are found alone or as formulas.
@@ -223,17 +222,13 @@ def _tested(
     progress: Callable[[int, int], None],
 ) -> Iterator[tuple[_Set, tuple[ScoreTest, np.ndarray]]]:
     """Each set's test, and by rank the p-values (R,) of the same on scores by chance."""
-
-    def tested(i: int) -> tuple[ScoreTest, np.ndarray | None]:
-        columns = bases.columns(*sets[i])
+    for i, each in enumerate(sets):
+        progress(i, len(sets))
+        columns = bases.columns(*each)
         scores = projection.scores(columns)
         found = score_test(scores, np.arange(columns.shape[1]))
-        return found, _by_chance(scores, found, projection.table.signs) if found.dof else None
-
-    for i, (found, by_chance) in enumerate(in_order(tested, len(sets))):
-        progress(i, len(sets))
-        if by_chance is not None:
-            yield sets[i], (found, by_chance)
+        if found.dof:
+            yield each, (found, _by_chance(scores, found, projection.table.signs))
 
 
 def _by_chance(scores: Scores, found: ScoreTest, signs: np.ndarray) -> np.ndarray:
