@@ -9,8 +9,9 @@ the mesh; or, of how uneven the planes of a recording are, which no effect needs
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from itertools import islice
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -116,7 +117,8 @@ def rows_at(problem: Problem, site: Site) -> list[Whose]:
         units = {body: ("m",) if point else ("rad", "m") for body, point in bodies.items()}
         return [Whose("body", body, unit) for body, some in units.items() for unit in some]
     if site is Site.JOINTS:
-        return [Whose("joints", JOINTS, unit) for unit in ("rad", "m") if read(problem, unit)]
+        units = [unit for unit in ("rad", "m") if any(True for _ in read(problem, unit))]
+        return [Whose("joints", JOINTS, unit) for unit in units]
     if site is Site.TARGET:
         there = any(isinstance(block, HangingTarget) for block in problem.blocks)
         return [Whose("target", part, "m") for part in PARTS_OF_SIGMAS] if there else []
@@ -124,10 +126,10 @@ def rows_at(problem: Problem, site: Site) -> list[Whose]:
     return [Whose("surface", part, "m") for part in SURFACE_SHARES] if meshes else []
 
 
-def read(problem: Problem, unit: str) -> list[Unknown]:
+def read(problem: Problem, unit: str) -> Iterator[Unknown]:
     """What encoders misreport, wherever that has a sigma in this unit."""
     every = (u for u in problem.variables.values() if u.role is Role.JOINTS)
-    return [unknown for unknown in every if len(unknown.read(unit))]
+    return (unknown for unknown in every if len(unknown.read(unit)))
 
 
 def sigmas(problem: Problem) -> dict[Whose, tuple[float, float]]:
@@ -138,7 +140,7 @@ def sigmas(problem: Problem) -> dict[Whose, tuple[float, float]]:
         for unit in ("rad", "m")
     }
     for unit in ("rad", "m"):
-        for unknown in read(problem, unit)[:1]:
+        for unknown in islice(read(problem, unit), 1):
             sigma = float(unknown.sigma[unknown.read(unit)[0]])
             out[Whose("joints", JOINTS, unit)] = sigma, unknown.scatter.get(unit, 0.0)
     for block in (b for b in problem.blocks if isinstance(b, HangingTarget)):

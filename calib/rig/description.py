@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
@@ -144,7 +145,7 @@ class Rig:
         """Frames that hang from the arm's tips; all of them where there is no arm."""
         return self.beyond(self.tips) if self.chains else frozenset(self.frame_sigma)
 
-    @property
+    @cached_property
     def joints(self) -> tuple[Joint, ...]:
         """Those that move by a value of their own, as `joint_names` has them."""
         known = {j.name: j for e in self.tree.edges if (j := e.joint) is not None and j.leads}

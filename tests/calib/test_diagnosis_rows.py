@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.sparse import csr_array
 
 from calib import effects
 from calib import problem as problems
@@ -96,8 +97,8 @@ def test_without_its_candidates_a_linearisation_is_that_of_the_fit(stand):
     np.testing.assert_array_equal(found.touched, fitted.touched)
     kept = np.diag(1.0 + np.arange(len(fitted.layout.kept)))
     rows = np.random.default_rng(0).normal(size=(5, fitted.layout.size))
-    expected = fitted.covariance(rows, kept)
-    np.testing.assert_allclose(found.covariance(rows, kept), expected, rtol=1e-6)
+    expected = fitted.covariance(csr_array(rows), kept)
+    np.testing.assert_allclose(found.covariance(csr_array(rows), kept), expected, rtol=1e-6)
     for stop, sums in fitted.scans.items():
         whole = np.zeros((2, len(sums.cross), fitted.layout.size))
         for out, each in zip(whole, (sums, found.scans[stop]), strict=True):
