@@ -166,8 +166,8 @@ class Assembly:
         for first in range(0, len(stops), STOPS_TOGETHER):
             self._finish_without_beams(stops[first : first + STOPS_TOGETHER])
         if self.raw is not None:
-            before = self.half[count:-1, count:-1]
-            self.raw += before + before.T
+            self.raw += self.half[count:-1, count:-1]
+            self.raw += self.raw.T.copy()
             self.half += self.taken
         rest = self.half[count:, count:] + self.half[count:, count:].T
         if count:
@@ -270,7 +270,7 @@ class Assembly:
         by_rows = Q.mT @ np.linalg.solve(factor, by_rows)
         W, beyond = R[:, :wide] @ Z, by_rows[:, wide:]
         W[:, :, others] += by_rows[:, :wide]
-        _subtract_square(self.taken, W.reshape(-1, W.shape[2]))
+        _add_square(self.taken, W.reshape(-1, W.shape[2]), -1.0)
         self.taken[np.ix_(others, others)] -= square(beyond.reshape(-1, len(others))) / 2
         turned = np.linalg.solve(factor.mT, Q)
         gain = turned[:, :, :wide] @ W
@@ -295,7 +295,6 @@ class Assembly:
         """Eliminate what is their own from stops that have no beams. Their rows are few: they are
         turned until no more of them touch a stop's own unknowns than there are of these (QR), which
         go with these, and all others go into one product."""
-        raw = []
         kept = positions(self.layout.size, self.layout.kept)
         for some in self._alike(stops):
             mine, at = self._columns(some[0])
@@ -310,12 +309,10 @@ class Assembly:
                     for stop, root, gain in zip(some, R, gains, strict=True)
                 ]
                 if self.raw is not None:
-                    raw.append(_over(rows[:, :count, count:], kept, over[:-1]))
-            self._add_squares(rows[:, count:, count:], self.at[mine[count:]])
+                    _add_square(self.raw, _over(rows[:, :count, count:-1], kept, over[:-1]))
+            _add_square(self.half, _over(rows[:, count:, count:], self.at, mine[count:]))
             for stop in some:
                 del self.waiting[stop]
-        if raw:
-            self.raw += square(np.vstack(raw))
 
     # ------------------------------------------------------------------------- stops' own rows
 
@@ -359,11 +356,11 @@ class Assembly:
         return out
 
 
-def _subtract_square(target: np.ndarray, rows: np.ndarray) -> None:
-    """Take ``rows.T @ rows`` off a matrix of which half is held, below its diagonal."""
+def _add_square(target: np.ndarray, rows: np.ndarray, times: float = 1.0) -> None:
+    """Add ``rows.T @ rows`` so many times to a matrix of which half is held, below its diagonal."""
     # Each pair of columns once, and each column by itself twice as much as is held of it.
-    dsyrk(-1.0, rows.T, beta=1.0, c=target.T, overwrite_c=1)
-    np.einsum("ii->i", target)[:] += np.einsum("ij,ij->j", rows, rows) / 2
+    dsyrk(times, rows.T, beta=1.0, c=target.T, overwrite_c=1)
+    np.einsum("ii->i", target)[:] -= times * np.einsum("ij,ij->j", rows, rows) / 2
 
 
 def _over(rows: np.ndarray, at: np.ndarray, columns: np.ndarray) -> np.ndarray:
@@ -371,5 +368,5 @@ def _over(rows: np.ndarray, at: np.ndarray, columns: np.ndarray) -> np.ndarray:
     `at`."""
     rows, there = rows.reshape(-1, rows.shape[2]), at[columns] >= 0
     out = np.zeros((len(rows), int(at.max(initial=-1)) + 1))
-    out[:, at[columns[there]]] = rows[:, : len(columns)][:, there]
+    out[:, at[columns[there]]] = rows[:, there]
     return out
