@@ -9,6 +9,7 @@ from calib.diagnosis.score import project, score_test
 from calib.diagnosis.stand import Stand
 from calib.effects import GEOMETRY, find
 from calib.linear.clusters import Gradients
+from calib.linear.linearise import own_rows
 from calib.problem.model import Model, Source
 from calib.solve.fit import solve
 
@@ -49,7 +50,8 @@ def test_a_stop_grows_by_its_part_of_the_hat_matrix(tmp_path, make):
     stand = fitted(make(tmp_path, 1))
     linear = stand.linearise([], quiet)[0]
     layout, values = linear.whole.layout, stand.estimate.values
-    rows = list(other_rows(stand.problem, layout, values, Gradients(layout.size)))
+    own = own_rows(layout, values)
+    rows = list(other_rows(stand.problem, layout, values, Gradients(layout.size), own))
     A = np.concatenate([_dense(r, layout.size) for r in rows])
     e, stop = (np.concatenate([getattr(r, k) for r in rows]) for k in ("b", "stop"))
     # Priors of the hardware are wider among these rows than they are in the fit.
