@@ -40,6 +40,7 @@ BETTER_SHAPE = 9.0
 # Change of a shape's logarithm at once: a choice, half as much again; the derivative holds no
 # further.
 LARGEST_SHAPE_STEP = 0.4
+MOST_SHAPE_STEPS = 5  # a choice: from the finer grid one or two sufficed in all that was tried
 SCANS_SAMPLED = 8  # scans from which the bins of covariates are taken
 # Beams of each of them at most: a quantile of so many beams in all is off by 0.15 % of them.
 BEAMS_DRAWN = 16_384
@@ -151,28 +152,34 @@ class Stand:
             at[name], start = np.arange(start, start + size), start + size
         return linear, at
 
-    def finest(self, effect: Effect, progress: Progress) -> Effect:
-        """An effect with its shape chosen more finely than the grid on which it was found."""
-        if not effect.shape_name:
-            return effect
-        shaped = finer(effect, shapes_of(effect, self.sources))
-        linear, at = self.linearise(shaped, progress)
-        scores = project(linear, linear.candidates)
-        return max(shaped, key=lambda e: score_test(scores, at[e.name]).statistic)
-
     def retuned(
         self, names: Collection[str], progress: Progress
     ) -> tuple[Stand, dict[str, Effect]]:
-        """With better shapes of some effects, where others have since changed what is best.
+        """With better shapes of some effects, those just found on a grid and those of which others
+        have since changed what is best.
 
         Returns:
             The fit with them, and the effects that took the place of others, by the others' names.
         """
+        stand, found = self, {}
+        for _ in range(MOST_SHAPE_STEPS):
+            first = {found[name].name if name in found else name: name for name in names}
+            swapped = stand._better_shapes(first, progress)
+            if not swapped:
+                break
+            effects = tuple(swapped.get(e.name, e) for e in stand.model.effects)
+            start = replace(stand.estimate.start, state=stand._state_with(swapped))
+            stand = stand._refitted(replace(stand.model, effects=effects), start, progress)
+            found |= {first[name]: effect for name, effect in swapped.items()}
+        return stand, found
+
+    def _better_shapes(self, names: Collection[str], progress: Progress) -> dict[str, Effect]:
+        """By their names, some effects of the model with the shapes that one step leads to."""
         shaped = [e for e in self.model.effects if e.name in names and e.has_derivative_by_shape]
         values = self.estimate.values
         steps = [ShapeStep(e, theta_of(self.problem, e, values)) for e in shaped]
         if not steps:
-            return self, {}
+            return {}
         linear, at = self.linearise(steps, progress)
         scores = project(linear, linear.candidates)
         swapped = {}
@@ -181,12 +188,7 @@ class Stand:
             if found.dof and found.statistic > BETTER_SHAPE:
                 by = np.exp(np.clip(found.estimate()[0], -LARGEST_SHAPE_STEP, LARGEST_SHAPE_STEP))
                 swapped[effect.name] = effect.at(float(f"{effect.shape * by:.6g}"))
-        if not swapped:
-            return self, {}
-        effects = tuple(swapped.get(e.name, e) for e in self.model.effects)
-        model = replace(self.model, effects=effects)
-        start = replace(self.estimate.start, state=self._state_with(swapped))
-        return self._refitted(model, start, progress), swapped
+        return swapped
 
     def _state_with(self, swapped: Mapping[str, Effect]) -> dict[str, np.ndarray]:
         """The state, for a model in which some effects have other shapes."""
@@ -302,6 +304,22 @@ class Look:
     def checked(self) -> set[Group]:
         """Groups of rows that others contradict, or could."""
         return {blunder.group for blunder in self.blunders}
+
+    def closely(self, candidate: Candidate, progress: Progress) -> tuple[Look, Candidate]:
+        """At one candidate alone, with its shape chosen more finely than on the grid on which it
+        was found; it pays for these shapes, too."""
+        stand, effect = self.stand, candidate.effect
+        if not effect.shape_name:
+            return self, candidate
+        shaped = finer(effect, shapes_of(effect, stand.sources))
+        linear, at = stand.linearise(shaped, progress)
+        scores = project(linear, linear.candidates, stand.spent)
+        near = screen(scores, shaped, at, self.named.common)
+        if not near.candidates:
+            return self, candidate
+        (finest,) = near.candidates
+        found = replace(finest, looks=finest.looks * candidate.looks)
+        return replace(self, linear=linear, named=near), found
 
     def judged(self, candidate: Candidate, progress: Progress) -> ScoreTest:
         """A candidate's test with its clusters jackknifed: see `jackknife`."""

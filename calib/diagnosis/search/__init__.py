@@ -25,7 +25,7 @@ from calib.diagnosis.search.confirmed import (
     suspects,
 )
 from calib.diagnosis.search.mishaps import adapted, restored
-from calib.diagnosis.stand import Look, Stand, tried
+from calib.diagnosis.stand import BETTER_SHAPE, Look, Stand, tried
 from calib.effects import Effect
 from calib.solve.fit import Progress
 
@@ -253,27 +253,31 @@ def _fitted(
     """What was found, and a candidate, fitted; nothing where it is not confirmed. One that is tried
     `instead` of blunders is confirmed if it leaves no blunder, at their p-value."""
     test, p = judged(look, candidate, progress)
+    near, finest = look.closely(candidate, progress)
+    better = (finest.test.statistic - candidate.test.statistic) / look.named.common
+    if p >= ALPHA_EFFECT and better > BETTER_SHAPE:
+        test, p = judged(near, finest, progress)
     p = max((b.p_adjusted for b in instead), default=p)
     if p >= ALPHA_EFFECT:
         return []
-    effect = look.stand.finest(candidate.effect, progress)
-    stand = tried(look.stand.with_effects, [effect], progress)
-    theta = stand.theta(effect) if stand else 0 * test.estimate()
-    if look.named.taken_up(candidate, theta) < HELD_BACK:
+    stand = tried(look.stand.with_effects, [finest.effect], progress)
+    theta = stand.theta(finest.effect) if stand else 0 * finest.test.estimate()
+    if near.named.taken_up(finest, theta) < HELD_BACK:
         return []
-    stand, swapped = stand.retuned([f.effect.name for f in found], progress)
+    names = [*(f.effect.name for f in found), finest.effect.name]
+    stand, swapped = stand.retuned(names, progress)
     after = stand.look(progress)
     if instead and any(b.found for b in after.blunders):
         return []
     step = NamedEffect(
-        candidate=replace(candidate, effect=effect, p_value=min(test.p_value(), p)),
+        candidate=replace(candidate, effect=finest.effect, p_value=min(test.p_value(), p)),
         before=look,
         after=after,
         judged=test,
         p_adjusted=p,
         rivals=rivals(look.named, candidate, max(after.named.common, test.inflation)),
     )
-    return [*(f.with_effect(swapped.get(f.effect.name)) for f in found), step]
+    return [f.with_effect(swapped.get(f.effect.name)) for f in (*found, step)]
 
 
 def _likelier(step: NamedEffect) -> Candidate | None:
