@@ -64,6 +64,7 @@ def run(case: Case, baselines: bool = True) -> dict[str, Any]:
             **_described(case, hidden, truth),
             **_said(found),
             "true": [_true(found, effect, truth) for effect in hidden.effects],
+            "beside": _beside(stand, hidden.effects),
             "estimates": [_estimate(found, effect, truth) for effect in hidden.effects],
             "baselines": answers(found.looks[0]) if baselines else {},
         }
@@ -162,6 +163,18 @@ def _true(found: Search, effect: Effect, truth: dict[str, Any]) -> dict[str, Any
         "explains_mm": 1e3 * named.rms_m(candidate),
         "inflation": test.inflation,
     }
+
+
+def _beside(stand: Stand, effects: Sequence[Effect]) -> list[list[float]]:
+    """Of several hidden effects, each one's statistic, directions and common inflation, with all
+    others in the model as they were hidden; none of a single one."""
+    out = []
+    for effect in effects if len(effects) > 1 else ():
+        others = stand.with_effects([e for e in effects if e is not effect], silent)
+        named = others.look(silent).named
+        test = next((c.test for c in named.candidates if c.effect.family == effect.family), None)
+        out.append([test.statistic, test.dof, named.common] if test else [0.0, 1, named.common])
+    return out
 
 
 def _estimate(found: Search, effect: Effect, truth: dict[str, Any]) -> dict[str, Any] | None:

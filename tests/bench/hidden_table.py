@@ -59,8 +59,17 @@ def seen(result: Result) -> bool:
     wanted = family(result["hidden"][0])
     for name, _, _, _, statistic, dof in result["candidates"]:
         if family(name) == wanted:
-            return float(stats.chi2.sf(statistic / result["common"][-1], dof)) < SEEN
+            return _beyond_chance(statistic, dof, result["common"][-1])
     return False
+
+
+def all_seen(result: Result) -> bool:
+    """Whether the oracle sees each of several, those beside it being known."""
+    return all(_beyond_chance(*each) for each in result["beside"])
+
+
+def _beyond_chance(statistic: float, dof: int, common: float) -> bool:
+    return float(stats.chi2.sf(statistic / common, dof)) < SEEN
 
 
 def all_named(result: Result) -> bool:
@@ -179,13 +188,22 @@ def _others(of: dict[str, list[Result]]) -> list[tuple[str, ...]]:
     return [
         *share("unknown: unexplained_structure", unknown, unexplained, ">= 0.90"),
         *share("unknown: and right covariates first", unknown, hangs, ">= 0.90"),
-        *share("pair: both found", of.get("pair", []), all_named, ""),
-        *share("pair-shot: both found", of.get("pair-shot", []), all_named, ">= 0.85"),
-        *share("triple-shot: all found", of.get("triple-shot", []), all_named, ">= 0.85"),
+        *_several("pair", of, ""),
+        *_several("pair-shot", of, ">= 0.85"),
+        *_several("triple-shot", of, ">= 0.85"),
         *share("rival: named, or in its group", rival, named, ""),
         *share("rival: a single wrong name", rival, wrongly_named, "<= 0.05"),
         *share("at the smallest detectable size: found", of.get("detectable", []), named, "0.8"),
     ]
+
+
+def _several(name: str, of: dict[str, list[Result]], goal: str) -> list[tuple[str, ...]]:
+    results = of.get(name, [])
+    shown = [r for r in results if all_seen(r)]
+    lines = share(f"{name}: all found", results, all_named, goal)
+    lines += share(f"{name}: another named, and not as a rival", results, wrongly_named, "")
+    lines += share(f"{name}: the data show all", results, all_seen, "")
+    return lines + share(f"{name}: all found, where they do", shown, all_named, "")
 
 
 def _estimates(results: Sequence[Result]) -> list[tuple[str, ...]]:

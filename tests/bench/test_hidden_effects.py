@@ -92,7 +92,18 @@ def test_the_table_counts():
     right = {**common, "case": "single-1mm/000", "family": "single-1mm", "steps": [step]}
     wrong = {**right, "case": "single-1mm/001", "steps": [{**step, "rivals": []}]}
     failed = {"case": "null/000", "family": "null", "error": "Traceback\nValueError: no"}
-    lines = table([right, wrong, failed]).splitlines()
+    # Of two effects one is named, and beside it the data do not show the other.
+    pair = {**right, "case": "pair/000", "family": "pair", "hidden": ["range_step@2", "faro_scale"]}
+    pair |= {"true": 2 * common["true"], "beside": [[40.0, 1, 2.0], [3.0, 1, 2.0]]}
+    shown = {**pair, "case": "pair/001", "beside": [[40.0, 1, 2.0], [30.0, 1, 2.0]]}
+    lines = table([right, wrong, pair, shown, failed]).splitlines()
+    counts = [line.split()[-6:-3] for line in lines if line.startswith("pair: ")]
+    assert [c[-2:] for c in counts] == [
+        ["2", "0.000"],
+        ["2", "0.000"],
+        ["2", "0.500"],
+        ["1", "0.000"],
+    ]
     (first,) = (line for line in lines if line.startswith("single-1mm: named first  "))
     assert first.split()[3:5] == ["2", "0.500"]
     assert any(line.startswith("single-1mm/001") for line in lines)

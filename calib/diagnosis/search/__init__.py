@@ -129,7 +129,13 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NEEDED) -> Search:
         most: how many effects are named at most; with none, blunders are all that is looked for:
             away from an optimum any effect, structure or scatter seems missing.
     """
-    looks, found, left = plain = _steps(stand, progress, most)
+    plain = _steps(stand, progress, most)
+    if most and not plain[1] and _chance_leads(plain[0][-1]):
+        beside, plain = plain, _steps(stand, progress, most, chance_leads=False)
+    else:
+        beside = plain
+    # Effects that leave nothing to chance predict other stops, and chance does not.
+    looks, found, left = plain if plain[1] and not _by_chance(plain[0][-1]) else beside
     chance: list[Chance] = []
     unsettled: Chance | None = None
     while most and (strongest := next((c for c in looks[-1].chance if c.found), None)):
@@ -163,8 +169,6 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NEEDED) -> Search:
         unsettled=unsettled,
     )
     if done.chance and done.unnamed and structures(plain[0][0], progress):
-        if not plain[1] and _chance_leads(plain[0][-1]):
-            plain = _steps(stand, progress, most, chance_leads=False)
         done = _without_chance(done, plain, progress)
     if done.found and done.dressed_up(0):
         return replace(done, at_first=structures(done.looks[0], progress))
@@ -213,6 +217,11 @@ def _chance_leads(look: Look) -> bool:
     best = max((c.test.statistic for c in every), default=0.0)
     found = [c for c in look.chance if c.found]
     return bool(found) and not found[0].effect.widens and found[0].statistic > best
+
+
+def _by_chance(look: Look) -> bool:
+    """Whether any values by chance are found."""
+    return any(c.found and not c.effect.widens for c in look.chance)
 
 
 def _named(look: Look, found: list[NamedEffect], progress: Progress) -> list[NamedEffect]:
