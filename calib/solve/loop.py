@@ -367,7 +367,8 @@ class Loop(Descent):
             self.take_spread(tolerance)
         self.linearise_here()
         _, fall = self.step()
-        if AT_OPTIMUM <= fall < SWAYS and self.problem.scans and not self.lost:
+        sways = AT_OPTIMUM <= fall < max(SWAYS[0], SWAYS[1] * self.cost())
+        if sways and self.problem.scans and not self.lost:
             self.keep_scales()
             any(self.descend(LAST) for _ in range(DESCENTS))  # redescending weights have plateaus
             self.linearise()
