@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from calib.diagnosis.verdict import _names_hold
+from calib.diagnosis.verdict.sentences import rival_sentence
 from calib.runs.calibrate import calibrate, grow, grown_model
 from calib.runs.diagnose import diagnose
 from calib.runs.run import Run
@@ -239,6 +240,21 @@ def test_rivals_and_structure_are_printed(studies, capsys):
     at = lines.index("not distinguishable on these data")
     assert lines[at + 1] == f"{HIDDEN} faro_scale"
     assert "ring x azimuth_rad 3e-05 1.94 empirical_azimuth" in lines
+
+
+@pytest.mark.parametrize(
+    ("odds", "said"),
+    [
+        (2.54, "not distinguishable from faro_scale (odds 2.5 to 1); some stops would"),
+        (0.4, "not distinguishable from faro_scale (odds 1 to 2.5); some stops would"),
+        (1 / 4567, "faro_scale explains more (odds 1 to 4,567), but is not confirmed by itself;"),
+        (1e-80, "faro_scale explains more (odds 1 to more than a million), but is not confirmed"),
+    ],
+)
+def test_a_rival_is_told_with_its_odds(odds, said):
+    """At which it cannot be told from an effect; beyond 20 to 1 against that it explains more."""
+    rival = {"effect": "faro_scale", "odds": odds, "separate": "some stops"}
+    assert said in rival_sentence(rival)
 
 
 # --------------------------------------------------------------------------------------- bad input

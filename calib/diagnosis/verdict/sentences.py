@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from calib.diagnosis.rejects import FEWEST_STOPS
-from calib.diagnosis.screen import Candidate
+from calib.diagnosis.screen import ODDS, Candidate
 from calib.diagnosis.search import NamedEffect
 from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import hangs_on, words
@@ -199,17 +201,19 @@ def _step_sentences(step: NamedEffect, candidate: Mapping[str, Any], worn: bool)
         f"{candidate['rms_mm']:.2f} mm rms, of which {candidate['unabsorbed_rms_mm']:.2f} mm is "
         f"not absorbed by the model (adjusted p = {step.p_adjusted:.1g}){fall}."
     ]
-    for rival in candidate["rivals"][:MOST_LISTED]:
-        out.append(
-            f"On these data it is not distinguishable from {rival['effect']} (odds "
-            f"{_odds(rival['odds'])}); {rival['separate']} would separate them."
-        )
-    return out
+    return [*out, *map(rival_sentence, candidate["rivals"][:MOST_LISTED])]
 
 
-def _odds(odds: float) -> str:
-    """That of an effect against a rival, as people say it."""
-    return f"{odds:.1f} to 1" if odds >= 1.0 else f"1 to {1.0 / max(odds, 1e-6):.1f}"
+def rival_sentence(rival: Mapping[str, Any]) -> str:
+    """Of a rival of an effect, as `rivals` of diagnosis.json has it."""
+    odds = rival["odds"]
+    ratio = max(odds, 1.0 / max(odds, 1e-300))
+    many = "more than a million" if ratio > 1e6 else f"{ratio:,.{1 if ratio < 100 else 0}f}"
+    told = f"odds {many} to 1" if odds >= 1.0 else f"odds 1 to {many}"
+    said = f"On these data it is not distinguishable from {rival['effect']} ({told})"
+    if odds < np.exp(-ODDS):
+        said = f"{rival['effect']} explains more ({told}), but is not confirmed by itself"
+    return f"{said}; {rival['separate']} would separate them."
 
 
 def _residual(look: Look) -> str:
