@@ -163,14 +163,16 @@ class Stand:
         """
         stand, found = self, {}
         for _ in range(MOST_SHAPE_STEPS):
-            first = {found[name].name if name in found else name: name for name in names}
-            swapped = stand._better_shapes(first, progress)
-            if not swapped:
-                break
+            original = {found[name].name if name in found else name: name for name in names}
+            swapped = stand._better_shapes(original, progress)
             effects = tuple(swapped.get(e.name, e) for e in stand.model.effects)
             start = replace(stand.estimate.start, state=stand._state_with(swapped))
-            stand = stand._refitted(replace(stand.model, effects=effects), start, progress)
-            found |= {first[name]: effect for name, effect in swapped.items()}
+            model = replace(stand.model, effects=effects)
+            further = tried(stand._refitted, model, start, progress) if swapped else None
+            if further is None:
+                break
+            stand = further
+            found |= {original[name]: effect for name, effect in swapped.items()}
         return stand, found
 
     def _better_shapes(self, names: Collection[str], progress: Progress) -> dict[str, Effect]:
@@ -306,8 +308,8 @@ class Look:
         return {blunder.group for blunder in self.blunders}
 
     def closely(self, candidate: Candidate, progress: Progress) -> tuple[Look, Candidate]:
-        """At one candidate alone, with its shape chosen more finely than on the grid on which it
-        was found; it pays for these shapes, too."""
+        """A look at one candidate alone, in finer shapes between those of the grid beside its own,
+        and the best of them, which is paid for as one of so many more."""
         stand, effect = self.stand, candidate.effect
         if not effect.shape_name:
             return self, candidate
@@ -320,6 +322,20 @@ class Look:
         (finest,) = near.candidates
         found = replace(finest, looks=finest.looks * candidate.looks)
         return replace(self, linear=linear, named=near), found
+
+    def with_shape(self, near: Look, finest: Candidate) -> tuple[Look, Candidate]:
+        """This look, and a candidate in it, as that is in a finer shape of another look."""
+        family = finest.effect.family
+        own = next(c for c in self.named.candidates if c.effect.family == family)
+        if len(own.test.columns) != len(finest.test.columns):  # the data show more or less of it
+            return self, replace(own, effect=finest.effect)
+        here, there = (np.ix_(c.test.columns, c.test.columns) for c in (own, finest))
+        scores, finer = self.named.scores, near.named.scores
+        whole, information = scores.whole.copy(), scores.information.copy()
+        whole[here], information[here] = finer.whole[there], finer.information[there]
+        changed = replace(scores, whole=whole, information=information)
+        shaped = replace(finest, test=replace(finest.test, columns=own.test.columns))
+        return replace(self, named=replace(self.named, scores=changed)), shaped
 
     def judged(self, candidate: Candidate, progress: Progress) -> ScoreTest:
         """A candidate's test with its clusters jackknifed: see `jackknife`."""

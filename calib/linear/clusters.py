@@ -92,7 +92,7 @@ class Gradients:
 
     size: int
     places: dict[object, int] = field(default_factory=dict)
-    _tables: list[Entries] = field(default_factory=list)
+    _entries: list[Entries] = field(default_factory=list)
     _clusters: list[np.ndarray] = field(default_factory=list)
 
     def place(self, key: object) -> int:
@@ -111,7 +111,7 @@ class Gradients:
         place: np.ndarray,
     ) -> None:
         """Add clusters (C, n) over some columns (n,), of stops and places (C,), -1 for none."""
-        self._tables.append(Entries.of(gradient, columns))
+        self._entries.append(Entries.of(gradient, columns))
         self._clusters.append(np.stack([stop, place]))
 
     def add_rows(self, rows: ClusteredRows) -> None:
@@ -130,4 +130,4 @@ class Gradients:
     def table(self) -> tuple[csr_array, np.ndarray, np.ndarray]:
         """All clusters (C, U), sparse; the stop and the place (C,) of each."""
         stop, place = np.concatenate(self._clusters, axis=1)
-        return over_all(self._tables, self.size), stop, place
+        return over_all(self._entries, self.size), stop, place

@@ -40,11 +40,6 @@ LAST = AT_OPTIMUM / 4
 # While weights still change, passes end when one lowers the cost by less than so much of what the
 # first was to lower it by.
 ROUGHLY = 0.01
-# By how much a step still lowers half the chi-square, at any rate and of itself, where the robust
-# scales alone keep a fit from its end. 0.002 to 0.010 in 4 of 50 recordings with a structured error
-# and 400 beams a stop; up to 2e-4 of it where 12 stops are up to 6 mm off, each by itself: ten and
-# five times that. Scales are then kept, as by MM-estimates (Yohai 1987, Annals of Statistics 15).
-SWAYS = 0.1, 1e-3
 STEADY = 1e-9  # the same, of trackers and targets alone, whose steps cost little
 COST_ROUNDING = 1e-14  # of a cost: what is less is rounding
 UPHILL = 1e-9  # of a cost: a step that raises it by more is shortened

@@ -166,14 +166,16 @@ def _true(found: Search, effect: Effect, truth: dict[str, Any]) -> dict[str, Any
 
 
 def _beside(stand: Stand, effects: Sequence[Effect]) -> list[list[float]]:
-    """Of several hidden effects, each one's statistic, directions and common inflation, with all
-    others in the model as they were hidden; none of a single one."""
-    out = []
-    for effect in effects if len(effects) > 1 else ():
+    """Of several hidden effects, each one's statistic and directions, with all others in the model
+    as they were hidden, and the inflation once all are; none of a single one."""
+    if len(effects) < 2:
+        return []
+    out, common = [], stand.with_effects(effects, silent).look(silent).named.common
+    for effect in effects:
         others = stand.with_effects([e for e in effects if e is not effect], silent)
-        named = others.look(silent).named
-        test = next((c.test for c in named.candidates if c.effect.family == effect.family), None)
-        out.append([test.statistic, test.dof, named.common] if test else [0.0, 1, named.common])
+        found = others.look(silent).named.candidates
+        test = next((c.test for c in found if c.effect.family == effect.family), None)
+        out.append([test.statistic, test.dof, common] if test else [0.0, 1, common])
     return out
 
 

@@ -65,7 +65,13 @@ def seen(result: Result) -> bool:
 
 def all_seen(result: Result) -> bool:
     """Whether the oracle sees each of several, those beside it being known."""
-    return all(_beyond_chance(*each) for each in result["beside"])
+    return "beside" in result and all(_beyond_chance(*each) for each in result["beside"])
+
+
+def any_wrong(result: Result) -> bool:
+    """Whether any name is not hidden, and has no rival that is."""
+    hidden = set(map(family, result["hidden"]))
+    return any(not hidden & group(step) for step in result["steps"])
 
 
 def _beyond_chance(statistic: float, dof: int, common: float) -> bool:
@@ -201,7 +207,7 @@ def _several(name: str, of: dict[str, list[Result]], goal: str) -> list[tuple[st
     results = of.get(name, [])
     shown = [r for r in results if all_seen(r)]
     lines = share(f"{name}: all found", results, all_named, goal)
-    lines += share(f"{name}: another named, and not as a rival", results, wrongly_named, "")
+    lines += share(f"{name}: another named, and not as a rival", results, any_wrong, "")
     lines += share(f"{name}: the data show all", results, all_seen, "")
     return lines + share(f"{name}: all found, where they do", shown, all_named, "")
 

@@ -96,14 +96,19 @@ def test_the_table_counts():
     pair = {**right, "case": "pair/000", "family": "pair", "hidden": ["range_step@2", "faro_scale"]}
     pair |= {"true": 2 * common["true"], "beside": [[40.0, 1, 2.0], [3.0, 1, 2.0]]}
     shown = {**pair, "case": "pair/001", "beside": [[40.0, 1, 2.0], [30.0, 1, 2.0]]}
-    lines = table([right, wrong, pair, shown, failed]).splitlines()
-    counts = [line.split()[-6:-3] for line in lines if line.startswith("pair: ")]
-    assert [c[-2:] for c in counts] == [
-        ["2", "0.000"],
-        ["2", "0.000"],
-        ["2", "0.500"],
-        ["1", "0.000"],
-    ]
+    second = {**step, "effect": "faro_scale", "rivals": []}
+    both = {**shown, "case": "pair/002", "steps": [step, second]}
+    more = {**shown, "case": "pair/003", "steps": [step, {**second, "effect": "base_flex"}]}
+    lines = table([right, wrong, pair, shown, both, more, failed]).splitlines()
+    counts = {line.split("  ")[0]: line.split() for line in lines if line.startswith("pair: ")}
+    expected = {
+        "all found": ["4", "0.250"],
+        "another named, and not as a rival": ["4", "0.250"],
+        "the data show all": ["4", "0.750"],
+        "all found, where they do": ["3", "0.333"],
+    }
+    for what, numbers in expected.items():
+        assert " ".join(numbers) in " ".join(counts[f"pair: {what}"])
     (first,) = (line for line in lines if line.startswith("single-1mm: named first  "))
     assert first.split()[3:5] == ["2", "0.500"]
     assert any(line.startswith("single-1mm/001") for line in lines)

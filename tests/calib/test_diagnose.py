@@ -247,8 +247,8 @@ def test_rivals_and_structure_are_printed(studies, capsys):
     [
         (2.54, "not distinguishable from faro_scale (odds 2.5 to 1); some stops would"),
         (0.4, "not distinguishable from faro_scale (odds 1 to 2.5); some stops would"),
-        (1 / 4567, "faro_scale explains more (odds 1 to 4,567), but is not confirmed by itself;"),
-        (1e-80, "faro_scale explains more (odds 1 to more than a million), but is not confirmed"),
+        (1 / 4567, "faro_scale explains more (odds 1 to 4,567); some stops would separate them."),
+        (1e-80, "faro_scale explains more (odds 1 to more than a million);"),
     ],
 )
 def test_a_rival_is_told_with_its_odds(odds, said):

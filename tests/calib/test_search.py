@@ -27,6 +27,9 @@ def test_an_effect_that_no_shape_of_the_grid_fits_is_named_in_its_own(tmp_path):
     (step,) = done.found
     assert step.effect.family == "range_cyclic"
     assert step.effect.shape == pytest.approx(0.815, abs=3e-4)
+    grid = next(c for c in step.before.named.candidates if c.effect.family == "range_cyclic")
+    assert step.candidate.test.statistic == pytest.approx(step.judged.statistic, rel=1e-6)
+    assert step.candidate.test.statistic > 1.1 * grid.test.statistic
     size = step.after.stand.theta(step.effect)
     assert size == pytest.approx(truth["effects"]["range_cyclic@0.815"], abs=5e-4)
     assert not done.chance

@@ -25,7 +25,7 @@ from calib.diagnosis.search.confirmed import (
     suspects,
 )
 from calib.diagnosis.search.mishaps import adapted, restored
-from calib.diagnosis.stand import BETTER_SHAPE, Look, Stand, tried
+from calib.diagnosis.stand import Look, Stand, tried
 from calib.effects import Effect
 from calib.solve.fit import Progress
 
@@ -129,13 +129,12 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NEEDED) -> Search:
         most: how many effects are named at most; with none, blunders are all that is looked for:
             away from an optimum any effect, structure or scatter seems missing.
     """
-    plain = _steps(stand, progress, most)
+    steps = plain = _steps(stand, progress, most)
     if most and not plain[1] and _chance_leads(plain[0][-1]):
-        beside, plain = plain, _steps(stand, progress, most, chance_leads=False)
-    else:
-        beside = plain
-    # Effects that leave nothing to chance predict other stops, and chance does not.
-    looks, found, left = plain if plain[1] and not _by_chance(plain[0][-1]) else beside
+        plain = _steps(stand, progress, most, begun=plain)
+        if plain[1] and _explains_all(plain[0][-1], progress):
+            steps = plain  # effects predict other stops, and values by chance do not
+    looks, found, left = steps
     chance: list[Chance] = []
     unsettled: Chance | None = None
     while most and (strongest := next((c for c in looks[-1].chance if c.found), None)):
@@ -186,10 +185,12 @@ def _without_chance(done: Search, steps: Steps, progress: Progress) -> Search:
     return replace(done, looks=looks, found=found, blunders=left, unnamed=unnamed, scatter=scatter)
 
 
-def _steps(stand: Stand, progress: Progress, most: int, chance_leads: bool = True) -> Steps:
+def _steps(stand: Stand, progress: Progress, most: int, begun: Steps | None = None) -> Steps:
     """Effects and blunders, one after another, with no more by chance than the model has: the
-    looks, and both, as `Search` has them."""
-    first, looks, found, left = stand, [stand.look(progress)], [], []
+    looks, and both, as `Search` has them. They end where values by chance lead at first; those that
+    have `begun` so go on from there."""
+    looks, found, left = map(list, begun or ([stand.look(progress)], [], []))
+    first = stand
     while True:
         before, mishaps = looks[-1], len(left)
         looks[-1] = adapted(before, left, progress, named=bool(found))
@@ -199,7 +200,7 @@ def _steps(stand: Stand, progress: Progress, most: int, chance_leads: bool = Tru
             found, looks[-1] = more, before
             looks.append(found[-1].after)
             continue
-        if chance_leads and not found and _chance_leads(looks[-1]):
+        if begun is None and not found and _chance_leads(looks[-1]):
             break
         more = _named(looks[-1], found, progress) if len(found) < most else found
         if len(more) == len(found):
@@ -219,9 +220,11 @@ def _chance_leads(look: Look) -> bool:
     return bool(found) and not found[0].effect.widens and found[0].statistic > best
 
 
-def _by_chance(look: Look) -> bool:
-    """Whether any values by chance are found."""
-    return any(c.found and not c.effect.widens for c in look.chance)
+def _explains_all(look: Look, progress: Progress) -> bool:
+    """Whether a fit with all that was named has come to its end, and leaves neither structure nor
+    values by chance to be found."""
+    left = any(c.found and not c.effect.widens for c in look.chance)
+    return look.stand.estimate.converged and not left and not structures(look, progress)
 
 
 def _named(look: Look, found: list[NamedEffect], progress: Progress) -> list[NamedEffect]:
@@ -261,11 +264,8 @@ def _fitted(
 ) -> list[NamedEffect]:
     """What was found, and a candidate, fitted; nothing where it is not confirmed. One that is tried
     `instead` of blunders is confirmed if it leaves no blunder, at their p-value."""
-    test, p = judged(look, candidate, progress)
     near, finest = look.closely(candidate, progress)
-    better = (finest.test.statistic - candidate.test.statistic) / look.named.common
-    if p >= ALPHA_EFFECT and better > BETTER_SHAPE:
-        test, p = judged(near, finest, progress)
+    test, p = judged(near, finest, progress)
     p = max((b.p_adjusted for b in instead), default=p)
     if p >= ALPHA_EFFECT:
         return []
@@ -273,18 +273,19 @@ def _fitted(
     theta = stand.theta(finest.effect) if stand else 0 * finest.test.estimate()
     if near.named.taken_up(finest, theta) < HELD_BACK:
         return []
+    before, finest = look.with_shape(near, finest)
     names = [*(f.effect.name for f in found), finest.effect.name]
     stand, swapped = stand.retuned(names, progress)
     after = stand.look(progress)
     if instead and any(b.found for b in after.blunders):
         return []
     step = NamedEffect(
-        candidate=replace(candidate, effect=finest.effect, p_value=min(test.p_value(), p)),
-        before=look,
+        candidate=replace(finest, p_value=min(test.p_value(), p)),
+        before=before,
         after=after,
         judged=test,
         p_adjusted=p,
-        rivals=rivals(look.named, candidate, max(after.named.common, test.inflation)),
+        rivals=rivals(before.named, finest, max(after.named.common, test.inflation)),
     )
     return [f.with_effect(swapped.get(f.effect.name)) for f in (*found, step)]
 

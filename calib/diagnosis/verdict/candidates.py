@@ -130,7 +130,8 @@ def explained(fall: Fall) -> float:
 
 
 def _rivals(step: NamedEffect) -> list[dict[str, Any]]:
-    screen = step.before.named
+    screen, family = step.before.named, step.effect.family
+    on_grid = next((c for c in screen.candidates if c.effect.family == family), step.candidate)
     scale = max(step.after.named.common, step.judged.inflation)
     own = step.candidate.test.log_score(scale)
     alike = {other.effect.name for other in step.rivals if _alike(step, other)}
@@ -139,7 +140,7 @@ def _rivals(step: NamedEffect) -> list[dict[str, Any]]:
             "effect": other.effect.family,
             "add": other.effect.name,
             "dof": other.test.dof,
-            "angle_deg": angle_deg(screen, step.candidate, other),
+            "angle_deg": angle_deg(screen, on_grid, other),
             "odds": float(np.exp(own - other.test.log_score(scale))),
             "separate": (
                 ALIKE if other.effect.name in alike else what_separates(step.effect, other.effect)

@@ -212,7 +212,7 @@ def rival_sentence(rival: Mapping[str, Any]) -> str:
     told = f"odds {many} to 1" if odds >= 1.0 else f"odds 1 to {many}"
     said = f"On these data it is not distinguishable from {rival['effect']} ({told})"
     if odds < np.exp(-ODDS):
-        said = f"{rival['effect']} explains more ({told}), but is not confirmed by itself"
+        said = f"{rival['effect']} explains more ({told})"
     return f"{said}; {rival['separate']} would separate them."
 
 

@@ -219,7 +219,7 @@ def test_gradients_by_cluster_are_those_of_their_rows(case, together):
     case.linear(gradients=gradients)
     chosen = np.flatnonzero(case.dense.kind == "beams")
     if not len(chosen):
-        assert gradients._tables == []
+        assert gradients._entries == []
         return
     expected = {}
     for i in chosen:
