@@ -17,7 +17,7 @@ from calib.diagnosis.chance import Spread
 from calib.diagnosis.rejects import rejects
 from calib.diagnosis.search import Search, search
 from calib.diagnosis.search.confirmed import structures
-from calib.diagnosis.stand import Look, Stand
+from calib.diagnosis.stand import Look, Stand, tried
 from calib.diagnosis.verdict import ABSORBED_BY_MODEL, Diagnosis, believed, conclude
 from calib.diagnosis.verdict.known import by_name
 from calib.diagnosis.verdict.matters import HELD_OUT_BY_CHANCE, weighed
@@ -128,8 +128,9 @@ def _found(
 
 
 def _falls(found: Search, stand: Stand, run: Run, progress: Progress) -> dict[str, Fall]:
-    """How the held-out error falls with each name that was found, after those before it; without
-    any, with all that scatters by chance, where it is larger than expected."""
+    """How the held-out error falls with each name that was found, after those before it, or beside
+    all others where it rises after those; without any, with all that scatters by chance, where it
+    is larger than expected."""
     falls = {}
     before, each_m2 = run.summary["rms_mm"]["held_out"], run.unseen_m2
     if found.looks[0].stand is not stand and found.found:
@@ -140,6 +141,13 @@ def _falls(found: Search, stand: Stand, run: Run, progress: Progress) -> dict[st
         gain = gains_m2(each_m2, unseen.each_m2)
         falls[step.effect.name] = Fall(before, unseen.rms_mm, unseen.floor_mm, gain)
         before, each_m2 = unseen.rms_mm, unseen.each_m2
+    for step in found.found[:-1]:
+        # What is named first may predict nothing as long as what is named later is missing.
+        name, whole = step.effect.name, found.found[-1].after.stand
+        if falls[name].rises and (less := tried(whole.lacking, [name], progress)):
+            unseen = _unseen(less, run, progress)
+            gain = gains_m2(unseen.each_m2, each_m2)
+            falls[name] = Fall(unseen.rms_mm, before, unseen.floor_mm, gain)
     last = found.looks[-1].stand
     scatter = [c.effect.name for c in found.chance if c.effect.name in last.model.names]
     nothing = not found.found and not found.unnamed

@@ -19,9 +19,10 @@ from calib.diagnosis.search import Search, in_place
 from calib.diagnosis.search.confirmed import ALPHA_UNNAMED, suspects
 from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import formula, hangs_on
-from calib.diagnosis.verdict.candidates import candidate_documents, explained
+from calib.diagnosis.verdict.candidates import candidate_documents
 from calib.diagnosis.verdict.curves import Curve, curves
 from calib.diagnosis.verdict.matters import (
+    ABSORBED,
     HELD_OUT_BESIDE_SCATTER,
     HELD_OUT_BY_CHANCE,
     weighed,
@@ -40,9 +41,6 @@ VERDICTS = {
     BAD: "something in the recording is wrong",
 }
 ABSORBED_BY_MODEL = "not identifiable: absorbed by the model"
-# Share of structure, or held-out error, that names must explain to be the answer: a choice. Of the
-# rms more than half is left by an answer that explains less than that of the squares.
-ABSORBED = 0.7
 
 
 @dataclass(frozen=True)
@@ -271,7 +269,7 @@ def _leave_most(found: Search, held_out: Mapping[str, Fall]) -> bool:
     if not falls or falls[-1].takes_back or not found.looks[0].stand.estimate.scans:
         return False
     whole = replace(falls[-1], before_mm=falls[0].before_mm)
-    return whole.after_mm > HELD_OUT_BY_CHANCE * whole.floor_mm and explained(whole) < ABSORBED
+    return whole.after_mm > HELD_OUT_BY_CHANCE * whole.floor_mm and whole.explained < ABSORBED
 
 
 def _names_hold(found: Search) -> bool:

@@ -102,7 +102,7 @@ def _candidate(candidate: Candidate, found: Search, held_out: Mapping[str, Fall]
         },
         "held_out_spread_mm": fall.spread_mm if fall else None,
         "rejected_share": _shares(fall),
-        "error_explained": None if fall is None or fall.takes_back else explained(fall),
+        "error_explained": None if fall is None or fall.takes_back else fall.explained,
         "rms_mm": None if noise else 1e3 * look.size_m(candidate),
         "unabsorbed_rms_mm": None if noise else 1e3 * look.rms_m(candidate),
         "parameters": {
@@ -121,12 +121,6 @@ def _shares(fall: Fall | None) -> dict[str, float | None]:
     """Of the beams held out that were rejected, where it takes some back."""
     both = fall.rejected_share if fall and fall.takes_back else None
     return dict(zip(("before", "after"), both or (None, None), strict=True))
-
-
-def explained(fall: Fall) -> float:
-    """Share of what the held-out error has above what is expected."""
-    before, after, floor = np.square([fall.before_mm, fall.after_mm, fall.floor_mm]).tolist()
-    return (before - after) / max(before - floor, before - after, 1e-12)
 
 
 def _rivals(step: NamedEffect) -> list[dict[str, Any]]:

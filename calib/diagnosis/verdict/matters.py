@@ -35,6 +35,9 @@ HELD_OUT_BY_CHANCE = 1.25
 # The same of models with something that scatters beyond its sigma: of 24 by that simulator the
 # largest was 1.31, with a mesh three times as bad as stated, whose errors steps only approach.
 HELD_OUT_BESIDE_SCATTER = 1.4
+# Share of structure, or held-out error, that names must explain to be the answer: a choice. Of the
+# rms more than half is left by an answer that explains less than that of the squares.
+ABSORBED = 0.7
 
 
 @dataclass(frozen=True)
@@ -160,7 +163,7 @@ def weighed(
                 f"{name} was tried and rejected: it absorbs part of the residuals, but stops that "
                 f"were held out are predicted worse with it ({told.held_out_mm:+.3f} mm)."
             )
-        elif named and fall is not None and fall.by_chance and (other := _more_general(step)):
+        elif named and not _borne_out(fall) and (other := _more_general(step)):
             refused.append(
                 f"{name} was tried and rejected: what {named[-1].effect.name} leaves of the "
                 f"residuals is significant (adjusted p = {step.p_adjusted:.1g}) and it absorbs "
@@ -185,6 +188,14 @@ def weighed(
     if not refused and not named:
         kept["at_first"] = []  # nothing stands in the way of what is left
     return Weighed(replace(found, found=named, **kept), matter, traces, refused=refused)
+
+
+def _borne_out(fall: Fall | None) -> bool:
+    """Whether stops held out bear a name out, as far as it is known: as they agree, or as it takes
+    most of an error that is larger than chance makes it."""
+    if fall is None or not fall.by_chance:
+        return True
+    return fall.before_mm > HELD_OUT_BY_CHANCE * fall.floor_mm and fall.explained > ABSORBED
 
 
 def _more_general(step: NamedEffect) -> str:
