@@ -69,14 +69,16 @@ class Stand:
     @cached_property
     def spent(self) -> int:
         """How many unknowns of the model differ by stop alone: those of effects that depend on
-        columns of the stops and on nothing else. Geometry of the arm, which depends on joints, is
-        not counted: each stop has the rows of its tracked bodies to tell of it."""
+        columns of the stops and on nothing else. Geometry of the arm, which depends on joints, and
+        errors of a tracker are not counted: each stop has the rows of its tracked bodies to tell of
+        them."""
         terms = {t.variable: t for some in self.problem.terms for t in some}
         columns = {c for s in self.sources for c in s.columns}
         return sum(
             len(term.free)
             for term in terms.values()
             if term.effect.covariates and not term.effect.by_chance
+            if term.effect.site is not Site.TRACKER
             if columns.issuperset(term.effect.covariates)
         )
 

@@ -13,9 +13,9 @@ def quiet(what, done, total):
     pass
 
 
-def found(folder, **hidden):
+def found(folder, seed=1, **hidden):
     """What is found in a small recording with these hidden, by the default model."""
-    _, truth = made(folder / "rec", "tiny", 1, **hidden)
+    _, truth = made(folder / "rec", "tiny", seed, **hidden)
     run = calibrate([folder / "rec"], folder / "run", hold_out="none")
     return search(stand_of(run, quiet), quiet), truth
 
@@ -33,6 +33,17 @@ def test_an_effect_that_no_shape_of_the_grid_fits_is_named_in_its_own(tmp_path):
     size = step.after.stand.theta(step.effect)
     assert size == pytest.approx(truth["effects"]["range_cyclic@0.815"], abs=5e-4)
     assert not done.chance
+
+
+def test_what_was_named_beside_chance_lets_others_take_its_place(tmp_path):
+    """Three effects, none of which explains as much alone as a zero of its own at every stop: the
+    warm-up is found once the others are in the model and the zeros are not."""
+    hidden = {"label_range_offset": 5.0, "optitrack_distortion": 3.0, "warmup_drift@400": 3.0}
+    done, _ = found(tmp_path, seed=738, **hidden)
+    names = [step.effect.family for step in done.found]
+    assert names == ["label_range_offset", "optitrack_distortion", "warmup_drift"]
+    assert done.found[-1].effect.shape == pytest.approx(400, rel=0.1)
+    assert not done.chance and not done.unnamed
 
 
 def test_a_drift_that_another_effect_covers_is_no_scatter_of_stops(tmp_path):

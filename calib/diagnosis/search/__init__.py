@@ -132,8 +132,7 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NEEDED) -> Search:
     steps = plain = _steps(stand, progress, most)
     if most and not plain[1] and _chance_leads(plain[0][-1]):
         plain = _steps(stand, progress, most, begun=plain)
-        if plain[1] and _explains_all(plain[0][-1], progress):
-            steps = plain  # effects predict other stops, and values by chance do not
+        steps = plain if _explain_all(plain, progress) else steps
     looks, found, left = steps
     chance: list[Chance] = []
     unsettled: Chance | None = None
@@ -150,7 +149,10 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NEEDED) -> Search:
         if widens:
             looks = [*looks, beside.look(progress)]
         else:
-            looks, found, left = _steps(beside, progress, most)
+            looks, found, left = steps = _steps(beside, progress, most)
+            if more := _in_place_of_chance(stand, plain[0][0], steps, progress, most):
+                (looks, found, left), chance = more, []
+                continue
         tested = {c.effect.name for c in looks[-1].chance}  # with it, and others that still can be
         near = (c for c in others if strongest.statistic - c.statistic < 2 * ODDS)
         alike = [*near, *(c for c in others if c.effect.name not in tested)]
@@ -220,11 +222,30 @@ def _chance_leads(look: Look) -> bool:
     return bool(found) and not found[0].effect.widens and found[0].statistic > best
 
 
-def _explains_all(look: Look, progress: Progress) -> bool:
+def _in_place_of_chance(
+    stand: Stand, first: Look, beside: Steps, progress: Progress, most: int
+) -> Steps | None:
+    """What is named from the fit of a stand and effects that were named beside values by chance,
+    without these, if that is all there is: such values take in an effect that differs by stop."""
+    _, found, left = beside
+    if not 0 < len(found) < most:
+        return None
+    bare = tried(stand.with_effects, [step.effect for step in found], progress)
+    if bare is None:
+        return None
+    looks, more, left = _steps(bare, progress, most, begun=([bare.look(progress)], found, left))
+    steps = [first, *looks], more, left
+    return steps if len(more) > len(found) and _explain_all(steps, progress) else None
+
+
+def _explain_all(steps: Steps, progress: Progress) -> bool:
     """Whether a fit with all that was named has come to its end, and leaves neither structure nor
-    values by chance to be found."""
+    values by chance to be found. Then these names stand: effects predict other stops, and values by
+    chance do not."""
+    (*_, look), found, _ = steps
     left = any(c.found and not c.effect.widens for c in look.chance)
-    return look.stand.estimate.converged and not left and not structures(look, progress)
+    whole = found and look.stand.estimate.converged and not left
+    return bool(whole and not structures(look, progress))
 
 
 def _named(look: Look, found: list[NamedEffect], progress: Progress) -> list[NamedEffect]:
