@@ -167,11 +167,12 @@ class Stand:
         for _ in range(MOST_SHAPE_STEPS):
             original = {found[name].name if name in found else name: name for name in names}
             swapped = stand._better_shapes(original, progress)
+            if not swapped:
+                break
             effects = tuple(swapped.get(e.name, e) for e in stand.model.effects)
             start = replace(stand.estimate.start, state=stand._state_with(swapped))
             model = replace(stand.model, effects=effects)
-            further = tried(stand._refitted, model, start, progress) if swapped else None
-            if further is None:
+            if (further := tried(stand._refitted, model, start, progress)) is None:
                 break
             stand = further
             found |= {original[name]: effect for name, effect in swapped.items()}
@@ -310,8 +311,8 @@ class Look:
         return {blunder.group for blunder in self.blunders}
 
     def closely(self, candidate: Candidate, progress: Progress) -> tuple[Look, Candidate]:
-        """A look at one candidate alone, in finer shapes between those of the grid beside its own,
-        and the best of them, which is paid for as one of so many more."""
+        """A look at one candidate alone, in finer shapes between those of the grid beside its own;
+        and the best of them, whose p-value is to be adjusted for these shapes as well."""
         stand, effect = self.stand, candidate.effect
         if not effect.shape_name:
             return self, candidate
@@ -325,19 +326,23 @@ class Look:
         found = replace(finest, looks=finest.looks * candidate.looks)
         return replace(self, linear=linear, named=near), found
 
-    def with_shape(self, near: Look, finest: Candidate) -> tuple[Look, Candidate]:
-        """This look, and a candidate in it, as that is in a finer shape of another look."""
-        family = finest.effect.family
-        own = next(c for c in self.named.candidates if c.effect.family == family)
-        if len(own.test.columns) != len(finest.test.columns):  # the data show more or less of it
-            return self, replace(own, effect=finest.effect)
-        here, there = (np.ix_(c.test.columns, c.test.columns) for c in (own, finest))
-        scores, finer = self.named.scores, near.named.scores
+    def with_shape(
+        self, candidate: Candidate, near: Look, finest: Candidate
+    ) -> tuple[Look, Candidate]:
+        """This look with one of its candidates in the finer shape that it has in another look."""
+        columns = candidate.test.columns
+        if near is self:
+            return self, finest
+        if len(columns) != len(finest.test.columns):  # the data show more or less of it
+            return self, replace(candidate, effect=finest.effect)
+        here, there = (np.ix_(each, each) for each in (columns, finest.test.columns))
+        scores, shaped = self.named.scores, near.named.scores
         whole, information = scores.whole.copy(), scores.information.copy()
-        whole[here], information[here] = finer.whole[there], finer.information[there]
+        whole[here], information[here] = shaped.whole[there], shaped.information[there]
         changed = replace(scores, whole=whole, information=information)
-        shaped = replace(finest, test=replace(finest.test, columns=own.test.columns))
-        return replace(self, named=replace(self.named, scores=changed)), shaped
+        named = replace(self.named, scores=changed)
+        moved = replace(finest, test=replace(finest.test, columns=columns))
+        return replace(self, named=named), moved
 
     def judged(self, candidate: Candidate, progress: Progress) -> ScoreTest:
         """A candidate's test with its clusters jackknifed: see `jackknife`."""

@@ -358,9 +358,9 @@ class Assembly:
 
 def _add_square(target: np.ndarray, rows: np.ndarray, times: float = 1.0) -> None:
     """Add ``rows.T @ rows`` so many times to a matrix of which half is held, below its diagonal."""
-    # Each pair of columns once, and each column by itself twice as much as is held of it.
     if not target.size:
-        return  # which LAPACK refuses
+        return  # which BLAS refuses
+    # Each pair of columns once, and each column by itself twice as much as is held of it.
     dsyrk(times, rows.T, beta=1.0, c=target.T, overwrite_c=1)
     np.einsum("ii->i", target)[:] -= times * np.einsum("ij,ij->j", rows, rows) / 2
 

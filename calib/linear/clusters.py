@@ -39,6 +39,11 @@ class Entries(NamedTuple):
         row, at = np.nonzero(A)
         return cls(A[row, at], columns[at], np.bincount(row, minlength=len(A)))
 
+    @classmethod
+    def one_each(cls, values: np.ndarray, columns: np.ndarray) -> Entries:
+        """Of rows with one value (m,) each, in these columns (m,)."""
+        return cls(values, columns, np.ones(len(columns), int))
+
 
 def over_all(some: Sequence[Entries], size: int) -> csr_array:
     """Some rows, one after the other, over all columns (R, U)."""

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from itertools import islice
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -117,7 +116,7 @@ def rows_at(problem: Problem, site: Site) -> list[Whose]:
         units = {body: ("m",) if point else ("rad", "m") for body, point in bodies.items()}
         return [Whose("body", body, unit) for body, some in units.items() for unit in some]
     if site is Site.JOINTS:
-        units = [unit for unit in ("rad", "m") if any(True for _ in read(problem, unit))]
+        units = [unit for unit in ("rad", "m") if next(read(problem, unit), None) is not None]
         return [Whose("joints", JOINTS, unit) for unit in units]
     if site is Site.TARGET:
         there = any(isinstance(block, HangingTarget) for block in problem.blocks)
@@ -140,7 +139,7 @@ def sigmas(problem: Problem) -> dict[Whose, tuple[float, float]]:
         for unit in ("rad", "m")
     }
     for unit in ("rad", "m"):
-        for unknown in islice(read(problem, unit), 1):
+        if (unknown := next(read(problem, unit), None)) is not None:
             sigma = float(unknown.sigma[unknown.read(unit)[0]])
             out[Whose("joints", JOINTS, unit)] = sigma, unknown.scatter.get(unit, 0.0)
     for block in (b for b in problem.blocks if isinstance(b, HangingTarget)):

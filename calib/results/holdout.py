@@ -87,10 +87,10 @@ class Fall:
         limit = special.stdtrit(len(self.gain_m2) - 1, 1.0 - BY_CHANCE / 2)
         if np.mean(self.gain_m2) > limit * self._spread_m2:
             return False
-        from scipy.stats import wilcoxon  # takes 0.2 s to import, and is seldom needed
-
         if not any(self.gain_m2):
             return True
+        from scipy.stats import wilcoxon  # seldom needed, and slow to import
+
         return bool(wilcoxon(self.gain_m2, alternative="greater").pvalue >= BY_CHANCE / 2)
 
     @property

@@ -319,7 +319,7 @@ def _of_joints(
     parts, found = (np.concatenate(each) for each in (residual, sigma, columns)), []
     batches = (np.array_split(part, -(-len(part) // READINGS_TOGETHER)) for part in parts)
     for v, s, c in zip(*batches, strict=True):
-        rows = over_all([Entries(1.0 / s, c, np.ones(len(c), int))], linear.layout.size)
+        rows = over_all([Entries.one_each(1.0 / s, c)], linear.layout.size)
         found.append(Checks.of(v, np.eye(len(c)) - linear.covariance(rows, kept)))
     return Checks.together(found)
 

@@ -127,8 +127,7 @@ class Estimate:
         if all(name in outer for name in names):
             return self.graph.covariance(self.values, names)
         columns = layout.columns(names)
-        one_each = Entries(np.ones(len(columns)), columns, np.ones(len(columns), int))
-        rows = over_all([one_each], layout.size)
+        rows = over_all([Entries.one_each(np.ones(len(columns)), columns)], layout.size)
         return self.linear.covariance(rows, self.kept)
 
     def variances(self, some: Sequence[Mapping[str, np.ndarray]]) -> list[np.ndarray]:

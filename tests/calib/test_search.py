@@ -21,8 +21,8 @@ def found(folder, seed=1, **hidden):
 
 
 def test_an_effect_that_no_shape_of_the_grid_fits_is_named_in_its_own(tmp_path):
-    """A wave of 8 mm halfway between two lengths of the grid: beams near and far, a quarter of a
-    period off, contradict either."""
+    """A wave of 8 mm between two lengths of the grid, each of which is a third of a period or more
+    off at 7 m: beams near and far contradict either."""
     done, truth = found(tmp_path, **{"range_cyclic@0.815": 3.0})
     (step,) = done.found
     assert step.effect.family == "range_cyclic"

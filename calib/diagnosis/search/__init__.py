@@ -294,7 +294,7 @@ def _fitted(
     theta = stand.theta(finest.effect) if stand else 0 * finest.test.estimate()
     if near.named.taken_up(finest, theta) < HELD_BACK:
         return []
-    before, finest = look.with_shape(near, finest)
+    before, finest = look.with_shape(candidate, near, finest)
     names = [*(f.effect.name for f in found), finest.effect.name]
     stand, swapped = stand.retuned(names, progress)
     after = stand.look(progress)

@@ -191,7 +191,7 @@ def weighed(
 
 
 def _borne_out(fall: Fall | None) -> bool:
-    """Whether stops held out bear a name out, as far as it is known: as they agree, or as it takes
+    """Whether stops held out confirm a name, as far as is known: they agree on it, or it takes away
     most of an error that is larger than chance makes it."""
     if fall is None or not fall.by_chance:
         return True
