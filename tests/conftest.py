@@ -81,6 +81,7 @@ def pytest_collection() -> Generator[None, object, object]:
         return (yield)
     finally:
         gc.freeze()  # what was made so far stays to the end
+        gc.set_threshold(20_000)  # as the command line has it
         gc.enable()
 
 

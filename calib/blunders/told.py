@@ -143,8 +143,11 @@ def _otherwise(kind: str, name: str, where: str, sentence: str) -> dict[str, Any
 
 
 def whole(clause: str) -> str:
-    """A clause as a sentence of its own."""
-    return f"{clause[0].upper()}{clause[1:]}."
+    """A clause as a sentence of its own; a name that it begins with is left as it is written."""
+    word = clause.partition(" ")[0]
+    return (
+        f"{word.capitalize() if word.islower() and word.isalpha() else word}{clause[len(word) :]}."
+    )
 
 
 def tokens(blunders: Iterable[Mapping[str, Any]]) -> list[str]:

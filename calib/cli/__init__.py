@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import os
 import sys
@@ -13,6 +14,9 @@ import typer
 # BLAS threads on shared cores cost many times what they save; set before numpy is imported.
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
+# A look at many stops makes thousands of arrays and next to no garbage in circles: with the usual
+# 700 objects, looking for that takes 9 % of the diagnosis of 1,000 poses, with so many next to 0.
+gc.set_threshold(20_000)
 
 # Each of these registers its commands.
 from calib.cli import (  # noqa: E402

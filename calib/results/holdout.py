@@ -65,10 +65,11 @@ class Fall:
 
     @property
     def explained(self) -> float:
-        """Share of what the error has above what is expected."""
+        """Share of what the error has above what is expected; from -1, where it rises by as much as
+        there was above that, or by more, to 1."""
         squares = np.square([self.before_mm, self.after_mm, self.floor_mm])
         before, after, floor = squares.tolist()
-        return (before - after) / max(before - floor, before - after, 1e-12)
+        return (before - after) / max(before - floor, abs(before - after), 1e-12)
 
     @property
     def spread_mm(self) -> float | None:

@@ -13,7 +13,7 @@ from calib.solve.fit import solve
 from chains import se3
 from chains.align import align_points
 from chains.errors import InputError
-from chains.minimal import own_slips
+from chains.minimal import own_errors
 
 from . import two_arms
 
@@ -85,7 +85,8 @@ def test_geometry_is_complete_and_minimal_over_both_chains(recording):
         (False, (False,) * 2),
     ):
         columns = [
-            moved(s.edge, s.twist) for s in own_slips(rig.tree, rig.chains, base_held, tips_held)
+            moved(s.edge, s.twist)
+            for s in own_errors(rig.tree, rig.chains, base_held, tips_held).slips
         ]
         own = len(columns)
         for name in rig.arm_edges:

@@ -8,7 +8,7 @@ from scipy.spatial.transform import RigidTransform
 
 from chains import minimal, se3
 from chains.frames import Edge, FrameTree, Joint
-from chains.minimal import own_slips
+from chains.minimal import own_errors
 
 from .arms import TABLES, edges_of
 
@@ -56,7 +56,7 @@ def motions(edges, ways, poses=20):
     return np.reshape(columns, (len(columns), -1)).T
 
 
-def all_ways(edges, slips, base_held, tip_held):
+def all_ways(edges, own, base_held, tip_held):
     """The base's and the tool's six, zeros, lengths and slips, as twists (E, 6, n) of the edges."""
     names, ways = [e.name for e in edges], []
 
@@ -71,9 +71,9 @@ def all_ways(edges, slips, base_held, tip_held):
         if each.joint is not None:
             way(i, each.joint.screw)
         t = each.T_parent_child[:3, :3].T @ each.T_parent_child[:3, 3]
-        if np.linalg.norm(t) > 1e-9:
+        if np.linalg.norm(t) > 1e-9 and each.name in own.lengths:
             way(i, [0, 0, 0, *t / np.linalg.norm(t)])
-    for slip in slips:
+    for slip in own.slips:
         way(names.index(slip.edge), slip.twist)
     return np.stack(ways, axis=2)
 
@@ -96,12 +96,12 @@ def test_all_that_geometry_can_be_and_nothing_twice(tmp_path, name, drawn):
     full = 4 * kinds.count("revolute") + 2 * kinds.count("prismatic") + 6
     arm = tuple(e.name for e in edges)
     for base_held, tip_held in ((True, True), (False, True), (True, False), (False, False)):
-        slips = own_slips(FrameTree(edges), (arm,), base_held, (tip_held,))
-        ways = all_ways(edges, slips, base_held, tip_held)
+        own = own_errors(FrameTree(edges), (arm,), base_held, (tip_held,))
+        ways = all_ways(edges, own, base_held, tip_held)
         columns = motions(edges, ways)
         assert rank(columns) == full, "complete"
-        said = columns.shape[1] - len(slips)
-        assert rank(columns[:, :said]) == full - len(slips), "minimal"
+        said = columns.shape[1] - len(own.slips)
+        assert rank(columns[:, :said]) == full - len(own.slips), "minimal"
 
 
 @pytest.mark.parametrize("name", TABLES)
@@ -112,7 +112,7 @@ def test_the_threshold_does_not_decide(tmp_path, monkeypatch, name):
     edges, rng = edges_of(tmp_path, name), np.random.default_rng(5)
 
     def found(edges):
-        slips = own_slips(FrameTree(edges), (tuple(e.name for e in edges),), True, (True,))
+        slips = own_errors(FrameTree(edges), (tuple(e.name for e in edges),), True, (True,)).slips
         return [(slip.edge, slip.name) for slip in slips]
 
     ours = found(edges)
@@ -130,7 +130,7 @@ def test_the_threshold_does_not_decide(tmp_path, monkeypatch, name):
 def test_axes_that_are_drawn_as_meeting_may_miss_each_other(tmp_path):
     """Of the Puma's wrist; a length has nothing to act on where the origin is zero."""
     edges = edges_of(tmp_path, "puma560")
-    slips = own_slips(FrameTree(edges), (tuple(e.name for e in edges),), True, (True,))
+    slips = own_errors(FrameTree(edges), (tuple(e.name for e in edges),), True, (True,)).slips
     assert [s.name for s in slips if s.edge == "j6"] == ["tilt_a", "shift_a", "shift_b"]
     for slip in slips:
         assert np.isclose(np.linalg.norm(slip.twist), 1)
@@ -141,8 +141,8 @@ def test_axes_that_are_drawn_as_meeting_may_miss_each_other(tmp_path):
 
 def test_an_arm_without_joints_has_no_geometry_of_its_own():
     edges = [Edge(name="a", parent="base", child="tip", T_parent_child=se3.exp(np.ones(6)))]
-    assert own_slips(FrameTree(edges), (("a",),), False, (False,)) == ()
+    assert own_errors(FrameTree(edges), (("a",),), False, (False,)).slips == ()
     joint = Joint("b", "revolute", np.array([0.0, 0, 1]))
     turn = Edge(name="b", parent="tip", child="end", T_parent_child=np.eye(4), joint=joint)
     tree = FrameTree([*edges, turn])
-    assert [s.edge for s in own_slips(tree, (("a", "b"),), False, (False,))] == ["b"] * 4
+    assert [s.edge for s in own_errors(tree, (("a", "b"),), False, (False,)).slips] == ["b"] * 4
