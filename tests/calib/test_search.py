@@ -1,11 +1,13 @@
 """What the search names first: an effect in its true shape, and one that predicts before chance."""
 
+import numpy as np
 import pytest
 
 from calib.diagnosis.search import search
 from calib.runs.calibrate import calibrate
 from calib.runs.diagnose import stand_of
 
+from . import arm_worlds
 from .simulated import made
 
 
@@ -53,3 +55,22 @@ def test_a_drift_that_another_effect_covers_is_no_scatter_of_stops(tmp_path):
     assert [step.effect.family for step in done.found] == ["warmup_drift", "optitrack_distortion"]
     assert done.found[0].effect.shape == pytest.approx(700, rel=0.1)
     assert not done.chance
+
+
+@pytest.mark.parametrize("wild", [False, True])
+def test_poses_that_scatter_of_the_joints_moves_far_are_no_blunders(tmp_path, wild):
+    """One error of a joint moves the tool further at some poses than at others. Before that scatter
+    is in the model three poses stand out; a row that was written down wrongly stands out after."""
+    rng, folder = np.random.default_rng([20, 5]), tmp_path / "rec"
+    folder.mkdir()
+    world = arm_worlds.bent(folder, "panda", rng)
+    (folder / "panda.urdf").rename(folder / "arm.urdf")
+    read = world.draw(rng, 80)
+    T = world.seen(read + 5e-4 * rng.normal(size=read.shape))
+    off = arm_worlds.noise(rng, 80)
+    off[30, 3:] += 0.03 * wild
+    arm_worlds.save(folder, world, read, T * arm_worlds.exp(off), {}, 2e-5)
+    run = calibrate([folder], tmp_path / "run", hold_out="none")
+    done = search(stand_of(run, quiet), quiet)
+    assert done.chance[0].effect.name == "joint_scatter"
+    assert [each.blunder.group.where for each in done.blunders] == ["p0030"] * wild

@@ -147,7 +147,8 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NEEDED) -> Search:
             unsettled = chance.pop()
             break
         if widens:
-            looks = [*looks, beside.look(progress)]
+            look, left = restored(stand, beside.look(progress), left, progress)
+            looks = [*looks, look]
         else:
             looks, found, left = steps = _steps(beside, progress, most)
             if more := _in_place_of_chance(stand, plain[0][0], steps, progress, most):
