@@ -20,6 +20,7 @@ from calib.diagnosis.screen import ODDS, Candidate, rivals
 from calib.diagnosis.search.confirmed import (
     ALPHA_EFFECT,
     judged,
+    outlasts,
     scattering,
     structures,
     suspects,
@@ -148,6 +149,7 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NEEDED) -> Search:
             break
         if widens:
             look, left = restored(stand, beside.look(progress), left, progress)
+            look, found = _outlasting(look, found, progress)
             looks = [*looks, look]
         else:
             looks, found, left = steps = _steps(beside, progress, most)
@@ -175,6 +177,18 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NEEDED) -> Search:
     if done.found and done.dressed_up(0):
         return replace(done, at_first=structures(done.looks[0], progress))
     return done
+
+
+def _outlasting(
+    look: Look, found: list[NamedEffect], progress: Progress
+) -> tuple[Look, list[NamedEffect]]:
+    """A look beside scatter that was found after some effects, and those of these that explain more
+    than chance beside it; without the others."""
+    kept = [step for step in found if outlasts(look, step.candidate)]
+    gone = [step.effect.name for step in found if step not in kept]
+    if not gone or (less := tried(look.stand.lacking, gone, progress)) is None:
+        return look, found
+    return less.look(progress), kept
 
 
 def _without_chance(done: Search, steps: Steps, progress: Progress) -> Search:

@@ -6,12 +6,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy import special
 
 from calib.blunders.chance import LEVELS, after_looks, log_tail
 from calib.diagnosis.rejects import FEWEST_STOPS
-from calib.diagnosis.score import ScoreTest, score_test
+from calib.diagnosis.score import ScoreTest, project, score_test
 from calib.diagnosis.screen import Candidate, Screen
-from calib.diagnosis.stand import Look
+from calib.diagnosis.stand import Look, variables_of
 from calib.solve.fit import Progress
 
 ALPHA_EFFECT = LEVELS["effect"]
@@ -63,6 +64,17 @@ def judged(look: Look, candidate: Candidate, progress: Progress) -> tuple[ScoreT
     """A candidate's test, its clusters jackknifed, and its p-value adjusted for all tests."""
     found = look.judged(candidate, progress)
     return found, float(after_looks(found.p_value(), candidate.looks))
+
+
+def outlasts(look: Look, candidate: Candidate) -> bool:
+    """Whether a candidate that has been fitted explains more than chance does, at the sigmas of the
+    look's model (Wald 1943), adjusted for all tests: with scatter in it these are right."""
+    names = variables_of(look.stand.problem, {candidate.effect.name})[candidate.effect.name]
+    scores = project(look.linear, names)
+    theta = np.concatenate([look.stand.estimate.values[name] for name in names])
+    dof = score_test(scores, np.arange(len(theta))).dof
+    p = special.chdtrc(dof, theta @ scores.information @ theta)
+    return float(after_looks(p, candidate.looks)) < ALPHA_EFFECT
 
 
 def suspects(screen: Screen, alpha: float) -> Iterator[Candidate]:
