@@ -16,6 +16,7 @@ from scipy import special
 
 from calib.blunders.chance import KNOWN, LEVELS, after_looks, at_least, enough, log_tail
 from calib.blunders.shifts import Shift, shifts
+from calib.blunders.uneven import Uneven, Whereabouts, unevenly
 from calib.linear.system import Linearisation
 from calib.problem.model import labels
 from calib.problem.problem import Problem
@@ -49,6 +50,7 @@ class Blunder:
         enough: noncentrality of the statistic at which it is found with 80 % power.
         detectable: unit -> size of such a blunder.
         looks: how many groups were looked at.
+        uneven: how those of its kind scatter unevenly, where they do.
     """
 
     shift: Shift
@@ -59,6 +61,7 @@ class Blunder:
     enough: float
     detectable: Mapping[str, float]
     looks: int
+    uneven: Uneven | None = None
 
     @property
     def group(self) -> Group:
@@ -134,8 +137,8 @@ def judge(whole: Linearisation, problem: Problem, planned: Collection[str] = ())
     for shift in shifts(whole, problem):
         if shift.dof and shift.group not in gone:
             kinds.setdefault((*_alike(shift.group), shift.of_ranges), []).append(shift)
-    looks = sum(len(some) for some in kinds.values())
-    found = [b for some in kinds.values() for b in _judged(some, looks, planned)]
+    looks, whereabouts = sum(len(some) for some in kinds.values()), Whereabouts.of(problem)
+    found = [b for some in kinds.values() for b in _judged(some, looks, planned, whereabouts)]
     return sorted(found, key=lambda b: -b.evidence)
 
 
@@ -171,9 +174,12 @@ def _bulk(some: Sequence[Shift]) -> float:
     return max(1.0, float(np.median([shift.statistic for shift in some] / by_chance)))
 
 
-def _judged(some: Sequence[Shift], looks: int, planned: Collection[str]) -> Iterator[Blunder]:
-    """Groups of one kind: in units of how far out their bulk is; a single joint's too, as readings
-    that scatter show most in the joints that move the body furthest."""
+def _judged(
+    some: Sequence[Shift], looks: int, planned: Collection[str], whereabouts: Whereabouts
+) -> Iterator[Blunder]:
+    """Groups of one kind: in units of how far out their bulk is, or their neighbours are where they
+    scatter unevenly; a single joint's too, as readings that scatter show most in the joints that
+    move the body furthest."""
     measured = [shift for shift in some if shift.group.stop not in planned]
     wholes = [shift for shift in measured if _whole(shift.group)]
     dof = np.array([shift.dof for shift in wholes])
@@ -182,16 +188,23 @@ def _judged(some: Sequence[Shift], looks: int, planned: Collection[str]) -> Iter
     for shift in (s for s in measured if not _whole(s.group)):
         single.setdefault((shift.group.recording, shift.group.what), []).append(shift)
     of_joint = {joint: max(of_kind, _bulk(mine)) for joint, mine in single.items()}
+    uneven = unevenly(wholes, whereabouts)
+    count = uneven.nearest if uneven else len(wholes)
 
     @cache
     def bounds(own: int) -> tuple[float, float, float]:
         """Of groups of so many dofs: those of the bulk, the limit of F, and its noncentrality."""
-        known, limit = limit_of(own, dof.sum() - own, len(wholes), looks)
+        others = dof.sum() * count / max(len(wholes), 1)
+        known, limit = limit_of(own, others - own, count, looks)
         return known, limit, enough(own, known, limit)
 
     for shift in some:
         known, limit, least = bounds(shift.dof)
-        bulk = of_joint.get((shift.group.recording, shift.group.what), of_kind)
+        recording, where, what = shift.group.recording, shift.group.where, shift.group.what
+        bulk = of_kind
+        if uneven:
+            bulk = max(1.0, uneven.scale.get((recording, where), of_kind))
+        bulk = max(bulk, of_joint.get((recording, what), 0.0))
         scaled = shift.statistic / bulk
         p = at_least(special.fdtrc(shift.dof, known, scaled / shift.dof))
         told = {u: np.diag(shift.information)[at].mean() for u, at in shift.parts.items()}
@@ -204,4 +217,5 @@ def _judged(some: Sequence[Shift], looks: int, planned: Collection[str]) -> Iter
             enough=float(least * bulk),
             detectable={u: float(np.sqrt(least * bulk / t)) for u, t in told.items() if t > 0},
             looks=looks,
+            uneven=uneven,
         )

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from calib.blunders.chance import LEAST_P
+from calib.blunders.chance import LEAST_P, at_least
 from calib.blunders.judged import Blunder, LeftOut
 from calib.blunders.reach import FurthestMoved
-from calib.residuals.groups import ALONG_BEAMS, JOINTS, MESH, Group
+from calib.residuals.groups import ALONG_BEAMS, JOINTS, MESH, SCAN, Group
 from calib.rig import Rig
 from sensors.rings import RingFinding
 
@@ -148,6 +148,22 @@ def whole(clause: str) -> str:
     return (
         f"{word.capitalize() if word.islower() and word.isalpha() else word}{clause[len(word) :]}."
     )
+
+
+def uneven(blunders: Iterable[Blunder]) -> list[str]:
+    """What scatters more at some stops than at others, a sentence for each body, and for scans."""
+    each = {
+        b.group.what: b.uneven
+        for b in blunders
+        if b.uneven and b.group.kind in ("body", "scan") and not b.shift.of_ranges
+    }
+    return [
+        f"How much {'the place of the LiDAR' if what == SCAN else what} scatters depends on "
+        f"{'when' if found.along == 'time' else 'where it is'}: {found.times:.1f} times as much at "
+        f"some stops as at others (p = {at_least(found.p_value):.1g}). All rows of it are weighted "
+        "alike: that costs precision, and does not change the mean."
+        for what, found in each.items()
+    ]
 
 
 def tokens(blunders: Iterable[Mapping[str, Any]]) -> list[str]:

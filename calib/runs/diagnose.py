@@ -119,6 +119,7 @@ def _found(
             *run.doubts,
             *suspect,
             *result.sentences,
+            *(told.uneven(found.looks[-1].blunders) if run.converged else ()),
             *hardly_checked(unseen),
             *map(told.whole, _cautions(run, result)),
             *run.omissions,

@@ -1,0 +1,133 @@
+"""Groups of one kind that scatter more at some stops than at others: far from the tracker, say, or
+while something heavy passed. Stops that stand out for that reason are no mishaps.
+
+Variances that hang on something are told from their squares: the logs of these are regressed on it
+(Harvey 1976, Econometrica 44, 461). How far out a group lies is then measured against those that
+are nearest to it along that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import special
+from scipy.ndimage import median_filter
+
+from calib.blunders.chance import LEVELS, after_looks
+from calib.blunders.shifts import Shift
+from calib.problem.model import labels
+from calib.problem.problem import Problem
+
+ALPHA_UNEVEN = LEVELS["effect on the scatter"]
+# Groups that tell, so that each of the classes of time has eight: a choice.
+FEWEST_UNEVEN = 40
+CLASSES = 5  # of time, of equally many groups: a while of a tenth of it shows in one of them
+NEAREST = 10  # share of the groups, one in so many, that are nearest; but no fewer than this:
+FEWEST_NEAREST = 15  # the median of so many squares of six dofs is known to 15 %
+LEAST_RATIO = 1e-6  # of a square to what chance makes it: what is less counts as so much
+TOLD_BETWEEN = (0.1, 0.9)  # quantiles between which it is told how unevenly they scatter
+
+StopKey = tuple[str, str]  # the recording, by its label, and the stop
+
+
+@dataclass(frozen=True)
+class Uneven:
+    """That groups of a kind scatter unevenly.
+
+    Args:
+        along: what on, "place" or "time".
+        p_value: how often chance alone makes it seem so.
+        scale: stop -> how far out its neighbours lie, in squares of what chance makes it.
+        nearest: how many neighbours tell it.
+    """
+
+    along: str
+    p_value: float
+    scale: Mapping[StopKey, float]
+    nearest: int
+
+    @property
+    def times(self) -> float:
+        """How many times as much they scatter where they do most as where they do least."""
+        least, most = np.quantile(list(self.scale.values()), TOLD_BETWEEN)
+        return float(np.sqrt(most / least))
+
+
+@dataclass(frozen=True)
+class Whereabouts:
+    """When stops were, and where the tracker saw each body.
+
+    Args:
+        time_s: stop -> when.
+        place: body -> stop -> where, (3,) in the tracker's frame.
+    """
+
+    time_s: Mapping[StopKey, float]
+    place: Mapping[str, Mapping[StopKey, np.ndarray]]
+
+    @classmethod
+    def of(cls, problem: Problem) -> Whereabouts:
+        """Of all stops of a problem."""
+        time_s: dict[StopKey, float] = {}
+        place: dict[str, dict[StopKey, np.ndarray]] = {}
+        for source, label in zip(problem.sources, labels(problem.sources), strict=True):
+            recording = source.recording
+            keys = [(label, stop) for stop in recording.stops]
+            time_s |= dict(zip(keys, recording.time_s.tolist(), strict=True))
+            for body, seen in recording.bodies.items():
+                at = seen if seen.ndim == 2 else seen[:, :3, 3]
+                known = np.isfinite(at).all(axis=1)
+                some = {key: p for key, p, k in zip(keys, at, known, strict=True) if k}
+                place.setdefault(body, {}).update(some)
+        return cls(time_s, place)
+
+    def columns(self, keys: Sequence[StopKey], body: str) -> dict[str, np.ndarray]:
+        """What scatter of groups (n,) may hang on: columns (n, q) of classes of time, and of where
+        a body was and how far; of any body where the groups are of none."""
+        out = {}
+        time = np.array([self.time_s.get(key, np.nan) for key in keys])
+        if np.isfinite(time).all() and np.ptp(time) > 0:
+            rank = np.argsort(np.argsort(time, kind="stable"), kind="stable")
+            out["time"] = np.eye(CLASSES)[rank * CLASSES // len(rank)][:, 1:]
+        for seen in [self.place[body]] if body in self.place else self.place.values():
+            if all(key in seen for key in keys):
+                at = np.stack([seen[key] for key in keys])
+                out["place"] = np.column_stack([at, np.linalg.norm(at, axis=1)])
+                break
+        return out
+
+
+def unevenly(some: Sequence[Shift], where: Whereabouts) -> Uneven | None:
+    """How groups of one kind scatter unevenly; None where they do not, or are too few to tell."""
+    if len(some) < FEWEST_UNEVEN or any(shift.group.stop is None for shift in some):
+        return None
+    keys = [(shift.group.recording, shift.group.where) for shift in some]
+    by_chance = special.chdtri([shift.dof for shift in some], 0.5)
+    ratio = np.maximum([shift.statistic for shift in some] / by_chance, LEAST_RATIO)
+    along = where.columns(keys, some[0].group.what)
+    tested = {name: _regressed(np.log(ratio), each) for name, each in along.items()}
+    name = min(tested, key=lambda name: tested[name][0], default="")
+    if not name or (p := float(after_looks(tested[name][0], len(tested)))) >= ALPHA_UNEVEN:
+        return None
+    time = [where.time_s[key] for key in keys]
+    order = np.argsort(time if name == "time" else tested[name][1], kind="stable")
+    nearest = max(FEWEST_NEAREST, len(some) // NEAREST)
+    local = median_filter(ratio[order], nearest, mode="mirror")
+    scale = dict(zip([keys[i] for i in order], local.tolist(), strict=True))
+    return Uneven(name, p, scale, nearest)
+
+
+def _regressed(y: np.ndarray, columns: np.ndarray) -> tuple[float, np.ndarray]:
+    """The p-value of a regression of y (n,) on columns (n, q) and a constant, by F; and what it
+    makes of y (n,)."""
+    X = np.column_stack([np.ones(len(y)), columns])
+    X = X / np.linalg.norm(X, axis=0).clip(1e-300)
+    found, _, rank, _ = np.linalg.lstsq(X, y, rcond=1e-9)
+    fitted = X @ found
+    left, taken = np.square(y - fitted).sum(), np.square(fitted - y.mean()).sum()
+    own, others = rank - 1, len(y) - rank
+    if own < 1 or others < 1 or left <= 0:
+        return 1.0, fitted
+    return float(special.fdtrc(own, others, taken / own / (left / others))), fitted
