@@ -8,7 +8,7 @@ import numpy as np
 
 from calib.forward import Stops, place
 from calib.problem import start
-from calib.problem.model import Model, labels
+from calib.problem.model import Model, Source, labels
 from calib.problem.problem import Problem, SourceStops
 from calib.problem.unknowns import (
     EXACT,
@@ -24,6 +24,16 @@ from chains import se3
 from chains.errors import InputError
 
 GUESSED_POSE = np.repeat([0.2, 0.3], 3)  # rad, m: a base_guess is set up by hand
+
+
+def standing(source: Source) -> np.ndarray:
+    """Label (K,) of each stop: those with one share where the rig stands."""
+    recording = source.recording
+    return {
+        "stop": np.array(recording.stops),
+        "location": recording.location,
+        "never": np.full(len(recording.stops), "all"),
+    }[source.rig.moves]
 
 
 def _joints(prefix: str, stop: str) -> str:
@@ -75,18 +85,9 @@ class Places:
         has_scan = self.part.source.recording.has_scan
         return [(k, self._geometry[root, k]) for root, k in self.stops if k >= 0 and has_scan[k]]
 
-    def _standing(self) -> np.ndarray:
-        """Label (K,) of each stop: those with one share where the rig stands."""
-        recording, moves = self.part.source.recording, self.part.source.rig.moves
-        return {
-            "stop": np.array(recording.stops),
-            "location": recording.location,
-            "never": np.full(len(recording.stops), "all"),
-        }[moves]
-
     def _groups(self) -> dict[str, np.ndarray]:
         """Unknown of the root -> the stops that share it."""
-        labels, index = self._standing(), np.flatnonzero(self.part.chosen)
+        labels, index = standing(self.part.source), np.flatnonzero(self.part.chosen)
         names = dict.fromkeys(labels[index])
         return {f"{self.part.prefix}root@{name}": index[labels[index] == name] for name in names}
 
@@ -159,7 +160,7 @@ class Places:
                     f"{source.recording.folder / 'stops.csv'}: '{stop}': nothing tracks the rig"
                     f" and there is no base_guess to start from; add base_guess.x … base_guess.qz"
                 )
-        owner = Owner(recording=self.part.label, where=str(self._standing()[stops[0]]))
+        owner = Owner(recording=self.part.label, where=str(standing(source)[stops[0]]))
         self.problem.add(pose_unknown(name, T, sigma, Role.PLACE, owner))
 
     def _neighbour(self, stops: np.ndarray) -> np.ndarray | None:

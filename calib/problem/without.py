@@ -1,4 +1,4 @@
-"""Leaving out what a mishap spoiled: ``--without WHERE:WHAT``.
+"""Leaving out what a mishap spoiled, ``--without WHERE:WHAT``, and scans that nothing places.
 
 A recording without a body at a stop is a recording in which that body was not seen, so everything
 that follows (where a fit starts, what is held out, what is tested) needs to know nothing of it.
@@ -6,21 +6,27 @@ that follows (where a fit starts, what is held out, what is tested) needs to kno
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from calib.effects import DEFAULT, Effect, Site, find
-from calib.problem.model import Source, labels
+from calib.problem import start
+from calib.problem.build import build
+from calib.problem.model import Model, Source, labels
+from calib.problem.places import standing
 from calib.residuals.groups import CAD, JOINTS, MESH, SCAN, Group, level_of
 from calib.residuals.targets import TARGET_PARTS
+from calib.rig.inventory import FAR_OFF_M
 from chains.errors import InputError
 from sensors.documents import nearest
 from sensors.recording import RecordedStops
 from sensors.stops import Targets
 
 ROD = "rod"  # of a target: all of it
+_LOG = logging.getLogger("rigcal")
 
 
 def leave_out(sources: Sequence[Source], tokens: Sequence[str]) -> list[Source]:
@@ -136,3 +142,63 @@ def _refusal(sources: Sequence[Source], token: str, called: Sequence[str]) -> st
         "STOP:joints, STOP:JOINT, TARGET:sphere, lower, upper or rod, cad:FRAME, "
         f"cad:EFFECT.PARAMETER or mesh:surface_N{nearest(token, known)}"
     )
+
+
+def placed(sources: Sequence[Source], model: Model) -> tuple[list[Source], Model]:
+    """The recordings, and a model of them, without scans that nothing places.
+
+    Where no tracked body and no guess tells of a stop, its scan starts from where the rig stood at
+    the stop nearest in time, of the same location if there is one. That will do where the base
+    hardly moved. Where half of the beams end more than `FAR_OFF_M` from the surface that they
+    should meet, it will not: what a fit then finds is wrong for all others too. So such scans are
+    left out, and the log of `rigcal` says so.
+
+    Raises:
+        InputError: as of `build`; or nothing places any scan.
+    """
+    lost = list(_lost(sources, model))
+    if not lost:
+        return list(sources), model
+    tokens = [group.token for group in lost]
+    if len(lost) == sum(int(source.recording.has_scan.sum()) for source in sources):
+        raise InputError(
+            f"{sources[0].recording.folder / 'stops.csv'}: no tracked body is seen at any stop "
+            "that has a scan, and there is no base_guess; add base_guess.x … base_guess.qz"
+        )
+    _LOG.warning(
+        "%s left out: no tracked body is seen there, and from where the rig stood at the stop "
+        "nearest in time beams miss the room; base_guess columns in stops.csv would place them",
+        ", ".join(tokens),
+    )
+    without = replace(model, without=(*model.without, *tokens))
+    return leave_out(sources, tokens), without
+
+
+def _lost(sources: Sequence[Source], model: Model) -> Iterator[Group]:
+    """Scans that nothing places, and that are far off where they start."""
+    pairs = zip(sources, labels(sources), strict=True)
+    nowhere = {(label, stop) for source, label in pairs for stop in _nowhere(source)}
+    if not nowhere:
+        return
+    problem = build(sources, model)
+    for scan in problem.scans:
+        group = scan.group
+        if (group.recording, group.where) in nowhere:
+            rows = scan.rows(problem.initial)
+            residual_m = np.abs(rows.residual_m[rows.usable])
+            if not len(residual_m) or np.median(residual_m) > FAR_OFF_M:
+                yield group
+
+
+def _nowhere(source: Source) -> Iterator[str]:
+    """Stops with a scan that are tracked by nothing and guessed by nothing."""
+    recording = source.recording
+    if source.rig.lidar is None or not recording.has_scan.any():
+        return
+    where = standing(source)
+    posed = [b for b in recording.bodies if not start.is_point(source, b)]
+    known = np.any([np.zeros(len(where), bool), *(_seen(recording, b) for b in posed)], axis=0)
+    for name in dict.fromkeys(where[~np.isin(where, where[known])]):
+        stops = np.flatnonzero(where == name)
+        if start.root_pose(source, stops) is None and start.guessed_pose(source, stops) is None:
+            yield from (recording.stops[k] for k in stops if recording.has_scan[k])

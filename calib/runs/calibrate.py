@@ -22,7 +22,7 @@ from calib.linear.parallel import one_blas_thread, over_stops
 from calib.outputs.journal import going_on
 from calib.problem import Problem
 from calib.problem.model import Model, Source
-from calib.problem.without import leave_out
+from calib.problem.without import leave_out, placed
 from calib.residuals.groups import CAD
 from calib.residuals.scan import ScanStop
 from calib.results.errors import Errors, body_errors, misfit, row_errors
@@ -97,7 +97,7 @@ def calibrate(
         _refuse_twice([r.resolve() for r in recordings])
         model = model or Model.of(None, (), (), recordings)
         opened = [Source.open(r).of_beams(model.beams) for r in recordings]
-        sources = leave_out(opened, model.without)
+        sources, model = placed(leave_out(opened, model.without), model)
         choices = _Choices(Path(out), hold_out, folds, prior)
         document = _model_document(sources, model, choices)
         with going_on(outputs.kept(folder, document)):
