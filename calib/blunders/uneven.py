@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import special
-from scipy.ndimage import median_filter
 
 from calib.blunders.chance import LEVELS, after_looks
 from calib.blunders.shifts import Shift
@@ -26,6 +25,9 @@ FEWEST_UNEVEN = 40
 CLASSES = 5  # of time, of equally many groups: a while of a tenth of it shows in one of them
 NEAREST = 10  # share of the groups, one in so many, that are nearest; but no fewer than this:
 FEWEST_NEAREST = 15  # the median of so many squares of six dofs is known to 15 %
+# No instrument scatters by more than so many times what most of its rows do: a choice. Rows of
+# zeros, which all lie in one place, are mishaps.
+MOST_TIMES = 10.0
 LEAST_RATIO = 1e-6  # of a square to what chance makes it: what is less counts as so much
 TOLD_BETWEEN = (0.1, 0.9)  # quantiles between which it is told how unevenly they scatter
 
@@ -114,9 +116,17 @@ def unevenly(some: Sequence[Shift], where: Whereabouts) -> Uneven | None:
     time = [where.time_s[key] for key in keys]
     order = np.argsort(time if name == "time" else tested[name][1], kind="stable")
     nearest = max(FEWEST_NEAREST, len(some) // NEAREST)
-    local = median_filter(ratio[order], nearest, mode="mirror")
+    local = _medians(ratio[order], nearest)
+    local = np.minimum(local, MOST_TIMES**2 * np.median(ratio))
     scale = dict(zip([keys[i] for i in order], local.tolist(), strict=True))
     return Uneven(name, p, scale, nearest)
+
+
+def _medians(values: np.ndarray, count: int) -> np.ndarray:
+    """Of each of some values (n,), in order, the median of so many around it; at both ends of the
+    first, or the last, so many."""
+    each = np.median(np.lib.stride_tricks.sliding_window_view(values, count), axis=1)
+    return each[np.clip(np.arange(len(values)) - count // 2, 0, len(each) - 1)]
 
 
 def _regressed(y: np.ndarray, columns: np.ndarray) -> tuple[float, np.ndarray]:

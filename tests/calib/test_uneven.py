@@ -1,10 +1,12 @@
 """A tracker that sees worse far away, or shakes for a while: no stop of it is a mishap."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from calib.blunders.shifts import Shift
-from calib.blunders.uneven import FEWEST_UNEVEN, Whereabouts, unevenly
+from calib.blunders.uneven import FEWEST_UNEVEN, MOST_TIMES, Whereabouts, unevenly
 from calib.residuals.groups import Group
 from calib.runs.calibrate import calibrate
 from calib.runs.diagnose import diagnose
@@ -61,6 +63,19 @@ def test_what_scatter_hangs_on_is_told_and_how_much(along, name, times):
     found = [unevenly(*drawn(rng, 200, along)) for _ in range(20)]
     assert all(each is not None and each.along == name for each in found)
     assert np.median([each.times for each in found]) == pytest.approx(times, rel=0.25)
+
+
+@pytest.mark.parametrize("count", [13, 40])
+def test_gross_rows_that_lie_in_one_place_are_measured_against_most(count):
+    """As of zeros, which a tracker writes where it saw nothing."""
+    rng = np.random.default_rng(6)
+    some, where = drawn(rng, 300)
+    wrong = [f"p{k}" for k in range(0, 300, 300 // count)]
+    for name in wrong:
+        where.place["tool"]["", name] = np.zeros(3)
+    some = [replace(s, statistic=1e8 if s.group.where in wrong else s.statistic) for s in some]
+    found = unevenly(some, where)
+    assert found is None or max(found.scale.values()) < 1.5 * MOST_TIMES**2
 
 
 def test_few_stops_and_such_as_have_no_time_tell_nothing():
