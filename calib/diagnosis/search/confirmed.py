@@ -68,12 +68,14 @@ def judged(look: Look, candidate: Candidate, progress: Progress) -> tuple[ScoreT
 
 def outlasts(look: Look, candidate: Candidate) -> bool:
     """Whether a candidate that has been fitted explains more than chance does, at the sigmas of the
-    look's model (Wald 1943), adjusted for all tests: with scatter in it these are right."""
+    look's model, adjusted for all tests: with scatter in it these are right. As for a candidate
+    that is not fitted, its own prior is no evidence against it: the score is that at zero."""
     names = variables_of(look.stand.problem, {candidate.effect.name})[candidate.effect.name]
     scores = project(look.linear, names)
     theta = np.concatenate([look.stand.estimate.values[name] for name in names])
-    dof = score_test(scores, np.arange(len(theta))).dof
-    p = special.chdtrc(dof, theta @ scores.information @ theta)
+    whiten = score_test(scores, np.arange(len(theta))).whiten
+    explained = np.square(whiten.T @ (scores.score + scores.information @ theta)).sum()
+    p = special.chdtrc(whiten.shape[1], explained)
     return float(after_looks(p, candidate.looks)) < ALPHA_EFFECT
 
 
