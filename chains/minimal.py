@@ -8,7 +8,7 @@ in local frames (He, Zhao, Yang and Yang 2010, IEEE Trans. Robotics 26(3); Chen,
 It needs no second convention where axes are parallel, as Denavit and Hartenberg's does.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
@@ -23,10 +23,12 @@ from chains.se3 import Array
 # tests/chains/arms.py shares are 0.014 and more or below 1e-9; in a URDF of calibrated values,
 # 1 mm and 1 mrad from such drawings, those below 1e-9 become up to 0.01.
 NEW = 0.01
-# Less than this is nearly said by others, and would have to be large to say the rest: an axis that
-# passes 25 mm beside the one before it moves by 1 mm, along itself, for a lean of 40 mrad. Of those
-# arms such shares are 0.06 and less, or 0.16 and more.
+# If less than this share of a direction is new, others nearly say it: its amount would have to be
+# many times as large as the error that it stands for. An axis that passes 25 mm beside the first
+# leans by 40 mrad to move along itself by 1 mm. Of those arms shares are 0.06 and less, or 0.16 and
+# more.
 NEARLY_SAID = 0.1
+NO_LENGTH_M = 1e-9  # rounding of an origin that is drawn as none
 RANDOM_POSES = 40  # drawn: 240 rows for some seventy columns
 
 
@@ -44,11 +46,11 @@ class Own(NamedTuple):
     """What an arm's geometry can be off by beside its joints' zeros.
 
     Args:
-        lengths: edges whose origins may be longer than drawn.
+        lengths: edge -> along which (3,), in the child's frame, its origin may be too long.
         slips: all else.
     """
 
-    lengths: frozenset[str]
+    lengths: Mapping[str, Array]
     slips: tuple[Slip, ...]
 
 
@@ -64,7 +66,7 @@ def own_errors(
     Of the tilts and shifts across every axis, in order, those are taken for which no zero, no
     length and nothing taken before can stand, wherever the arm is: a QR by blocks at poses drawn
     over all joints (Khalil and Gautier 1991, Int. Conf. Robotics and Automation). What others
-    nearly say comes last, and a length that they nearly say is none: see `NEARLY_SAID`.
+    nearly say comes last, and a length that they nearly say acts across that: see `NEARLY_SAID`.
 
     Args:
         tree: the frames.
@@ -77,7 +79,7 @@ def own_errors(
     edges = [tree.edges[tree.edge_names.index(name)] for name in arm]
     moving = [i for i, edge in enumerate(edges) if edge.joint is not None]
     if not moving:
-        return Own(frozenset(arm), ())
+        return Own({edge.name: _along(edge) for edge in edges if _along(edge).any()}, ())
     by_base, by_twist, by_joint, by_tools = _columns(tree, chains, edges)
     span = _Span()
     span.take(by_base[:, : 6 * base_held])
@@ -85,12 +87,17 @@ def own_errors(
         span.take(by_tool[:, : 6 * held])
     for column in by_joint.T:
         span.take(column[:, None])
-    lengths = set()
+    lengths = {}
     for edge, columns in zip(edges, by_twist, strict=True):
-        along = edge.T_parent_child[:3, :3].T @ edge.T_parent_child[:3, 3:]
-        if not NEW < span.share(columns[:, 3:] @ along) < NEARLY_SAID:
-            span.take(columns[:, 3:] @ along)
-            lengths.add(edge.name)
+        along, by_shift = _along(edge), columns[:, 3:]
+        if not along.any():
+            continue
+        if NEW < span.share(by_shift @ along[:, None]) < NEARLY_SAID:
+            told = span.directions(by_shift, NEARLY_SAID)
+            along = told @ (told.T @ along)
+            along = along / np.linalg.norm(along)
+        span.take(by_shift @ along[:, None])
+        lengths[edge.name] = along
     behind = [arm.index(name) for chain in chains for name in _behind(tree, chain)]
     ways = [(i, *way) for i in [*moving, *dict.fromkeys(behind)] for way in _ways(edges[i])]
     found: dict[tuple[int, str, str], list[Array]] = {way[:3]: [] for way in ways}
@@ -102,7 +109,14 @@ def own_errors(
         for (i, kind, unit), twists in found.items()
         for letter, twist in zip("abc", twists, strict=False)
     )
-    return Own(frozenset(lengths), tuple(slips))
+    return Own(lengths, tuple(slips))
+
+
+def _along(edge: Edge) -> Array:
+    """Return the direction (3,) of an edge's origin, in its child's frame; 0 where it has none."""
+    t = edge.T_parent_child[:3, :3].T @ edge.T_parent_child[:3, 3]
+    length_m = float(np.linalg.norm(t))
+    return t / length_m if length_m > NO_LENGTH_M else np.zeros(3)
 
 
 def _behind(tree: FrameTree, chain: Sequence[str]) -> Sequence[str]:
@@ -165,17 +179,27 @@ class _Span:
     def _new(self, columns: Array) -> Array:
         return columns if self.basis is None else columns - self.basis @ (self.basis.T @ columns)
 
+    def directions(self, columns: Array, least: float) -> Array:
+        """Return along which directions (n, m) of some columns (R, n) at least such a share is
+        new."""
+        return self._told(columns, least)[0]
+
     def take(self, columns: Array, least: float = NEW) -> Array:
         """Take what is new of some columns (R, n), of directions of which at least so much is;
         return it as directions (n, m) of theirs."""
+        directions, new = self._told(columns, least)
+        self.basis = np.hstack([new, *([] if self.basis is None else [self.basis])])
+        return directions
+
+    def _told(self, columns: Array, least: float) -> tuple[Array, Array]:
+        """Return these directions, and an orthonormal basis (R, m) of what is new along them."""
         size = np.linalg.norm(columns)
         if not size:
-            return np.zeros((columns.shape[1], 0))
+            return np.zeros((columns.shape[1], 0)), np.zeros((len(columns), 0))
         left, share, axes = np.linalg.svd(self._new(columns) / size, full_matrices=False)
         found = share > least
-        self.basis = np.hstack([left[:, found], *([] if self.basis is None else [self.basis])])
         if found.all():
-            return np.eye(columns.shape[1])
+            return np.eye(columns.shape[1]), left
         directions = axes[found].T
         largest = np.take_along_axis(directions, np.abs(directions).argmax(axis=0)[None], axis=0)
-        return directions * np.sign(largest)
+        return directions * np.sign(largest), left[:, found]

@@ -143,7 +143,8 @@ def _otherwise(kind: str, name: str, where: str, sentence: str) -> dict[str, Any
 
 
 def whole(clause: str) -> str:
-    """A clause as a sentence of its own; a name that it begins with is left as it is written."""
+    """A clause as a sentence of its own; a name with a dot or the like, with which it begins, is
+    left as it is written."""
     word = clause.partition(" ")[0]
     return (
         f"{word.capitalize() if word.islower() and word.isalpha() else word}{clause[len(word) :]}."
@@ -158,10 +159,10 @@ def uneven(blunders: Iterable[Blunder]) -> list[str]:
         if b.uneven and b.group.kind in ("body", "scan") and not b.shift.of_ranges
     }
     return [
-        f"How much {'the place of the LiDAR' if what == SCAN else what} scatters depends on "
-        f"{'when' if found.along == 'time' else 'where it is'}: {found.times:.1f} times as much at "
-        f"some stops as at others (p = {at_least(found.p_value):.1g}). All rows of it are weighted "
-        "alike: that costs precision, and does not change the mean."
+        f"The scatter of {'the place of the LiDAR' if what == SCAN else what} "
+        f"{'changes with time' if found.along == 'time' else 'depends on where it is'}: it is "
+        f"{found.times:.1f} times as large at some stops as at others (p = "
+        f"{at_least(found.p_value):.1g}). All rows of it are weighted alike, which costs precision."
         for what, found in each.items()
     ]
 

@@ -29,7 +29,7 @@ FEWEST_NEAREST = 15  # the median of so many squares of six dofs is known to 15 
 # zeros, which all lie in one place, are mishaps.
 MOST_TIMES = 10.0
 LEAST_RATIO = 1e-6  # of a square to what chance makes it: what is less counts as so much
-TOLD_BETWEEN = (0.1, 0.9)  # quantiles between which it is told how unevenly they scatter
+TOLD_BETWEEN = (0.05, 0.95)  # quantiles between which it is told how unevenly they scatter
 
 StopKey = tuple[str, str]  # the recording, by its label, and the stop
 
@@ -79,7 +79,7 @@ class Whereabouts:
             keys = [(label, stop) for stop in recording.stops]
             time_s |= dict(zip(keys, recording.time_s.tolist(), strict=True))
             for body, seen in recording.bodies.items():
-                at = seen if seen.ndim == 2 else seen[:, :3, 3]
+                at = seen[:, :3]  # a point, or a pose: the quaternion after it
                 known = np.isfinite(at).all(axis=1)
                 some = {key: p for key, p, k in zip(keys, at, known, strict=True) if k}
                 place.setdefault(body, {}).update(some)
@@ -87,17 +87,17 @@ class Whereabouts:
 
     def columns(self, keys: Sequence[StopKey], body: str) -> dict[str, np.ndarray]:
         """What scatter of groups (n,) may hang on: columns (n, q) of classes of time, and of where
-        a body was and how far; of any body where the groups are of none."""
+        a body was and how far; of the body that moves most where the groups are of none."""
         out = {}
         time = np.array([self.time_s.get(key, np.nan) for key in keys])
         if np.isfinite(time).all() and np.ptp(time) > 0:
             rank = np.argsort(np.argsort(time, kind="stable"), kind="stable")
             out["time"] = np.eye(CLASSES)[rank * CLASSES // len(rank)][:, 1:]
-        for seen in [self.place[body]] if body in self.place else self.place.values():
-            if all(key in seen for key in keys):
-                at = np.stack([seen[key] for key in keys])
-                out["place"] = np.column_stack([at, np.linalg.norm(at, axis=1)])
-                break
+        bodies = [self.place[body]] if body in self.place else self.place.values()
+        places = [np.stack([b[k] for k in keys]) for b in bodies if all(k in b for k in keys)]
+        if places:
+            at = max(places, key=lambda at: at.var(axis=0).sum())  # of that which moves most
+            out["place"] = np.column_stack([at, np.linalg.norm(at, axis=1)])
         return out
 
 
@@ -117,16 +117,43 @@ def unevenly(some: Sequence[Shift], where: Whereabouts) -> Uneven | None:
     order = np.argsort(time if name == "time" else tested[name][1], kind="stable")
     nearest = max(FEWEST_NEAREST, len(some) // NEAREST)
     local = _medians(ratio[order], nearest)
+    if _one_way([some[i] for i in order], local, nearest):
+        return None
     local = np.minimum(local, MOST_TIMES**2 * np.median(ratio))
     scale = dict(zip([keys[i] for i in order], local.tolist(), strict=True))
     return Uneven(name, p, scale, nearest)
 
 
 def _medians(values: np.ndarray, count: int) -> np.ndarray:
-    """Of each of some values (n,), in order, the median of so many around it; at both ends of the
-    first, or the last, so many."""
+    """Of each of some values (n,), in order, the largest median of so many before, around and after
+    it: where scatter changes at an edge, one of these lies on its side of that."""
     each = np.median(np.lib.stride_tricks.sliding_window_view(values, count), axis=1)
-    return each[np.clip(np.arange(len(values)) - count // 2, 0, len(each) - 1)]
+    first = np.arange(len(values))[:, None] - np.array([count - 1, count // 2, 0])
+    return each[np.clip(first, 0, len(each) - 1)].max(axis=1)
+
+
+def _one_way(some: Sequence[Shift], local: np.ndarray, count: int) -> bool:
+    """Whether groups, in order, are off the same way where they lie furthest out, so many of them:
+    then something is wrong there, and nothing scatters (Hotelling's T squared)."""
+    last = int(np.argmax(local))
+    around = range(max(0, last - count + 1), min(last, len(some) - count) + 1)
+    sizes = {len(shift.offset) for shift in some}
+    if len(sizes) > 1 or not 0 < (own := sizes.pop()) < count:
+        return False
+    offsets = np.stack([shift.offset for shift in some])
+    p = min(_p_of_mean(offsets[first : first + count], own) for first in around)
+    return bool(after_looks(p, len(around)) < ALPHA_UNEVEN)
+
+
+def _p_of_mean(offsets: np.ndarray, own: int) -> float:
+    """How often chance alone puts the mean of some offsets (n, q) as far from none."""
+    count = len(offsets)
+    spread = np.cov(offsets.T).reshape(own, own)
+    size = np.sqrt(np.maximum(np.diag(spread), 1e-300))
+    mean = offsets.mean(axis=0) / size
+    squared = count * mean @ np.linalg.pinv(spread / np.outer(size, size), hermitian=True) @ mean
+    others = count - own
+    return float(special.fdtrc(own, others, squared * others / (own * (count - 1))))
 
 
 def _regressed(y: np.ndarray, columns: np.ndarray) -> tuple[float, np.ndarray]:

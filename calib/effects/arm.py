@@ -14,9 +14,9 @@ from chains.minimal import Own, across, own_errors
 class ArmLinkLength(Effect):
     """A URDF joint origin is longer than drawn: ``t -> t + dL * t / |t|``.
 
-    One that points nearly where the base, the tool or a zero moves all that follows is not
-    estimated: of an origin 25 mm out and 400 mm up, on a base of unknown height, an error of
-    0.7 mm out would be told as 11 mm of length. `arm_geometry` has a shift in its place.
+    One that points nearly where the base, the tool or a zero moves all that follows acts across
+    that alone: of an origin 25 mm out and 400 mm up, on a base of unknown height, only the part out
+    is told, and 0.7 mm of it would otherwise be 11 mm of length.
     """
 
     name = "arm_link_length"
@@ -29,25 +29,16 @@ class ArmLinkLength(Effect):
     source = "circle-point analysis: Mooring, Roth, Driels 1991, Manipulator Calibration"
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
-        told = {n for n in _own(rig).lengths if _length_m(rig, n)}
+        told = _own(rig).lengths
         return tuple(Param(n, "m", 0.005 if n in told else 0.0) for n in rig.arm_edges)
 
     def basis(self, view: View) -> np.ndarray:
-        tree = view.rig.tree
+        tree, lengths = view.rig.tree, _own(view.rig).lengths
         basis = np.zeros((1, len(tree.edges), 6, len(view.rig.arm_edges)))
         for p, name in enumerate(view.rig.arm_edges):
-            e = tree.edge_names.index(name)
-            T_parent_child = tree.edges[e].T_parent_child
-            if length_m := _length_m(view.rig, name):
-                basis[0, e, 3:, p] = T_parent_child[:3, :3].T @ T_parent_child[:3, 3] / length_m
+            if name in lengths:
+                basis[0, tree.edge_names.index(name), 3:, p] = lengths[name]
         return basis
-
-
-def _length_m(rig: Rig, edge: str) -> float:
-    """Length of a joint's origin; exactly 0 where it has none to speak of."""
-    T_parent_child = rig.tree.edges[rig.tree.edge_names.index(edge)].T_parent_child
-    length_m = float(np.linalg.norm(T_parent_child[:3, 3]))
-    return length_m if length_m > 1e-9 else 0.0
 
 
 class ArmJointOffset(Effect):

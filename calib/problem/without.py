@@ -7,7 +7,7 @@ that follows (where a fit starts, what is held out, what is tested) needs to kno
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -18,6 +18,7 @@ from calib.problem.build import build
 from calib.problem.model import Model, Source, labels
 from calib.problem.places import standing
 from calib.residuals.groups import CAD, JOINTS, MESH, SCAN, Group, level_of
+from calib.residuals.scan import ScanStop
 from calib.residuals.targets import TARGET_PARTS
 from calib.rig.inventory import FAR_OFF_M
 from chains.errors import InputError
@@ -150,8 +151,9 @@ def placed(sources: Sequence[Source], model: Model) -> tuple[list[Source], Model
     Where no tracked body and no guess tells of a stop, its scan starts from where the rig stood at
     the stop nearest in time, of the same location if there is one. That will do where the base
     hardly moved. Where half of the beams end more than `FAR_OFF_M` from the surface that they
-    should meet, it will not: what a fit then finds is wrong for all others too. So such scans are
-    left out, and the log of `rigcal` says so.
+    should meet, it will not: what a fit then finds is wrong for all others too. Without a mesh
+    nothing tells, as such scans meet planes of their own. So these scans are left out, and the log
+    of `rigcal` says so.
 
     Raises:
         InputError: as of `build`; or nothing places any scan.
@@ -166,8 +168,9 @@ def placed(sources: Sequence[Source], model: Model) -> tuple[list[Source], Model
             "that has a scan, and there is no base_guess; add base_guess.x … base_guess.qz"
         )
     _LOG.warning(
-        "%s left out: no tracked body is seen there, and from where the rig stood at the stop "
-        "nearest in time beams miss the room; base_guess columns in stops.csv would place them",
+        "%s left out: no tracked body is seen there, and beams miss the room from where the rig "
+        "stood at the stop nearest in time, or there is no mesh to tell; base_guess columns in "
+        "stops.csv would place them",
         ", ".join(tokens),
     )
     without = replace(model, without=(*model.without, *tokens))
@@ -175,23 +178,40 @@ def placed(sources: Sequence[Source], model: Model) -> tuple[list[Source], Model
 
 
 def _lost(sources: Sequence[Source], model: Model) -> Iterator[Group]:
-    """Scans that nothing places, and that are far off where they start."""
-    pairs = zip(sources, labels(sources), strict=True)
-    nowhere = {(label, stop) for source, label in pairs for stop in _nowhere(source)}
+    """Scans that nothing places, and that are far off where they start; those of stops at which the
+    rig stands alike are so together."""
+    nowhere: dict[tuple[str, str], tuple[str, str]] = {}
+    for source, label in zip(sources, labels(sources), strict=True):
+        for stop, where in _nowhere(source):
+            if source.reference is None:
+                yield Group("scan", stop, SCAN, label)
+            else:
+                nowhere[label, stop] = label, where
     if not nowhere:
         return
     problem = build(sources, model)
-    for scan in problem.scans:
-        group = scan.group
-        if (group.recording, group.where) in nowhere:
-            rows = scan.rows(problem.initial)
-            residual_m = np.abs(rows.residual_m[rows.usable])
-            if not len(residual_m) or np.median(residual_m) > FAR_OFF_M:
-                yield group
+    scans = [s for s in problem.scans if (s.group.recording, s.group.where) in nowhere]
+    at = [nowhere[scan.group.recording, scan.group.where] for scan in scans]
+    off_m = [_off_m(scan, problem.initial) for scan in scans]
+    for scan, where in zip(scans, at, strict=True):
+        together = [off for off, there in zip(off_m, at, strict=True) if there == where]
+        if np.median(together) > FAR_OFF_M:
+            yield scan.group
 
 
-def _nowhere(source: Source) -> Iterator[str]:
-    """Stops with a scan that are tracked by nothing and guessed by nothing."""
+def _off_m(scan: ScanStop, values: Mapping[str, np.ndarray]) -> float:
+    """How far half of a scan's beams end from what they meet, at least; infinite if they meet
+    nothing."""
+    try:
+        rows = scan.rows(values)
+    except InputError:
+        return np.inf
+    return float(np.median(np.abs(rows.residual_m[rows.usable])))
+
+
+def _nowhere(source: Source) -> Iterator[tuple[str, str]]:
+    """Stops with a scan that are tracked by nothing and guessed by nothing, and where each stands,
+    as `standing` has it."""
     recording = source.recording
     if source.rig.lidar is None or not recording.has_scan.any():
         return
@@ -201,4 +221,4 @@ def _nowhere(source: Source) -> Iterator[str]:
     for name in dict.fromkeys(where[~np.isin(where, where[known])]):
         stops = np.flatnonzero(where == name)
         if start.root_pose(source, stops) is None and start.guessed_pose(source, stops) is None:
-            yield from (recording.stops[k] for k in stops if recording.has_scan[k])
+            yield from ((recording.stops[k], str(name)) for k in stops if recording.has_scan[k])

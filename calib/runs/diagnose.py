@@ -121,7 +121,7 @@ def _found(
             *result.sentences,
             *(told.uneven(found.looks[-1].blunders) if run.converged else ()),
             *hardly_checked(unseen),
-            *map(told.whole, _cautions(run, result)),
+            *map(told.whole, _cautions(run, result, found.looks[-1])),
             *run.omissions,
         ],
         command=_command(run, result),
@@ -159,9 +159,12 @@ def _falls(found: Search, stand: Stand, run: Run, progress: Progress) -> dict[st
     return falls
 
 
-def _cautions(run: Run, found: Diagnosis) -> list[str]:
-    """What is to be looked at besides, without what was found to be wrong."""
-    named = tuple(f"{each['where']}, {each['name']}:" for each in found.blunders)
+def _cautions(run: Run, found: Diagnosis, look: Look) -> list[str]:
+    """What is to be looked at besides, without what was found to be wrong, or scatters as far as
+    what is near it does."""
+    named = [f"{each['where']}, {each['name']}:" for each in found.blunders]
+    uneven = (b.group for b in look.blunders if b.uneven and not b.found)
+    named = (*named, *(f"{group.where}, {group.what}:" for group in uneven))
     return [each for each in cautions(run) if not each.startswith(named)]
 
 

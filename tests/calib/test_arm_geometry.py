@@ -43,11 +43,10 @@ def named(folder, name, rng):
     lengths, tree = [], FrameTree(edges)
     own = own_errors(tree, (tuple(e.name for e in edges),), True, (True,))
     for edge in edges:
-        t = edge.T_parent_child[:3, :3].T @ edge.T_parent_child[:3, 3]
-        long = np.linalg.norm(t) > 1e-9 and edge.name in own.lengths
+        long = edge.name in own.lengths
         lengths.append(0.005 * rng.normal() if long else 0.0)
         if long:
-            twists[edge.name][3:] += lengths[-1] * t / np.linalg.norm(t)
+            twists[edge.name][3:] += lengths[-1] * own.lengths[edge.name]
     truth["arm_link_length"] = np.array(lengths)
     zeros = {joint: 0.005 * rng.normal() for joint in world.joints}
     truth["arm_joint_offset"] = np.array(list(zeros.values()))
@@ -108,6 +107,19 @@ def test_small_errors_are_told_as_small_ones(tmp_path, name):
     unknowns = estimate.problem.variables
     for effect in GEOMETRY:
         assert np.all(np.abs(estimate.values[effect]) < 2.5 * unknowns[effect].prior_sigma), effect
+
+
+def test_of_few_poses_lengths_alone_say_what_they_can(tmp_path):
+    """Of a KUKA KR 6 whose second axis is drawn 1 mm too near to the first: with 30 poses the whole
+    geometry is not in the model, and the length of that origin acts where the base does not."""
+    rng = np.random.default_rng(6)
+    world = arm_worlds.bent(tmp_path, "kr6", rng, size=0.0)
+    world.twists["j2"][3] += 0.001
+    source = opened(tmp_path, "kr6", world, rng, poses=30)
+    assert "arm_geometry" not in default_effects([tmp_path])
+    estimate = fitted(source, LESS)
+    assert estimate.converged and estimate.cost < 1.5 * 90
+    assert estimate.values["arm_link_length"][0] == pytest.approx(0.001, abs=2e-4)
 
 
 @pytest.mark.slow

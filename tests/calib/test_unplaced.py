@@ -43,6 +43,17 @@ def test_a_scan_that_nothing_places_is_left_out_and_it_is_said(tmp_path, caplog)
     assert rms["held_out"] < 1.2 * rms["noise_floor"]
 
 
+def test_without_a_mesh_what_nothing_places_is_left_out(tmp_path):
+    """It would meet planes of its own, or none at all."""
+    source, _ = made(tmp_path / "rec", Spec(**{**HANDHELD.model_dump(), "mesh": False}), 1)
+    blank = np.isnan(source.recording.bodies["mount_markers"]).any(axis=1)
+    hidden = {*np.array(source.recording.stops)[blank].tolist(), "L02P01", "L01P02"}
+    unseen(tmp_path / "rec", hidden)
+    source = Source.open(tmp_path / "rec")
+    _, model = placed([source], Model.of(None, (), (), [tmp_path / "rec"]))
+    assert set(model.without) == {f"{stop}:scan" for stop in hidden}
+
+
 def test_a_scan_of_a_base_that_hardly_moved_is_placed_by_its_neighbour(tmp_path, caplog):
     made(tmp_path / "rec", "tiny", 5)
     unseen(tmp_path / "rec", {"L00P01", "L02P01"})

@@ -70,9 +70,8 @@ def all_ways(edges, own, base_held, tip_held):
     for i, each in enumerate(edges):
         if each.joint is not None:
             way(i, each.joint.screw)
-        t = each.T_parent_child[:3, :3].T @ each.T_parent_child[:3, 3]
-        if np.linalg.norm(t) > 1e-9 and each.name in own.lengths:
-            way(i, [0, 0, 0, *t / np.linalg.norm(t)])
+        if each.name in own.lengths:
+            way(i, [0, 0, 0, *own.lengths[each.name]])
     for slip in own.slips:
         way(names.index(slip.edge), slip.twist)
     return np.stack(ways, axis=2)

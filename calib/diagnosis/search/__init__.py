@@ -183,12 +183,18 @@ def _outlasting(
     look: Look, found: list[NamedEffect], progress: Progress
 ) -> tuple[Look, list[NamedEffect]]:
     """A look beside scatter that was found after some effects, and those of these that explain more
-    than chance beside it; without the others."""
+    than chance beside it; without the others, which looks after kept ones are without as well."""
     kept = [step for step in found if outlasts(look, step.candidate)]
     gone = [step.effect.name for step in found if step not in kept]
-    if not gone or (less := tried(look.stand.lacking, gone, progress)) is None:
+    less = tried(look.stand.lacking, gone, progress) if gone else None
+    if less is None or not less.estimate.converged:
         return look, found
-    return less.look(progress), kept
+    steps: list[NamedEffect] = []
+    for step in kept:
+        there = [name for name in gone if name in step.after.stand.model.names]
+        bare = tried(step.after.stand.lacking, there, progress) if there else None
+        steps.append(replace(step, after=bare.look(progress)) if bare else step)
+    return less.look(progress), steps
 
 
 def _without_chance(done: Search, steps: Steps, progress: Progress) -> Search:
