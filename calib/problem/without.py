@@ -211,14 +211,17 @@ def _off_m(scan: ScanStop, values: Mapping[str, np.ndarray]) -> float:
 
 def _nowhere(source: Source) -> Iterator[tuple[str, str]]:
     """Stops with a scan that are tracked by nothing and guessed by nothing, and where each stands,
-    as `standing` has it."""
+    as `standing` has it; none where no stop has a place, as then any will do, or `build` asks."""
     recording = source.recording
     if source.rig.lidar is None or not recording.has_scan.any():
         return
     where = standing(source)
     posed = [b for b in recording.bodies if not start.is_point(source, b)]
     known = np.any([np.zeros(len(where), bool), *(_seen(recording, b) for b in posed)], axis=0)
-    for name in dict.fromkeys(where[~np.isin(where, where[known])]):
-        stops = np.flatnonzero(where == name)
-        if start.root_pose(source, stops) is None and start.guessed_pose(source, stops) is None:
-            yield from ((recording.stops[k], str(name)) for k in stops if recording.has_scan[k])
+    names, at = np.unique(where, return_inverse=True)
+    unseen = np.setdiff1d(np.arange(len(names)), at[known])
+    each = {str(names[i]): np.flatnonzero(at == i) for i in unseen}
+    lost = [name for name, stops in each.items() if start.root_pose(source, stops) is None]
+    lost = [name for name in lost if start.guessed_pose(source, each[name]) is None]
+    for name in lost if len(lost) < len(names) else ():
+        yield from ((recording.stops[k], name) for k in each[name] if recording.has_scan[k])
