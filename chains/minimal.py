@@ -23,7 +23,7 @@ from chains.se3 import Array
 # tests/chains/arms.py shares are 0.014 and more or below 1e-9; in a URDF of calibrated values,
 # 1 mm and 1 mrad from such drawings, those below 1e-9 become up to 0.01.
 NEW = 0.01
-# If less than this share of a direction is new, others nearly say it: its amount would have to be
+# If less than this share of a direction is new, others nearly say it: its value would have to be
 # many times as large as the error that it stands for. An axis that passes 25 mm beside the first
 # leans by 40 mrad to move along itself by 1 mm. Of those arms shares are 0.06 and less, or 0.16 and
 # more.
@@ -65,8 +65,9 @@ def own_errors(
 
     Of the tilts and shifts across every axis, in order, those are taken for which no zero, no
     length and nothing taken before can stand, wherever the arm is: a QR by blocks at poses drawn
-    over all joints (Khalil and Gautier 1991, Int. Conf. Robotics and Automation). What others
-    nearly say comes last, and a length that they nearly say acts across that: see `NEARLY_SAID`.
+    over all joints (Khalil and Gautier 1991, Int. Conf. Robotics and Automation). Directions for
+    which others can nearly stand are taken last, and of such a length the part that is new is
+    taken: see `NEARLY_SAID`.
 
     Args:
         tree: the frames.

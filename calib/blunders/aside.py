@@ -90,5 +90,4 @@ def _off_there(scan: ScanStop, values: Mapping[str, np.ndarray], other: ScanStop
 def _off(scan: ScanStop, values: Mapping[str, np.ndarray], T: np.ndarray) -> tuple[float, float]:
     """How far the points lie off, the LiDAR being there, and how far they should."""
     rows = scan.rows(values, None, T)
-    residual_m, sigma_m = rows.residual_m[rows.usable], rows.sigma_m[rows.usable]
-    return MAD * float(np.median(np.abs(residual_m))), float(np.median(sigma_m))
+    return MAD * rows.median_m, float(np.median(rows.sigma_m[rows.usable]))

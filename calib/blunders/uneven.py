@@ -1,9 +1,8 @@
 """Groups of one kind that scatter more at some stops than at others: far from the tracker, say, or
 while something heavy passed. Stops that stand out for that reason are no mishaps.
 
-Variances that hang on something are told from their squares: the logs of these are regressed on it
-(Harvey 1976, Econometrica 44, 461). How far out a group lies is then measured against those that
-are nearest to it along that.
+What a variance depends on is found by regression of the logs of squares (Harvey 1976, Econometrica
+44, 461). How far out a group lies is then measured against those that are nearest to it in that.
 """
 
 from __future__ import annotations
@@ -24,14 +23,14 @@ ALPHA_UNEVEN = LEVELS["effect on the scatter"]
 FEWEST_UNEVEN = 40
 CLASSES = 5  # of time, of equally many groups: a while of a tenth of it shows in one of them
 NEAREST = 10  # share of the groups, one in so many, that are nearest; but no fewer than this:
-FEWEST_NEAREST = 15  # the median of so many squares of six dofs is known to 15 %
+FEWEST_NEAREST = 15  # the median of so many squares of six dofs is known to 20 %
 # No instrument scatters by more than so many times what most of its rows do: a choice. Rows of
 # zeros, which all lie in one place, are mishaps.
 MOST_TIMES = 10.0
 LEAST_RATIO = 1e-6  # of a square to what chance makes it: what is less counts as so much
 TOLD_BETWEEN = (0.05, 0.95)  # quantiles between which it is told how unevenly they scatter
 
-StopKey = tuple[str, str]  # the recording, by its label, and the stop
+NamedStop = tuple[str, str]  # the recording, by its label, and the stop
 
 
 @dataclass(frozen=True)
@@ -39,7 +38,7 @@ class Uneven:
     """That groups of a kind scatter unevenly.
 
     Args:
-        along: what on, "place" or "time".
+        along: what it depends on, "place" or "time".
         p_value: how often chance alone makes it seem so.
         scale: stop -> how far out its neighbours lie, in squares of what chance makes it.
         nearest: how many neighbours tell it.
@@ -47,7 +46,7 @@ class Uneven:
 
     along: str
     p_value: float
-    scale: Mapping[StopKey, float]
+    scale: Mapping[NamedStop, float]
     nearest: int
 
     @property
@@ -66,14 +65,14 @@ class Whereabouts:
         place: body -> stop -> where, (3,) in the tracker's frame.
     """
 
-    time_s: Mapping[StopKey, float]
-    place: Mapping[str, Mapping[StopKey, np.ndarray]]
+    time_s: Mapping[NamedStop, float]
+    place: Mapping[str, Mapping[NamedStop, np.ndarray]]
 
     @classmethod
     def of(cls, problem: Problem) -> Whereabouts:
         """Of all stops of a problem."""
-        time_s: dict[StopKey, float] = {}
-        place: dict[str, dict[StopKey, np.ndarray]] = {}
+        time_s: dict[NamedStop, float] = {}
+        place: dict[str, dict[NamedStop, np.ndarray]] = {}
         for source, label in zip(problem.sources, labels(problem.sources), strict=True):
             recording = source.recording
             keys = [(label, stop) for stop in recording.stops]
@@ -85,9 +84,9 @@ class Whereabouts:
                 place.setdefault(body, {}).update(some)
         return cls(time_s, place)
 
-    def columns(self, keys: Sequence[StopKey], body: str) -> dict[str, np.ndarray]:
-        """What scatter of groups (n,) may hang on: columns (n, q) of classes of time, and of where
-        a body was and how far; of the body that moves most where the groups are of none."""
+    def columns(self, keys: Sequence[NamedStop], body: str) -> dict[str, np.ndarray]:
+        """What the scatter of groups (n,) may depend on: columns (n, q) of classes of time, and of
+        where a body was and how far; of the body that moves most where the groups are of none."""
         out = {}
         time = np.array([self.time_s.get(key, np.nan) for key in keys])
         if np.isfinite(time).all() and np.ptp(time) > 0:
@@ -113,8 +112,8 @@ def unevenly(some: Sequence[Shift], where: Whereabouts) -> Uneven | None:
     name = min(tested, key=lambda name: tested[name][0], default="")
     if not name or (p := float(after_looks(tested[name][0], len(tested)))) >= ALPHA_UNEVEN:
         return None
-    time = [where.time_s[key] for key in keys]
-    order = np.argsort(time if name == "time" else tested[name][1], kind="stable")
+    by = tested[name][1] if name == "place" else [where.time_s[key] for key in keys]
+    order = np.argsort(by, kind="stable")
     nearest = max(FEWEST_NEAREST, len(some) // NEAREST)
     local = _medians(ratio[order], nearest)
     if _one_way([some[i] for i in order], local, nearest):

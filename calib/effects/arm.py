@@ -14,9 +14,9 @@ from chains.minimal import Own, across, own_errors
 class ArmLinkLength(Effect):
     """A URDF joint origin is longer than drawn: ``t -> t + dL * t / |t|``.
 
-    One that points nearly where the base, the tool or a zero moves all that follows acts across
-    that alone: of an origin 25 mm out and 400 mm up, on a base of unknown height, only the part out
-    is told, and 0.7 mm of it would otherwise be 11 mm of length.
+    Where a move of the base, the tool or a zero does nearly the same, only the part that these do
+    not do is estimated. Of an origin 25 mm out and 400 mm up, on a base of unknown height, that is
+    the part out: 0.7 mm of it would otherwise be told as 11 mm of length.
     """
 
     name = "arm_link_length"

@@ -203,10 +203,9 @@ def _off_m(scan: ScanStop, values: Mapping[str, np.ndarray]) -> float:
     """How far half of a scan's beams end from what they meet, at least; infinite if they meet
     nothing."""
     try:
-        rows = scan.rows(values)
+        return scan.rows(values).median_m
     except InputError:
         return np.inf
-    return float(np.median(np.abs(rows.residual_m[rows.usable])))
 
 
 def _nowhere(source: Source) -> Iterator[tuple[str, str]]:

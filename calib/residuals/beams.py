@@ -145,6 +145,11 @@ class Rows:
         return self._derivatives[2]
 
     @property
+    def median_m(self) -> float:
+        """Median size of the residuals of usable rows."""
+        return float(np.median(np.abs(self.residual_m[self.usable])))
+
+    @property
     def cost(self) -> float:
         """Half the robust chi-square."""
         return tukey_cost(self.residual_m / self.sigma_m, self.scale)

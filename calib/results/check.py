@@ -285,7 +285,7 @@ def _place(scan: ScanStop, values: Values) -> PlacedScan:
         share=float(rows.usable.mean()),
         range_m=rows.view["range_m"][met],
         incidence_rad=rows.view["incidence_rad"][met],
-        residual_m=float(np.median(np.abs(rows.residual_m[rows.usable]))),
+        residual_m=rows.median_m,
     )
 
 

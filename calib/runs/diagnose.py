@@ -162,9 +162,9 @@ def _falls(found: Search, stand: Stand, run: Run, progress: Progress) -> dict[st
 def _cautions(run: Run, found: Diagnosis, look: Look) -> list[str]:
     """What is to be looked at besides, without what was found to be wrong, or scatters as far as
     what is near it does."""
-    named = [f"{each['where']}, {each['name']}:" for each in found.blunders]
-    uneven = (b.group for b in look.blunders if b.uneven and not b.found)
-    named = (*named, *(f"{group.where}, {group.what}:" for group in uneven))
+    wrong = [(each["where"], each["name"]) for each in found.blunders]
+    uneven = [(b.group.where, b.group.what) for b in look.blunders if b.uneven and not b.found]
+    named = tuple(f"{where}, {what}:" for where, what in (*wrong, *uneven))
     return [each for each in cautions(run) if not each.startswith(named)]
 
 

@@ -51,7 +51,6 @@ def written(folder: Path, case: Case) -> None:
     arm, kind, size, poses = case
     rng = np.random.default_rng([SEED, list(TABLES).index(arm), list(KINDS).index(kind)])
     world = bent(folder, arm, rng)
-    (folder / f"{arm}.urdf").rename(folder / "arm.urdf")
     session = Session.drawn(world, rng, poses)
     T = scaled(KINDS[kind].hide(world, session, rng), size)
     read = session.joints + JOINT_RAD * rng.normal(size=session.joints.shape)

@@ -71,8 +71,11 @@ def exp(twist: np.ndarray) -> RigidTransform:
 
 
 def bent(folder, name: str, rng: np.random.Generator, size: float = 1.0) -> ArmWorld:
-    """A world of twists: every edge is off by 1 mm and 1 mrad in each of six ways, joints by 2."""
+    """A world of twists: every edge is off by 1 mm and 1 mrad in each of six ways, joints by 2; its
+    URDF is written into a folder, which is made if it is not there."""
+    folder.mkdir(exist_ok=True)
     edges = edges_of(folder, name)
+    (folder / f"{name}.urdf").rename(folder / "arm.urdf")
     return ArmWorld(
         edges=edges,
         twists={e.name: size * 1e-3 * rng.normal(size=6) for e in edges},

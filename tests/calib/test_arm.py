@@ -76,7 +76,7 @@ def test_it_is_where_the_graph_has_it(source, name, tip):
 def test_what_is_commanded_brings_the_tip_where_it_should_be(tmp_path, name):
     rng = np.random.default_rng(6)
     world = arm_worlds.bent(tmp_path, name, rng, size=0.0)
-    source = opened(tmp_path, name, world, rng, poses=2)
+    source = opened(tmp_path, world, rng, poses=2)
     names = ("arm_link_length", "arm_joint_offset", "arm_geometry", "arm_joint_eccentricity")
     part, known, values = found(source, (*names, "arm_gravity_sag"), rng, size=0.3)
     arm = Arm.as_found(source.rig, part, known, "tool")
@@ -101,7 +101,7 @@ def test_what_is_commanded_brings_the_tip_where_it_should_be(tmp_path, name):
 def test_an_arm_of_few_joints_says_how_far_it_stays_off(tmp_path):
     rng = np.random.default_rng(7)
     world = arm_worlds.bent(tmp_path, "scara", rng, size=0.0)
-    source = opened(tmp_path, "scara", world, rng, poses=2)
+    source = opened(tmp_path, world, rng, poses=2)
     part, known, _ = found(source, ("arm_link_length", "arm_joint_offset", "arm_geometry"), rng)
     arm = Arm.as_found(source.rig, part, known)
     joints = world.draw(rng, 500)
@@ -115,7 +115,7 @@ def test_an_arm_of_seven_joints_reaches_towards_what_is_out_of_reach(tmp_path):
     """Every step brings the tip nearer, and so damps the next less: without an end to that, seven
     joints have no least step."""
     world = arm_worlds.bent(tmp_path, "iiwa7", np.random.default_rng(9), size=0.0)
-    source = opened(tmp_path, "iiwa7", world, np.random.default_rng(9), poses=2)
+    source = opened(tmp_path, world, np.random.default_rng(9), poses=2)
     names = ("arm_link_length", "arm_joint_offset", "arm_geometry")
     part, known, _ = found(source, names, np.random.default_rng(9), size=0.3)
     arm = Arm.as_found(source.rig, part, known)

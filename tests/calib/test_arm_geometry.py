@@ -25,10 +25,9 @@ POSES = 120
 LIKE_ANOTHER = ("ur5e",)  # as ur10, but for its lengths
 
 
-def opened(folder, name, world, rng, poses=POSES):
+def opened(folder, world, rng, poses=POSES):
     """A recording of the world, opened."""
     arm_worlds.write(folder, world, rng, poses)
-    (folder / f"{name}.urdf").rename(folder / "arm.urdf")
     return Source.open(folder)
 
 
@@ -86,7 +85,7 @@ def test_every_name_of_eleven_arms_is_found_within_its_sigma(tmp_path):
             folder = tmp_path / f"{name}{seed}"
             folder.mkdir()
             world, truth = named(folder, name, rng)
-            estimate = fitted(opened(folder, name, world, rng), GEOMETRY)
+            estimate = fitted(opened(folder, world, rng), GEOMETRY)
             assert estimate.converged
             z = np.concatenate(list(z_of(estimate, truth).values()))
             held.append(np.mean(np.abs(z) < 1.96))
@@ -103,7 +102,7 @@ def test_small_errors_are_told_as_small_ones(tmp_path, name):
     an axis that misses the first by 1 mm would be a lean of 40 mrad."""
     rng = np.random.default_rng([18, list(TABLES).index(name)])
     world = arm_worlds.bent(tmp_path, name, rng)
-    estimate = fitted(opened(tmp_path, name, world, rng), GEOMETRY)
+    estimate = fitted(opened(tmp_path, world, rng), GEOMETRY)
     unknowns = estimate.problem.variables
     for effect in GEOMETRY:
         assert np.all(np.abs(estimate.values[effect]) < 2.5 * unknowns[effect].prior_sigma), effect
@@ -115,7 +114,7 @@ def test_of_few_poses_lengths_alone_say_what_they_can(tmp_path):
     rng = np.random.default_rng(6)
     world = arm_worlds.bent(tmp_path, "kr6", rng, size=0.0)
     world.twists["j2"][3] += 0.001
-    source = opened(tmp_path, "kr6", world, rng, poses=30)
+    source = opened(tmp_path, world, rng, poses=30)
     assert "arm_geometry" not in default_effects([tmp_path])
     estimate = fitted(source, LESS)
     assert estimate.converged and estimate.cost < 1.5 * 90
@@ -132,7 +131,7 @@ def test_where_the_tool_is_at_new_poses_is_known_as_well_as_is_said(tmp_path, na
         folder = tmp_path / f"{seed}"
         folder.mkdir()
         world = arm_worlds.bent(folder, name, rng)
-        source = opened(folder, name, world, rng)
+        source = opened(folder, world, rng)
         joints = world.draw(rng, 200)
         for effects, found in squares.items():
             found.append(off_by(fitted(source, effects), source, world, joints))
@@ -165,7 +164,7 @@ def test_bent_links_are_named_and_with_them_the_model_is_adequate(tmp_path, name
     rng = np.random.default_rng([5, list(TABLES).index(name)])
     folder = tmp_path / name
     folder.mkdir()
-    opened(folder, name, arm_worlds.bent(folder, name, rng), rng, poses=150)
+    opened(folder, arm_worlds.bent(folder, name, rng), rng, poses=150)
     less = calibrate([folder], tmp_path / "less", Model(LESS), hold_out="none")
     first = diagnose(less, refits=False).candidates[0]
     assert "arm_geometry" in (first["effect"], *first["indistinguishable_from"])
@@ -223,7 +222,7 @@ def test_the_default_holds_the_geometry_where_the_poses_tell_it(shared):
 def test_ten_rows_a_parameter_a_pose_being_six_and_a_point_three(tmp_path):
     rng = np.random.default_rng(0)
     world = arm_worlds.bent(tmp_path, "positioner", rng)
-    source = opened(tmp_path, "positioner", world, rng, poses=40)
+    source = opened(tmp_path, world, rng, poses=40)
     free = sum(p.sigma > 0 for name in GEOMETRY for p in find(name).params(source.rig))
     rows = (tmp_path / "stops.csv").read_text().splitlines()
     enough = -(-10 * free // 6)

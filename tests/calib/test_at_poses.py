@@ -24,7 +24,7 @@ def world(tmp_path_factory):
     folder = tmp_path_factory.mktemp("arm")
     rng = np.random.default_rng(21)
     world = arm_worlds.bent(folder, "irb120", rng)
-    source = opened(folder, "irb120", world, rng, poses=150)
+    source = opened(folder, world, rng, poses=150)
     run = calibrate([folder], folder.with_name("run"), hold_out="none")
     joints = world.draw(rng, 300)
     table = folder.with_name("poses.csv")

@@ -26,7 +26,6 @@ def arm(folder, seed, sigma_joint_rad=0.0):
     """Forty poses of a UR10 with nothing wrong but its geometry."""
     rng = np.random.default_rng(seed)
     world = arm_worlds.bent(folder, "ur10", rng)
-    (folder / "ur10.urdf").rename(folder / "arm.urdf")
     q, noise = world.draw(rng, 40), arm_worlds.exp(arm_worlds.noise(rng, 40))
     read = q + sigma_joint_rad * rng.normal(size=q.shape)
     arm_worlds.save(folder, world, read, world.seen(q) * noise, {}, sigma_joint_rad)

@@ -62,9 +62,7 @@ def test_poses_that_scatter_of_the_joints_moves_far_are_no_blunders(tmp_path, wi
     """One error of a joint moves the tool further at some poses than at others. Before that scatter
     is in the model three poses stand out; a row that was written down wrongly stands out after."""
     rng, folder = np.random.default_rng([20, 5]), tmp_path / "rec"
-    folder.mkdir()
     world = arm_worlds.bent(folder, "panda", rng)
-    (folder / "panda.urdf").rename(folder / "arm.urdf")
     read = world.draw(rng, 80)
     T = world.seen(read + 5e-4 * rng.normal(size=read.shape))
     off = arm_worlds.noise(rng, 80)

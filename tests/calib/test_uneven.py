@@ -117,9 +117,7 @@ def test_places_are_those_of_points_and_of_poses(tmp_path):
 def test_a_zone_that_is_off_one_way_does_not_scatter(tmp_path):
     """2 mm in one direction where the arm reaches one corner: something is wrong there."""
     rng, folder = np.random.default_rng(23), tmp_path / "rec"
-    folder.mkdir()
     world = arm_worlds.bent(folder, "ur10", rng)
-    (folder / "ur10.urdf").rename(folder / "arm.urdf")
     read = world.draw(rng, 150)
     T = world.seen(read)
     near = np.linalg.norm(T.translation - T.translation[0], axis=1) < 0.7
@@ -148,9 +146,7 @@ def test_a_tracker_that_sees_worse_far_away_has_no_blunders_but_true_ones(tmp_pa
     """Sigmas from half to six times those stated, by the distance: two stops would stand out of
     their bulk. A row that was written down wrongly still does."""
     rng, folder = np.random.default_rng(21), tmp_path / "rec"
-    folder.mkdir()
     world = arm_worlds.bent(folder, "ur10", rng)
-    (folder / "ur10.urdf").rename(folder / "arm.urdf")
     read = world.draw(rng, 150)
     T = world.seen(read)
     far = np.linalg.norm(T.translation, axis=1)

@@ -10,9 +10,10 @@ from scipy import special
 
 from calib.blunders.chance import LEVELS, after_looks, log_tail
 from calib.diagnosis.rejects import FEWEST_STOPS
-from calib.diagnosis.score import ScoreTest, project, score_test
+from calib.diagnosis.score import Scores, ScoreTest, project, score_test
 from calib.diagnosis.screen import Candidate, Screen
 from calib.diagnosis.stand import Look, variables_of
+from calib.effects import Effect
 from calib.solve.fit import Progress
 
 ALPHA_EFFECT = LEVELS["effect"]
@@ -70,13 +71,18 @@ def outlasts(look: Look, candidate: Candidate) -> bool:
     """Whether a candidate that has been fitted explains more than chance does, at the sigmas of the
     look's model, adjusted for all tests: with scatter in it these are right. As for a candidate
     that is not fitted, its own prior is no evidence against it: the score is that at zero."""
-    names = variables_of(look.stand.problem, {candidate.effect.name})[candidate.effect.name]
-    scores = project(look.linear, names)
-    theta = np.concatenate([look.stand.estimate.values[name] for name in names])
+    scores, theta = as_fitted(look, candidate.effect)
     whiten = score_test(scores, np.arange(len(theta))).whiten
     explained = np.square(whiten.T @ (scores.score + scores.information @ theta)).sum()
     p = special.chdtrc(whiten.shape[1], explained)
     return float(after_looks(p, candidate.looks)) < ALPHA_EFFECT
+
+
+def as_fitted(look: Look, effect: Effect) -> tuple[Scores, np.ndarray]:
+    """Scores of the parameters of an effect of a look's model, and these parameters (Q,)."""
+    names = variables_of(look.stand.problem, {effect.name})[effect.name]
+    values = look.stand.estimate.values
+    return project(look.linear, names), np.concatenate([values[name] for name in names])
 
 
 def suspects(screen: Screen, alpha: float) -> Iterator[Candidate]:

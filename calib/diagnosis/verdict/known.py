@@ -13,10 +13,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib.diagnosis.score import information_left, project, score_test
+from calib.diagnosis.score import information_left, score_test
 from calib.diagnosis.screen import Candidate
 from calib.diagnosis.search import NamedEffect, Search
-from calib.diagnosis.search.confirmed import structures
+from calib.diagnosis.search.confirmed import as_fitted, structures
 from calib.diagnosis.stand import Look, Stand, finer, tried, variables_of
 from calib.diagnosis.verdict.matters import FALL_MATTERS
 from calib.diagnosis.verdict.unnamed import Unnamed
@@ -77,10 +77,7 @@ def by_name(
 
 def _as_fitted(candidate: Candidate, before: Look, after: Look, p_adjusted: float) -> NamedEffect:
     """A candidate as its fit has it, with the beams that this takes back."""
-    estimate, effect = after.stand.estimate, candidate.effect
-    names = variables_of(after.stand.problem, {effect.name})[effect.name]
-    scores = project(after.linear, names)
-    theta = np.concatenate([estimate.values[name] for name in names])
+    scores, theta = as_fitted(after, candidate.effect)
     told = scores.information @ theta
     own = score_test(scores, np.arange(len(theta)))
     test = replace(
