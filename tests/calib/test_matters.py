@@ -10,15 +10,16 @@ from scipy.stats import ttest_rel, wilcoxon
 from calib import add, diagnose, fit
 from calib.diagnosis.search import NamedEffect, Search
 from calib.diagnosis.stand import Stand
-from calib.diagnosis.verdict import _over_the_expected, _unconfirmed, conclude
+from calib.diagnosis.verdict import _dressed_up, _over_the_expected, _unconfirmed, conclude
 from calib.diagnosis.verdict.matters import (
     FALL_MATTERS,
     SHIFT_MATTERS,
     Consequences,
     Matters,
-    _borne_out,
+    borne_out,
     weighed,
 )
+from calib.diagnosis.verdict.unnamed import Unnamed
 from calib.effects import find
 from calib.problem import build
 from calib.problem.model import Model, Source
@@ -93,15 +94,13 @@ def test_one_stop_far_from_all_others_does_not_hide_that_they_agree():
 
 
 @pytest.mark.parametrize(
-    ("before_mm", "after_mm", "borne_out"),
+    ("before_mm", "after_mm", "sure"),
     [(42.0, 1.6, True), (42.0, 30.0, False), (1.7, 1.5, False), (2.2, 1.5, True)],
 )
-def test_three_stops_bear_out_what_takes_the_error_to_the_expected_one(
-    before_mm, after_mm, borne_out
-):
+def test_three_stops_bear_out_what_takes_the_error_to_the_expected_one(before_mm, after_mm, sure):
     fall = Fall(before_mm, after_mm, 1.5, (0.1, 2.0, 90.0))
-    assert fall.by_chance and _borne_out(fall) is borne_out
-    assert _borne_out(None) and _borne_out(replace(fall, gain_m2=(1.0, 1.1, 0.9)))
+    assert fall.by_chance and borne_out(fall) is sure
+    assert borne_out(None) and borne_out(replace(fall, gain_m2=(1.0, 1.1, 0.9)))
 
 
 def test_what_predicts_nothing_before_another_is_in_is_asked_beside_it(tmp_path):
@@ -208,6 +207,28 @@ def test_a_name_that_held_out_stops_refuse_says_something_only_where_structure_d
     assert len(told.unexplained) == structure and not told.worth_adding
     assert structure or "none that matters is significant" in told.sentences[0]
     assert any("incidence_angle_bias was tried and rejected" in s for s in told.sentences)
+
+
+@pytest.mark.parametrize(
+    ("formulas", "after_mm", "told"),
+    [
+        (Unnamed(["a formula"]), 3.0, True),
+        (Unnamed(["a formula"]), 8.9, False),
+        (Unnamed(["a formula"], instead=True), 3.0, False),
+        (Unnamed(), 3.0, False),
+    ],
+    ids=["beside it", "which takes little of the error", "in its place", "no formula"],
+)
+def test_a_name_stands_beside_a_larger_structure_of_what_it_leaves(look, formulas, after_mm, told):
+    weakest = min(look.named.candidates, key=lambda c: c.test.evidence(look.named.common))
+    fields = {"before": look, "after": look, "judged": weakest.test, "p_adjusted": 1e-3}
+    step = NamedEffect(candidate=weakest, **fields, rivals=[])
+    found = Search([look], found=[step], blunders=(), unnamed=(), scatter=None)
+    assert found.dressed_up(0)
+    name = weakest.effect.name
+    falls = {name: Fall(9.0, after_mm, 2.0, (1.0, -1.0, 4.0))}
+    assert falls[name].by_chance
+    assert _dressed_up(found, falls, False, formulas) == ([] if told else [name])
 
 
 @pytest.mark.slow

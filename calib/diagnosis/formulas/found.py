@@ -120,6 +120,12 @@ class Formula:
         return np.concatenate([part.amount for part in self.parts])
 
     @property
+    def constants(self) -> int:
+        """How many were found: amounts, and constants of factors."""
+        free = (factor.free for part in self.parts for factor in part.term.factors)
+        return len(self.amount) + sum(free)
+
+    @property
     def says(self) -> str:
         """The formula as people write it, each number with the sigma of its last digits."""
         what = (

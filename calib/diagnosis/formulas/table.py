@@ -158,6 +158,11 @@ class BeamTable:
         found, cell = np.unique((stop + 1) * wide + place + 1, return_inverse=True)
         return found // wide - 1, found % wide - 1, cell
 
+    def clustered(self, label: np.ndarray) -> BeamTable:
+        """The same where stops (S,) of one label err together, as one stop does."""
+        others = np.where(self.others_stop >= 0, label[self.others_stop], -1)
+        return replace(self, stop=label[self.stop], others_stop=others)
+
     def beside(self, columns_m: np.ndarray) -> BeamTable:
         """The table of a model that has such columns (N, F) of the range, too: its last unknowns,
         of which nothing was known."""

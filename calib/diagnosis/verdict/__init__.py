@@ -25,6 +25,7 @@ from calib.diagnosis.verdict.matters import (
     ABSORBED,
     HELD_OUT_BESIDE_SCATTER,
     HELD_OUT_BY_CHANCE,
+    borne_out,
     weighed,
 )
 from calib.diagnosis.verdict.sentences import BAD, UNNAMED, sentences_of, stops_of, unconfirmed
@@ -161,19 +162,19 @@ def conclude(
     """
     heavy = weighed(found, held_out, summary["rms_mm"])
     found, first = heavy.found, found.looks[0]
-    spoilt = [*rings, *(rejected.blunders() if rejected and not found.found else [])]
+    blunders = [*rings, *(rejected.blunders() if rejected and not found.found else [])]
+    blunders += [told.document(left, _rig(left, first)) for left in found.blunders]
     hold = believed(found, held_out) and not formulas.instead
-    more = formulas.formulas or (rejected and not rejected.explained)
-    more = bool(more or found.unsettled or (heavy.refused and found.at_first))
+    more = formulas.formulas or found.unsettled or (heavy.refused and found.at_first)
+    more = bool(more or (rejected and not rejected.explained))
     over = _over_the_expected(found, held_out, summary["rms_mm"])
-    bad = bool(spoilt or found.blunders)
-    doubt = None if bad or more else _unconfirmed(found, over)
+    doubt = None if blunders or more else _unconfirmed(found, over)
     calm = BAD if forbids else UNNAMED if doubt else "adequate"
-    verdict = BAD if bad else _verdict(found, hold, more or bool(doubt and found.chance), calm)
-    candidates = candidate_documents(heavy, held_out, verdict == UNNAMED, hold)
-    untestable = _untestable(first)
+    verdict = BAD if blunders else _verdict(found, hold, more, bool(doubt), calm)
+    worn = _dressed_up(found, held_out, hold, formulas) if verdict == UNNAMED else []
+    candidates = candidate_documents(heavy, held_out, verdict == UNNAMED, worn)
     unexplained = _structure(found, verdict, formulas, rejected, doubt)
-    blunders = [*spoilt, *(told.document(left, _rig(left, first)) for left in found.blunders)]
+    untestable = _untestable(first)
     unsure = unconfirmed(doubt, over) if doubt else ""
     sentences = sentences_of(verdict, heavy, candidates, unexplained, untestable, blunders, unsure)
     if forbids and verdict in (BAD, UNNAMED) and not blunders:
@@ -235,17 +236,18 @@ def _rig(left: LeftOut, look: Look) -> Rig:
     return rigs.get(left.blunder.group.recording) or sources[0].rig
 
 
-def _verdict(found: Search, hold: bool, more: bool, calm: str) -> str:
+def _verdict(found: Search, hold: bool, more: bool, doubt: bool, calm: str) -> str:
     """Of a search without blunders.
 
     Args:
         found: the search.
         hold: whether its names are to be believed.
         more: whether there is something beside all that it found.
+        doubt: whether there may be, and nothing confirms it.
         calm: the verdict where it found nothing.
     """
     if not found.found:
-        if found.unnamed or more:
+        if found.unnamed or more or (doubt and found.chance):
             return UNNAMED
         return "missing_effect" if found.chance else calm
     named = hold and (not found.unnamed or _absorbed(found) > ABSORBED)
@@ -260,6 +262,26 @@ def believed(found: Search, held_out: Mapping[str, Fall]) -> bool:
         held_out: as of `conclude`.
     """
     return _names_hold(found) and not _leave_most(found, held_out)
+
+
+def _dressed_up(
+    found: Search, held_out: Mapping[str, Fall], hold: bool, formulas: Unnamed
+) -> list[str]:
+    """Names that stand in for residual structure. Where formulas were found of what the names
+    leave, and stops held out bear out each name, none does: bins explain more than it then because
+    they take in the rest as well.
+
+    Args:
+        found: the search.
+        held_out: as of `conclude`.
+        hold: whether its names are the answer.
+        formulas: of residual structure.
+    """
+    names = [step.effect.name for step in found.found]
+    sure = all(name in held_out and borne_out(held_out[name]) for name in names)
+    if sure and formulas.formulas and not formulas.instead:
+        return []
+    return [name for i, name in enumerate(names) if not hold or found.dressed_up(i)]
 
 
 def _leave_most(found: Search, held_out: Mapping[str, Fall]) -> bool:

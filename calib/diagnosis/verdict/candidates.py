@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -27,7 +27,7 @@ def candidate_documents(
     heavy: Weighed,
     held_out: Mapping[str, Fall],
     unnamed: bool,
-    hold: bool,
+    worn: Sequence[str],
 ) -> list[dict[str, Any]]:
     """All of them, those first that were confirmed.
 
@@ -35,15 +35,14 @@ def candidate_documents(
         heavy: what of the search matters.
         held_out: as of `conclude`.
         unnamed: whether residual structure is left.
-        hold: whether the names are to be believed nevertheless, where bins do not do better.
+        worn: names that stand in for it.
     """
     found = heavy.found
     named, out = len(found.found), [_candidate(c, found, held_out) for c in _ranked(found)]
     for each in out:
         told_of = heavy.matter.get(each["add"])
         each["matters"] = told_of.document() if told_of else None
-        worn = bool(each["step"]) and (not hold or found.dressed_up(each["step"] - 1))
-        each["dressed_up"] = unnamed and worn
+        each["dressed_up"] = bool(each["step"]) and each["add"] in worn
     # Residual structure may be random scatter: that is judged once it is in the model.
     chance = [
         each.document(None if unnamed else named + i) for i, each in enumerate(found.chance, 1)

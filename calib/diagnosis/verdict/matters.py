@@ -163,7 +163,7 @@ def weighed(
                 f"{name} was tried and rejected: it absorbs part of the residuals, but stops that "
                 f"were held out are predicted worse with it ({told.held_out_mm:+.3f} mm)."
             )
-        elif named and not _borne_out(fall) and (other := _more_general(step)):
+        elif named and not borne_out(fall) and (other := _more_general(step)):
             refused.append(
                 f"{name} was tried and rejected: what {named[-1].effect.name} leaves of the "
                 f"residuals is significant (adjusted p = {step.p_adjusted:.1g}) and it absorbs "
@@ -190,7 +190,7 @@ def weighed(
     return Weighed(replace(found, found=named, **kept), matter, traces, refused=refused)
 
 
-def _borne_out(fall: Fall | None) -> bool:
+def borne_out(fall: Fall | None) -> bool:
     """Whether stops held out confirm a name, as far as is known: they agree on it, or it takes away
     most of an error that is larger than chance makes it."""
     if fall is None or not fall.by_chance:

@@ -57,18 +57,18 @@ def sentences_of(
         out += [each.sentence for each in found.chance]
     out += [found.unsettled.unsettled] if found.unsettled else []
     out += [*heavy.refused, *traces]
+    named = [c["add"] for c in candidates if c["step"] and not c["dressed_up"]]
+    beside = f"Beside {' and '.join(named)}, there" if named else "There"
+    structure = [
+        f"{beside} is residual structure that no known effect explains.",
+        *(line for each in formulas for line in _formula_sentences(each, residual)),
+    ]
     if doubt:
         out = [doubt, *out]
     elif verdict == UNNAMED:
-        named = [c["add"] for c in candidates if c["step"] and not c["dressed_up"]]
-        beside = f"Beside {' and '.join(named)}, there" if named else "There"
-        out = [
-            f"{beside} is residual structure that no known effect explains.",
-            *(line for each in formulas for line in _formula_sentences(each, residual)),
-            *out,
-        ]
-    else:
-        out += [line for each in formulas for line in _formula_sentences(each, residual)]
+        out = [*structure, *out]
+    elif formulas:
+        out += structure
     out += _structure_sentences([each for each in unexplained if "says" not in each], residual)
     if found.scatter is not None:
         what = " and ".join(words(c) for c in found.scatter.effect.covariates)

@@ -14,6 +14,7 @@ from calib.diagnosis.search import Search
 from calib.diagnosis.stand import Stand
 from calib.diagnosis.suggest import DESCRIBES, span, what_differs, words
 from calib.diagnosis.verdict.matters import FALL_MATTERS, HELD_OUT_BY_CHANCE
+from calib.effects import Effect, Site
 from calib.effects.own.formula import FormulaEffect
 from calib.results.errors import Errors
 from calib.results.holdout import Fall
@@ -62,8 +63,11 @@ def unnamed(
     progress: Progress,
 ) -> Unnamed:
     """Look for formulas of what a search left: of the ranges, or of a joint where there are none.
-    Where something seems to move instead, a formula takes its place only if nothing is left beside
-    it: an error of the range that follows azimuth looks much like a motion, and a motion like it.
+
+    One takes the place of names if it predicts unseen stops better, or as well and with fewer
+    constants than several functions of the same covariates, which may make up any curve. Where
+    something seems to move, a formula takes the place of that only if nothing is left beside it: an
+    error of the range that follows azimuth looks much like a motion, and a motion like it.
 
     Args:
         found: the search.
@@ -77,19 +81,20 @@ def unnamed(
     if moves and unseen is None:
         return Unnamed()
     first, last = found.looks[0].stand, found.looks[-1].stand
-    if found.found and doubtful and unseen is not None and not moves:
+    names = [step.effect for step in found.found]
+    if unseen is not None and (_of_one_curve(names) or (names and doubtful and not moves)):
         formulas = find(first, progress)
         if formulas:
             after = unseen(with_formulas(first, formulas, progress)).rms_mm
-            before = falls[found.found[0].effect.name].before_mm
-            named = falls[found.found[-1].effect.name].after_mm
-            if after < named - FALL_MATTERS * before:
+            before, named = falls[names[0].name].before_mm, falls[names[-1].name].after_mm
+            better = -FALL_MATTERS * before
+            if after < named + (-better if _simpler(formulas, names, first) else better):
                 return Unnamed(formulas, True, (before, after))
     # Values by chance take in most of a structure that differs from stop to stop.
     there = set(last.model.names)
     chance = [c.effect.name for c in found.chance if c.effect.name in there]
     last = last.lacking(chance, progress) if chance else last
-    formulas = find(last, progress)
+    formulas = find(last, progress, any(c.effect.per == "location" for c in found.chance))
     if not formulas or unseen is None:
         return Unnamed(formulas)
     fitted = with_formulas(last, formulas, progress)
@@ -107,6 +112,22 @@ def unnamed(
         refused=f"A formula over {over} fits part of the residuals, but stops that were held out "
         f"are predicted no better with it ({fall_mm[0]:.2f} to {fall_mm[1]:.2f} mm)."
     )
+
+
+def _of_one_curve(names: Sequence[Effect]) -> bool:
+    """Whether several effects make up one function of the same covariates for the range."""
+    over = {frozenset(effect.covariates) for effect in names if effect.site is Site.BEAM}
+    return len(over) == 1 < len(names) and all(e.site is Site.BEAM for e in names)
+
+
+def _simpler(formulas: Sequence[Formula], names: Sequence[Effect], stand: Stand) -> bool:
+    """Whether one formula has fewer constants than several effects of the same covariates."""
+    covariates = {c for effect in names for c in effect.covariates}
+    if not _of_one_curve(names) or len(formulas) > 1 or {*formulas[0].covariates} != covariates:
+        return False
+    rig = stand.sources[0].rig
+    known = sum(len(effect.params(rig)) + bool(effect.shape_name) for effect in names)
+    return formulas[0].constants < known
 
 
 def with_formulas(stand: Stand, formulas: Sequence[Formula], progress: Progress) -> Stand:

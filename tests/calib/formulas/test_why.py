@@ -59,6 +59,17 @@ def test_nothing_known_hangs_on_a_column_of_the_users_own():
 FLOOR = 2.0  # mm
 
 
+def effect(i, over):
+    """An effect on ranges with one parameter; the second has a shape as well."""
+    return SimpleNamespace(
+        name=f"effect_{i}",
+        site=Site.BEAM,
+        covariates=(over,),
+        params=lambda rig: range(1),
+        shape_name="scale" if i else "",
+    )
+
+
 class World:
     """A search that found some names, and what held-out stops say of models, in mm.
 
@@ -68,10 +79,10 @@ class World:
             there are none.
     """
 
-    def __init__(self, monkeypatch, names=0, first=None, last=None):
-        model = SimpleNamespace(names=())
-        self.stands = [SimpleNamespace(estimate=i, model=model) for i in range(names + 1)]
-        found = [SimpleNamespace(effect=SimpleNamespace(name=f"effect_{i}")) for i in range(names)]
+    def __init__(self, monkeypatch, names=0, first=None, last=None, over=None, constants=1):
+        known = {"model": SimpleNamespace(names=()), "sources": [SimpleNamespace(rig=None)]}
+        self.stands = [SimpleNamespace(estimate=i, **known) for i in range(names + 1)]
+        found = [SimpleNamespace(effect=effect(i, over or f"column_{i}")) for i in range(names)]
         self.search = SimpleNamespace(
             looks=[SimpleNamespace(stand=s) for s in self.stands],
             found=found,
@@ -83,10 +94,11 @@ class World:
         after = {0: first, names: last} if names else {0: last}
         self.asked = []
 
-        def find(stand, progress):
+        def find(stand, progress, by_location=False):
             self.asked.append(stand.estimate)
             error = after[stand.estimate]
-            return [] if error is None else [SimpleNamespace(covariates=("wind",), after=error)]
+            formula = {"covariates": ("wind",), "constants": constants}
+            return [] if error is None else [SimpleNamespace(**formula, after=error)]
 
         monkeypatch.setattr(module, "find", find)
         monkeypatch.setattr(module, "with_formulas", lambda _, formulas, __: formulas[0].after)
@@ -169,3 +181,26 @@ def test_doubtful_names_are_kept_where_no_formula_is(monkeypatch):
     found = world.unnamed(doubtful=True)
     assert not found.instead and found.fall_mm == (3.0, 2.5)
     assert world.asked == [0, 2]
+
+
+@pytest.mark.parametrize(
+    ("over", "constants", "first", "instead"),
+    [
+        ("wind", 2, 3.03, True),
+        ("wind", 2, 3.05, False),
+        ("wind", 3, 3.03, False),
+        ("rain", 2, 3.03, False),
+        (None, 2, 3.03, False),
+    ],
+)
+def test_a_simpler_formula_takes_the_place_of_several_names_that_make_up_a_curve(
+    monkeypatch, over, constants, first, instead
+):
+    """Two effects have three constants, and come down to 3 mm, as the formula does but for 0.04."""
+    made = {"first": first, "over": over, "constants": constants}
+    assert World(monkeypatch, names=2, **made).unnamed().instead == instead
+
+
+def test_one_name_is_no_curve_of_several(monkeypatch):
+    world = World(monkeypatch, names=1, first=3.0, over="wind", constants=0)
+    assert not world.unnamed().instead and world.asked == [1]
