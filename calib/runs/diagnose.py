@@ -15,7 +15,7 @@ from calib.blunders import told
 from calib.blunders.reach import FurthestMoved, hardly_checked, reaches
 from calib.diagnosis.chance import Spread
 from calib.diagnosis.rejects import rejects
-from calib.diagnosis.search import Search, search
+from calib.diagnosis.search import Search, nameless, search
 from calib.diagnosis.search.confirmed import structures
 from calib.diagnosis.stand import Look, Stand, tried
 from calib.diagnosis.verdict import ABSORBED_BY_MODEL, Diagnosis, believed, conclude
@@ -92,6 +92,11 @@ def _found(
     known = by_name(found, formulas, unseen, progress) if unseen else None
     if known and believed(*known) and weighed(*known, run.summary["rms_mm"]).found.found:
         (found, falls), formulas = known, Unnamed()
+    told_otherwise = formulas.formulas or found.unnamed or found.at_first
+    if doubtful and found.chance and not told_otherwise:
+        # Names that leave most of what scatter by chance accounts for explain nothing beside it.
+        found = nameless(found, progress)
+        falls = _falls(found, stand, run, progress) if refits else {}
     rise = any(falls[s.effect.name].rises for s in found.found if s.effect.name in falls)
     if rise and not found.at_first:
         # A name that stops held out refuse says nothing by itself: is there structure without it?

@@ -215,9 +215,16 @@ def test_a_name_that_held_out_stops_refuse_says_something_only_where_structure_d
         (Unnamed(["a formula"]), 3.0, True),
         (Unnamed(["a formula"]), 8.9, False),
         (Unnamed(["a formula"], instead=True), 3.0, False),
+        (Unnamed(["a formula"], needless=["it"]), 3.0, False),
         (Unnamed(), 3.0, False),
     ],
-    ids=["beside it", "which takes little of the error", "in its place", "no formula"],
+    ids=[
+        "beside it",
+        "which takes little of the error",
+        "in its place",
+        "beside which it is nothing",
+        "no formula",
+    ],
 )
 def test_a_name_stands_beside_a_larger_structure_of_what_it_leaves(look, formulas, after_mm, told):
     weakest = min(look.named.candidates, key=lambda c: c.test.evidence(look.named.common))
@@ -228,6 +235,7 @@ def test_a_name_stands_beside_a_larger_structure_of_what_it_leaves(look, formula
     name = weakest.effect.name
     falls = {name: Fall(9.0, after_mm, 2.0, (1.0, -1.0, 4.0))}
     assert falls[name].by_chance
+    formulas = replace(formulas, needless=[name] * len(formulas.needless))
     assert _dressed_up(found, falls, False, formulas) == ([] if told else [name])
 
 

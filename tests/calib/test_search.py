@@ -1,9 +1,13 @@
 """What the search names first: an effect in its true shape, and one that predicts before chance."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
-from calib.diagnosis.search import search
+from calib.diagnosis.search import nameless, search
+from calib.effects import find
 from calib.runs.calibrate import calibrate
 from calib.runs.diagnose import stand_of
 
@@ -80,3 +84,11 @@ def test_a_name_that_is_nothing_beside_scatter_is_dropped(tmp_path):
     assert done.looks[1].stand.model.names[-1] == "mesh_shift"
     assert not done.found and [c.effect.name for c in done.chance] == ["target_scatter"]
     assert "mesh_shift" not in done.looks[-1].stand.model.names
+    # Were it left, and taken away later, scatter would be what it is without it.
+    beside = done.looks[-1].stand.with_effects([find("mesh_shift")], quiet)
+    named = [SimpleNamespace(effect=find("mesh_shift"))]
+    again = nameless(replace(done, looks=[done.looks[0], beside.look(quiet)], found=named), quiet)
+    assert not again.found and "mesh_shift" not in again.looks[-1].stand.model.names
+    (one,), (other,) = done.chance, again.chance
+    for spread, same in zip(one.spreads, other.spreads, strict=True):
+        assert same.sd == pytest.approx(spread.sd, abs=0.01 * spread.sigma)

@@ -197,6 +197,24 @@ def _outlasting(
     return less.look(progress), steps
 
 
+def nameless(done: Search, progress: Progress) -> Search:
+    """A search without its names: what scatters by chance, and the structure beside that. The same
+    where a fit without them comes to no end."""
+    names = [step.effect.name for step in done.found]
+    less = tried(done.looks[-1].stand.lacking, names, progress)
+    if less is None or not less.estimate.converged:
+        return done
+    look = less.look(progress)
+    return replace(
+        done,
+        looks=[done.looks[0], look],
+        found=(),
+        unnamed=structures(look, progress),
+        scatter=scattering(look, progress),
+        chance=[c for c in (each.beside(less.estimate) for each in done.chance) if c.found],
+    )
+
+
 def _without_chance(done: Search, steps: Steps, progress: Progress) -> Search:
     """The same without values by chance in the model, if structure is left then: values by stop
     take in most of a structure that differs from stop to stop, and what still stands beside them

@@ -164,7 +164,7 @@ def conclude(
     found, first = heavy.found, found.looks[0]
     blunders = [*rings, *(rejected.blunders() if rejected and not found.found else [])]
     blunders += [told.document(left, _rig(left, first)) for left in found.blunders]
-    hold = believed(found, held_out) and not formulas.instead
+    hold = believed(found, held_out) and not (formulas.instead or formulas.needless)
     more = formulas.formulas or found.unsettled or (heavy.refused and found.at_first)
     more = bool(more or (rejected and not rejected.explained))
     over = _over_the_expected(found, held_out, summary["rms_mm"])
@@ -268,8 +268,8 @@ def _dressed_up(
     found: Search, held_out: Mapping[str, Fall], hold: bool, formulas: Unnamed
 ) -> list[str]:
     """Names that stand in for residual structure. Where formulas were found of what the names
-    leave, and stops held out bear out each name, none does: bins explain more than it then because
-    they take in the rest as well.
+    leave, and stops held out bear out each name, only those do that predict nothing beside the
+    formulas: bins explain more than the others because they take in the rest as well.
 
     Args:
         found: the search.
@@ -280,7 +280,7 @@ def _dressed_up(
     names = [step.effect.name for step in found.found]
     sure = all(name in held_out and borne_out(held_out[name]) for name in names)
     if sure and formulas.formulas and not formulas.instead:
-        return []
+        return list(formulas.needless)
     return [name for i, name in enumerate(names) if not hold or found.dressed_up(i)]
 
 

@@ -36,6 +36,7 @@ class Unnamed:
             is not known.
         refused: a sentence, where held-out stops are predicted no better with them.
         fitted: the model with them, where they are told and somebody looked.
+        needless: names of effects of the same covariates that predict nothing beside them.
     """
 
     formulas: Sequence[Formula] = ()
@@ -44,6 +45,7 @@ class Unnamed:
     thrown: tuple[float, float] | None = None
     refused: str = ""
     fitted: Stand | None = field(default=None, repr=False, compare=False)
+    needless: Sequence[str] = ()
 
     def documents(self, taken: Sequence[str]) -> list[dict[str, Any]]:
         """As in diagnosis.json, to be added by names that the model has not."""
@@ -83,13 +85,9 @@ def unnamed(
     first, last = found.looks[0].stand, found.looks[-1].stand
     names = [step.effect for step in found.found]
     if unseen is not None and (_of_one_curve(names) or (names and doubtful and not moves)):
-        formulas = find(first, progress)
-        if formulas:
-            after = unseen(with_formulas(first, formulas, progress)).rms_mm
-            before, named = falls[names[0].name].before_mm, falls[names[-1].name].after_mm
-            better = -FALL_MATTERS * before
-            if after < named + (-better if _simpler(formulas, names, first) else better):
-                return Unnamed(formulas, True, (before, after))
+        ends = falls[names[0].name].before_mm, falls[names[-1].name].after_mm
+        if instead := _in_place_of(names, ends, first, unseen, progress):
+            return instead
     # Values by chance take in most of a structure that differs from stop to stop.
     there = set(last.model.names)
     chance = [c.effect.name for c in found.chance if c.effect.name in there]
@@ -106,12 +104,36 @@ def unnamed(
     thrown = before.rejected_share or 0.0, after.rejected_share or 0.0
     fall = Fall(*fall_mm, after.floor_mm, rejected_share=thrown)
     if fall.takes_back or fall_mm[0] - fall_mm[1] > FALL_MATTERS * after.floor_mm:
-        return Unnamed(formulas, False, fall_mm, thrown, fitted=fitted)
+        drawn = {c for each in formulas for c in each.covariates}
+        alike = [effect.name for effect in names if drawn.intersection(effect.covariates)]
+        worse = after.rms_mm + FALL_MATTERS * after.floor_mm
+        needless = [n for n in alike if unseen(fitted.lacking([n], progress)).rms_mm < worse]
+        return Unnamed(formulas, False, fall_mm, thrown, fitted=fitted, needless=needless)
     over = " and ".join(words(c) for c in formulas[0].covariates)
     return Unnamed(
         refused=f"A formula over {over} fits part of the residuals, but stops that were held out "
         f"are predicted no better with it ({fall_mm[0]:.2f} to {fall_mm[1]:.2f} mm)."
     )
+
+
+def _in_place_of(
+    names: Sequence[Effect],
+    ends_mm: tuple[float, float],
+    stand: Stand,
+    unseen: Callable[[Stand], Errors],
+    progress: Progress,
+) -> Unnamed | None:
+    """Formulas from a fit without the names, with which the error at unseen stops goes from the
+    first of the ends to the second, if they take their place."""
+    formulas = find(stand, progress)
+    if not formulas:
+        return None
+    before, named = ends_mm
+    after = unseen(with_formulas(stand, formulas, progress)).rms_mm
+    better = -FALL_MATTERS * before
+    if after < named + (-better if _simpler(formulas, names, stand) else better):
+        return Unnamed(formulas, True, (before, after))
+    return None
 
 
 def _of_one_curve(names: Sequence[Effect]) -> bool:
