@@ -92,15 +92,10 @@ def _found(
     known = by_name(found, formulas, unseen, progress) if unseen else None
     if known and believed(*known) and weighed(*known, run.summary["rms_mm"]).found.found:
         (found, falls), formulas = known, Unnamed()
-    told_otherwise = formulas.formulas or found.unnamed or found.at_first
-    if doubtful and found.chance and not told_otherwise:
-        # Names that leave most of what scatter by chance accounts for explain nothing beside it.
-        found = nameless(found, progress)
-        falls = _falls(found, stand, run, progress) if refits else {}
-    rise = any(falls[s.effect.name].rises for s in found.found if s.effect.name in falls)
-    if rise and not found.at_first:
-        # A name that stops held out refuse says nothing by itself: is there structure without it?
-        found = replace(found, at_first=structures(found.looks[0], progress))
+    again = _as_held_out(found, falls, formulas, progress)
+    if refits and len(again.found) < len(found.found):
+        falls = _falls(again, stand, run, progress)
+    found = again
     result = conclude(
         found,
         falls,
@@ -131,6 +126,25 @@ def _found(
         ],
         command=_command(run, result),
     )
+
+
+def _as_held_out(
+    found: Search, falls: Mapping[str, Fall], formulas: Unnamed, progress: Progress
+) -> Search:
+    """A search as stops that were held out have it.
+
+    Names explain nothing if they leave most of an error that scatter by chance accounts for, and no
+    structure is found. A name with which the error rises says nothing by itself: is there structure
+    without it?
+    """
+    structured = formulas.formulas or found.unnamed or found.at_first
+    if found.chance and not structured and not believed(found, falls):
+        return nameless(found, progress)
+    if not found.at_first and any(
+        falls[s.effect.name].rises for s in found.found if s.effect.name in falls
+    ):
+        return replace(found, at_first=structures(found.looks[0], progress))
+    return found
 
 
 def _falls(found: Search, stand: Stand, run: Run, progress: Progress) -> dict[str, Fall]:
