@@ -58,7 +58,8 @@ def sentences_of(
     out += [found.unsettled.unsettled] if found.unsettled else []
     out += [*heavy.refused, *traces]
     named = [c["add"] for c in candidates if c["step"] and not c["dressed_up"]]
-    beside = f"Beside {' and '.join(named)}, there" if named else "There"
+    every = " and ".join(filter(None, [", ".join(named[:-1]), *named[-1:]]))
+    beside = f"Beside {every}, there" if named else "There"
     structure = [
         f"{beside} is residual structure that no known effect explains.",
         *(line for each in formulas for line in _formula_sentences(each, residual)),
