@@ -240,7 +240,7 @@ def _told(candidate: dict[str, Any]) -> list[str]:
         cell = estimate_cell(parameters["estimate"][0], parameters["sigma"][0], unit)
         out.append(f"its size would be {cell} {shown(unit)[1]}".rstrip())
     if candidate["dressed_up"]:
-        out.append("rejected: a generic function of other covariates (bins) explains more")
+        out.append("rejected: residual structure that no effect explains accounts for more")
     for rival in candidate["rivals"]:
         out.append(
             f"on these data not distinguishable from {rival['effect']}; {rival['separate']} would "

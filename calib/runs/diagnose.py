@@ -20,7 +20,7 @@ from calib.diagnosis.search.confirmed import structures
 from calib.diagnosis.stand import Look, Stand, tried
 from calib.diagnosis.verdict import ABSORBED_BY_MODEL, Diagnosis, believed, conclude
 from calib.diagnosis.verdict.known import by_name
-from calib.diagnosis.verdict.matters import HELD_OUT_BY_CHANCE, weighed
+from calib.diagnosis.verdict.matters import HELD_OUT_BY_CHANCE, borne_out, weighed
 from calib.diagnosis.verdict.unnamed import Unnamed, unnamed
 from calib.diagnosis.weak import group, to_be_planned, to_be_told_apart, weak_directions
 from calib.effects import own_effects
@@ -92,8 +92,8 @@ def _found(
     known = by_name(found, formulas, unseen, progress) if unseen else None
     if known and believed(*known) and weighed(*known, run.summary["rms_mm"]).found.found:
         (found, falls), formulas = known, Unnamed()
-    again = _as_held_out(found, falls, formulas, progress)
-    if refits and len(again.found) < len(found.found):
+    again = _as_held_out(found, falls, formulas, run, progress)
+    if len(again.found) < len(found.found):
         falls = _falls(again, stand, run, progress)
     found = again
     result = conclude(
@@ -129,20 +129,23 @@ def _found(
 
 
 def _as_held_out(
-    found: Search, falls: Mapping[str, Fall], formulas: Unnamed, progress: Progress
+    found: Search, falls: Mapping[str, Fall], formulas: Unnamed, run: Run, progress: Progress
 ) -> Search:
     """A search as stops that were held out have it.
 
-    Names explain nothing if they leave most of an error that scatter by chance accounts for, and no
-    structure is found. A name with which the error rises says nothing by itself: is there structure
-    without it?
+    Beside scatter by chance names say nothing if these stops bear out none, most of the error stays
+    and no structure is found. A name with which the error rises says nothing by itself: is there
+    structure without it?
     """
     structured = formulas.formulas or found.unnamed or found.at_first
-    if found.chance and not structured and not believed(found, falls):
-        return nameless(found, progress)
-    if not found.at_first and any(
-        falls[s.effect.name].rises for s in found.found if s.effect.name in falls
-    ):
+    scatters = found.chance or any(e.by_chance for e in found.looks[-1].stand.model.effects)
+    if falls and scatters and not structured and not any(map(borne_out, falls.values())):
+        kept = weighed(found, falls, run.summary["rms_mm"]).found
+        bare = found if believed(kept, falls) else nameless(found, progress)
+        if not bare.found:
+            return bare
+    rise = any(falls[s.effect.name].rises for s in found.found if s.effect.name in falls)
+    if rise and not found.at_first:
         return replace(found, at_first=structures(found.looks[0], progress))
     return found
 

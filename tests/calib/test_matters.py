@@ -1,6 +1,7 @@
 """What a finding would change, as predicted, is what it does change once it is fitted."""
 
 from dataclasses import replace
+from importlib import import_module
 from types import SimpleNamespace
 
 import numpy as np
@@ -30,6 +31,8 @@ from calib.solve.fit import solve
 from ..worlds import World, write
 
 SPEC = Spec(lidar="hesai_pandarxt32", locations=6, stops_per_location=4, column_step=100)
+
+runs = import_module("calib.runs.diagnose")
 
 
 def quiet(what, done, total):
@@ -237,6 +240,43 @@ def test_a_name_stands_beside_a_larger_structure_of_what_it_leaves(look, formula
     assert falls[name].by_chance
     formulas = replace(formulas, needless=[name] * len(formulas.needless))
     assert _dressed_up(found, falls, False, formulas) == ([] if told else [name])
+
+
+def test_a_needless_name_leaves_the_others(look):
+    one, other = look.named.candidates[:2]
+    fields = {"before": look, "after": look, "p_adjusted": 1e-3, "rivals": []}
+    steps = [NamedEffect(candidate=c, judged=c.test, **fields) for c in (one, other)]
+    found = Search([look], found=steps, blunders=(), unnamed=(), scatter=None)
+    falls = {one.effect.name: Fall(9.0, 3.0, 2.0), other.effect.name: Fall(3.0, 2.9, 2.0, (1, -1))}
+    formulas = Unnamed(["a formula"], needless=[other.effect.name])
+    for hold in (True, False):
+        assert _dressed_up(found, falls, hold, formulas) == [other.effect.name]
+
+
+@pytest.mark.parametrize(
+    ("after_mm", "gain_m2", "scatters", "gone"),
+    [
+        (8.9, (1.0, -1.0, 4.0), True, True),
+        (8.9, (1.0, -1.0, 4.0), False, False),
+        (8.0, (1.0, 1.1, 0.9), True, False),
+        (2.4, (1.0, -1.0, 4.0), True, False),
+    ],
+    ids=["most stays", "without scatter", "stops agree", "little stays"],
+)
+def test_beside_scatter_names_that_leave_most_are_none(
+    look, monkeypatch, after_mm, gain_m2, scatters, gone
+):
+    candidate = max(look.named.candidates, key=lambda c: c.test.evidence(look.named.common))
+    fields = {"before": look, "after": look, "judged": candidate.test, "p_adjusted": 1e-3}
+    step = NamedEffect(candidate=candidate, **fields, rivals=[])
+    found = Search([look], found=[step], blunders=(), unnamed=(), scatter=None)
+    found = replace(found, chance=[SimpleNamespace()] if scatters else ())
+    monkeypatch.setattr(runs, "nameless", lambda found, progress: replace(found, found=()))
+    falls = {candidate.effect.name: Fall(9.0, after_mm, 2.0, gain_m2)}
+    run = SimpleNamespace(summary={"rms_mm": {"held_out": 9.0, "fit": 2.0, "noise_floor": 2.0}})
+    again = runs._as_held_out(found, falls, Unnamed(), run, quiet)
+    assert bool(again.found) != gone
+    assert runs._as_held_out(found, {}, Unnamed(), run, quiet) is found, "nothing was held out"
 
 
 @pytest.mark.slow

@@ -198,18 +198,19 @@ def _outlasting(
 
 
 def nameless(done: Search, progress: Progress) -> Search:
-    """A search without its names: what scatters by chance, and the structure beside that. The same
-    where a fit without them comes to no end."""
+    """A search without its names: what scatters by chance, alone. The same where a fit without them
+    comes to no end, or structure is found in their place."""
     names = [step.effect.name for step in done.found]
     less = tried(done.looks[-1].stand.lacking, names, progress)
     if less is None or not less.estimate.converged:
         return done
     look = less.look(progress)
+    if structures(look, progress):
+        return done
     return replace(
         done,
         looks=[done.looks[0], look],
         found=(),
-        unnamed=structures(look, progress),
         scatter=scattering(look, progress),
         chance=[c for c in (each.beside(less.estimate) for each in done.chance) if c.found],
     )

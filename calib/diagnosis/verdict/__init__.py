@@ -164,25 +164,21 @@ def conclude(
     found, first = heavy.found, found.looks[0]
     blunders = [*rings, *(rejected.blunders() if rejected and not found.found else [])]
     blunders += [told.document(left, _rig(left, first)) for left in found.blunders]
-    hold = believed(found, held_out) and not (formulas.instead or formulas.needless)
+    hold = believed(found, held_out) and not formulas.instead
     more = formulas.formulas or found.unsettled or (heavy.refused and found.at_first)
     more = bool(more or (rejected and not rejected.explained))
     over = _over_the_expected(found, held_out, summary["rms_mm"])
     doubt = None if blunders or more else _unconfirmed(found, over)
     calm = BAD if forbids else UNNAMED if doubt else "adequate"
-    verdict = BAD if blunders else _verdict(found, hold, more, bool(doubt), calm)
+    answer = hold and not formulas.needless
+    verdict = BAD if blunders else _verdict(found, answer, more, bool(doubt), calm)
     worn = _dressed_up(found, held_out, hold, formulas) if verdict == UNNAMED else []
     candidates = candidate_documents(heavy, held_out, verdict == UNNAMED, worn)
     unexplained = _structure(found, verdict, formulas, rejected, doubt)
     untestable = _untestable(first)
     unsure = unconfirmed(doubt, over) if doubt else ""
     sentences = sentences_of(verdict, heavy, candidates, unexplained, untestable, blunders, unsure)
-    if forbids and verdict in (BAD, UNNAMED) and not blunders:
-        sentences.insert(0 if verdict == BAD else len(sentences), _disbelief(forbids))
-    sentences += [formulas.refused] if formulas.refused else []
-    if rejected:
-        leads = not formulas.formulas and verdict == UNNAMED and not rejected.explained
-        sentences.insert(0 if leads else len(sentences), rejected.sentence)
+    _caution(sentences, verdict, formulas, rejected, () if blunders else forbids)
     return Diagnosis(
         verdict=verdict,
         sentences=sentences,
@@ -198,6 +194,23 @@ def conclude(
         rejected=rejected,
         scatter=[s.document(each.effect.name) for each in found.chance for s in each.spreads],
     )
+
+
+def _caution(
+    sentences: list[str],
+    verdict: str,
+    formulas: Unnamed,
+    rejected: Rejects | None,
+    forbids: Sequence[str],
+) -> None:
+    """Add what is to be said of the run, of a formula that was refused, and of what was rejected:
+    first where it is the verdict, else last. Arguments are as of `conclude`."""
+    if forbids and verdict in (BAD, UNNAMED):
+        sentences.insert(0 if verdict == BAD else len(sentences), _disbelief(forbids))
+    sentences += [formulas.refused] if formulas.refused else []
+    if rejected:
+        leads = not formulas.formulas and verdict == UNNAMED and not rejected.explained
+        sentences.insert(0 if leads else len(sentences), rejected.sentence)
 
 
 def _disbelief(forbids: Sequence[str]) -> str:
@@ -278,10 +291,12 @@ def _dressed_up(
         formulas: of residual structure.
     """
     names = [step.effect.name for step in found.found]
-    sure = all(name in held_out and borne_out(held_out[name]) for name in names)
+    rest = [name for name in names if name not in formulas.needless]
+    sure = all(name in held_out and borne_out(held_out[name]) for name in rest)
     if sure and formulas.formulas and not formulas.instead:
-        return list(formulas.needless)
-    return [name for i, name in enumerate(names) if not hold or found.dressed_up(i)]
+        return [name for name in names if name not in rest]
+    worn = (not hold or found.dressed_up(i) for i in range(len(names)))
+    return [n for n, each in zip(names, worn, strict=True) if each or n not in rest]
 
 
 def _leave_most(found: Search, held_out: Mapping[str, Fall]) -> bool:

@@ -11,13 +11,13 @@ from calib.diagnosis.formulas import Formula, find
 from calib.diagnosis.formulas.found import bare
 from calib.diagnosis.formulas.why import why
 from calib.diagnosis.search import Search
-from calib.diagnosis.stand import Stand
+from calib.diagnosis.stand import Stand, tried
 from calib.diagnosis.suggest import DESCRIBES, span, what_differs, words
 from calib.diagnosis.verdict.matters import FALL_MATTERS, HELD_OUT_BY_CHANCE
 from calib.effects import Effect, Site
 from calib.effects.own.formula import FormulaEffect
 from calib.results.errors import Errors
-from calib.results.holdout import Fall
+from calib.results.holdout import TAKEN_BACK, Fall
 from calib.solve.fit import Progress
 
 MOST_ALIKE = 3  # other forms that are listed
@@ -66,10 +66,11 @@ def unnamed(
 ) -> Unnamed:
     """Look for formulas of what a search left: of the ranges, or of a joint where there are none.
 
-    One takes the place of names if it predicts unseen stops better, or as well and with fewer
-    constants than several functions of the same covariates, which may make up any curve. Where
-    something seems to move, a formula takes the place of that only if nothing is left beside it: an
-    error of the range that follows azimuth looks much like a motion, and a motion like it.
+    One takes the place of doubtful names if it predicts unseen stops better; and of several that
+    are functions of the same covariates of the range, which may make up any curve, if it predicts
+    them as well with fewer constants. Where something seems to move, a formula takes the place of
+    that only if nothing is left beside it: an error of the range that follows azimuth looks much
+    like a motion, and a motion like it.
 
     Args:
         found: the search.
@@ -84,15 +85,20 @@ def unnamed(
         return Unnamed()
     first, last = found.looks[0].stand, found.looks[-1].stand
     names = [step.effect for step in found.found]
-    if unseen is not None and (_of_one_curve(names) or (names and doubtful and not moves)):
-        ends = falls[names[0].name].before_mm, falls[names[-1].name].after_mm
-        if instead := _in_place_of(names, ends, first, unseen, progress):
-            return instead
+    scatters = [c.effect.per for c in (*found.chance, found.unsettled) if c]
+    by_location, curve = "location" in scatters, _of_one_curve(names)
+    asked = unseen is not None and (curve or (names and doubtful and not moves))
+    if asked and (formulas := find(first, progress, by_location)):
+        after = unseen(with_formulas(first, formulas, progress))
+        before, named = falls[names[0].name].before_mm, falls[names[-1].name].after_mm
+        better = doubtful and not moves and after.rms_mm < named - FALL_MATTERS * before
+        if better or (curve and _simpler(formulas, names, first, unseen(last), after)):
+            return Unnamed(formulas, True, (before, after.rms_mm))
     # Values by chance take in most of a structure that differs from stop to stop.
     there = set(last.model.names)
     chance = [c.effect.name for c in found.chance if c.effect.name in there]
     last = last.lacking(chance, progress) if chance else last
-    formulas = find(last, progress, any(c.effect.per == "location" for c in found.chance))
+    formulas = find(last, progress, by_location)
     if not formulas or unseen is None:
         return Unnamed(formulas)
     fitted = with_formulas(last, formulas, progress)
@@ -104,10 +110,7 @@ def unnamed(
     thrown = before.rejected_share or 0.0, after.rejected_share or 0.0
     fall = Fall(*fall_mm, after.floor_mm, rejected_share=thrown)
     if fall.takes_back or fall_mm[0] - fall_mm[1] > FALL_MATTERS * after.floor_mm:
-        drawn = {c for each in formulas for c in each.covariates}
-        alike = [effect.name for effect in names if drawn.intersection(effect.covariates)]
-        worse = after.rms_mm + FALL_MATTERS * after.floor_mm
-        needless = [n for n in alike if unseen(fitted.lacking([n], progress)).rms_mm < worse]
+        needless = _needless(names, formulas, fitted, unseen, progress)
         return Unnamed(formulas, False, fall_mm, thrown, fitted=fitted, needless=needless)
     over = " and ".join(words(c) for c in formulas[0].covariates)
     return Unnamed(
@@ -116,40 +119,62 @@ def unnamed(
     )
 
 
-def _in_place_of(
+def _needless(
     names: Sequence[Effect],
-    ends_mm: tuple[float, float],
-    stand: Stand,
+    formulas: Sequence[Formula],
+    fitted: Stand,
     unseen: Callable[[Stand], Errors],
     progress: Progress,
-) -> Unnamed | None:
-    """Formulas from a fit without the names, with which the error at unseen stops goes from the
-    first of the ends to the second, if they take their place."""
-    formulas = find(stand, progress)
-    if not formulas:
-        return None
-    before, named = ends_mm
-    after = unseen(with_formulas(stand, formulas, progress)).rms_mm
-    better = -FALL_MATTERS * before
-    if after < named + (-better if _simpler(formulas, names, stand) else better):
-        return Unnamed(formulas, True, (before, after))
-    return None
+) -> list[str]:
+    """Effects of the formulas' covariates without which a fit with the formulas predicts unseen
+    stops as well, the last that was named first."""
+    drawn = {c for each in formulas for c in each.covariates}
+    with_all, gone = unseen(fitted), []
+    for effect in reversed(names):
+        if drawn.intersection(effect.covariates):
+            less = tried(fitted.lacking, [*gone, effect.name], progress)
+            if less and _as_good(unseen(less), with_all):
+                gone.append(effect.name)
+    return gone
+
+
+def _as_good(errors: Errors, others: Errors) -> bool:
+    """Whether unseen stops are predicted as well as by another fit, with as few beams rejected."""
+    worse = errors.rms_mm > others.rms_mm + FALL_MATTERS * others.floor_mm
+    thrown, still = errors.rejected_share or 0.0, others.rejected_share or 0.0
+    return not worse and thrown <= still + TAKEN_BACK
 
 
 def _of_one_curve(names: Sequence[Effect]) -> bool:
     """Whether several effects make up one function of the same covariates for the range."""
-    over = {frozenset(effect.covariates) for effect in names if effect.site is Site.BEAM}
-    return len(over) == 1 < len(names) and all(e.site is Site.BEAM for e in names)
+    over = {frozenset(effect.covariates) for effect in names}
+    of_range = all(e.site is Site.BEAM and "range = " in e.formula for e in names)
+    return of_range and len(over) == 1 < len(names)
 
 
-def _simpler(formulas: Sequence[Formula], names: Sequence[Effect], stand: Stand) -> bool:
-    """Whether one formula has fewer constants than several effects of the same covariates."""
+def _simpler(
+    formulas: Sequence[Formula],
+    names: Sequence[Effect],
+    stand: Stand,
+    named: Errors,
+    after: Errors,
+) -> bool:
+    """Whether one formula does what several effects of the same covariates do with more constants,
+    and leaves nothing.
+
+    Args:
+        formulas: from a fit without the effects.
+        names: these.
+        stand: that fit.
+        named, after: errors at unseen stops, with the effects and with the formulas.
+    """
     covariates = {c for effect in names for c in effect.covariates}
-    if not _of_one_curve(names) or len(formulas) > 1 or {*formulas[0].covariates} != covariates:
+    if len(formulas) > 1 or {*formulas[0].covariates} != covariates:
         return False
-    rig = stand.sources[0].rig
-    known = sum(len(effect.params(rig)) + bool(effect.shape_name) for effect in names)
-    return formulas[0].constants < known
+    rigs = [source.rig for source in stand.sources]
+    known = sum(max(len(e.params(rig)) for rig in rigs) + bool(e.shape_name) for e in names)
+    whole = after.rms_mm <= HELD_OUT_BY_CHANCE * after.floor_mm
+    return formulas[0].constants < known and whole and _as_good(after, named)
 
 
 def with_formulas(stand: Stand, formulas: Sequence[Formula], progress: Progress) -> Stand:

@@ -67,6 +67,7 @@ def effect(i, over):
         covariates=(over,),
         params=lambda rig: range(1),
         shape_name="scale" if i else "",
+        formula="azimuth = true + a" if over == "turn" else "range = true + a",
     )
 
 
@@ -94,6 +95,7 @@ class World:
             looks=[SimpleNamespace(stand=s) for s in self.stands],
             found=found,
             chance=(),
+            unsettled=None,
             at_first=(),
             unnamed=(),
         )
@@ -103,6 +105,7 @@ class World:
 
         def find(stand, progress, by_location=False):
             self.asked.append(stand.estimate)
+            self.by_location = by_location
             error = after[stand.estimate]
             formula = {"covariates": ("wind",), "constants": constants}
             return [] if error is None else [SimpleNamespace(**formula, after=error)]
@@ -193,24 +196,47 @@ def test_doubtful_names_are_kept_where_no_formula_is(monkeypatch):
 @pytest.mark.parametrize(
     ("over", "constants", "first", "instead"),
     [
-        ("wind", 2, 3.03, True),
-        ("wind", 2, 3.05, False),
-        ("wind", 3, 3.03, False),
-        ("rain", 2, 3.03, False),
-        (None, 2, 3.03, False),
+        ("wind", 6, 2.01, True),
+        ("wind", 6, 2.03, False),  # worse by more than a hundredth of the floor, of 2 mm
+        ("wind", 7, 2.01, False),
+        ("rain", 6, 2.01, False),
+        ("turn", 6, 2.01, False),
+        (None, 6, 2.01, False),
     ],
 )
 def test_a_simpler_formula_takes_the_place_of_several_names_that_make_up_a_curve(
     monkeypatch, over, constants, first, instead
 ):
-    """Two effects have three constants, and come down to 3 mm, as the formula does but for 0.04."""
-    made = {"first": first, "over": over, "constants": constants}
-    assert World(monkeypatch, names=2, **made).unnamed().instead == instead
+    """Four effects have seven constants, and come down to 2 mm."""
+    world = World(monkeypatch, names=4, first=first, over=over, constants=constants)
+    assert world.unnamed().instead == instead
+
+
+def test_a_formula_of_more_takes_no_place_of_names_without_doubt(monkeypatch):
+    world = World(monkeypatch, names=4, first=1.0, last=None, over="wind", constants=99)
+    assert not world.unnamed().instead and world.unnamed(doubtful=True).instead
+
+
+def test_a_formula_that_leaves_much_is_no_better_than_several_names(monkeypatch):
+    """Of 2 mm."""
+    assert not World(monkeypatch, names=2, first=3.0, over="wind").unnamed().instead
 
 
 def test_one_name_is_no_curve_of_several(monkeypatch):
     world = World(monkeypatch, names=1, first=3.0, over="wind", constants=0)
     assert not world.unnamed().instead and world.asked == [1]
+
+
+@pytest.mark.parametrize("settled", [True, False])
+@pytest.mark.parametrize("per", ["location", "stop"])
+@pytest.mark.parametrize("names", [0, 2])
+def test_formulas_are_judged_by_location_where_locations_scatter(monkeypatch, settled, per, names):
+    world = World(monkeypatch, names=names, last=2.1, first=2.1)
+    scatter = SimpleNamespace(effect=SimpleNamespace(per=per, name="scatter"))
+    key, value = ("chance", (scatter,)) if settled else ("unsettled", scatter)
+    setattr(world.search, key, value)
+    world.unnamed(doubtful=True)
+    assert world.by_location == (per == "location")
 
 
 @pytest.mark.parametrize(("over", "needless"), [("wind", ["effect_1"]), ("rain", [])])
