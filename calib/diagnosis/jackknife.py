@@ -216,6 +216,9 @@ class Clusters:
     def crowded(self) -> bool:
         """Whether they are too few for the parameters that each of them tells as one: these then
         fit what the clusters err by, and nothing is left of it."""
+        bound = np.linalg.norm(self.information, axis=(1, 2)).sum()  # of the largest eigenvalues
+        if PER_PARAMETER * bound <= self.count:
+            return False
         return PER_PARAMETER * np.linalg.eigvalsh(self.information)[:, -1].sum() > self.count
 
     def covariance(self, score: np.ndarray) -> np.ndarray:

@@ -99,6 +99,7 @@ class SomeCells:
         unit length and at right angles; None where they say next to nothing."""
         ways = tuple(_numbered(cells, kept, way) for way in (0, 1))
         by_stop, by_place = (_added(information, way) for way in ways)
+        plain = kept.all() and axes is None
         axes = np.eye(information.shape[1]) if axes is None else axes
         whole = axes.T @ by_stop.sum(axis=0) @ axes
         values, vectors = np.linalg.eigh(whole)
@@ -107,7 +108,7 @@ class SomeCells:
             return None
         whiten = axes if kept.all() else axes @ (vectors[:, seen] / np.sqrt(values[seen]))
         clusters = tuple(
-            Clusters.of(whiten.T @ each @ whiten, _stated(cells[kept], way))
+            Clusters.of(each if plain else whiten.T @ each @ whiten, _stated(cells[kept], way))
             for way, each in enumerate((by_stop, by_place))
         )
         return cls(
