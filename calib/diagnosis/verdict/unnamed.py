@@ -110,7 +110,7 @@ def unnamed(
     thrown = before.rejected_share or 0.0, after.rejected_share or 0.0
     fall = Fall(*fall_mm, after.floor_mm, rejected_share=thrown)
     if fall.takes_back or fall_mm[0] - fall_mm[1] > FALL_MATTERS * after.floor_mm:
-        needless = _needless(names, formulas, fitted, unseen, progress)
+        needless = _needless(_alike(names, formulas), fitted, after, unseen, progress)
         return Unnamed(formulas, False, fall_mm, thrown, fitted=fitted, needless=needless)
     over = " and ".join(words(c) for c in formulas[0].covariates)
     return Unnamed(
@@ -119,22 +119,26 @@ def unnamed(
     )
 
 
+def _alike(names: Sequence[Effect], formulas: Sequence[Formula]) -> list[Effect]:
+    """Effects that depend on a covariate of the formulas."""
+    drawn = {c for each in formulas for c in each.covariates}
+    return [effect for effect in names if drawn.intersection(effect.covariates)]
+
+
 def _needless(
-    names: Sequence[Effect],
-    formulas: Sequence[Formula],
+    effects: Sequence[Effect],
     fitted: Stand,
+    errors: Errors,
     unseen: Callable[[Stand], Errors],
     progress: Progress,
 ) -> list[str]:
-    """Effects of the formulas' covariates without which a fit with the formulas predicts unseen
-    stops as well, the last that was named first."""
-    drawn = {c for each in formulas for c in each.covariates}
-    with_all, gone = unseen(fitted), []
-    for effect in reversed(names):
-        if drawn.intersection(effect.covariates):
-            less = tried(fitted.lacking, [*gone, effect.name], progress)
-            if less and _as_good(unseen(less), with_all):
-                gone.append(effect.name)
+    """Effects without which a fit predicts unseen stops as well as it does, with these errors; what
+    was named last is asked for first."""
+    gone: list[str] = []
+    for effect in reversed(effects):
+        less = tried(fitted.lacking, [*gone, effect.name], progress)
+        if less and _as_good(unseen(less), errors):
+            gone.append(effect.name)
     return gone
 
 
