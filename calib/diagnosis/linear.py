@@ -8,7 +8,7 @@ matrix of ``[J | Z]``, and the gradient ``[J | Z]^T b`` of each cluster of rows 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -147,7 +147,7 @@ def linearise_with(
         own=own,
         progress=lambda done, total: progress("testing what is missing", done, total),
     )
-    information, raw = linear.kept[:-1, :-1].copy(), linear.raw.copy()
+    information, raw = linear.kept[:-1, :-1].copy(), linear.raw
     at = positions(layout.size, layout.kept)
     others = list(other_rows(wide, layout, values, gradients, own))
     alike: dict[bytes, list[ClusteredRows]] = {}  # of the same unknowns, as most poses of an arm
@@ -180,7 +180,7 @@ def linearise_with(
         place=place,
         places=gradients.places,
         weight_m2=linear.weight_m2 or sum(len(b.measured) / b.sigma_m**2 for b in wide.bodies),
-        whole=linear,
+        whole=replace(linear, raw=None),  # here already
     )
 
 

@@ -70,16 +70,21 @@ class Scores:
     @cached_property
     def both(self) -> np.ndarray:
         """Shares of the score of rows that have a stop and a place, by both."""
-        return self.cells[(self.stop >= 0) & (self.place >= 0)]
+        return _some(self.cells, (self.stop >= 0) & (self.place >= 0))
+
+    def ways(self, columns: np.ndarray) -> list[np.ndarray]:
+        """Shares of some columns (n, q) by stop, by place, and by both, of those that have any
+        share of any; each adds up to the score, as rows that have no stop, or no place, are
+        clusters of their own."""
+        return [part[np.ix_(rows, columns)] for part, rows in self._ways]
 
     @cached_property
-    def ways(self) -> tuple[np.ndarray, ...]:
-        """By stop, by place, and by both, of those that have any share; each adds up to the
-        score, as rows that have no stop, or no place, are clusters of their own."""
+    def _ways(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Their shares (n, Q) by these ways, and which of them have any."""
         by_stop = np.vstack([self.by_stop, self.cells[self.stop < 0]])
         by_place = np.vstack([self.by_place, self.cells[self.place < 0]])
         every = (by_stop, by_place, self.cells)
-        return tuple(part[np.any(part != 0, axis=1)] for part in every)
+        return [(part, np.flatnonzero(np.any(part, axis=1))) for part in every]
 
     @cached_property
     def draws(self) -> np.ndarray:
@@ -87,6 +92,11 @@ class Scores:
         number of its own (the multiplier bootstrap)."""
         shares = np.vstack([self.by_stop, self.by_place])
         return np.random.default_rng(0).standard_normal((SCORE_DRAWS, len(shares))) @ shares
+
+
+def _some(rows: np.ndarray, which: np.ndarray) -> np.ndarray:
+    """Some of the rows (N, Q); the same array where that is all of them, as it is large."""
+    return rows if which.all() else rows[which]
 
 
 def projection(linear: Linear, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -265,9 +275,7 @@ def score_test(scores: Scores, columns: np.ndarray) -> ScoreTest:
         columns=columns,
         statistic=float(np.sum(np.square(whiten.T @ score))),
         whiten=whiten,
-        chances=(
-            by_signs([way[:, columns] @ whiten for way in scores.ways], clusters, scores.spent),
-        ),
+        chances=(by_signs([way @ whiten for way in scores.ways(columns)], clusters, scores.spent),),
         clusters=clusters,
         score=score,
         spent=scores.spent,
