@@ -61,7 +61,8 @@ class Linearisation:
     cost_before: float | None = None
 
     def onto(self, layout: Layout) -> Linearisation:
-        """The same rows over the unknowns of another layout, which lacks some of those kept."""
+        """The same rows, but for `raw`, over the unknowns of another layout, which lacks some of
+        those kept."""
         here = np.concatenate([np.r_[self.layout.at[name]] for name in layout.at])
         to = positions(self.layout.size + 1, np.append(here, self.layout.size))
         at = positions(self.layout.size, self.layout.kept)[here[layout.kept]]
@@ -70,7 +71,7 @@ class Linearisation:
             self,
             layout=layout,
             kept=self.kept[np.ix_(withal, withal)],
-            raw=None if self.raw is None else self.raw[np.ix_(at, at)],
+            raw=None,
             touched=self.touched[here],
             eliminated=[each.onto(to) for each in self.eliminated],
             scans={stop: sums.onto(to) for stop, sums in self.scans.items()},
