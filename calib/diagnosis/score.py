@@ -70,7 +70,8 @@ class Scores:
     @cached_property
     def both(self) -> np.ndarray:
         """Shares of the score of rows that have a stop and a place, by both."""
-        return _some(self.cells, (self.stop >= 0) & (self.place >= 0))
+        whole = (self.stop >= 0) & (self.place >= 0)
+        return self.cells if whole.all() else self.cells[whole]
 
     def ways(self, columns: np.ndarray) -> list[np.ndarray]:
         """Shares of some columns (n, q) by stop, by place, and by both, of those that have any
@@ -92,11 +93,6 @@ class Scores:
         number of its own (the multiplier bootstrap)."""
         shares = np.vstack([self.by_stop, self.by_place])
         return np.random.default_rng(0).standard_normal((SCORE_DRAWS, len(shares))) @ shares
-
-
-def _some(rows: np.ndarray, which: np.ndarray) -> np.ndarray:
-    """Some of the rows (N, Q); the same array where that is all of them, as it is large."""
-    return rows if which.all() else rows[which]
 
 
 def projection(linear: Linear, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -18,12 +18,12 @@ from calib.diagnosis.screen import Candidate
 from calib.diagnosis.search import NamedEffect, Search
 from calib.diagnosis.search.confirmed import as_fitted, structures
 from calib.diagnosis.stand import Look, Stand, finer, tried, variables_of
-from calib.diagnosis.verdict.matters import FALL_MATTERS
+from calib.diagnosis.verdict.matters import as_good
 from calib.diagnosis.verdict.unnamed import Unnamed
 from calib.effects import Effect, Site
 from calib.problem.build import shapes_of
 from calib.results.errors import Errors
-from calib.results.holdout import TAKEN_BACK, Fall
+from calib.results.holdout import Fall
 from calib.solve.fit import Progress
 
 # Of what a formula does, in squared sigmas, which an effect does too: a choice. What it leaves is
@@ -55,10 +55,8 @@ def by_name(
     effect = _doing_the_same(formulas.fitted, look.stand.model.names, alike, progress)
     if effect is None or (stand := tried(look.stand.with_effects, [effect], progress)) is None:
         return None
-    errors = unseen(stand)
-    (thrown, still), now = formulas.thrown or (0.0, 0.0), errors.rejected_share or 0.0
-    worse = errors.rms_mm > with_formulas_mm + FALL_MATTERS * errors.floor_mm
-    if worse or now > still + TAKEN_BACK:
+    errors, (thrown, still) = unseen(stand), formulas.thrown or (0.0, 0.0)
+    if not as_good(errors, with_formulas_mm, still):
         return None
     after, sure = stand.look(progress), formulas.formulas[0].steps[0]
     candidate = next(c for c in alike if c.effect.family == effect.family)
@@ -70,7 +68,7 @@ def by_name(
         before_mm=before_mm,
         after_mm=errors.rms_mm,
         floor_mm=errors.floor_mm,
-        rejected_share=(thrown, now),
+        rejected_share=(thrown, errors.rejected_share or 0.0),
     )
     return named, {effect.name: fall}
 

@@ -24,7 +24,8 @@ from calib.diagnosis.screen import Candidate, Screen
 from calib.diagnosis.search import NamedEffect, Search
 from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import hangs_on, words
-from calib.results.holdout import Fall
+from calib.results.errors import Errors
+from calib.results.holdout import TAKEN_BACK, Fall
 
 # Where neither is reached a user would decide nothing otherwise: a hundredth of an error is less
 # than two folds of one recording differ by, and half a sigma widens an interval by a tenth.
@@ -188,6 +189,13 @@ def weighed(
     if not refused and not named:
         kept["at_first"] = []  # nothing stands in the way of what is left
     return Weighed(replace(found, found=named, **kept), matter, traces, refused=refused)
+
+
+def as_good(errors: Errors, rms_mm: float, thrown: float) -> bool:
+    """Whether errors at unseen stops are no larger than another fit's, as far as that matters, and
+    no more beams are rejected than this share."""
+    worse = errors.rms_mm > rms_mm + FALL_MATTERS * errors.floor_mm
+    return not worse and (errors.rejected_share or 0.0) <= thrown + TAKEN_BACK
 
 
 def borne_out(fall: Fall | None) -> bool:

@@ -13,11 +13,11 @@ from calib.diagnosis.formulas.why import why
 from calib.diagnosis.search import Search
 from calib.diagnosis.stand import Stand, tried
 from calib.diagnosis.suggest import DESCRIBES, span, what_differs, words
-from calib.diagnosis.verdict.matters import FALL_MATTERS, HELD_OUT_BY_CHANCE
+from calib.diagnosis.verdict.matters import FALL_MATTERS, HELD_OUT_BY_CHANCE, as_good
 from calib.effects import Effect, Site
 from calib.effects.own.formula import FormulaEffect
 from calib.results.errors import Errors
-from calib.results.holdout import TAKEN_BACK, Fall
+from calib.results.holdout import Fall
 from calib.solve.fit import Progress
 
 MOST_ALIKE = 3  # other forms that are listed
@@ -137,16 +137,9 @@ def _needless(
     gone: list[str] = []
     for effect in reversed(effects):
         less = tried(fitted.lacking, [*gone, effect.name], progress)
-        if less and _as_good(unseen(less), errors):
+        if less and as_good(unseen(less), errors.rms_mm, errors.rejected_share or 0.0):
             gone.append(effect.name)
     return gone
-
-
-def _as_good(errors: Errors, others: Errors) -> bool:
-    """Whether unseen stops are predicted as well as by another fit, with as few beams rejected."""
-    worse = errors.rms_mm > others.rms_mm + FALL_MATTERS * others.floor_mm
-    thrown, still = errors.rejected_share or 0.0, others.rejected_share or 0.0
-    return not worse and thrown <= still + TAKEN_BACK
 
 
 def _of_one_curve(names: Sequence[Effect]) -> bool:
@@ -178,7 +171,8 @@ def _simpler(
     rigs = [source.rig for source in stand.sources]
     known = sum(max(len(e.params(rig)) for rig in rigs) + bool(e.shape_name) for e in names)
     whole = after.rms_mm <= HELD_OUT_BY_CHANCE * after.floor_mm
-    return formulas[0].constants < known and whole and _as_good(after, named)
+    as_well = as_good(after, named.rms_mm, named.rejected_share or 0.0)
+    return formulas[0].constants < known and whole and as_well
 
 
 def with_formulas(stand: Stand, formulas: Sequence[Formula], progress: Progress) -> Stand:
