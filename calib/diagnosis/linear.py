@@ -165,14 +165,17 @@ def linearise_with(
         gradients.add_rows(larger)
         more[rows.columns] += rows.A.T @ (larger.b - rows.b)
     unit = layout.sigma[layout.kept]
+    for each in (information, raw):  # in their place: there may be thousands of columns
+        each /= unit
+        each /= unit[:, None]
     table, stop, place = gradients.table()
     return Linear(
         candidates=tuple(candidates),
         owner={name: unknown.owner for name, unknown in wide.variables.items()},
         at={name: at[np.r_[layout.at[name]]] for name in layout.outer()},
         columns=layout.at,
-        information=information / np.outer(unit, unit),
-        raw=raw / np.outer(unit, unit),
+        information=information,
+        raw=raw,
         gradient=table,
         others=grown,
         score=np.asarray(table.sum(axis=0)).ravel() - more,

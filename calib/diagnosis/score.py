@@ -21,7 +21,7 @@ from calib.blunders.chance import at_least, enough, log_tail
 from calib.diagnosis.jackknife import ScoreSpread, by_signs
 from calib.diagnosis.judges import Shares
 from calib.diagnosis.linear import Linear
-from calib.linear.clusters import summed
+from calib.linear.clusters import add_product, summed
 from calib.problem.unknowns import Owner
 
 GAUGE = 1e-6  # share of a direction's information that is left, below which there is none
@@ -116,10 +116,7 @@ def projection(linear: Linear, names: Sequence[str]) -> tuple[np.ndarray, np.nda
 def away_from_model(linear: Linear, names: Sequence[str]) -> np.ndarray:
     """Directions (U, Q) of variables with all that the model absorbs of them taken off, stops'
     poses and surfaces' errors included."""
-    theirs, model, taken = projection(linear, names)
-    kept = np.zeros((len(linear.information), len(theirs)))
-    kept[theirs], kept[model] = np.eye(len(theirs)), -taken
-    return linear.whole.followed(kept)
+    return linear.whole.away(*projection(linear, names))
 
 
 def information_left(linear: Linear, names: Sequence[str]) -> np.ndarray:
@@ -130,8 +127,10 @@ def information_left(linear: Linear, names: Sequence[str]) -> np.ndarray:
 def _left(linear: Linear, theirs: np.ndarray, model: np.ndarray, taken: np.ndarray) -> np.ndarray:
     """The same, projected so."""
     left = linear.information[np.ix_(theirs, theirs)]
-    left = left - linear.information[np.ix_(theirs, model)] @ taken
-    return (left + left.T) / 2
+    left -= linear.information[np.ix_(theirs, model)] @ taken
+    left += left.T
+    left /= 2.0
+    return left
 
 
 def project(linear: Linear, names: Sequence[str], spent: int = 0) -> Scores:
@@ -142,9 +141,7 @@ def project(linear: Linear, names: Sequence[str], spent: int = 0) -> Scores:
         size = len(linear.at[name])
         at[name], start = slice(start, start + size), start + size
     theirs, model, taken = projection(linear, names)
-    every = csr_array(vstack([linear.gradient, csr_array(linear.score[None])]))
-    shares = linear.whole.onto_kept(every)
-    shares = shares[:, theirs] - shares[:, model] @ taken
+    shares = _shares(linear, names, linear.whole.away(theirs, model, taken))
     return Scores(
         at=at,
         owner={name: linear.owner[name] for name in names},
@@ -157,6 +154,25 @@ def project(linear: Linear, names: Sequence[str], spent: int = 0) -> Scores:
         weight_m2=linear.weight_m2,
         spent=spent,
     )
+
+
+def _shares(linear: Linear, names: Sequence[str], away: np.ndarray) -> np.ndarray:
+    """Shares (C + 1, Q) of the score along directions (U, Q), of clusters and, last, of all rows as
+    they are. Clusters of a stop depend on its own unknowns, and those of a surface on its parts:
+    these go one after another for either."""
+    every = csr_array(vstack([linear.gradient, csr_array(linear.score[None])]))
+    theirs = np.concatenate([np.r_[linear.columns[name]] for name in names])
+    out = every[:, theirs].toarray()  # along these directions it is these that move, by 1
+    layout, rest = linear.whole.layout, away.any(axis=1)
+    parts = np.zeros(len(rest), bool)
+    parts[np.append(layout.finest, layout.cells)] = True
+    rest[theirs] = rest[parts] = False
+    for some, number in ((rest, linear.stop), (parts, linear.place)):
+        only = every.copy()
+        only.data *= some[only.indices]
+        only.eliminate_zeros()
+        add_product(out, only, away, np.argsort(np.append(number, -1), kind="stable"))
+    return out
 
 
 @dataclass(frozen=True)

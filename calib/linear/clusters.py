@@ -9,6 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.sparse import csr_array, issparse
 
+ROWS_AT_ONCE = 256  # of a product: about those of four stops with a LiDAR, or of one surface
+
 
 def summed(values: np.ndarray, at: np.ndarray) -> np.ndarray:
     """Sums (G, P) of values (N, P) by group (N,), numbered from 0; -1 for none."""
@@ -51,6 +53,16 @@ def over_all(some: Sequence[Entries], size: int) -> csr_array:
         return csr_array((0, size))
     values, columns, count = map(np.concatenate, zip(*some, strict=True))
     return csr_array((values, columns, np.append(0, np.cumsum(count))), shape=(len(count), size))
+
+
+def add_product(out: np.ndarray, rows: csr_array, by: np.ndarray, order: np.ndarray) -> None:
+    """Add ``rows @ by`` to (n, q), of rows (n, U) of which those that stand side by side in an
+    `order` (n,) have few columns among them: so many at once, as a dense product over these."""
+    for some in np.split(order, range(ROWS_AT_ONCE, len(order), ROWS_AT_ONCE)):
+        here = rows[some]
+        touched, at = np.unique(here.indices, return_inverse=True)
+        shape = len(some), len(touched)
+        out[some] += csr_array((here.data, at, here.indptr), shape=shape).toarray() @ by[touched]
 
 
 class ClusteredRows(NamedTuple):

@@ -77,15 +77,21 @@ class Linearisation:
             scans={stop: sums.onto(to) for stop, sums in self.scans.items()},
         )
 
-    def directions(self, kept: np.ndarray) -> np.ndarray:
+    def directions(self, kept: np.ndarray, alone: np.ndarray | None = None) -> np.ndarray:
         """All unknowns (U, q) that follow from those kept (S + 1, q), in units of their sigmas.
 
         The last row of `kept` is what the right side is multiplied by: -1 for a solution, 0 for a
         direction, of which the right side is no part.
+
+        Args:
+            alone: (q,) of each direction one of those kept that moves by 1 in it, and in no other;
+                its row of `kept` is 0. None where there are no such.
         """
         layout = self.layout
         out = np.zeros((layout.size + 1, kept.shape[1]))
         out[layout.kept], out[-1] = kept[:-1], kept[-1]
+        alone = layout.kept[np.zeros(0, int) if alone is None else alone]
+        one = positions(layout.size + 1, alone)
         for some in self._batches():
             over = np.unique(np.concatenate([each.over for each in some]))
             at = positions(layout.size + 1, over)
@@ -93,7 +99,11 @@ class Linearisation:
             for each in some:
                 gain[first : first + len(each.columns), at[each.over]] = each.gain
                 first += len(each.columns)
-            out[np.concatenate([each.columns for each in some])] = -gain @ out[over]
+            apart = one[over] >= 0
+            moved = gain[:, ~apart] @ out[over[~apart]]
+            moved[:, one[over[apart]]] += gain[:, apart]
+            out[np.concatenate([each.columns for each in some])] = -moved
+        out[alone, np.arange(len(alone))] = 1.0
         return out[:-1]
 
     def _batches(self) -> Iterator[list[Eliminated]]:
@@ -116,20 +126,23 @@ class Linearisation:
         scaled = np.vstack([kept / sigma[self.layout.kept, None], np.zeros((1, kept.shape[1]))])
         return self.directions(scaled) * sigma[:, None]
 
+    def away(self, one: np.ndarray, others: np.ndarray, taken: np.ndarray) -> np.ndarray:
+        """Directions in all unknowns (U, q), in the unknowns' own units: in each, one of the kept
+        (q,) moves by 1, others of the kept (m,) by minus what is taken off (m, q), and what was
+        eliminated follows."""
+        sigma, unit = self.layout.sigma, self.layout.sigma[self.layout.kept]
+        kept = np.zeros((len(unit) + 1, len(one)))
+        kept[others] = -taken / unit[others, None] * unit[one]
+        out = self.directions(kept, one)
+        out *= sigma[:, None]
+        out /= unit[one]
+        return out
+
     def step(self, kept: np.ndarray) -> dict[str, np.ndarray]:
         """Tangent step of each eliminated unknown, given that of the kept (S,) in their units."""
         scaled = np.append(kept / self.layout.sigma[self.layout.kept], -1.0)
         moved = self.directions(scaled[:, None])[:, 0] * self.layout.sigma
         return {name: moved[self.layout.at[name]] for name in self.layout.inner()}
-
-    def onto_kept(self, rows: csr_array) -> np.ndarray:
-        """Rows (n, S) over the kept alone, of rows (n, U) over all: with the eliminated unknowns as
-        they follow from the kept (see `followed`), the products are the same."""
-        out = np.zeros((rows.shape[0], len(self.layout.kept)))
-        for first in range(0, len(out), ROWS_AT_ONCE):
-            here = slice(first, first + ROWS_AT_ONCE)
-            *_, (_, out[here], _) = self._passed_on(rows[here])
-        return out
 
     def covariance(self, rows: csr_array, kept: np.ndarray) -> np.ndarray:
         """Covariance (q, q) of ``rows @ unknowns``.

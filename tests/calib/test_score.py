@@ -1,5 +1,6 @@
 """The score test: against a dense re-solve, against chance, and against what it must not see."""
 
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -76,8 +77,18 @@ class World:
             place=place,
             places={},
             weight_m2=float(len(J)),
-            whole=SimpleNamespace(followed=lambda kept: kept, onto_kept=csr_array.toarray),
+            whole=SimpleNamespace(
+                away=partial(_away, J.shape[1]),
+                layout=SimpleNamespace(finest=np.zeros(0, int), cells=np.zeros(0, int)),
+            ),
         )
+
+
+def _away(unknowns, one, others, taken):
+    """Directions (U, q) in unknowns of which none was eliminated."""
+    out = np.zeros((unknowns, len(one)))
+    out[one], out[others] = np.eye(len(one)), -taken
+    return out
 
 
 def scores(world):

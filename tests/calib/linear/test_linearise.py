@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array
 
-from calib.linear import assembly, system
+from calib.linear import assembly
 from calib.linear.clusters import Gradients
 from calib.linear.parallel import workers
 
@@ -127,17 +127,19 @@ def test_covariances_are_those_of_dense_rows(case, together):
             np.testing.assert_allclose(found, correlation[np.ix_(at, at)], atol=1e-6)
 
 
-def test_rows_over_the_kept_say_of_them_what_those_over_all_say(case, together, monkeypatch):
-    """Whatever the kept do, the others following; some rows at a time, and those about nothing."""
-    monkeypatch.setattr(system, "ROWS_AT_ONCE", 4)
+def test_one_that_moves_alone_is_followed_as_any_other(case, together):
+    """Each of some of the kept in a direction of its own, in any order, others with it."""
     linear, rng = case.linear(), np.random.default_rng(6)
-    sigma, kept = linear.layout.sigma, linear.layout.kept
-    rows = rng.normal(size=(9, len(sigma))) * (rng.random((9, len(sigma))) < 0.2) / sigma
-    rows[4] = 0.0
-    moves = rng.normal(size=(len(kept), 3)) * sigma[kept, None]
-    expected = rows @ linear.followed(moves)
-    found = linear.onto_kept(csr_array(rows)) @ moves
-    np.testing.assert_allclose(found, expected, atol=1e-9 * np.abs(expected).max(initial=1.0))
+    kept = linear.layout.sigma[linear.layout.kept]
+    order = rng.permutation(len(kept))
+    one, others = order[: len(kept) // 3], order[len(kept) // 2 :]
+    taken = rng.normal(size=(len(others), len(one))) * kept[others, None]
+    moves = np.zeros((len(kept), len(one)))
+    moves[one], moves[others] = np.eye(len(one)), -taken
+    expected = linear.followed(moves)
+    found = linear.away(one, others, taken)
+    size = np.abs(expected).max(axis=1, keepdims=True).clip(1e-300)
+    np.testing.assert_allclose(found / size, expected / size, atol=1e-9)
 
 
 def test_covariances_of_rows_over_any_unknowns_are_those_of_dense_rows(case, together):
