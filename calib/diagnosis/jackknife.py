@@ -70,6 +70,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 from scipy import special
@@ -193,7 +194,7 @@ class Clusters:
     @classmethod
     def of(cls, information: np.ndarray, count: int) -> Clusters:
         """Of clusters that hold so much of the information, (c, r, r)."""
-        apart, alone = {}, np.zeros_like(information[0])
+        apart, alone = {}, np.zeros(information.shape[1:])
         for c in np.flatnonzero(np.linalg.norm(information, axis=(1, 2)) > SLIGHT_SHARE).tolist():
             values, axes = np.linalg.eigh(information[c])
             apart[c] = (axes / (1.0 - np.clip(values, 0.0, ALONE))) @ axes.T
@@ -223,18 +224,34 @@ class Clusters:
 
     def covariance(self, score: np.ndarray) -> np.ndarray:
         """Covariance (r, r) of the sum of scores (c, r), each compared with what others predict."""
-        beyond = score - self.information @ score.sum(axis=0)
+        return self.of_beyond(score - self.information @ score.sum(axis=0))
+
+    def of_beyond(self, beyond: np.ndarray) -> np.ndarray:
+        """The same, of what scores are beyond their part (c, r) of what all predict."""
+        beyond = beyond.copy()
         for c, inverse in self.apart.items():
             beyond[c] = inverse @ beyond[c]
         return beyond.T @ beyond + self.alone
 
 
+class Scattering(Protocol):
+    """Clusters, however their information is held."""
+
+    def covariance(self, score: np.ndarray) -> np.ndarray:
+        """As of `Clusters`."""
+
+
 def by_leaving_out(
-    ways: Sequence[Clusters], scores: Sequence[np.ndarray], nu: float, spent: int = 0
+    ways: Sequence[Clusters],
+    each: Scattering,
+    scores: Sequence[np.ndarray],
+    nu: float,
+    spent: int = 0,
 ) -> ScoreSpread:
-    """Chance from clusters and their scores (c, r), by stop, by surface, and by both; the model has
-    spent so many unknowns on stops alone."""
-    by_stop, by_place, both = (w.covariance(s) for w, s in zip(ways, scores, strict=True))
+    """Chance from clusters by stop and by surface, from each cell of both, and from their scores
+    (c, r); the model has spent so many unknowns on stops alone."""
+    every = (*ways, each)
+    by_stop, by_place, both = (w.covariance(s) for w, s in zip(every, scores, strict=True))
     if ways[0].crowded or ways[1].crowded:
         by_stop = UNKNOWN_VARIANCE * np.eye(len(by_stop))
     more = _beyond(by_place, both)

@@ -13,8 +13,16 @@ from functools import cached_property
 import numpy as np
 from scipy import special
 
-from calib.diagnosis.jackknife import Clusters, ScoreSpread, by_leaving_out, by_signs
+from calib.diagnosis.jackknife import (
+    SLIGHT_SHARE,
+    Clusters,
+    ScoreSpread,
+    by_leaving_out,
+    by_signs,
+)
 from calib.linear.clusters import ClusteredRows, summed
+from calib.linear.elimination import square_root
+from calib.linear.layout import positions
 
 SLIGHT_LEFT = 0.05  # of a direction's information: with less of it left, it is not tested
 # Of a part's information, from which a cluster is worth a look without it: where none holds as much
@@ -31,37 +39,89 @@ LIMIT = 1e-4  # the level at which parts are compared: about that of one test af
 HIGHEST_WORTH = 1.0 / float(special.chdtri(1.0, LIMIT))  # of a share of 1: with d without end
 
 
+@dataclass(frozen=True)
+class Cells:
+    """Rows along a candidate's directions, projected off the model and whitened, or fewer of the
+    same information; by the cell of stop and place that each is of.
+
+    Args:
+        pairs: (n, 2) the stop and the place of each cell; -1 for none.
+        rows: (N, r); cell: (N,) of which of these each is.
+    """
+
+    pairs: np.ndarray
+    rows: np.ndarray = field(repr=False)
+    cell: np.ndarray = field(repr=False)
+
+    def information(self, group: np.ndarray) -> np.ndarray:
+        """Of groups of cells (G, r, r), by the group (n,) of each; -1 for none."""
+        return _information(self.rows, group[self.cell], group.max(initial=-1) + 1)
+
+
 @dataclass
 class Shares:
-    """Each cluster's share of a candidate's whitened score and of its information."""
+    """Rows of clusters along a candidate's directions, as they come."""
 
-    cells: dict[tuple[int, int], list[np.ndarray]] = field(default_factory=dict)
+    rows: list[np.ndarray] = field(default_factory=list)
+    pairs: list[tuple[int, int]] = field(default_factory=list)
 
     def add(self, rows: ClusteredRows) -> None:
-        """Add rows along the candidate's directions, projected off the model and whitened."""
+        """Add some rows; of a cell that has more of them than there are directions, as many of the
+        same information."""
         order = np.lexsort([rows.place, rows.stop])
         stop, place = rows.stop[order], rows.place[order]
         bounds = np.flatnonzero((np.diff(stop) != 0) | (np.diff(place) != 0)) + 1
         for some in np.split(order, bounds):
-            mine, right = rows.A[some], rows.b[some]
-            score, information = mine.T @ right, mine.T @ mine
-            cell = int(rows.stop[some[0]]), int(rows.place[some[0]])
-            if cell in self.cells:
-                self.cells[cell][0] += score
-                self.cells[cell][1] += information
-            else:
-                self.cells[cell] = [score, information]
+            mine = rows.A[some]
+            if len(mine) > mine.shape[1]:
+                mine = square_root(mine.T @ mine)
+            self.rows.append(mine)
+            self.pairs += [(int(rows.stop[some[0]]), int(rows.place[some[0]]))] * len(mine)
 
-    def left_out(self, nu: float, spent: int = 0) -> tuple[ScoreSpread, ...]:
+    def left_out(
+        self, pairs: np.ndarray, scores: np.ndarray, nu: float, spent: int = 0
+    ) -> tuple[ScoreSpread, ...]:
         """Chance from leaving out cluster after cluster, of all and of those that tell most where
         few dominate; see the module.
 
         Args:
+            pairs: (c, 2) the stop and the place of each share of the score.
+            scores: (c, r) these shares, along the same directions.
             nu: degrees of freedom of the statistic, by signs.
             spent: how many unknowns of the model differ by stop alone.
         """
-        scores, information = (np.stack(each) for each in zip(*self.cells.values(), strict=True))
-        return Judges.of(np.array(list(self.cells)), information, spent).chances(scores, nu)
+        every = np.concatenate([pairs, np.array(self.pairs, int).reshape(-1, 2)])
+        cells, at = np.unique(every, axis=0, return_inverse=True)
+        mine, theirs = np.split(at.ravel(), [len(pairs)])
+        scores = summed(scores, mine, len(cells))
+        cells = Cells(cells, np.concatenate(self.rows), theirs)
+        return Judges.of(cells, spent).chances(scores, nu)
+
+
+@dataclass(frozen=True)
+class EachCell:
+    """Every cell a cluster; the information of most of them is never formed.
+
+    Args:
+        rows: (N, k) along the directions that are asked about; cell: (N,) of which of so many.
+        count: how many.
+    """
+
+    rows: np.ndarray
+    cell: np.ndarray
+    count: int
+
+    def covariance(self, score: np.ndarray) -> np.ndarray:
+        """As of `Clusters`, of scores (n, k)."""
+        told = self.rows * (self.rows @ score.sum(axis=0))[:, None]
+        beyond = score - summed(told, self.cell, self.count)
+        # The trace of its information, which that along no direction exceeds.
+        size = summed(np.square(self.rows).sum(axis=1, keepdims=True), self.cell, self.count)
+        heavy = np.flatnonzero(size > SLIGHT_SHARE)
+        held = positions(self.count, heavy)[self.cell]
+        held = Clusters.of(_information(self.rows, held, len(heavy)), len(heavy))
+        light = np.delete(beyond, heavy, axis=0)
+        return light.T @ light + held.of_beyond(beyond[heavy])
 
 
 @dataclass(frozen=True)
@@ -70,7 +130,7 @@ class SomeCells:
 
     Args:
         kept: (n,) which of all cells.
-        information: (n, r, r) of the whitened score, of all of them.
+        cells: all of them.
         whiten: (r, k), of what the kept ones say of the directions that are asked about.
         share: of the information, that they hold.
         ways: numbers (n,) of the stop and of the place of each; -1 for those that are not kept.
@@ -79,7 +139,7 @@ class SomeCells:
     """
 
     kept: np.ndarray
-    information: np.ndarray = field(repr=False)
+    cells: Cells
     whiten: np.ndarray
     share: float
     ways: tuple[np.ndarray, ...]
@@ -88,19 +148,14 @@ class SomeCells:
 
     @classmethod
     def of(
-        cls,
-        cells: np.ndarray,
-        information: np.ndarray,
-        kept: np.ndarray,
-        spent: int,
-        axes: np.ndarray | None = None,
+        cls, cells: Cells, kept: np.ndarray, spent: int, axes: np.ndarray | None = None
     ) -> SomeCells | None:
-        """Some of the cells (n, 2), which hold (n, r, r), about all directions or these (r, k), of
-        unit length and at right angles; None where they say next to nothing."""
-        ways = tuple(_numbered(cells, kept, way) for way in (0, 1))
-        by_stop, by_place = (_added(information, way) for way in ways)
+        """Some of the cells, about all directions or these (r, k), of unit length and at right
+        angles; None where they say next to nothing."""
+        ways = tuple(_numbered(cells.pairs, kept, way) for way in (0, 1))
+        by_stop, by_place = (cells.information(way) for way in ways)
         plain = kept.all() and axes is None
-        axes = np.eye(information.shape[1]) if axes is None else axes
+        axes = np.eye(cells.rows.shape[1]) if axes is None else axes
         whole = axes.T @ by_stop.sum(axis=0) @ axes
         values, vectors = np.linalg.eigh(whole)
         seen = values > SLIGHT_LEFT
@@ -108,12 +163,15 @@ class SomeCells:
             return None
         whiten = axes if kept.all() else axes @ (vectors[:, seen] / np.sqrt(values[seen]))
         clusters = tuple(
-            Clusters.of(each if plain else whiten.T @ each @ whiten, _stated(cells[kept], way))
-            for way, each in enumerate((by_stop, by_place))
+            Clusters.of(each if plain else whiten.T @ each @ whiten, count)
+            for each, count in (
+                (by_stop, _stated(cells.pairs[kept], 0)),
+                (by_place, _stated(cells.pairs[kept], 1)),
+            )
         )
         return cls(
             kept=kept,
-            information=information,
+            cells=cells,
             whiten=whiten,
             share=float(np.trace(whole)) / len(axes),
             ways=ways,
@@ -155,20 +213,18 @@ class SomeCells:
         """Chance from the scores (n, r) of all cells, and the statistic; `nu` is that of the
         statistic, by signs, and as these cells have it where None."""
         mine = scores @ self.whiten
-        ways = [*(_added(mine, way) for way in self.ways), mine[self.kept]]
+        ways = [*(summed(mine, way) for way in self.ways), mine[self.kept]]
         if nu is None:
             nu = by_signs(ways, self.clusters[0].count, self.spent).nu
-        clusters = (*self.clusters, self.alone)
         statistic = float(np.square(ways[0].sum(axis=0)).sum())
-        return by_leaving_out(clusters, ways, nu, self.spent), statistic
+        return by_leaving_out(self.clusters, self.alone, ways, nu, self.spent), statistic
 
     @property
-    def alone(self) -> Clusters:
+    def alone(self) -> EachCell:
         """Each cell a cluster."""
-        kept, wide = self.information, self.whiten.shape
-        if not self.kept.all() or wide[0] > wide[1]:
-            kept = self.whiten.T @ kept[self.kept] @ self.whiten
-        return Clusters.of(kept, len(kept))
+        number = positions(len(self.kept), np.flatnonzero(self.kept))[self.cells.cell]
+        mine = number >= 0
+        return EachCell(self.cells.rows[mine] @ self.whiten, number[mine], int(self.kept.sum()))
 
 
 @dataclass(frozen=True)
@@ -181,22 +237,22 @@ class Judges:
     best: SomeCells
 
     @classmethod
-    def of(cls, cells: np.ndarray, information: np.ndarray, spent: int = 0) -> Judges:
+    def of(cls, cells: Cells, spent: int = 0) -> Judges:
         """As of `SomeCells`."""
-        whole = np.ones(len(cells), bool)
-        every = best = this = SomeCells.of(cells, information, whole, spent)
+        whole = np.ones(len(cells.pairs), bool)
+        every = best = this = SomeCells.of(cells, whole, spent)
         axes = every.whiten
         for most in HELD_BY_ONE:
             axes = every.held_by_no_one(axes, most)
             if axes.shape[1] <= len(axes) * best.worth / HIGHEST_WORTH:
                 break
             if axes.shape[1] < len(axes):
-                part = SomeCells.of(cells, information, whole, spent, axes)
+                part = SomeCells.of(cells, whole, spent, axes)
                 best = max(best, part, key=lambda part: part.worth)
         if not best.worth:
             return cls(every, every)
         while max(each.max() for each in this.shares) > HEAVY:
-            this = SomeCells.of(cells, information, this.without_the_heaviest(), spent)
+            this = SomeCells.of(cells, this.without_the_heaviest(), spent)
             if this is None or this.share < best.worth / HIGHEST_WORTH:
                 break
             best = max(best, this, key=lambda part: part.worth)
@@ -221,7 +277,8 @@ class Judges:
         other way; an effect whose shape is not quite right is off by less."""
         kept, whiten = self.best.kept, self.best.whiten
         told = scores[kept].sum(axis=0) @ whiten @ whiten.T
-        held = self.best.information[~kept].sum(axis=0)
+        rows = self.best.cells.rows[~kept[self.best.cells.cell]]
+        held = rows.T @ rows
         said = held @ told
         off = scores[~kept].sum(axis=0) - said
         variance = held + held @ whiten @ whiten.T @ held
@@ -262,7 +319,12 @@ def _stated(cells: np.ndarray, way: int) -> int:
     return len(np.unique(cells[cells[:, way] >= 0, way])) or len(cells)
 
 
-def _added(values: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Sums (G, ...) of values (n, ...) by group (n,); -1 for none."""
-    sums = summed(values.reshape(len(values), -1), at)
-    return sums.reshape(-1, *values.shape[1:])
+def _information(rows: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
+    """Of so many groups of rows (count, r, r), by the group (N,) of each row; -1 for none."""
+    out = np.zeros((count, rows.shape[1], rows.shape[1]))
+    order = np.argsort(group, kind="stable")
+    for some in np.split(order, np.flatnonzero(np.diff(group[order])) + 1):
+        if len(some) and group[some[0]] >= 0:
+            mine = rows[some]
+            out[group[some[0]]] = mine.T @ mine
+    return out

@@ -31,6 +31,10 @@ from calib.solve.reweight import weighted_as
 # Priors of the hardware (CAD, data sheets) are no evidence against a candidate. Their sigmas are
 # widened by this factor: what only a prior could tell from a candidate then counts as a gauge.
 WIDENED = 100.0
+# Entries of beams' rows along a candidate's directions that clusters are judged by, 1 GB: of 24
+# stops of 131,072 beams all, up to 42 directions.
+ENTRIES = 2**27
+FEWEST_BEAMS = 1024  # of a stop in any case: what one direction gets of them is known to 5 %
 
 
 @dataclass(frozen=True)
@@ -85,7 +89,8 @@ def rows_along(
     away: np.ndarray,
     progress: Callable[[int, int], None],
 ) -> Iterator[ClusteredRows]:
-    """All rows along some directions, weighted; no more than a few stops' beams in memory.
+    """Rows along some directions, weighted: all of those that few are, and of beams as many as
+    memory is given to.
 
     Args:
         linear: that knows these directions, and the rows that are of no beam.
@@ -111,7 +116,8 @@ def rows_along(
         places=Gradients(layout.size, linear.places),
         progress=progress,
     )
-    yield from beams.rows()
+    each = ENTRIES // (max(away.shape[1], 1) * len(wide.scans))
+    yield from beams.rows(max(each, FEWEST_BEAMS))
 
 
 def beside(wide: Problem, estimate: Estimate) -> tuple[Problem, dict[str, np.ndarray]]:

@@ -67,11 +67,9 @@ class Scores:
         """(M, Q) shares of the score of rows of each place."""
         return summed(self.cells, self.place)
 
-    @cached_property
-    def both(self) -> np.ndarray:
-        """Shares of the score of rows that have a stop and a place, by both."""
-        whole = (self.stop >= 0) & (self.place >= 0)
-        return self.cells if whole.all() else self.cells[whole]
+    def by_both(self, columns: slice) -> np.ndarray:
+        """Shares of some columns (n, q) of rows that have a stop and a place, by both."""
+        return self.cells[(self.stop >= 0) & (self.place >= 0), columns]
 
     def ways(self, columns: np.ndarray) -> list[np.ndarray]:
         """Shares of some columns (n, q) by stop, by place, and by both, of those that have any
@@ -213,9 +211,15 @@ class ScoreTest:
         """How much wider its score scatters than independent rows of their sigmas would."""
         return self.chance.trace / self.dof
 
-    def judged(self, shares: Shares) -> ScoreTest:
-        """The same with its clusters left out one by one."""
-        left_out = shares.left_out(self.chances[0].nu, self.spent)
+    def judged(self, shares: Shares, scores: Scores) -> ScoreTest:
+        """The same with its clusters left out one by one.
+
+        Args:
+            shares: their rows along the whitened directions.
+            scores: that it is a test of.
+        """
+        pairs, mine = np.stack([scores.stop, scores.place], axis=1), scores.cells[:, self.columns]
+        left_out = shares.left_out(pairs, mine @ self.whiten, self.chances[0].nu, self.spent)
         return replace(self, chances=(*self.chances, *left_out))
 
     def p_value(self) -> float:

@@ -358,7 +358,7 @@ class Look:
 
         for rows in rows_along(self.linear, wide, stand.estimate, away, tell):
             shares.add(rows)
-        return found.judged(shares)
+        return found.judged(shares, self.named.scores)
 
 
 def finer(effect: Effect, grid: Sequence[float]) -> list[Effect]:

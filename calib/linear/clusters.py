@@ -12,11 +12,12 @@ from scipy.sparse import csr_array, issparse
 ROWS_AT_ONCE = 256  # of a product: about those of four stops with a LiDAR, or of one surface
 
 
-def summed(values: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Sums (G, P) of values (N, P) by group (N,), numbered from 0; -1 for none."""
+def summed(values: np.ndarray, at: np.ndarray, count: int | None = None) -> np.ndarray:
+    """Sums (G, P) of values (N, P) by group (N,), numbered from 0; -1 for none. There are as many
+    groups as are met, or this `count` of them."""
     used = np.flatnonzero(at >= 0)
-    shape = (int(at.max(initial=-1)) + 1, len(at))
-    return csr_array((np.ones(len(used)), (at[used], used)), shape=shape) @ values
+    count = int(at.max(initial=-1)) + 1 if count is None else count
+    return csr_array((np.ones(len(used)), (at[used], used)), shape=(count, len(at))) @ values
 
 
 class Entries(NamedTuple):

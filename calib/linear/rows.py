@@ -191,6 +191,12 @@ class StopRows:
         number[parts] = np.arange(len(parts))
         return parts - 1, number[met]
 
+    def only(self, some: np.ndarray, times: np.ndarray) -> StopRows:
+        """Some of the rows (n,), each as heavy as so many (n,) like it."""
+        weight = self.weight[some] * times
+        picked = {name: getattr(self, name)[some] for name in ("dense", "index", "value")}
+        return replace(self, weight=weight, **picked)
+
     def gradient(self, cluster: np.ndarray, clusters: int) -> tuple[np.ndarray, np.ndarray]:
         """``J^T W b`` (clusters, n) of the rows of each cluster (N,), and its columns (n,)."""
         found = cluster_sums(

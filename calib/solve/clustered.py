@@ -57,9 +57,11 @@ class BeamsAlong:
     kinds: Sequence[str] = PLACES
     progress: Callable[[int, int], None] = lambda done, total: None
 
-    def rows(self) -> Iterator[ClusteredRows]:
-        """Each row, weighted."""
-        for (A, b, more, stop, cluster), place in self._each_stop(_rows_along):
+    def rows(self, most: int) -> Iterator[ClusteredRows]:
+        """Rows, weighted: each one, or of a stop that has more than so many about as many, drawn by
+        chance from what meets the same part of the room and each as heavy as those it stands for:
+        products of derivatives then add up to about the same, gradients to nothing like it."""
+        for (A, b, more, stop, cluster), place in self._each_stop(partial(_rows_along, most)):
             at = np.full(len(cluster), stop), place[cluster]
             yield self._clustered(A, b, *at)
             if more is not None:
@@ -87,11 +89,30 @@ class BeamsAlong:
 
 
 def _rows_along(
-    layout: Layout, directions: np.ndarray, rows: StopRows, cluster: np.ndarray, count: int
+    most: int,
+    layout: Layout,
+    directions: np.ndarray,
+    rows: StopRows,
+    cluster: np.ndarray,
+    count: int,
 ) -> tuple[Any, ...]:
+    scatter = _scatter(layout, directions, rows)
+    if len(cluster) > most:
+        some, times = _drawn(cluster, count, most, rows.stop)
+        rows, cluster = rows.only(some, times), cluster[some]
+        if scatter is not None:
+            scatter = scatter[0][some] * np.sqrt(times)[:, None], scatter[1][some] * np.sqrt(times)
     root = np.sqrt(rows.weight)
-    A = rows.along(directions) * root[:, None]
-    return A, root * rows.b, _scatter(layout, directions, rows), rows.stop, cluster
+    return rows.along(directions) * root[:, None], root * rows.b, scatter, rows.stop, cluster
+
+
+def _drawn(cluster: np.ndarray, count: int, most: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """About so many rows, at least one of each cluster (N,), and for how many each stands."""
+    order = np.lexsort([np.random.default_rng(seed).random(len(cluster)), cluster])
+    size = np.bincount(cluster, minlength=count)
+    rank = np.arange(len(cluster)) - np.repeat(np.cumsum(size) - size, size)
+    some = np.sort(order[rank % -(-len(cluster) // most) == 0])
+    return some, (size / np.maximum(np.bincount(cluster[some], minlength=count), 1))[cluster[some]]
 
 
 def _cells_along(

@@ -31,7 +31,7 @@ from scipy import stats
 from threadpoolctl import threadpool_limits
 
 from calib.diagnosis.jackknife import Clusters, ScoreSpread, by_signs
-from calib.diagnosis.judges import Judges
+from calib.diagnosis.judges import Cells, Judges
 
 PLACES, EACH = 25, 2
 STOPS, PARAMETERS = (6, 8, 12, 20, 30, 60), (1, 4, 16, 64)
@@ -130,9 +130,9 @@ class World:
         values, axes = np.linalg.eigh(mine.T @ mine)
         seen = values > 1e-6 * values.max()
         self.columns = mine @ (axes[:, seen] / np.sqrt(values[seen]))
-        information = np.einsum("bki,bkj->bij", self._cells(), self._cells())
-        cells = np.stack(np.divmod(np.arange(stops * PLACES), PLACES), axis=1)
-        self.judges = Judges.of(cells, information, family.model_by_stop)
+        pairs = np.stack(np.divmod(np.arange(stops * PLACES), PLACES), axis=1)
+        cells = Cells(pairs, self.columns, np.repeat(np.arange(len(pairs)), EACH))
+        self.judges = Judges.of(cells, family.model_by_stop)
         self.clusters = [*self.judges.every.clusters, self.judges.every.alone]
 
     def _cells(self) -> np.ndarray:

@@ -180,23 +180,47 @@ def test_beams_cluster_by_surface_and_trackers_by_stop(stand, linear):
 
 
 @pytest.mark.parametrize("name", ["incidence_angle_bias", "arm_gravity_sag"])
-def test_shares_of_clusters_add_up_to_the_whole(looked, name):
+def test_rows_of_clusters_add_up_to_what_is_known_of_each(looked, name):
+    """Their information to the whole, and of each stop and place their score to its share."""
     candidate = next(c for c in looked.named.candidates if c.effect.name == name)
-    shares = shares_of(looked, candidate)
-    total = sum(information for _, information in shares.cells.values())
+    whiten, scores, found = candidate.test.whiten, looked.named.scores, {}
+    every = rows_of(looked, candidate)
+    total = sum(rows.A.T @ rows.A for rows in every)
     np.testing.assert_allclose(total, np.eye(candidate.test.dof), atol=1e-5)
-    score = sum(score for score, _ in shares.cells.values())
-    assert np.sum(np.square(score)) == pytest.approx(candidate.test.statistic, rel=1e-4)
+    shares = np.vstack([rows.A * rows.b[:, None] for rows in every])
+    at = (np.concatenate([getattr(rows, way) for rows in every]) for way in ("stop", "place"))
+    for pair, share in zip(zip(*at, strict=True), shares, strict=True):
+        found[pair] = found.get(pair, 0.0) + share
+    pairs = zip(scores.stop, scores.place, strict=True)
+    for pair, share in zip(pairs, scores.cells[:, candidate.test.columns] @ whiten, strict=True):
+        found[pair] = found.get(pair, 0.0) - share
+    np.testing.assert_allclose(np.vstack([*found.values()]), 0.0, atol=1e-4)
 
 
-def shares_of(look, candidate):
+def rows_of(look, candidate):
     names = [candidate.effect.name]
     away = away_from_model(look.linear, names) @ candidate.test.whiten
-    wide, shares = problem_with(look.stand, names), Shares()
     told = look.stand.estimate, away, lambda done, total: None
-    for rows in rows_along(look.linear, wide, *told):
-        shares.add(rows)
-    return shares
+    return [*rows_along(look.linear, problem_with(look.stand, names), *told)]
+
+
+def test_some_beams_tell_what_each_cluster_holds(looked, monkeypatch):
+    """Drawn from each wall of each stop, they stand for all: what a stop holds is known to what so
+    many beams allow, and the test is nearly that by all."""
+    candidate = looked.named.candidates[0]
+    every, judged = rows_of(looked, candidate), looked.judged(candidate, quiet)
+    monkeypatch.setattr("calib.diagnosis.linear.ENTRIES", 0)
+    monkeypatch.setattr("calib.diagnosis.linear.FEWEST_BEAMS", 200)
+    some = rows_of(looked, candidate)
+    fewer = [b for a, b in zip(every, some, strict=True) if len(b.A) < len(a.A)]
+    assert len(fewer) == len(looked.stand.estimate.scans)
+    for a, b in zip(every, some, strict=True):
+        np.testing.assert_array_equal(np.unique(a.place), np.unique(b.place))
+        if len(b.A) < len(a.A):
+            assert np.sum(np.square(b.A)) == pytest.approx(np.sum(np.square(a.A)), rel=0.3)
+    by_some = looked.judged(candidate, quiet)
+    assert np.log(by_some.p_value()) == pytest.approx(np.log(judged.p_value()), rel=0.1)
+    assert by_some.sigma(1.0) == pytest.approx(judged.sigma(1.0), rel=0.1)
 
 
 def test_a_signal_no_longer_widens_the_clusters_that_judge_it(looked):
@@ -208,17 +232,21 @@ def test_a_signal_no_longer_widens_the_clusters_that_judge_it(looked):
 
 
 def test_what_one_cluster_alone_says_is_not_believed():
-    one = np.ones((1, 1))
     # Twenty stops with a little each, and one that has nearly all of the information and signal.
-    cells = {(k, -1): [np.array([0.1 * (-1) ** k]), 0.002 * one] for k in range(20)}
-    cells[20, -1] = [np.array([6.0]), 0.96 * one]
-    assert Shares(cells).left_out(1.0)[0].trace > 10.0
+    scores, holds = [*(0.1 * (-1) ** k for k in range(20)), 6.0], [*[0.002] * 20, 0.96]
+    assert left_out(scores, holds).trace > 10.0
     # One that has all of it: nothing is there to compare it with.
-    shares = Shares({(0, -1): [np.array([6.0]), one], (1, -1): [np.array([0.0]), 0.0 * one]})
-    assert shares.left_out(1.0)[0].trace > 1e9
+    assert left_out([6.0, 0.0], [1.0, 0.0]).trace > 1e9
     # The same signal, spread evenly over all of them, is believed.
-    cells = {(k, -1): [np.array([6.0 / 21]), one / 21] for k in range(21)}
-    assert Shares(cells).left_out(1.0)[0].trace < 1e-12
+    assert left_out([6.0 / 21] * 21, [1.0 / 21] * 21).trace < 1e-12
+
+
+def left_out(scores, holds):
+    """Chance from stops with such scores and shares of the information, of one parameter."""
+    pairs = np.stack([np.arange(len(holds)), np.full(len(holds), -1)], axis=1)
+    rows = np.sqrt(holds)[:, None]
+    shares = Shares([*rows[:, None]], [*map(tuple, pairs)])
+    return shares.left_out(pairs, np.array(scores)[:, None], 1.0)[0]
 
 
 def test_a_gauge_is_named_not_observable(looked):

@@ -103,15 +103,16 @@ def trial(world, name):
 
 def judged(world, name):
     """The test of a candidate with its clusters jackknifed."""
-    found = trial(world, name)
+    every = scores(world)
+    found = score.score_test(every, np.r_[every.at[name]])
     column = world.columns[name]
     away = column - world.model @ np.linalg.lstsq(world.model, column, rcond=None)[0]
     left = world.b - world.model @ np.linalg.lstsq(world.model, world.b, rcond=None)[0]
-    along, every = away @ found.whiten, np.arange(found.dof)
+    along, each = away @ found.whiten, np.arange(found.dof)
     shares = Shares()
     at = {"stop": world.stop, "place": world.place}
-    shares.add(ClusteredRows(A=along, b=left, columns=every, **at))
-    return found.judged(shares)
+    shares.add(ClusteredRows(A=along, b=left, columns=each, **at))
+    return found.judged(shares, every)
 
 
 @pytest.mark.parametrize("name", ["one", "several", "rings"])

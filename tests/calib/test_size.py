@@ -76,9 +76,11 @@ def test_a_cluster_says_nothing_of_a_direction_that_it_alone_holds(shown):
     holds[0, 0, 0], holds[:, 1, 1] = 1.0, 1.0 / walls
     size = np.array([30.0, 0.0] if shown == "by one" else [0.0, 30.0])
     scores = holds @ size + np.sqrt(holds.diagonal(axis1=1, axis2=2)) * rng.normal(size=(walls, 2))
-    shares = Shares({(k % 10, k): [scores[k], holds[k]] for k in range(walls)})
+    pairs = np.array([(k % 10, k) for k in range(walls)])
+    rows = np.sqrt(holds).reshape(-1, 2)
+    shares = Shares([*rows[:, None]], [*map(tuple, np.repeat(pairs, 2, axis=0))])
     statistic = float(np.square(scores.sum(axis=0)).sum())
-    p = min(each.p_value(statistic) for each in shares.left_out(1.5))
+    p = min(each.p_value(statistic) for each in shares.left_out(pairs, scores, 1.5))
     assert p > 0.05 if shown == "by one" else p < 1e-4
 
 
@@ -89,8 +91,10 @@ def test_the_cluster_that_holds_most_says_nothing_without_the_others(agree):
     rng, holds = np.random.default_rng(0), np.array([0.8, *np.full(20, 0.01)])
     scores = 30.0 * holds if agree else 30.0 * holds * (np.arange(21) == 0)
     scores = scores + np.sqrt(holds) * rng.standard_normal(21)
-    shares = Shares({(k, -1): [scores[k : k + 1], holds[k] * np.eye(1)] for k in range(21)})
-    p = min(each.p_value(float(scores.sum() ** 2)) for each in shares.left_out(1.0))
+    pairs = np.array([(k, -1) for k in range(21)])
+    shares = Shares([*np.sqrt(holds)[:, None, None]], [*map(tuple, pairs)])
+    told = shares.left_out(pairs, scores[:, None], 1.0)
+    p = min(each.p_value(float(scores.sum() ** 2)) for each in told)
     assert p < 1e-4 if agree else p > 0.05
 
 

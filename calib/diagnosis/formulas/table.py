@@ -312,7 +312,8 @@ class Projection:
     def judged(self, columns_m: np.ndarray) -> ScoreTest:
         """The test of columns (N, q) with its clusters left out one by one: see `jackknife`."""
         table, (kept, taken) = self.table, self.off(columns_m)
-        found = self.test(columns_m)
+        scores = self.scores(columns_m)
+        found = score_test(scores, np.arange(columns_m.shape[1]))
         root, every = np.sqrt(self.weight), np.arange(found.dof)
         of_beams, of_others = root[:, None] * (kept @ found.whiten), taken @ found.whiten
         shares = Shares()
@@ -321,7 +322,7 @@ class Projection:
             (table.others @ of_others, self._away, table.others_stop, table.others_place),
         ):
             shares.add(ClusteredRows(A=A, b=b, columns=every, stop=stop, place=place))
-        return found.judged(shares)
+        return found.judged(shares, scores)
 
 
 def _wider(left: Matrix, right: np.ndarray) -> Matrix:

@@ -62,8 +62,8 @@ def _curve(screen: Screen, effect: Binned, columns: slice, rig: str) -> Curve:
     scores = screen.scores
     weight = np.diag(scores.whole)[columns]
     weight = np.where(weight > 1e-9 * weight.max(), weight, np.nan)
-    ways = (scores.by_stop, scores.by_place, scores.both)
-    squares = TwoWay.of(*(way[:, columns] for way in ways))
+    ways = (scores.by_stop[:, columns], scores.by_place[:, columns], scores.by_both(columns))
+    squares = TwoWay.of(*ways)
     model = screen.common * np.diag(scores.information)[columns]
     # A range error of 1 m changes every residual of its bin by as much: mean = score / weight.
     found = BinnedMean.of(scores.score[columns], weight, squares, model)
