@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 import numpy as np
 import pydantic
@@ -105,6 +105,26 @@ class Beams:
         """(N,) of the direction, up positive."""
         u = self.direction
         return np.arctan2(u[:, 2], np.hypot(u[:, 0], u[:, 1]))
+
+    def only(self, some: Array) -> Self:
+        """Some of them (n,)."""
+        return type(self)(self.origin_m[some], self.direction[some], self.range_m[some])
+
+    def turned(self, azimuth_rad: Array, elevation_rad: Array) -> Self:
+        """The same, turned by small angles (N,): their origin goes along in azimuth."""
+        azimuth, elevation = self.azimuth_rad + azimuth_rad, self.elevation_rad + elevation_rad
+        u = np.stack(
+            [
+                np.cos(elevation) * np.cos(azimuth),
+                np.cos(elevation) * np.sin(azimuth),
+                np.sin(elevation),
+            ],
+            axis=1,
+        )
+        c, s = np.cos(azimuth_rad), np.sin(azimuth_rad)
+        x, y, z = self.origin_m.T
+        origin = np.stack([c * x - s * y, s * x + c * y, z], axis=1)
+        return type(self)(origin, u, self.range_m)
 
 
 def beams(xyz_m: ArrayLike, beam_origin_m: ArrayLike) -> Beams:

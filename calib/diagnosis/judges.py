@@ -40,7 +40,7 @@ HIGHEST_WORTH = 1.0 / float(special.chdtri(1.0, LIMIT))  # of a share of 1: with
 
 
 @dataclass(frozen=True)
-class Cells:
+class CellRows:
     """Rows along a candidate's directions, projected off the model and whitened, or fewer of the
     same information; by the cell of stop and place that each is of.
 
@@ -94,7 +94,7 @@ class Shares:
         cells, at = np.unique(every, axis=0, return_inverse=True)
         mine, theirs = np.split(at.ravel(), [len(pairs)])
         scores = summed(scores, mine, len(cells))
-        cells = Cells(cells, np.concatenate(self.rows), theirs)
+        cells = CellRows(cells, np.concatenate(self.rows), theirs)
         return Judges.of(cells, spent).chances(scores, nu)
 
 
@@ -139,7 +139,7 @@ class SomeCells:
     """
 
     kept: np.ndarray
-    cells: Cells
+    cells: CellRows
     whiten: np.ndarray
     share: float
     ways: tuple[np.ndarray, ...]
@@ -148,7 +148,7 @@ class SomeCells:
 
     @classmethod
     def of(
-        cls, cells: Cells, kept: np.ndarray, spent: int, axes: np.ndarray | None = None
+        cls, cells: CellRows, kept: np.ndarray, spent: int, axes: np.ndarray | None = None
     ) -> SomeCells | None:
         """Some of the cells, about all directions or these (r, k), of unit length and at right
         angles; None where they say next to nothing."""
@@ -237,7 +237,7 @@ class Judges:
     best: SomeCells
 
     @classmethod
-    def of(cls, cells: Cells, spent: int = 0) -> Judges:
+    def of(cls, cells: CellRows, spent: int = 0) -> Judges:
         """As of `SomeCells`."""
         whole = np.ones(len(cells.pairs), bool)
         every = best = this = SomeCells.of(cells, whole, spent)

@@ -33,8 +33,8 @@ from calib.solve.reweight import weighted_as
 WIDENED = 100.0
 # Entries of beams' rows along a candidate's directions that clusters are judged by, 1 GB: of 24
 # stops of 131,072 beams all, up to 42 directions.
-ENTRIES = 2**27
-FEWEST_BEAMS = 1024  # of a stop in any case: what one direction gets of them is known to 5 %
+JUDGING_ENTRIES = 2**27
+FEWEST_JUDGING = 1024  # of a stop in any case: what one direction gets of them is known to 5 %
 
 
 @dataclass(frozen=True)
@@ -116,8 +116,8 @@ def rows_along(
         places=Gradients(layout.size, linear.places),
         progress=progress,
     )
-    each = ENTRIES // (max(away.shape[1], 1) * len(wide.scans))
-    yield from beams.rows(max(each, FEWEST_BEAMS))
+    each = JUDGING_ENTRIES // (max(away.shape[1], 1) * len(wide.scans))
+    yield from beams.rows(max(each, FEWEST_JUDGING))
 
 
 def beside(wide: Problem, estimate: Estimate) -> tuple[Problem, dict[str, np.ndarray]]:
@@ -170,10 +170,9 @@ def linearise_with(
     for rows, larger in zip(others, grown, strict=True):
         gradients.add_rows(larger)
         more[rows.columns] += rows.A.T @ (larger.b - rows.b)
-    unit = layout.sigma[layout.kept]
     for each in (information, raw):  # in their place: there may be thousands of columns
-        each /= unit
-        each /= unit[:, None]
+        each /= layout.sigma[layout.kept]
+        each /= layout.sigma[layout.kept, None]
     table, stop, place = gradients.table()
     return Linear(
         candidates=tuple(candidates),

@@ -18,7 +18,6 @@ from calib.diagnosis.formulas.seen import ColumnRanges
 from calib.effects import Effect, LazyColumn, Site, View
 from calib.problem.model import Source
 from calib.residuals.beams import site_error
-from calib.residuals.scan import turned
 from calib.residuals.store import common_median
 from calib.rig import Rig, load_rig
 from calib.runs.reopen import effects_that_may_run
@@ -107,7 +106,7 @@ class Correction:
             view = View(self.rig, len(xyz_m), there, np.zeros((1, 0)))
             each = (site_error(e.basis(view), theta) for e, theta in self.effects)
             error = sum(each, np.zeros((len(xyz_m), 3)))
-        back = turned(ray, -error[:, 1], -error[:, 2]) if error[:, 1:].any() else ray
+        back = ray.turned(-error[:, 1], -error[:, 2]) if error[:, 1:].any() else ray
         return back.origin_m + (ray.range_m - error[:, 0])[:, None] * back.direction
 
 

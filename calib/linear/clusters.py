@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.sparse import csr_array, issparse
 
-ROWS_AT_ONCE = 256  # of a product: about those of four stops with a LiDAR, or of one surface
+CLUSTERS_AT_ONCE = 256  # of a product: about those of four stops with a LiDAR, or of one surface
 
 
 def summed(values: np.ndarray, at: np.ndarray, count: int | None = None) -> np.ndarray:
@@ -59,7 +59,7 @@ def over_all(some: Sequence[Entries], size: int) -> csr_array:
 def add_product(out: np.ndarray, rows: csr_array, by: np.ndarray, order: np.ndarray) -> None:
     """Add ``rows @ by`` to (n, q), of rows (n, U) of which those that stand side by side in an
     `order` (n,) have few columns among them: so many at once, as a dense product over these."""
-    for some in np.split(order, range(ROWS_AT_ONCE, len(order), ROWS_AT_ONCE)):
+    for some in np.split(order, range(CLUSTERS_AT_ONCE, len(order), CLUSTERS_AT_ONCE)):
         here = rows[some]
         touched, at = np.unique(here.indices, return_inverse=True)
         shape = len(some), len(touched)

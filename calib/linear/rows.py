@@ -121,13 +121,16 @@ class StopRows:
         association: Association | None,
         newton: bool = False,
         slowed: Weighing | None = None,
+        times: np.ndarray | None = None,
     ) -> StopRows:
-        """The rows of a scan, linearised at a state where its LiDAR is `placed`; other arguments
-        as of `linearise`."""
+        """The rows of a scan, linearised at a state where its LiDAR is `placed`, each as heavy as
+        so many `times` (N,) where these are given; other arguments as of `linearise`."""
         rows = scan.rows(values, association, placed.T[0])
         if slowed is not None:
             scale = slowed.scale if slowed.kept else (slowed.scale + rows.scale) / 2
             rows = rows.scaled(scale)
+        if times is not None:
+            rows = rows.heavier(times)
         weight, residual = rows.whitened(newton)
         columns = [layout.columns(list(rows.dense))]
         index = np.empty((len(weight), len(rows.sparse)), np.int32)
@@ -190,12 +193,6 @@ class StopRows:
         number = np.zeros(parts[-1] + 1, int)
         number[parts] = np.arange(len(parts))
         return parts - 1, number[met]
-
-    def only(self, some: np.ndarray, times: np.ndarray) -> StopRows:
-        """Some of the rows (n,), each as heavy as so many (n,) like it."""
-        weight = self.weight[some] * times
-        picked = {name: getattr(self, name)[some] for name in ("dense", "index", "value")}
-        return replace(self, weight=weight, **picked)
 
     def gradient(self, cluster: np.ndarray, clusters: int) -> tuple[np.ndarray, np.ndarray]:
         """``J^T W b`` (clusters, n) of the rows of each cluster (N,), and its columns (n,)."""

@@ -53,6 +53,10 @@ class Association:
     part: np.ndarray
     patches: Mapping[str, np.ndarray] = field(default_factory=dict)
 
+    def only(self, some: np.ndarray) -> Association:
+        """What some of the beams (n,) meet."""
+        return Association(self.part[some], {n: each[some] for n, each in self.patches.items()})
+
 
 @dataclass(frozen=True, eq=False)
 class CellNumbers:
@@ -158,6 +162,11 @@ class Rows:
         """The same rows, weighed as if their bulk were so many sigmas wide."""
         weight = tukey_weight(self.residual_m / self.sigma_m, scale)
         return replace(self, scale=scale, weight=np.where(self.usable, weight, 0.0))
+
+    def heavier(self, times: np.ndarray) -> Rows:
+        """The same rows, each as heavy as so many (N,) of its like."""
+        spread = None if self.spread is None else self.spread.heavier(times)
+        return replace(self, weight=self.weight * times, spread=spread)
 
     def whitened(self, newton: bool) -> tuple[np.ndarray, np.ndarray]:
         """Weight over variance (N,) 1/m2, and the residual (N,) m that goes with it.

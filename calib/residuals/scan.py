@@ -30,7 +30,7 @@ from calib.residuals.compiled import twist_derivative
 from calib.residuals.groups import Group
 from calib.residuals.robust import robust_scale, tukey_weight
 from calib.residuals.spread import spread_rows
-from calib.residuals.store import BeamStore, common_median
+from calib.residuals.store import BeamStore, SomeBeams, common_median, drawn_of_each
 from calib.residuals.surfaces import Meeting
 from chains import se3
 from chains.errors import InputError
@@ -96,7 +96,7 @@ class ScanStop:
     columns: Mapping[str, np.ndarray]
     meeting: Meeting
     reference_sigma_m: float
-    store: BeamStore
+    store: BeamStore | SomeBeams
     room: int | str
     group: Group
     reference_scatter_m: Mapping[str, float] = field(default_factory=dict, kw_only=True)
@@ -177,6 +177,18 @@ class ScanStop:
             return np.where(association.part >= 0, association.patches[kind], -1)
         return self.meeting.surfaces(association)
 
+    def some(
+        self, association: Association, most: int
+    ) -> tuple[ScanStop, Association, np.ndarray | None]:
+        """About so many of the beams that meet anything, drawn by chance from those on each
+        surface; what they meet, and for how many each stands. All, and None, of no more."""
+        met = self.meeting.surfaces(association)
+        if np.count_nonzero(met >= 0) <= most:
+            return self, association, None
+        at, times = drawn_of_each(met, most, self.index)
+        store, alike = SomeBeams(self.store, at), self.alike or (self.store,)
+        return replace(self, store=store, alike=alike), association.only(at), times
+
     def ranges(self, values: Values) -> Ranges:
         """Every beam that meets the surface, before and after what the effects correct."""
         T = self.pose(values)
@@ -233,7 +245,7 @@ class ScanStop:
         for name, (site, basis) in bases.items():
             error[site] = error[site] + site_error(basis, values[name])
         if error[Site.BEAM][:, 1:].any():
-            ray = turned(ray, -error[Site.BEAM][:, 1], -error[Site.BEAM][:, 2])
+            ray = ray.turned(-error[Site.BEAM][:, 1], -error[Site.BEAM][:, 2])
             surface = self.meeting.meet(T, ray, values, association)
         cells = [
             (name, cell.of_beams(self.parts(association, cell.column)), len(values[name]))
@@ -380,20 +392,3 @@ def _finite(basis: np.ndarray | OneHot, usable: np.ndarray) -> np.ndarray | OneH
     kept = basis.copy()
     kept[lost] = 0.0
     return kept
-
-
-def turned(ray: Beams, azimuth_rad: np.ndarray, elevation_rad: np.ndarray) -> Beams:
-    """Beams turned by small angles: their origin goes along in azimuth."""
-    azimuth, elevation = ray.azimuth_rad + azimuth_rad, ray.elevation_rad + elevation_rad
-    u = np.stack(
-        [
-            np.cos(elevation) * np.cos(azimuth),
-            np.cos(elevation) * np.sin(azimuth),
-            np.sin(elevation),
-        ],
-        axis=1,
-    )
-    c, s = np.cos(azimuth_rad), np.sin(azimuth_rad)
-    x, y, z = ray.origin_m.T
-    origin = np.stack([c * x - s * y, s * x + c * y, z], axis=1)
-    return Beams(origin, u, ray.range_m)

@@ -29,6 +29,12 @@ class SpreadRows:
     residual: np.ndarray
     columns: Mapping[str, np.ndarray]
 
+    def heavier(self, times: np.ndarray) -> SpreadRows:
+        """The same rows, each as heavy as so many (N,) of its like."""
+        root = np.sqrt(times)
+        columns = {name: each * root[:, None] for name, each in self.columns.items()}
+        return SpreadRows(self.residual * root, columns)
+
 
 def spread_rows(
     scan: Scan, variance_m2: np.ndarray, usable: np.ndarray, growth: Mapping[str, np.ndarray]

@@ -107,12 +107,40 @@ def drawn_evenly(count: int, most: int, seed: int) -> np.ndarray:
     return np.random.default_rng(seed).integers(ends[:-1], ends[1:])
 
 
+def drawn_of_each(group: np.ndarray, most: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """About so many rows, ascending, drawn from each group (N,) alike and at least one of it, and
+    for how many each stands; none of those of no group, which are at -1."""
+    known = np.flatnonzero(group >= 0)
+    order = known[np.lexsort([np.random.default_rng(seed).random(len(known)), group[known]])]
+    size = np.bincount(group[known])
+    rank = np.arange(len(order)) - np.repeat(np.cumsum(size) - size, size)
+    some = np.sort(order[rank % max(-(-len(order) // most), 1) == 0])
+    return some, (size / np.maximum(np.bincount(group[some], minlength=len(size)), 1))[group[some]]
+
+
+@dataclass(frozen=True)
+class SomeBeams:
+    """Some beams (n,) of a scan of a store."""
+
+    store: BeamStore
+    some: np.ndarray
+
+    def read(self, stop: int) -> tuple[Scan, Beams]:
+        """As of the store."""
+        scan, ray = self.store.read(stop)
+        return _only(scan, self.some), ray.only(self.some)
+
+
 def _thinned(scan: Scan, most: int, stop: int) -> Scan:
     """So many beams of a scan: scans are stored by ring or by column, so that beams drawn evenly
     are spread over all directions."""
-    at = drawn_evenly(len(scan.ring), most, stop)
-    columns = {n: c[at] for n, c in vars(scan).items() if isinstance(c, np.ndarray)}
-    return replace(scan, **columns, extra={n: c[at] for n, c in scan.extra.items()})
+    return _only(scan, drawn_evenly(len(scan.ring), most, stop))
+
+
+def _only(scan: Scan, some: np.ndarray) -> Scan:
+    """A scan of some beams (n,)."""
+    columns = {n: c[some] for n, c in vars(scan).items() if isinstance(c, np.ndarray)}
+    return replace(scan, **columns, extra={n: c[some] for n, c in scan.extra.items()})
 
 
 def common_median(stores: Sequence[BeamStore]) -> float:

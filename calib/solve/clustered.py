@@ -58,10 +58,9 @@ class BeamsAlong:
     progress: Callable[[int, int], None] = lambda done, total: None
 
     def rows(self, most: int) -> Iterator[ClusteredRows]:
-        """Rows, weighted: each one, or of a stop that has more than so many about as many, drawn by
-        chance from what meets the same part of the room and each as heavy as those it stands for:
-        products of derivatives then add up to about the same, gradients to nothing like it."""
-        for (A, b, more, stop, cluster), place in self._each_stop(partial(_rows_along, most)):
+        """Rows, weighted: each one, or of a stop with more beams about as many as asked for (see
+        `ScanStop.some`). The information is then nearly that of all, the gradient is not."""
+        for (A, b, more, stop, cluster), place in self._each_stop(_rows_along, most):
             at = np.full(len(cluster), stop), place[cluster]
             yield self._clustered(A, b, *at)
             if more is not None:
@@ -82,37 +81,20 @@ class BeamsAlong:
         along = np.arange(self.directions.shape[1])
         return ClusteredRows(A=A, b=b, columns=along, stop=stop, place=place)
 
-    def _each_stop(self, found: Callable[..., T]) -> Iterator[tuple[T, np.ndarray]]:
+    def _each_stop(
+        self, found: Callable[..., T], most: int | None = None
+    ) -> Iterator[tuple[T, np.ndarray]]:
         state = self.problem, self.layout, self.values, self.associations
         along = partial(found, self.layout, self.directions)
-        return each_stop(*state, self.places, along, self.kinds, self.progress)
+        return each_stop(*state, self.places, along, self.kinds, self.progress, most)
 
 
 def _rows_along(
-    most: int,
-    layout: Layout,
-    directions: np.ndarray,
-    rows: StopRows,
-    cluster: np.ndarray,
-    count: int,
+    layout: Layout, directions: np.ndarray, rows: StopRows, cluster: np.ndarray, count: int
 ) -> tuple[Any, ...]:
-    scatter = _scatter(layout, directions, rows)
-    if len(cluster) > most:
-        some, times = _drawn(cluster, count, most, rows.stop)
-        rows, cluster = rows.only(some, times), cluster[some]
-        if scatter is not None:
-            scatter = scatter[0][some] * np.sqrt(times)[:, None], scatter[1][some] * np.sqrt(times)
     root = np.sqrt(rows.weight)
-    return rows.along(directions) * root[:, None], root * rows.b, scatter, rows.stop, cluster
-
-
-def _drawn(cluster: np.ndarray, count: int, most: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """About so many rows, at least one of each cluster (N,), and for how many each stands."""
-    order = np.lexsort([np.random.default_rng(seed).random(len(cluster)), cluster])
-    size = np.bincount(cluster, minlength=count)
-    rank = np.arange(len(cluster)) - np.repeat(np.cumsum(size) - size, size)
-    some = np.sort(order[rank % -(-len(cluster) // most) == 0])
-    return some, (size / np.maximum(np.bincount(cluster[some], minlength=count), 1))[cluster[some]]
+    A = rows.along(directions) * root[:, None]
+    return A, root * rows.b, _scatter(layout, directions, rows), rows.stop, cluster
 
 
 def _cells_along(
@@ -148,6 +130,7 @@ def each_stop(
     found: Found[T],
     kinds: Sequence[str] = PLACES,
     progress: Callable[[int, int], None] = lambda done, total: None,
+    most: int | None = None,
 ) -> Iterator[tuple[T, np.ndarray]]:
     """What is found of the rows of each stop, and the numbers of what they meet; arguments as of
     `BeamsAlong`.
@@ -155,9 +138,10 @@ def each_stop(
     Args:
         found: a function of a module, or a partial of one, called with the rows of a stop, which of
             what they meet each meets, and how many there are.
+        most: of how many beams of a stop; of all where None.
     """
     scans = problem.scans
-    work = partial(_of_rows, layout, values, found, kinds)
+    work = partial(_of_rows, layout, values, found, kinds, most)
     of_each = over_stops(work, scans, lidars(scans, values), associations)
     for i, (parts, told) in enumerate(of_each):
         progress(i, len(scans))
@@ -169,11 +153,15 @@ def _of_rows(
     values: Values,
     found: Found[T],
     kinds: Sequence[str],
+    most: int | None,
     scan: ScanStop,
     placed: Placed,
     association: Association,
 ) -> tuple[np.ndarray, T]:
-    rows = StopRows.of(scan, layout, values, placed, association)
+    times = None
+    if most is not None:
+        scan, association, times = scan.some(association, most)
+    rows = StopRows.of(scan, layout, values, placed, association, times=times)
     parts, cluster = rows.places(kinds)
     return parts, found(rows, cluster, len(parts))
 

@@ -31,7 +31,7 @@ from scipy import stats
 from threadpoolctl import threadpool_limits
 
 from calib.diagnosis.jackknife import Clusters, ScoreSpread, by_signs
-from calib.diagnosis.judges import Cells, Judges
+from calib.diagnosis.judges import CellRows, Judges
 
 PLACES, EACH = 25, 2
 STOPS, PARAMETERS = (6, 8, 12, 20, 30, 60), (1, 4, 16, 64)
@@ -131,7 +131,7 @@ class World:
         seen = values > 1e-6 * values.max()
         self.columns = mine @ (axes[:, seen] / np.sqrt(values[seen]))
         pairs = np.stack(np.divmod(np.arange(stops * PLACES), PLACES), axis=1)
-        cells = Cells(pairs, self.columns, np.repeat(np.arange(len(pairs)), EACH))
+        cells = CellRows(pairs, self.columns, np.repeat(np.arange(len(pairs)), EACH))
         self.judges = Judges.of(cells, family.model_by_stop)
         self.clusters = [*self.judges.every.clusters, self.judges.every.alone]
 

@@ -11,7 +11,6 @@ from calib.forward import Term
 from calib.problem.build import effect_unknown
 from calib.residuals.beams import Association, CellNumbers
 from calib.residuals.robust import tukey_weight
-from calib.residuals.scan import turned
 from sensors.lidar import Beams, beams
 
 from . import bent, rigs
@@ -61,7 +60,7 @@ def test_turned_beams_are_turned_as_their_names_say():
         [-np.sin(ray.azimuth_rad), np.cos(ray.azimuth_rad), 0 * ray.azimuth_rad], axis=1
     )
     up = spin * rigs.Rotation.from_rotvec(-elevation * left)
-    found = turned(ray, np.full(50, azimuth), np.full(50, elevation))
+    found = ray.turned(np.full(50, azimuth), np.full(50, elevation))
     np.testing.assert_allclose(found.origin_m, spin.apply(ray.origin_m), atol=1e-12)
     np.testing.assert_allclose(found.direction, up.apply(ray.direction), atol=1e-12)
     np.testing.assert_array_equal(found.range_m, ray.range_m)
@@ -80,7 +79,7 @@ def test_perfect_beams_on_the_walls_have_no_residual(on_mesh):
     for _ in range(20):
         by_turn = np.stack([np.ones(len(ring)), np.cos(measured.azimuth_rad)])
         reach_m, *turns = values["warp"].reshape(3, 2) @ by_turn
-        measured = turned(true, *turns)
+        measured = true.turned(*turns)
     xyz = measured.origin_m + (range_m + reach_m)[:, None] * measured.direction
     read = replace(scan.recording.scan(0), xyz_m=xyz, ring=ring)
     seeing = rescanned(scan, read)

@@ -8,7 +8,7 @@ from calib.linear import clusters
 
 def test_products_in_any_order_are_added_to_what_is_there(monkeypatch):
     """Some rows at once, rows of nothing and columns that stand twice in a row among them."""
-    monkeypatch.setattr(clusters, "ROWS_AT_ONCE", 4)
+    monkeypatch.setattr(clusters, "CLUSTERS_AT_ONCE", 4)
     rng = np.random.default_rng(0)
     count = rng.integers(0, 6, 23)
     count[4] = 0
