@@ -60,7 +60,8 @@ class CellRows:
 
 @dataclass
 class Shares:
-    """Rows of clusters along a candidate's directions, as they come."""
+    """Rows (n, r) of clusters along a candidate's directions, as they come, and the stop and the
+    place of each."""
 
     rows: list[np.ndarray] = field(default_factory=list)
     pairs: list[tuple[int, int]] = field(default_factory=list)
@@ -76,7 +77,7 @@ class Shares:
             if len(mine) > mine.shape[1]:
                 mine = square_root(mine.T @ mine)
             self.rows.append(mine)
-            self.pairs += [(int(rows.stop[some[0]]), int(rows.place[some[0]]))] * len(mine)
+            self.pairs.append((int(rows.stop[some[0]]), int(rows.place[some[0]])))
 
     def left_out(
         self, pairs: np.ndarray, scores: np.ndarray, nu: float, spent: int = 0
@@ -94,6 +95,7 @@ class Shares:
         cells, at = np.unique(every, axis=0, return_inverse=True)
         mine, theirs = np.split(at.ravel(), [len(pairs)])
         scores = summed(scores, mine, len(cells))
+        theirs = np.repeat(theirs, [len(rows) for rows in self.rows])
         cells = CellRows(cells, np.concatenate(self.rows), theirs)
         return Judges.of(cells, spent).chances(scores, nu)
 

@@ -31,9 +31,9 @@ from calib.solve.reweight import weighted_as
 # Priors of the hardware (CAD, data sheets) are no evidence against a candidate. Their sigmas are
 # widened by this factor: what only a prior could tell from a candidate then counts as a gauge.
 WIDENED = 100.0
-# Entries of beams' rows along a candidate's directions that clusters are judged by, 1 GB: of 24
-# stops of 131,072 beams all, up to 42 directions.
-JUDGING_ENTRIES = 2**27
+# Entries of beams' rows along a candidate's directions that clusters are judged by, 268 MB: of 24
+# stops of 131,072 beams all, up to 10 directions; of 8,192 beams, up to 170.
+JUDGING_ENTRIES = 2**25
 FEWEST_JUDGING = 1024  # of a stop in any case: what one direction gets of them is known to 5 %
 
 

@@ -77,8 +77,7 @@ def test_a_cluster_says_nothing_of_a_direction_that_it_alone_holds(shown):
     size = np.array([30.0, 0.0] if shown == "by one" else [0.0, 30.0])
     scores = holds @ size + np.sqrt(holds.diagonal(axis1=1, axis2=2)) * rng.normal(size=(walls, 2))
     pairs = np.array([(k % 10, k) for k in range(walls)])
-    rows = np.sqrt(holds).reshape(-1, 2)
-    shares = Shares([*rows[:, None]], [*map(tuple, np.repeat(pairs, 2, axis=0))])
+    shares = Shares([*np.sqrt(holds)], [*map(tuple, pairs)])
     statistic = float(np.square(scores.sum(axis=0)).sum())
     p = min(each.p_value(statistic) for each in shares.left_out(pairs, scores, 1.5))
     assert p > 0.05 if shown == "by one" else p < 1e-4
