@@ -67,20 +67,23 @@ number.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Protocol
+from itertools import pairwise
 
 import numpy as np
 from scipy import special
 
+from calib.linear.clusters import summed
+from calib.linear.layout import positions
 from calib.results.intervals import ALONE
 
 UNKNOWN_VARIANCE = 1e12  # variance, of a whitened score, where nothing tells it
 # Least stops, or surfaces, for each parameter that one of these tells as one. Measured in the
 # benchmark: with fewer, 0.1 to 1.0 of empty worlds where stops err show something; else below 0.1.
 PER_PARAMETER = 2
+TRIFLING = 1e-9  # of a direction's information, below which a cluster holds none
 SLIGHT_SHARE = 0.05  # of a direction's information: the others predict a cluster with less to 5 %
 
 
@@ -177,37 +180,83 @@ def _beyond(by_place: np.ndarray, both: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Clusters:
-    """What can be said of clusters before their scores are known.
+    """What can be said of clusters of rows before their scores are known.
 
     Args:
-        information: (c, r, r) of the whitened score; they add up to 1.
+        rows: (N, r) of the whitened score, or fewer of the same information; all add up to 1.
+        at: (N,) of which cluster each is.
+        size: how many clusters there are.
         count: how many are stops, in the way by stops, or surfaces.
-        apart: cluster -> ``(1 - I)^-1`` (r, r), where that is not nearly 1.
-        alone: (r, r) variance in directions that one cluster alone holds.
     """
 
-    information: np.ndarray
+    rows: np.ndarray = field(repr=False)
+    at: np.ndarray = field(repr=False)
+    size: int
     count: int
-    apart: Mapping[int, np.ndarray]
-    alone: np.ndarray
 
-    @classmethod
-    def of(cls, information: np.ndarray, count: int) -> Clusters:
-        """Of clusters that hold so much of the information, (c, r, r)."""
-        apart, alone = {}, np.zeros(information.shape[1:])
-        for c in np.flatnonzero(np.linalg.norm(information, axis=(1, 2)) > SLIGHT_SHARE).tolist():
-            values, axes = np.linalg.eigh(information[c])
-            apart[c] = (axes / (1.0 - np.clip(values, 0.0, ALONE))) @ axes.T
-            lonely = axes[:, values > ALONE]
-            alone += UNKNOWN_VARIANCE * lonely @ lonely.T
-        return cls(information, count, apart, alone)
+    @cached_property
+    def trace(self) -> np.ndarray:
+        """(c,) of the information of each, which is no less than that along any direction."""
+        return np.bincount(self.at, np.einsum("ij,ij->i", self.rows, self.rows), self.size)
+
+    @cached_property
+    def information(self) -> np.ndarray:
+        """(h, r, r) of those that hold any."""
+        return self._of(self._holding)
+
+    @cached_property
+    def _holding(self) -> np.ndarray:
+        return np.flatnonzero(self.trace > TRIFLING)
+
+    def _of(self, some: np.ndarray) -> np.ndarray:
+        """Information (n, r, r) of some clusters."""
+        number = positions(self.size, some)[self.at]
+        order = np.argsort(number, kind="stable")
+        ends = np.searchsorted(number[order], np.arange(len(some) + 1))
+        parts = (self.rows[order[i:k]] for i, k in pairwise(ends))
+        out = np.empty((len(some), *2 * self.rows.shape[1:]))
+        for each, rows in zip(out, parts, strict=True):
+            each[:] = rows.T @ rows
+        return out
+
+    @cached_property
+    def apart(self) -> dict[int, np.ndarray]:
+        """Cluster -> ``(1 - I)^-1`` (r, r), where that is not nearly 1."""
+        return {c: inverse for c, inverse, _ in self._predicted}
+
+    @cached_property
+    def alone(self) -> np.ndarray:
+        """Variance (r, r) in directions that one cluster alone holds."""
+        out = np.zeros(2 * self.rows.shape[1:])
+        for _, _, lonely in self._predicted:
+            out += UNKNOWN_VARIANCE * lonely @ lonely.T
+        return out
+
+    @cached_property
+    def _predicted(self) -> list[tuple[int, np.ndarray, np.ndarray]]:
+        """Of clusters that others do not predict nearly, each with the inverse of what they miss,
+        and the directions (r, h) that it alone holds."""
+        some = np.flatnonzero(self.trace > SLIGHT_SHARE)
+        out, one = [], np.eye(self.rows.shape[1])
+        for c, information in zip(some.tolist(), self._of(some), strict=True):
+            norm = np.linalg.norm(information)  # no less than the largest eigenvalue
+            if norm <= SLIGHT_SHARE:
+                continue
+            if norm < ALONE:
+                out.append((c, np.linalg.inv(one - information), one[:, :0]))
+                continue
+            values, axes = np.linalg.eigh(information)
+            inverse = (axes / (1.0 - np.clip(values, 0.0, ALONE))) @ axes.T
+            out.append((c, inverse, axes[:, values > ALONE]))
+        return out
 
     @cached_property
     def d(self) -> float:
         """Degrees of freedom of the covariance's trace, were each cluster's rows to err as one."""
         variance = self.information.copy()  # I (1 - I)^-1, of what each is compared by
+        number = positions(self.size, self._holding)
         for c, inverse in self.apart.items():
-            variance[c] = variance[c] @ inverse
+            variance[number[c]] = variance[number[c]] @ inverse
         common = variance @ variance  # of two clusters: minus I (1 - I)^-1 of one by the other's
         among = np.square(common.sum(axis=0)).sum() - np.square(common).sum()
         size = np.trace(variance, axis1=1, axis2=2)
@@ -224,34 +273,19 @@ class Clusters:
 
     def covariance(self, score: np.ndarray) -> np.ndarray:
         """Covariance (r, r) of the sum of scores (c, r), each compared with what others predict."""
-        return self.of_beyond(score - self.information @ score.sum(axis=0))
-
-    def of_beyond(self, beyond: np.ndarray) -> np.ndarray:
-        """The same, of what scores are beyond their part (c, r) of what all predict."""
-        beyond = beyond.copy()
+        told = self.rows * (self.rows @ score.sum(axis=0))[:, None]
+        beyond = score - summed(told, self.at, self.size)
         for c, inverse in self.apart.items():
             beyond[c] = inverse @ beyond[c]
         return beyond.T @ beyond + self.alone
 
 
-class Scattering(Protocol):
-    """Clusters, however their information is held."""
-
-    def covariance(self, score: np.ndarray) -> np.ndarray:
-        """As of `Clusters`."""
-
-
 def by_leaving_out(
-    ways: Sequence[Clusters],
-    each: Scattering,
-    scores: Sequence[np.ndarray],
-    nu: float,
-    spent: int = 0,
+    ways: Sequence[Clusters], scores: Sequence[np.ndarray], nu: float, spent: int = 0
 ) -> ScoreSpread:
-    """Chance from clusters by stop and by surface, from each cell of both, and from their scores
-    (c, r); the model has spent so many unknowns on stops alone."""
-    every = (*ways, each)
-    by_stop, by_place, both = (w.covariance(s) for w, s in zip(every, scores, strict=True))
+    """Chance from clusters and their scores (c, r), by stop, by surface, and by both; the model has
+    spent so many unknowns on stops alone."""
+    by_stop, by_place, both = (w.covariance(s) for w, s in zip(ways, scores, strict=True))
     if ways[0].crowded or ways[1].crowded:
         by_stop = UNKNOWN_VARIANCE * np.eye(len(by_stop))
     more = _beyond(by_place, both)

@@ -13,13 +13,7 @@ from functools import cached_property
 import numpy as np
 from scipy import special
 
-from calib.diagnosis.jackknife import (
-    SLIGHT_SHARE,
-    Clusters,
-    ScoreSpread,
-    by_leaving_out,
-    by_signs,
-)
+from calib.diagnosis.jackknife import Clusters, ScoreSpread, by_leaving_out, by_signs
 from calib.linear.clusters import ClusteredRows, summed
 from calib.linear.elimination import square_root
 from calib.linear.layout import positions
@@ -52,10 +46,6 @@ class CellRows:
     pairs: np.ndarray
     rows: np.ndarray = field(repr=False)
     cell: np.ndarray = field(repr=False)
-
-    def information(self, group: np.ndarray) -> np.ndarray:
-        """Of groups of cells (G, r, r), by the group (n,) of each; -1 for none."""
-        return _information(self.rows, group[self.cell], group.max(initial=-1) + 1)
 
 
 @dataclass
@@ -101,32 +91,6 @@ class Shares:
 
 
 @dataclass(frozen=True)
-class EachCell:
-    """Every cell a cluster; the information of most of them is never formed.
-
-    Args:
-        rows: (N, k) along the directions that are asked about; cell: (N,) of which of so many.
-        count: how many.
-    """
-
-    rows: np.ndarray
-    cell: np.ndarray
-    count: int
-
-    def covariance(self, score: np.ndarray) -> np.ndarray:
-        """As of `Clusters`, of scores (n, k)."""
-        told = self.rows * (self.rows @ score.sum(axis=0))[:, None]
-        beyond = score - summed(told, self.cell, self.count)
-        # The trace of its information, which that along no direction exceeds.
-        size = summed(np.square(self.rows).sum(axis=1, keepdims=True), self.cell, self.count)
-        heavy = np.flatnonzero(size > SLIGHT_SHARE)
-        held = positions(self.count, heavy)[self.cell]
-        held = Clusters.of(_information(self.rows, held, len(heavy)), len(heavy))
-        light = np.delete(beyond, heavy, axis=0)
-        return light.T @ light + held.of_beyond(beyond[heavy])
-
-
-@dataclass(frozen=True)
 class SomeCells:
     """Cells of stop and place, all or some.
 
@@ -136,7 +100,7 @@ class SomeCells:
         whiten: (r, k), of what the kept ones say of the directions that are asked about.
         share: of the information, that they hold.
         ways: numbers (n,) of the stop and of the place of each; -1 for those that are not kept.
-        clusters: by stop and by place.
+        clusters: by stop, by place, and each cell by itself.
         spent: how many unknowns of the model differ by stop alone.
     """
 
@@ -155,20 +119,26 @@ class SomeCells:
         """Some of the cells, about all directions or these (r, k), of unit length and at right
         angles; None where they say next to nothing."""
         ways = tuple(_numbered(cells.pairs, kept, way) for way in (0, 1))
-        by_stop, by_place = (cells.information(way) for way in ways)
+        rows, cell = cells.rows, cells.cell
+        if not kept.all():
+            mine = kept[cell]
+            rows, cell = rows[mine], cell[mine]
         plain = kept.all() and axes is None
-        axes = np.eye(cells.rows.shape[1]) if axes is None else axes
-        whole = axes.T @ by_stop.sum(axis=0) @ axes
+        axes = np.eye(rows.shape[1]) if axes is None else axes
+        whole = axes.T @ (rows.T @ rows) @ axes
         values, vectors = np.linalg.eigh(whole)
         seen = values > SLIGHT_LEFT
         if not seen.any():
             return None
         whiten = axes if kept.all() else axes @ (vectors[:, seen] / np.sqrt(values[seen]))
+        rows = rows if plain else rows @ whiten
+        each = positions(len(kept), np.flatnonzero(kept))
         clusters = tuple(
-            Clusters.of(each if plain else whiten.T @ each @ whiten, count)
-            for each, count in (
-                (by_stop, _stated(cells.pairs[kept], 0)),
-                (by_place, _stated(cells.pairs[kept], 1)),
+            Clusters(rows, way[cell], way.max() + 1, count)
+            for way, count in (
+                (ways[0], _stated(cells.pairs[kept], 0)),
+                (ways[1], _stated(cells.pairs[kept], 1)),
+                (each, int(kept.sum())),
             )
         )
         return cls(
@@ -192,8 +162,7 @@ class SomeCells:
     @cached_property
     def shares(self) -> list[np.ndarray]:
         """Of its information, by stop and by place."""
-        parts = (np.trace(each.information, axis1=1, axis2=2) for each in self.clusters)
-        return [each / len(self.whiten.T) for each in parts]
+        return [each.trace / len(self.whiten.T) for each in self.clusters[:2]]
 
     def without_the_heaviest(self) -> np.ndarray:
         """Which of all cells (n,) are left without the stop, or the place, that holds most."""
@@ -204,7 +173,7 @@ class SomeCells:
         """Those among some directions (r, k) of which no stop, and no place, holds more than a
         share; all cells being kept, in all directions."""
         while axes.shape[1]:
-            held = [_held(each.information, axes, most) for each in self.clusters]
+            held = [_held(each.information, axes, most) for each in self.clusters[:2]]
             if not (found := np.hstack(held)).shape[1]:
                 break
             along, size, _ = np.linalg.svd(found)
@@ -219,14 +188,7 @@ class SomeCells:
         if nu is None:
             nu = by_signs(ways, self.clusters[0].count, self.spent).nu
         statistic = float(np.square(ways[0].sum(axis=0)).sum())
-        return by_leaving_out(self.clusters, self.alone, ways, nu, self.spent), statistic
-
-    @property
-    def alone(self) -> EachCell:
-        """Each cell a cluster."""
-        number = positions(len(self.kept), np.flatnonzero(self.kept))[self.cells.cell]
-        mine = number >= 0
-        return EachCell(self.cells.rows[mine] @ self.whiten, number[mine], int(self.kept.sum()))
+        return by_leaving_out(self.clusters, ways, nu, self.spent), statistic
 
 
 @dataclass(frozen=True)
@@ -300,10 +262,10 @@ def _held(information: np.ndarray, axes: np.ndarray, most: float) -> np.ndarray:
     """Directions among some (r, k) of which one cluster holds more than a share of the information
     (c, r, r), all of them side by side (k, h)."""
     found = [np.zeros((axes.shape[1], 0))]
-    for each in information:
-        if np.linalg.norm(each) > most:  # no less than what it holds of any direction
-            values, vectors = np.linalg.eigh(axes.T @ each @ axes)
-            found.append(vectors[:, values > most])
+    norm = np.linalg.norm(information, axis=(1, 2))  # no less than it holds of any direction
+    for each in information[norm > most]:
+        values, vectors = np.linalg.eigh(axes.T @ each @ axes)
+        found.append(vectors[:, values > most])
     return np.hstack(found)
 
 
@@ -319,14 +281,3 @@ def _numbered(cells: np.ndarray, kept: np.ndarray, way: int) -> np.ndarray:
 def _stated(cells: np.ndarray, way: int) -> int:
     """How many stops (0), or places (1), cells (n, 2) have; of cells that have none, how many."""
     return len(np.unique(cells[cells[:, way] >= 0, way])) or len(cells)
-
-
-def _information(rows: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
-    """Of so many groups of rows (count, r, r), by the group (N,) of each row; -1 for none."""
-    out = np.zeros((count, rows.shape[1], rows.shape[1]))
-    order = np.argsort(group, kind="stable")
-    for some in np.split(order, np.flatnonzero(np.diff(group[order])) + 1):
-        if len(some) and group[some[0]] >= 0:
-            mine = rows[some]
-            out[group[some[0]]] = mine.T @ mine
-    return out

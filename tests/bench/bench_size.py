@@ -133,7 +133,7 @@ class World:
         pairs = np.stack(np.divmod(np.arange(stops * PLACES), PLACES), axis=1)
         cells = CellRows(pairs, self.columns, np.repeat(np.arange(len(pairs)), EACH))
         self.judges = Judges.of(cells, family.model_by_stop)
-        self.clusters = [*self.judges.every.clusters, self.judges.every.alone]
+        self.clusters = self.judges.every.clusters
 
     def _cells(self) -> np.ndarray:
         return self.columns.reshape(self.stops * PLACES, EACH, -1)

@@ -119,7 +119,8 @@ def test_one_stop_that_alone_shows_an_effect_proves_nothing():
     assert by_signs(lone, 3).p_value(49.9**2) > 0.1
     assert by_signs([lone[0], lone[1], lone[2]], 1).p_value(1e6) == 1.0
     holds = np.array([0.9995, 0.0003, 0.0002])[:, None, None]
-    assert Clusters.of(holds, 3).covariance(lone[0])[0, 0] > 0.99 * UNKNOWN_VARIANCE
+    clusters = Clusters(np.sqrt(holds)[:, 0], np.arange(3), 3, 3)
+    assert clusters.covariance(lone[0])[0, 0] > 0.99 * UNKNOWN_VARIANCE
 
 
 def test_no_p_value_is_told_below_the_least_nor_adjusted_below_itself():
