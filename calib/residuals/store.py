@@ -108,14 +108,19 @@ def drawn_evenly(count: int, most: int, seed: int) -> np.ndarray:
 
 
 def drawn_of_each(group: np.ndarray, most: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """About so many rows, ascending, drawn from each group (N,) alike and at least one of it, and
-    for how many each stands; none of those of no group, which are at -1."""
+    """About so many rows, ascending: one drawn from every few that stand side by side in a group
+    (N,), and how many these are. None of no group, which are at -1."""
     known = np.flatnonzero(group >= 0)
-    order = known[np.lexsort([np.random.default_rng(seed).random(len(known)), group[known]])]
-    size = np.bincount(group[known])
-    rank = np.arange(len(order)) - np.repeat(np.cumsum(size) - size, size)
-    some = np.sort(order[rank % max(-(-len(order) // most), 1) == 0])
-    return some, (size / np.maximum(np.bincount(group[some], minlength=len(size)), 1))[group[some]]
+    theirs = group[known].astype(np.min_scalar_type(int(group.max(initial=0))))  # sorts faster
+    order, size = known[np.argsort(theirs, kind="stable")], np.bincount(theirs)
+    step, ends = max(-(-len(known) // most), 1), np.cumsum(size)
+    parts = -(-size // step)
+    first = np.arange(parts.sum()) - np.repeat(np.cumsum(parts) - parts, parts)
+    low = np.repeat(ends - size, parts) + step * first
+    high = np.minimum(low + step, np.repeat(ends, parts))
+    some = order[np.random.default_rng(seed).integers(low, high)]
+    ascending = np.argsort(some)
+    return some[ascending], (high - low)[ascending]
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from calib.forward import Term
 from calib.problem.build import effect_unknown
 from calib.residuals.beams import Association, CellNumbers
 from calib.residuals.robust import tukey_weight
+from calib.residuals.store import drawn_of_each
 from sensors.lidar import Beams, beams
 
 from . import bent, rigs
@@ -230,3 +231,16 @@ def test_every_beam_moves_with_the_cells_that_it_meets_and_with_no_other(on_mesh
             index = scan.cells[name].of_beams(met)
             np.testing.assert_array_equal(cells.parts[index], view[cells.column])
             np.testing.assert_array_equal(cells.surface[index], view["surface"])
+
+
+@pytest.mark.parametrize("most", [1, 40, 4000])
+def test_of_each_group_some_are_drawn_that_stand_for_all_of_it(most):
+    group = np.repeat([-1, 0, 2, 7], [50, 1, 700, 299])[np.random.default_rng(0).permutation(1050)]
+    some, times = drawn_of_each(group, most, seed=3)
+    assert (np.diff(some) > 0).all() and len(some) <= most + len(np.unique(group))
+    stands_for = np.bincount(group[some], times, 8)
+    np.testing.assert_array_equal(stands_for, np.bincount(group[group >= 0], minlength=8))
+    if most == 4000:
+        np.testing.assert_array_equal(some, np.flatnonzero(group >= 0))
+    else:
+        assert times.max() == -(-1000 // most) or times.max() == 700
