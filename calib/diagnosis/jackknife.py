@@ -20,11 +20,12 @@ inverted, so there may be more parameters than clusters. There are two ways to V
 - **By leaving out** cluster after cluster, which needs the information ``I_c`` of each, thus one
   more pass over the rows, for one candidate. Each cluster is compared with what the others predict:
   ``(1 - I_c)^-1 (s_c - I_c s)`` (the cluster jackknife CV3 of MacKinnon, Nielsen and Webb 2022), so
-  a true effect widens nothing. The degrees of freedom of either way come from the I_c, as Bell and
-  McCaffrey (2002) have it, were the rows of a cluster to err as one; those of the sum are
-  Satterthwaite's. A cluster that alone holds a direction leaves nothing to compare it with: the
-  variance there is infinite. Clusters fewer than two for each parameter that one of them tells as
-  one (the sum of the largest eigenvalues of the I_c) tell nothing: parameters fit their errors.
+  a true effect widens nothing; a little, where the I_c are of beams that were drawn (`linear`). The
+  degrees of freedom of either way come from the I_c, as Bell and McCaffrey (2002) have it, were the
+  rows of a cluster to err as one; those of the sum are Satterthwaite's. A cluster that alone holds
+  a direction leaves nothing to compare it with: the variance there is infinite. Clusters fewer than
+  two for each parameter that one of them tells as one (the sum of the largest eigenvalues of the
+  I_c) tell nothing: parameters fit their errors.
 
 Where few clusters hold most of the information, few degrees of freedom are left, however well all
 others agree. Then the others are asked by themselves, in the second way: those without the cluster
@@ -83,6 +84,7 @@ UNKNOWN_VARIANCE = 1e12  # variance, of a whitened score, where nothing tells it
 # Least stops, or surfaces, for each parameter that one of these tells as one. Measured in the
 # benchmark: with fewer, 0.1 to 1.0 of empty worlds where stops err show something; else below 0.1.
 PER_PARAMETER = 2
+ROUNDED_UP = 1.0 + 1e-6  # shares of two surfaces in one parameter add up to 1, but for rounding
 TRIFLING = 1e-9  # of a direction's information, below which a cluster holds none
 SLIGHT_SHARE = 0.05  # of a direction's information: the others predict a cluster with less to 5 %
 
@@ -183,7 +185,8 @@ class Clusters:
     """What can be said of clusters of rows before their scores are known.
 
     Args:
-        rows: (N, r) of the whitened score, or fewer of the same information; all add up to 1.
+        rows: (N, r) of the whitened score, or others of the same information; ``rows.T @ rows``, of
+            all of them, is 1.
         at: (N,) of which cluster each is.
         size: how many clusters there are.
         count: how many are stops, in the way by stops, or surfaces.
@@ -267,9 +270,10 @@ class Clusters:
         """Whether they are too few for the parameters that each of them tells as one: these then
         fit what the clusters err by, and nothing is left of it."""
         bound = np.linalg.norm(self.information, axis=(1, 2)).sum()  # of the largest eigenvalues
-        if PER_PARAMETER * bound <= self.count:
+        enough = self.count * ROUNDED_UP
+        if PER_PARAMETER * bound <= enough:
             return False
-        return PER_PARAMETER * np.linalg.eigvalsh(self.information)[:, -1].sum() > self.count
+        return PER_PARAMETER * np.linalg.eigvalsh(self.information)[:, -1].sum() > enough
 
     def covariance(self, score: np.ndarray) -> np.ndarray:
         """Covariance (r, r) of the sum of scores (c, r), each compared with what others predict."""

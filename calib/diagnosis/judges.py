@@ -14,7 +14,7 @@ import numpy as np
 from scipy import special
 
 from calib.diagnosis.jackknife import Clusters, ScoreSpread, by_leaving_out, by_signs
-from calib.linear.clusters import ClusteredRows, summed
+from calib.linear.clusters import summed
 from calib.linear.elimination import square_root
 from calib.linear.layout import positions
 
@@ -35,8 +35,8 @@ HIGHEST_WORTH = 1.0 / float(special.chdtri(1.0, LIMIT))  # of a share of 1: with
 
 @dataclass(frozen=True)
 class CellRows:
-    """Rows along a candidate's directions, projected off the model and whitened, or fewer of the
-    same information; by the cell of stop and place that each is of.
+    """Rows along a candidate's directions, projected off the model and whitened, or others of the
+    same information; and the cell, of stop and place, that each is of.
 
     Args:
         pairs: (n, 2) the stop and the place of each cell; -1 for none.
@@ -56,18 +56,17 @@ class Shares:
     rows: list[np.ndarray] = field(default_factory=list)
     pairs: list[tuple[int, int]] = field(default_factory=list)
 
-    def add(self, rows: ClusteredRows) -> None:
-        """Add some rows; of a cell that has more of them than there are directions, as many of the
-        same information."""
-        order = np.lexsort([rows.place, rows.stop])
-        stop, place = rows.stop[order], rows.place[order]
-        bounds = np.flatnonzero((np.diff(stop) != 0) | (np.diff(place) != 0)) + 1
-        for some in np.split(order, bounds):
-            mine = rows.A[some]
+    def add(self, rows: np.ndarray, stop: np.ndarray, place: np.ndarray) -> None:
+        """Add some rows (m, r), of stops and places (m,); of a cell that has more of them than
+        there are directions, as many as these with the same information."""
+        order = np.lexsort([place, stop])
+        pairs = np.stack([stop, place], axis=1)[order]
+        for some in np.split(order, np.flatnonzero(np.diff(pairs, axis=0).any(axis=1)) + 1):
+            mine = rows[some]
             if len(mine) > mine.shape[1]:
                 mine = square_root(mine.T @ mine)
             self.rows.append(mine)
-            self.pairs.append((int(rows.stop[some[0]]), int(rows.place[some[0]])))
+            self.pairs.append((int(stop[some[0]]), int(place[some[0]])))
 
     def left_out(
         self, pairs: np.ndarray, scores: np.ndarray, nu: float, spent: int = 0
@@ -86,7 +85,7 @@ class Shares:
         mine, theirs = np.split(at.ravel(), [len(pairs)])
         scores = summed(scores, mine, len(cells))
         theirs = np.repeat(theirs, [len(rows) for rows in self.rows])
-        cells = CellRows(cells, np.concatenate(self.rows), theirs)
+        cells = CellRows(cells, _adding_up(np.concatenate(self.rows)), theirs)
         return Judges.of(cells, spent).chances(scores, nu)
 
 
@@ -256,6 +255,13 @@ class Judges:
             return True
         times = square / max(rest.trace / len(rest.covariance), 1e-300) / int(seen.sum())
         return bool(special.fdtrc(int(seen.sum()), rest.d, times) > DISAGREE)
+
+
+def _adding_up(rows: np.ndarray) -> np.ndarray:
+    """Rows (N, r) turned into such that ``rows.T @ rows`` is 1, as it is but for rounding unless
+    beams were drawn."""
+    values, axes = np.linalg.eigh(rows.T @ rows)
+    return rows @ (axes / np.sqrt(np.maximum(values, SLIGHT_LEFT))) @ axes.T
 
 
 def _held(information: np.ndarray, axes: np.ndarray, most: float) -> np.ndarray:

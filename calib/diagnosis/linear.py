@@ -31,10 +31,14 @@ from calib.solve.reweight import weighted_as
 # Priors of the hardware (CAD, data sheets) are no evidence against a candidate. Their sigmas are
 # widened by this factor: what only a prior could tell from a candidate then counts as a gauge.
 WIDENED = 100.0
-# Entries of beams' rows along a candidate's directions that clusters are judged by, 268 MB: of 24
-# stops of 131,072 beams all, up to 10 directions; of 8,192 beams, up to 170.
-JUDGING_ENTRIES = 2**25
-FEWEST_JUDGING = 1024  # of a stop in any case: what one direction gets of them is known to 5 %
+# Rows by which clusters are judged, one number for each direction. Kept of a stop and surface are
+# as many rows as there are directions, at most; where all of these would be more numbers than the
+# first (268 MB), beams are drawn, as many as make the second, though not fewer of a stop than the
+# third, a choice. The shares of a stop in what n beams in all tell of one direction are then
+# wrong by chance, which widens the judgement of an effect of k sigmas by 2 k^2 / n.
+JUDGING_NUMBERS = 2**25
+DRAWN_NUMBERS = 2**26
+FEWEST_DRAWN = 1024
 
 
 @dataclass(frozen=True)
@@ -89,8 +93,8 @@ def rows_along(
     away: np.ndarray,
     progress: Callable[[int, int], None],
 ) -> Iterator[ClusteredRows]:
-    """Rows along some directions, weighted: all of those that few are, and of beams as many as
-    memory is given to.
+    """Weighted rows along some directions: all that are of no beam, and of all beams or, where
+    these are too many, of some that are drawn (see `JUDGING_NUMBERS`).
 
     Args:
         linear: that knows these directions, and the rows that are of no beam.
@@ -116,8 +120,11 @@ def rows_along(
         places=Gradients(layout.size, linear.places),
         progress=progress,
     )
-    each = JUDGING_ENTRIES // (max(away.shape[1], 1) * len(wide.scans))
-    yield from beams.rows(max(each, FEWEST_JUDGING))
+    cells = np.count_nonzero((linear.stop >= 0) & (linear.place >= 0))
+    if cells * len(every) ** 2 <= JUDGING_NUMBERS:
+        yield from beams.rows()
+        return
+    yield from beams.rows(max(DRAWN_NUMBERS // (len(every) * len(wide.scans)), FEWEST_DRAWN))
 
 
 def beside(wide: Problem, estimate: Estimate) -> tuple[Problem, dict[str, np.ndarray]]:

@@ -156,8 +156,8 @@ def project(linear: Linear, names: Sequence[str], spent: int = 0) -> Scores:
 
 def _shares(linear: Linear, names: Sequence[str], away: np.ndarray) -> np.ndarray:
     """Shares (C + 1, Q) of the score along directions (U, Q), of clusters and, last, of all rows as
-    they are. Clusters of a stop depend on its own unknowns, and those of a surface on its parts:
-    these go one after another for either."""
+    they are. Clusters of one stop depend on the same unknowns of that stop, those of one surface on
+    the same parts of it: so they are taken in the order of stops, and of places."""
     every = csr_array(vstack([linear.gradient, csr_array(linear.score[None])]))
     theirs = np.concatenate([np.r_[linear.columns[name]] for name in names])
     out = every[:, theirs].toarray()  # along these directions it is these that move, by 1
@@ -216,7 +216,7 @@ class ScoreTest:
 
         Args:
             shares: their rows along the whitened directions.
-            scores: that it is a test of.
+            scores: those that this test was made from.
         """
         pairs, mine = np.stack([scores.stop, scores.place], axis=1), scores.cells[:, self.columns]
         left_out = shares.left_out(pairs, mine @ self.whiten, self.chances[0].nu, self.spent)

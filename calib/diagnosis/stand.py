@@ -357,7 +357,7 @@ class Look:
             progress("fitting the candidates", done, total)
 
         for rows in rows_along(self.linear, wide, stand.estimate, away, tell):
-            shares.add(rows)
+            shares.add(rows.A, rows.stop, rows.place)
         return found.judged(shares, self.named.scores)
 
 

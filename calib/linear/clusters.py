@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.sparse import csr_array, issparse
 
-CLUSTERS_AT_ONCE = 256  # of a product: about those of four stops with a LiDAR, or of one surface
+CLUSTERS_AT_ONCE = 256  # rows of such a block: about the clusters of four stops with a LiDAR
 
 
 def summed(values: np.ndarray, at: np.ndarray, count: int | None = None) -> np.ndarray:
@@ -57,8 +57,8 @@ def over_all(some: Sequence[Entries], size: int) -> csr_array:
 
 
 def add_product(out: np.ndarray, rows: csr_array, by: np.ndarray, order: np.ndarray) -> None:
-    """Add ``rows @ by`` to (n, q), of rows (n, U) of which those that stand side by side in an
-    `order` (n,) have few columns among them: so many at once, as a dense product over these."""
+    """Add ``rows @ by`` (n, q), of sparse rows (n, U). Rows that follow each other in an `order`
+    (n,) share few columns: blocks of them are multiplied as dense matrices over these."""
     for some in np.split(order, range(CLUSTERS_AT_ONCE, len(order), CLUSTERS_AT_ONCE)):
         here = rows[some]
         touched, at = np.unique(here.indices, return_inverse=True)

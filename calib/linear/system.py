@@ -84,8 +84,9 @@ class Linearisation:
         direction, of which the right side is no part.
 
         Args:
-            alone: (q,) of each direction one of those kept that moves by 1 in it, and in no other;
-                its row of `kept` is 0. None where there are no such.
+            alone: (q,) of each direction the position, among the kept, of an unknown that moves by
+                1 in it and in no other direction; its row of `kept` is 0. None where there are no
+                such unknowns.
         """
         layout = self.layout
         out = np.zeros((layout.size + 1, kept.shape[1]))

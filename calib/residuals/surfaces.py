@@ -36,6 +36,8 @@ ROOM_M2 = 200.0
 class Meeting(Protocol):
     """Something that beams meet. First associate, then meet: an association can be kept."""
 
+    def surfaces(self, association: Association) -> np.ndarray: ...
+
     def divided(self, T: np.ndarray, beams: Beams, part: np.ndarray) -> Association: ...
 
     def associate(
@@ -169,6 +171,10 @@ class PlaneSurface:
     def _grid(self) -> SurfaceGrid:
         """Over the cells in which each plane was seen."""
         return self.planes.grid(self.axes)
+
+    def surfaces(self, association: Association) -> np.ndarray:
+        """The plane (N,) that each beam meets, -1 for none."""
+        return association.part
 
     def surface_of(self, kind: str, parts: np.ndarray) -> np.ndarray:
         """The plane that each of those parts is of."""

@@ -35,7 +35,7 @@ Found = Callable[[StopRows, np.ndarray, int], T]
 
 @dataclass(frozen=True)
 class BeamsAlong:
-    """All beams along some directions; no more than a few stops' in memory.
+    """Beams along some directions, all or some of each stop; a few stops' in memory at a time.
 
     Args:
         problem: with its scans.
@@ -57,9 +57,10 @@ class BeamsAlong:
     kinds: Sequence[str] = PLACES
     progress: Callable[[int, int], None] = lambda done, total: None
 
-    def rows(self, most: int) -> Iterator[ClusteredRows]:
-        """Rows, weighted: each one, or of a stop with more beams about as many as asked for (see
-        `ScanStop.some`). The information is then nearly that of all, the gradient is not."""
+    def rows(self, most: int | None = None) -> Iterator[ClusteredRows]:
+        """Weighted rows of every beam or, of a stop with more than `most` of them, of about so many
+        that are drawn (see `ScanStop.some`). Their information is about that of all beams; their
+        gradient is not."""
         for (A, b, more, stop, cluster), place in self._each_stop(_rows_along, most):
             at = np.full(len(cluster), stop), place[cluster]
             yield self._clustered(A, b, *at)

@@ -204,13 +204,18 @@ def rows_of(look, candidate):
     return [*rows_along(look.linear, problem_with(look.stand, names), *told)]
 
 
-def test_some_beams_tell_what_each_cluster_holds(looked, monkeypatch):
-    """Drawn from each wall of each stop, they stand for all: what a stop holds is known to what so
-    many beams allow, and the test is nearly that by all."""
+@pytest.fixture
+def drawn(monkeypatch):
+    """Of each stop 200 beams judge."""
+    monkeypatch.setattr("calib.diagnosis.linear.JUDGING_NUMBERS", 0)
+    monkeypatch.setattr("calib.diagnosis.linear.DRAWN_NUMBERS", 0)
+    monkeypatch.setattr("calib.diagnosis.linear.FEWEST_DRAWN", 200)
+
+
+def test_some_beams_stand_for_all_of_each_wall(looked, request):
     candidate = looked.named.candidates[0]
-    every, judged = rows_of(looked, candidate), looked.judged(candidate, quiet)
-    monkeypatch.setattr("calib.diagnosis.linear.JUDGING_ENTRIES", 0)
-    monkeypatch.setattr("calib.diagnosis.linear.FEWEST_JUDGING", 200)
+    every = rows_of(looked, candidate)
+    request.getfixturevalue("drawn")
     some = rows_of(looked, candidate)
     fewer = [b for a, b in zip(every, some, strict=True) if len(b.A) < len(a.A)]
     assert len(fewer) == len(looked.stand.estimate.scans)
@@ -219,9 +224,33 @@ def test_some_beams_tell_what_each_cluster_holds(looked, monkeypatch):
         assert np.isin(a.place[felt], b.place).all()
         if len(b.A) < len(a.A):
             assert np.sum(np.square(b.A)) == pytest.approx(np.sum(np.square(a.A)), rel=0.3)
+
+
+@pytest.mark.parametrize("name", ["incidence_angle_bias", "ring_elevation_offset"])
+def test_some_beams_judge_about_as_all_do(looked, name, request):
+    """One parameter, and one for each ring."""
+    candidate = next(c for c in looked.named.candidates if c.effect.name == name)
+    by_all = looked.judged(candidate, quiet)
+    request.getfixturevalue("drawn")
     by_some = looked.judged(candidate, quiet)
-    assert np.log(by_some.p_value()) == pytest.approx(np.log(judged.p_value()), rel=0.1)
-    assert by_some.sigma(1.0) == pytest.approx(judged.sigma(1.0), rel=0.1)
+    some, every = by_some.chances[1].trace, by_all.chances[1].trace
+    assert some != every and some == pytest.approx(every, rel=0.2)
+    assert np.log(by_some.p_value()) == pytest.approx(np.log(by_all.p_value()), rel=0.1, abs=0.2)
+
+
+@pytest.mark.parametrize("beams", ["all", "drawn"])
+def test_planes_judge_as_a_mesh_does(tmp_path, beams, request):
+    """Where no mesh was scanned, beams are drawn from each plane."""
+    spec = SMALL.model_copy(update={"mesh": False, "targets": 0, "column_step": 20})
+    source, _ = made(tmp_path / "rec", spec, 4, near_range_bias=3.0)
+    problem = problems.build([source], Model())
+    look = Stand([source], Model(), problem, solve(problem)).look(quiet)
+    if beams == "drawn":
+        request.getfixturevalue("drawn")
+    best = next(c for c in look.named.candidates if c.effect.family == "near_range_bias")
+    total = sum(rows.A.T @ rows.A for rows in rows_of(look, best))
+    np.testing.assert_allclose(total, 1.0, atol=1e-5 if beams == "all" else 0.3)
+    assert look.judged(best, quiet).p_value() < 1e-3
 
 
 def test_a_signal_no_longer_widens_the_clusters_that_judge_it(looked):

@@ -14,7 +14,6 @@ from calib.diagnosis.judges import Shares
 from calib.diagnosis.linear import Linear
 from calib.diagnosis.screen import ODDS, looked, rivals, screen
 from calib.effects import Site
-from calib.linear.clusters import ClusteredRows
 from calib.problem.unknowns import Owner
 
 STOPS, PLACES, EACH = 30, 25, 6
@@ -107,11 +106,8 @@ def judged(world, name):
     found = score.score_test(every, np.r_[every.at[name]])
     column = world.columns[name]
     away = column - world.model @ np.linalg.lstsq(world.model, column, rcond=None)[0]
-    left = world.b - world.model @ np.linalg.lstsq(world.model, world.b, rcond=None)[0]
-    along, each = away @ found.whiten, np.arange(found.dof)
     shares = Shares()
-    at = {"stop": world.stop, "place": world.place}
-    shares.add(ClusteredRows(A=along, b=left, columns=each, **at))
+    shares.add(away @ found.whiten, world.stop, world.place)
     return found.judged(shares, every)
 
 

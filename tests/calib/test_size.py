@@ -83,6 +83,16 @@ def test_a_cluster_says_nothing_of_a_direction_that_it_alone_holds(shown):
     assert p > 0.05 if shown == "by one" else p < 1e-4
 
 
+@pytest.mark.parametrize("size", [0.96, 1.0, 1.04])
+def test_two_walls_tell_one_parameter_whatever_drawn_beams_add_up_to(size):
+    """Shares of two walls in it add up to two of its parameters, exactly: they are just enough."""
+    scores = np.random.default_rng(0).standard_normal(24) / 5 + 0.9
+    pairs = np.array([(k % 12, k // 12) for k in range(24)])
+    shares = Shares([*np.full((24, 1, 1), np.sqrt(size / 24))], [*map(tuple, pairs)])
+    (told,) = shares.left_out(pairs, scores[:, None], 1.0)
+    assert 0.5 < told.trace < 3.0
+
+
 @pytest.mark.parametrize("agree", [True, False])
 def test_the_cluster_that_holds_most_says_nothing_without_the_others(agree):
     """One stop shows 30 sigmas of an effect; the others show as much each as it would have there,

@@ -19,7 +19,7 @@ from calib.diagnosis.judges import Shares
 from calib.diagnosis.linear import beside, other_rows
 from calib.diagnosis.score import GAUGE, Scores, ScoreTest, score_test
 from calib.linear.arrow import Arrow, apart, cheapest
-from calib.linear.clusters import ClusteredRows, Entries, Gradients, over_all, summed
+from calib.linear.clusters import Entries, Gradients, over_all, summed
 from calib.linear.layout import Layout
 from calib.linear.linearise import own_rows
 from calib.linear.rows import TWIST
@@ -314,14 +314,10 @@ class Projection:
         table, (kept, taken) = self.table, self.off(columns_m)
         scores = self.scores(columns_m)
         found = score_test(scores, np.arange(columns_m.shape[1]))
-        root, every = np.sqrt(self.weight), np.arange(found.dof)
-        of_beams, of_others = root[:, None] * (kept @ found.whiten), taken @ found.whiten
-        shares = Shares()
-        for A, b, stop, place in (
-            (of_beams, root * self.left_m, table.stop, table.place),
-            (table.others @ of_others, self._away, table.others_stop, table.others_place),
-        ):
-            shares.add(ClusteredRows(A=A, b=b, columns=every, stop=stop, place=place))
+        root, shares = np.sqrt(self.weight)[:, None], Shares()
+        shares.add(root * (kept @ found.whiten), table.stop, table.place)
+        others = table.others @ (taken @ found.whiten)
+        shares.add(others, table.others_stop, table.others_place)
         return found.judged(shares, scores)
 
 
