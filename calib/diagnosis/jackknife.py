@@ -20,12 +20,12 @@ inverted, so there may be more parameters than clusters. There are two ways to V
 - **By leaving out** cluster after cluster, which needs the information ``I_c`` of each, thus one
   more pass over the rows, for one candidate. Each cluster is compared with what the others predict:
   ``(1 - I_c)^-1 (s_c - I_c s)`` (the cluster jackknife CV3 of MacKinnon, Nielsen and Webb 2022), so
-  a true effect widens nothing; a little, where the I_c are of beams that were drawn (`linear`). The
-  degrees of freedom of either way come from the I_c, as Bell and McCaffrey (2002) have it, were the
-  rows of a cluster to err as one; those of the sum are Satterthwaite's. A cluster that alone holds
-  a direction leaves nothing to compare it with: the variance there is infinite. Clusters fewer than
-  two for each parameter that one of them tells as one (the sum of the largest eigenvalues of the
-  I_c) tell nothing: parameters fit their errors.
+  a true effect widens nothing. Where the I_c are those of drawn beams, it widens V a little (see
+  `DRAWN_NUMBERS` in `linear`). The degrees of freedom of either way come from the I_c, as Bell and
+  McCaffrey (2002) have it, were the rows of a cluster to err as one; those of the sum are
+  Satterthwaite's. A cluster that alone holds a direction leaves nothing to compare it with: the
+  variance there is infinite. Clusters fewer than two for each parameter that one of them tells as
+  one (the sum of the largest eigenvalues of the I_c) tell nothing: parameters fit their errors.
 
 Where few clusters hold most of the information, few degrees of freedom are left, however well all
 others agree. Then the others are asked by themselves, in the second way: those without the cluster

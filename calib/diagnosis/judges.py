@@ -57,8 +57,8 @@ class Shares:
     pairs: list[tuple[int, int]] = field(default_factory=list)
 
     def add(self, rows: np.ndarray, stop: np.ndarray, place: np.ndarray) -> None:
-        """Add some rows (m, r), of stops and places (m,); of a cell that has more of them than
-        there are directions, as many as these with the same information."""
+        """Add some rows (m, r), of stops and places (m,). Of a cell with more rows than there are
+        directions only as many are kept, of the same information."""
         order = np.lexsort([place, stop])
         pairs = np.stack([stop, place], axis=1)[order]
         for some in np.split(order, np.flatnonzero(np.diff(pairs, axis=0).any(axis=1)) + 1):
@@ -258,8 +258,8 @@ class Judges:
 
 
 def _adding_up(rows: np.ndarray) -> np.ndarray:
-    """Rows (N, r) turned into such that ``rows.T @ rows`` is 1, as it is but for rounding unless
-    beams were drawn."""
+    """Rows (N, r), changed so that ``rows.T @ rows`` is 1. It is so already, but for rounding,
+    unless beams were drawn."""
     values, axes = np.linalg.eigh(rows.T @ rows)
     return rows @ (axes / np.sqrt(np.maximum(values, SLIGHT_LEFT))) @ axes.T
 

@@ -31,12 +31,12 @@ from calib.solve.reweight import weighted_as
 # Priors of the hardware (CAD, data sheets) are no evidence against a candidate. Their sigmas are
 # widened by this factor: what only a prior could tell from a candidate then counts as a gauge.
 WIDENED = 100.0
-# Rows by which clusters are judged, one number for each direction. Kept of a stop and surface are
-# as many rows as there are directions, at most; where all of these would be more numbers than the
-# first (268 MB), beams are drawn, as many as make the second, though not fewer of a stop than the
-# third, a choice. The shares of a stop in what n beams in all tell of one direction are then
-# wrong by chance, which widens the judgement of an effect of k sigmas by 2 k^2 / n.
+# All beams judge a candidate if their rows take no more numbers than this (268 MB), one for each
+# direction: of each stop and surface no more rows are kept than there are directions.
 JUDGING_NUMBERS = 2**25
+# Else beams are drawn whose rows take so many numbers, and at least so many of each stop; both are
+# choices. By n beams that tell of a direction, the variance of a score of k sigmas in it is told
+# larger by 2 k^2 / n, as the share of each stop in the information is known less well.
 DRAWN_NUMBERS = 2**26
 FEWEST_DRAWN = 1024
 
@@ -120,11 +120,10 @@ def rows_along(
         places=Gradients(layout.size, linear.places),
         progress=progress,
     )
-    cells = np.count_nonzero((linear.stop >= 0) & (linear.place >= 0))
-    if cells * len(every) ** 2 <= JUDGING_NUMBERS:
-        yield from beams.rows()
-        return
-    yield from beams.rows(max(DRAWN_NUMBERS // (len(every) * len(wide.scans)), FEWEST_DRAWN))
+    most, cells = None, np.count_nonzero((linear.stop >= 0) & (linear.place >= 0))
+    if cells * len(every) ** 2 > JUDGING_NUMBERS:
+        most = max(DRAWN_NUMBERS // (len(every) * len(wide.scans)), FEWEST_DRAWN)
+    yield from beams.rows(most)
 
 
 def beside(wide: Problem, estimate: Estimate) -> tuple[Problem, dict[str, np.ndarray]]:

@@ -163,21 +163,12 @@ class Linearisation:
         """What each step of the elimination, and the kept, add to a covariance of rows: of which
         rows (n,), these over some unknowns (n, e), and the unknowns' covariance with them (e, n);
         arguments as of `covariance`."""
-        for some, mine, step in self._passed_on(rows):
-            yield some, mine, kept @ mine.T if step is None else step.solve(mine.T)
-
-    def _passed_on(
-        self, rows: csr_array
-    ) -> Iterator[tuple[np.ndarray, np.ndarray, Eliminated | None]]:
-        """Rows (q, U) as unknowns are eliminated: of each step which rows (n,) touch what goes in
-        it, these over that (n, e), in units of sigmas, and the step; last, all rows over the kept
-        (q, S), in the unknowns' own units."""
-        sigma, kept = self.layout.sigma, self.layout.kept
+        sigma, last = self.layout.sigma, self.layout.kept
         touched = np.unique(rows.indices)
         concerned = self._concerned(touched)
         # Over no more columns than these rows come to: of many stops they touch a few.
         parts = [p for each in concerned for p in (each.columns, each.over)]
-        columns = np.unique(np.concatenate([touched, kept, [self.layout.size], *parts]))
+        columns = np.unique(np.concatenate([touched, last, [self.layout.size], *parts]))
         at = positions(self.layout.size + 1, columns)
         scaled = rows.data * sigma[rows.indices], at[rows.indices], rows.indptr
         left = csr_array(scaled, (rows.shape[0], len(columns))).toarray()
@@ -187,9 +178,10 @@ class Linearisation:
             if not len(some):
                 continue
             mine = mine[some]
-            yield some, mine, each
+            yield some, mine, each.solve(mine.T)
             left[np.ix_(some, at[each.over])] -= mine @ each.gain
-        yield np.arange(len(left)), left[:, at[kept]] / sigma[kept], None
+        mine = left[:, at[last]] / sigma[last]
+        yield np.arange(len(left)), mine, kept @ mine.T
 
     @cached_property
     def _gone_in(self) -> np.ndarray:

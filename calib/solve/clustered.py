@@ -139,7 +139,7 @@ def each_stop(
     Args:
         found: a function of a module, or a partial of one, called with the rows of a stop, which of
             what they meet each meets, and how many there are.
-        most: of how many beams of a stop; of all where None.
+        most: about so many beams of each stop are drawn (see `ScanStop.some`); all where None.
     """
     scans = problem.scans
     work = partial(_of_rows, layout, values, found, kinds, most)
