@@ -14,14 +14,14 @@ from calib import outputs
 from calib.blunders import told
 from calib.blunders.reach import FurthestMoved, hardly_checked, reaches
 from calib.diagnosis.chance import Spread
-from calib.diagnosis.rejects import rejects
-from calib.diagnosis.search import Search, nameless, search
+from calib.diagnosis.rejects import Rejects, rejects
+from calib.diagnosis.search import Search, beside_formulas, nameless, search
 from calib.diagnosis.search.confirmed import structures
 from calib.diagnosis.stand import Look, Stand, tried
 from calib.diagnosis.verdict import ABSORBED_BY_MODEL, Diagnosis, believed, conclude
 from calib.diagnosis.verdict.known import by_name
 from calib.diagnosis.verdict.matters import HELD_OUT_BY_CHANCE, borne_out, weighed
-from calib.diagnosis.verdict.unnamed import Unnamed, unnamed
+from calib.diagnosis.verdict.unnamed import Unnamed, unnamed, with_formulas
 from calib.diagnosis.weak import group, to_be_planned, to_be_told_apart, weak_directions
 from calib.effects import own_effects
 from calib.effects.reference import FaroScale
@@ -92,6 +92,8 @@ def _found(
     known = by_name(found, formulas, unseen, progress) if unseen else None
     if known and believed(*known) and weighed(*known, run.summary["rms_mm"]).found.found:
         (found, falls), formulas = known, Unnamed()
+    if whole := _with_formulas(stand, found, formulas, rejected, progress):
+        found, rejected = beside_formulas(found, whole, progress), rejects(whole, progress)
     again = _as_held_out(found, falls, formulas, run, progress)
     if len(again.found) < len(found.found):
         falls = _falls(again, stand, run, progress)
@@ -107,6 +109,7 @@ def _found(
         formulas,
     )
     unseen = _reaches(found.looks[0], run) if run.converged else {}
+    last = found.beside or found.looks[-1]
     apart = to_be_told_apart(result.candidates, result.weak_directions)
     return replace(
         result,
@@ -119,13 +122,27 @@ def _found(
             *run.doubts,
             *suspect,
             *result.sentences,
-            *(told.uneven(found.looks[-1].blunders) if run.converged else ()),
+            *(told.uneven(last.blunders) if run.converged else ()),
             *hardly_checked(unseen),
-            *map(told.whole, _cautions(run, result, found.looks[-1])),
+            *map(told.whole, _cautions(run, result, last)),
             *run.omissions,
         ],
         command=_command(run, result),
     )
+
+
+def _with_formulas(
+    stand: Stand, found: Search, formulas: Unnamed, rejected: Rejects | None, progress: Progress
+) -> Stand | None:
+    """A run's fit with formulas that stops held out bear out, and the names that stand beside them;
+    None where nothing is to be judged beside these, or they come to no optimum."""
+    moved = rejected is not None and rejected.moved
+    if formulas.fall_mm is None or not (found.chance or found.blunders or moved):
+        return None
+    named = () if formulas.instead else found.found
+    names = [s.effect for s in named if s.effect.name not in formulas.needless]
+    whole = tried(with_formulas, stand, formulas.formulas, progress, names)
+    return whole if whole and whole.estimate.converged else None
 
 
 def _as_held_out(

@@ -81,6 +81,8 @@ class Search:
             the first of them is dressed up, or stops that were held out speak against it.
         chance: what scatters by chance beside all that was found, strongest first.
         unsettled: what scatters beside that, and with which no fit comes to an optimum.
+        beside: the last look at a fit with formulas of the structure, where blunders and scatter
+            were judged beside these; see `beside_formulas`.
     """
 
     looks: Sequence[Look]
@@ -91,6 +93,7 @@ class Search:
     at_first: Sequence[Candidate] = ()
     chance: Sequence[Chance] = ()
     unsettled: Chance | None = None
+    beside: Look | None = None
 
     def dressed_up(self, i: int) -> bool:
         """Whether residual structure would have explained more than the i-th name did."""
@@ -213,6 +216,26 @@ def nameless(done: Search, progress: Progress) -> Search:
         found=(),
         scatter=scattering(look, progress),
         chance=[c for c in (each.beside(less.estimate) for each in done.chance) if c.found],
+    )
+
+
+def beside_formulas(done: Search, stand: Stand, progress: Progress) -> Search:
+    """A search whose blunders, and whose scatter by chance, are those beside its names and formulas
+    of the structure that these leave: scatter and mishaps take in much of a structure that a model
+    lacks. Its looks and its names stay: they are what the formulas were found beside.
+
+    Args:
+        done: the search.
+        stand: a fit with these names and formulas, of all rows.
+        progress: as of `fit.solve`.
+    """
+    again = search(stand, progress)
+    return replace(
+        done,
+        blunders=again.blunders,
+        chance=again.chance,
+        unsettled=again.unsettled,
+        beside=again.looks[-1],
     )
 
 

@@ -187,7 +187,7 @@ def conclude(
         weak_directions=weak,
         untestable=untestable,
         blunders=blunders,
-        groups=[*(left.blunder for left in found.blunders), *first.blunders],
+        groups=[*(left.blunder for left in found.blunders), *(found.beside or first).blunders],
         misfit=summary["misfit"],
         curves=curves(first.unnamed),
         too_few=stops_of(first) < FEWEST_STOPS,

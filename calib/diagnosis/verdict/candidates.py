@@ -45,9 +45,10 @@ def candidate_documents(
         each["dressed_up"] = bool(each["step"]) and each["add"] in worn
     # Residual structure may be random scatter: that is judged once it is in the model.
     chance = [
-        each.document(None if unnamed else named + i) for i, each in enumerate(found.chance, 1)
+        each.document(None if unnamed and found.beside is None else named + i)
+        for i, each in enumerate(found.chance, 1)
     ]
-    others = [each.document(None) for each in found.looks[-1].chance]
+    others = [each.document(None) for each in (found.beside or found.looks[-1]).chance]
     return [*out[:named], *chance, *out[named:], *others]
 
 

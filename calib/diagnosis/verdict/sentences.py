@@ -50,7 +50,7 @@ def sentences_of(
         candidate = next(c for c in candidates if c["add"] == step.effect.name)
         if not (formulas and candidate["dressed_up"]):  # what was tried before is of no use then
             out += _step_sentences(step, candidate, found.dressed_up(i))
-    if verdict == UNNAMED and found.chance:
+    if verdict == UNNAMED and found.chance and found.beside is None:
         beside = ", ".join(each.effect.name for each in found.chance)
         out.append(f"Random scatter ({beside}) is judged once that structure is in the model.")
     else:

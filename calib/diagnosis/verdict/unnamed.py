@@ -36,7 +36,7 @@ class Unnamed:
             is not known.
         refused: a sentence, where held-out stops are predicted no better with them.
         fitted: the model with them, where they are told and somebody looked.
-        needless: names of effects of the same covariates that predict nothing beside them.
+        needless: names of effects that predict nothing beside them.
     """
 
     formulas: Sequence[Formula] = ()
@@ -110,7 +110,7 @@ def unnamed(
     thrown = before.rejected_share or 0.0, after.rejected_share or 0.0
     fall = Fall(*fall_mm, after.floor_mm, rejected_share=thrown)
     if fall.takes_back or fall_mm[0] - fall_mm[1] > FALL_MATTERS * after.floor_mm:
-        needless = _needless(_alike(names, formulas), fitted, after, unseen, progress)
+        needless = _needless(_replaced(names, formulas), fitted, after, unseen, progress)
         return Unnamed(formulas, False, fall_mm, thrown, fitted=fitted, needless=needless)
     over = " and ".join(words(c) for c in formulas[0].covariates)
     return Unnamed(
@@ -119,10 +119,16 @@ def unnamed(
     )
 
 
-def _alike(names: Sequence[Effect], formulas: Sequence[Formula]) -> list[Effect]:
-    """Effects that depend on a covariate of the formulas."""
+def _replaced(names: Sequence[Effect], formulas: Sequence[Formula]) -> list[Effect]:
+    """Effects that formulas may take the place of: of beams, as formulas of the range are, or of a
+    covariate of theirs. What else moves may go together with it: paint with how dark it is."""
     drawn = {c for each in formulas for c in each.covariates}
-    return [effect for effect in names if drawn.intersection(effect.covariates)]
+    of_range = any(each.unit == "m" for each in formulas)
+    return [
+        effect
+        for effect in names
+        if drawn.intersection(effect.covariates) or (of_range and effect.site is Site.BEAM)
+    ]
 
 
 def _needless(
@@ -175,10 +181,12 @@ def _simpler(
     return formulas[0].constants < known and whole and as_well
 
 
-def with_formulas(stand: Stand, formulas: Sequence[Formula], progress: Progress) -> Stand:
-    """A model with formulas, fitted."""
-    taken = list(stand.model.names)
-    effects = []
+def with_formulas(
+    stand: Stand, formulas: Sequence[Formula], progress: Progress, names: Sequence[Effect] = ()
+) -> Stand:
+    """A model with formulas, and effects that were named before, fitted."""
+    effects = list(names)
+    taken = [*stand.model.names, *(effect.name for effect in names)]
     for each in formulas:
         effects.append(FormulaEffect.read(each.effect(taken, ""), "diagnosis.json", {}))
         taken.append(effects[-1].name)
