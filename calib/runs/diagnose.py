@@ -82,22 +82,9 @@ def _found(
     if found.blunders and unexplained:
         suspect = [told.suspect(found.blunders[0])]
         found = replace(found, looks=found.looks[:1], blunders=())
-    rejected = rejects(found.looks[0].stand, progress) if run.converged else None
     refits = refits and run.summary["rms_mm"]["held_out"] is not None
     refits = refits and run.model["hold_out"] != "none"
-    falls = _falls(found, stand, run, progress) if refits else {}
-    unseen = partial(_unseen, run=run, progress=progress) if refits else None
-    doubtful = not believed(found, falls)
-    formulas = unnamed(found, falls, doubtful, unseen, progress) if run.converged else Unnamed()
-    known = by_name(found, formulas, unseen, progress) if unseen else None
-    if known and believed(*known) and weighed(*known, run.summary["rms_mm"]).found.found:
-        (found, falls), formulas = known, Unnamed()
-    if whole := _with_formulas(stand, found, formulas, rejected, progress):
-        found, rejected = beside_formulas(found, whole, progress), rejects(whole, progress)
-    again = _as_held_out(found, falls, formulas, run, progress)
-    if len(again.found) < len(found.found):
-        falls = _falls(again, stand, run, progress)
-    found = again
+    found, falls, formulas, rejected = _answer(run, stand, found, refits, progress)
     result = conclude(
         found,
         falls,
@@ -131,7 +118,29 @@ def _found(
     )
 
 
-def _with_formulas(
+def _answer(
+    run: Run, stand: Stand, found: Search, refits: bool, progress: Progress
+) -> tuple[Search, Mapping[str, Fall], Unnamed, Rejects | None]:
+    """A search as stops that were held out have it, and what is asked after it: how the error of
+    these falls with each name, formulas of what the names leave, and what was rejected; arguments
+    as of `diagnose`."""
+    rejected = rejects(found.looks[0].stand, progress) if run.converged else None
+    falls = _falls(found, stand, run, progress) if refits else {}
+    unseen = partial(_unseen, run=run, progress=progress) if refits else None
+    doubtful = not believed(found, falls)
+    formulas = unnamed(found, falls, doubtful, unseen, progress) if run.converged else Unnamed()
+    known = by_name(found, formulas, unseen, progress) if unseen else None
+    if known and believed(*known) and weighed(*known, run.summary["rms_mm"]).found.found:
+        (found, falls), formulas = known, Unnamed()
+    if whole := with_formulas_and_names(stand, found, formulas, rejected, progress):
+        found, rejected = beside_formulas(found, whole, progress), rejects(whole, progress)
+    again = _as_held_out(found, falls, formulas, run, progress)
+    if len(again.found) < len(found.found):
+        falls = _falls(again, stand, run, progress)
+    return again, falls, formulas, rejected
+
+
+def with_formulas_and_names(
     stand: Stand, found: Search, formulas: Unnamed, rejected: Rejects | None, progress: Progress
 ) -> Stand | None:
     """A run's fit with formulas that stops held out bear out, and the names that stand beside them;
