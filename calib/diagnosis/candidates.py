@@ -34,6 +34,7 @@ PAIRS = (*combinations(POINT[:4], 2), ("intensity", "range_m"), ("label", "incid
 # What a column of the stops may act on: an offset by stop alone may be chance, but one that differs
 # from ring to ring, or with range, is none.
 WITH_OWN = ("range_m", "elevation_rad")
+FINER = 9  # shapes tried between the two beside the best one of a grid
 
 
 class Binned(Effect):
@@ -293,3 +294,21 @@ def _edges(values: np.ndarray, bins: int) -> np.ndarray:
     if len(distinct) <= bins:
         return (distinct[1:] + distinct[:-1]) / 2
     return np.unique(np.quantile(values, np.arange(1, bins) / bins))
+
+
+def finer(effect: Effect, grid: Sequence[float]) -> list[Effect]:
+    """An effect in finer shapes between those of a grid beside its own, which is one of them."""
+    i = grid.index(effect.shape)
+    ends = grid[max(0, i - 1)], grid[min(len(grid) - 1, i + 1)]
+    spaced = (np.geomspace if ends[0] > 0 else np.linspace)(*ends, FINER)
+    spaced = np.rint(spaced) if effect.whole else spaced
+    shapes = {float(f"{shape:.6g}") for shape in (*spaced, effect.shape)}
+    return [effect.at(shape) for shape in sorted(shapes)]
+
+
+def reach(grid: Sequence[float]) -> tuple[float, float]:
+    """Between which shapes an effect is what its name says: as far beyond each end of its grid as
+    the next shape is before it. A wave much longer than all ranges would stand for any curve."""
+    if len(grid) < 2:
+        return 0.0, np.inf
+    return grid[0] ** 2 / grid[1], grid[-1] ** 2 / grid[-2]

@@ -39,6 +39,7 @@ JUDGING_NUMBERS = 2**25
 # larger by 2 k^2 / n, as the share of each stop in the information is known less well.
 DRAWN_NUMBERS = 2**26
 FEWEST_DRAWN = 1024
+NONE = np.zeros(0, int)  # the stops, or places, of no clusters
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,8 @@ class Linear:
         weight_m2: sum of the beams' weights over their variances [1/m2]; without beams that of the
             tracked positions.
         whole: the linearisation that these are made of.
+
+    Where nothing more is to be judged, `raw` and `whole` are None, and there are no clusters.
     """
 
     candidates: tuple[str, ...]
@@ -71,7 +74,7 @@ class Linear:
     at: Mapping[str, np.ndarray]
     columns: Mapping[str, slice]
     information: np.ndarray
-    raw: np.ndarray
+    raw: np.ndarray | None
     gradient: csr_array
     score: np.ndarray
     others: Sequence[ClusteredRows]
@@ -79,11 +82,17 @@ class Linear:
     place: np.ndarray
     places: dict[object, int]
     weight_m2: float
-    whole: Linearisation
+    whole: Linearisation | None
 
     def among(self, names: Sequence[str]) -> np.ndarray:
         """Columns of some unknowns among the S, in the order given."""
         return np.concatenate([self.at[name] for name in names])
+
+    def thinned(self) -> Linear:
+        """Without all that only judging needs."""
+        return replace(
+            self, raw=None, gradient=self.gradient[:0], others=(), stop=NONE, place=NONE, whole=None
+        )
 
 
 def rows_along(
@@ -194,7 +203,7 @@ def linearise_with(
         place=place,
         places=gradients.places,
         weight_m2=linear.weight_m2 or sum(len(b.measured) / b.sigma_m**2 for b in wide.bodies),
-        whole=replace(linear, raw=None),  # here already
+        whole=replace(linear, raw=None, layout=replace(layout, bodies=(), others=())),  # all here
     )
 
 

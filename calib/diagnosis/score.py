@@ -20,7 +20,7 @@ from scipy.sparse import csr_array, vstack
 from calib.blunders.chance import at_least, enough, log_tail
 from calib.diagnosis.jackknife import ScoreSpread, by_signs
 from calib.diagnosis.judges import Shares
-from calib.diagnosis.linear import Linear
+from calib.diagnosis.linear import NONE, Linear
 from calib.linear.clusters import add_product, summed
 from calib.problem.unknowns import Owner
 
@@ -56,6 +56,10 @@ class Scores:
     place: np.ndarray
     weight_m2: float
     spent: int = 0
+
+    def thinned(self) -> Scores:
+        """The same without clusters, of which nothing more is asked."""
+        return replace(self, cells=self.cells[:0].copy(), stop=NONE, place=NONE)
 
     @cached_property
     def by_stop(self) -> np.ndarray:

@@ -12,7 +12,7 @@ import numpy as np
 
 from calib import problem as problems
 from calib.blunders.judged import Blunder, judge
-from calib.diagnosis.candidates import covariates, known_effects, structure
+from calib.diagnosis.candidates import covariates, finer, known_effects, reach, structure
 from calib.diagnosis.chance import Chance, chances, of_lidar, ranked, rows_by_chance
 from calib.diagnosis.judges import Shares
 from calib.diagnosis.linear import Linear, linearise_with, rows_along
@@ -33,7 +33,6 @@ from calib.solve.estimate import DOFS, SEEN, Estimate, Start
 from calib.solve.fit import Progress, shapes_freed, solve
 from chains.errors import InputError
 
-FINER = 9  # shapes tried between the two beside the best one
 # Squared sigmas by which another shape must fit better: three sigmas of one parameter, 0.3 % by
 # chance.
 BETTER_SHAPE = 9.0
@@ -192,7 +191,9 @@ class Stand:
             found = score_test(scores, at[step.name])
             if found.dof and found.statistic > BETTER_SHAPE:
                 by = np.exp(np.clip(found.estimate()[0], -LARGEST_SHAPE_STEP, LARGEST_SHAPE_STEP))
-                swapped[effect.name] = effect.at(float(f"{effect.shape * by:.6g}"))
+                ends = reach(shapes_of(effect, self.sources))
+                shape = float(f"{np.clip(effect.shape * by, *ends):.6g}")
+                swapped |= {effect.name: effect.at(shape)} if shape != effect.shape else {}
         return swapped
 
     def _state_with(self, swapped: Mapping[str, Effect]) -> dict[str, np.ndarray]:
@@ -285,6 +286,15 @@ class Look:
     by_rows: Sequence[Scatter]
     columns: frozenset[str]
 
+    def thinned(self) -> Look:
+        """What is asked of a look that a search has left behind: what its tests said, and what its
+        candidates would change. None of them can be judged with it."""
+        scores = self.named.scores.thinned()
+        screens = (replace(s, scores=scores) for s in (self.named, self.unnamed, self.noise))
+        named, unnamed, noise = screens
+        thin = self.linear.thinned()
+        return replace(self, linear=thin, named=named, unnamed=unnamed, noise=noise)
+
     @cached_property
     def fitted(self) -> Linearisation:
         """The rows, linearised, over the unknowns of the fit alone."""
@@ -359,16 +369,6 @@ class Look:
         for rows in rows_along(self.linear, wide, stand.estimate, away, tell):
             shares.add(rows.A, rows.stop, rows.place)
         return found.judged(shares, self.named.scores)
-
-
-def finer(effect: Effect, grid: Sequence[float]) -> list[Effect]:
-    """An effect in finer shapes between those of a grid beside its own, which is one of them."""
-    i = grid.index(effect.shape)
-    ends = grid[max(0, i - 1)], grid[min(len(grid) - 1, i + 1)]
-    spaced = (np.geomspace if ends[0] > 0 else np.linspace)(*ends, FINER)
-    spaced = np.rint(spaced) if effect.whole else spaced
-    shapes = {float(f"{shape:.6g}") for shape in (*spaced, effect.shape)}
-    return [effect.at(shape) for shape in sorted(shapes)]
 
 
 def tried(fit: Callable[..., Stand], *of: Any) -> Stand | None:

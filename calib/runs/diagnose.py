@@ -122,12 +122,14 @@ def _answer(
     run: Run, stand: Stand, found: Search, refits: bool, progress: Progress
 ) -> tuple[Search, Mapping[str, Fall], Unnamed, Rejects | None]:
     """A search as stops that were held out have it, and what is asked after it: how the error of
-    these falls with each name, formulas of what the names leave, and what was rejected; arguments
-    as of `diagnose`."""
+    these falls with each name, formulas of what the names leave, and what is rejected beside them;
+    arguments as of `diagnose`."""
     rejected = rejects(found.looks[0].stand, progress) if run.converged else None
+    if found.found and rejected and not rejected.explained:
+        rejected = rejects(found.looks[-1].stand, progress)
     falls = _falls(found, stand, run, progress) if refits else {}
     unseen = partial(_unseen, run=run, progress=progress) if refits else None
-    doubtful = not believed(found, falls)
+    doubtful = not believed(found, falls) or (rejected is not None and not rejected.explained)
     formulas = unnamed(found, falls, doubtful, unseen, progress) if run.converged else Unnamed()
     known = by_name(found, formulas, unseen, progress) if unseen else None
     if known and believed(*known) and weighed(*known, run.summary["rms_mm"]).found.found:

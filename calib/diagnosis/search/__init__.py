@@ -124,6 +124,22 @@ def in_place(
 Steps = tuple[list[Look], list[NamedEffect], list[LeftOut]]
 
 
+def _left_behind(
+    looks: Sequence[Look], found: Sequence[NamedEffect]
+) -> tuple[list[Look], list[NamedEffect]]:
+    """Looks, and what was found at them; all but the first and the last are thinned, as each holds
+    far more than a fit."""
+    now = {id(look): look for look in (looks[0], looks[-1])}
+
+    def of(look: Look) -> Look:
+        if id(look) not in now:
+            now[id(look)] = look.thinned()
+        return now[id(look)]
+
+    steps = [replace(s, before=of(s.before), after=of(s.after)) for s in found]
+    return [of(each) for each in looks], steps
+
+
 def search(stand: Stand, progress: Progress, most: int = MOST_NEEDED) -> Search:
     """Name what is missing, one effect after another, then ask whether that is all.
 
@@ -153,7 +169,7 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NEEDED) -> Search:
         if widens:
             look, left = restored(stand, beside.look(progress), left, progress)
             look, found = _outlasting(look, found, progress)
-            looks = [*looks, look]
+            looks, found = _left_behind([*looks, look], found)
         else:
             looks, found, left = steps = _steps(beside, progress, most)
             if more := _in_place_of_chance(stand, plain[0][0], steps, progress, most):
@@ -263,17 +279,16 @@ def _steps(stand: Stand, progress: Progress, most: int, begun: Steps | None = No
         if len(found) < most and (more := _one_for_all(before, wild, found, progress)):
             del left[mishaps:]
             found, looks[-1] = more, before
-            looks.append(found[-1].after)
+            looks, found = _left_behind([*looks, found[-1].after], found)
             continue
         if begun is None and not found and _chance_leads(looks[-1]):
             break
         more = _named(looks[-1], found, progress) if len(found) < most else found
         if len(more) == len(found):
             break
-        found = more
-        looks.append(found[-1].after)
+        looks, found = _left_behind([*looks, more[-1].after], more)
     looks[-1], left = restored(first, looks[-1], left, progress) if found else (looks[-1], left)
-    return looks, found, left
+    return *_left_behind(looks, found), left
 
 
 def _chance_leads(look: Look) -> bool:

@@ -172,7 +172,8 @@ def conclude(
     calm = BAD if forbids else UNNAMED if doubt else "adequate"
     answer = hold and not formulas.needless
     verdict = BAD if blunders else _verdict(found, answer, more, bool(doubt), calm)
-    worn = _dressed_up(found, held_out, hold, formulas) if verdict == UNNAMED else []
+    doubted = verdict == UNNAMED or formulas.instead or formulas.needless
+    worn = _dressed_up(found, held_out, hold, formulas) if doubted else []
     candidates = candidate_documents(heavy, held_out, verdict == UNNAMED, worn)
     unexplained = _structure(found, verdict, formulas, rejected, doubt)
     untestable = _untestable(first)

@@ -75,7 +75,7 @@ def unnamed(
     Args:
         found: the search.
         falls: effect -> how the held-out error falls once it is fitted.
-        doubtful: whether its names leave much, so that one formula may explain more.
+        doubtful: whether its names leave much, or much that is rejected: a formula may do more.
         unseen: errors of a fit at stops that were held out; None if nobody is to look.
         progress: as of `fit.solve`.
     """
