@@ -6,8 +6,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from calib.diagnosis.candidates import reach
 from calib.diagnosis.search import nameless, search
+from calib.diagnosis.verdict.matters import Consequences
 from calib.effects import find
+from calib.problem.build import shapes_of
+from calib.problem.model import Model
 from calib.runs.calibrate import calibrate
 from calib.runs.diagnose import stand_of
 
@@ -50,6 +54,28 @@ def test_what_was_named_beside_chance_lets_others_take_its_place(tmp_path):
     assert names == ["label_range_offset", "optitrack_distortion", "warmup_drift"]
     assert done.found[-1].effect.shape == pytest.approx(400, rel=0.1)
     assert not done.chance and not done.unnamed
+    first, *between, last = done.looks
+    assert between and all(each.linear.whole is None for each in between)
+    assert not any(len(each.named.scores.cells) for each in between)
+    assert all(len(each.named.scores.cells) == len(each.linear.stop) > 0 for each in (first, last))
+    rms_mm = {"held_out": 5.0, "noise_floor": 3.0}
+    whole, thin = (
+        Consequences(look, rms_mm).of(done.found[0].candidate, look.named)
+        for look in (first, first.thinned())
+    )
+    assert thin == whole and whole.largest_shift_sigmas > 0
+
+
+def test_a_shape_stays_where_the_name_means_what_it_says(tmp_path):
+    """What fades with range over 9 m is nearly a line where all ranges are shorter: not near."""
+    made(tmp_path / "rec", "tiny", 1, **{"near_range_bias@9": 5.0})
+    effects = ("arm_link_length", "arm_joint_offset", "ring_range_offset", "near_range_bias@2")
+    run = calibrate([tmp_path / "rec"], tmp_path / "run", Model(effects), "none")
+    stand, swapped = stand_of(run, quiet).retuned(["near_range_bias@2"], quiet)
+    grid = shapes_of(find("near_range_bias"), stand.sources)
+    (low, high), found = reach(grid), swapped["near_range_bias@2"]
+    assert found.shape == pytest.approx(high, rel=1e-5) and found.name in stand.model.names
+    assert low < grid[0] and high / grid[-1] == pytest.approx(grid[-1] / grid[-2])
 
 
 def test_a_drift_that_another_effect_covers_is_no_scatter_of_stops(tmp_path):

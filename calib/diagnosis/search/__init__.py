@@ -312,7 +312,7 @@ def _in_place_of_chance(
     if bare is None:
         return None
     looks, more, left = _steps(bare, progress, most, begun=([bare.look(progress)], found, left))
-    steps = [first, *looks], more, left
+    steps = *_left_behind([first, *looks], more), left
     return steps if len(more) > len(found) and _explain_all(steps, progress) else None
 
 
