@@ -9,8 +9,10 @@ from calib.problem.model import Model
 from calib.runs.calibrate import calibrate
 from calib.runs.diagnose import diagnose
 from calib.runs.run import Run
+from sensors.recording import read_table, write_table
 
 from ..test_examples import of_a_ur10
+from ..thinned import thinned
 from . import foreign
 
 
@@ -51,6 +53,25 @@ def test_a_base_that_creeps_is_what_creeps(shared, tmp_path):
     hidden = 0.0008 / (299 * 20 / 3600)
     assert abs(per_h - hidden) < 3 * sigma and sigma < hidden / 5
     assert grown.summary["rms_mm"]["held_out"] < 0.5 * run.summary["rms_mm"]["held_out"]
+
+
+def test_dark_beams_that_were_rejected_are_no_matter_of_what_paint_they_hit(shared, tmp_path):
+    """Paints differ in how dark they are: an offset by paint takes in most of a step of 48 mm, and
+    the dark beams of bright paints are rejected beside it."""
+    thinned(shared / "recordings/mystery_b", tmp_path / "rec", 1, 8)
+    for path in (tmp_path / "rec/scans").iterdir():
+        table = read_table(path)
+        xyz = np.stack([table[axis] for axis in "xyz"], axis=1).astype(float)
+        shorter = 0.048 * (table["intensity"] < 0.3)
+        xyz *= (1 - shorter / np.linalg.norm(xyz, axis=1))[:, None]
+        moved = {a: xyz[:, k].astype(np.float32) for k, a in enumerate("xyz")}
+        write_table(path, table | moved)
+    found = diagnose(calibrate([tmp_path / "rec"], tmp_path / "run"))
+    (structure,) = found.unexplained
+    (term,) = structure["terms"]
+    assert term["text"].startswith("intensity > 0.71")  # 0.3, over the median
+    assert abs(term["estimate"] - 0.048) < 4 * term["sigma"] < 0.002
+    assert not found.worth_adding and not found.blunders
 
 
 @pytest.mark.parametrize("kind", ["qt64", "ouster"])

@@ -89,10 +89,10 @@ def unnamed(
     by_location, curve = "location" in scatters, _of_one_curve(names)
     asked = unseen is not None and (curve or (names and doubtful and not moves))
     if asked and (formulas := find(first, progress, by_location)):
-        after = unseen(with_formulas(first, formulas, progress))
-        before, named = falls[names[0].name].before_mm, falls[names[-1].name].after_mm
-        better = doubtful and not moves and after.rms_mm < named - FALL_MATTERS * before
-        if better or (curve and _simpler(formulas, names, first, unseen(last), after)):
+        named, after = unseen(last), unseen(with_formulas(first, formulas, progress))
+        before = falls[names[0].name].before_mm
+        better = doubtful and not moves and _better(named, after, before)
+        if better or (curve and _simpler(formulas, names, first, named, after)):
             return Unnamed(formulas, True, (before, after.rms_mm))
     # Values by chance take in most of a structure that differs from stop to stop.
     there = set(last.model.names)
@@ -153,6 +153,15 @@ def _of_one_curve(names: Sequence[Effect]) -> bool:
     over = {frozenset(effect.covariates) for effect in names}
     of_range = all(e.site is Site.BEAM and "range = " in e.formula for e in names)
     return of_range and len(over) == 1 < len(names)
+
+
+def _better(named: Errors, after: Errors, before_mm: float) -> bool:
+    """Whether unseen stops are predicted better after formulas took the place of names, as far as
+    that matters, or far fewer of their beams are rejected; without either they are off by so
+    much."""
+    shares = named.rejected_share or 0.0, after.rejected_share or 0.0
+    fall = Fall(named.rms_mm, after.rms_mm, after.floor_mm, rejected_share=shares)
+    return fall.takes_back or after.rms_mm < named.rms_mm - FALL_MATTERS * before_mm
 
 
 def _simpler(
