@@ -18,9 +18,10 @@ from calib.diagnosis.rejects import Rejects, rejects
 from calib.diagnosis.search import Search, beside_formulas, nameless, search
 from calib.diagnosis.search.confirmed import structures
 from calib.diagnosis.stand import Look, Stand, tried
-from calib.diagnosis.verdict import ABSORBED_BY_MODEL, Diagnosis, believed, conclude
+from calib.diagnosis.verdict import ABSORBED_BY_MODEL, Diagnosis, conclude
 from calib.diagnosis.verdict.known import by_name
 from calib.diagnosis.verdict.matters import HELD_OUT_BY_CHANCE, borne_out, weighed
+from calib.diagnosis.verdict.names import believed
 from calib.diagnosis.verdict.unnamed import Unnamed, unnamed, with_formulas
 from calib.diagnosis.weak import group, to_be_planned, to_be_told_apart, weak_directions
 from calib.effects import own_effects
@@ -134,8 +135,9 @@ def _answer(
     known = by_name(found, formulas, unseen, progress) if unseen else None
     if known and believed(*known) and weighed(*known, run.summary["rms_mm"]).found.found:
         (found, falls), formulas = known, Unnamed()
-    if whole := with_formulas_and_names(stand, found, formulas, rejected, progress):
-        found, rejected = beside_formulas(found, whole, progress), rejects(whole, progress)
+    if fitted := with_formulas_and_names(stand, found, formulas, rejected, progress):
+        found = beside_formulas(found, fitted, formulas.whole, progress)
+        rejected = rejects(fitted, progress)
     again = _as_held_out(found, falls, formulas, run, progress)
     if len(again.found) < len(found.found):
         falls = _falls(again, stand, run, progress)
@@ -167,21 +169,21 @@ def _as_held_out(
     """
     structured = formulas.formulas or found.unnamed or found.at_first
     scatters = found.chance or any(e.by_chance for e in found.looks[-1].stand.model.effects)
-    if falls and scatters and not structured and not any(map(borne_out, falls.values())):
+    named = [falls[s.effect.name] for s in found.found if s.effect.name in falls]
+    if falls and scatters and not structured and not any(map(borne_out, named)):
         kept = weighed(found, falls, run.summary["rms_mm"]).found
         bare = found if believed(kept, falls) else nameless(found, progress)
         if not bare.found:
             return bare
-    rise = any(falls[s.effect.name].rises for s in found.found if s.effect.name in falls)
-    if rise and not found.at_first:
+    if any(fall.rises for fall in named) and not found.at_first:
         return replace(found, at_first=structures(found.looks[0], progress))
     return found
 
 
 def _falls(found: Search, stand: Stand, run: Run, progress: Progress) -> dict[str, Fall]:
     """How the held-out error falls with each name that was found, after those before it, or beside
-    all others where it rises after those; without any, with all that scatters by chance, where it
-    is larger than expected."""
+    all others where it rises after those; and with all that scatters by chance, beside names or
+    where it is larger than expected."""
     falls = {}
     before, each_m2 = run.summary["rms_mm"]["held_out"], run.unseen_m2
     if found.looks[0].stand is not stand and found.found:
@@ -201,8 +203,8 @@ def _falls(found: Search, stand: Stand, run: Run, progress: Progress) -> dict[st
             falls[name] = Fall(unseen.rms_mm, before, unseen.floor_mm, gain)
     last = found.looks[-1].stand
     scatter = [c.effect.name for c in found.chance if c.effect.name in last.model.names]
-    nothing = not found.found and not found.unnamed
-    if scatter and nothing and over_floor(run) > HELD_OUT_BY_CHANCE:
+    nothing = not found.unnamed and over_floor(run) > HELD_OUT_BY_CHANCE
+    if scatter and (found.found or nothing):
         # What scatters is in the expected error only once the model has it.
         unseen = _unseen(last, run, progress)
         falls[scatter[-1]] = Fall(before, unseen.rms_mm, unseen.floor_mm)

@@ -65,7 +65,8 @@ def test_scatter_is_judged_beside_a_formula_and_so_are_mishaps(stand):
     done = search(stand, quiet)
     assert {c.effect.name for c in done.chance} > {"stop_range_scatter"}
     formula = FormulaEffect.read(DARK, "dark.yaml", {})
-    beside = beside_formulas(done, stand.with_effects([formula], quiet), quiet)
+    fitted = stand.with_effects([formula], quiet)
+    beside = beside_formulas(done, fitted, True, quiet)
     (scatter,) = beside.chance
     assert scatter.effect.name == "stop_range_scatter"
     (spread,) = scatter.spreads

@@ -11,7 +11,7 @@ from scipy.stats import ttest_rel, wilcoxon
 from calib import add, diagnose, fit
 from calib.diagnosis.search import NamedEffect, Search
 from calib.diagnosis.stand import Stand
-from calib.diagnosis.verdict import _dressed_up, _over_the_expected, _unconfirmed, conclude
+from calib.diagnosis.verdict import _over_the_expected, _unconfirmed, conclude
 from calib.diagnosis.verdict.matters import (
     FALL_MATTERS,
     SHIFT_MATTERS,
@@ -20,6 +20,7 @@ from calib.diagnosis.verdict.matters import (
     borne_out,
     weighed,
 )
+from calib.diagnosis.verdict.names import believed, dressed_up
 from calib.diagnosis.verdict.unnamed import Unnamed
 from calib.effects import find
 from calib.problem import build
@@ -239,7 +240,7 @@ def test_a_name_stands_beside_a_larger_structure_of_what_it_leaves(look, formula
     falls = {name: Fall(9.0, after_mm, 2.0, (1.0, -1.0, 4.0))}
     assert falls[name].by_chance
     formulas = replace(formulas, needless=[name] * len(formulas.needless))
-    assert _dressed_up(found, falls, False, formulas) == ([] if told else [name])
+    assert dressed_up(found, falls, False, formulas) == ([] if told else [name])
 
 
 def test_a_needless_name_leaves_the_others(look):
@@ -250,7 +251,35 @@ def test_a_needless_name_leaves_the_others(look):
     falls = {one.effect.name: Fall(9.0, 3.0, 2.0), other.effect.name: Fall(3.0, 2.9, 2.0, (1, -1))}
     formulas = Unnamed(["a formula"], needless=[other.effect.name])
     for hold in (True, False):
-        assert _dressed_up(found, falls, hold, formulas) == [other.effect.name]
+        assert dressed_up(found, falls, hold, formulas) == [other.effect.name]
+
+
+SCATTER = SimpleNamespace(effect=SimpleNamespace(name="joint_scatter"))
+
+
+@pytest.mark.parametrize(
+    ("gain_m2", "floor_mm", "holds"),
+    [
+        ((1.0, 1.1, 0.9), 6.0, True),
+        ((1.0, 1.1, 0.9), 2.0, False),
+        ((1.0, -1.0, 4.0), 6.0, False),
+        ((1.0, 1.1, 0.9), None, False),
+    ],
+    ids=["scatter explains the rest", "it does not", "stops do not confirm it", "no scatter"],
+)
+def test_a_name_that_stops_confirm_holds_beside_scatter_that_explains_the_rest(
+    look, gain_m2, floor_mm, holds
+):
+    """It takes the error from 9 to 7 mm, which is far above the 2 mm of noise alone."""
+    best = max(look.named.candidates, key=lambda c: c.test.evidence(look.named.common))
+    strong = replace(best, test=replace(best.test, statistic=1e6))
+    fields = {"before": look, "after": look, "judged": best.test, "p_adjusted": 1e-3}
+    step = NamedEffect(candidate=strong, **fields, rivals=[])
+    found = Search([look], found=[step], blunders=(), unnamed=(), scatter=None, chance=[SCATTER])
+    falls = {best.effect.name: Fall(9.0, 7.0, 2.0, gain_m2)}
+    if floor_mm:
+        falls["joint_scatter"] = Fall(7.0, 7.0, floor_mm)
+    assert believed(found, falls) == holds
 
 
 @pytest.mark.parametrize(
@@ -270,7 +299,7 @@ def test_beside_scatter_names_that_leave_most_are_none(
     fields = {"before": look, "after": look, "judged": candidate.test, "p_adjusted": 1e-3}
     step = NamedEffect(candidate=candidate, **fields, rivals=[])
     found = Search([look], found=[step], blunders=(), unnamed=(), scatter=None)
-    found = replace(found, chance=[SimpleNamespace()] if scatters else ())
+    found = replace(found, chance=[SCATTER] if scatters else ())
     monkeypatch.setattr(runs, "nameless", lambda found, progress: replace(found, found=()))
     falls = {candidate.effect.name: Fall(9.0, after_mm, 2.0, gain_m2)}
     run = SimpleNamespace(summary={"rms_mm": {"held_out": 9.0, "fit": 2.0, "noise_floor": 2.0}})

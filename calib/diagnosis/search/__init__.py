@@ -81,8 +81,8 @@ class Search:
             the first of them is dressed up, or stops that were held out speak against it.
         chance: what scatters by chance beside all that was found, strongest first.
         unsettled: what scatters beside that, and with which no fit comes to an optimum.
-        beside: the last look at a fit with formulas of the structure, where blunders and scatter
-            were judged beside these; see `beside_formulas`.
+        beside: the last look at a fit with formulas of the structure, where scatter was judged
+            beside these; see `beside_formulas`.
     """
 
     looks: Sequence[Look]
@@ -235,7 +235,7 @@ def nameless(done: Search, progress: Progress) -> Search:
     )
 
 
-def beside_formulas(done: Search, stand: Stand, progress: Progress) -> Search:
+def beside_formulas(done: Search, stand: Stand, whole: bool, progress: Progress) -> Search:
     """A search whose blunders, and whose scatter by chance, are those beside its names and formulas
     of the structure that these leave: scatter and mishaps take in much of a structure that a model
     lacks. Its looks and its names stay: they are what the formulas were found beside.
@@ -243,6 +243,7 @@ def beside_formulas(done: Search, stand: Stand, progress: Progress) -> Search:
     Args:
         done: the search.
         stand: a fit with these names and formulas, of all rows.
+        whole: whether nothing but chance is left beside them; else no scatter is judged yet.
         progress: as of `fit.solve`.
     """
     again = search(stand, progress)
@@ -251,7 +252,7 @@ def beside_formulas(done: Search, stand: Stand, progress: Progress) -> Search:
         blunders=again.blunders,
         chance=again.chance,
         unsettled=again.unsettled,
-        beside=again.looks[-1],
+        beside=again.looks[-1] if whole else None,
     )
 
 

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-
 from calib.blunders import told
-from calib.blunders.chance import log_tail
 from calib.blunders.judged import Blunder, LeftOut
 from calib.blunders.reach import FurthestMoved
 from calib.diagnosis.candidates import PoseShape, concerned, lacking
 from calib.diagnosis.rejects import FEWEST_STOPS, Rejects
-from calib.diagnosis.screen import ODDS, Candidate, Screen
-from calib.diagnosis.search import Search, in_place
+from calib.diagnosis.screen import Candidate, Screen
+from calib.diagnosis.search import Search
 from calib.diagnosis.search.confirmed import ALPHA_UNNAMED, suspects
 from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import formula, hangs_on
@@ -25,9 +22,9 @@ from calib.diagnosis.verdict.matters import (
     ABSORBED,
     HELD_OUT_BESIDE_SCATTER,
     HELD_OUT_BY_CHANCE,
-    borne_out,
     weighed,
 )
+from calib.diagnosis.verdict.names import absorbed, believed, beside_scatter, dressed_up
 from calib.diagnosis.verdict.sentences import BAD, UNNAMED, sentences_of, stops_of, unconfirmed
 from calib.diagnosis.verdict.unnamed import Unnamed
 from calib.problem.model import labels
@@ -173,7 +170,7 @@ def conclude(
     answer = hold and not formulas.needless
     verdict = BAD if blunders else _verdict(found, answer, more, bool(doubt), calm)
     doubted = verdict == UNNAMED or formulas.instead or formulas.needless
-    worn = _dressed_up(found, held_out, hold, formulas) if doubted else []
+    worn = dressed_up(found, held_out, hold, formulas) if doubted else []
     candidates = candidate_documents(heavy, held_out, verdict == UNNAMED, worn)
     unexplained = _structure(found, verdict, formulas, rejected, doubt)
     untestable = _untestable(first)
@@ -223,8 +220,7 @@ def _over_the_expected(
 ) -> float:
     """The held-out error over the expected one, of the model with what scatters by chance; 0 where
     nothing was held out."""
-    falls = (held_out.get(each.effect.name) for each in reversed(found.chance))
-    if fall := next(filter(None, falls), None):
+    if fall := beside_scatter(found, held_out):
         return fall.after_mm / fall.floor_mm
     error, floor = rms_mm.get("held_out"), rms_mm["noise_floor"]
     unknown = error is None or not floor or found.chance
@@ -264,78 +260,8 @@ def _verdict(found: Search, hold: bool, more: bool, doubt: bool, calm: str) -> s
         if found.unnamed or more or (doubt and found.chance):
             return UNNAMED
         return "missing_effect" if found.chance else calm
-    named = hold and (not found.unnamed or _absorbed(found) > ABSORBED)
+    named = hold and (not found.unnamed or absorbed(found) > ABSORBED)
     return "missing_effect" if named else UNNAMED
-
-
-def believed(found: Search, held_out: Mapping[str, Fall]) -> bool:
-    """Whether the names that a search found are the answer; so they are where there are none.
-
-    Args:
-        found: the search.
-        held_out: as of `conclude`.
-    """
-    return _names_hold(found) and not _leave_most(found, held_out)
-
-
-def _dressed_up(
-    found: Search, held_out: Mapping[str, Fall], hold: bool, formulas: Unnamed
-) -> list[str]:
-    """Names that stand in for residual structure. Where formulas were found of what the names
-    leave, and stops held out bear out each name, only those do that predict nothing beside the
-    formulas: bins explain more than the others because they take in the rest as well.
-
-    Args:
-        found: the search.
-        held_out: as of `conclude`.
-        hold: whether its names are the answer.
-        formulas: of residual structure.
-    """
-    names = [step.effect.name for step in found.found]
-    rest = [name for name in names if name not in formulas.needless]
-    sure = all(name in held_out and borne_out(held_out[name]) for name in rest)
-    if sure and formulas.formulas and not formulas.instead:
-        return [name for name in names if name not in rest]
-    worn = (not hold or found.dressed_up(i) for i in range(len(names)))
-    return [n for n, each in zip(names, worn, strict=True) if each or n not in rest]
-
-
-def _leave_most(found: Search, held_out: Mapping[str, Fall]) -> bool:
-    """Whether the names leave most of the held-out error, where that is further above its floor
-    than chance puts it."""
-    falls = [held_out[s.effect.name] for s in found.found if s.effect.name in held_out]
-    if not falls or falls[-1].takes_back or not found.looks[0].stand.estimate.scans:
-        return False
-    whole = replace(falls[-1], before_mm=falls[0].before_mm)
-    return whole.after_mm > HELD_OUT_BY_CHANCE * whole.floor_mm and whole.explained < ABSORBED
-
-
-def _names_hold(found: Search) -> bool:
-    """Whether the names explain as much as a single residual structure, each at its price; so
-    they do where there are none.
-
-    A search may describe residual structure by several effects, each of which takes
-    a part of it; where a name is right, no bins do better.
-    """
-    if not found.found:
-        return True
-    common = found.looks[-1].named.common
-    tests = [step.candidate.test for step in found.found]
-    together = sum(t.statistic for t in tests), sum(t.dof for t in tests)
-    price = sum(np.log(step.candidate.looks) for step in found.found)
-    named = -log_tail(together[0] / common, together[1]) - price
-    structure = in_place(together[0], found.looks[0], found.looks[-1], common)
-    bins = (evidence - np.log(c.looks) for c, evidence in structure)
-    return named > max(bins, default=0.0) - ODDS
-
-
-def _absorbed(found: Search) -> float:
-    """Share of the structure seen at first that the named effects account for."""
-    before, after = (
-        max((c.test.statistic - c.test.dof for c in look.unnamed.candidates), default=0.0)
-        for look in (found.looks[0], found.looks[-1])
-    )
-    return 1.0 - max(after, 0.0) / max(before, after, 1e-9)
 
 
 def _without_a_name(found: Search, verdict: str) -> list[tuple[Screen, Candidate]]:

@@ -32,6 +32,7 @@ class Unnamed:
         instead: whether they take the place of the names, which predict unseen stops worse.
         fall_mm: the held-out error before and after all of them were fitted; None where nobody
             looked.
+        whole: whether the held-out error with them is what chance makes it.
         thrown: the share of the held-out beams without weight, before and after; None where that
             is not known.
         refused: a sentence, where held-out stops are predicted no better with them.
@@ -42,6 +43,7 @@ class Unnamed:
     formulas: Sequence[Formula] = ()
     instead: bool = False
     fall_mm: tuple[float, float] | None = None
+    whole: bool = False
     thrown: tuple[float, float] | None = None
     refused: str = ""
     fitted: Stand | None = field(default=None, repr=False, compare=False)
@@ -83,40 +85,71 @@ def unnamed(
     moves = leading is not None and isinstance(leading.effect, PoseShape)
     if moves and unseen is None:
         return Unnamed()
-    first, last = found.looks[0].stand, found.looks[-1].stand
     names = [step.effect for step in found.found]
     scatters = [c.effect.per for c in (*found.chance, found.unsettled) if c]
-    by_location, curve = "location" in scatters, _of_one_curve(names)
-    asked = unseen is not None and (curve or (names and doubtful and not moves))
-    if asked and (formulas := find(first, progress, by_location)):
-        named, after = unseen(last), unseen(with_formulas(first, formulas, progress))
-        before = falls[names[0].name].before_mm
-        better = doubtful and not moves and _better(named, after, before)
-        if better or (curve and _simpler(formulas, names, first, named, after)):
-            return Unnamed(formulas, True, (before, after.rms_mm))
-    # Values by chance take in most of a structure that differs from stop to stop.
-    there = set(last.model.names)
-    chance = [c.effect.name for c in found.chance if c.effect.name in there]
-    last = last.lacking(chance, progress) if chance else last
+    by_location, better = "location" in scatters, bool(names) and doubtful and not moves
+    asked = unseen is not None and (better or _of_one_curve(names))
+    if asked and (instead := _instead(found, falls, by_location, better, unseen, progress)):
+        return instead
+    last = _bare(found, -1, progress)
     formulas = find(last, progress, by_location)
     if not formulas or unseen is None:
         return Unnamed(formulas)
     fitted = with_formulas(last, formulas, progress)
     before, after = unseen(last), unseen(fitted)
     fall_mm = before.rms_mm, after.rms_mm
-    if moves and after.rms_mm > HELD_OUT_BY_CHANCE * after.floor_mm:
+    if moves and not _by_chance(after):
         return Unnamed()
     # A gross structure is rejected, not fitted: what falls then is the share of such beams.
     thrown = before.rejected_share or 0.0, after.rejected_share or 0.0
     fall = Fall(*fall_mm, after.floor_mm, rejected_share=thrown)
     if fall.takes_back or fall_mm[0] - fall_mm[1] > FALL_MATTERS * after.floor_mm:
         needless = _needless(_replaced(names, formulas), fitted, after, unseen, progress)
-        return Unnamed(formulas, False, fall_mm, thrown, fitted=fitted, needless=needless)
+        return Unnamed(
+            formulas=formulas,
+            fall_mm=fall_mm,
+            whole=_by_chance(after),
+            thrown=thrown,
+            fitted=fitted,
+            needless=needless,
+        )
     over = " and ".join(words(c) for c in formulas[0].covariates)
     return Unnamed(
         refused=f"A formula over {over} fits part of the residuals, but stops that were held out "
         f"are predicted no better with it ({fall_mm[0]:.2f} to {fall_mm[1]:.2f} mm)."
     )
+
+
+def _instead(
+    found: Search,
+    falls: Mapping[str, Fall],
+    by_location: bool,
+    better: bool,
+    unseen: Callable[[Stand], Errors],
+    progress: Progress,
+) -> Unnamed | None:
+    """Formulas in place of the names: simpler, where these are one curve, or, where that is asked,
+    `better`; None without. Other arguments as of `unnamed`."""
+    first, names = _bare(found, 0, progress), [step.effect for step in found.found]
+    if not (formulas := find(first, progress, by_location)):
+        return None
+    named = unseen(found.looks[-1].stand)
+    after = unseen(with_formulas(first, formulas, progress))
+    before_mm = falls[names[0].name].before_mm
+    better = better and _better(named, after, before_mm)
+    curve = _of_one_curve(names)
+    if not better and not (curve and _simpler(formulas, names, first, named, after)):
+        return None
+    fall_mm = before_mm, after.rms_mm
+    return Unnamed(formulas, instead=True, fall_mm=fall_mm, whole=_by_chance(after))
+
+
+def _bare(found: Search, look: int, progress: Progress) -> Stand:
+    """The fit of one look of a search, without the values by chance that it found: these take in
+    most of a structure that differs from stop to stop."""
+    stand = found.looks[look].stand
+    chance = [c.effect.name for c in found.chance if c.effect.name in stand.model.names]
+    return stand.lacking(chance, progress) if chance else stand
 
 
 def _replaced(names: Sequence[Effect], formulas: Sequence[Formula]) -> list[Effect]:
@@ -155,6 +188,11 @@ def _of_one_curve(names: Sequence[Effect]) -> bool:
     return of_range and len(over) == 1 < len(names)
 
 
+def _by_chance(errors: Errors) -> bool:
+    """Whether errors at unseen stops are no larger than chance makes them."""
+    return errors.rms_mm <= HELD_OUT_BY_CHANCE * errors.floor_mm
+
+
 def _better(named: Errors, after: Errors, before_mm: float) -> bool:
     """Whether unseen stops are predicted better after formulas took the place of names, as far as
     that matters, or far fewer of their beams are rejected; without either they are off by so
@@ -185,9 +223,8 @@ def _simpler(
         return False
     rigs = [source.rig for source in stand.sources]
     known = sum(max(len(e.params(rig)) for rig in rigs) + bool(e.shape_name) for e in names)
-    whole = after.rms_mm <= HELD_OUT_BY_CHANCE * after.floor_mm
     as_well = as_good(after, named.rms_mm, named.rejected_share or 0.0)
-    return formulas[0].constants < known and whole and as_well
+    return formulas[0].constants < known and _by_chance(after) and as_well
 
 
 def with_formulas(
