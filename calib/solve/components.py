@@ -32,7 +32,8 @@ PRECISE = {"ftol": 1e-15, "gtol": 1e-7}  # of twice a log-likelihood: sds to som
 LEAST_SD = 1e-3  # of the sd that a group starts from: what is smaller counts as none
 LARGEST_SD = 1e6  # times that: far from an optimum scores are of any size, and squares overflow
 DIRECTION_SEEN = 1e-9  # of the largest information, below which a direction of values is not seen
-GROWN = np.geomspace(1e-3, 1e4, 50) - 1.0  # of a variance: no less and no more is found at once
+# Of a variance; no less and no more is found at once. Joints read to 0.1 mrad may scatter by 1 rad.
+GROWN = np.geomspace(1e-3, 1e8, 78) - 1.0
 UNSEEN_REDUNDANCY = 1e-6  # of a redundancy: rounding of a covariance is some 1e-9 of it
 UNTOLD_ROWS = 1e-6  # rows: what fewer tell of a variance is nothing
 READINGS_TOGETHER = 400  # joint readings whose covariance is computed at once: bounds the memory
