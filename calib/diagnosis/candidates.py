@@ -309,6 +309,6 @@ def finer(effect: Effect, grid: Sequence[float]) -> list[Effect]:
 def reach(grid: Sequence[float]) -> tuple[float, float]:
     """Between which shapes an effect is what its name says: as far beyond each end of its grid as
     the next shape is before it. A wave much longer than all ranges would stand for any curve."""
-    if len(grid) < 2:
-        return 0.0, np.inf
+    if len(grid) < 2 or grid[0] <= 0:
+        return -np.inf, np.inf
     return grid[0] ** 2 / grid[1], grid[-1] ** 2 / grid[-2]

@@ -147,7 +147,7 @@ def project(linear: Linear, names: Sequence[str], spent: int = 0) -> Scores:
     return Scores(
         at=at,
         owner={name: linear.owner[name] for name in names},
-        score=shares[-1],
+        score=shares[-1].copy(),  # or the clusters would be kept with it
         information=_left(linear, theirs, model, taken),
         whole=linear.raw[np.ix_(theirs, theirs)],
         cells=shares[:-1],

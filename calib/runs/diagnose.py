@@ -125,22 +125,30 @@ def _answer(
     """A search as stops that were held out have it, and what is asked after it: how the error of
     these falls with each name, formulas of what the names leave, and what is rejected beside them;
     arguments as of `diagnose`."""
-    rejected = rejects(found.looks[0].stand, progress) if run.converged else None
-    if found.found and rejected and not rejected.explained:
-        rejected = rejects(found.looks[-1].stand, progress)
+    at_first = rejects(found.looks[0].stand, progress) if run.converged else None
+
+    def beside_names() -> Rejects | None:
+        settled = not found.found or at_first is None or at_first.explained
+        return at_first if settled else rejects(found.looks[-1].stand, progress)
+
+    rejected = beside_names()
     falls = _falls(found, stand, run, progress) if refits else {}
     unseen = partial(_unseen, run=run, progress=progress) if refits else None
     doubtful = not believed(found, falls) or (rejected is not None and not rejected.explained)
-    formulas = unnamed(found, falls, doubtful, unseen, progress) if run.converged else Unnamed()
+    formulas = unnamed(found, doubtful, unseen, progress) if run.converged else Unnamed()
     known = by_name(found, formulas, unseen, progress) if unseen else None
     if known and believed(*known) and weighed(*known, run.summary["rms_mm"]).found.found:
         (found, falls), formulas = known, Unnamed()
+        rejected = beside_names()
     if fitted := with_formulas_and_names(stand, found, formulas, rejected, progress):
         found = beside_formulas(found, fitted, formulas.whole, progress)
         rejected = rejects(fitted, progress)
+    elif formulas.instead:
+        rejected = at_first
     again = _as_held_out(found, falls, formulas, run, progress)
     if len(again.found) < len(found.found):
         falls = _falls(again, stand, run, progress)
+        rejected = rejected if again.found else at_first
     return again, falls, formulas, rejected
 
 
@@ -203,8 +211,8 @@ def _falls(found: Search, stand: Stand, run: Run, progress: Progress) -> dict[st
             falls[name] = Fall(unseen.rms_mm, before, unseen.floor_mm, gain)
     last = found.looks[-1].stand
     scatter = [c.effect.name for c in found.chance if c.effect.name in last.model.names]
-    nothing = not found.unnamed and over_floor(run) > HELD_OUT_BY_CHANCE
-    if scatter and (found.found or nothing):
+    alone = not found.unnamed and over_floor(run) > HELD_OUT_BY_CHANCE
+    if scatter and (found.found or alone):
         # What scatters is in the expected error only once the model has it.
         unseen = _unseen(last, run, progress)
         falls[scatter[-1]] = Fall(before, unseen.rms_mm, unseen.floor_mm)

@@ -73,7 +73,7 @@ def test_scatter_is_judged_beside_a_formula_and_so_are_mishaps(stand):
     assert abs(spread.sd - WORLD.stop_scatter_m) < 3 * spread.sigma < WORLD.stop_scatter_m
     assert {b.blunder.group.where for b in beside.blunders} == {"L00P03"}
     assert "dark" in beside.beside.stand.model.names
-    assert beside.looks == done.looks and beside.found == done.found
+    assert beside.looks is done.looks and beside.found is done.found and beside.scatter_judged
 
 
 @pytest.mark.parametrize("instead", [False, True])

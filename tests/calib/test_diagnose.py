@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from calib.diagnosis.verdict import _names_hold
+from calib.diagnosis.verdict.names import _names_hold
 from calib.diagnosis.verdict.sentences import rival_sentence
 from calib.runs.calibrate import calibrate, grow, grown_model
 from calib.runs.diagnose import diagnose

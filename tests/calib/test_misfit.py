@@ -23,6 +23,7 @@ from calib.results.misfit import (
 )
 from calib.runs.calibrate import calibrate
 from calib.show.comparison import print_comparison
+from calib.solve.components import Checks
 from calib.solve.fit import solve
 
 from . import broken, rigs
@@ -273,3 +274,10 @@ def test_bodies_and_targets_are_compared_the_worst_first(good, capsys):
     assert compared.index("target t19 20.00") < compared.index("target t08 9.00")
     assert "target t07" not in compared and "over sigma, tool" not in compared
     assert "more that are less" in compared and "in its sigmas, lidar" in compared
+
+
+@pytest.mark.parametrize("times", [1.5, 120.0, 3000.0])
+def test_rows_may_scatter_by_far_more_than_their_sigmas(times):
+    """An encoder said to read to 0.1 mrad, on a joint that slips by 12."""
+    grown = Checks.alone(times**2 * 300.0, 300.0).growth()
+    assert np.sqrt(1.0 + grown) == pytest.approx(times, rel=1e-3)

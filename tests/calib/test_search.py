@@ -56,7 +56,8 @@ def test_what_was_named_beside_chance_lets_others_take_its_place(tmp_path):
     assert not done.chance and not done.unnamed
     first, *between, last = done.looks
     assert between and all(each.linear.whole is None for each in between)
-    assert not any(len(each.named.scores.cells) for each in between)
+    thin = [each.named.scores for each in between]
+    assert all(not len(s.cells) and s.score.base is None for s in thin)
     assert all(len(each.named.scores.cells) == len(each.linear.stop) > 0 for each in (first, last))
     rms_mm = {"held_out": 5.0, "noise_floor": 3.0}
     whole, thin = (

@@ -81,8 +81,9 @@ class Search:
             the first of them is dressed up, or stops that were held out speak against it.
         chance: what scatters by chance beside all that was found, strongest first.
         unsettled: what scatters beside that, and with which no fit comes to an optimum.
-        beside: the last look at a fit with formulas of the structure, where scatter was judged
+        beside: the last look at a fit with formulas of the structure, where blunders were judged
             beside these; see `beside_formulas`.
+        scatter_judged: whether what scatters by chance was judged there, too.
     """
 
     looks: Sequence[Look]
@@ -94,6 +95,7 @@ class Search:
     chance: Sequence[Chance] = ()
     unsettled: Chance | None = None
     beside: Look | None = None
+    scatter_judged: bool = False
 
     def dressed_up(self, i: int) -> bool:
         """Whether residual structure would have explained more than the i-th name did."""
@@ -238,22 +240,20 @@ def nameless(done: Search, progress: Progress) -> Search:
 def beside_formulas(done: Search, stand: Stand, whole: bool, progress: Progress) -> Search:
     """A search whose blunders, and whose scatter by chance, are those beside its names and formulas
     of the structure that these leave: scatter and mishaps take in much of a structure that a model
-    lacks. Its looks and its names stay: they are what the formulas were found beside.
+    lacks. Its looks and its names stay: they are what the formulas were found beside. Where more
+    is missing beside them, scatter stays to be judged.
 
     Args:
         done: the search.
         stand: a fit with these names and formulas, of all rows.
-        whole: whether nothing but chance is left beside them; else no scatter is judged yet.
+        whole: whether stops held out are predicted as well as chance lets them beside these.
         progress: as of `fit.solve`.
     """
     again = search(stand, progress)
-    return replace(
-        done,
-        blunders=again.blunders,
-        chance=again.chance,
-        unsettled=again.unsettled,
-        beside=again.looks[-1] if whole else None,
-    )
+    done = replace(done, blunders=again.blunders, beside=again.looks[-1])
+    if not whole or again.found:
+        return done
+    return replace(done, chance=again.chance, unsettled=again.unsettled, scatter_judged=True)
 
 
 def _without_chance(done: Search, steps: Steps, progress: Progress) -> Search:

@@ -169,13 +169,16 @@ def conclude(
     calm = BAD if forbids else UNNAMED if doubt else "adequate"
     answer = hold and not formulas.needless
     verdict = BAD if blunders else _verdict(found, answer, more, bool(doubt), calm)
-    doubted = verdict == UNNAMED or formulas.instead or formulas.needless
-    worn = dressed_up(found, held_out, hold, formulas) if doubted else []
-    candidates = candidate_documents(heavy, held_out, verdict == UNNAMED, worn)
+    worn = list(formulas.needless)
+    if verdict == UNNAMED or formulas.instead:
+        worn = dressed_up(found, held_out, hold, formulas)
+    deferred = not found.scatter_judged and (verdict == UNNAMED or bool(formulas.formulas))
+    candidates = candidate_documents(heavy, held_out, deferred, worn)
     unexplained = _structure(found, verdict, formulas, rejected, doubt)
     untestable = _untestable(first)
     unsure = unconfirmed(doubt, over) if doubt else ""
-    sentences = sentences_of(verdict, heavy, candidates, unexplained, untestable, blunders, unsure)
+    told_of = verdict, heavy, candidates, unexplained, untestable, blunders
+    sentences = sentences_of(*told_of, deferred=deferred, doubt=unsure)
     _caution(sentences, verdict, formulas, rejected, () if blunders else forbids)
     return Diagnosis(
         verdict=verdict,

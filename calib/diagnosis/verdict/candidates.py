@@ -26,7 +26,7 @@ ALIKE = (
 def candidate_documents(
     heavy: Weighed,
     held_out: Mapping[str, Fall],
-    unnamed: bool,
+    deferred: bool,
     worn: Sequence[str],
 ) -> list[dict[str, Any]]:
     """All of them, those first that were confirmed.
@@ -34,7 +34,7 @@ def candidate_documents(
     Args:
         heavy: what of the search matters.
         held_out: as of `conclude`.
-        unnamed: whether residual structure is left.
+        deferred: whether scatter by chance is to be judged once structure is in the model.
         worn: names that stand in for it.
     """
     found = heavy.found
@@ -45,10 +45,10 @@ def candidate_documents(
         each["dressed_up"] = bool(each["step"]) and each["add"] in worn
     # Residual structure may be random scatter: that is judged once it is in the model.
     chance = [
-        each.document(None if unnamed and found.beside is None else named + i)
-        for i, each in enumerate(found.chance, 1)
+        each.document(None if deferred else named + i) for i, each in enumerate(found.chance, 1)
     ]
-    others = [each.document(None) for each in (found.beside or found.looks[-1]).chance]
+    beside = found.beside if found.scatter_judged else found.looks[-1]
+    others = [each.document(None) for each in beside.chance]
     return [*out[:named], *chance, *out[named:], *others]
 
 

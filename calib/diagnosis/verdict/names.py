@@ -32,7 +32,7 @@ def believed(found: Search, held_out: Mapping[str, Fall]) -> bool:
 
 def _leave_most(found: Search, held_out: Mapping[str, Fall]) -> bool:
     """Whether the names leave most of the held-out error, where that is further above its floor
-    than chance puts it, and than what scatters beside them does if stops confirm each of them."""
+    than chance puts it; not where stops confirm each name and scatter explains the rest."""
     falls = [held_out[s.effect.name] for s in found.found if s.effect.name in held_out]
     if not falls or falls[-1].takes_back or not found.looks[0].stand.estimate.scans:
         return False

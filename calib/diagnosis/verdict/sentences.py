@@ -34,10 +34,11 @@ def sentences_of(
     unexplained: Sequence[Mapping[str, Any]],
     untestable: Mapping[str, str],
     blunders: Sequence[Mapping[str, Any]],
+    deferred: bool = False,
     doubt: str = "",
 ) -> list[str]:
     """The finding in words, the verdict first; arguments as `conclude` has made them, `doubt` being
-    what is said of structure that nothing confirms."""
+    what is said of structure that nothing confirms, and `deferred` as of `candidate_documents`."""
     found, traces = heavy.found, heavy.traces
     look = found.looks[0]
     residual = _residual(look)
@@ -50,7 +51,7 @@ def sentences_of(
         candidate = next(c for c in candidates if c["add"] == step.effect.name)
         if not (formulas and candidate["dressed_up"]):  # what was tried before is of no use then
             out += _step_sentences(step, candidate, found.dressed_up(i))
-    if verdict == UNNAMED and found.chance and found.beside is None:
+    if deferred and found.chance:
         beside = ", ".join(each.effect.name for each in found.chance)
         out.append(f"Random scatter ({beside}) is judged once that structure is in the model.")
     else:

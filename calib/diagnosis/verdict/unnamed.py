@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,7 +17,7 @@ from calib.diagnosis.verdict.matters import FALL_MATTERS, HELD_OUT_BY_CHANCE, as
 from calib.effects import Effect, Site
 from calib.effects.own.formula import FormulaEffect
 from calib.results.errors import Errors
-from calib.results.holdout import Fall
+from calib.results.holdout import TAKEN_BACK, Fall
 from calib.solve.fit import Progress
 
 MOST_ALIKE = 3  # other forms that are listed
@@ -29,7 +29,7 @@ class Unnamed:
 
     Args:
         formulas: strongest first.
-        instead: whether they take the place of the names, which predict unseen stops worse.
+        instead: whether they take the place of the names, as `unnamed` has it.
         fall_mm: the held-out error before and after all of them were fitted; None where nobody
             looked.
         whole: whether the held-out error with them is what chance makes it.
@@ -61,22 +61,20 @@ class Unnamed:
 
 def unnamed(
     found: Search,
-    falls: Mapping[str, Fall],
     doubtful: bool,
     unseen: Callable[[Stand], Errors] | None,
     progress: Progress,
 ) -> Unnamed:
     """Look for formulas of what a search left: of the ranges, or of a joint where there are none.
 
-    One takes the place of doubtful names if it predicts unseen stops better; and of several that
-    are functions of the same covariates of the range, which may make up any curve, if it predicts
-    them as well with fewer constants. Where something seems to move, a formula takes the place of
-    that only if nothing is left beside it: an error of the range that follows azimuth looks much
-    like a motion, and a motion like it.
+    One takes the place of doubtful names if it predicts unseen stops better, or rejects far fewer
+    of their beams; and of several that are functions of the same covariates of the range, which may
+    make up any curve, if it predicts them as well with fewer constants. Where something seems to
+    move, a formula takes the place of that only if nothing is left beside it: an error of the range
+    that follows azimuth looks much like a motion, and a motion like it.
 
     Args:
         found: the search.
-        falls: effect -> how the held-out error falls once it is fitted.
         doubtful: whether its names leave much, or much that is rejected: a formula may do more.
         unseen: errors of a fit at stops that were held out; None if nobody is to look.
         progress: as of `fit.solve`.
@@ -89,9 +87,9 @@ def unnamed(
     scatters = [c.effect.per for c in (*found.chance, found.unsettled) if c]
     by_location, better = "location" in scatters, bool(names) and doubtful and not moves
     asked = unseen is not None and (better or _of_one_curve(names))
-    if asked and (instead := _instead(found, falls, by_location, better, unseen, progress)):
+    if asked and (instead := _instead(found, by_location, better, unseen, progress)):
         return instead
-    last = _bare(found, -1, progress)
+    last = _bare(found, (), progress)
     formulas = find(last, progress, by_location)
     if not formulas or unseen is None:
         return Unnamed(formulas)
@@ -101,7 +99,7 @@ def unnamed(
     if moves and not _by_chance(after):
         return Unnamed()
     # A gross structure is rejected, not fitted: what falls then is the share of such beams.
-    thrown = before.rejected_share or 0.0, after.rejected_share or 0.0
+    thrown = _thrown(before, after)
     fall = Fall(*fall_mm, after.floor_mm, rejected_share=thrown)
     if fall.takes_back or fall_mm[0] - fall_mm[1] > FALL_MATTERS * after.floor_mm:
         needless = _needless(_replaced(names, formulas), fitted, after, unseen, progress)
@@ -122,7 +120,6 @@ def unnamed(
 
 def _instead(
     found: Search,
-    falls: Mapping[str, Fall],
     by_location: bool,
     better: bool,
     unseen: Callable[[Stand], Errors],
@@ -130,26 +127,32 @@ def _instead(
 ) -> Unnamed | None:
     """Formulas in place of the names: simpler, where these are one curve, or, where that is asked,
     `better`; None without. Other arguments as of `unnamed`."""
-    first, names = _bare(found, 0, progress), [step.effect for step in found.found]
-    if not (formulas := find(first, progress, by_location)):
+    names = [step.effect for step in found.found]
+    less = tried(_bare, found, [effect.name for effect in names], progress)
+    formulas = find(less, progress, by_location) if less else []
+    fitted = tried(with_formulas, less, formulas, progress) if formulas else None
+    if fitted is None:
         return None
-    named = unseen(found.looks[-1].stand)
-    after = unseen(with_formulas(first, formulas, progress))
-    before_mm = falls[names[0].name].before_mm
-    better = better and _better(named, after, before_mm)
+    before, named, after = map(unseen, (less, found.looks[-1].stand, fitted))
+    better = better and _better(before, named, after)
     curve = _of_one_curve(names)
-    if not better and not (curve and _simpler(formulas, names, first, named, after)):
+    if not better and not (curve and _simpler(formulas, names, less, named, after)):
         return None
-    fall_mm = before_mm, after.rms_mm
-    return Unnamed(formulas, instead=True, fall_mm=fall_mm, whole=_by_chance(after))
+    return Unnamed(
+        formulas=formulas,
+        instead=True,
+        fall_mm=(before.rms_mm, after.rms_mm),
+        whole=_by_chance(after),
+        thrown=_thrown(before, after),
+    )
 
 
-def _bare(found: Search, look: int, progress: Progress) -> Stand:
-    """The fit of one look of a search, without the values by chance that it found: these take in
-    most of a structure that differs from stop to stop."""
-    stand = found.looks[look].stand
-    chance = [c.effect.name for c in found.chance if c.effect.name in stand.model.names]
-    return stand.lacking(chance, progress) if chance else stand
+def _bare(found: Search, names: Sequence[str], progress: Progress) -> Stand:
+    """The last fit of a search without some names, and without the values by chance that it found:
+    these take in most of a structure that differs from stop to stop."""
+    stand = found.looks[-1].stand
+    gone = [*names, *(c.effect.name for c in found.chance if c.effect.name in stand.model.names)]
+    return stand.lacking(gone, progress) if gone else stand
 
 
 def _replaced(names: Sequence[Effect], formulas: Sequence[Formula]) -> list[Effect]:
@@ -193,13 +196,19 @@ def _by_chance(errors: Errors) -> bool:
     return errors.rms_mm <= HELD_OUT_BY_CHANCE * errors.floor_mm
 
 
-def _better(named: Errors, after: Errors, before_mm: float) -> bool:
-    """Whether unseen stops are predicted better after formulas took the place of names, as far as
-    that matters, or far fewer of their beams are rejected; without either they are off by so
-    much."""
-    shares = named.rejected_share or 0.0, after.rejected_share or 0.0
-    fall = Fall(named.rms_mm, after.rms_mm, after.floor_mm, rejected_share=shares)
-    return fall.takes_back or after.rms_mm < named.rms_mm - FALL_MATTERS * before_mm
+def _thrown(before: Errors, after: Errors) -> tuple[float, float]:
+    """Shares of unseen beams that are rejected."""
+    return before.rejected_share or 0.0, after.rejected_share or 0.0
+
+
+def _better(before: Errors, named: Errors, after: Errors) -> bool:
+    """Whether unseen stops are predicted better after formulas took the place of names, by as much
+    as matters, and no more beams are rejected; or far fewer are, and these fit."""
+    now, then = _thrown(named, after)
+    if now - then > TAKEN_BACK:
+        return _by_chance(after) or after.rms_mm <= named.rms_mm
+    falls = after.rms_mm < named.rms_mm - FALL_MATTERS * before.rms_mm
+    return falls and then - now <= TAKEN_BACK
 
 
 def _simpler(

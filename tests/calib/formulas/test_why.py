@@ -10,7 +10,6 @@ from calib.diagnosis.formulas.why import ARM_JOINT, MECHANISMS, OF_ARM, WHY_JOIN
 from calib.diagnosis.verdict import unnamed as module
 from calib.diagnosis.verdict.unnamed import unnamed
 from calib.effects import CATALOGUE, Site
-from calib.results.holdout import Fall
 
 KNOWN = sorted({c for e in CATALOGUE if e.site is Site.BEAM for c in e.covariates})
 
@@ -87,9 +86,18 @@ class World:
             there are none.
     """
 
-    def __init__(self, monkeypatch, names=0, first=None, last=None, over=None, constants=1):
+    def __init__(
+        self, monkeypatch, names=0, first=None, last=None, over=None, constants=1, unit="m"
+    ):
         known = {"model": SimpleNamespace(names=()), "sources": [SimpleNamespace(rig=None)]}
         self.stands = [SimpleNamespace(estimate=i, **known) for i in range(names + 1)]
+        every = [f"effect_{i}" for i in range(names)]
+
+        def lacking(gone, progress):
+            assert list(gone) == every
+            return self.stands[0]
+
+        self.stands[-1].lacking = lacking
         found = [SimpleNamespace(effect=effect(i, over or f"column_{i}")) for i in range(names)]
         self.search = SimpleNamespace(
             looks=[SimpleNamespace(stand=s) for s in self.stands],
@@ -99,7 +107,6 @@ class World:
             at_first=(),
             unnamed=(),
         )
-        self.falls = {f"effect_{i}": Fall(4.0 - 0.5 * i, 3.5 - 0.5 * i, 0.0) for i in range(names)}
         after = {0: first, names: last} if names else {0: last}
         self.asked = []
 
@@ -107,7 +114,7 @@ class World:
             self.asked.append(stand.estimate)
             self.by_location = by_location
             error = after[stand.estimate]
-            formula = {"covariates": ("wind",), "constants": constants}
+            formula = {"covariates": ("wind",), "constants": constants, "unit": unit}
             return [] if error is None else [SimpleNamespace(**formula, after=error)]
 
         monkeypatch.setattr(module, "find", find)
@@ -118,9 +125,7 @@ class World:
             rms = 4.0 - 0.5 * stand.estimate if stand in self.stands else stand
             return SimpleNamespace(rms_mm=rms, floor_mm=FLOOR, rejected_share=0.0)
 
-        return unnamed(
-            self.search, self.falls, doubtful, unseen if looks else None, lambda *_: None
-        )
+        return unnamed(self.search, doubtful, unseen if looks else None, lambda *_: None)
 
 
 def test_a_formula_beside_no_name_is_told_with_what_it_gains(monkeypatch):
@@ -239,8 +244,35 @@ def test_formulas_are_judged_by_location_where_locations_scatter(monkeypatch, se
     assert world.by_location == (per == "location")
 
 
-@pytest.mark.parametrize(("over", "needless"), [("wind", ["effect_1"]), ("rain", [])])
-def test_names_of_its_covariates_are_asked_for_beside_a_formula(monkeypatch, over, needless):
-    """Without the first name the error is 0.5 mm larger, without the second 0.01."""
-    found = World(monkeypatch, names=2, last=2.5, over=over).unnamed()
+@pytest.mark.parametrize(
+    ("over", "unit", "needless"),
+    [("wind", "m", ["effect_1"]), ("rain", "m", ["effect_1"]), ("rain", "rad", [])],
+)
+def test_names_that_it_may_replace_are_asked_for_beside_a_formula(
+    monkeypatch, over, unit, needless
+):
+    """The error is 0.5 mm larger without the first name, 0.01 without the second, both of beams;
+    a formula of a joint takes the place of what depends on its covariates alone."""
+    found = World(monkeypatch, names=2, last=2.5, over=over, unit=unit).unnamed()
     assert found.formulas and found.needless == needless
+
+
+@pytest.mark.parametrize(
+    ("named", "after", "better"),
+    [
+        ((3.0, 0.05), (3.1, 0.004), False),
+        ((3.0, 0.05), (2.4, 0.004), True),
+        ((2.1, 0.05), (2.4, 0.004), True),
+        ((3.0, 0.004), (2.4, 0.05), False),
+        ((3.0, 0.004), (2.4, 0.004), True),
+        ((2.41, 0.004), (2.4, 0.004), False),
+    ],
+    ids=["worse, of more", "of more", "by chance, of more", "of fewer", "of as many", "no better"],
+)
+def test_errors_are_compared_by_how_many_beams_they_are_of(named, after, better):
+    """In mm, where 2 are expected, and the share of beams that were rejected."""
+    before, *both = (
+        SimpleNamespace(rms_mm=rms_mm, floor_mm=FLOOR, rejected_share=share)
+        for rms_mm, share in ((4.0, 0.1), named, after)
+    )
+    assert module._better(before, *both) == better
