@@ -185,7 +185,8 @@ def _estimate(found: Search, effect: Effect, truth: dict[str, Any]) -> dict[str,
     step = next((s for s in found.found if s.effect.name == effect.name), None)
     if step is None:
         return None
-    stand, look = step.after.stand, step.after
+    stand = step.after.stand
+    look = stand.look(silent)  # that of the step may have been left behind
     term = next(t for t in stand.problem.terms[0] if t.effect.name == effect.name)
     theta = np.array(truth["effects"][effect.name])[term.free]
     told, sigma = stand.sigma(effect), stand.problem.variables[term.variable].sigma
