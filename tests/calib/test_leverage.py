@@ -9,6 +9,7 @@ from calib.diagnosis.score import project, score_test
 from calib.diagnosis.stand import Stand
 from calib.effects import GEOMETRY, find
 from calib.linear.clusters import Gradients
+from calib.linear.layout import Layout
 from calib.linear.linearise import own_rows
 from calib.problem.model import Model, Source
 from calib.solve.fit import solve
@@ -48,7 +49,7 @@ def fitted(folder):
 def test_a_stop_grows_by_its_part_of_the_hat_matrix(tmp_path, make):
     stand = fitted(make(tmp_path, 1))
     linear = stand.linearise([], quiet)[0]
-    layout, values = linear.whole.layout, stand.estimate.values
+    layout, values = Layout.of(stand.problem), stand.estimate.values
     own = own_rows(layout, values)
     rows = list(other_rows(stand.problem, layout, values, Gradients(layout.size), own))
     A = np.concatenate([_dense(r, layout.size) for r in rows])
