@@ -40,7 +40,8 @@ def solve(
     stop's rows at the present state (robust weights and, until the fit has settled, the surface met
     included), eliminates what belongs to surfaces and stops, and takes one Gauss-Newton step of the
     graph of all that is left, as far as it lowers the cost. From an earlier state, what beams meet
-    is known and a few passes are all; the cost does not end above that of the state.
+    is known and a few passes are all; where the cost ends above that of the state, the fit has not
+    converged.
 
     A fit whose bodies, beams, or rows of trackers and targets are hopelessly far off is given up.
 
@@ -160,13 +161,10 @@ def _raised(loop: Loop, more: float = UPHILL, least: float = 0.0) -> bool:
 
 
 def _not_raised(loop: Loop, estimate: Estimate) -> Estimate:
-    """The estimate of a fit that went on from an earlier one: more unknowns never cost more.
-
-    Raises:
-        RuntimeError: they do, which is a fault of the program.
-    """
+    """The estimate of a fit that went on from an earlier one: more unknowns never cost more, so
+    where they do it is not at an optimum."""
     if loop.start.state and estimate.converged and _raised(loop, ROUNDED, AT_OPTIMUM):
-        raise RuntimeError("a fit ended above the cost of the one that it went on from")
+        return replace(estimate, converged=False)
     return estimate
 
 

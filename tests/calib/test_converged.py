@@ -309,10 +309,9 @@ def test_a_fit_of_an_arm_that_is_led_astray_goes_back_to_where_it_began(of_arm, 
     assert found.cost <= small.cost + 1e-9
 
 
-def test_a_cost_that_an_effect_has_raised_is_a_fault(of_arm, monkeypatch):
+def test_a_cost_that_an_effect_has_raised_is_no_optimum(of_arm, monkeypatch):
     small, wide = of_arm
     led_astray(monkeypatch)
     monkeypatch.setattr("calib.solve.fit._stay_below", lambda loop, descend: None)
     monkeypatch.setattr("calib.solve.loop.AT_OPTIMUM", np.inf)  # or it is not called converged
-    with pytest.raises(RuntimeError, match="above the cost"):
-        solve(wide, start=small.start)
+    assert not solve(wide, start=small.start).converged
