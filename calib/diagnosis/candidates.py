@@ -306,7 +306,7 @@ def finer(effect: Effect, grid: Sequence[float]) -> list[Effect]:
     return [effect.at(shape) for shape in sorted(shapes)]
 
 
-def reach(grid: Sequence[float]) -> tuple[float, float]:
+def shape_limits(grid: Sequence[float]) -> tuple[float, float]:
     """Between which shapes an effect is what its name says: as far beyond each end of its grid as
     the next shape is before it. A wave much longer than all ranges would stand for any curve."""
     if len(grid) < 2 or grid[0] <= 0:

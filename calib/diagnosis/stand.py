@@ -12,7 +12,7 @@ import numpy as np
 
 from calib import problem as problems
 from calib.blunders.judged import Blunder, judge
-from calib.diagnosis.candidates import covariates, finer, known_effects, reach, structure
+from calib.diagnosis.candidates import covariates, finer, known_effects, shape_limits, structure
 from calib.diagnosis.chance import Chance, chances, of_lidar, ranked, rows_by_chance
 from calib.diagnosis.judges import Shares
 from calib.diagnosis.linear import Linear, linearise_with, rows_along
@@ -191,7 +191,7 @@ class Stand:
             found = score_test(scores, at[step.name])
             if found.dof and found.statistic > BETTER_SHAPE:
                 by = np.exp(np.clip(found.estimate()[0], -LARGEST_SHAPE_STEP, LARGEST_SHAPE_STEP))
-                ends = reach(shapes_of(effect, self.sources))
+                ends = shape_limits(shapes_of(effect, self.sources))
                 shape = float(f"{np.clip(effect.shape * by, *ends):.6g}")
                 swapped |= {effect.name: effect.at(shape)} if shape != effect.shape else {}
         return swapped

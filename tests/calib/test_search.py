@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from calib.diagnosis.candidates import reach
+from calib.diagnosis.candidates import shape_limits
 from calib.diagnosis.search import nameless, search
 from calib.diagnosis.verdict.matters import Consequences
 from calib.effects import find
@@ -74,7 +74,7 @@ def test_a_shape_stays_where_the_name_means_what_it_says(tmp_path):
     run = calibrate([tmp_path / "rec"], tmp_path / "run", Model(effects), "none")
     stand, swapped = stand_of(run, quiet).retuned(["near_range_bias@2"], quiet)
     grid = shapes_of(find("near_range_bias"), stand.sources)
-    (low, high), found = reach(grid), swapped["near_range_bias@2"]
+    (low, high), found = shape_limits(grid), swapped["near_range_bias@2"]
     assert found.shape == pytest.approx(high, rel=1e-5) and found.name in stand.model.names
     assert low < grid[0] and high / grid[-1] == pytest.approx(grid[-1] / grid[-2])
 

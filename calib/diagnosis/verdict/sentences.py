@@ -51,11 +51,12 @@ def sentences_of(
         candidate = next(c for c in candidates if c["add"] == step.effect.name)
         if not (formulas and candidate["dressed_up"]):  # what was tried before is of no use then
             out += _step_sentences(step, candidate, found.dressed_up(i))
+    scatter = [each.sentence for each in found.chance]
     if deferred and found.chance:
         beside = ", ".join(each.effect.name for each in found.chance)
-        out.append(f"Random scatter ({beside}) is judged once that structure is in the model.")
-    else:
-        out += [each.sentence for each in found.chance]
+        scatter = [f"Random scatter ({beside}) is judged once that structure is in the model."]
+    told_later = deferred and verdict != UNNAMED  # after the structure that it speaks of
+    out += [] if told_later else scatter
     out += [found.unsettled.unsettled] if found.unsettled else []
     out += [*heavy.refused, *traces]
     named = [c["add"] for c in candidates if c["step"] and not c["dressed_up"]]
@@ -70,7 +71,7 @@ def sentences_of(
     elif verdict == UNNAMED:
         out = [*structure, *out]
     elif formulas:
-        out += structure
+        out += [*structure, *(scatter if told_later else ())]
     out += _structure_sentences([each for each in unexplained if "says" not in each], residual)
     if found.scatter is not None:
         what = " and ".join(words(c) for c in found.scatter.effect.covariates)

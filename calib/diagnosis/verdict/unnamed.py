@@ -157,7 +157,7 @@ def _bare(found: Search, names: Sequence[str], progress: Progress) -> Stand:
 
 def _replaced(names: Sequence[Effect], formulas: Sequence[Formula]) -> list[Effect]:
     """Effects that formulas may take the place of: of beams, as formulas of the range are, or of a
-    covariate of theirs. What else moves may go together with it: paint with how dark it is."""
+    covariate of theirs. An offset by paint may stand for one by how dark a surface is."""
     drawn = {c for each in formulas for c in each.covariates}
     of_range = any(each.unit == "m" for each in formulas)
     return [
