@@ -232,6 +232,18 @@ class Reference:
         """Surface (P,) int64 of every patch that `patch` can return for that size."""
         return self._grid.patch_surface(size_m)
 
+    def surface_centre_m(self, surface: int) -> np.ndarray:
+        """The centre (3,) of a surface, by area."""
+        mine = self.surface == surface
+        centres_m = self.vertices_m[self.triangles[mine]].mean(axis=1)
+        return np.average(centres_m, axis=0, weights=self.area_m2[mine])
+
+    def patch_centre_m(self, patch: int, size_m: float) -> np.ndarray:
+        """The middle (3,) of a patch of that size, on the plane through its surface's centre."""
+        surface, middle_m = self._grid.centre(patch, size_m)
+        axes, centre_m = self._grid.axes[surface], self.surface_centre_m(surface)
+        return centre_m + (middle_m - axes @ centre_m) @ axes
+
     @property
     def _normal(self) -> np.ndarray:
         return self._plane[:-1, :3]

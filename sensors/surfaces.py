@@ -12,6 +12,7 @@ THINNEST_TRIANGLE_M = 1e-9
 SAME_VERTEX_M = 1e-6
 # Across an edge that turns more than this, another surface begins.
 SMOOTH_TURN_RAD = np.radians(30.0)
+UPRIGHT = 0.9  # of a normal, upwards, from which a surface is a floor, and no wall: a choice
 
 
 def triangle_planes(corners_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -63,13 +64,19 @@ class SurfaceGrid:
     ) -> "SurfaceGrid":
         """Grid over triangles: corners (F, 3, 3), unit normals (F, 3), areas (F,), surfaces (F,).
 
-        The tangent plane stands across the main direction of the surface's normals, by area.
+        The tangent plane stands across the main direction of the surface's normals, by area. That
+        direction's largest component is positive, and one axis is level, so that patches keep their
+        numbers where the mesh is moved a little.
         """
         count = int(surface.max()) + 1
         moment = np.zeros((count, 3, 3))
         np.add.at(moment, surface, np.einsum("f,fi,fj->fij", area_m2, normal, normal))
         main = np.linalg.eigh(moment)[1][:, :, -1]
-        side = transverse(main)
+        largest = np.take_along_axis(main, np.abs(main).argmax(axis=1)[:, None], axis=1)
+        main = main * np.sign(largest)
+        level = np.abs(main[:, 2:]) < UPRIGHT
+        side = np.cross(main, np.where(level, np.eye(3)[2], np.eye(3)[0]))
+        side /= np.linalg.norm(side, axis=1, keepdims=True)
         axes = np.stack([side, np.cross(main, side)], axis=1)
         place_m = np.einsum("fki,fci->fck", axes[surface], corners_m)
         low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
@@ -94,6 +101,13 @@ class SurfaceGrid:
         """Surface (P,) int64 of every patch."""
         cells = self._cells(cell_m)
         return np.repeat(np.arange(len(cells)), cells.prod(axis=1))
+
+    def centre(self, patch: int, cell_m: float) -> tuple[int, np.ndarray]:
+        """The surface that a patch is of, and its middle (2,) along that one's axes."""
+        cells, surface = self._cells(cell_m), int(self.patch_surface(cell_m)[patch])
+        first = int(cells[:surface].prod(axis=1).sum())
+        step = np.array(divmod(patch - first, int(cells[surface, 1]))) + 0.5
+        return surface, self.corner_m[surface] + step * self.size_m[surface] / cells[surface]
 
     def _cells(self, cell_m: float) -> np.ndarray:
         """Cells (S, 2) along the axes, each about `cell_m` wide: no slivers at the far rim."""

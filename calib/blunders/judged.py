@@ -144,6 +144,8 @@ def judge(whole: Linearisation, problem: Problem, planned: Collection[str] = ())
 
 def _alike(group: Group) -> tuple[str, str]:
     """Groups that are as likely as each other to be somewhat off."""
+    if group.kind == "surface":
+        return group.kind, group.what.partition("_")[0]
     return group.kind, group.what if group.kind in ("body", "level") else ""
 
 

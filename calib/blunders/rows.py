@@ -15,7 +15,16 @@ from calib.problem.model import labels
 from calib.problem.problem import Block, Problem
 from calib.problem.unknowns import Role
 from calib.problem.without import ROD, of_the_arm
-from calib.residuals.groups import ALONG_BEAMS, CAD, JOINTS, MESH, Group
+from calib.residuals.groups import (
+    ALONG_BEAMS,
+    ALONG_NORMAL,
+    CAD,
+    JOINTS,
+    MESH,
+    SURFACE,
+    Group,
+    part_of_mesh,
+)
 from calib.residuals.scan import ScanStop
 from calib.residuals.seen import BodiesTogether, SeenBody
 from calib.residuals.targets import HangingTarget
@@ -69,9 +78,8 @@ class GroupRows:
 
     @property
     def at(self) -> tuple[str, str]:
-        """Recording, and stop or target: groups of one place may contradict each other alone."""
-        group = next(iter(self.groups))
-        return group.recording, group.where
+        """Recording, and place: groups of one place may contradict each other alone."""
+        return next(iter(self.groups)).place
 
 
 def group_rows(
@@ -87,6 +95,7 @@ def group_rows(
     yield from _bodies(whole)
     yield from _targets(whole, graph_rows)
     yield from _paper(whole, problem)
+    yield from _mesh(whole, problem)
     yield from scan_rows(whole, problem)
     yield from _exact_joints(whole, problem)
 
@@ -159,7 +168,7 @@ def _off_rod(block: HangingTarget, values: Values) -> np.ndarray:
 
 
 def _paper(whole: Linearisation, problem: Problem) -> Iterator[GroupRows]:
-    """What is known beforehand: joint readings at a stop, frames, the URDF, the mesh's surfaces."""
+    """What is known beforehand: joint readings at a stop, frames, the URDF."""
     layout, geometry = whole.layout, _geometry(problem)
     stops = _stop_names(layout, problem)
     for name, unknown in layout.unknowns.items():
@@ -170,10 +179,6 @@ def _paper(whole: Linearisation, problem: Problem) -> Iterator[GroupRows]:
         if unknown.role is Role.JOINTS:
             for stop in layout.touched.get(name, ()):  # of a stop without any row there is none
                 groups = _joints(unknown.dofs, each, *stops[stop])
-        elif unknown.role is Role.SURFACE and problem.cells[name].column == "surface":
-            parts = problem.cells[name].parts.tolist()
-            names = (Group("surface", MESH, f"surface_{part}") for part in parts)
-            groups = dict(zip(names, each, strict=True))
         elif name in geometry:
             groups = _geometric(unknown.dofs, each, geometry[name])
         if groups:
@@ -186,6 +191,31 @@ def _paper(whole: Linearisation, problem: Problem) -> Iterator[GroupRows]:
                 axes=unknown.dofs,
                 units=unknown.units,
                 groups=groups,
+            )
+
+
+def _mesh(whole: Linearisation, problem: Problem) -> Iterator[GroupRows]:
+    """Surfaces of the mesh, and parts of them: a wall that has moved, and one that is warped. The
+    only region of a surface, or its only patch, is that surface."""
+    for name, cells in problem.cells.items():
+        if not cells.of_mesh:
+            continue
+        unknown, columns = whole.layout.unknowns[name], whole.layout.columns([name])
+        alone = np.bincount(cells.surface)[cells.surface] == 1
+        off = whole.values[name] - unknown.mean
+        for k, part in enumerate(cells.parts.tolist()):
+            if cells.column != SURFACE and alone[k]:
+                continue
+            sigma = unknown.sigma[k : k + 1]
+            yield GroupRows(
+                A=1.0 / sigma[:, None],
+                columns=columns[k : k + 1],
+                b=-off[k : k + 1] / sigma,
+                weight=np.full(1, unknown.weight),
+                sigma=-sigma,
+                axes=[ALONG_NORMAL],
+                units=["m"],
+                groups={Group("surface", MESH, part_of_mesh(cells.column, part)): np.eye(1)},
             )
 
 

@@ -10,7 +10,9 @@ import numpy as np
 from calib.blunders.chance import LEAST_P, at_least
 from calib.blunders.judged import Blunder, LeftOut
 from calib.blunders.reach import FurthestMoved
+from calib.problem.model import Source
 from calib.residuals.groups import ALONG_BEAMS, JOINTS, MESH, SCAN, Group
+from calib.residuals.surfaces import part_centre_m
 from calib.rig import Rig
 from sensors.rings import RingFinding
 
@@ -50,15 +52,16 @@ def groups(
     }
 
 
-def document(left: LeftOut, rig: Rig) -> dict[str, Any]:
+def document(left: LeftOut, source: Source) -> dict[str, Any]:
     """A blunder as diagnosis.json has it.
 
     Args:
         left: it, and what else could be wrong in its place.
-        rig: on paper.
+        source: the recording that it is in.
     """
     blunder, group, shift = left.blunder, left.blunder.group, left.blunder.shift
     size, sigma, unit, axis = blunder.leading()
+    wrong_sign = _wrong_sign(left, source.rig)
     return {
         "kind": group.kind,
         "name": group.what,
@@ -69,7 +72,7 @@ def document(left: LeftOut, rig: Rig) -> dict[str, Any]:
         "unit": unit,
         "sigma": sigma,
         "axis": axis or None,
-        "wrong_sign": _wrong_sign(left, rig),
+        "wrong_sign": wrong_sign,
         "offset": {
             "names": list(shift.axes),
             "units": list(shift.units),
@@ -82,7 +85,7 @@ def document(left: LeftOut, rig: Rig) -> dict[str, Any]:
         "indistinguishable_from": [other.token for other in left.rivals],
         "belongs_to": left.belongs.where if left.belongs else None,
         "without": group.token,
-        "sentence": _sentence(left, _wrong_sign(left, rig)),
+        "sentence": _sentence(left, wrong_sign, _about(group, source)),
     }
 
 
@@ -97,20 +100,22 @@ def of_rings(lidar: str, found: RingFinding) -> dict[str, Any]:
     }
 
 
-def of_surface(name: str, off_m: float, sigma_m: float, p: float) -> dict[str, Any]:
-    """A surface of the mesh whose beams were rejected as they agree on another place, in the same
+def of_part(name: str, source: Source, off_m: float, sigma_m: float, p: float) -> dict[str, Any]:
+    """A part of the mesh whose beams were rejected as they agree on another place, in the same
     form.
 
     Args:
         name: as of `Group.what`.
+        source: a recording with that mesh.
         off_m, sigma_m: residual of its beams, and of their mean; infinite where it is not known.
         p: by chance, all looks paid for.
     """
     group = Group("surface", MESH, name)
     side = "long" if off_m > 0 else "short"
     beams = f"its beams read {size_told(abs(off_m), sigma_m, 'm')} {side}"
+    said = f"{group}{_about(group, source)} is not where it was scanned: {beams}"
     return {
-        **_otherwise("surface", name, MESH, whole(f"{group} is not where it was scanned: {beams}")),
+        **_otherwise("surface", name, MESH, whole(said)),
         "size": abs(off_m),
         "unit": "m",
         "sigma": sigma_m,
@@ -171,16 +176,24 @@ def tokens(blunders: Iterable[Mapping[str, Any]]) -> list[str]:
     return [each["without"] for each in blunders if each["without"]]
 
 
-def _sentence(left: LeftOut, wrong_sign: str | None) -> str:
+def _about(group: Group, source: Source) -> str:
+    """About where a part of the mesh is."""
+    if group.where != MESH or source.reference is None:
+        return ""
+    at = ", ".join(f"{m:.1f}" for m in part_centre_m(source.reference, group.what))
+    return f" (about {at} m)"
+
+
+def _sentence(left: LeftOut, wrong_sign: str | None, about: str) -> str:
     *size, axis = left.blunder.leading()
-    along = f" {axis}" if axis.startswith("about") else f" in {axis}" if axis else ""
-    along = f" {axis}" if axis == ALONG_BEAMS else along
+    told = axis.startswith(("about ", "along "))
+    along = f" {axis}" if told else f" in {axis}" if axis else ""
     along = "" if left.blunder.group.what.endswith(f".{axis}") else along
     sign = f", as if the sign of its {wrong_sign} were wrong" if wrong_sign else ""
     group = str(left.blunder.group)
     group = f"T{group[1:]}" if group.startswith("the ") else group
     verb = "are" if left.blunder.group.what == JOINTS else "is"
-    out = f"{group} {verb} {size_told(*size)} off{along}, against everything else"
+    out = f"{group}{about} {verb} {size_told(*size)} off{along}, against everything else"
     if left.belongs:
         return f"{out}: it was taken at {left.belongs.where}."
     if left.rivals:

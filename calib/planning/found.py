@@ -183,7 +183,7 @@ def _kind(group: Group) -> str:
         "level": group.what,
         "target": f"a target's {TARGET_WORDS.get(group.what, group.what)}",
         "frame": "paper: a frame or a length",
-        "surface": "a surface of the mesh",
+        "surface": f"a {group.what.partition('_')[0]} of the mesh",
     }
     return said.get(group.kind, f"a {group.kind}")
 

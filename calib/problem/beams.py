@@ -10,7 +10,7 @@ from calib.problem.places import Places
 from calib.problem.problem import Problem, SourceStops
 from calib.problem.surfaces import LEAST_BEAMS
 from calib.problem.unknowns import Owner, Role, Unknown, vector_unknown
-from calib.residuals.groups import SCAN, Group
+from calib.residuals.groups import MESH_PARTS, SCAN, Group
 from calib.residuals.scan import ScanStop
 from calib.residuals.surfaces import PLANE_PATCHES_M, Meeting, MeshSurface, PlaneSurface
 from chains import se3
@@ -65,7 +65,11 @@ def _meeting(problem: Problem, part: SourceStops, places: Places) -> Meeting:
     if found is None:
         lidar, reference = part.source.rig.lidar, part.source.reference
         found = (
-            MeshSurface(reference, 1.5 * lidar.beam_divergence_rad, _left_out(part.source))
+            MeshSurface(
+                reference,
+                1.5 * lidar.beam_divergence_rad,
+                {kind: _left_out(part.source, kind) for kind in MESH_PARTS},
+            )
             if reference is not None
             else PlaneSurface(_find_planes(problem, part, places), f"{part.prefix}planes")
         )
@@ -75,9 +79,10 @@ def _meeting(problem: Problem, part: SourceStops, places: Places) -> Meeting:
     return found
 
 
-def _left_out(source: Source) -> frozenset[int]:
-    """Numbers of the surfaces of its mesh that are left out."""
-    return frozenset(int(what.removeprefix("surface_")) for _, what in source.lacks("surface"))
+def _left_out(source: Source, kind: str) -> frozenset[int]:
+    """Numbers of the parts of its mesh that are left out, of one of `MESH_PARTS`."""
+    names = (what.partition("_") for _, what in source.lacks("surface"))
+    return frozenset(int(number) for part, _, number in names if part == kind)
 
 
 def _planes_unknown(found: PlaneSurface, owner: Owner) -> Unknown:

@@ -81,6 +81,11 @@ class SurfaceCells:
     surface: np.ndarray
     room: int | str
 
+    @property
+    def of_mesh(self) -> bool:
+        """Whether they are parts of a mesh."""
+        return isinstance(self.room, int)
+
 
 @dataclass
 class Problem:

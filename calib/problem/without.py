@@ -17,8 +17,17 @@ from calib.problem import start
 from calib.problem.build import build
 from calib.problem.model import Model, Source, labels
 from calib.problem.places import standing
-from calib.residuals.groups import CAD, JOINTS, MESH, SCAN, Group, level_of
+from calib.residuals.groups import (
+    CAD,
+    JOINTS,
+    MESH,
+    SCAN,
+    Group,
+    level_of,
+    part_of_mesh,
+)
 from calib.residuals.scan import ScanStop
+from calib.residuals.surfaces import parts_of_mesh
 from calib.residuals.targets import TARGET_PARTS
 from calib.rig.inventory import FAR_OFF_M
 from chains.errors import InputError
@@ -74,8 +83,8 @@ def _groups(source: Source, label: str = "") -> list[Group]:
     out += [Group("frame", CAD, frame) for frame in rig.frame_sigma]
     out += [Group("frame", CAD, f"{e}.{p}") for e, p in on_paper(source)]
     if source.reference is not None:
-        surfaces = np.unique(source.reference.surface).tolist()
-        out += [Group("surface", MESH, f"surface_{number}") for number in surfaces]
+        for kind, count in parts_of_mesh(source.reference).items():
+            out += [Group("surface", MESH, part_of_mesh(kind, n)) for n in range(count)]
     return out
 
 
@@ -141,7 +150,8 @@ def _refusal(sources: Sequence[Source], token: str, called: Sequence[str]) -> st
     return (
         f"--without {token}: no recording has that; write STOP:BODY, STOP:FRAME.level, STOP:scan, "
         "STOP:joints, STOP:JOINT, TARGET:sphere, lower, upper or rod, cad:FRAME, "
-        f"cad:EFFECT.PARAMETER or mesh:surface_N{nearest(token, known)}"
+        "cad:EFFECT.PARAMETER, mesh:surface_N, mesh:region_N or mesh:patch_N"
+        f"{nearest(token, known)}"
     )
 
 

@@ -9,7 +9,14 @@ GroupKind = Literal["body", "level", "joints", "scan", "target", "frame", "rings
 AT_STOPS = ("body", "level", "joints", "scan")  # kinds that a stop has
 SCAN, JOINTS = "scan", "joints"  # what of a stop, beside its bodies and single joints
 CAD, MESH = "cad", "mesh"  # where, of what belongs to no stop and no target
+SURFACE, REGION, PATCH = MESH_PARTS = "surface", "region", "patch"  # each may be off by itself
 ALONG_BEAMS = "along the beams"  # the direction of a range zero
+ALONG_NORMAL = "along its normal"  # that of a part of the mesh
+
+
+def part_of_mesh(kind: str, number: int) -> str:
+    """What a part of the mesh, of one of `MESH_PARTS`, is called."""
+    return f"{kind}_{number}"
 
 
 def level_of(frame: str) -> str:
@@ -25,7 +32,7 @@ class Group:
         kind: what kind of thing it is, as diagnosis.json has it.
         where: the stop or target; `CAD` for what rig.yaml or the URDF says, `MESH` for a surface.
         what: the body, a level as `level_of` has it, `SCAN`, `JOINTS` or one joint; the part of the
-            target; the frame or ``effect.parameter``; the surface.
+            target; the frame or ``effect.parameter``; the part of the mesh, as `part_of_mesh`.
         recording: name of its folder, where there are several recordings.
     """
 
@@ -38,6 +45,11 @@ class Group:
     def stop(self) -> str | None:
         """The stop that it is of."""
         return self.where if self.kind in AT_STOPS else None
+
+    @property
+    def place(self) -> tuple[str, str]:
+        """Recording, and where it is: each part of the mesh is a place of its own."""
+        return self.recording, self.what if self.where == MESH else self.where
 
     @property
     def bare(self) -> str:

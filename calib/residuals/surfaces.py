@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import Any, Protocol
 
@@ -14,6 +14,7 @@ from calib.effects import LazyColumn
 from calib.forward import Values
 from calib.residuals.beams import Association, Columns, Surface
 from calib.residuals.compiled import meet_planes
+from calib.residuals.groups import PATCH, REGION, SURFACE
 from chains import se3
 from sensors.lidar import Beams
 from sensors.planes import Cells, Planes
@@ -28,8 +29,8 @@ PARALLEL_RAD = np.deg2rad(89.0)  # a choice: where it is 57 mm of range, nothing
 # larger ones the cells grow alike, so that there are never many more of them. Patches of planes are
 # as wide as the cells that planes are found in: within patches of 0.5 m the walls of the simulated
 # labs are uneven enough for ring zeros of an XT32 to be 1.2 to 1.5 times their sigmas off.
-PATCHES_M = {"region": 1.2, "patch": 0.5}
-PLANE_PATCHES_M = {"region": 1.2, "patch": 0.3}
+PATCHES_M = {REGION: 1.2, PATCH: 0.5}
+PLANE_PATCHES_M = {REGION: 1.2, PATCH: 0.3}
 ROOM_M2 = 200.0
 
 
@@ -56,17 +57,18 @@ class MeshSurface:
     Args:
         reference: the mesh.
         footprint_rad: how far beside a beam a depth edge spoils it.
-        without: surfaces that are left out: a beam that meets one is not used.
+        without: kind of part -> numbers of those that are left out: a beam that meets one is not
+            used.
     """
 
     reference: Reference
     footprint_rad: float
-    without: frozenset[int] = frozenset()
+    without: Mapping[str, Collection[int]] = field(default_factory=dict)
 
     @cached_property
     def patches_m(self) -> dict[str, float]:
         """Kind of patch -> its width, in this room."""
-        return _widths_m(PATCHES_M, self.reference.vertices_m)
+        return patch_widths_m(self.reference)
 
     @cached_property
     def roughness_m(self) -> np.ndarray:
@@ -77,7 +79,7 @@ class MeshSurface:
 
     def surface_of(self, kind: str, parts: np.ndarray) -> np.ndarray:
         """The surface that each of those parts is of; a surface is its own."""
-        if kind == "surface":
+        if kind == SURFACE:
             return parts
         return self.reference.patch_surface(self.patches_m[kind])[parts]
 
@@ -97,7 +99,7 @@ class MeshSurface:
             near_edges: True drops beams near a depth edge, and grazing ones.
         """
         origins, directions = _in_reference(T, beams)
-        triangle = self._kept(self.reference.first_triangle(origins, directions))
+        triangle = self._kept(T, beams, self.reference.first_triangle(origins, directions))
         if not near_edges:
             return Association(triangle)
         hits = self.reference.hits(triangle, origins, directions)
@@ -107,8 +109,8 @@ class MeshSurface:
 
     def divided(self, T: np.ndarray, beams: Beams, part: np.ndarray) -> Association:
         """The triangles (N,) that beams meet from there, and the patches of them; -1 for one of a
-        surface that is left out."""
-        part = self._kept(part)
+        part that is left out."""
+        part = self._kept(T, beams, part)
         met = _Met(T, beams, self.reference.planes, part)
         patches = {
             kind: self._patch(met, size_m).astype(np.int32)
@@ -131,11 +133,19 @@ class MeshSurface:
             columns[kind] = partial(self._patch, met, size_m)
         return met.surface(columns | association.patches)
 
-    def _kept(self, triangle: np.ndarray) -> np.ndarray:
-        if not self.without:
-            return triangle
-        gone = np.isin(self.reference.facts(triangle)[2], [*self.without])
-        return np.where(gone, -1, triangle).astype(np.int32)
+    def _kept(self, T: np.ndarray, beams: Beams, triangle: np.ndarray) -> np.ndarray:
+        for kind, numbers in self.without.items():
+            if numbers:
+                gone = np.isin(self._number(kind, T, beams, triangle), [*numbers])
+                triangle = np.where(gone, -1, triangle).astype(np.int32)
+        return triangle
+
+    def _number(self, kind: str, T: np.ndarray, beams: Beams, triangle: np.ndarray) -> np.ndarray:
+        """Number (N,) of the part of a kind that each beam meets, -1 for none."""
+        if kind == SURFACE:
+            return self.reference.facts(triangle)[2]
+        met = _Met(T, beams, self.reference.planes, triangle)
+        return self._patch(met, self.patches_m[kind])
 
     def _patch(self, met: _Met, size_m: float) -> np.ndarray:
         return self.reference.patch(met.part, met.point_m, size_m)
@@ -298,6 +308,26 @@ class _Met:
             columns=columns,
             unknown=unknown,
         )
+
+
+def patch_widths_m(reference: Reference) -> dict[str, float]:
+    """Kind of patch -> its width, on a mesh."""
+    return _widths_m(PATCHES_M, reference.vertices_m)
+
+
+def part_centre_m(reference: Reference, part: str) -> np.ndarray:
+    """About where (3,) a part of the mesh is, called as `part_of_mesh` calls it."""
+    kind, _, number = part.partition("_")
+    if kind == SURFACE:
+        return reference.surface_centre_m(int(number))
+    return reference.patch_centre_m(int(number), patch_widths_m(reference)[kind])
+
+
+def parts_of_mesh(reference: Reference) -> dict[str, int]:
+    """How many parts of each kind a mesh has, counted from 0."""
+    surfaces = {SURFACE: int(reference.surface.max()) + 1}
+    widths_m = patch_widths_m(reference).items()
+    return surfaces | {kind: len(reference.patch_surface(size_m)) for kind, size_m in widths_m}
 
 
 def _widths_m(patches_m: Mapping[str, float], points_m: np.ndarray) -> dict[str, float]:

@@ -4,7 +4,7 @@ quaternions, bodies exchanged, and poses that no other pose and no joint bears o
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,9 +25,15 @@ OUTLIER_SIGMAS = 8.0
 NOT_THIS_ARM = 0.05
 TURNED_RAD, FITS_RAD = 0.1, 0.03  # turns that are not the arm's, and turns that are
 MOST_TAKEN = 0.5  # of the rows by what is unknown: more, and what is left of the others says little
+# Of how far poses are off, left where columns are moved by a stop, if that is it: a choice, as 0.2
+# to 0.3 was left where it was, and 1 where it was not.
+OUT_OF_STEP = 0.5
+READINGS = "joints"  # whose columns may be out of step, as those of bodies may
+ALIKE = 1.5  # times what the best leaves, by which another does as well: a choice
 SWAPPED = 0.2  # of the misfit, left where two bodies are exchanged
 MOST_COMPARED = 100  # stops, each with each
 MOST_FITTED = 1000  # stops, to which what is unknown is fitted; all are held against it
+SLIPPED = (-2, -1, 1, 2)  # stops by which columns are out of step: as far as tables slip, a choice
 QUATERNION_ORDERS = {"qx, qy, qz, qw": (3, 0, 1, 2), "qz, qw, qx, qy": (1, 2, 3, 0)}
 
 
@@ -55,6 +61,21 @@ class _Pair:
         """(K, 4, 4) as measured, the quaternions' columns taken in some order."""
         T = [se3.from_xyz_quat(pose[:, :3], pose[:, 3:][:, list(order)]) for pose in self.poses]
         return T[0] if len(T) == 1 else se3.inverse(T[0]) @ T[1]
+
+    def slipped(self, name: str, by: int) -> _Pair:
+        """The same, had the columns of one of the bodies, or of the "joints", come from so many
+        stops later, at the stops that have one."""
+        here = np.flatnonzero(np.isin(self.stops + by, self.stops))
+        there = np.searchsorted(self.stops, self.stops[here] + by)
+        of = dict(zip(self.names, self.poses, strict=True))
+        return replace(
+            self,
+            stops=self.stops[here],
+            place=self.place[here],
+            nominal=self.nominal[there if name == READINGS else here],
+            poses=tuple(pose[there if body == name else here] for body, pose in of.items()),
+            d_twist=self.d_twist[here],
+        )
 
 
 def odd_bodies(rig: Rig, recording: RecordedStops) -> Iterator[Suspect]:
@@ -145,7 +166,7 @@ def _pairs(rig: Rig, recording: RecordedStops, usable: Mapping[str, np.ndarray])
 
 
 def _at_all_stops(pair: _Pair) -> Suspect | None:
-    """Bodies exchanged, or quaternions in another order."""
+    """Bodies exchanged, columns that belong to another stop, or quaternions in another order."""
     if len(pair.stops) < 4:
         return None
     seen, names = pair.seen(), " and ".join(pair.names)
@@ -158,6 +179,8 @@ def _at_all_stops(pair: _Pair) -> Suspect | None:
             return Suspect("body", names, said)
     if _turns(pair, seen)[0] < TURNED_RAD:
         return None
+    if said := _out_of_step(pair):
+        return Suspect("body", names, said)
     orders = {order: _turns(pair, pair.seen(index)) for order, index in QUATERNION_ORDERS.items()}
     fitting = [order for order, (left, _) in orders.items() if left < FITS_RAD]
     if not fitting:
@@ -168,6 +191,34 @@ def _at_all_stops(pair: _Pair) -> Suspect | None:
         "their order"
     )
     return Suspect("body", names, said)
+
+
+def _out_of_step(pair: _Pair) -> str:
+    """What belongs to the stop before, or after, if all then fits; of those that do, the first that
+    fits best, and all that fit as well."""
+    ways = [(name, by) for name in (*pair.names, READINGS) for by in SLIPPED]
+    moved = {way: pair.slipped(*way) for way in ways}
+    left = {way: _apart(some) for way, some in moved.items() if len(some.stops) >= 4}
+    least = min(left.values(), default=np.inf)
+    if least > OUT_OF_STEP * _apart(pair):
+        return ""
+    fitting = [way for way, each in left.items() if each < ALIKE * max(least, 1e-9)]
+    told = [
+        f"the columns of {name} are taken {abs(by)} stop{'s' * (abs(by) > 1)} "
+        f"{'later' if by > 0 else 'earlier'}"
+        for name, by in fitting
+    ]
+    return (
+        f"{' and '.join(pair.names)} lie as CAD and joints say if {', or '.join(told)}: stops.csv "
+        "is out of step"
+    )
+
+
+def _apart(pair: _Pair) -> float:
+    """How far poses are from where joints and CAD put them, rad and m alike: the mean over stops,
+    of which none counts more than `TURNED_RAD`."""
+    size = _size(_gap(_from_places(pair), pair.seen()))
+    return float(np.mean(np.minimum(size, TURNED_RAD)))
 
 
 def _turns(pair: _Pair, seen: Array) -> tuple[float, float]:

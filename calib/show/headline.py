@@ -107,7 +107,7 @@ def closing(run: Run) -> list[str]:
         )
     if diagnosis:
         return [first, *first_answer, f"verdict: {verdict.meaning}. {verdict.sentence}"]
-    told = "no contradiction to the model; not diagnosed yet"
+    told, lost = "no contradiction to the model; not diagnosed yet", not run.converged
     if reasons := [each for each in verdict.reasons if not each.startswith(UNASKED)]:
         why, more = reasons[0].partition(": ")[0], len(reasons) - 1
         others = f" (and {more} more reason{'s' * (more > 1)})" if more else ""
@@ -116,5 +116,6 @@ def closing(run: Run) -> list[str]:
         first,
         *first_answer,
         f"verdict so far: {told}",
+        *(f"first: {shlex.join(['rigcal', 'check', str(r)])}" for r in run.recordings if lost),
         f"next: rigcal diagnose {shlex.quote(str(run.folder))}",
     ]

@@ -116,6 +116,27 @@ def test_quaternions_in_another_order(sound, shared, order):
     assert named in found.sentence
 
 
+@pytest.mark.parametrize("by", [-2, -1, 1])
+@pytest.mark.parametrize("name", [MOUNT, "joints"])
+def test_columns_out_of_step(sound, name, by):
+    """As where a table has lost a row: which columns, and which way they are to be moved."""
+    rig, recording = sound
+    if name == MOUNT:
+        late = changed(recording, MOUNT, slice(None), lambda p: np.roll(p, by, axis=0))
+    else:
+        late = replace(recording, joints=np.roll(recording.joints, by, axis=0))
+    found = only(odd_bodies(rig, late))
+    way = f"{abs(by)} stop{'s' * (abs(by) > 1)} {'later' if by > 0 else 'earlier'}"
+    assert f"the columns of {name} are taken {way}" in found.sentence and found.stops == ()
+
+
+def test_an_arm_alone_whose_joints_are_a_row_late(shared):
+    rig, recording = opened(shared, "arm_base_creeps")
+    late = replace(recording, joints=np.roll(recording.joints, 1, axis=0))
+    found = only(odd_bodies(rig, late))
+    assert "the columns of joints are taken 1 stop later" in found.sentence
+
+
 def test_bodies_exchanged_at_all_stops_or_at_one(sound):
     rig, recording = sound
     bodies = recording.bodies

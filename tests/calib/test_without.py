@@ -100,14 +100,23 @@ def test_just_what_is_named_is_left_out(box, token):
     assert all(loose[name] == 1.0 for name in free), "m or rad: as good as unknown"
 
 
-def test_no_beam_meets_a_surface_that_is_left_out(box, tmp_path):
+@pytest.mark.parametrize("part", ["surface", "patch"])
+def test_no_beam_meets_a_part_of_the_mesh_that_is_left_out(box, tmp_path, part):
     """And all others meet what they met, whether they look anew or are known to."""
     source = Source.open(box)
-    values, token = state([source]), "mesh:surface_2"
+    values, gone = state([source]), 2
+    if part == "patch":
+        scan = build([source], MODEL).scans[0]
+        met = scan.associate(values, near_edges=False).part
+        gone = int(scan.settled(met, values).patches[part].max())
+    token = f"mesh:{part}_{gone}"
     whole, less = build([source], MODEL), build(leave_out([source], [token]), MODEL)
     for a, b in zip(whole.scans, less.scans, strict=True):
         met = a.associate(values, near_edges=False).part
-        expected = np.where(source.reference.facts(met)[2] == 2, -1, met)
+        number = source.reference.facts(met)[2]
+        if part == "patch":
+            number = a.settled(met, values).patches["patch"]
+        expected = np.where(number == gone, -1, met)
         np.testing.assert_array_equal(b.associate(values, near_edges=False).part, expected)
         np.testing.assert_array_equal(b.settled(met, values).part, expected)
         assert 0 < np.sum(expected >= 0) < np.sum(met >= 0)
@@ -237,7 +246,7 @@ def test_the_command_that_is_printed_fits_the_same_without_more(box, run, rigcal
     ("tokens", "said"),
     [
         (["s9:scan"], "--without s9:scan: no recording has that"),
-        (["s1:base_marker"], "or mesh:surface_N; did you mean s1:base_markers?"),
+        (["s1:base_marker"], "mesh:surface_N or mesh:patch_N; did you mean s1:base_markers?"),
         (["lidar"], "write STOP:BODY"),
         (["s1:scan", "s1:scan"], "--without s1:scan: that is left out already"),
         (["s1:lift", "s1:lift"], "--without s1:lift: that is left out already"),

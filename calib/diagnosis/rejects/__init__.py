@@ -11,9 +11,10 @@ A bin's share is held against the share elsewhere. Stops, and the patches of a m
 beams meet, are the clusters, not beams: the variance of the difference is the cluster jackknife's
 (Bell and McCaffrey 2002), that by stops and that by patches added, and Student's t with the
 effective number of the fewer clusters (Carter, Schnepel and Steigerwald 2017) judges it. Sidak pays
-for all looks. Surfaces and stops are looked at as covariates too, with the other as clusters. Where
-a covariate stands out, its interval is the one of the largest binomial likelihood (the scan
-statistic of Kulldorff 1997); its beams are set aside, and the rest is looked at again.
+for all looks. Surfaces and stops are looked at as covariates too, with the other as clusters, and
+regions of surfaces with stops as clusters. Where a covariate stands out, its interval is the one of
+the largest binomial likelihood (the scan statistic of Kulldorff 1997); its beams are set aside, and
+the rest is looked at again.
 """
 
 from __future__ import annotations
@@ -25,9 +26,10 @@ import numpy as np
 from scipy import special
 
 from calib.blunders.chance import LEAST_P, LEVELS, after_looks
-from calib.diagnosis.rejects.counts import CellAxis, Counts, Rejected, count
+from calib.diagnosis.rejects.counts import CellAxis, Counts, Rejected, count, meshed
 from calib.diagnosis.rejects.found import CLUTTER, Place, Rejects
 from calib.diagnosis.stand import Stand
+from calib.residuals.groups import REGION, SURFACE
 from calib.solve.fit import Progress
 
 ALPHA_REJECTED = LEVELS["structure of what was rejected"]
@@ -80,7 +82,7 @@ def rejects(stand: Stand, progress: Progress = lambda what, done, total: None) -
         expected=min(usual / max(outside, 1.0 / total), CLUTTER + hit),
         p_adjusted=least,
         places=places,
-        meshed=all(source.reference for source in stand.sources),
+        meshed=meshed(stand),
         clutter=hit,
         clutter_stops=tuple(counts.stop_names[i] for i in np.flatnonzero(crowded.any(axis=1))),
         beyond=beyond,
@@ -119,15 +121,19 @@ def _views(counts: Counts) -> Iterator[_View]:
             cell=cell,
             ways=(
                 (rejected.stop, counts.stops[a], of_stop),
-                (rejected.place, counts.places[a], counts.of_place),
+                (rejected.place, counts.places[a], counts.met_places.sum(axis=0)),
             ),
         )
     stops = CellAxis.of_things("stop", counts.stop_names)
-    surfaces = CellAxis.of_things("surface", counts.surface_names)
-    for axis, mine, other, beams in (
+    surfaces = CellAxis.of_things(SURFACE, counts.surface_names)
+    things = [
         (stops, rejected.stop, rejected.surface, met.T),
         (surfaces, rejected.surface, rejected.stop, met),
-    ):
+    ]
+    if counts.place_names:
+        regions = CellAxis.of_things(REGION, counts.place_names)
+        things.append((regions, rejected.place, rejected.stop, counts.met_places))
+    for axis, mine, other, beams in things:
         rows, ways = beams.sum(axis=0), ((other, beams, beams.sum(axis=1)),)
         yield _View(axis=axis, rows=rows, bin=mine, cell=mine, ways=ways)
 

@@ -169,8 +169,8 @@ class Counts:
         stops, places: per axis (K, B) and (P, B) beams of each stop, and of each place, by bins.
         cells: per axis (C,) beams by cells.
         met: (K, S) beams of each stop on each surface.
-        of_place: (P,) beams of each place: a patch of a surface of a mesh, or a plane.
-        stop_names, surface_names: by number.
+        met_places: (K, P) the same at each place: a region of a surface of a mesh, or of a plane.
+        stop_names, surface_names: by number; place_names: likewise, empty without a mesh.
         rejected: the rejected ones.
     """
 
@@ -179,9 +179,10 @@ class Counts:
     places: Sequence[np.ndarray]
     cells: Sequence[np.ndarray]
     met: np.ndarray
-    of_place: np.ndarray
+    met_places: np.ndarray
     stop_names: Sequence[str]
     surface_names: Sequence[str]
+    place_names: Sequence[str]
     rejected: Rejected
 
 
@@ -192,7 +193,7 @@ def count(stand: Stand, progress: Progress) -> Counts:
     stops, rejected = [[] for _ in axes], []
     by_place = [np.zeros((0, axis.count), int) for axis in axes]
     cells = [np.zeros(len(axis.bins), int) for axis in axes]
-    met, of_place = np.zeros((len(scans), 0), int), np.zeros((0, 1), int)
+    met, met_places = np.zeros((2, len(scans), 0), int)
     work = partial(_count_stop, stand.estimate.values, axes)
     of_each = over_stops(work, scans, stand.estimate.associations, range(len(scans)))
     for i, found in enumerate(of_each):
@@ -205,8 +206,8 @@ def count(stand: Stand, progress: Progress) -> Counts:
         rejected.append(replace(own, place=place[own.place], surface=surface[own.surface]))
         met = _grown(met.T, len(surfaces.known)).T
         met[i, surface] = found.met
-        of_place = _grown(of_place, len(places.known))
-        of_place[place, 0] += beams
+        met_places = _grown(met_places.T, len(places.known)).T
+        met_places[i, place] = beams
         for a, (table, fine) in enumerate(zip(found.tables, found.cells, strict=True)):
             stops[a].append(table.sum(axis=0))
             by_place[a] = _grown(by_place[a], len(places.known))
@@ -218,11 +219,17 @@ def count(stand: Stand, progress: Progress) -> Counts:
         places=by_place,
         cells=cells,
         met=met,
-        of_place=of_place[:, 0],
+        met_places=met_places,
         stop_names=[scan.name for scan in scans],
         surface_names=[str(part) for _, part in surfaces.known],
+        place_names=[str(part) for _, part in places.known] if meshed(stand) else [],
         rejected=Rejected.of(rejected),
     )
+
+
+def meshed(stand: Stand) -> bool:
+    """Whether beams meet a mesh, and not planes found in the scans."""
+    return all(source.reference for source in stand.sources)
 
 
 class _Numbers:

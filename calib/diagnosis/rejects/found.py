@@ -10,6 +10,8 @@ import numpy as np
 
 from calib.blunders import told
 from calib.diagnosis.suggest import words
+from calib.problem.model import Source
+from calib.residuals.groups import MESH_PARTS, part_of_mesh
 from calib.rig.suspect import listed
 
 MOST_NAMED = 6  # stops or surfaces that a sentence names
@@ -34,7 +36,7 @@ class Place:
     """Where beams are rejected more than elsewhere.
 
     Args:
-        covariate: a column; "stop" or "surface".
+        covariate: a column; "stop", "surface" or "region".
         lower, upper: of its interval, in the column's own unit; an azimuth interval with
             ``lower > upper`` runs through pi. Of things, the first and the last.
         names: of things: stops, surfaces, labels; else empty.
@@ -163,16 +165,19 @@ class Rejects:
 
     @property
     def moved(self) -> Sequence[Place]:
-        """Those of them that are surfaces which stand elsewhere than the mesh has them."""
-        mine = (place for place in self.structured if place.covariate == "surface")
+        """Those of them that are surfaces, or parts, which stand elsewhere than the mesh has
+        them."""
+        mine = (place for place in self.structured if place.covariate in MESH_PARTS)
         return [place for place in mine if place.coherent and self.meshed]
 
-    def blunders(self) -> list[dict[str, Any]]:
-        """These as blunders in diagnosis.json, to be left out."""
+    def blunders(self, source: Source) -> list[dict[str, Any]]:
+        """These as blunders in diagnosis.json, to be left out; of a recording with the mesh."""
+        parts = (
+            (part_of_mesh(each.covariate, name), each) for each in self.moved for name in each.names
+        )
         return [
-            told.of_surface(f"surface_{name}", place.residual_m, place.sigma_m, place.p_adjusted)
-            for place in self.moved
-            for name in place.names
+            told.of_part(name, source, place.residual_m, place.sigma_m, place.p_adjusted)
+            for name, place in parts
         ]
 
     @property

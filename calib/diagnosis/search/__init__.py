@@ -26,6 +26,7 @@ from calib.diagnosis.search.confirmed import (
     suspects,
 )
 from calib.diagnosis.search.mishaps import adapted, restored
+from calib.diagnosis.search.parts import likeliest_part
 from calib.diagnosis.stand import Look, Stand, tried
 from calib.effects import Effect
 from calib.solve.fit import Progress
@@ -81,8 +82,7 @@ class Search:
             the first of them is dressed up, or stops that were held out speak against it.
         chance: what scatters by chance beside all that was found, strongest first.
         unsettled: what scatters beside that, and with which no fit comes to an optimum.
-        beside: the last look at a fit with formulas of the structure, where blunders were judged
-            beside these; see `beside_formulas`.
+        beside: the last look, where blunders were judged beside formulas; see `beside_formulas`.
         scatter_judged: whether what scatters by chance was judged there, too.
     """
 
@@ -100,9 +100,10 @@ class Search:
     def dressed_up(self, i: int) -> bool:
         """Whether residual structure would have explained more than the i-th name did."""
         common, step = self.looks[-1].named.common, self.found[i]
-        test = step.candidate.test
-        bins = (e for _, e in in_place(test.statistic, step.before, step.after, common))
-        return test.evidence(common) < max(bins, default=0.0) - ODDS
+        named = likeliest_part(step.before, step.candidate, common).evidence(common)
+        whole = step.candidate.test.statistic
+        bins = (e for _, e in in_place(whole, step.before, step.after, common))
+        return named < max(bins, default=0.0) - ODDS
 
 
 def in_place(

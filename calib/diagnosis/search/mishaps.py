@@ -98,7 +98,7 @@ def _wild(look: Look) -> list[Blunder]:
     places: dict[tuple[str, str], list[Blunder]] = {}
     for each in found:
         if each.evidence > AS_FAR * found[0].evidence:
-            places.setdefault((each.group.recording, each.group.where), []).append(each)
+            places.setdefault(each.group.place, []).append(each)
     worst = [likeliest(here) for here in places.values()]
     if len(worst) < 2:
         return worst

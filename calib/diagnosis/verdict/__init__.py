@@ -27,10 +27,9 @@ from calib.diagnosis.verdict.matters import (
 from calib.diagnosis.verdict.names import absorbed, believed, beside_scatter, dressed_up
 from calib.diagnosis.verdict.sentences import BAD, UNNAMED, sentences_of, stops_of, unconfirmed
 from calib.diagnosis.verdict.unnamed import Unnamed
-from calib.problem.model import labels
+from calib.problem.model import Source, labels
 from calib.residuals.groups import Group
 from calib.results.holdout import Fall
-from calib.rig import Rig
 
 VERDICTS = {
     "adequate": "the model is adequate",
@@ -159,8 +158,9 @@ def conclude(
     """
     heavy = weighed(found, held_out, summary["rms_mm"])
     found, first = heavy.found, found.looks[0]
-    blunders = [*rings, *(rejected.blunders() if rejected and not found.found else [])]
-    blunders += [told.document(left, _rig(left, first)) for left in found.blunders]
+    moved = rejected.blunders(first.stand.sources[0]) if rejected and not found.found else []
+    blunders = [*rings, *moved]
+    blunders += [told.document(left, _source(left, first)) for left in found.blunders]
     hold = believed(found, held_out) and not formulas.instead
     more = formulas.formulas or found.unsettled or (heavy.refused and found.at_first)
     more = bool(more or (rejected and not rejected.explained))
@@ -242,11 +242,11 @@ def _unconfirmed(found: Search, over: float) -> Candidate | None:
     return next(suspects(found.looks[-1].unnamed, ALPHA_UNNAMED), None)
 
 
-def _rig(left: LeftOut, look: Look) -> Rig:
-    """On paper, of the recording that a blunder is in."""
+def _source(left: LeftOut, look: Look) -> Source:
+    """The recording that a blunder is in."""
     sources = look.stand.sources
-    rigs = dict(zip(labels(sources), (source.rig for source in sources), strict=True))
-    return rigs.get(left.blunder.group.recording) or sources[0].rig
+    called = dict(zip(labels(sources), sources, strict=True))
+    return called.get(left.blunder.group.recording, sources[0])
 
 
 def _verdict(found: Search, hold: bool, more: bool, doubt: bool, calm: str) -> str:

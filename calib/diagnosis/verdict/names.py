@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib.blunders.chance import log_tail
 from calib.diagnosis.screen import ODDS
 from calib.diagnosis.search import Search, in_place
+from calib.diagnosis.search.parts import Part, likeliest_part
 from calib.diagnosis.verdict.matters import (
     ABSORBED,
     HELD_OUT_BESIDE_SCATTER,
@@ -59,11 +59,18 @@ def _names_hold(found: Search) -> bool:
     if not found.found:
         return True
     common = found.looks[-1].named.common
-    tests = [step.candidate.test for step in found.found]
-    together = sum(t.statistic for t in tests), sum(t.dof for t in tests)
-    price = sum(np.log(step.candidate.looks) for step in found.found)
-    named = -log_tail(together[0] / common, together[1]) - price
-    structure = in_place(together[0], found.looks[0], found.looks[-1], common)
+    explained = sum(step.candidate.test.statistic for step in found.found)
+    parts = [likeliest_part(step.before, step.candidate, common) for step in found.found]
+    together = Part(
+        statistic=sum(part.statistic for part in parts),
+        dof=sum(part.dof for part in parts),
+        price=sum(
+            part.price + np.log(step.candidate.looks)
+            for part, step in zip(parts, found.found, strict=True)
+        ),
+    )
+    named = together.evidence(common)
+    structure = in_place(explained, found.looks[0], found.looks[-1], common)
     bins = (evidence - np.log(c.looks) for c, evidence in structure)
     return named > max(bins, default=0.0) - ODDS
 

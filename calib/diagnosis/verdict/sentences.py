@@ -189,7 +189,7 @@ def _step_sentences(step: NamedEffect, candidate: Mapping[str, Any], worn: bool)
     """Of a named effect; `worn` where bins explain more than it does."""
     before, after = (candidate["held_out_rms_mm"][k] for k in ("before", "after"))
     if candidate["dressed_up"]:
-        why = "a generic function of other covariates (bins) explains more"
+        why = "a generic function (bins) explains more, or as much by fewer parameters"
         if after and not worn:
             why = f"most of the held-out error stays ({before:.2f} to {after:.2f} mm)"
         return [

@@ -125,9 +125,12 @@ class Groups:
             recording = source.recording.folder.name if self.several else ""
             yield Group("joints", stop, "joints", recording), every
             yield from ((Group("joints", stop, dof, recording), [k]) for k, dof in each)
-        elif name in self.problem.cells and self.problem.cells[name].column == "surface":
-            parts = self.problem.cells[name].parts
-            yield from ((Group("surface", "mesh", f"surface_{parts[k]}"), [k]) for k, _ in each)
+        elif (cells := self.problem.cells.get(name)) and isinstance(cells.room, int):  # a mesh
+            single = np.bincount(cells.surface)[cells.surface] < 2  # that surface is its only patch
+            for k, _ in each:
+                what = f"{cells.column}_{cells.parts[k]}"
+                if cells.column == "surface" or not single[k]:
+                    yield Group("surface", "mesh", what), [k]
         elif isinstance(effects.get(name), FrameOffset):
             yield Group("frame", "cad", name), every
         elif name in ("arm_link_length", "arm_joint_offset"):
