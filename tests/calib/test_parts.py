@@ -1,0 +1,72 @@
+"""An effect with parameters for every joint may be that of one: held against bins by that one."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib.diagnosis.score import score_test
+from calib.diagnosis.search.parts import likeliest_part
+from calib.diagnosis.stand import Stand
+from calib.problem import build
+from calib.problem.model import Model, Source
+from calib.simulation import Spec, simulate
+from calib.solve.fit import solve
+
+SPEC = Spec(lidar="hesai_pandarxt32", locations=4, stops_per_location=3, column_step=400)
+EFFECTS = {
+    "arm_joint_scale": 1,
+    "arm_gravity_sag": 1,
+    "arm_joint_eccentricity": 2,
+}  # dof of a joint
+
+
+@pytest.fixture(scope="module")
+def look(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("parts") / "rec"
+    simulate(SPEC, folder, 3, {})
+    source = Source.open(folder)
+    problem = build([source], Model())
+    stand = Stand([source], Model(), problem, solve(problem))
+    return stand.look(lambda what, done, total: None)
+
+
+def acting(look, name, theta):
+    """The look, and an effect of it, had its parameters (q,) been these and no noise: its score is
+    then ``information @ theta``."""
+    candidate = next(c for c in look.named.candidates if c.effect.family == name)
+    columns, scores = candidate.test.columns, look.named.scores
+    score = scores.score.copy()
+    score[columns] = scores.information[np.ix_(columns, columns)] @ theta
+    scores = replace(scores, score=score)
+    candidate = replace(candidate, test=score_test(scores, columns))
+    return replace(look, named=replace(look.named, scores=scores)), candidate
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+@pytest.mark.parametrize("joint", range(5))  # the poses tell nothing of how the last one sags
+def test_what_one_joint_does_is_told_by_its_own_parameters(look, name, joint):
+    """In closed form: what a joint alone explains is ``theta^T M theta``, with its block M."""
+    each = EFFECTS[name]
+    theta = np.zeros(6 * each)
+    theta[each * joint : each * (joint + 1)] = 0.01
+    moved, candidate = acting(look, name, theta)
+    part = likeliest_part(moved, candidate, 1.0)
+    assert part.dof <= each and part.price == pytest.approx(np.log(6))
+    assert part.statistic == pytest.approx(candidate.test.statistic, rel=1e-6)
+    assert part.evidence(1.0) > candidate.test.evidence(1.0)
+
+
+def test_what_all_joints_do_is_told_by_all(look):
+    theta = np.where(np.arange(6) % 2, 0.01, -0.01)
+    moved, candidate = acting(look, "arm_joint_scale", theta)
+    part = likeliest_part(moved, candidate, 1.0)
+    assert (part.statistic, part.dof) == (candidate.test.statistic, candidate.test.dof)
+    assert part.price == 0.0
+
+
+@pytest.mark.parametrize("name", ["incidence_angle_bias", "label_range_offset", "mount_slip"])
+def test_an_effect_that_is_not_of_joints_has_no_parts(look, name):
+    candidate = next(c for c in look.named.candidates if c.effect.family == name)
+    part = likeliest_part(look, candidate, 1.0)
+    assert (part.statistic, part.dof) == (candidate.test.statistic, candidate.test.dof)
