@@ -239,8 +239,14 @@ class Reference:
         return np.average(centres_m, axis=0, weights=self.area_m2[mine])
 
     def patch_centre_m(self, patch: int, size_m: float) -> np.ndarray:
-        """The middle (3,) of a patch of that size, on the plane through its surface's centre."""
+        """The middle (3,) of a patch of that size: the centre of the triangles in it, or of its
+        cell where these are larger."""
         surface, middle_m = self._grid.centre(patch, size_m)
+        mine = np.flatnonzero(self.surface == surface)
+        middles_m = self.vertices_m[self.triangles[mine]].mean(axis=1)
+        here = (self.patch(mine, middles_m, size_m) == patch) & (self.area_m2[mine] > 0)
+        if here.any():
+            return np.average(middles_m[here], axis=0, weights=self.area_m2[mine[here]])
         axes, centre_m = self._grid.axes[surface], self.surface_centre_m(surface)
         return centre_m + (middle_m - axes @ centre_m) @ axes
 

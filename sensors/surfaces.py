@@ -12,7 +12,10 @@ THINNEST_TRIANGLE_M = 1e-9
 SAME_VERTEX_M = 1e-6
 # Across an edge that turns more than this, another surface begins.
 SMOOTH_TURN_RAD = np.radians(30.0)
-UPRIGHT = 0.9  # of a normal, upwards, from which a surface is a floor, and no wall: a choice
+# A direction to which walls and floors are not parallel: a choice.
+NO_WALL = np.array([1.0, 0.61, 0.37])
+STEEPEST_WALL = 0.9  # of a normal, upwards, from which a surface is a floor, and no wall: a choice
+HALF_A_CELL = 0.501  # from where cells are one more: walls often have just half a cell more
 
 
 def triangle_planes(corners_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -64,17 +67,16 @@ class SurfaceGrid:
     ) -> "SurfaceGrid":
         """Grid over triangles: corners (F, 3, 3), unit normals (F, 3), areas (F,), surfaces (F,).
 
-        The tangent plane stands across the main direction of the surface's normals, by area. That
-        direction's largest component is positive, and one axis is level, so that patches keep their
-        numbers where the mesh is moved a little.
+        The tangent plane stands across the main direction of the surface's normals, by area. Which
+        way that points, and one axis, are told by fixed directions, so that patches of walls and
+        floors keep their numbers where the mesh is moved a little.
         """
         count = int(surface.max()) + 1
         moment = np.zeros((count, 3, 3))
         np.add.at(moment, surface, np.einsum("f,fi,fj->fij", area_m2, normal, normal))
         main = np.linalg.eigh(moment)[1][:, :, -1]
-        largest = np.take_along_axis(main, np.abs(main).argmax(axis=1)[:, None], axis=1)
-        main = main * np.sign(largest)
-        level = np.abs(main[:, 2:]) < UPRIGHT
+        main = np.where(main @ NO_WALL < 0, -1.0, 1.0)[:, None] * main
+        level = np.abs(main[:, 2:]) < STEEPEST_WALL
         side = np.cross(main, np.where(level, np.eye(3)[2], np.eye(3)[0]))
         side /= np.linalg.norm(side, axis=1, keepdims=True)
         axes = np.stack([side, np.cross(main, side)], axis=1)
@@ -111,7 +113,7 @@ class SurfaceGrid:
 
     def _cells(self, cell_m: float) -> np.ndarray:
         """Cells (S, 2) along the axes, each about `cell_m` wide: no slivers at the far rim."""
-        return np.maximum(1, np.rint(self.size_m / cell_m)).astype(np.int64)
+        return np.maximum(1, np.ceil(self.size_m / cell_m - HALF_A_CELL)).astype(np.int64)
 
 
 def transverse(directions: np.ndarray) -> np.ndarray:

@@ -81,7 +81,6 @@ TEXTS = {
     "calib/diagnosis/verdict/sentences.py": "sentences",
     "calib/planning/purpose.py": "--for",
     "calib/planning/tolerance.py": "--until",
-    "calib/problem/beams.py": "--without",
     "calib/problem/model.py": "--fix",
     "calib/problem/without.py": "--without",
     "calib/residuals/groups.py": "--without",

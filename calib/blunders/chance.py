@@ -45,5 +45,7 @@ def at_least(p: float) -> float:
 
 def after_looks(p: np.ndarray | float, looks: float) -> np.ndarray | float:
     """Chance that the smallest of so many independent p-values is as small (Sidak 1967); no less
-    than a p-value that is told."""
-    return -np.expm1(looks * np.log1p(-np.clip(p, LEAST_P, 1 - 1e-15)))
+    than a p-value that is told. The p-value itself may be: however many looks there are, what is
+    far enough out is found."""
+    adjusted = -np.expm1(looks * np.log1p(-np.clip(p, 0.0, 1 - 1e-15)))
+    return np.maximum(adjusted, LEAST_P)

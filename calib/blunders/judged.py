@@ -7,6 +7,7 @@ tell, and so does the sigma that is stated of them.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -20,7 +21,7 @@ from calib.blunders.uneven import Uneven, Whereabouts, unevenly
 from calib.linear.system import Linearisation
 from calib.problem.model import labels
 from calib.problem.problem import Problem
-from calib.residuals.groups import JOINTS, Group
+from calib.residuals.groups import JOINTS, Group, kind_and_number
 
 ALPHA_BLUNDER = LEVELS["blunder"]
 # How much the median of squares tells of their scale, against their mean, for Gaussian rows.
@@ -49,7 +50,7 @@ class Blunder:
         limit: of the statistic, beyond which it is named.
         enough: noncentrality of the statistic at which it is found with 80 % power.
         detectable: unit -> size of such a blunder.
-        looks: how many groups were looked at.
+        looks: how many groups p_adjusted pays for.
         uneven: how those of its kind scatter unevenly, where they do.
     """
 
@@ -130,22 +131,27 @@ def judge(whole: Linearisation, problem: Problem, planned: Collection[str] = ())
         planned: names of stops that nobody has measured yet, which tell nothing of how far out
             others of their kind are.
     """
-    kinds: dict[object, list[Shift]] = {}
+    kinds: dict[tuple[str, str, bool], list[Shift]] = {}
     pairs = list(zip(problem.sources, labels(problem.sources), strict=True))
     gone = {group for source, _ in pairs for group in source.without}
     gone |= {Group("joints", *where, label) for source, label in pairs for where in source.unread}
     for shift in shifts(whole, problem):
         if shift.dof and shift.group not in gone:
             kinds.setdefault((*_alike(shift.group), shift.of_ranges), []).append(shift)
-    looks, whereabouts = sum(len(some) for some in kinds.values()), Whereabouts.of(problem)
-    found = [b for some in kinds.values() for b in _judged(some, looks, planned, whereabouts)]
+    # Of the level one half is for parts of the mesh, which are many, and one for all others.
+    groups = [kind == "surface" for (kind, *_), some in kinds.items() for _ in some]
+    halves, whereabouts = Counter(groups), Whereabouts.of(problem)
+    found: list[Blunder] = []
+    for (kind, *_), some in kinds.items():
+        looks = len(halves) * halves[kind == "surface"]
+        found += _judged(some, looks, planned, whereabouts)
     return sorted(found, key=lambda b: -b.evidence)
 
 
 def _alike(group: Group) -> tuple[str, str]:
     """Groups that are as likely as each other to be somewhat off."""
     if group.kind == "surface":
-        return group.kind, group.what.partition("_")[0]
+        return group.kind, kind_and_number(group.what)[0]
     return group.kind, group.what if group.kind in ("body", "level") else ""
 
 
@@ -208,11 +214,11 @@ def _judged(
             bulk = max(1.0, uneven.scale.get((recording, where), of_kind))
         bulk = max(bulk, of_joint.get((recording, what), 0.0))
         scaled = shift.statistic / bulk
-        p = at_least(special.fdtrc(shift.dof, known, scaled / shift.dof))
+        p = float(special.fdtrc(shift.dof, known, scaled / shift.dof))
         told = {u: np.diag(shift.information)[at].mean() for u, at in shift.parts.items()}
         yield Blunder(
             shift=shift,
-            p_value=p,
+            p_value=at_least(p),
             p_adjusted=float(after_looks(p, looks)),
             evidence=-log_tail(scaled, shift.dof),
             limit=float(limit * shift.dof * bulk),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy as np
 from calib.blunders.chance import LEAST_P, at_least
 from calib.blunders.judged import Blunder, LeftOut
 from calib.blunders.reach import FurthestMoved
-from calib.problem.model import Source
+from calib.problem.model import Source, labels, same_mesh
 from calib.residuals.groups import ALONG_BEAMS, JOINTS, MESH, SCAN, Group
 from calib.residuals.surfaces import part_centre_m
 from calib.rig import Rig
@@ -52,16 +52,17 @@ def groups(
     }
 
 
-def document(left: LeftOut, source: Source) -> dict[str, Any]:
+def document(left: LeftOut, sources: Sequence[Source]) -> dict[str, Any]:
     """A blunder as diagnosis.json has it.
 
     Args:
         left: it, and what else could be wrong in its place.
-        source: the recording that it is in.
+        sources: the recordings, of which it is in one.
     """
     blunder, group, shift = left.blunder, left.blunder.group, left.blunder.shift
     size, sigma, unit, axis = blunder.leading()
-    wrong_sign = _wrong_sign(left, source.rig)
+    of = dict(zip(labels(sources), sources, strict=True)).get(group.recording, sources[0])
+    wrong_sign, at_m = _wrong_sign(left, of.rig), _at_m(group, sources)
     return {
         "kind": group.kind,
         "name": group.what,
@@ -72,6 +73,7 @@ def document(left: LeftOut, source: Source) -> dict[str, Any]:
         "unit": unit,
         "sigma": sigma,
         "axis": axis or None,
+        "at_m": at_m,
         "wrong_sign": wrong_sign,
         "offset": {
             "names": list(shift.axes),
@@ -85,7 +87,7 @@ def document(left: LeftOut, source: Source) -> dict[str, Any]:
         "indistinguishable_from": [other.token for other in left.rivals],
         "belongs_to": left.belongs.where if left.belongs else None,
         "without": group.token,
-        "sentence": _sentence(left, wrong_sign, _about(group, source)),
+        "sentence": _sentence(left, wrong_sign, _about(at_m)),
     }
 
 
@@ -100,26 +102,30 @@ def of_rings(lidar: str, found: RingFinding) -> dict[str, Any]:
     }
 
 
-def of_part(name: str, source: Source, off_m: float, sigma_m: float, p: float) -> dict[str, Any]:
+def of_part(
+    name: str, sources: Sequence[Source], off_m: float, sigma_m: float, p: float
+) -> dict[str, Any]:
     """A part of the mesh whose beams were rejected as they agree on another place, in the same
     form.
 
     Args:
         name: as of `Group.what`.
-        source: a recording with that mesh.
+        sources: the recordings.
         off_m, sigma_m: residual of its beams, and of their mean; infinite where it is not known.
         p: by chance, all looks paid for.
     """
     group = Group("surface", MESH, name)
     side = "long" if off_m > 0 else "short"
     beams = f"its beams read {size_told(abs(off_m), sigma_m, 'm')} {side}"
-    said = f"{group}{_about(group, source)} is not where it was scanned: {beams}"
+    at_m = _at_m(group, sources)
+    said = f"{group}{_about(at_m)} is not where it was scanned: {beams}"
     return {
         **_otherwise("surface", name, MESH, whole(said)),
         "size": abs(off_m),
         "unit": "m",
         "sigma": sigma_m,
         "axis": ALONG_BEAMS,
+        "at_m": at_m,
         "p_value": p,
         "p_adjusted": p,
         "without": group.token,
@@ -135,6 +141,7 @@ def _otherwise(kind: str, name: str, where: str, sentence: str) -> dict[str, Any
         "stop": None,
         "recording": None,
         "axis": None,
+        "at_m": None,
         "wrong_sign": None,
         "offset": None,
         "p_value": LEAST_P,  # chance puts no ring in another's place
@@ -176,12 +183,16 @@ def tokens(blunders: Iterable[Mapping[str, Any]]) -> list[str]:
     return [each["without"] for each in blunders if each["without"]]
 
 
-def _about(group: Group, source: Source) -> str:
-    """About where a part of the mesh is."""
-    if group.where != MESH or source.reference is None:
-        return ""
-    at = ", ".join(f"{m:.1f}" for m in part_centre_m(source.reference, group.what))
-    return f" (about {at} m)"
+def _at_m(group: Group, sources: Sequence[Source]) -> list[float] | None:
+    """About where a part of the mesh is; None of several meshes, whose parts are numbered alike."""
+    meshes = [source.reference for source in sources if source.reference is not None]
+    if group.where != MESH or any(not same_mesh(mesh, meshes[0]) for mesh in meshes):
+        return None
+    return part_centre_m(meshes[0], group.what).tolist()
+
+
+def _about(at_m: Sequence[float] | None) -> str:
+    return f" (about {', '.join(f'{m:.1f}' for m in at_m)} m)" if at_m else ""
 
 
 def _sentence(left: LeftOut, wrong_sign: str | None, about: str) -> str:

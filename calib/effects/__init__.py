@@ -20,6 +20,7 @@ from calib.effects.arm import (
     ArmJointSlip,
     ArmLinkLength,
     ArmThermalGrowth,
+    joints_acting,
 )
 from calib.effects.base import (
     Basis,
@@ -178,6 +179,7 @@ __all__ = [
     "View",
     "find",
     "is_known",
+    "joints_acting",
     "load_effects",
     "own_effects",
     "read",

@@ -22,7 +22,7 @@ from calib.planning.scene import PlanningScene
 from calib.planning.stops import MARK, Poses
 from calib.problem import Problem
 from calib.problem.unknowns import Key
-from calib.residuals.groups import CAD, JOINTS, Group
+from calib.residuals.groups import CAD, JOINTS, Group, kind_and_number
 from calib.solve.fit import Progress
 
 TARGET_WORDS = {"lower": "lower marker", "upper": "upper marker"}
@@ -176,6 +176,8 @@ def _sizes(blunders: Sequence[Blunder]) -> dict[str, dict[str, Size]]:
 
 def _kind(group: Group) -> str:
     """What may be off, wherever it is."""
+    if group.kind == "surface":
+        return f"a {kind_and_number(group.what)[0]} of the mesh"
     if group.kind == "joints":
         return "all joints of a stop" if group.what == JOINTS else "a joint"
     said = {
@@ -183,7 +185,6 @@ def _kind(group: Group) -> str:
         "level": group.what,
         "target": f"a target's {TARGET_WORDS.get(group.what, group.what)}",
         "frame": "paper: a frame or a length",
-        "surface": f"a {group.what.partition('_')[0]} of the mesh",
     }
     return said.get(group.kind, f"a {group.kind}")
 

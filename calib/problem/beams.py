@@ -10,7 +10,7 @@ from calib.problem.places import Places
 from calib.problem.problem import Problem, SourceStops
 from calib.problem.surfaces import LEAST_BEAMS
 from calib.problem.unknowns import Owner, Role, Unknown, vector_unknown
-from calib.residuals.groups import MESH_PARTS, SCAN, Group
+from calib.residuals.groups import MESH_PARTS, SCAN, Group, kind_and_number
 from calib.residuals.scan import ScanStop
 from calib.residuals.surfaces import PLANE_PATCHES_M, Meeting, MeshSurface, PlaneSurface
 from chains import se3
@@ -81,8 +81,8 @@ def _meeting(problem: Problem, part: SourceStops, places: Places) -> Meeting:
 
 def _left_out(source: Source, kind: str) -> frozenset[int]:
     """Numbers of the parts of its mesh that are left out, of one of `MESH_PARTS`."""
-    names = (what.partition("_") for _, what in source.lacks("surface"))
-    return frozenset(int(number) for part, _, number in names if part == kind)
+    parts = (kind_and_number(what) for _, what in source.lacks("surface"))
+    return frozenset(number for part, number in parts if part == kind)
 
 
 def _planes_unknown(found: PlaneSurface, owner: Owner) -> Unknown:

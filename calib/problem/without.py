@@ -146,7 +146,7 @@ def _refusal(sources: Sequence[Source], token: str, called: Sequence[str]) -> st
         what = token.rpartition("/")[2]
         choice = " or ".join(f"{label}/{what}" for label in called)
         return f"--without {token}: several recordings have that; say which: {choice}"
-    known = [group.token for s in sources for group in _groups(s)]
+    known = [g.token for s in sources for g in _groups(s) if g.where != MESH]
     return (
         f"--without {token}: no recording has that; write STOP:BODY, STOP:FRAME.level, STOP:scan, "
         "STOP:joints, STOP:JOINT, TARGET:sphere, lower, upper or rod, cad:FRAME, "

@@ -9,7 +9,8 @@ GroupKind = Literal["body", "level", "joints", "scan", "target", "frame", "rings
 AT_STOPS = ("body", "level", "joints", "scan")  # kinds that a stop has
 SCAN, JOINTS = "scan", "joints"  # what of a stop, beside its bodies and single joints
 CAD, MESH = "cad", "mesh"  # where, of what belongs to no stop and no target
-SURFACE, REGION, PATCH = MESH_PARTS = "surface", "region", "patch"  # each may be off by itself
+# Parts of the mesh: each may be off by itself.
+SURFACE, REGION_PART, PATCH = MESH_PARTS = "surface", "region", "patch"
 ALONG_BEAMS = "along the beams"  # the direction of a range zero
 ALONG_NORMAL = "along its normal"  # that of a part of the mesh
 
@@ -17,6 +18,12 @@ ALONG_NORMAL = "along its normal"  # that of a part of the mesh
 def part_of_mesh(kind: str, number: int) -> str:
     """What a part of the mesh, of one of `MESH_PARTS`, is called."""
     return f"{kind}_{number}"
+
+
+def kind_and_number(part: str) -> tuple[str, int]:
+    """The inverse of `part_of_mesh`."""
+    kind, _, number = part.rpartition("_")
+    return kind, int(number)
 
 
 def level_of(frame: str) -> str:
@@ -30,7 +37,7 @@ class Group:
 
     Args:
         kind: what kind of thing it is, as diagnosis.json has it.
-        where: the stop or target; `CAD` for what rig.yaml or the URDF says, `MESH` for a surface.
+        where: the stop or target; `CAD` for what rig.yaml or the URDF says, `MESH` of the mesh.
         what: the body, a level as `level_of` has it, `SCAN`, `JOINTS` or one joint; the part of the
             target; the frame or ``effect.parameter``; the part of the mesh, as `part_of_mesh`.
         recording: name of its folder, where there are several recordings.

@@ -14,7 +14,7 @@ from calib.effects import LazyColumn
 from calib.forward import Values
 from calib.residuals.beams import Association, Columns, Surface
 from calib.residuals.compiled import meet_planes
-from calib.residuals.groups import PATCH, REGION, SURFACE
+from calib.residuals.groups import PATCH, REGION_PART, SURFACE, kind_and_number
 from chains import se3
 from sensors.lidar import Beams
 from sensors.planes import Cells, Planes
@@ -29,8 +29,8 @@ PARALLEL_RAD = np.deg2rad(89.0)  # a choice: where it is 57 mm of range, nothing
 # larger ones the cells grow alike, so that there are never many more of them. Patches of planes are
 # as wide as the cells that planes are found in: within patches of 0.5 m the walls of the simulated
 # labs are uneven enough for ring zeros of an XT32 to be 1.2 to 1.5 times their sigmas off.
-PATCHES_M = {REGION: 1.2, PATCH: 0.5}
-PLANE_PATCHES_M = {REGION: 1.2, PATCH: 0.3}
+PATCHES_M = {REGION_PART: 1.2, PATCH: 0.5}
+PLANE_PATCHES_M = {REGION_PART: 1.2, PATCH: 0.3}
 ROOM_M2 = 200.0
 
 
@@ -317,10 +317,10 @@ def patch_widths_m(reference: Reference) -> dict[str, float]:
 
 def part_centre_m(reference: Reference, part: str) -> np.ndarray:
     """About where (3,) a part of the mesh is, called as `part_of_mesh` calls it."""
-    kind, _, number = part.partition("_")
+    kind, number = kind_and_number(part)
     if kind == SURFACE:
-        return reference.surface_centre_m(int(number))
-    return reference.patch_centre_m(int(number), patch_widths_m(reference)[kind])
+        return reference.surface_centre_m(number)
+    return reference.patch_centre_m(number, patch_widths_m(reference)[kind])
 
 
 def parts_of_mesh(reference: Reference) -> dict[str, int]:

@@ -1,5 +1,6 @@
 """What is wrong with tracked bodies, as far as it shows before any fit: placeholders, orders of
-quaternions, bodies exchanged, and poses that no other pose and no joint bears out."""
+quaternions, bodies exchanged, columns out of step, and poses that no other pose and no joint bears
+out."""
 
 from __future__ import annotations
 
@@ -25,11 +26,10 @@ OUTLIER_SIGMAS = 8.0
 NOT_THIS_ARM = 0.05
 TURNED_RAD, FITS_RAD = 0.1, 0.03  # turns that are not the arm's, and turns that are
 MOST_TAKEN = 0.5  # of the rows by what is unknown: more, and what is left of the others says little
-# Of how far poses are off, left where columns are moved by a stop, if that is it: a choice, as 0.2
-# to 0.3 was left where it was, and 1 where it was not.
-OUT_OF_STEP = 0.5
+# Stops far off, from which columns may be out of step, and of these what is left if they are: a
+# choice, as one in ten was left where columns were moved back, and all where they were not.
+FEWEST_OFF, OUT_OF_STEP = 3, 0.25
 READINGS = "joints"  # whose columns may be out of step, as those of bodies may
-ALIKE = 1.5  # times what the best leaves, by which another does as well: a choice
 SWAPPED = 0.2  # of the misfit, left where two bodies are exchanged
 MOST_COMPARED = 100  # stops, each with each
 MOST_FITTED = 1000  # stops, to which what is unknown is fitted; all are held against it
@@ -74,7 +74,7 @@ class _Pair:
             place=self.place[here],
             nominal=self.nominal[there if name == READINGS else here],
             poses=tuple(pose[there if body == name else here] for body, pose in of.items()),
-            d_twist=self.d_twist[here],
+            d_twist=self.d_twist[there if name == READINGS else here],
         )
 
 
@@ -177,10 +177,10 @@ def _at_all_stops(pair: _Pair) -> Suspect | None:
         if apart > TURNED_RAD and swapped < SWAPPED * apart:
             said = f"{names} lie as CAD says if they are exchanged; is each named as it should be?"
             return Suspect("body", names, said)
-    if _turns(pair, seen)[0] < TURNED_RAD:
-        return None
     if said := _out_of_step(pair):
         return Suspect("body", names, said)
+    if _turns(pair, seen)[0] < TURNED_RAD:
+        return None
     orders = {order: _turns(pair, pair.seen(index)) for order, index in QUATERNION_ORDERS.items()}
     fitting = [order for order, (left, _) in orders.items() if left < FITS_RAD]
     if not fitting:
@@ -194,31 +194,31 @@ def _at_all_stops(pair: _Pair) -> Suspect | None:
 
 
 def _out_of_step(pair: _Pair) -> str:
-    """What belongs to the stop before, or after, if all then fits; of those that do, the first that
-    fits best, and all that fit as well."""
+    """What belongs to a stop before, or after, if all then fits: every way in which it does."""
+    here = _far_off(pair)
     ways = [(name, by) for name in (*pair.names, READINGS) for by in SLIPPED]
     moved = {way: pair.slipped(*way) for way in ways}
-    left = {way: _apart(some) for way, some in moved.items() if len(some.stops) >= 4}
-    least = min(left.values(), default=np.inf)
-    if least > OUT_OF_STEP * _apart(pair):
+    left = {way: _far_off(some) for way, some in moved.items() if len(some.stops) >= 4}
+    least = min(left.values(), default=len(pair.stops))
+    if here < FEWEST_OFF or least > OUT_OF_STEP * here:
         return ""
-    fitting = [way for way, each in left.items() if each < ALIKE * max(least, 1e-9)]
     told = [
-        f"the columns of {name} are taken {abs(by)} stop{'s' * (abs(by) > 1)} "
-        f"{'later' if by > 0 else 'earlier'}"
-        for name, by in fitting
+        f"the columns of {name} from the {'row' if abs(by) == 1 else 'second row'} "
+        f"{'below' if by > 0 else 'above'}"
+        for (name, by), count in left.items()
+        if count == least
     ]
     return (
-        f"{' and '.join(pair.names)} lie as CAD and joints say if {', or '.join(told)}: stops.csv "
-        "is out of step"
+        f"{' and '.join(pair.names)} would lie where CAD and joints put "
+        f"{'it' if len(pair.names) == 1 else 'them'} if each row of stops.csv took "
+        f"{', or '.join(told)}: is the table out of step?"
     )
 
 
-def _apart(pair: _Pair) -> float:
-    """How far poses are from where joints and CAD put them, rad and m alike: the mean over stops,
-    of which none counts more than `TURNED_RAD`."""
-    size = _size(_gap(_from_places(pair), pair.seen()))
-    return float(np.mean(np.minimum(size, TURNED_RAD)))
+def _far_off(pair: _Pair) -> int:
+    """At how many stops poses are further off than any CAD or arm: see `TURNED_RAD`, rad and m
+    alike."""
+    return int(np.sum(_size(_gap(_from_places(pair), pair.seen())) > TURNED_RAD))
 
 
 def _turns(pair: _Pair, seen: Array) -> tuple[float, float]:

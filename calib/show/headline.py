@@ -45,6 +45,8 @@ DIFFERS = Words(  # of one recording: nothing moved, two models tell it otherwis
     title_of_none="does not differ significantly",
 )
 
+FIRST_CHECKED = 3  # recordings that are to be checked where a fit did not converge: a choice
+
 
 def moved_sentence(links: Sequence[Mapping[str, Any]], words: Words = MOVED_WORDS) -> str:
     """What moved since the run that was the prior, and that nothing else did.
@@ -107,7 +109,8 @@ def closing(run: Run) -> list[str]:
         )
     if diagnosis:
         return [first, *first_answer, f"verdict: {verdict.meaning}. {verdict.sentence}"]
-    told, lost = "no contradiction to the model; not diagnosed yet", not run.converged
+    told = "no contradiction to the model; not diagnosed yet"
+    odd = () if run.converged else list(run.recordings)[:FIRST_CHECKED]
     if reasons := [each for each in verdict.reasons if not each.startswith(UNASKED)]:
         why, more = reasons[0].partition(": ")[0], len(reasons) - 1
         others = f" (and {more} more reason{'s' * (more > 1)})" if more else ""
@@ -116,6 +119,6 @@ def closing(run: Run) -> list[str]:
         first,
         *first_answer,
         f"verdict so far: {told}",
-        *(f"first: {shlex.join(['rigcal', 'check', str(r)])}" for r in run.recordings if lost),
+        *(f"first: {shlex.join(['rigcal', 'check', str(folder)])}" for folder in odd),
         f"next: rigcal diagnose {shlex.quote(str(run.folder))}",
     ]

@@ -117,24 +117,25 @@ def test_quaternions_in_another_order(sound, shared, order):
 
 
 @pytest.mark.parametrize("by", [-2, -1, 1])
-@pytest.mark.parametrize("name", [MOUNT, "joints"])
+@pytest.mark.parametrize("name", [BASE, MOUNT, "joints"])
 def test_columns_out_of_step(sound, name, by):
-    """As where a table has lost a row: which columns, and which way they are to be moved."""
+    """As where tables were joined a row apart: which columns, and which way."""
     rig, recording = sound
-    if name == MOUNT:
-        late = changed(recording, MOUNT, slice(None), lambda p: np.roll(p, by, axis=0))
-    else:
+    if name == "joints":
         late = replace(recording, joints=np.roll(recording.joints, by, axis=0))
+    else:
+        late = changed(recording, name, slice(None), lambda p: np.roll(p, by, axis=0))
     found = only(odd_bodies(rig, late))
-    way = f"{abs(by)} stop{'s' * (abs(by) > 1)} {'later' if by > 0 else 'earlier'}"
-    assert f"the columns of {name} are taken {way}" in found.sentence and found.stops == ()
+    row = f"the {'second ' * (abs(by) == 2)}row {'below' if by > 0 else 'above'}"
+    assert f"the columns of {name} from {row}" in found.sentence and found.stops == ()
 
 
 def test_an_arm_alone_whose_joints_are_a_row_late(shared):
     rig, recording = opened(shared, "arm_base_creeps")
     late = replace(recording, joints=np.roll(recording.joints, 1, axis=0))
     found = only(odd_bodies(rig, late))
-    assert "the columns of joints are taken 1 stop later" in found.sentence
+    assert "the columns of joints from the row below" in found.sentence
+    assert found.sentence.startswith("tool would lie where CAD and joints put it if")
 
 
 def test_bodies_exchanged_at_all_stops_or_at_one(sound):

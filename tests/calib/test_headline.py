@@ -14,10 +14,10 @@ RMS_MM = {"fit": 3.34, "held_out": 3.47, "noise_floor": 3.62}
 SUMMARY = {"residual": "range", "rms_mm": RMS_MM, "converged": True, "misfit": {"beams": 0.9}}
 
 
-def fitted(folder="somewhere/run", **summary):
-    part = Part({}, {})
+def fitted(folder="somewhere/run", recordings=("rec",), **summary):
+    part, model = Part({}, {}), {"recordings": [{"path": each} for each in recordings]}
     solution = Solution(shared=part, recordings={}, not_estimated=[], keys=(), covariance=None)
-    return Run(Path(folder), {}, SUMMARY | summary, solution)
+    return Run(Path(folder), model, SUMMARY | summary, solution)
 
 
 def closing_lines(folder="somewhere/run", **summary):
@@ -43,6 +43,13 @@ def test_the_last_lines_are_the_error_what_it_is_worth_and_the_next_command():
 def test_what_speaks_against_a_run_stands_in_its_last_lines(summary, light, reason):
     told = closing_lines(**summary)[1]
     assert told.startswith(f"verdict so far: {light}; ") and reason in told
+
+
+def test_where_a_fit_did_not_converge_its_recordings_are_to_be_checked_first():
+    *_, first, second, last = closing_lines(recordings=("a rec", "b"), converged=False)
+    assert shlex.split(first) == ["first:", "rigcal", "check", "a rec"]
+    assert (second, last) == ("first: rigcal check b", "next: rigcal diagnose somewhere/run")
+    assert len(closing_lines(recordings="abcdefgh", converged=False)) == 2 + 3 + 1
 
 
 def test_of_a_diagnosed_run_the_last_line_is_the_verdict_and_there_is_nothing_to_ask(monkeypatch):

@@ -110,7 +110,8 @@ def test_parts_keep_their_numbers_where_the_mesh_is_moved(bulged, tmp_path):
     of = before.patch_surface(0.5)
     many = np.flatnonzero(np.bincount(of)[of] > 3).tolist()
     away_m = [after.patch_centre_m(k, 0.5) - before.patch_centre_m(k, 0.5) for k in many]
-    assert len(many) > 100 and np.linalg.norm(away_m, axis=1).max() < 0.05
+    assert len(many) > 100
+    assert np.linalg.norm(away_m, axis=1).max() < 0.25  # the next patch is half a metre away
 
 
 @pytest.mark.long

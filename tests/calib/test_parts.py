@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.diagnosis.score import score_test
+from calib.diagnosis.score import project, score_test
 from calib.diagnosis.search.parts import likeliest_part
 from calib.diagnosis.stand import Stand
+from calib.effects import CATALOGUE
 from calib.problem import build
 from calib.problem.model import Model, Source
 from calib.simulation import Spec, simulate
@@ -63,6 +64,26 @@ def test_what_all_joints_do_is_told_by_all(look):
     part = likeliest_part(moved, candidate, 1.0)
     assert (part.statistic, part.dof) == (candidate.test.statistic, candidate.test.dof)
     assert part.price == 0.0
+
+
+@pytest.mark.parametrize("joint", [1, 2])
+def test_a_shape_between_those_of_the_grid_is_told_as_well(look, joint):
+    """Once it is found its information is that of its own shape, and its score that of its test."""
+    effect = next(e for e in CATALOGUE if e.name == "arm_gear_error").at(28)
+    stand = look.stand
+    linear, at = stand.linearise([effect], lambda what, done, total: None)
+    own = project(linear, linear.candidates, stand.spent)
+    theta = np.zeros(12)
+    theta[2 * joint : 2 * joint + 2] = 0.001
+    columns = at[effect.name]
+    score = own.information[np.ix_(columns, columns)] @ theta
+    shaped = replace(own, score=score)  # it alone was linearised
+    on_grid = next(c for c in look.named.candidates if c.effect.family == effect.family)
+    finest = replace(on_grid, effect=effect, test=score_test(shaped, columns))
+    near = replace(look, linear=linear, named=replace(look.named, scores=shaped))
+    before, finest = look.with_shape(on_grid, near, finest)
+    part = likeliest_part(before, finest, 1.0)
+    assert part.dof == 2 and part.statistic == pytest.approx(finest.test.statistic, rel=1e-6)
 
 
 @pytest.mark.parametrize("name", ["incidence_angle_bias", "label_range_offset", "mount_slip"])

@@ -182,7 +182,7 @@ def test_the_wild_group_stands_alone_above_the_line():
     assert chart.title == "b/s2:base is 7.0 times further off than chance allows"
     (ax,) = chart.figure().axes
     names = [tick.get_text() for tick in ax.get_xticklabels()]
-    assert names == ["a/s2", "b/s2", "b/s10", "T1", "cad", "mesh"]
+    assert names == ["a/s2", "b/s2", "b/s10", "T1", "cad", "surface"]
     rings = [line for line in ax.lines if line.get_markerfacecolor() == "none"]
     assert [(line.get_xdata()[0], line.get_ydata()[0]) for line in rings] == [(1, 7.0)]
     assert [text.get_text() for text in ax.texts] == ["b/s2:base"]

@@ -139,7 +139,13 @@ def test_no_p_value_is_told_below_the_least_nor_adjusted_below_itself():
         assert LEAST_P <= told <= 1.0
         for looks in (1.0, 3.7, 300.0):
             assert told <= after_looks(p, looks) * (1 + 1e-9)
-            assert after_looks(p, looks) == pytest.approx(after_looks(told, looks))
+            assert after_looks(p, looks) <= after_looks(told, looks) * (1 + 1e-9)
+
+
+@pytest.mark.parametrize("looks", [10.0, 6_000.0, 1e6])
+def test_what_is_far_enough_out_is_found_however_many_looks_there_are(looks):
+    assert after_looks(1e-30, looks) == LEAST_P
+    assert after_looks(1e-9, looks) == pytest.approx(max(1e-9 * looks, LEAST_P), rel=1e-3)
 
 
 def test_unknowns_that_stops_are_spent_on_count(bench):

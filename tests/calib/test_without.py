@@ -246,7 +246,7 @@ def test_the_command_that_is_printed_fits_the_same_without_more(box, run, rigcal
     ("tokens", "said"),
     [
         (["s9:scan"], "--without s9:scan: no recording has that"),
-        (["s1:base_marker"], "mesh:surface_N or mesh:patch_N; did you mean s1:base_markers?"),
+        (["s1:base_marker"], "mesh:region_N or mesh:patch_N; did you mean s1:base_markers?"),
         (["lidar"], "write STOP:BODY"),
         (["s1:scan", "s1:scan"], "--without s1:scan: that is left out already"),
         (["s1:lift", "s1:lift"], "--without s1:lift: that is left out already"),

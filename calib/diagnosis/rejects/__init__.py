@@ -29,7 +29,7 @@ from calib.blunders.chance import LEAST_P, LEVELS, after_looks
 from calib.diagnosis.rejects.counts import CellAxis, Counts, Rejected, count, meshed
 from calib.diagnosis.rejects.found import CLUTTER, Place, Rejects
 from calib.diagnosis.stand import Stand
-from calib.residuals.groups import REGION, SURFACE
+from calib.residuals.groups import REGION_PART, SURFACE
 from calib.solve.fit import Progress
 
 ALPHA_REJECTED = LEVELS["structure of what was rejected"]
@@ -111,7 +111,7 @@ class _View:
 
 def _views(counts: Counts) -> Iterator[_View]:
     rejected, met = counts.rejected, counts.met
-    of_stop = met.sum(axis=1)
+    of_stop, of_place = met.sum(axis=1), counts.met_places.sum(axis=0)
     for a, axis in enumerate(counts.axes):
         cell = rejected.cells[:, a]
         yield _View(
@@ -121,7 +121,7 @@ def _views(counts: Counts) -> Iterator[_View]:
             cell=cell,
             ways=(
                 (rejected.stop, counts.stops[a], of_stop),
-                (rejected.place, counts.places[a], counts.met_places.sum(axis=0)),
+                (rejected.place, counts.places[a], of_place),
             ),
         )
     stops = CellAxis.of_things("stop", counts.stop_names)
@@ -131,7 +131,7 @@ def _views(counts: Counts) -> Iterator[_View]:
         (surfaces, rejected.surface, rejected.stop, met),
     ]
     if counts.place_names:
-        regions = CellAxis.of_things(REGION, counts.place_names)
+        regions = CellAxis.of_things(REGION_PART, counts.place_names)
         things.append((regions, rejected.place, rejected.stop, counts.met_places))
     for axis, mine, other, beams in things:
         rows, ways = beams.sum(axis=0), ((other, beams, beams.sum(axis=1)),)

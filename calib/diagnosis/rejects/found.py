@@ -170,13 +170,13 @@ class Rejects:
         mine = (place for place in self.structured if place.covariate in MESH_PARTS)
         return [place for place in mine if place.coherent and self.meshed]
 
-    def blunders(self, source: Source) -> list[dict[str, Any]]:
-        """These as blunders in diagnosis.json, to be left out; of a recording with the mesh."""
+    def blunders(self, sources: Sequence[Source]) -> list[dict[str, Any]]:
+        """These as blunders in diagnosis.json, to be left out; of these recordings."""
         parts = (
             (part_of_mesh(each.covariate, name), each) for each in self.moved for name in each.names
         )
         return [
-            told.of_part(name, source, place.residual_m, place.sigma_m, place.p_adjusted)
+            told.of_part(name, sources, place.residual_m, place.sigma_m, place.p_adjusted)
             for name, place in parts
         ]
 

@@ -7,7 +7,7 @@ that joint, of fewer.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,10 +15,11 @@ from calib.blunders.chance import log_tail
 from calib.diagnosis.score import score_test
 from calib.diagnosis.screen import Candidate
 from calib.diagnosis.stand import Look
+from calib.effects import joints_acting
 
 
 @dataclass(frozen=True)
-class Part:
+class Explained:
     """What some parameters of an effect explain.
 
     Args:
@@ -36,7 +37,7 @@ class Part:
         return -log_tail(self.statistic / max(common, 1e-300), self.dof) - self.price
 
 
-def likeliest_part(look: Look, candidate: Candidate, common: float) -> Part:
+def likeliest_part(look: Look, candidate: Candidate, common: float) -> Explained:
     """Of a candidate of a look all of it, or the joint of most evidence.
 
     Args:
@@ -45,13 +46,14 @@ def likeliest_part(look: Look, candidate: Candidate, common: float) -> Part:
         common: as of `ScoreTest.evidence`.
     """
     test = candidate.test
-    whole = Part(test.statistic, test.dof)
-    rig = look.stand.sources[0].rig
-    of = np.array([p.name.partition(".")[0] for p in candidate.effect.params(rig)])
-    joints = [name for name in rig.joint_names if name in of]
+    whole = Explained(test.statistic, test.dof)
+    of = np.array(joints_acting(candidate.effect, look.stand.sources[0].rig))
+    joints = np.unique(of[of != ""])
     if len(of) != len(test.columns) or len(joints) < 2:
         return whole
-    price = float(np.log(len(joints)))
-    each = (score_test(look.named.scores, test.columns[of == name]) for name in joints)
-    parts = [Part(own.statistic, own.dof, price) for own in each if own.dof]
+    score = look.named.scores.score.copy()
+    score[test.columns] = test.score  # in the shape that it was tested in
+    scores, price = replace(look.named.scores, score=score), float(np.log(len(joints)))
+    each = (score_test(scores, test.columns[of == joint]) for joint in joints)
+    parts = [Explained(own.statistic, own.dof, price) for own in each if own.dof]
     return max([whole, *parts], key=lambda part: part.evidence(common))

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from calib.blunders import told
-from calib.blunders.judged import Blunder, LeftOut
+from calib.blunders.judged import Blunder
 from calib.blunders.reach import FurthestMoved
 from calib.diagnosis.candidates import PoseShape, concerned, lacking
 from calib.diagnosis.rejects import FEWEST_STOPS, Rejects
@@ -27,7 +27,6 @@ from calib.diagnosis.verdict.matters import (
 from calib.diagnosis.verdict.names import absorbed, believed, beside_scatter, dressed_up
 from calib.diagnosis.verdict.sentences import BAD, UNNAMED, sentences_of, stops_of, unconfirmed
 from calib.diagnosis.verdict.unnamed import Unnamed
-from calib.problem.model import Source, labels
 from calib.residuals.groups import Group
 from calib.results.holdout import Fall
 
@@ -158,9 +157,9 @@ def conclude(
     """
     heavy = weighed(found, held_out, summary["rms_mm"])
     found, first = heavy.found, found.looks[0]
-    moved = rejected.blunders(first.stand.sources[0]) if rejected and not found.found else []
-    blunders = [*rings, *moved]
-    blunders += [told.document(left, _source(left, first)) for left in found.blunders]
+    sources = first.stand.sources
+    blunders = [*rings, *(rejected.blunders(sources) if rejected and not found.found else [])]
+    blunders += [told.document(left, sources) for left in found.blunders]
     hold = believed(found, held_out) and not formulas.instead
     more = formulas.formulas or found.unsettled or (heavy.refused and found.at_first)
     more = bool(more or (rejected and not rejected.explained))
@@ -175,8 +174,7 @@ def conclude(
     deferred = not found.scatter_judged and (verdict == UNNAMED or bool(formulas.formulas))
     candidates = candidate_documents(heavy, held_out, deferred, worn)
     unexplained = _structure(found, verdict, formulas, rejected, doubt)
-    untestable = _untestable(first)
-    unsure = unconfirmed(doubt, over) if doubt else ""
+    untestable, unsure = _untestable(first), unconfirmed(doubt, over) if doubt else ""
     told_of = verdict, heavy, candidates, unexplained, untestable, blunders
     sentences = sentences_of(*told_of, deferred=deferred, doubt=unsure)
     _caution(sentences, verdict, formulas, rejected, () if blunders else forbids)
@@ -240,13 +238,6 @@ def _unconfirmed(found: Search, over: float) -> Candidate | None:
     if there or over <= (HELD_OUT_BESIDE_SCATTER if found.chance else HELD_OUT_BY_CHANCE):
         return None
     return next(suspects(found.looks[-1].unnamed, ALPHA_UNNAMED), None)
-
-
-def _source(left: LeftOut, look: Look) -> Source:
-    """The recording that a blunder is in."""
-    sources = look.stand.sources
-    called = dict(zip(labels(sources), sources, strict=True))
-    return called.get(left.blunder.group.recording, sources[0])
 
 
 def _verdict(found: Search, hold: bool, more: bool, doubt: bool, calm: str) -> str:

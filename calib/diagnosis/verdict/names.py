@@ -9,7 +9,7 @@ import numpy as np
 
 from calib.diagnosis.screen import ODDS
 from calib.diagnosis.search import Search, in_place
-from calib.diagnosis.search.parts import Part, likeliest_part
+from calib.diagnosis.search.parts import Explained, likeliest_part
 from calib.diagnosis.verdict.matters import (
     ABSORBED,
     HELD_OUT_BESIDE_SCATTER,
@@ -61,7 +61,7 @@ def _names_hold(found: Search) -> bool:
     common = found.looks[-1].named.common
     explained = sum(step.candidate.test.statistic for step in found.found)
     parts = [likeliest_part(step.before, step.candidate, common) for step in found.found]
-    together = Part(
+    together = Explained(
         statistic=sum(part.statistic for part in parts),
         dof=sum(part.dof for part in parts),
         price=sum(

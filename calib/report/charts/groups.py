@@ -10,7 +10,7 @@ import numpy as np
 from calib.report import plots
 from calib.report.chart import Absent, Chart
 from calib.report.evidence import Evidence
-from calib.residuals.groups import AT_STOPS, JOINTS, SCAN
+from calib.residuals.groups import AT_STOPS, JOINTS, MESH, SCAN, kind_and_number
 from calib.results.outstanding import times
 from calib.show.misfit import furthest
 
@@ -47,7 +47,8 @@ def groups(evidence: Evidence) -> Iterator[Chart | Absent]:
         "predict, over the limit of the test, which is adjusted for all groups that are tested. "
         "Above the dashed line is a blunder; what the diagnosis left out is drawn as it was "
         "before. Small dots: single joints and, after the stops, targets, nominal values (cad) "
-        "and surfaces (mesh). Groups without redundancy cannot be tested and are not drawn.",
+        "and parts of the mesh by their kind. Groups without redundancy cannot be tested and are "
+        "not drawn.",
         lambda: _groups(found, loud, stops),
         wide=True,
         quiet=not loud,
@@ -92,8 +93,9 @@ def _groups(
 
 
 def _place(token: str) -> str:
-    """Where a group is: its stop or target, `CAD` or `MESH`."""
-    return token.rpartition(":")[0]
+    """Where a group is: its stop or target, or `CAD`; of the mesh what kind of part it is."""
+    where, _, what = token.rpartition(":")
+    return kind_and_number(what)[0] if where == MESH else where
 
 
 def _columns(found: Mapping[str, tuple[str, float]], stops: Mapping[str, int]) -> dict[str, int]:
