@@ -14,8 +14,9 @@ SAME_VERTEX_M = 1e-6
 SMOOTH_TURN_RAD = np.radians(30.0)
 # A direction to which walls and floors are not parallel: a choice.
 NO_WALL = np.array([1.0, 0.61, 0.37])
-STEEPEST_WALL = 0.9  # of a normal, upwards, from which a surface is a floor, and no wall: a choice
-HALF_A_CELL = 0.501  # from where cells are one more: walls often have just half a cell more
+# Digits to which normals, and extents in cells, decide how a surface is divided: a choice, so that
+# walls along the axes, and of half a cell more, are divided alike however they were measured.
+DIGITS_DIVIDED = 2
 
 
 def triangle_planes(corners_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -76,8 +77,8 @@ class SurfaceGrid:
         np.add.at(moment, surface, np.einsum("f,fi,fj->fij", area_m2, normal, normal))
         main = np.linalg.eigh(moment)[1][:, :, -1]
         main = np.where(main @ NO_WALL < 0, -1.0, 1.0)[:, None] * main
-        level = np.abs(main[:, 2:]) < STEEPEST_WALL
-        side = np.cross(main, np.where(level, np.eye(3)[2], np.eye(3)[0]))
+        furthest_axis = np.eye(3)[np.argmin(np.abs(main).round(DIGITS_DIVIDED), axis=1)]
+        side = np.cross(main, furthest_axis)
         side /= np.linalg.norm(side, axis=1, keepdims=True)
         axes = np.stack([side, np.cross(main, side)], axis=1)
         place_m = np.einsum("fki,fci->fck", axes[surface], corners_m)
@@ -113,7 +114,7 @@ class SurfaceGrid:
 
     def _cells(self, cell_m: float) -> np.ndarray:
         """Cells (S, 2) along the axes, each about `cell_m` wide: no slivers at the far rim."""
-        return np.maximum(1, np.ceil(self.size_m / cell_m - HALF_A_CELL)).astype(np.int64)
+        return np.maximum(1, np.rint((self.size_m / cell_m).round(DIGITS_DIVIDED))).astype(np.int64)
 
 
 def transverse(directions: np.ndarray) -> np.ndarray:

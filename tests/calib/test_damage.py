@@ -36,7 +36,8 @@ LONGEST_S = 60
 ENOUGH = 30  # cases that were run, for their passes to be looked at
 # 64 passes where a good fit takes 12. Nothing that the model has brings the scans onto a mesh of
 # wrong scale, and what they meet changes as they move; it comes to an optimum, and is named.
-TAKES_LONGER = {"mesh scaled"}
+# Of ranges of a wrong scale, parts of the mesh that seem off are left out on trial first.
+TAKES_LONGER = {"mesh scaled", "ranges scaled"}
 
 # Others of their sort are run always.
 LONG = (

@@ -300,8 +300,9 @@ def test_a_name_is_held_against_structure_at_the_price_of_both(looks, hold):
 
     def explains(evidence, looks):
         # Of two degrees of freedom the tail is exp(-x / 2).
-        test = SimpleNamespace(statistic=2 * evidence, dof=2, evidence=lambda common: evidence)
-        return SimpleNamespace(test=test, looks=looks, effect=SimpleNamespace(name="bins"))
+        test = SimpleNamespace(statistic=2 * evidence, dof=2, columns=[0, 1])
+        effect = SimpleNamespace(name="bins", params=lambda rig: [])
+        return SimpleNamespace(test=test, looks=looks, effect=effect)
 
     named = explains(50.0, 30.0)
 
@@ -309,7 +310,10 @@ def test_a_name_is_held_against_structure_at_the_price_of_both(looks, hold):
         looks = [SimpleNamespace(named=SimpleNamespace(common=1.0)) for _ in range(2)]
         for look, candidate in zip(looks, (bins, explains(left, looks)), strict=True):
             look.unnamed = SimpleNamespace(candidates=[candidate])
-        return _names_hold(SimpleNamespace(looks=looks, found=[SimpleNamespace(candidate=named)]))
+        rig = SimpleNamespace(joint_names=[])
+        looks[0].stand = SimpleNamespace(sources=[SimpleNamespace(rig=rig)])
+        step = SimpleNamespace(candidate=named, before=looks[0])
+        return _names_hold(SimpleNamespace(looks=looks, found=[step]))
 
     assert names_hold(explains(52.0, looks), left=2.0) == hold
     # In its place it explains no more than the name does, and what that leaves it.

@@ -41,6 +41,17 @@ def flipped(path):
     path.write_bytes(data)
 
 
+def spoilt(path):
+    """One byte of what the archive holds of an unknown is another."""
+    data = bytearray(path.read_bytes())
+    with zipfile.ZipFile(path) as archive:
+        entry = archive.getinfo("state/ring_range_offset.npy")
+        following = [i.header_offset for i in archive.infolist()] + [archive.start_dir]
+    end = min(offset for offset in following if offset > entry.header_offset)
+    data[end - entry.compress_size // 2] ^= 0xFF
+    path.write_bytes(data)
+
+
 def header(shape, descr="<f8"):
     file = io.BytesIO()
     np.lib.format.write_array_header_1_0(
@@ -119,7 +130,7 @@ DAMAGES = [
     ("covariance.npz", gone("covariance")),
 ]
 OF_STATES = [
-    *[text(""), cut, flipped, huge, shorter("lidar"), gone("lidar"), shorter(".dofs")],
+    *[text(""), cut, spoilt, huge, shorter("lidar"), gone("lidar"), shorter(".dofs")],
     *[gone("state/ring_range_offset"), arrays(beyond)],
 ]
 

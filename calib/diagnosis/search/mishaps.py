@@ -37,7 +37,7 @@ def adapted(look: Look, left: list[LeftOut], progress: Progress, named: bool) ->
         wild = [] if stray else _wild(look)
         wild = [b for b in wild if not (named and b.group.kind == "frame")]
         groups = [each.blunder.group for each in stray] + [b.group for b in wild]
-        if not groups or (on_trial and wild and _outdone(look, wild[0])) or _hopeless(look, wild):
+        if not groups or (on_trial and wild and _outdone(look, wild[0])):
             break
         if (stand := tried(look.stand.without, groups, progress)) is None:
             break
@@ -110,20 +110,9 @@ def _wild(look: Look) -> list[Blunder]:
 def _outdone(look: Look, by: Blunder) -> bool:
     """Whether an effect or a structure explains more than a blunder, at its price: also one that
     chance by stops may make, as where stops scatter none of them is a blunder."""
-    return by.evidence - np.log(by.looks) < _most_evidence(look)
-
-
-def _hopeless(look: Look, wild: Sequence[Blunder]) -> bool:
-    """Whether blunders are led by a part of the mesh, and all of them together explain less than an
-    effect or a structure does: parts of the mesh take in some of whatever is missing."""
-    together = sum(b.evidence for b in look.blunders if b.found)
-    return bool(wild) and wild[0].group.where == MESH and together < _most_evidence(look)
-
-
-def _most_evidence(look: Look) -> float:
-    """Of any effect or structure, at its price."""
     every = (*look.named.candidates, *look.unnamed.candidates)
-    return max((c.evidence - np.log(c.looks) for c in every), default=0.0)
+    best = max((c.evidence - np.log(c.looks) for c in every), default=0.0)
+    return by.evidence - np.log(by.looks) < best
 
 
 def _quiet(look: Look) -> bool:
