@@ -12,11 +12,6 @@ THINNEST_TRIANGLE_M = 1e-9
 SAME_VERTEX_M = 1e-6
 # Across an edge that turns more than this, another surface begins.
 SMOOTH_TURN_RAD = np.radians(30.0)
-# A direction to which walls and floors are not parallel: a choice.
-NO_WALL = np.array([1.0, 0.61, 0.37])
-# Digits to which normals, and extents in cells, decide how a surface is divided: a choice, so that
-# walls along the axes, and of half a cell more, are divided alike however they were measured.
-DIGITS_DIVIDED = 2
 
 
 def triangle_planes(corners_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -68,18 +63,13 @@ class SurfaceGrid:
     ) -> "SurfaceGrid":
         """Grid over triangles: corners (F, 3, 3), unit normals (F, 3), areas (F,), surfaces (F,).
 
-        The tangent plane stands across the main direction of the surface's normals, by area. Which
-        way that points, and one axis, are told by fixed directions, so that patches of walls and
-        floors keep their numbers where the mesh is moved a little.
+        The tangent plane stands across the main direction of the surface's normals, by area.
         """
         count = int(surface.max()) + 1
         moment = np.zeros((count, 3, 3))
         np.add.at(moment, surface, np.einsum("f,fi,fj->fij", area_m2, normal, normal))
         main = np.linalg.eigh(moment)[1][:, :, -1]
-        main = np.where(main @ NO_WALL < 0, -1.0, 1.0)[:, None] * main
-        furthest_axis = np.eye(3)[np.argmin(np.abs(main).round(DIGITS_DIVIDED), axis=1)]
-        side = np.cross(main, furthest_axis)
-        side /= np.linalg.norm(side, axis=1, keepdims=True)
+        side = transverse(main)
         axes = np.stack([side, np.cross(main, side)], axis=1)
         place_m = np.einsum("fki,fci->fck", axes[surface], corners_m)
         low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
@@ -114,7 +104,7 @@ class SurfaceGrid:
 
     def _cells(self, cell_m: float) -> np.ndarray:
         """Cells (S, 2) along the axes, each about `cell_m` wide: no slivers at the far rim."""
-        return np.maximum(1, np.rint((self.size_m / cell_m).round(DIGITS_DIVIDED))).astype(np.int64)
+        return np.maximum(1, np.rint(self.size_m / cell_m)).astype(np.int64)
 
 
 def transverse(directions: np.ndarray) -> np.ndarray:

@@ -101,19 +101,6 @@ def test_the_centre_of_a_surface_is_on_it(bulged):
     assert abs((centre_m - corners_m.mean(axis=0)) @ normal) <= spread
 
 
-def test_parts_keep_their_numbers_where_the_mesh_is_moved(bulged, tmp_path):
-    """A run says which are left out by number: a mesh that was measured anew renames none."""
-    folder = shutil.copytree(bulged[0], tmp_path / "rec")
-    shaken_m = np.random.default_rng(0).normal(0, 1e-5, (*bulged[1].shape, 3))
-    Scene(folder, np.random.default_rng(0)).remesh(lambda at, triangles: at + shaken_m)
-    before, after = (Source.open(each).reference for each in (bulged[0], folder))
-    of = before.patch_surface(0.5)
-    many = np.flatnonzero(np.bincount(of)[of] > 3).tolist()
-    away_m = [after.patch_centre_m(k, 0.5) - before.patch_centre_m(k, 0.5) for k in many]
-    assert len(many) > 100
-    assert np.linalg.norm(away_m, axis=1).max() < 0.25  # the next patch is half a metre away
-
-
 @pytest.mark.long
 @pytest.mark.parametrize("seed", range(3))
 def test_a_bulge_in_a_room_of_another_program_is_named(shared, tmp_path, seed):
