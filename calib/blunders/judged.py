@@ -139,8 +139,8 @@ def judge(whole: Linearisation, problem: Problem, planned: Collection[str] = ())
         if shift.dof and shift.group not in gone:
             kinds.setdefault((*_alike(shift.group), shift.of_ranges), []).append(shift)
     # Of the level one half is for parts of the mesh, which are many, and one for all others.
-    groups = [kind == "surface" for (kind, *_), some in kinds.items() for _ in some]
-    halves, whereabouts = Counter(groups), Whereabouts.of(problem)
+    halves = Counter(s.group.kind == "surface" for some in kinds.values() for s in some)
+    whereabouts = Whereabouts.of(problem)
     found: list[Blunder] = []
     for (kind, *_), some in kinds.items():
         looks = len(halves) * halves[kind == "surface"]

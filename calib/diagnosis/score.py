@@ -233,7 +233,7 @@ class ScoreTest:
     def evidence(self, common: float) -> float:
         """Minus the log of the p-value were rows independent but for the common inflation. It
         ranks what candidates explain, at a price for their parameters, and decides nothing."""
-        return -log_tail(self.statistic / max(common, 1e-300), self.dof)
+        return evidence(self.statistic, self.dof, common)
 
     def log_score(self, common: float) -> float:
         """By how much it is expected to raise the log-likelihood of rows that it is not fitted to:
@@ -279,6 +279,11 @@ class ScoreTest:
         limit = special.fdtri(nu, d, 1.0 - alpha / chance.looks)
         scale = max(chance.trace, common * self.dof)
         return float(np.sqrt(enough(nu, d, limit) * scale / nu / chance.share))
+
+
+def evidence(statistic: float, dof: int, common: float) -> float:
+    """As of `ScoreTest.evidence`, of a statistic in so many directions."""
+    return -log_tail(statistic / max(common, 1e-300), dof)
 
 
 def score_test(scores: Scores, columns: np.ndarray) -> ScoreTest:

@@ -20,7 +20,6 @@ from calib.effects.arm import (
     ArmJointSlip,
     ArmLinkLength,
     ArmThermalGrowth,
-    joints_acting,
 )
 from calib.effects.base import (
     Basis,
@@ -179,7 +178,6 @@ __all__ = [
     "View",
     "find",
     "is_known",
-    "joints_acting",
     "load_effects",
     "own_effects",
     "read",

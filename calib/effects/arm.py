@@ -282,11 +282,3 @@ def _units(rig: Rig) -> dict[str, str]:
     """The unit of every joint, by its name."""
     units = {"revolute": "rad", "prismatic": "m"}
     return {j: units[kind] for j, kind in zip(rig.joint_names, rig.joint_kinds, strict=True)}
-
-
-def joints_acting(effect: Effect, rig: Rig) -> list[str]:
-    """The joint that each parameter of an effect is of, as its name says (``JOINT`` or
-    ``JOINT.what``); empty where it is of none."""
-    params = [param.name for param in effect.params(rig)]
-    each = ([j for j in rig.joint_names if f"{name}.".startswith(f"{j}.")] for name in params)
-    return [max(mine, key=len, default="") for mine in each]

@@ -27,7 +27,7 @@ from calib.residuals.groups import (
     part_of_mesh,
 )
 from calib.residuals.scan import ScanStop
-from calib.residuals.surfaces import parts_of_mesh
+from calib.residuals.surfaces import part_counts
 from calib.residuals.targets import TARGET_PARTS
 from calib.rig.inventory import FAR_OFF_M
 from chains.errors import InputError
@@ -83,7 +83,7 @@ def _groups(source: Source, label: str = "") -> list[Group]:
     out += [Group("frame", CAD, frame) for frame in rig.frame_sigma]
     out += [Group("frame", CAD, f"{e}.{p}") for e, p in on_paper(source)]
     if source.reference is not None:
-        for kind, count in parts_of_mesh(source.reference).items():
+        for kind, count in part_counts(source.reference).items():
             out += [Group("surface", MESH, part_of_mesh(kind, n)) for n in range(count)]
     return out
 

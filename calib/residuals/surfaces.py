@@ -99,9 +99,9 @@ class MeshSurface:
             near_edges: True drops beams near a depth edge, and grazing ones.
         """
         origins, directions = _in_reference(T, beams)
-        triangle = self._kept(T, beams, self.reference.first_triangle(origins, directions))
+        triangle = self.reference.first_triangle(origins, directions)
         if not near_edges:
-            return Association(triangle)
+            return Association(self._kept(T, beams, triangle))
         hits = self.reference.hits(triangle, origins, directions)
         spoilt = hits.incidence_rad > FLATTEST_FITTED_RAD
         spoilt |= self.reference.near_edge(origins, directions, hits, self.footprint_rad)
@@ -323,7 +323,7 @@ def part_centre_m(reference: Reference, part: str) -> np.ndarray:
     return reference.patch_centre_m(number, patch_widths_m(reference)[kind])
 
 
-def parts_of_mesh(reference: Reference) -> dict[str, int]:
+def part_counts(reference: Reference) -> dict[str, int]:
     """How many parts of each kind a mesh has, counted from 0."""
     surfaces = {SURFACE: int(reference.surface.max()) + 1}
     widths_m = patch_widths_m(reference).items()

@@ -196,11 +196,13 @@ def _at_all_stops(pair: _Pair) -> Suspect | None:
 def _out_of_step(pair: _Pair) -> str:
     """What belongs to a stop before, or after, if all then fits: every way in which it does."""
     here = _far_off(pair)
+    if here < FEWEST_OFF:
+        return ""
     ways = [(name, by) for name in (*pair.names, READINGS) for by in SLIPPED]
     moved = {way: pair.slipped(*way) for way in ways}
     left = {way: _far_off(some) for way, some in moved.items() if len(some.stops) >= 4}
     least = min(left.values(), default=len(pair.stops))
-    if here < FEWEST_OFF or least > OUT_OF_STEP * here:
+    if least > OUT_OF_STEP * here:
         return ""
     told = [
         f"the columns of {name} from the {'row' if abs(by) == 1 else 'second row'} "

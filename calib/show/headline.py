@@ -110,7 +110,7 @@ def closing(run: Run) -> list[str]:
     if diagnosis:
         return [first, *first_answer, f"verdict: {verdict.meaning}. {verdict.sentence}"]
     told = "no contradiction to the model; not diagnosed yet"
-    odd = () if run.converged else list(run.recordings)[:FIRST_CHECKED]
+    unchecked = () if run.converged else list(run.recordings)[:FIRST_CHECKED]
     if reasons := [each for each in verdict.reasons if not each.startswith(UNASKED)]:
         why, more = reasons[0].partition(": ")[0], len(reasons) - 1
         others = f" (and {more} more reason{'s' * (more > 1)})" if more else ""
@@ -119,6 +119,6 @@ def closing(run: Run) -> list[str]:
         first,
         *first_answer,
         f"verdict so far: {told}",
-        *(f"first: {shlex.join(['rigcal', 'check', str(folder)])}" for folder in odd),
+        *(f"first: {shlex.join(['rigcal', 'check', str(folder)])}" for folder in unchecked),
         f"next: rigcal diagnose {shlex.quote(str(run.folder))}",
     ]

@@ -12,10 +12,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.blunders.chance import log_tail
 from calib.blunders.judged import Blunder, LeftOut
 from calib.diagnosis.chance import Chance
-from calib.diagnosis.score import ScoreTest
+from calib.diagnosis.score import ScoreTest, evidence
 from calib.diagnosis.screen import ODDS, Candidate, rivals
 from calib.diagnosis.search.confirmed import (
     ALPHA_EFFECT,
@@ -121,7 +120,7 @@ def in_place(
     for candidate in before.unnamed.candidates:
         most = explained + left.get(candidate.effect.name, np.inf)
         statistic = min(candidate.test.statistic, most)
-        yield candidate, -log_tail(statistic / max(common, 1e-300), candidate.test.dof)
+        yield candidate, evidence(statistic, candidate.test.dof, common)
 
 
 Steps = tuple[list[Look], list[NamedEffect], list[LeftOut]]

@@ -11,11 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.blunders.chance import log_tail
-from calib.diagnosis.score import score_test
+from calib.diagnosis.score import evidence, score_test
 from calib.diagnosis.screen import Candidate
 from calib.diagnosis.stand import Look
-from calib.effects import joints_acting
 
 
 @dataclass(frozen=True)
@@ -34,7 +32,7 @@ class Explained:
 
     def evidence(self, common: float) -> float:
         """As of `ScoreTest.evidence`, less the price."""
-        return -log_tail(self.statistic / max(common, 1e-300), self.dof) - self.price
+        return evidence(self.statistic, self.dof, common) - self.price
 
 
 def likeliest_part(look: Look, candidate: Candidate, common: float) -> Explained:
@@ -47,7 +45,8 @@ def likeliest_part(look: Look, candidate: Candidate, common: float) -> Explained
     """
     test = candidate.test
     whole = Explained(test.statistic, test.dof)
-    of = np.array(joints_acting(candidate.effect, look.stand.sources[0].rig))
+    rig = look.stand.sources[0].rig
+    of = np.array([rig.joint_of(param.name) for param in candidate.effect.params(rig)])
     joints = np.unique(of[of != ""])
     if len(of) != len(test.columns) or len(joints) < 2:
         return whole
