@@ -26,6 +26,7 @@ from calib.effects import CATALOGUE, Scatter, Site
 from calib.linear.system import Linearisation
 from calib.problem import Problem
 from calib.problem.spread import SpreadName, Whose, by_chance, rows_at, sigmas, spread_keys
+from calib.results.holdout import fall_document
 from calib.results.solution import one_unit
 from calib.solve.components import (
     DIRECTION_SEEN,
@@ -150,7 +151,7 @@ class Chance:
             "dof": len(self.spreads),
             "step": step,
             "dressed_up": False,
-            "held_out_rms_mm": {"before": None, "after": None},
+            **fall_document(None),
             "rejected_share": {"before": None, "after": None},
             "error_explained": None,
             "rms_mm": size_mm,

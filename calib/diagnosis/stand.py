@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain
@@ -12,34 +12,26 @@ import numpy as np
 
 from calib import problem as problems
 from calib.blunders.judged import Blunder, judge
-from calib.diagnosis.candidates import covariates, finer, known_effects, shape_limits, structure
+from calib.diagnosis.candidates import covariates, finer, known_effects, structure
 from calib.diagnosis.chance import Chance, chances, of_lidar, ranked, rows_by_chance
 from calib.diagnosis.judges import Shares
 from calib.diagnosis.linear import Linear, linearise_with, rows_along
-from calib.diagnosis.score import ScoreTest, away_from_model, project, score_test
+from calib.diagnosis.score import ScoreTest, away_from_model, project
 from calib.diagnosis.screen import Candidate, Screen, screen
-from calib.effects import CATALOGUE, Effect, Scatter, ShapeStep, Site
-from calib.forward import named
+from calib.effects import CATALOGUE, Effect, Scatter, Site
 from calib.linear.layout import Layout
 from calib.linear.system import Linearisation
 from calib.problem import Problem
-from calib.problem.build import shapes_of, theta_of
+from calib.problem.build import shapes_of
 from calib.problem.model import Model, Source
 from calib.problem.without import leave_out
 from calib.residuals.groups import Group
 from calib.residuals.scan import ScanStop
 from calib.results.intervals import Intervals, intervals
-from calib.solve.estimate import DOFS, SEEN, Estimate, Start
+from calib.solve.estimate import Estimate, Start
 from calib.solve.fit import Progress, shapes_freed, solve
 from chains.errors import InputError
 
-# Squared sigmas by which another shape must fit better: three sigmas of one parameter, 0.3 % by
-# chance.
-BETTER_SHAPE = 9.0
-# Change of a shape's logarithm at once: a choice, half as much again; the derivative holds no
-# further.
-LARGEST_SHAPE_STEP = 0.4
-MOST_SHAPE_STEPS = 5  # a choice: from the finer grid one or two sufficed in all that was tried
 SCANS_SAMPLED = 8  # scans from which the bins of covariates are taken
 # Beams of each of them at most: a quantile of so many beams in all is off by 0.15 % of them.
 BEAMS_DRAWN = 16_384
@@ -83,11 +75,11 @@ class Stand:
 
     def with_effects(self, added: Sequence[Effect], progress: Progress) -> Stand:
         """The model with more effects, fitted from here."""
-        return self._refitted(self.model.plus(tuple(added)), self.estimate.start, progress)
+        return self.refitted(self.model.plus(tuple(added)), self.estimate.start, progress)
 
     def lacking(self, names: Collection[str], progress: Progress) -> Stand:
         """The model without some of its effects, fitted from here."""
-        return self._refitted(self.model.minus(names), self.estimate.start, progress)
+        return self.refitted(self.model.minus(names), self.estimate.start, progress)
 
     def without(
         self, groups: Sequence[Group], progress: Progress, of: Stand | None = None
@@ -105,7 +97,8 @@ class Stand:
         estimate = solve(problem, progress=progress, start=self.estimate.start)
         return Stand(sources, model, problem, estimate, own=self.own)
 
-    def _refitted(self, model: Model, start: Start, progress: Progress) -> Stand:
+    def refitted(self, model: Model, start: Start, progress: Progress) -> Stand:
+        """Another model on these recordings, fitted from a start."""
         problem = self.problem_of(model)
         estimate = solve(problem, progress=progress, start=start)
         return Stand(self.sources, model, problem, estimate, own=self.own)
@@ -152,61 +145,6 @@ class Stand:
             size = sum(wide.variables[v].dim for v in theirs)
             at[name], start = np.arange(start, start + size), start + size
         return linear, at
-
-    def retuned(
-        self, names: Collection[str], progress: Progress
-    ) -> tuple[Stand, dict[str, Effect]]:
-        """With better shapes of some effects, those just found on a grid and those of which others
-        have since changed what is best.
-
-        Returns:
-            The fit with them, and the effects that took the place of others, by the others' names.
-        """
-        stand, found = self, {}
-        for _ in range(MOST_SHAPE_STEPS):
-            original = {found[name].name if name in found else name: name for name in names}
-            swapped = stand._better_shapes(original, progress)
-            if not swapped:
-                break
-            effects = tuple(swapped.get(e.name, e) for e in stand.model.effects)
-            start = replace(stand.estimate.start, state=stand._state_with(swapped))
-            model = replace(stand.model, effects=effects)
-            if (further := tried(stand._refitted, model, start, progress)) is None:
-                break
-            stand = further
-            found |= {original[name]: effect for name, effect in swapped.items()}
-        return stand, found
-
-    def _better_shapes(self, names: Collection[str], progress: Progress) -> dict[str, Effect]:
-        """By their names, some effects of the model with the shapes that one step leads to."""
-        shaped = [e for e in self.model.effects if e.name in names and e.has_derivative_by_shape]
-        values = self.estimate.values
-        steps = [ShapeStep(e, theta_of(self.problem, e, values)) for e in shaped]
-        if not steps:
-            return {}
-        linear, at = self.linearise(steps, progress)
-        scores = project(linear, linear.candidates)
-        swapped = {}
-        for effect, step in zip(shaped, steps, strict=True):
-            found = score_test(scores, at[step.name])
-            if found.dof and found.statistic > BETTER_SHAPE:
-                by = np.exp(np.clip(found.estimate()[0], -LARGEST_SHAPE_STEP, LARGEST_SHAPE_STEP))
-                ends = shape_limits(shapes_of(effect, self.sources))
-                shape = float(f"{np.clip(effect.shape * by, *ends):.6g}")
-                swapped |= {effect.name: effect.at(shape)} if shape != effect.shape else {}
-        return swapped
-
-    def _state_with(self, swapped: Mapping[str, Effect]) -> dict[str, np.ndarray]:
-        """The state, for a model in which some effects have other shapes."""
-        renamed = {
-            t.variable: named(swapped[t.effect.name].name, t.rig)
-            for terms in self.problem.terms
-            for t in terms
-            if t.effect.name in swapped
-        }
-        endings = ("", DOFS, SEEN)
-        every = {f"{old}{end}": f"{new}{end}" for old, new in renamed.items() for end in endings}
-        return {every.get(name, name): value for name, value in self.estimate.state.items()}
 
     def theta(self, effect: Effect) -> np.ndarray:
         """The free parameters (q,) of an effect of the model."""

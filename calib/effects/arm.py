@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from calib.effects.base import Effect, Param, Site, View
-from calib.effects.basis import finite, step_times
+from calib.effects.basis import finite, nearest_times, step_times
 from calib.effects.range import AMBIENT_C
 from calib.rig import Rig
 from chains.minimal import Own, across, own_errors
@@ -77,6 +77,9 @@ class ArmJointSlip(ArmJointOffset):
 
     def shapes(self, stops: View) -> tuple[float, ...]:
         return step_times(stops) if self.params(stops.rig) else ()
+
+    def beside(self, stops: View) -> tuple[float, ...]:
+        return nearest_times(stops, self.shape) if self.params(stops.rig) else ()
 
     def basis(self, view: View) -> np.ndarray:
         late = (view["elapsed_s"] > self.shape).astype(float)

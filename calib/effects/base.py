@@ -165,6 +165,15 @@ class Effect(ABC):
         """
         return ()
 
+    def beside(self, stops: View) -> tuple[float, ...]:
+        """Of an effect that jumps, the shapes next to its own with which it acts otherwise on a
+        recording; empty where these are not known.
+
+        Args:
+            stops: as of `shapes`.
+        """
+        return ()
+
     def at(self, shape: float) -> Self:
         """The effect with this shape chosen."""
         chosen = copy.copy(self)
@@ -197,19 +206,28 @@ class Effect(ABC):
 
 class ShapeStep(Effect):
     """What an effect of a model would do more were its shape larger: its derivative, per unit of
-    the shape's logarithm.
+    the shape's logarithm; or in another shape, less what it does.
 
     Args:
         effect: in the model, with a shape.
         theta: rig's name -> (P,) its parameters as estimated.
         sigma: of the logarithm, before any data.
+        to: the other shape, if it is that.
     """
 
     typical = "derivative"
 
-    def __init__(self, effect: Effect, theta: Mapping[str, np.ndarray], sigma: float = 1.0) -> None:
+    def __init__(
+        self,
+        effect: Effect,
+        theta: Mapping[str, np.ndarray],
+        sigma: float = 1.0,
+        to: float | None = None,
+    ) -> None:
         self.effect, self.theta, self.sigma, self.site = effect, theta, sigma, effect.site
-        self.name, self.shape = self.name_of(effect), effect.shape
+        self.name, self.shape, self.to = self.name_of(effect), effect.shape, to
+        if to is not None:
+            self.name, self.shape = f"{self.name} to {to:.6g}", to
 
     @staticmethod
     def name_of(effect: Effect) -> str:
@@ -225,8 +243,8 @@ class ShapeStep(Effect):
         return (Param("log", "1", self.sigma),) if there else ()
 
     def basis(self, view: View) -> np.ndarray:
-        sides = (
-            self.effect.at(self.effect.shape * f) for f in (1 + SHAPE_STEP, 1 / (1 + SHAPE_STEP))
-        )
-        larger, smaller = (side.basis(view) @ self.theta[view.rig.name] for side in sides)
-        return (larger - smaller)[..., None] / (2 * np.log1p(SHAPE_STEP))
+        own, by = self.effect.shape, 1 + SHAPE_STEP
+        ends = (own * by, own / by) if self.to is None else (self.to, own)
+        sides = (self.effect.at(end) for end in ends)
+        after, before = (side.basis(view) @ self.theta[view.rig.name] for side in sides)
+        return (after - before)[..., None] / (2 * np.log1p(SHAPE_STEP) if self.to is None else 1.0)

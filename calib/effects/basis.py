@@ -28,6 +28,10 @@ def incidence_rad(view: View) -> np.ndarray:
     return np.clip(finite(view["incidence_rad"]), 0.0, GRAZING_RAD)
 
 
+# A choice: two such steps reach the next of `step_times` where there are 300 stops.
+TIMES_BESIDE = 8
+
+
 def finite(column: np.ndarray) -> np.ndarray:
     """A column with 0 where nothing was recorded."""
     return np.where(np.isfinite(column), column, 0.0)
@@ -41,9 +45,23 @@ def place_of(values: np.ndarray, known: np.ndarray) -> np.ndarray:
 
 def step_times(stops: View) -> tuple[float, ...]:
     """Times midway between stops, three or more of them on either side; 20 at most."""
-    time_s = np.sort(stops["elapsed_s"])
-    between = (0.5 * (time_s[1:] + time_s[:-1]))[2:-2]
+    between = _between(stops)
     if not len(between):
         return ()
     chosen = np.linspace(0, len(between) - 1, min(len(between), 20)).round().astype(int)
     return tuple(float(f"{t:.6g}") for t in np.unique(between[chosen]))
+
+
+def nearest_times(stops: View, t_s: float) -> tuple[float, ...]:
+    """Of times midway between stops, as of `step_times`, those nearest to one: on either side as
+    many as `TIMES_BESIDE`, with at least one stop between each and that one."""
+    between = _between(stops)
+    time_s = np.sort(stops["elapsed_s"])
+    gone = np.searchsorted(time_s, between, "right") - np.searchsorted(time_s, t_s, "right")
+    return tuple(float(f"{t:.6g}") for t in between[(gone != 0) & (np.abs(gone) <= TIMES_BESIDE)])
+
+
+def _between(stops: View) -> np.ndarray:
+    """Times midway between stops, three or more of them on either side."""
+    time_s = np.sort(stops["elapsed_s"])
+    return (0.5 * (time_s[1:] + time_s[:-1]))[2:-2]

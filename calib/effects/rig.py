@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from calib.effects.base import Effect, Param, Site, View
-from calib.effects.basis import step_times
+from calib.effects.basis import nearest_times, step_times
 from calib.rig import Rig
 
 DOF = ("rx", "ry", "rz", "tx", "ty", "tz")
@@ -60,6 +60,9 @@ class MountSlip(Effect):
 
     def shapes(self, stops: View) -> tuple[float, ...]:
         return step_times(stops) if self.params(stops.rig) else ()
+
+    def beside(self, stops: View) -> tuple[float, ...]:
+        return nearest_times(stops, self.shape) if self.params(stops.rig) else ()
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
         return self.moves() if mount_edges(rig) else ()

@@ -16,6 +16,7 @@ from calib.report.calibration import calibration_tables
 from calib.report.chart import Absent, Chart
 from calib.report.charts.fit import error_mm
 from calib.report.evidence import Evidence, folder_name
+from calib.results.holdout import from_to
 from calib.results.outstanding import shown
 from calib.runs.run import Run
 from calib.show.blunders import BLUNDER_HEADINGS, blunder_cells
@@ -227,9 +228,8 @@ def _told(candidate: dict[str, Any]) -> list[str]:
             f"would explain {mm(candidate['unabsorbed_rms_mm'])} mm rms that the model does not "
             f"absorb, of its {mm(candidate['rms_mm'])} mm in all"
         )
-    before, after = (candidate["held_out_rms_mm"][k] for k in ("before", "after"))
-    if before is not None and after is not None:
-        out.append(f"the held-out error goes from {before:.2f} to {after:.2f} mm with it")
+    if went := from_to(candidate):
+        out.append(f"the held-out error goes from {went} with it")
         share = candidate.get("rejected_share") or {}  # which earlier versions did not write
         if share.get("before") is not None:
             ends = (f"{100 * share[key]:.1f}" for key in ("before", "after"))

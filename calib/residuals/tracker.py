@@ -70,6 +70,16 @@ class TrackedBody(SeenBody):
         changed = {f"sigma_{unit}": float(wider), "scatter": {**self.scatter, unit: sd}}
         return replace(self, **changed)
 
+    @property
+    def turns_at_m(self) -> float:
+        """How far [m] from the body a sigma of its orientation moves a point by a sigma of its
+        position, both as stated, without what scatters beyond; 0 of a point."""
+        if self.is_point:
+            return 0.0
+        sigma = {"m": self.sigma_m, "rad": self.sigma_rad}
+        stated = {unit: np.sqrt(sigma[unit] ** 2 - self.scatter[unit] ** 2) for unit in sigma}
+        return float(stated["m"] / stated["rad"])
+
     def predicted(self, values: Values) -> np.ndarray:
         """T_world_body (K, 4, 4)."""
         return self.seen(values).T

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -24,8 +26,35 @@ CHECKED = 1.0
 
 
 @dataclass(frozen=True)
+class Squares:
+    """Sums over squares of residuals, of any unit.
+
+    Args:
+        count: how many residuals.
+        total: of their squares.
+        expected: of the variances that their sigmas lead one to expect.
+    """
+
+    count: int = 0
+    total: float = 0.0
+    expected: float = 0.0
+
+    def __add__(self, other: Squares) -> Squares:
+        return Squares(*map(operator.add, vars(self).values(), vars(other).values()))
+
+    @property
+    def rms(self) -> float | None:
+        return float(np.sqrt(self.total / self.count)) if self.count else None
+
+    @property
+    def floor(self) -> float | None:
+        """What is expected of the rms."""
+        return float(np.sqrt(self.expected / self.count)) if self.count else None
+
+
+@dataclass(frozen=True)
 class Errors:
-    """Sums over residuals.
+    """Sums over residuals: ranges of beams, or positions of bodies.
 
     Args:
         count: how many there are, those of weight 0 left out, as from the next three sums.
@@ -33,8 +62,10 @@ class Errors:
         expected_m2: sum of the variances [m2] that their sigmas lead one to expect.
         rejected: how many have weight 0: their beams meet a surface, and they were rejected.
         rejected_m2: sum of the squares of those [m2].
-        each_m2: mean square [m2] of each stop, or of each tracked position, in order; NaN where a
-            stop has none.
+        each_m2: mean square [m2] of each stop, or of each tracked pose as in `poses`, in order;
+            NaN where a stop has none.
+        turned: of bodies, the angles [rad] between orientations as tracked and as predicted.
+        poses: of bodies, positions and orientations [m] together; see `body_errors`.
     """
 
     count: int = 0
@@ -44,6 +75,8 @@ class Errors:
     rejected: int = 0
     rejected_m2: float = 0.0
     each_m2: tuple[float, ...] = ()
+    turned: Squares = Squares()
+    poses: Squares = Squares()
 
     def __add__(self, other: Errors) -> Errors:
         return Errors(**{name: mine + getattr(other, name) for name, mine in vars(self).items()})
@@ -82,6 +115,63 @@ class Errors:
     @property
     def floor_mm(self) -> float | None:
         return 1e3 * float(np.sqrt(self.expected_m2 / self.count)) if self.count else None
+
+    @property
+    def size(self) -> ErrorSize:
+        """How large they are; of some."""
+        mm, floor_mm = self.rms_mm, self.floor_mm
+        if not self.turned.count:
+            return ErrorSize(mm, mm, floor_mm)
+        return ErrorSize(
+            mm, 1e3 * self.poses.rms, 1e3 * self.poses.floor, turned_mrad=1e3 * self.turned.rms
+        )
+
+
+@dataclass(frozen=True)
+class ErrorSize:
+    """How large errors are.
+
+    Args:
+        rms_mm: of ranges, or of positions.
+        judged_mm, floor_mm: by which models are compared, and what is expected of it: the same, or
+            that of positions and orientations together.
+        turned_mrad: rms of orientations, where these are seen.
+    """
+
+    rms_mm: float
+    judged_mm: float
+    floor_mm: float
+    turned_mrad: float | None = None
+
+
+def of_orientations(nominal: Errors, seen: Errors, unseen: Errors) -> dict[str, Any]:
+    """For a run's summary: the rms of orientations, and of poses, where a tracker sees some; before
+    the fit, after it, and of stops held out."""
+    floor = unseen if unseen.count else seen
+    if not floor.turned.count:
+        return {}
+    kinds = {"nominal": nominal, "fit": seen, "held_out": unseen}
+    out = {}
+    for key, of in (("rms_mrad", "turned"), ("rms_pose_mm", "poses")):
+        every = {kind: getattr(errors, of).rms for kind, errors in kinds.items()}
+        every["noise_floor"] = getattr(floor, of).floor
+        out[key] = {kind: None if rms is None else 1e3 * rms for kind, rms in every.items()}
+    return out
+
+
+def judged_mm(summary: Mapping[str, Any]) -> Mapping[str, float | None]:
+    """Of a run's summary the rms by which models are compared: ``fit``, ``held_out``, and the
+    ``noise_floor`` that is expected; see `ErrorSize`."""
+    return summary.get("rms_pose_mm") or summary["rms_mm"]
+
+
+def held_out_size(summary: Mapping[str, Any]) -> ErrorSize | None:
+    """Of a run's summary how large the errors of stops held out are; None where none were."""
+    rms_mm, judged = summary["rms_mm"]["held_out"], judged_mm(summary)
+    if rms_mm is None:
+        return None
+    turned = (summary.get("rms_mrad") or {}).get("held_out")
+    return ErrorSize(rms_mm, judged["held_out"], judged["noise_floor"], turned)
 
 
 def row_errors(rows: Rows, predicted_m2: np.ndarray | float = 0.0) -> Errors:
@@ -148,7 +238,9 @@ def body_errors(
     values: Mapping[str, np.ndarray],
     predicted: Estimate | None,
 ) -> Errors:
-    """Distances between tracked and predicted positions of bodies.
+    """Distances between tracked and predicted positions of bodies, and angles between orientations.
+
+    In `Errors.poses` an angle counts as far as it moves a point at `TrackedBody.turns_at_m`.
 
     Rows that the estimate rests on have less error than their noise, by what it takes from them:
     their residuals' covariance is R - A C A^T, and R + A C A^T that of other rows.
@@ -161,27 +253,31 @@ def body_errors(
     """
     out, own = Errors(), set() if predicted is None else set(map(id, predicted.problem.blocks))
     found = evaluated([unweighted(block) for block in blocks], values)
-    at = [_positions(block) for block in blocks]
-    known = [np.zeros(3)] * len(blocks)
+    known = [np.zeros(1)] * len(blocks)
     if predicted is not None:
-        rows = zip(found, at, strict=True)
-        known = predicted.variances([{n: x[some] for n, x in d.items()} for (_, d), some in rows])
-    for block, (residual, _), some, variance in zip(blocks, found, at, known, strict=True):
-        squares = np.square(block.sigma_m * residual[some]).reshape(-1, 3).sum(axis=1)
-        more = float(variance.sum()) * (-1.0 if id(block) in own else 1.0)
-        out += Errors(
-            count=len(squares),
-            total_m=float(np.sqrt(squares).sum()),
-            squares_m2=float(squares.sum()),
-            expected_m2=block.sigma_m**2 * (3.0 * len(squares) + more),
-            each_m2=tuple(squares.tolist()),
-        )
+        known = predicted.variances([d for _, d in found])
+    for block, (residual, _), variance in zip(blocks, found, known, strict=True):
+        more = np.broadcast_to(variance, residual.shape) * (-1.0 if id(block) in own else 1.0)
+        out += _of_body(block, np.square(residual), 1.0 + more)
     return out
 
 
-def _positions(block: TrackedBody) -> np.ndarray:
-    """Which of a block's rows are of positions."""
-    return np.flatnonzero(np.tile(np.array(block.units) == "m", len(block.measured)))
+def _of_body(block: TrackedBody, squares: np.ndarray, expected: np.ndarray) -> Errors:
+    """Of a body's whitened rows (m,): their squares, and what is expected of these."""
+    count, rad = len(block.measured), np.array(block.units) == "rad"
+    each, should = (x.reshape(count, -1) * np.square(block.sigma) for x in (squares, expected))
+    moved = (each[:, ~rad].sum(axis=1), should[:, ~rad].sum(axis=1))
+    turned = (each[:, rad].sum(axis=1), should[:, rad].sum(axis=1))
+    pose = [m + block.turns_at_m**2 * t for m, t in zip(moved, turned, strict=True)]
+    return Errors(
+        count=count,
+        total_m=float(np.sqrt(moved[0]).sum()),
+        squares_m2=float(moved[0].sum()),
+        expected_m2=float(moved[1].sum()),
+        each_m2=tuple(pose[0].tolist()),
+        turned=Squares(0 if block.is_point else count, *(float(t.sum()) for t in turned)),
+        poses=Squares(count, *(float(p.sum()) for p in pose)),
+    )
 
 
 def misfit(estimate: Estimate, beams: Errors, weighted: bool = False) -> dict[str, float]:

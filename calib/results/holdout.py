@@ -21,7 +21,7 @@ from calib.residuals.beams import Rows
 from calib.residuals.scan import ScanStop
 from calib.residuals.seen import SeenBody
 from calib.residuals.surfaces import PlaneSurface
-from calib.results.errors import Errors, Foretold, body_errors, row_errors
+from calib.results.errors import Errors, ErrorSize, Foretold, body_errors, row_errors
 from calib.solve.estimate import Estimate, Start
 from calib.solve.fit import Progress, solve
 
@@ -39,11 +39,12 @@ class Fall:
     """How the held-out error falls once something is added to a model.
 
     Args:
-        before_mm, after_mm: its rms.
+        before_mm, after_mm: its rms, as models are compared by it.
         floor_mm: what is expected of it.
         gain_m2: how much the mean square [m2] of each stop, or of each tracked position, falls;
             empty where that is not known.
         rejected_share: of the beams held out, before and after, where it may take some back.
+        sizes: how large errors are before and after; None where that is not told apart.
     """
 
     before_mm: float
@@ -51,6 +52,25 @@ class Fall:
     floor_mm: float
     gain_m2: tuple[float, ...] = ()
     rejected_share: tuple[float, float] | None = None
+    sizes: tuple[ErrorSize, ErrorSize] | None = None
+
+    @classmethod
+    def of(
+        cls,
+        before: ErrorSize,
+        after: ErrorSize,
+        gain_m2: tuple[float, ...] = (),
+        rejected_share: tuple[float, float] | None = None,
+    ) -> Fall:
+        """From one size to another."""
+        return cls(
+            before_mm=before.judged_mm,
+            after_mm=after.judged_mm,
+            floor_mm=after.floor_mm,
+            gain_m2=gain_m2,
+            rejected_share=rejected_share,
+            sizes=(before, after),
+        )
 
     @property
     def rises(self) -> bool:
@@ -97,6 +117,28 @@ class Fall:
     @property
     def _spread_m2(self) -> float:
         return float(np.std(self.gain_m2, ddof=1) / np.sqrt(len(self.gain_m2)))
+
+
+def fall_document(fall: Fall | None) -> dict[str, dict[str, float | None]]:
+    """As diagnosis.json has it: the rms, and that of orientations, before and after; nothing in
+    them where nobody looked."""
+    both = turned = (None, None)
+    if fall is not None:
+        both = fall.before_mm, fall.after_mm
+        if fall.sizes is not None:
+            both, turned = zip(*((s.rms_mm, s.turned_mrad) for s in fall.sizes), strict=True)
+    pairs = {"held_out_rms_mm": both, "held_out_rms_mrad": turned}
+    return {key: dict(zip(("before", "after"), some, strict=True)) for key, some in pairs.items()}
+
+
+def from_to(document: Mapping[str, Any]) -> str:
+    """What `fall_document` says, in words; of a fall that is known."""
+    told = []
+    for unit in ("mm", "mrad"):
+        ends = document.get(f"held_out_rms_{unit}") or {}  # earlier versions wrote no mrad
+        if None not in (before := ends.get("before"), after := ends.get("after")):
+            told.append(f"{before:.2f} to {after:.2f} {unit}")
+    return " and, of orientations, from ".join(told)
 
 
 def gains_m2(before: Sequence[float], after: Sequence[float]) -> tuple[float, ...]:

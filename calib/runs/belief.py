@@ -10,6 +10,7 @@ import numpy as np
 from calib.blunders.judged import limit_of
 from calib.diagnosis.verdict import HELD_OUT_BY_CHANCE
 from calib.residuals.groups import CAD
+from calib.results.errors import judged_mm
 from calib.results.outstanding import standing_out, together_told
 from calib.results.rings import harmful
 from calib.runs.run import Run
@@ -51,7 +52,7 @@ def _rings(run: Run, bad: bool) -> list[str]:
 
 def over_floor(run: Run) -> float:
     """The held-out error over the expected one; 0 where nothing was held out."""
-    rms = run.summary["rms_mm"]
+    rms = judged_mm(run.summary)
     return (rms.get("held_out") or 0.0) / rms["noise_floor"]
 
 

@@ -25,7 +25,7 @@ from calib.problem.model import Model, Source
 from calib.problem.without import leave_out, placed
 from calib.residuals.groups import CAD
 from calib.residuals.scan import ScanStop
-from calib.results.errors import Errors, body_errors, misfit, row_errors
+from calib.results.errors import Errors, body_errors, misfit, of_orientations, row_errors
 from calib.results.holdout import Keep, held_out, unit_of
 from calib.results.intervals import intervals
 from calib.results.misfit import (
@@ -317,6 +317,7 @@ def _summary(
             "held_out": unseen.rms_mm,
             "noise_floor": floor.floor_mm,
         },
+        **of_orientations(nominal, seen, unseen),
         "mean_mm": {"nominal": nominal.mean_mm, "fit": seen.mean_mm, "held_out": unseen.mean_mm},
         **_of_all_beams(estimate, seen, unseen),
         "std_mm": {"nominal": nominal.std_mm, "fit": seen.std_mm, "held_out": unseen.std_mm},

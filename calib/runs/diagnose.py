@@ -31,7 +31,7 @@ from calib.problem import build
 from calib.problem.model import default_effects
 from calib.problem.spread import names_of
 from calib.residuals.groups import MESH, Group
-from calib.results.errors import Errors
+from calib.results.errors import Errors, held_out_size, judged_mm
 from calib.results.holdout import Fall, gains_m2, held_out
 from calib.results.rings import harmful, odd_rings
 from calib.results.stages import DIAGNOSE as DIAGNOSE_STAGES
@@ -137,7 +137,7 @@ def _answer(
     doubtful = not believed(found, falls) or (rejected is not None and not rejected.explained)
     formulas = unnamed(found, doubtful, unseen, progress) if run.converged else Unnamed()
     known = by_name(found, formulas, unseen, progress) if unseen else None
-    if known and believed(*known) and weighed(*known, run.summary["rms_mm"]).found.found:
+    if known and believed(*known) and weighed(*known, judged_mm(run.summary)).found.found:
         (found, falls), formulas = known, Unnamed()
         rejected = beside_names()
     if fitted := with_formulas_and_names(stand, found, formulas, rejected, progress):
@@ -158,7 +158,7 @@ def with_formulas_and_names(
     """A run's fit with formulas that stops held out bear out, and the names that stand beside them;
     None where nothing is to be judged beside these, or they come to no optimum."""
     moved = rejected is not None and rejected.moved
-    if formulas.fall_mm is None or not (found.chance or found.blunders or moved):
+    if formulas.fall is None or not (found.chance or found.blunders or moved):
         return None
     named = () if formulas.instead else found.found
     names = [s.effect for s in named if s.effect.name not in formulas.needless]
@@ -179,7 +179,7 @@ def _as_held_out(
     scatters = found.chance or any(e.by_chance for e in found.looks[-1].stand.model.effects)
     named = [falls[s.effect.name] for s in found.found if s.effect.name in falls]
     if falls and scatters and not structured and not any(map(borne_out, named)):
-        kept = weighed(found, falls, run.summary["rms_mm"]).found
+        kept = weighed(found, falls, judged_mm(run.summary)).found
         bare = found if believed(kept, falls) else nameless(found, progress)
         if not bare.found:
             return bare
@@ -193,29 +193,29 @@ def _falls(found: Search, stand: Stand, run: Run, progress: Progress) -> dict[st
     all others where it rises after those; and with all that scatters by chance, beside names or
     where it is larger than expected."""
     falls = {}
-    before, each_m2 = run.summary["rms_mm"]["held_out"], run.unseen_m2
+    before, each_m2 = held_out_size(run.summary), run.unseen_m2
     if found.looks[0].stand is not stand and found.found:
         unseen = _unseen(found.looks[0].stand, run, progress)
-        before, each_m2 = unseen.rms_mm, unseen.each_m2
+        before, each_m2 = unseen.size, unseen.each_m2
     for step in found.found:
         unseen = _unseen(step.after.stand, run, progress)
         gain = gains_m2(each_m2, unseen.each_m2)
-        falls[step.effect.name] = Fall(before, unseen.rms_mm, unseen.floor_mm, gain)
-        before, each_m2 = unseen.rms_mm, unseen.each_m2
+        falls[step.effect.name] = Fall.of(before, unseen.size, gain)
+        before, each_m2 = unseen.size, unseen.each_m2
     for step in found.found[:-1]:
         # What is named first may predict nothing as long as what is named later is missing.
         name, whole = step.effect.name, found.found[-1].after.stand
         if falls[name].rises and (less := tried(whole.lacking, [name], progress)):
             unseen = _unseen(less, run, progress)
             gain = gains_m2(unseen.each_m2, each_m2)
-            falls[name] = Fall(unseen.rms_mm, before, unseen.floor_mm, gain)
+            falls[name] = Fall.of(unseen.size, before, gain)
     last = found.looks[-1].stand
     scatter = [c.effect.name for c in found.chance if c.effect.name in last.model.names]
     alone = not found.unnamed and over_floor(run) > HELD_OUT_BY_CHANCE
     if scatter and (found.found or alone):
         # What scatters is in the expected error only once the model has it.
         unseen = _unseen(last, run, progress)
-        falls[scatter[-1]] = Fall(before, unseen.rms_mm, unseen.floor_mm)
+        falls[scatter[-1]] = Fall.of(before, unseen.size)
     return falls
 
 

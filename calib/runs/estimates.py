@@ -80,9 +80,10 @@ def comparison(runs: Sequence[Run]) -> dict[str, Any]:
         ],
         **{
             error: {
-                kind: [run.summary[error].get(kind) for run in runs] for kind in _kinds(runs, error)
+                kind: [run.summary.get(error, {}).get(kind) for run in runs]
+                for kind in _kinds(runs, error)
             }
-            for error in ("rms_mm", "mean_mm", "std_mm")
+            for error in ("rms_mm", "mean_mm", "std_mm", "rms_mrad")
         },
         **{key: [run.summary.get(key) for run in runs] for key in ("rms_all_mm", "rejected_share")},
         "misfit": {

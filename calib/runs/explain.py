@@ -13,6 +13,7 @@ from calib.blunders import told
 from calib.diagnosis import Diagnosis
 from calib.effects import Effect, is_known, load_effects, own_effects, read, trust_in
 from calib.problem.model import Model, Source
+from calib.results.errors import judged_mm
 from calib.results.holdout import Fall, gains_m2
 from calib.rig import load_rig
 from calib.runs.calibrate import calibrate, grow, recordings_document
@@ -277,17 +278,17 @@ class _Climb:
 def _falls(before: Run, after: Run, share: float) -> bool:
     """Whether the squared held-out error falls, and by this share of what is above the floor."""
     was, now = _held_out(before) ** 2, _held_out(after) ** 2
-    excess = was - before.summary["rms_mm"]["noise_floor"] ** 2
+    excess = was - judged_mm(before.summary)["noise_floor"] ** 2
     return now < was and was - now >= share * excess
 
 
 def _by_chance(before: Run, after: Run) -> bool:
     """Whether the fall of the held-out error may be chance."""
-    floor = after.summary["rms_mm"]["noise_floor"]
+    floor = judged_mm(after.summary)["noise_floor"]
     gain = gains_m2(before.unseen_m2, after.unseen_m2)
     return Fall(_held_out(before), _held_out(after), floor, gain).by_chance
 
 
 def _held_out(run: Run) -> float:
-    held_out = run.summary["rms_mm"]["held_out"]
-    return run.summary["rms_mm"]["fit"] if held_out is None else held_out
+    rms = judged_mm(run.summary)
+    return rms["fit"] if rms["held_out"] is None else rms["held_out"]

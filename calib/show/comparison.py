@@ -74,31 +74,41 @@ def _words(found: Moved) -> Words:
 
 def ladder_table(rungs: Sequence[Rung]) -> Table:
     """What each rung changed of the model, and what that did to the error of stops held out."""
-    table = columns_table("ladder", "model", "held out, mm", "fit, mm", "expected, mm")
+    turned = any(rung.run.summary.get("rms_mrad") for rung in rungs)
+    more = ["held out, mrad"] if turned else []
+    table = columns_table("ladder", "model", "held out, mm", "fit, mm", "expected, mm", *more)
     for column in table.columns[2:]:
         column.justify = "right"
     table.columns[1].overflow = "fold"  # names are there to be copied
     for rung in rungs:
         rms = rung.run.summary["rms_mm"]
-        below = rung.below.summary["rms_mm"] if rung.below else {}
-        held_out = " -> ".join(filter(None, (mm(r.get("held_out")) for r in (below, rms))))
         name = rung.run.folder.name or str(rung.run.folder)
-        table.add_row(name, rung.step, held_out, mm(rms["fit"]), mm(rms["noise_floor"]))
+        own = mm(rms["fit"]), mm(rms["noise_floor"])
+        angles = [_held_out(rung, "rms_mrad")] if turned else []
+        table.add_row(name, rung.step, _held_out(rung, "rms_mm"), *own, *angles)
     if any(rung.empirical for rung in rungs):
         table.caption = f"{DESCRIBED} {FORMULA}"
         table.caption_justify, table.caption_style = "left", ""
     return table
 
 
+def _held_out(rung: Rung, key: str) -> str:
+    """The held-out error of the rung below, and its own."""
+    runs = [rung.below, rung.run] if rung.below else [rung.run]
+    every = (mm((run.summary.get(key) or {}).get("held_out")) for run in runs)
+    return " -> ".join(filter(None, every))
+
+
 def _comparison_table(runs: Sequence[Run]) -> Table:
     compared = comparison(runs)
     table = columns_table("", "", *(run.folder.name or str(run.folder) for run in runs))
-    for error in ("rms_mm", "mean_mm", "std_mm"):
+    for error in ("rms_mm", "mean_mm", "std_mm", "rms_mrad"):
         for kind, label in ERROR_LABELS.items():
             values = compared[error].get(kind, ())
             if any(value is not None for value in values):
                 cells = (mm(value, "+" if error == "mean_mm" else "") for value in values)
-                table.add_row(f"{error[:-3]} {label}", "mm", *cells)
+                name, unit = error.split("_")
+                table.add_row(f"{name} {label}", unit, *cells)
     if not all(compared["converged"]):
         how = {True: "converged", False: "NOT CONVERGED"}
         table.add_row("the fit has", "", *(how[each] for each in compared["converged"]))

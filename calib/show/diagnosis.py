@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -118,17 +118,24 @@ def candidates_table(candidates: Sequence[Mapping[str, Any]], residual: str) -> 
     table.title = f"candidate effects; adjusted p, mm rms of {residual}"
     table.title_justify, table.title_style = "left", "bold"
     for each in candidates:
-        held_out = each["held_out_rms_mm"]
         table.add_row(
             str(each["step"] or ""),
             each["add"],
             small(each["p_adjusted"]),
             _size(each["unabsorbed_rms_mm"]),
-            " -> ".join(filter(None, (mm(held_out["before"]), mm(held_out["after"])))),
+            "\n".join(_fall(each)),
             _estimate(each["parameters"]),
         )
     table.add_row()
     return table
+
+
+def _fall(candidate: Mapping[str, Any]) -> Iterator[str]:
+    """How the held-out error falls, and that of orientations; a line each."""
+    for unit in ("mm", "mrad"):
+        ends = candidate.get(f"held_out_rms_{unit}") or {}  # earlier versions wrote no mrad
+        if fall := " -> ".join(filter(None, (mm(ends.get(key)) for key in ("before", "after")))):
+            yield fall if unit == "mm" else f"{fall} {unit}"
 
 
 def unexplained_table(unexplained: Sequence[Mapping[str, Any]], residual: str) -> Table:

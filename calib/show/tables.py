@@ -207,7 +207,7 @@ def estimate_texts(estimate: float, sigma: float, unit: str) -> tuple[str, str]:
 
 
 def mm(value: float | None, sign: str = "") -> str:
-    """A length in mm that may be missing."""
+    """A length in mm, or an angle in mrad, that may be missing."""
     return "" if value is None else f"{value:{sign}z.2f}"
 
 
@@ -314,13 +314,15 @@ def _summary_cell(row: VariableEstimate, free: np.ndarray, unit: str) -> tuple[s
 
 def error_table(summary: Mapping[str, Any]) -> Table:
     """The errors of a run's summary: before, after, of stops held out; and what is expected."""
-    table = columns_table(f"{summary['residual']} residual, mm", "rms", "mean", "std")
+    angles = {"orientation, mrad": summary["rms_mrad"]} if "rms_mrad" in summary else {}
+    table = columns_table(f"{summary['residual']} residual, mm", "rms", "mean", "std", *angles)
     for column in table.columns[1:]:
         column.justify = "right"
     for kind, label in ERROR_LABELS.items():
         rms, mean, std = (summary[error].get(kind) for error in ("rms_mm", "mean_mm", "std_mm"))
         if rms is not None:
-            table.add_row(label, mm(rms), mm(mean, "+"), mm(std))
+            turned = (mm(each.get(kind)) for each in angles.values())
+            table.add_row(label, mm(rms), mm(mean, "+"), mm(std), *turned)
     table.add_row()
     return table
 

@@ -8,6 +8,7 @@ import pytest
 
 from calib.diagnosis.candidates import shape_limits
 from calib.diagnosis.search import nameless, search
+from calib.diagnosis.search.shapes import retuned
 from calib.diagnosis.verdict.matters import Consequences
 from calib.effects import find
 from calib.problem.build import shapes_of
@@ -72,7 +73,7 @@ def test_a_shape_stays_where_the_name_means_what_it_says(tmp_path):
     made(tmp_path / "rec", "tiny", 1, **{"near_range_bias@9": 5.0})
     effects = ("arm_link_length", "arm_joint_offset", "ring_range_offset", "near_range_bias@2")
     run = calibrate([tmp_path / "rec"], tmp_path / "run", Model(effects), "none")
-    stand, swapped = stand_of(run, quiet).retuned(["near_range_bias@2"], quiet)
+    stand, swapped = retuned(stand_of(run, quiet), ["near_range_bias@2"], quiet)
     grid = shapes_of(find("near_range_bias"), stand.sources)
     (low, high), found = shape_limits(grid), swapped["near_range_bias@2"]
     assert found.shape == pytest.approx(high, rel=1e-5) and found.name in stand.model.names
@@ -119,3 +120,22 @@ def test_a_name_that_is_nothing_beside_scatter_is_dropped(tmp_path):
     (one,), (other,) = done.chance, again.chance
     for spread, same in zip(one.spreads, other.spreads, strict=True):
         assert same.sd == pytest.approx(spread.sd, abs=0.01 * spread.sigma)
+
+
+@pytest.mark.parametrize("first", [95, 96, 97, 98])
+def test_what_slips_does_so_between_two_stops_and_none_of_them_is_a_blunder(tmp_path, first):
+    """A grid of times, and a finer one beside the best of it, are 4 stops apart. Stops between the
+    true time and one of these stand out alone."""
+    rng, folder = np.random.default_rng(40 + first), tmp_path / "rec"
+    world, poses = arm_worlds.bent(folder, "puma560", rng), 300
+    read, time_s = world.draw(rng, poses), np.cumsum(rng.uniform(8.0, 16.0, poses))
+    late = np.arange(poses) >= first
+    T = world.seen(read - 4e-3 * np.outer(late, np.eye(6)[5]))
+    T = T * arm_worlds.exp(arm_worlds.noise(rng, poses))
+    arm_worlds.save(folder, world, read, T, {"time_s": time_s})
+    done = search(stand_of(calibrate([folder], tmp_path / "run"), quiet), quiet)
+    assert not done.blunders
+    (step,) = done.found
+    assert step.effect.family in ("arm_joint_slip", "mount_slip")
+    elapsed_s = time_s - time_s[0]
+    assert elapsed_s[first - 1] < step.effect.shape < elapsed_s[first]

@@ -14,7 +14,7 @@ import numpy as np
 
 from calib.blunders.judged import Blunder, LeftOut
 from calib.diagnosis.chance import Chance
-from calib.diagnosis.score import ScoreTest, evidence
+from calib.diagnosis.score import evidence
 from calib.diagnosis.screen import ODDS, Candidate, rivals
 from calib.diagnosis.search.confirmed import (
     ALPHA_EFFECT,
@@ -25,9 +25,10 @@ from calib.diagnosis.search.confirmed import (
     suspects,
 )
 from calib.diagnosis.search.mishaps import adapted, restored
+from calib.diagnosis.search.named import NamedEffect
 from calib.diagnosis.search.parts import likeliest_part
+from calib.diagnosis.search.shapes import retuned
 from calib.diagnosis.stand import Look, Stand, tried
-from calib.effects import Effect
 from calib.solve.fit import Progress
 
 MOST_NEEDED = 3  # an explanation that needs more names than this is none: a choice
@@ -35,36 +36,6 @@ FEWEST_ALIKE = 2  # stops with a blunder each, for one effect to be asked for in
 # Of what a test says of an effect, below which a fit does not bear it out: a choice, far below the
 # whole that it takes up where the test is right.
 HELD_BACK = 0.1
-
-
-@dataclass(frozen=True)
-class NamedEffect:
-    """An effect that the data confirm.
-
-    Args:
-        candidate: as it stood out before, in its best shape.
-        before, after: the looks before it was fitted and after.
-        judged: its test with clusters jackknifed.
-        p_adjusted: as judged, or of the blunders in whose place it stands.
-        rivals: candidates that explain as much, and what to tell them apart by.
-    """
-
-    candidate: Candidate
-    before: Look
-    after: Look
-    judged: ScoreTest
-    p_adjusted: float
-    rivals: Sequence[Candidate]
-
-    @property
-    def effect(self) -> Effect:
-        return self.candidate.effect
-
-    def with_effect(self, effect: Effect | None) -> NamedEffect:
-        """With another shape of its effect, if there is one."""
-        if effect is None:
-            return self
-        return replace(self, candidate=replace(self.candidate, effect=effect))
 
 
 @dataclass(frozen=True)
@@ -169,7 +140,7 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NEEDED) -> Search:
             unsettled = chance.pop()
             break
         if widens:
-            look, left = restored(stand, beside.look(progress), left, progress)
+            look, left, found = restored(stand, beside.look(progress), left, found, progress)
             look, found = _outlasting(look, found, progress)
             looks, found = _left_behind([*looks, look], found)
         else:
@@ -272,7 +243,6 @@ def _steps(stand: Stand, progress: Progress, most: int, begun: Steps | None = No
     looks, and both, as `Search` has them. They end where values by chance lead at first; those that
     have `begun` so go on from there."""
     looks, found, left = map(list, begun or ([stand.look(progress)], [], []))
-    first = stand
     while True:
         before, mishaps = looks[-1], len(left)
         looks[-1] = adapted(before, left, progress, named=bool(found))
@@ -288,7 +258,8 @@ def _steps(stand: Stand, progress: Progress, most: int, begun: Steps | None = No
         if len(more) == len(found):
             break
         looks, found = _left_behind([*looks, more[-1].after], more)
-    looks[-1], left = restored(first, looks[-1], left, progress) if found else (looks[-1], left)
+    if found:
+        looks[-1], left, found = restored(stand, looks[-1], left, found, progress)
     return *_left_behind(looks, found), left
 
 
@@ -375,7 +346,7 @@ def _fitted(
         return []
     before, finest = look.with_shape(candidate, near, finest)
     names = [*(f.effect.name for f in found), finest.effect.name]
-    stand, swapped = stand.retuned(names, progress)
+    stand, swapped = retuned(stand, names, progress)
     after = stand.look(progress)
     if instead and any(b.found for b in after.blunders):
         return []

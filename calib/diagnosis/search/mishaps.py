@@ -12,6 +12,8 @@ from calib.blunders.judged import Blunder, LeftOut
 from calib.blunders.shifts import standing_alone
 from calib.diagnosis.screen import ODDS
 from calib.diagnosis.search.confirmed import ALPHA_EFFECT, ALPHA_UNNAMED, stands_out
+from calib.diagnosis.search.named import NamedEffect
+from calib.diagnosis.search.shapes import retuned
 from calib.diagnosis.stand import Look, Stand, tried
 from calib.residuals.groups import CAD, JOINTS, MESH
 from calib.solve.fit import Progress
@@ -66,23 +68,40 @@ def _left_out(look: Look, wild: Sequence[Blunder], after: Look) -> Iterator[Left
 
 
 def restored(
-    first: Stand, last: Look, left: list[LeftOut], progress: Progress
-) -> tuple[Look, list[LeftOut]]:
+    first: Stand,
+    last: Look,
+    left: list[LeftOut],
+    found: list[NamedEffect],
+    progress: Progress,
+) -> tuple[Look, list[LeftOut], list[NamedEffect]]:
     """What was left out of the first fit is tested once more, beside the effects that have been
-    named since: those that explain it leave no blunder there (backward elimination)."""
+    named since, in the shapes that are best with it: those that explain it leave no blunder there
+    (backward elimination).
+
+    Args:
+        first: the first fit.
+        last: the last look.
+        left: what was left out.
+        found: these effects.
+        progress: as of `fit.solve`.
+
+    Returns:
+        The last look with what is no blunder, what is one, and the effects.
+    """
     aside = [each.blunder.group for each in left if each.aside]
     less = len(aside) < len(left)
     if (stand := tried(last.stand.without, aside, progress, first) if less else None) is None:
-        return last, left
+        return last, left, found
+    stand, swapped = retuned(stand, [step.effect.name for step in found], progress)
     look = stand.look(progress)
-    found = {blunder.group for blunder in look.blunders if blunder.found}
-    kept = [each for each in left if each.aside or each.blunder.group in found]
+    loud = {blunder.group for blunder in look.blunders if blunder.found}
+    kept = [each for each in left if each.aside or each.blunder.group in loud]
     if len(kept) == len(left):
-        return last, left
+        return last, left, found
     if len(kept) > len(aside):
         groups = [each.blunder.group for each in kept]
-        look = last.stand.without(groups, progress, of=first).look(progress)
-    return look, kept
+        look = stand.without(groups, progress, of=first).look(progress)
+    return look, kept, [step.with_effect(swapped.get(step.effect.name)) for step in found]
 
 
 def _meet(a: Blunder, b: Blunder) -> bool:

@@ -28,6 +28,7 @@ from calib.diagnosis.verdict.names import absorbed, believed, beside_scatter, dr
 from calib.diagnosis.verdict.sentences import BAD, UNNAMED, sentences_of, stops_of, unconfirmed
 from calib.diagnosis.verdict.unnamed import Unnamed
 from calib.residuals.groups import Group
+from calib.results.errors import judged_mm
 from calib.results.holdout import Fall
 
 VERDICTS = {
@@ -155,7 +156,7 @@ def conclude(
         rings: whose numbers are wrong, as blunders.
         formulas: of residual structure.
     """
-    heavy = weighed(found, held_out, summary["rms_mm"])
+    heavy = weighed(found, held_out, judged_mm(summary))
     found, first = heavy.found, found.looks[0]
     sources = first.stand.sources
     blunders = [*rings, *(rejected.blunders(sources) if rejected and not found.found else [])]
@@ -163,7 +164,7 @@ def conclude(
     hold = believed(found, held_out) and not formulas.instead
     more = formulas.formulas or found.unsettled or (heavy.refused and found.at_first)
     more = bool(more or (rejected and not rejected.explained))
-    over = _over_the_expected(found, held_out, summary["rms_mm"])
+    over = _over_the_expected(found, held_out, judged_mm(summary))
     doubt = None if blunders or more else _unconfirmed(found, over)
     calm = BAD if forbids else UNNAMED if doubt else "adequate"
     answer = hold and not formulas.needless

@@ -14,7 +14,7 @@ from calib.diagnosis.search.confirmed import ALPHA_EFFECT, ALPHA_NOISE
 from calib.diagnosis.suggest import what_separates
 from calib.diagnosis.verdict.matters import Weighed
 from calib.effects import Site
-from calib.results.holdout import Fall
+from calib.results.holdout import Fall, fall_document
 from calib.results.solution import one_unit
 
 ALIKE = (
@@ -96,10 +96,7 @@ def _candidate(candidate: Candidate, found: Search, held_out: Mapping[str, Fall]
         "dof": test.dof,
         "step": step,
         "dressed_up": False,
-        "held_out_rms_mm": {
-            "before": fall.before_mm if fall else None,
-            "after": fall.after_mm if fall else None,
-        },
+        **fall_document(fall),
         "held_out_spread_mm": fall.spread_mm if fall else None,
         "rejected_share": _shares(fall),
         "error_explained": None if fall is None or fall.takes_back else fall.explained,

@@ -47,7 +47,7 @@ def by_name(
     """
     if found.found or formulas.fitted is None:
         return None
-    look, (before_mm, with_formulas_mm) = found.looks[-1], formulas.fall_mm
+    look, (before, with_formulas) = found.looks[-1], formulas.fall.sizes
     drawn = {c for each in formulas.formulas for c in each.covariates}
     alike = [c for c in look.named.candidates if {*c.effect.covariates} == drawn]
     alike = [c for c in alike if c.effect.site is Site.BEAM]
@@ -57,7 +57,7 @@ def by_name(
     if effect is None or (stand := tried(look.stand.with_effects, [effect], progress)) is None:
         return None
     errors, (thrown, still) = unseen(stand), formulas.thrown or (0.0, 0.0)
-    if not as_good(errors, with_formulas_mm, still):
+    if not as_good(errors, with_formulas.judged_mm, still):
         return None
     after, sure = stand.look(progress), formulas.formulas[0].steps[0]
     candidate = next(c for c in alike if c.effect.family == effect.family)
@@ -65,12 +65,8 @@ def by_name(
     step = _as_fitted(candidate, look, after, sure.p_adjusted)
     unnamed = structures(after, progress)
     named = replace(found, looks=[*found.looks, after], found=[step], unnamed=unnamed)
-    fall = Fall(
-        before_mm=before_mm,
-        after_mm=errors.rms_mm,
-        floor_mm=errors.floor_mm,
-        rejected_share=(thrown, errors.rejected_share or 0.0),
-    )
+    share = (thrown, errors.rejected_share or 0.0)
+    fall = Fall.of(before, errors.size, rejected_share=share)
     return named, {effect.name: fall}
 
 

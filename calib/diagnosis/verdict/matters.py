@@ -84,8 +84,7 @@ class Consequences:
 
     Args:
         look: at which they were tested.
-        rms_mm: keys ``held_out`` and ``noise_floor`` of a run's summary, or ``fit`` where nothing
-            was held out.
+        rms_mm: as of `errors.judged_mm`; ``fit`` counts where nothing was held out.
     """
 
     def __init__(self, look: Look, rms_mm: Mapping[str, float | None]) -> None:
@@ -191,10 +190,11 @@ def weighed(
     return Weighed(replace(found, found=named, **kept), matter, traces, refused=refused)
 
 
-def as_good(errors: Errors, rms_mm: float, thrown: float) -> bool:
+def as_good(errors: Errors, than_mm: float, thrown: float) -> bool:
     """Whether errors at unseen stops are no larger than another fit's, as far as that matters, and
     no more beams are rejected than this share."""
-    worse = errors.rms_mm > rms_mm + FALL_MATTERS * errors.floor_mm
+    size = errors.size
+    worse = size.judged_mm > than_mm + FALL_MATTERS * size.floor_mm
     return not worse and (errors.rejected_share or 0.0) <= thrown + TAKEN_BACK
 
 

@@ -13,7 +13,7 @@ from calib.diagnosis.search import NamedEffect
 from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import hangs_on, words
 from calib.diagnosis.verdict.matters import Weighed
-from calib.results.holdout import TAKEN_BACK
+from calib.results.holdout import TAKEN_BACK, from_to
 
 UNNAMED, BAD = "unexplained_structure", "bad_data"
 MOST_LISTED = 6  # untestable effects and rivals that a sentence names
@@ -145,8 +145,8 @@ def _structure_sentences(unexplained: Sequence[Mapping[str, Any]], residual: str
 
 def _formula_sentences(each: Mapping[str, Any], residual: str) -> list[str]:
     """Of structure whose formula was found: what it does, how it is added, and why it may be so."""
-    before, after = (each["held_out_rms_mm"][k] for k in ("before", "after"))
-    fall = f" The held-out error goes from {before:.2f} to {after:.2f} mm." if after else ""
+    went = from_to(each)
+    fall = f" The held-out error goes from {went}." if went else ""
     was, now = (each["rejected_share"][k] for k in ("before", "after"))
     if None not in (was, now) and was - now > TAKEN_BACK:
         fall += f" Rejected beams go from {100 * was:.1f} to {100 * now:.1f} %."
@@ -187,16 +187,16 @@ def _why_sentences(why: Mapping[str, Any]) -> list[str]:
 
 def _step_sentences(step: NamedEffect, candidate: Mapping[str, Any], worn: bool) -> list[str]:
     """Of a named effect; `worn` where bins explain more than it does."""
-    before, after = (candidate["held_out_rms_mm"][k] for k in ("before", "after"))
+    went = from_to(candidate)
     if candidate["dressed_up"]:
         why = "a generic function (bins) explains more, or as much by fewer parameters"
-        if after and not worn:
-            why = f"most of the held-out error stays ({before:.2f} to {after:.2f} mm)"
+        if went and not worn:
+            why = f"most of the held-out error stays ({went})"
         return [
             f"{step.effect.name} was tried and rejected: it absorbs part of the residuals, but "
             f"{why}."
         ]
-    fall = f"; the held-out error goes from {before:.2f} to {after:.2f} mm" if after else ""
+    fall = f"; the held-out error goes from {went}" if went else ""
     was, now = (candidate["rejected_share"][k] for k in ("before", "after"))
     fall += "" if was is None else f", rejected beams from {100 * was:.1f} to {100 * now:.1f} %"
     out = [

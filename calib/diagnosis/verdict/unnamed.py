@@ -17,7 +17,7 @@ from calib.diagnosis.verdict.matters import FALL_MATTERS, HELD_OUT_BY_CHANCE, as
 from calib.effects import Effect, Site
 from calib.effects.own.formula import FormulaEffect
 from calib.results.errors import Errors
-from calib.results.holdout import TAKEN_BACK, Fall
+from calib.results.holdout import TAKEN_BACK, Fall, fall_document, from_to
 from calib.solve.fit import Progress
 
 MOST_ALIKE = 3  # other forms that are listed
@@ -30,8 +30,7 @@ class Unnamed:
     Args:
         formulas: strongest first.
         instead: whether they take the place of the names, as `unnamed` has it.
-        fall_mm: the held-out error before and after all of them were fitted; None where nobody
-            looked.
+        fall: how the held-out error falls once all of them are fitted; None where nobody looked.
         whole: whether the held-out error with them is what chance makes it.
         thrown: the share of the held-out beams without weight, before and after; None where that
             is not known.
@@ -42,7 +41,7 @@ class Unnamed:
 
     formulas: Sequence[Formula] = ()
     instead: bool = False
-    fall_mm: tuple[float, float] | None = None
+    fall: Fall | None = None
     whole: bool = False
     thrown: tuple[float, float] | None = None
     refused: str = ""
@@ -51,11 +50,8 @@ class Unnamed:
 
     def documents(self, taken: Sequence[str]) -> list[dict[str, Any]]:
         """As in diagnosis.json, to be added by names that the model has not."""
-        both = {"held_out_rms_mm": self.fall_mm, "rejected_share": self.thrown}
-        fell = {
-            key: dict(zip(("before", "after"), pair or (None, None), strict=True))
-            for key, pair in both.items()
-        }
+        thrown = dict(zip(("before", "after"), self.thrown or (None, None), strict=True))
+        fell = fall_document(self.fall) | {"rejected_share": thrown}
         return [_document(each, taken) | fell for each in self.formulas]
 
 
@@ -95,17 +91,16 @@ def unnamed(
         return Unnamed(formulas)
     fitted = with_formulas(last, formulas, progress)
     before, after = unseen(last), unseen(fitted)
-    fall_mm = before.rms_mm, after.rms_mm
     if moves and not _by_chance(after):
         return Unnamed()
     # A gross structure is rejected, not fitted: what falls then is the share of such beams.
     thrown = _thrown(before, after)
-    fall = Fall(*fall_mm, after.floor_mm, rejected_share=thrown)
-    if fall.takes_back or fall_mm[0] - fall_mm[1] > FALL_MATTERS * after.floor_mm:
+    fall = Fall.of(before.size, after.size, rejected_share=thrown)
+    if fall.takes_back or fall.before_mm - fall.after_mm > FALL_MATTERS * fall.floor_mm:
         needless = _needless(_replaced(names, formulas), fitted, after, unseen, progress)
         return Unnamed(
             formulas=formulas,
-            fall_mm=fall_mm,
+            fall=fall,
             whole=_by_chance(after),
             thrown=thrown,
             fitted=fitted,
@@ -114,7 +109,7 @@ def unnamed(
     over = " and ".join(words(c) for c in formulas[0].covariates)
     return Unnamed(
         refused=f"A formula over {over} fits part of the residuals, but stops that were held out "
-        f"are predicted no better with it ({fall_mm[0]:.2f} to {fall_mm[1]:.2f} mm)."
+        f"are predicted no better with it ({from_to(fall_document(fall))})."
     )
 
 
@@ -141,7 +136,7 @@ def _instead(
     return Unnamed(
         formulas=formulas,
         instead=True,
-        fall_mm=(before.rms_mm, after.rms_mm),
+        fall=Fall.of(before.size, after.size),
         whole=_by_chance(after),
         thrown=_thrown(before, after),
     )
@@ -179,7 +174,7 @@ def _needless(
     gone: list[str] = []
     for effect in reversed(effects):
         less = tried(fitted.lacking, [*gone, effect.name], progress)
-        if less and as_good(unseen(less), errors.rms_mm, errors.rejected_share or 0.0):
+        if less and as_good(unseen(less), errors.size.judged_mm, errors.rejected_share or 0.0):
             gone.append(effect.name)
     return gone
 
@@ -193,7 +188,8 @@ def _of_one_curve(names: Sequence[Effect]) -> bool:
 
 def _by_chance(errors: Errors) -> bool:
     """Whether errors at unseen stops are no larger than chance makes them."""
-    return errors.rms_mm <= HELD_OUT_BY_CHANCE * errors.floor_mm
+    size = errors.size
+    return size.judged_mm <= HELD_OUT_BY_CHANCE * size.floor_mm
 
 
 def _thrown(before: Errors, after: Errors) -> tuple[float, float]:
@@ -206,8 +202,9 @@ def _better(before: Errors, named: Errors, after: Errors) -> bool:
     as matters, and no more beams are rejected; or far fewer are, and these fit."""
     now, then = _thrown(named, after)
     if now - then > TAKEN_BACK:
-        return _by_chance(after) or after.rms_mm <= named.rms_mm
-    falls = after.rms_mm < named.rms_mm - FALL_MATTERS * before.rms_mm
+        return _by_chance(after) or after.size.judged_mm <= named.size.judged_mm
+    least = FALL_MATTERS * before.size.judged_mm
+    falls = after.size.judged_mm < named.size.judged_mm - least
     return falls and then - now <= TAKEN_BACK
 
 
@@ -232,7 +229,7 @@ def _simpler(
         return False
     rigs = [source.rig for source in stand.sources]
     known = sum(max(len(e.params(rig)) for rig in rigs) + bool(e.shape_name) for e in names)
-    as_well = as_good(after, named.rms_mm, named.rejected_share or 0.0)
+    as_well = as_good(after, named.size.judged_mm, named.rejected_share or 0.0)
     return formulas[0].constants < known and _by_chance(after) and as_well
 
 

@@ -10,6 +10,7 @@ from calib.diagnosis.formulas.why import ARM_JOINT, MECHANISMS, OF_ARM, WHY_JOIN
 from calib.diagnosis.verdict import unnamed as module
 from calib.diagnosis.verdict.unnamed import unnamed
 from calib.effects import CATALOGUE, Site
+from calib.results.errors import ErrorSize
 
 KNOWN = sorted({c for e in CATALOGUE if e.site is Site.BEAM for c in e.covariates})
 
@@ -123,15 +124,20 @@ class World:
     def unnamed(self, doubtful=False, looks=True):
         def unseen(stand):
             rms = 4.0 - 0.5 * stand.estimate if stand in self.stands else stand
-            return SimpleNamespace(rms_mm=rms, floor_mm=FLOOR, rejected_share=0.0)
+            return SimpleNamespace(size=ErrorSize(rms, rms, FLOOR), rejected_share=0.0)
 
         return unnamed(self.search, doubtful, unseen if looks else None, lambda *_: None)
+
+
+def went(found):
+    """The held-out error before and after, where anybody looked."""
+    return found.fall and (found.fall.before_mm, found.fall.after_mm)
 
 
 def test_a_formula_beside_no_name_is_told_with_what_it_gains(monkeypatch):
     found = World(monkeypatch, last=2.1).unnamed()
     assert len(found.formulas) == 1 and not found.instead
-    assert found.fall_mm == (4.0, 2.1) and not found.refused
+    assert went(found) == (4.0, 2.1) and not found.refused
 
 
 @pytest.mark.parametrize(("after", "told"), [(3.97, True), (3.99, False), (4.5, False)])
@@ -161,7 +167,7 @@ def test_a_formula_takes_the_place_of_a_motion_where_it_leaves_nothing(
 
 def test_nobody_looks_and_a_formula_is_told_without_a_gain(monkeypatch):
     found = World(monkeypatch, last=9.0).unnamed(looks=False)
-    assert len(found.formulas) == 1 and found.fall_mm is None and not found.refused
+    assert len(found.formulas) == 1 and found.fall is None and not found.refused
 
 
 def test_nothing_is_found_and_nothing_said(monkeypatch):
@@ -172,7 +178,7 @@ def test_nothing_is_found_and_nothing_said(monkeypatch):
 def test_a_formula_beside_the_names_is_judged_against_them(monkeypatch):
     found = World(monkeypatch, names=2, first=1.0, last=2.5).unnamed()
     assert not found.instead
-    assert found.fall_mm == (3.0, 2.5)
+    assert went(found) == (3.0, 2.5)
 
 
 @pytest.mark.parametrize(("first", "instead"), [(2.9, True), (2.97, False), (3.2, False)])
@@ -182,7 +188,7 @@ def test_a_formula_takes_the_place_of_doubtful_names_that_predict_worse(
     """The names come down from 4 to 3 mm; better is by a hundredth of 4."""
     found = World(monkeypatch, names=2, first=first, last=None).unnamed(doubtful=True)
     assert found.instead == instead
-    assert found.fall_mm == ((4.0, first) if instead else None)
+    assert went(found) == ((4.0, first) if instead else None)
 
 
 def test_names_without_doubt_are_not_replaced(monkeypatch):
@@ -194,7 +200,7 @@ def test_names_without_doubt_are_not_replaced(monkeypatch):
 def test_doubtful_names_are_kept_where_no_formula_is(monkeypatch):
     world = World(monkeypatch, names=2, first=None, last=2.5)
     found = world.unnamed(doubtful=True)
-    assert not found.instead and found.fall_mm == (3.0, 2.5)
+    assert not found.instead and went(found) == (3.0, 2.5)
     assert world.asked == [0, 2]
 
 
@@ -272,7 +278,7 @@ def test_names_that_it_may_replace_are_asked_for_beside_a_formula(
 def test_errors_are_compared_by_how_many_beams_they_are_of(named, after, better):
     """In mm, where 2 are expected, and the share of beams that were rejected."""
     before, *both = (
-        SimpleNamespace(rms_mm=rms_mm, floor_mm=FLOOR, rejected_share=share)
+        SimpleNamespace(size=ErrorSize(rms_mm, rms_mm, FLOOR), rejected_share=share)
         for rms_mm, share in ((4.0, 0.1), named, after)
     )
     assert module._better(before, *both) == better

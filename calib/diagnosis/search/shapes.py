@@ -1,0 +1,113 @@
+"""Better shapes of effects that a model has: those just found on a grid, and those of which others
+have since changed what is best."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from calib.diagnosis.candidates import shape_limits
+from calib.diagnosis.score import ScoreTest, project, score_test
+from calib.diagnosis.stand import Stand, tried
+from calib.effects import Effect, ShapeStep
+from calib.forward import named
+from calib.problem.build import shapes_of, stops_view, theta_of
+from calib.problem.model import Source
+from calib.solve.estimate import DOFS, SEEN
+from calib.solve.fit import Progress
+
+# Squared sigmas by which another shape must fit better: three sigmas of one parameter, 0.3 % by
+# chance.
+BETTER_SHAPE = 9.0
+# Change of a shape's logarithm at once: a choice, half as much again; the derivative holds no
+# further.
+LARGEST_SHAPE_STEP = 0.4
+MOST_SHAPE_STEPS = 5  # a choice: from the finer grid one or two sufficed in all that was tried
+
+
+def retuned(
+    stand: Stand, names: Collection[str], progress: Progress
+) -> tuple[Stand, dict[str, Effect]]:
+    """A fit with better shapes of some effects.
+
+    Args:
+        stand: the fit.
+        names: of effects of its model.
+        progress: as of `fit.solve`.
+
+    Returns:
+        The fit with them, and the effects that took the place of others, by the others' names.
+    """
+    found: dict[str, Effect] = {}
+    for _ in range(MOST_SHAPE_STEPS):
+        original = {found[name].name if name in found else name: name for name in names}
+        swapped = _better_shapes(stand, original, progress)
+        if not swapped or (further := tried(_with_shapes, stand, swapped, progress)) is None:
+            break
+        stand = further
+        found |= {original[name]: effect for name, effect in swapped.items()}
+    return stand, found
+
+
+def _with_shapes(stand: Stand, swapped: Mapping[str, Effect], progress: Progress) -> Stand:
+    effects = tuple(swapped.get(e.name, e) for e in stand.model.effects)
+    start = replace(stand.estimate.start, state=_state_with(stand, swapped))
+    return stand.refitted(replace(stand.model, effects=effects), start, progress)
+
+
+def _better_shapes(stand: Stand, names: Collection[str], progress: Progress) -> dict[str, Effect]:
+    """By their names, some effects of the model with the shapes that one step leads to."""
+    steps: dict[str, list[ShapeStep]] = {}
+    for effect in (e for e in stand.model.effects if e.name in names):
+        theta = theta_of(stand.problem, effect, stand.estimate.values)
+        if effect.has_derivative_by_shape:
+            steps[effect.name] = [ShapeStep(effect, theta)]
+        elif others := _beside(effect, stand.sources):
+            steps[effect.name] = [ShapeStep(effect, theta, to=shape) for shape in others]
+    if not steps:
+        return {}
+    linear, at = stand.linearise([step for some in steps.values() for step in some], progress)
+    scores, swapped = project(linear, linear.candidates), {}
+    for name, some in steps.items():
+        effect = some[0].effect
+        tests = ((step, score_test(scores, at[step.name])) for step in some)
+        further = [_further(stand, step, test) for step, test in tests if test.dof]
+        gain, shape = max(further, default=(0.0, effect.shape))
+        if gain > BETTER_SHAPE and shape != effect.shape:
+            swapped[name] = effect.at(shape)
+    return swapped
+
+
+def _beside(effect: Effect, sources: Collection[Source]) -> list[float]:
+    """Shapes to which an effect that jumps may go next."""
+    return sorted({shape for source in sources for shape in effect.beside(stops_view(source))})
+
+
+def _further(stand: Stand, step: ShapeStep, test: ScoreTest) -> tuple[float, float]:
+    """By how much, in squared sigmas, another shape fits better, and which one.
+
+    Where the shape has a derivative, what its best step gains; of another shape, ``2 u - M`` with
+    the score u and information M of going there, no more and no less.
+    """
+    (best,) = test.estimate()
+    effect = step.effect
+    if step.to is not None:
+        return float(test.statistic * (2.0 - 1.0 / best) / best) if best > 0 else 0.0, step.to
+    by = np.exp(np.clip(best, -LARGEST_SHAPE_STEP, LARGEST_SHAPE_STEP))
+    ends = shape_limits(shapes_of(effect, stand.sources))
+    return test.statistic, float(f"{np.clip(effect.shape * by, *ends):.6g}")
+
+
+def _state_with(stand: Stand, swapped: Mapping[str, Effect]) -> dict[str, np.ndarray]:
+    """The state, for a model in which some effects have other shapes."""
+    renamed = {
+        t.variable: named(swapped[t.effect.name].name, t.rig)
+        for terms in stand.problem.terms
+        for t in terms
+        if t.effect.name in swapped
+    }
+    endings = ("", DOFS, SEEN)
+    every = {f"{old}{end}": f"{new}{end}" for old, new in renamed.items() for end in endings}
+    return {every.get(name, name): value for name, value in stand.estimate.state.items()}
