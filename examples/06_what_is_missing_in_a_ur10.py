@@ -26,7 +26,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from ur10_tmac import elsewhere_mm, recording
+from ur10_tmac import elsewhere, recording
 
 import calib
 
@@ -49,4 +49,6 @@ for folder, other in ((A, D), (D, A)):
             run = calib.add(run, step, out / f"{folder.name}-{step}")
         held_out = run.summary["rms_mm"]["held_out"]
         print(f"  {step or 'geometry':17} {held_out:.3f} mm held out,", end=" ")
-        print(f"{elsewhere_mm(run, other):.3f} mm in series {other.name}, but for base and tool")
+        print(
+            f"{elsewhere(run, other).rms_mm:.3f} mm in series {other.name}, but for base and tool"
+        )

@@ -14,7 +14,7 @@ from calib import problem as problems
 from calib.intake import Choices, import_files
 from calib.problem.model import Source
 from calib.problem.prior import JointPrior
-from calib.results.errors import body_errors
+from calib.results.errors import ErrorSize, body_errors
 from calib.solve.fit import solve
 from sensors.readers.base import Options
 
@@ -34,8 +34,9 @@ def recording(data: Path, series: str, folder: Path, most: int | None = None) ->
     return import_files(given, folder, Options(columns=COLUMNS, euler="XYZ"), choices).folder
 
 
-def elsewhere_mm(run: calib.Run, folder: Path) -> float:
-    """The error on other poses with the arm as a run found it, only base and tool being free."""
+def elsewhere(run: calib.Run, folder: Path) -> ErrorSize:
+    """How large errors are on other poses with the arm as a run found it, only base and tool being
+    free."""
     problem = problems.build([Source.open(folder)], calib.Model.read(run.model))
     held = [v for n, v in problem.variables.items() if n in run.solution.shared.effects]
     means = {}
@@ -45,4 +46,4 @@ def elsewhere_mm(run: calib.Run, folder: Path) -> float:
         means[variable.name] = np.array([known.get(dof, 0.0) for dof in variable.dofs])
     tight = 1e-16 * np.eye(sum(v.dim for v in held))
     solved = solve(problem, JointPrior(held, means, tight))
-    return body_errors(problem.blocks, solved.values, None).rms_mm
+    return body_errors(problem.blocks, solved.values, None).size

@@ -204,7 +204,8 @@ def _sentence(left: LeftOut, wrong_sign: str | None, about: str) -> str:
     group = str(left.blunder.group)
     group = f"T{group[1:]}" if group.startswith("the ") else group
     verb = "are" if left.blunder.group.what == JOINTS else "is"
-    out = f"{group}{about} {verb} {size_told(*size)} off{along}, against everything else"
+    off = f"{size_told(*size)} off{along}" if left.blunder.possible else "too far off for a size"
+    out = f"{group}{about} {verb} {off}, against everything else"
     if left.belongs:
         return f"{out}: it was taken at {left.belongs.where}."
     if left.rivals:

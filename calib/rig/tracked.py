@@ -30,6 +30,9 @@ MOST_TAKEN = 0.5  # of the rows by what is unknown: more, and what is left of th
 # choice, as one in ten was left where columns were moved back, and all where they were not.
 FEWEST_OFF, OUT_OF_STEP = 3, 0.25
 READINGS = "joints"  # whose columns may be out of step, as those of bodies may
+# Of the stops of a place, which agree where it is: a choice, below half, as half of a table may be
+# out of step.
+AGREE = 0.3
 SWAPPED = 0.2  # of the misfit, left where two bodies are exchanged
 MOST_COMPARED = 100  # stops, each with each
 MOST_FITTED = 1000  # stops, to which what is unknown is fitted; all are held against it
@@ -87,7 +90,9 @@ def odd_bodies(rig: Rig, recording: RecordedStops) -> Iterator[Suspect]:
         bad = yield from _placeholders(rig, recording, body)
         usable[body] = np.isfinite(recording.bodies[body]).all(axis=1) & ~bad
     pairs = list(_pairs(rig, recording, usable))
-    wrong = next((s for pair in pairs if (s := _at_all_stops(pair)) is not None), None)
+    wrong = next(
+        (s for pair in pairs if (s := _at_all_stops(pair, recording.stops)) is not None), None
+    )
     if wrong is not None:
         yield wrong
         return
@@ -165,7 +170,7 @@ def _pairs(rig: Rig, recording: RecordedStops, usable: Mapping[str, np.ndarray])
         )
 
 
-def _at_all_stops(pair: _Pair) -> Suspect | None:
+def _at_all_stops(pair: _Pair, stops: Sequence[str]) -> Suspect | None:
     """Bodies exchanged, columns that belong to another stop, or quaternions in another order."""
     if len(pair.stops) < 4:
         return None
@@ -177,7 +182,7 @@ def _at_all_stops(pair: _Pair) -> Suspect | None:
         if apart > TURNED_RAD and swapped < SWAPPED * apart:
             said = f"{names} lie as CAD says if they are exchanged; is each named as it should be?"
             return Suspect("body", names, said)
-    if said := _out_of_step(pair):
+    if said := _out_of_step(pair, stops):
         return Suspect("body", names, said)
     if _turns(pair, seen)[0] < TURNED_RAD:
         return None
@@ -193,34 +198,44 @@ def _at_all_stops(pair: _Pair) -> Suspect | None:
     return Suspect("body", names, said)
 
 
-def _out_of_step(pair: _Pair) -> str:
-    """What belongs to a stop before, or after, if all then fits: every way in which it does."""
-    here = _far_off(pair)
-    if here < FEWEST_OFF:
+def _out_of_step(pair: _Pair, stops: Sequence[str]) -> str:
+    """What belongs to a stop before, or after, if what lies far off then fits: every way in which
+    it does; of all `stops`, from the first of these to the last."""
+    roots = _roots(pair)
+    off = _far_off(pair, roots)
+    if len(off) < FEWEST_OFF:
         return ""
     ways = [(name, by) for name in (*pair.names, READINGS) for by in SLIPPED]
     moved = {way: pair.slipped(*way) for way in ways}
-    left = {way: _far_off(some) for way, some in moved.items() if len(some.stops) >= 4}
-    least = min(left.values(), default=len(pair.stops))
-    if least > OUT_OF_STEP * here:
+    left = {
+        way: min(len(off & _far_off(some, of)) for of in (roots, _roots(some)))
+        for way, some in moved.items()
+        if off & {*some.stops.tolist()}
+    }
+    least = min(left.values(), default=len(off))
+    if least > OUT_OF_STEP * len(off):
         return ""
     told = [
         f"the columns of {name} from the {'row' if abs(by) == 1 else 'second row'} "
         f"{'below' if by > 0 else 'above'}"
         for (name, by), count in left.items()
-        if count == least
+        if count <= least + abs(by)  # where rows of one table moved on, the last have gone
     ]
+    first, last = min(off), max(off)
+    whole = last - first + 1 > len(stops) - FEWEST_OFF
+    rows = "each row" if whole else f"each row from {stops[first]} to {stops[last]}"
     return (
         f"{' and '.join(pair.names)} would lie where CAD and joints put "
-        f"{'it' if len(pair.names) == 1 else 'them'} if each row of stops.csv took "
-        f"{', or '.join(told)}: is the table out of step?"
+        f"{'it' if len(pair.names) == 1 else 'them'} if {rows} of stops.csv took "
+        f"{', or '.join(told)}: is the table out of step{'' if whole else ' there'}?"
     )
 
 
-def _far_off(pair: _Pair) -> int:
-    """At how many stops poses are further off than any CAD or arm: see `TURNED_RAD`, rad and m
-    alike."""
-    return int(np.sum(_size(_gap(_from_places(pair), pair.seen())) > TURNED_RAD))
+def _far_off(pair: _Pair, roots: Mapping[int, Array]) -> set[int]:
+    """Stops at which poses are further off than any CAD or arm, from some places of the root: see
+    `TURNED_RAD`, rad and m alike."""
+    far = _size(_gap(_from_places(pair, roots), pair.seen())) > TURNED_RAD
+    return {*pair.stops[far].tolist()}
 
 
 def _turns(pair: _Pair, seen: Array) -> tuple[float, float]:
@@ -250,7 +265,7 @@ def _outliers(rig: Rig, pair: _Pair) -> Iterator[tuple[int, Array, bool]]:
     """
     if len(pair.stops) < 4:
         return
-    nominal, seen = _from_places(pair), pair.seen()
+    nominal, seen = _from_places(pair, _roots(pair)), pair.seen()
     gap = _gap(nominal, seen)
     noise = np.repeat([rig.tracker.sigma_rad, rig.tracker.sigma_m], 3) * np.sqrt(len(pair.names))
     noise = np.hypot(noise, max(rig.sigma_joint_rad, JITTER))
@@ -286,15 +301,22 @@ def _edge_sigmas(rig: Rig) -> Array:
     return 3.0 * np.concatenate(sigma)  # one in a hundred lies beyond
 
 
-def _from_places(pair: _Pair) -> Array:
-    """(K, 4, 4) nominal poses in the world, from places that most of their stops agree on."""
-    nominal = pair.nominal.copy()
-    for p in np.unique(pair.place[pair.place >= 0]):
-        at = np.flatnonzero(pair.place == p)
-        roots = (pair.seen() @ se3.inverse(pair.nominal))[at]
+def _roots(pair: _Pair) -> dict[int, Array]:
+    """T_world_root of each place, on which enough of its stops agree."""
+    every, found = pair.seen() @ se3.inverse(pair.nominal), {}
+    for p in np.unique(pair.place[pair.place >= 0]).tolist():
+        roots = every[pair.place == p]
         some = roots[:: -(-len(roots) // MOST_COMPARED)]
         apart = _size(_gap(some[:, None], some[None]))
-        nominal[at] = some[np.median(apart, axis=1).argmin()] @ nominal[at]
+        found[p] = some[np.quantile(apart, AGREE, axis=1).argmin()]
+    return found
+
+
+def _from_places(pair: _Pair, roots: Mapping[int, Array]) -> Array:
+    """(K, 4, 4) nominal poses in the world, from these places of the root."""
+    nominal = pair.nominal.copy()
+    for p, T in roots.items():
+        nominal[pair.place == p] = T @ nominal[pair.place == p]
     return nominal
 
 

@@ -138,6 +138,30 @@ def test_an_arm_alone_whose_joints_are_a_row_late(shared):
     assert found.sentence.startswith("tool would lie where CAD and joints put it if")
 
 
+@pytest.mark.parametrize(("first", "last"), [(10, 16), (100, 119), (150, 299)])
+def test_some_rows_of_an_arm_are_out_of_step(shared, first, last):
+    """From a row on, or between two: most rows may be good, or most bad."""
+    rig, recording = opened(shared, "arm_base_creeps")
+    some = np.arange(first, last + 1)
+    late = replace(recording, joints=recording.joints.copy())
+    late.joints[some] = recording.joints[some - 1]
+    (found,) = (f for f in odd_bodies(rig, late) if "out of step" in f.sentence)
+    stops = recording.stops[first], recording.stops[last]
+    assert "if each row from {} to {} of stops.csv took".format(*stops) in found.sentence
+    assert "the columns of joints from the row below" in found.sentence
+
+
+def test_rows_that_have_nothing_in_common_are_not_out_of_step(shared):
+    """Ten rows of the joints, drawn anew: each is told, and no step."""
+    rig, recording = opened(shared, "arm_base_creeps")
+    wild = replace(recording, joints=recording.joints.copy())
+    some = np.arange(40, 50)
+    wild.joints[some] = np.random.default_rng(1).permutation(recording.joints)[some]
+    told = list(odd_bodies(rig, wild))
+    assert {s for f in told for s in f.stops} == {recording.stops[k] for k in some}
+    assert not any("out of step" in f.sentence for f in told)
+
+
 def test_bodies_exchanged_at_all_stops_or_at_one(sound):
     rig, recording = sound
     bodies = recording.bodies
