@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -145,7 +145,24 @@ def judge(whole: Linearisation, problem: Problem, planned: Collection[str] = ())
     for (kind, *_), some in kinds.items():
         looks = len(halves) * halves[kind == "surface"]
         found += _judged(some, looks, planned, whereabouts)
-    return sorted(found, key=lambda b: -b.evidence)
+    return sorted(_as_one_joint_scatters(found), key=lambda b: -b.evidence)
+
+
+def _as_one_joint_scatters(judged: Sequence[Blunder]) -> Iterator[Blunder]:
+    """Where one joint's reading explains how far out a stop is, and chance puts that joint so far
+    out, as it scatters more than others do, chance puts the stop there: neither its body nor its
+    joints together are further out than that."""
+    single: dict[tuple[str, str], list[Blunder]] = {}
+    for each in judged:
+        if not _whole(each.group):
+            single.setdefault(each.group.place, []).append(each)
+    for each in judged:
+        if each.found and _whole(each.group):
+            least = each.shift.statistic - each.limit * (1.0 - 1.0 / each.shift.dof)
+            for one in single.get(each.group.place, ()):
+                if one.shift.statistic > least and one.p_adjusted > each.p_adjusted:
+                    each = replace(each, p_value=one.p_value, p_adjusted=one.p_adjusted)
+        yield each
 
 
 def _alike(group: Group) -> tuple[str, str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,13 +11,15 @@ from calib.blunders.chance import LEAST_P, at_least
 from calib.blunders.judged import Blunder, LeftOut
 from calib.blunders.reach import FurthestMoved
 from calib.problem.model import Source, labels, same_mesh
-from calib.residuals.groups import ALONG_BEAMS, JOINTS, MESH, SCAN, Group
+from calib.residuals.groups import ALONG_BEAMS, CAD, JOINTS, MESH, SCAN, Group
 from calib.residuals.surfaces import part_centre_m
 from calib.rig import Rig
 from sensors.rings import RingFinding
 
 SHOWN = {"m": ("mm", 1e3), "rad": ("mrad", 1e3)}
 LARGE_SIZE = 1000.0  # mm or mrad, from which on metres and radians are read more easily
+# Where an angle of an arm is not as drawn: a choice, ten times what arms are off by at most.
+DRAWN_OTHERWISE_RAD = 0.5
 SIGN = 0.05  # of twice a value on paper, within which it is off as a wrong sign would have it
 
 
@@ -100,6 +102,25 @@ def of_rings(lidar: str, found: RingFinding) -> dict[str, Any]:
         "unit": "rad",
         "sigma": found.left_rad,
     }
+
+
+def of_the_arm(moved: Mapping[str, Mapping[str, Any]]) -> Iterator[dict[str, Any]]:
+    """Angles of an arm that are far from where they are drawn, in the same form: no arm is built so
+    far off, and a fit gets there where joints are read otherwise than the URDF has them.
+
+    Args:
+        moved: ``prior`` of ``misfit_by`` of a run's summary.
+    """
+    for name, found in moved.items():
+        off_rad = abs(found["change"])
+        if "." in name and found["unit"] == "rad" and off_rad > DRAWN_OTHERWISE_RAD:
+            group = Group("frame", CAD, name)
+            said = (
+                f"{group} is {np.degrees(off_rad):.0f} deg from where it is drawn; is each joint "
+                "read as the URDF has it? 'rigcal check' tries other signs and orders"
+            )
+            off = {"size": off_rad, "unit": "rad", "sigma": found["sigma"]}
+            yield {**_otherwise("frame", name, CAD, whole(said)), **off}
 
 
 def of_part(

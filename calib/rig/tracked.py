@@ -4,12 +4,24 @@ out."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from itertools import combinations
 
 import numpy as np
 
 from calib.rig import Rig
+from calib.rig.pairs import (
+    MOST_COMPARED,
+    READINGS,
+    TURNED_RAD,
+    Pair,
+    far_off,
+    from_places,
+    gap_of,
+    pairs_of,
+    roots_of,
+    size_of,
+)
 from calib.rig.suspect import Suspect, listed
 from chains import se3
 from chains.align import hand_eye
@@ -24,61 +36,16 @@ JITTER = 1e-4  # rad by which joints scatter at least, as of industrial arms
 OUTLIER_SIGMAS = 8.0
 # Left by all that CAD and the arm may be off by, m and rad: not this arm, or not so.
 NOT_THIS_ARM = 0.05
-TURNED_RAD, FITS_RAD = 0.1, 0.03  # turns that are not the arm's, and turns that are
+FITS_RAD = 0.03  # turns that are the arm's, others than those of `TURNED_RAD`
 MOST_TAKEN = 0.5  # of the rows by what is unknown: more, and what is left of the others says little
 # Stops far off, from which columns may be out of step, and of these what is left if they are: a
 # choice, as one in ten was left where columns were moved back, and all where they were not.
 FEWEST_OFF, OUT_OF_STEP = 3, 0.25
-READINGS = "joints"  # whose columns may be out of step, as those of bodies may
-# Of the stops of a place, which agree where it is: a choice, below half, as half of a table may be
-# out of step.
-AGREE = 0.3
+TURNED_DEG = (-90, 90, 180)  # by which zeros of joints are drawn otherwise
 SWAPPED = 0.2  # of the misfit, left where two bodies are exchanged
-MOST_COMPARED = 100  # stops, each with each
 MOST_FITTED = 1000  # stops, to which what is unknown is fitted; all are held against it
 SLIPPED = (-2, -1, 1, 2)  # stops by which columns are out of step: as far as tables slip, a choice
 QUATERNION_ORDERS = {"qx, qy, qz, qw": (3, 0, 1, 2), "qz, qw, qx, qy": (1, 2, 3, 0)}
-
-
-@dataclass(frozen=True)
-class _Pair:
-    """A body as seen from another, or from the tracker, at K stops.
-
-    Args:
-        names: the bodies: that which is seen from, if any, and that which is seen.
-        stops: (K,) indices.
-        place: (K,) which unknown place the rig's root has; -1 where the other body carries it.
-        nominal: (K, 4, 4) as joints and CAD say.
-        poses: (K, 7) as measured, of each of the names.
-        d_twist: (K, 6, P) of the nominal pose, by every edge of the rig.
-    """
-
-    names: tuple[str, ...]
-    stops: np.ndarray
-    place: np.ndarray
-    nominal: Array
-    poses: tuple[Array, ...]
-    d_twist: Array
-
-    def seen(self, order: Sequence[int] = range(4)) -> Array:
-        """(K, 4, 4) as measured, the quaternions' columns taken in some order."""
-        T = [se3.from_xyz_quat(pose[:, :3], pose[:, 3:][:, list(order)]) for pose in self.poses]
-        return T[0] if len(T) == 1 else se3.inverse(T[0]) @ T[1]
-
-    def slipped(self, name: str, by: int) -> _Pair:
-        """The same, had the columns of one of the bodies, or of the "joints", come from so many
-        stops later, at the stops that have one."""
-        here = np.flatnonzero(np.isin(self.stops + by, self.stops))
-        there = np.searchsorted(self.stops, self.stops[here] + by)
-        of = dict(zip(self.names, self.poses, strict=True))
-        return replace(
-            self,
-            stops=self.stops[here],
-            place=self.place[here],
-            nominal=self.nominal[there if name == READINGS else here],
-            poses=tuple(pose[there if body == name else here] for body, pose in of.items()),
-            d_twist=self.d_twist[there if name == READINGS else here],
-        )
 
 
 def odd_bodies(rig: Rig, recording: RecordedStops) -> Iterator[Suspect]:
@@ -89,14 +56,13 @@ def odd_bodies(rig: Rig, recording: RecordedStops) -> Iterator[Suspect]:
     for body in rig.tracker.bodies:
         bad = yield from _placeholders(rig, recording, body)
         usable[body] = np.isfinite(recording.bodies[body]).all(axis=1) & ~bad
-    pairs = list(_pairs(rig, recording, usable))
-    wrong = next(
-        (s for pair in pairs if (s := _at_all_stops(pair, recording.stops)) is not None), None
-    )
-    if wrong is not None:
-        yield wrong
-        return
-    met: dict[int, list[tuple[_Pair, Array, bool]]] = {}
+    pairs = list(pairs_of(rig, recording, usable))
+    for pair in pairs:
+        wrong = _at_all_stops(pair, recording.stops) or _misread(rig, recording, pair)
+        if wrong is not None:
+            yield wrong
+            return
+    met: dict[int, list[tuple[Pair, Array, bool]]] = {}
     for pair in pairs:
         for k, gap, exchanged in _outliers(rig, pair):
             met.setdefault(int(pair.stops[k]), []).append((pair, gap, exchanged))
@@ -142,42 +108,14 @@ def _repeated(rig: Rig, recording: RecordedStops, body: str) -> np.ndarray:
 # ------------------------------------------------------------------------------- at all stops
 
 
-def _pairs(rig: Rig, recording: RecordedStops, usable: Mapping[str, np.ndarray]) -> Iterator[_Pair]:
-    """Each body as the tracker sees it, where the rig's root stands still; else as the body
-    nearest to the root does. None beyond a joint that nothing reads, which would follow it."""
-    read = (b for b in usable if set(rig.passive).isdisjoint(rig.joints_to(b)))
-    bodies = sorted((b for b in read if usable[b].any()), key=lambda b: len(rig.joints_to(b)))
-    still = np.zeros((1, len(rig.tree.edges), 6))
-    placed = {b: rig.tree.place(b, recording.joints, still) for b in bodies}
-    place = np.zeros(len(recording.stops), int)
-    if rig.moves == "location":
-        place = np.unique(recording.location, return_inverse=True)[1]
-    for body in bodies if rig.moves != "stop" else bodies[1:]:
-        names = (body,) if rig.moves != "stop" else (bodies[0], body)
-        at = np.flatnonzero(np.all([usable[name] for name in names], axis=0))
-        T, d = placed[body].Ts_root_frame[at], placed[body].d_twist[at].reshape(len(at), 6, -1)
-        if len(names) == 2:
-            first = placed[names[0]]
-            T = se3.inverse(first.Ts_root_frame[at]) @ T
-            d = d - se3.adjoint(se3.inverse(T)) @ first.d_twist[at].reshape(len(at), 6, -1)
-        yield _Pair(
-            names=names,
-            stops=at,
-            place=place[at] if len(names) == 1 else np.full(len(at), -1),
-            nominal=T,
-            poses=tuple(recording.bodies[name][at] for name in names),
-            d_twist=d,
-        )
-
-
-def _at_all_stops(pair: _Pair, stops: Sequence[str]) -> Suspect | None:
+def _at_all_stops(pair: Pair, stops: Sequence[str]) -> Suspect | None:
     """Bodies exchanged, columns that belong to another stop, or quaternions in another order."""
     if len(pair.stops) < 4:
         return None
     seen, names = pair.seen(), " and ".join(pair.names)
     if len(pair.names) == 2:
         apart, swapped = (
-            np.median(_size(_gap(pair.nominal, T))) for T in (seen, se3.inverse(seen))
+            np.median(size_of(gap_of(pair.nominal, T))) for T in (seen, se3.inverse(seen))
         )
         if apart > TURNED_RAD and swapped < SWAPPED * apart:
             said = f"{names} lie as CAD says if they are exchanged; is each named as it should be?"
@@ -198,17 +136,17 @@ def _at_all_stops(pair: _Pair, stops: Sequence[str]) -> Suspect | None:
     return Suspect("body", names, said)
 
 
-def _out_of_step(pair: _Pair, stops: Sequence[str]) -> str:
+def _out_of_step(pair: Pair, stops: Sequence[str]) -> str:
     """What belongs to a stop before, or after, if what lies far off then fits: every way in which
     it does; of all `stops`, from the first of these to the last."""
-    roots = _roots(pair)
-    off = _far_off(pair, roots)
+    roots = roots_of(pair)
+    off = far_off(pair, roots)
     if len(off) < FEWEST_OFF:
         return ""
     ways = [(name, by) for name in (*pair.names, READINGS) for by in SLIPPED]
     moved = {way: pair.slipped(*way) for way in ways}
     left = {
-        way: min(len(off & _far_off(some, of)) for of in (roots, _roots(some)))
+        way: min(len(off & far_off(some, of)) for of in (roots, roots_of(some)))
         for way, some in moved.items()
         if off & {*some.stops.tolist()}
     }
@@ -231,14 +169,7 @@ def _out_of_step(pair: _Pair, stops: Sequence[str]) -> str:
     )
 
 
-def _far_off(pair: _Pair, roots: Mapping[int, Array]) -> set[int]:
-    """Stops at which poses are further off than any CAD or arm, from some places of the root: see
-    `TURNED_RAD`, rad and m alike."""
-    far = _size(_gap(_from_places(pair, roots), pair.seen())) > TURNED_RAD
-    return {*pair.stops[far].tolist()}
-
-
-def _turns(pair: _Pair, seen: Array) -> tuple[float, float]:
+def _turns(pair: Pair, seen: Array) -> tuple[float, float]:
     """Rad by which a body turns otherwise than the joints say, median, whatever it hangs on and
     wherever the rig stands, and by which it hangs otherwise than CAD says; 0 where not to be told.
     """
@@ -248,14 +179,69 @@ def _turns(pair: _Pair, seen: Array) -> tuple[float, float]:
         X, Z = hand_eye(seen[at], pair.nominal[at])
     except InputError:
         return 0.0, 0.0
-    left = _gap(Z @ pair.nominal[at] @ X, seen[at])
-    return float(np.median(np.linalg.norm(left[:, :3], axis=1))), float(_size(se3.log(X)[:3]))
+    left = gap_of(Z @ pair.nominal[at] @ X, seen[at])
+    return float(np.median(np.linalg.norm(left[:, :3], axis=1))), float(size_of(se3.log(X)[:3]))
+
+
+# ------------------------------------------------------------------------------------- joints
+
+
+def _misread(rig: Rig, recording: RecordedStops, pair: Pair) -> Suspect | None:
+    """Joints with another sign, exchanged, or a quarter or half a turn off, if all then fits; or a
+    joint whose reading stood still."""
+    off = far_off(pair, roots_of(pair))
+    if len(off) < FEWEST_OFF:
+        return None
+    names, joints = " and ".join(pair.names), pair.joints_between(rig)
+    for joint in joints:
+        read = recording.joints[:, rig.joint_names.index(joint)]
+        still = {*(1 + np.flatnonzero(np.diff(read) == 0)).tolist()}
+        there = len(off & still)
+        if there >= (1 - OUT_OF_STEP) * len(off) and there >= (1 - OUT_OF_STEP) * len(still):
+            stops = tuple(recording.stops[k] for k in sorted(still))
+            said = (
+                f"{joint} reads the same to the last digit at {listed(stops)} as at the stop "
+                f"before, and {names} far from where that puts it: did the reading stand still?"
+            )
+            return Suspect("joints", joint, said, stops=stops)
+    some = pair.some(slice(None, None, -(-len(pair.stops) // MOST_COMPARED)))
+    off = far_off(some, roots_of(some))
+    left: dict[str, int] = {}
+    for what, otherwise in _otherwise_read(rig, joints, recording.joints[some.stops]):
+        moved = some.reading(rig, otherwise)
+        left[what] = len(off & far_off(moved, roots_of(moved)))
+    least = min(left.values(), default=len(off))
+    if len(off) < FEWEST_OFF or least > OUT_OF_STEP * len(off):
+        return None
+    ways = ", or if ".join(what for what, count in left.items() if count == least)
+    said = (
+        f"{names} would lie where CAD and joints put {'it' if len(pair.names) == 1 else 'them'} if "
+        f"{ways}: are the joints read as the URDF has them?"
+    )
+    return Suspect("body", names, said)
+
+
+def _otherwise_read(rig: Rig, names: Sequence[str], read: Array) -> Iterator[tuple[str, Array]]:
+    """In what other ways joints could be read, and (K, J) the joints then."""
+    at = {name: rig.joint_names.index(name) for name in names}
+    for name in names:
+        otherwise = read.copy()
+        otherwise[:, at[name]] *= -1
+        yield f"{name} had the other sign", otherwise
+        for deg in TURNED_DEG if rig.joint_kinds[at[name]] == "revolute" else ():
+            otherwise = read.copy()
+            otherwise[:, at[name]] += np.radians(deg)
+            yield f"{name} read {abs(deg)} deg {'more' if deg > 0 else 'less'}", otherwise
+    for a, b in combinations(names, 2):
+        otherwise = read.copy()
+        otherwise[:, [at[a], at[b]]] = read[:, [at[b], at[a]]]
+        yield f"the columns of {a} and {b} were exchanged", otherwise
 
 
 # -------------------------------------------------------------------------------- at one stop
 
 
-def _outliers(rig: Rig, pair: _Pair) -> Iterator[tuple[int, Array, bool]]:
+def _outliers(rig: Rig, pair: Pair) -> Iterator[tuple[int, Array, bool]]:
     """Stops of a pair that stand out from the others: which, by how much (6,) [rad m], and whether
     they would not if the bodies were exchanged.
 
@@ -265,8 +251,8 @@ def _outliers(rig: Rig, pair: _Pair) -> Iterator[tuple[int, Array, bool]]:
     """
     if len(pair.stops) < 4:
         return
-    nominal, seen = _from_places(pair, _roots(pair)), pair.seen()
-    gap = _gap(nominal, seen)
+    nominal, seen = from_places(pair, roots_of(pair)), pair.seen()
+    gap = gap_of(nominal, seen)
     noise = np.repeat([rig.tracker.sigma_rad, rig.tracker.sigma_m], 3) * np.sqrt(len(pair.names))
     noise = np.hypot(noise, max(rig.sigma_joint_rad, JITTER))
     d_place = se3.adjoint(se3.inverse(pair.nominal))
@@ -282,7 +268,7 @@ def _outliers(rig: Rig, pair: _Pair) -> Iterator[tuple[int, Array, bool]]:
         return
     for k in np.flatnonzero((size > OUTLIER_SIGMAS * np.maximum(spread, 1.0)).any(axis=1)):
         exchanged = len(pair.names) == 2 and (
-            _size(_gap(nominal[k], se3.inverse(seen[k]))) < SWAPPED * _size(gap[k])
+            size_of(gap_of(nominal[k], se3.inverse(seen[k]))) < SWAPPED * size_of(gap[k])
         )
         yield int(k), left[k] * noise, bool(exchanged)
 
@@ -299,25 +285,6 @@ def _edge_sigmas(rig: Rig) -> Array:
         for name in rig.tree.edge_names
     ]
     return 3.0 * np.concatenate(sigma)  # one in a hundred lies beyond
-
-
-def _roots(pair: _Pair) -> dict[int, Array]:
-    """T_world_root of each place, on which enough of its stops agree."""
-    every, found = pair.seen() @ se3.inverse(pair.nominal), {}
-    for p in np.unique(pair.place[pair.place >= 0]).tolist():
-        roots = every[pair.place == p]
-        some = roots[:: -(-len(roots) // MOST_COMPARED)]
-        apart = _size(_gap(some[:, None], some[None]))
-        found[p] = some[np.quantile(apart, AGREE, axis=1).argmin()]
-    return found
-
-
-def _from_places(pair: _Pair, roots: Mapping[int, Array]) -> Array:
-    """(K, 4, 4) nominal poses in the world, from these places of the root."""
-    nominal = pair.nominal.copy()
-    for p, T in roots.items():
-        nominal[pair.place == p] = T @ nominal[pair.place == p]
-    return nominal
 
 
 def _robust(A: Array, b: Array) -> tuple[Array, float]:
@@ -338,7 +305,7 @@ def _robust(A: Array, b: Array) -> tuple[Array, float]:
     return b - A @ x, taken
 
 
-def _at_one_stop(rig: Rig, stop: str, found: list[tuple[_Pair, Array, bool]]) -> Suspect:
+def _at_one_stop(rig: Rig, stop: str, found: list[tuple[Pair, Array, bool]]) -> Suspect:
     """One stop's bodies that stand out: the one that all pairs have in common, if there is one."""
     pair, gap, exchanged = found[0]
     common = [name for name in pair.names if all(name in other.names for other, *_ in found)]
@@ -353,13 +320,3 @@ def _at_one_stop(rig: Rig, stop: str, found: list[tuple[_Pair, Array, bool]]) ->
             f"{' and the joints' if joints else ''} put it; look at its row"
         )
     return Suspect("body", names, said, stops=(stop,), size=float(shift_mm / 1e3), unit="m")
-
-
-def _gap(a: Array, b: Array) -> Array:
-    """(..., 6) by which poses b differ from a, in their own axes."""
-    return se3.log(se3.inverse(a) @ b)
-
-
-def _size(twist: Array) -> Array:
-    """Rad and m alike: (...,) how large a twist is."""
-    return np.linalg.norm(twist, axis=-1)

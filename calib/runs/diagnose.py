@@ -93,7 +93,10 @@ def _found(
         weak_directions(run.solution, found.looks[0]),
         rejected,
         forbids(run),
-        [told.of_rings(lidar, each) for lidar, each in rings if harmful(each.what)],
+        [
+            *(told.of_rings(lidar, each) for lidar, each in rings if harmful(each.what)),
+            *_not_as_drawn(run, found),
+        ],
         formulas,
     )
     unseen = _reaches(found.looks[0], run) if run.converged else {}
@@ -217,6 +220,14 @@ def _falls(found: Search, stand: Stand, run: Run, progress: Progress) -> dict[st
         unseen = _unseen(last, run, progress)
         falls[scatter[-1]] = Fall.of(before, unseen.size)
     return falls
+
+
+def _not_as_drawn(run: Run, found: Search) -> Iterator[dict[str, Any]]:
+    """Angles of the arm that are far from where they are drawn, of a fit that has come to its end;
+    not those that were found to be blunders."""
+    named = {left.blunder.group.what for left in found.blunders}
+    moved = run.summary["misfit_by"]["prior"] if run.converged else {}
+    yield from (each for each in told.of_the_arm(moved) if each["name"] not in named)
 
 
 def _cautions(run: Run, found: Diagnosis, look: Look) -> list[str]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from calib.blunders import judged
+from calib.blunders import judged, told
 from calib.blunders.shifts import Shift, of_poses, shifts, standing_alone
 from calib.effects import find
 from calib.linear.clusters import Gradients
@@ -363,3 +363,17 @@ def test_of_many_scans_some_drawn_evenly_tell_what_they_tell_among_all(tmp_path,
     expected = every.information[np.ix_(at, at)] / unit
     np.testing.assert_allclose(some.information / unit, expected, atol=1e-6)
     np.testing.assert_array_equal(some.group, every.group[at])
+
+
+def test_an_arm_far_from_as_drawn_is_plainly_wrong():
+    """Where a fit explains all by a link turned over, nothing is left for a test."""
+    moved = {
+        "tool": {"change": 1.5, "sigma": 0.01, "unit": "rad"},  # how it hangs, CAD may not know
+        "arm_geometry.j2.tilt_b": {"change": -3.14, "sigma": 0.003, "unit": "rad"},
+        "arm_joint_offset.j4": {"change": 0.2, "sigma": 0.005, "unit": "rad"},
+        "arm_link_length.j3": {"change": 0.9, "sigma": 0.005, "unit": "m"},
+    }
+    (found,) = told.of_the_arm(moved)
+    assert (found["kind"], found["name"]) == ("frame", "arm_geometry.j2.tilt_b")
+    assert found["size"] == 3.14 and found["without"] is None
+    assert "is 180 deg from where it is drawn" in found["sentence"]

@@ -162,6 +162,37 @@ def test_rows_that_have_nothing_in_common_are_not_out_of_step(shared):
     assert not any("out of step" in f.sentence for f in told)
 
 
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda q: q * [1, -1, 1, 1, 1, 1], "joint_2 had the other sign"),
+        (lambda q: q * [1, 1, 1, 1, -1, 1], "joint_5 had the other sign"),
+        (lambda q: q[:, [0, 2, 1, 3, 4, 5]], "the columns of joint_2 and joint_3 were exchanged"),
+        (lambda q: q[:, [0, 1, 2, 5, 4, 3]], "the columns of joint_4 and joint_6 were exchanged"),
+        (lambda q: q + [0, 0, np.pi / 2, 0, 0, 0], "joint_3 read 90 deg less"),
+        (lambda q: q - [0, np.pi / 2, 0, 0, 0, 0], "joint_2 read 90 deg more"),
+    ],
+)
+def test_joints_read_otherwise_than_the_urdf_has_them(shared, change, said):
+    rig, recording = opened(shared, "arm_base_creeps")
+    found = only(odd_bodies(rig, replace(recording, joints=change(recording.joints))))
+    assert f"if {said}" in found.sentence and found.stops == ()
+    assert "are the joints read as the URDF has them?" in found.sentence
+
+
+@pytest.mark.parametrize("count", [4, 90])
+def test_a_joint_whose_reading_stood_still(shared, count):
+    """Some rows of 300, each to be left out by its name; a joint that nobody moves is none."""
+    rig, recording = opened(shared, "arm_base_creeps")
+    joints = recording.joints.copy()
+    joints[50 : 50 + count, 3] = joints[49, 3]
+    found = only(odd_bodies(rig, replace(recording, joints=joints)))
+    assert (found.kind, found.name) == ("joints", "joint_4") and "stand still" in found.sentence
+    assert found.stops == tuple(recording.stops[50 : 50 + count])
+    source = Source(rig, replace(recording, joints=joints), None)
+    leave_out([source], [f"{found.stops[0]}:joint_4"])
+
+
 def test_bodies_exchanged_at_all_stops_or_at_one(sound):
     rig, recording = sound
     bodies = recording.bodies

@@ -139,3 +139,19 @@ def test_what_slips_does_so_between_two_stops_and_none_of_them_is_a_blunder(tmp_
     assert step.effect.family in ("arm_joint_slip", "mount_slip")
     elapsed_s = time_s - time_s[0]
     assert elapsed_s[first - 1] < step.effect.shape < elapsed_s[first]
+
+
+@pytest.mark.parametrize("wild", [False, True])
+def test_poses_are_no_blunders_where_one_joint_scatters_more_than_all(tmp_path, wild):
+    """Scatter of the joints is one number, and an encoder may be worse than the others: what its
+    readings do to a pose is judged as these readings are. A row far beyond them is named."""
+    rng, folder = np.random.default_rng([21, 10]), tmp_path / "rec"
+    world, poses = arm_worlds.bent(folder, "stanford", rng), 150
+    read = world.draw(rng, poses)
+    q = read + 1.2e-3 * np.outer(rng.normal(size=poses), np.eye(6)[4])
+    q[70, 4] += 12e-3 * wild
+    T = world.seen(q) * arm_worlds.exp(arm_worlds.noise(rng, poses))
+    arm_worlds.save(folder, world, read, T, {}, 2e-5)
+    done = search(stand_of(calibrate([folder], tmp_path / "run"), quiet), quiet)
+    assert "joint_scatter" in [found.effect.name for found in done.chance]
+    assert [each.blunder.group.stop for each in done.blunders] == ["p0070"] * wild

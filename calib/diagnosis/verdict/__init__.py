@@ -141,7 +141,7 @@ def conclude(
     weak: Sequence[Mapping[str, Any]],
     rejected: Rejects | None = None,
     forbids: Sequence[str] = (),
-    rings: Sequence[Mapping[str, Any]] = (),
+    plain: Sequence[Mapping[str, Any]] = (),
     formulas: Unnamed = Unnamed(),  # noqa: B008 - frozen
 ) -> Diagnosis:
     """Sum up a search.
@@ -153,13 +153,14 @@ def conclude(
         weak: weak directions.
         rejected: what the fit threw away.
         forbids: why the run is not to be believed, whatever its model explains; a clause each.
-        rings: whose numbers are wrong, as blunders.
+        plain: what is wrong whatever the search says, as blunders: numbers of rings, an arm
+            that is not as drawn.
         formulas: of residual structure.
     """
     heavy = weighed(found, held_out, judged_mm(summary))
     found, first = heavy.found, found.looks[0]
     sources = first.stand.sources
-    blunders = [*rings, *(rejected.blunders(sources) if rejected and not found.found else [])]
+    blunders = [*plain, *(rejected.blunders(sources) if rejected and not found.found else [])]
     blunders += [told.document(left, sources) for left in found.blunders]
     hold = believed(found, held_out) and not formulas.instead
     more = formulas.formulas or found.unsettled or (heavy.refused and found.at_first)

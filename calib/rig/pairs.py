@@ -1,0 +1,149 @@
+"""Bodies as others, or the tracker, see them, against where joints and CAD put them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.rig import Rig
+from chains import se3
+from chains.se3 import Array
+from sensors.recording import RecordedStops
+
+READINGS = "joints"  # whose columns may belong to other stops, as those of bodies may
+# Turns, in rad, that are not the arm's; and how far off, rad and m alike, no CAD or arm is.
+TURNED_RAD = 0.1
+MOST_COMPARED = 100  # stops, each with each
+# Of the stops of a place, which agree where it is: a choice, below half, as half of a table may be
+# out of step.
+AGREE = 0.3
+
+
+@dataclass(frozen=True)
+class Pair:
+    """A body as seen from another, or from the tracker, at K stops.
+
+    Args:
+        names: the bodies: that which is seen from, if any, and that which is seen.
+        stops: (K,) indices.
+        place: (K,) which unknown place the rig's root has; -1 where the other body carries it.
+        nominal: (K, 4, 4) as joints and CAD say.
+        poses: (K, 7) as measured, of each of the names.
+        d_twist: (K, 6, P) of the nominal pose, by every edge of the rig.
+    """
+
+    names: tuple[str, ...]
+    stops: np.ndarray
+    place: np.ndarray
+    nominal: Array
+    poses: tuple[Array, ...]
+    d_twist: Array
+
+    def seen(self, order: Sequence[int] = range(4)) -> Array:
+        """(K, 4, 4) as measured, the quaternions' columns taken in some order."""
+        T = [se3.from_xyz_quat(pose[:, :3], pose[:, 3:][:, list(order)]) for pose in self.poses]
+        return T[0] if len(T) == 1 else se3.inverse(T[0]) @ T[1]
+
+    def some(self, index: Array) -> Pair:
+        """At some of its stops, by index or as bool."""
+        return replace(
+            self,
+            stops=self.stops[index],
+            place=self.place[index],
+            nominal=self.nominal[index],
+            poses=tuple(pose[index] for pose in self.poses),
+            d_twist=self.d_twist[index],
+        )
+
+    def reading(self, rig: Rig, joints: Array) -> Pair:
+        """The same, had the joints read so (K, J)."""
+        T = [rig.tree.place(name, joints).Ts_root_frame for name in self.names]
+        return replace(self, nominal=T[0] if len(T) == 1 else se3.inverse(T[0]) @ T[1])
+
+    def joints_between(self, rig: Rig) -> list[str]:
+        """Joints that move its bodies against each other, or against the rig's root."""
+        each = [set(rig.joints_to(name)) for name in self.names]
+        return sorted(set.symmetric_difference(*each, *[set()] * (len(each) == 1)))
+
+    def slipped(self, name: str, by: int) -> Pair:
+        """The same, had the columns of one of the bodies, or of the "joints", come from so many
+        stops later, at the stops that have one."""
+        here = np.flatnonzero(np.isin(self.stops + by, self.stops))
+        there = np.searchsorted(self.stops, self.stops[here] + by)
+        of = dict(zip(self.names, self.poses, strict=True))
+        return replace(
+            self,
+            stops=self.stops[here],
+            place=self.place[here],
+            nominal=self.nominal[there if name == READINGS else here],
+            poses=tuple(pose[there if body == name else here] for body, pose in of.items()),
+            d_twist=self.d_twist[there if name == READINGS else here],
+        )
+
+
+def pairs_of(
+    rig: Rig, recording: RecordedStops, usable: Mapping[str, np.ndarray]
+) -> Iterator[Pair]:
+    """Each body as the tracker sees it, where the rig's root stands still; else as the body
+    nearest to the root does. None beyond a joint that nothing reads, which would follow it."""
+    read = (b for b in usable if set(rig.passive).isdisjoint(rig.joints_to(b)))
+    bodies = sorted((b for b in read if usable[b].any()), key=lambda b: len(rig.joints_to(b)))
+    still = np.zeros((1, len(rig.tree.edges), 6))
+    placed = {b: rig.tree.place(b, recording.joints, still) for b in bodies}
+    place = np.zeros(len(recording.stops), int)
+    if rig.moves == "location":
+        place = np.unique(recording.location, return_inverse=True)[1]
+    for body in bodies if rig.moves != "stop" else bodies[1:]:
+        names = (body,) if rig.moves != "stop" else (bodies[0], body)
+        at = np.flatnonzero(np.all([usable[name] for name in names], axis=0))
+        T, d = placed[body].Ts_root_frame[at], placed[body].d_twist[at].reshape(len(at), 6, -1)
+        if len(names) == 2:
+            first = placed[names[0]]
+            T = se3.inverse(first.Ts_root_frame[at]) @ T
+            d = d - se3.adjoint(se3.inverse(T)) @ first.d_twist[at].reshape(len(at), 6, -1)
+        yield Pair(
+            names=names,
+            stops=at,
+            place=place[at] if len(names) == 1 else np.full(len(at), -1),
+            nominal=T,
+            poses=tuple(recording.bodies[name][at] for name in names),
+            d_twist=d,
+        )
+
+
+def far_off(pair: Pair, roots: Mapping[int, Array]) -> set[int]:
+    """Stops at which poses are further off than any CAD or arm, from some places of the root: see
+    `TURNED_RAD`, rad and m alike."""
+    far = size_of(gap_of(from_places(pair, roots), pair.seen())) > TURNED_RAD
+    return {*pair.stops[far].tolist()}
+
+
+def roots_of(pair: Pair) -> dict[int, Array]:
+    """T_world_root of each place, on which enough of its stops agree."""
+    every, found = pair.seen() @ se3.inverse(pair.nominal), {}
+    for p in np.unique(pair.place[pair.place >= 0]).tolist():
+        roots = every[pair.place == p]
+        some = roots[:: -(-len(roots) // MOST_COMPARED)]
+        apart = size_of(gap_of(some[:, None], some[None]))
+        found[p] = some[np.quantile(apart, AGREE, axis=1).argmin()]
+    return found
+
+
+def from_places(pair: Pair, roots: Mapping[int, Array]) -> Array:
+    """(K, 4, 4) nominal poses in the world, from these places of the root."""
+    nominal = pair.nominal.copy()
+    for p, T in roots.items():
+        nominal[pair.place == p] = T @ nominal[pair.place == p]
+    return nominal
+
+
+def gap_of(a: Array, b: Array) -> Array:
+    """(..., 6) by which poses b differ from a, in their own axes."""
+    return se3.log(se3.inverse(a) @ b)
+
+
+def size_of(twist: Array) -> Array:
+    """Rad and m alike: (...,) how large a twist is."""
+    return np.linalg.norm(twist, axis=-1)
