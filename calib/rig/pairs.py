@@ -22,7 +22,7 @@ AGREE = 0.3
 
 
 @dataclass(frozen=True)
-class Pair:
+class SeenPair:
     """A body as seen from another, or from the tracker, at K stops.
 
     Args:
@@ -46,7 +46,7 @@ class Pair:
         T = [se3.from_xyz_quat(pose[:, :3], pose[:, 3:][:, list(order)]) for pose in self.poses]
         return T[0] if len(T) == 1 else se3.inverse(T[0]) @ T[1]
 
-    def some(self, index: Array) -> Pair:
+    def some(self, index: Array) -> SeenPair:
         """At some of its stops, by index or as bool."""
         return replace(
             self,
@@ -57,7 +57,7 @@ class Pair:
             d_twist=self.d_twist[index],
         )
 
-    def reading(self, rig: Rig, joints: Array) -> Pair:
+    def reading(self, rig: Rig, joints: Array) -> SeenPair:
         """The same, had the joints read so (K, J)."""
         T = [rig.tree.place(name, joints).Ts_root_frame for name in self.names]
         return replace(self, nominal=T[0] if len(T) == 1 else se3.inverse(T[0]) @ T[1])
@@ -67,7 +67,7 @@ class Pair:
         each = [set(rig.joints_to(name)) for name in self.names]
         return sorted(set.symmetric_difference(*each, *[set()] * (len(each) == 1)))
 
-    def slipped(self, name: str, by: int) -> Pair:
+    def slipped(self, name: str, by: int) -> SeenPair:
         """The same, had the columns of one of the bodies, or of the "joints", come from so many
         stops later, at the stops that have one."""
         here = np.flatnonzero(np.isin(self.stops + by, self.stops))
@@ -85,7 +85,7 @@ class Pair:
 
 def pairs_of(
     rig: Rig, recording: RecordedStops, usable: Mapping[str, np.ndarray]
-) -> Iterator[Pair]:
+) -> Iterator[SeenPair]:
     """Each body as the tracker sees it, where the rig's root stands still; else as the body
     nearest to the root does. None beyond a joint that nothing reads, which would follow it."""
     read = (b for b in usable if set(rig.passive).isdisjoint(rig.joints_to(b)))
@@ -103,7 +103,7 @@ def pairs_of(
             first = placed[names[0]]
             T = se3.inverse(first.Ts_root_frame[at]) @ T
             d = d - se3.adjoint(se3.inverse(T)) @ first.d_twist[at].reshape(len(at), 6, -1)
-        yield Pair(
+        yield SeenPair(
             names=names,
             stops=at,
             place=place[at] if len(names) == 1 else np.full(len(at), -1),
@@ -113,14 +113,14 @@ def pairs_of(
         )
 
 
-def far_off(pair: Pair, roots: Mapping[int, Array]) -> set[int]:
+def far_off(pair: SeenPair, roots: Mapping[int, Array]) -> set[int]:
     """Stops at which poses are further off than any CAD or arm, from some places of the root: see
     `TURNED_RAD`, rad and m alike."""
     far = size_of(gap_of(from_places(pair, roots), pair.seen())) > TURNED_RAD
     return {*pair.stops[far].tolist()}
 
 
-def roots_of(pair: Pair) -> dict[int, Array]:
+def roots_of(pair: SeenPair) -> dict[int, Array]:
     """T_world_root of each place, on which enough of its stops agree."""
     every, found = pair.seen() @ se3.inverse(pair.nominal), {}
     for p in np.unique(pair.place[pair.place >= 0]).tolist():
@@ -131,7 +131,7 @@ def roots_of(pair: Pair) -> dict[int, Array]:
     return found
 
 
-def from_places(pair: Pair, roots: Mapping[int, Array]) -> Array:
+def from_places(pair: SeenPair, roots: Mapping[int, Array]) -> Array:
     """(K, 4, 4) nominal poses in the world, from these places of the root."""
     nominal = pair.nominal.copy()
     for p, T in roots.items():

@@ -14,7 +14,7 @@ from calib.rig.pairs import (
     MOST_COMPARED,
     READINGS,
     TURNED_RAD,
-    Pair,
+    SeenPair,
     far_off,
     from_places,
     gap_of,
@@ -62,7 +62,7 @@ def odd_bodies(rig: Rig, recording: RecordedStops) -> Iterator[Suspect]:
         if wrong is not None:
             yield wrong
             return
-    met: dict[int, list[tuple[Pair, Array, bool]]] = {}
+    met: dict[int, list[tuple[SeenPair, Array, bool]]] = {}
     for pair in pairs:
         for k, gap, exchanged in _outliers(rig, pair):
             met.setdefault(int(pair.stops[k]), []).append((pair, gap, exchanged))
@@ -108,7 +108,7 @@ def _repeated(rig: Rig, recording: RecordedStops, body: str) -> np.ndarray:
 # ------------------------------------------------------------------------------- at all stops
 
 
-def _at_all_stops(pair: Pair, stops: Sequence[str]) -> Suspect | None:
+def _at_all_stops(pair: SeenPair, stops: Sequence[str]) -> Suspect | None:
     """Bodies exchanged, columns that belong to another stop, or quaternions in another order."""
     if len(pair.stops) < 4:
         return None
@@ -136,7 +136,7 @@ def _at_all_stops(pair: Pair, stops: Sequence[str]) -> Suspect | None:
     return Suspect("body", names, said)
 
 
-def _out_of_step(pair: Pair, stops: Sequence[str]) -> str:
+def _out_of_step(pair: SeenPair, stops: Sequence[str]) -> str:
     """What belongs to a stop before, or after, if what lies far off then fits: every way in which
     it does; of all `stops`, from the first of these to the last."""
     roots = roots_of(pair)
@@ -169,7 +169,7 @@ def _out_of_step(pair: Pair, stops: Sequence[str]) -> str:
     )
 
 
-def _turns(pair: Pair, seen: Array) -> tuple[float, float]:
+def _turns(pair: SeenPair, seen: Array) -> tuple[float, float]:
     """Rad by which a body turns otherwise than the joints say, median, whatever it hangs on and
     wherever the rig stands, and by which it hangs otherwise than CAD says; 0 where not to be told.
     """
@@ -186,7 +186,7 @@ def _turns(pair: Pair, seen: Array) -> tuple[float, float]:
 # ------------------------------------------------------------------------------------- joints
 
 
-def _misread(rig: Rig, recording: RecordedStops, pair: Pair) -> Suspect | None:
+def _misread(rig: Rig, recording: RecordedStops, pair: SeenPair) -> Suspect | None:
     """Joints with another sign, exchanged, or a quarter or half a turn off, if all then fits; or a
     joint whose reading stood still."""
     off = far_off(pair, roots_of(pair))
@@ -241,7 +241,7 @@ def _otherwise_read(rig: Rig, names: Sequence[str], read: Array) -> Iterator[tup
 # -------------------------------------------------------------------------------- at one stop
 
 
-def _outliers(rig: Rig, pair: Pair) -> Iterator[tuple[int, Array, bool]]:
+def _outliers(rig: Rig, pair: SeenPair) -> Iterator[tuple[int, Array, bool]]:
     """Stops of a pair that stand out from the others: which, by how much (6,) [rad m], and whether
     they would not if the bodies were exchanged.
 
@@ -305,7 +305,7 @@ def _robust(A: Array, b: Array) -> tuple[Array, float]:
     return b - A @ x, taken
 
 
-def _at_one_stop(rig: Rig, stop: str, found: list[tuple[Pair, Array, bool]]) -> Suspect:
+def _at_one_stop(rig: Rig, stop: str, found: list[tuple[SeenPair, Array, bool]]) -> Suspect:
     """One stop's bodies that stand out: the one that all pairs have in common, if there is one."""
     pair, gap, exchanged = found[0]
     common = [name for name in pair.names if all(name in other.names for other, *_ in found)]

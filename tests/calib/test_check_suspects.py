@@ -169,8 +169,8 @@ def test_rows_that_have_nothing_in_common_are_not_out_of_step(shared):
         (lambda q: q * [1, 1, 1, 1, -1, 1], "joint_5 had the other sign"),
         (lambda q: q[:, [0, 2, 1, 3, 4, 5]], "the columns of joint_2 and joint_3 were exchanged"),
         (lambda q: q[:, [0, 1, 2, 5, 4, 3]], "the columns of joint_4 and joint_6 were exchanged"),
-        (lambda q: q + [0, 0, np.pi / 2, 0, 0, 0], "joint_3 read 90 deg less"),
-        (lambda q: q - [0, np.pi / 2, 0, 0, 0, 0], "joint_2 read 90 deg more"),
+        (lambda q: q + np.pi / 2 * np.eye(6)[2], "joint_3 read 90 deg less"),
+        (lambda q: q - np.pi / 2 * np.eye(6)[1], "joint_2 read 90 deg more"),
     ],
 )
 def test_joints_read_otherwise_than_the_urdf_has_them(shared, change, said):

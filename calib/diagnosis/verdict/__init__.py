@@ -153,8 +153,7 @@ def conclude(
         weak: weak directions.
         rejected: what the fit threw away.
         forbids: why the run is not to be believed, whatever its model explains; a clause each.
-        plain: what is wrong whatever the search says, as blunders: numbers of rings, an arm
-            that is not as drawn.
+        plain: what is wrong whatever the search says, as blunders: rings, an arm not as drawn.
         formulas: of residual structure.
     """
     heavy = weighed(found, held_out, judged_mm(summary))
