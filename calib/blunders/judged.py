@@ -150,8 +150,8 @@ def judge(whole: Linearisation, problem: Problem, planned: Collection[str] = ())
 
 def _as_one_joint_scatters(judged: Sequence[Blunder]) -> Iterator[Blunder]:
     """Where one joint's reading explains how far out a stop is, and chance puts that joint so far
-    out, as it scatters more than others do, chance puts the stop there: neither its body nor its
-    joints together are further out than that."""
+    out, as it scatters more than others do, chance puts the stop there: nothing else of the stop
+    is further out than that, and further out it would have to be to be named."""
     single: dict[tuple[str, str], list[Blunder]] = {}
     for each in judged:
         if not _whole(each.group):
@@ -161,7 +161,15 @@ def _as_one_joint_scatters(judged: Sequence[Blunder]) -> Iterator[Blunder]:
             least = each.shift.statistic - each.limit * (1.0 - 1.0 / each.shift.dof)
             for one in single.get(each.group.place, ()):
                 if one.shift.statistic > least and one.p_adjusted > each.p_adjusted:
-                    each = replace(each, p_value=one.p_value, p_adjusted=one.p_adjusted)
+                    wider = max(1.0, each.shift.statistic / each.limit)
+                    each = replace(
+                        each,
+                        p_value=one.p_value,
+                        p_adjusted=one.p_adjusted,
+                        limit=wider * each.limit,
+                        enough=wider * each.enough,
+                        detectable={u: np.sqrt(wider) * x for u, x in each.detectable.items()},
+                    )
         yield each
 
 

@@ -104,7 +104,7 @@ def of_rings(lidar: str, found: RingFinding) -> dict[str, Any]:
     }
 
 
-def of_the_arm(moved: Mapping[str, Mapping[str, Any]]) -> Iterator[dict[str, Any]]:
+def not_as_drawn(moved: Mapping[str, Mapping[str, Any]]) -> Iterator[dict[str, Any]]:
     """Angles of an arm that are far from where they are drawn, in the same form: no arm is built so
     far off, and a fit gets there where joints are read otherwise than the URDF has them.
 
@@ -113,7 +113,8 @@ def of_the_arm(moved: Mapping[str, Mapping[str, Any]]) -> Iterator[dict[str, Any
     """
     for name, found in moved.items():
         off_rad = abs(found["change"])
-        if "." in name and found["unit"] == "rad" and off_rad > DRAWN_OTHERWISE_RAD:
+        drawn = found.get("drawn", False) and found["unit"] == "rad"
+        if drawn and off_rad > DRAWN_OTHERWISE_RAD:
             group = Group("frame", CAD, name)
             said = (
                 f"{group} is {np.degrees(off_rad):.0f} deg from where it is drawn; is each joint "
@@ -225,8 +226,10 @@ def _sentence(left: LeftOut, wrong_sign: str | None, about: str) -> str:
     group = str(left.blunder.group)
     group = f"T{group[1:]}" if group.startswith("the ") else group
     verb = "are" if left.blunder.group.what == JOINTS else "is"
-    off = f"{size_told(*size)} off{along}" if left.blunder.possible else "too far off for a size"
-    out = f"{group}{about} {verb} {off}, against everything else"
+    off = f"{size_told(*size)} off{along}, against everything else"
+    if not left.blunder.possible:
+        off = "so far from everything else that no number tells by how much"
+    out = f"{group}{about} {verb} {off}"
     if left.belongs:
         return f"{out}: it was taken at {left.belongs.where}."
     if left.rivals:

@@ -55,8 +55,7 @@ def step_times(stops: View) -> tuple[float, ...]:
 def nearest_times(stops: View, t_s: float) -> tuple[float, ...]:
     """Of times midway between stops, as of `step_times`, those nearest to one: on either side as
     many as `TIMES_BESIDE`, with at least one stop between each and that one."""
-    between = _between(stops)
-    time_s = np.sort(stops["elapsed_s"])
+    between, time_s = _between(stops), np.sort(stops["elapsed_s"])
     gone = np.searchsorted(time_s, between, "right") - np.searchsorted(time_s, t_s, "right")
     return tuple(float(f"{t:.6g}") for t in between[(gone != 0) & (np.abs(gone) <= TIMES_BESIDE)])
 

@@ -23,6 +23,7 @@ from calib.solve.reweight import unweighted
 # Redundancy of all that CAD says of frames, below which nothing is told of how right it is: with
 # less than one row's worth, chance alone puts the ratio anywhere.
 CHECKED = 1.0
+OF_POSITIONS = "tracked position"  # what is told of in mm where there are no scans
 
 
 @dataclass(frozen=True)
@@ -145,14 +146,14 @@ class ErrorSize:
 
 
 def of_orientations(nominal: Errors, seen: Errors, unseen: Errors) -> dict[str, Any]:
-    """For a run's summary: the rms of orientations, and of poses, where a tracker sees some; before
-    the fit, after it, and of stops held out."""
+    """For a run's summary: the rms of orientations where a tracker sees some, and of the poses of
+    bodies where there are no scans; before the fit, after it, and of stops held out."""
     floor = unseen if unseen.count else seen
-    if not floor.turned.count:
-        return {}
     kinds = {"nominal": nominal, "fit": seen, "held_out": unseen}
     out = {}
     for key, of in (("rms_mrad", "turned"), ("rms_pose_mm", "poses")):
+        if not getattr(floor, of).count:
+            continue
         every = {kind: getattr(errors, of).rms for kind, errors in kinds.items()}
         every["noise_floor"] = getattr(floor, of).floor
         out[key] = {kind: None if rms is None else 1e3 * rms for kind, rms in every.items()}
@@ -163,6 +164,12 @@ def judged_mm(summary: Mapping[str, Any]) -> Mapping[str, float | None]:
     """Of a run's summary the rms by which models are compared: ``fit``, ``held_out``, and the
     ``noise_floor`` that is expected; see `ErrorSize`."""
     return summary.get("rms_pose_mm") or summary["rms_mm"]
+
+
+def tells_of_poses(summary: Mapping[str, Any]) -> bool:
+    """Whether the errors by which models are compared are of orientations, too, where these are
+    seen: earlier versions told of positions alone."""
+    return summary["residual"] != OF_POSITIONS or "rms_pose_mm" in summary
 
 
 def held_out_size(summary: Mapping[str, Any]) -> ErrorSize | None:

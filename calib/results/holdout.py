@@ -41,7 +41,7 @@ class Fall:
     Args:
         before_mm, after_mm: its rms, as models are compared by it.
         floor_mm: what is expected of it.
-        gain_m2: how much the mean square [m2] of each stop, or of each tracked position, falls;
+        gain_m2: how much the mean square [m2] of each stop, or of each tracked pose, falls;
             empty where that is not known.
         rejected_share: of the beams held out, before and after, where it may take some back.
         sizes: how large errors are before and after; None where that is not told apart.
@@ -132,7 +132,7 @@ def fall_document(fall: Fall | None) -> dict[str, dict[str, float | None]]:
 
 
 def from_to(document: Mapping[str, Any]) -> str:
-    """What `fall_document` says, in words; of a fall that is known."""
+    """What `fall_document` says, in words; empty of a fall that is not known."""
     told = []
     for unit in ("mm", "mrad"):
         ends = document.get(f"held_out_rms_{unit}") or {}  # earlier versions wrote no mrad

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.effects import FrameOffset, Site
+from calib.effects import GEOMETRY, FrameOffset, Site
 from calib.linear.layout import StopKey, key_of
 from calib.problem.model import Source, recording_names
 from calib.problem.unknowns import Role, Unknown
@@ -318,5 +318,6 @@ def _moves(estimate: Estimate) -> Iterator[tuple[str, dict[str, Any]]]:
                     "change": float(moved[i] * unknown.sigma[i]),
                     "sigma": float(unknown.sigma[i]),
                     "unit": unknown.units[i],
+                    "drawn": effect.family in GEOMETRY,  # by the URDF
                 },
             )

@@ -98,6 +98,8 @@ def pairs_of(
     for body in bodies if rig.moves != "stop" else bodies[1:]:
         names = (body,) if rig.moves != "stop" else (bodies[0], body)
         at = np.flatnonzero(np.all([usable[name] for name in names], axis=0))
+        if not len(at):
+            continue
         T, d = placed[body].Ts_root_frame[at], placed[body].d_twist[at].reshape(len(at), 6, -1)
         if len(names) == 2:
             first = placed[names[0]]

@@ -4,7 +4,7 @@ out."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from itertools import combinations
 
 import numpy as np
@@ -56,14 +56,14 @@ def odd_bodies(rig: Rig, recording: RecordedStops) -> Iterator[Suspect]:
     for body in rig.tracker.bodies:
         bad = yield from _placeholders(rig, recording, body)
         usable[body] = np.isfinite(recording.bodies[body]).all(axis=1) & ~bad
-    pairs = list(pairs_of(rig, recording, usable))
-    for pair in pairs:
-        wrong = _at_all_stops(pair, recording.stops) or _misread(rig, recording, pair)
+    met: dict[int, list[tuple[SeenPair, Array, bool]]] = {}
+    for pair in pairs_of(rig, recording, usable):
+        wrong = _at_all_stops(pair) or _misread(rig, recording, pair)
         if wrong is not None:
             yield wrong
             return
-    met: dict[int, list[tuple[SeenPair, Array, bool]]] = {}
-    for pair in pairs:
+        told = yield from _of_some_rows(rig, recording, pair)
+        pair = pair.some(~np.isin(pair.stops, [*told]))
         for k, gap, exchanged in _outliers(rig, pair):
             met.setdefault(int(pair.stops[k]), []).append((pair, gap, exchanged))
     for stop, found in sorted(met.items()):
@@ -108,8 +108,8 @@ def _repeated(rig: Rig, recording: RecordedStops, body: str) -> np.ndarray:
 # ------------------------------------------------------------------------------- at all stops
 
 
-def _at_all_stops(pair: SeenPair, stops: Sequence[str]) -> Suspect | None:
-    """Bodies exchanged, columns that belong to another stop, or quaternions in another order."""
+def _at_all_stops(pair: SeenPair) -> Suspect | None:
+    """Bodies exchanged, or quaternions in another order."""
     if len(pair.stops) < 4:
         return None
     seen, names = pair.seen(), " and ".join(pair.names)
@@ -120,8 +120,6 @@ def _at_all_stops(pair: SeenPair, stops: Sequence[str]) -> Suspect | None:
         if apart > TURNED_RAD and swapped < SWAPPED * apart:
             said = f"{names} lie as CAD says if they are exchanged; is each named as it should be?"
             return Suspect("body", names, said)
-    if said := _out_of_step(pair, stops):
-        return Suspect("body", names, said)
     if _turns(pair, seen)[0] < TURNED_RAD:
         return None
     orders = {order: _turns(pair, pair.seen(index)) for order, index in QUATERNION_ORDERS.items()}
@@ -134,39 +132,6 @@ def _at_all_stops(pair: SeenPair, stops: Sequence[str]) -> Suspect | None:
         "their order"
     )
     return Suspect("body", names, said)
-
-
-def _out_of_step(pair: SeenPair, stops: Sequence[str]) -> str:
-    """What belongs to a stop before, or after, if what lies far off then fits: every way in which
-    it does; of all `stops`, from the first of these to the last."""
-    roots = roots_of(pair)
-    off = far_off(pair, roots)
-    if len(off) < FEWEST_OFF:
-        return ""
-    ways = [(name, by) for name in (*pair.names, READINGS) for by in SLIPPED]
-    moved = {way: pair.slipped(*way) for way in ways}
-    left = {
-        way: min(len(off & far_off(some, of)) for of in (roots, roots_of(some)))
-        for way, some in moved.items()
-        if off & {*some.stops.tolist()}
-    }
-    least = min(left.values(), default=len(off))
-    if least > OUT_OF_STEP * len(off):
-        return ""
-    told = [
-        f"the columns of {name} from the {'row' if abs(by) == 1 else 'second row'} "
-        f"{'below' if by > 0 else 'above'}"
-        for (name, by), count in left.items()
-        if count <= least + abs(by)  # where rows of one table moved on, the last have gone
-    ]
-    first, last = min(off), max(off)
-    whole = last - first + 1 > len(stops) - FEWEST_OFF
-    rows = "each row" if whole else f"each row from {stops[first]} to {stops[last]}"
-    return (
-        f"{' and '.join(pair.names)} would lie where CAD and joints put "
-        f"{'it' if len(pair.names) == 1 else 'them'} if {rows} of stops.csv took "
-        f"{', or '.join(told)}: is the table out of step{'' if whole else ' there'}?"
-    )
 
 
 def _turns(pair: SeenPair, seen: Array) -> tuple[float, float]:
@@ -183,35 +148,102 @@ def _turns(pair: SeenPair, seen: Array) -> tuple[float, float]:
     return float(np.median(np.linalg.norm(left[:, :3], axis=1))), float(size_of(se3.log(X)[:3]))
 
 
+# ------------------------------------------------------------------------------- at some rows
+
+
+def _of_some_rows(
+    rig: Rig, recording: RecordedStops, pair: SeenPair
+) -> Generator[Suspect, None, set[int]]:
+    """Columns that belong to another stop, and readings that stood still; returns which stops these
+    explain."""
+    off = far_off(pair, roots_of(pair))
+    if len(off) < FEWEST_OFF:
+        return set()
+    if said := _out_of_step(pair, off, recording.stops):
+        suspect, rows = said
+        yield suspect
+        return rows
+    return (yield from _stood_still(rig, recording, pair, off))
+
+
+def _out_of_step(
+    pair: SeenPair, off: set[int], stops: Sequence[str]
+) -> tuple[Suspect, set[int]] | None:
+    """What belongs to a stop before, or after, if what lies far `off` then fits and nothing between
+    is spoiled: every way in which it does; and the rows, from the first of these to the last."""
+    roots, mended = roots_of(pair), {}
+    for way in ((name, by) for name in (*pair.names, READINGS) for by in SLIPPED):
+        moved = pair.slipped(*way)
+        if len(moved.stops) < FEWEST_OFF:
+            continue
+        far = min((far_off(moved, of) for of in (roots, roots_of(moved))), key=len)
+        fits = (off & {*moved.stops.tolist()}) - far
+        spoiled = [k for k in far if fits and min(fits) <= k <= max(fits)]
+        if len(fits) >= (1 - OUT_OF_STEP) * len(off) and len(spoiled) <= OUT_OF_STEP * len(fits):
+            mended[way] = fits
+    if not mended:
+        return None
+    most = max(mended.values(), key=len)
+    told = [
+        f"the columns of {name} from the {'row' if abs(by) == 1 else 'second row'} "
+        f"{'below' if by > 0 else 'above'}"
+        for (name, by), fits in mended.items()
+        if len(fits) + abs(by) >= len(most)  # where rows of one table moved on, the last have gone
+    ]
+    first, last = min(most), max(most)
+    whole = last - first + 1 > len(stops) - FEWEST_OFF
+    rows = "each row" if whole else f"each row from {stops[first]} to {stops[last]}"
+    names = " and ".join(pair.names)
+    said = (
+        f"{names} would lie where CAD and joints put {'it' if len(pair.names) == 1 else 'them'} if "
+        f"{rows} of stops.csv took {', or '.join(told)}: is the table out of step"
+        f"{'' if whole else ' there'}?"
+    )
+    rows_told = range(len(stops)) if whole else range(first, last + 1)
+    return Suspect("body", names, said), {*rows_told}
+
+
+def _stood_still(
+    rig: Rig, recording: RecordedStops, pair: SeenPair, off: set[int]
+) -> Generator[Suspect, None, set[int]]:
+    """Joints whose readings stood still where a body lies far `off`; returns at which stops."""
+    found: dict[str, set[int]] = {}
+    joints = pair.joints_between(rig)
+    for joint in joints:
+        read = recording.joints[:, rig.joint_names.index(joint)]
+        still = {*(1 + np.flatnonzero(np.diff(read) == 0)).tolist()}
+        if len(off & still) >= (1 - OUT_OF_STEP) * max(len(off), len(still)):
+            found[joint] = still
+    if len(found) == len(joints) > 1:
+        found = {READINGS: set.intersection(*found.values())}
+    for joint, still in found.items():
+        stops = tuple(recording.stops[k] for k in sorted(still))
+        what, verb = ("all joints", "read") if joint == READINGS else (joint, "reads")
+        said = (
+            f"{what} {verb} the same to the last digit at {listed(stops)} as at the stop before, "
+            f"and {' and '.join(pair.names)} is far from where that puts it: did the reading "
+            "stand still?"
+        )
+        yield Suspect("joints", joint, said, stops=stops)
+    return set().union(*found.values())
+
+
 # ------------------------------------------------------------------------------------- joints
 
 
 def _misread(rig: Rig, recording: RecordedStops, pair: SeenPair) -> Suspect | None:
-    """Joints with another sign, exchanged, or a quarter or half a turn off, if all then fits; or a
-    joint whose reading stood still."""
+    """Joints with another sign, exchanged, or a quarter or half a turn off, if all then fits."""
+    pair = pair.some(slice(None, None, max(1, -(-len(pair.stops) // MOST_COMPARED))))
     off = far_off(pair, roots_of(pair))
-    if len(off) < FEWEST_OFF:
+    if len(pair.stops) < 4 or len(off) < FEWEST_OFF:
         return None
-    names, joints = " and ".join(pair.names), pair.joints_between(rig)
-    for joint in joints:
-        read = recording.joints[:, rig.joint_names.index(joint)]
-        still = {*(1 + np.flatnonzero(np.diff(read) == 0)).tolist()}
-        there = len(off & still)
-        if there >= (1 - OUT_OF_STEP) * len(off) and there >= (1 - OUT_OF_STEP) * len(still):
-            stops = tuple(recording.stops[k] for k in sorted(still))
-            said = (
-                f"{joint} reads the same to the last digit at {listed(stops)} as at the stop "
-                f"before, and {names} far from where that puts it: did the reading stand still?"
-            )
-            return Suspect("joints", joint, said, stops=stops)
-    some = pair.some(slice(None, None, -(-len(pair.stops) // MOST_COMPARED)))
-    off = far_off(some, roots_of(some))
-    left: dict[str, int] = {}
-    for what, otherwise in _otherwise_read(rig, joints, recording.joints[some.stops]):
-        moved = some.reading(rig, otherwise)
-        left[what] = len(off & far_off(moved, roots_of(moved)))
+    names, left = " and ".join(pair.names), {}
+    read = recording.joints[pair.stops]
+    for what, otherwise in _otherwise_read(rig, pair.joints_between(rig), read):
+        moved = pair.reading(rig, otherwise)
+        left[what] = len(far_off(moved, roots_of(moved)))
     least = min(left.values(), default=len(off))
-    if len(off) < FEWEST_OFF or least > OUT_OF_STEP * len(off):
+    if least > OUT_OF_STEP * len(off):
         return None
     ways = ", or if ".join(what for what, count in left.items() if count == least)
     said = (

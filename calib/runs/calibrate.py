@@ -25,7 +25,14 @@ from calib.problem.model import Model, Source
 from calib.problem.without import leave_out, placed
 from calib.residuals.groups import CAD
 from calib.residuals.scan import ScanStop
-from calib.results.errors import Errors, body_errors, misfit, of_orientations, row_errors
+from calib.results.errors import (
+    OF_POSITIONS,
+    Errors,
+    body_errors,
+    misfit,
+    of_orientations,
+    row_errors,
+)
 from calib.results.holdout import Keep, held_out, unit_of
 from calib.results.intervals import intervals
 from calib.results.misfit import (
@@ -310,7 +317,7 @@ def _summary(
     return {
         "points": seen.count if estimate.scans else 0,
         "stops": sum(len(s.recording.stops) for s in problem.sources),
-        "residual": "range" if estimate.scans else "tracked position",
+        "residual": "range" if estimate.scans else OF_POSITIONS,
         "rms_mm": {
             "nominal": nominal.rms_mm,
             "fit": seen.rms_mm,

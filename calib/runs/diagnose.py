@@ -31,8 +31,9 @@ from calib.problem import build
 from calib.problem.model import default_effects
 from calib.problem.spread import names_of
 from calib.residuals.groups import MESH, Group
-from calib.results.errors import Errors, held_out_size, judged_mm
+from calib.results.errors import Errors, held_out_size, judged_mm, tells_of_poses
 from calib.results.holdout import Fall, gains_m2, held_out
+from calib.results.outstanding import moves
 from calib.results.rings import harmful, odd_rings
 from calib.results.stages import DIAGNOSE as DIAGNOSE_STAGES
 from calib.results.stages import staged
@@ -197,7 +198,8 @@ def _falls(found: Search, stand: Stand, run: Run, progress: Progress) -> dict[st
     where it is larger than expected."""
     falls = {}
     before, each_m2 = held_out_size(run.summary), run.unseen_m2
-    if found.looks[0].stand is not stand and found.found:
+    as_it_was = found.looks[0].stand is stand and tells_of_poses(run.summary)
+    if found.found and not as_it_was:
         unseen = _unseen(found.looks[0].stand, run, progress)
         before, each_m2 = unseen.size, unseen.each_m2
     for step in found.found:
@@ -226,8 +228,8 @@ def _not_as_drawn(run: Run, found: Search) -> Iterator[dict[str, Any]]:
     """Angles of the arm that are far from where they are drawn, of a fit that has come to its end;
     not those that were found to be blunders."""
     named = {left.blunder.group.what for left in found.blunders}
-    moved = run.summary["misfit_by"]["prior"] if run.converged else {}
-    yield from (each for each in told.of_the_arm(moved) if each["name"] not in named)
+    moved = moves(run.summary) if run.converged else {}
+    yield from (each for each in told.not_as_drawn(moved) if each["name"] not in named)
 
 
 def _cautions(run: Run, found: Diagnosis, look: Look) -> list[str]:

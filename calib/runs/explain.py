@@ -13,7 +13,7 @@ from calib.blunders import told
 from calib.diagnosis import Diagnosis
 from calib.effects import Effect, is_known, load_effects, own_effects, read, trust_in
 from calib.problem.model import Model, Source
-from calib.results.errors import judged_mm
+from calib.results.errors import judged_mm, tells_of_poses
 from calib.results.holdout import Fall, gains_m2
 from calib.rig import load_rig
 from calib.runs.calibrate import calibrate, grow, recordings_document
@@ -252,6 +252,8 @@ class _Climb:
             run = Run.open(folder, trust_in(model.effects))
             run.state()
         except InputError:
+            return None
+        if not tells_of_poses(run.summary):
             return None
         wanted = {
             "beams": None,

@@ -13,6 +13,7 @@ from rich.table import Table
 from calib.diagnosis.verdict.sentences import UNNAMED
 from calib.runs.ladder import Rung, ladder
 from calib.show.comparison import ladder_table
+from calib.show.misfit import and_angle
 from calib.show.tables import (
     columns_table,
     estimate_cell,
@@ -88,8 +89,12 @@ def print_explanation(explanation: Explanation) -> None:
     kind = "held_out" if last.get("held_out") is not None else "fit"
     what = {"held_out": "held-out error", "fit": "error of the fit, none held out"}[kind]
     way = f"{first[kind]:.2f} -> {last[kind]:.2f}" if runs[1:] else f"{last[kind]:.2f}"
-    expected = f"{last['noise_floor']:.2f} mm expected if the model is right"
-    console.print(f"{what}: {way} mm; {expected}", style="bold")
+    way = f"{way} mm"
+    ends = (run.summary.get("rms_mrad", {}).get(kind) for run in (*runs[:1], *runs[1:][-1:]))
+    if turned := [f"{mrad:.2f}" for mrad in ends if mrad is not None]:
+        way = f"{way} and {' -> '.join(turned)} mrad"
+    expected = and_angle(f"{last['noise_floor']:.2f} mm", runs[-1].summary, "noise_floor")
+    console.print(f"{what}: {way}; {expected} expected if the model is right", style="bold")
     console.print(f"verdict: {explanation.diagnosis.heading}", style="bold")
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from calib.results.outstanding import shown
 from calib.runs.run import Run
-from calib.show.misfit import over_beams
+from calib.show.misfit import and_angle, over_beams
 from calib.show.verdict import UNASKED, judge
 
 TOLD_AXES = 3.0  # sigmas of a change, from which the axis along which it went is named
@@ -99,7 +99,9 @@ def closing(run: Run) -> list[str]:
     kind, before = ("held_out", "held_out_") if rms.get("held_out") is not None else ("fit", "")
     what = {"held_out": "held-out error", "fit": "error of the fit, none held out"}[kind]
     error = over_beams(rms[kind], run.summary, before).partition("; ")[0]
-    first = f"{what}: {error}; {rms['noise_floor']:.2f} mm expected if the model is right"
+    error = and_angle(error, run.summary, kind)
+    expected = and_angle(f"{rms['noise_floor']:.2f} mm", run.summary, "noise_floor")
+    first = f"{what}: {error}; {expected} expected if the model is right"
     first_answer = []
     if run.beams and run.summary["residual"] == "range":
         whole = ["rigcal", "add", str(run.folder), "--every-beam", "-o", f"{run.folder}-all"]

@@ -25,6 +25,18 @@ def over_beams(rms_mm: float, summary: Mapping[str, Any], before: str = "") -> s
     return f"{rms_mm:.2f} mm over {100 * (1 - share):.1f} % of the beams; {every:.2f} mm over all"
 
 
+def and_angle(told: str, summary: Mapping[str, Any], kind: str) -> str:
+    """An error in words, and that of orientations where a tracker sees some.
+
+    Args:
+        told: the error.
+        summary: of the run.
+        kind: "fit", "held_out" or "noise_floor".
+    """
+    mrad = summary.get("rms_mrad", {}).get(kind)
+    return told if mrad is None else f"{told} and {mrad:.2f} mrad"
+
+
 def beams_told(summary: Mapping[str, Any]) -> list[str]:
     """Of a run with beams: its errors, of how many beams they speak, and those of all."""
     if summary["residual"] != "range" or summary.get("rejected_share") is None:

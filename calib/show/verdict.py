@@ -8,6 +8,7 @@ from typing import Any
 
 from calib.runs.belief import FAR_OFF, cautions, forbids
 from calib.runs.run import Run
+from calib.show.misfit import and_angle
 
 UNASKED = "not diagnosed"
 LIGHT_MEANS = {"green": "use it", "amber": "use it with care", "red": "do not use it yet"}
@@ -58,10 +59,12 @@ def _first_found(run: Run, diagnosis: Mapping[str, Any]) -> str:
 
 def _undiagnosed(run: Run) -> str:
     rms = run.summary["rms_mm"]
-    told = f"its residuals are {rms['fit']:.2f} mm, and no stops were held out"
-    if rms.get("held_out") is not None:
-        told = f"the held-out error is {rms['held_out']:.2f} mm"
-    return f"Not diagnosed yet: {told}; {rms['noise_floor']:.2f} mm are expected."
+    known = {kind: x for kind, x in rms.items() if x is not None}
+    size = {kind: and_angle(f"{x:.2f} mm", run.summary, kind) for kind, x in known.items()}
+    told = f"its residuals are {size['fit']}, and no stops were held out"
+    if "held_out" in size:
+        told = f"the held-out error is {size['held_out']}"
+    return f"Not diagnosed yet: {told}; {size['noise_floor']} are expected."
 
 
 def _wrong(run: Run, diagnosis: Mapping[str, Any] | None) -> Iterator[str]:

@@ -368,12 +368,13 @@ def test_of_many_scans_some_drawn_evenly_tell_what_they_tell_among_all(tmp_path,
 def test_an_arm_far_from_as_drawn_is_plainly_wrong():
     """Where a fit explains all by a link turned over, nothing is left for a test."""
     moved = {
-        "tool": {"change": 1.5, "sigma": 0.01, "unit": "rad"},  # how it hangs, CAD may not know
-        "arm_geometry.j2.tilt_b": {"change": -3.14, "sigma": 0.003, "unit": "rad"},
-        "arm_joint_offset.j4": {"change": 0.2, "sigma": 0.005, "unit": "rad"},
-        "arm_link_length.j3": {"change": 0.9, "sigma": 0.005, "unit": "m"},
+        # How a tool hangs, CAD may not know; and a dot in its name says nothing.
+        "tool.a": {"change": 1.5, "sigma": 0.01, "unit": "rad", "drawn": False},
+        "arm_geometry.j2.tilt_b": {"change": -3.14, "sigma": 0.003, "unit": "rad", "drawn": True},
+        "arm_joint_offset.j4": {"change": 0.2, "sigma": 0.005, "unit": "rad", "drawn": True},
+        "arm_link_length.j3": {"change": 0.9, "sigma": 0.005, "unit": "m", "drawn": True},
     }
-    (found,) = told.of_the_arm(moved)
+    (found,) = told.not_as_drawn(moved)
     assert (found["kind"], found["name"]) == ("frame", "arm_geometry.j2.tilt_b")
     assert found["size"] == 3.14 and found["without"] is None
     assert "is 180 deg from where it is drawn" in found["sentence"]

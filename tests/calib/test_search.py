@@ -1,5 +1,6 @@
 """What the search names first: an effect in its true shape, and one that predicts before chance."""
 
+import shutil
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -10,7 +11,7 @@ from calib.diagnosis.candidates import shape_limits
 from calib.diagnosis.search import nameless, search
 from calib.diagnosis.search.shapes import retuned
 from calib.diagnosis.verdict.matters import Consequences
-from calib.effects import find
+from calib.effects import GEOMETRY, find
 from calib.problem.build import shapes_of
 from calib.problem.model import Model
 from calib.runs.calibrate import calibrate
@@ -155,3 +156,27 @@ def test_poses_are_no_blunders_where_one_joint_scatters_more_than_all(tmp_path, 
     done = search(stand_of(calibrate([folder], tmp_path / "run"), quiet), quiet)
     assert "joint_scatter" in [found.effect.name for found in done.chance]
     assert [each.blunder.group.stop for each in done.blunders] == ["p0070"] * wild
+
+
+def test_what_slips_in_two_rigs_has_one_time_and_each_its_own_size(tmp_path):
+    """A mount is of one rig, so its slip is estimated for each; the time, for both together."""
+    rng, poses, first = np.random.default_rng(3), 60, 33
+    time_s = np.arange(poses) * 12.0
+    world = arm_worlds.bent(tmp_path / "one", "ur10", rng)
+    shutil.copytree(tmp_path / "one", tmp_path / "two")
+    for rig, size_m in (("one", 1e-3), ("two", -2e-3)):
+        folder = tmp_path / rig
+        read = world.draw(rng, poses)
+        slip = size_m * np.outer(np.arange(poses) >= first, np.eye(6)[3])
+        T = world.seen(read) * arm_worlds.exp(slip) * arm_worlds.exp(arm_worlds.noise(rng, poses))
+        arm_worlds.save(folder, world, read, T, {"time_s": time_s})
+        path = folder / "rig.yaml"
+        path.write_text(path.read_text("utf-8").replace("name: arm", f"name: {rig}"), "utf-8")
+    model = Model((*GEOMETRY, "mount_slip@366"))  # two stops early
+    run = calibrate([tmp_path / "one", tmp_path / "two"], tmp_path / "run", model, "none")
+    stand, swapped = retuned(stand_of(run, quiet), ["mount_slip@366"], quiet)
+    assert time_s[first - 1] < swapped["mount_slip@366"].shape < time_s[first]
+    sizes = {name: x for name, x in stand.estimate.values.items() if "mount_slip" in name}
+    assert len(sizes) == 2
+    for (_, x), size_m in zip(sorted(sizes.items()), (1e-3, -2e-3), strict=True):
+        assert x[3] == pytest.approx(size_m, abs=1e-4)

@@ -177,13 +177,14 @@ def _outlasting(
     """A look beside scatter that was found after some effects, and those of these that explain more
     than chance beside it; without the others, which looks after kept ones are without as well."""
     kept = [step for step in found if outlasts(look, step.candidate)]
-    gone = [step.effect.name for step in found if step not in kept]
+    out = [step.effect for step in found if step not in kept]
+    gone, families = [effect.name for effect in out], {effect.family for effect in out}
     less = tried(look.stand.lacking, gone, progress) if gone else None
     if less is None or not less.estimate.converged:
         return look, found
     steps: list[NamedEffect] = []
     for step in kept:
-        there = [name for name in gone if name in step.after.stand.model.names]
+        there = [e.name for e in step.after.stand.model.effects if e.family in families]
         bare = tried(step.after.stand.lacking, there, progress) if there else None
         steps.append(replace(step, after=bare.look(progress)) if bare else step)
     return less.look(progress), steps

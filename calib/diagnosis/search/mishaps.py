@@ -4,6 +4,7 @@ identification and adaptation (Teunissen 1990)."""
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -101,7 +102,10 @@ def restored(
     if len(kept) > len(aside):
         groups = [each.blunder.group for each in kept]
         look = stand.without(groups, progress, of=first).look(progress)
-    return look, kept, [step.with_effect(swapped.get(step.effect.name)) for step in found]
+    steps = [step.with_effect(swapped.get(step.effect.name)) for step in found]
+    if swapped:
+        steps[-1] = replace(steps[-1], after=look)
+    return look, kept, steps
 
 
 def _meet(a: Blunder, b: Blunder) -> bool:

@@ -64,7 +64,7 @@ def _better_shapes(stand: Stand, names: Collection[str], progress: Progress) -> 
         theta = theta_of(stand.problem, effect, stand.estimate.values)
         if effect.has_derivative_by_shape:
             steps[effect.name] = [ShapeStep(effect, theta)]
-        elif others := _beside(effect, stand.sources):
+        elif effect.jumps and (others := _beside(effect, stand.sources)):
             steps[effect.name] = [ShapeStep(effect, theta, to=shape) for shape in others]
     if not steps:
         return {}
@@ -88,16 +88,17 @@ def _beside(effect: Effect, sources: Collection[Source]) -> list[float]:
 def _further(stand: Stand, step: ShapeStep, test: ScoreTest) -> tuple[float, float]:
     """By how much, in squared sigmas, another shape fits better, and which one.
 
-    Where the shape has a derivative, what its best step gains; of another shape, ``2 u - M`` with
-    the score u and information M of going there, no more and no less.
+    With the score u and information M of a step that all rigs take together: where the shape has a
+    derivative ``u^2 / M``, what its best step gains; of another shape ``2 u - M``, what going there
+    does, no more and no less.
     """
-    (best,) = test.estimate()
+    u, M = test.score.sum(), np.linalg.pinv(test.whiten @ test.whiten.T, hermitian=True).sum()
     effect = step.effect
     if step.to is not None:
-        return float(test.statistic * (2.0 - 1.0 / best) / best) if best > 0 else 0.0, step.to
-    by = np.exp(np.clip(best, -LARGEST_SHAPE_STEP, LARGEST_SHAPE_STEP))
+        return float(2.0 * u - M), step.to
+    by = np.exp(np.clip(u / M, -LARGEST_SHAPE_STEP, LARGEST_SHAPE_STEP))
     ends = shape_limits(shapes_of(effect, stand.sources))
-    return test.statistic, float(f"{np.clip(effect.shape * by, *ends):.6g}")
+    return float(u**2 / M), float(f"{np.clip(effect.shape * by, *ends):.6g}")
 
 
 def _state_with(stand: Stand, swapped: Mapping[str, Effect]) -> dict[str, np.ndarray]:

@@ -12,6 +12,7 @@ from calib.report import plots
 from calib.report.chart import Absent, Chart
 from calib.report.evidence import Evidence, folder_name
 from calib.report.statistics import Z_EDGES
+from calib.runs.belief import over_floor
 from calib.runs.ladder import FORMULA, Rung
 
 if TYPE_CHECKING:
@@ -33,7 +34,7 @@ def ladder(evidence: Evidence) -> Iterator[Chart | Absent]:
     floor = evidence.run.summary["rms_mm"]["noise_floor"]
     first = error_mm(evidence.rungs[0])[1]
     way = f" from {first:.2f}" if len(evidence.rungs) > 1 else ""
-    near = "down to" if last <= HELD_OUT_BY_CHANCE * floor else "still above"
+    near = "still above" if over_floor(evidence.run) > HELD_OUT_BY_CHANCE else "down to"
     near = "below" if last > first and last <= floor else near
     yield Chart(
         "ladder",
