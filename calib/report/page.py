@@ -22,7 +22,7 @@ from calib.runs.run import Run
 from calib.show.blunders import BLUNDER_HEADINGS, blunder_cells
 from calib.show.headline import moved_sentence
 from calib.show.misfit import and_angle, over_beams
-from calib.show.tables import chance, effect_page, estimate_cell, mm
+from calib.show.tables import ERROR_LABELS, chance, effect_page, estimate_cell, mm
 from calib.show.verdict import Verdict
 from chains import escape
 
@@ -168,9 +168,6 @@ def _hash(text: str) -> str:
     return f"'sha256-{digest}'"
 
 
-EXPECTED = "expected if the model is right"
-
-
 def _numbers(evidence: Evidence) -> list[tuple[str, str]]:
     """The few numbers that one looks for first: a value, and what it is."""
     summary, (kind, error) = evidence.run.summary, error_mm(evidence.rungs[-1])
@@ -183,7 +180,10 @@ def _numbers(evidence: Evidence) -> list[tuple[str, str]]:
     value, _, share = over_beams(error, summary, before).partition(" over ")
     out = [
         (and_angle(value, summary, key), f"{told[kind]}, over {share}" if share else told[kind]),
-        (and_angle(f"{rms['noise_floor']:.2f} mm", summary, "noise_floor"), EXPECTED),
+        (
+            and_angle(f"{rms['noise_floor']:.2f} mm", summary, "noise_floor"),
+            ERROR_LABELS["noise_floor"],
+        ),
         (f"{rms['nominal']:.1f} mm", "before, with everything as in CAD"),
         (f"{summary['stops']}", "stops"),
     ]

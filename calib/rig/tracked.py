@@ -4,7 +4,7 @@ out."""
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from itertools import combinations
 
 import numpy as np
@@ -156,10 +156,11 @@ def _of_some_rows(
 ) -> Generator[Suspect, None, set[int]]:
     """Columns that belong to another stop, and readings that stood still; returns which stops these
     explain."""
-    off = far_off(pair, roots_of(pair))
+    roots = roots_of(pair)
+    off = far_off(pair, roots)
     if len(off) < FEWEST_OFF:
         return set()
-    if said := _out_of_step(pair, off, recording.stops):
+    if said := _out_of_step(pair, roots, off, recording.stops):
         suspect, rows = said
         yield suspect
         return rows
@@ -167,11 +168,12 @@ def _of_some_rows(
 
 
 def _out_of_step(
-    pair: SeenPair, off: set[int], stops: Sequence[str]
+    pair: SeenPair, roots: Mapping[int, Array], off: set[int], stops: Sequence[str]
 ) -> tuple[Suspect, set[int]] | None:
-    """What belongs to a stop before, or after, if what lies far `off` then fits and nothing between
-    is spoiled: every way in which it does; and the rows, from the first of these to the last."""
-    roots, mended = roots_of(pair), {}
+    """What belongs to a stop before, or after, if what lies far `off` from places of the root then
+    fits and nothing between is spoiled: every way in which it does; and the rows, from the first of
+    these to the last."""
+    mended: dict[tuple[str, int], set[int]] = {}
     for way in ((name, by) for name in (*pair.names, READINGS) for by in SLIPPED):
         moved = pair.slipped(*way)
         if len(moved.stops) < FEWEST_OFF:

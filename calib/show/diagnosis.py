@@ -28,6 +28,7 @@ from calib.show.tables import (
 if TYPE_CHECKING:
     from calib.diagnosis import Diagnosis
     from calib.runs.explain import Explanation
+    from calib.runs.run import Run
 
 LEADING = 8  # candidates that are shown; diagnosis.json has all
 WEAKEST = 4  # directions that are shown
@@ -85,17 +86,20 @@ def print_explanation(explanation: Explanation) -> None:
         console.print(f"Kept for other recordings ('rigcal fit --effects'): {path}")
     console.print()
     _say_found(console, explanation.diagnosis)
-    first, last = (run.summary["rms_mm"] for run in (runs[0], runs[-1]))
-    kind = "held_out" if last.get("held_out") is not None else "fit"
+    last = runs[-1].summary
+    kind = "held_out" if last["rms_mm"].get("held_out") is not None else "fit"
     what = {"held_out": "held-out error", "fit": "error of the fit, none held out"}[kind]
-    way = f"{first[kind]:.2f} -> {last[kind]:.2f}" if runs[1:] else f"{last[kind]:.2f}"
-    way = f"{way} mm"
-    ends = (run.summary.get("rms_mrad", {}).get(kind) for run in (*runs[:1], *runs[1:][-1:]))
-    if turned := [f"{mrad:.2f}" for mrad in ends if mrad is not None]:
-        way = f"{way} and {' -> '.join(turned)} mrad"
-    expected = and_angle(f"{last['noise_floor']:.2f} mm", runs[-1].summary, "noise_floor")
-    console.print(f"{what}: {way}; {expected} expected if the model is right", style="bold")
+    errors = {"mm": "rms_mm", "mrad": "rms_mrad"}.items()
+    ways = (f"{_way(runs, key, kind)} {unit}" for unit, key in errors if key in last)
+    expected = and_angle(f"{last['rms_mm']['noise_floor']:.2f} mm", last, "noise_floor")
+    way = f"{' and '.join(ways)}; {expected} expected if the model is right"
+    console.print(f"{what}: {way}", style="bold")
     console.print(f"verdict: {explanation.diagnosis.heading}", style="bold")
+
+
+def _way(runs: Sequence[Run], key: str, kind: str) -> str:
+    """An error of the first run, and of the last if it is another."""
+    return " -> ".join(f"{run.summary[key][kind]:.2f}" for run in (*runs[:1], *runs[1:][-1:]))
 
 
 def _say_verdict(console: Console, diagnosis: Diagnosis) -> None:
